@@ -1,0 +1,65 @@
+"""GigaVoxels on PyTorch tensors: explore, render and learn from scenes far larger than memory.
+
+Names are loaded when they are first used, so that `gvtorch --help` does not wait for torch. A program that only
+loads TorchScript archives or exported programs imports `gvtorch.ops`, which registers the ops.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .frame import Hits, Rays
+    from .io import read_volume
+    from .pool import BrickPool, Channel, N3Tree, NodePool
+    from .rendering import Camera, Picture, RenderOptions, TransferFunction, TreeTracer, render
+    from .volume import Volume
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "BrickPool": ".pool",
+    "Camera": ".rendering",
+    "Channel": ".pool",
+    "Hits": ".frame",
+    "N3Tree": ".pool",
+    "NodePool": ".pool",
+    "Picture": ".rendering",
+    "Rays": ".frame",
+    "RenderOptions": ".rendering",
+    "TransferFunction": ".rendering",
+    "TreeTracer": ".rendering",
+    "Volume": ".volume",
+    "read_volume": ".io",
+    "render": ".rendering",
+}
+
+__all__ = [
+    "BrickPool",
+    "Camera",
+    "Channel",
+    "Hits",
+    "N3Tree",
+    "NodePool",
+    "Picture",
+    "Rays",
+    "RenderOptions",
+    "TransferFunction",
+    "TreeTracer",
+    "Volume",
+    "read_volume",
+    "render",
+]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME:
+        raise AttributeError(f"module 'gvtorch' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOME[name], __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

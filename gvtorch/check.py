@@ -1,0 +1,116 @@
+"""Checks of what a user hands in: one line that says who complains, what was expected and what came."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def describe(tensor: Any) -> str:
+    """Returns shape, dtype and device of a tensor as one phrase, or the type of anything else."""
+    if not isinstance(tensor, Tensor):
+        return type(tensor).__name__
+    shape = ", ".join(str(size) for size in tensor.shape)
+    dtype = str(tensor.dtype).removeprefix("torch.")
+    return f"({shape}{',' if tensor.dim() == 1 else ''}) {dtype} on {tensor.device}"
+
+
+def tensor(
+    where: str,
+    name: str,
+    value: Any,
+    shape: Sequence[int | str],
+    dtype: torch.dtype,
+    device: torch.device,
+) -> None:
+    """Raises unless `value` has the shape, dtype and device.
+
+    Args:
+        where: The function that the user called.
+        name: The argument's name.
+        value: What came.
+        shape: An int where a size is fixed, a letter where it is free.
+        dtype: The dtype expected.
+        device: The device expected.
+
+    Raises:
+        ValueError: `where: name must be (r, 3) float32 on cpu, got (4, 2) float64 on cpu`.
+    """
+    fits = (
+        isinstance(value, Tensor)
+        and value.dim() == len(shape)
+        and all(isinstance(s, str) or s == size for s, size in zip(shape, value.shape, strict=True))
+        and value.dtype == dtype
+        and value.device == device
+    )
+    if not fits:
+        wanted = ", ".join(str(s) for s in shape) + ("," if len(shape) == 1 else "")
+        kind = str(dtype).removeprefix("torch.")
+        raise ValueError(
+            f"{where}: {name} must be ({wanted}) {kind} on {device}, got {describe(value)}"
+        )
+
+
+def number(
+    where: str,
+    name: str,
+    value: Any,
+    *,
+    low: float = -math.inf,
+    high: float = math.inf,
+    open_low: bool = False,
+) -> float:
+    """Returns `value` as a finite float inside [low, high] (or (low, high]).
+
+    Raises:
+        ValueError: It is no number, not finite, or out of the range.
+    """
+    try:
+        result = float(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{where}: {name} must be a number, got {value!r}") from None
+    inside = low < result <= high if open_low else low <= result <= high
+    if not (math.isfinite(result) and inside):
+        bounds = []
+        if low > -math.inf:
+            bounds.append(f"{'>' if open_low else '>='} {low:g}")
+        if high < math.inf:
+            bounds.append(f"<= {high:g}")
+        wanted = " and ".join(["finite", *bounds])
+        raise ValueError(f"{where}: {name} must be {wanted}, got {value!r}")
+    return result
+
+
+def whole(where: str, name: str, value: Any, *, low: int, high: int = sys.maxsize) -> int:
+    """Returns `value` as an int inside [low, high].
+
+    Raises:
+        ValueError: It is no whole number, or out of the range.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        upper = f" and <= {high}" if high < sys.maxsize else ""
+        raise ValueError(f"{where}: {name} must be an int >= {low}{upper}, got {value!r}")
+    return value
+
+
+def triple(where: str, name: str, value: Any) -> tuple[float, float, float]:
+    """Returns three finite floats (x, y, z).
+
+    Raises:
+        ValueError: There are not three, or one is no finite number.
+    """
+    if isinstance(value, Tensor):
+        value = value.tolist()
+    try:
+        items = tuple(value)
+    except TypeError:
+        raise ValueError(f"{where}: {name} must be three numbers, got {value!r}") from None
+    if len(items) != 3:
+        raise ValueError(f"{where}: {name} must be three numbers, got {len(items)}: {value!r}")
+    x, y, z = (number(where, name, item) for item in items)
+    return (x, y, z)

@@ -1,0 +1,33 @@
+"""Constants that more than one floor needs. What a user may change is an argument with this as its default."""
+
+from __future__ import annotations
+
+#: The pixel cone is taken this much wider than the pixel, so that a level of detail is chosen a little early
+#: rather than late. Source: the original engine's factor (devkit, GvRendererKernel documentation: 1.333).
+CONE_OVERESTIMATE = 4 / 3
+
+#: A ray ends where its alpha reaches this; 1 integrates to the far side. Source: Crassin et al., I3D 2009.
+STOP_ALPHA = 0.99
+
+#: The depth of a ray is where its alpha passes this; rays that stay below have depth +inf.
+DEPTH_ALPHA = 0.1
+
+#: Interval length in voxels of the finest level.
+STEP = 0.5
+
+#: Most voxels that a volume read at once may have (2^31).
+MAX_VOXELS = 2**31
+
+#: Most intervals on one ray: their number is kept in a float32.
+MAX_INTERVALS = 2**23
+
+#: Node words, see cpp_ext/csrc/tree.h.
+ABSENT = -1
+TERMINAL = -2
+EMPTY = -2
+CONSTANT = -3
+
+#: Request words, see cpp_ext/csrc/hd.h: kind bits above a priority of 16 bits.
+REQUEST_PRIORITY = 0xFFFF
+REQUEST_LOAD = 1 << 16
+REQUEST_SUBDIVIDE = 1 << 17

@@ -1,0 +1,44 @@
+"""Finds and loads the compiled libraries.
+
+Loading `libgvtorch_cpu.so` defines `torch.ops.gvtorch.*` and its CPU kernels; `libgvtorch_cuda.so` adds the CUDA
+kernels. A C++ program loads the same files with `dlopen` before it loads a TorchScript archive.
+"""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import torch
+
+FOLDER = Path(__file__).parent / "lib"
+
+
+@functools.cache
+def load() -> dict[str, str]:
+    """Loads each library once.
+
+    Returns:
+        For each backend, `cpp` and `cuda`, an empty text if it can be used and else the reason why not.
+    """
+    reasons = {"cpp": _load("libgvtorch_cpu.so")}
+    if reasons["cpp"]:
+        reasons["cuda"] = "it needs the C++ library"
+    elif torch.version.cuda is None:
+        reasons["cuda"] = f"this torch ({torch.__version__}) is built without CUDA"
+    elif not torch.cuda.is_available():
+        reasons["cuda"] = "torch sees no CUDA device"
+    else:
+        reasons["cuda"] = _load("libgvtorch_cuda.so")
+    return reasons
+
+
+def _load(name: str) -> str:
+    library = FOLDER / name
+    if not library.exists():
+        return f"{name} was not built (pip install builds it; CUDA needs nvcc at build time)"
+    try:
+        torch.ops.load_library(library)
+    except OSError as error:
+        return f"{name} does not load: {error}"
+    return ""

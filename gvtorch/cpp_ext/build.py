@@ -1,0 +1,112 @@
+"""Compiles the two extension libraries and makes the wheel that holds them.
+
+setuptools loads this file by itself (see `[tool.setuptools]` in pyproject.toml), so it imports nothing of gvtorch.
+Both libraries use the LibTorch Stable ABI and no Python C API: one wheel serves every Python >= 3.11 and every
+torch >= 2.11. The CUDA library is built where nvcc stands and is loaded only where torch has CUDA.
+
+Environment:
+    GVTORCH_CUDA        auto (default: build when nvcc is found), 0 (never), 1 (fail without nvcc)
+    GVTORCH_CUDA_ARCHS  compute capabilities, as in "80;90"; the last one is also shipped as PTX
+    CXX, NVCC           the compilers
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from setuptools.command.bdist_wheel import bdist_wheel
+from setuptools.command.build_ext import build_ext
+
+ARCHS = "75;80;86;89;90;100;120"
+TARGET_VERSION = "0x020b000000000000"  # torch 2.11, the oldest that may load the libraries
+FOLDER = Path("gvtorch") / "cpp_ext"
+
+
+def find_nvcc() -> str | None:
+    """Returns the path of nvcc, or None where there is none or GVTORCH_CUDA=0."""
+    choice = os.environ.get("GVTORCH_CUDA", "auto")
+    if choice not in ("auto", "0", "1"):
+        raise SystemExit(f"GVTORCH_CUDA must be auto, 0 or 1, got {choice!r}")
+    if choice == "0":
+        return None
+    home = os.environ.get("CUDA_HOME", "/usr/local/cuda")
+    nvcc = os.environ.get("NVCC") or shutil.which("nvcc") or shutil.which("nvcc", path=f"{home}/bin")
+    if nvcc is None and choice == "1":
+        raise SystemExit("GVTORCH_CUDA=1, but nvcc is neither on PATH nor in CUDA_HOME/bin")
+    return nvcc
+
+
+def commands(output: Path) -> dict[Path, list[str]]:
+    """Returns the compiler call of each library, by the library's path under `output`."""
+    import torch
+
+    root = Path(torch.__file__).parent
+    source = FOLDER / "csrc"
+    # Contraction stays off: a fused multiply-add would round other than the torch twin does.
+    shared = ["-std=c++17", "-O3", "-shared", f"-DTORCH_TARGET_VERSION={TARGET_VERSION}"]
+    include = ["-isystem", str(root / "include")]
+    link = [f"-L{root / 'lib'}", "-ltorch", "-ltorch_cpu"]
+    cxx = [*shlex.split(os.environ.get("CXX", "g++")), *shared, "-fPIC", "-Wall", "-Wextra"]
+    cxx += ["-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden", *include, str(source / "cpu.cpp")]
+    calls = {output / "libgvtorch_cpu.so": [*cxx, "-Wl,--no-as-needed", *link, "-pthread"]}
+    nvcc = find_nvcc()
+    if nvcc is not None:
+        archs = os.environ.get("GVTORCH_CUDA_ARCHS", ARCHS).split(";")
+        codes = [f"-gencode=arch=compute_{a},code=sm_{a}" for a in archs]
+        codes.append(f"-gencode=arch=compute_{archs[-1]},code=compute_{archs[-1]}")
+        call = [nvcc, *shared, "-DUSE_CUDA", "-fmad=false", "-Xcompiler=-fPIC,-fvisibility=hidden", "--threads=2", *codes, *include]
+        call += [str(source / "cuda.cu"), "-Xlinker=--no-as-needed", *link, "-cudart=static"]
+        calls[output / "libgvtorch_cuda.so"] = call
+    return calls
+
+
+def compile_libraries(output: Path) -> list[Path]:
+    """Compiles what is missing or older than its sources or flags; returns the libraries."""
+    sources = sorted((FOLDER / "csrc").iterdir())
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
+    output.mkdir(parents=True, exist_ok=True)
+    libraries = []
+    for library, call in commands(output).items():
+        stamp = library.with_suffix(".stamp")
+        state = digest + " " + shlex.join(call)
+        if not (library.exists() and stamp.exists() and stamp.read_text() == state):
+            print("gvtorch:", shlex.join([*call, "-o", str(library)]), file=sys.stderr, flush=True)
+            subprocess.run([*call, "-o", str(library)], check=True)
+            stamp.write_text(state)
+        libraries.append(library)
+    return libraries
+
+
+class BuildExt(build_ext):
+    """Puts the libraries beside cpp_ext/__init__.py: in the source tree (editable) and in the wheel."""
+
+    def run(self) -> None:
+        """Compiles in the source tree, where the next build finds them, and copies to the build folder."""
+        self._libraries = compile_libraries(FOLDER / "lib")
+        if not (self.inplace or self.editable_mode):
+            for library in self._libraries:
+                target = Path(self.build_lib) / library
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(library, target)
+
+    def get_outputs(self) -> list[str]:
+        """Returns the libraries as they lie in the build folder."""
+        return [str(Path(self.build_lib) / library) for library in commands(FOLDER / "lib")]
+
+    def get_output_mapping(self) -> dict[str, str]:
+        """Returns build folder path -> source tree path, for editable installs."""
+        return {str(Path(self.build_lib) / library): str(library) for library in commands(FOLDER / "lib")}
+
+
+class BdistWheel(bdist_wheel):
+    """Tags the wheel for any Python 3: the libraries do not use the Python C API."""
+
+    def get_tag(self) -> tuple[str, str, str]:
+        """Returns (py3, none, platform)."""
+        return ("py3", "none", super().get_tag()[2])

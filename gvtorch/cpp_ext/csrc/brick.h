@@ -1,0 +1,83 @@
+// Trilinear sampling of one channel of the brick pool.
+//
+// A brick is B*B*B voxels plus `border` voxels on every side, stored (z, y, x, c), x next to fastest. Voxel
+// centres lie at half-integers of the brick's own units [0, B], so neighbours agree at the face they share as
+// long as border >= 1: both interpolate the same two voxels. A place beyond the stored centres is clamped.
+#pragma once
+
+#include "tree.h"
+
+namespace gvtorch {
+
+template <class Voxel>
+struct BrickView {
+  const Voxel* bricks_bzyxc;
+  const Voxel* constant_tnc;
+  int32_t* stamp_b;
+  int32_t side;  // B + 2 * border
+  int32_t border;
+  int32_t channels;
+  int32_t component;
+};
+
+// One brick (or constant) seen along one ray: voxel coordinate = offset + t * slope.
+template <class T>
+struct BrickRay {
+  int64_t base = -1;  // index of the brick's first voxel; < 0: `constant` everywhere
+  T constant = 0;
+  Vec3<T> offset{0, 0, 0};
+  Vec3<T> slope{0, 0, 0};
+};
+
+template <class T, class Voxel>
+GV_HD BrickRay<T> aim(const BrickView<Voxel>& view, const Holder<T>& holder, Vec3<T> origin, Vec3<T> direction) {
+  BrickRay<T> ray;
+  if (holder.brick < 0) {
+    if (holder.node >= 0) {
+      ray.constant = static_cast<T>(view.constant_tnc[holder.node * view.channels + view.component]);
+    }
+    return ray;
+  }
+  const int64_t volume = static_cast<int64_t>(view.side) * view.side * view.side;
+  ray.base = holder.brick * volume * view.channels + view.component;
+  const T scale = static_cast<T>(view.side - 2 * view.border) / holder.size;
+  const T first = static_cast<T>(view.border) - static_cast<T>(0.5);
+  for (int axis = 0; axis < 3; ++axis) {
+    ray.offset[axis] = (origin[axis] - holder.corner[axis]) * scale + first;
+    ray.slope[axis] = direction[axis] * scale;
+  }
+  return ray;
+}
+
+template <class T, class Voxel>
+GV_HD T sample(const BrickView<Voxel>& view, const BrickRay<T>& ray, T t) {
+  if (ray.base < 0) return ray.constant;
+  int64_t index[3];
+  T weight[3];
+  const T last = static_cast<T>(view.side - 1);
+  const T last_cell = static_cast<T>(view.side - 2);
+  for (int axis = 0; axis < 3; ++axis) {
+    const T place = clamp(ray.offset[axis] + t * ray.slope[axis], static_cast<T>(0), last);
+    const T cell = smaller(std::floor(place), last_cell);
+    index[axis] = static_cast<int64_t>(cell);
+    weight[axis] = place - cell;
+  }
+  const int64_t step_x = view.channels;
+  const int64_t step_y = step_x * view.side;
+  const int64_t step_z = step_y * view.side;
+  const Voxel* corner = view.bricks_bzyxc + ray.base + index[2] * step_z + index[1] * step_y + index[0] * step_x;
+  T plane[2];
+  for (int z = 0; z < 2; ++z) {
+    T row[2];
+    for (int y = 0; y < 2; ++y) {
+      const Voxel* pair = corner + z * step_z + y * step_y;
+      const T left = static_cast<T>(pair[0]);
+      const T right = static_cast<T>(pair[step_x]);
+      row[y] = left + weight[0] * (right - left);
+    }
+    plane[z] = row[0] + weight[1] * (row[1] - row[0]);
+  }
+  return plane[0] + weight[2] * (plane[1] - plane[0]);
+}
+
+}  // namespace gvtorch

@@ -1,0 +1,158 @@
+// Where torch meets the kernels: the schema of every op, and the step from tensors to the borrowed views of the
+// kernel headers. Included once by cpu.cpp and once by cuda.cu, each of which brings its own `for_each`.
+//
+// Only the LibTorch Stable ABI is used (torch/csrc/stable), so that one binary serves every torch >= 2.11.
+// Messages for users are made in gvtorch/ops/*.py; the checks here only keep memory safe.
+#pragma once
+
+#include <torch/csrc/stable/library.h>
+#include <torch/csrc/stable/ops.h>
+#include <torch/csrc/stable/tensor.h>
+#include <torch/headeronly/core/ScalarType.h>
+#include <torch/headeronly/util/BFloat16.h>
+#include <torch/headeronly/util/Half.h>
+
+#include <tuple>
+
+#include "trace.h"
+
+namespace gvtorch {
+
+using torch::headeronly::ScalarType;
+using torch::stable::Tensor;
+
+// (a!) request words, (b!) tile stamps, (c!) brick stamps are written in place.
+constexpr const char* kTraceRaysSchema =
+    "trace_rays("
+    "Tensor origin_r3, Tensor direction_r3, Tensor cone_r2, Tensor range_r2, Tensor bounds_23, "
+    "Tensor child_tn, Tensor brick_tn, Tensor(a!) request_tn, Tensor(b!) stamp_t, "
+    "Tensor bricks_bzyxc, Tensor constant_tnc, Tensor(c!) stamp_b, "
+    "Tensor table_m4, Tensor domain_3, Tensor frame_1, "
+    "int branching, int root, int max_depth, int border, int component, "
+    "float root_voxel, float step, float stop_alpha, float depth_alpha"
+    ") -> (Tensor color_r3, Tensor alpha_r1, Tensor depth_r1, Tensor samples_r)";
+
+inline void require(const Tensor& tensor, const char* name, const Tensor& like, ScalarType dtype) {
+  STD_TORCH_CHECK(tensor.is_contiguous(), "gvtorch: ", name, " must be contiguous");
+  STD_TORCH_CHECK(tensor.scalar_type() == dtype, "gvtorch: ", name, " has the wrong dtype");
+  STD_TORCH_CHECK(tensor.device() == like.device(), "gvtorch: ", name, " lies on another device than the rays");
+}
+
+inline void require_numel(const Tensor& tensor, const char* name, int64_t expected) {
+  STD_TORCH_CHECK(tensor.numel() == expected, "gvtorch: ", name, " must hold ", expected, " elements, got ",
+                  tensor.numel());
+}
+
+inline void require_float(ScalarType dtype) {
+  STD_TORCH_CHECK(dtype == ScalarType::Float || dtype == ScalarType::Double,
+                  "gvtorch: rays must be float32 or float64");
+}
+
+template <class T>
+constexpr ScalarType scalar_type_of() {
+  return sizeof(T) == 8 ? ScalarType::Double : ScalarType::Float;
+}
+
+// Calls `body(Voxel{})` with the C++ type of a channel's dtype.
+template <class Body>
+void with_voxel_type(ScalarType dtype, const Body& body) {
+  switch (dtype) {
+    case ScalarType::Byte: return body(uint8_t{});
+    case ScalarType::Char: return body(int8_t{});
+    case ScalarType::Short: return body(int16_t{});
+    case ScalarType::UInt16: return body(uint16_t{});
+    case ScalarType::Half: return body(torch::headeronly::Half{});
+    case ScalarType::BFloat16: return body(torch::headeronly::BFloat16{});
+    case ScalarType::Float: return body(float{});
+    default: STD_TORCH_CHECK(false, "gvtorch: this channel dtype has no kernel");
+  }
+}
+
+template <class Device>
+std::tuple<Tensor, Tensor, Tensor, Tensor> trace_rays(
+    const Tensor& origin_r3, const Tensor& direction_r3, const Tensor& cone_r2, const Tensor& range_r2,
+    const Tensor& bounds_23, const Tensor& child_tn, const Tensor& brick_tn, const Tensor& request_tn,
+    const Tensor& stamp_t, const Tensor& bricks_bzyxc, const Tensor& constant_tnc, const Tensor& stamp_b,
+    const Tensor& table_m4, const Tensor& domain_3, const Tensor& frame_1, int64_t branching, int64_t root,
+    int64_t max_depth, int64_t border, int64_t component, double root_voxel, double step, double stop_alpha,
+    double depth_alpha) {
+  const ScalarType real = origin_r3.scalar_type();
+  const ScalarType word = ScalarType::Int;
+  const ScalarType voxel = bricks_bzyxc.scalar_type();
+  require_float(real);
+  STD_TORCH_CHECK(origin_r3.dim() == 2 && origin_r3.size(1) == 3, "gvtorch: origin_r3 must be (r, 3)");
+  STD_TORCH_CHECK(bricks_bzyxc.dim() == 5 && bricks_bzyxc.size(1) >= 2 && bricks_bzyxc.size(1) == bricks_bzyxc.size(2) &&
+                      bricks_bzyxc.size(2) == bricks_bzyxc.size(3),
+                  "gvtorch: bricks_bzyxc must be (b, s, s, s, c) with s >= 2");
+  const int64_t rays = origin_r3.size(0);
+  const int64_t side = bricks_bzyxc.size(1);
+  const int64_t channels = bricks_bzyxc.size(4);
+  const int64_t nodes = child_tn.numel();
+  STD_TORCH_CHECK(branching >= 2 && branching <= 16 && max_depth >= 0 && max_depth <= 62, "gvtorch: tree out of range");
+  STD_TORCH_CHECK(root >= 0 && root < nodes, "gvtorch: root is not a node");
+  STD_TORCH_CHECK(border >= 0 && side > 2 * border && component >= 0 && component < channels,
+                  "gvtorch: border or component out of range");
+  STD_TORCH_CHECK(step > 0 && root_voxel > 0, "gvtorch: step and root_voxel must be positive");
+
+  for (const auto& [tensor, name, numel] :
+       {std::tuple<const Tensor&, const char*, int64_t>{origin_r3, "origin_r3", 3 * rays},
+        {direction_r3, "direction_r3", 3 * rays},
+        {cone_r2, "cone_r2", 2 * rays},
+        {range_r2, "range_r2", 2 * rays},
+        {bounds_23, "bounds_23", 6},
+        {table_m4, "table_m4", table_m4.size(0) * 4},
+        {domain_3, "domain_3", 3}}) {
+    require(tensor, name, origin_r3, real);
+    require_numel(tensor, name, numel);
+  }
+  STD_TORCH_CHECK(table_m4.size(0) >= 2, "gvtorch: table_m4 needs two rows");
+  for (const auto& [tensor, name, numel] :
+       {std::tuple<const Tensor&, const char*, int64_t>{child_tn, "child_tn", nodes},
+        {brick_tn, "brick_tn", nodes},
+        {request_tn, "request_tn", nodes},
+        {stamp_t, "stamp_t", nodes / (branching * branching * branching)},
+        {stamp_b, "stamp_b", bricks_bzyxc.size(0)},
+        {frame_1, "frame_1", 1}}) {
+    require(tensor, name, origin_r3, word);
+    require_numel(tensor, name, numel);
+  }
+  require(bricks_bzyxc, "bricks_bzyxc", origin_r3, voxel);
+  require(constant_tnc, "constant_tnc", origin_r3, voxel);
+  require_numel(constant_tnc, "constant_tnc", nodes * channels);
+
+  Tensor color_r3 = torch::stable::new_empty(origin_r3, {rays, 3});
+  Tensor alpha_r1 = torch::stable::new_empty(origin_r3, {rays, 1});
+  Tensor depth_r1 = torch::stable::new_empty(origin_r3, {rays, 1});
+  Tensor samples_r = torch::stable::new_empty(origin_r3, {rays}, word);
+
+  const auto run = [&](auto scalar) {
+    using T = decltype(scalar);
+    with_voxel_type(voxel, [&](auto stored) {
+      using Voxel = decltype(stored);
+      const auto real_in = [](const Tensor& tensor) { return static_cast<const T*>(tensor.const_data_ptr()); };
+      const auto real_out = [](const Tensor& tensor) { return static_cast<T*>(tensor.mutable_data_ptr()); };
+      const auto word_in = [](const Tensor& tensor) { return static_cast<const int32_t*>(tensor.const_data_ptr()); };
+      const auto word_out = [](const Tensor& tensor) { return static_cast<int32_t*>(tensor.mutable_data_ptr()); };
+      const TraceRay<T, Voxel> body{
+          {real_in(origin_r3), real_in(direction_r3), real_in(cone_r2), real_in(range_r2), real_in(bounds_23)},
+          {word_in(child_tn), word_in(brick_tn), word_out(request_tn), word_out(stamp_t), root,
+           static_cast<int32_t>(branching), static_cast<int32_t>(max_depth)},
+          {static_cast<const Voxel*>(bricks_bzyxc.const_data_ptr()),
+           static_cast<const Voxel*>(constant_tnc.const_data_ptr()), word_out(stamp_b), static_cast<int32_t>(side),
+           static_cast<int32_t>(border), static_cast<int32_t>(channels), static_cast<int32_t>(component)},
+          {real_in(table_m4), real_in(domain_3), static_cast<int32_t>(table_m4.size(0))},
+          {static_cast<T>(root_voxel), static_cast<T>(step), static_cast<T>(stop_alpha), static_cast<T>(depth_alpha)},
+          {real_out(color_r3), real_out(alpha_r1), real_out(depth_r1), word_out(samples_r)},
+          word_in(frame_1)};
+      for_each<Device>(origin_r3, rays, body);
+    });
+  };
+  if (real == ScalarType::Double) {
+    run(double{});
+  } else {
+    run(float{});
+  }
+  return {color_r3, alpha_r1, depth_r1, samples_r};
+}
+
+}  // namespace gvtorch

@@ -1,0 +1,173 @@
+"""`trace_rays`: rays through an N3 tree, checked and sent to a backend."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from .. import check, config
+from ..volume import CHANNEL_DTYPES
+from . import reference
+from .registry import available
+
+Backend = Literal["auto", "reference", "cpp", "cuda"]
+
+
+def choose_backend(backend: str, device: torch.device) -> str:
+    """Returns the backend that runs on `device`: `auto` takes the compiled one where there is one.
+
+    Raises:
+        ValueError: The backend is unknown, can't be used here, or does not run on `device`.
+    """
+    if backend not in ("auto", "reference", "cpp", "cuda"):
+        raise ValueError(f"backend must be auto, reference, cpp or cuda, got {backend!r}")
+    compiled = {"cpu": "cpp", "cuda": "cuda"}.get(device.type)
+    if backend == "auto":
+        return compiled if compiled and not available()[compiled] else "reference"
+    reason = available()[backend]
+    if reason:
+        raise ValueError(f"backend {backend!r} can't be used here: {reason}")
+    if backend != "reference" and backend != compiled:
+        raise ValueError(f"backend {backend!r} does not run on device {device}")
+    return backend
+
+
+def trace_rays(
+    origin_r3: Tensor,
+    direction_r3: Tensor,
+    cone_r2: Tensor,
+    range_r2: Tensor,
+    bounds_23: Tensor,
+    child_tn: Tensor,
+    brick_tn: Tensor,
+    request_tn: Tensor,
+    stamp_t: Tensor,
+    bricks_bzyxc: Tensor,
+    constant_tnc: Tensor,
+    stamp_b: Tensor,
+    table_m4: Tensor,
+    domain_3: Tensor,
+    frame_1: Tensor,
+    *,
+    branching: int,
+    root: int,
+    max_depth: int,
+    border: int,
+    component: int,
+    root_voxel: float,
+    step: float,
+    stop_alpha: float = config.STOP_ALPHA,
+    depth_alpha: float = config.DEPTH_ALPHA,
+    backend: Backend = "auto",
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Traces rays through a tree and shades what they meet with a transfer function.
+
+    Mutates `request_tn` (what rays missed), `stamp_t` and `stamp_b` (what rays used). Every tensor is contiguous
+    and on one device; reals are all float32 or all float64, words int32.
+
+    Args:
+        origin_r3: (r, 3) ray origins, tree units.
+        direction_r3: (r, 3) tree units per world unit.
+        cone_r2: (r, 2) cone width at distance 0 and its growth, world units; zeros ask for the finest level.
+        range_r2: (r, 2) first and last distance, world units.
+        bounds_23: (2, 3) the part of the root cube that is drawn, tree units.
+        child_tn: (t, n) tile of a node's children, or ABSENT, TERMINAL.
+        brick_tn: (t, n) a node's brick slot, or ABSENT, EMPTY, CONSTANT.
+        request_tn: (t, n) request words, written.
+        stamp_t: (t,) last frame that used a tile, written.
+        bricks_bzyxc: (b, s, s, s, c) one channel of the brick pool, s = brick size + 2 border.
+        constant_tnc: (t, n, c) the value of CONSTANT nodes (and the mean of EMPTY ones), same dtype.
+        stamp_b: (b,) last frame that used a brick, written.
+        table_m4: (m, 4) transfer function: linear RGB and opacity per reference length, m >= 2.
+        domain_3: (3,) value of the first row, value of the last row, reference length in world units.
+        frame_1: (1,) int32 number of this frame.
+        branching: N, nodes of a tile along an axis.
+        root: Index of the root node.
+        max_depth: Depth of the finest level.
+        border: Voxels of border on each side of a brick.
+        component: Which of the c values the transfer function reads.
+        root_voxel: World size of a depth-0 voxel along its largest side.
+        step: World length of the shortest interval between samples.
+        stop_alpha: A ray ends at this alpha; 1 integrates to the end.
+        depth_alpha: Depth is where alpha passes this.
+        backend: auto, reference, cpp or cuda.
+
+    Returns:
+        color (r, 3) premultiplied linear RGB, alpha (r, 1), depth (r, 1) world units or +inf, samples (r,) int32.
+
+    Raises:
+        ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.
+
+    Source: Crassin, Neyret, Lefebvre, Eisemann, "GigaVoxels", I3D 2009, sections 3 and 4.
+    """
+    where, device = "trace_rays", origin_r3.device
+    real = origin_r3.dtype
+    if real not in (torch.float32, torch.float64):
+        raise ValueError(
+            f"{where}: origin_r3 must be (r, 3) float32 or float64, got {check.describe(origin_r3)}"
+        )
+    rays, (tiles, nodes) = origin_r3.shape[0], child_tn.shape
+    bricks, side = bricks_bzyxc.shape[0], bricks_bzyxc.shape[1]
+    channels, voxel = bricks_bzyxc.shape[-1], bricks_bzyxc.dtype
+    if voxel not in CHANNEL_DTYPES:
+        raise ValueError(f"{where}: bricks_bzyxc has dtype {voxel}, which no channel can have")
+    for name, tensor, shape, dtype in (
+        ("origin_r3", origin_r3, (rays, 3), real),
+        ("direction_r3", direction_r3, (rays, 3), real),
+        ("cone_r2", cone_r2, (rays, 2), real),
+        ("range_r2", range_r2, (rays, 2), real),
+        ("bounds_23", bounds_23, (2, 3), real),
+        ("child_tn", child_tn, (tiles, branching**3), torch.int32),
+        ("brick_tn", brick_tn, (tiles, nodes), torch.int32),
+        ("request_tn", request_tn, (tiles, nodes), torch.int32),
+        ("stamp_t", stamp_t, (tiles,), torch.int32),
+        ("bricks_bzyxc", bricks_bzyxc, (bricks, side, side, side, channels), voxel),
+        ("constant_tnc", constant_tnc, (tiles, nodes, channels), voxel),
+        ("stamp_b", stamp_b, (bricks,), torch.int32),
+        ("table_m4", table_m4, ("m", 4), real),
+        ("domain_3", domain_3, (3,), real),
+        ("frame_1", frame_1, (1,), torch.int32),
+    ):
+        check.tensor(where, name, tensor, shape, dtype, device)
+        if not tensor.is_contiguous():
+            raise ValueError(f"{where}: {name} must be contiguous")
+    if table_m4.shape[0] < 2:
+        raise ValueError(f"{where}: table_m4 needs at least 2 rows, got {table_m4.shape[0]}")
+    check.whole(where, "branching", branching, low=2, high=16)
+    check.whole(where, "root", root, low=0, high=tiles * nodes - 1)
+    check.whole(where, "max_depth", max_depth, low=0, high=62)
+    check.whole(where, "border", border, low=0, high=(side - 1) // 2)
+    check.whole(where, "component", component, low=0, high=channels - 1)
+    for name, number in (("root_voxel", root_voxel), ("step", step)):
+        check.number(where, name, number, low=0, open_low=True)
+    for name, number in (("stop_alpha", stop_alpha), ("depth_alpha", depth_alpha)):
+        check.number(where, name, number, low=0, high=1)
+
+    args = (
+        *(origin_r3, direction_r3, cone_r2, range_r2, bounds_23),
+        *(child_tn, brick_tn, request_tn, stamp_t, bricks_bzyxc, constant_tnc, stamp_b),
+        *(table_m4, domain_3, frame_1),
+        *(branching, root, max_depth, border, component),
+        *(float(root_voxel), float(step), float(stop_alpha), float(depth_alpha)),
+    )
+    if choose_backend(backend, device) == "reference":
+        return reference.trace_rays(*args)
+    return torch.ops.gvtorch.trace_rays(*args)
+
+
+def most_intervals(length: float, step: float) -> int:
+    """Returns how many intervals a ray of `length` can have.
+
+    Raises:
+        ValueError: More than a ray can count.
+    """
+    count = math.ceil(length / step)
+    if count > config.MAX_INTERVALS:
+        raise ValueError(
+            f"step: {step:g} world units cuts a ray of {length:g} into {count} intervals, "
+            f"more than {config.MAX_INTERVALS}"
+        )
+    return count

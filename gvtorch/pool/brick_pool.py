@@ -1,0 +1,89 @@
+"""`BrickPool`: bricks of voxels in any number of named, typed channels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .. import check
+from ..volume import CHANNEL_DTYPES
+
+
+@dataclass(frozen=True)
+class Channel:
+    """What a voxel of a channel holds: `width` numbers of `dtype`."""
+
+    dtype: torch.dtype = torch.float32
+    width: int = 1
+
+    def __post_init__(self) -> None:
+        """Checks dtype and width."""
+        if self.dtype not in CHANNEL_DTYPES:
+            names = ", ".join(str(dtype).removeprefix("torch.") for dtype in CHANNEL_DTYPES)
+            raise ValueError(f"Channel: dtype must be one of {names}, got {self.dtype}")
+        check.whole("Channel", "width", self.width, low=1)
+
+
+class BrickPool:
+    """Room for `capacity` bricks of brick_size ** 3 voxels with `border` voxels around.
+
+    Attributes:
+        bricks: For each channel (b, z, y, x, c), sides of brick_size + 2 * border.
+        stamp_b: (b,) last frame in which a ray sampled the brick, -1 for never.
+        owner_b: (b,) node index that the brick belongs to, -1 for free.
+    """
+
+    def __init__(
+        self,
+        capacity: int,
+        channels: Mapping[str, Channel],
+        *,
+        brick_size: int = 8,
+        border: int = 1,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """Takes the memory.
+
+        Args:
+            capacity: Number of bricks, 0 or more.
+            channels: What each voxel holds, by name.
+            brick_size: Voxels along a side, without the border, >= 2.
+            border: Voxels around, 0 or more; neighbours agree at their faces from 1 on.
+            device: Where the tensors lie.
+
+        Raises:
+            ValueError: A number is out of its range, or there is no channel.
+        """
+        check.whole("BrickPool", "capacity", capacity, low=0, high=2**31 - 1)
+        check.whole("BrickPool", "brick_size", brick_size, low=2, high=256)
+        check.whole("BrickPool", "border", border, low=0, high=16)
+        if not channels:
+            raise ValueError("BrickPool: channels must name at least one channel")
+        self.brick_size, self.border = brick_size, border
+        self.channels = dict(channels)
+        side = brick_size + 2 * border
+        self.bricks = {
+            name: torch.zeros((capacity, side, side, side, c.width), dtype=c.dtype, device=device)
+            for name, c in channels.items()
+        }
+        self.stamp_b = torch.full((capacity,), -1, dtype=torch.int32, device=device)
+        self.owner_b = torch.full((capacity,), -1, dtype=torch.int32, device=device)
+
+    @property
+    def fields(self) -> dict[str, Tensor]:
+        """All tensors by name; channels as `bricks.NAME`."""
+        channels = {f"bricks.{name}": tensor for name, tensor in self.bricks.items()}
+        return {**channels, "stamp_b": self.stamp_b, "owner_b": self.owner_b}
+
+    @property
+    def capacity(self) -> int:
+        """Number of bricks."""
+        return self.stamp_b.shape[0]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all fields."""
+        return sum(field.nbytes for field in self.fields.values())

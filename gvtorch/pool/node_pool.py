@@ -1,0 +1,82 @@
+"""`NodePool`: node tiles as flat int32 tensors, one row a tile."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .. import check
+from ..config import ABSENT
+
+
+class NodePool:
+    """Room for `capacity` node tiles of n = branching ** dimensions sibling nodes.
+
+    Node index = tile * n + child. A fresh tile's nodes have neither children nor brick.
+
+    Attributes:
+        child_tn: (t, n) tile index of the node's children, or ABSENT, TERMINAL.
+        brick_tn: (t, n) brick slot, or ABSENT, EMPTY, CONSTANT.
+        request_tn: (t, n) what rays wished for since the words were last cleared.
+        loc_t4: (t, 4) x, y, z of the tile's parent node at its depth, and the depth of the tile's own nodes;
+            node x at that depth = loc x * N + child x.
+        parent_t: (t,) node index whose children this tile holds, -1 for a root tile.
+        tree_t: (t,) number of the tree that owns the tile.
+        stamp_t: (t,) last frame in which a ray passed through, -1 for never.
+    """
+
+    def __init__(
+        self,
+        capacity: int,
+        *,
+        branching: int = 2,
+        dimensions: int = 3,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """Takes the memory.
+
+        Args:
+            capacity: Number of tiles.
+            branching: N >= 2.
+            dimensions: 3 for volumes, 2 for maps.
+            device: Where the tensors lie.
+
+        Raises:
+            ValueError: A number is out of its range, or nodes could not be counted in int32.
+        """
+        check.whole("NodePool", "capacity", capacity, low=1)
+        check.whole("NodePool", "branching", branching, low=2, high=16)
+        check.whole("NodePool", "dimensions", dimensions, low=2, high=3)
+        n = branching**dimensions
+        if capacity * n >= 2**31:
+            raise ValueError(
+                f"NodePool: {capacity} tiles of {n} nodes are more than int32 can name"
+            )
+        self.branching, self.dimensions = branching, dimensions
+        self.child_tn = torch.full((capacity, n), ABSENT, dtype=torch.int32, device=device)
+        self.brick_tn = torch.full((capacity, n), ABSENT, dtype=torch.int32, device=device)
+        self.request_tn = torch.zeros((capacity, n), dtype=torch.int32, device=device)
+        self.loc_t4 = torch.zeros((capacity, 4), dtype=torch.int32, device=device)
+        self.parent_t = torch.full((capacity,), -1, dtype=torch.int32, device=device)
+        self.tree_t = torch.zeros((capacity,), dtype=torch.int32, device=device)
+        self.stamp_t = torch.full((capacity,), -1, dtype=torch.int32, device=device)
+
+    @property
+    def fields(self) -> dict[str, Tensor]:
+        """All tensors by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+
+    @property
+    def capacity(self) -> int:
+        """Number of tiles."""
+        return self.child_tn.shape[0]
+
+    @property
+    def nodes_per_tile(self) -> int:
+        """n = N ** dimensions."""
+        return self.child_tn.shape[1]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all fields."""
+        return sum(field.nbytes for field in self.fields.values())

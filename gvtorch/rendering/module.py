@@ -1,0 +1,115 @@
+"""`TreeTracer`: a tree and a transfer function as one `nn.Module` of plain tensors and one op.
+
+It can be scripted, saved and loaded (also from C++), exported and compiled. Programs that load an archive import
+`gvtorch.ops` first; C++ programs open `libgvtorch_cpu.so`.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .. import config
+from ..ops import available
+from ..pool import N3Tree
+from .shader import TransferFunction
+
+
+class TreeTracer(torch.nn.Module):
+    """Traces world rays through a resident tree. Pools are buffers: `.to(device)` moves them."""
+
+    def __init__(
+        self,
+        tree: N3Tree,
+        shader: TransferFunction,
+        *,
+        channel: str | None = None,
+        component: int = 0,
+        step: float = config.STEP,
+        stop_alpha: float = config.STOP_ALPHA,
+        depth_alpha: float = config.DEPTH_ALPHA,
+    ) -> None:
+        """Shares the tree's tensors.
+
+        Args:
+            tree: The tree.
+            shader: The transfer function.
+            channel: Name of the channel it reads; the first if left out.
+            component: Which number of the channel.
+            step: Interval length in voxels of the finest level.
+            stop_alpha: A ray ends at this alpha.
+            depth_alpha: Depth is where alpha passes this.
+
+        Raises:
+            RuntimeError: The compiled op is missing.
+        """
+        super().__init__()
+        if available()["cpp"]:
+            raise RuntimeError(f"TreeTracer needs the compiled op: {available()['cpp']}")
+        channel = channel or tree.channel_names[0]
+        table, domain = shader.table(min(tree.spacing), torch.float32, tree.device)
+        size = torch.tensor(tree.spacing, dtype=torch.float64) * tree.side
+        nodes, bricks = tree.nodes, tree.bricks
+        for name, tensor in (
+            ("corner", tree.box[0].to(tree.device)),
+            ("size", size.to(tree.device)),
+            ("bounds", tree.bounds(torch.float32)),
+            ("child", nodes.child_tn),
+            ("brick", nodes.brick_tn),
+            ("request", nodes.request_tn),
+            ("stamp_tile", nodes.stamp_t),
+            ("bricks", bricks.bricks[channel]),
+            ("constant", tree.constants[channel]),
+            ("stamp_brick", bricks.stamp_b),
+            ("table", table),
+            ("domain", domain),
+            ("frame", torch.zeros(1, dtype=torch.int32, device=tree.device)),
+        ):
+            self.register_buffer(name, tensor)
+        self.branching, self.root, self.depth = tree.branching, tree.root, tree.depth
+        self.border, self.component = bricks.border, component
+        self.root_voxel, self.step = float(tree.root_voxel), step * min(tree.spacing)
+        self.stop_alpha, self.depth_alpha = float(stop_alpha), float(depth_alpha)
+
+    def forward(
+        self, origin: Tensor, direction: Tensor, cone: Tensor, range: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Traces rays in world units.
+
+        Args:
+            origin: (r, 3) float32.
+            direction: (r, 3) float32, unit length.
+            cone: (r, 2) float32, width at the origin and growth per unit distance; zeros for the finest level.
+            range: (r, 2) float32, first and last distance.
+
+        Returns:
+            color (r, 3) premultiplied, alpha (r, 1), depth (r, 1), samples (r,) int32.
+        """
+        start = ((origin.to(torch.float64) - self.corner) / self.size).to(torch.float32)
+        along = (direction.to(torch.float64) / self.size).to(torch.float32)
+        return torch.ops.gvtorch.trace_rays(
+            start,
+            along,
+            cone,
+            range,
+            self.bounds,
+            self.child,
+            self.brick,
+            self.request,
+            self.stamp_tile,
+            self.bricks,
+            self.constant,
+            self.stamp_brick,
+            self.table,
+            self.domain,
+            self.frame,
+            self.branching,
+            self.root,
+            self.depth,
+            self.border,
+            self.component,
+            self.root_voxel,
+            self.step,
+            self.stop_alpha,
+            self.depth_alpha,
+        )

@@ -1,0 +1,181 @@
+"""`render`: camera -> rays -> trace -> picture."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+
+from .. import check, config
+from ..frame import Hits, Rays
+from ..ops import trace_rays
+from ..ops.trace import Backend, choose_backend, most_intervals
+from ..pool import N3Tree
+from ..stage import Progress, collect_timings, no_progress, stage
+from .camera import Camera
+from .picture import Picture, RenderStats
+from .shader import TransferFunction
+
+_RAYS_A_CALL = {"cpu": 1 << 15, "cuda": 1 << 24}  # small on the CPU, so that progress shows
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderOptions:
+    """How a picture is made."""
+
+    step: float = config.STEP  # interval length in voxels of the finest level
+    lod: Literal["auto", "finest"] = "auto"  # auto: voxels as wide as the pixel cone
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # linear RGB
+    stop_alpha: float = config.STOP_ALPHA  # a ray ends here; 1 integrates to the end
+    depth_alpha: float = config.DEPTH_ALPHA  # depth is where alpha passes this
+    cone_scale: float = config.CONE_OVERESTIMATE  # widens the pixel cone
+    channel: str | None = None  # name of the channel the shader reads; None: the first
+    component: int = 0  # which number of the channel
+    backend: Backend = "auto"
+    dtype: torch.dtype = torch.float32  # float64 for trees deeper than about 2^16 voxels
+
+    def __post_init__(self) -> None:
+        """Checks every option."""
+        where = "render"
+        check.number(where, "step", self.step, low=0, open_low=True)
+        if self.lod not in ("auto", "finest"):
+            raise ValueError(f"{where}: lod must be 'auto' or 'finest', got {self.lod!r}")
+        check.triple(where, "background", self.background)
+        check.number(where, "stop_alpha", self.stop_alpha, low=0, high=1, open_low=True)
+        check.number(where, "depth_alpha", self.depth_alpha, low=0, high=1)
+        check.number(where, "cone_scale", self.cone_scale, low=0, open_low=True)
+        check.whole(where, "component", self.component, low=0)
+        if self.dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"{where}: dtype must be float32 or float64, got {self.dtype}")
+
+
+def render(
+    tree: N3Tree,
+    camera: Camera,
+    shader: TransferFunction,
+    *,
+    progress: Progress = no_progress,
+    **options: Any,
+) -> Picture:
+    """Renders a resident tree.
+
+    Args:
+        tree: What to render, on the device that renders it; its stamps and request words are written.
+        camera: One camera or a batch; an orbit camera stands around the tree's box.
+        shader: The transfer function, in data units.
+        progress: Told how many rays are done.
+        **options: Fields of `RenderOptions`.
+
+    Returns:
+        The picture, (h, w, c) for one camera and (n, h, w, c) for a batch.
+
+    Raises:
+        ValueError: An option is unknown or out of its range, or the backend can't be used.
+    """
+    unknown = sorted(set(options) - set(RenderOptions.__dataclass_fields__))
+    if unknown:
+        raise ValueError(
+            f"render: unknown option {unknown[0]!r}; known: {', '.join(RenderOptions.__dataclass_fields__)}"
+        )
+    for name, value, kind in (
+        *(("tree", tree, N3Tree), ("camera", camera, Camera)),
+        ("shader", shader, TransferFunction),
+    ):
+        if not isinstance(value, kind):
+            raise ValueError(f"render: {name} must be a {kind.__name__}, got {type(value).__name__}")
+    chosen = RenderOptions(**options)
+    start = time.perf_counter()
+    with collect_timings() as timings:
+        with stage("rays"):
+            rays = camera.placed(tree.box).rays(tree.device)
+        hits = trace(tree, rays, shader, chosen, progress)
+        shape = (len(camera), camera.height, camera.width)
+        background = torch.tensor(chosen.background, dtype=hits.color.dtype, device=tree.device)
+        color = hits.color + (1 - hits.alpha) * background
+        frame = tree.frame
+        stats = RenderStats(
+            milliseconds=1e3 * (time.perf_counter() - start),
+            stages=timings,
+            backend=choose_backend(chosen.backend, tree.device),
+            rays=hits.alpha.shape[0],
+            samples=int(hits.samples.sum(dtype=torch.int64)),
+            nodes=tree.nodes.child_tn.numel(),
+            bricks=tree.bricks.capacity,
+            bytes=tree.nbytes,
+            tiles_used=int((tree.nodes.stamp_t == frame).sum()),
+            bricks_used=int((tree.bricks.stamp_b == frame).sum()),
+        )
+    images = {
+        "color": color.reshape(*shape, 3),
+        "alpha": hits.alpha.reshape(*shape, 1),
+        "depth": hits.depth.reshape(*shape, 1),
+        "samples": hits.samples.reshape(*shape, 1),
+    }
+    if not camera.batched:
+        images = {name: image[0] for name, image in images.items()}
+    return Picture(**images, stats=stats)
+
+
+def trace(
+    tree: N3Tree,
+    rays: Rays,
+    shader: TransferFunction,
+    options: RenderOptions | None = None,
+    progress: Progress = no_progress,
+) -> Hits:
+    """Traces any world rays through a tree as one frame: counts `tree.frame` up, then marks with it.
+
+    Args:
+        tree: The tree.
+        rays: Rays in world units, on the tree's device.
+        shader: The transfer function.
+        options: Lod, step and the like; `background` is not used.
+        progress: Told how many rays are done.
+
+    Returns:
+        Colour, alpha, depth and samples of each ray, in `options.dtype`.
+    """
+    options = options or RenderOptions()
+    backend = choose_backend(options.backend, tree.device)
+    channel = options.channel or tree.channel_names[0]
+    if channel not in tree.bricks.bricks:
+        raise ValueError(
+            f"render: unknown channel {channel!r}; the tree has {', '.join(tree.channel_names)}"
+        )
+    step = options.step * min(tree.spacing)
+    most_intervals(float((tree.box[1] - tree.box[0]).norm()), step)
+    tree.frame += 1
+    origin, direction = tree.to_tree(rays.origin, rays.direction)
+    cone = rays.cone * options.cone_scale if options.lod == "auto" else torch.zeros_like(rays.cone)
+    columns = [column.to(options.dtype) for column in (origin, direction, cone, rays.range)]
+    table, domain = shader.table(min(tree.spacing), options.dtype, tree.device)
+    bounds = tree.bounds(options.dtype)
+    frame = torch.tensor([tree.frame], dtype=torch.int32, device=tree.device)
+    nodes, bricks = tree.nodes, tree.bricks
+    count, parts = origin.shape[0], []
+    size = _RAYS_A_CALL[tree.device.type]
+    with stage("trace"):
+        for first in range(0, count, size):
+            parts.append(
+                trace_rays(
+                    *(column[first : first + size] for column in columns),
+                    *(bounds, nodes.child_tn, nodes.brick_tn, nodes.request_tn, nodes.stamp_t),
+                    *(bricks.bricks[channel], tree.constants[channel], bricks.stamp_b),
+                    *(table, domain, frame),
+                    branching=tree.branching,
+                    root=tree.root,
+                    max_depth=tree.depth,
+                    border=bricks.border,
+                    component=options.component,
+                    root_voxel=tree.root_voxel,
+                    step=step,
+                    stop_alpha=options.stop_alpha,
+                    depth_alpha=options.depth_alpha,
+                    backend=backend,  # type: ignore[arg-type]
+                )
+            )
+            progress("rays", min(first + size, count), count)
+    color, alpha, depth, samples = (torch.cat(part) for part in zip(*parts, strict=True))
+    return Hits(color=color, alpha=alpha, depth=depth, samples=samples)

@@ -1,0 +1,186 @@
+"""`TransferFunction`: value -> linear RGB and opacity, piecewise linear.
+
+Opacity is given per reference length: a slab that long, filled with the value, has that alpha. The colour of a
+value is its own (not premultiplied); the renderer composites premultiplied.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .. import check
+
+Points = Sequence[Sequence[float]]
+
+#: Presets over [0, 1], which stands for the range of the data: opacity (v, a) and colour (v, r, g, b).
+PRESETS: dict[str, tuple[Points, Points]] = {
+    "gray": ([(0, 0), (0.05, 0), (1, 0.5)], [(0, 0, 0, 0), (1, 1, 1, 1)]),
+    "hot": (
+        [(0, 0), (0.1, 0), (0.4, 0.05), (1, 0.6)],
+        [(0, 0.1, 0, 0), (0.35, 0.9, 0.1, 0), (0.7, 1, 0.6, 0.05), (1, 1, 1, 0.8)],
+    ),
+    "vessels": (
+        [(0, 0), (0.15, 0), (0.3, 0.25), (0.6, 0.9), (1, 0.95)],
+        [(0, 0.3, 0.02, 0.02), (0.3, 0.55, 0.05, 0.03), (0.6, 0.9, 0.45, 0.25), (1, 1, 0.95, 0.8)],
+    ),
+    "bone": (
+        [(0, 0), (0.45, 0), (0.55, 0.02), (0.65, 0.4), (1, 0.9)],
+        [(0, 0.3, 0.1, 0.05), (0.5, 0.6, 0.25, 0.15), (0.65, 0.9, 0.8, 0.6), (1, 1, 1, 0.95)],
+    ),
+    "tissue": (
+        [(0, 0), (0.1, 0), (0.25, 0.03), (0.4, 0.01), (0.6, 0.2), (0.8, 0.8), (1, 0.9)],
+        [(0, 0.4, 0.15, 0.1), (0.3, 0.8, 0.4, 0.25), (0.6, 0.95, 0.75, 0.5), (1, 1, 1, 0.95)],
+    ),
+}
+
+_MOST_CELLS = 65535
+
+
+class TransferFunction:
+    """Two piecewise linear functions of a value in data units; constant beyond their end points.
+
+    Attributes:
+        opacity: (k, 2) float64 points (value, alpha per reference length).
+        color: (k, 4) float64 points (value, linear r, g, b).
+        reference: World units, or None for the smallest spacing of what is rendered.
+    """
+
+    def __init__(self, opacity: Points, color: Points, reference: float | None = None) -> None:
+        """See `from_points`."""
+        self.opacity = _points("opacity", opacity, 2)
+        self.color = _points("color", color, 4)
+        if reference is not None:
+            reference = check.number(
+                "TransferFunction", "reference", reference, low=0, open_low=True
+            )
+        self.reference = reference
+
+    @classmethod
+    def from_points(
+        cls, opacity: Points, color: Points = ((0, 1, 1, 1),), reference: float | None = None
+    ) -> TransferFunction:
+        """Makes a transfer function from its corner points.
+
+        Args:
+            opacity: Points (value, alpha), values strictly increasing, alpha in [0, 1] per reference length.
+            color: Points (value, red, green, blue), linear, in [0, 1]; white if left out.
+            reference: World units; the smallest spacing of the volume if left out.
+
+        Raises:
+            ValueError: No points, values that do not increase, numbers out of [0, 1] or not finite.
+        """
+        return cls(opacity, color, reference)
+
+    @classmethod
+    def from_json(cls, path: str | Path) -> TransferFunction:
+        """Reads `{"opacity": [[v, a], ...], "color": [[v, r, g, b], ...], "reference": length}`.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: It is no such JSON, or its points are refused by `from_points`.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise FileNotFoundError(f"transfer function file not found: {path}")
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise ValueError(f"{path}: not a JSON file: {error}") from None
+        if not isinstance(content, dict) or "opacity" not in content:
+            raise ValueError(f'{path}: expected an object with "opacity", "color" and "reference"')
+        unknown = sorted(set(content) - {"opacity", "color", "reference"})
+        if unknown:
+            raise ValueError(f"{path}: unknown key {unknown[0]!r}; known: opacity, color, reference")
+        try:
+            return cls.from_points(**content)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+
+    @classmethod
+    def preset(cls, name: str, low: float, high: float) -> TransferFunction:
+        """Stretches a named preset over the data range [low, high].
+
+        Raises:
+            ValueError: The name is unknown.
+        """
+        if name not in PRESETS:
+            raise ValueError(f"unknown preset {name!r}; known: {', '.join(sorted(PRESETS))}")
+        if not high > low:
+            high = low + 1.0
+        opacity, color = PRESETS[name]
+        return cls(
+            [(low + v * (high - low), a) for v, a in opacity],
+            [(low + point[0] * (high - low), *point[1:]) for point in color],
+        )
+
+    def to_json(self) -> str:
+        """Returns the text that `from_json` reads."""
+        content = {"opacity": self.opacity.tolist(), "color": self.color.tolist()}
+        return json.dumps({**content, "reference": self.reference} if self.reference else content)
+
+    def __call__(self, value: np.ndarray) -> np.ndarray:
+        """Returns (..., 4) linear RGB and opacity per reference length, exactly, in float64."""
+        channels = [np.interp(value, self.color[:, 0], self.color[:, i]) for i in (1, 2, 3)]
+        return np.stack([*channels, np.interp(value, *self.opacity.T)], axis=-1)
+
+    def table(
+        self, smallest_spacing: float, dtype: torch.dtype, device: torch.device | str
+    ) -> tuple[Tensor, Tensor]:
+        """Returns the function as the kernel reads it: rows at even distances, and their domain.
+
+        The number of rows is chosen so that every corner point falls on a row: then the table is the function,
+        not a sampling of it. Points that share no grid of 65,536 rows are sampled on that grid.
+
+        Returns:
+            table (m, 4), domain (3,): value of the first row, of the last row, reference length.
+        """
+        corners = np.unique(np.concatenate((self.opacity[:, 0], self.color[:, 0])))
+        low, high = float(corners[0]), float(corners[-1])
+        if high == low:
+            high = low + max(1.0, abs(low))
+        cells = _shared_grid((corners - low) / (high - low))
+        rows = self(low + (high - low) * np.arange(cells + 1) / cells)
+        domain = torch.tensor([low, high, self.reference or smallest_spacing], dtype=dtype)
+        return torch.tensor(rows, dtype=dtype, device=device), domain.to(device)
+
+
+def _shared_grid(places: np.ndarray) -> int:
+    """Fewest cells of [0, 1] such that every place is a cell's end; the most there may be if there is none."""
+    cells = 1
+    for place in places:
+        fraction = Fraction(float(place)).limit_denominator(_MOST_CELLS)
+        cells = math.lcm(cells, fraction.denominator)
+        if abs(float(fraction) - place) > 1e-9 or cells > _MOST_CELLS:
+            return _MOST_CELLS
+    return cells
+
+
+def _points(name: str, points: Points, width: int) -> np.ndarray:
+    where = "TransferFunction"
+    names = "(value, alpha)" if width == 2 else "(value, red, green, blue)"
+    try:
+        array = np.array([[float(number) for number in point] for point in points])
+    except (TypeError, ValueError):
+        raise ValueError(f"{where}: {name} must be a list of points {names}") from None
+    if array.ndim != 2 or array.shape[0] == 0 or array.shape[1] != width:
+        raise ValueError(f"{where}: {name} must be a list of points {names}, got {points!r}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{where}: {name} must be finite, got {points!r}")
+    steps = np.diff(array[:, 0])
+    if (steps <= 0).any():
+        at = int(np.argmax(steps <= 0))
+        raise ValueError(
+            f"{where}: {name} values must increase, got {array[at, 0]:g} before {array[at + 1, 0]:g} "
+            "(for a jump use two values close to each other)"
+        )
+    if (array[:, 1:] < 0).any() or (array[:, 1:] > 1).any():
+        raise ValueError(f"{where}: {name} numbers must lie in [0, 1], got {points!r}")
+    return array
