@@ -114,6 +114,11 @@ class Volume:
         return f"Volume({self.name!r}, {extent} (x, y, z), {dtype}x{self.data.shape[3]}, spacing={self.spacing})"
 
 
+def movable(tensor: Tensor) -> Tensor:
+    """Returns a view that can be indexed and written: torch can do neither to uint16, but to int16."""
+    return tensor.view(torch.int16) if tensor.dtype == torch.uint16 else tensor
+
+
 def _orderable(data: Tensor) -> Tensor:
     """uint16 has no comparisons in torch: int32 has the same order."""
     return data.to(torch.int32) if data.dtype == torch.uint16 else data

@@ -109,6 +109,7 @@ def trace_rays(
         raise ValueError(
             f"{where}: origin_r3 must be (r, 3) float32 or float64, got {check.describe(origin_r3)}"
         )
+    check.whole(where, "branching", branching, low=2, high=16)
     rays, (tiles, nodes) = origin_r3.shape[0], child_tn.shape
     bricks, side = bricks_bzyxc.shape[0], bricks_bzyxc.shape[1]
     channels, voxel = bricks_bzyxc.shape[-1], bricks_bzyxc.dtype
@@ -136,7 +137,6 @@ def trace_rays(
             raise ValueError(f"{where}: {name} must be contiguous")
     if table_m4.shape[0] < 2:
         raise ValueError(f"{where}: table_m4 needs at least 2 rows, got {table_m4.shape[0]}")
-    check.whole(where, "branching", branching, low=2, high=16)
     check.whole(where, "root", root, low=0, high=tiles * nodes - 1)
     check.whole(where, "max_depth", max_depth, low=0, high=62)
     check.whole(where, "border", border, low=0, high=(side - 1) // 2)

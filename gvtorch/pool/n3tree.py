@@ -10,7 +10,7 @@ from torch import Tensor
 from .. import check
 from ..config import CONSTANT, EMPTY, TERMINAL
 from ..stage import Progress, no_progress
-from ..volume import Volume
+from ..volume import Volume, movable
 from .brick_pool import BrickPool, Channel
 from .node_pool import NodePool
 from .pyramid import Level, build_levels, round_to
@@ -313,7 +313,7 @@ class _Plan:
         tree.bricks.owner_b[region[owned].long()] = here[owned].to(torch.int32)
         for name, constant in tree.constants.items():
             value = round_to(self.constant[name, at][place], constant.dtype).to(tree.device)
-            constant.view(-1, constant.shape[-1])[here] = value
+            movable(constant).view(-1, constant.shape[-1])[here] = movable(value)
 
     def _node_index(self, at: int, zyx: Tensor, dim: int) -> Tensor:
         """Node index of the nodes at a depth: tile of the parent's children, then the child's place."""
@@ -329,14 +329,15 @@ class _Plan:
         pool = tree.bricks
         size, border = pool.brick_size, pool.border
         reach = torch.arange(-border, size + border)
+        values, bricks = movable(level.values), movable(pool.bricks[name])
         data = (self.region[at] >= 0).nonzero()
         slots = self.region[at][tuple(data.T)].to(torch.int64)
         for start in range(0, data.shape[0], _BATCH):
             corner = data[start : start + _BATCH, :, None] * size + reach  # (k, 3, s)
             z, y, x = (
-                corner[:, axis].clamp(0, level.values.shape[axis] - 1) for axis in range(3)
+                corner[:, axis].clamp(0, values.shape[axis] - 1) for axis in range(3)
             )
-            brick = level.values[z[:, :, None, None], y[:, None, :, None], x[:, None, None, :]]
-            pool.bricks[name][slots[start : start + _BATCH].to(tree.device)] = brick.to(tree.device)
+            brick = values[z[:, :, None, None], y[:, None, :, None], x[:, None, None, :]]
+            bricks[slots[start : start + _BATCH].to(tree.device)] = brick.to(tree.device)
 
 

@@ -157,7 +157,7 @@ def trace(
     count, parts = origin.shape[0], []
     size = _RAYS_A_CALL[tree.device.type]
     with stage("trace"):
-        for first in range(0, count, size):
+        for first in range(0, max(count, 1), size):
             parts.append(
                 trace_rays(
                     *(column[first : first + size] for column in columns),

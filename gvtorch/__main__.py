@@ -1,0 +1,5 @@
+"""`python -m gvtorch`."""
+
+from .tools.cli import main
+
+main()

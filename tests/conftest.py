@@ -1,0 +1,101 @@
+"""Fixtures, and a summary that tells how many tests ran on each backend."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import gvtorch as gv
+from gvtorch.ops import available
+
+ROOT = Path(__file__).parent.parent
+DATA = ROOT / "examples" / "data"
+SHARED = ROOT.parent / "shared" / "data"
+DEVICES = {"reference": "cpu", "cpp": "cpu", "cuda": "cuda"}
+_ran: Counter[str] = Counter()
+_absent: set[str] = set()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "backend(name): runs on this backend; counted in the summary")
+
+
+@pytest.fixture(params=["reference", "cpp", "cuda"])
+def backend(request: pytest.FixtureRequest) -> str:
+    """Every backend that can run here."""
+    reason = available()[request.param]
+    if reason:
+        pytest.skip(f"backend {request.param}: {reason}")
+    return request.param
+
+
+@pytest.fixture(params=["cpp", "cuda"])
+def compiled(request: pytest.FixtureRequest) -> str:
+    """Every compiled backend that can run here."""
+    reason = available()[request.param]
+    if reason:
+        pytest.skip(f"backend {request.param}: {reason}")
+    return request.param
+
+
+def shared(path: str) -> Path:
+    """A file of the shared test data, or a skip that the summary tells of."""
+    file = SHARED / path
+    if not file.exists():
+        _absent.add(path)
+        pytest.skip(f"shared test data is not here: {path}")
+    return file
+
+
+@pytest.fixture(scope="session")
+def aneurism() -> gv.Volume:
+    return gv.read_volume(DATA / "aneurism_256x256x256_uint8.raw.gz")
+
+
+@pytest.fixture(scope="session")
+def stent() -> gv.Volume:
+    return gv.read_volume(DATA / "stent_256x128x128_int16.npz")
+
+
+@pytest.fixture(scope="session")
+def blobs() -> gv.Volume:
+    """A small smooth volume of no special extent, with empty space around: float32, anisotropic."""
+    z, y, x = np.mgrid[0:37, 0:29, 0:45].astype(np.float32)
+    value = np.zeros_like(x)
+    for cx, cy, cz, r in ((14, 10, 12, 7), (30, 18, 22, 9), (22, 14, 30, 4)):
+        distance = np.sqrt((x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2)
+        value = np.maximum(value, np.clip(r - distance, 0, 3) / 3)
+    return gv.Volume(torch.from_numpy(value), spacing=(1.0, 0.8, 1.5), origin=(5.0, -3.0, 2.0))
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]):
+    outcome = yield
+    report = outcome.get_result()
+    if report.when == "call" and report.passed:
+        values = getattr(item, "callspec", None)
+        names = {v for v in (values.params.values() if values else ()) if v in tuple(DEVICES)}
+        names |= {mark.args[0] for mark in item.iter_markers("backend")}
+        _ran.update(names or {"no backend"})
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    counts = ", ".join(f"{name} {_ran[name]}" for name in ("reference", "cpp", "cuda", "no backend"))
+    terminalreporter.write_line(f"passed by backend: {counts}")
+    for name, reason in available().items():
+        if reason:
+            terminalreporter.write_line(f"backend {name} did not run: {reason}")
+    for path in sorted(_absent):
+        terminalreporter.write_line(f"did not run for want of shared data: {path}")
+
+
+def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+    """With GVTORCH_REQUIRE=cpp a run in which no test passed on the C++ backend has failed."""
+    needed = os.environ.get("GVTORCH_REQUIRE", "")
+    if needed and exitstatus == 0 and not all(_ran[name] for name in needed.split(",")):
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED

@@ -1,0 +1,331 @@
+"""`trace_rays`: the compiled backends equal the torch twin, bit by bit in integers."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from conftest import DEVICES
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import gvtorch as gv
+from gvtorch import config
+from gvtorch.ops import reference
+from gvtorch.rendering.renderer import trace
+
+SHADER = gv.TransferFunction.from_points(
+    opacity=[(0, 0), (0.2, 0), (0.6, 0.4), (1, 1)],
+    color=[(0, 1, 0, 0), (0.5, 0.2, 0.8, 0.1), (1, 1, 1, 1)],
+)
+
+
+def on(tree: gv.N3Tree, device: str) -> gv.N3Tree:
+    """A copy of the tree whose marks are clean, on a device."""
+    nodes = gv.NodePool(tree.nodes.capacity, branching=tree.branching, device=device)
+    bricks = gv.BrickPool(
+        tree.bricks.capacity,
+        tree.bricks.channels,
+        brick_size=tree.bricks.brick_size,
+        border=tree.bricks.border,
+        device=device,
+    )
+    origin = tuple((tree.box[0] + 0.5 * torch.tensor(tree.spacing)).tolist())
+    copy = gv.N3Tree(
+        *(nodes, bricks), depth=tree.depth, extent=tree.extent, spacing=tree.spacing, origin=origin
+    )
+    for old, new in ((tree.nodes.fields, nodes.fields), (tree.bricks.fields, bricks.fields)):
+        for name, field in new.items():
+            field.copy_(old[name])
+    for name, constant in copy.constants.items():
+        constant.copy_(tree.constants[name])
+    nodes.request_tn.zero_()
+    nodes.stamp_t.fill_(-1)
+    bricks.stamp_b.fill_(-1)
+    return copy
+
+
+def run(tree, backend, rays, shader=SHADER, **options):
+    """Everything `trace_rays` writes, on the CPU."""
+    device = DEVICES[backend]
+    copy = on(tree, device)
+    moved = gv.Rays(**{n: t.to(device) for n, t in vars(rays).items()})
+    hits = trace(copy, moved, shader, gv.RenderOptions(backend=backend, **options))
+    result = {n: t.cpu() for n, t in vars(hits).items()}
+    marks = {"request": copy.nodes.request_tn, "tile": copy.nodes.stamp_t, "brick": copy.bricks.stamp_b}
+    return result, {n: t.cpu() for n, t in marks.items()}
+
+
+def camera_rays(tree, size=24, **place):
+    return gv.Camera.orbit(width=size, height=size, **place).placed(tree.box).rays()
+
+
+def assert_equal(tree, backend, rays, shader=SHADER, **options):
+    expected, expected_marks = run(tree, "reference", rays, shader, **options)
+    actual, marks = run(tree, backend, rays, shader, **options)
+    assert torch.equal(actual["samples"], expected["samples"])
+    for name, mark in marks.items():
+        assert torch.equal(mark, expected_marks[name]), name
+    tolerance = 1e-5 if expected["color"].dtype == torch.float32 else 1e-12
+    for name in ("color", "alpha", "depth"):
+        torch.testing.assert_close(actual[name], expected[name], rtol=tolerance, atol=tolerance)
+    return expected, expected_marks
+
+
+@pytest.mark.parametrize("lod", ["finest", "auto"])
+@pytest.mark.parametrize("branching", [2, 3, 4])
+@pytest.mark.parametrize("brick_size", [2, 4, 8])
+def test_compiled_equals_reference(blobs, compiled, brick_size, branching, lod):
+    tree = gv.N3Tree.from_volume(blobs, brick_size, branching=branching)
+    for distance in (0.2, 1.3, 6.0):
+        rays = camera_rays(tree, distance=distance)
+        result, marks = assert_equal(tree, compiled, rays, lod=lod)
+        if distance > 1:
+            assert result["alpha"].max() > 0.3, "the test must see something"
+            assert (marks["brick"] == 1).any()
+    assert not marks["request"].any(), "a resident tree misses nothing"
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("border", [0, 1, 2])
+@pytest.mark.parametrize("step", [0.3, 1.0, 3.0])
+def test_compiled_equals_reference_for_steps_borders_and_dtypes(blobs, compiled, border, step, dtype):
+    tree = gv.N3Tree.from_volume(blobs, 4, border)
+    assert_equal(tree, compiled, camera_rays(tree), step=step, dtype=dtype)
+
+
+@pytest.mark.parametrize(
+    "dtype", ["uint8", "int8", "int16", "uint16", "float16", "bfloat16", "float32"]
+)
+def test_every_channel_dtype(blobs, compiled, dtype):
+    data = (blobs.data * 100).to(getattr(torch, dtype))
+    tree = gv.N3Tree.from_volume(gv.Volume(data), 4)
+    shader = gv.TransferFunction.from_points([(10, 0), (90, 0.8)], [(0, 0, 0, 1), (100, 1, 1, 0)])
+    result, _ = assert_equal(tree, compiled, camera_rays(tree), shader)
+    assert result["alpha"].max() > 0.5
+
+
+def test_second_channel_and_second_component(blobs, compiled):
+    ramp = torch.stack((blobs.data[..., 0] * 0, blobs.data[..., 0]), -1)
+    other = gv.Volume(ramp, blobs.spacing, blobs.origin)
+    tree = gv.N3Tree.from_volume({"air": gv.Volume(blobs.data * 0, blobs.spacing, blobs.origin), "two": other})
+    rays = camera_rays(tree)
+    assert run(tree, compiled, rays)[0]["alpha"].max() == 0
+    result, _ = assert_equal(tree, compiled, rays, channel="two", component=1)
+    single, _ = run(gv.N3Tree.from_volume(blobs), compiled, rays)
+    assert torch.equal(result["alpha"], single["alpha"])
+
+
+def forget(tree: gv.N3Tree, share: float, seed: int) -> gv.N3Tree:
+    """A copy in which a share of the bricks and of the tiles is not there yet."""
+    copy = on(tree, "cpu")
+    generator = torch.Generator().manual_seed(seed)
+    for words, absent in ((copy.nodes.brick_tn, config.ABSENT), (copy.nodes.child_tn, config.ABSENT)):
+        gone = (torch.rand(words.shape, generator=generator) < share) & (words >= 0)
+        words[gone] = absent
+    return copy
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    share=st.floats(0, 1),
+    seed=st.integers(0, 2**31),
+    lod=st.sampled_from(["auto", "finest"]),
+    distance=st.floats(0.1, 8),
+    azimuth=st.floats(-180, 180),
+    elevation=st.floats(-90, 90),
+)
+@pytest.mark.backend("cpp")
+def test_missing_nodes_give_equal_pictures_and_requests(
+    blobs, share, seed, lod, distance, azimuth, elevation
+):
+    tree = forget(gv.N3Tree.from_volume(blobs, 4), share, seed)
+    rays = camera_rays(tree, 12, distance=distance, azimuth=azimuth, elevation=elevation)
+    assert_equal(tree, "cpp", rays, lod=lod)
+
+
+def test_requests_name_what_is_missing(blobs, backend):
+    tree = gv.N3Tree.from_volume(blobs, 4)
+    rays = camera_rays(tree, distance=1.2)
+    _, full = run(tree, backend, rays, lod="finest")
+    seen = (full["brick"] == 1).nonzero()[:, 0]
+    gone = on(tree, "cpu")
+    slot = int(seen[-1])  # finest bricks come last
+    node = int(tree.bricks.owner_b[slot])
+    gone.nodes.brick_tn.view(-1)[node] = config.ABSENT
+    _, marks = run(gone, backend, rays, lod="finest")
+    word = int(marks["request"].view(-1)[node])
+    assert word & config.REQUEST_LOAD and not word & config.REQUEST_SUBDIVIDE
+    assert word & config.REQUEST_PRIORITY == config.REQUEST_PRIORITY, "finest: no cone, top priority"
+    marks["request"].view(-1)[node] = 0
+    assert not marks["request"].any(), "nothing else is missing"
+
+    gone = on(tree, "cpu")
+    gone.nodes.child_tn.view(-1)[tree.root] = config.ABSENT
+    _, marks = run(gone, backend, rays, lod="finest")
+    assert int(marks["request"].view(-1)[tree.root]) & config.REQUEST_SUBDIVIDE
+    assert (marks["request"] != 0).sum() == 1
+
+
+def test_a_missing_brick_is_drawn_from_its_ancestor(blobs, backend):
+    tree = gv.N3Tree.from_volume(blobs, 4)
+    rays = camera_rays(tree, distance=1.2)
+    haze = gv.TransferFunction.from_points([(0, 0), (1, 0.5)])
+    full, _ = run(tree, backend, rays, haze)
+    top = on(tree, "cpu")
+    top.nodes.child_tn.view(-1)[tree.root] = config.ABSENT
+    coarse, _ = run(top, backend, rays, haze)
+    assert coarse["alpha"].max() > 0.3, "the root's brick stands in for all"
+    error = (coarse["alpha"] - full["alpha"]).abs().mean()
+    assert 1e-4 < error < 0.2
+    top.nodes.brick_tn.view(-1)[tree.root] = config.ABSENT
+    nothing, marks = run(top, backend, rays, haze)
+    assert nothing["alpha"].max() == 0 and torch.isinf(nothing["depth"]).all()
+    assert int(marks["request"].view(-1)[tree.root]) & config.REQUEST_LOAD
+
+
+@pytest.mark.backend("cpp")
+def test_threads_give_the_same_bits(aneurism):
+    tree = gv.N3Tree.from_volume(aneurism)
+    shader = gv.TransferFunction.preset("vessels", 0, 255)
+    rays = camera_rays(tree, 96)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        one = run(tree, "cpp", rays, shader)
+        torch.set_num_threads(2)
+        two = run(tree, "cpp", rays, shader)
+    finally:
+        torch.set_num_threads(before)
+    for first, second in zip(one, two, strict=True):
+        assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_skipping_does_not_move_samples(blobs, backend):
+    """A huge value range in an unused channel makes all nodes DATA: no skipping, the same samples, the same picture."""
+    noise = torch.rand(blobs.data.shape, generator=torch.Generator().manual_seed(1))
+    dense = {"value": blobs, "noise": gv.Volume(noise, blobs.spacing, blobs.origin)}
+    sparse, full = gv.N3Tree.from_volume(blobs, 4), gv.N3Tree.from_volume(dense, 4)
+    rays = camera_rays(sparse, distance=1.3)
+    a, _ = run(sparse, backend, rays, lod="finest")
+    b, _ = run(full, backend, rays, lod="finest")
+    assert (a["samples"] < b["samples"]).any()
+    assert torch.equal(a["alpha"], b["alpha"]) and torch.equal(a["color"], b["color"])
+
+
+def test_strange_rays_end(blobs, backend):
+    tree = gv.N3Tree.from_volume(blobs, 4)
+    centre = tree.box.mean(0).tolist()
+    zero, inf, nan = 0.0, math.inf, math.nan
+    cases = [
+        (centre, (zero, zero, zero), (0, 0), (0, inf)),
+        (centre, (nan, nan, nan), (0, 0), (0, inf)),
+        ((nan, 0, 0), (1, 0, 0), (0, 0), (0, inf)),
+        ((inf, 0, 0), (-1, 0, 0), (0, 0), (0, inf)),
+        ((1e30, 0, 0), (-1, 0, 0), (0, 1e-3), (0, inf)),
+        (centre, (1, 0, 0), (nan, nan), (0, inf)),
+        (centre, (1, 0, 0), (inf, inf), (0, inf)),
+        (centre, (1, 0, 0), (0, 0), (5, 1)),
+        (centre, (1, 0, 0), (0, 0), (nan, nan)),
+        (centre, (1e-30, 1e-30, 1), (0, -1), (0, inf)),
+        (centre, (1, 0, 0), (0, 0), (0, inf)),
+    ]
+    columns = [torch.tensor(column, dtype=torch.float32) for column in zip(*cases, strict=True)]
+    rays = gv.Rays(**dict(zip(("origin", "direction", "cone", "range"), columns, strict=True)))
+    result, _ = run(tree, backend, rays)
+    assert torch.isfinite(result["color"]).all() and torch.isfinite(result["alpha"]).all()
+    assert result["alpha"][0] == 0 and result["alpha"][-1] > 0
+
+
+def test_no_rays(blobs, backend):
+    tree = gv.N3Tree.from_volume(blobs, 4)
+    rays = camera_rays(tree)
+    none = gv.Rays(**{n: t[:0] for n, t in vars(rays).items()})
+    device = DEVICES[backend]
+    hits = trace(on(tree, device), gv.Rays(**{n: t.to(device) for n, t in vars(none).items()}), SHADER)
+    assert hits.color.shape == (0, 3) and hits.samples.shape == (0,)
+
+
+@pytest.mark.backend("reference")
+def test_logarithm_and_power_are_accurate():
+    x = torch.cat((torch.logspace(-37, 38, 20001, dtype=torch.float64), torch.linspace(0.5, 2, 20001).double()))
+    x = x.float()
+    error = (reference.log2_exact(x).double() - torch.log2(x.double())).abs()
+    assert (error / torch.log2(x.double()).abs().clamp(min=1)).max() < 3e-7
+    y = torch.linspace(-126, 127, 40001)[:-1]
+    y = y[(y > -126) & (y < 126)]
+    ratio = reference.exp2_exact(y).double() / torch.exp2(y.double())
+    assert (ratio - 1).abs().max() < 3e-7
+    assert reference.exp2_exact(torch.tensor([-1000.0, -math.inf])).tolist() == [0, 0]
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"origin_r3": torch.zeros(4, 2)}, "origin_r3 must be (4, 3) float32 on cpu, got (4, 2)"),
+        ({"direction_r3": torch.zeros(4, 3).double()}, "direction_r3 must be (4, 3) float32"),
+        ({"origin_r3": torch.zeros(4, 3, dtype=torch.int32)}, "origin_r3 must be (r, 3) float32 or"),
+        ({"cone_r2": torch.zeros(5, 2)}, "cone_r2 must be (4, 2)"),
+        ({"table_m4": torch.zeros(1, 4)}, "table_m4 needs at least 2 rows"),
+        ({"frame_1": torch.zeros(1)}, "frame_1 must be (1,) int32"),
+        ({"direction_r3": torch.zeros(3, 4).T}, "direction_r3 must be contiguous"),
+        ({"branching": 1}, "branching must be an int >= 2"),
+        ({"root": -1}, "root must be an int >= 0"),
+        ({"component": 1}, "component must be an int >= 0 and <= 0"),
+        ({"step": 0.0}, "step must be finite and > 0"),
+        ({"step": math.nan}, "step must be finite"),
+        ({"stop_alpha": 1.5}, "stop_alpha must be finite and >= 0 and <= 1"),
+        ({"backend": "opengl"}, "backend must be auto, reference, cpp or cuda"),
+    ],
+)
+def test_bad_arguments_have_one_clear_message(blobs, change, message):
+    tree = gv.N3Tree.from_volume(blobs, 8)
+    with pytest.raises(ValueError) as caught:
+        gv.ops.trace_rays(**{**arguments(tree, 4), **change})
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def arguments(tree: gv.N3Tree, rays: int, shader: gv.TransferFunction = SHADER) -> dict:
+    """Keyword arguments of the op for parallel rays through the middle of a tree."""
+    device = tree.device
+    table, domain = shader.table(min(tree.spacing), torch.float32, device)
+    origin = torch.full((rays, 3), 0.25, device=device)
+    direction = torch.tensor([[0.3, 0.2, 1.0]], device=device).repeat(rays, 1) / 60
+    channel = tree.channel_names[0]
+    return {
+        "origin_r3": origin + torch.linspace(0, 0.1, rays, device=device)[:, None],
+        "direction_r3": direction,
+        "cone_r2": torch.tensor([[0.5, 0.02]], device=device).repeat(rays, 1),
+        "range_r2": torch.tensor([[0.0, 1e9]], device=device).repeat(rays, 1),
+        "bounds_23": tree.bounds(torch.float32),
+        "child_tn": tree.nodes.child_tn,
+        "brick_tn": tree.nodes.brick_tn,
+        "request_tn": tree.nodes.request_tn,
+        "stamp_t": tree.nodes.stamp_t,
+        "bricks_bzyxc": tree.bricks.bricks[channel],
+        "constant_tnc": tree.constants[channel],
+        "stamp_b": tree.bricks.stamp_b,
+        "table_m4": table,
+        "domain_3": domain,
+        "frame_1": torch.tensor([3], dtype=torch.int32, device=device),
+        "branching": tree.branching,
+        "root": tree.root,
+        "max_depth": tree.depth,
+        "border": tree.bricks.border,
+        "component": 0,
+        "root_voxel": tree.root_voxel,
+        "step": 0.5 * min(tree.spacing),
+        "stop_alpha": 0.99,
+        "depth_alpha": 0.1,
+    }
+
+
+def test_options_are_checked():
+    for change in ({"lod": "best"}, {"step": -1}, {"dtype": torch.float16}, {"background": (0, 0)}):
+        with pytest.raises(ValueError, match="render"):
+            gv.RenderOptions(**change)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        gv.RenderOptions().step = 2  # type: ignore[misc]
