@@ -172,14 +172,14 @@ def test_requests_name_what_is_missing(blobs, backend):
 def test_a_missing_brick_is_drawn_from_its_ancestor(blobs, backend):
     tree = gv.N3Tree.from_volume(blobs, 4)
     rays = camera_rays(tree, distance=1.2)
-    haze = gv.TransferFunction.from_points([(0, 0), (1, 0.5)])
+    haze = gv.TransferFunction.from_points([(0, 0), (1, 0.01)])  # so thin that alpha adds up
     full, _ = run(tree, backend, rays, haze)
     top = on(tree, "cpu")
     top.nodes.child_tn.view(-1)[tree.root] = config.ABSENT
     coarse, _ = run(top, backend, rays, haze)
-    assert coarse["alpha"].max() > 0.3, "the root's brick stands in for all"
-    error = (coarse["alpha"] - full["alpha"]).abs().mean()
-    assert 1e-4 < error < 0.2
+    ratio = coarse["alpha"].sum() / full["alpha"].sum()
+    assert 0.7 < ratio < 1.3, "the root's brick stands in for all: a mean filter keeps what is absorbed"
+    assert (coarse["alpha"] - full["alpha"]).abs().max() > 1e-3, "and it is coarser"
     top.nodes.brick_tn.view(-1)[tree.root] = config.ABSENT
     nothing, marks = run(top, backend, rays, haze)
     assert nothing["alpha"].max() == 0 and torch.isinf(nothing["depth"]).all()

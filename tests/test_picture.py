@@ -1,0 +1,311 @@
+"""Pictures against a dense marcher written apart (marcher.py), and against closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import marcher
+import numpy as np
+import pytest
+import torch
+from conftest import DEVICES, shared
+from kornia.metrics import psnr
+
+import gvtorch as gv
+from gvtorch.rendering.renderer import trace
+
+SIZE = 96
+PLACE = {"azimuth": 30.0, "elevation": 20.0, "distance": 2.4, "fov": 30.0}
+
+
+def dense(volume: gv.Volume, shader: gv.TransferFunction, step: float, size: int = SIZE, **place):
+    place = {**PLACE, **place}
+    data = volume.data[..., 0].double().numpy()
+    rays = marcher.orbit_rays(
+        marcher.box_of(data.shape, volume.spacing, volume.origin), **place, width=size, height=size
+    )
+    reference = shader.reference or min(volume.spacing)
+    color, alpha, depth = marcher.march(
+        *(data, volume.spacing, volume.origin, rays, shader, reference),
+        step=step * min(volume.spacing),
+        stop_alpha=0.9999,
+    )
+    return color.reshape(size, size, 3), alpha.reshape(size, size), depth.reshape(size, size)
+
+
+def ours(volume, shader, backend, size=SIZE, brick_size=8, border=1, branching=2, place=None, **options):
+    tree = gv.N3Tree.from_volume(
+        volume, brick_size, border, branching=branching, device=DEVICES[backend]
+    )
+    camera = gv.Camera.orbit(**{**PLACE, **(place or {})}, width=size, height=size)
+    return gv.render(tree, camera, shader, backend=backend, **options)
+
+
+def assert_agrees(picture: gv.Picture, color: np.ndarray, alpha: np.ndarray) -> None:
+    for mine, theirs in ((picture.color, color), (picture.alpha, alpha[..., None])):
+        theirs = torch.from_numpy(theirs).float()
+        error = (mine.cpu() - theirs).abs().max()
+        quality = float(psnr(mine.cpu(), theirs, 1.0))
+        assert quality >= 45 and error <= 0.02, f"PSNR {quality:.1f} dB, largest error {error:.4f}"
+    assert alpha.max() > 0.5 and alpha.min() < 0.5, "the test must see something"
+
+
+VESSELS = gv.TransferFunction.from_points(
+    [(20, 0), (60, 0.3), (120, 0.9)], [(0, 0.5, 0, 0), (60, 0.8, 0.3, 0.1), (255, 1, 1, 0.8)]
+)
+STENT = gv.TransferFunction.from_points(
+    [(900, 0), (1200, 0.2), (1800, 0.9)], [(0, 0.2, 0.1, 0), (1200, 0.9, 0.6, 0.3), (2000, 1, 1, 1)]
+)
+TOOTH = gv.TransferFunction.preset("tissue", 0, 255)
+
+
+@pytest.mark.parametrize("step", [0.5, 1.0])
+@pytest.mark.parametrize("name", ["aneurism", "stent", "tooth", "blobs", "brain"])
+def test_finest_lod_agrees_with_the_dense_marcher(request, compiled, name, step):
+    if name == "tooth":
+        volume = gv.read_volume(shared("volumes/tooth_103x94x161_uint8.raw.gz"))
+    elif name == "brain":
+        volume = gv.read_volume(shared("volumes/mni_icbm152_t1_197x233x189_uint8.nii.gz"))
+    else:
+        volume = request.getfixturevalue(name)
+    shader = {"aneurism": VESSELS, "stent": STENT, "tooth": TOOTH}.get(name)
+    shader = shader or gv.TransferFunction.preset("hot", *volume.value_range)
+    color, alpha, _ = dense(volume, shader, step)
+    assert_agrees(ours(volume, shader, compiled, lod="finest", step=step), color, alpha)
+
+
+@pytest.mark.backend("reference")
+def test_reference_agrees_with_the_dense_marcher(blobs):
+    shader = gv.TransferFunction.preset("hot", *blobs.value_range)
+    color, alpha, _ = dense(blobs, shader, 0.5, 48)
+    assert_agrees(ours(blobs, shader, "reference", 48, 4, lod="finest"), color, alpha)
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("distance", [0.2, 0.6, 5.0])
+def test_agrees_from_inside_and_from_afar(blobs, distance):
+    shader = gv.TransferFunction.preset("hot", *blobs.value_range)
+    place = {"distance": distance, "azimuth": -140.0, "elevation": -35.0}
+    color, alpha, _ = dense(blobs, shader, 0.5, **place)
+    picture = ours(blobs, shader, "cpp", place=place, lod="finest", stop_alpha=1.0)
+    theirs = torch.from_numpy(color).float()
+    assert (picture.color - theirs).abs().max() < 2e-3
+
+
+def test_agrees_with_background_and_a_coarse_opaque_pyramid_level(aneurism, compiled):
+    shader = VESSELS
+    color, alpha, _ = dense(aneurism, shader, 0.5)
+    background = (0.2, 0.4, 0.6)
+    color = color + (1 - alpha[..., None]) * np.array(background)
+    picture = ours(aneurism, shader, compiled, lod="finest", background=background)
+    assert (picture.color.cpu() - torch.from_numpy(color).float()).abs().max() <= 0.02
+
+
+@pytest.mark.parametrize("brick_size", [4, 8, 16])
+def test_no_seam_at_brick_faces(compiled, brick_size):
+    """Along a smooth ramp the error is no larger near a brick's face than elsewhere."""
+    z, y, x = np.mgrid[0:64, 0:64, 0:64].astype(np.float32)
+    volume = gv.Volume((x + 0.5 * y + 0.25 * z) / 112)
+    tree = gv.N3Tree.from_volume(volume, brick_size, device=DEVICES[compiled])
+    shader = gv.TransferFunction.from_points([(0, 0.001), (1, 0.02)], [(0, 1, 0, 0), (1, 0, 0, 1)])
+    n = 512
+    across = torch.linspace(-0.4, 63.4, n, dtype=torch.float64)
+    origin = torch.stack((across, across.flip(0) * 0.5 + 20, torch.full_like(across, -5)), 1)
+    direction = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).repeat(n, 1)
+    rays = {"origin": origin, "direction": direction}
+    limits = torch.tensor([[0.0, 1e9]], dtype=torch.float64).repeat(n, 1)
+    device = tree.device
+    hits = trace(
+        tree,
+        gv.Rays(
+            **{name: t.to(device) for name, t in rays.items()},
+            cone=torch.zeros(n, 2, dtype=torch.float64, device=device),
+            range=limits.to(device),
+        ),
+        shader,
+        gv.RenderOptions(lod="finest", dtype=torch.float64, stop_alpha=1.0),
+    )
+    color, _, _ = marcher.march(
+        volume.data[..., 0].double().numpy(),
+        *((1, 1, 1), (0, 0, 0), (origin.numpy(), direction.numpy()), shader, 1.0, 0.5),
+    )
+    error = (hits.color.cpu() - torch.from_numpy(color)).abs().amax(1).numpy()
+    face = np.abs((across.numpy() + 0.5) / brick_size - np.round((across.numpy() + 0.5) / brick_size))
+    near = face * brick_size < 0.5
+    assert error.max() < 1e-6
+    assert error[near].mean() <= error[~near].mean() * 1.5 + 1e-12
+
+
+def test_border_zero_shows_the_seam_that_borders_remove(compiled):
+    x = np.mgrid[0:32, 0:32, 0:32][2].astype(np.float32)
+    volume = gv.Volume(np.minimum(x, 31 - x))
+    shader = gv.TransferFunction.from_points([(0, 0), (15, 0.05)])
+    without = ours(volume, shader, compiled, border=0, lod="finest", brick_size=4).alpha
+    with_border = ours(volume, shader, compiled, border=1, lod="finest", brick_size=4).alpha
+    _, alpha, _ = dense(volume, shader, 0.5)
+    seam = (without.cpu()[..., 0] - torch.from_numpy(alpha).float()).abs().max()
+    none = (with_border.cpu()[..., 0] - torch.from_numpy(alpha).float()).abs().max()
+    assert none < 1e-5 and seam > 1e-3
+
+
+def ball(radius: float, n: int = 64, value: float = 1.0) -> gv.Volume:
+    """A ball with a one-voxel ramp at its face, the ramp's middle at the radius."""
+    z, y, x = np.mgrid[0:n, 0:n, 0:n] - (n - 1) / 2
+    distance = np.sqrt(x**2 + y**2 + z**2)
+    return gv.Volume((np.clip(radius - distance + 0.5, 0, 1) * value).astype(np.float32))
+
+
+def chord(camera: gv.Camera, volume: gv.Volume, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Length of each pixel's ray inside the ball, and the distance of its near side (NaN beside it)."""
+    tree = gv.N3Tree.from_volume(volume)
+    rays = camera.placed(tree.box).rays()
+    to_centre = tree.box.mean(0) - rays.origin
+    along = (to_centre * rays.direction).sum(1)
+    across2 = (to_centre**2).sum(1) - along**2
+    half = torch.sqrt((radius**2 - across2).clamp(min=0))
+    shape = (camera.height, camera.width)
+    near = torch.where(across2 < radius**2, along - half, math.nan)
+    return (2 * half).reshape(shape).numpy(), near.reshape(shape).numpy()
+
+
+def test_homogeneous_ball_follows_beer_and_lambert(backend):
+    radius, opacity = 24.0, 0.01
+    size = 32 if backend == "reference" else 96
+    volume = ball(radius)
+    camera = gv.Camera.orbit(**PLACE, width=size, height=size)
+    shader = gv.TransferFunction.from_points([(0, 0), (1, opacity)])
+    tree = gv.N3Tree.from_volume(volume, device=DEVICES[backend])
+    picture = gv.render(
+        tree, camera, shader, backend=backend, lod="finest", step=0.25, stop_alpha=1.0
+    )
+    length, _ = chord(camera, volume, radius)
+    expected = 1 - (1 - opacity) ** length
+    # Near the rim a ray runs along the face, where voxels, not the renderer, decide what the ball is.
+    grazing = (length < 1.5 * radius) & (chord(camera, volume, radius + 1.5)[0] > 0)
+    error = np.abs(picture.alpha.cpu()[..., 0].numpy() - expected)[~grazing]
+    assert error.max() < 1e-3 and expected.max() > 0.3
+
+
+def test_homogeneous_box_is_exact(backend):
+    """A volume of one value is one CONSTANT region: closed form, whatever the step."""
+    volume = gv.Volume(torch.full((20, 30, 25), 7, dtype=torch.uint8), spacing=(1, 1, 2))
+    tree = gv.N3Tree.from_volume(volume, device=DEVICES[backend])
+    assert tree.bricks.capacity == 0
+    shader = gv.TransferFunction.from_points([(7, 0.05)], [(7, 0.2, 0.5, 1)], reference=1.5)
+    camera = gv.Camera.orbit(**PLACE, width=40, height=40)
+    picture = gv.render(
+        tree, camera, shader, backend=backend, step=3.0, stop_alpha=1.0, lod="finest"
+    )
+    rays = camera.placed(tree.box).rays()
+    a, b = ((face - rays.origin) / rays.direction for face in tree.box)
+    length = (torch.maximum(a, b).amin(1) - torch.minimum(a, b).amax(1)).clamp(min=0)
+    expected = (1 - 0.95 ** (length / 1.5)).reshape(40, 40).float()
+    torch.testing.assert_close(picture.alpha.cpu()[..., 0], expected, rtol=0, atol=2e-6)
+    assert expected.max() > 0.5 and int(picture.samples.max()) == 1
+
+
+@pytest.mark.parametrize("step", [0.25, 0.5])
+def test_depth_of_an_opaque_sphere(backend, step):
+    radius = 20.0
+    volume = ball(radius)
+    size = 32 if backend == "reference" else 80
+    camera = gv.Camera.orbit(**PLACE, width=size, height=size)
+    shader = gv.TransferFunction.from_points([(0.499, 0), (0.501, 1)])
+    tree = gv.N3Tree.from_volume(volume, device=DEVICES[backend])
+    picture = gv.render(tree, camera, shader, backend=backend, lod="finest", step=step)
+    length, near = chord(camera, volume, radius)
+    depth = picture.depth.cpu()[..., 0].numpy()
+    facing = length > 12  # along a grazing ray a fraction of a voxel of the data is many
+    assert np.abs(depth - near)[facing].max() < 0.5
+    beside = chord(camera, volume, radius + 1.5)[0] == 0
+    assert np.isinf(depth[beside]).all() and facing.sum() > 20 and beside.sum() > 20
+
+
+def test_auto_lod_is_close_to_the_finest_and_cheaper(aneurism, compiled):
+    place = {"distance": 3.0}
+    fine = ours(aneurism, VESSELS, compiled, place=place, lod="finest", step=0.5)
+    auto = ours(aneurism, VESSELS, compiled, place=place, lod="auto", step=0.5)
+    assert auto.stats.samples < 0.5 * fine.stats.samples
+    assert psnr(auto.color.cpu(), fine.color.cpu(), 1.0) > 20
+
+
+def test_levels_blend_without_a_step(compiled):
+    """As the cone widens through three levels, what a ray sees changes smoothly."""
+    z, y, x = np.mgrid[0:64, 0:64, 0:64] - 31.5
+    volume = gv.Volume(np.exp(-(x**2 + y**2 + z**2) / (2 * 7.0**2)).astype(np.float32))
+    tree = gv.N3Tree.from_volume(volume, 8, device=DEVICES[compiled])
+    n = 300
+    cone = torch.stack((torch.linspace(1.1, 7.9, n), torch.zeros(n)), 1)
+    rays = gv.Rays(
+        origin=torch.tensor([[33.0, 35.0, -10.0]]).repeat(n, 1).to(tree.device),
+        direction=torch.tensor([[0.0, 0.0, 1.0]]).repeat(n, 1).to(tree.device),
+        cone=cone.to(tree.device),
+        range=torch.tensor([[0.0, math.inf]]).repeat(n, 1).to(tree.device),
+    )
+    haze = gv.TransferFunction.from_points([(0, 0), (1, 0.01)])
+    hits = trace(tree, rays, haze, gv.RenderOptions(cone_scale=1.0))
+    alpha = hits.alpha.cpu()[:, 0].numpy()
+    steps = np.abs(np.diff(alpha))
+    assert alpha.max() - alpha.min() > 0.01, "wider cones see a blurred ball"
+    assert steps.max() < 0.05 * (alpha.max() - alpha.min())
+
+
+def test_thresholded_regions_are_skipped(aneurism, compiled):
+    camera = gv.Camera.orbit(**PLACE, width=SIZE, height=SIZE)
+    device = DEVICES[compiled]
+    full = gv.N3Tree.from_volume(aneurism, device=device)
+    cut = gv.N3Tree.from_volume(aneurism, threshold=20, device=device)
+    assert cut.bricks.capacity < 0.8 * full.bricks.capacity
+    a = gv.render(full, camera, VESSELS, lod="finest")
+    b = gv.render(cut, camera, VESSELS, lod="finest")
+    assert torch.equal(a.color, b.color), "below 20 this transfer function shows nothing"
+    assert b.stats.samples < 0.7 * a.stats.samples
+
+
+@pytest.mark.parametrize("threshold", [None, 0.0, 5.0])
+def test_all_empty_volume_renders_the_background(backend, threshold):
+    volume = gv.Volume(np.zeros((9, 17, 33), np.uint8))
+    tree = gv.N3Tree.from_volume(volume, threshold=threshold, device=DEVICES[backend])
+    shader = gv.TransferFunction.preset("gray", *volume.value_range)
+    camera = gv.Camera.orbit(width=16, height=8)
+    picture = gv.render(tree, camera, shader, backend=backend, background=(0.1, 0.2, 0.3))
+    assert picture.alpha.max() == 0 and torch.isinf(picture.depth).all()
+    assert torch.allclose(picture.color.cpu(), torch.tensor([0.1, 0.2, 0.3]))
+
+
+def test_a_batch_of_cameras_equals_one_by_one(blobs, backend):
+    tree = gv.N3Tree.from_volume(blobs, device=DEVICES[backend])
+    shader = gv.TransferFunction.preset("hot", 0, 1)
+    batch = gv.Camera.orbit([0, 90, 180], [10, -20, 90], 2.0, 30, 20, 12)
+    pictures = gv.render(tree, batch, shader, backend=backend)
+    assert pictures.color.shape == (3, 12, 20, 3) and pictures.depth.shape == (3, 12, 20, 1)
+    for index in range(3):
+        one = gv.render(tree, batch[index], shader, backend=backend)
+        assert one.color.shape == (12, 20, 3)
+        assert torch.equal(one.color, pictures.color[index])
+
+
+def test_stats_count_what_was_used(blobs, backend):
+    tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[backend])
+    camera = gv.Camera.orbit(width=16, height=16)
+    picture = gv.render(tree, camera, gv.TransferFunction.preset("hot", 0, 1), backend=backend)
+    stats = picture.stats
+    assert stats.rays == 256 and stats.samples == int(picture.samples.sum()) > 0
+    assert 0 < stats.bricks_used <= stats.bricks == tree.bricks.capacity
+    assert 0 < stats.tiles_used <= tree.nodes.capacity and stats.bytes == tree.nbytes
+    assert stats.backend == backend and stats.milliseconds > 0
+
+
+def test_wrong_arguments_are_named(blobs):
+    tree, camera = gv.N3Tree.from_volume(blobs), gv.Camera.orbit(width=4, height=4)
+    shader = gv.TransferFunction.preset("gray", 0, 1)
+    with pytest.raises(ValueError, match="unknown option 'stepp'"):
+        gv.render(tree, camera, shader, stepp=1)
+    with pytest.raises(ValueError, match="shader must be a TransferFunction, got str"):
+        gv.render(tree, camera, "gray")
+    with pytest.raises(ValueError, match="unknown channel 'density'; the tree has value"):
+        gv.render(tree, camera, shader, channel="density")
+    with pytest.raises(ValueError, match="intervals"):
+        gv.render(tree, camera, shader, step=1e-9)
+    with pytest.raises(ValueError, match="can't be used here|does not run"):
+        gv.render(tree, camera, shader, backend="cuda")
