@@ -1,7 +1,8 @@
 """GigaVoxels on PyTorch tensors: explore, render and learn from scenes far larger than memory.
 
-Names are loaded when they are first used, so that `gvtorch --help` does not wait for torch. A program that only
-loads TorchScript archives or exported programs imports `gvtorch.ops`, which registers the ops.
+Names are loaded when they are first used, so that `gvtorch --help` does not wait for torch. A
+program that only loads TorchScript archives or exported programs imports `gvtorch.ops`, which
+registers the ops.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Checks of what a user hands in: one line that says who complains, what was expected and what came."""
+"""Checks of what a user hands in: one line that says who complains, what was expected and what
+came.
+"""
 
 from __future__ import annotations
 

@@ -1,12 +1,16 @@
-"""Constants that more than one floor needs. What a user may change is an argument with this as its default."""
+"""Constants that more than one floor needs. What a user may change is an argument with this as its
+default.
+"""
 
 from __future__ import annotations
 
-#: The pixel cone is taken this much wider than the pixel, so that a level of detail is chosen a little early
-#: rather than late. Source: the original engine's factor (devkit, GvRendererKernel documentation: 1.333).
+#: The pixel cone is taken this much wider than the pixel, so that a level of detail is chosen a
+#: little early rather than late. Source: the original engine's factor (devkit, GvRendererKernel
+#: documentation: 1.333).
 CONE_OVERESTIMATE = 4 / 3
 
-#: A ray ends where its alpha reaches this; 1 integrates to the far side. Source: Crassin et al., I3D 2009.
+#: A ray ends where its alpha reaches this; 1 integrates to the far side. Source: Crassin et al.,
+#: I3D 2009.
 STOP_ALPHA = 0.99
 
 #: The depth of a ray is where its alpha passes this; rays that stay below have depth +inf.

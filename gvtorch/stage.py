@@ -1,4 +1,4 @@
-"""Names for the steps of a frame: `with stage("trace"):` feeds the timer and the profiler's range."""
+"""Names for the steps of a frame: `with stage("trace"):` feeds timer and profiler."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from contextvars import ContextVar
 
 import torch
 
-#: Told (what, done, total) by work that can be long; the command line draws its progress bar from it.
+#: Told (what, done, total) by work that can be long; the command line draws its progress bar from
+#: it.
 Progress = Callable[[str, int, int], None]
 
 _timings: ContextVar[dict[str, float] | None] = ContextVar("gvtorch_timings", default=None)
@@ -21,7 +22,9 @@ def no_progress(what: str, done: int, total: int) -> None:
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Names a step: adds its milliseconds to the open `timings()` and shows it to torch's profiler."""
+    """Names a step: adds its milliseconds to the open `timings()` and shows it to torch's
+    profiler.
+    """
     timings = _timings.get()
     with torch.profiler.record_function(f"gvtorch.{name}"):
         if timings is None:

@@ -43,8 +43,8 @@ def check_extent(where: str, shape: Sequence[int], *, what: str = "extent") -> N
 class Volume:
     """A dense grid. The centre of voxel (x, y, z) lies at index * spacing + origin in the world.
 
-    The box runs from voxel face to voxel face, -0.5 to n - 0.5 in index units; between the outermost centres and
-    the box's faces the outermost values go on.
+    The box runs from voxel face to voxel face, -0.5 to n - 0.5 in index units; between the
+    outermost centres and the box's faces the outermost values go on.
 
     Attributes:
         data: (z, y, x, c) tensor on the CPU, one of `CHANNEL_DTYPES`.
@@ -65,16 +65,16 @@ class Volume:
         """Checks and takes over a grid.
 
         Args:
-            data: (z, y, x) or (z, y, x, c). Any byte order. bool becomes uint8; 32 and 64 bit integers and
-                float64 become float32.
+            data: (z, y, x) or (z, y, x, c). Any byte order. bool becomes uint8; 32 and 64 bit
+                integers and float64 become float32.
             spacing: (x, y, z) world units, positive.
             origin: (x, y, z) world units.
             name: Shown in messages.
             nan: The value that voxels which are not finite get; None refuses them.
 
         Raises:
-            ValueError: data is empty, of another shape or dtype, has more than 2^31 voxels or holds values that
-                are not finite; spacing is not positive.
+            ValueError: data is empty, of another shape or dtype, has more than 2^31 voxels or
+                holds values that are not finite; spacing is not positive.
         """
         where = f"Volume {name!r}" if name != "volume" else "Volume"
         tensor = _as_tensor(where, data)
@@ -111,11 +111,16 @@ class Volume:
         """Shows extent, dtype, channels and spacing."""
         dtype = str(self.data.dtype).removeprefix("torch.")
         extent = "x".join(str(size) for size in self.extent)
-        return f"Volume({self.name!r}, {extent} (x, y, z), {dtype}x{self.data.shape[3]}, spacing={self.spacing})"
+        return (
+            f"Volume({self.name!r}, {extent} (x, y, z), {dtype}x{self.data.shape[3]}, "
+            f"spacing={self.spacing})"
+        )
 
 
 def movable(tensor: Tensor) -> Tensor:
-    """Returns a view that can be indexed and written: torch can do neither to uint16, but to int16."""
+    """Returns a view that can be indexed and written: torch can do neither to uint16, but to
+    int16.
+    """
     return tensor.view(torch.int16) if tensor.dtype == torch.uint16 else tensor
 
 

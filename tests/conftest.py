@@ -22,7 +22,9 @@ _absent: set[str] = set()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line("markers", "backend(name): runs on this backend; counted in the summary")
+    config.addinivalue_line(
+        "markers", "backend(name): runs on this backend; counted in the summary"
+    )
 
 
 @pytest.fixture(params=["reference", "cpp", "cuda"])
@@ -85,7 +87,9 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]):
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    counts = ", ".join(f"{name} {_ran[name]}" for name in ("reference", "cpp", "cuda", "no backend"))
+    counts = ", ".join(
+        f"{name} {_ran[name]}" for name in ("reference", "cpp", "cuda", "no backend")
+    )
     terminalreporter.write_line(f"passed by backend: {counts}")
     for name, reason in available().items():
         if reason:

@@ -1,7 +1,8 @@
-"""A dense marcher that shares nothing with gvtorch but the camera's convention: NumPy, float64, no tree, no skipping.
+"""A dense marcher that shares nothing with gvtorch but the camera's convention: NumPy, float64, no
+tree, no skipping.
 
-Samples lie in the middle of intervals of one length, counted from where the ray enters the volume's box; the last
-interval is cut at the far side.
+Samples lie in the middle of intervals of one length, counted from where the ray enters the
+volume's box; the last interval is cut at the far side.
 """
 
 from __future__ import annotations

@@ -48,7 +48,9 @@ def test_opcheck(blobs, compiled, dtype):
     tree = on(gv.N3Tree.from_volume(blobs, 4), DEVICES[compiled])
     values = list(arguments(tree, 5).values())
     values = [
-        v.to(dtype) if isinstance(v, torch.Tensor) and v.dtype == torch.float32 and v.dim() < 5 else v
+        v.to(dtype)
+        if isinstance(v, torch.Tensor) and v.dtype == torch.float32 and v.dim() < 5
+        else v
         for v in values
     ]
     values[10] = tree.constants["value"]
@@ -102,7 +104,7 @@ def test_exports_with_a_dynamic_ray_count(tracer, rays):
     count = torch.export.Dim("rays", min=2, max=1 << 24)
     program = torch.export.export(tracer, rays, dynamic_shapes=[{0: count}] * 4)
     assert_same(program.module()(*rays), tracer(*rays))
-    shorter = tuple(t[:11] for t in rays)
+    shorter = tuple(t[11:22].contiguous() for t in rays)
     assert_same(program.module()(*shorter), tracer(*shorter))
     file = io.BytesIO()
     torch.export.save(program, file)
@@ -155,8 +157,20 @@ def test_a_cpp_process_without_python_loads_the_archive(blobs, tmp_path):
     program = tmp_path / "render"
     subprocess.run(
         [
-            *(compiler, "-std=c++20", "-O0", str(ROOT / "tests" / "cpp" / "render.cpp"), "-o", str(program)),
-            *("-isystem", str(libtorch / "include"), "-isystem", str(libtorch / "include/torch/csrc/api/include")),
+            *(
+                compiler,
+                "-std=c++20",
+                "-O0",
+                str(ROOT / "tests" / "cpp" / "render.cpp"),
+                "-o",
+                str(program),
+            ),
+            *(
+                "-isystem",
+                str(libtorch / "include"),
+                "-isystem",
+                str(libtorch / "include/torch/csrc/api/include"),
+            ),
             *(f"-L{libtorch / 'lib'}", f"-Wl,-rpath,{libtorch / 'lib'}"),
             *("-Wl,--no-as-needed", "-ltorch", "-ltorch_cpu", "-lc10", "-ldl"),
         ],

@@ -33,7 +33,9 @@ def dense(volume: gv.Volume, shader: gv.TransferFunction, step: float, size: int
     return color.reshape(size, size, 3), alpha.reshape(size, size), depth.reshape(size, size)
 
 
-def ours(volume, shader, backend, size=SIZE, brick_size=8, border=1, branching=2, place=None, **options):
+def ours(
+    volume, shader, backend, size=SIZE, brick_size=8, border=1, branching=2, place=None, **options
+):
     tree = gv.N3Tree.from_volume(
         volume, brick_size, border, branching=branching, device=DEVICES[backend]
     )
@@ -42,8 +44,8 @@ def ours(volume, shader, backend, size=SIZE, brick_size=8, border=1, branching=2
 
 
 def assert_agrees(picture: gv.Picture, color: np.ndarray, alpha: np.ndarray) -> None:
-    for mine, theirs in ((picture.color, color), (picture.alpha, alpha[..., None])):
-        theirs = torch.from_numpy(theirs).float()
+    for mine, dense_one in ((picture.color, color), (picture.alpha, alpha[..., None])):
+        theirs = torch.from_numpy(dense_one).float()
         error = (mine.cpu() - theirs).abs().max()
         quality = float(psnr(mine.cpu(), theirs, 1.0))
         assert quality >= 45 and error <= 0.02, f"PSNR {quality:.1f} dB, largest error {error:.4f}"
@@ -86,7 +88,7 @@ def test_reference_agrees_with_the_dense_marcher(blobs):
 def test_agrees_from_inside_and_from_afar(blobs, distance):
     shader = gv.TransferFunction.preset("hot", *blobs.value_range)
     place = {"distance": distance, "azimuth": -140.0, "elevation": -35.0}
-    color, alpha, _ = dense(blobs, shader, 0.5, **place)
+    color, _, _ = dense(blobs, shader, 0.5, **place)
     picture = ours(blobs, shader, "cpp", place=place, lod="finest", stop_alpha=1.0)
     theirs = torch.from_numpy(color).float()
     assert (picture.color - theirs).abs().max() < 2e-3
@@ -130,7 +132,9 @@ def test_no_seam_at_brick_faces(compiled, brick_size):
         *((1, 1, 1), (0, 0, 0), (origin.numpy(), direction.numpy()), shader, 1.0, 0.5),
     )
     error = (hits.color.cpu() - torch.from_numpy(color)).abs().amax(1).numpy()
-    face = np.abs((across.numpy() + 0.5) / brick_size - np.round((across.numpy() + 0.5) / brick_size))
+    face = np.abs(
+        (across.numpy() + 0.5) / brick_size - np.round((across.numpy() + 0.5) / brick_size)
+    )
     near = face * brick_size < 0.5
     assert error.max() < 1e-6
     assert error[near].mean() <= error[~near].mean() * 1.5 + 1e-12
@@ -156,7 +160,9 @@ def ball(radius: float, n: int = 64, value: float = 1.0) -> gv.Volume:
 
 
 def chord(camera: gv.Camera, volume: gv.Volume, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Length of each pixel's ray inside the ball, and the distance of its near side (NaN beside it)."""
+    """Length of each pixel's ray inside the ball, and the distance of its near side (NaN beside
+    it).
+    """
     tree = gv.N3Tree.from_volume(volume)
     rays = camera.placed(tree.box).rays()
     to_centre = tree.box.mean(0) - rays.origin
@@ -169,7 +175,7 @@ def chord(camera: gv.Camera, volume: gv.Volume, radius: float) -> tuple[np.ndarr
 
 
 def test_homogeneous_ball_follows_beer_and_lambert(backend):
-    radius, opacity = 28.0, 0.006
+    radius, opacity = 28.0, 0.005
     size = 32 if backend == "reference" else 96
     volume = ball(radius, 72)
     camera = gv.Camera.orbit(**PLACE, width=size, height=size)
@@ -180,10 +186,11 @@ def test_homogeneous_ball_follows_beer_and_lambert(backend):
     )
     length, _ = chord(camera, volume, radius)
     expected = 1 - (1 - opacity) ** length
-    # Near the rim a ray runs along the face, where voxels, not the renderer, decide what the ball is.
+    # Near the rim a ray runs along the face, where voxels, not the renderer, decide what the ball
+    # is.
     grazing = (length < 1.5 * radius) & (chord(camera, volume, radius + 1.5)[0] > 0)
     error = np.abs(picture.alpha.cpu()[..., 0].numpy() - expected)[~grazing]
-    assert error.max() < 1e-3 and expected.max() > 0.25
+    assert error.max() < 1e-3 and expected.max() > 0.2
 
 
 def test_homogeneous_box_is_exact(backend):
@@ -307,5 +314,5 @@ def test_wrong_arguments_are_named(blobs):
         gv.render(tree, camera, shader, channel="density")
     with pytest.raises(ValueError, match="intervals"):
         gv.render(tree, camera, shader, step=1e-9)
-    with pytest.raises(ValueError, match="can't be used here|does not run"):
+    with pytest.raises(ValueError, match=r"can't be used here|does not run"):
         gv.render(tree, camera, shader, backend="cuda")

@@ -54,7 +54,11 @@ def run(tree, backend, rays, shader=SHADER, **options):
     moved = gv.Rays(**{n: t.to(device) for n, t in vars(rays).items()})
     hits = trace(copy, moved, shader, gv.RenderOptions(backend=backend, **options))
     result = {n: t.cpu() for n, t in vars(hits).items()}
-    marks = {"request": copy.nodes.request_tn, "tile": copy.nodes.stamp_t, "brick": copy.bricks.stamp_b}
+    marks = {
+        "request": copy.nodes.request_tn,
+        "tile": copy.nodes.stamp_t,
+        "brick": copy.bricks.stamp_b,
+    }
     return result, {n: t.cpu() for n, t in marks.items()}
 
 
@@ -91,7 +95,9 @@ def test_compiled_equals_reference(blobs, compiled, brick_size, branching, lod):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("border", [0, 1, 2])
 @pytest.mark.parametrize("step", [0.3, 1.0, 3.0])
-def test_compiled_equals_reference_for_steps_borders_and_dtypes(blobs, compiled, border, step, dtype):
+def test_compiled_equals_reference_for_steps_borders_and_dtypes(
+    blobs, compiled, border, step, dtype
+):
     tree = gv.N3Tree.from_volume(blobs, 4, border)
     assert_equal(tree, compiled, camera_rays(tree), step=step, dtype=dtype)
 
@@ -110,7 +116,9 @@ def test_every_channel_dtype(blobs, compiled, dtype):
 def test_second_channel_and_second_component(blobs, compiled):
     ramp = torch.stack((blobs.data[..., 0] * 0, blobs.data[..., 0]), -1)
     other = gv.Volume(ramp, blobs.spacing, blobs.origin)
-    tree = gv.N3Tree.from_volume({"air": gv.Volume(blobs.data * 0, blobs.spacing, blobs.origin), "two": other})
+    tree = gv.N3Tree.from_volume(
+        {"air": gv.Volume(blobs.data * 0, blobs.spacing, blobs.origin), "two": other}
+    )
     rays = camera_rays(tree)
     assert run(tree, compiled, rays)[0]["alpha"].max() == 0
     result, _ = assert_equal(tree, compiled, rays, channel="two", component=1)
@@ -122,7 +130,10 @@ def forget(tree: gv.N3Tree, share: float, seed: int) -> gv.N3Tree:
     """A copy in which a share of the bricks and of the tiles is not there yet."""
     copy = on(tree, "cpu")
     generator = torch.Generator().manual_seed(seed)
-    for words, absent in ((copy.nodes.brick_tn, config.ABSENT), (copy.nodes.child_tn, config.ABSENT)):
+    for words, absent in (
+        (copy.nodes.brick_tn, config.ABSENT),
+        (copy.nodes.child_tn, config.ABSENT),
+    ):
         gone = (torch.rand(words.shape, generator=generator) < share) & (words >= 0)
         words[gone] = absent
     return copy
@@ -158,7 +169,9 @@ def test_requests_name_what_is_missing(blobs, backend):
     _, marks = run(gone, backend, rays, lod="finest")
     word = int(marks["request"].view(-1)[node])
     assert word & config.REQUEST_LOAD and not word & config.REQUEST_SUBDIVIDE
-    assert word & config.REQUEST_PRIORITY == config.REQUEST_PRIORITY, "finest: no cone, top priority"
+    assert word & config.REQUEST_PRIORITY == config.REQUEST_PRIORITY, (
+        "finest: no cone, top priority"
+    )
     marks["request"].view(-1)[node] = 0
     assert not marks["request"].any(), "nothing else is missing"
 
@@ -178,7 +191,9 @@ def test_a_missing_brick_is_drawn_from_its_ancestor(blobs, backend):
     top.nodes.child_tn.view(-1)[tree.root] = config.ABSENT
     coarse, _ = run(top, backend, rays, haze)
     ratio = coarse["alpha"].sum() / full["alpha"].sum()
-    assert 0.7 < ratio < 1.3, "the root's brick stands in for all: a mean filter keeps what is absorbed"
+    assert 0.7 < ratio < 1.3, (
+        "the root's brick stands in for all: a mean filter keeps what is absorbed"
+    )
     assert (coarse["alpha"] - full["alpha"]).abs().max() > 1e-3, "and it is coarser"
     top.nodes.brick_tn.view(-1)[tree.root] = config.ABSENT
     nothing, marks = run(top, backend, rays, haze)
@@ -204,7 +219,9 @@ def test_threads_give_the_same_bits(aneurism):
 
 
 def test_skipping_does_not_move_samples(blobs, backend):
-    """A huge value range in an unused channel makes all nodes DATA: no skipping, the same samples, the same picture."""
+    """A huge value range in an unused channel makes all nodes DATA: no skipping, the same samples,
+    the same picture.
+    """
     noise = torch.rand(blobs.data.shape, generator=torch.Generator().manual_seed(1))
     dense = {"value": blobs, "noise": gv.Volume(noise, blobs.spacing, blobs.origin)}
     sparse, full = gv.N3Tree.from_volume(blobs, 4), gv.N3Tree.from_volume(dense, 4)
@@ -244,13 +261,20 @@ def test_no_rays(blobs, backend):
     rays = camera_rays(tree)
     none = gv.Rays(**{n: t[:0] for n, t in vars(rays).items()})
     device = DEVICES[backend]
-    hits = trace(on(tree, device), gv.Rays(**{n: t.to(device) for n, t in vars(none).items()}), SHADER)
+    hits = trace(
+        on(tree, device), gv.Rays(**{n: t.to(device) for n, t in vars(none).items()}), SHADER
+    )
     assert hits.color.shape == (0, 3) and hits.samples.shape == (0,)
 
 
 @pytest.mark.backend("reference")
 def test_logarithm_and_power_are_accurate():
-    x = torch.cat((torch.logspace(-37, 38, 20001, dtype=torch.float64), torch.linspace(0.5, 2, 20001).double()))
+    x = torch.cat(
+        (
+            torch.logspace(-37, 38, 20001, dtype=torch.float64),
+            torch.linspace(0.5, 2, 20001).double(),
+        )
+    )
     x = x.float()
     error = (reference.log2_exact(x).double() - torch.log2(x.double())).abs()
     assert (error / torch.log2(x.double()).abs().clamp(min=1)).max() < 3e-7
@@ -267,7 +291,10 @@ def test_logarithm_and_power_are_accurate():
     [
         ({"origin_r3": torch.zeros(4, 2)}, "origin_r3 must be (4, 3) float32 on cpu, got (4, 2)"),
         ({"direction_r3": torch.zeros(4, 3).double()}, "direction_r3 must be (4, 3) float32"),
-        ({"origin_r3": torch.zeros(4, 3, dtype=torch.int32)}, "origin_r3 must be (r, 3) float32 or"),
+        (
+            {"origin_r3": torch.zeros(4, 3, dtype=torch.int32)},
+            "origin_r3 must be (r, 3) float32 or",
+        ),
         ({"cone_r2": torch.zeros(5, 2)}, "cone_r2 must be (4, 2)"),
         ({"table_m4": torch.zeros(1, 4)}, "table_m4 needs at least 2 rows"),
         ({"frame_1": torch.zeros(1)}, "frame_1 must be (1,) int32"),

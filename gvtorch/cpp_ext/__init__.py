@@ -1,7 +1,8 @@
 """Finds and loads the compiled libraries.
 
-Loading `libgvtorch_cpu.so` defines `torch.ops.gvtorch.*` and its CPU kernels; `libgvtorch_cuda.so` adds the CUDA
-kernels. A C++ program loads the same files with `dlopen` before it loads a TorchScript archive.
+Loading `libgvtorch_cpu.so` defines `torch.ops.gvtorch.*` and its CPU kernels; `libgvtorch_cuda.so`
+adds the CUDA kernels. A C++ program loads the same files with `dlopen` before it loads a
+TorchScript archive.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ def load() -> dict[str, str]:
     """Loads each library once.
 
     Returns:
-        For each backend, `cpp` and `cuda`, an empty text if it can be used and else the reason why not.
+        For each backend, `cpp` and `cuda`, an empty text if it can be used and else the reason why
+        not.
     """
     reasons = {"cpp": _load("libgvtorch_cpu.so")}
     if reasons["cpp"]:

@@ -1,8 +1,9 @@
 """Compiles the two extension libraries and makes the wheel that holds them.
 
-setuptools loads this file by itself (see `[tool.setuptools]` in pyproject.toml), so it imports nothing of gvtorch.
-Both libraries use the LibTorch Stable ABI and no Python C API: one wheel serves every Python >= 3.11 and every
-torch >= 2.11. The CUDA library is built where nvcc stands and is loaded only where torch has CUDA.
+setuptools loads this file by itself (see `[tool.setuptools]` in pyproject.toml), so it imports
+nothing of gvtorch. Both libraries use the LibTorch Stable ABI and no Python C API: one wheel
+serves every Python >= 3.11 and every torch >= 2.11. The CUDA library is built where nvcc stands
+and is loaded only where torch has CUDA.
 
 Environment:
     GVTORCH_CUDA        auto (default: build when nvcc is found), 0 (never), 1 (fail without nvcc)
@@ -36,7 +37,9 @@ def find_nvcc() -> str | None:
     if choice == "0":
         return None
     home = os.environ.get("CUDA_HOME", "/usr/local/cuda")
-    nvcc = os.environ.get("NVCC") or shutil.which("nvcc") or shutil.which("nvcc", path=f"{home}/bin")
+    nvcc = (
+        os.environ.get("NVCC") or shutil.which("nvcc") or shutil.which("nvcc", path=f"{home}/bin")
+    )
     if nvcc is None and choice == "1":
         raise SystemExit("GVTORCH_CUDA=1, but nvcc is neither on PATH nor in CUDA_HOME/bin")
     return nvcc
@@ -53,14 +56,29 @@ def commands(output: Path) -> dict[Path, list[str]]:
     include = ["-isystem", str(root / "include")]
     link = [f"-L{root / 'lib'}", "-ltorch", "-ltorch_cpu"]
     cxx = [*shlex.split(os.environ.get("CXX", "g++")), *shared, "-fPIC", "-Wall", "-Wextra"]
-    cxx += ["-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden", *include, str(source / "cpu.cpp")]
+    cxx += [
+        "-ffp-contract=off",
+        "-fno-math-errno",
+        "-fvisibility=hidden",
+        *include,
+        str(source / "cpu.cpp"),
+    ]
     calls = {output / "libgvtorch_cpu.so": [*cxx, "-Wl,--no-as-needed", *link, "-pthread"]}
     nvcc = find_nvcc()
     if nvcc is not None:
         archs = os.environ.get("GVTORCH_CUDA_ARCHS", ARCHS).split(";")
         codes = [f"-gencode=arch=compute_{a},code=sm_{a}" for a in archs]
         codes.append(f"-gencode=arch=compute_{archs[-1]},code=compute_{archs[-1]}")
-        call = [nvcc, *shared, "-DUSE_CUDA", "-fmad=false", "-Xcompiler=-fPIC,-fvisibility=hidden", "--threads=2", *codes, *include]
+        call = [
+            nvcc,
+            *shared,
+            "-DUSE_CUDA",
+            "-fmad=false",
+            "-Xcompiler=-fPIC,-fvisibility=hidden",
+            "--threads=2",
+            *codes,
+            *include,
+        ]
         call += [str(source / "cuda.cu"), "-Xlinker=--no-as-needed", *link, "-cudart=static"]
         calls[output / "libgvtorch_cuda.so"] = call
     return calls
@@ -84,10 +102,14 @@ def compile_libraries(output: Path) -> list[Path]:
 
 
 class BuildExt(build_ext):
-    """Puts the libraries beside cpp_ext/__init__.py: in the source tree (editable) and in the wheel."""
+    """Puts the libraries beside cpp_ext/__init__.py: in the source tree (editable) and in the
+    wheel.
+    """
 
     def run(self) -> None:
-        """Compiles in the source tree, where the next build finds them, and copies to the build folder."""
+        """Compiles in the source tree, where the next build finds them, and copies to the build
+        folder.
+        """
         self._libraries = compile_libraries(FOLDER / "lib")
         if not (self.inplace or self.editable_mode):
             for library in self._libraries:
@@ -101,7 +123,10 @@ class BuildExt(build_ext):
 
     def get_output_mapping(self) -> dict[str, str]:
         """Returns build folder path -> source tree path, for editable installs."""
-        return {str(Path(self.build_lib) / library): str(library) for library in commands(FOLDER / "lib")}
+        return {
+            str(Path(self.build_lib) / library): str(library)
+            for library in commands(FOLDER / "lib")
+        }
 
 
 class BdistWheel(bdist_wheel):

@@ -1,7 +1,8 @@
 """`read_volume`: a file or folder -> `Volume`, each format through its own library.
 
-Every reader looks at the header first and refuses an extent that does not fit, before memory is taken. Nothing
-is unpickled. RAW and NPY are read here; NIfTI, NRRD, TIFF and FITS need `pip install 'gvtorch[io]'`.
+Every reader looks at the header first and refuses an extent that does not fit, before memory is
+taken. Nothing is unpickled. RAW and NPY are read here; NIfTI, NRRD, TIFF and FITS need `pip
+install 'gvtorch[io]'`.
 """
 
 from __future__ import annotations
@@ -48,17 +49,19 @@ def read_volume(
 ) -> Volume:
     """Reads a volume.
 
-    Formats: RAW (`.raw`, `.raw.gz`; x fastest), `.npy`, `.npy.gz`, `.npy.bz2`, `.npz`, NIfTI (`.nii`, `.nii.gz`),
-    NRRD (`.nrrd`, `.nhdr`), TIFF (`.tif`, `.tiff`, or a folder of them), FITS (`.fits`, `.fits.gz`). NumPy arrays
-    are (z, y, x) or (z, y, x, c). NIfTI and NRRD with axes along the world's are turned to x, y, z; oblique ones
-    keep their voxel axes, with a warning.
+    Formats: RAW (`.raw`, `.raw.gz`; x fastest), `.npy`, `.npy.gz`, `.npy.bz2`, `.npz`, NIfTI
+        (`.nii`, `.nii.gz`),
+    NRRD (`.nrrd`, `.nhdr`), TIFF (`.tif`, `.tiff`, or a folder of them), FITS (`.fits`,
+    `.fits.gz`). NumPy arrays are (z, y, x) or (z, y, x, c). NIfTI and NRRD with axes along the
+    world's are turned to x, y, z; oblique ones keep their voxel axes, with a warning.
 
     Args:
         path: The file, or a folder of TIFF slices.
         shape: RAW only: (x, y, z) voxels; the name's `_XxYxZ_dtype` if left out.
         dtype: RAW only: a NumPy dtype, as in "int16" or ">i2"; the name's if left out.
         spacing: (x, y, z) world units; overrides the file's. 1 where neither tells.
-        origin: (x, y, z) world place of the first voxel's centre; overrides the file's. 0 where neither tells.
+        origin: (x, y, z) world place of the first voxel's centre; overrides the file's. 0 where
+            neither tells.
         key: `.npz` only: which array; needed where there are several.
         nan: Value for voxels that are NaN or infinite; they are refused if left out.
 
@@ -67,7 +70,8 @@ def read_volume(
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The format is unknown, the file is damaged or too short, or an argument does not fit.
+        ValueError: The format is unknown, the file is damaged or too short, or an argument does
+            not fit.
         ImportError: A library is missing; the message tells which pip command brings it.
     """
     path = Path(path)
@@ -110,7 +114,9 @@ def _reader(path: Path, key: str | None) -> tuple[Callable[..., _Grid], str]:
         if name.endswith(endings):
             return found
     known = ", ".join(ending for endings in readers for ending in endings)
-    raise ValueError(f"{path}: unknown volume format; known endings: {known}, or a folder of TIFF slices")
+    raise ValueError(
+        f"{path}: unknown volume format; known endings: {known}, or a folder of TIFF slices"
+    )
 
 
 def _need(module: str, package: str, path: Path) -> Any:
@@ -122,7 +128,8 @@ def _need(module: str, package: str, path: Path) -> Any:
         ) from None
 
 
-# --- RAW and NumPy ----------------------------------------------------------------------------------------
+# --- RAW and NumPy
+# ----------------------------------------------------------------------------------------
 
 
 def _open(path: Path) -> IO[bytes]:
@@ -138,12 +145,15 @@ def _read_raw(
     if shape is None:
         if named is None:
             raise ValueError(
-                f"{path}: a RAW file needs its extent: name it *_XxYxZ_dtype.raw or pass shape and dtype"
+                f"{path}: a RAW file needs its extent: "
+                "name it *_XxYxZ_dtype.raw or pass shape and dtype"
             )
         shape = [int(named[axis]) for axis in (1, 2, 3)]
     if dtype is None:
         if named is None:
-            raise ValueError(f"{path}: a RAW file needs its dtype: name it *_XxYxZ_dtype.raw or pass dtype")
+            raise ValueError(
+                f"{path}: a RAW file needs its dtype: name it *_XxYxZ_dtype.raw or pass dtype"
+            )
         dtype = named[4]
         order = {"be": ">", "le": "<", None: "<"}[named[5]]
     else:
@@ -155,7 +165,7 @@ def _read_raw(
     if kind.kind not in "iuf":
         raise ValueError(f"{path}: dtype must be an integer or a float, got {dtype!r}")
     if order != "=":
-        kind = kind.newbyteorder(order)
+        kind = kind.newbyteorder(order)  # type: ignore[arg-type]
     if len(shape) != 3:
         raise ValueError(f"{path}: shape must be three numbers X,Y,Z, got {tuple(shape)}")
     check_extent(str(path), shape)
@@ -166,7 +176,9 @@ def _read_raw(
     if len(content) != expected:
         size = path.stat().st_size if path.suffix == ".raw" else len(content)
         got = f"{size}" if len(content) < expected or path.suffix == ".raw" else "more"
-        raise ValueError(f"{path}: {x}x{y}x{z} {kind.name} takes {expected} bytes, the file has {got}")
+        raise ValueError(
+            f"{path}: {x}x{y}x{z} {kind.name} takes {expected} bytes, the file has {got}"
+        )
     return _Grid(np.frombuffer(content, kind).reshape(z, y, x))
 
 
@@ -186,7 +198,9 @@ def _read_array(file: IO[bytes], where: str) -> np.ndarray:
     expected = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
     content = file.read(expected)
     if len(content) != expected:
-        raise ValueError(f"{where}: {shape} {dtype} takes {expected} bytes, the file has {len(content)}")
+        raise ValueError(
+            f"{where}: {shape} {dtype} takes {expected} bytes, the file has {len(content)}"
+        )
     return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C")
 
 
@@ -199,7 +213,9 @@ def _read_npz(path: Path, key: str | None) -> _Grid:
     with zipfile.ZipFile(path) as archive:
         names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
         if key is None and len(names) != 1:
-            raise ValueError(f"{path}: holds {len(names)} arrays, choose one with key: {', '.join(names)}")
+            raise ValueError(
+                f"{path}: holds {len(names)} arrays, choose one with key: {', '.join(names)}"
+            )
         chosen = names[0] if key is None else key
         if chosen not in names:
             raise ValueError(f"{path}: has no array {chosen!r}; it holds {', '.join(names)}")
@@ -207,7 +223,8 @@ def _read_npz(path: Path, key: str | None) -> _Grid:
             return _Grid(_read_array(file, str(path)))
 
 
-# --- through libraries ------------------------------------------------------------------------------------
+# --- through libraries
+# ------------------------------------------------------------------------------------
 
 
 def _read_nifti(path: Path) -> _Grid:
@@ -232,9 +249,13 @@ def _read_nrrd(path: Path) -> _Grid:
         places = [np.isfinite(row).all() for row in directions] or list(np.isfinite(spacings))
         axis = places.index(False) if False in places else 0
         if kinds:
-            axis = next((i for i, kind in enumerate(kinds) if kind not in ("domain", "space")), axis)
+            axis = next(
+                (i for i, kind in enumerate(kinds) if kind not in ("domain", "space")), axis
+            )
         data = np.moveaxis(data, axis, -1)
-        directions, spacings = (np.delete(a, axis, 0) if len(a) == 4 else a for a in (directions, spacings))
+        directions, spacings = (
+            np.delete(a, axis, 0) if len(a) == 4 else a for a in (directions, spacings)
+        )
     affine = np.eye(4)
     if directions.shape == (3, 3) and np.isfinite(directions).all():
         affine[:3, :3] = directions.T
@@ -247,7 +268,9 @@ def _read_nrrd(path: Path) -> _Grid:
 
 
 def _turned(path: Path, data_xyz: np.ndarray, affine: np.ndarray) -> _Grid:
-    """Lays (x, y, z[, c]) data along the world's axes: permutes and flips; keeps oblique axes as they are."""
+    """Lays (x, y, z[, c]) data along the world's axes: permutes and flips; keeps oblique axes as
+    they are.
+    """
     matrix, place = affine[:3, :3], affine[:3, 3]
     sizes = np.linalg.norm(matrix, axis=0)
     if not np.isfinite(affine).all() or (sizes == 0).any():
@@ -255,7 +278,10 @@ def _turned(path: Path, data_xyz: np.ndarray, affine: np.ndarray) -> _Grid:
     world_axis = np.abs(matrix).argmax(axis=0)  # of each voxel axis
     along = np.abs(matrix[world_axis, [0, 1, 2]]) / sizes
     if sorted(world_axis.tolist()) != [0, 1, 2] or (along < 1 - 1e-4).any():
-        warnings.warn(f"{path.name}: voxel axes are oblique; the world's axes are taken along them", stacklevel=5)
+        warnings.warn(
+            f"{path.name}: voxel axes are oblique; the world's axes are taken along them",
+            stacklevel=5,
+        )
         return _Grid(_to_zyx(data_xyz), sizes.tolist(), place.tolist())
     order = np.argsort(world_axis)
     data = np.moveaxis(data_xyz, order, (0, 1, 2))
@@ -289,7 +315,9 @@ def _check_slices(path: Path, shape: Sequence[int]) -> None:
 
 
 def _tiff_spacing(file: Any) -> tuple[float, float, float] | None:
-    """Voxel size as ImageJ writes it: slices apart in the description, pixels per unit in the tags."""
+    """Voxel size as ImageJ writes it: slices apart in the description, pixels per unit in the
+    tags.
+    """
     described = file.imagej_metadata
     if not described or "spacing" not in described:
         return None
@@ -308,7 +336,10 @@ def _read_tiff_folder(path: Path) -> _Grid:
         raise ValueError(f"{path}: no .tif or .tiff slices in this folder")
 
     def natural(file: Path) -> list[tuple[int, str]]:
-        return [(int(part or 0), part) if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", file.name)]
+        return [
+            (int(part or 0), part) if part.isdigit() else (-1, part)
+            for part in re.split(r"(\d+)", file.name)
+        ]
 
     slices.sort(key=natural)
     first = tifffile.imread(slices[0])
@@ -320,14 +351,15 @@ def _read_tiff_folder(path: Path) -> _Grid:
         image = tifffile.imread(file)
         if image.shape != first.shape or image.dtype != first.dtype:
             raise ValueError(
-                f"{file}: {image.shape} {image.dtype} differs from {first.shape} {first.dtype} of {slices[0].name}"
+                f"{file}: {image.shape} {image.dtype} differs from "
+                f"{first.shape} {first.dtype} of {slices[0].name}"
             )
         data[index] = image
     return _Grid(data)
 
 
 def _read_fits(path: Path) -> _Grid:
-    """FITS axes carry units of their own (degrees, m/s), which no box in space has: spacing is 1."""
+    """Spacing is 1: FITS axes have units of their own (degrees, m/s), a box in space has one."""
     fits = _need("astropy.io.fits", "astropy", path)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*truncated.*")
@@ -346,7 +378,11 @@ def describe(volume: Volume, bins: int = 32) -> dict[str, Any]:
     """Returns extent, dtype, place, range and histogram of a volume as plain values."""
     check.whole("describe", "bins", bins, low=1)
     low, high = volume.value_range
-    values = volume.data.numpy() if str(volume.data.dtype) != "torch.bfloat16" else volume.data.float().numpy()
+    values = (
+        volume.data.numpy()
+        if str(volume.data.dtype) != "torch.bfloat16"
+        else volume.data.float().numpy()
+    )
     counts, _ = np.histogram(values, bins=bins, range=(low, high) if high > low else (low, low + 1))
     return {
         "name": volume.name,

@@ -1,5 +1,5 @@
-"""The ops on bare tensors. Importing this package loads the compiled libraries, so that TorchScript archives and
-exported programs that hold `gvtorch::` ops can be loaded."""
+"""The ops on bare tensors. Importing this package loads the compiled libraries, so that TorchScript
+archives and exported programs that hold `gvtorch::` ops can be loaded."""
 
 from .registry import available
 from .trace import trace_rays

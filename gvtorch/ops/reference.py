@@ -1,10 +1,13 @@
-"""The torch twins of the compiled ops, right by definition: plain tensor code, in float32 or float64.
+"""The torch twins of the compiled ops, right by definition: plain tensor code, in float32 or
+float64.
 
-Every float operation stands in the order of the kernel (cpp_ext/csrc), and no two of them are fused, so integers
-come out equal and colours equal to rounding. All rays walk in lockstep: a row of every tensor is a ray.
+Every float operation stands in the order of the kernel (cpp_ext/csrc), and no two of them are
+fused, so integers come out equal and colours equal to rounding. All rays walk in lockstep: a row of
+every tensor is a ray.
 
-Sources: Crassin, Neyret, Lefebvre, Eisemann, "GigaVoxels: Ray-Guided Streaming for Efficient and Detailed Voxel
-Rendering", I3D 2009; Crassin, PhD thesis 2011, chapter 6. The method is told in docs/design.md, section 3.
+Sources: Crassin, Neyret, Lefebvre, Eisemann, "GigaVoxels: Ray-Guided Streaming for Efficient and
+Detailed Voxel Rendering", I3D 2009; Crassin, PhD thesis 2011, chapter 6. The method is told in
+docs/design.md, section 3.
 """
 
 from __future__ import annotations
@@ -26,7 +29,8 @@ from ..config import (
 INF = math.inf
 
 
-# --- numbers ----------------------------------------------------------------------------------------------
+# --- numbers
+# ----------------------------------------------------------------------------------------------
 
 
 def clamp(value: Tensor, low: float | Tensor, high: float | Tensor) -> Tensor:
@@ -37,7 +41,8 @@ def clamp(value: Tensor, low: float | Tensor, high: float | Tensor) -> Tensor:
 
 
 def divide(a: Tensor | float, b: Tensor | float, like: Tensor) -> Tensor:
-    """Returns a / b, rounded once: torch turns a number on either side into a product with a reciprocal."""
+    """Returns a / b, rounded once: torch turns a number on either side into a product with a
+    reciprocal."""
     return torch.div(torch.as_tensor(a).to(like), torch.as_tensor(b).to(like).expand(like.shape))
 
 
@@ -98,7 +103,8 @@ def exp2_exact(value: Tensor) -> Tensor:
     return torch.where(tiny, 0.0, series * power)
 
 
-# --- the intervals of a ray -------------------------------------------------------------------------------
+# --- the intervals of a ray
+# -------------------------------------------------------------------------------
 
 
 @dataclass
@@ -156,7 +162,8 @@ class Intervals:
         self.middle = torch.where(go, middle, self.middle)
 
 
-# --- the tree ---------------------------------------------------------------------------------------------
+# --- the tree
+# -----------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -176,33 +183,71 @@ class Place:
     coarse_size: Tensor  # (r,)
 
 
-def descend(
-    position_r3: Tensor,
-    wanted_r: Tensor,
-    child_n: Tensor,
-    brick_n: Tensor,
-    stamp_t: Tensor,
-    frame: Tensor,
-    *,
-    branching: int,
-    root: int,
-    max_depth: int,
-) -> Place:
-    """Descends from the root to the wanted depth, or as far as tiles exist; stamps the tiles on the way."""
-    rays = position_r3.shape[0]
-    children = branching**3
-    local = position_r3
-    node = torch.full((rays,), root, dtype=torch.int64, device=position_r3.device)
+@dataclass
+class Tree:
+    """The node pool as flat words, and the numbers of one tree in it."""
+
+    child_n: Tensor
+    brick_n: Tensor
+    request_n: Tensor
+    stamp_t: Tensor
+    stamp_b: Tensor
+    frame: Tensor  # ()
+    root_voxel: Tensor  # () world size of a depth-0 voxel
+    branching: int
+    root: int
+    max_depth: int
+
+    def voxel_at(self, depth: Tensor) -> Tensor:
+        """World size of a voxel at each depth."""
+        voxel = self.root_voxel.expand(depth.shape)
+        for level in range(self.max_depth):
+            voxel = torch.where(depth > level, divide(voxel, self.branching, voxel), voxel)
+        return voxel
+
+    def mark(self, found: Place, wanted: Tensor, blends: Tensor, cone: Tensor) -> None:
+        """Stamps the bricks that answer; requests children and bricks that are not there."""
+        for node in (found.fine_node, found.coarse_node):
+            slot = torch.where(node >= 0, self.brick_n[node.clamp(min=0)], -1)
+            self.stamp_b[torch.unique(slot[slot >= 0]).to(torch.int64)] = self.frame
+        short = (found.depth < wanted) & (self.child_n[found.node] == ABSENT)
+        missing = self.brick_n[found.node] == ABSENT
+        parent = found.parent.clamp(min=0)
+        above = blends & (found.depth == wanted) & (self.brick_n[parent] == ABSENT)
+        self.request(found.node[short], found.depth[short], cone[short], REQUEST_SUBDIVIDE)
+        self.request(found.node[missing], found.depth[missing], cone[missing], REQUEST_LOAD)
+        self.request(parent[above], found.depth[above] - 1, cone[above], REQUEST_LOAD)
+
+    def request(self, node: Tensor, depth: Tensor, cone: Tensor, kind: int) -> None:
+        """Joins wishes into the request words: kinds by OR, priorities by maximum.
+
+        The priority is the width of one voxel of the node on the screen in sixteenths of a pixel.
+        """
+        priority = torch.where(cone > 0, self.voxel_at(depth) / cone * 16, REQUEST_PRIORITY)
+        priority = torch.where(priority < REQUEST_PRIORITY, priority, REQUEST_PRIORITY)
+        wished, inverse = torch.unique(node, return_inverse=True)
+        most = torch.zeros_like(wished, dtype=torch.int32)
+        most.scatter_reduce_(0, inverse, priority.to(torch.int32), "amax")
+        word = self.request_n[wished]
+        kinds = (word & ~REQUEST_PRIORITY) | kind
+        self.request_n[wished] = kinds | torch.maximum(word & REQUEST_PRIORITY, most)
+
+
+def descend(position_r3: Tensor, wanted_r: Tensor, tree: Tree) -> Place:
+    """Descends from the root to the wanted depth, or as far as tiles exist; stamps the tiles."""
+    n = tree.branching
+    local, corner = position_r3, torch.zeros_like(position_r3)
+    size = torch.ones_like(position_r3[:, 0])
+    node = torch.full_like(wanted_r, tree.root)
     nobody = torch.full_like(node, -1)
-    corner, size = torch.zeros_like(position_r3), torch.ones_like(position_r3[:, 0])
     place = Place(
         *(corner, size, torch.zeros_like(node), node, nobody),
         *(nobody, corner, size, nobody, corner, size),
     )
     going = torch.ones_like(node, dtype=torch.bool)
-    for _ in range(max_depth + 1):
-        stamp_t[torch.unique(place.node[going] // children)] = frame
-        answers = going & (brick_n[place.node] != ABSENT)
+    for _ in range(tree.max_depth + 1):
+        tree.stamp_t[torch.unique(place.node[going] // n**3)] = tree.frame
+        answers = going & (tree.brick_n[place.node] != ABSENT)
         place.fine_node = torch.where(answers, place.node, place.fine_node)
         place.fine_corner = torch.where(answers[:, None], place.corner, place.fine_corner)
         place.fine_size = torch.where(answers, place.size, place.fine_size)
@@ -211,27 +256,28 @@ def descend(
         place.coarse_corner = torch.where(above[:, None], place.corner, place.coarse_corner)
         place.coarse_size = torch.where(above, place.size, place.coarse_size)
 
-        tile = child_n[place.node].to(torch.int64)
+        tile = tree.child_n[place.node].to(torch.int64)
         going = going & (place.depth < wanted_r) & (tile >= 0)
         if not going.any():
             break
-        size = divide(place.size, branching, place.size)
-        scaled = local * branching
-        digit = clamp(torch.floor(scaled), 0, branching - 1)
+        size = divide(place.size, n, place.size)
+        scaled = local * n
+        digit = clamp(torch.floor(scaled), 0, n - 1)
         x, y, z = digit.to(torch.int64).unbind(1)
-        child = (z * branching + y) * branching + x
+        child = (z * n + y) * n + x
+        moved = place.corner + digit * size[:, None]
         local = torch.where(going[:, None], scaled - digit, local)
-        place.corner = torch.where(
-            going[:, None], place.corner + digit * size[:, None], place.corner
-        )
+        place.corner = torch.where(going[:, None], moved, place.corner)
         place.size = torch.where(going, size, place.size)
         place.parent = torch.where(going, place.node, place.parent)
-        place.node = torch.where(going, tile * children + child, place.node)
+        place.node = torch.where(going, tile * n**3 + child, place.node)
         place.depth = torch.where(going, place.depth + 1, place.depth)
     return place
 
 
-def exit_distance(origin_r3: Tensor, direction_r3: Tensor, corner_r3: Tensor, size_r: Tensor) -> Tensor:
+def exit_distance(
+    origin_r3: Tensor, direction_r3: Tensor, corner_r3: Tensor, size_r: Tensor
+) -> Tensor:
     """Distance at which a ray leaves a box (+inf without a direction)."""
     face = torch.where(direction_r3 > 0, corner_r3 + size_r[:, None], corner_r3)
     t = torch.where(direction_r3 == 0, INF, (face - origin_r3) / direction_r3)
@@ -239,92 +285,76 @@ def exit_distance(origin_r3: Tensor, direction_r3: Tensor, corner_r3: Tensor, si
     return smaller(smaller(smaller(inf, t[:, 0]), t[:, 1]), t[:, 2])
 
 
-def voxel_at(depth: Tensor, root_voxel: Tensor, branching: int, max_depth: int) -> Tensor:
-    """World size of a voxel at each depth."""
-    voxel = root_voxel.expand(depth.shape)
-    for level in range(max_depth):
-        voxel = torch.where(depth > level, divide(voxel, branching, voxel), voxel)
-    return voxel
-
-
-def wanted_depth(
-    cone: Tensor, root_voxel: Tensor, branching: int, max_depth: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Level of detail: the first depth whose voxel fits into the cone, its voxel, and the voxel above it."""
-    voxel = root_voxel.expand(cone.shape).clone()
+def wanted_depth(cone: Tensor, tree: Tree) -> tuple[Tensor, Tensor, Tensor]:
+    """Level of detail: the first depth whose voxel fits the cone, its voxel, and the voxel
+    above."""
+    voxel = tree.root_voxel.expand(cone.shape)
     above = torch.full_like(cone, INF)
     wanted = torch.zeros_like(cone, dtype=torch.int64)
-    for _ in range(max_depth):
+    for _ in range(tree.max_depth):
         deeper = voxel > cone
         above = torch.where(deeper, voxel, above)
         wanted = torch.where(deeper, wanted + 1, wanted)
-        voxel = torch.where(deeper, divide(voxel, branching, voxel), voxel)
+        voxel = torch.where(deeper, divide(voxel, tree.branching, voxel), voxel)
     return wanted, voxel, above
 
 
-def post_requests(request_n: Tensor, node: Tensor, kind: int, voxel: Tensor, cone: Tensor) -> None:
-    """Joins wishes into the request words: kinds by OR, priorities by maximum.
-
-    The priority is the width of one voxel of the node on the screen in sixteenths of a pixel.
-    """
-    priority = torch.where(cone > 0, voxel / cone * 16, REQUEST_PRIORITY)
-    priority = torch.where(priority < REQUEST_PRIORITY, priority, REQUEST_PRIORITY).to(torch.int32)
-    wished, inverse = torch.unique(node, return_inverse=True)
-    most = torch.zeros_like(wished, dtype=torch.int32)
-    most.scatter_reduce_(0, inverse, priority, "amax")
-    word = request_n[wished]
-    kinds = (word & ~REQUEST_PRIORITY) | kind
-    request_n[wished] = kinds | torch.maximum(word & REQUEST_PRIORITY, most)
+# --- bricks
+# -------------------------------------------------------------------------------------------
 
 
-# --- bricks -----------------------------------------------------------------------------------------------
+@dataclass
+class Bricks:
+    """One component of one channel."""
+
+    bricks_bzyxc: Tensor
+    constant_nc: Tensor
+    border: int
+    component: int
+
+    def sample(
+        self,
+        brick_n: Tensor,
+        node: Tensor,
+        corner: Tensor,
+        size: Tensor,
+        origin_r3: Tensor,
+        direction_r3: Tensor,
+        t: Tensor,
+    ) -> Tensor:
+        """Trilinear value of each ray's node at distance t; its constant where it has no brick."""
+        real, known = origin_r3.dtype, node.clamp(min=0)
+        constant = torch.where(node >= 0, self.constant_nc[known, self.component].to(real), 0.0)
+        slot = torch.where(node >= 0, brick_n[known].to(torch.int64), -1)
+        if self.bricks_bzyxc.shape[0] == 0:
+            return constant
+        side = self.bricks_bzyxc.shape[1]
+        scale = divide(side - 2 * self.border, size, size)
+        offset = (origin_r3 - corner) * scale[:, None] + (self.border - 0.5)
+        place = clamp(offset + t[:, None] * (direction_r3 * scale[:, None]), 0, side - 1)
+        cell = smaller(torch.floor(place), torch.full_like(place, side - 2))
+        wx, wy, wz = (place - cell).unbind(1)
+        x, y, z = cell.to(torch.int64).unbind(1)
+        brick = slot.clamp(min=0)
+
+        def voxel(dx: int, dy: int, dz: int) -> Tensor:
+            found = self.bricks_bzyxc[brick, z + dz, y + dy, x + dx, self.component]
+            return found.to(real)
+
+        def row(dy: int, dz: int) -> Tensor:
+            left, right = voxel(0, dy, dz), voxel(1, dy, dz)
+            return left + wx * (right - left)
+
+        def plane(dz: int) -> Tensor:
+            low, high = row(0, dz), row(1, dz)
+            return low + wy * (high - low)
+
+        near, far = plane(0), plane(1)
+        return torch.where(slot >= 0, near + wz * (far - near), constant)
 
 
-def sample_bricks(
-    bricks_bzyxc: Tensor,
-    constant_nc: Tensor,
-    brick_n: Tensor,
-    node: Tensor,
-    corner: Tensor,
-    size: Tensor,
-    origin_r3: Tensor,
-    direction_r3: Tensor,
-    t: Tensor,
-    *,
-    border: int,
-    component: int,
-) -> Tensor:
-    """Trilinear value of each ray's node at distance t; the node's constant where it has no brick."""
-    real = origin_r3.dtype
-    constant = torch.where(node >= 0, constant_nc[node.clamp(min=0), component].to(real), 0.0)
-    slot = torch.where(node >= 0, brick_n[node.clamp(min=0)].to(torch.int64), -1)
-    if bricks_bzyxc.shape[0] == 0:
-        return constant
-    side = bricks_bzyxc.shape[1]
-    scale = divide(side - 2 * border, size, size)
-    offset = (origin_r3 - corner) * scale[:, None] + (border - 0.5)
-    place = clamp(offset + t[:, None] * (direction_r3 * scale[:, None]), 0, side - 1)
-    cell = smaller(torch.floor(place), torch.full_like(place, side - 2))
-    wx, wy, wz = (place - cell).unbind(1)
-    x, y, z = cell.to(torch.int64).unbind(1)
-    brick = slot.clamp(min=0)
-
-    def voxel(dx: int, dy: int, dz: int) -> Tensor:
-        return bricks_bzyxc[brick, z + dz, y + dy, x + dx, component].to(real)
-
-    def row(dy: int, dz: int) -> Tensor:
-        left, right = voxel(0, dy, dz), voxel(1, dy, dz)
-        return left + wx * (right - left)
-
-    def plane(dz: int) -> Tensor:
-        low, high = row(0, dz), row(1, dz)
-        return low + wy * (high - low)
-
-    near, far = plane(0), plane(1)
-    return torch.where(slot >= 0, near + wz * (far - near), constant)
-
-
-# --- colour -----------------------------------------------------------------------------------------------
+# --- colour
+# -----------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -347,7 +377,8 @@ def composite(
     hit_clear: Tensor,
     where: Tensor,
 ) -> None:
-    """Adds an interval of `length` with one value, seen through the transfer function, where `where` is true.
+    """Adds an interval of `length` with one value, seen through the transfer function, where
+    `where` is true.
 
     Opacity is per reference length: 1 - (1 - a)^(length / reference).
     """
@@ -377,7 +408,8 @@ def composite(
     sum_.clear = torch.where(add, clear, sum_.clear)
 
 
-# --- the op -----------------------------------------------------------------------------------------------
+# --- the op
+# -------------------------------------------------------------------------------------------
 
 
 def trace_rays(
@@ -410,118 +442,154 @@ def trace_rays(
 
     Writes request_tn, stamp_t and stamp_b in place.
     """
-    real, frame = origin_r3.dtype, frame_1[0]
-    child_n, brick_n, request_n = child_tn.view(-1), brick_tn.view(-1), request_tn.view(-1)
-    constant_nc = constant_tnc.view(child_n.shape[0], -1)
-    root_voxel_t = torch.tensor(root_voxel, dtype=real, device=origin_r3.device)
-    stop_clear = 1 - torch.tensor(stop_alpha, dtype=real, device=origin_r3.device)
-    hit_clear = 1 - torch.tensor(depth_alpha, dtype=real, device=origin_r3.device)
-    levels = log2_exact(torch.tensor([branching], dtype=real, device=origin_r3.device))
-
     first, last = _clip(origin_r3, direction_r3, range_r2, bounds_23)
-    at = Intervals.begin(first, last, cone_r2, step)
-    rays = origin_r3.shape[0]
-    zero = torch.zeros(rays, dtype=real, device=origin_r3.device)
-    sum_ = Accumulator(torch.zeros_like(origin_r3), zero + 1, zero + INF, zero > 0)
-    samples = torch.zeros(rays, dtype=torch.int32, device=origin_r3.device)
-
-    def alive() -> Tensor:
-        return at.inside() & (sum_.clear > stop_clear)
-
-    active = alive()
-    arrived = active.clone()  # rays that stand in a node they have not looked up yet
-    place: Place | None = None
-    exit_t, cone_low, cone_high, voxel = zero, zero, zero, zero
-    blend = mixed = nothing = uniform = arrived
-
-    def look_up() -> None:
-        """Finds the node of the rays that arrived, marks what it used and misses."""
-        nonlocal place, exit_t, cone_low, cone_high, voxel, blend, mixed, nothing, uniform
-        cone = at.cone(at.middle)
-        wanted, fits, above = wanted_depth(cone, root_voxel_t, branching, max_depth)
-        position = clamp(origin_r3 + at.middle[:, None] * direction_r3, 0, 1)
-        which = arrived.nonzero()[:, 0]
-        found = descend(
-            *(position[which], wanted[which], child_n, brick_n, stamp_t, frame),
-            branching=branching,
-            root=root,
-            max_depth=max_depth,
+    stop_clear, hit_clear, root_voxel_t = (
+        number.to(origin_r3)
+        for number in (
+            1 - torch.tensor(stop_alpha, dtype=origin_r3.dtype),
+            1 - torch.tensor(depth_alpha, dtype=origin_r3.dtype),
+            torch.tensor(root_voxel, dtype=origin_r3.dtype),
         )
+    )
+    at = Intervals.begin(first, last, cone_r2, step)
+    tree = Tree(
+        child_tn.view(-1),
+        brick_tn.view(-1),
+        request_tn.view(-1),
+        stamp_t,
+        stamp_b,
+        frame_1[0],
+        root_voxel_t,
+        branching,
+        root,
+        max_depth,
+    )
+    bricks = Bricks(bricks_bzyxc, constant_tnc.view(tree.child_n.shape[0], -1), border, component)
+    visit = Visit.none(origin_r3, tree)
+    zero = torch.zeros_like(first)
+    sum_ = Accumulator(torch.zeros_like(origin_r3), zero + 1, zero + INF, zero > 0)
+    samples = torch.zeros_like(zero, dtype=torch.int32)
+
+    active = at.inside() & (sum_.clear > stop_clear)
+    arrived = active  # rays that stand in a node they have not looked up yet
+    while active.any():
+        if arrived.any():
+            visit.look_up(arrived, origin_r3, direction_r3, at, tree, bricks)
+        value = visit.value(active, origin_r3, direction_r3, at, tree, bricks)
+
+        # A node of one value, or of none, is left in one go; else one interval is taken.
+        whole = active & (visit.uniform | visit.nothing)
+        entry, one = at.start, at.end - at.start
+        at.next(active)
+        leaving = whole & visit.stays(at)
+        while leaving.any():
+            at.next(leaving)
+            leaving = whole & visit.stays(at)
+        length = torch.where(whole, smaller(at.start, at.stop) - entry, one)
+        shaded = active & ~visit.nothing
+        composite(sum_, value, entry, length, table_m4, domain_3, hit_clear, shaded)
+        samples = samples + shaded.to(torch.int32)
+        active = at.inside() & (sum_.clear > stop_clear)
+        arrived = active & (whole | ~visit.stays(at))
+    return sum_.color, (1 - sum_.clear)[:, None], sum_.depth[:, None], samples
+
+
+@dataclass
+class Visit:
+    """The node each ray stands in: where the visit ends, and what the node shows."""
+
+    place: Place
+    exit: Tensor  # (r,) distance at which the ray leaves the node
+    cone_low: Tensor  # (r,) the visit ends where the cone is below this
+    cone_high: Tensor  # (r,) or not below this
+    voxel: Tensor  # (r,) world size of a voxel at the wanted depth
+    mixed: Tensor  # (r,) bool: two nodes answer
+    nothing: Tensor  # (r,) bool: no node answers, or only EMPTY ones
+    uniform: Tensor  # (r,) bool: one value answers all over the node
+
+    @classmethod
+    def none(cls, origin_r3: Tensor, tree: Tree) -> Visit:
+        """Stands in no node: every field is filled by `look_up` before it is read."""
+        rays = origin_r3.shape[0]
+        number = origin_r3.new_zeros(rays)
+        word = torch.full((rays,), tree.root, dtype=torch.int64, device=origin_r3.device)
+        corner = torch.zeros_like(origin_r3)
+        place = Place(
+            *(corner, number, word, word, word),
+            *(word, corner, number + 1, word, corner, number + 1),
+        )
+        place = Place(*(field.clone() for field in vars(place).values()))
+        return cls(place, number, number, number, number, number > 0, number > 0, number > 0)
+
+    def look_up(
+        self,
+        arrived: Tensor,
+        origin_r3: Tensor,
+        direction_r3: Tensor,
+        at: Intervals,
+        tree: Tree,
+        bricks: Bricks,
+    ) -> None:
+        """Finds the node of the rays that arrived; marks what they use and what they miss."""
+        which = arrived.nonzero()[:, 0]
+        cone, middle = at.cone(at.middle)[which], at.middle[which]
+        wanted, fits, above = wanted_depth(cone, tree)
+        position = clamp(origin_r3[which] + middle[:, None] * direction_r3[which], 0, 1)
+        found = descend(position, wanted, tree)
         reaches = fits <= cone
         blends = reaches & (wanted > 0)
-        alone = ~blends[which] | (found.coarse_node < 0)
+        alone = ~blends | (found.coarse_node < 0)
         found.coarse_node = torch.where(alone, found.fine_node, found.coarse_node)
         found.coarse_corner = torch.where(alone[:, None], found.fine_corner, found.coarse_corner)
         found.coarse_size = torch.where(alone, found.fine_size, found.coarse_size)
+        tree.mark(found, wanted, blends, cone)
 
-        node_voxel = voxel_at(found.depth, root_voxel_t, branching, max_depth)
-        missing = brick_n[found.node] == ABSENT
-        short = (found.depth < wanted[which]) & (child_n[found.node] == ABSENT)
-        parent = found.parent.clamp(min=0)
-        parent_missing = blends[which] & (found.depth == wanted[which]) & (brick_n[parent] == ABSENT)
-        parent_voxel = voxel_at(found.depth - 1, root_voxel_t, branching, max_depth)
-        for chosen, node, kind, size in (
-            (short, found.node, REQUEST_SUBDIVIDE, node_voxel),
-            (missing, found.node, REQUEST_LOAD, node_voxel),
-            (parent_missing, parent, REQUEST_LOAD, parent_voxel),
-        ):
-            post_requests(request_n, node[chosen], kind, size[chosen], cone[which][chosen])
-        for node in (found.fine_node, found.coarse_node):
-            slot = torch.where(node >= 0, brick_n[node.clamp(min=0)], -1)
-            stamp_b[torch.unique(slot[slot >= 0]).to(torch.int64)] = frame
-
-        if place is None:
-            place = Place(*(f.new_zeros((rays, *f.shape[1:])) for f in vars(found).values()))
         for name, field in vars(found).items():
-            getattr(place, name)[which] = field
-        exit_t = torch.where(
-            arrived, exit_distance(origin_r3, direction_r3, place.corner, place.size), exit_t
-        )
-        cone_low = torch.where(arrived, torch.where(reaches, fits, -INF), cone_low)
-        cone_high = torch.where(arrived, torch.where(reaches, above, fits), cone_high)
-        voxel = torch.where(arrived, fits, voxel)
-        blend = torch.where(arrived, blends, blend)
-        fine, coarse = place.fine_node, place.coarse_node
-        fine_brick, coarse_brick = brick_n[fine.clamp(min=0)], brick_n[coarse.clamp(min=0)]
-        mixed = fine != coarse
-        nothing = (fine < 0) | ((fine_brick == EMPTY) & (coarse_brick == EMPTY))
-        same = constant_nc[fine.clamp(min=0), component] == constant_nc[coarse.clamp(min=0), component]
+            getattr(self.place, name)[which] = field
+        leave = exit_distance(origin_r3[which], direction_r3[which], found.corner, found.size)
+        low = torch.where(reaches, fits, -INF)
+        high = torch.where(reaches, above, fits)
+        fine, coarse = found.fine_node.clamp(min=0), found.coarse_node.clamp(min=0)
+        fine_brick, coarse_brick = tree.brick_n[fine], tree.brick_n[coarse]
+        empty = (fine_brick == EMPTY) & (coarse_brick == EMPTY)
+        nothing = (found.fine_node < 0) | empty
+        values = bricks.constant_nc[:, bricks.component]
+        same = values[fine] == values[coarse]
         uniform = ~nothing & (fine_brick < 0) & (coarse_brick < 0) & same
+        mixed = found.fine_node != found.coarse_node
+        for name, now in (
+            *(("exit", leave), ("cone_low", low), ("cone_high", high), ("voxel", fits)),
+            *(("mixed", mixed), ("nothing", nothing), ("uniform", uniform)),
+        ):
+            setattr(self, name, getattr(self, name).index_put((which,), now))
 
-    def stays() -> Tensor:
+    def stays(self, at: Intervals) -> Tensor:
+        """(r,) bool: the interval's middle still lies in the node, and wants the same levels."""
         cone = at.cone(at.middle)
-        return at.inside() & (at.middle < exit_t) & (cone >= cone_low) & (cone < cone_high)
+        fits = (cone >= self.cone_low) & (cone < self.cone_high)
+        return at.inside() & (at.middle < self.exit) & fits
 
-    while active.any():
-        if arrived.any():
-            look_up()
-        assert place is not None
-        fine = (place.fine_node, place.fine_corner, place.fine_size)
-        coarse = (place.coarse_node, place.coarse_corner, place.coarse_size)
-        rest = (origin_r3, direction_r3, at.middle)
-        pools = (bricks_bzyxc, constant_nc, brick_n)
-        value = sample_bricks(*pools, *fine, *rest, border=border, component=component)
-        if (active & mixed).any():
-            other = sample_bricks(*pools, *coarse, *rest, border=border, component=component)
-            ratio = torch.where(active & mixed, at.cone(at.middle) / voxel, 1.0)
-            weight = clamp(log2_exact(ratio) / levels, 0, 1)
-            value = torch.where(mixed, value + weight * (other - value), value)
-
-        # A node of one value, or of none, is left in one go; else one interval is taken.
-        whole = active & (uniform | nothing)
-        entry, one = at.start, at.end - at.start
-        at.next(active)
-        leaving = whole & stays()
-        while leaving.any():
-            at.next(leaving)
-            leaving = whole & stays()
-        length = torch.where(whole, smaller(at.start, at.stop) - entry, one)
-        shaded = active & ~nothing
-        composite(sum_, value, entry, length, table_m4, domain_3, hit_clear, shaded)
-        samples = samples + shaded.to(torch.int32)
-        active = alive()
-        arrived = active & (whole | ~stays())
-    return sum_.color, (1 - sum_.clear)[:, None], sum_.depth[:, None], samples
+    def value(
+        self,
+        active: Tensor,
+        origin_r3: Tensor,
+        direction_r3: Tensor,
+        at: Intervals,
+        tree: Tree,
+        bricks: Bricks,
+    ) -> Tensor:
+        """Value at the interval's middle: the node's and its parent's, by weight log_N(cone /
+        voxel)."""
+        p, ray = self.place, (origin_r3, direction_r3, at.middle)
+        value = bricks.sample(tree.brick_n, p.fine_node, p.fine_corner, p.fine_size, *ray)
+        blend = active & self.mixed
+        if not blend.any():
+            return value
+        other = bricks.sample(tree.brick_n, p.coarse_node, p.coarse_corner, p.coarse_size, *ray)
+        ratio = torch.where(blend, at.cone(at.middle) / self.voxel, 1.0)
+        levels = log2_exact(torch.full_like(ratio, tree.branching))
+        weight = clamp(log2_exact(ratio) / levels, 0, 1)
+        return torch.where(self.mixed, value + weight * (other - value), value)
 
 
 def _clip(

@@ -1,4 +1,5 @@
-"""Joins the compiled ops to torch: loads the libraries and gives each op its fake (shapes without data).
+"""Joins the compiled ops to torch: loads the libraries and gives each op its fake (shapes without
+data).
 
 The schema of an op stands once, in cpp_ext/csrc/entry.h.
 """
@@ -12,7 +13,8 @@ from .. import cpp_ext
 
 
 def available() -> dict[str, str]:
-    """Returns, for `reference`, `cpp` and `cuda`, an empty text or the reason why it can't be used."""
+    """Returns, for `reference`, `cpp` and `cuda`, an empty text or the reason why it can't be
+    used."""
     return {"reference": "", **_reasons}
 
 

@@ -30,7 +30,7 @@ def choose_backend(backend: str, device: torch.device) -> str:
     reason = available()[backend]
     if reason:
         raise ValueError(f"backend {backend!r} can't be used here: {reason}")
-    if backend != "reference" and backend != compiled:
+    if backend not in ("reference", compiled):
         raise ValueError(f"backend {backend!r} does not run on device {device}")
     return backend
 
@@ -65,13 +65,14 @@ def trace_rays(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Traces rays through a tree and shades what they meet with a transfer function.
 
-    Mutates `request_tn` (what rays missed), `stamp_t` and `stamp_b` (what rays used). Every tensor is contiguous
-    and on one device; reals are all float32 or all float64, words int32.
+    Mutates `request_tn` (what rays missed), `stamp_t` and `stamp_b` (what rays used). Every tensor
+    is contiguous and on one device; reals are all float32 or all float64, words int32.
 
     Args:
         origin_r3: (r, 3) ray origins, tree units.
         direction_r3: (r, 3) tree units per world unit.
-        cone_r2: (r, 2) cone width at distance 0 and its growth, world units; zeros ask for the finest level.
+        cone_r2: (r, 2) cone width at distance 0 and its growth, world units; zeros ask for the
+            finest level.
         range_r2: (r, 2) first and last distance, world units.
         bounds_23: (2, 3) the part of the root cube that is drawn, tree units.
         child_tn: (t, n) tile of a node's children, or ABSENT, TERMINAL.
@@ -79,10 +80,12 @@ def trace_rays(
         request_tn: (t, n) request words, written.
         stamp_t: (t,) last frame that used a tile, written.
         bricks_bzyxc: (b, s, s, s, c) one channel of the brick pool, s = brick size + 2 border.
-        constant_tnc: (t, n, c) the value of CONSTANT nodes (and the mean of EMPTY ones), same dtype.
+        constant_tnc: (t, n, c) the value of CONSTANT nodes (and the mean of EMPTY ones), same
+            dtype.
         stamp_b: (b,) last frame that used a brick, written.
         table_m4: (m, 4) transfer function: linear RGB and opacity per reference length, m >= 2.
-        domain_3: (3,) value of the first row, value of the last row, reference length in world units.
+        domain_3: (3,) value of the first row, value of the last row, reference length in world
+            units.
         frame_1: (1,) int32 number of this frame.
         branching: N, nodes of a tile along an axis.
         root: Index of the root node.
@@ -96,7 +99,8 @@ def trace_rays(
         backend: auto, reference, cpp or cuda.
 
     Returns:
-        color (r, 3) premultiplied linear RGB, alpha (r, 1), depth (r, 1) world units or +inf, samples (r,) int32.
+        color (r, 3) premultiplied linear RGB, alpha (r, 1), depth (r, 1) world units or +inf,
+        samples (r,) int32.
 
     Raises:
         ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.

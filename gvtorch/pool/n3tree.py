@@ -19,10 +19,11 @@ _BATCH = 4096  # bricks cut from a level at a time
 
 
 class N3Tree:
-    """A tree whose root cube holds brick_size * N ** depth voxels of the finest level along each axis.
+    """A tree whose root cube holds brick_size * N ** depth voxels of the finest level along each
+    axis.
 
-    Tree units are [0, 1] over the root cube. The scene fills it from its low corner; spacing may differ by axis,
-    so the cube is a box in the world.
+    Tree units are [0, 1] over the root cube. The scene fills it from its low corner; spacing may
+    differ by axis, so the cube is a box in the world.
 
     Attributes:
         nodes: The node pool.
@@ -107,7 +108,9 @@ class N3Tree:
         return self.nodes.nbytes + self.bricks.nbytes + constants
 
     def to_tree(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Takes world points (r, 3) and directions (r, 3) to tree units, in float64 and back to their dtype."""
+        """Takes world points (r, 3) and directions (r, 3) to tree units, in float64 and back to
+        their dtype.
+        """
         box = self.box.to(points.device)
         size = torch.tensor(self.spacing, dtype=torch.float64, device=points.device) * self.side
         origin = (points.to(torch.float64) - box[0]) / size
@@ -126,11 +129,14 @@ class N3Tree:
         return (
             f"N3Tree({extent} (x, y, z), N={self.branching}, depth={self.depth}, "
             f"{self.nodes.capacity} tiles, {self.bricks.capacity} bricks of "
-            f"{self.bricks.brick_size}^3+{self.bricks.border}, {self.nbytes / 1e6:.1f} MB on {self.device})"
+            f"{self.bricks.brick_size}^3+{self.bricks.border}, "
+            f"{self.nbytes / 1e6:.1f} MB on {self.device})"
         )
 
     def validate(self) -> None:
-        """Raises ValueError unless every pointer leads to a tile or brick that exists and is owned once."""
+        """Raises ValueError unless every pointer leads to a tile or brick that exists and is owned
+        once.
+        """
         child, brick = self.nodes.child_tn, self.nodes.brick_tn
         if bool(((child < TERMINAL) | (child >= self.nodes.capacity)).any()):
             raise ValueError("N3Tree: a child pointer leads out of the node pool")
@@ -155,16 +161,17 @@ class N3Tree:
     ) -> N3Tree:
         """Builds the whole tree of a dense volume: mean-filtered levels, cut into bricks.
 
-        A node is CONSTANT where all finest voxels in reach of its brick are equal, EMPTY where they are all at
-        most `threshold`; neither has a brick or children.
+        A node is CONSTANT where all finest voxels in reach of its brick are equal, EMPTY where
+        they are all at most `threshold`; neither has a brick or children.
 
         Args:
-            volume: A volume, which becomes channel "value", or one volume for each channel, all of one extent.
+            volume: A volume, which becomes channel "value", or one volume for each channel, all of
+                one extent.
             brick_size: Voxels along a side of a brick without border, >= 2.
             border: Voxels around a brick; from 1 on no seam shows.
             branching: N >= 2.
-            threshold: Regions with no value above it are EMPTY: they are never drawn, whatever the transfer
-                function. None keeps every value.
+            threshold: Regions with no value above it are EMPTY: they are never drawn, whatever the
+                transfer function. None keeps every value.
             device: Where the pools lie.
             progress: Told how many levels are done.
 
@@ -172,11 +179,12 @@ class N3Tree:
             A tree with every node resident.
 
         Raises:
-            ValueError: An argument is out of its range, or channels differ in extent, spacing or origin.
+            ValueError: An argument is out of its range, or channels differ in extent, spacing or
+                origin.
 
         Source: Crassin et al., "GigaVoxels", I3D 2009, section 3; docs/design.md, section 2.
         """
-        volumes = {"value": volume} if isinstance(volume, Volume) else dict(volume)
+        volumes = dict(volume) if isinstance(volume, Mapping) else {"value": volume}
         first = _check_channels(volumes)
         check.whole("from_volume", "branching", branching, low=2, high=16)
         if threshold is not None:
@@ -230,7 +238,8 @@ def _check_channels(volumes: Mapping[str, Volume]) -> Volume:
 class _Plan:
     """Which nodes exist and what they hold, by depth, before any pool is made.
 
-    region: for each depth (gz, gy, gx) int32: DATA nodes hold their brick slot, others CONSTANT or EMPTY.
+    region: for each depth (gz, gy, gx) int32: DATA nodes hold their brick slot, others CONSTANT or
+        EMPTY.
     tile: for each depth (gz, gy, gx) int32: tile of the node's children, or TERMINAL.
     """
 
@@ -289,7 +298,9 @@ class _Plan:
         nodes = tree.nodes
         device, n, dim = tree.device, self.branching, nodes.nodes_per_tile
         nodes.child_tn[:], nodes.brick_tn[:] = TERMINAL, EMPTY  # also the nodes beyond the extent
-        self._link_nodes(tree, 0, torch.zeros((1, 3), dtype=torch.int64), torch.zeros(1, dtype=torch.int64))
+        self._link_nodes(
+            tree, 0, torch.zeros((1, 3), dtype=torch.int64), torch.zeros(1, dtype=torch.int64)
+        )
         for at in range(self.depth):
             parent = (self.tile[at] >= 0).nonzero()  # (k, 3) z y x
             tile = self.tile[at][tuple(parent.T)].to(torch.int64)
@@ -316,7 +327,9 @@ class _Plan:
             movable(constant).view(-1, constant.shape[-1])[here] = movable(value)
 
     def _node_index(self, at: int, zyx: Tensor, dim: int) -> Tensor:
-        """Node index of the nodes at a depth: tile of the parent's children, then the child's place."""
+        """Node index of the nodes at a depth: tile of the parent's children, then the child's
+        place.
+        """
         if at == 0:
             return torch.zeros(zyx.shape[0], dtype=torch.int64)
         n = self.branching
@@ -325,7 +338,9 @@ class _Plan:
         return tile * dim + (z * n + y) * n + x
 
     def fill(self, tree: N3Tree, name: str, at: int, level: Level) -> None:
-        """Cuts the bricks of a depth out of its level, borders from the neighbours, clamped at the faces."""
+        """Cuts the bricks of a depth out of its level, borders from the neighbours, clamped at the
+        faces.
+        """
         pool = tree.bricks
         size, border = pool.brick_size, pool.border
         reach = torch.arange(-border, size + border)
@@ -334,10 +349,6 @@ class _Plan:
         slots = self.region[at][tuple(data.T)].to(torch.int64)
         for start in range(0, data.shape[0], _BATCH):
             corner = data[start : start + _BATCH, :, None] * size + reach  # (k, 3, s)
-            z, y, x = (
-                corner[:, axis].clamp(0, values.shape[axis] - 1) for axis in range(3)
-            )
+            z, y, x = (corner[:, axis].clamp(0, values.shape[axis] - 1) for axis in range(3))
             brick = values[z[:, :, None, None], y[:, None, :, None], x[:, None, None, :]]
             bricks[slots[start : start + _BATCH].to(tree.device)] = brick.to(tree.device)
-
-

@@ -18,8 +18,8 @@ class NodePool:
         child_tn: (t, n) tile index of the node's children, or ABSENT, TERMINAL.
         brick_tn: (t, n) brick slot, or ABSENT, EMPTY, CONSTANT.
         request_tn: (t, n) what rays wished for since the words were last cleared.
-        loc_t4: (t, 4) x, y, z of the tile's parent node at its depth, and the depth of the tile's own nodes;
-            node x at that depth = loc x * N + child x.
+        loc_t4: (t, 4) x, y, z of the tile's parent node at its depth, and the depth of the tile's
+            own nodes; node x at that depth = loc x * N + child x.
         parent_t: (t,) node index whose children this tile holds, -1 for a root tile.
         tree_t: (t,) number of the tree that owns the tile.
         stamp_t: (t,) last frame in which a ray passed through, -1 for never.

@@ -1,10 +1,12 @@
 """The levels of a volume: mean-filtered values, and per-node minimum and maximum.
 
-A coarse voxel is the mean of the N^3 voxels below it (a box filter). With it a level holds, for every voxel, the
-average of just the space the voxel covers: a cone as wide as a voxel reads its own footprint, and sums over a
-region do not change from level to level, so neither does how much light a thin medium absorbs. Wider kernels blur
-more and need more border; maximum filters keep thin shells opaque but let them grow.
-Source: Crassin et al., I3D 2009, section 3 (mip-mapped bricks); Williams, "Pyramidal parametrics", 1983.
+A coarse voxel is the mean of the N^3 voxels below it (a box filter). With it a level holds, for
+every voxel, the average of just the space the voxel covers: a cone as wide as a voxel reads its
+own footprint, and sums over a region do not change from level to level, so neither does how much
+light a thin medium absorbs. Wider kernels blur more and need more border; maximum filters keep
+thin shells opaque but let them grow.
+Source: Crassin et al., I3D 2009, section 3 (mip-mapped bricks); Williams, "Pyramidal parametrics",
+    1983.
 """
 
 from __future__ import annotations
@@ -29,9 +31,11 @@ class Level:
 def build_levels(
     data_zyxc: Tensor, count: int, *, branching: int, brick_size: int, border: int
 ) -> Iterator[Level]:
-    """Yields `count` levels, finest first. Only one level's arrays are alive at a time, beside the data.
+    """Yields `count` levels, finest first. Only one level's arrays are alive at a time, beside the
+    data.
 
-    Means are taken in float32 from the level below, unrounded; stored values are rounded to the dtype.
+    Means are taken in float32 from the level below, unrounded; stored values are rounded to the
+    dtype.
     """
     dtype = data_zyxc.dtype
     values = data_zyxc
@@ -81,7 +85,9 @@ def _windows(values: Tensor, how: str, *, size: int, border: int, step: int) -> 
     """Reduces the window of every brick: `size` voxels from `border` before its first voxel."""
     for axis in range(3):
         extra = -values.shape[axis] % step
-        values = _reduce(_extend(values, axis, border, extra + border).unfold(axis, size, step), how, -1)
+        values = _reduce(
+            _extend(values, axis, border, extra + border).unfold(axis, size, step), how, -1
+        )
     return values.to(torch.float32)
 
 

@@ -1,8 +1,8 @@
 """Cameras, transfer functions, the renderer and the pictures it makes."""
 
 from .camera import Camera
-from .picture import Picture
 from .module import TreeTracer
+from .picture import Picture
 from .renderer import RenderOptions, render
 from .shader import TransferFunction
 

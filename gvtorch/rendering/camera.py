@@ -1,8 +1,9 @@
 """`Camera`: pinhole cameras, one or a batch, and the rays through their pixels.
 
-Conventions: camera axes are OpenCV's (x right, y down, z forward); pixel (i, j) covers [i, i + 1) x [j, j + 1) of
-the image plane, its centre is at +0.5 (so do gsplat and nerfstudio; kornia puts centres at integers, and
-`from_kornia` and `to_kornia` shift the principal point by half a pixel).
+Conventions: camera axes are OpenCV's (x right, y down, z forward); pixel (i, j) covers [i, i + 1)
+    x [j, j + 1) of
+the image plane, its centre is at +0.5 (so do gsplat and nerfstudio; kornia puts centres at
+integers, and `from_kornia` and `to_kornia` shift the principal point by half a pixel).
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ class Camera:
         """Takes matrices (4, 4) and (3, 3), or batches (n, 4, 4) and (n, 3, 3).
 
         Raises:
-            ValueError: A wrong shape, a value that is not finite, a focal length that is not positive or a
-                rotation that is none.
+            ValueError: A wrong shape, a value that is not finite, a focal length that is not
+                positive or a rotation that is none.
         """
         self.width = check.whole("Camera", "width", width, low=1, high=65536)
         self.height = check.whole("Camera", "height", height, low=1, high=65536)
@@ -76,7 +77,8 @@ class Camera:
             self.Ks = intrinsics.expand(count, 3, 3).contiguous()
         except RuntimeError:
             raise ValueError(
-                f"Camera: viewmats {tuple(view.shape)} and Ks {tuple(intrinsics.shape)} do not match"
+                f"Camera: viewmats {tuple(view.shape)} and Ks {tuple(intrinsics.shape)} "
+                "do not match"
             ) from None
         if bool((self.Ks[:, (0, 1), (0, 1)] <= 0).any()):
             raise ValueError("Camera: Ks must have positive focal lengths")
@@ -98,7 +100,8 @@ class Camera:
     ) -> Camera:
         """Looks at the centre of the scene's box from a sphere around it; up is +y.
 
-        position = centre + distance * L * (sin az cos el, sin el, cos az cos el), L the box's largest side.
+        position = centre + distance * L * (sin az cos el, sin el, cos az cos el), L the box's
+        largest side.
 
         Args:
             azimuth: Degrees; a number, or (n,) for a batch.
@@ -127,7 +130,9 @@ class Camera:
         )
         right = torch.stack((turn.cos(), zero, -turn.sin()), dim=-1)
         view = _viewmat(outward * far[..., None], -outward, right)
-        return cls(view, _intrinsics("Camera.orbit", fov, width, height), width, height, frame=Frame.BOX)
+        return cls(
+            view, _intrinsics("Camera.orbit", fov, width, height), width, height, frame=Frame.BOX
+        )
 
     @classmethod
     def look_at(
@@ -144,7 +149,8 @@ class Camera:
         Args:
             eye: (3,) or (n, 3).
             target: (3,) or (n, 3).
-            up: (3,) or (n, 3); where it is parallel to the view, -z takes its place (or +y, if up is z).
+            up: (3,) or (n, 3); where it is parallel to the view, -z takes its place (or +y, if up
+                is z).
             fov: Vertical field of view, degrees.
             width: Pixels.
             height: Pixels.
@@ -171,7 +177,9 @@ class Camera:
         forward = forward / length
         right = torch.linalg.cross(forward, up_)
         other = torch.where(
-            forward[..., 2:3].abs() > 0.9, forward.new_tensor([0, 1, 0]), forward.new_tensor([0, 0, -1])
+            forward[..., 2:3].abs() > 0.9,
+            forward.new_tensor([0, 1, 0]),
+            forward.new_tensor([0, 0, -1]),
         )
         parallel = right.norm(dim=-1, keepdim=True) < 1e-9 * up_.norm(dim=-1, keepdim=True) + 1e-300
         right = torch.where(parallel, torch.linalg.cross(forward, other), right)
@@ -181,12 +189,16 @@ class Camera:
 
     @classmethod
     def from_viewmat_K(cls, viewmats: Tensor, Ks: Tensor, width: int, height: int) -> Camera:
-        """Takes the matrices that gsplat takes: (..., 4, 4) world-to-camera (OpenCV) and (..., 3, 3)."""
+        """Takes the matrices that gsplat takes: (..., 4, 4) world-to-camera (OpenCV) and (..., 3,
+        3).
+        """
         return cls(viewmats, Ks, width, height)
 
     @classmethod
     def from_kornia(cls, camera: PinholeCamera) -> Camera:
-        """Takes kornia's `PinholeCamera` (a batch). Its pixel centres are at integers, ours at +0.5."""
+        """Takes kornia's `PinholeCamera` (a batch). Its pixel centres are at integers, ours at
+        +0.5.
+        """
         sizes = torch.stack((camera.height, camera.width)).long().unique(dim=1)
         if sizes.shape[1] != 1:
             raise ValueError("Camera.from_kornia: all cameras must have one height and width")
@@ -211,7 +223,9 @@ class Camera:
 
     def __getitem__(self, index: int) -> Camera:
         """Returns one camera of the batch."""
-        return Camera(self.viewmats[index], self.Ks[index], self.width, self.height, frame=self.frame)
+        return Camera(
+            self.viewmats[index], self.Ks[index], self.width, self.height, frame=self.frame
+        )
 
     def placed(self, box: Tensor) -> Camera:
         """Returns the camera in world units, given the (2, 3) box of the scene."""
@@ -239,7 +253,12 @@ class Camera:
         centred = Ks.clone()
         centred[:, :2, 2] -= 0.5
         local = unproject_meshgrid(
-            self.height, self.width, centred, normalize_points=True, device=view.device, dtype=view.dtype
+            self.height,
+            self.width,
+            centred,
+            normalize_points=True,
+            device=view.device,
+            dtype=view.dtype,
         )
         rotation, translation = view[:, :3, :3], view[:, :3, 3]
         direction = (local.reshape(len(self), -1, 3) @ rotation).reshape(-1, 3)
@@ -281,4 +300,6 @@ def _intrinsics(where: str, fov: float, width: int, height: int) -> Tensor:
     check.whole(where, "width", width, low=1, high=65536)
     check.whole(where, "height", height, low=1, high=65536)
     focal = 0.5 * height / math.tan(0.5 * math.radians(angle))
-    return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
+    return torch.tensor(
+        [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64
+    )

@@ -1,10 +1,12 @@
 """`TreeTracer`: a tree and a transfer function as one `nn.Module` of plain tensors and one op.
 
-It can be scripted, saved and loaded (also from C++), exported and compiled. Programs that load an archive import
-`gvtorch.ops` first; C++ programs open `libgvtorch_cpu.so`.
+It can be scripted, saved and loaded (also from C++), exported and compiled. Programs that load an
+archive import `gvtorch.ops` first; C++ programs open `libgvtorch_cpu.so`.
 """
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -17,6 +19,10 @@ from .shader import TransferFunction
 
 class TreeTracer(torch.nn.Module):
     """Traces world rays through a resident tree. Pools are buffers: `.to(device)` moves them."""
+
+    if TYPE_CHECKING:  # TorchScript would read these as attributes of its own
+        corner: Tensor
+        size: Tensor
 
     def __init__(
         self,
@@ -79,7 +85,8 @@ class TreeTracer(torch.nn.Module):
         Args:
             origin: (r, 3) float32.
             direction: (r, 3) float32, unit length.
-            cone: (r, 2) float32, width at the origin and growth per unit distance; zeros for the finest level.
+            cone: (r, 2) float32, width at the origin and growth per unit distance; zeros for the
+                finest level.
             range: (r, 2) float32, first and last distance.
 
         Returns:

@@ -47,7 +47,9 @@ class Picture:
         from kornia.color import linear_rgb_to_rgb
 
         planes = self.color.detach().to("cpu", torch.float32).movedim(-1, -3).clamp(0, 1)
-        return (linear_rgb_to_rgb(planes) * 255).round().to(torch.uint8).movedim(-3, -1).contiguous()
+        return (
+            (linear_rgb_to_rgb(planes) * 255).round().to(torch.uint8).movedim(-3, -1).contiguous()
+        )
 
     def save(self, path: str | Path) -> None:
         """Writes a PNG (sRGB; a batch side by side) or an NPZ of float32 color, alpha and depth.
@@ -69,7 +71,9 @@ class Picture:
             if path.suffix == ".png":
                 _write_png(Path(name), self.to_srgb8())
             else:
-                arrays = {n: getattr(self, n).detach().cpu().float() for n in ("color", "alpha", "depth")}
+                arrays = {
+                    n: getattr(self, n).detach().cpu().float() for n in ("color", "alpha", "depth")
+                }
                 np.savez(name, **{n: array.numpy() for n, array in arrays.items()})
             os.chmod(name, 0o666 & ~_umask())
             os.replace(name, path)

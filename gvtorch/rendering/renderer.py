@@ -62,7 +62,8 @@ def render(
     """Renders a resident tree.
 
     Args:
-        tree: What to render, on the device that renders it; its stamps and request words are written.
+        tree: What to render, on the device that renders it; its stamps and request words are
+            written.
         camera: One camera or a batch; an orbit camera stands around the tree's box.
         shader: The transfer function, in data units.
         progress: Told how many rays are done.
@@ -77,14 +78,17 @@ def render(
     unknown = sorted(set(options) - set(RenderOptions.__dataclass_fields__))
     if unknown:
         raise ValueError(
-            f"render: unknown option {unknown[0]!r}; known: {', '.join(RenderOptions.__dataclass_fields__)}"
+            f"render: unknown option {unknown[0]!r}; "
+            f"known: {', '.join(RenderOptions.__dataclass_fields__)}"
         )
     for name, value, kind in (
         *(("tree", tree, N3Tree), ("camera", camera, Camera)),
         ("shader", shader, TransferFunction),
     ):
         if not isinstance(value, kind):
-            raise ValueError(f"render: {name} must be a {kind.__name__}, got {type(value).__name__}")
+            raise ValueError(
+                f"render: {name} must be a {kind.__name__}, got {type(value).__name__}"
+            )
     chosen = RenderOptions(**options)
     start = time.perf_counter()
     with collect_timings() as timings:
@@ -125,7 +129,8 @@ def trace(
     options: RenderOptions | None = None,
     progress: Progress = no_progress,
 ) -> Hits:
-    """Traces any world rays through a tree as one frame: counts `tree.frame` up, then marks with it.
+    """Traces any world rays through a tree as one frame: counts `tree.frame` up, then marks with
+    it.
 
     Args:
         tree: The tree.
@@ -138,7 +143,7 @@ def trace(
         Colour, alpha, depth and samples of each ray, in `options.dtype`.
     """
     options = options or RenderOptions()
-    backend = choose_backend(options.backend, tree.device)
+    choose_backend(options.backend, tree.device)
     channel = options.channel or tree.channel_names[0]
     if channel not in tree.bricks.bricks:
         raise ValueError(
@@ -151,31 +156,35 @@ def trace(
     cone = rays.cone * options.cone_scale if options.lod == "auto" else torch.zeros_like(rays.cone)
     columns = [column.to(options.dtype) for column in (origin, direction, cone, rays.range)]
     table, domain = shader.table(min(tree.spacing), options.dtype, tree.device)
-    bounds = tree.bounds(options.dtype)
-    frame = torch.tensor([tree.frame], dtype=torch.int32, device=tree.device)
-    nodes, bricks = tree.nodes, tree.bricks
+    arguments: dict[str, Any] = {
+        "bounds_23": tree.bounds(options.dtype),
+        "child_tn": tree.nodes.child_tn,
+        "brick_tn": tree.nodes.brick_tn,
+        "request_tn": tree.nodes.request_tn,
+        "stamp_t": tree.nodes.stamp_t,
+        "bricks_bzyxc": tree.bricks.bricks[channel],
+        "constant_tnc": tree.constants[channel],
+        "stamp_b": tree.bricks.stamp_b,
+        "table_m4": table,
+        "domain_3": domain,
+        "frame_1": torch.tensor([tree.frame], dtype=torch.int32, device=tree.device),
+        "branching": tree.branching,
+        "root": tree.root,
+        "max_depth": tree.depth,
+        "border": tree.bricks.border,
+        "component": options.component,
+        "root_voxel": tree.root_voxel,
+        "step": step,
+        "stop_alpha": options.stop_alpha,
+        "depth_alpha": options.depth_alpha,
+        "backend": options.backend,
+    }
     count, parts = origin.shape[0], []
     size = _RAYS_A_CALL[tree.device.type]
     with stage("trace"):
         for first in range(0, max(count, 1), size):
-            parts.append(
-                trace_rays(
-                    *(column[first : first + size] for column in columns),
-                    *(bounds, nodes.child_tn, nodes.brick_tn, nodes.request_tn, nodes.stamp_t),
-                    *(bricks.bricks[channel], tree.constants[channel], bricks.stamp_b),
-                    *(table, domain, frame),
-                    branching=tree.branching,
-                    root=tree.root,
-                    max_depth=tree.depth,
-                    border=bricks.border,
-                    component=options.component,
-                    root_voxel=tree.root_voxel,
-                    step=step,
-                    stop_alpha=options.stop_alpha,
-                    depth_alpha=options.depth_alpha,
-                    backend=backend,  # type: ignore[arg-type]
-                )
-            )
+            some = [column[first : first + size] for column in columns]
+            parts.append(trace_rays(*some, **arguments))
             progress("rays", min(first + size, count), count)
     color, alpha, depth, samples = (torch.cat(part) for part in zip(*parts, strict=True))
     return Hits(color=color, alpha=alpha, depth=depth, samples=samples)

@@ -1,7 +1,7 @@
 """`TransferFunction`: value -> linear RGB and opacity, piecewise linear.
 
-Opacity is given per reference length: a slab that long, filled with the value, has that alpha. The colour of a
-value is its own (not premultiplied); the renderer composites premultiplied.
+Opacity is given per reference length: a slab that long, filled with the value, has that alpha. The
+colour of a value is its own (not premultiplied); the renderer composites premultiplied.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from .. import check
 
 Points = Sequence[Sequence[float]]
 
-#: Presets over [0, 1], which stands for the range of the data: opacity (v, a) and colour (v, r, g, b).
+#: Presets over [0, 1], which stands for the range of the data: opacity (v, a) and colour (v, r, g,
+#: b).
 PRESETS: dict[str, tuple[Points, Points]] = {
     "gray": ([(0, 0), (0.05, 0), (1, 0.5)], [(0, 0, 0, 0), (1, 1, 1, 1)]),
     "hot": (
@@ -70,7 +71,8 @@ class TransferFunction:
         """Makes a transfer function from its corner points.
 
         Args:
-            opacity: Points (value, alpha), values strictly increasing, alpha in [0, 1] per reference length.
+            opacity: Points (value, alpha), values strictly increasing, alpha in [0, 1] per
+                reference length.
             color: Points (value, red, green, blue), linear, in [0, 1]; white if left out.
             reference: World units; the smallest spacing of the volume if left out.
 
@@ -98,7 +100,9 @@ class TransferFunction:
             raise ValueError(f'{path}: expected an object with "opacity", "color" and "reference"')
         unknown = sorted(set(content) - {"opacity", "color", "reference"})
         if unknown:
-            raise ValueError(f"{path}: unknown key {unknown[0]!r}; known: opacity, color, reference")
+            raise ValueError(
+                f"{path}: unknown key {unknown[0]!r}; known: opacity, color, reference"
+            )
         try:
             return cls.from_points(**content)
         except ValueError as error:
@@ -136,8 +140,9 @@ class TransferFunction:
     ) -> tuple[Tensor, Tensor]:
         """Returns the function as the kernel reads it: rows at even distances, and their domain.
 
-        The number of rows is chosen so that every corner point falls on a row: then the table is the function,
-        not a sampling of it. Points that share no grid of 65,536 rows are sampled on that grid.
+        The number of rows is chosen so that every corner point falls on a row: then the table is
+        the function, not a sampling of it. Points that share no grid of 65,536 rows are sampled on
+        that grid.
 
         Returns:
             table (m, 4), domain (3,): value of the first row, of the last row, reference length.
@@ -153,7 +158,9 @@ class TransferFunction:
 
 
 def _shared_grid(places: np.ndarray) -> int:
-    """Fewest cells of [0, 1] such that every place is a cell's end; the most there may be if there is none."""
+    """Fewest cells of [0, 1] such that every place is a cell's end; the most there may be if there
+    is none.
+    """
     cells = 1
     for place in places:
         fraction = Fraction(float(place)).limit_denominator(_MOST_CELLS)
@@ -178,7 +185,8 @@ def _points(name: str, points: Points, width: int) -> np.ndarray:
     if (steps <= 0).any():
         at = int(np.argmax(steps <= 0))
         raise ValueError(
-            f"{where}: {name} values must increase, got {array[at, 0]:g} before {array[at + 1, 0]:g} "
+            f"{where}: {name} values must increase, "
+            f"got {array[at, 0]:g} before {array[at + 1, 0]:g} "
             "(for a jump use two values close to each other)"
         )
     if (array[:, 1:] < 0).any() or (array[:, 1:] > 1).any():

@@ -1,7 +1,7 @@
 """The command line: `gvtorch info` and `gvtorch render`.
 
-torch is imported inside the commands, so that `--help` answers at once. A mistake of the user ends in one line
-on standard error and status 2.
+torch is imported inside the commands, so that `--help` answers at once. A mistake of the user ends
+in one line on standard error and status 2.
 """
 
 from __future__ import annotations
@@ -88,13 +88,15 @@ class Render:
     stats: Annotated[Path | None, arg(metavar="FILE.json")] = None
     """milliseconds, rays, samples, nodes, bricks, bytes"""
     camera: Annotated[str, arg(metavar="CAMERA")] = "orbit:30,20,2.4"
-    """orbit:AZIMUTH,ELEVATION,DISTANCE (degrees; largest sides of the box) or look:ex,ey,ez,tx,ty,tz (world)"""
+    """orbit:AZIMUTH,ELEVATION,DISTANCE (degrees, and largest sides of the box) or
+    look:ex,ey,ez,tx,ty,tz (world units)"""
     fov: Annotated[float, arg(metavar="DEG")] = 30.0
     """vertical field of view"""
     size: Annotated[str, arg(metavar="WxH")] = "512x512"
     """pixels"""
     tf: Annotated[str, arg(metavar="FILE|PRESET")] = "gray"
-    """transfer function: a JSON file, or gray, hot, vessels, bone, tissue (stretched over the data)"""
+    """transfer function: a JSON file, or a preset over the data's range: gray, hot, vessels, bone,
+    tissue"""
     step: Annotated[float, arg(metavar="VOXELS")] = 0.5
     """distance between samples"""
     lod: Literal["auto", "finest"] = "auto"
@@ -263,7 +265,9 @@ def _print_table(content: dict[str, Any]) -> None:
         elif isinstance(value, dict):
             text = "\n".join(f"{key}: {item}" for key, item in value.items())
         elif isinstance(value, (list, tuple)):
-            text = ", ".join(f"{item:g}" if isinstance(item, float) else str(item) for item in value)
+            text = ", ".join(
+                f"{item:g}" if isinstance(item, float) else str(item) for item in value
+            )
         else:
             text = f"{value:g}" if isinstance(value, float) else str(value)
         table.add_row(f"[bold]{name}[/bold]", text.replace("[", "\\["))
@@ -305,7 +309,9 @@ def main(args: list[str] | None = None) -> None:
         description="GigaVoxels on PyTorch tensors.",
         config=(tyro.conf.CascadeSubcommandArgs,),
     )
-    warnings.showwarning = lambda message, *_rest, **_more: print(f"gvtorch: {message}", file=sys.stderr)
+    warnings.showwarning = lambda message, *_rest, **_more: print(
+        f"gvtorch: {message}", file=sys.stderr
+    )
     try:
         command.run()
     except (ValueError, OSError, ImportError, MemoryError) as error:

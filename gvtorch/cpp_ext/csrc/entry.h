@@ -57,14 +57,22 @@ constexpr ScalarType scalar_type_of() {
 template <class Body>
 void with_voxel_type(ScalarType dtype, const Body& body) {
   switch (dtype) {
-    case ScalarType::Byte: return body(uint8_t{});
-    case ScalarType::Char: return body(int8_t{});
-    case ScalarType::Short: return body(int16_t{});
-    case ScalarType::UInt16: return body(uint16_t{});
-    case ScalarType::Half: return body(torch::headeronly::Half{});
-    case ScalarType::BFloat16: return body(torch::headeronly::BFloat16{});
-    case ScalarType::Float: return body(float{});
-    default: STD_TORCH_CHECK(false, "gvtorch: this channel dtype has no kernel");
+    case ScalarType::Byte:
+      return body(uint8_t{});
+    case ScalarType::Char:
+      return body(int8_t{});
+    case ScalarType::Short:
+      return body(int16_t{});
+    case ScalarType::UInt16:
+      return body(uint16_t{});
+    case ScalarType::Half:
+      return body(torch::headeronly::Half{});
+    case ScalarType::BFloat16:
+      return body(torch::headeronly::BFloat16{});
+    case ScalarType::Float:
+      return body(float{});
+    default:
+      STD_TORCH_CHECK(false, "gvtorch: this channel dtype has no kernel");
   }
 }
 
@@ -81,8 +89,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> trace_rays(
   const ScalarType voxel = bricks_bzyxc.scalar_type();
   require_float(real);
   STD_TORCH_CHECK(origin_r3.dim() == 2 && origin_r3.size(1) == 3, "gvtorch: origin_r3 must be (r, 3)");
-  STD_TORCH_CHECK(bricks_bzyxc.dim() == 5 && bricks_bzyxc.size(1) >= 2 && bricks_bzyxc.size(1) == bricks_bzyxc.size(2) &&
-                      bricks_bzyxc.size(2) == bricks_bzyxc.size(3),
+  STD_TORCH_CHECK(bricks_bzyxc.dim() == 5 && bricks_bzyxc.size(1) >= 2 &&
+                      bricks_bzyxc.size(1) == bricks_bzyxc.size(2) && bricks_bzyxc.size(2) == bricks_bzyxc.size(3),
                   "gvtorch: bricks_bzyxc must be (b, s, s, s, c) with s >= 2");
   const int64_t rays = origin_r3.size(0);
   const int64_t side = bricks_bzyxc.size(1);

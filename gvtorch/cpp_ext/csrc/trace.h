@@ -26,8 +26,8 @@ struct RayView {
 
 template <class T>
 struct TransferView {
-  const T* table_m4;   // red, green, blue, opacity per reference length
-  const T* domain_3;   // value of the first row, value of the last row, reference length (world units)
+  const T* table_m4;  // red, green, blue, opacity per reference length
+  const T* domain_3;  // value of the first row, value of the last row, reference length (world units)
   int32_t rows;
 };
 
@@ -270,7 +270,8 @@ struct TraceRay {
   }
 
   GV_HD void mark_missing(const Place<T>& place, int32_t wanted, bool blend, T cone) const {
-    if (place.depth < wanted && tree.child_tn[place.node] == kAbsent) request(place.node, place.depth, cone, kSubdivide);
+    if (place.depth < wanted && tree.child_tn[place.node] == kAbsent)
+      request(place.node, place.depth, cone, kSubdivide);
     if (tree.brick_tn[place.node] == kAbsent) request(place.node, place.depth, cone, kLoad);
     if (blend && place.depth == wanted && tree.brick_tn[place.parent] == kAbsent) {
       request(place.parent, place.depth - 1, cone, kLoad);

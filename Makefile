@@ -1,0 +1,52 @@
+# make demo   sets up .venv, renders the bundled CT scan, prints where the picture lies
+# make test   sets up .venv, runs every test
+# make lint   ruff, mypy, clang-format
+# make wheel  one wheel for every Python >= 3.11 and every torch >= 2.11, in dist/
+#
+# Torch is pinned in pyproject.toml ([build-system] requires) and nowhere else.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+TORCH := $(shell sed -n 's/.*"\(torch==[0-9.]*\)".*/\1/p' pyproject.toml)
+NATIVE := $(shell nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u | tr -d . | paste -sd ';')
+# A development build compiles CUDA for the cards that are here; without one, for one architecture, to see it compile.
+export GVTORCH_CUDA_ARCHS ?= $(or $(NATIVE),90)
+
+.PHONY: demo test lint format wheel clean
+.DELETE_ON_ERROR:
+
+demo: $(VENV)/ready
+	@mkdir -p out
+	$(BIN)/gvtorch render examples/data/aneurism_256x256x256_uint8.raw.gz --tf vessels -o out/demo.png
+	@echo "The picture: $(CURDIR)/out/demo.png"
+
+test: $(VENV)/ready
+	GVTORCH_REQUIRE=reference,cpp $(BIN)/python -m pytest $(ARGS)
+
+lint: $(VENV)/ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/clang-format --dry-run --Werror $(wildcard gvtorch/cpp_ext/csrc/*) tests/cpp/render.cpp
+
+format: $(VENV)/ready
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+	$(BIN)/clang-format -i $(wildcard gvtorch/cpp_ext/csrc/*) tests/cpp/render.cpp
+
+wheel: $(VENV)/ready
+	$(BIN)/python -m build --wheel --no-isolation
+
+clean:
+	rm -rf $(VENV) build dist out gvtorch/cpp_ext/lib *.egg-info
+
+$(VENV)/torch: pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "gvtorch needs Python 3.11 or newer, this is " + sys.version)'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "setuptools>=78" wheel "$(TORCH)"
+	@touch $@
+
+$(VENV)/ready: $(VENV)/torch $(wildcard gvtorch/cpp_ext/csrc/*) gvtorch/cpp_ext/build.py
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation -e ".[dev]"
+	@touch $@

@@ -1,0 +1,140 @@
+"""Cameras: where they stand, what their rays hit, and other people's conventions."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from kornia.geometry.camera import PinholeCamera
+
+import gvtorch as gv
+
+BOX = torch.tensor([[1.0, 2.0, 3.0], [5.0, 4.0, 4.0]], dtype=torch.float64)
+
+
+def centre_of(camera: gv.Camera) -> torch.Tensor:
+    return -(camera.viewmats[:, :3, :3].mT @ camera.viewmats[:, :3, 3:])[..., 0]
+
+
+@pytest.mark.parametrize("elevation", [-90.0, -30.0, 0.0, 20.0, 90.0])
+@pytest.mark.parametrize("azimuth", [0.0, 30.0, 200.0])
+def test_orbit_stands_where_the_formula_says(azimuth, elevation):
+    camera = gv.Camera.orbit(azimuth, elevation, 2.4, 30, 64, 48).placed(BOX)
+    az, el = math.radians(azimuth), math.radians(elevation)
+    out = [math.sin(az) * math.cos(el), math.sin(el), math.cos(az) * math.cos(el)]
+    out = torch.tensor(out, dtype=torch.float64)
+    expected = BOX.mean(0) + 2.4 * 4 * out
+    torch.testing.assert_close(centre_of(camera)[0], expected)
+    rays = camera.rays()
+    middle = rays.direction.reshape(48, 64, 3)[23:25, 31:33].mean((0, 1))
+    torch.testing.assert_close(middle / middle.norm(), -out, atol=1e-12, rtol=0)
+
+
+def test_up_is_up_and_right_is_right():
+    rays = gv.Camera.orbit(0, 0, 2, 40, 9, 9).placed(BOX).rays()
+    direction = rays.direction.reshape(9, 9, 3)
+    assert direction[0, 4, 1] > 0 > direction[8, 4, 1]
+    assert direction[4, 8, 0] > 0 > direction[4, 0, 0]
+
+
+def test_vertical_field_of_view_and_cone():
+    camera = gv.Camera.look_at((0, 0, 5), (0, 0, 0), fov=40, width=200, height=100)
+    rays = camera.rays()
+    edge = rays.direction.reshape(100, 200, 3)[0, 99]
+    slope = -float(edge[1] / edge[2])
+    half_pixel = math.tan(math.radians(20)) / 100
+    assert slope == pytest.approx(math.tan(math.radians(20)) - half_pixel, rel=1e-9)
+    assert rays.cone[0].tolist() == pytest.approx([0, 2 * half_pixel])
+    assert torch.allclose(rays.direction.norm(dim=1), torch.ones(20000, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("up", [(0, 1, 0), (0, 0, 1)])
+def test_look_at_survives_a_parallel_up(up):
+    eye = torch.tensor(up) * 3.0
+    camera = gv.Camera.look_at(eye, (0, 0, 0), up, 30, 8, 8)
+    assert torch.isfinite(camera.viewmats).all()
+    torch.testing.assert_close(centre_of(camera)[0], eye.double())
+
+
+def test_kornia_projects_our_rays_back_onto_their_pixels():
+    camera = gv.Camera.look_at((3, 2, 5), (0.5, 0, 0), fov=35, width=12, height=8)
+    rays = camera.rays()
+    kornia = camera.to_kornia()
+    pixels = kornia.project((rays.origin + 2.5 * rays.direction)[None])[0].reshape(8, 12, 2)
+    v, u = torch.meshgrid(torch.arange(8.0), torch.arange(12.0), indexing="ij")
+    torch.testing.assert_close(pixels, torch.stack((u, v), -1).double(), atol=1e-9, rtol=0)
+
+
+def test_from_kornia_and_back():
+    camera = gv.Camera.orbit([0, 40], 10, 2.0, 30, 16, 12).placed(BOX)
+    again = gv.Camera.from_kornia(camera.to_kornia())
+    assert (again.width, again.height, len(again)) == (16, 12, 2)
+    torch.testing.assert_close(again.viewmats, camera.viewmats)
+    torch.testing.assert_close(again.Ks, camera.Ks)
+    ours, theirs = camera.rays(), again.rays()
+    torch.testing.assert_close(ours.direction, theirs.direction)
+
+
+def test_from_kornia_takes_its_own_constructor():
+    intrinsics = torch.eye(4)[None].clone()
+    intrinsics[0, 0, 0] = intrinsics[0, 1, 1] = 20
+    intrinsics[0, :2, 2] = torch.tensor([7.5, 5.5])  # kornia: the middle of 16 x 12 pixels
+    kornia = PinholeCamera(intrinsics, torch.eye(4)[None], torch.tensor([12]), torch.tensor([16]))
+    rays = gv.Camera.from_kornia(kornia).rays()
+    middle = rays.direction.reshape(12, 16, 3)[5:7, 7:9].mean((0, 1))
+    torch.testing.assert_close(middle[:2], torch.zeros(2, dtype=torch.float64), atol=1e-9, rtol=0)
+
+
+def test_from_viewmat_K_is_opencv():
+    """A camera at (0, 0, -2) that looks along +z, x right, y down; pixel centres at +0.5."""
+    view = torch.eye(4)
+    view[2, 3] = 2
+    K = torch.tensor([[50.0, 0, 16], [0, 50, 8], [0, 0, 1]])
+    rays = gv.Camera.from_viewmat_K(view, K, 32, 16).rays()
+    assert torch.equal(rays.origin[0], torch.tensor([0, 0, -2], dtype=torch.float64))
+    corner = rays.direction[0] / rays.direction[0, 2]
+    assert corner.tolist() == pytest.approx([-15.5 / 50, -7.5 / 50, 1])
+
+
+def test_batches_broadcast():
+    camera = gv.Camera.look_at(torch.tensor([[1.0, 0, 0], [0, 0, 1]]), (0, 0, 0), width=4, height=3)
+    assert len(camera) == 2 and camera.rays().origin.shape == (24, 3)
+    single = camera[1].rays()
+    assert torch.equal(single.direction, camera.rays().direction[12:])
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: gv.Camera.orbit(azimuth=math.nan), "azimuth must be finite"),
+        (lambda: gv.Camera.orbit(elevation=math.inf), "elevation must be finite"),
+        (lambda: gv.Camera.orbit(distance=0), "distance must be > 0"),
+        (lambda: gv.Camera.orbit(fov=0), "fov must be finite and > 0 and <= 179"),
+        (lambda: gv.Camera.orbit(fov=math.nan), "fov must be finite"),
+        (lambda: gv.Camera.orbit(width=0), "width must be an int >= 1"),
+        (lambda: gv.Camera.orbit(height=2.5), "height must be an int"),
+        (lambda: gv.Camera.orbit("north"), "azimuth must be numbers"),
+        (lambda: gv.Camera.look_at((0, 0, 0), (0, 0, 0)), "the same place"),
+        (
+            lambda: gv.Camera.look_at((0, 0), (0, 0, 0)),
+            r"eye must be \(3,\) or \(n, 3\), got \(2,\)",
+        ),
+        (lambda: gv.Camera.look_at((math.nan, 0, 0), (0, 0, 0)), "eye must be finite"),
+        (lambda: gv.Camera(torch.eye(3), torch.eye(3), 4, 4), r"viewmats must be \(..., 4, 4\)"),
+        (lambda: gv.Camera(torch.eye(4) * 2, torch.eye(3), 4, 4), "must hold rotations"),
+        (lambda: gv.Camera(torch.eye(4), -torch.eye(3), 4, 4), "positive focal lengths"),
+        (
+            lambda: gv.Camera(torch.full((4, 4), math.nan), torch.eye(3), 4, 4),
+            "viewmats must be finite",
+        ),
+        (
+            lambda: gv.Camera(torch.eye(4).repeat(2, 1, 1), torch.eye(3).repeat(3, 1, 1), 4, 4),
+            "do not match",
+        ),
+        (lambda: gv.Camera.orbit().rays(), "placed"),
+    ],
+)
+def test_bad_cameras_are_named(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -1,0 +1,204 @@
+"""The command line as a user meets it: in a process of its own."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from conftest import DATA, ROOT
+
+import gvtorch as gv
+
+ANEURISM = DATA / "aneurism_256x256x256_uint8.raw.gz"
+
+
+def gvtorch(*args: object, cwd=None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "gvtorch", *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False)
+
+
+def test_help_does_not_import_torch():
+    code = (
+        "import sys; from gvtorch.tools.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "print('torch' in sys.modules or 'numpy' in sys.modules)"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "render" in run.stdout and run.stdout.strip().endswith("False")
+
+
+def test_info_tells_backends_and_devices():
+    content = json.loads(gvtorch("info", "--json").stdout)
+    assert content["backends"]["reference"] == "ready" and content["gvtorch"] == gv.__version__
+    assert content["devices"][0].startswith("cpu")
+    assert "backends" in gvtorch("info").stdout
+
+
+def test_info_tells_about_a_file():
+    content = json.loads(gvtorch("info", ANEURISM, "--json").stdout)
+    assert content["extent"] == [256, 256, 256] and content["dtype"] == "uint8"
+    assert content["range"] == [0, 255] and sum(content["histogram"]) == 256**3
+    assert "256, 256, 256" in gvtorch("info", ANEURISM).stdout
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    file = tmp_path_factory.mktemp("cli") / "ball_24x20x16_uint8.raw"
+    z, y, x = np.mgrid[0:16, 0:20, 0:24]
+    ball = np.clip(8 - np.sqrt((x - 12) ** 2 + (y - 10) ** 2 + (z - 8) ** 2), 0, 1) * 200
+    file.write_bytes(ball.astype(np.uint8).tobytes())
+    return file
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("camera", ["orbit:10,20,1.5", "look:-12,-10,-40,12,10,8"])
+def test_render_writes_picture_arrays_and_stats(small, tmp_path, camera):
+    out, npz, stats = (tmp_path / name for name in ("a.png", "a.npz", "a.json"))
+    run = gvtorch(
+        *("render", small, "-o", out, "--npz", npz, "--stats", stats, "--camera", camera),
+        *(
+            "--size",
+            "40x24",
+            "--tf",
+            "hot",
+            "--lod",
+            "finest",
+            "--background",
+            "0,0,1",
+            "--backend",
+            "cpp",
+        ),
+    )
+    assert run.returncode == 0, run.stderr
+    assert out.read_bytes().startswith(b"\x89PNG") and str(out) in run.stdout
+    arrays = np.load(npz)
+    assert arrays["color"].shape == (24, 40, 3) and arrays["color"].dtype == np.float32
+    assert arrays["alpha"].shape == arrays["depth"].shape == (24, 40, 1)
+    assert arrays["alpha"].max() > 0.3 and np.isinf(arrays["depth"]).any()
+    assert arrays["color"][0, 0].tolist() == [0, 0, 1]
+    content = json.loads(stats.read_text())
+    assert content["rays"] == 960 and content["extent"] == [24, 20, 16]
+    assert {"milliseconds", "samples", "nodes", "bricks", "bytes"} <= set(content)
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.backend("reference")
+def test_backends_agree_on_the_command_line(small, tmp_path):
+    arrays = []
+    for backend in ("reference", "cpp"):
+        npz = tmp_path / f"{backend}.npz"
+        args = ("--npz", npz, "--size", "20x20", "--backend", backend)
+        run = gvtorch("render", small, "-o", tmp_path / "a.png", *args)
+        assert run.returncode == 0, run.stderr
+        arrays.append(np.load(npz))
+    for name in ("color", "alpha", "depth"):
+        np.testing.assert_allclose(arrays[0][name], arrays[1][name], atol=1e-5)
+
+
+@pytest.mark.backend("cpp")
+def test_raw_options(tmp_path):
+    file = tmp_path / "plain.raw"
+    file.write_bytes(np.arange(60, dtype=">i2").tobytes())
+    args = ("--shape", "5,4,3", "--dtype", ">i2", "--spacing", "1,2,3")
+    run = gvtorch("info", file, *args, "--json")
+    content = json.loads(run.stdout)
+    assert (
+        content["extent"] == [5, 4, 3]
+        and content["range"] == [0, 59]
+        and content["spacing"] == [1, 2, 3]
+    )
+
+
+@pytest.mark.backend("cpp")
+def test_all_empty_volume_renders_the_background(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((4, 5, 6), np.float32))
+    args = ("--npz", tmp_path / "a.npz", "--size", "8x8", "--background", "0.5,0,0")
+    run = gvtorch("render", tmp_path / "a.npy", "-o", tmp_path / "a.png", *args)
+    assert run.returncode == 0, run.stderr
+    assert (np.load(tmp_path / "a.npz")["color"] == [0.5, 0, 0]).all()
+
+
+def spoiled(tmp_path, name: str, content: bytes):
+    file = tmp_path / name
+    file.write_bytes(content)
+    return file
+
+
+def npy(tmp_path, array):
+    np.save(tmp_path / "a.npy", array)
+    return tmp_path / "a.npy"
+
+
+TF = '{"opacity": [[5, 0], [1, 1]]}'
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda t, s: ["nowhere.raw"], "volume not found: nowhere.raw"),
+        (
+            lambda t, s: [spoiled(t, "a_4x4x4_uint8.raw.gz", gzip.compress(bytes(range(64)))[:-9])],
+            "can't be read as RAW",
+        ),
+        (lambda t, s: [s, "--shape", "24,20,17"], "takes 8160 bytes, the file has 7680"),
+        (lambda t, s: [s, "--shape", "24,20"], "--shape must be 3 whole numbers"),
+        (lambda t, s: [s, "--shape", "2048,2048,2048"], "more than the 2147483648"),
+        (lambda t, s: [s, "--dtype", "rainbow"], "dtype must be a NumPy dtype"),
+        (lambda t, s: [s, "--spacing", "1,-1,1"], "spacing must be positive"),
+        (lambda t, s: [s, "--spacing=-1,1,1"], "spacing must be positive"),
+        (lambda t, s: [s, "--camera", "orbit:nan,0,2"], "azimuth must be finite"),
+        (lambda t, s: [s, "--camera", "look:0,0,inf,0,0,0"], "eye must be finite"),
+        (lambda t, s: [s, "--camera", "look:0,0,1,0,0"], "--camera look must be 6 numbers"),
+        (lambda t, s: [s, "--camera", "fish:1"], "--camera must be orbit:AZ,EL,DIST or look:"),
+        (lambda t, s: [s, "--fov", "nan"], "fov must be finite"),
+        (lambda t, s: [s, "--size", "0x5"], "--size must be WIDTHxHEIGHT"),
+        (lambda t, s: [s, "--size", "99999x5"], "width must be an int >= 1 and <= 65536"),
+        (lambda t, s: [s, "--tf", "lungs"], "unknown preset 'lungs'; known: bone"),
+        (lambda t, s: [s, "--tf", "lungs.json"], "transfer function file not found"),
+        (
+            lambda t, s: [s, "--tf", spoiled(t, "tf.json", TF.encode())],
+            "opacity values must increase",
+        ),
+        (lambda t, s: [s, "--step", "0"], "step must be finite and > 0"),
+        (lambda t, s: [s, "--step", "1e-9"], "intervals"),
+        (lambda t, s: [s, "--background", "1,1"], "--background must be 3 numbers"),
+        (lambda t, s: [s, "--brick-size", "1"], "brick_size must be an int >= 2"),
+        (lambda t, s: [s, "--threshold", "nan"], "threshold must be finite"),
+        (lambda t, s: [s, "--backend", "cuda"], "backend 'cuda' can't be used here"),
+        (lambda t, s: [npy(t, np.zeros((0, 4, 4)))], "at least 1 in every direction"),
+        (lambda t, s: [npy(t, np.full((4, 4, 4), np.nan))], "NaN or infinite"),
+        (lambda t, s: [s, "--npz", "a.txt"], "--npz must end in .npz"),
+        (lambda t, s: [s, "--npz", "no/such/folder/a.npz"], "folder not found: no/such/folder"),
+    ],
+)
+def test_a_mistake_gets_one_line_and_status_2(small, tmp_path, make, message):
+    import torch
+
+    if "cuda" in message and torch.cuda.is_available():
+        pytest.skip("CUDA can be used here")
+    run = gvtorch("render", *make(tmp_path, small), "-o", "a.png", cwd=tmp_path)
+    lines = run.stderr.strip().splitlines()
+    assert run.returncode == 2 and len(lines) == 1, run.stderr
+    assert lines[0].startswith("gvtorch: error: ") and message in lines[0]
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_a_wrong_flag_gets_status_2(small):
+    for args in (
+        ["render"],
+        ["render", small],
+        ["fly"],
+        ["render", small, "-o", "a.png", "--lod", "best"],
+    ):
+        run = gvtorch(*args)
+        assert run.returncode == 2 and "Traceback" not in run.stderr
+
+
+def test_package_runs_as_a_module():
+    assert "usage: gvtorch" in gvtorch("--help").stdout
+    assert (ROOT / "gvtorch" / "py.typed").exists()

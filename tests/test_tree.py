@@ -1,0 +1,195 @@
+"""Pools, the mean-filtered pyramid and `N3Tree.from_volume`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import gvtorch as gv
+from gvtorch import config
+from gvtorch.pool.pyramid import build_levels
+
+SIZES = {"branching": 2, "brick_size": 4, "border": 1}
+
+
+def random_volume(extent, dtype=torch.float32, seed=0, channels=1):
+    x, y, z = extent
+    data = torch.rand((z, y, x, channels), generator=torch.Generator().manual_seed(seed)) * 200
+    return gv.Volume(data.to(dtype))
+
+
+def coarse_by_hand(data: np.ndarray, n: int) -> np.ndarray:
+    """One level of the pyramid, voxel by voxel: the mean of the voxels below, the last one
+    repeated."""
+    shape = [-(-size // n) for size in data.shape]
+    out = np.zeros(shape)
+    for index in np.ndindex(*shape):
+        picks = [
+            np.minimum(np.arange(i * n, (i + 1) * n), size - 1)
+            for i, size in zip(index, data.shape, strict=True)
+        ]
+        out[index] = data[np.ix_(*picks)].mean()
+    return out
+
+
+@pytest.mark.parametrize("branching", [2, 3])
+@pytest.mark.parametrize("extent", [(9, 5, 7), (16, 8, 4), (1, 13, 2)])
+def test_levels_are_means_of_the_voxels_below(extent, branching):
+    volume = random_volume(extent)
+    sizes = {**SIZES, "branching": branching}
+    expected = volume.data[..., 0].double().numpy()
+    for number, level in enumerate(build_levels(volume.data, 3, **sizes)):
+        if number:
+            expected = coarse_by_hand(expected, branching)
+        np.testing.assert_allclose(level.values[..., 0].numpy(), expected, rtol=1e-5)
+
+
+def test_integer_levels_are_rounded_once():
+    volume = random_volume((8, 8, 8), torch.uint8)
+    levels = list(build_levels(volume.data, 4, **SIZES))
+    mean = volume.data.double().mean()
+    assert levels[3].values.dtype == torch.uint8 and abs(int(levels[3].values) - mean) <= 0.5
+
+
+def node_at(tree: gv.N3Tree, depth: int, xyz: tuple[int, int, int]) -> int | None:
+    """Index of a node by its place, or None where the tree ends above it."""
+    node = tree.root
+    n, dim = tree.branching, tree.nodes.nodes_per_tile
+    for level in range(1, depth + 1):
+        tile = int(tree.nodes.child_tn.view(-1)[node])
+        if tile < 0:
+            return None
+        x, y, z = (p // n ** (depth - level) % n for p in xyz)
+        node = tile * dim + (z * n + y) * n + x
+    return node
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    extent=st.tuples(*[st.integers(1, 21)] * 3),
+    branching=st.integers(2, 3),
+    brick_size=st.integers(2, 5),
+    border=st.integers(0, 2),
+    seed=st.integers(0, 1000),
+)
+def test_every_brick_holds_its_region_of_its_level(extent, branching, brick_size, border, seed):
+    volume = random_volume(extent, seed=seed)
+    tree = gv.N3Tree.from_volume(volume, brick_size, border, branching=branching)
+    tree.validate()
+    sizes = {"branching": branching, "brick_size": brick_size, "border": border}
+    levels = [level.values for level in build_levels(volume.data, tree.depth + 1, **sizes)][::-1]
+    found = 0
+    for depth, level in enumerate(levels):
+        grid = [-(-size // brick_size) for size in level.shape[2::-1]]
+        for xyz in np.ndindex(*grid):
+            node = node_at(tree, depth, xyz)
+            slot = config.EMPTY if node is None else int(tree.nodes.brick_tn.view(-1)[node])
+            if slot < 0:
+                continue
+            found += 1
+            assert int(tree.bricks.owner_b[slot]) == node
+            picks = [
+                np.clip(np.arange(i * brick_size - border, (i + 1) * brick_size + border), 0, s - 1)
+                for i, s in zip(xyz[::-1], level.shape[:3], strict=True)
+            ]
+            expected = level[np.ix_(*picks)]
+            assert torch.equal(tree.bricks.bricks["value"][slot], expected)
+    assert found == tree.bricks.capacity
+
+
+def test_tiles_know_their_place_and_parent():
+    tree = gv.N3Tree.from_volume(random_volume((20, 9, 14)), 4)
+    for tile in range(1, tree.nodes.capacity):
+        x, y, z, depth = tree.nodes.loc_t4[tile].tolist()
+        parent = node_at(tree, depth - 1, (x, y, z))
+        assert parent == int(tree.nodes.parent_t[tile])
+        assert int(tree.nodes.child_tn.view(-1)[parent]) == tile
+    assert tree.nodes.loc_t4[0].tolist() == [0, 0, 0, 0] and int(tree.nodes.parent_t[0]) == -1
+
+
+def test_uniform_regions_take_no_brick():
+    data = torch.full((32, 32, 32), 5, dtype=torch.uint8)
+    data[20:28, 20:28, 20:28] = 9
+    tree = gv.N3Tree.from_volume(gv.Volume(data), 4)
+    node = node_at(tree, tree.depth, (5, 5, 5))
+    assert int(tree.nodes.brick_tn.view(-1)[node]) >= 0
+    corner = node_at(tree, 1, (0, 0, 0))
+    words = tree.nodes.brick_tn.view(-1), tree.nodes.child_tn.view(-1)
+    assert [int(word[corner]) for word in words] == [config.CONSTANT, config.TERMINAL]
+    assert int(tree.constants["value"].view(-1)[corner]) == 5
+
+
+def test_threshold_never_hides_a_thin_bright_detail():
+    """EMPTY is decided by the largest finest voxel, not by the coarse mean, which a thin line
+    hardly moves."""
+    data = torch.zeros((32, 32, 32), dtype=torch.uint8)
+    data[:, 17, 17] = 200
+    tree = gv.N3Tree.from_volume(gv.Volume(data), 4, threshold=100)
+    for z in range(8):
+        node = node_at(tree, tree.depth, (4, 4, z))
+        assert node is not None and int(tree.nodes.brick_tn.view(-1)[node]) >= 0
+    far = node_at(tree, 2, (0, 0, 0))
+    assert far is None or int(tree.nodes.brick_tn.view(-1)[far]) == config.EMPTY
+
+
+def test_box_runs_from_face_to_face(blobs):
+    tree = gv.N3Tree.from_volume(blobs)
+    low, high = tree.box.tolist()
+    assert low == pytest.approx([4.5, -3.4, 1.25]) and high == pytest.approx([49.5, 19.8, 56.75])
+    point, _ = tree.to_tree(tree.box.clone(), torch.ones(2, 3, dtype=torch.float64))
+    assert torch.allclose(point, tree.bounds(torch.float64))
+
+
+def test_channels_keep_dtype_and_width(blobs):
+    four = (blobs.data.repeat(1, 1, 1, 4) * 255).to(torch.uint8)
+    color = gv.Volume(four, blobs.spacing, blobs.origin)
+    tree = gv.N3Tree.from_volume({"density": blobs, "color": color}, 4)
+    assert tree.channel_names == ("density", "color")
+    for name, width in (("density", 1), ("color", 4)):
+        assert tree.bricks.bricks[name].shape == (tree.bricks.capacity, 6, 6, 6, width)
+    assert tree.bricks.bricks["color"].dtype == torch.uint8
+    fields = (tree.nodes.fields, tree.bricks.fields, tree.constants)
+    assert tree.nbytes == sum(tensor.nbytes for part in fields for tensor in part.values())
+
+
+def test_pools_hold_maps_as_well_as_volumes():
+    pool = gv.NodePool(10, branching=3, dimensions=2)
+    assert pool.child_tn.shape == (10, 9) and (pool.child_tn == config.ABSENT).all()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda v: gv.N3Tree.from_volume(v, 1), "brick_size must be an int >= 2"),
+        (lambda v: gv.N3Tree.from_volume(v, 8.0), "brick_size must be an int"),
+        (lambda v: gv.N3Tree.from_volume(v, 8, -1), "border must be an int >= 0"),
+        (lambda v: gv.N3Tree.from_volume(v, branching=1), "branching must be an int >= 2"),
+        (lambda v: gv.N3Tree.from_volume(v, threshold=float("nan")), "threshold must be finite"),
+        (lambda v: gv.N3Tree.from_volume(v.data), "volume must be a Volume"),
+        (lambda v: gv.N3Tree.from_volume({}), "at least one channel"),
+        (lambda v: gv.NodePool(0), "capacity must be an int >= 1"),
+        (lambda v: gv.NodePool(2**30), "more than int32 can name"),
+        (lambda v: gv.BrickPool(1, {}), "at least one channel"),
+        (lambda v: gv.Channel(torch.float64), "dtype must be one of uint8"),
+        (
+            lambda v: gv.N3Tree.from_volume({"a": v, "b": gv.Volume(v.data[1:])}),
+            "channels must share extent",
+        ),
+    ],
+)
+def test_bad_arguments_are_named(call, message):
+    with pytest.raises(ValueError, match=message.replace("(", r"\(")):
+        call(random_volume((8, 8, 8)))
+
+
+def test_validate_finds_wrong_pointers(blobs):
+    for change in ("far", "twice"):
+        tree = gv.N3Tree.from_volume(blobs, 4)
+        words = tree.nodes.brick_tn.view(-1)
+        owned = (words >= 0).nonzero()[:, 0]
+        words[owned[0]] = tree.bricks.capacity if change == "far" else words[owned[1]]
+        with pytest.raises(ValueError, match="brick"):
+            tree.validate()
