@@ -55,12 +55,11 @@ GV_HD T sample(const BrickView<Voxel>& view, const BrickRay<T>& ray, T t) {
   int64_t index[3];
   T weight[3];
   const T last = static_cast<T>(view.side - 1);
-  const T last_cell = static_cast<T>(view.side - 2);
   for (int axis = 0; axis < 3; ++axis) {
     const T place = clamp(ray.offset[axis] + t * ray.slope[axis], static_cast<T>(0), last);
-    const T cell = smaller(std::floor(place), last_cell);
-    index[axis] = static_cast<int64_t>(cell);
-    weight[axis] = place - cell;
+    const int32_t cell = smaller(floor_int(place), view.side - 2);
+    index[axis] = cell;
+    weight[axis] = place - static_cast<T>(cell);
   }
   const int64_t step_x = view.channels;
   const int64_t step_y = step_x * view.side;

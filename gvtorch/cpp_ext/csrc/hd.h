@@ -45,6 +45,13 @@ GV_HD T larger(T a, T b) {
   return b > a ? b : a;
 }
 
+// floor of a value that fits an int32. Without SSE4.1 (the baseline of x86-64) std::floor is a call.
+template <class T>
+GV_HD int32_t floor_int(T value) {
+  const int32_t whole = static_cast<int32_t>(value);
+  return whole - (static_cast<T>(whole) > value ? 1 : 0);
+}
+
 template <class To, class From>
 GV_HD To bit_cast(From value) {
   static_assert(sizeof(To) == sizeof(From));
@@ -76,8 +83,8 @@ GV_HD float log2_exact(float value) {
 GV_HD float exp2_exact(float value) {
   if (!(value > -126.0f)) return 0.0f;
   const float x = smaller(value, 126.0f);
-  const float whole = floorf(x + 0.5f);
-  const float f = x - whole;
+  const int32_t whole = floor_int(x + 0.5f);
+  const float f = x - static_cast<float>(whole);
   float series = 1.52527338e-5f;
   series = series * f + 1.54035304e-4f;
   series = series * f + 1.33335581e-3f;
@@ -86,7 +93,7 @@ GV_HD float exp2_exact(float value) {
   series = series * f + 2.40226507e-1f;
   series = series * f + 6.93147181e-1f;
   series = series * f + 1.0f;
-  return series * bit_cast<float>((static_cast<int32_t>(whole) + 127) << 23);
+  return series * bit_cast<float>((whole + 127) << 23);
 }
 
 GV_HD double log2_exact(double value) { return ::log2(value); }

@@ -31,6 +31,23 @@ struct TransferView {
   int32_t rows;
 };
 
+// The transfer function with its numbers read once a ray.
+template <class T>
+struct Transfer {
+  const T* table_m4;
+  T low, scale, last, reference;
+  int32_t last_cell;
+
+  GV_HD explicit Transfer(const TransferView<T>& view)
+      : table_m4(view.table_m4),
+        low(view.domain_3[0]),
+        last(static_cast<T>(view.rows - 1)),
+        reference(view.domain_3[2]),
+        last_cell(view.rows - 2) {
+    scale = last / (view.domain_3[1] - low);
+  }
+};
+
 template <class T>
 struct TraceOptions {
   T root_voxel;  // world size of a depth-0 voxel, largest axis
@@ -88,7 +105,7 @@ struct Intervals {
   GV_HD void leap(T exit) {
     const T limit = smaller(exit, stop);
     if (length != step || cone(limit) > step) return;
-    const T target = std::floor((limit - base) / length) - 2;
+    const T target = floor((limit - base) / length) - 2;
     if (target > count) {
       count = target;
       place(base + count * length);
@@ -105,19 +122,17 @@ struct Accumulator {
 };
 
 template <class T>
-GV_HD void composite(const TransferView<T>& transfer, T value, T start, T length, T hit_clear, Accumulator<T>& sum) {
-  const T low = transfer.domain_3[0];
-  const T last = static_cast<T>(transfer.rows - 1);
-  const T place = clamp((value - low) * (last / (transfer.domain_3[1] - low)), static_cast<T>(0), last);
-  const T cell = smaller(std::floor(place), last - 1);
-  const T weight = place - cell;
+GV_HD void composite(const Transfer<T>& transfer, T value, T start, T length, T hit_clear, Accumulator<T>& sum) {
+  const T place = clamp((value - transfer.low) * transfer.scale, static_cast<T>(0), transfer.last);
+  const int32_t cell = smaller(floor_int(place), transfer.last_cell);
+  const T weight = place - static_cast<T>(cell);
   const T* row = transfer.table_m4 + static_cast<int64_t>(cell) * 4;
   const T opacity = row[3] + weight * (row[7] - row[3]);
   if (!(opacity > 0)) return;
 
   const bool opaque = opacity >= 1;
   const T decay = opaque ? static_cast<T>(0) : log2_exact(1 - opacity);
-  const T kept = opaque ? static_cast<T>(0) : exp2_exact(decay * (length / transfer.domain_3[2]));
+  const T kept = opaque ? static_cast<T>(0) : exp2_exact(decay * (length / transfer.reference));
   const T clear = sum.clear * kept;
   const T share = sum.clear - clear;
   sum.red = sum.red + share * (row[0] + weight * (row[4] - row[0]));
@@ -125,7 +140,7 @@ GV_HD void composite(const TransferView<T>& transfer, T value, T start, T length
   sum.blue = sum.blue + share * (row[2] + weight * (row[6] - row[2]));
   if (!sum.hit && clear < hit_clear) {  // where, inside the interval, the transmittance fell to hit_clear
     sum.hit = true;
-    const T into = opaque ? static_cast<T>(0) : log2_exact(hit_clear / sum.clear) / decay * transfer.domain_3[2];
+    const T into = opaque ? static_cast<T>(0) : log2_exact(hit_clear / sum.clear) / decay * transfer.reference;
     sum.depth = start + clamp(into, static_cast<T>(0), length);
   }
   sum.clear = clear;
@@ -149,12 +164,13 @@ struct TraceRay {
     clip(origin, direction, first, last);
 
     Intervals<T> at(first, last, rays.cone_r2[2 * ray], rays.cone_r2[2 * ray + 1], options.step);
+    const Transfer<T> shader(transfer);
     Accumulator<T> sum;
     const T stop_clear = 1 - options.stop_alpha;
     const T hit_clear = 1 - options.depth_alpha;
     int32_t samples = 0;
     while (at.inside() && sum.clear > stop_clear) {
-      samples += visit(origin, direction, at, stop_clear, hit_clear, sum);
+      samples += visit(origin, direction, shader, at, stop_clear, hit_clear, sum);
     }
     hits.color_r3[3 * ray] = sum.red;
     hits.color_r3[3 * ray + 1] = sum.green;
@@ -202,8 +218,8 @@ struct TraceRay {
   }
 
   // One node: finds it, marks it, and takes all intervals whose middle lies in it. Returns the samples taken.
-  GV_HD int32_t visit(Vec3<T> origin, Vec3<T> direction, Intervals<T>& at, T stop_clear, T hit_clear,
-                      Accumulator<T>& sum) const {
+  GV_HD int32_t visit(Vec3<T> origin, Vec3<T> direction, const Transfer<T>& shader, Intervals<T>& at, T stop_clear,
+                      T hit_clear, Accumulator<T>& sum) const {
     // Level of detail: the first depth whose voxel fits into the cone.
     const T cone = at.cone(at.middle);
     T voxel = options.root_voxel;
@@ -245,7 +261,7 @@ struct TraceRay {
       while (stays(at, exit, cone_low, cone_high));
       if (nothing) return 0;
       const T length = smaller(at.start, at.stop) - entry;
-      composite(transfer, fine_ray.constant, entry, length, hit_clear, sum);
+      composite(shader, fine_ray.constant, entry, length, hit_clear, sum);
       return 1;
     }
 
@@ -257,7 +273,7 @@ struct TraceRay {
         const T weight = clamp(log2_exact(at.cone(at.middle) / voxel) / levels, static_cast<T>(0), one);
         value = value + weight * (sample(bricks, coarse_ray, at.middle) - value);
       }
-      composite(transfer, value, at.start, at.end - at.start, hit_clear, sum);
+      composite(shader, value, at.start, at.end - at.start, hit_clear, sum);
       ++samples;
       at.next();
     } while (sum.clear > stop_clear && stays(at, exit, cone_low, cone_high));

@@ -75,10 +75,11 @@ GV_HD Place<T> descend(const TreeView& tree, Vec3<T> position, int32_t wanted, i
     int64_t child = 0;
     for (int axis = 2; axis >= 0; --axis) {
       const T scaled = local[axis] * branching;
-      const T digit = clamp(std::floor(scaled), static_cast<T>(0), branching - 1);
+      const int32_t whole = clamp(floor_int(scaled), 0, tree.branching - 1);
+      const T digit = static_cast<T>(whole);
       local[axis] = scaled - digit;
       place.corner[axis] = place.corner[axis] + digit * place.size;
-      child = child * tree.branching + static_cast<int64_t>(digit);
+      child = child * tree.branching + whole;
     }
     place.parent = place.node;
     place.node = tile * children + child;
