@@ -18,7 +18,8 @@ export GVTORCH_CUDA_ARCHS ?= $(or $(NATIVE),90)
 
 demo: $(VENV)/ready
 	@mkdir -p out
-	$(BIN)/gvtorch render examples/data/aneurism_256x256x256_uint8.raw.gz --tf vessels -o out/demo.png
+	$(BIN)/gvtorch render examples/data/stent_256x128x128_int16.npz --tf examples/data/stent.json \
+	  --camera look:-260,-340,190,63.5,63.5,127.5 --up 0,0,1 --background 0.02,0.02,0.03 -o out/demo.png
 	@echo "The picture: $(CURDIR)/out/demo.png"
 
 test: $(VENV)/ready

@@ -7,17 +7,13 @@ import tyro
 
 import gvtorch as gv
 
-SCAN = Path(__file__).parent / "data" / "stent_256x128x128_int16.npz"
-
-# The stent's metal is above 1,600 of these units, bone and contrast agent above 1,250, soft tissue
-# below.
-OPACITY = [(1100, 0), (1250, 0.05), (1500, 0.3), (1700, 0.95)]
-COLOR = [
-    (1100, 0.35, 0.04, 0.02),
-    (1350, 0.85, 0.35, 0.16),
-    (1600, 0.95, 0.85, 0.6),
-    (1700, 0.6, 0.8, 1.0),
-]
+DATA = Path(__file__).parent / "data"
+EYE, TARGET, UP = (
+    (-260.0, -340.0, 190.0),
+    (63.5, 63.5, 127.5),
+    (0.0, 0.0, 1.0),
+)  # z is along the body
+BACKGROUND = (0.02, 0.02, 0.03)
 
 
 @dataclass
@@ -31,13 +27,12 @@ class Settings:
 
 def main(settings: Settings) -> None:
     """Renders one picture."""
-    volume = gv.read_volume(SCAN)
+    volume = gv.read_volume(DATA / "stent_256x128x128_int16.npz")
     tree = gv.N3Tree.from_volume(volume, brick_size=8, device=settings.device)
     print(tree)
-    camera = gv.Camera.orbit(
-        azimuth=30, elevation=20, distance=2.4, fov=30, width=settings.size, height=settings.size
-    )
-    picture = gv.render(tree, camera, gv.TransferFunction.from_points(OPACITY, COLOR))
+    camera = gv.Camera.look_at(EYE, TARGET, UP, fov=30, width=settings.size, height=settings.size)
+    shader = gv.TransferFunction.from_json(DATA / "stent.json")
+    picture = gv.render(tree, camera, shader, background=BACKGROUND)
     picture.save(settings.output)
     print(
         f"{settings.output}: {picture.stats.milliseconds:.0f} ms, {picture.stats.samples} samples"

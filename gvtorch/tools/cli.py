@@ -90,6 +90,8 @@ class Render:
     camera: Annotated[str, arg(metavar="CAMERA")] = "orbit:30,20,2.4"
     """orbit:AZIMUTH,ELEVATION,DISTANCE (degrees, and largest sides of the box) or
     look:ex,ey,ez,tx,ty,tz (world units)"""
+    up: Annotated[str, arg(metavar="X,Y,Z")] = "0,1,0"
+    """what a look camera takes for up"""
     fov: Annotated[float, arg(metavar="DEG")] = 30.0
     """vertical field of view"""
     size: Annotated[str, arg(metavar="WxH")] = "512x512"
@@ -126,7 +128,7 @@ class Render:
         for file in (self.output, self.npz, self.stats):
             if file is not None and not file.parent.is_dir():
                 raise FileNotFoundError(f"folder not found: {file.parent}")
-        camera = parse_camera(self.camera, self.fov, width, height)
+        camera = parse_camera(self.camera, self.up, self.fov, width, height)
         with Bar() as bar:
             bar("reading", 0, 0)
             volume = self.source.read(self.path)
@@ -214,7 +216,7 @@ class Bar:
         self._progress.update(self._tasks[what], completed=done, total=total or None)
 
 
-def parse_camera(text: str, fov: float, width: int, height: int) -> Camera:
+def parse_camera(text: str, up: str, fov: float, width: int, height: int) -> Camera:
     """Makes a camera from `orbit:AZ,EL,DIST` or `look:ex,ey,ez,tx,ty,tz`.
 
     Raises:
@@ -228,7 +230,8 @@ def parse_camera(text: str, fov: float, width: int, height: int) -> Camera:
         return Camera.orbit(azimuth, elevation, distance, fov, width, height)
     if kind == "look":
         values = _numbers("--camera look", rest, 6, float)
-        return Camera.look_at(values[:3], values[3:], fov=fov, width=width, height=height)
+        upward = _numbers("--up", up, 3, float)
+        return Camera.look_at(values[:3], values[3:], upward, fov, width, height)
     raise ValueError(f"--camera must be orbit:AZ,EL,DIST or look:ex,ey,ez,tx,ty,tz, got {text!r}")
 
 
