@@ -3,7 +3,7 @@
 # make lint   ruff, mypy, clang-format
 # make wheel  one wheel for every Python >= 3.11 and every torch >= 2.11, in dist/
 #
-# Torch is pinned in pyproject.toml ([build-system] requires) and nowhere else.
+# Torch is pinned in pyproject.toml ([build-system] requires) and nowhere else, the rest in .ci/constraints.txt.
 
 PYTHON ?= python3
 VENV := .venv
@@ -11,6 +11,7 @@ BIN := $(VENV)/bin
 TORCH := $(shell sed -n 's/.*"\(torch==[0-9.]*\)".*/\1/p' pyproject.toml)
 NATIVE := $(shell nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u | tr -d . | paste -sd ';')
 # A development build compiles CUDA for the cards that are here; without one, for one architecture, to see it compile.
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint .ci/constraints.txt
 export GVTORCH_CUDA_ARCHS ?= $(or $(NATIVE),90)
 
 .PHONY: demo test lint format wheel clean
@@ -42,12 +43,12 @@ wheel: $(VENV)/ready
 clean:
 	rm -rf $(VENV) build dist out gvtorch/cpp_ext/lib *.egg-info
 
-$(VENV)/torch: pyproject.toml
+$(VENV)/torch: pyproject.toml .ci/constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "gvtorch needs Python 3.11 or newer, this is " + sys.version)'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check "setuptools>=78" wheel "$(TORCH)"
+	$(PIP) setuptools wheel "$(TORCH)"
 	@touch $@
 
 $(VENV)/ready: $(VENV)/torch $(wildcard gvtorch/cpp_ext/csrc/*) gvtorch/cpp_ext/build.py
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation -e ".[dev]"
+	$(PIP) --no-build-isolation -e ".[dev]"
 	@touch $@

@@ -87,6 +87,15 @@ def test_compiles_without_graph_breaks(tracer, rays):
     assert_same(compiled_module(*shorter), tracer(*shorter))
 
 
+@pytest.mark.backend("cpp")
+def test_compiles_with_the_default_backend(blobs):
+    """Inductor compiles what stands around the op and calls the op itself."""
+    tree = gv.N3Tree.from_volume(blobs, 4)
+    tracer = gv.TreeTracer(tree, SHADER)
+    rays = world_rays(tree.box, 33, "cpu")
+    assert_same(torch.compile(tracer, fullgraph=True)(*rays), tracer(*rays))
+
+
 def test_the_checked_function_compiles(blobs, compiled):
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
     fixed = arguments(tree, 7)

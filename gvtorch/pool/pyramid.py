@@ -67,7 +67,7 @@ def comparable(values: Tensor) -> Tensor:
 
 def _reduce(values: Tensor, how: str, dim: int) -> Tensor:
     if how == "mean":
-        return values.to(torch.float32).mean(dim)
+        return comparable(values).mean(dim, dtype=torch.float32)
     return comparable(values).amin(dim) if how == "min" else comparable(values).amax(dim)
 
 
