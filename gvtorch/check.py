@@ -5,6 +5,7 @@ came.
 from __future__ import annotations
 
 import math
+import os
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -55,6 +56,18 @@ def tensor(
         kind = str(dtype).removeprefix("torch.")
         raise ValueError(
             f"{where}: {name} must be ({wanted}) {kind} on {device}, got {describe(value)}"
+        )
+
+
+def memory(where: str, what: str, nbytes: int, device: torch.device) -> None:
+    """Raises ValueError if something takes more memory than the device has in all."""
+    if device.type == "cuda":
+        total = torch.cuda.get_device_properties(device).total_memory
+    else:
+        total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if nbytes > total:
+        raise ValueError(
+            f"{where}: {what} takes {nbytes / 2**30:.1f} GiB, {device} has {total / 2**30:.1f} GiB"
         )
 
 

@@ -239,8 +239,12 @@ class Camera:
         placed.batched = self.batched
         return placed
 
-    def rays(self, device: torch.device | str = "cpu") -> Rays:
-        """Returns the rays through all pixel centres, camera by camera, row by row, in float64.
+    def rays(self, device: torch.device | str = "cpu", rows: tuple[int, int] | None = None) -> Rays:
+        """Returns the rays through pixel centres, camera by camera, row by row, in float64.
+
+        Args:
+            device: Where they are made.
+            rows: First row and the row after the last; all rows if left out.
 
         Raises:
             ValueError: The camera is relative to a box: call `placed(box)` first.
@@ -249,13 +253,12 @@ class Camera:
             raise ValueError("Camera.rays: an orbit camera has no place yet, call placed(tree.box)")
         from kornia.geometry.depth import unproject_meshgrid
 
+        top, end = rows or (0, self.height)
         view, Ks = self.viewmats.to(device), self.Ks.to(device)
-        centred = Ks.clone()
-        centred[:, :2, 2] -= 0.5
+        moved = Ks.clone()
+        moved[:, :2, 2] -= torch.tensor([0.5, 0.5 + top], dtype=Ks.dtype, device=Ks.device)
         local = unproject_meshgrid(
-            self.height,
-            self.width,
-            centred,
+            *(end - top, self.width, moved),
             normalize_points=True,
             device=view.device,
             dtype=view.dtype,
@@ -263,7 +266,7 @@ class Camera:
         rotation, translation = view[:, :3, :3], view[:, :3, 3]
         direction = (local.reshape(len(self), -1, 3) @ rotation).reshape(-1, 3)
         position = -(translation[:, None] @ rotation)  # (n, 1, 3): -R^T t
-        pixels = self.width * self.height
+        pixels = self.width * (end - top)
         origin = position.expand(-1, pixels, -1).reshape(-1, 3)
         growth = (1 / Ks[:, (0, 1), (0, 1)].min(1).values)[:, None].expand(-1, pixels).reshape(-1)
         zero = torch.zeros_like(growth)

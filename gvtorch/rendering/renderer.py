@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -18,7 +19,7 @@ from .camera import Camera
 from .picture import Picture, RenderStats
 from .shader import TransferFunction
 
-_RAYS_A_CALL = {"cpu": 1 << 15, "cuda": 1 << 24}  # small on the CPU, so that progress shows
+_RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that progress shows
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,99 +93,137 @@ def render(
     chosen = RenderOptions(**options)
     start = time.perf_counter()
     with collect_timings() as timings:
-        with stage("rays"):
-            rays = camera.placed(tree.box).rays(tree.device)
-        hits = trace(tree, rays, shader, chosen, progress)
-        shape = (len(camera), camera.height, camera.width)
-        background = torch.tensor(chosen.background, dtype=hits.color.dtype, device=tree.device)
-        color = hits.color + (1 - hits.alpha) * background
-        frame = tree.frame
-        stats = RenderStats(
-            milliseconds=1e3 * (time.perf_counter() - start),
-            stages=timings,
-            backend=choose_backend(chosen.backend, tree.device),
-            rays=hits.alpha.shape[0],
-            samples=int(hits.samples.sum(dtype=torch.int64)),
-            nodes=tree.nodes.child_tn.numel(),
-            bricks=tree.bricks.capacity,
-            bytes=tree.nbytes,
-            tiles_used=int((tree.nodes.stamp_t == frame).sum()),
-            bricks_used=int((tree.bricks.stamp_b == frame).sum()),
-        )
+        with stage("prepare"):
+            tracer = Tracer(tree, shader, chosen)
+            world = camera.placed(tree.box)
+            hits = _room(tree.device, chosen.dtype, len(camera) * camera.height * camera.width)
+        done = 0
+        for part in _trace_blocks(world, tracer, progress):
+            for name, field in vars(part).items():
+                vars(hits)[name][done : done + field.shape[0]] = field
+            done += part.alpha.shape[0]
+        with stage("picture"):
+            color, alpha, depth, samples = vars(hits).values()
+            background = torch.tensor(chosen.background, dtype=color.dtype, device=tree.device)
+            color.addcmul_(1 - alpha, background)
+            stats = RenderStats(
+                milliseconds=1e3 * (time.perf_counter() - start),
+                stages=timings,
+                backend=choose_backend(chosen.backend, tree.device),
+                rays=alpha.shape[0],
+                samples=int(samples.sum(dtype=torch.int64)),
+                nodes=tree.nodes.child_tn.numel(),
+                bricks=tree.bricks.capacity,
+                bytes=tree.nbytes,
+                tiles_used=int((tree.nodes.stamp_t == tree.frame).sum()),
+                bricks_used=int((tree.bricks.stamp_b == tree.frame).sum()),
+            )
+    shape = (len(camera), camera.height, camera.width)
     images = {
         "color": color.reshape(*shape, 3),
-        "alpha": hits.alpha.reshape(*shape, 1),
-        "depth": hits.depth.reshape(*shape, 1),
-        "samples": hits.samples.reshape(*shape, 1),
+        "alpha": alpha.reshape(*shape, 1),
+        "depth": depth.reshape(*shape, 1),
+        "samples": samples.reshape(*shape, 1),
     }
     if not camera.batched:
         images = {name: image[0] for name, image in images.items()}
     return Picture(**images, stats=stats)
 
 
+def _room(device: torch.device, dtype: torch.dtype, pixels: int) -> Hits:
+    """Takes the memory of a whole picture before the first ray, so that too large a one fails at once."""
+    check.memory(
+        "render", f"a picture of {pixels} pixels", pixels * (5 * dtype.itemsize + 4), device
+    )
+    widths = {"color": (3,), "alpha": (1,), "depth": (1,)}
+    reals = {n: torch.empty((pixels, *w), dtype=dtype, device=device) for n, w in widths.items()}
+    return Hits(**reals, samples=torch.empty(pixels, dtype=torch.int32, device=device))
+
+
+def _trace_blocks(camera: Camera, tracer: Tracer, progress: Progress) -> Iterator[Hits]:
+    """Traces block after block of rows: rays take more memory than the picture they make."""
+    device = tracer.tree.device
+    rows = max(1, _RAYS_A_BLOCK[device.type] // camera.width)
+    done, total = 0, len(camera) * camera.height
+    for index in range(len(camera)):
+        one = camera[index]
+        for top in range(0, camera.height, rows):
+            end = min(top + rows, camera.height)
+            with stage("rays"):
+                rays = one.rays(device, (top, end))
+            with stage("trace"):
+                yield tracer(rays)
+            done += end - top
+            progress("rays", done, total)
+
+
 def trace(
-    tree: N3Tree,
-    rays: Rays,
-    shader: TransferFunction,
-    options: RenderOptions | None = None,
-    progress: Progress = no_progress,
+    tree: N3Tree, rays: Rays, shader: TransferFunction, options: RenderOptions | None = None
 ) -> Hits:
-    """Traces any world rays through a tree as one frame: counts `tree.frame` up, then marks with
-    it.
+    """Traces any world rays through a tree as one frame.
 
     Args:
-        tree: The tree.
+        tree: The tree; its stamps and request words are written.
         rays: Rays in world units, on the tree's device.
         shader: The transfer function.
         options: Lod, step and the like; `background` is not used.
-        progress: Told how many rays are done.
 
     Returns:
         Colour, alpha, depth and samples of each ray, in `options.dtype`.
+
+    Raises:
+        ValueError: The channel is unknown, the step too short, or the backend can't be used.
     """
-    options = options or RenderOptions()
-    choose_backend(options.backend, tree.device)
-    channel = options.channel or tree.channel_names[0]
-    if channel not in tree.bricks.bricks:
-        raise ValueError(
-            f"render: unknown channel {channel!r}; the tree has {', '.join(tree.channel_names)}"
+    return Tracer(tree, shader, options or RenderOptions())(rays)
+
+
+class Tracer:
+    """One frame of a tree: counts `tree.frame` up, then traces any number of batches of rays."""
+
+    def __init__(self, tree: N3Tree, shader: TransferFunction, options: RenderOptions) -> None:
+        """Lays the op's arguments ready; see `trace`."""
+        choose_backend(options.backend, tree.device)
+        channel = options.channel or tree.channel_names[0]
+        if channel not in tree.bricks.bricks:
+            known = ", ".join(tree.channel_names)
+            raise ValueError(f"render: unknown channel {channel!r}; the tree has {known}")
+        step = options.step * min(tree.spacing)
+        most_intervals(float((tree.box[1] - tree.box[0]).norm()), step)
+        tree.frame += 1
+        self.tree, self.options = tree, options
+        table, domain = shader.table(min(tree.spacing), options.dtype, tree.device)
+        self.arguments: dict[str, Any] = {
+            "bounds_23": tree.bounds(options.dtype),
+            "child_tn": tree.nodes.child_tn,
+            "brick_tn": tree.nodes.brick_tn,
+            "request_tn": tree.nodes.request_tn,
+            "stamp_t": tree.nodes.stamp_t,
+            "bricks_bzyxc": tree.bricks.bricks[channel],
+            "constant_tnc": tree.constants[channel],
+            "stamp_b": tree.bricks.stamp_b,
+            "table_m4": table,
+            "domain_3": domain,
+            "frame_1": torch.tensor([tree.frame], dtype=torch.int32, device=tree.device),
+            "branching": tree.branching,
+            "root": tree.root,
+            "max_depth": tree.depth,
+            "border": tree.bricks.border,
+            "component": options.component,
+            "root_voxel": tree.root_voxel,
+            "step": step,
+            "stop_alpha": options.stop_alpha,
+            "depth_alpha": options.depth_alpha,
+            "backend": options.backend,
+        }
+
+    def __call__(self, rays: Rays) -> Hits:
+        """Traces rays in world units."""
+        options = self.options
+        scale = options.cone_scale if options.lod == "auto" else 0.0
+        origin, direction = self.tree.to_tree(rays.origin, rays.direction)
+        columns = (origin, direction, rays.cone * scale, rays.range)
+        color, alpha, depth, samples = trace_rays(
+            *(column.to(options.dtype) for column in columns),
+            **self.arguments,
         )
-    step = options.step * min(tree.spacing)
-    most_intervals(float((tree.box[1] - tree.box[0]).norm()), step)
-    tree.frame += 1
-    origin, direction = tree.to_tree(rays.origin, rays.direction)
-    cone = rays.cone * options.cone_scale if options.lod == "auto" else torch.zeros_like(rays.cone)
-    columns = [column.to(options.dtype) for column in (origin, direction, cone, rays.range)]
-    table, domain = shader.table(min(tree.spacing), options.dtype, tree.device)
-    arguments: dict[str, Any] = {
-        "bounds_23": tree.bounds(options.dtype),
-        "child_tn": tree.nodes.child_tn,
-        "brick_tn": tree.nodes.brick_tn,
-        "request_tn": tree.nodes.request_tn,
-        "stamp_t": tree.nodes.stamp_t,
-        "bricks_bzyxc": tree.bricks.bricks[channel],
-        "constant_tnc": tree.constants[channel],
-        "stamp_b": tree.bricks.stamp_b,
-        "table_m4": table,
-        "domain_3": domain,
-        "frame_1": torch.tensor([tree.frame], dtype=torch.int32, device=tree.device),
-        "branching": tree.branching,
-        "root": tree.root,
-        "max_depth": tree.depth,
-        "border": tree.bricks.border,
-        "component": options.component,
-        "root_voxel": tree.root_voxel,
-        "step": step,
-        "stop_alpha": options.stop_alpha,
-        "depth_alpha": options.depth_alpha,
-        "backend": options.backend,
-    }
-    count, parts = origin.shape[0], []
-    size = _RAYS_A_CALL[tree.device.type]
-    with stage("trace"):
-        for first in range(0, max(count, 1), size):
-            some = [column[first : first + size] for column in columns]
-            parts.append(trace_rays(*some, **arguments))
-            progress("rays", min(first + size, count), count)
-    color, alpha, depth, samples = (torch.cat(part) for part in zip(*parts, strict=True))
-    return Hits(color=color, alpha=alpha, depth=depth, samples=samples)
+        return Hits(color=color, alpha=alpha, depth=depth, samples=samples)

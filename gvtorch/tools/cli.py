@@ -321,6 +321,12 @@ def main(args: list[str] | None = None) -> None:
         text = " ".join(str(error).split()) or type(error).__name__
         print(f"gvtorch: error: {text}", file=sys.stderr)
         sys.exit(2)
+    except RuntimeError as error:
+        if "alloc" not in str(error) and "memory" not in str(error):
+            raise
+        text = " ".join(str(error).split())
+        print(f"gvtorch: error: not enough memory: {text}", file=sys.stderr)
+        sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
 
