@@ -105,7 +105,7 @@ def render(
         with stage("picture"):
             color, alpha, depth, samples = vars(hits).values()
             background = torch.tensor(chosen.background, dtype=color.dtype, device=tree.device)
-            color.addcmul_(1 - alpha, background)
+            color += (1 - alpha) * background
             stats = RenderStats(
                 milliseconds=1e3 * (time.perf_counter() - start),
                 stages=timings,
@@ -131,7 +131,7 @@ def render(
 
 
 def _room(device: torch.device, dtype: torch.dtype, pixels: int) -> Hits:
-    """Takes the memory of a whole picture before the first ray, so that too large a one fails at once."""
+    """Takes the memory of a picture before the first ray: too large a one fails at once."""
     check.memory(
         "render", f"a picture of {pixels} pixels", pixels * (5 * dtype.itemsize + 4), device
     )
