@@ -120,6 +120,7 @@ def test_batches_broadcast():
             lambda: gv.Camera.look_at((0, 0), (0, 0, 0)),
             r"eye must be \(3,\) or \(n, 3\), got \(2,\)",
         ),
+        (lambda: gv.Camera.look_at((0, 0, 1), (0, 0, 0), (0, 0, 0)), "up must not be zero"),
         (lambda: gv.Camera.look_at((math.nan, 0, 0), (0, 0, 0)), "eye must be finite"),
         (lambda: gv.Camera(torch.eye(3), torch.eye(3), 4, 4), r"viewmats must be \(..., 4, 4\)"),
         (lambda: gv.Camera(torch.eye(4) * 2, torch.eye(3), 4, 4), "must hold rotations"),

@@ -183,7 +183,7 @@ def test_a_mistake_gets_one_line_and_status_2(small, tmp_path, make, message):
     if "cuda" in message and torch.cuda.is_available():
         pytest.skip("CUDA can be used here")
     run = gvtorch("render", *make(tmp_path, small), "-o", "a.png", cwd=tmp_path)
-    lines = run.stderr.strip().splitlines()
+    lines = run.stderr.splitlines()
     assert run.returncode == 2 and len(lines) == 1, run.stderr
     assert lines[0].startswith("gvtorch: error: ") and message in lines[0]
     assert not (tmp_path / "a.png").exists()

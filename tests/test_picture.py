@@ -316,3 +316,24 @@ def test_wrong_arguments_are_named(blobs):
         gv.render(tree, camera, shader, step=1e-9)
     with pytest.raises(ValueError, match=r"can't be used here|does not run"):
         gv.render(tree, camera, shader, backend="cuda")
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("spacing", [(1, 1, 1), (1, 1, 10), (1e-3, 1e-3, 2e-3), (1e4, 2e4, 1e4)])
+@pytest.mark.parametrize("extent", [(1, 1, 1), (1, 7, 3), (33, 2, 18), (65, 9, 30)])
+def test_odd_extents_and_spacings_agree_with_the_dense_marcher(extent, spacing):
+    z, y, x = np.mgrid[0 : extent[2], 0 : extent[1], 0 : extent[0]]
+    data = 100 + 50 * np.sin(0.5 * x + 1) + 40 * np.cos(0.4 * y) * np.sin(0.6 * z + 0.3)
+    volume = gv.Volume(data.astype(np.float32), spacing, [3 * s for s in spacing])
+    shader = gv.TransferFunction.from_points(
+        [(60, 0), (120, 0.05), (200, 0.4)], [(0, 1, 0, 0), (200, 0, 0.3, 1)]
+    )
+    for brick_size, border, branching in ((8, 1, 2), (3, 1, 3), (16, 2, 2), (2, 1, 4)):
+        for place in ({}, {"distance": 0.3}):
+            color, _, _ = dense(volume, shader, 0.5, 24, **place)
+            picture = ours(
+                *(volume, shader, "cpp", 24, brick_size, border, branching, place),
+                lod="finest",
+                stop_alpha=1.0,
+            )
+            assert np.abs(picture.color.numpy() - color).max() < 1e-3

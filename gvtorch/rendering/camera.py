@@ -156,7 +156,7 @@ class Camera:
             height: Pixels.
 
         Raises:
-            ValueError: A place is not finite, or eye and target are the same.
+            ValueError: A place is not finite, up is zero, or eye and target are the same.
         """
         places = []
         for name, value in (("eye", eye), ("target", target), ("up", up)):
@@ -170,6 +170,8 @@ class Camera:
             eye_, target_, up_ = torch.broadcast_tensors(*places)
         except RuntimeError:
             raise ValueError("Camera.look_at: eye, target and up have different lengths") from None
+        if bool((up_ == 0).all(-1).any()):
+            raise ValueError("Camera.look_at: up must not be zero")
         forward = target_ - eye_
         length = forward.norm(dim=-1, keepdim=True)
         if bool((length == 0).any()):

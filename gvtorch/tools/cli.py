@@ -191,7 +191,10 @@ class Bar:
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
         columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-        self._progress = Progress(*columns, console=Console(stderr=True), transient=True)
+        console = Console(stderr=True)
+        self._progress = Progress(
+            *columns, console=console, transient=True, disable=not console.is_terminal
+        )
         self._tasks: dict[str, Any] = {}
         self._timer = threading.Timer(1.0, self._progress.start)
         self._timer.daemon = True
@@ -205,7 +208,8 @@ class Bar:
         """Takes the bar away."""
         self._timer.cancel()
         self._timer.join()
-        self._progress.stop()
+        if self._progress.live.is_started:
+            self._progress.stop()
 
     def __call__(self, what: str, done: int, total: int) -> None:
         """Shows that `done` of `total` (0: unknown) parts of `what` are done."""
