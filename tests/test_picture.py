@@ -303,6 +303,15 @@ def test_stats_count_what_was_used(blobs, backend):
     assert stats.backend == backend and stats.milliseconds > 0
 
 
+def test_a_picture_larger_than_memory_fails_before_the_first_ray(blobs, backend):
+    tree = gv.N3Tree.from_volume(blobs, device=DEVICES[backend])
+    view = torch.eye(4, dtype=torch.float64).expand(2**12, 4, 4)
+    camera = gv.Camera(view, torch.diag(torch.tensor([9.0, 9.0, 1.0])), 65536, 65536)
+    shader = gv.TransferFunction.preset("gray", 0, 1)
+    with pytest.raises(ValueError, match=r"a picture of 17592186044416 pixels takes .* GiB"):
+        gv.render(tree, camera, shader, backend=backend)
+
+
 def test_wrong_arguments_are_named(blobs):
     tree, camera = gv.N3Tree.from_volume(blobs), gv.Camera.orbit(width=4, height=4)
     shader = gv.TransferFunction.preset("gray", 0, 1)

@@ -201,6 +201,22 @@ def test_a_missing_brick_is_drawn_from_its_ancestor(blobs, backend):
     assert int(marks["request"].view(-1)[tree.root]) & config.REQUEST_LOAD
 
 
+@pytest.mark.parametrize("compiled", ["cuda"], indirect=True)
+@pytest.mark.parametrize("lod", ["finest", "auto"])
+def test_cuda_equals_cpp_on_a_million_rays(aneurism, compiled, lod):
+    """Every bit of it: pictures, samples, stamps and requests, with a tenth of the tree missing."""
+    tree = forget(gv.N3Tree.from_volume(aneurism), 0.1, 0)
+    rays = camera_rays(tree, 1024, distance=1.4)
+    shader = gv.TransferFunction.preset("vessels", 0, 255)
+    expected, expected_marks = run(tree, "cpp", rays, shader, lod=lod)
+    actual, marks = run(tree, compiled, rays, shader, lod=lod)
+    for name in expected:
+        assert torch.equal(actual[name], expected[name]), name
+    for name in marks:
+        assert torch.equal(marks[name], expected_marks[name]), name
+    assert (marks["request"] != 0).sum() > 100 and expected["alpha"].max() > 0.9
+
+
 @pytest.mark.backend("cpp")
 def test_threads_give_the_same_bits(aneurism):
     tree = gv.N3Tree.from_volume(aneurism)
