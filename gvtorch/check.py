@@ -5,6 +5,7 @@ came.
 from __future__ import annotations
 
 import math
+import operator
 import os
 import sys
 from collections.abc import Sequence
@@ -107,10 +108,11 @@ def whole(where: str, name: str, value: Any, *, low: int, high: int = sys.maxsiz
     Raises:
         ValueError: It is no whole number, or out of the range.
     """
-    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+    plain = operator.index(value) if hasattr(value, "__index__") else None
+    if isinstance(value, bool) or plain is None or not low <= plain <= high:
         upper = f" and <= {high}" if high < sys.maxsize else ""
         raise ValueError(f"{where}: {name} must be an int >= {low}{upper}, got {value!r}")
-    return value
+    return plain
 
 
 def triple(where: str, name: str, value: Any) -> tuple[float, float, float]:

@@ -153,6 +153,9 @@ def _as_tensor(where: str, data: Tensor | np.ndarray) -> Tensor:
 def _finite(where: str, tensor: Tensor, nan: float | None) -> Tensor:
     if not tensor.is_floating_point() or tensor.numel() == 0:
         return tensor
+    if nan is not None:
+        limits = torch.finfo(tensor.dtype)
+        nan = check.number(where, "nan", nan, low=limits.min, high=limits.max)
     low, high = torch.aminmax(tensor)
     if torch.isfinite(low) and torch.isfinite(high):
         return tensor

@@ -17,7 +17,7 @@ def centre_of(camera: gv.Camera) -> torch.Tensor:
     return -(camera.viewmats[:, :3, :3].mT @ camera.viewmats[:, :3, 3:])[..., 0]
 
 
-@pytest.mark.parametrize("elevation", [-90.0, -30.0, 0.0, 20.0, 90.0])
+@pytest.mark.parametrize("elevation", [-90.0, -30.0, 0.0, 20.0, 90.0, 130.0])
 @pytest.mark.parametrize("azimuth", [0.0, 30.0, 200.0])
 def test_orbit_stands_where_the_formula_says(azimuth, elevation):
     camera = gv.Camera.orbit(azimuth, elevation, 2.4, 30, 64, 48).placed(BOX)
@@ -97,6 +97,18 @@ def test_from_viewmat_K_is_opencv():
     assert corner.tolist() == pytest.approx([-15.5 / 50, -7.5 / 50, 1])
 
 
+def test_up_is_plus_y_beyond_the_pole():
+    camera = gv.Camera.orbit(30, 120, 2, 40, 9, 9).placed(BOX)
+    other = gv.Camera.look_at(centre_of(camera)[0], BOX.mean(0), fov=40, width=9, height=9)
+    torch.testing.assert_close(camera.rays().direction, other.rays().direction)
+
+
+def test_leading_dimensions_are_one_batch():
+    view = torch.eye(4).expand(2, 3, 4, 4)
+    camera = gv.Camera.from_viewmat_K(view, torch.eye(3), 4, 4)
+    assert len(camera) == 6 and camera.batched
+
+
 def test_batches_broadcast():
     camera = gv.Camera.look_at(torch.tensor([[1.0, 0, 0], [0, 0, 1]]), (0, 0, 0), width=4, height=3)
     assert len(camera) == 2 and camera.rays().origin.shape == (24, 3)
@@ -122,7 +134,10 @@ def test_batches_broadcast():
         ),
         (lambda: gv.Camera.look_at((0, 0, 1), (0, 0, 0), (0, 0, 0)), "up must not be zero"),
         (lambda: gv.Camera.look_at((math.nan, 0, 0), (0, 0, 0)), "eye must be finite"),
-        (lambda: gv.Camera(torch.eye(3), torch.eye(3), 4, 4), r"viewmats must be \(..., 4, 4\)"),
+        (
+            lambda: gv.Camera(torch.eye(3), torch.eye(3), 4, 4),
+            r"viewmats must be \(4, 4\) or \(n, 4, 4\)",
+        ),
         (lambda: gv.Camera(torch.eye(4) * 2, torch.eye(3), 4, 4), "must hold rotations"),
         (lambda: gv.Camera(torch.eye(4), -torch.eye(3), 4, 4), "positive focal lengths"),
         (
@@ -133,6 +148,14 @@ def test_batches_broadcast():
             lambda: gv.Camera(torch.eye(4).repeat(2, 1, 1), torch.eye(3).repeat(3, 1, 1), 4, 4),
             "do not match",
         ),
+        (lambda: gv.Camera.orbit([0, 1], [0, 1, 2]), "different lengths"),
+        (
+            lambda: gv.Camera(
+                torch.eye(4), torch.tensor([[1.0, 5, 0], [0, 1, 0], [0, 0, 1]]), 4, 4
+            ),
+            "skew",
+        ),
+        (lambda: gv.Camera(torch.eye(4), torch.diag(torch.tensor([1.0, 1, 2])), 4, 4), "last rows"),
         (lambda: gv.Camera.orbit().rays(), "placed"),
     ],
 )

@@ -327,6 +327,47 @@ def test_wrong_arguments_are_named(blobs):
         gv.render(tree, camera, shader, backend="cuda")
 
 
+@pytest.mark.parametrize("distance", [1e3, 1e5, 1e7])
+def test_far_cameras_with_narrow_views_see_the_same(blobs, compiled, distance):
+    fov = math.degrees(2 * math.atan(0.6 / distance))
+    shader = gv.TransferFunction.preset("hot", *blobs.value_range)
+    place = {"distance": distance, "fov": fov}
+    color, alpha, _ = dense(blobs, shader, 0.5, 24, **place)
+    picture = ours(blobs, shader, compiled, 24, place=place, lod="finest", stop_alpha=1.0)
+    error = np.abs(picture.color.cpu().numpy() - color).max()
+    assert error < (2e-3 if distance < 1e6 else 0.02) and alpha.max() > 0.5
+
+
+def test_a_ray_along_the_high_face_sees_the_volume(backend):
+    volume = gv.Volume(np.random.default_rng(0).random((24, 24, 24)).astype(np.float32))
+    tree = gv.N3Tree.from_volume(volume, 8, device=DEVICES[backend])
+    faces = torch.tensor([[-0.5, 12.0, -9.0], [23.5, 12.0, -9.0]])
+    rays = gv.Rays(
+        origin=faces.to(tree.device),
+        direction=torch.tensor([[0.0, 0.0, 1.0]]).repeat(2, 1).to(tree.device),
+        cone=torch.zeros(2, 2, device=tree.device),
+        range=torch.tensor([[0.0, math.inf]]).repeat(2, 1).to(tree.device),
+    )
+    shader = gv.TransferFunction.from_points([(0, 0), (1, 0.2)])
+    alpha = trace(tree, rays, shader, gv.RenderOptions(backend=backend)).alpha
+    assert alpha.min() > 0.5
+
+
+def test_flat_voxels_are_not_undersampled(compiled):
+    """Spacing 1, 1, 8: `auto` is no further from a supersampled picture than `finest` is."""
+    noise = np.random.default_rng(1).random((8, 64, 64)).astype(np.float32)
+    volume = gv.Volume(noise, (1, 1, 8))
+    shader = gv.TransferFunction.from_points([(0.3, 0), (1, 0.1)])
+    place = {"distance": 2.0}
+    fine = ours(volume, shader, compiled, 128, place=place, lod="finest").alpha
+    truth = fine.reshape(16, 8, 16, 8).mean((1, 3)).cpu()
+    errors = {
+        lod: (ours(volume, shader, compiled, 16, place=place, lod=lod).alpha[..., 0].cpu() - truth)
+        for lod in ("auto", "finest")
+    }
+    assert errors["auto"].abs().max() < 1.2 * errors["finest"].abs().max()
+
+
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("spacing", [(1, 1, 1), (1, 1, 10), (1e-3, 1e-3, 2e-3), (1e4, 2e4, 1e4)])
 @pytest.mark.parametrize("extent", [(1, 1, 1), (1, 7, 3), (33, 2, 18), (65, 9, 30)])

@@ -54,6 +54,18 @@ def test_corners_without_a_shared_grid_are_sampled_finely():
     assert np.abs(look_up(function, value) - function(value)).max() < 1e-4
 
 
+def test_corners_too_close_for_any_table_are_refused():
+    function = gv.TransferFunction.from_points([(0, 0), (1e-3, 0.5), (2e-3, 0), (1e6, 0)])
+    with pytest.raises(ValueError, match=r"values .* are too close for a table of"):
+        function.table(1.0, torch.float32, "cpu")
+
+
+def test_far_corners_on_a_fine_grid_are_exact():
+    function = gv.TransferFunction.from_points([(0, 0), (1, 0.5), (2, 0), (1e6, 0)])
+    value = np.linspace(0, 3, 1001)
+    np.testing.assert_allclose(look_up(function, value), function(value), atol=1e-9)
+
+
 def test_values_beyond_the_corners_keep_the_last_value():
     function = gv.TransferFunction.from_points([(10, 0.25), (20, 0.75)], [(0, 1, 0, 0)])
     assert function(np.array([-5.0, 15.0, 99.0]))[:, 3].tolist() == [0.25, 0.5, 0.75]

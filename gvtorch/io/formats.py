@@ -80,6 +80,8 @@ def read_volume(
     reader, what = _reader(path, key)
     if reader is not _read_raw and (shape is not None or dtype is not None):
         raise ValueError(f"{path}: shape and dtype are for RAW files, {what} files tell their own")
+    if key is not None and not path.name.lower().endswith(".npz"):
+        raise ValueError(f"{path}: key is for NPZ files, this is {what}")
     try:
         grid = _read_raw(path, shape, dtype) if reader is _read_raw else reader(path)
     except (ImportError, FileNotFoundError):
@@ -133,9 +135,9 @@ def _need(module: str, package: str, path: Path) -> Any:
 
 
 def _open(path: Path) -> IO[bytes]:
-    if path.name.endswith(".gz"):
+    if path.name.lower().endswith(".gz"):
         return gzip.open(path, "rb")  # type: ignore[return-value]
-    return bz2.open(path, "rb") if path.name.endswith(".bz2") else path.open("rb")
+    return bz2.open(path, "rb") if path.name.lower().endswith(".bz2") else path.open("rb")
 
 
 def _read_raw(

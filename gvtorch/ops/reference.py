@@ -451,6 +451,8 @@ def trace_rays(
             torch.tensor(root_voxel, dtype=origin_r3.dtype),
         )
     )
+    # A place on the scene's high face belongs to the scene.
+    inside_3 = bounds_23[1] * torch.tensor(0.9999999, dtype=bounds_23.dtype).to(bounds_23)
     at = Intervals.begin(first, last, cone_r2, step)
     tree = Tree(
         child_tn.view(-1),
@@ -474,7 +476,7 @@ def trace_rays(
     arrived = active  # rays that stand in a node they have not looked up yet
     while active.any():
         if arrived.any():
-            visit.look_up(arrived, origin_r3, direction_r3, at, tree, bricks)
+            visit.look_up(arrived, origin_r3, direction_r3, inside_3, at, tree, bricks)
         value = visit.value(active, origin_r3, direction_r3, at, tree, bricks)
 
         # A node of one value, or of none, is left in one go; else one interval is taken.
@@ -526,6 +528,7 @@ class Visit:
         arrived: Tensor,
         origin_r3: Tensor,
         direction_r3: Tensor,
+        inside_3: Tensor,
         at: Intervals,
         tree: Tree,
         bricks: Bricks,
@@ -534,7 +537,8 @@ class Visit:
         which = arrived.nonzero()[:, 0]
         cone, middle = at.cone(at.middle)[which], at.middle[which]
         wanted, fits, above = wanted_depth(cone, tree)
-        position = clamp(origin_r3[which] + middle[:, None] * direction_r3[which], 0, 1)
+        position = origin_r3[which] + middle[:, None] * direction_r3[which]
+        position = clamp(position, 0, inside_3)
         found = descend(position, wanted, tree)
         reaches = fits <= cone
         blends = reaches & (wanted > 0)

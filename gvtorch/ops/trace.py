@@ -92,7 +92,7 @@ def trace_rays(
         max_depth: Depth of the finest level.
         border: Voxels of border on each side of a brick.
         component: Which of the c values the transfer function reads.
-        root_voxel: World size of a depth-0 voxel along its largest side.
+        root_voxel: World size of a depth-0 voxel: a cone this wide wants depth 0.
         step: World length of the shortest interval between samples.
         stop_alpha: A ray ends at this alpha; 1 integrates to the end.
         depth_alpha: Depth is where alpha passes this.

@@ -93,8 +93,15 @@ class N3Tree:
 
     @property
     def root_voxel(self) -> float:
-        """World size of a depth-0 voxel along its largest side."""
-        return max(self.spacing) * self.branching**self.depth
+        """World size of a depth-0 voxel along its smallest side."""
+        return min(self.spacing) * self.branching**self.depth
+
+    @property
+    def flatness(self) -> float:
+        """Smallest over largest side of a voxel. Cones are narrowed by it: then the level is chosen
+        by the largest side, so that no detail is lost, and intervals fit the smallest one.
+        """
+        return min(self.spacing) / max(self.spacing)
 
     @property
     def channel_names(self) -> tuple[str, ...]:
@@ -108,14 +115,12 @@ class N3Tree:
         return self.nodes.nbytes + self.bricks.nbytes + constants
 
     def to_tree(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Takes world points (r, 3) and directions (r, 3) to tree units, in float64 and back to
-        their dtype.
-        """
+        """Takes world points (r, 3) and directions (r, 3) to tree units, in float64."""
         box = self.box.to(points.device)
         size = torch.tensor(self.spacing, dtype=torch.float64, device=points.device) * self.side
         origin = (points.to(torch.float64) - box[0]) / size
         direction = directions.to(torch.float64) / size
-        return origin.to(points.dtype).contiguous(), direction.to(points.dtype).contiguous()
+        return origin, direction
 
     def bounds(self, dtype: torch.dtype) -> Tensor:
         """(2, 3) the part of the root cube that the scene fills, tree units."""

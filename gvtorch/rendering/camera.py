@@ -66,7 +66,8 @@ class Camera:
         for name, matrix, side in (("viewmats", view, 4), ("Ks", intrinsics, 3)):
             if matrix.dim() not in (2, 3) or matrix.shape[-2:] != (side, side):
                 raise ValueError(
-                    f"Camera: {name} must be (..., {side}, {side}), got {tuple(matrix.shape)}"
+                    f"Camera: {name} must be ({side}, {side}) or (n, {side}, {side}), "
+                    f"got {tuple(matrix.shape)}"
                 )
             if not bool(torch.isfinite(matrix).all()):
                 raise ValueError(f"Camera: {name} must be finite, got NaN or infinity")
@@ -86,6 +87,11 @@ class Camera:
         error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().max()
         if error > 1e-3 or bool((torch.linalg.det(rotation) < 0).any()):
             raise ValueError("Camera: viewmats must hold rotations (orthonormal, determinant +1)")
+        bottom = torch.tensor([0, 0, 0, 1], dtype=torch.float64)
+        if bool((self.viewmats[:, 3] != bottom).any() or (self.Ks[:, 2] != bottom[1:]).any()):
+            raise ValueError("Camera: last rows must be (0, 0, 0, 1) of viewmats, (0, 0, 1) of Ks")
+        if bool((self.Ks[:, (0, 1), (1, 0)] != 0).any()):
+            raise ValueError("Camera: Ks must have no skew")
         self.frame = frame
 
     @classmethod
@@ -123,12 +129,23 @@ class Camera:
         )
         if bool((far <= 0).any()):
             raise ValueError(f"Camera.orbit: distance must be > 0, got {distance!r}")
-        turn, lift, far = torch.broadcast_tensors(torch.deg2rad(turn), torch.deg2rad(lift), far)
+        try:
+            turn, lift, far = torch.broadcast_tensors(turn.deg2rad(), lift.deg2rad(), far)
+        except RuntimeError:
+            raise ValueError(
+                "Camera.orbit: azimuth, elevation and distance have different lengths"
+            ) from None
+        if far.dim() > 1:
+            raise ValueError(
+                "Camera.orbit: azimuth, elevation and distance must be numbers or (n,), "
+                f"got {tuple(far.shape)}"
+            )
         zero = torch.zeros_like(turn)
         outward = torch.stack(
             (turn.sin() * lift.cos(), lift.sin(), turn.cos() * lift.cos()), dim=-1
         )
-        right = torch.stack((turn.cos(), zero, -turn.sin()), dim=-1)
+        over = torch.where(lift.cos() < -1e-12, -1.0, 1.0)  # beyond a pole up is still +y
+        right = torch.stack((over * turn.cos(), zero, -over * turn.sin()), dim=-1)
         view = _viewmat(outward * far[..., None], -outward, right)
         return cls(
             view, _intrinsics("Camera.orbit", fov, width, height), width, height, frame=Frame.BOX
@@ -191,10 +208,16 @@ class Camera:
 
     @classmethod
     def from_viewmat_K(cls, viewmats: Tensor, Ks: Tensor, width: int, height: int) -> Camera:
-        """Takes the matrices that gsplat takes: (..., 4, 4) world-to-camera (OpenCV) and (..., 3,
-        3).
+        """Takes gsplat's matrices: (..., 4, 4) world-to-camera (OpenCV) and (..., 3, 3).
+
+        Leading dimensions are laid in a row: the cameras are a batch of their product.
         """
-        return cls(viewmats, Ks, width, height)
+        flat = []
+        for name, matrix in (("viewmats", viewmats), ("Ks", Ks)):
+            matrices = _numbers("Camera.from_viewmat_K", name, matrix)
+            many = matrices.dim() > 3
+            flat.append(matrices.reshape(-1, *matrices.shape[-2:]) if many else matrices)
+        return cls(flat[0], flat[1], width, height)
 
     @classmethod
     def from_kornia(cls, camera: PinholeCamera) -> Camera:

@@ -11,10 +11,32 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from .. import config
+from .. import check, config
 from ..ops import available
+from ..ops.trace import most_intervals
 from ..pool import N3Tree
 from .shader import TransferFunction
+
+
+def approach(
+    origin: Tensor, direction: Tensor, cone: Tensor, range: Tensor, high: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Moves ray origins to where they enter the scene, so that float32 is fine from any distance.
+
+    Args:
+        origin: (r, 3) float64, tree units.
+        direction: (r, 3) float64, tree units per world unit.
+        cone: (r, 2) float64, width at the origin and growth.
+        range: (r, 2) float64, first and last distance.
+        high: (3,) float64, the scene's high corner in tree units; its low corner is 0.
+
+    Returns:
+        The new origin, cone and range, and the distance moved (r, 1), to be added to depths.
+    """
+    near = torch.minimum(-origin / direction, (high - origin) / direction).amax(1, keepdim=True)
+    moved = torch.where(torch.isfinite(near) & (near > 0), near, torch.zeros_like(near))
+    cone = torch.cat((cone[:, :1] + cone[:, 1:] * moved, cone[:, 1:]), 1)
+    return origin + moved * direction, cone, range - moved, moved
 
 
 class TreeTracer(torch.nn.Module):
@@ -23,6 +45,7 @@ class TreeTracer(torch.nn.Module):
     if TYPE_CHECKING:  # TorchScript would read these as attributes of its own
         corner: Tensor
         size: Tensor
+        bounds: Tensor
 
     def __init__(
         self,
@@ -35,7 +58,7 @@ class TreeTracer(torch.nn.Module):
         stop_alpha: float = config.STOP_ALPHA,
         depth_alpha: float = config.DEPTH_ALPHA,
     ) -> None:
-        """Shares the tree's tensors.
+        """Shares the tree's pools, but for the usage stamps, which are its own.
 
         Args:
             tree: The tree.
@@ -48,11 +71,21 @@ class TreeTracer(torch.nn.Module):
 
         Raises:
             RuntimeError: The compiled op is missing.
+            ValueError: The channel is unknown, or a number is out of its range.
         """
         super().__init__()
         if available()["cpp"]:
             raise RuntimeError(f"TreeTracer needs the compiled op: {available()['cpp']}")
         channel = channel or tree.channel_names[0]
+        if channel not in tree.bricks.bricks:
+            known = ", ".join(tree.channel_names)
+            raise ValueError(f"TreeTracer: unknown channel {channel!r}; the tree has {known}")
+        where, width = "TreeTracer", tree.bricks.channels[channel].width
+        check.whole(where, "component", component, low=0, high=width - 1)
+        check.number(where, "step", step, low=0, open_low=True)
+        check.number(where, "stop_alpha", stop_alpha, low=0, high=1, open_low=True)
+        check.number(where, "depth_alpha", depth_alpha, low=0, high=1)
+        most_intervals(float((tree.box[1] - tree.box[0]).norm()), step * min(tree.spacing))
         table, domain = shader.table(min(tree.spacing), torch.float32, tree.device)
         size = torch.tensor(tree.spacing, dtype=torch.float64) * tree.side
         nodes, bricks = tree.nodes, tree.bricks
@@ -63,16 +96,17 @@ class TreeTracer(torch.nn.Module):
             ("child", nodes.child_tn),
             ("brick", nodes.brick_tn),
             ("request", nodes.request_tn),
-            ("stamp_tile", nodes.stamp_t),
+            ("stamp_tile", nodes.stamp_t.clone()),  # frames of its own, not the tree's
             ("bricks", bricks.bricks[channel]),
             ("constant", tree.constants[channel]),
-            ("stamp_brick", bricks.stamp_b),
+            ("stamp_brick", bricks.stamp_b.clone()),
             ("table", table),
             ("domain", domain),
             ("frame", torch.zeros(1, dtype=torch.int32, device=tree.device)),
         ):
             self.register_buffer(name, tensor)
         self.branching, self.root, self.depth = tree.branching, tree.root, tree.depth
+        self.flatness = float(tree.flatness)
         self.border, self.component = bricks.border, component
         self.root_voxel, self.step = float(tree.root_voxel), step * min(tree.spacing)
         self.stop_alpha, self.depth_alpha = float(stop_alpha), float(depth_alpha)
@@ -92,13 +126,19 @@ class TreeTracer(torch.nn.Module):
         Returns:
             color (r, 3) premultiplied, alpha (r, 1), depth (r, 1), samples (r,) int32.
         """
-        start = ((origin.to(torch.float64) - self.corner) / self.size).to(torch.float32)
-        along = (direction.to(torch.float64) / self.size).to(torch.float32)
-        return torch.ops.gvtorch.trace_rays(
-            start,
+        along = direction.to(torch.float64) / self.size
+        start, width, limits, moved = approach(
+            (origin.to(torch.float64) - self.corner) / self.size,
             along,
-            cone,
-            range,
+            cone.to(torch.float64) * self.flatness,
+            range.to(torch.float64),
+            self.bounds[1].to(torch.float64),
+        )
+        color, alpha, depth, samples = torch.ops.gvtorch.trace_rays(
+            start.to(torch.float32).contiguous(),
+            along.to(torch.float32).contiguous(),
+            width.to(torch.float32).contiguous(),
+            limits.to(torch.float32).contiguous(),
             self.bounds,
             self.child,
             self.brick,
@@ -120,3 +160,4 @@ class TreeTracer(torch.nn.Module):
             self.stop_alpha,
             self.depth_alpha,
         )
+        return color, alpha, depth + moved.to(torch.float32), samples

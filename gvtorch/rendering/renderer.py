@@ -16,6 +16,7 @@ from ..ops.trace import Backend, choose_backend, most_intervals
 from ..pool import N3Tree
 from ..stage import Progress, collect_timings, no_progress, stage
 from .camera import Camera
+from .module import approach
 from .picture import Picture, RenderStats
 from .shader import TransferFunction
 
@@ -43,9 +44,15 @@ class RenderOptions:
         check.number(where, "step", self.step, low=0, open_low=True)
         if self.lod not in ("auto", "finest"):
             raise ValueError(f"{where}: lod must be 'auto' or 'finest', got {self.lod!r}")
-        check.triple(where, "background", self.background)
+        for part in check.triple(where, "background", self.background):
+            check.number(where, "background", part, low=0, high=1)
         check.number(where, "stop_alpha", self.stop_alpha, low=0, high=1, open_low=True)
         check.number(where, "depth_alpha", self.depth_alpha, low=0, high=1)
+        if self.depth_alpha >= self.stop_alpha:
+            raise ValueError(
+                f"{where}: depth_alpha must be below stop_alpha, "
+                f"got {self.depth_alpha} and {self.stop_alpha}"
+            )
         check.number(where, "cone_scale", self.cone_scale, low=0, open_low=True)
         check.whole(where, "component", self.component, low=0)
         if self.dtype not in (torch.float32, torch.float64):
@@ -219,11 +226,17 @@ class Tracer:
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays in world units."""
         options = self.options
-        scale = options.cone_scale if options.lod == "auto" else 0.0
+        scale = options.cone_scale * self.tree.flatness if options.lod == "auto" else 0.0
         origin, direction = self.tree.to_tree(rays.origin, rays.direction)
-        columns = (origin, direction, rays.cone * scale, rays.range)
+        cone = rays.cone.to(torch.float64) * scale
+        high = self.arguments["bounds_23"][1].to(torch.float64)
+        origin, cone, limits, moved = approach(
+            origin, direction, cone, rays.range.to(torch.float64), high
+        )
+        columns = (origin, direction, cone, limits)
         color, alpha, depth, samples = trace_rays(
-            *(column.to(options.dtype) for column in columns),
+            *(column.to(options.dtype).contiguous() for column in columns),
             **self.arguments,
         )
+        depth = depth + moved.to(options.dtype)
         return Hits(color=color, alpha=alpha, depth=depth, samples=samples)

@@ -42,7 +42,7 @@ PRESETS: dict[str, tuple[Points, Points]] = {
     ),
 }
 
-_MOST_CELLS = 65535
+_MOST_CELLS = 2**20 - 1
 
 
 class TransferFunction:
@@ -118,7 +118,7 @@ class TransferFunction:
         if name not in PRESETS:
             raise ValueError(f"unknown preset {name!r}; known: {', '.join(sorted(PRESETS))}")
         if not high > low:
-            high = low + 1.0
+            high = low + max(1.0, 1e-6 * abs(low))
         opacity, color = PRESETS[name]
         return cls(
             [(low + v * (high - low), a) for v, a in opacity],
@@ -141,7 +141,7 @@ class TransferFunction:
         """Returns the function as the kernel reads it: rows at even distances, and their domain.
 
         The number of rows is chosen so that every corner point falls on a row: then the table is
-        the function, not a sampling of it. Points that share no grid of 65,536 rows are sampled on
+        the function, not a sampling of it. Points that share no grid of 2^20 rows are sampled on
         that grid.
 
         Returns:
@@ -152,6 +152,13 @@ class TransferFunction:
         if high == low:
             high = low + max(1.0, abs(low))
         cells = _shared_grid((corners - low) / (high - low))
+        gaps = np.diff(corners)
+        if len(gaps) and float(gaps.min()) < 0.999 * (high - low) / cells:
+            at = int(gaps.argmin())
+            raise ValueError(
+                f"TransferFunction: values {corners[at]:g} and {corners[at + 1]:g} are too close "
+                f"for a table of {cells + 1} rows from {low:g} to {high:g}"
+            )
         rows = self(low + (high - low) * np.arange(cells + 1) / cells)
         domain = torch.tensor([low, high, self.reference or smallest_spacing], dtype=dtype)
         return torch.tensor(rows, dtype=dtype, device=device), domain.to(device)

@@ -286,6 +286,8 @@ def _sparkline(counts: list[int]) -> str:
     import math
 
     most = math.log1p(max(counts))
+    if not (sys.stdout.encoding or "ascii").lower().startswith("utf"):
+        return ", ".join(str(count) for count in counts)
     return "".join(" ▁▂▃▄▅▆▇█"[math.ceil(8 * math.log1p(count) / most)] for count in counts)
 
 

@@ -236,8 +236,10 @@ struct TraceRay {
 
     Vec3<T> position;
     const T one = 1;
+    const T inner = static_cast<T>(0.9999999);  // a place on the scene's high face belongs to the scene
     for (int axis = 0; axis < 3; ++axis) {
-      position[axis] = clamp(origin[axis] + at.middle * direction[axis], static_cast<T>(0), one);
+      position[axis] =
+          clamp(origin[axis] + at.middle * direction[axis], static_cast<T>(0), rays.bounds_23[3 + axis] * inner);
     }
     const Place<T> place = descend(tree, position, wanted, *frame_1);
     mark_missing(place, wanted, blend, cone);
