@@ -196,7 +196,8 @@ def test_a_wrong_flag_gets_status_2(small):
         ["render", small, "-o", "a.png", "--lod", "best"],
     ):
         run = gvtorch(*args)
-        assert run.returncode == 2 and "Traceback" not in run.stderr
+        assert run.returncode == 2 and len(run.stderr.splitlines()) == 1, run.stderr
+        assert run.stderr.startswith("gvtorch: error: ")
 
 
 def test_package_runs_as_a_module():

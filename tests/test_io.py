@@ -142,6 +142,17 @@ def test_tiff_stack_and_folder(tmp_path):
     assert_is_grid(gv.read_volume(tmp_path / "a.tif"))
     assert_is_grid(gv.read_volume(tmp_path / "big.tif"))
     assert gv.read_volume(tmp_path / "ij.tif").spacing == (2, 4, 3)
+    four = np.stack((grid(), grid() + 1000), 1)  # z c y x, as ImageJ has it
+    tifffile.imwrite(tmp_path / "zcyx.tif", four, imagej=True, metadata={"axes": "ZCYX"})
+    volume = gv.read_volume(tmp_path / "zcyx.tif")
+    assert volume.extent == EXTENT and volume.data.shape[3] == 2
+    assert np.array_equal(volume.data[..., 1].numpy(), grid() + 1000)
+    tifffile.imwrite(tmp_path / "t.tif", four, imagej=True, metadata={"axes": "TZYX"})
+    with pytest.raises(ValueError, match="axes TZYX"):
+        gv.read_volume(tmp_path / "t.tif")
+    page = np.zeros((6, 7, 3), np.uint8)
+    tifffile.imwrite(tmp_path / "rgb.tif", page, photometric="rgb")
+    assert gv.read_volume(tmp_path / "rgb.tif").data.shape == (1, 6, 7, 3)
     folder = tmp_path / "slices"
     folder.mkdir()
     with pytest.raises(ValueError, match=r"no \.tif or \.tiff slices"):

@@ -304,16 +304,29 @@ def _read_tiff(path: Path) -> _Grid:
     tifffile = _need("tifffile", "tifffile", path)
     with tifffile.TiffFile(path) as file:
         series = file.series[0]
-        _check_slices(path, series.shape)
-        data = series.asarray()
-        spacing = _tiff_spacing(file)
-    return _Grid(data[None] if data.ndim == 2 else data, spacing)
+        check_extent(str(path), series.shape)
+        return _Grid(_zyxc(path, series.asarray(), series.axes), _tiff_spacing(file))
 
 
-def _check_slices(path: Path, shape: Sequence[int]) -> None:
-    check_extent(str(path), shape)
-    if len(shape) not in (2, 3, 4):
-        raise ValueError(f"{path}: expected slices (z, y, x) or (z, y, x, c), got {tuple(shape)}")
+def _zyxc(path: Path, data: np.ndarray, axes: str) -> np.ndarray:
+    """Lays an array out as (z, y, x[, c]) by the letters tifffile gives its axes."""
+    for index in reversed(range(len(axes))):
+        if data.shape[index] == 1 and axes[index] not in "ZYX":
+            data, axes = data.squeeze(index), axes[:index] + axes[index + 1 :]
+    others = [letter for letter in axes if letter not in "ZYXCS"]
+    if (
+        "Z" not in axes and len(others) == 1 and others[0] in "QI"
+    ):  # pages without a meaning: slices
+        axes, others = axes.replace(others[0], "Z"), []
+    if "Z" not in axes:
+        data, axes = data[None], "Z" + axes
+    channels = [letter for letter in "CS" if letter in axes]
+    wanted = "ZYX" + "".join(channels)
+    if others or len(channels) > 1 or sorted(wanted) != sorted(axes):
+        raise ValueError(
+            f"{path}: axes {axes} {data.shape}; expected Z, Y, X and at most one of C, S"
+        )
+    return data.transpose([axes.index(letter) for letter in wanted])
 
 
 def _tiff_spacing(file: Any) -> tuple[float, float, float] | None:
@@ -345,7 +358,7 @@ def _read_tiff_folder(path: Path) -> _Grid:
 
     slices.sort(key=natural)
     first = tifffile.imread(slices[0])
-    _check_slices(path, (len(slices), *first.shape))
+    check_extent(str(path), (len(slices), *first.shape))
     if first.ndim not in (2, 3):
         raise ValueError(f"{slices[0]}: expected one slice (y, x) or (y, x, c), got {first.shape}")
     data = np.empty((len(slices), *first.shape), first.dtype)

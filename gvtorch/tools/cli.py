@@ -6,7 +6,10 @@ in one line on standard error and status 2.
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
+import re
 import sys
 import threading
 import warnings
@@ -311,13 +314,21 @@ def _size(text: str) -> tuple[int, int]:
 
 def main(args: list[str] | None = None) -> None:
     """Runs the command line and ends the process."""
-    command = tyro.extras.subcommand_cli_from_dict(
-        {"info": Info, "render": Render},
-        args=args,
-        prog="gvtorch",
-        description="GigaVoxels on PyTorch tensors.",
-        config=(tyro.conf.CascadeSubcommandArgs,),
-    )
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            command = tyro.extras.subcommand_cli_from_dict(
+                {"info": Info, "render": Render},
+                args=args,
+                prog="gvtorch",
+                description="GigaVoxels on PyTorch tensors.",
+                config=(tyro.conf.CascadeSubcommandArgs,),
+            )
+    except SystemExit as end:
+        if end.code:
+            words = " ".join(re.sub(r"[^\x20-\x7e]+|[-+|]{3,}", " ", said.getvalue()).split())
+            print(f"gvtorch: error: {words}", file=sys.stderr)
+        raise
     warnings.showwarning = lambda message, *_rest, **_more: print(
         f"gvtorch: {message}", file=sys.stderr
     )
