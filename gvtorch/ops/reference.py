@@ -443,28 +443,15 @@ def trace_rays(
     Writes request_tn, stamp_t and stamp_b in place.
     """
     first, last = _clip(origin_r3, direction_r3, range_r2, bounds_23)
-    stop_clear, hit_clear, root_voxel_t = (
-        number.to(origin_r3)
-        for number in (
-            1 - torch.tensor(stop_alpha, dtype=origin_r3.dtype),
-            1 - torch.tensor(depth_alpha, dtype=origin_r3.dtype),
-            torch.tensor(root_voxel, dtype=origin_r3.dtype),
-        )
-    )
+    stop_clear = 1 - torch.tensor(stop_alpha, dtype=origin_r3.dtype).to(origin_r3)
+    hit_clear = 1 - torch.tensor(depth_alpha, dtype=origin_r3.dtype).to(origin_r3)
+    top_voxel = torch.tensor(root_voxel, dtype=origin_r3.dtype).to(origin_r3)
     # A place on the scene's high face belongs to the scene.
     inside_3 = bounds_23[1] * torch.tensor(0.9999999, dtype=bounds_23.dtype).to(bounds_23)
     at = Intervals.begin(first, last, cone_r2, step)
     tree = Tree(
-        child_tn.view(-1),
-        brick_tn.view(-1),
-        request_tn.view(-1),
-        stamp_t,
-        stamp_b,
-        frame_1[0],
-        root_voxel_t,
-        branching,
-        root,
-        max_depth,
+        *(child_tn.view(-1), brick_tn.view(-1), request_tn.view(-1), stamp_t, stamp_b, frame_1[0]),
+        *(top_voxel, branching, root, max_depth),
     )
     bricks = Bricks(bricks_bzyxc, constant_tnc.view(tree.child_n.shape[0], -1), border, component)
     visit = Visit.none(origin_r3, tree)
