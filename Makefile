@@ -24,7 +24,7 @@ demo: $(VENV)/ready
 	@echo "The picture: $(CURDIR)/out/demo.png"
 
 test: $(VENV)/ready
-	GVTORCH_REQUIRE=reference,cpp $(BIN)/python -m pytest $(ARGS)
+	GVTORCH_REQUIRE=reference,cpp,io $(BIN)/python -m pytest $(ARGS)
 
 lint: $(VENV)/ready
 	$(BIN)/ruff check .
