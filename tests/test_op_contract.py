@@ -46,14 +46,13 @@ def assert_same(actual, expected) -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_opcheck(blobs, compiled, dtype):
     tree = on(gv.N3Tree.from_volume(blobs, 4), DEVICES[compiled])
-    values = list(arguments(tree, 5).values())
+    voxels = ("bricks_bzyxc", "constant_tnc", "range_tn2c")
     values = [
-        v.to(dtype)
-        if isinstance(v, torch.Tensor) and v.dtype == torch.float32 and v.dim() < 5
-        else v
-        for v in values
+        value.to(dtype)
+        if isinstance(value, torch.Tensor) and value.is_floating_point() and name not in voxels
+        else value
+        for name, value in arguments(tree, 5).items()
     ]
-    values[10] = tree.constants["value"]
     torch.library.opcheck(torch.ops.gvtorch.trace_rays.default, tuple(values))
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import gvtorch as gv
 from gvtorch import config
 from gvtorch.ops import reference
-from gvtorch.rendering.renderer import trace
+from gvtorch.rendering.renderer import Tracer, trace
 
 SHADER = gv.TransferFunction.from_points(
     opacity=[(0, 0), (0.2, 0), (0.6, 0.4), (1, 1)],
@@ -24,7 +24,9 @@ SHADER = gv.TransferFunction.from_points(
 
 def on(tree: gv.N3Tree, device: str) -> gv.N3Tree:
     """A copy of the tree whose marks are clean, on a device."""
-    nodes = gv.NodePool(tree.nodes.capacity, branching=tree.branching, device=device)
+    nodes = gv.NodePool(
+        tree.nodes.capacity, tree.bricks.channels, branching=tree.branching, device=device
+    )
     bricks = gv.BrickPool(
         tree.bricks.capacity,
         tree.bricks.channels,
@@ -39,8 +41,6 @@ def on(tree: gv.N3Tree, device: str) -> gv.N3Tree:
     for old, new in ((tree.nodes.fields, nodes.fields), (tree.bricks.fields, bricks.fields)):
         for name, field in new.items():
             field.copy_(old[name])
-    for name, constant in copy.constants.items():
-        constant.copy_(tree.constants[name])
     nodes.request_tn.zero_()
     nodes.stamp_t.fill_(-1)
     bricks.stamp_b.fill_(-1)
@@ -235,12 +235,14 @@ def test_threads_give_the_same_bits(aneurism):
 
 
 def test_skipping_does_not_move_samples(blobs, backend):
-    """A huge value range in an unused channel makes all nodes DATA: no skipping, the same samples,
-    the same picture.
+    """A second channel makes all nodes DATA, and their ranges are unknown: nothing is skipped, and
+    the picture is the same.
     """
     noise = torch.rand(blobs.data.shape, generator=torch.Generator().manual_seed(1))
     dense = {"value": blobs, "noise": gv.Volume(noise, blobs.spacing, blobs.origin)}
     sparse, full = gv.N3Tree.from_volume(blobs, 4), gv.N3Tree.from_volume(dense, 4)
+    low, high = gv.Channel(torch.float32).limits
+    full.nodes.ranges["value"][:, :, 0], full.nodes.ranges["value"][:, :, 1] = low, high
     rays = camera_rays(sparse, distance=1.3)
     a, _ = run(sparse, backend, rays, lod="finest")
     b, _ = run(full, backend, rays, lod="finest")
@@ -312,7 +314,12 @@ def test_logarithm_and_power_are_accurate():
             "origin_r3 must be (r, 3) float32 or",
         ),
         ({"cone_r2": torch.zeros(5, 2)}, "cone_r2 must be (4, 2)"),
-        ({"table_m4": torch.zeros(1, 4)}, "table_m4 needs at least 2 rows"),
+        (
+            {"table_m4": torch.zeros(1, 4), "opaque_m": torch.zeros(1, dtype=torch.int32)},
+            "table_m4 needs at least 2 rows",
+        ),
+        ({"opaque_m": torch.zeros(3)}, "opaque_m must be"),
+        ({"range_tn2c": torch.zeros(3)}, "range_tn2c must be"),
         ({"frame_1": torch.zeros(1)}, "frame_1 must be (1,) int32"),
         ({"direction_r3": torch.zeros(3, 4).T}, "direction_r3 must be contiguous"),
         ({"branching": 1}, "branching must be an int >= 2"),
@@ -334,7 +341,7 @@ def test_bad_arguments_have_one_clear_message(blobs, change, message):
 def arguments(tree: gv.N3Tree, rays: int, shader: gv.TransferFunction = SHADER) -> dict:
     """Keyword arguments of the op for parallel rays through the middle of a tree."""
     device = tree.device
-    table, domain = shader.table(min(tree.spacing), torch.float32, device)
+    table, domain, opaque = shader.table(min(tree.spacing), torch.float32, device)
     origin = torch.full((rays, 3), 0.25, device=device)
     direction = torch.tensor([[0.3, 0.2, 1.0]], device=device).repeat(rays, 1) / 60
     channel = tree.channel_names[0]
@@ -349,10 +356,12 @@ def arguments(tree: gv.N3Tree, rays: int, shader: gv.TransferFunction = SHADER) 
         "request_tn": tree.nodes.request_tn,
         "stamp_t": tree.nodes.stamp_t,
         "bricks_bzyxc": tree.bricks.bricks[channel],
-        "constant_tnc": tree.constants[channel],
+        "constant_tnc": tree.nodes.constants[channel],
+        "range_tn2c": tree.nodes.ranges[channel],
         "stamp_b": tree.bricks.stamp_b,
         "table_m4": table,
         "domain_3": domain,
+        "opaque_m": opaque,
         "frame_1": torch.tensor([3], dtype=torch.int32, device=device),
         "branching": tree.branching,
         "root": tree.root,
@@ -363,6 +372,7 @@ def arguments(tree: gv.N3Tree, rays: int, shader: gv.TransferFunction = SHADER) 
         "step": 0.5 * min(tree.spacing),
         "stop_alpha": 0.99,
         "depth_alpha": 0.1,
+        "by_level": False,
     }
 
 
@@ -372,3 +382,93 @@ def test_options_are_checked():
             gv.RenderOptions(**change)
     with pytest.raises(dataclasses.FrozenInstanceError):
         gv.RenderOptions().step = 2  # type: ignore[misc]
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    share=st.floats(0, 1),
+    seed=st.integers(0, 2**31),
+    low=st.sampled_from([0.0, 0.1, 0.25, 0.5, 0.75, 0.9]),
+    lod=st.sampled_from(["auto", "finest"]),
+    by_level=st.booleans(),
+)
+@pytest.mark.backend("cpp")
+def test_transparent_ranges_ask_for_nothing_and_change_no_bit(
+    blobs, share, seed, low, lod, by_level
+):
+    """What a node's range shows to be transparent is not requested; the picture of a tree whose
+    ranges are unknown is the same in every bit, and it asks for more."""
+    shader = gv.TransferFunction.from_points([(low, 0), (low + 0.1, 0.3)], [(0, 1, 0, 0)])
+    known = forget(gv.N3Tree.from_volume(blobs, 4), share, seed)
+    unknown = on(known, "cpu")
+    limits = gv.Channel(torch.float32).limits
+    unknown.nodes.ranges["value"][:, :, 0], unknown.nodes.ranges["value"][:, :, 1] = limits
+    rays = camera_rays(known, 16, distance=1.6)
+    a, a_marks = run_by_level(known, rays, shader, lod, by_level)
+    b, b_marks = run_by_level(unknown, rays, shader, lod, by_level)
+    asked, would_ask = a_marks != 0, b_marks != 0
+    assert not (asked & ~would_ask).any()
+    if share == 0:
+        for name in ("color", "alpha", "depth"):
+            assert torch.equal(a[name], b[name]), name
+
+
+def run_by_level(tree, rays, shader, lod, by_level):
+    """The hits and request words of the twin and of the kernel, which must be equal."""
+    found = []
+    for backend in ("reference", "cpp"):
+        copy = on(tree, "cpu")
+        options = gv.RenderOptions(backend=backend, lod=lod)
+        found.append((vars(Tracer(copy, shader, options, by_level=by_level)(rays)), copy))
+    (expected, twin), (actual, kernel) = found
+    for name in expected:
+        assert torch.equal(actual[name], expected[name]), name
+    for name, field in twin.nodes.fields.items():
+        assert torch.equal(kernel.nodes.fields[name], field), name
+    return actual, kernel.nodes.request_tn
+
+
+def test_level_by_level_asks_for_a_brick_before_its_children(blobs, backend):
+    tree = on(gv.N3Tree.from_volume(blobs, 4), DEVICES[backend])
+    rays = camera_rays(tree, 8, distance=1.3)
+    rays = gv.Rays(**{n: t.to(tree.device) for n, t in vars(rays).items()})
+    tree.nodes.child_tn.view(-1)[tree.root] = config.ABSENT
+    tree.nodes.brick_tn.view(-1)[tree.root] = config.ABSENT
+    kinds = {}
+    for by_level in (True, False):
+        tree.nodes.request_tn.zero_()
+        Tracer(tree, SHADER, gv.RenderOptions(backend=backend), by_level=by_level)(rays)
+        kinds[by_level] = int(tree.nodes.request_tn.view(-1)[tree.root]) >> 16
+    both = (config.REQUEST_LOAD | config.REQUEST_SUBDIVIDE) >> 16
+    assert kinds == {True: config.REQUEST_LOAD >> 16, False: both}, "nothing answers for the root"
+    tree.nodes.request_tn.zero_()
+    tree.nodes.brick_tn.view(-1)[tree.root] = 0
+    Tracer(tree, SHADER, gv.RenderOptions(backend=backend), by_level=True)(rays)
+    assert int(tree.nodes.request_tn.view(-1)[tree.root]) >> 16 == config.REQUEST_SUBDIVIDE >> 16
+
+
+def test_trees_of_smaller_branching_share_wider_tiles(blobs, compiled):
+    """A pool as wide as N=3 holds an N=2 tree: same picture, same marks."""
+    narrow = gv.N3Tree.from_volume(blobs, 4)
+    nodes = gv.NodePool(narrow.nodes.capacity, narrow.bricks.channels, branching=3)
+    wide = gv.N3Tree(
+        *(nodes, narrow.bricks),
+        branching=2,
+        depth=narrow.depth,
+        extent=narrow.extent,
+        spacing=narrow.spacing,
+        origin=tuple((narrow.box[0] + 0.5 * torch.tensor(narrow.spacing)).tolist()),
+    )
+    nodes.child_tn[:], nodes.brick_tn[:] = config.TERMINAL, config.EMPTY
+    for name, field in narrow.nodes.fields.items():
+        target = nodes.fields[name]
+        (target[:, :8] if target.dim() > 1 and name != "loc_t4" else target).copy_(field)
+    rays = camera_rays(narrow)
+    expected, _ = run(narrow, "reference", rays)
+    for backend in ("reference", compiled):
+        if DEVICES[backend] != "cpu":
+            continue
+        hits = vars(Tracer(wide, SHADER, gv.RenderOptions(backend=backend))(rays))
+        assert all(torch.equal(hits[name], expected[name]) for name in expected)
+        used = (wide.nodes.stamp_t == wide.frame).sum()
+        assert used > 5

@@ -16,7 +16,7 @@ from gvtorch.rendering.shader import PRESETS
 
 def look_up(function: gv.TransferFunction, value: np.ndarray) -> np.ndarray:
     """What the kernel does with the table, in float64."""
-    table, domain = function.table(1.0, torch.float64, "cpu")
+    table, domain, _ = function.table(1.0, torch.float64, "cpu")
     low, high, _ = domain.tolist()
     place = np.clip((value - low) / (high - low) * (len(table) - 1), 0, len(table) - 1)
     cell = np.minimum(np.floor(place), len(table) - 2).astype(int)
@@ -43,7 +43,7 @@ def test_the_table_is_the_function_when_corners_are_whole_numbers(corners, seed)
 
 def test_tables_stay_small_for_plain_corners():
     function = gv.TransferFunction.from_points([(0, 0), (40, 0), (60, 0.5), (255, 1)])
-    table, _ = function.table(1.0, torch.float32, "cpu")
+    table, *_ = function.table(1.0, torch.float32, "cpu")
     assert table.shape == (52, 4)
 
 

@@ -119,7 +119,7 @@ def test_uniform_regions_take_no_brick():
     corner = node_at(tree, 1, (0, 0, 0))
     words = tree.nodes.brick_tn.view(-1), tree.nodes.child_tn.view(-1)
     assert [int(word[corner]) for word in words] == [config.CONSTANT, config.TERMINAL]
-    assert int(tree.constants["value"].view(-1)[corner]) == 5
+    assert int(tree.nodes.constants["value"].view(-1)[corner]) == 5
 
 
 def test_threshold_never_hides_a_thin_bright_detail():
@@ -151,7 +151,7 @@ def test_channels_keep_dtype_and_width(blobs):
     for name, width in (("density", 1), ("color", 4)):
         assert tree.bricks.bricks[name].shape == (tree.bricks.capacity, 6, 6, 6, width)
     assert tree.bricks.bricks["color"].dtype == torch.uint8
-    fields = (tree.nodes.fields, tree.bricks.fields, tree.constants)
+    fields = (tree.nodes.fields, tree.bricks.fields)
     assert tree.nbytes == sum(tensor.nbytes for part in fields for tensor in part.values())
 
 

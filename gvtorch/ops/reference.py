@@ -195,8 +195,10 @@ class Tree:
     frame: Tensor  # ()
     root_voxel: Tensor  # () world size of a depth-0 voxel
     branching: int
+    nodes_per_tile: int
     root: int
     max_depth: int
+    by_level: bool
 
     def voxel_at(self, depth: Tensor) -> Tensor:
         """World size of a voxel at each depth."""
@@ -205,15 +207,23 @@ class Tree:
             voxel = torch.where(depth > level, divide(voxel, self.branching, voxel), voxel)
         return voxel
 
-    def mark(self, found: Place, wanted: Tensor, blends: Tensor, cone: Tensor) -> None:
-        """Stamps the bricks that answer; requests children and bricks that are not there."""
+    def mark(
+        self, found: Place, wanted: Tensor, blends: Tensor, cone: Tensor, seen: Tensor
+    ) -> None:
+        """Stamps the bricks that answer where something is seen; requests what is not there.
+
+        Straight to the wanted level, or level by level: then a brick is there before its node is
+        subdivided.
+        """
         for node in (found.fine_node, found.coarse_node):
-            slot = torch.where(node >= 0, self.brick_n[node.clamp(min=0)], -1)
+            slot = torch.where(seen & (node >= 0), self.brick_n[node.clamp(min=0)], -1)
             self.stamp_b[torch.unique(slot[slot >= 0]).to(torch.int64)] = self.frame
-        short = (found.depth < wanted) & (self.child_n[found.node] == ABSENT)
-        missing = self.brick_n[found.node] == ABSENT
+        absent = self.brick_n[found.node] == ABSENT
+        deeper = (found.depth < wanted) & (self.child_n[found.node] == ABSENT)
+        short = seen & deeper & ~(self.by_level & absent)
+        missing = seen & absent & (self.by_level | ~deeper | (found.fine_node < 0))
         parent = found.parent.clamp(min=0)
-        above = blends & (found.depth == wanted) & (self.brick_n[parent] == ABSENT)
+        above = seen & blends & (found.depth == wanted) & (self.brick_n[parent] == ABSENT)
         self.request(found.node[short], found.depth[short], cone[short], REQUEST_SUBDIVIDE)
         self.request(found.node[missing], found.depth[missing], cone[missing], REQUEST_LOAD)
         self.request(parent[above], found.depth[above] - 1, cone[above], REQUEST_LOAD)
@@ -246,7 +256,7 @@ def descend(position_r3: Tensor, wanted_r: Tensor, tree: Tree) -> Place:
     )
     going = torch.ones_like(node, dtype=torch.bool)
     for _ in range(tree.max_depth + 1):
-        tree.stamp_t[torch.unique(place.node[going] // n**3)] = tree.frame
+        tree.stamp_t[torch.unique(place.node[going] // tree.nodes_per_tile)] = tree.frame
         answers = going & (tree.brick_n[place.node] != ABSENT)
         place.fine_node = torch.where(answers, place.node, place.fine_node)
         place.fine_corner = torch.where(answers[:, None], place.corner, place.fine_corner)
@@ -270,7 +280,7 @@ def descend(position_r3: Tensor, wanted_r: Tensor, tree: Tree) -> Place:
         place.corner = torch.where(going[:, None], moved, place.corner)
         place.size = torch.where(going, size, place.size)
         place.parent = torch.where(going, place.node, place.parent)
-        place.node = torch.where(going, tile * n**3 + child, place.node)
+        place.node = torch.where(going, tile * tree.nodes_per_tile + child, place.node)
         place.depth = torch.where(going, place.depth + 1, place.depth)
     return place
 
@@ -309,8 +319,15 @@ class Bricks:
 
     bricks_bzyxc: Tensor
     constant_nc: Tensor
+    range_n2c: Tensor
     border: int
     component: int
+
+    def unseen(self, node: Tensor, transfer: Transfer) -> Tensor:
+        """(r,) bool: all in reach of the nodes' bricks, and of the nodes below, is transparent."""
+        real = transfer.table_m4.dtype
+        ends = self.range_n2c[node, :, self.component].to(real)
+        return transfer.transparent(ends[:, 0], ends[:, 1])
 
     def sample(
         self,
@@ -367,13 +384,38 @@ class Accumulator:
     hit: Tensor  # (r,) bool
 
 
+@dataclass
+class Transfer:
+    """The transfer function: rows at even distances over a domain."""
+
+    table_m4: Tensor
+    domain_3: Tensor  # value of the first row, of the last row, reference length
+    opaque_m: Tensor  # rows with an opacity up to this one
+
+    def place(self, value: Tensor) -> Tensor:
+        """Row of a value, with a fraction."""
+        low, high, _ = self.domain_3.unbind(0)
+        rows = self.table_m4.shape[0]
+        return clamp((value - low) * divide(rows - 1, high - low, high), 0, rows - 1)
+
+    def transparent(self, smallest: Tensor, largest: Tensor) -> Tensor:
+        """Bool: no value between the two is seen. They are taken a little apart, since
+        interpolation may round beyond its ends.
+        """
+        below = smallest - larger(smallest, -smallest) * 2.0**-20
+        above = largest + larger(largest, -largest) * 2.0**-20
+        first = torch.floor(self.place(below)).to(torch.int64)
+        end = torch.ceil(self.place(above)).to(torch.int64)
+        before = torch.where(first > 0, self.opaque_m[(first - 1).clamp(min=0)], 0)
+        return self.opaque_m[end] == before
+
+
 def composite(
     sum_: Accumulator,
     value: Tensor,
     start: Tensor,
     length: Tensor,
-    table_m4: Tensor,
-    domain_3: Tensor,
+    transfer: Transfer,
     hit_clear: Tensor,
     where: Tensor,
 ) -> None:
@@ -382,13 +424,13 @@ def composite(
 
     Opacity is per reference length: 1 - (1 - a)^(length / reference).
     """
-    low, high, reference = domain_3.unbind(0)
-    rows = table_m4.shape[0]
-    place = clamp((value - low) * divide(rows - 1, high - low, high), 0, rows - 1)
-    cell = smaller(torch.floor(place), torch.full_like(place, rows - 2))
+    reference = transfer.domain_3[2]
+    place = transfer.place(value)
+    last_cell = transfer.table_m4.shape[0] - 2
+    cell = smaller(torch.floor(place), torch.full_like(place, last_cell))
     weight = place - cell
     row = cell.to(torch.int64)
-    r0, r1 = table_m4[row], table_m4[row + 1]
+    r0, r1 = transfer.table_m4[row], transfer.table_m4[row + 1]
     rgba = r0 + weight[:, None] * (r1 - r0)
     opacity = rgba[:, 3]
 
@@ -424,9 +466,11 @@ def trace_rays(
     stamp_t: Tensor,
     bricks_bzyxc: Tensor,
     constant_tnc: Tensor,
+    range_tn2c: Tensor,
     stamp_b: Tensor,
     table_m4: Tensor,
     domain_3: Tensor,
+    opaque_m: Tensor,
     frame_1: Tensor,
     branching: int,
     root: int,
@@ -437,6 +481,7 @@ def trace_rays(
     step: float,
     stop_alpha: float,
     depth_alpha: float,
+    by_level: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Twin of `torch.ops.gvtorch.trace_rays`; arguments as in `gvtorch.ops.trace_rays`.
 
@@ -451,9 +496,11 @@ def trace_rays(
     at = Intervals.begin(first, last, cone_r2, step)
     tree = Tree(
         *(child_tn.view(-1), brick_tn.view(-1), request_tn.view(-1), stamp_t, stamp_b, frame_1[0]),
-        *(top_voxel, branching, root, max_depth),
+        *(top_voxel, branching, child_tn.shape[1], root, max_depth, by_level),
     )
-    bricks = Bricks(bricks_bzyxc, constant_tnc.view(tree.child_n.shape[0], -1), border, component)
+    values = constant_tnc.flatten(0, 1), range_tn2c.flatten(0, 1)
+    bricks = Bricks(bricks_bzyxc, *values, border, component)
+    transfer = Transfer(table_m4, domain_3, opaque_m)
     visit = Visit.none(origin_r3, tree)
     zero = torch.zeros_like(first)
     sum_ = Accumulator(torch.zeros_like(origin_r3), zero + 1, zero + INF, zero > 0)
@@ -463,7 +510,7 @@ def trace_rays(
     arrived = active  # rays that stand in a node they have not looked up yet
     while active.any():
         if arrived.any():
-            visit.look_up(arrived, origin_r3, direction_r3, inside_3, at, tree, bricks)
+            visit.look_up(arrived, origin_r3, direction_r3, inside_3, at, tree, bricks, transfer)
         value = visit.value(active, origin_r3, direction_r3, at, tree, bricks)
 
         # A node of one value, or of none, is left in one go; else one interval is taken.
@@ -476,7 +523,7 @@ def trace_rays(
             leaving = whole & visit.stays(at)
         length = torch.where(whole, smaller(at.start, at.stop) - entry, one)
         shaded = active & ~visit.nothing
-        composite(sum_, value, entry, length, table_m4, domain_3, hit_clear, shaded)
+        composite(sum_, value, entry, length, transfer, hit_clear, shaded)
         samples = samples + shaded.to(torch.int32)
         active = at.inside() & (sum_.clear > stop_clear)
         arrived = active & (whole | ~visit.stays(at))
@@ -519,6 +566,7 @@ class Visit:
         at: Intervals,
         tree: Tree,
         bricks: Bricks,
+        transfer: Transfer,
     ) -> None:
         """Finds the node of the rays that arrived; marks what they use and what they miss."""
         which = arrived.nonzero()[:, 0]
@@ -533,7 +581,10 @@ class Visit:
         found.coarse_node = torch.where(alone, found.fine_node, found.coarse_node)
         found.coarse_corner = torch.where(alone[:, None], found.fine_corner, found.coarse_corner)
         found.coarse_size = torch.where(alone, found.fine_size, found.coarse_size)
-        tree.mark(found, wanted, blends, cone)
+        unseen = bricks.unseen(found.node, transfer) & (
+            ~blends | (found.depth < wanted) | bricks.unseen(found.parent.clamp(min=0), transfer)
+        )
+        tree.mark(found, wanted, blends, cone, ~unseen)
 
         for name, field in vars(found).items():
             getattr(self.place, name)[which] = field
@@ -543,7 +594,7 @@ class Visit:
         fine, coarse = found.fine_node.clamp(min=0), found.coarse_node.clamp(min=0)
         fine_brick, coarse_brick = tree.brick_n[fine], tree.brick_n[coarse]
         empty = (fine_brick == EMPTY) & (coarse_brick == EMPTY)
-        nothing = (found.fine_node < 0) | empty
+        nothing = unseen | (found.fine_node < 0) | empty
         values = bricks.constant_nc[:, bricks.component]
         same = values[fine] == values[coarse]
         uniform = ~nothing & (fine_brick < 0) & (coarse_brick < 0) & same

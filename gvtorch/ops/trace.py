@@ -47,9 +47,11 @@ def trace_rays(
     stamp_t: Tensor,
     bricks_bzyxc: Tensor,
     constant_tnc: Tensor,
+    range_tn2c: Tensor,
     stamp_b: Tensor,
     table_m4: Tensor,
     domain_3: Tensor,
+    opaque_m: Tensor,
     frame_1: Tensor,
     *,
     branching: int,
@@ -61,6 +63,7 @@ def trace_rays(
     step: float,
     stop_alpha: float = config.STOP_ALPHA,
     depth_alpha: float = config.DEPTH_ALPHA,
+    by_level: bool = False,
     backend: Backend = "auto",
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Traces rays through a tree and shades what they meet with a transfer function.
@@ -82,10 +85,13 @@ def trace_rays(
         bricks_bzyxc: (b, s, s, s, c) one channel of the brick pool, s = brick size + 2 border.
         constant_tnc: (t, n, c) the value of CONSTANT nodes (and the mean of EMPTY ones), same
             dtype.
+        range_tn2c: (t, n, 2, c) smallest and largest value in reach of the node's brick, same
+            dtype: a node that shows nothing is neither sampled nor requested.
         stamp_b: (b,) last frame that used a brick, written.
         table_m4: (m, 4) transfer function: linear RGB and opacity per reference length, m >= 2.
         domain_3: (3,) value of the first row, value of the last row, reference length in world
             units.
+        opaque_m: (m,) int32, how many rows of the table up to this one have an opacity.
         frame_1: (1,) int32 number of this frame.
         branching: N, nodes of a tile along an axis.
         root: Index of the root node.
@@ -96,6 +102,7 @@ def trace_rays(
         step: World length of the shortest interval between samples.
         stop_alpha: A ray ends at this alpha; 1 integrates to the end.
         depth_alpha: Depth is where alpha passes this.
+        by_level: A node's brick is requested before its children; else the wanted level at once.
         backend: auto, reference, cpp or cuda.
 
     Returns:
@@ -125,20 +132,24 @@ def trace_rays(
         ("cone_r2", cone_r2, (rays, 2), real),
         ("range_r2", range_r2, (rays, 2), real),
         ("bounds_23", bounds_23, (2, 3), real),
-        ("child_tn", child_tn, (tiles, branching**3), torch.int32),
+        ("child_tn", child_tn, (tiles, nodes), torch.int32),
         ("brick_tn", brick_tn, (tiles, nodes), torch.int32),
         ("request_tn", request_tn, (tiles, nodes), torch.int32),
         ("stamp_t", stamp_t, (tiles,), torch.int32),
         ("bricks_bzyxc", bricks_bzyxc, (bricks, side, side, side, channels), voxel),
         ("constant_tnc", constant_tnc, (tiles, nodes, channels), voxel),
+        ("range_tn2c", range_tn2c, (tiles, nodes, 2, channels), voxel),
         ("stamp_b", stamp_b, (bricks,), torch.int32),
         ("table_m4", table_m4, ("m", 4), real),
         ("domain_3", domain_3, (3,), real),
+        ("opaque_m", opaque_m, (table_m4.shape[0],), torch.int32),
         ("frame_1", frame_1, (1,), torch.int32),
     ):
         check.tensor(where, name, tensor, shape, dtype, device)
         if not tensor.is_contiguous():
             raise ValueError(f"{where}: {name} must be contiguous")
+    if nodes < branching**3:
+        raise ValueError(f"{where}: child_tn must hold {branching}^3 nodes a tile, got {nodes}")
     if table_m4.shape[0] < 2:
         raise ValueError(f"{where}: table_m4 needs at least 2 rows, got {table_m4.shape[0]}")
     check.whole(where, "root", root, low=0, high=tiles * nodes - 1)
@@ -152,10 +163,10 @@ def trace_rays(
 
     args = (
         *(origin_r3, direction_r3, cone_r2, range_r2, bounds_23),
-        *(child_tn, brick_tn, request_tn, stamp_t, bricks_bzyxc, constant_tnc, stamp_b),
-        *(table_m4, domain_3, frame_1),
+        *(child_tn, brick_tn, request_tn, stamp_t, bricks_bzyxc, constant_tnc, range_tn2c),
+        *(stamp_b, table_m4, domain_3, opaque_m, frame_1),
         *(branching, root, max_depth, border, component),
-        *(float(root_voxel), float(step), float(stop_alpha), float(depth_alpha)),
+        *(float(root_voxel), float(step), float(stop_alpha), float(depth_alpha), by_level),
     )
     if choose_backend(backend, device) == "reference":
         return reference.trace_rays(*args)

@@ -1,6 +1,7 @@
 """Node pool, brick pool and the tree over them."""
 
-from .brick_pool import BrickPool, Channel
+from .brick_pool import BrickPool
+from .channel import Channel
 from .n3tree import N3Tree
 from .node_pool import NodePool
 

@@ -3,28 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from .. import check
-from ..volume import CHANNEL_DTYPES
-
-
-@dataclass(frozen=True)
-class Channel:
-    """What a voxel of a channel holds: `width` numbers of `dtype`."""
-
-    dtype: torch.dtype = torch.float32
-    width: int = 1
-
-    def __post_init__(self) -> None:
-        """Checks dtype and width."""
-        if self.dtype not in CHANNEL_DTYPES:
-            names = ", ".join(str(dtype).removeprefix("torch.") for dtype in CHANNEL_DTYPES)
-            raise ValueError(f"Channel: dtype must be one of {names}, got {self.dtype}")
-        check.whole("Channel", "width", self.width, low=1)
+from .channel import Channel
 
 
 class BrickPool:

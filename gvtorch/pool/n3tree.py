@@ -11,7 +11,8 @@ from .. import check
 from ..config import CONSTANT, EMPTY, TERMINAL
 from ..stage import Progress, no_progress
 from ..volume import Volume, movable
-from .brick_pool import BrickPool, Channel
+from .brick_pool import BrickPool
+from .channel import Channel
 from .node_pool import NodePool
 from .pyramid import Level, build_levels, round_to
 
@@ -28,7 +29,7 @@ class N3Tree:
     Attributes:
         nodes: The node pool.
         bricks: The brick pool.
-        constants: For each channel (t, n, c): the value of CONSTANT nodes, the mean of EMPTY ones.
+        branching: N.
         root: Node index of the root.
         depth: Depth of the finest level.
         box: (2, 3) float64 world corners of the scene, x y z.
@@ -47,6 +48,7 @@ class N3Tree:
         spacing: tuple[float, float, float],
         origin: tuple[float, float, float],
         root: int = 0,
+        branching: int | None = None,
         value_range: Mapping[str, tuple[float, float]] | None = None,
     ) -> None:
         """Joins two pools to a tree that is empty but for its root.
@@ -59,32 +61,25 @@ class N3Tree:
             spacing: World size of a finest voxel.
             origin: World place of the centre of voxel 0.
             root: Node index of the root.
+            branching: N; the pool's if left out.
             value_range: For each channel, its smallest and largest value.
         """
         if nodes.dimensions != 3:
             raise ValueError(f"N3Tree: nodes must have 3 dimensions, got {nodes.dimensions}")
         self.nodes, self.bricks = nodes, bricks
+        self.branching = nodes.branching if branching is None else branching
+        check.whole("N3Tree", "branching", self.branching, low=2, high=nodes.branching)
         self.root, self.depth, self.extent, self.spacing = root, depth, extent, spacing
         low = [o - 0.5 * s for o, s in zip(origin, spacing, strict=True)]
         high = [a + n * s for a, n, s in zip(low, extent, spacing, strict=True)]
         self.box = torch.tensor([low, high], dtype=torch.float64)
         self.value_range = dict(value_range or {})
         self.frame = 0
-        shape = (nodes.capacity, nodes.nodes_per_tile)
-        self.constants = {
-            name: torch.zeros((*shape, channel.width), dtype=channel.dtype, device=self.device)
-            for name, channel in bricks.channels.items()
-        }
 
     @property
     def device(self) -> torch.device:
         """Where the pools lie."""
         return self.nodes.child_tn.device
-
-    @property
-    def branching(self) -> int:
-        """N."""
-        return self.nodes.branching
 
     @property
     def side(self) -> int:
@@ -110,9 +105,8 @@ class N3Tree:
 
     @property
     def nbytes(self) -> int:
-        """Memory of both pools and the constants."""
-        constants = sum(tensor.nbytes for tensor in self.constants.values())
-        return self.nodes.nbytes + self.bricks.nbytes + constants
+        """Memory of both pools."""
+        return self.nodes.nbytes + self.bricks.nbytes
 
     def to_tree(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Takes world points (r, 3) and directions (r, 3) to tree units, in float64."""
@@ -203,7 +197,7 @@ class N3Tree:
         sizes = {"branching": branching, "brick_size": brick_size, "border": border}
         plan = _Plan.make(volumes, depth, threshold, sizes, progress)
         tree = cls(
-            NodePool(plan.tiles, branching=branching, device=device),
+            NodePool(plan.tiles, channels, branching=branching, device=device),
             BrickPool(plan.bricks, channels, brick_size=brick_size, border=border, device=device),
             depth=depth,
             extent=first.extent,
@@ -253,6 +247,7 @@ class _Plan:
         self.region: dict[int, Tensor] = {}
         self.tile: dict[int, Tensor] = {}
         self.constant: dict[tuple[str, int], Tensor] = {}
+        self.range: dict[tuple[str, int], Tensor] = {}
         self.tiles, self.bricks = 1, 0
 
     @classmethod
@@ -277,6 +272,7 @@ class _Plan:
                 constant[at] = constant.get(at, flat) & flat
                 empty[at] = empty.get(at, below) & below
                 plan.constant[name, at] = torch.where(flat[..., None], level.low, level.mean)
+                plan.range[name, at] = torch.stack((level.low, level.high), -2)
                 progress("levels", done + 1, depth + 1)
         for at in range(depth + 1):
             plan._number(at, constant[at], empty[at])
@@ -327,9 +323,10 @@ class _Plan:
         nodes.brick_tn.view(-1)[here] = region
         owned = region >= 0
         tree.bricks.owner_b[region[owned].long()] = here[owned].to(torch.int32)
-        for name, constant in tree.constants.items():
-            value = round_to(self.constant[name, at][place], constant.dtype).to(tree.device)
-            movable(constant).view(-1, constant.shape[-1])[here] = movable(value)
+        for pool, plan in ((nodes.constants, self.constant), (nodes.ranges, self.range)):
+            for name, words in pool.items():
+                value = round_to(plan[name, at][place], words.dtype).to(tree.device)
+                movable(words).flatten(0, 1)[here] = movable(value)
 
     def _node_index(self, at: int, zyx: Tensor, dim: int) -> Tensor:
         """Node index of the nodes at a depth: tile of the parent's children, then the child's

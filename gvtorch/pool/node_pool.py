@@ -1,18 +1,23 @@
-"""`NodePool`: node tiles as flat int32 tensors, one row a tile."""
+"""`NodePool`: node tiles as flat tensors, one row a tile."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
 from .. import check
 from ..config import ABSENT
+from ..volume import movable
+from .channel import Channel
 
 
 class NodePool:
     """Room for `capacity` node tiles of n = branching ** dimensions sibling nodes.
 
-    Node index = tile * n + child. A fresh tile's nodes have neither children nor brick.
+    Node index = tile * n + child. A fresh tile's nodes have neither children nor brick. Trees of
+    several N may share a pool, which is then as wide as the widest: n = largest N ** dimensions.
 
     Attributes:
         child_tn: (t, n) tile index of the node's children, or ABSENT, TERMINAL.
@@ -23,11 +28,15 @@ class NodePool:
         parent_t: (t,) node index whose children this tile holds, -1 for a root tile.
         tree_t: (t,) number of the tree that owns the tile.
         stamp_t: (t,) last frame in which a ray passed through, -1 for never.
+        constants: For each channel (t, n, c): the value of CONSTANT nodes, the mean of EMPTY ones.
+        ranges: For each channel (t, n, 2, c): smallest and largest value in reach of the node's
+            brick, of all levels; what may be anything spans all that the dtype can hold.
     """
 
     def __init__(
         self,
         capacity: int,
+        channels: Mapping[str, Channel] | None = None,
         *,
         branching: int = 2,
         dimensions: int = 3,
@@ -37,7 +46,8 @@ class NodePool:
 
         Args:
             capacity: Number of tiles.
-            branching: N >= 2.
+            channels: What each voxel holds, by name; a node keeps a constant and a range of each.
+            branching: N >= 2, of the widest tree.
             dimensions: 3 for volumes, 2 for maps.
             device: Where the tensors lie.
 
@@ -60,11 +70,21 @@ class NodePool:
         self.parent_t = torch.full((capacity,), -1, dtype=torch.int32, device=device)
         self.tree_t = torch.zeros((capacity,), dtype=torch.int32, device=device)
         self.stamp_t = torch.full((capacity,), -1, dtype=torch.int32, device=device)
+        self.constants: dict[str, Tensor] = {}
+        self.ranges: dict[str, Tensor] = {}
+        for name, channel in (channels or {}).items():
+            shape, kind = (capacity, n, channel.width), {"dtype": channel.dtype, "device": device}
+            self.constants[name] = torch.zeros(shape, **kind)
+            limits = torch.tensor(channel.limits, dtype=torch.float64).to(channel.dtype)
+            ends = movable(limits.to(device))[:, None].expand(capacity, n, 2, channel.width)
+            self.ranges[name] = ends.contiguous().view(channel.dtype)
 
     @property
     def fields(self) -> dict[str, Tensor]:
-        """All tensors by name."""
-        return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+        """All tensors by name; those of a channel as `constants.NAME` and `ranges.NAME`."""
+        plain = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+        constants = {f"constants.{name}": value for name, value in self.constants.items()}
+        return plain | constants | {f"ranges.{name}": v for name, v in self.ranges.items()}
 
     @property
     def capacity(self) -> int:

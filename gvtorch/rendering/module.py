@@ -86,7 +86,7 @@ class TreeTracer(torch.nn.Module):
         check.number(where, "stop_alpha", stop_alpha, low=0, high=1, open_low=True)
         check.number(where, "depth_alpha", depth_alpha, low=0, high=1)
         most_intervals(float((tree.box[1] - tree.box[0]).norm()), step * min(tree.spacing))
-        table, domain = shader.table(min(tree.spacing), torch.float32, tree.device)
+        table, domain, opaque = shader.table(min(tree.spacing), torch.float32, tree.device)
         size = torch.tensor(tree.spacing, dtype=torch.float64) * tree.side
         nodes, bricks = tree.nodes, tree.bricks
         for name, tensor in (
@@ -98,10 +98,12 @@ class TreeTracer(torch.nn.Module):
             ("request", nodes.request_tn),
             ("stamp_tile", nodes.stamp_t.clone()),  # frames of its own, not the tree's
             ("bricks", bricks.bricks[channel]),
-            ("constant", tree.constants[channel]),
+            ("constant", nodes.constants[channel]),
+            ("value_range", nodes.ranges[channel]),
             ("stamp_brick", bricks.stamp_b.clone()),
             ("table", table),
             ("domain", domain),
+            ("opaque", opaque),
             ("frame", torch.zeros(1, dtype=torch.int32, device=tree.device)),
         ):
             self.register_buffer(name, tensor)
@@ -146,9 +148,11 @@ class TreeTracer(torch.nn.Module):
             self.stamp_tile,
             self.bricks,
             self.constant,
+            self.value_range,
             self.stamp_brick,
             self.table,
             self.domain,
+            self.opaque,
             self.frame,
             self.branching,
             self.root,
@@ -159,5 +163,6 @@ class TreeTracer(torch.nn.Module):
             self.step,
             self.stop_alpha,
             self.depth_alpha,
+            False,
         )
         return color, alpha, depth + moved.to(torch.float32), samples

@@ -187,8 +187,15 @@ def trace(
 class Tracer:
     """One frame of a tree: counts `tree.frame` up, then traces any number of batches of rays."""
 
-    def __init__(self, tree: N3Tree, shader: TransferFunction, options: RenderOptions) -> None:
-        """Lays the op's arguments ready; see `trace`."""
+    def __init__(
+        self,
+        tree: N3Tree,
+        shader: TransferFunction,
+        options: RenderOptions,
+        *,
+        by_level: bool = False,
+    ) -> None:
+        """Lays the op's arguments ready; see `trace` and, for `by_level`, `trace_rays`."""
         choose_backend(options.backend, tree.device)
         channel = options.channel or tree.channel_names[0]
         if channel not in tree.bricks.bricks:
@@ -198,7 +205,7 @@ class Tracer:
         most_intervals(float((tree.box[1] - tree.box[0]).norm()), step)
         tree.frame += 1
         self.tree, self.options = tree, options
-        table, domain = shader.table(min(tree.spacing), options.dtype, tree.device)
+        table, domain, opaque = shader.table(min(tree.spacing), options.dtype, tree.device)
         self.arguments: dict[str, Any] = {
             "bounds_23": tree.bounds(options.dtype),
             "child_tn": tree.nodes.child_tn,
@@ -206,10 +213,12 @@ class Tracer:
             "request_tn": tree.nodes.request_tn,
             "stamp_t": tree.nodes.stamp_t,
             "bricks_bzyxc": tree.bricks.bricks[channel],
-            "constant_tnc": tree.constants[channel],
+            "constant_tnc": tree.nodes.constants[channel],
+            "range_tn2c": tree.nodes.ranges[channel],
             "stamp_b": tree.bricks.stamp_b,
             "table_m4": table,
             "domain_3": domain,
+            "opaque_m": opaque,
             "frame_1": torch.tensor([tree.frame], dtype=torch.int32, device=tree.device),
             "branching": tree.branching,
             "root": tree.root,
@@ -220,6 +229,7 @@ class Tracer:
             "step": step,
             "stop_alpha": options.stop_alpha,
             "depth_alpha": options.depth_alpha,
+            "by_level": by_level,
             "backend": options.backend,
         }
 

@@ -137,7 +137,7 @@ class TransferFunction:
 
     def table(
         self, smallest_spacing: float, dtype: torch.dtype, device: torch.device | str
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Returns the function as the kernel reads it: rows at even distances, and their domain.
 
         The number of rows is chosen so that every corner point falls on a row: then the table is
@@ -145,7 +145,8 @@ class TransferFunction:
         that grid.
 
         Returns:
-            table (m, 4), domain (3,): value of the first row, of the last row, reference length.
+            table (m, 4); domain (3,): value of the first row, of the last row, reference length;
+            opaque (m,) int32: how many rows up to this one have an opacity.
         """
         corners = np.unique(np.concatenate((self.opacity[:, 0], self.color[:, 0])))
         low, high = float(corners[0]), float(corners[-1])
@@ -161,7 +162,9 @@ class TransferFunction:
             )
         rows = self(low + (high - low) * np.arange(cells + 1) / cells)
         domain = torch.tensor([low, high, self.reference or smallest_spacing], dtype=dtype)
-        return torch.tensor(rows, dtype=dtype, device=device), domain.to(device)
+        table = torch.tensor(rows, dtype=dtype, device=device)
+        opaque = (table[:, 3] > 0).cumsum(0, dtype=torch.int32)
+        return table, domain.to(device), opaque
 
 
 def _shared_grid(places: np.ndarray) -> int:

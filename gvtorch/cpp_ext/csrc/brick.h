@@ -13,6 +13,7 @@ template <class Voxel>
 struct BrickView {
   const Voxel* bricks_bzyxc;
   const Voxel* constant_tnc;
+  const Voxel* range_tn2c;  // smallest and largest value in reach of the node's brick
   int32_t* stamp_b;
   int32_t side;  // B + 2 * border
   int32_t border;

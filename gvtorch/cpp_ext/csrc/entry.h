@@ -26,10 +26,10 @@ constexpr const char* kTraceRaysSchema =
     "trace_rays("
     "Tensor origin_r3, Tensor direction_r3, Tensor cone_r2, Tensor range_r2, Tensor bounds_23, "
     "Tensor child_tn, Tensor brick_tn, Tensor(a!) request_tn, Tensor(b!) stamp_t, "
-    "Tensor bricks_bzyxc, Tensor constant_tnc, Tensor(c!) stamp_b, "
-    "Tensor table_m4, Tensor domain_3, Tensor frame_1, "
+    "Tensor bricks_bzyxc, Tensor constant_tnc, Tensor range_tn2c, Tensor(c!) stamp_b, "
+    "Tensor table_m4, Tensor domain_3, Tensor opaque_m, Tensor frame_1, "
     "int branching, int root, int max_depth, int border, int component, "
-    "float root_voxel, float step, float stop_alpha, float depth_alpha"
+    "float root_voxel, float step, float stop_alpha, float depth_alpha, bool by_level"
     ") -> (Tensor color_r3, Tensor alpha_r1, Tensor depth_r1, Tensor samples_r)";
 
 inline void require(const Tensor& tensor, const char* name, const Tensor& like, ScalarType dtype) {
@@ -80,10 +80,10 @@ template <class Device>
 std::tuple<Tensor, Tensor, Tensor, Tensor> trace_rays(
     const Tensor& origin_r3, const Tensor& direction_r3, const Tensor& cone_r2, const Tensor& range_r2,
     const Tensor& bounds_23, const Tensor& child_tn, const Tensor& brick_tn, const Tensor& request_tn,
-    const Tensor& stamp_t, const Tensor& bricks_bzyxc, const Tensor& constant_tnc, const Tensor& stamp_b,
-    const Tensor& table_m4, const Tensor& domain_3, const Tensor& frame_1, int64_t branching, int64_t root,
+    const Tensor& stamp_t, const Tensor& bricks_bzyxc, const Tensor& constant_tnc, const Tensor& range_tn2c,
+    const Tensor& stamp_b, const Tensor& table_m4, const Tensor& domain_3, const Tensor& opaque_m, const Tensor& frame_1, int64_t branching, int64_t root,
     int64_t max_depth, int64_t border, int64_t component, double root_voxel, double step, double stop_alpha,
-    double depth_alpha) {
+    double depth_alpha, bool by_level) {
   const ScalarType real = origin_r3.scalar_type();
   const ScalarType word = ScalarType::Int;
   const ScalarType voxel = bricks_bzyxc.scalar_type();
@@ -95,8 +95,12 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> trace_rays(
   const int64_t rays = origin_r3.size(0);
   const int64_t side = bricks_bzyxc.size(1);
   const int64_t channels = bricks_bzyxc.size(4);
+  STD_TORCH_CHECK(child_tn.dim() == 2, "gvtorch: child_tn must be (t, n)");
   const int64_t nodes = child_tn.numel();
-  STD_TORCH_CHECK(branching >= 2 && branching <= 16 && max_depth >= 0 && max_depth <= 62, "gvtorch: tree out of range");
+  const int64_t nodes_per_tile = child_tn.size(1);
+  STD_TORCH_CHECK(branching >= 2 && branching <= 16 && max_depth >= 0 && max_depth <= 62 &&
+                      nodes_per_tile >= branching * branching * branching && nodes_per_tile <= INT32_MAX,
+                  "gvtorch: tree out of range");
   STD_TORCH_CHECK(root >= 0 && root < nodes, "gvtorch: root is not a node");
   STD_TORCH_CHECK(border >= 0 && side > 2 * border && component >= 0 && component < channels,
                   "gvtorch: border or component out of range");
@@ -118,8 +122,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> trace_rays(
        {std::tuple<const Tensor&, const char*, int64_t>{child_tn, "child_tn", nodes},
         {brick_tn, "brick_tn", nodes},
         {request_tn, "request_tn", nodes},
-        {stamp_t, "stamp_t", nodes / (branching * branching * branching)},
+        {stamp_t, "stamp_t", child_tn.size(0)},
         {stamp_b, "stamp_b", bricks_bzyxc.size(0)},
+        {opaque_m, "opaque_m", table_m4.size(0)},
         {frame_1, "frame_1", 1}}) {
     require(tensor, name, origin_r3, word);
     require_numel(tensor, name, numel);
@@ -127,6 +132,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> trace_rays(
   require(bricks_bzyxc, "bricks_bzyxc", origin_r3, voxel);
   require(constant_tnc, "constant_tnc", origin_r3, voxel);
   require_numel(constant_tnc, "constant_tnc", nodes * channels);
+  require(range_tn2c, "range_tn2c", origin_r3, voxel);
+  require_numel(range_tn2c, "range_tn2c", 2 * nodes * channels);
 
   Tensor color_r3 = torch::stable::new_empty(origin_r3, {rays, 3});
   Tensor alpha_r1 = torch::stable::new_empty(origin_r3, {rays, 1});
@@ -144,12 +151,13 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> trace_rays(
       const TraceRay<T, Voxel> body{
           {real_in(origin_r3), real_in(direction_r3), real_in(cone_r2), real_in(range_r2), real_in(bounds_23)},
           {word_in(child_tn), word_in(brick_tn), word_out(request_tn), word_out(stamp_t), root,
-           static_cast<int32_t>(branching), static_cast<int32_t>(max_depth)},
+           static_cast<int32_t>(branching), static_cast<int32_t>(nodes_per_tile), static_cast<int32_t>(max_depth)},
           {static_cast<const Voxel*>(bricks_bzyxc.const_data_ptr()),
-           static_cast<const Voxel*>(constant_tnc.const_data_ptr()), word_out(stamp_b), static_cast<int32_t>(side),
+           static_cast<const Voxel*>(constant_tnc.const_data_ptr()),
+           static_cast<const Voxel*>(range_tn2c.const_data_ptr()), word_out(stamp_b), static_cast<int32_t>(side),
            static_cast<int32_t>(border), static_cast<int32_t>(channels), static_cast<int32_t>(component)},
-          {real_in(table_m4), real_in(domain_3), static_cast<int32_t>(table_m4.size(0))},
-          {static_cast<T>(root_voxel), static_cast<T>(step), static_cast<T>(stop_alpha), static_cast<T>(depth_alpha)},
+          {real_in(table_m4), real_in(domain_3), word_in(opaque_m), static_cast<int32_t>(table_m4.size(0))},
+          {static_cast<T>(root_voxel), static_cast<T>(step), static_cast<T>(stop_alpha), static_cast<T>(depth_alpha), by_level},
           {real_out(color_r3), real_out(alpha_r1), real_out(depth_r1), word_out(samples_r)},
           word_in(frame_1)};
       for_each<Device>(origin_r3, rays, body);

@@ -28,6 +28,7 @@ template <class T>
 struct TransferView {
   const T* table_m4;  // red, green, blue, opacity per reference length
   const T* domain_3;  // value of the first row, value of the last row, reference length (world units)
+  const int32_t* opaque_m;  // rows with an opacity up to this one, itself included
   int32_t rows;
 };
 
@@ -35,16 +36,28 @@ struct TransferView {
 template <class T>
 struct Transfer {
   const T* table_m4;
+  const int32_t* opaque_m;
   T low, scale, last, reference;
   int32_t last_cell;
 
   GV_HD explicit Transfer(const TransferView<T>& view)
       : table_m4(view.table_m4),
+        opaque_m(view.opaque_m),
         low(view.domain_3[0]),
         last(static_cast<T>(view.rows - 1)),
         reference(view.domain_3[2]),
         last_cell(view.rows - 2) {
     scale = last / (view.domain_3[1] - low);
+  }
+
+  // No value between the two is seen. They are taken a little apart: interpolation may round beyond its ends.
+  GV_HD bool transparent(T smallest, T largest) const {
+    const T slack = static_cast<T>(9.5367431640625e-7);  // 2^-20
+    const T below = smallest - larger(smallest, -smallest) * slack;
+    const T above = largest + larger(largest, -largest) * slack;
+    const int32_t first = floor_int(clamp((below - low) * scale, static_cast<T>(0), last));
+    const int32_t end = -floor_int(-clamp((above - low) * scale, static_cast<T>(0), last));
+    return opaque_m[end] == (first > 0 ? opaque_m[first - 1] : 0);
   }
 };
 
@@ -54,6 +67,7 @@ struct TraceOptions {
   T step;        // world length of the shortest interval
   T stop_alpha;
   T depth_alpha;
+  bool by_level;  // a node's brick is asked for before its children
 };
 
 template <class T>
@@ -242,16 +256,17 @@ struct TraceRay {
           clamp(origin[axis] + at.middle * direction[axis], static_cast<T>(0), rays.bounds_23[3 + axis] * inner);
     }
     const Place<T> place = descend(tree, position, wanted, *frame_1);
-    mark_missing(place, wanted, blend, cone);
     const T exit = leave(origin, direction, place);
+    const bool clear = unseen(place.node, shader) && (!blend || place.depth < wanted || unseen(place.parent, shader));
+    if (!clear) mark_missing(place, wanted, blend, cone);
 
     // The two levels that blend; below the finest level, or where both are the same node, only one is read.
     const Holder<T> fine = place.fine;
     const Holder<T> coarse = blend && place.coarse.node >= 0 ? place.coarse : fine;
     const bool mixed = coarse.node != fine.node;
-    const bool nothing = fine.node < 0 || (fine.brick == kEmpty && coarse.brick == kEmpty);
-    if (fine.brick >= 0) store_stamp(&bricks.stamp_b[fine.brick], *frame_1);
-    if (coarse.brick >= 0) store_stamp(&bricks.stamp_b[coarse.brick], *frame_1);
+    const bool nothing = clear || fine.node < 0 || (fine.brick == kEmpty && coarse.brick == kEmpty);
+    if (!clear && fine.brick >= 0) store_stamp(&bricks.stamp_b[fine.brick], *frame_1);
+    if (!clear && coarse.brick >= 0) store_stamp(&bricks.stamp_b[coarse.brick], *frame_1);
 
     const BrickRay<T> fine_ray = aim(bricks, fine, origin, direction);
     const BrickRay<T> coarse_ray = aim(bricks, coarse, origin, direction);
@@ -287,10 +302,21 @@ struct TraceRay {
     return at.inside() && at.middle < exit && cone >= cone_low && cone < cone_high;
   }
 
+  // Everything in reach of the node's brick, and so of every node below it, is transparent.
+  GV_HD bool unseen(int64_t node, const Transfer<T>& shader) const {
+    const int64_t row = 2 * node * bricks.channels + bricks.component;
+    return shader.transparent(static_cast<T>(bricks.range_tn2c[row]),
+                              static_cast<T>(bricks.range_tn2c[row + bricks.channels]));
+  }
+
+  // Straight to the wanted level, or level by level: then a brick is there before its node is subdivided.
   GV_HD void mark_missing(const Place<T>& place, int32_t wanted, bool blend, T cone) const {
-    if (place.depth < wanted && tree.child_tn[place.node] == kAbsent)
-      request(place.node, place.depth, cone, kSubdivide);
-    if (tree.brick_tn[place.node] == kAbsent) request(place.node, place.depth, cone, kLoad);
+    const bool absent = tree.brick_tn[place.node] == kAbsent;
+    const bool deeper = place.depth < wanted && tree.child_tn[place.node] == kAbsent;
+    if (deeper && !(options.by_level && absent)) request(place.node, place.depth, cone, kSubdivide);
+    if (absent && (options.by_level || !deeper || place.fine.node < 0)) {
+      request(place.node, place.depth, cone, kLoad);
+    }
     if (blend && place.depth == wanted && tree.brick_tn[place.parent] == kAbsent) {
       request(place.parent, place.depth - 1, cone, kLoad);
     }

@@ -1,8 +1,8 @@
 // The N3 tree as kernels see it: borrowed pointers into the node pool, and the descent from the root to the
 // node that a sample needs.
 //
-// A node tile is N*N*N sibling nodes; node = tile * N*N*N + child, child = (z * N + y) * N + x. The root node is
-// child 0 of a tile of its own. Words of a node (GigaVoxels keeps two: Crassin et al., I3D 2009, section 4.1):
+// A node tile is N*N*N sibling nodes; node = tile * nodes_per_tile + child, child = (z * N + y) * N + x. The root
+// node is child 0 of a tile of its own. Trees of several N share a pool: its tiles are as wide as the widest. Words of a node (GigaVoxels keeps two: Crassin et al., I3D 2009, section 4.1):
 //
 //   child_tn    >= 0 tile of its children | kAbsent: not made yet | kTerminal: nothing finer exists
 //   brick_tn    >= 0 brick slot | kAbsent: not loaded yet | kEmpty | kConstant: one value, see constant_tnc
@@ -28,6 +28,7 @@ struct TreeView {
   int32_t* stamp_t;
   int64_t root;
   int32_t branching;  // N
+  int32_t nodes_per_tile;
   int32_t max_depth;
 };
 
@@ -57,12 +58,11 @@ struct Place {
 template <class T>
 GV_HD Place<T> descend(const TreeView& tree, Vec3<T> position, int32_t wanted, int32_t frame) {
   const T branching = static_cast<T>(tree.branching);
-  const int64_t children = static_cast<int64_t>(tree.branching) * tree.branching * tree.branching;
   Place<T> place;
   place.node = tree.root;
   Vec3<T> local = position;
   for (;;) {
-    store_stamp(&tree.stamp_t[place.node / children], frame);
+    store_stamp(&tree.stamp_t[place.node / tree.nodes_per_tile], frame);
     const int32_t brick = tree.brick_tn[place.node];
     if (brick != kAbsent) {
       place.fine = Holder<T>{place.node, brick, place.corner, place.size};
@@ -82,7 +82,7 @@ GV_HD Place<T> descend(const TreeView& tree, Vec3<T> position, int32_t wanted, i
       child = child * tree.branching + whole;
     }
     place.parent = place.node;
-    place.node = tile * children + child;
+    place.node = static_cast<int64_t>(tile) * tree.nodes_per_tile + child;
     place.depth = place.depth + 1;
   }
 }
