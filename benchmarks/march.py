@@ -81,7 +81,7 @@ class DenseMarcher:
         a, b = (-1 - self.origin) / self.direction, (1 - self.origin) / self.direction
         self.first = torch.minimum(a, b).amax(1).clamp(min=0)
         self.last = torch.maximum(a, b).amin(1)
-        self.table, domain = shader.table(1.0, torch.float32, device)
+        self.table, domain, _ = shader.table(1.0, torch.float32, device)
         self.low, self.high, _ = domain.tolist()
         self.step = step
 

@@ -35,3 +35,6 @@ CONSTANT = -3
 REQUEST_PRIORITY = 0xFFFF
 REQUEST_LOAD = 1 << 16
 REQUEST_SUBDIVIDE = 1 << 17
+REQUEST_KINDS = REQUEST_LOAD | REQUEST_SUBDIVIDE
+#: Kinds shifted by this are pending: asked for, not here yet, see cpp_ext/csrc/cache.h.
+REQUEST_PENDING_SHIFT = 2

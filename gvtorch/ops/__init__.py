@@ -1,7 +1,8 @@
 """The ops on bare tensors. Importing this package loads the compiled libraries, so that TorchScript
 archives and exported programs that hold `gvtorch::` ops can be loaded."""
 
+from .cache import compact_requests, link, lru_partition, unlink
 from .registry import available
 from .trace import trace_rays
 
-__all__ = ["available", "trace_rays"]
+__all__ = ["available", "compact_requests", "link", "lru_partition", "trace_rays", "unlink"]

@@ -28,6 +28,23 @@ def _fake_trace_rays(origin_r3: Tensor, *_args: object) -> tuple[Tensor, Tensor,
     )
 
 
+def _fake_compact_requests(request_tn: Tensor, capacity: int) -> tuple[Tensor, Tensor, Tensor]:
+    words = request_tn.new_empty((capacity,))
+    return words, torch.empty_like(words), request_tn.new_empty((2,), dtype=torch.int64)
+
+
+def _fake_lru_partition(order_k: Tensor, stamp_s: Tensor, frame_1: Tensor) -> tuple[Tensor, Tensor]:
+    return torch.empty_like(order_k), order_k.new_empty((1,), dtype=torch.int64)
+
+
+def _fake_in_place(*_args: object) -> None:
+    return None
+
+
 _reasons = cpp_ext.load()
 if not _reasons["cpp"]:
     torch.library.register_fake("gvtorch::trace_rays", _fake_trace_rays)
+    torch.library.register_fake("gvtorch::compact_requests", _fake_compact_requests)
+    torch.library.register_fake("gvtorch::lru_partition", _fake_lru_partition)
+    torch.library.register_fake("gvtorch::unlink", _fake_in_place)
+    torch.library.register_fake("gvtorch::link", _fake_in_place)

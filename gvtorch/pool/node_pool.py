@@ -73,8 +73,8 @@ class NodePool:
         self.constants: dict[str, Tensor] = {}
         self.ranges: dict[str, Tensor] = {}
         for name, channel in (channels or {}).items():
-            shape, kind = (capacity, n, channel.width), {"dtype": channel.dtype, "device": device}
-            self.constants[name] = torch.zeros(shape, **kind)
+            shape = (capacity, n, channel.width)
+            self.constants[name] = torch.zeros(shape, dtype=channel.dtype, device=device)
             limits = torch.tensor(channel.limits, dtype=torch.float64).to(channel.dtype)
             ends = movable(limits.to(device))[:, None].expand(capacity, n, 2, channel.width)
             self.ranges[name] = ends.contiguous().view(channel.dtype)

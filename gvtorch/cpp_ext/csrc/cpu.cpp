@@ -27,12 +27,32 @@ void for_each(const torch::stable::Tensor&, int64_t count, const Functor& functo
   });
 }
 
+// Calls put(index, rank) for every index that `keep` accepts, in order; writes their number.
+template <class Device, class Keep, class Put>
+void compact(const torch::stable::Tensor&, int64_t count, const Keep& keep, const Put& put, int64_t* kept) {
+  int64_t rank = 0;
+  for (int64_t index = 0; index < count; ++index) {
+    if (keep(index)) put(index, rank++);
+  }
+  *kept = rank;
+}
+
 }  // namespace gvtorch
 
 #include "entry.h"
 
-STABLE_TORCH_LIBRARY(gvtorch, library) { library.def(gvtorch::kTraceRaysSchema); }
+STABLE_TORCH_LIBRARY(gvtorch, library) {
+  library.def(gvtorch::kTraceRaysSchema);
+  library.def(gvtorch::kCompactRequestsSchema);
+  library.def(gvtorch::kLruPartitionSchema);
+  library.def(gvtorch::kUnlinkSchema);
+  library.def(gvtorch::kLinkSchema);
+}
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) {
   library.impl("trace_rays", TORCH_BOX(&gvtorch::trace_rays<gvtorch::Cpu>));
+  library.impl("compact_requests", TORCH_BOX(&gvtorch::compact_requests<gvtorch::Cpu>));
+  library.impl("lru_partition", TORCH_BOX(&gvtorch::lru_partition<gvtorch::Cpu>));
+  library.impl("unlink", TORCH_BOX(&gvtorch::unlink<gvtorch::Cpu>));
+  library.impl("link", TORCH_BOX(&gvtorch::link<gvtorch::Cpu>));
 }

@@ -1,11 +1,15 @@
 // The CUDA library: the same functors, one thread an index. It needs the CPU library, which defines the ops.
 
 #include <cuda_runtime.h>
+#include <thrust/iterator/counting_iterator.h>
+#include <thrust/iterator/transform_iterator.h>
 #include <torch/csrc/inductor/aoti_torch/c/shim.h>
 #include <torch/csrc/stable/accelerator.h>
+#include <torch/csrc/stable/ops.h>
 #include <torch/csrc/stable/tensor.h>
 
 #include <cstdint>
+#include <cub/device/device_scan.cuh>
 
 namespace gvtorch {
 
@@ -33,10 +37,56 @@ void for_each(const torch::stable::Tensor& like, int64_t count, const Functor& f
   STD_TORCH_CHECK(status == cudaSuccess, "gvtorch: kernel launch failed: ", cudaGetErrorString(status));
 }
 
+template <class Keep>
+struct KeepFlag {
+  Keep keep;
+  __device__ int32_t operator()(int64_t index) const { return keep(index) ? 1 : 0; }
+};
+
+template <class Keep, class Put>
+struct PutKept {
+  Keep keep;
+  Put put;
+  const int32_t* rank_n;  // exclusive
+  int64_t count;
+  int64_t* kept;
+  __device__ void operator()(int64_t index) const {
+    const bool keeps = keep(index);
+    const int64_t rank = rank_n[index];
+    if (keeps) put(index, rank);
+    if (index == count - 1) *kept = rank + (keeps ? 1 : 0);
+  }
+};
+
+// Calls put(index, rank) for every index that `keep` accepts, ranks in order; writes their number on the device.
+template <class Device, class Keep, class Put>
+void compact(const torch::stable::Tensor& like, int64_t count, const Keep& keep, const Put& put, int64_t* kept) {
+  using torch::headeronly::ScalarType;
+  if (count == 0) return;  // the counts are zero already
+  const torch::stable::accelerator::DeviceGuard guard(like.get_device_index());
+  void* stream = nullptr;
+  TORCH_ERROR_CODE_CHECK(aoti_torch_get_current_cuda_stream(like.get_device_index(), &stream));
+  const auto on = static_cast<cudaStream_t>(stream);
+  const auto flags = thrust::make_transform_iterator(thrust::counting_iterator<int64_t>(0), KeepFlag<Keep>{keep});
+  torch::stable::Tensor rank = torch::stable::new_empty(like, {count}, ScalarType::Int);
+  auto* rank_n = static_cast<int32_t*>(rank.mutable_data_ptr());
+  size_t bytes = 0;
+  cudaError_t status = cub::DeviceScan::ExclusiveSum(nullptr, bytes, flags, rank_n, count, on);
+  STD_TORCH_CHECK(status == cudaSuccess, "gvtorch: scan failed: ", cudaGetErrorString(status));
+  torch::stable::Tensor scratch = torch::stable::new_empty(like, {static_cast<int64_t>(bytes)}, ScalarType::Byte);
+  status = cub::DeviceScan::ExclusiveSum(scratch.mutable_data_ptr(), bytes, flags, rank_n, count, on);
+  STD_TORCH_CHECK(status == cudaSuccess, "gvtorch: scan failed: ", cudaGetErrorString(status));
+  for_each<Device>(like, count, PutKept<Keep, Put>{keep, put, rank_n, count, kept});
+}
+
 }  // namespace gvtorch
 
 #include "entry.h"
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch, CUDA, library) {
   library.impl("trace_rays", TORCH_BOX(&gvtorch::trace_rays<gvtorch::Cuda>));
+  library.impl("compact_requests", TORCH_BOX(&gvtorch::compact_requests<gvtorch::Cuda>));
+  library.impl("lru_partition", TORCH_BOX(&gvtorch::lru_partition<gvtorch::Cuda>));
+  library.impl("unlink", TORCH_BOX(&gvtorch::unlink<gvtorch::Cuda>));
+  library.impl("link", TORCH_BOX(&gvtorch::link<gvtorch::Cuda>));
 }

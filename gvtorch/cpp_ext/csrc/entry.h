@@ -14,6 +14,7 @@
 
 #include <tuple>
 
+#include "cache.h"
 #include "trace.h"
 
 namespace gvtorch {
@@ -31,6 +32,13 @@ constexpr const char* kTraceRaysSchema =
     "int branching, int root, int max_depth, int border, int component, "
     "float root_voxel, float step, float stop_alpha, float depth_alpha, bool by_level"
     ") -> (Tensor color_r3, Tensor alpha_r1, Tensor depth_r1, Tensor samples_r)";
+constexpr const char* kCompactRequestsSchema =
+    "compact_requests(Tensor(a!) request_tn, int capacity) -> (Tensor node_k, Tensor word_k, Tensor count_2)";
+constexpr const char* kLruPartitionSchema =
+    "lru_partition(Tensor order_k, Tensor stamp_s, Tensor frame_1) -> (Tensor order_k, Tensor unused_1)";
+constexpr const char* kUnlinkSchema = "unlink(Tensor(a!) pointer, Tensor slot_k, int slots, int divisor) -> ()";
+constexpr const char* kLinkSchema =
+    "link(Tensor(a!) pointer_tn, Tensor(b!) request_tn, Tensor node_k, Tensor word_k, int kind) -> ()";
 
 inline void require(const Tensor& tensor, const char* name, const Tensor& like, ScalarType dtype) {
   STD_TORCH_CHECK(tensor.is_contiguous(), "gvtorch: ", name, " must be contiguous");
@@ -81,9 +89,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> trace_rays(
     const Tensor& origin_r3, const Tensor& direction_r3, const Tensor& cone_r2, const Tensor& range_r2,
     const Tensor& bounds_23, const Tensor& child_tn, const Tensor& brick_tn, const Tensor& request_tn,
     const Tensor& stamp_t, const Tensor& bricks_bzyxc, const Tensor& constant_tnc, const Tensor& range_tn2c,
-    const Tensor& stamp_b, const Tensor& table_m4, const Tensor& domain_3, const Tensor& opaque_m, const Tensor& frame_1, int64_t branching, int64_t root,
-    int64_t max_depth, int64_t border, int64_t component, double root_voxel, double step, double stop_alpha,
-    double depth_alpha, bool by_level) {
+    const Tensor& stamp_b, const Tensor& table_m4, const Tensor& domain_3, const Tensor& opaque_m,
+    const Tensor& frame_1, int64_t branching, int64_t root, int64_t max_depth, int64_t border, int64_t component,
+    double root_voxel, double step, double stop_alpha, double depth_alpha, bool by_level) {
   const ScalarType real = origin_r3.scalar_type();
   const ScalarType word = ScalarType::Int;
   const ScalarType voxel = bricks_bzyxc.scalar_type();
@@ -157,7 +165,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> trace_rays(
            static_cast<const Voxel*>(range_tn2c.const_data_ptr()), word_out(stamp_b), static_cast<int32_t>(side),
            static_cast<int32_t>(border), static_cast<int32_t>(channels), static_cast<int32_t>(component)},
           {real_in(table_m4), real_in(domain_3), word_in(opaque_m), static_cast<int32_t>(table_m4.size(0))},
-          {static_cast<T>(root_voxel), static_cast<T>(step), static_cast<T>(stop_alpha), static_cast<T>(depth_alpha), by_level},
+          {static_cast<T>(root_voxel), static_cast<T>(step), static_cast<T>(stop_alpha), static_cast<T>(depth_alpha),
+           by_level},
           {real_out(color_r3), real_out(alpha_r1), real_out(depth_r1), word_out(samples_r)},
           word_in(frame_1)};
       for_each<Device>(origin_r3, rays, body);
@@ -169,6 +178,74 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> trace_rays(
     run(float{});
   }
   return {color_r3, alpha_r1, depth_r1, samples_r};
+}
+
+inline const int32_t* words_in(const Tensor& tensor) { return static_cast<const int32_t*>(tensor.const_data_ptr()); }
+inline int32_t* words_out(const Tensor& tensor) { return static_cast<int32_t*>(tensor.mutable_data_ptr()); }
+
+template <class Device>
+std::tuple<Tensor, Tensor, Tensor> compact_requests(const Tensor& request_tn, int64_t capacity) {
+  require(request_tn, "request_tn", request_tn, ScalarType::Int);
+  STD_TORCH_CHECK(capacity >= 1 && request_tn.numel() <= INT32_MAX, "gvtorch: capacity or request_tn out of range");
+  Tensor node_k = torch::stable::new_empty(request_tn, {capacity});
+  Tensor word_k = torch::stable::new_zeros(request_tn, {capacity});
+  Tensor count_2 = torch::stable::new_zeros(request_tn, {2}, ScalarType::Long);
+  torch::stable::fill_(node_k, -1);
+  const int64_t nodes = request_tn.numel();
+  auto* count = static_cast<int64_t*>(count_2.mutable_data_ptr());
+  compact<Device>(request_tn, nodes, KeepOpenRequest{words_in(request_tn)},
+                  PutRequest{words_in(request_tn), words_out(node_k), words_out(word_k), capacity}, count + 1);
+  for_each<Device>(request_tn, 1, CapCount{count, capacity});
+  for_each<Device>(request_tn, nodes, ClearWishes{words_out(request_tn)});
+  return {node_k, word_k, count_2};
+}
+
+template <class Device>
+std::tuple<Tensor, Tensor> lru_partition(const Tensor& order_k, const Tensor& stamp_s, const Tensor& frame_1) {
+  for (const auto& [tensor, name] :
+       {std::tuple<const Tensor&, const char*>{order_k, "order_k"}, {stamp_s, "stamp_s"}, {frame_1, "frame_1"}}) {
+    require(tensor, name, order_k, ScalarType::Int);
+  }
+  require_numel(frame_1, "frame_1", 1);
+  Tensor sorted_k = torch::stable::new_empty(order_k, {order_k.numel()});
+  Tensor unused_1 = torch::stable::new_zeros(order_k, {2}, ScalarType::Long);
+  auto* count = static_cast<int64_t*>(unused_1.mutable_data_ptr());
+  const int64_t size = order_k.numel();
+  for (const bool used : {false, true}) {
+    const KeepByUse keep{words_in(order_k), words_in(stamp_s), stamp_s.numel(), words_in(frame_1), used};
+    const PutSlot put{words_in(order_k), words_out(sorted_k), used ? count : count + 1};
+    compact<Device>(order_k, size, keep, put, used ? count + 1 : count);
+  }
+  return {sorted_k, torch::stable::narrow(unused_1, 0, 0, 1)};
+}
+
+template <class Device>
+void unlink(const Tensor& pointer, const Tensor& slot_k, int64_t slots, int64_t divisor) {
+  require(pointer, "pointer", pointer, ScalarType::Int);
+  require(slot_k, "slot_k", pointer, ScalarType::Int);
+  STD_TORCH_CHECK(slots >= 0 && divisor >= 1 && divisor <= INT32_MAX, "gvtorch: slots or divisor out of range");
+  Tensor leaving_s = torch::stable::new_zeros(pointer, {slots}, ScalarType::Byte);
+  auto* leaving = static_cast<uint8_t*>(leaving_s.mutable_data_ptr());
+  for_each<Device>(pointer, slot_k.numel(), MarkSlot{words_in(slot_k), leaving, slots});
+  for_each<Device>(pointer, pointer.numel(),
+                   ClearPointer{words_out(pointer), leaving, slots, static_cast<int32_t>(divisor)});
+}
+
+template <class Device>
+void link(const Tensor& pointer_tn, const Tensor& request_tn, const Tensor& node_k, const Tensor& word_k,
+          int64_t kind) {
+  for (const auto& [tensor, name] : {std::tuple<const Tensor&, const char*>{pointer_tn, "pointer_tn"},
+                                     {request_tn, "request_tn"},
+                                     {node_k, "node_k"},
+                                     {word_k, "word_k"}}) {
+    require(tensor, name, pointer_tn, ScalarType::Int);
+  }
+  require_numel(request_tn, "request_tn", pointer_tn.numel());
+  require_numel(word_k, "word_k", node_k.numel());
+  STD_TORCH_CHECK(kind == kLoad || kind == kSubdivide, "gvtorch: kind must be LOAD or SUBDIVIDE");
+  for_each<Device>(pointer_tn, node_k.numel(),
+                   WritePointer{words_out(pointer_tn), words_out(request_tn), words_in(node_k), words_in(word_k),
+                                pointer_tn.numel(), static_cast<int32_t>(kind)});
 }
 
 }  // namespace gvtorch

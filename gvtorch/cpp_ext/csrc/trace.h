@@ -26,8 +26,8 @@ struct RayView {
 
 template <class T>
 struct TransferView {
-  const T* table_m4;  // red, green, blue, opacity per reference length
-  const T* domain_3;  // value of the first row, value of the last row, reference length (world units)
+  const T* table_m4;        // red, green, blue, opacity per reference length
+  const T* domain_3;        // value of the first row, value of the last row, reference length (world units)
   const int32_t* opaque_m;  // rows with an opacity up to this one, itself included
   int32_t rows;
 };

@@ -2,7 +2,8 @@
 // node that a sample needs.
 //
 // A node tile is N*N*N sibling nodes; node = tile * nodes_per_tile + child, child = (z * N + y) * N + x. The root
-// node is child 0 of a tile of its own. Trees of several N share a pool: its tiles are as wide as the widest. Words of a node (GigaVoxels keeps two: Crassin et al., I3D 2009, section 4.1):
+// node is child 0 of a tile of its own. Trees of several N share a pool: its tiles are as wide as the widest. Words of
+// a node (GigaVoxels keeps two: Crassin et al., I3D 2009, section 4.1):
 //
 //   child_tn    >= 0 tile of its children | kAbsent: not made yet | kTerminal: nothing finer exists
 //   brick_tn    >= 0 brick slot | kAbsent: not loaded yet | kEmpty | kConstant: one value, see constant_tnc

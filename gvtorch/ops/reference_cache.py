@@ -1,0 +1,47 @@
+"""The torch twins of the cache's ops, right by definition. Arguments as in `ops/cache.py`.
+
+Source: Crassin et al., "GigaVoxels", I3D 2009, section 5.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..config import REQUEST_KINDS, REQUEST_PENDING_SHIFT, REQUEST_PRIORITY
+
+
+def compact_requests(request_tn: Tensor, capacity: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Twin of `torch.ops.gvtorch.compact_requests`."""
+    words = request_tn.view(-1)
+    open_kinds = words & REQUEST_KINDS & ~(words >> REQUEST_PENDING_SHIFT)
+    node = open_kinds.nonzero()[:, 0]
+    kept = node[:capacity]
+    node_k = torch.full((capacity,), -1, dtype=torch.int32, device=words.device)
+    word_k = torch.zeros(capacity, dtype=torch.int32, device=words.device)
+    node_k[: len(kept)] = kept.to(torch.int32)
+    word_k[: len(kept)] = open_kinds[kept] | (words[kept] & REQUEST_PRIORITY)
+    words &= REQUEST_KINDS << REQUEST_PENDING_SHIFT
+    return node_k, word_k, torch.tensor([len(kept), len(node)], device=words.device)
+
+
+def lru_partition(order_k: Tensor, stamp_s: Tensor, frame_1: Tensor) -> tuple[Tensor, Tensor]:
+    """Twin of `torch.ops.gvtorch.lru_partition`."""
+    used = stamp_s[order_k.to(torch.int64)] == frame_1
+    return torch.cat((order_k[~used], order_k[used])), (~used).sum().view(1)
+
+
+def unlink(pointer: Tensor, slot_k: Tensor, slots: int, divisor: int) -> None:
+    """Twin of `torch.ops.gvtorch.unlink`."""
+    leaving = torch.zeros(slots + 1, dtype=torch.bool, device=pointer.device)
+    leaving[slot_k[(slot_k >= 0) & (slot_k < slots)].to(torch.int64)] = True
+    named = torch.where(pointer >= 0, pointer // divisor, slots).clamp(max=slots)
+    pointer[leaving[named.to(torch.int64)]] = -1
+
+
+def link(pointer_tn: Tensor, request_tn: Tensor, node_k: Tensor, word_k: Tensor, kind: int) -> None:
+    """Twin of `torch.ops.gvtorch.link`."""
+    valid = (node_k >= 0) & (node_k < pointer_tn.numel())
+    node = node_k[valid].to(torch.int64)
+    pointer_tn.view(-1)[node] = word_k[valid]
+    request_tn.view(-1)[node] &= ~(kind | kind << REQUEST_PENDING_SHIFT)

@@ -1,0 +1,161 @@
+"""The cache's ops: kernel equals twin, and both equal plain Python."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from conftest import DEVICES
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from gvtorch import config, ops
+from gvtorch.ops import reference_cache
+
+LOAD, SUBDIVIDE = config.REQUEST_LOAD, config.REQUEST_SUBDIVIDE
+PENDING = config.REQUEST_PENDING_SHIFT
+fixed = settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+words = st.integers(0, 31).flatmap(
+    lambda kinds: st.sampled_from([0, 1, 77, 0xFFFF]).map(lambda p: (kinds % 16) << 16 | p)
+)
+
+
+def int32(values, device="cpu") -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.int32, device=device)
+
+
+@fixed
+@given(request_words=st.lists(words, min_size=8, max_size=400), capacity=st.integers(1, 500))
+def test_compact_requests_lists_open_wishes_and_keeps_pending_ones(
+    backend, request_words, capacity
+):
+    count = len(request_words) // 8 * 8
+    request = int32(request_words[:count], DEVICES[backend]).view(-1, 8)
+    node, word, counts = ops.compact_requests(request, capacity, backend=backend)
+    expected = []
+    for index, before in enumerate(request_words[:count]):
+        kinds = before & (LOAD | SUBDIVIDE) & ~(before >> PENDING)
+        if kinds:
+            expected.append((index, kinds | before & config.REQUEST_PRIORITY))
+    kept = expected[:capacity]
+    assert counts.tolist() == [len(kept), len(expected)]
+    assert list(zip(node.tolist(), word.tolist(), strict=True))[: len(kept)] == kept
+    assert set(node.tolist()[len(kept) :]) <= {-1}
+    left = [before & (LOAD | SUBDIVIDE) << PENDING for before in request_words[:count]]
+    assert request.view(-1).tolist() == left
+
+
+@fixed
+@given(data=st.data(), size=st.integers(1, 60))
+def test_lru_equals_a_python_list_over_random_traces(backend, data, size):
+    """Frames use slots at random and take some: the model is a list that moves what is used back."""
+    device = DEVICES[backend]
+    order = torch.arange(size, dtype=torch.int32, device=device)
+    stamp = torch.full((size,), -1, dtype=torch.int32, device=device)
+    model = list(range(size))
+    for frame in range(1, data.draw(st.integers(1, 8)) + 1):
+        used = data.draw(st.sets(st.integers(0, size - 1)))
+        stamp[torch.tensor(sorted(used), dtype=torch.int64, device=device)] = frame
+        order, unused = ops.lru_partition(order, stamp, int32([frame], device), backend=backend)
+        model = [s for s in model if s not in used] + [s for s in model if s in used]
+        assert order.tolist() == model and int(unused) == size - len(used)
+        take = data.draw(st.integers(0, int(unused)))
+        order = torch.cat((order[take:], order[:take]))
+        model = model[take:] + model[:take]
+
+
+@fixed
+@given(
+    pointers=st.lists(st.integers(-3, 40), min_size=1, max_size=200),
+    leaving=st.lists(st.integers(-1, 45), max_size=30),
+    divisor=st.integers(1, 5),
+    slots=st.integers(0, 41),
+)
+def test_unlink_clears_every_pointer_to_a_slot(backend, pointers, leaving, divisor, slots):
+    device = DEVICES[backend]
+    words_ = int32(pointers, device)
+    ops.unlink(words_, int32(leaving, device), slots, divisor, backend=backend)
+    gone = {slot for slot in leaving if 0 <= slot < slots}
+    assert words_.tolist() == [-1 if p >= 0 and p // divisor in gone else p for p in pointers]
+
+
+@fixed
+@given(data=st.data(), tiles=st.integers(1, 20))
+def test_link_writes_pointers_and_takes_wishes_back(backend, data, tiles):
+    nodes = tiles * 8
+    device = DEVICES[backend]
+    pointer = data.draw(st.lists(st.integers(-3, 99), min_size=nodes, max_size=nodes))
+    request = data.draw(st.lists(words, min_size=nodes, max_size=nodes))
+    chosen = data.draw(st.lists(st.integers(0, nodes - 1), unique=True, max_size=nodes))
+    values = data.draw(st.lists(st.integers(-3, 99), min_size=len(chosen), max_size=len(chosen)))
+    kind = data.draw(st.sampled_from([LOAD, SUBDIVIDE]))
+    a, b = (int32(w, device).view(-1, 8) for w in (pointer, request))
+    node_k, word_k = int32([*chosen, -1], device), int32([*values, 5], device)
+    ops.link(a, b, node_k, word_k, kind, backend=backend)
+    for node, value in zip(chosen, values, strict=True):
+        pointer[node] = value
+        request[node] &= ~(kind | kind << PENDING)
+    assert a.view(-1).tolist() == pointer and b.view(-1).tolist() == request
+
+
+def test_kernels_equal_twins_on_a_large_pool(compiled):
+    device, generator = DEVICES[compiled], torch.Generator().manual_seed(3)
+    request = torch.randint(0, 1 << 20, (200_000, 8), generator=generator, dtype=torch.int32)
+    request *= torch.randint(0, 2, request.shape, generator=generator, dtype=torch.int32)
+    there = request.clone().to(device)
+    expected = reference_cache.compact_requests(request, 300_000)
+    actual = ops.compact_requests(there, 300_000, backend=compiled)
+    assert all(torch.equal(a.cpu(), e) for a, e in zip(actual, expected, strict=True))
+    assert torch.equal(there.cpu(), request) and int(expected[2][1]) > 300_000
+
+    order = torch.randperm(500_000, generator=generator).to(torch.int32)
+    stamp = torch.randint(0, 3, (500_000,), generator=generator, dtype=torch.int32)
+    frame = int32([1])
+    expected = reference_cache.lru_partition(order, stamp, frame)
+    actual = ops.lru_partition(*(t.to(device) for t in (order, stamp, frame)), backend=compiled)
+    assert all(torch.equal(a.cpu(), e) for a, e in zip(actual, expected, strict=True))
+
+
+def test_cache_ops_pass_opcheck(compiled):
+    device = DEVICES[compiled]
+    request = int32([[1 << 16, 0, 3 << 16, 9 << 16]], device)
+    table, frame = torch.ops.gvtorch, int32([1], device)
+    for op, arguments in (
+        (table.compact_requests, (request, 3)),
+        (table.lru_partition, (int32([2, 0, 1], device), int32([1, 0, 1], device), frame)),
+        (table.unlink, (request, int32([0, -1], device), 4, 1)),
+        (table.link, (request, request.clone(), frame, frame, LOAD)),
+    ):
+        torch.library.opcheck(op.default, arguments)
+
+
+def test_nothing_to_do(backend):
+    device = DEVICES[backend]
+    none, frame = int32([], device), int32([1], device)
+    request = torch.zeros((1, 8), dtype=torch.int32, device=device)
+    assert ops.compact_requests(request, 4, backend=backend)[2].tolist() == [0, 0]
+    assert int(ops.lru_partition(none, none, frame, backend=backend)[1]) == 0
+    ops.unlink(request, none, 0, backend=backend)
+    ops.link(request, request.clone(), none, none, LOAD, backend=backend)
+    assert not request.any()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda w: ops.compact_requests(w.float(), 4), "request_tn must be (t, n) int32"),
+        (lambda w: ops.compact_requests(w.T, 4), "request_tn must be contiguous"),
+        (lambda w: ops.compact_requests(w, 0), "capacity must be an int >= 1"),
+        (lambda w: ops.lru_partition(w, w[0], w[0, :1]), "order_k must be (k,)"),
+        (lambda w: ops.unlink(w, w, 4), "slot_k must be (k,)"),
+        (lambda w: ops.unlink(w, w[0], 4, 0), "divisor must be an int >= 1"),
+        (lambda w: ops.link(w, w, w[0], w[0, :2], LOAD), "word_k must be (8,)"),
+        (lambda w: ops.link(w, w, w[0], w[0], 3), "kind must be REQUEST_LOAD"),
+        (lambda w: ops.link(w, w, w[0], w[0], LOAD, backend="gpu"), "backend must be auto"),
+    ],
+)
+def test_bad_arguments_are_named(call, message):
+    with pytest.raises(ValueError) as caught:
+        call(torch.zeros((4, 8), dtype=torch.int32))
+    assert message in str(caught.value)
