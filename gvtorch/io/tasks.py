@@ -1,0 +1,200 @@
+"""`write_shard`: what one task of the converter does; a plain function of picklable arguments.
+
+A task makes one cube of a level: its shard of the pyramid, of the blocks and of the cells. It reads
+the source (level 0) or the level below as stored, with the voxels around the cube, so it needs no
+other task of its own level. Run twice, it writes the same again.
+"""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..pool.pyramid import extend, pool_max, pool_mean, pool_min, round_array, window
+from .layout import BORDER, CELL, Layout, opened
+from .levels import Deadline, Stored, StoreError, short
+from .sources import Source
+from .store import needed_cells
+
+_TIMEOUT = 3600.0  # seconds for one read of local data
+_SLAB = 32  # planes of a level made at a time: two chunks of the level below
+
+Zyx = tuple[int, int, int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """What all tasks of a conversion share."""
+
+    root: dict[str, Any]  # kvstore of the store
+    layout: Layout
+    source: Source
+    threshold: float | None
+    nan: float | None
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a task tells."""
+
+    level: int
+    place: Zyx
+    voxels: int
+    bad: int  # values that are not finite; the shard is not written then
+
+
+def write_shard(job: Job, level: int, place: Zyx) -> Done:
+    """Writes the shards of one cube of a level.
+
+    Args:
+        job: The conversion.
+        level: 0 is the finest.
+        place: (z, y, x) of the cube, in shards.
+
+    Raises:
+        OSError: The source can't be read, or the store can't be written (ENOSPC: the disk is full).
+    """
+    layout = job.layout
+    shape = layout.shape(level)
+    low = [at * layout.shard for at in place]
+    stop = [min(a + layout.shard, n) for a, n in zip(low, shape, strict=True)]
+    size = [b - a for a, b in zip(low, stop, strict=True)]
+    padded = [-(-n // layout.block) * layout.block for n in size]
+    box = [a - BORDER for a in low], [a + n + BORDER for a, n in zip(low, padded, strict=True)]
+    inner = tuple(slice(BORDER, BORDER + n) for n in size)
+    if level == 0:
+        values, bad = _from_source(job, *box, inner)
+        if bad:
+            return Done(level, place, 0, bad)
+        least = most = values
+    else:
+        values = _from_below(job, level, *box, None)
+        least, most = (_from_below(job, level, *box, which) for which in ("low", "high"))
+    writes = [_write(job, layout.plain(level), low, _plain(values[inner]))]
+    if 0 < level < layout.levels - 1:
+        for which, bound in (("low", least), ("high", most)):
+            writes.append(_write(job, layout.bound(which, level), low, _plain(bound[inner])))
+    cells = _cells(values, least, most, [-(-n // CELL) for n in size])
+    writes.append(_write(job, layout.cells(level), [a // CELL for a in low], cells))
+    blocks = _blocks(layout, values, needed_cells(cells, job.threshold))
+    if blocks is not None:
+        writes.append(_write(job, layout.blocks(level), [a // layout.block for a in low], blocks))
+    for write in writes:
+        _finish(write, job.root.get("path", "store"))
+    return Done(level, place, int(np.prod(size)), 0)
+
+
+def _from_source(
+    job: Job, low: list[int], high: list[int], inner: tuple[slice, ...]
+) -> tuple[np.ndarray, int]:
+    shape = job.layout.shape(0)
+    start = [max(a, 0) for a in low]
+    stop = [min(b, n) for b, n in zip(high, shape, strict=True)]
+    values = job.source.read(start, stop)
+    bad = 0
+    if values.dtype.kind == "f":
+        wrong = ~np.isfinite(values)
+        if wrong.any():
+            if job.nan is not None:
+                values = np.where(wrong, values.dtype.type(job.nan), values)
+            else:
+                bad = int(_pad(wrong, low, high, start, stop)[inner].sum())
+    return _pad(values, low, high, start, stop), bad
+
+
+def _from_below(
+    job: Job, level: int, low: list[int], high: list[int], which: str | None
+) -> np.ndarray:
+    """Makes a box of a level, voxels around it included, from the level below."""
+    layout = job.layout
+    shape, below = layout.shape(level), layout.shape(level - 1)
+    plain = which is None or level == 1
+    spec = layout.plain(level - 1) if plain else layout.bound(str(which), level - 1)
+    deadline = Deadline(_TIMEOUT)
+    where = f"level {level - 1}"
+    array = deadline.wait(opened(job.root, spec), where)
+    stored = Stored(array, "czyx"[-array.rank :], (1, 1, 1), where)
+    pool: Callable[..., np.ndarray] = {None: pool_mean, "low": pool_min, "high": pool_max}[which]
+    start = [max(a, 0) for a in low]
+    stop = [min(b, n) for b, n in zip(high, shape, strict=True)]
+    out = np.empty((*[b - a for a, b in zip(start, stop, strict=True)], layout.width), layout.dtype)
+    z = start[0]
+    while z < stop[0]:
+        end = min(stop[0], (z // _SLAB + 1) * _SLAB)
+        first = [2 * z, 2 * start[1], 2 * start[2]]
+        last = [min(2 * b, n) for b, n in zip((end, *stop[1:]), below, strict=True)]
+        out[z - start[0] : end - start[0]] = pool(stored.read(first, last, deadline), 2)
+        z = end
+    return _pad(out, low, high, start, stop)
+
+
+def _pad(
+    values: np.ndarray, low: list[int], high: list[int], start: list[int], stop: list[int]
+) -> np.ndarray:
+    for axis in range(3):
+        values = extend(values, axis, start[axis] - low[axis], high[axis] - stop[axis])
+    return values
+
+
+def _plain(values: np.ndarray) -> np.ndarray:
+    """(z, y, x, c) as the pyramid stores it."""
+    return values[..., 0] if values.shape[3] == 1 else np.moveaxis(values, 3, 0)
+
+
+def _cells(values: np.ndarray, least: np.ndarray, most: np.ndarray, count: list[int]) -> np.ndarray:
+    """(gz, gy, gx, 3, c) low, high, mean of the cells of a cube with its border."""
+    reach = tuple(slice(0, n * CELL + 2 * BORDER) for n in count)
+    own = tuple(slice(BORDER, BORDER + n * CELL) for n in count)
+    size = CELL + 2 * BORDER
+    low = window(least[reach], "min", size=size, step=CELL)
+    high = window(most[reach], "max", size=size, step=CELL)
+    mean = window(values[own], "mean", size=CELL, step=CELL)
+    return np.stack((low, high, round_array(mean, values.dtype)), axis=3)
+
+
+def _blocks(layout: Layout, values: np.ndarray, needed: np.ndarray) -> np.ndarray | None:
+    """(gz, gy, gx, s, s, s, c) blocks of a cube; zero, which is not written, where no cell needs
+    them.
+    """
+    per, side = layout.block // CELL, layout.stored
+    grid = [-(-n // per) for n in needed.shape]
+    wanted = np.zeros([n * per for n in grid], bool)
+    wanted[tuple(slice(0, n) for n in needed.shape)] = needed
+    wanted = wanted.reshape(grid[0], per, grid[1], per, grid[2], per).any((1, 3, 5))
+    if not wanted.any():
+        return None
+    strides = values.strides
+    view = np.lib.stride_tricks.as_strided(
+        values,
+        (*grid, side, side, side, layout.width),
+        (*[step * layout.block for step in strides[:3]], *strides),
+        writeable=False,
+    )
+    blocks = np.zeros(view.shape, values.dtype)
+    blocks[wanted] = view[wanted]
+    return blocks
+
+
+def _write(job: Job, spec: dict[str, Any], low: list[int], data: np.ndarray) -> Any:
+    """Begins to write a box into an array of the store."""
+    array = Deadline(_TIMEOUT).wait(opened(job.root, spec, "write"), spec["path"])
+    sizes = data.shape
+    if len(sizes) == 4:  # (c, z, y, x)
+        low = [0, *low]
+    place = tuple(
+        slice(a, a + n) for a, n in zip([*low, *[0] * (len(sizes) - len(low))], sizes, strict=True)
+    )
+    return array[place].write(data)
+
+
+def _finish(write: Any, where: str) -> None:
+    try:
+        write.result()
+    except Exception as error:  # tensorstore raises what its status maps to
+        if "No space left" in str(error):
+            raise OSError(errno.ENOSPC, "the disk is full", where) from None
+        raise StoreError(f"{where}: can't be written: {short(error)}") from None
