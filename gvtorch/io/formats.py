@@ -121,13 +121,26 @@ def _reader(path: Path, key: str | None) -> tuple[Callable[..., _Grid], str]:
     )
 
 
-def _need(module: str, package: str, path: Path) -> Any:
+def need(module: str, package: str, path: Path) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
         raise ImportError(
             f"{path}: reading this format needs {package}: pip install 'gvtorch[io]' ({error})"
         ) from None
+
+
+def unpacked_size(path: Path) -> int:
+    """Bytes that a packed file holds, as far as it tells without being unpacked; else 0."""
+    if path.name.lower().endswith(".npz") and zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            return max((item.file_size for item in archive.infolist()), default=0)
+    if path.suffix.lower() == ".gz" and path.is_file() and path.stat().st_size > 4:
+        with path.open("rb") as file:  # the last four bytes, modulo 2^32
+            file.seek(-4, 2)
+            told = int.from_bytes(file.read(4), "little")
+        return max(told, path.stat().st_size)
+    return path.stat().st_size
 
 
 # --- RAW and NumPy
@@ -140,9 +153,10 @@ def _open(path: Path) -> IO[bytes]:
     return bz2.open(path, "rb") if path.name.lower().endswith(".bz2") else path.open("rb")
 
 
-def _read_raw(
-    path: Path, shape: Sequence[int] | None = None, dtype: str | np.dtype | None = None
-) -> _Grid:
+def raw_header(
+    path: Path, shape: Sequence[int] | None, dtype: str | np.dtype | None
+) -> tuple[tuple[int, int, int], np.dtype]:
+    """Returns (x, y, z) voxels and dtype of a RAW file, from the arguments or its name."""
     named = _RAW_NAME.search(path.name.lower())
     if shape is None:
         if named is None:
@@ -170,22 +184,36 @@ def _read_raw(
         kind = kind.newbyteorder(order)  # type: ignore[arg-type]
     if len(shape) != 3:
         raise ValueError(f"{path}: shape must be three numbers X,Y,Z, got {tuple(shape)}")
-    check_extent(str(path), shape)
     x, y, z = (int(size) for size in shape)
+    return (x, y, z), kind
+
+
+def check_raw_size(path: Path, shape: tuple[int, int, int], kind: np.dtype, size: int) -> None:
+    """Raises ValueError unless a RAW file has just the bytes that its extent takes."""
+    x, y, z = shape
     expected = x * y * z * kind.itemsize
-    with _open(path) as file:
-        content = file.read(expected + 1)
-    if len(content) != expected:
-        size = path.stat().st_size if path.suffix == ".raw" else len(content)
-        got = f"{size}" if len(content) < expected or path.suffix == ".raw" else "more"
+    if size != expected:
+        got = f"{size}" if size < expected or path.suffix == ".raw" else "more"
         raise ValueError(
             f"{path}: {x}x{y}x{z} {kind.name} takes {expected} bytes, the file has {got}"
         )
+
+
+def _read_raw(
+    path: Path, shape: Sequence[int] | None = None, dtype: str | np.dtype | None = None
+) -> _Grid:
+    (x, y, z), kind = raw_header(path, shape, dtype)
+    check_extent(str(path), (x, y, z))
+    expected = x * y * z * kind.itemsize
+    with _open(path) as file:
+        content = file.read(expected + 1)
+    size = path.stat().st_size if path.suffix == ".raw" else len(content)
+    check_raw_size(path, (x, y, z), kind, size)
     return _Grid(np.frombuffer(content, kind).reshape(z, y, x))
 
 
-def _read_array(file: IO[bytes], where: str) -> np.ndarray:
-    """Reads one .npy stream, its extent checked before its data is read."""
+def npy_header(file: IO[bytes], where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Returns shape, Fortran order and dtype of a .npy stream, which is then at its data."""
     version = np.lib.format.read_magic(file)
     read_header = {
         (1, 0): np.lib.format.read_array_header_1_0,
@@ -196,6 +224,12 @@ def _read_array(file: IO[bytes], where: str) -> np.ndarray:
     shape, fortran, dtype = read_header(file)
     if dtype.hasobject:
         raise ValueError(f"{where}: holds Python objects, not numbers")
+    return shape, fortran, dtype
+
+
+def _read_array(file: IO[bytes], where: str) -> np.ndarray:
+    """Reads one .npy stream, its extent checked before its data is read."""
+    shape, fortran, dtype = npy_header(file, where)
     check_extent(where, shape)
     expected = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
     content = file.read(expected)
@@ -230,7 +264,7 @@ def _read_npz(path: Path, key: str | None) -> _Grid:
 
 
 def _read_nifti(path: Path) -> _Grid:
-    nibabel = _need("nibabel", "nibabel", path)
+    nibabel = need("nibabel", "nibabel", path)
     image = nibabel.load(path)
     check_extent(str(path), image.shape)
     if len(image.shape) not in (3, 4):
@@ -239,22 +273,28 @@ def _read_nifti(path: Path) -> _Grid:
 
 
 def _read_nrrd(path: Path) -> _Grid:
-    nrrd = _need("nrrd", "pynrrd", path)
+    nrrd = need("nrrd", "pynrrd", path)
     with path.open("rb") as file:
         header = nrrd.read_header(file)
     check_extent(str(path), [int(size) for size in header["sizes"]])
     data, header = nrrd.read(str(path), index_order="F")
+    axis, affine = nrrd_place(header, data.ndim)
+    return _turned(path, data if axis is None else np.moveaxis(data, axis, -1), affine)
+
+
+def nrrd_place(header: dict[str, Any], rank: int) -> tuple[int | None, np.ndarray]:
+    """Returns the axis that counts components, if any, and the (4, 4) place of the others."""
     directions = np.asarray(header.get("space directions", np.zeros((0, 3))), dtype=np.float64)
     spacings = np.asarray(header.get("spacings", np.zeros(0)), dtype=np.float64)
     kinds = list(header.get("kinds", ()))
-    if data.ndim == 4:  # one axis counts components: the one that is no place, else the first
+    axis = None
+    if rank == 4:  # one axis counts components: the one that is no place, else the first
         places = [np.isfinite(row).all() for row in directions] or list(np.isfinite(spacings))
         axis = places.index(False) if False in places else 0
         if kinds:
             axis = next(
                 (i for i, kind in enumerate(kinds) if kind not in ("domain", "space")), axis
             )
-        data = np.moveaxis(data, axis, -1)
         directions, spacings = (
             np.delete(a, axis, 0) if len(a) == 4 else a for a in (directions, spacings)
         )
@@ -266,34 +306,52 @@ def _read_nrrd(path: Path) -> _Grid:
     place = np.asarray(header.get("space origin", np.zeros(3)), dtype=np.float64)
     if place.shape == (3,) and np.isfinite(place).all():
         affine[:3, 3] = place
-    return _turned(path, data, affine)
+    return axis, affine
 
 
-def _turned(path: Path, data_xyz: np.ndarray, affine: np.ndarray) -> _Grid:
-    """Lays (x, y, z[, c]) data along the world's axes: permutes and flips; keeps oblique axes as
-    they are.
+def orientation(
+    path: Path, affine: np.ndarray, sizes: Sequence[int]
+) -> tuple[list[int], list[bool], list[float], list[float]]:
+    """Lays voxel axes along the world's; oblique ones stay as they are.
+
+    Args:
+        path: For messages.
+        affine: (4, 4) voxel to world.
+        sizes: Voxels along each voxel axis.
+
+    Returns:
+        For world axes x, y, z: which voxel axis lies along it, whether it runs backwards, spacing
+        and origin.
     """
     matrix, place = affine[:3, :3], affine[:3, 3]
-    sizes = np.linalg.norm(matrix, axis=0)
-    if not np.isfinite(affine).all() or (sizes == 0).any():
+    lengths = np.linalg.norm(matrix, axis=0)
+    if not np.isfinite(affine).all() or (lengths == 0).any():
         raise ValueError(f"{path}: the header's voxel axes are degenerate: {matrix.tolist()}")
     world_axis = np.abs(matrix).argmax(axis=0)  # of each voxel axis
-    along = np.abs(matrix[world_axis, [0, 1, 2]]) / sizes
+    along = np.abs(matrix[world_axis, [0, 1, 2]]) / lengths
     if sorted(world_axis.tolist()) != [0, 1, 2] or (along < 1 - 1e-4).any():
         warnings.warn(
             f"{path.name}: voxel axes are oblique; the world's axes are taken along them",
-            stacklevel=5,
+            stacklevel=6,
         )
-        return _Grid(_to_zyx(data_xyz), sizes.tolist(), place.tolist())
+        return [0, 1, 2], [False] * 3, lengths.tolist(), place.tolist()
     order = np.argsort(world_axis)
-    data = np.moveaxis(data_xyz, order, (0, 1, 2))
     spacing = matrix[[0, 1, 2], order]
     origin = place.astype(np.float64).copy()
     for axis in range(3):
         if spacing[axis] < 0:
+            origin[axis] += spacing[axis] * (sizes[order[axis]] - 1)
+    return order.tolist(), (spacing < 0).tolist(), np.abs(spacing).tolist(), origin.tolist()
+
+
+def _turned(path: Path, data_xyz: np.ndarray, affine: np.ndarray) -> _Grid:
+    """Lays (x, y, z[, c]) data along the world's axes: permutes and flips."""
+    order, flips, spacing, origin = orientation(path, affine, data_xyz.shape)
+    data = np.moveaxis(data_xyz, order, (0, 1, 2))
+    for axis, backwards in enumerate(flips):
+        if backwards:
             data = np.flip(data, axis)
-            origin[axis] += spacing[axis] * (data.shape[axis] - 1)
-    return _Grid(_to_zyx(data), np.abs(spacing).tolist(), origin.tolist())
+    return _Grid(_to_zyx(data), spacing, origin)
 
 
 def _to_zyx(data_xyz: np.ndarray) -> np.ndarray:
@@ -301,35 +359,41 @@ def _to_zyx(data_xyz: np.ndarray) -> np.ndarray:
 
 
 def _read_tiff(path: Path) -> _Grid:
-    tifffile = _need("tifffile", "tifffile", path)
+    tifffile = need("tifffile", "tifffile", path)
     with tifffile.TiffFile(path) as file:
         series = file.series[0]
         check_extent(str(path), series.shape)
-        return _Grid(_zyxc(path, series.asarray(), series.axes), _tiff_spacing(file))
+        return _Grid(_zyxc(path, series.asarray(), series.axes), tiff_spacing(file))
+
+
+def tiff_letters(path: Path, shape: Sequence[int], axes: str) -> str:
+    """Returns what each axis of a TIFF series is: z, y, x, c, or - for one of size 1 to drop."""
+    letters = "".join(
+        "-" if size == 1 and letter not in "ZYX" else letter
+        for size, letter in zip(shape, axes, strict=True)
+    )
+    others = [letter for letter in letters if letter not in "ZYXCS-"]
+    if "Z" not in letters and len(others) == 1 and others[0] in "QI":
+        letters, others = letters.replace(others[0], "Z"), []  # pages without a meaning: slices
+    channels = [letter for letter in letters if letter in "CS"]
+    if others or len(channels) > 1 or letters.count("Y") != 1 or letters.count("X") != 1:
+        raise ValueError(
+            f"{path}: axes {axes} {tuple(shape)}; expected Z, Y, X and at most one of C, S"
+        )
+    return letters.replace("S", "C").lower()
 
 
 def _zyxc(path: Path, data: np.ndarray, axes: str) -> np.ndarray:
     """Lays an array out as (z, y, x[, c]) by the letters tifffile gives its axes."""
-    for index in reversed(range(len(axes))):
-        if data.shape[index] == 1 and axes[index] not in "ZYX":
-            data, axes = data.squeeze(index), axes[:index] + axes[index + 1 :]
-    others = [letter for letter in axes if letter not in "ZYXCS"]
-    if (
-        "Z" not in axes and len(others) == 1 and others[0] in "QI"
-    ):  # pages without a meaning: slices
-        axes, others = axes.replace(others[0], "Z"), []
-    if "Z" not in axes:
-        data, axes = data[None], "Z" + axes
-    channels = [letter for letter in "CS" if letter in axes]
-    wanted = "ZYX" + "".join(channels)
-    if others or len(channels) > 1 or sorted(wanted) != sorted(axes):
-        raise ValueError(
-            f"{path}: axes {axes} {data.shape}; expected Z, Y, X and at most one of C, S"
-        )
-    return data.transpose([axes.index(letter) for letter in wanted])
+    letters = tiff_letters(path, data.shape, axes)
+    data = data.squeeze(tuple(i for i, letter in enumerate(letters) if letter == "-"))
+    letters = letters.replace("-", "")
+    if "z" not in letters:
+        data, letters = data[None], "z" + letters
+    return data.transpose([letters.index(letter) for letter in "zyxc" if letter in letters])
 
 
-def _tiff_spacing(file: Any) -> tuple[float, float, float] | None:
+def tiff_spacing(file: Any) -> tuple[float, float, float] | None:
     """Voxel size as ImageJ writes it: slices apart in the description, pixels per unit in the
     tags.
     """
@@ -344,8 +408,8 @@ def _tiff_spacing(file: Any) -> tuple[float, float, float] | None:
     return (sides[0], sides[1], float(described["spacing"]))
 
 
-def _read_tiff_folder(path: Path) -> _Grid:
-    tifffile = _need("tifffile", "tifffile", path)
+def tiff_slices(path: Path) -> list[Path]:
+    """Returns the slices of a folder in natural order."""
     slices = [p for p in path.iterdir() if p.suffix.lower() in (".tif", ".tiff")]
     if not slices:
         raise ValueError(f"{path}: no .tif or .tiff slices in this folder")
@@ -356,7 +420,12 @@ def _read_tiff_folder(path: Path) -> _Grid:
             for part in re.split(r"(\d+)", file.name)
         ]
 
-    slices.sort(key=natural)
+    return sorted(slices, key=natural)
+
+
+def _read_tiff_folder(path: Path) -> _Grid:
+    tifffile = need("tifffile", "tifffile", path)
+    slices = tiff_slices(path)
     first = tifffile.imread(slices[0])
     check_extent(str(path), (len(slices), *first.shape))
     if first.ndim not in (2, 3):
@@ -375,7 +444,7 @@ def _read_tiff_folder(path: Path) -> _Grid:
 
 def _read_fits(path: Path) -> _Grid:
     """Spacing is 1: FITS axes have units of their own (degrees, m/s), a box in space has one."""
-    fits = _need("astropy.io.fits", "astropy", path)
+    fits = need("astropy.io.fits", "astropy", path)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*truncated.*")
         with fits.open(path, memmap=False) as units:

@@ -2,7 +2,7 @@
 
     STORE.zarr/zarr.json             metadata; written last, so a store that has it is whole
     STORE.zarr/0, 1, ...             (z, y, x) or (c, z, y, x), the mean pyramid, 0 the finest
-    STORE.zarr/gvtorch/blocks/0 ...  (gz, gy, gx, s, s, s, c), s = block + 2 border: a chunk a block,
+    STORE.zarr/gvtorch/blocks/0 ...  (gz, gy, gx, s, s, s, c), s = block + 2 border, a chunk each,
                                      its border the true neighbours, repeated at the volume's faces;
                                      blocks of CONSTANT and EMPTY cells only are not written
     STORE.zarr/gvtorch/cells/0 ...   (gz, gy, gx, 3, c) low, high, mean of every cell of 8^3 voxels

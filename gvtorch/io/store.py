@@ -157,6 +157,26 @@ class Store:
             f"{self.levels} levels, {kind})"
         )
 
+    def describe(self) -> dict[str, Any]:
+        """Returns extent, dtype, place, levels, range and size on disk as plain values."""
+        folder = Path(self.location)
+        files = (file for file in folder.rglob("*") if file.is_file()) if folder.is_dir() else ()
+        return {
+            "name": self.name,
+            "extent": list(self.extent),
+            "channels": self.width,
+            "dtype": str(self.dtype).removeprefix("torch."),
+            "spacing": list(self.spacing),
+            "origin": list(self.origin),
+            "unit": self.unit,
+            "levels": self.levels,
+            "level extents": [list(self.level_extent(level)) for level in range(self.levels)],
+            "blocks": f"{self.block}^3+{self.border}" if self.has_blocks else "none",
+            "threshold": self.threshold,
+            "range": [list(pair) for pair in self.value_range] if self.value_range else None,
+            "disk bytes": sum(file.stat().st_size for file in files),
+        }
+
     def level_extent(self, level: int) -> tuple[int, int, int]:
         """(x, y, z) voxels of a level, 0 the finest."""
         z, y, x = level_shape(self.extent, self._checked(level))

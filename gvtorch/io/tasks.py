@@ -8,7 +8,6 @@ other task of its own level. Run twice, it writes the same again.
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,13 +16,14 @@ import numpy as np
 from ..pool.pyramid import extend, pool_max, pool_mean, pool_min, round_array, window
 from .layout import BORDER, CELL, Layout, opened
 from .levels import Deadline, Stored, StoreError, short
-from .sources import Source
+from .sources import Array, Source
 from .store import needed_cells
 
 _TIMEOUT = 3600.0  # seconds for one read of local data
 _SLAB = 32  # planes of a level made at a time: two chunks of the level below
 
 Zyx = tuple[int, int, int]
+_POOLS = (pool_mean, pool_min, pool_max)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +32,7 @@ class Job:
 
     root: dict[str, Any]  # kvstore of the store
     layout: Layout
-    source: Source
+    source: Source | Array
     threshold: float | None
     nan: float | None
 
@@ -72,8 +72,7 @@ def write_shard(job: Job, level: int, place: Zyx) -> Done:
             return Done(level, place, 0, bad)
         least = most = values
     else:
-        values = _from_below(job, level, *box, None)
-        least, most = (_from_below(job, level, *box, which) for which in ("low", "high"))
+        values, least, most = _from_below(job, level, *box)
     writes = [_write(job, layout.plain(level), low, _plain(values[inner]))]
     if 0 < level < layout.levels - 1:
         for which, bound in (("low", least), ("high", most)):
@@ -94,7 +93,7 @@ def _from_source(
     shape = job.layout.shape(0)
     start = [max(a, 0) for a in low]
     stop = [min(b, n) for b, n in zip(high, shape, strict=True)]
-    values = job.source.read(start, stop)
+    values = job.source.read_box(start, stop)
     bad = 0
     if values.dtype.kind == "f":
         wrong = ~np.isfinite(values)
@@ -106,30 +105,32 @@ def _from_source(
     return _pad(values, low, high, start, stop), bad
 
 
-def _from_below(
-    job: Job, level: int, low: list[int], high: list[int], which: str | None
-) -> np.ndarray:
-    """Makes a box of a level, voxels around it included, from the level below."""
+def _from_below(job: Job, level: int, low: list[int], high: list[int]) -> list[np.ndarray]:
+    """Makes a box of a level, voxels around it included, from the level below: means, smallest and
+    largest finest values.
+    """
     layout = job.layout
     shape, below = layout.shape(level), layout.shape(level - 1)
-    plain = which is None or level == 1
-    spec = layout.plain(level - 1) if plain else layout.bound(str(which), level - 1)
+    specs = [layout.plain(level - 1)]
+    if level > 1:  # below that, the values are their own smallest and largest
+        specs += [layout.bound(which, level - 1) for which in ("low", "high")]
     deadline = Deadline(_TIMEOUT)
-    where = f"level {level - 1}"
-    array = deadline.wait(opened(job.root, spec), where)
-    stored = Stored(array, "czyx"[-array.rank :], (1, 1, 1), where)
-    pool: Callable[..., np.ndarray] = {None: pool_mean, "low": pool_min, "high": pool_max}[which]
+    arrays = []
+    for spec in specs:
+        array = deadline.wait(opened(job.root, spec), spec["path"])
+        arrays.append(Stored(array, "czyx"[-array.rank :], (1, 1, 1), spec["path"]))
     start = [max(a, 0) for a in low]
     stop = [min(b, n) for b, n in zip(high, shape, strict=True)]
-    out = np.empty((*[b - a for a, b in zip(start, stop, strict=True)], layout.width), layout.dtype)
-    z = start[0]
-    while z < stop[0]:
+    size = (*[b - a for a, b in zip(start, stop, strict=True)], layout.width)
+    made = [np.empty(size, layout.dtype) for _ in _POOLS]
+    for z in (start[0], *range((start[0] // _SLAB + 1) * _SLAB, stop[0], _SLAB)):
         end = min(stop[0], (z // _SLAB + 1) * _SLAB)
         first = [2 * z, 2 * start[1], 2 * start[2]]
         last = [min(2 * b, n) for b, n in zip((end, *stop[1:]), below, strict=True)]
-        out[z - start[0] : end - start[0]] = pool(stored.read(first, last, deadline), 2)
-        z = end
-    return _pad(out, low, high, start, stop)
+        parts = [array.read(first, last, deadline) for array in arrays]
+        for out, part, pool in zip(made, parts * (len(_POOLS) // len(parts)), _POOLS, strict=True):
+            out[z - start[0] : end - start[0]] = pool(part, 2)
+    return [_pad(values, low, high, start, stop) for values in made]
 
 
 def _pad(
@@ -164,7 +165,8 @@ def _blocks(layout: Layout, values: np.ndarray, needed: np.ndarray) -> np.ndarra
     grid = [-(-n // per) for n in needed.shape]
     wanted = np.zeros([n * per for n in grid], bool)
     wanted[tuple(slice(0, n) for n in needed.shape)] = needed
-    wanted = wanted.reshape(grid[0], per, grid[1], per, grid[2], per).any((1, 3, 5))
+    parts = wanted.reshape(grid[0], per, grid[1], per, grid[2], per)
+    wanted = np.asarray(parts.any((1, 3, 5)))
     if not wanted.any():
         return None
     strides = values.strides

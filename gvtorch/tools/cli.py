@@ -1,4 +1,4 @@
-"""The command line: `gvtorch info` and `gvtorch render`.
+"""The command line: `gvtorch info`, `gvtorch render` and `gvtorch convert`.
 
 torch is imported inside the commands, so that `--help` answers at once. A mistake of the user ends
 in one line on standard error and status 2.
@@ -12,7 +12,9 @@ import json
 import re
 import sys
 import threading
+import time
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -21,6 +23,8 @@ import tyro
 from tyro.conf import Positional, arg
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from ..pool import N3Tree
     from ..rendering import Camera, TransferFunction
     from ..volume import Volume
@@ -45,19 +49,25 @@ class Source:
         """Reads the volume at `path`."""
         from ..io import read_volume
 
-        shape = _numbers("--shape", self.shape, 3, int) if self.shape else None
-        spacing = _numbers("--spacing", self.spacing, 3, float) if self.spacing else None
-        return read_volume(
-            path, shape=shape, dtype=self.dtype, spacing=spacing, key=self.key, nan=self.nan
-        )
+        return read_volume(path, **self.options())
+
+    def options(self) -> dict[str, Any]:
+        """The options as arguments of `read_volume` and `convert`."""
+        return {
+            "shape": _numbers("--shape", self.shape, 3, int) if self.shape else None,
+            "dtype": self.dtype,
+            "spacing": _numbers("--spacing", self.spacing, 3, float) if self.spacing else None,
+            "key": self.key,
+            "nan": self.nan,
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
 class Info:
-    """Tell about this installation, or about a volume file."""
+    """Tell about this installation, a volume file, or a store."""
 
-    path: Positional[Annotated[Path | None, arg(metavar="PATH")]] = None
-    """a volume; without it backends, devices and versions"""
+    path: Positional[Annotated[str | None, arg(metavar="PATH")]] = None
+    """a volume or a store; without it backends, devices and versions"""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """print JSON"""
     source: tyro.conf.OmitArgPrefixes[Source] = Source()
@@ -66,12 +76,16 @@ class Info:
         """Prints the answer."""
         if self.path is None:
             content = installation()
+        elif _is_store(self.path):
+            from ..io import Store
+
+            content = Store.open(self.path).describe()
         else:
             from ..io.formats import describe
 
             with Bar() as bar:
                 bar("reading", 0, 0)
-                content = describe(self.source.read(self.path))
+                content = describe(self.source.read(Path(self.path)))
         if self.json:
             print(json.dumps(content))
         else:
@@ -185,15 +199,88 @@ class Render:
         return TransferFunction.preset(self.tf, *volume.value_range)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Convert:
+    """Convert a volume of any size to a store: OME-Zarr with bordered blocks."""
+
+    path: Positional[Annotated[str, arg(metavar="PATH")]]
+    """the volume: RAW, NPY, NPZ, NIfTI, NRRD, TIFF, FITS or OME-Zarr (folder or URL)"""
+    store: Positional[Annotated[Path, arg(metavar="STORE.zarr")]]
+    """the folder to make"""
+    block: Literal[32, 64] = 32
+    """voxels along a side of a block"""
+    threshold: Annotated[float | None, arg(metavar="VALUE")] = None
+    """regions with no value above it are not kept as blocks"""
+    workers: Annotated[int | None, arg(metavar="N")] = None
+    """processes; one a core if left out"""
+    scheduler: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """of a dask cluster that shares this folder, as in tcp://host:8786"""
+    resume: tyro.conf.FlagCreatePairsOff[bool] = False
+    """go on with a half-written store"""
+    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
+    """tell disk, memory and time, and write nothing"""
+    source: tyro.conf.OmitArgPrefixes[Source] = Source()
+
+    def run(self) -> None:
+        """Converts, or tells what it would take."""
+        from ..io.convert import convert, estimate
+
+        if self.scheduler is not None and self.workers is not None:
+            raise ValueError("--scheduler brings its own workers: leave --workers out")
+        common: dict[str, Any] = {
+            **self.source.options(),
+            "block": self.block,
+            "threshold": self.threshold,
+            "workers": self.workers,
+        }
+        if self.dry_run:
+            del common["spacing"]
+            _print_table(_readable(estimate(self.path, self.store, **common).as_dict()))
+            return
+        start = time.perf_counter()
+        with Bar(speed=True) as bar, self._cluster() as executor:
+            store = convert(
+                *(self.path, self.store),
+                **common,
+                executor=executor,
+                resume=self.resume,
+                progress=bar,
+            )
+        seconds = time.perf_counter() - start
+        size = store.describe()["disk bytes"] / 1e6
+        extent = "x".join(str(n) for n in store.extent)
+        print(f"{self.store}: {extent}, {store.levels} levels, {size:.1f} MB in {seconds:.1f} s")
+
+    @contextlib.contextmanager
+    def _cluster(self) -> Iterator[Executor | None]:
+        if self.scheduler is None:
+            yield None
+            return
+        try:
+            from distributed import Client
+        except ImportError:
+            raise ImportError("--scheduler needs dask: pip install distributed") from None
+        with Client(self.scheduler, timeout="20s") as client:
+            yield client.get_executor()
+
+
 class Bar:
     """A progress bar on standard error that shows itself once the work has taken a second."""
 
-    def __init__(self) -> None:
-        """Shows nothing yet."""
+    def __init__(self, *, speed: bool = False) -> None:
+        """Shows nothing yet. With `speed` what is done counts bytes."""
         from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+        from rich.progress import (
+            BarColumn,
+            Progress,
+            ProgressColumn,
+            TextColumn,
+            TimeRemainingColumn,
+            TransferSpeedColumn,
+        )
 
-        columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+        rate: tuple[ProgressColumn, ...] = (TransferSpeedColumn(),) if speed else ()
+        columns = (TextColumn("{task.description}"), BarColumn(), *rate, TimeRemainingColumn())
         console = Console(stderr=True)
         self._progress = Progress(
             *columns, console=console, transient=True, disable=not console.is_terminal
@@ -264,6 +351,22 @@ def installation() -> dict[str, Any]:
     }
 
 
+def _is_store(path: str) -> bool:
+    return (
+        "://" in path or path.rstrip("/").endswith(".zarr") or (Path(path) / "zarr.json").exists()
+    )
+
+
+def _readable(content: dict[str, Any]) -> dict[str, Any]:
+    """Underscores to blanks, and bytes as MB."""
+    out = {}
+    for name, value in content.items():
+        is_bytes = name.endswith(("_bytes", "_free"))
+        text = f"{value / 1e6:.1f} MB" if is_bytes else value
+        out[name.removesuffix("_bytes").replace("_", " ")] = text
+    return out
+
+
 def _print_table(content: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
@@ -318,7 +421,7 @@ def main(args: list[str] | None = None) -> None:
     try:
         with contextlib.redirect_stderr(said):
             command = tyro.extras.subcommand_cli_from_dict(
-                {"info": Info, "render": Render},
+                {"info": Info, "render": Render, "convert": Convert},
                 args=args,
                 prog="gvtorch",
                 description="GigaVoxels on PyTorch tensors.",

@@ -1,0 +1,45 @@
+"""What the machine has, cores and memory, and how a worker process begins."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+
+_LOOK = 1.0  # seconds between two looks whether the parent process still lives
+
+
+def existing(path: Path) -> Path:
+    """The nearest folder above that is there."""
+    path = path.absolute()
+    return path if path.exists() else existing(path.parent)
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def memory_free() -> int:
+    """Bytes of memory that can be had without swapping; half of all where it is not told."""
+    try:
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except OSError:
+        pass
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+
+
+def begin_worker(parent: int) -> None:
+    """Sets a worker process up: Ctrl-C is the parent's business, and it ends with its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_LOOK)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -1,0 +1,205 @@
+"""A store while it is made: state, lock, manifest, journal, and the step that makes it a store.
+
+The work itself is in convert.py.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+from ..volume import Volume, movable
+from .layout import BORDER, CELL, GROUPS, VERSION, WORK, Layout
+from .ngff import image_metadata, parse_json
+
+
+class NotFiniteError(ValueError):
+    """The source holds NaN or infinite values."""
+
+
+class Work:
+    """The hidden folder of a store that is being made."""
+
+    def __init__(self, target: Path, done: dict[tuple[int, ...], int], journal: IO[str]) -> None:
+        """Takes the folder over; `done` maps (level, z, y, x) of finished tasks to their voxels."""
+        self.target, self.done, self._journal = target, done, journal
+
+    def note(self, task: tuple[int, ...], voxels: int) -> None:
+        """Writes down that a task is done; on disk when this returns."""
+        self.done[task] = voxels
+        self._journal.write(json.dumps({"task": task, "voxels": voxels}) + "\n")
+        self._journal.flush()
+        os.fsync(self._journal.fileno())
+
+    def forget_bounds(self, level: int) -> None:
+        """Removes the temporary pyramids of a level that is not needed any more."""
+        for which in ("low", "high"):
+            shutil.rmtree(self.target / WORK / which / str(level), ignore_errors=True)
+
+    def discard(self) -> None:
+        """Removes the half-written store."""
+        shutil.rmtree(self.target, ignore_errors=True)
+
+    def finish(
+        self, layout: Layout, settings: dict[str, Any], value_range: list[list[float]]
+    ) -> None:
+        """Writes the metadata, the root's last of all, and removes the hidden folder."""
+        for group in GROUPS:
+            _write_json(self.target / group / "zarr.json", _group({}))
+        place = {"spacing": settings["spacing"], "origin": settings["origin"]}
+        image = image_metadata(
+            self.target.name.removesuffix(".zarr"),
+            layout.levels,
+            width=layout.width,
+            unit=settings["unit"],
+            **place,
+        )
+        own = {
+            "version": VERSION,
+            "extent": list(layout.extent),
+            **place,
+            "dtype": layout.dtype,
+            "channels": layout.width,
+            "block": layout.block,
+            "border": BORDER,
+            "cell": CELL,
+            "levels": layout.levels,
+            "branching": 2,
+            "threshold": settings["threshold"],
+            "value_range": value_range,
+            "complete": True,
+        }
+        _write_json(self.target / "zarr.json", _group({"ome": image, "gvtorch": own}))
+        shutil.rmtree(self.target / WORK, ignore_errors=True)
+
+
+def state(target: Path, *, resume: bool) -> bool:
+    """Returns whether there is a half-written store to go on with.
+
+    Raises:
+        FileExistsError: There is a whole store, a half-written one without `resume`, or something
+            else.
+        FileNotFoundError: The folder that it shall be in is not there.
+    """
+    if (target / "zarr.json").exists():
+        raise FileExistsError(f"{target}: there is a store already; remove it or choose a new name")
+    manifest = target / WORK / "manifest.json"
+    if manifest.exists():
+        if not resume:
+            raise FileExistsError(
+                f"{target}: half-written; --resume (resume=True) goes on with it, or remove it"
+            )
+        return True
+    if target.is_dir() and {entry.name for entry in target.iterdir()} <= {WORK}:
+        return False
+    if target.exists():
+        raise FileExistsError(f"{target}: exists and is no store; choose a new name")
+    if not target.absolute().parent.is_dir():
+        raise FileNotFoundError(f"folder not found: {target.absolute().parent}")
+    return False
+
+
+@contextmanager
+def locked(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator[Work]:
+    """Makes or takes over the hidden folder, for this process alone.
+
+    Raises:
+        OSError: Another process is at work there.
+        ValueError: `resume`, and settings or source differ.
+    """
+    import fcntl
+
+    folder = target / WORK
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "lock").open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise OSError(f"{target}: another process is converting to it") from None
+        done: dict[tuple[int, ...], int] = {}
+        if resume:
+            _compare(target, settings)
+            done = _read_journal(folder / "journal.jsonl")
+        with (folder / "journal.jsonl").open("w", encoding="utf-8") as journal:
+            for task, voxels in done.items():
+                journal.write(json.dumps({"task": task, "voxels": voxels}) + "\n")
+            journal.flush()
+            os.fsync(journal.fileno())
+            _write_json(folder / "manifest.json", settings)
+            yield Work(target, done, journal)
+
+
+def _compare(target: Path, settings: dict[str, Any]) -> None:
+    manifest = target / WORK / "manifest.json"
+    before = parse_json(str(manifest), manifest.read_bytes())
+    plain = json.loads(json.dumps(settings))
+    if before.get("fingerprint") != plain["fingerprint"]:
+        raise ValueError(
+            f"{target}: the source is not the one that it was begun with ({before.get('source')}): "
+            "size or time of change differ; remove the store to begin again"
+        )
+    for key, value in plain.items():
+        if key != "source" and before.get(key) != value:
+            raise ValueError(
+                f"{target}: was begun with {key} {before.get(key)!r}, now it is {value!r}; "
+                "remove the store to begin again"
+            )
+
+
+def _read_journal(path: Path) -> dict[tuple[int, ...], int]:
+    """Finished tasks; a last line that was cut off is none."""
+    done = {}
+    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
+        try:
+            entry = json.loads(line)
+            done[tuple(int(n) for n in entry["task"])] = int(entry["voxels"])
+        except (ValueError, KeyError, TypeError):
+            break
+    return done
+
+
+def _group(attributes: dict[str, Any]) -> dict[str, Any]:
+    return {"zarr_format": 3, "node_type": "group", "attributes": attributes}
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    """Writes a file that is either there as a whole or not at all."""
+    draft = path.with_name(f".{path.name}.draft")
+    with draft.open("w", encoding="utf-8") as file:
+        json.dump(content, file, indent=1, allow_nan=False)
+        file.flush()
+        os.fsync(file.fileno())
+    draft.replace(path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def fingerprint(source: str | Path | Volume) -> list[Any]:
+    """What tells whether a source is still the same: sizes and times of change, or a checksum."""
+    if isinstance(source, Volume):
+        data = movable(source.data)
+        return [list(data.shape), str(source.data.dtype), zlib.crc32(data.numpy().tobytes())]
+    text = str(source)
+    if "://" in text:
+        return [text]
+    path = Path(text)
+    if not path.is_dir():
+        stat = path.stat()
+        return [stat.st_size, stat.st_mtime_ns]
+    digest, files = hashlib.sha256(), 0
+    for file in sorted(path.iterdir()):
+        stat = file.stat()
+        size = stat.st_size if file.is_file() else 0
+        digest.update(f"{file.name} {size} {stat.st_mtime_ns}\n".encode())
+        files += 1
+    return [files, digest.hexdigest()]
