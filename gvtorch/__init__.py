@@ -11,9 +11,11 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from .frame import Hits, Rays
+    from .engine import Engine
+    from .frame import FrameStats, Hits, Rays
     from .io import read_volume
     from .pool import BrickPool, Channel, N3Tree, NodePool
+    from .producers import Bricks, Nodes, Producer, Region, Regions, VolumeProducer
     from .rendering import Camera, Picture, RenderOptions, TransferFunction, TreeTracer, render
     from .volume import Volume
 
@@ -21,6 +23,14 @@ __version__ = "0.1.0"
 
 _HOME = {
     "BrickPool": ".pool",
+    "Bricks": ".producers",
+    "Engine": ".engine",
+    "FrameStats": ".frame",
+    "Nodes": ".producers",
+    "Producer": ".producers",
+    "Region": ".producers",
+    "Regions": ".producers",
+    "VolumeProducer": ".producers",
     "Camera": ".rendering",
     "Channel": ".pool",
     "Hits": ".frame",
@@ -38,17 +48,25 @@ _HOME = {
 
 __all__ = [
     "BrickPool",
+    "Bricks",
     "Camera",
     "Channel",
+    "Engine",
+    "FrameStats",
     "Hits",
     "N3Tree",
     "NodePool",
+    "Nodes",
     "Picture",
+    "Producer",
     "Rays",
+    "Region",
+    "Regions",
     "RenderOptions",
     "TransferFunction",
     "TreeTracer",
     "Volume",
+    "VolumeProducer",
     "read_volume",
     "render",
 ]

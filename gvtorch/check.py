@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 import operator
 import os
+import re
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -70,6 +71,25 @@ def memory(where: str, what: str, nbytes: int, device: torch.device) -> None:
         raise ValueError(
             f"{where}: {what} takes {nbytes / 2**30:.1f} GiB, {device} has {total / 2**30:.1f} GiB"
         )
+
+
+_UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+_UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30, "TIB": 2**40}
+
+
+def nbytes(where: str, name: str, value: Any) -> int:
+    """Returns bytes from a number or a text such as "8 MB" (10^6) or "8 MiB" (2^20).
+
+    Raises:
+        ValueError: It is neither, or not positive.
+    """
+    if isinstance(value, str):
+        match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([A-Za-z]*)\s*", value)
+        unit = _UNITS.get(match[2].upper()) if match else None
+        if match is None or unit is None:
+            raise ValueError(f'{where}: {name} must be bytes, as in "256 MB", got {value!r}')
+        value = int(float(match[1]) * unit)
+    return whole(where, name, value, low=1, high=2**62)
 
 
 def number(

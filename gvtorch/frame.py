@@ -1,8 +1,8 @@
-"""The records of tensors that the steps of a frame hand to each other."""
+"""The records that the steps of a frame hand to each other, and what a frame cost."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 
 from torch import Tensor
 
@@ -25,3 +25,51 @@ class Hits:
     alpha: Tensor  # (r, 1)
     depth: Tensor  # (r, 1) distance along the ray in world units, +inf where nothing was hit
     samples: Tensor  # (r,) int32, places at which the shader was evaluated
+
+
+@dataclass(kw_only=True)
+class RenderStats:
+    """What a picture cost."""
+
+    milliseconds: float = 0.0  # wall time of the whole call
+    stages: dict[str, float] = field(default_factory=dict)  # milliseconds by stage
+    backend: str = ""
+    rays: int = 0
+    samples: int = 0  # places at which the shader was evaluated
+    nodes: int = 0  # nodes in the pool
+    bricks: int = 0  # bricks in the pool
+    bytes: int = 0  # memory of the pools
+    tiles_used: int = 0  # node tiles that rays passed through
+    bricks_used: int = 0  # bricks that rays sampled
+
+    def as_dict(self) -> dict[str, object]:
+        """Returns plain values, ready for JSON."""
+        return asdict(self)
+
+
+@dataclass(kw_only=True)
+class FrameStats(RenderStats):
+    """What a frame of the engine cost, and what it asked for."""
+
+    frame: int = 0  # number of the frame, from 1
+    frames: int = 1  # frames that this picture took
+    requests: dict[str, int] = field(default_factory=dict)  # wishes by kind: load, subdivide
+    misses: int = 0  # nodes that rays missed, those whose answer is on its way counted too
+    produced: dict[str, int] = field(default_factory=dict)  # tiles, bricks, constant nodes
+    evicted: dict[str, int] = field(default_factory=dict)  # tiles, bricks that others replaced
+    bytes_uploaded: int = 0  # voxels moved into the brick pool
+    pending: int = 0  # answers on their way
+    deferred: int = 0  # wishes that the budgets put off
+    overflow: int = 0  # nodes with a wish that the list had no place for
+    failed: int = 0  # nodes that could not be produced, since the engine was made
+    capacity_exceeded: bool = False  # a wish found no slot that this frame had not used itself
+    converged: bool = False  # nothing that could be served was missing
+
+    @property
+    def miss_rate(self) -> float:
+        """Missed nodes over missed nodes and bricks used."""
+        return self.misses / max(1, self.misses + self.bricks_used)
+
+    def as_dict(self) -> dict[str, object]:
+        """Returns plain values, ready for JSON."""
+        return {**asdict(self), "miss_rate": self.miss_rate}

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from .. import check
+from ..volume import movable
 from .channel import Channel
 
 
@@ -18,6 +19,7 @@ class BrickPool:
         bricks: For each channel (b, z, y, x, c), sides of brick_size + 2 * border.
         stamp_b: (b,) last frame in which a ray sampled the brick, -1 for never.
         owner_b: (b,) node index that the brick belongs to, -1 for free.
+        shared_b: (b,) bool, other nodes may point to the brick as well (instancing).
     """
 
     def __init__(
@@ -55,12 +57,14 @@ class BrickPool:
         }
         self.stamp_b = torch.full((capacity,), -1, dtype=torch.int32, device=device)
         self.owner_b = torch.full((capacity,), -1, dtype=torch.int32, device=device)
+        self.shared_b = torch.zeros((capacity,), dtype=torch.bool, device=device)
 
     @property
     def fields(self) -> dict[str, Tensor]:
         """All tensors by name; channels as `bricks.NAME`."""
         channels = {f"bricks.{name}": tensor for name, tensor in self.bricks.items()}
-        return {**channels, "stamp_b": self.stamp_b, "owner_b": self.owner_b}
+        words = {"stamp_b": self.stamp_b, "owner_b": self.owner_b, "shared_b": self.shared_b}
+        return channels | words
 
     @property
     def capacity(self) -> int:
@@ -71,3 +75,22 @@ class BrickPool:
     def nbytes(self) -> int:
         """Memory of all fields."""
         return sum(field.nbytes for field in self.fields.values())
+
+
+def cut_bricks(values_zyxc: Tensor, place_k3: Tensor, brick_size: int, border: int) -> Tensor:
+    """Cuts bricks out of a level, borders from the neighbours, clamped at the level's faces.
+
+    Args:
+        values_zyxc: (z, y, x, c) a whole level.
+        place_k3: (k, 3) int64 brick indices, z y x.
+        brick_size: Voxels along a side, without the border.
+        border: Voxels around.
+
+    Returns:
+        (k, s, s, s, c), s = brick_size + 2 * border.
+    """
+    reach = torch.arange(-border, brick_size + border)
+    corner = place_k3[:, :, None] * brick_size + reach  # (k, 3, s)
+    z, y, x = (corner[:, axis].clamp(0, values_zyxc.shape[axis] - 1) for axis in range(3))
+    index = (z[:, :, None, None], y[:, None, :, None], x[:, None, None, :])
+    return movable(values_zyxc)[index].view(values_zyxc.dtype)

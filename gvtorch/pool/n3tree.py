@@ -11,7 +11,7 @@ from .. import check
 from ..config import CONSTANT, EMPTY, TERMINAL
 from ..stage import Progress, no_progress
 from ..volume import Volume, movable
-from .brick_pool import BrickPool
+from .brick_pool import BrickPool, cut_bricks
 from .channel import Channel
 from .node_pool import NodePool
 from .pyramid import Level, build_levels, round_to
@@ -82,6 +82,11 @@ class N3Tree:
         return self.nodes.child_tn.device
 
     @property
+    def number(self) -> int:
+        """What `tree_t` holds for its tiles: the tile of its root."""
+        return self.root // self.nodes.nodes_per_tile
+
+    @property
     def side(self) -> int:
         """Voxels of the finest level along a side of the root cube."""
         return self.bricks.brick_size * self.branching**self.depth
@@ -122,6 +127,31 @@ class N3Tree:
         high = torch.tensor([n / self.side for n in self.extent], dtype=dtype)
         return torch.stack((low, high)).to(self.device)
 
+    def loc(self, node: Tensor) -> Tensor:
+        """Returns (k, 4) int64 x, y, z, depth of nodes (k,) of this tree."""
+        n, per_tile = self.branching, self.nodes.nodes_per_tile
+        above = self.nodes.loc_t4[node // per_tile].to(torch.int64)
+        child = node % per_tile
+        digits = torch.stack((child % n, child // n % n, child // n**2, torch.zeros_like(child)), 1)
+        factor = torch.tensor([n, n, n, 1], device=node.device)
+        return above * factor + digits
+
+    def find(self, loc: Tensor) -> Tensor:
+        """Returns (k,) int64 node indices of places (k, 4) x, y, z, depth; -1 where there is none
+        yet.
+        """
+        n = self.branching
+        node = torch.full_like(loc[:, 0], self.root)
+        child = self.nodes.child_tn.view(-1)
+        for level in range(1, int(loc[:, 3].max()) + 1 if len(loc) else 0):
+            tile = torch.where(node >= 0, child[node.clamp(min=0)].to(torch.int64), -1)
+            up = (loc[:, 3] - level).clamp(min=0)
+            x, y, z = (loc[:, axis] // n**up % n for axis in range(3))
+            below = tile * self.nodes.nodes_per_tile + (z * n + y) * n + x
+            deeper = level <= loc[:, 3]
+            node = torch.where(deeper, torch.where(tile >= 0, below, -1), node)
+        return node
+
     def __repr__(self) -> str:
         """Shows extent, depth, pools and memory."""
         extent = "x".join(str(n) for n in self.extent)
@@ -133,16 +163,19 @@ class N3Tree:
         )
 
     def validate(self) -> None:
-        """Raises ValueError unless every pointer leads to a tile or brick that exists and is owned
-        once.
+        """Raises ValueError unless every pointer leads to a tile or brick that exists and, where
+        it is not shared, is owned once.
         """
         child, brick = self.nodes.child_tn, self.nodes.brick_tn
         if bool(((child < TERMINAL) | (child >= self.nodes.capacity)).any()):
             raise ValueError("N3Tree: a child pointer leads out of the node pool")
         if bool(((brick < CONSTANT) | (brick >= self.bricks.capacity)).any()):
             raise ValueError("N3Tree: a brick pointer leads out of the brick pool")
-        for name, pointers in (("tile", child), ("brick", brick)):
-            used = pointers[pointers >= 0]
+        for name, pointers, shared in (
+            *(("tile", child, self.nodes.shared_t), ("brick", brick, self.bricks.shared_b)),
+        ):
+            used = pointers[pointers >= 0].to(torch.int64)
+            used = used[~shared[used]]
             if used.unique().numel() != used.numel():
                 raise ValueError(f"N3Tree: a {name} has two owners")
 
@@ -340,17 +373,12 @@ class _Plan:
         return tile * dim + (z * n + y) * n + x
 
     def fill(self, tree: N3Tree, name: str, at: int, level: Level) -> None:
-        """Cuts the bricks of a depth out of its level, borders from the neighbours, clamped at the
-        faces.
-        """
+        """Cuts the bricks of a depth out of its level."""
         pool = tree.bricks
-        size, border = pool.brick_size, pool.border
-        reach = torch.arange(-border, size + border)
-        values, bricks = movable(level.values), movable(pool.bricks[name])
+        bricks = movable(pool.bricks[name])
         data = (self.region[at] >= 0).nonzero()
         slots = self.region[at][tuple(data.T)].to(torch.int64)
         for start in range(0, data.shape[0], _BATCH):
-            corner = data[start : start + _BATCH, :, None] * size + reach  # (k, 3, s)
-            z, y, x = (corner[:, axis].clamp(0, values.shape[axis] - 1) for axis in range(3))
-            brick = values[z[:, :, None, None], y[:, None, :, None], x[:, None, None, :]]
-            bricks[slots[start : start + _BATCH].to(tree.device)] = brick.to(tree.device)
+            part = slice(start, start + _BATCH)
+            brick = cut_bricks(level.values, data[part], pool.brick_size, pool.border)
+            bricks[slots[part].to(tree.device)] = movable(brick).to(tree.device)

@@ -28,6 +28,7 @@ class NodePool:
         parent_t: (t,) node index whose children this tile holds, -1 for a root tile.
         tree_t: (t,) number of the tree that owns the tile.
         stamp_t: (t,) last frame in which a ray passed through, -1 for never.
+        shared_t: (t,) bool, other nodes may point to the tile as well (instancing, recursion).
         constants: For each channel (t, n, c): the value of CONSTANT nodes, the mean of EMPTY ones.
         ranges: For each channel (t, n, 2, c): smallest and largest value in reach of the node's
             brick, of all levels; what may be anything spans all that the dtype can hold.
@@ -70,6 +71,7 @@ class NodePool:
         self.parent_t = torch.full((capacity,), -1, dtype=torch.int32, device=device)
         self.tree_t = torch.zeros((capacity,), dtype=torch.int32, device=device)
         self.stamp_t = torch.full((capacity,), -1, dtype=torch.int32, device=device)
+        self.shared_t = torch.zeros((capacity,), dtype=torch.bool, device=device)
         self.constants: dict[str, Tensor] = {}
         self.ranges: dict[str, Tensor] = {}
         for name, channel in (channels or {}).items():

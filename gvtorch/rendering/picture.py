@@ -4,32 +4,14 @@ from __future__ import annotations
 
 import os
 import tempfile
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-
-@dataclass(frozen=True, kw_only=True)
-class RenderStats:
-    """What a picture cost."""
-
-    milliseconds: float  # wall time of the whole call
-    stages: dict[str, float]  # milliseconds by stage
-    backend: str
-    rays: int
-    samples: int  # places at which the shader was evaluated
-    nodes: int  # nodes in the pool
-    bricks: int  # bricks in the pool
-    bytes: int  # memory of the pools
-    tiles_used: int  # node tiles that rays passed through
-    bricks_used: int  # bricks that rays sampled
-
-    def as_dict(self) -> dict[str, object]:
-        """Returns plain values, ready for JSON."""
-        return asdict(self)
+from ..frame import RenderStats
 
 
 @dataclass(frozen=True, kw_only=True)

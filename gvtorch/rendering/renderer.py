@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
 
 from .. import check, config
-from ..frame import Hits, Rays
+from ..frame import Hits, Rays, RenderStats
 from ..ops import trace_rays
 from ..ops.trace import Backend, choose_backend, most_intervals
 from ..pool import N3Tree
 from ..stage import Progress, collect_timings, no_progress, stage
 from .camera import Camera
 from .module import approach
-from .picture import Picture, RenderStats
+from .picture import Picture
 from .shader import TransferFunction
 
 _RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that progress shows
@@ -83,48 +83,55 @@ def render(
     Raises:
         ValueError: An option is unknown or out of its range, or the backend can't be used.
     """
-    unknown = sorted(set(options) - set(RenderOptions.__dataclass_fields__))
-    if unknown:
-        raise ValueError(
-            f"render: unknown option {unknown[0]!r}; "
-            f"known: {', '.join(RenderOptions.__dataclass_fields__)}"
-        )
-    for name, value, kind in (
-        *(("tree", tree, N3Tree), ("camera", camera, Camera)),
-        ("shader", shader, TransferFunction),
-    ):
-        if not isinstance(value, kind):
-            raise ValueError(
-                f"render: {name} must be a {kind.__name__}, got {type(value).__name__}"
-            )
-    chosen = RenderOptions(**options)
+    chosen = render_options("render", camera, options)
+    for name, value, kind in (("tree", tree, N3Tree), ("shader", shader, TransferFunction)):
+        check_type("render", name, value, kind)
     start = time.perf_counter()
     with collect_timings() as timings:
         with stage("prepare"):
+            tree.frame += 1
             tracer = Tracer(tree, shader, chosen)
-            world = camera.placed(tree.box)
-            hits = _room(tree.device, chosen.dtype, len(camera) * camera.height * camera.width)
-        done = 0
-        for part in _trace_blocks(world, tracer, progress):
-            for name, field in vars(part).items():
-                vars(hits)[name][done : done + field.shape[0]] = field
-            done += part.alpha.shape[0]
+        hits = trace_camera(camera.placed(tree.box), tree.device, tracer, chosen.dtype, progress)
         with stage("picture"):
-            color, alpha, depth, samples = vars(hits).values()
-            background = torch.tensor(chosen.background, dtype=color.dtype, device=tree.device)
-            color += (1 - alpha) * background
             stats = RenderStats(
                 milliseconds=1e3 * (time.perf_counter() - start),
                 stages=timings,
                 backend=choose_backend(chosen.backend, tree.device),
-                rays=alpha.shape[0],
-                samples=int(samples.sum(dtype=torch.int64)),
+                rays=hits.alpha.shape[0],
+                samples=int(hits.samples.sum(dtype=torch.int64)),
                 nodes=tree.nodes.child_tn.numel(),
                 bricks=tree.bricks.capacity,
                 bytes=tree.nbytes,
                 tiles_used=int((tree.nodes.stamp_t == tree.frame).sum()),
                 bricks_used=int((tree.bricks.stamp_b == tree.frame).sum()),
             )
+            return develop(hits, camera, chosen.background, stats)
+
+
+def render_options(where: str, camera: Camera, options: dict[str, Any]) -> RenderOptions:
+    """Checks a user's camera and options."""
+    check_type(where, "camera", camera, Camera)
+    unknown = sorted(set(options) - set(RenderOptions.__dataclass_fields__))
+    if unknown:
+        raise ValueError(
+            f"{where}: unknown option {unknown[0]!r}; "
+            f"known: {', '.join(RenderOptions.__dataclass_fields__)}"
+        )
+    return RenderOptions(**options)
+
+
+def check_type(where: str, name: str, value: Any, kind: type) -> None:
+    """Raises ValueError unless a user's argument is of a class."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{where}: {name} must be a {kind.__name__}, got {type(value).__name__}")
+
+
+def develop(
+    hits: Hits, camera: Camera, background: tuple[float, float, float], stats: RenderStats
+) -> Picture:
+    """Puts the hits of a camera's rays over the background, in the camera's shape."""
+    color, alpha, depth, samples = vars(hits).values()
+    color += (1 - alpha) * torch.tensor(background, dtype=color.dtype, device=color.device)
     shape = (len(camera), camera.height, camera.width)
     images = {
         "color": color.reshape(*shape, 3),
@@ -147,9 +154,28 @@ def _room(device: torch.device, dtype: torch.dtype, pixels: int) -> Hits:
     return Hits(**reals, samples=torch.empty(pixels, dtype=torch.int32, device=device))
 
 
-def _trace_blocks(camera: Camera, tracer: Tracer, progress: Progress) -> Iterator[Hits]:
-    """Traces block after block of rows: rays take more memory than the picture they make."""
-    device = tracer.tree.device
+def trace_camera(
+    camera: Camera,
+    device: torch.device,
+    trace_rays: Callable[[Rays], Hits],
+    dtype: torch.dtype,
+    progress: Progress,
+) -> Hits:
+    """Traces all rays of a camera, or of a batch, block after block: rays take more memory than
+    the picture they make.
+    """
+    hits = _room(device, dtype, len(camera) * camera.height * camera.width)
+    done = 0
+    for part in _trace_blocks(camera, device, trace_rays, progress):
+        for name, field in vars(part).items():
+            vars(hits)[name][done : done + field.shape[0]] = field
+        done += part.alpha.shape[0]
+    return hits
+
+
+def _trace_blocks(
+    camera: Camera, device: torch.device, trace_rays: Callable[[Rays], Hits], progress: Progress
+) -> Iterator[Hits]:
     rows = max(1, _RAYS_A_BLOCK[device.type] // camera.width)
     done, total = 0, len(camera) * camera.height
     for index in range(len(camera)):
@@ -159,7 +185,7 @@ def _trace_blocks(camera: Camera, tracer: Tracer, progress: Progress) -> Iterato
             with stage("rays"):
                 rays = one.rays(device, (top, end))
             with stage("trace"):
-                yield tracer(rays)
+                yield trace_rays(rays)
             done += end - top
             progress("rays", done, total)
 
@@ -181,11 +207,12 @@ def trace(
     Raises:
         ValueError: The channel is unknown, the step too short, or the backend can't be used.
     """
+    tree.frame += 1
     return Tracer(tree, shader, options or RenderOptions())(rays)
 
 
 class Tracer:
-    """One frame of a tree: counts `tree.frame` up, then traces any number of batches of rays."""
+    """One frame of a tree, `tree.frame`: traces any number of batches of rays."""
 
     def __init__(
         self,
@@ -203,7 +230,6 @@ class Tracer:
             raise ValueError(f"render: unknown channel {channel!r}; the tree has {known}")
         step = options.step * min(tree.spacing)
         most_intervals(float((tree.box[1] - tree.box[0]).norm()), step)
-        tree.frame += 1
         self.tree, self.options = tree, options
         table, domain, opaque = shader.table(min(tree.spacing), options.dtype, tree.device)
         self.arguments: dict[str, Any] = {
@@ -250,3 +276,36 @@ class Tracer:
         )
         depth = depth + moved.to(options.dtype)
         return Hits(color=color, alpha=alpha, depth=depth, samples=samples)
+
+
+def composite_trees(tracers: list[Tracer], rays: Rays) -> Hits:
+    """Traces rays through several trees and puts them one over the other, nearest box first.
+
+    Right wherever boxes do not overlap along a ray; where they do, the nearer box as a whole comes
+    first.
+    """
+    near = torch.stack([_entry(tracer.tree.box, rays) for tracer in tracers])  # (m, r)
+    order = near.argsort(0, stable=True)
+    hits = [tracer(rays) for tracer in tracers]
+    fields = {name: torch.stack([vars(one)[name] for one in hits]) for name in vars(hits[0])}
+    which = order[:, :, None]
+    color, alpha = (fields[n].gather(0, which.expand_as(fields[n])) for n in ("color", "alpha"))
+    depths = fields["depth"].gather(0, which)
+    total_color, total_alpha = color[0], alpha[0]
+    for behind in range(1, len(tracers)):
+        total_color = total_color + (1 - total_alpha) * color[behind]
+        total_alpha = total_alpha + (1 - total_alpha) * alpha[behind]
+    return Hits(
+        color=total_color,
+        alpha=total_alpha,
+        depth=depths.amin(0),
+        samples=fields["samples"].sum(0, dtype=torch.int32),
+    )
+
+
+def _entry(box: torch.Tensor, rays: Rays) -> torch.Tensor:
+    """(r,) distance at which rays enter a world box, +inf where they pass it by."""
+    low, high = box.to(rays.origin)
+    a, b = (low - rays.origin) / rays.direction, (high - rays.origin) / rays.direction
+    first, last = torch.fmin(a, b).amax(1), torch.fmax(a, b).amin(1)
+    return torch.where(first <= last, first.clamp(min=0), torch.inf)

@@ -1,0 +1,8 @@
+"""The cache: pools with an order of use, requests, and which of them are served."""
+
+from .cache import Cache, Children, Written
+from .lru import LRU
+from .requests import KINDS, Requests
+from .scheduler import Scheduler
+
+__all__ = ["KINDS", "LRU", "Cache", "Children", "Requests", "Scheduler", "Written"]

@@ -1,0 +1,288 @@
+"""`Cache`: a node pool and a brick pool with their order of use; writes what was produced.
+
+Slots change hands in one order, always: slots are taken from those this frame did not use, every
+pointer to them is cleared, the new content is written, the nodes are linked to it. So no pointer
+ever leads to a slot that holds something else.
+Source: Crassin et al., "GigaVoxels", I3D 2009, section 5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from ..config import (
+    ABSENT,
+    EMPTY,
+    REQUEST_LOAD,
+    REQUEST_PENDING_SHIFT,
+    REQUEST_SUBDIVIDE,
+    TERMINAL,
+)
+from ..ops import link, unlink
+from ..pool import BrickPool, N3Tree, NodePool
+from ..volume import movable
+from .lru import LRU
+from .requests import Requests, collect
+
+
+@dataclass
+class Written:
+    """What one write did."""
+
+    items: int = 0  # tiles, or bricks
+    evicted: int = 0  # of them in slots that held something
+    constant: int = 0  # nodes that turned out to need no brick
+    stale: int = 0  # answers whose node is gone, or served already
+    unplaced: int = 0  # answers for which no slot was free
+    nbytes: int = 0  # voxels moved into the pool
+    lost: Tensor | None = field(default=None, repr=False)  # (k,) bool, neither written nor stale
+
+
+class Cache:
+    """Two pools, several trees. The first slots belong to the roots and are never given away.
+
+    Attributes:
+        nodes: The node pool.
+        bricks: The brick pool.
+        lru: For REQUEST_SUBDIVIDE the order of tiles, for REQUEST_LOAD that of bricks.
+    """
+
+    def __init__(self, nodes: NodePool, bricks: BrickPool, roots: int) -> None:
+        """Locks the first `roots` tiles and bricks."""
+        self.nodes, self.bricks = nodes, bricks
+        device = nodes.child_tn.device
+        self.lru = {
+            REQUEST_SUBDIVIDE: LRU(nodes.capacity, roots, device),
+            REQUEST_LOAD: LRU(bricks.capacity, roots, device),
+        }
+
+    def requests(self, capacity: int) -> Requests:
+        """Takes the frame's wishes out of the node pool."""
+        return collect(self.nodes, capacity)
+
+    def sort_by_use(self, frame: Tensor) -> None:
+        """Makes what `frame` (1,) did not use available."""
+        self.lru[REQUEST_SUBDIVIDE].sort(self.nodes.stamp_t, frame)
+        self.lru[REQUEST_LOAD].sort(self.bricks.stamp_b, frame)
+
+    def room(self) -> dict[int, int]:
+        """For each kind, the slots that may be taken in this frame."""
+        return {kind: lru.unused for kind, lru in self.lru.items()}
+
+    def mark_pending(self, node: Tensor, kind: int, pending: bool = True) -> None:
+        """Sets or clears the mark that an answer is on its way: the wish is not listed again."""
+        words, bit = self.nodes.request_tn.view(-1), kind << REQUEST_PENDING_SHIFT
+        words[node] = words[node] | bit if pending else words[node] & ~bit
+
+    def wanted(self, tree: N3Tree, node: Tensor, loc: Tensor, kind: int) -> Tensor:
+        """(k,) bool: the node still stands for the place, and still lacks what was asked for."""
+        tile = node // self.nodes.nodes_per_tile
+        words = self.nodes.brick_tn if kind == REQUEST_LOAD else self.nodes.child_tn
+        linked = (self.nodes.parent_t[tile] >= 0) | self.nodes.shared_t[tile] | (node == tree.root)
+        own = (self.nodes.tree_t[tile] == tree.number) & (tree.loc(node) == loc).all(1)
+        return linked & own & (words.view(-1)[node] == ABSENT)
+
+    def write_tiles(self, tree: N3Tree, node: Tensor, loc: Tensor, children: Children) -> Written:
+        """Gives nodes their children.
+
+        Args:
+            tree: Whose nodes they are.
+            node: (k,) int64 nodes to subdivide, each once.
+            loc: (k, 4) their places.
+            children: What the (k, n) children hold.
+        """
+        done = Written()
+        wanted = self.wanted(tree, node, loc, REQUEST_SUBDIVIDE)
+        place = wanted.nonzero()[:, 0]
+        done.stale = len(node) - len(place)
+        lru = self.lru[REQUEST_SUBDIVIDE]
+        fits = place[: lru.unused]
+        done.unplaced = len(place) - len(fits)
+        done.lost = torch.zeros_like(wanted)
+        done.lost[place[lru.unused :]] = True
+        done.items = len(fits)
+        if not len(fits):
+            return done
+        pool, per_tile = self.nodes, self.nodes.nodes_per_tile
+        tile_k = lru.take(len(fits))
+        tile = tile_k.to(torch.int64)
+        done.evicted = int((pool.parent_t[tile] >= 0).sum())
+        unlink(pool.child_tn, tile_k, pool.capacity)
+        unlink(pool.parent_t, tile_k, pool.capacity, per_tile)
+        unlink(self.bricks.owner_b, tile_k, pool.capacity, per_tile)
+
+        width = children.child.shape[1]
+        pool.child_tn[tile], pool.brick_tn[tile] = TERMINAL, EMPTY
+        pool.child_tn[tile, :width] = children.child[fits]
+        pool.brick_tn[tile, :width] = children.brick[fits]
+        pool.request_tn[tile], pool.stamp_t[tile], pool.shared_t[tile] = 0, -1, False
+        pool.loc_t4[tile] = loc[fits].to(torch.int32)
+        pool.loc_t4[tile, 3] += 1
+        pool.parent_t[tile] = node[fits].to(torch.int32)
+        pool.tree_t[tile] = tree.number
+        for words, values in (
+            (pool.constants, children.constants),
+            (pool.ranges, children.ranges),
+        ):
+            for name, tensor in values.items():
+                movable(words[name])[tile, :width] = movable(tensor)[fits]
+        node_k = node[fits].to(torch.int32)
+        link(pool.child_tn, pool.request_tn, node_k, tile_k, REQUEST_SUBDIVIDE)
+        if children.alias is not None:
+            self._share_children(tree, tile, children, fits)
+        return done
+
+    def _share_children(self, tree: N3Tree, tile: Tensor, children: Children, fits: Tensor) -> None:
+        """Points aliased children to the tiles and bricks of the nodes they are the same as."""
+        assert children.alias is not None
+        row, child = children.is_alias[fits].nonzero().unbind(1)
+        target = tree.find(children.alias[fits][row, child])
+        node = tile[row] * self.nodes.nodes_per_tile + child
+        known = target >= 0
+        self.share(node[known], target[known])
+
+    def share(self, node: Tensor, target: Tensor) -> None:
+        """Makes nodes the same as others: they point to the same tile and brick.
+
+        Args:
+            node: (k,) int64 nodes that own neither.
+            target: (k,) int64 nodes.
+        """
+        pool = self.nodes
+        child, brick = pool.child_tn.view(-1), pool.brick_tn.view(-1)
+        child[node], brick[node] = child[target], brick[target]
+        for words in (*pool.constants.values(), *pool.ranges.values()):
+            flat = movable(words).flatten(0, 1)
+            flat[node] = flat[target]
+        tiles, slots = child[node], brick[node]
+        pool.shared_t[tiles[tiles >= 0].to(torch.int64)] = True
+        self.bricks.shared_b[slots[slots >= 0].to(torch.int64)] = True
+
+    def write_bricks(
+        self,
+        tree: N3Tree,
+        node: Tensor,
+        loc: Tensor,
+        word: Tensor,
+        data: Mapping[str, Tensor],
+        constants: Mapping[str, Tensor],
+    ) -> Written:
+        """Gives nodes their bricks.
+
+        Args:
+            tree: Whose nodes they are.
+            node: (k,) int64 nodes, each once.
+            loc: (k, 4) their places.
+            word: (k,) int32: 0 where there are voxels, EMPTY or CONSTANT where none are needed.
+            data: For each channel (k, z, y, x, c).
+            constants: For each channel (k, c).
+        """
+        done = Written()
+        wanted = self.wanted(tree, node, loc, REQUEST_LOAD)
+        done.stale = len(node) - int(wanted.sum())
+        lru, pool = self.lru[REQUEST_LOAD], self.bricks
+        bare = (wanted & (word < 0)).nonzero()[:, 0]
+        full = (wanted & (word >= 0)).nonzero()[:, 0]
+        fits = full[: lru.unused]
+        done.items, done.constant = len(fits), len(bare)
+        done.unplaced = len(full) - len(fits)
+        done.lost = torch.zeros_like(wanted)
+        done.lost[full[lru.unused :]] = True
+        if len(bare):
+            for name, values in constants.items():
+                movable(self.nodes.constants[name]).flatten(0, 1)[node[bare]] = movable(values)[
+                    bare
+                ]
+            self._link_bricks(node[bare], word[bare])
+            child = self.nodes.child_tn.view(-1)
+            child[node[bare]] = torch.where(
+                child[node[bare]] == ABSENT, TERMINAL, child[node[bare]]
+            )
+        if len(fits):
+            slot_k = lru.take(len(fits))
+            done.evicted = int((pool.owner_b[slot_k.to(torch.int64)] >= 0).sum())
+            done.nbytes = self.put_bricks(slot_k, node[fits], {n: d[fits] for n, d in data.items()})
+        return done
+
+    def share_bricks(self, tree: N3Tree, node: Tensor, loc: Tensor, target: Tensor) -> None:
+        """Gives nodes the bricks of others, whatever they are, voxels, EMPTY or CONSTANT.
+
+        Args:
+            tree: Whose nodes they are.
+            node: (k,) int64 nodes without a brick.
+            loc: (k, 4) their places; nodes that are gone or served already are left alone.
+            target: (k,) int64 nodes whose bricks they share.
+        """
+        wanted = self.wanted(tree, node, loc, REQUEST_LOAD)
+        node, target = node[wanted], target[wanted]
+        word = self.nodes.brick_tn.view(-1)[target]
+        self.bricks.shared_b[word[word >= 0].to(torch.int64)] = True
+        for words in self.nodes.constants.values():
+            flat = movable(words).flatten(0, 1)
+            flat[node] = flat[target]
+        self._link_bricks(node, word)
+
+    def put_bricks(self, slot_k: Tensor, node: Tensor, data: Mapping[str, Tensor]) -> int:
+        """Writes voxels into slots, which lose what they held, and links nodes to them.
+
+        Returns:
+            Bytes moved.
+        """
+        pool, slot = self.bricks, slot_k.to(torch.int64)
+        unlink(self.nodes.brick_tn, slot_k, pool.capacity)
+        nbytes = 0
+        for name, bricks in pool.bricks.items():
+            if name in data:
+                movable(bricks).index_copy_(0, slot, movable(data[name]))
+                nbytes += data[name].nbytes
+            else:
+                movable(bricks)[slot] = 0  # a tree without this channel
+        pool.owner_b[slot] = node.to(torch.int32)
+        pool.stamp_b[slot], pool.shared_b[slot] = -1, False
+        self._link_bricks(node, slot_k)
+        return nbytes
+
+    def _link_bricks(self, node: Tensor, word: Tensor) -> None:
+        node_k, word_k = node.to(torch.int32), word.to(torch.int32)
+        link(self.nodes.brick_tn, self.nodes.request_tn, node_k, word_k, REQUEST_LOAD)
+
+    def validate(self) -> None:
+        """Raises ValueError unless every slot is where the order, its owner and all pointers say.
+
+        Pointers that lead nowhere are found by `N3Tree.validate`.
+        """
+        nodes, bricks = self.nodes, self.bricks
+        for kind, capacity in (
+            (REQUEST_SUBDIVIDE, nodes.capacity),
+            (REQUEST_LOAD, bricks.capacity),
+        ):
+            order = self.lru[kind].order.sort().values
+            locked = capacity - len(order)
+            if not torch.equal(order, torch.arange(locked, capacity).to(order)):
+                raise ValueError("Cache: the order of use is no permutation of the slots")
+        for what, owner, pointer, shared in (
+            ("brick", bricks.owner_b, nodes.brick_tn.view(-1), bricks.shared_b),
+            ("tile", nodes.parent_t, nodes.child_tn.view(-1), nodes.shared_t),
+        ):
+            slot = (owner >= 0).nonzero()[:, 0]
+            if bool((pointer[owner[slot].to(torch.int64)] != slot).any()):
+                raise ValueError(f"Cache: a {what}'s owner does not point to it")
+            named = pointer[pointer >= 0].to(torch.int64)
+            if bool(((owner[named] < 0) & ~shared[named]).any()):
+                raise ValueError(f"Cache: a pointer leads to a {what} that nobody owns")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Children:
+    """The words of k tiles' children, made from a producer's answer."""
+
+    child: Tensor  # (k, n) int32 ABSENT or TERMINAL
+    brick: Tensor  # (k, n) int32 ABSENT, EMPTY or CONSTANT
+    constants: Mapping[str, Tensor]  # (k, n, c)
+    ranges: Mapping[str, Tensor]  # (k, n, 2, c)
+    is_alias: Tensor  # (k, n) bool
+    alias: Tensor | None  # (k, n, 4) loc

@@ -1,0 +1,98 @@
+"""`Scheduler`: which wishes are served in a frame, by priority and within the budgets."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from .. import check
+from ..config import REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
+from .requests import Requests
+
+_LEARN_FROM = 64  # items: smaller batches tell more about overhead than about throughput
+_LEARN_RATE = 0.3  # weight of the newest frame
+
+
+class Scheduler:
+    """Orders wishes and trims them to budgets.
+
+    Attributes:
+        rate: For each kind, items a millisecond, learned from what production took; None at first.
+    """
+
+    def __init__(
+        self,
+        *,
+        order: Literal["coarse", "fine"] = "coarse",
+        loads: int = 4096,
+        subdivisions: int = 4096,
+        milliseconds: float | None = None,
+    ) -> None:
+        """Sets the budgets of a frame.
+
+        Args:
+            order: Coarse levels first, which shows something everywhere soon, or fine ones; then
+                by size on the screen.
+            loads: Most bricks a frame.
+            subdivisions: Most node tiles a frame.
+            milliseconds: Most time a frame for production, shared by both kinds; None: no limit.
+
+        Raises:
+            ValueError: A number is out of its range.
+        """
+        if order not in ("coarse", "fine"):
+            raise ValueError(f"Engine: order must be 'coarse' or 'fine', got {order!r}")
+        self.order = order
+        self.most = {
+            REQUEST_LOAD: check.whole("Engine", "load_budget", loads, low=1),
+            REQUEST_SUBDIVIDE: check.whole("Engine", "subdivide_budget", subdivisions, low=1),
+        }
+        if milliseconds is not None:
+            check.number("Engine", "time_budget", milliseconds, low=0, open_low=True)
+        self.milliseconds = milliseconds
+        self.rate: dict[int, float | None] = dict.fromkeys(self.most)
+
+    def choose(self, requests: Requests, room: dict[int, int]) -> tuple[Requests, int, bool]:
+        """Returns the wishes to serve, most wanted first.
+
+        Args:
+            requests: All wishes of the frame.
+            room: For each kind, how many slots are free to take.
+
+        Returns:
+            The wishes; how many the budgets put off; whether slots were too few.
+        """
+        kept: list[Tensor] = []
+        deferred, exceeded = 0, False
+        for kind, most in self.most.items():
+            which = (requests.kind == kind).nonzero()[:, 0]
+            budget = min(most, self._in_time(kind))
+            deferred += max(0, min(len(which), room[kind]) - budget)
+            exceeded |= len(which) > room[kind]
+            which = which[self.rank(requests[which])]
+            kept.append(which[: min(budget, room[kind])])
+        return requests[torch.cat(kept)], deferred, exceeded
+
+    def rank(self, requests: Requests) -> Tensor:
+        """Returns the order in which wishes are served: by level, then by size on the screen, then
+        by node, so that it does not depend on chance.
+        """
+        level = requests.depth if self.order == "coarse" else -requests.depth
+        small = REQUEST_PRIORITY - requests.priority.to(torch.int64)
+        return (level * (REQUEST_PRIORITY + 1) + small).argsort(stable=True)
+
+    def learn(self, kind: int, items: int, milliseconds: float) -> None:
+        """Learns the throughput from a batch that took `milliseconds`."""
+        if items < _LEARN_FROM or milliseconds <= 0:
+            return
+        seen, known = items / milliseconds, self.rate[kind]
+        self.rate[kind] = seen if known is None else known + _LEARN_RATE * (seen - known)
+
+    def _in_time(self, kind: int) -> int:
+        if self.milliseconds is None:
+            return self.most[kind]
+        rate = self.rate[kind]
+        half = 0.5 * self.milliseconds
+        return _LEARN_FROM if rate is None else max(1, int(rate * half))

@@ -1,0 +1,6 @@
+"""Producers: what makes the content of trees."""
+
+from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
+from .volume import VolumeProducer
+
+__all__ = ["Bricks", "Layout", "Nodes", "Producer", "Region", "Regions", "VolumeProducer"]

@@ -1,0 +1,227 @@
+"""`Producer`: what makes the content of a tree. It answers two questions, both on a batch: what is
+in these nodes (`classify`), and what are the voxels of these bricks (`fill`).
+
+It never sees pools, slots or the order of use: nodes are named by place. Source: Crassin et al.,
+"GigaVoxels", I3D 2009, section 5; Crassin, PhD thesis 2011, chapter 7 (a producer may decline).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import torch
+from torch import Tensor
+
+from .. import check
+from ..pool import Channel
+
+
+class Region(IntEnum):
+    """What a node holds."""
+
+    EMPTY = 0  # nothing is ever drawn here, nor below
+    CONSTANT = 1  # one value all over, also below
+    DATA = 2  # voxels; its children may hold more detail
+    DATA_MAX_DEPTH = 3  # voxels; its children would hold nothing new
+    ALIAS = 4  # the same as another node, with all that is below it
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """How the engine cuts a producer's world into bricks."""
+
+    depth: int  # of the finest level
+    branching: int
+    brick_size: int
+    border: int
+    extent: tuple[int, int, int]  # finest voxels along x, y, z
+    spacing: tuple[float, float, float]  # world size of a finest voxel
+    origin: tuple[float, float, float]  # world place of the centre of voxel 0
+    device: torch.device
+
+
+class Nodes:
+    """A batch of nodes of one tree, by place.
+
+    Attributes:
+        loc: (k, 4) int64 x, y, z, depth: node x of its level covers voxels x * brick_size to
+            (x + 1) * brick_size of that level.
+        layout: Brick size, border, spacing and the like.
+    """
+
+    def __init__(self, loc: Tensor, layout: Layout) -> None:
+        """Holds the places."""
+        self.loc, self.layout = loc, layout
+
+    def __len__(self) -> int:
+        """Number of nodes."""
+        return self.loc.shape[0]
+
+    def __getitem__(self, index: slice | Tensor) -> Nodes:
+        """Some of the nodes."""
+        return Nodes(self.loc[index], self.layout)
+
+    @property
+    def depth(self) -> Tensor:
+        """(k,) int64, 0 for the root."""
+        return self.loc[:, 3]
+
+    @functools.cached_property
+    def scale(self) -> Tensor:
+        """(k,) float64, finest voxels along a side of one of the node's voxels."""
+        base = torch.full_like(self.loc[:, 3], self.layout.branching, dtype=torch.float64)
+        return base ** (self.layout.depth - self.loc[:, 3])
+
+    @property
+    def voxel_size(self) -> Tensor:
+        """(k, 3) float64 world size of one of the node's voxels."""
+        return self.scale[:, None] * self._vector(self.layout.spacing)
+
+    @property
+    def box(self) -> Tensor:
+        """(k, 2, 3) float64 world corners, x y z, without the border."""
+        low = self.loc[:, :3] * self.layout.brick_size
+        faces = torch.stack((low, low + self.layout.brick_size), 1) * self.scale[:, None, None]
+        return self._world(faces - 0.5)
+
+    @property
+    def center(self) -> Tensor:
+        """(k, 3) float64 world centre."""
+        return self.box.mean(1)
+
+    @property
+    def radius(self) -> Tensor:
+        """(k,) float64 world distance from the centre to the farthest voxel centre of the brick,
+        border included.
+        """
+        side = self.layout.brick_size + 2 * self.layout.border - 1
+        return (self.voxel_size * (0.5 * side)).norm(dim=1)
+
+    @functools.cached_property
+    def positions(self) -> Tensor:
+        """(k, z, y, x, 3) float32 world places of the voxel centres, x y z, border included."""
+        side = torch.arange(
+            -self.layout.border, self.layout.brick_size + self.layout.border, device=self.loc.device
+        )
+        voxel = self.loc[:, :3, None] * self.layout.brick_size + side  # (k, 3, s)
+        finest = (voxel + 0.5) * self.scale[:, None, None] - 0.5
+        x, y, z = self._world(finest.movedim(1, -1)).to(torch.float32).unbind(-1)
+        s = len(side)
+        axes = (x[:, None, None, :], y[:, None, :, None], z[:, :, None, None])
+        return torch.stack([axis.expand(-1, s, s, s) for axis in axes], -1)
+
+    def _vector(self, values: Sequence[float]) -> Tensor:
+        return torch.tensor(values, dtype=torch.float64, device=self.loc.device)
+
+    def _world(self, finest: Tensor) -> Tensor:
+        return finest * self._vector(self.layout.spacing) + self._vector(self.layout.origin)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Regions:
+    """Answer of `classify`: what each of k nodes holds."""
+
+    kind: Tensor  # (k,) of `Region`
+    constants: Mapping[str, Tensor] = field(default_factory=dict)  # (k, c): of CONSTANT and EMPTY
+    ranges: Mapping[str, Tensor] = field(default_factory=dict)  # (k, 2, c) smallest, largest value
+    alias: Tensor | None = None  # (k, 4) loc of the node that an ALIAS is the same as
+    errors: Mapping[int, str] = field(default_factory=dict)  # which can't be told, and why
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bricks:
+    """Answer of `fill`: the voxels of k bricks, or why a brick has none."""
+
+    data: Mapping[str, Tensor]  # (k, z, y, x, c) for each channel, border included
+    kind: Tensor | None = None  # (k,) of `Region`; all DATA if left out
+    constants: Mapping[str, Tensor] = field(default_factory=dict)  # (k, c)
+    alias: Tensor | None = None  # (k, 4) loc
+    errors: Mapping[int, str] = field(default_factory=dict)
+
+
+class Producer(torch.nn.Module):
+    """Base of producers: subclass it and write `fill`, and `classify` where that saves work.
+
+    Attributes:
+        extent: (x, y, z) voxels of the finest level.
+        spacing: (x, y, z) world size of a finest voxel.
+        origin: (x, y, z) world place of the centre of voxel 0.
+        branching: N of its tree.
+        channels: What a voxel holds, by name.
+        value_range: For each channel its smallest and largest value, where they are known.
+    """
+
+    def __init__(
+        self,
+        extent: int | Sequence[int],
+        *,
+        channels: Mapping[str, Channel] | None = None,
+        box: Sequence[Sequence[float]] | None = None,
+        spacing: float | Sequence[float] = 1.0,
+        origin: Sequence[float] = (0.0, 0.0, 0.0),
+        branching: int = 2,
+        value_range: Mapping[str, tuple[float, float]] | None = None,
+    ) -> None:
+        """Tells where the content lies.
+
+        Args:
+            extent: Voxels of the finest level, one number or (x, y, z).
+            channels: What a voxel holds, by name; one float32 "value" if left out.
+            box: World corners ((x, y, z), (x, y, z)) that the extent fills; takes the place of
+                spacing and origin.
+            spacing: World size of a finest voxel, one number or (x, y, z).
+            origin: World place of the centre of voxel 0.
+            branching: N >= 2.
+            value_range: For each channel its smallest and largest value, where they are known.
+
+        Raises:
+            ValueError: A number is out of its range.
+        """
+        super().__init__()
+        where = type(self).__name__
+        sizes = (extent,) * 3 if isinstance(extent, int) else tuple(extent)
+        if len(sizes) != 3:
+            raise ValueError(f"{where}: extent must be a number or (x, y, z), got {extent!r}")
+        x, y, z = (check.whole(where, "extent", size, low=1, high=2**40) for size in sizes)
+        self.extent = (x, y, z)
+        if box is not None:
+            if len(box) != 2:
+                raise ValueError(f"{where}: box must be two corners, got {box!r}")
+            low, high = (check.triple(where, "box", corner) for corner in box)
+            spacing = [(b - a) / n for a, b, n in zip(low, high, self.extent, strict=True)]
+            origin = [a + 0.5 * s for a, s in zip(low, spacing, strict=True)]
+        if isinstance(spacing, (int, float)):
+            spacing = (spacing,) * 3
+        self.spacing = check.triple(where, "spacing", spacing)
+        if min(self.spacing) <= 0:
+            raise ValueError(f"{where}: spacing must be positive, got {self.spacing}")
+        self.origin = check.triple(where, "origin", origin)
+        self.branching = check.whole(where, "branching", branching, low=2, high=16)
+        self.channels = dict(channels) if channels is not None else {"value": Channel()}
+        self.value_range = dict(value_range or {})
+
+    def prepare(self, layout: Layout) -> None:
+        """Learns how the engine cuts the world; called once, before the first question."""
+
+    def classify(self, nodes: Nodes) -> Regions | Tensor | Future:
+        """Tells what nodes hold: `Regions`, or a (k,) tensor of `Region`, now or as a future.
+
+        A wrong DATA costs memory; a wrong EMPTY or CONSTANT costs the picture: what lies in reach
+        of the node's brick, border included, and of all nodes below counts. All DATA unless
+        overridden.
+        """
+        return torch.full((len(nodes),), Region.DATA, device=nodes.loc.device)
+
+    def fill(self, nodes: Nodes) -> Bricks | Mapping[str, Tensor] | Future:
+        """Makes bricks: `Bricks`, or {channel: (k, z, y, x, c)}, now or as a future.
+
+        Coarse levels must be pre-filtered: a voxel stands for the mean over the space it covers.
+        """
+        raise NotImplementedError(f"{type(self).__name__}: fill is not written")
+
+    def close(self) -> None:
+        """Lets go of files and threads."""
