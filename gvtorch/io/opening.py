@@ -181,11 +181,11 @@ def open_arrays(
 def _check_array(where: str, array: Any, axes: str) -> None:
     if array.rank != len(axes):
         raise ValueError(f"{where}: has {array.rank} axes, the metadata {len(axes)}: {axes}")
-    if min(array.shape) < 1 or math.prod(array.shape) > MOST_VOXELS * 2**10:
-        raise ValueError(f"{where}: extent {tuple(array.shape)} is empty or far too large")
     voxels = math.prod(array.shape[axes.index(axis)] for axis in "zyx" if axis in axes)
     if voxels > MOST_VOXELS:
         raise ValueError(f"{where}: {voxels} voxels are more than the {MOST_VOXELS} of a store")
+    if min(array.shape) < 1 or math.prod(array.shape) > MOST_VOXELS * 2**10:
+        raise ValueError(f"{where}: extent {tuple(array.shape)} is empty or far too large")
     chunk = (
         math.prod(array.chunk_layout.read_chunk.shape or (1,)) * array.dtype.numpy_dtype.itemsize
     )

@@ -1,0 +1,540 @@
+"""Reading stores: our own, bit for bit, and any other OME-Zarr image; and all that can be wrong."""
+
+from __future__ import annotations
+
+import http.server
+import itertools
+import json
+import math
+import re
+import shutil
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tensorstore as ts
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import gvtorch as gv
+from gvtorch.io import Store, convert
+from gvtorch.io.levels import StoreError
+from gvtorch.pool.pyramid import build_levels, pool_mean, round_to
+
+DTYPES = ["uint8", "int8", "uint16", "int16", "float16", "float32"]
+
+
+def noise(shape: tuple[int, ...], dtype: str = "uint8", seed: int = 0) -> np.ndarray:
+    """(z, y, x, c) values with constant regions among them."""
+    rng = np.random.default_rng(seed)
+    low, high = (0, 255) if dtype.startswith("u") else (-120, 120)
+    data = (rng.random(shape) * (high - low) + low).astype(dtype)
+    z, y, x = (n // 2 for n in shape[:3])
+    data[:z, :y] = 3
+    data[z:, y:, :x] = 0
+    return data
+
+
+def block_of(level: np.ndarray, at: np.ndarray, block: int) -> np.ndarray:
+    """A block with its border, cut out of a whole level."""
+    places = [
+        np.arange(n * block - 1, (n + 1) * block + 1).clip(0, size - 1)
+        for n, size in zip(at, level.shape[:3], strict=True)
+    ]
+    return level[np.ix_(*places)]
+
+
+def assert_holds(store: Store, data: np.ndarray) -> None:
+    """The store has the bits of the pyramid that is built in memory."""
+    sizes = {"branching": 2, "brick_size": store.cell, "border": store.border}
+    levels = list(build_levels(torch.from_numpy(data), store.levels, **sizes))
+    for number, level in enumerate(levels):
+        values = level.values.numpy()
+        assert store.level_extent(number) == values.shape[2::-1]
+        assert np.array_equal(store.read_region(number, (0, 0, 0), values.shape[:3]), values)
+        places = np.array(list(np.ndindex(*store.block_grid(number))))
+        blocks, errors = store.read_blocks(number, places)
+        assert not errors
+        for block, at in zip(blocks, places, strict=True):
+            assert np.array_equal(block, block_of(values, at, store.block))
+        if store.has_blocks:
+            cells = store.read_cells(number, (0, 0, 0), store.cell_grid(number))
+            for index, expected in enumerate((level.low, level.high, level.mean)):
+                rounded = round_to(expected, store.dtype).numpy()
+                assert np.array_equal(cells[..., index, :], rounded)
+    assert max(store.level_extent(store.levels - 1)) <= 8
+
+
+@settings(
+    max_examples=20,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+@given(
+    long=st.integers(1, 290),
+    short=st.tuples(st.integers(1, 40), st.integers(1, 40)),
+    axis=st.integers(0, 2),
+    dtype=st.sampled_from(DTYPES),
+    width=st.sampled_from([1, 3]),
+    block=st.sampled_from([32, 64]),
+    seed=st.integers(0, 99),
+)
+def test_a_store_has_the_bits_of_the_pyramid(
+    tmp_path, long, short, axis, dtype, width, block, seed
+):
+    shape = [*short]
+    shape.insert(axis, long)
+    data = noise((*shape, width), dtype, seed)
+    folder = tmp_path / "property.zarr"
+    shutil.rmtree(folder, ignore_errors=True)
+    store = convert(gv.Volume(data, (1, 2, 3), (4, 5, 6)), folder, block=block, workers=1)
+    assert store.spacing == (1, 2, 3) and store.origin == (4, 5, 6)
+    low, high = data.min((0, 1, 2)), data.max((0, 1, 2))
+    assert store.value_range == list(zip(low.tolist(), high.tolist(), strict=True))
+    assert_holds(store, data)
+
+
+@pytest.fixture(scope="module")
+def data() -> np.ndarray:
+    return noise((70, 45, 90, 1))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, data) -> Path:
+    """A store that no test changes."""
+    folder = tmp_path_factory.mktemp("stores") / "whole.zarr"
+    convert(gv.Volume(data, (1, 1, 2)), folder)
+    return folder
+
+
+@pytest.fixture
+def damaged(tmp_path, whole) -> Path:
+    """A copy to be damaged."""
+    return Path(shutil.copytree(whole, tmp_path / "damaged.zarr"))
+
+
+def test_metadata_is_ome_zarr(whole, data):
+    import ome_zarr_models
+    import yaozarrs
+    import zarr
+
+    yaozarrs.validate_zarr_store(str(whole))
+    group = zarr.open_group(whole, mode="r")
+    image = ome_zarr_models.open_ome_zarr(group)
+    assert type(image).__name__ == "Image" and image.ome_zarr_version == "0.5"
+    assert np.array_equal(group["0"][:], data[..., 0])
+    transforms = image.ome_attributes.multiscales[0].datasets[1].coordinateTransformations
+    assert transforms[0].scale == [4.0, 2.0, 2.0] and transforms[1].translation == [1.0, 0.5, 0.5]
+    assert group["gvtorch/blocks/0"].chunks == (1, 1, 1, 34, 34, 34, 1)
+
+
+def test_channels_have_their_axis(tmp_path):
+    import yaozarrs
+
+    data = noise((20, 30, 40, 3), "uint16")
+    convert(gv.Volume(data), tmp_path / "rgb.zarr")
+    yaozarrs.validate_zarr_store(str(tmp_path / "rgb.zarr"))
+    store = Store.open(tmp_path / "rgb.zarr", channels=[2, 0])
+    assert store.width == 2 and store.value_range is not None and len(store.value_range) == 2
+    assert_holds(store, np.ascontiguousarray(data[..., [2, 0]]))
+
+
+def test_empty_blocks_are_not_written_and_read_right(tmp_path):
+    data = np.zeros((64, 64, 64, 1), np.uint8)
+    data[:, :, 40:] = np.random.default_rng(0).integers(0, 9, (64, 64, 24, 1))
+    data[5, 5, 60] = 200
+    full = convert(gv.Volume(data), tmp_path / "full.zarr")
+    cut = convert(gv.Volume(data), tmp_path / "cut.zarr", threshold=100)
+    assert cut.threshold == 100 and full.threshold is None
+    sizes = [s.describe()["disk bytes"] for s in (full, cut)]
+    assert sizes[1] < sizes[0]
+    assert_holds(full, data)
+    assert_holds(cut, data)
+
+
+def test_regions_beyond_the_volume_repeat_its_faces(whole, data):
+    store = Store.open(whole)
+    found = store.read_region(0, (-3, 40, 85), (2, 50, 99))
+    z, y, x = np.arange(-3, 2), np.arange(40, 50), np.arange(85, 99)
+    expected = data[np.ix_(z.clip(0), y.clip(0, 44), x.clip(0, 89))]
+    assert np.array_equal(found, expected)
+    assert (store.read_region(0, (-9, -9, -9), (-8, -8, -8)) == data[0, 0, 0]).all()
+    with pytest.raises(ValueError, match="low < high"):
+        store.read_region(0, (0, 0, 0), (0, 1, 1))
+    with pytest.raises(ValueError, match="leaves the grid"):
+        store.read_blocks(0, np.array([[0, 0, 3]]))
+    with pytest.raises(ValueError, match="leaves the grid"):
+        store.read_cells(0, (0, 0, 0), (99, 1, 1))
+    with pytest.raises(ValueError, match="level must be an int >= 0 and <= 4"):
+        store.read_region(5, (0, 0, 0), (1, 1, 1))
+
+
+def test_many_threads_read_the_same(whole, data):
+    store = Store.open(whole)
+    places = np.array(list(np.ndindex(*store.block_grid(0))) * 4)
+    expected, _ = store.read_blocks(0, places)
+    wrong = []
+
+    def read() -> None:
+        for _ in range(3):
+            if not np.array_equal(store.read_blocks(0, places)[0], expected):
+                wrong.append(1)
+
+    threads = [threading.Thread(target=read) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+
+
+# --- damage
+
+
+def first_file(folder: Path) -> Path:
+    return next(file for file in sorted((folder / "c").rglob("*")) if file.is_file())
+
+
+def test_a_missing_chunk_is_an_error_of_its_block(damaged, data):
+    first_file(damaged / "gvtorch/blocks/0").unlink()
+    store = Store.open(damaged)
+    places = np.array(list(np.ndindex(*store.block_grid(0))))
+    errors = store.read_blocks(0, places)[1]
+    varied = [i for i, at in enumerate(places) if np.ptp(block_of(data, at, 32))]
+    assert sorted(errors) == varied
+    z, y, x = places[varied[0]]
+    name = f"{damaged}: block ({z}, {y}, {x}) z y x of level 0: missing chunk"
+    assert errors[varied[0]] == name
+    assert not store.read_blocks(1, places[:1])[1], "other levels are whole"
+
+
+def test_a_missing_shard_of_cells_is_an_error(damaged):
+    first_file(damaged / "gvtorch/cells/0").unlink()
+    store = Store.open(damaged)
+    with pytest.raises(StoreError, match=r"cells of level 0.*missing chunk"):
+        store.read_cells(0, (0, 0, 0), (2, 2, 2))
+
+
+def test_a_corrupt_chunk_is_an_error_of_its_block_alone(damaged, data):
+    file = first_file(damaged / "gvtorch/blocks/0")
+    content = bytearray(file.read_bytes())
+    content[100] ^= 0xFF
+    file.write_bytes(content)
+    store = Store.open(damaged)
+    places = np.array(list(np.ndindex(*store.block_grid(0))))
+    blocks, errors = store.read_blocks(0, places)
+    assert len(errors) == 1
+    ((bad, text),) = errors.items()
+    assert text.startswith(f"{damaged}: block") and "level 0" in text and "\n" not in text
+    assert not blocks[bad].any()
+    for i in set(range(len(places))) - {bad}:
+        assert np.array_equal(blocks[i], block_of(data, places[i], 32))
+    file = first_file(damaged / "0")
+    file.write_bytes(file.read_bytes()[:-7])
+    with pytest.raises(StoreError, match=r"damaged\.zarr/0"):
+        store.read_region(0, (0, 0, 0), (9, 9, 9))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"complete": False}, "half-written or damaged"),
+        ({"version": 2}, "store version 2, this reads 1"),
+        ({"extent": [2**41, 1, 1]}, "damaged: gvtorch.extent"),
+        ({"extent": [90, 45, 71]}, "metadata and level 0 differ"),
+        ({"block": 33}, "damaged: gvtorch.block"),
+        ({"value_range": [[0]]}, "damaged: gvtorch.value_range"),
+        ({"dtype": "float64"}, "damaged: gvtorch.dtype"),
+    ],
+)
+def test_wrong_metadata_is_refused(damaged, change, message):
+    file = damaged / "zarr.json"
+    content = json.loads(file.read_text())
+    content["attributes"]["gvtorch"].update(change)
+    file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=message):
+        Store.open(damaged)
+
+
+def test_what_is_no_store_is_refused(tmp_path, whole):
+    with pytest.raises(FileNotFoundError, match="store not found"):
+        Store.open(tmp_path / "none.zarr")
+    with pytest.raises(ValueError, match=r"not a store: has neither zarr.json nor .zattrs"):
+        Store.open(tmp_path)
+    (tmp_path / "zarr.json").write_text('{"node_type": "group", "attri')
+    with pytest.raises(ValueError, match="damaged JSON"):
+        Store.open(tmp_path)
+    (tmp_path / "zarr.json").write_text('{"node_type": "group", "attributes": {}}')
+    with pytest.raises(ValueError, match="has no multiscale image"):
+        Store.open(tmp_path)
+    (tmp_path / "zarr.json").write_text("[" * 100_000)
+    with pytest.raises(ValueError, match="damaged JSON"):
+        Store.open(tmp_path)
+    with pytest.raises(ValueError, match="group"):
+        Store.open(whole / "0")
+    with pytest.raises(ValueError, match="has no image 'other'"):
+        Store.open(whole, image="other")
+    with pytest.raises(ValueError, match="has no time 1"):
+        Store.open(whole, time=1)
+    with pytest.raises(ValueError, match=r"has no channels \[1\]"):
+        Store.open(whole, channels=[1])
+
+
+# --- foreign images
+
+
+def write_foreign(
+    folder: Path,
+    arrays: list[np.ndarray],
+    axes: str,
+    scales: list[list[float]],
+    *,
+    version: int = 3,
+    sharded: bool = False,
+    name: str = "a",
+) -> Path:
+    """Writes an image with zarr-python: NGFF 0.5 on Zarr v3, or 0.4 on v2."""
+    import zarr
+
+    group = zarr.open_group(folder, mode="w", zarr_format=version)  # type: ignore[arg-type]
+    datasets = []
+    for number, (array, scale) in enumerate(zip(arrays, scales, strict=True)):
+        chunk = tuple(min(16, n) for n in array.shape)
+        options = {"shards": tuple(4 * n for n in chunk)} if sharded else {}
+        made = group.create_array(
+            f"s{number}", shape=array.shape, dtype=array.dtype, chunks=chunk, **options
+        )
+        made[...] = array
+        transforms = [{"type": "scale", "scale": scale}]
+        datasets.append({"path": f"s{number}", "coordinateTransformations": transforms})
+    kinds = {"t": "time", "c": "channel"}
+    named = [{"name": axis, "type": kinds.get(axis, "space")} for axis in axes]
+    image = {"name": name, "axes": named, "datasets": datasets}
+    if version == 3:
+        group.attrs["ome"] = {"version": "0.5", "multiscales": [image]}
+    else:
+        group.attrs["multiscales"] = [{**image, "version": "0.4"}]
+    return folder
+
+
+def pyramid(data_zyxc: np.ndarray, count: int) -> list[np.ndarray]:
+    """Levels of factor 2, finest first."""
+    levels = [data_zyxc]
+    for _ in range(count - 1):
+        levels.append(pool_mean(levels[-1], 2))
+    return levels
+
+
+@pytest.mark.parametrize(
+    ("version", "sharded", "axes", "dtype"),
+    [
+        (2, False, "zyx", "uint8"),
+        (2, False, "tczyx", ">u2"),
+        (3, False, "czyx", "int16"),
+        (3, True, "zyx", "float32"),
+        (3, True, "tczyx", "uint8"),
+        (3, False, "xyzc", "int8"),
+    ],
+)
+def test_foreign_images_hold_the_same(tmp_path, version, sharded, axes, dtype):
+    width = 2 if "c" in axes else 1
+    kind = np.dtype(dtype).newbyteorder("=").name
+    data = noise((37, 30, 50, width), kind)
+    stored = []
+    for level in pyramid(data, 3):  # coarser ones are missing and made on demand
+        letters = "zyxc"
+        array = level if "c" in axes else level[..., 0]
+        if "t" in axes:
+            array, letters = np.stack([array * 0, array]), "tzyxc"
+        array = array.transpose([letters.index(a) for a in axes])
+        stored.append(array.astype(dtype))
+    scales = [[0.5 * 2.0**n if a in "zyx" else 1.0 for a in axes] for n in range(3)]
+    write_foreign(tmp_path, stored, axes, scales, version=version, sharded=sharded)
+    store = Store.open(tmp_path, time=1 if "t" in axes else 0)
+    assert not store.has_blocks and store.value_range is None and store.spacing == (0.5,) * 3
+    assert store.width == width and store.dtype == getattr(torch, kind)
+    assert_holds(store, data)
+    with pytest.raises(ValueError, match="has no cells"):
+        store.read_cells(0, (0, 0, 0), (1, 1, 1))
+    if width == 2:
+        one = Store.open(tmp_path, time=1 if "t" in axes else 0, channels=[1])
+        assert_holds(one, np.ascontiguousarray(data[..., 1:]))
+
+
+def test_scales_that_leave_z_alone(tmp_path):
+    data = noise((12, 40, 70, 1))
+    levels = [data, pool_mean(data, (1, 2, 2)), pool_mean(pool_mean(data, (1, 2, 2)), (1, 2, 2))]
+    scales = [[4.0, 1, 1], [4.0, 2, 2], [4.0, 4, 4]]
+    write_foreign(tmp_path, [level[..., 0] for level in levels], "zyx", scales)
+    store = Store.open(tmp_path)
+    assert store.spacing == (1, 1, 4) and store.levels == 5
+    for level, factor in ((1, (2, 1, 1)), (2, (4, 1, 1))):
+        expected = pool_mean(levels[level], factor)
+        found = store.read_region(level, (0, 0, 0), expected.shape[:3])
+        assert np.array_equal(found, expected)
+    third = pool_mean(pool_mean(levels[2], (4, 1, 1)), 2)
+    found = store.read_region(3, (0, 0, 0), third.shape[:3])
+    assert np.abs(found.astype(int) - third).max() <= 1, "rounded once or twice"
+
+
+def test_scales_that_dropped_a_last_voxel(tmp_path):
+    """Many writers halve 45 to 22: beyond the last voxel the outermost repeats."""
+    data = noise((45, 45, 45, 1))
+    half = pool_mean(data[:44, :44, :44], 2)
+    write_foreign(
+        tmp_path, [data[..., 0], half[..., 0]], "zyx", [[1.0] * 3, [45 / 22] * 3], version=2
+    )
+    store = Store.open(tmp_path)
+    found = store.read_region(1, (0, 0, 0), (23, 23, 23))
+    assert np.array_equal(found[:22, :22, :22], half) and np.array_equal(
+        found[22, :22, :22], half[-1]
+    )
+
+
+def test_two_dimensional_images_are_one_slice(tmp_path):
+    data = noise((1, 40, 70, 1))
+    write_foreign(tmp_path, [data[0, ..., 0]], "yx", [[1.0, 1.0]])
+    assert_holds(Store.open(tmp_path), data)
+
+
+def test_images_by_name_and_folder(tmp_path):
+    data = noise((9, 9, 9, 1))
+    write_foreign(tmp_path / "0", [data[..., 0]], "zyx", [[1.0] * 3], version=2, name="first")
+    write_foreign(tmp_path / "b", [data[..., 0] + 1], "zyx", [[1.0] * 3], version=2)
+    (tmp_path / ".zgroup").write_text('{"zarr_format": 2}')
+    (tmp_path / ".zattrs").write_text('{"bioformats2raw.layout": 3}')
+    assert Store.open(tmp_path).read_region(0, (0, 0, 0), (1, 1, 1))[0, 0, 0, 0] == data[0, 0, 0, 0]
+    other = Store.open(tmp_path, image="b")
+    assert other.read_region(0, (0, 0, 0), (1, 1, 1))[0, 0, 0, 0] == data[0, 0, 0, 0] + 1
+    assert Store.open(tmp_path / "0", image="first").extent == (9, 9, 9)
+    with pytest.raises(ValueError, match=r"has no image '\.\./0'"):
+        Store.open(tmp_path / "b", image="../0")
+
+
+def test_foreign_mistakes_are_one_line(tmp_path):
+    cube = np.zeros((4, 4, 4), np.complex64)
+    write_foreign(tmp_path / "a", [cube], "zyx", [[1.0] * 3], version=2)
+    with pytest.raises(ValueError, match="dtype complex64 is unknown; known: uint8"):
+        Store.open(tmp_path / "a")
+    write_foreign(tmp_path / "b", [cube.real], "zyx", [[1.0] * 3])
+    file = tmp_path / "b" / "s0" / "zarr.json"
+    content = json.loads(file.read_text())
+    file.write_text(json.dumps({**content, "shape": [2**20] * 3}))
+    with pytest.raises(ValueError, match="voxels are more than"):
+        Store.open(tmp_path / "b")
+    grid = {"name": "regular", "configuration": {"chunk_shape": [2**14] * 3}}
+    file.write_text(json.dumps({**content, "chunk_grid": grid}))
+    with pytest.raises(ValueError, match="a chunk takes"):
+        Store.open(tmp_path / "b")
+    file.write_text("{")
+    with pytest.raises(ValueError, match="damaged JSON"):
+        Store.open(tmp_path / "b")
+    root = tmp_path / "b" / "zarr.json"
+    root.write_text(root.read_text().replace('"s0"', '"../a/s0"'))
+    with pytest.raises(ValueError, match="needs a path inside the store"):
+        Store.open(tmp_path / "b")
+
+
+def test_levels_that_are_missing_are_made_once(tmp_path, monkeypatch):
+    data = noise((140, 10, 10, 1))
+    write_foreign(tmp_path, [data[..., 0]], "zyx", [[1.0] * 3])
+    store = Store.open(tmp_path)
+    assert_holds(store, data)
+    from gvtorch.io import levels
+
+    monkeypatch.setattr(levels, "pool_mean", lambda *_: pytest.fail("made again"))
+    store.read_region(2, (0, 0, 0), (35, 3, 3))
+
+
+# --- over the network
+
+
+class Handler(http.server.SimpleHTTPRequestHandler):
+    """Serves a folder with byte ranges, as servers of such data do; chunks late if told so."""
+
+    delay = 0.0
+
+    def do_GET(self) -> None:
+        if "/c/" in self.path:
+            time.sleep(self.delay)
+        file = Path(self.translate_path(self.path))
+        wanted = re.fullmatch(r"bytes=(\d*)-(\d*)", self.headers.get("Range", ""))
+        if wanted is None or not file.is_file():
+            super().do_GET()
+            return
+        content = file.read_bytes()
+        first, last = wanted.groups()
+        start = int(first) if first else len(content) - int(last)
+        stop = int(last) + 1 if first and last else len(content)
+        self.send_response(206)
+        self.send_header("Content-Length", str(stop - start))
+        self.send_header("Content-Range", f"bytes {start}-{stop - 1}/{len(content)}")
+        self.end_headers()
+        self.wfile.write(content[start:stop])
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def served(whole):
+    """URL of the folder that holds the store."""
+
+    def handler(*args):
+        return Handler(*args, directory=str(whole.parent))
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}"
+    Handler.delay = 0.0
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+def test_a_store_behind_http(served, data):
+    store = Store.open(f"{served}/whole.zarr")
+    assert store.has_blocks
+    places = np.array(list(itertools.islice(np.ndindex(*store.block_grid(0)), 5)))
+    blocks, errors = store.read_blocks(0, places)
+    assert not errors
+    for block, at in zip(blocks, places, strict=True):
+        assert np.array_equal(block, block_of(data, at, 32))
+    with pytest.raises(ValueError, match="not a store"):
+        Store.open(f"{served}/none.zarr")
+
+
+def test_reads_end_in_time(served):
+    store = Store.open(f"{served}/whole.zarr")
+    Handler.delay = 1.5
+    places = np.array([[0, 0, 2]])
+    for read in (
+        lambda: store.read_blocks(0, places, timeout=0.2),
+        lambda: store.read_region(0, (0, 0, 0), (9, 9, 9), timeout=0.2),
+        lambda: store.read_cells(0, (0, 0, 0), (1, 1, 1), timeout=0.2),
+    ):
+        with pytest.raises(TimeoutError, match=r"no answer within 0\.2 s"):
+            read()
+
+
+def test_stores_in_memory_open_too():
+    from gvtorch.io.layout import context
+
+    root = ts.KvStore.open("memory://gvtorch-test/", context=context()).result()
+    image = {"axes": ["z", "y", "x"], "datasets": [{"path": "0"}]}
+    root["zarr.json"] = json.dumps(
+        {"node_type": "group", "attributes": {"ome": {"multiscales": [image]}}}
+    )
+    array = ts.open(
+        {"driver": "zarr3", "kvstore": "memory://gvtorch-test/0/"},
+        **{"dtype": ts.uint8, "shape": [5, 6, 7], "create": True, "context": context()},
+    ).result()
+    array[...] = np.arange(5 * 6 * 7, dtype=np.uint8).reshape(5, 6, 7)
+    store = Store.open("memory://gvtorch-test/")
+    assert store.extent == (7, 6, 5)
+    expected = math.prod((5, 6, 7)) - 1
+    assert store.read_region(0, (4, 5, 6), (5, 6, 7))[0, 0, 0, 0] == expected
