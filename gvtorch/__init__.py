@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from .frame import FrameStats, Hits, Rays
     from .io import read_volume
     from .pool import BrickPool, Channel, N3Tree, NodePool
-    from .producers import Bricks, Nodes, Producer, Region, Regions, VolumeProducer
+    from .producers import Bricks, Nodes, Producer, Region, Regions, StoredProducer, VolumeProducer
     from .rendering import Camera, Picture, RenderOptions, TransferFunction, TreeTracer, render
     from .volume import Volume
 
@@ -30,6 +30,7 @@ _HOME = {
     "Producer": ".producers",
     "Region": ".producers",
     "Regions": ".producers",
+    "StoredProducer": ".producers",
     "VolumeProducer": ".producers",
     "Camera": ".rendering",
     "Channel": ".pool",
@@ -63,6 +64,7 @@ __all__ = [
     "Region",
     "Regions",
     "RenderOptions",
+    "StoredProducer",
     "TransferFunction",
     "TreeTracer",
     "Volume",

@@ -160,6 +160,7 @@ class Engine:
             with stage("schedule"):
                 room = self._room()
                 served, deferred, exceeded = self.scheduler.choose(wishes, room)  # 5
+            late = sum(self.production.pending.values())
             with stage("produce"):
                 answers = self.production.answers([*self.plants.values()], served)  # 6
             with stage("write"):
@@ -168,7 +169,7 @@ class Engine:
                 self._count(stats, hits, wishes)
                 picture = develop(hits, camera, chosen.background, stats)
         stats.deferred, stats.capacity_exceeded = deferred, stats.capacity_exceeded or exceeded
-        stats.converged = not (len(wishes) or wishes.overflow or stats.pending)
+        stats.converged = not (len(wishes) or wishes.overflow or late)
         stats.stages = dict(timings)
         stats.milliseconds = 1e3 * (time.perf_counter() - start)
         if self.options.monitor:
@@ -228,17 +229,7 @@ class Engine:
                 self.production.wait()
         total.frames = number
         summed = ("frames", "milliseconds", "stages", "produced", "evicted", "bytes_uploaded")
-        merged: dict[str, Any] = {
-            name: getattr(total, name)
-            for name in (
-                "frames",
-                "milliseconds",
-                "stages",
-                "produced",
-                "evicted",
-                "bytes_uploaded",
-            )
-        }
+        merged: dict[str, Any] = {name: getattr(total, name) for name in summed}
         return dataclasses.replace(picture, stats=dataclasses.replace(stats, **merged))
 
     @property

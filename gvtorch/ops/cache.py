@@ -9,6 +9,8 @@ Source: Crassin et al., "GigaVoxels", I3D 2009, section 5.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -21,7 +23,7 @@ from .trace import Backend, choose_backend
 def compact_requests(
     request_tn: Tensor, capacity: int, *, backend: Backend = "auto"
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Lists what rays asked for and clears the wishes; pending kinds are neither listed nor cleared.
+    """Lists what rays asked for and clears the wishes; pending kinds are left alone.
 
     Mutates `request_tn`.
 
@@ -134,7 +136,7 @@ def _words(where: str, name: str, value: Tensor, shape: tuple, like: Tensor) -> 
         raise ValueError(f"{where}: {name} must be contiguous")
 
 
-def _home(backend: Backend, tensor: Tensor):  # the module of twins, or the compiled ops
+def _home(backend: Backend, tensor: Tensor) -> Any:  # the module of twins, or the compiled ops
     if choose_backend(backend, tensor.device) == "reference":
         return reference_cache
     return torch.ops.gvtorch

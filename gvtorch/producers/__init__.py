@@ -1,6 +1,16 @@
 """Producers: what makes the content of trees."""
 
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
+from .stored import StoredProducer
 from .volume import VolumeProducer
 
-__all__ = ["Bricks", "Layout", "Nodes", "Producer", "Region", "Regions", "VolumeProducer"]
+__all__ = [
+    "Bricks",
+    "Layout",
+    "Nodes",
+    "Producer",
+    "Region",
+    "Regions",
+    "StoredProducer",
+    "VolumeProducer",
+]

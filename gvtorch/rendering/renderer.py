@@ -285,7 +285,7 @@ def composite_trees(tracers: list[Tracer], rays: Rays) -> Hits:
     first.
     """
     near = torch.stack([_entry(tracer.tree.box, rays) for tracer in tracers])  # (m, r)
-    order = near.argsort(0, stable=True)
+    order = near.argsort(dim=0, stable=True)
     hits = [tracer(rays) for tracer in tracers]
     fields = {name: torch.stack([vars(one)[name] for one in hits]) for name in vars(hits[0])}
     which = order[:, :, None]
