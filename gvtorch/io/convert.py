@@ -416,8 +416,8 @@ def _run(
             if not running:
                 return
             finished, running = wait(running, return_when=FIRST_COMPLETED)
-            for future in finished:
-                yield future.result()
+            for future in sorted(finished, key=lambda future: future.exception() is not None):
+                yield future.result()  # first what is done, then what failed
     finally:
         for future in running:
             future.cancel()

@@ -229,9 +229,14 @@ def _read_nifti(source: Source, index: tuple[slice, ...]) -> np.ndarray:
 
 
 def _read_fits(source: Source, index: tuple[slice, ...]) -> np.ndarray:
+    """Scaled images, plane by plane; those that are not scaled are mapped."""
     fits = formats.need("astropy.io.fits", "astropy", Path(source.path))
-    with fits.open(source.path, memmap=True) as units:
-        return np.array(_cube(units).section[index])
+    first = (0,) * (len(index) - 3)
+    with fits.open(source.path, memmap=False) as units:
+        section = _cube(units).section
+        planes = range(*index[-3].indices(source.shape[-3]))
+        found = np.stack([np.asarray(section[(*first, z)])[index[-2:]] for z in planes])
+    return found.reshape((1,) * len(first) + found.shape)
 
 
 def _read_pages(source: Source, index: tuple[slice, ...]) -> np.ndarray:
@@ -495,9 +500,17 @@ def _of_fits(path: Path) -> Source:
     fits = formats.need("astropy.io.fits", "astropy", path)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*truncated.*")
-        with fits.open(path, memmap=True) as units:
+        with fits.open(path, memmap=False) as units:
             cube = _cube(units)
             shape = tuple(int(n) for n in cube.shape)
+            plain = not any(key in cube.header for key in ("BSCALE", "BZERO", "BLANK"))
             one = np.asarray(cube.section[(slice(0, 1),) * len(shape)])
+            offset = int(cube.fileinfo()["datLoc"])
+            plain = plain and not isinstance(cube, fits.CompImageHDU)
     axes = "-" * (len(shape) - 3) + "zyx"
-    return Source(path=str(path), kind="fits", shape=shape, axes=axes, stored=one.dtype.str)
+    told: dict[str, Any] = {"path": str(path), "shape": shape, "axes": axes}
+    if not plain:
+        return Source(kind="fits", stored=one.dtype.str, **told)
+    source = Source(kind="mapped", stored=one.dtype.newbyteorder(">").str, offset=offset, **told)
+    _check_bytes(source)
+    return source

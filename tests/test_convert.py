@@ -1,0 +1,384 @@
+"""Converting volumes to stores: every source, every way to be interrupted, and the command."""
+
+from __future__ import annotations
+
+import errno
+import gzip
+import importlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_store import assert_holds, noise, write_foreign
+
+import gvtorch as gv
+from gvtorch.io import Store, convert, estimate, sources, tasks
+from gvtorch.io.layout import WORK
+from gvtorch.tools.cli import main
+
+#: `gvtorch.io.convert` names the function.
+convert_module = importlib.import_module("gvtorch.io.convert")
+SHAPE = (9, 20, 300)  # z y x: two shards along x
+
+
+@pytest.fixture(scope="module")
+def data() -> np.ndarray:
+    return noise((*SHAPE, 1))
+
+
+@pytest.fixture
+def raw(tmp_path, data) -> Path:
+    file = tmp_path / "scan_300x20x9_uint8.raw"
+    file.write_bytes(data.tobytes())
+    return file
+
+
+# --- sources
+
+
+def source_files(folder: Path) -> dict[str, Path]:
+    """One small volume in every format that is read in parts, and in some that are not."""
+    import nibabel
+    import nrrd
+    import tifffile
+    from astropy.io import fits
+
+    folder.mkdir(exist_ok=True)
+    grid = noise((7, 9, 12, 1), "int16")[..., 0]
+    turned = np.diag([-0.5, 2.0, 1.0, 1.0])
+    turned[:3, 3] = (1, 2, 3)
+    swapped = turned[:, [1, 0, 2, 3]]
+    nibabel.save(nibabel.Nifti1Image(grid.T.copy(), turned), folder / "a.nii")
+    nibabel.save(nibabel.Nifti1Image(grid.swapaxes(1, 2).T.copy(), swapped), folder / "swap.nii")
+    nibabel.save(nibabel.Nifti1Image(grid.T.copy(), turned), folder / "a.nii.gz")
+    header = {"space directions": turned[:3, :3], "space origin": [1, 2, 3], "space": "LPS"}
+    for name, more in (("raw", {}), ("gzip", {}), ("raw", {"detached_header": True})):
+        file = folder / (f"{name}.nhdr" if more else f"{name}.nrrd")
+        nrrd.write(str(file), grid.T.copy(), {**header, "encoding": name}, index_order="F", **more)
+    rgb = noise((7, 9, 12, 3))
+    nrrd.write(
+        str(folder / "rgb.nrrd"),
+        rgb.transpose(3, 2, 1, 0).copy(),
+        {"encoding": "raw", "kinds": ["vector", "space", "space", "space"]},
+        index_order="F",
+    )
+    tifffile.imwrite(folder / "plain.tif", grid, photometric="minisblack", byteorder=">")
+    tifffile.imwrite(folder / "packed.tif", grid, photometric="minisblack", compression="zlib")
+    tifffile.imwrite(folder / "rgb.tif", rgb, photometric="rgb", compression="zlib")
+    (folder / "slices").mkdir(exist_ok=True)
+    for index, image in enumerate(grid):
+        tifffile.imwrite(folder / "slices" / f"s{index}.tif", image)
+    fits.writeto(folder / "a.fits", grid[None], overwrite=True)
+    fits.writeto(folder / "u.fits", grid.astype(np.uint16), overwrite=True)
+    np.save(folder / "c.npy", rgb)
+    np.save(folder / "fortran.npy", np.asfortranarray(grid.astype(">f8")))
+    np.savez(folder / "a.npz", grid)
+    (folder / "a_12x9x7_int16be.raw").write_bytes(grid.astype(">i2").tobytes())
+    (folder / "b_12x9x7_int16.raw.gz").write_bytes(gzip.compress(grid.tobytes()))
+    names = sorted(p for p in folder.iterdir() if not p.name.endswith(".raw.part"))
+    return {p.name: p for p in names}
+
+
+def test_every_format_converts_to_what_read_volume_reads(tmp_path):
+    whole = {"a.nii.gz", "gzip.nrrd", "a.npz", "b_12x9x7_int16.raw.gz"}
+    files = source_files(tmp_path / "files")
+    detached = files.pop("raw.raw", None)
+    assert detached is not None and len(files) == 18
+    for name, file in files.items():
+        volume = gv.read_volume(file)
+        source = sources.open_source(file)
+        assert (source is None) == (name in whole), name
+        store = convert(file, tmp_path / f"{name}.zarr")
+        assert store.spacing == pytest.approx(volume.spacing), name
+        assert store.origin == pytest.approx(volume.origin), name
+        data = volume.data.numpy()
+        assert store.width == data.shape[3]
+        assert np.array_equal(store.read_region(0, (0, 0, 0), data.shape[:3]), data), name
+        if source is not None:
+            box = source.read_box((2, 3, 4), (5, 4, 11))
+            assert np.array_equal(box, data[2:5, 3:4, 4:11]), name
+
+
+def test_an_ome_zarr_image_becomes_a_store(tmp_path):
+    data = noise((20, 33, 40, 2), "uint16")
+    write_foreign(tmp_path / "a", [np.moveaxis(data, 3, 0)], "czyx", [[1, 3.0, 2, 1]], version=2)
+    store = convert(tmp_path / "a", tmp_path / "b.zarr", block=64)
+    assert store.has_blocks and store.spacing == (1, 2, 3)
+    assert_holds(store, data)
+    again = convert(tmp_path / "b.zarr", tmp_path / "c.zarr", origin=(1, 1, 1))
+    assert again.origin == (1, 1, 1)
+    assert_holds(again, data)
+
+
+def test_values_that_are_not_finite(tmp_path):
+    data = noise(SHAPE, "float32")
+    data[0, 0, 254:258] = np.nan  # around the seam of two shards: each is counted once
+    data[1, 1, 1] = np.inf
+    np.save(tmp_path / "a.npy", data)
+    with pytest.raises(ValueError, match=r"5 values are NaN or infinite \(of 54000\); pass nan="):
+        convert(tmp_path / "a.npy", tmp_path / "a.zarr")
+    assert not (tmp_path / "a.zarr").exists()
+    store = convert(tmp_path / "a.npy", tmp_path / "a.zarr", nan=7)
+    assert_holds(store, np.where(np.isfinite(data), data, np.float32(7))[..., None])
+
+
+# --- mistakes
+
+
+def test_nothing_is_overwritten(tmp_path, raw):
+    convert(raw, tmp_path / "a.zarr")
+    for resume in (False, True):
+        with pytest.raises(FileExistsError, match="there is a store already"):
+            convert(raw, tmp_path / "a.zarr", resume=resume)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    with pytest.raises(FileExistsError, match="exists and is no store"):
+        convert(raw, tmp_path / "mine")
+    with pytest.raises(FileNotFoundError, match="folder not found"):
+        convert(raw, tmp_path / "no" / "a.zarr")
+
+
+def test_arguments_are_checked_before_the_work(tmp_path, raw):
+    target = tmp_path / "a.zarr"
+    for options, message in (
+        ({"block": 48}, "block must be 32 or 64, got 48"),
+        ({"threshold": "much"}, "threshold must be a number"),
+        ({"workers": 0}, "workers must be an int >= 1"),
+        ({"spacing": (1, 0, 1)}, "spacing must be positive"),
+        ({"shape": (300, 20, 10), "dtype": "uint8"}, "takes 60000 bytes, the file has 54000"),
+        ({"dtype": "text"}, "dtype must be a NumPy dtype"),
+        ({"key": "a"}, "key is for NPZ files"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            convert(raw, target, **options)
+    with pytest.raises(FileNotFoundError, match="volume not found"):
+        convert(tmp_path / "none.raw", target)
+    with pytest.raises(ValueError, match="bfloat16 has no place in a store"):
+        convert(gv.Volume(gv.Volume(np.zeros((2, 2, 2))).data.bfloat16()), target)
+    assert not target.exists()
+
+
+def test_what_does_not_fit_is_told_with_numbers(tmp_path, raw, monkeypatch):
+    target = tmp_path / "a.zarr"
+    (tmp_path / "b_300x20x9_uint8.raw.gz").write_bytes(gzip.compress(raw.read_bytes()))
+    monkeypatch.setattr(sources, "memory_free", lambda: 1000)
+    with pytest.raises(ValueError, match=r"takes 0\.0 GB, and 0\.0 GB of memory are free: unpack"):
+        convert(tmp_path / "b_300x20x9_uint8.raw.gz", target)
+    with monkeypatch.context() as patch:
+        patch.setattr(convert_module.machine, "memory_free", lambda: 1000)
+        with pytest.raises(OSError, match=r"takes up to .* GB of memory, 0\.00 GB are free"):
+            convert(raw, target)
+    with monkeypatch.context() as patch:
+        usage = type("usage", (), {"free": 1000})
+        patch.setattr(convert_module.shutil, "disk_usage", lambda _: usage)
+        with pytest.raises(OSError, match=r"the store takes about .* GB, 0\.00 GB are free"):
+            convert(raw, target)
+    assert not target.exists()
+
+
+# --- interruptions
+
+
+class Crash(Exception):
+    """Stands for anything that ends a conversion."""
+
+
+def crash_after(monkeypatch, count: int, error: Exception) -> list[tuple[int, ...]]:
+    """Lets so many tasks run, then fails; returns the list of those that ran."""
+    ran: list[tuple[int, ...]] = []
+    original = tasks.write_shard
+
+    def write(job, level, place):
+        if len(ran) == count:
+            raise error
+        result = original(job, level, place)
+        if "memory" not in job.root["driver"]:
+            ran.append((level, *place))
+        return result
+
+    monkeypatch.setattr(tasks, "write_shard", write)
+    return ran
+
+
+def test_a_broken_conversion_goes_on_where_it_was(tmp_path, raw, data, monkeypatch):
+    target = tmp_path / "a.zarr"
+    with monkeypatch.context() as patch:
+        crash_after(patch, 1, Crash())
+        with pytest.raises(Crash):
+            convert(raw, target, workers=1)
+    message = rf"half-written: 1 of 8 shards are done; gvtorch convert {raw} {target} --resume"
+    with pytest.raises(ValueError, match=message):
+        Store.open(target)
+    with pytest.raises(FileExistsError, match="half-written; --resume"):
+        convert(raw, target)
+    with pytest.raises(ValueError, match="was begun with threshold None, now it is 5"):
+        convert(raw, target, threshold=5, resume=True)
+    journal = target / WORK / "journal.jsonl"
+    journal.write_text(journal.read_text() + '{"task": [0, 0')  # killed while it wrote
+    ran = crash_after(monkeypatch, -1, Crash())
+    store = convert(raw, target, workers=1, resume=True)
+    assert len(ran) == 7 and (0, 0, 0, 0) not in ran
+    assert not (target / WORK).exists()
+    assert_holds(store, data)
+
+
+def test_resume_refuses_a_source_that_has_changed(tmp_path, raw, monkeypatch):
+    with monkeypatch.context() as patch:
+        crash_after(patch, 1, Crash())
+        with pytest.raises(Crash):
+            convert(raw, tmp_path / "a.zarr", workers=1)
+    raw.write_bytes(bytes(len(raw.read_bytes())))
+    os.utime(raw, ns=(1, 1))
+    with pytest.raises(ValueError, match="the source is not the one that it was begun with"):
+        convert(raw, tmp_path / "a.zarr", resume=True)
+
+
+def test_a_full_disk_is_told_and_goes_on(tmp_path, raw, data, monkeypatch):
+    target = tmp_path / "a.zarr"
+
+    class Full:
+        def result(self):
+            raise ValueError("RESOURCE_EXHAUSTED: Error writing: [OS error 28: No space left on")
+
+    original = tasks._write
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            tasks,
+            "_write",
+            lambda job, spec, *rest: (
+                Full()
+                if spec["path"] == "gvtorch/blocks/0" and job.root["driver"] == "file"
+                else original(job, spec, *rest)
+            ),
+        )
+        with pytest.raises(OSError, match="the disk is full") as caught:
+            convert(raw, target, workers=1)
+    assert caught.value.errno == errno.ENOSPC
+    with pytest.raises(ValueError, match="half-written: 0 of 8"):
+        Store.open(target)
+    assert_holds(convert(raw, target, workers=1, resume=True), data)
+
+
+KILLED = """
+import sys, time
+from gvtorch.io import convert, tasks
+original = tasks.write_shard
+def slow(job, level, place):
+    result = original(job, level, place)
+    if job.root["driver"] == "file":
+        time.sleep(0.2)
+    return result
+tasks.write_shard = slow
+convert(sys.argv[1], sys.argv[2], workers=1)
+"""
+
+
+def test_kill_9_and_resume(tmp_path, raw, data, monkeypatch):
+    target = tmp_path / "a.zarr"
+    process = subprocess.Popen([sys.executable, "-c", KILLED, str(raw), str(target)])
+    journal = target / WORK / "journal.jsonl"
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        if journal.exists() and journal.read_text().count("\n") >= 3:
+            break
+        time.sleep(0.02)
+    with pytest.raises(OSError, match="another process is converting to it"):
+        convert(raw, target, resume=True)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    done = journal.read_text().count("\n")
+    assert 3 <= done < 8
+    with pytest.raises(ValueError, match=f"half-written: {done} of 8"):
+        Store.open(target)
+    ran = crash_after(monkeypatch, -1, Crash())
+    store = convert(raw, target, workers=1, resume=True)
+    assert len(ran) == 8 - done
+    assert_holds(store, data)
+
+
+# --- executors
+
+
+def test_processes_write_the_same(tmp_path, data, raw, monkeypatch):
+    monkeypatch.setattr(convert_module, "_FEW", 1)
+    seen: list[tuple[int, int]] = []
+    store = convert(
+        raw,
+        tmp_path / "a.zarr",
+        workers=2,
+        progress=lambda _, done, total: seen.append((done, total)),
+    )
+    assert_holds(store, data)
+    assert seen[0][0] == 0 and seen[-1][0] == seen[-1][1] > data.nbytes
+    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+
+
+def test_an_executor_of_ones_own(tmp_path, data, raw):
+    with ThreadPoolExecutor(3) as pool:
+        assert_holds(convert(raw, tmp_path / "a.zarr", executor=pool), data)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_dask_cluster(tmp_path, data, raw):
+    distributed = pytest.importorskip("distributed")
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        store = convert(gv.Volume(data), tmp_path / "a.zarr", executor=client.get_executor())
+        assert_holds(store, data)
+
+
+# --- the command
+
+
+def run(capsys, *args: object) -> tuple[int, str, str]:
+    try:
+        main([str(arg) for arg in args])
+        code = 0
+    except SystemExit as end:
+        code = int(end.code or 0)
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def test_command_converts_and_tells(tmp_path, raw, data, capsys):
+    target = tmp_path / "a.zarr"
+    code, out, err = run(capsys, "convert", raw, target, "--dry-run")
+    assert code == 0 and not err and not target.exists()
+    assert "disk free" in out and "memory" in out and "seconds" in out
+    code, out, err = run(
+        capsys, "convert", raw, target, "--block", 64, "--spacing", "1,2,3", "--threshold", 4
+    )
+    assert (code, err) == (0, "") and "300x20x9, 7 levels" in out
+    store = Store.open(target)
+    assert (store.block, store.spacing, store.threshold) == (64, (1, 2, 3), 4)
+    code, out, err = run(capsys, "info", target, "--json")
+    told = json.loads(out)
+    assert told["extent"] == [300, 20, 9] and told["dtype"] == "uint8" and told["levels"] == 7
+    assert told["range"] == [[float(data.min()), float(data.max())]] and told["disk bytes"] > 0
+    code, out, err = run(capsys, "convert", raw, target)
+    assert code == 2 and err.count("\n") == 1 and "there is a store already" in err
+    code, out, err = run(
+        capsys, "convert", raw, tmp_path / "b", "--workers", 2, "--scheduler", "tcp://x:1"
+    )
+    assert code == 2 and "leave --workers out" in err
+
+
+def test_estimate_is_near_the_truth(tmp_path):
+    data = noise((150, 150, 150, 1))
+    told = estimate(gv.Volume(data), tmp_path / "a.zarr")
+    store = convert(gv.Volume(data), tmp_path / "a.zarr")
+    size = store.describe()["disk bytes"]
+    assert told.disk_bytes == pytest.approx(size, rel=0.35)
+    assert told.levels == store.levels and told.tasks == 6
+    assert told.source_bytes == data.nbytes and told.seconds > 0
