@@ -160,6 +160,8 @@ class Engine:
             with stage("schedule"):
                 room = self._room()
                 served, deferred, exceeded = self.scheduler.choose(wishes, room)  # 5
+                if exceeded:
+                    served = self.cache.stand_ins(wishes, served, room)
             late = sum(self.production.pending.values())
             with stage("produce"):
                 answers = self.production.answers([*self.plants.values()], served)  # 6

@@ -73,6 +73,53 @@ class Cache:
         """For each kind, the slots that may be taken in this frame."""
         return {kind: lru.unused for kind, lru in self.lru.items()}
 
+    def stand_ins(self, wishes: Requests, served: Requests, room: dict[int, int]) -> Requests:
+        """Where slots are too few for all wishes: serves coarser bricks in their place, so that
+        what is not served is drawn from a near ancestor and not from the root.
+
+        Wishes are moved up the tree, the deepest first, until there are at most as many nodes as
+        slots. Where those nodes have bricks already, `served` stays as it is.
+
+        Args:
+            wishes: All wishes of the frame.
+            served: What the scheduler chose of them.
+            room: For each kind, how many slots are free to take.
+
+        Returns:
+            `served`, or its subdivisions and the loads of the coarser nodes.
+        """
+        nodes, most = self.nodes, room[REQUEST_LOAD]
+        subdivide = wishes.kind == REQUEST_SUBDIVIDE
+        node = wishes.node[~subdivide]
+        if int(subdivide.sum()) > room[REQUEST_SUBDIVIDE]:
+            node = torch.cat((node, wishes.node[subdivide])).unique()  # too deep for the pool
+        while len(node) > most:
+            tile = node // nodes.nodes_per_tile
+            depth = nodes.loc_t4[tile, 3]
+            deepest = depth.max()
+            if most == 0 or deepest == 0:
+                return served
+            parent = nodes.parent_t[tile].to(torch.int64)
+            node = torch.where(depth == deepest, parent, node).unique()
+            node = node[node >= 0]  # a shared tile whose owner is gone knows no way up
+        words = nodes.brick_tn.view(-1)[node]
+        pending = nodes.request_tn.view(-1)[node] & REQUEST_LOAD << REQUEST_PENDING_SHIFT
+        node = node[(words == ABSENT) & (pending == 0)]
+        if not len(node):
+            return served
+        keep = served[served.kind == REQUEST_SUBDIVIDE]
+        zeros = torch.zeros_like(node, dtype=torch.int32)
+        return Requests(
+            node=torch.cat((keep.node, node)),
+            kind=torch.cat((keep.kind, zeros + REQUEST_LOAD)),
+            depth=torch.cat(
+                (keep.depth, nodes.loc_t4[node // nodes.nodes_per_tile, 3].to(torch.int64))
+            ),
+            priority=torch.cat((keep.priority, zeros)),
+            misses=wishes.misses,
+            overflow=wishes.overflow,
+        )
+
     def mark_pending(self, node: Tensor, kind: int, pending: bool = True) -> None:
         """Sets or clears the mark that an answer is on its way: the wish is not listed again."""
         words, bit = self.nodes.request_tn.view(-1), kind << REQUEST_PENDING_SHIFT

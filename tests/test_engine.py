@@ -1,0 +1,416 @@
+"""The engine: a picture from small pools is the picture of the whole, and the pools stay in order."""
+
+from __future__ import annotations
+
+import gc
+import random
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+from conftest import DEVICES, shared
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import gvtorch as gv
+from gvtorch import config
+from gvtorch.cache import LRU, Scheduler
+from gvtorch.cache.requests import Requests
+
+VESSELS = gv.TransferFunction.preset("vessels", 0, 255)
+AORTA = gv.TransferFunction.from_points([(140, 0), (400, 0.25), (900, 0.95)])
+PARTS = ("color", "alpha", "depth", "samples")
+
+
+def camera(size=48, **place) -> gv.Camera:
+    return gv.Camera.orbit(**{"azimuth": 30, "elevation": 20, **place}, width=size, height=size)
+
+
+def assert_same_picture(actual: gv.Picture, expected: gv.Picture) -> None:
+    for name in PARTS:
+        assert torch.equal(getattr(actual, name), getattr(expected, name)), name
+    assert expected.alpha.max() > 0.3, "the test must see something"
+
+
+class Late(gv.VolumeProducer):
+    """Answers from threads, after random delays, so in any order."""
+
+    def __init__(self, volume: gv.Volume, seed: int = 0, most: float = 0.004) -> None:
+        super().__init__(volume)
+        self.random, self.most = random.Random(seed), most
+        self.threads = ThreadPoolExecutor(6)
+
+    def later(self, answer, nodes: gv.Nodes) -> Future:
+        delay = self.random.uniform(0, self.most)
+
+        def work():
+            time.sleep(delay)
+            return answer(nodes)
+
+        return self.threads.submit(work)
+
+    def classify(self, nodes):
+        return self.later(super().classify, nodes)
+
+    def fill(self, nodes):
+        return self.later(super().fill, nodes)
+
+    def close(self):
+        self.threads.shutdown()
+
+
+def working_set(picture: gv.Picture) -> int:
+    return picture.stats.bricks_used
+
+
+def tooth() -> gv.Volume:
+    return gv.read_volume(shared("volumes/tooth_103x94x161_uint8.raw.gz"))
+
+
+@pytest.mark.parametrize("loading", ["straight", "levels"])
+@pytest.mark.parametrize("producer", [gv.VolumeProducer, Late])
+@pytest.mark.parametrize("scan", ["aneurism", "stent", "tooth", "blobs"])
+def test_a_small_pool_gives_the_picture_of_the_whole(request, compiled, scan, producer, loading):
+    volume = tooth() if scan == "tooth" else request.getfixturevalue(scan)
+    shader = AORTA if scan == "stent" else gv.TransferFunction.preset("gray", *volume.value_range)
+    device, view = DEVICES[compiled], camera(distance=1.4)
+    resident = gv.render(gv.N3Tree.from_volume(volume, device=device), view, shader)
+    bricks = int(1.25 * working_set(resident)) + 8
+    pool = bricks * 1000 * volume.data.element_size()
+    options = {"brick_pool": pool, "node_pool": "1 MB", "device": device, "loading": loading}
+    with gv.Engine(producer(volume), **options) as engine:
+        picture = engine.render(view, shader)
+        engine.validate()
+        stats = picture.stats
+        assert stats.converged and not stats.capacity_exceeded and stats.failed == 0
+        assert_same_picture(picture, resident)
+        again, stats = engine.frame(view, shader)
+        assert stats.converged and not any(stats.produced.values()), "nothing is asked for twice"
+        assert_same_picture(again, resident)
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("lod", ["auto", "finest"])
+def test_many_views_from_one_small_pool(aneurism, lod):
+    """Bricks come and go between views; each converged picture is that of the whole tree."""
+    tree = gv.N3Tree.from_volume(aneurism)
+    views = [camera(32, azimuth=a, distance=d) for a, d in ((0, 0.5), (80, 0.7), (200, 0.4))]
+    whole = [gv.render(tree, view, VESSELS, lod=lod) for view in views]
+    most = max(working_set(picture) for picture in whole)
+    with gv.Engine(gv.VolumeProducer(aneurism), brick_pool=int(1.3 * most) * 1000) as engine:
+        evicted = 0
+        for view, expected in [*zip(views, whole, strict=True)] * 2:
+            picture = engine.render(view, VESSELS, lod=lod)
+            engine.validate()
+            assert picture.stats.converged
+            assert_same_picture(picture, expected)
+            evicted += picture.stats.evicted["bricks"]
+        assert evicted > most, "the views must not fit together"
+
+
+@pytest.mark.parametrize("loading", ["straight", "levels"])
+def test_a_pool_that_is_too_small_still_shows_the_whole_scene(aneurism, compiled, loading):
+    device, view = DEVICES[compiled], camera(64, distance=1.2)
+    whole = gv.render(gv.N3Tree.from_volume(aneurism, device=device), view, VESSELS)
+    errors = []
+    for share in (0.05, 0.3, 0.8, 1.3):
+        pool = int(share * working_set(whole)) * 1000
+        options = {"brick_pool": pool, "device": device, "loading": loading}
+        with gv.Engine(gv.VolumeProducer(aneurism), **options) as engine:
+            picture = engine.render(view, VESSELS, max_frames=200)
+            engine.validate()
+            assert picture.stats.frames < 200, "the loop ends"
+            assert picture.stats.capacity_exceeded == (share < 1)
+            assert picture.stats.converged == (share > 1)
+            assert (picture.alpha > 0).float().mean() > 0.5 * (whole.alpha > 0).float().mean()
+            errors.append(float((picture.color - whole.color).square().mean().sqrt()))
+    assert errors == sorted(errors, reverse=True) and errors[-1] == 0 < errors[2] < errors[0]
+
+
+@pytest.mark.backend("cpp")
+def test_a_node_pool_that_is_too_small_ends_as_well(aneurism):
+    whole = gv.render(gv.N3Tree.from_volume(aneurism), camera(), VESSELS)
+    used = whole.stats.tiles_used
+    for tiles in (16, used // 2, used + 8):
+        with gv.Engine(gv.VolumeProducer(aneurism), node_pool=tiles * 8 * 11) as engine:
+            picture = engine.render(camera(), VESSELS, max_frames=300)
+            engine.validate()
+            assert picture.stats.frames < 300
+            assert picture.stats.capacity_exceeded == (tiles < used)
+            assert picture.alpha.max() > 0.3
+
+
+class Checked(gv.Engine):
+    """Looks after every frame at what the frame may have done."""
+
+    def frame(self, *args, **options):
+        nodes, bricks = self.cache.nodes, self.cache.bricks
+        roots = len(self.plants)
+        locked = nodes.brick_tn[:roots, 0].clone()
+        before = bricks.owner_b.clone(), nodes.parent_t.clone(), nodes.tree_t.clone()
+        picture, stats = super().frame(*args, **options)
+        self.validate()
+        used_b = bricks.stamp_b == self.frames
+        used_t = nodes.stamp_t == self.frames
+        assert torch.equal(bricks.owner_b[used_b], before[0][used_b]), "a brick in use was taken"
+        assert torch.equal(nodes.parent_t[used_t], before[1][used_t]), "a tile in use was taken"
+        assert torch.equal(nodes.brick_tn[:roots, 0], locked), "a root was touched"
+        assert int(stats.tiles_used) == int(used_t.sum())
+        assert not (nodes.request_tn & config.REQUEST_KINDS).any(), "wishes are cleared"
+        return picture, stats
+
+
+@settings(max_examples=25, deadline=None)
+@given(data=st.data())
+@pytest.mark.backend("cpp")
+def test_pools_stay_in_order_over_random_frames(blobs, data):
+    branching = data.draw(st.sampled_from([2, 3]))
+    loading = data.draw(st.sampled_from(["straight", "levels"]))
+    producer = Late(blobs, most=0.001) if data.draw(st.booleans()) else gv.VolumeProducer(blobs)
+    producer.branching = branching
+    options = {
+        "brick_size": 4,
+        "brick_pool": data.draw(st.integers(3, 300)) * 6**3 * 4,
+        "node_pool": data.draw(st.integers(8, 80)) * branching**3 * 20,
+        "load_budget": data.draw(st.integers(1, 200)),
+        "subdivide_budget": data.draw(st.integers(1, 50)),
+        "order": data.draw(st.sampled_from(["coarse", "fine"])),
+    }
+    shader = gv.TransferFunction.preset("gray", 0, 1)
+    with Checked(producer, loading=loading, **options) as engine:
+        for _ in range(data.draw(st.integers(1, 12))):
+            view = camera(
+                10,
+                azimuth=data.draw(st.floats(-180, 180)),
+                distance=data.draw(st.sampled_from([0.1, 0.6, 1.5, 5.0])),
+            )
+            lod = data.draw(st.sampled_from(["auto", "finest"]))
+            engine.frame(view, shader, lod=lod)
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 1000), loading=st.sampled_from(["straight", "levels"]))
+@pytest.mark.backend("cpp")
+def test_twins_and_kernels_drive_the_engine_alike(blobs, seed, loading):
+    """The same frames through the reference and the C++ backend leave the same pools."""
+    pick = random.Random(seed)
+    views = [
+        camera(8, azimuth=pick.uniform(0, 360), distance=pick.choice([0.3, 1.2, 4.0]))
+        for _ in range(4)
+    ]
+    shader = gv.TransferFunction.preset("gray", 0, 1)
+    fields = []
+    for backend in ("reference", "cpp"):
+        options = {"brick_size": 4, "brick_pool": 40 * 6**3 * 4, "node_pool": 30 * 8 * 20}
+        with gv.Engine(gv.VolumeProducer(blobs), loading=loading, **options) as engine:
+            for view in views:
+                engine.frame(view, shader, backend=backend)
+            nodes, bricks = engine.cache.nodes, engine.cache.bricks
+            fields.append({**nodes.fields, **bricks.fields})
+    for name, field in fields[0].items():
+        assert torch.equal(field, fields[1][name]), name
+
+
+def test_lru_takes_from_the_front_and_refuses_more_than_is_unused():
+    lru = LRU(6, 2, torch.device("cpu"))
+    stamp = torch.tensor([9, 9, 9, 1, 9, 1], dtype=torch.int32)
+    lru.sort(stamp, torch.tensor([9], dtype=torch.int32))
+    assert lru.order.tolist() == [3, 5, 2, 4] and lru.unused == 2
+    assert lru.take(1).tolist() == [3] and lru.order.tolist() == [5, 2, 4, 3]
+    with pytest.raises(ValueError, match="2 slots wanted, 1 are unused"):
+        lru.take(2)
+
+
+def wishes(depth, priority, kind=config.REQUEST_LOAD) -> Requests:
+    count = len(depth)
+    return Requests(
+        node=torch.arange(count),
+        kind=torch.full((count,), kind, dtype=torch.int32),
+        depth=torch.tensor(depth),
+        priority=torch.tensor(priority, dtype=torch.int32),
+        misses=count,
+        overflow=0,
+    )
+
+
+def test_the_scheduler_serves_by_level_then_by_size_and_trims():
+    asked = wishes([3, 1, 2, 1], [5, 7, 1, 9])
+    room = {config.REQUEST_LOAD: 10, config.REQUEST_SUBDIVIDE: 10}
+    for order, expected in (("coarse", [3, 1, 2, 0]), ("fine", [0, 2, 3, 1])):
+        served, deferred, exceeded = Scheduler(order=order).choose(asked, room)
+        assert served.node.tolist() == expected and deferred == 0 and not exceeded
+    served, deferred, _ = Scheduler(loads=3).choose(asked, room)
+    assert served.node.tolist() == [3, 1, 2] and deferred == 1
+    room[config.REQUEST_LOAD] = 2
+    served, deferred, exceeded = Scheduler().choose(asked, room)
+    assert served.node.tolist() == [3, 1] and exceeded
+
+
+def test_the_time_budget_learns_what_fits():
+    scheduler = Scheduler(milliseconds=4.0)
+    asked = wishes([0] * 1000, [1] * 1000)
+    room = {config.REQUEST_LOAD: 5000, config.REQUEST_SUBDIVIDE: 5000}
+    first, deferred, _ = scheduler.choose(asked, room)
+    assert 0 < len(first) < 1000 and deferred == 1000 - len(first)
+    scheduler.learn(config.REQUEST_LOAD, 10, 1e-6)  # too few to tell
+    for _ in range(30):
+        scheduler.learn(config.REQUEST_LOAD, 100, 1.0)  # 100 bricks a millisecond
+    assert len(scheduler.choose(asked, room)[0]) == 200, "half of the time is for bricks"
+
+
+@pytest.mark.backend("cpp")
+def test_modes(blobs):
+    shader = gv.TransferFunction.preset("gray", 0, 1)
+    with gv.Engine(gv.VolumeProducer(blobs), brick_size=4) as engine:
+        once = engine.render(camera(), shader, "interactive")
+        assert once.stats.frames == 1 and not once.stats.converged
+        four = engine.render(camera(), shader, "balanced", productions=3)
+        assert four.stats.frames == 3 and engine.frames == 4
+        done = engine.render(camera(), shader, "converge")
+        assert done.stats.converged
+    with gv.Engine(gv.VolumeProducer(blobs), brick_size=4) as engine:
+        cut = engine.render(camera(), shader, "converge", max_frames=1)
+        assert cut.stats.frames == 1 and not cut.stats.converged
+
+
+@pytest.mark.backend("cpp")
+def test_several_trees_of_different_branching_share_the_pools(blobs):
+    """Two scans side by side, N = 2 and N = 3, in one cache: each looks as it does alone."""
+    right = gv.Volume(blobs.data, blobs.spacing, (70.0, -3.0, 2.0))
+    scene = {"left": gv.VolumeProducer(blobs), "right": gv.VolumeProducer(right)}
+    scene["right"].branching = 3
+    shader = gv.TransferFunction.preset("hot", 0, 1)
+    view = gv.Camera.look_at((60, 10, 170), (60, 10, 30), (0, 1, 0), 40, 64, 40)
+    with gv.Engine(scene, brick_size=4) as engine:
+        both = engine.render(view, shader)
+        engine.validate()
+        assert both.stats.converged
+    alone = []
+    for volume, branching in ((blobs, 2), (right, 3)):
+        tree = gv.N3Tree.from_volume(volume, 4, branching=branching)
+        alone.append(gv.render(tree, view, shader))
+    a, b = alone
+    assert ((a.alpha > 0) & (b.alpha > 0)).sum() == 0, "they stand side by side"
+    assert torch.equal(both.color, a.color + b.color)
+    assert torch.equal(both.alpha, a.alpha + b.alpha)
+    assert torch.equal(both.depth, torch.minimum(a.depth, b.depth))
+    assert a.alpha.max() > 0.3 and b.alpha.max() > 0.3
+
+
+@pytest.mark.backend("cpp")
+def test_the_nearer_tree_hides_the_farther_one():
+    solid = np.full((8, 8, 8), 200, np.uint8)
+    near = gv.VolumeProducer(gv.Volume(solid, origin=(0, 0, 20)))
+    far = gv.VolumeProducer(gv.Volume(solid, origin=(0, 0, 0)))
+    red = gv.TransferFunction.from_points([(0, 1)], [(0, 1, 0, 0)])
+    blue = gv.TransferFunction.from_points([(0, 1)], [(0, 0, 0, 1)])
+    shaders = {"near": red, "far": blue}
+    for eye, color in ((60, [1, 0, 0]), (-60, [0, 0, 1])):
+        view = gv.Camera.look_at((3.5, 3.5, eye), (3.5, 3.5, 13), (0, 1, 0), 20, 9, 9)
+        with gv.Engine({"near": near, "far": far}) as engine:
+            picture = engine.render(view, shaders)
+        assert picture.color[4, 4].tolist() == color
+
+
+def test_pools_are_honoured_to_the_byte():
+    """Content up to the bytes asked for, less than a slot below; bookkeeping at most 3.1 %."""
+
+    class Colour(gv.Producer):
+        def fill(self, nodes):
+            side = nodes.layout.brick_size + 2 * nodes.layout.border
+            return {"rgba": torch.ones((len(nodes), *(side,) * 3, 4), dtype=torch.uint8)}
+
+    producer = Colour(1 << 20, channels={"rgba": gv.Channel(torch.uint8, 4)})
+    with gv.Engine(producer, node_pool="8 MB", brick_pool="256 MB") as engine:
+        memory = engine.memory()
+        assert 8e6 - 8 * 20 < memory["node_pool"] <= 8e6
+        assert 256e6 - 4000 < memory["brick_pool"] <= 256e6
+        managed = memory["node_pool"] + memory["brick_pool"]
+        assert memory["bookkeeping"] <= 0.031 * managed
+        lru = engine.cache.lru.values()
+        fields = [*engine.cache.nodes.fields.values(), *engine.cache.bricks.fields.values()]
+        total = sum(field.nbytes for field in fields) + sum(one.order.nbytes for one in lru)
+        assert total == sum(memory.values())
+
+
+@pytest.mark.backend("cpp")
+def test_a_wandering_camera_leaves_memory_flat(blobs):
+    """10,000 frames: nothing piles up, and the pools are in order at the end."""
+    pick = random.Random(7)
+    shader = gv.TransferFunction.preset("gray", 0, 1)
+    options = {"brick_size": 4, "brick_pool": 60 * 6**3 * 4, "node_pool": 40 * 8 * 20}
+    azimuth, distance, live, evicted = 0.0, 1.0, [], 0
+    with gv.Engine(gv.VolumeProducer(blobs), **options) as engine:
+        for number in range(10_000):
+            azimuth += pick.gauss(0, 6)
+            distance = min(3.0, max(0.2, distance * np.exp(pick.gauss(0, 0.05))))
+            view = camera(4, azimuth=azimuth % 360 - 180, distance=distance)
+            _, stats = engine.frame(view, shader)
+            evicted += stats.evicted["bricks"]
+            if number % 3000 == 999:
+                engine.validate()
+                gc.collect()
+                live.append(sum(isinstance(one, torch.Tensor) for one in gc.get_objects()))
+        engine.validate()
+        assert len(live) == 4 and max(live) - min(live) <= 8, live
+        assert evicted > 1000 and len(engine.production.failures) == 0
+
+
+@pytest.mark.backend("cpp")
+def test_report_tells_stages_rates_and_occupancy(blobs):
+    shader = gv.TransferFunction.preset("gray", 0, 1)
+    with gv.Engine(gv.VolumeProducer(blobs), brick_size=4) as engine:
+        engine.render(camera(), shader)
+        content = engine.report().as_dict()
+        assert content["frames"] == engine.frames and content["bricks_per_second"] > 0
+        for name in ("rays", "trace", "requests", "lru", "schedule", "produce", "write"):
+            assert 0 < content["stages"][name]["median"] <= content["stages"][name]["p95"]
+        assert content["hit_rate"] + content["miss_rate"] == pytest.approx(1)
+        assert 0 < content["occupancy"]["bricks"] < 1
+        text = str(engine.report())
+        assert "trace, ms" in text and "bookkeeping" in text
+    with gv.Engine(gv.VolumeProducer(blobs), brick_size=4, monitor=False) as engine:
+        picture = engine.render(camera(), shader)
+        assert engine.report().as_dict()["frames"] == 0 and picture.stats.stages == {}
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda v: gv.Engine(v), "must be a Producer, got Volume"),
+        (lambda v: gv.Engine({}), "at least one producer"),
+        (lambda v: engine(v, brick_pool="lots"), 'brick_pool must be bytes, as in "256 MB"'),
+        (lambda v: engine(v, brick_pool=0), "brick_pool must be an int >= 1"),
+        (lambda v: engine(v, brick_pool="4 kB"), "holds 1 slots of 4000 bytes, at least 2"),
+        (lambda v: engine(v, brick_pool="900 TB"), "GiB"),
+        (lambda v: engine(v, node_pool="100 B"), "node_pool of 100 bytes holds 0 slots"),
+        (lambda v: engine(v, brick_size=1), "brick_size must be an int >= 2"),
+        (lambda v: engine(v, loading="fast"), "loading must be 'straight' or 'levels'"),
+        (lambda v: engine(v, order="best"), "order must be 'coarse' or 'fine'"),
+        (lambda v: engine(v, time_budget=-1), "time_budget must be finite and > 0"),
+        (lambda v: engine(v, patience=0), "patience must be finite and > 0"),
+        (lambda v: engine(v, cache="1 MB"), "unknown option 'cache'; known: node_pool"),
+        (lambda v: engine(v).frame(None, VESSELS), "camera must be a Camera, got NoneType"),
+        (lambda v: engine(v).frame(camera(), None), "must be a TransferFunction, got NoneType"),
+        (lambda v: engine(v).frame(camera(), VESSELS, lod="x"), "lod must be 'auto'"),
+        (lambda v: engine(v).render(camera(), VESSELS, "fast"), "mode must be 'interactive'"),
+        (lambda v: engine(v).render(camera(), VESSELS, max_frames=0), "max_frames must be"),
+        (lambda v: engine(v).render(camera(), {"other": VESSELS}), "shader of tree 'scene'"),
+    ],
+)
+def test_bad_arguments_are_named(blobs, call, message):
+    with pytest.raises(ValueError) as caught:
+        call(blobs)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def engine(volume: gv.Volume, **options) -> gv.Engine:
+    return gv.Engine(gv.VolumeProducer(volume), **options)
+
+
+def test_trees_must_agree_on_channels(blobs):
+    other = gv.Volume((blobs.data * 9).to(torch.uint8))
+    with pytest.raises(ValueError, match="trees disagree on channel 'value'"):
+        gv.Engine({"a": gv.VolumeProducer(blobs), "b": gv.VolumeProducer(other)})
