@@ -169,16 +169,16 @@ def test_what_does_not_fit_is_told_with_numbers(tmp_path, raw, monkeypatch):
     target = tmp_path / "a.zarr"
     (tmp_path / "b_300x20x9_uint8.raw.gz").write_bytes(gzip.compress(raw.read_bytes()))
     monkeypatch.setattr(sources, "memory_free", lambda: 1000)
-    with pytest.raises(ValueError, match=r"takes 0\.0 GB, and 0\.0 GB of memory are free: unpack"):
+    with pytest.raises(ValueError, match=r"takes 0\.1 MB, and 0\.0 MB of memory are free: unpack"):
         convert(tmp_path / "b_300x20x9_uint8.raw.gz", target)
     with monkeypatch.context() as patch:
         patch.setattr(convert_module.machine, "memory_free", lambda: 1000)
-        with pytest.raises(OSError, match=r"takes up to .* GB of memory, 0\.00 GB are free"):
+        with pytest.raises(OSError, match=r"takes up to .* MB of memory, 0\.0 MB are free"):
             convert(raw, target)
     with monkeypatch.context() as patch:
         usage = type("usage", (), {"free": 1000})
         patch.setattr(convert_module.shutil, "disk_usage", lambda _: usage)
-        with pytest.raises(OSError, match=r"the store takes about .* GB, 0\.00 GB are free"):
+        with pytest.raises(OSError, match=r"the store takes about .* MB, 0\.0 MB are free"):
             convert(raw, target)
     assert not target.exists()
 

@@ -310,14 +310,14 @@ def _check_room(target: Path, needs: Estimate) -> None:
     disk = needs.disk_bytes + needs.temporary_bytes
     if disk > needs.disk_free:
         raise OSError(
-            f"{target}: the store takes about {disk / 1e9:.2f} GB, "
-            f"{needs.disk_free / 1e9:.2f} GB are free on the disk"
+            f"{target}: the store takes about {machine.amount(disk)}, "
+            f"{machine.amount(needs.disk_free)} are free on the disk"
         )
     if needs.memory_bytes > needs.memory_free:
         raise OSError(
             f"{target}: converting with {needs.workers} workers takes up to "
-            f"{needs.memory_bytes / 1e9:.2f} GB of memory, {needs.memory_free / 1e9:.2f} GB are "
-            "free; fewer --workers take less"
+            f"{machine.amount(needs.memory_bytes)} of memory, "
+            f"{machine.amount(needs.memory_free)} are free; fewer --workers take less"
         )
 
 

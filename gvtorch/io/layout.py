@@ -23,6 +23,8 @@ from typing import Any
 
 import numpy as np
 
+from .machine import cores
+
 VERSION = 1
 CELL = 8  # voxels along a side of a cell
 BORDER = 1  # voxels around a block, and around a cell for its low and high
@@ -44,8 +46,8 @@ def context() -> Any:
     return ts.Context(
         {
             "cache_pool": {"total_bytes_limit": 0},
-            "data_copy_concurrency": {"limit": 4},
-            "file_io_concurrency": {"limit": 8},
+            "data_copy_concurrency": {"limit": min(8, cores())},
+            "file_io_concurrency": {"limit": min(16, 2 * cores())},
             "http_request_concurrency": {"limit": 16},
         }
     )
@@ -75,8 +77,8 @@ class Layout:
 
     @property
     def shard(self) -> int:
-        """Voxels along a side of the cube that one shard covers: about 16 to 64 MB."""
-        return 256 if np.dtype(self.dtype).itemsize * self.width <= 4 else 128
+        """Voxels along a side of the cube that one shard covers: 8 to 32 MB of one to four bytes."""
+        return 256 if np.dtype(self.dtype).itemsize * self.width <= 2 else 128
 
     @property
     def stored(self) -> int:

@@ -17,6 +17,11 @@ def existing(path: Path) -> Path:
     return path if path.exists() else existing(path.parent)
 
 
+def amount(nbytes: float) -> str:
+    """Bytes for people: "3.2 MB", "1.50 GB"."""
+    return f"{nbytes / 1e9:.2f} GB" if nbytes >= 1e9 else f"{nbytes / 1e6:.1f} MB"
+
+
 def cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

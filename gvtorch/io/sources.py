@@ -21,7 +21,7 @@ import numpy as np
 from ..volume import CHANNEL_DTYPES, Volume
 from . import formats
 from .layout import DTYPES, MOST_VOXELS
-from .machine import memory_free
+from .machine import amount, memory_free
 from .store import Store
 
 _TIMEOUT = 600.0  # seconds for one read of another store
@@ -179,8 +179,8 @@ class Array:
         free, size = memory_free(), formats.unpacked_size(path)
         if 2 * size > free:  # what was read, and what it is converted to
             raise ValueError(
-                f"{path}: can only be read as a whole, which takes {2 * size / 1e9:.1f} GB, and "
-                f"{free / 1e9:.1f} GB of memory are free: unpack it first"
+                f"{path}: can only be read as a whole, which takes {amount(2 * size)}, and "
+                f"{amount(free)} of memory are free: unpack it first"
             )
         return dataclasses.replace(cls.of(formats.read_volume(path, **options)), path=str(path))
 

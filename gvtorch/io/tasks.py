@@ -198,5 +198,6 @@ def _finish(write: Any, where: str) -> None:
         write.result()
     except Exception as error:  # tensorstore raises what its status maps to
         if "No space left" in str(error):
-            raise OSError(errno.ENOSPC, "the disk is full", where) from None
+            text = "the disk is full; with room again, --resume (resume=True) goes on"
+            raise OSError(errno.ENOSPC, text, where) from None
         raise StoreError(f"{where}: can't be written: {short(error)}") from None

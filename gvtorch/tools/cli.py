@@ -224,6 +224,7 @@ class Convert:
     def run(self) -> None:
         """Converts, or tells what it would take."""
         from ..io.convert import convert, estimate
+        from ..io.machine import amount
 
         if self.scheduler is not None and self.workers is not None:
             raise ValueError("--scheduler brings its own workers: leave --workers out")
@@ -247,9 +248,9 @@ class Convert:
                 progress=bar,
             )
         seconds = time.perf_counter() - start
-        size = store.describe()["disk bytes"] / 1e6
+        size = amount(store.describe()["disk bytes"])
         extent = "x".join(str(n) for n in store.extent)
-        print(f"{self.store}: {extent}, {store.levels} levels, {size:.1f} MB in {seconds:.1f} s")
+        print(f"{self.store}: {extent}, {store.levels} levels, {size} in {seconds:.1f} s")
 
     @contextlib.contextmanager
     def _cluster(self) -> Iterator[Executor | None]:
@@ -358,11 +359,13 @@ def _is_store(path: str) -> bool:
 
 
 def _readable(content: dict[str, Any]) -> dict[str, Any]:
-    """Underscores to blanks, and bytes as MB."""
+    """Underscores to blanks, and bytes for people."""
+    from ..io.machine import amount
+
     out = {}
     for name, value in content.items():
         is_bytes = name.endswith(("_bytes", "_free"))
-        text = f"{value / 1e6:.1f} MB" if is_bytes else value
+        text = amount(value) if is_bytes else value
         out[name.removesuffix("_bytes").replace("_", " ")] = text
     return out
 
