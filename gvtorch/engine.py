@@ -42,7 +42,7 @@ from .volume import movable
 Scene = Producer | Mapping[str, Producer]
 Shaders = TransferFunction | Mapping[str, TransferFunction]
 
-_LISTED = 1 << 20  # most nodes with a wish that one frame lists
+_LISTED = 1 << 17  # most nodes with a wish that one frame lists
 _PAYLOAD = 256 * 10**6  # most bytes of voxels produced in one frame
 
 
@@ -154,7 +154,7 @@ class Engine:
             world = camera.placed(self.box)
             hits = trace_camera(world, self.device, trace, chosen.dtype, progress)  # 1, 2
             with stage("requests"):
-                wishes = self.cache.requests(_LISTED)  # 3
+                wishes = self.cache.requests(min(_LISTED, self.cache.nodes.child_tn.numel()))  # 3
             with stage("lru"):
                 self.cache.sort_by_use(self._frame_1)  # 4
             with stage("schedule"):

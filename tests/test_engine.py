@@ -1,4 +1,4 @@
-"""The engine: a picture from small pools is the picture of the whole, and the pools stay in order."""
+"""The engine: a picture from small pools is the picture of the whole; pools stay in order."""
 
 from __future__ import annotations
 
@@ -379,7 +379,7 @@ def test_report_tells_stages_rates_and_occupancy(blobs):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda v: gv.Engine(v), "must be a Producer, got Volume"),
+        (gv.Engine, "must be a Producer, got Volume"),
         (lambda v: gv.Engine({}), "at least one producer"),
         (lambda v: engine(v, brick_pool="lots"), 'brick_pool must be bytes, as in "256 MB"'),
         (lambda v: engine(v, brick_pool=0), "brick_pool must be an int >= 1"),

@@ -1,0 +1,40 @@
+"""A sphere that nobody stored: a producer of one's own, and its picture.
+
+65,536 voxels along a side would be 1,100 TB; the picture needs a few MB of them.
+"""
+
+import argparse
+
+import torch
+
+import gvtorch as gv
+
+RADIUS, BANDS = 0.9, torch.tensor([6.0, 28.0, 4.0])
+
+
+class Sphere(gv.Producer):
+    """Bands of density 0.4 to 1 inside the radius, with a rim one voxel wide."""
+
+    def classify(self, nodes):
+        outside = nodes.center.norm(dim=1) - nodes.radius > RADIUS
+        return torch.where(outside, gv.Region.EMPTY, gv.Region.DATA)
+
+    def fill(self, nodes):
+        gap = RADIUS - nodes.positions.norm(dim=-1, keepdim=True)
+        inside = (0.5 + gap / nodes.voxel_size.float()[:, None, None, None, :1]).clamp(0, 1)
+        bands = (nodes.positions * BANDS.to(gap)).sum(-1, keepdim=True).sin()
+        return {"value": inside * (0.7 + 0.3 * bands)}
+
+
+parser = argparse.ArgumentParser()
+parser.add_argument("--output", default="hello_sphere.png")
+parser.add_argument("--device", default="cpu")
+arguments = parser.parse_args()
+
+engine = gv.Engine(Sphere(65536, box=((-1, -1, -1), (1, 1, 1))), device=arguments.device)
+look = gv.TransferFunction.from_points(
+    [(0, 0), (0.4, 0.9)], [(0.4, 0.1, 0.2, 0.7), (1, 1, 0.8, 0.4)], reference=0.06
+)
+picture = engine.render(gv.Camera.orbit(distance=2, width=400, height=400), look)
+picture.save(arguments.output)
+print(f"{arguments.output}: {picture.stats.frames} frames, {picture.stats.bricks_used} bricks")
