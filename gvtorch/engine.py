@@ -217,14 +217,15 @@ class Engine:
             raise ValueError(
                 f"render: mode must be 'interactive', 'balanced' or 'converge', got {mode!r}"
             )
-        total = FrameStats()
+        total, failed = FrameStats(), self.production.failed
         for number in range(1, limits[mode] + 1):
             picture, stats = self.frame(camera, shader, **options)
             _add_up(total, stats)
             progress("frames", number, 0)
             if stats.converged:
                 break
-            moved = sum(stats.produced.values()) > 0
+            moved = sum(stats.produced.values()) + stats.stale > 0 or stats.failed > failed
+            failed = stats.failed
             if mode == "converge" and not moved:
                 if not stats.pending:
                     break  # nothing more can be served: the pools are too small

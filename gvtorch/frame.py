@@ -58,6 +58,7 @@ class FrameStats(RenderStats):
     produced: dict[str, int] = field(default_factory=dict)  # tiles, bricks, constant nodes
     evicted: dict[str, int] = field(default_factory=dict)  # tiles, bricks that others replaced
     bytes_uploaded: int = 0  # voxels moved into the brick pool
+    stale: int = 0  # answers that came when their node was gone
     pending: int = 0  # answers on their way
     deferred: int = 0  # wishes that the budgets put off
     overflow: int = 0  # nodes with a wish that the list had no place for

@@ -168,6 +168,7 @@ class Production:
             stats.produced[name] += written.items
             stats.produced["constant"] += written.constant
             stats.evicted[name] += written.evicted
+            stats.stale += written.stale
             stats.bytes_uploaded += written.nbytes
             stats.capacity_exceeded |= written.unplaced > 0
             if written.unplaced:

@@ -1,0 +1,350 @@
+"""Producers: what they are asked, what they may answer, and what happens when they fail."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import pytest
+import torch
+
+import gvtorch as gv
+from gvtorch import config
+from gvtorch.producers import Layout
+from gvtorch.production import ProductionError
+
+GRAY = gv.TransferFunction.preset("gray", 0, 1)
+SIZE = {"brick_size": 4, "brick_pool": "4 MB", "node_pool": "200 kB"}
+
+
+def camera(size=24, **place) -> gv.Camera:
+    return gv.Camera.orbit(**{"distance": 1.3, **place}, width=size, height=size)
+
+
+class Ball(gv.Producer):
+    """Density 1 in the middle, falling to 0 at distance 1."""
+
+    def __init__(self, extent=32, **options):
+        super().__init__(extent, box=((-1, -1, -1), (1, 1, 1)), **options)
+        self.filled: list[torch.Tensor] = []
+
+    def fill(self, nodes):
+        self.filled.append(nodes.loc.clone())
+        return {"value": (1 - nodes.positions.norm(dim=-1)).clamp(min=0)}
+
+
+def layout(**changes) -> Layout:
+    options = {
+        "depth": 3,
+        "branching": 2,
+        "brick_size": 4,
+        "border": 1,
+        "extent": (32, 20, 9),
+        "spacing": (0.5, 1.0, 2.0),
+        "origin": (10.0, 20.0, 30.0),
+        "device": torch.device("cpu"),
+    }
+    return Layout(**{**options, **changes})
+
+
+def test_nodes_know_their_place():
+    nodes = gv.Nodes(torch.tensor([[0, 0, 0, 0], [3, 1, 0, 2], [7, 4, 2, 3]]), layout())
+    assert nodes.scale.tolist() == [8, 2, 1]
+    assert nodes.voxel_size.tolist() == [[4, 8, 16], [1, 2, 4], [0.5, 1, 2]]
+    low = [(0, 0, 0), (24, 8, 0), (28, 16, 8)]  # finest voxels
+    for row, corner in enumerate(low):
+        expected = [
+            o + s * (c - 0.5) for o, s, c in zip((10, 20, 30), (0.5, 1, 2), corner, strict=True)
+        ]
+        assert nodes.box[row, 0].tolist() == pytest.approx(expected)
+        side = 4 * nodes.voxel_size[row]
+        assert torch.allclose(nodes.box[row, 1] - nodes.box[row, 0], side)
+    positions = nodes.positions
+    assert positions.shape == (3, 6, 6, 6, 3) and positions.dtype == torch.float32
+    first = nodes.box[:, 0] + 0.5 * nodes.voxel_size
+    assert torch.allclose(positions[:, 1, 1, 1].double(), first, atol=1e-5)
+    step = positions[:, 2, 3, 4] - positions[:, 1, 1, 1]
+    assert torch.allclose(step.double(), nodes.voxel_size * torch.tensor([3, 2, 1]), atol=1e-5)
+    reach = (positions.double() - nodes.center[:, None, None, None]).norm(dim=-1)
+    assert torch.allclose(reach.flatten(1).amax(1), nodes.radius, atol=1e-5)
+    assert len(nodes[1:]) == 2 and nodes[1:].depth.tolist() == [2, 3]
+
+
+@pytest.mark.backend("cpp")
+def test_a_producer_is_asked_only_for_what_is_seen_and_once():
+    ball = Ball(256)
+    with gv.Engine(ball, **SIZE) as engine:
+        picture = engine.render(camera(distance=0.3), GRAY)
+        assert picture.stats.converged and picture.alpha.max() > 0.5
+    asked = torch.cat(ball.filled)
+    assert len(asked.unique(dim=0)) == len(asked)
+    assert len(asked) < 0.1 * (256 // 4) ** 3
+    assert len(asked) == picture.stats.produced["bricks"] + 1, "and the root"
+
+
+@pytest.mark.backend("cpp")
+def test_a_brick_may_turn_out_constant_or_empty():
+    class Told(Ball):
+        def fill(self, nodes):
+            data = super().fill(nodes)["value"]
+            finest = nodes.depth == nodes.layout.depth
+            flat = finest & (data == 0).flatten(1).all(1)
+            kind = torch.where(flat, gv.Region.CONSTANT, gv.Region.DATA)
+            return gv.Bricks(
+                data={"value": data}, kind=kind, constants={"value": data[:, 0, 0, 0, None]}
+            )
+
+    view = camera()
+    with gv.Engine(Ball(), **SIZE) as plain, gv.Engine(Told(), **SIZE) as told:
+        a, b = (e.render(view, GRAY, lod="finest") for e in (plain, told))
+        told.validate()
+    assert b.stats.produced["constant"] > 0
+    assert b.stats.produced["bricks"] < a.stats.produced["bricks"]
+    assert torch.equal(a.color, b.color) and a.alpha.max() > 0.3
+
+
+class Sponge(gv.Producer):
+    """The Menger sponge: 3^3 children, 7 of them holes, 20 the same as the whole. One tile."""
+
+    def __init__(self, levels=4):
+        super().__init__(4 * 3**levels, branching=3, box=((0, 0, 0), (1, 1, 1)))
+        self.classified = self.filled = 0
+
+    def classify(self, nodes):
+        self.classified += len(nodes)
+        middle = (nodes.loc[:, :3] % 3 == 1).sum(1)
+        whole = torch.where(nodes.depth == 0, gv.Region.DATA, gv.Region.ALIAS)
+        kind = torch.where((middle >= 2) & (nodes.depth > 0), gv.Region.EMPTY, whole)
+        return gv.Regions(kind=kind, alias=torch.zeros_like(nodes.loc))
+
+    def fill(self, nodes):
+        self.filled += len(nodes)
+        side = nodes.layout.brick_size + 2 * nodes.layout.border
+        return {"value": torch.full((len(nodes), side, side, side), 20 / 27)}
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("loading", ["straight", "levels"])
+def test_a_node_may_be_the_same_as_another_even_as_its_own_ancestor(loading):
+    """The graph has cycles: one tile and one brick draw every level of the sponge."""
+    sponge = Sponge()
+    options = {"brick_size": 4, "node_pool": "20 kB", "brick_pool": "20 kB", "loading": loading}
+    shader = gv.TransferFunction.from_points([(0, 0), (20 / 27, 1)])
+    view = gv.Camera.look_at((0.5, 0.5, 4), (0.5, 0.5, 0.5), (0, 1, 0), 17, 81, 81)
+    with gv.Engine(sponge, **options) as engine:
+        picture = engine.render(view, shader, lod="finest")
+        engine.validate()
+        assert picture.stats.converged and sponge.classified == 1 + 27 and sponge.filled == 1
+        assert int((engine.cache.nodes.parent_t >= 0).sum()) == 1
+        assert int((engine.cache.bricks.owner_b >= 0).sum()) == 1
+        assert picture.alpha[40, 40] == 0 and picture.alpha[12, 12] == 1
+
+
+@pytest.mark.backend("cpp")
+def test_eviction_clears_every_pointer_to_a_shared_tile():
+    """The sponge beside a ball whose bricks and tiles push it out of the pools."""
+    scene = {"sponge": Sponge(3), "ball": Ball(256)}
+    view = gv.Camera.look_at((0.5, 0.5, 4), (0.5, 0.5, 0.5), (0, 1, 0), 20, 40, 40)
+    away = gv.Camera.look_at((0, 0, 1.4), (-0.9, 0.2, -1), (0, 1, 0), 20, 40, 40)
+    options = {"brick_size": 4, "node_pool": "60 kB", "brick_pool": "100 kB"}
+    with gv.Engine(scene, **options) as engine:
+        first = engine.render(view, GRAY, max_frames=60)
+        for look in (away, view, away, view):
+            picture = engine.render(look, GRAY, max_frames=60)
+            engine.validate()
+        assert torch.equal(picture.alpha > 0, first.alpha > 0)
+
+
+class Broken(Ball):
+    """Fails in one way for nodes in one corner of the finest level."""
+
+    def __init__(self, how):
+        super().__init__()
+        self.how = how
+
+    def bad(self, nodes):
+        return (nodes.loc[:, :3] >= 4).all(1) & (nodes.depth == nodes.layout.depth)
+
+    def fill(self, nodes):
+        data, bad = super().fill(nodes)["value"], self.bad(nodes)
+        if not bad.any():
+            return {"value": data}
+        if self.how == "raises":
+            raise RuntimeError("the disk is on fire")
+        if self.how == "raises later":
+            future: Future = Future()
+            future.set_exception(RuntimeError("the disk is on fire"))
+            return future
+        if self.how == "never answers":
+            return Future()
+        if self.how == "nan":
+            data[bad] = float("nan")
+            return {"value": data}
+        if self.how == "names":
+            wrong = {int(i): "chunk 7 is damaged" for i in bad.nonzero()[:, 0]}
+            return gv.Bricks(data={"value": data}, errors=wrong)
+        return {"shape": {"value": data[:, 1:]}, "dtype": {"value": data.double()}}.get(
+            self.how, {"colour": data}
+        )
+
+
+REASONS = {
+    "raises": "RuntimeError: the disk is on fire",
+    "raises later": "RuntimeError: the disk is on fire",
+    "never answers": "no answer within 0.2 s",
+    "nan": "channel 'value' holds NaN or infinite values",
+    "names": "chunk 7 is damaged",
+    "shape": "Broken.fill: data['value'] must be (",
+    "dtype": "float32, got",
+    "channel": "Broken.fill: channel 'value' is missing",
+}
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("how", REASONS)
+def test_what_fails_is_named_and_takes_nobody_with_it(how):
+    """The picture stays complete, coarser where bricks failed; each failure is named once."""
+    view = camera(elevation=35, azimuth=45)
+    with gv.Engine(Ball(), **SIZE) as whole, gv.Engine(Broken(how), patience=0.2, **SIZE) as engine:
+        expected = whole.render(view, GRAY, lod="finest")
+        start = time.monotonic()
+        picture = engine.render(view, GRAY, lod="finest")
+        assert time.monotonic() - start < 30
+        engine.validate()
+        stats = picture.stats
+        assert stats.converged and stats.failed == len(engine.failures) > 0
+        assert len({failure.loc for failure in engine.failures}) == stats.failed
+        failure = engine.failures[0]
+        assert failure.kind == "load" and failure.tree == "scene" and failure.loc[3] == 3
+        assert REASONS[how] in failure.message, failure
+        x, y, z, _ = failure.loc
+        assert f"depth 3, node ({x}, {y}, {z}), load: " in str(failure)
+        if how in ("raises", "nan", "names"):  # a whole batch of the wrong shape is lost
+            assert all(min(failure.loc[:3]) >= 4 for failure in engine.failures)
+        assert (picture.color - expected.color).abs().max() < 0.2
+        assert not torch.equal(picture.color, expected.color)
+        again = engine.render(view, GRAY, lod="finest")
+        assert again.stats.failed == stats.failed, "what failed is not asked for again"
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("how", REASONS)
+def test_a_strict_engine_raises_what_failed(how):
+    with gv.Engine(Broken(how), patience=0.2, strict=True, **SIZE) as engine:
+        with pytest.raises(ProductionError) as caught:
+            engine.render(camera(elevation=35, azimuth=45), GRAY, lod="finest")
+        assert REASONS[how] in str(caught.value) and "depth 3, node" in str(caught.value)
+
+
+@pytest.mark.backend("cpp")
+def test_failures_can_be_forgotten_and_are_then_asked_for_again():
+    view, broken = camera(elevation=35, azimuth=45), Broken("raises")
+    with gv.Engine(Ball(), **SIZE) as whole, gv.Engine(broken, **SIZE) as engine:
+        assert engine.render(view, GRAY, lod="finest").stats.failed > 0
+        broken.how = "nothing"
+        broken.bad = lambda nodes: torch.zeros(len(nodes), dtype=torch.bool)
+        engine.forget_failures()
+        picture = engine.render(view, GRAY, lod="finest")
+        assert picture.stats.failed == 0 and engine.failures == []
+        assert torch.equal(picture.color, whole.render(view, GRAY, lod="finest").color)
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (lambda n: None, "classify: must return Regions or a tensor, got NoneType"),
+        (lambda n: torch.zeros(3), "classify: kind must be (8,) of Region, got (3,) float32"),
+        (lambda n: torch.full((len(n),), 9), "9 is no Region"),
+        (lambda n: torch.full((len(n),), 4), "classify: alias must be (8, 4)"),
+        (
+            lambda n: gv.Regions(kind=torch.full((len(n),), 2), ranges={"value": torch.zeros(2)}),
+            "classify: ranges['value'] must be (8, 2, 1) float32",
+        ),
+        (
+            lambda n: gv.Regions(kind=torch.full((len(n),), 2), constants={"red": torch.zeros(8)}),
+            "classify: constants has channel 'red'; the producer has value",
+        ),
+    ],
+)
+def test_wrong_regions_are_named(answer, message):
+    class Wrong(Ball):
+        def classify(self, nodes):
+            return answer(nodes) if (nodes.depth > 0).any() else super().classify(nodes)
+
+    with gv.Engine(Wrong(), **SIZE) as engine:
+        picture = engine.render(camera(), GRAY)
+        assert picture.stats.failed >= 1 and message in engine.failures[0].message
+        assert engine.failures[0].kind == "subdivide" and picture.alpha.max() > 0.1
+
+
+@pytest.mark.parametrize("how", ["raises", "nan", "never answers"])
+def test_a_root_that_cannot_be_made_is_an_error_at_once(how):
+    class Rootless(Broken):
+        def bad(self, nodes):
+            return nodes.depth == 0
+
+    with pytest.raises(ProductionError, match="the root of tree 'scene' can't be made: "):
+        gv.Engine(Rootless(how), patience=0.1, **SIZE)
+
+
+@pytest.mark.backend("cpp")
+def test_an_answer_for_a_node_that_is_gone_is_dropped():
+    """Futures that come after their tile was evicted do no harm."""
+    slow = ThreadPoolExecutor(1)
+
+    class Slow(Ball):
+        def fill(self, nodes):
+            if (nodes.depth == 0).any():
+                return super().fill(nodes)
+            data = super().fill(nodes)
+            return slow.submit(lambda: (time.sleep(0.02), data)[1])
+
+    options = {**SIZE, "node_pool": 12 * 8 * 20}
+    with gv.Engine(Slow(128), **options) as engine:
+        for azimuth in range(0, 360, 20):
+            engine.frame(camera(8, azimuth=azimuth, distance=0.4), GRAY)
+            engine.validate()
+        picture = engine.render(camera(distance=9.0), GRAY)
+        engine.validate()
+        assert picture.stats.failed == 0
+    slow.shutdown()
+
+
+def test_pending_wishes_are_not_listed_twice(backend):
+    asked = []
+
+    class Never(Ball):
+        def fill(self, nodes):
+            if (nodes.depth == 0).any():
+                return super().fill(nodes)
+            asked.append(nodes.loc)
+            return Future()
+
+    device = "cuda" if backend == "cuda" else "cpu"
+    with gv.Engine(Never(), device=device, **SIZE) as engine:
+        for _ in range(6):
+            _, stats = engine.frame(camera(8), GRAY, backend=backend)
+        everything = torch.cat(asked)
+        assert len(everything.unique(dim=0)) == len(everything) == stats.pending
+        assert stats.misses >= stats.pending > 0 and not stats.converged
+        request = engine.cache.nodes.request_tn
+        bits = config.REQUEST_LOAD << config.REQUEST_PENDING_SHIFT
+        assert int((request & bits).count_nonzero()) == stats.pending
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: gv.Producer(0), "extent must be an int >= 1"),
+        (lambda: gv.Producer((4, 4)), "extent must be a number or (x, y, z)"),
+        (lambda: gv.Producer(4, spacing=0), "spacing must be positive"),
+        (lambda: gv.Producer(4, box=((0, 0, 0), (1, 1, -1))), "spacing must be positive"),
+        (lambda: gv.Producer(4, box=((0, 0, 0),)), "box must be two corners"),
+        (lambda: gv.Producer(4, branching=1), "branching must be an int >= 2"),
+    ],
+)
+def test_bad_producers_are_named(call, message):
+    with pytest.raises(ValueError) as caught:
+        call()
+    assert message in str(caught.value)
