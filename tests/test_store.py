@@ -214,8 +214,22 @@ def test_a_missing_chunk_is_an_error_of_its_block(damaged, data):
 def test_a_missing_shard_of_cells_is_an_error(damaged):
     first_file(damaged / "gvtorch/cells/0").unlink()
     store = Store.open(damaged)
-    with pytest.raises(StoreError, match=r"cells of level 0.*missing chunk"):
+    with pytest.raises(StoreError, match=r"cells/0: shard \(0, 0, 0\) z y x: missing chunk"):
         store.read_cells(0, (0, 0, 0), (2, 2, 2))
+
+
+@pytest.mark.parametrize("width", [1, 2])
+def test_a_missing_shard_of_the_pyramid_is_an_error(tmp_path, width):
+    data = noise((10, 10, 300, width))
+    data[:, :, :100] = 0
+    store = convert(gv.Volume(data), tmp_path / "a.zarr")
+    assert not store.read_region(0, (-2, -2, -2), (5, 5, 5)).any(), "zeros that are there"
+    files = sorted(file for file in (tmp_path / "a.zarr/0/c").rglob("*") if file.is_file())
+    files[-1].unlink()
+    store = Store.open(tmp_path / "a.zarr")
+    assert np.array_equal(store.read_region(0, (0, 0, 0), (10, 10, 256)), data[:, :, :256])
+    with pytest.raises(StoreError, match=r"a\.zarr/0: shard \(0, 0, 1\) z y x: missing chunk"):
+        store.read_region(0, (-2, 0, 200), (10, 10, 310))
 
 
 def test_a_corrupt_chunk_is_an_error_of_its_block_alone(damaged, data):

@@ -77,7 +77,7 @@ class Layout:
 
     @property
     def shard(self) -> int:
-        """Voxels along a side of the cube that one shard covers: 8 to 32 MB of one to four bytes."""
+        """Voxels along a side of the cube that one shard covers."""
         return 256 if np.dtype(self.dtype).itemsize * self.width <= 2 else 128
 
     @property
@@ -104,6 +104,7 @@ class Layout:
             chunk=[1] * len(first) + [_PLAIN_CHUNK] * 3,
             dtype=self.dtype,
             names="czyx"[-3 - len(first) :],
+            keep=True,
         )
 
     def blocks(self, level: int) -> dict[str, Any]:

@@ -127,11 +127,6 @@ class Levels:
         self._tiles: OrderedDict[tuple[int, ...], np.ndarray] = OrderedDict()
         self._lock = threading.Lock()
 
-    def is_stored(self, level: int) -> bool:
-        """Whether the level is read as it lies there."""
-        plan = self._plans[level]
-        return plan is not None and math.prod(plan[1]) == 1
-
     def read(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         """Reads (z, y, x, c) voxels `low` to `high` of a level; beyond it the outermost repeat."""
         shape = level_shape(self.extent, level)

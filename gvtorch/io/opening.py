@@ -148,11 +148,10 @@ def open_arrays(
     deadline: Deadline,
 ) -> tuple[list[Stored], slice | list[int]]:
     """Opens the image's arrays that fit the tree, the finest first."""
-    futures = []
-    for scale in image.scales:
-        at = child(root, scale.path)
-        driver = "zarr3" if _read_json(where, at, "zarr.json", deadline) is not None else "zarr"
-        futures.append(opened(root, {"driver": driver, "path": scale.path}))
+    at = child(root, image.scales[0].path)
+    is_v3 = _read_json(f"{where}/{image.scales[0].path}", at, "zarr.json", deadline) is not None
+    driver = "zarr3" if is_v3 else "zarr"
+    futures = [opened(root, {"driver": driver, "path": scale.path}) for scale in image.scales]
     stored: list[Stored] = []
     chosen: slice | list[int] = slice(None)
     for scale, future in zip(image.scales, futures, strict=True):

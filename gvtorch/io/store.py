@@ -92,7 +92,7 @@ class Store:
         self._blocks: list[Any] = []
         self._cells: list[Any] = []
         self._root = kvstore(location)
-        self._seen: set[tuple[int, ...]] = set()
+        self._seen: set[tuple[Any, ...]] = set()
         if own is not None:
             ranges = [(float(low), float(high)) for low, high in own["value_range"]]
             picked = [ranges[c] for c in channels] if isinstance(channels, list) else ranges
@@ -140,12 +140,20 @@ class Store:
             raise ValueError(f"{where}: damaged: metadata and level 0 differ in extent or dtype")
         self = cls(where, levels, count, found, own, chosen)
         if own:
-            for level in range(count):
-                spec = self._layout.blocks(level), self._layout.cells(level)
-                blocks, cells = (opened(self._root, s) for s in spec)
-                self._blocks.append(deadline.wait(blocks, f"{where}: blocks of level {level}"))
-                self._cells.append(deadline.wait(cells, f"{where}: cells of level {level}"))
+            self._open_own(deadline)
         return self
+
+    def _open_own(self, deadline: Deadline) -> None:
+        """Opens blocks and cells of all levels, and compares them with what they must be."""
+        specs = [self._layout.blocks(level) for level in range(self.levels)]
+        specs += [self._layout.cells(level) for level in range(self.levels)]
+        for spec, future in [(spec, opened(self._root, spec)) for spec in specs]:
+            where = f"{self.location}/{spec['path']}"
+            array = deadline.wait(future, where)
+            wanted = spec["metadata"]
+            if list(array.shape) != wanted["shape"] or array.dtype.name != wanted["data_type"]:
+                raise ValueError(f"{where}: damaged: {array.shape} {array.dtype.name}")
+            (self._blocks if "blocks" in spec["path"] else self._cells).append(array)
 
     def __repr__(self) -> str:
         """Shows location, extent, dtype, channels and levels."""
@@ -211,7 +219,14 @@ class Store:
             OSError: A chunk is damaged or can't be read.
         """
         _check_box(low, high)
-        data = self._levels.read(self._checked(level), low, high, Deadline(timeout))
+        deadline = Deadline(timeout)
+        data = self._levels.read(self._checked(level), low, high, deadline)
+        if self.has_blocks:
+            shape = level_shape(self.extent, level)
+            start = [min(max(a, 0), n - 1) for a, n in zip(low, shape, strict=True)]
+            stop = [max(min(b, n), a + 1) for a, b, n in zip(start, high, shape, strict=True)]
+            box = data[tuple(slice(max(0, a - b), None) for a, b in zip(start, low, strict=True))]
+            self._check_shards(self._layout.plain(level), box, start, stop, 1, deadline)
         return data
 
     def read_cells(
@@ -244,8 +259,8 @@ class Store:
         where = f"{self.location}: cells of level {level}"
         place = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
         data = deadline.wait(self._cells[level][place].read(order="C"), where)
-        if not data.any(axis=(3, 4)).all():
-            self._check_cell_shards(level, low, high, deadline)
+        spec = self._layout.cells(level)
+        self._check_shards(spec, data, low, high, CELL, deadline)
         return data[..., self._channels]
 
     def read_blocks(
@@ -341,8 +356,8 @@ class Store:
         try:
             where = self._name(level, at)
             cells = deadline.wait(self._cells[level][place].read(order="C"), where)
-            if not cells.any():
-                self._check_cell_shards(level, low.tolist(), high.tolist(), deadline)
+            spec = self._layout.cells(level)
+            self._check_shards(spec, cells, low.tolist(), high.tolist(), CELL, deadline)
             if (cells == cells[:1, :1, :1, :1]).all():
                 out[:] = cells[0, 0, 0, 0]
                 return ""
@@ -358,28 +373,45 @@ class Store:
         out[..., self._channels] = found
         return ""
 
-    def _check_cell_shards(
-        self, level: int, low: Sequence[int], high: Sequence[int], deadline: Deadline
+    def _check_shards(
+        self,
+        spec: dict[str, Any],
+        data: np.ndarray,
+        low: Sequence[int],
+        high: Sequence[int],
+        unit: int,
+        deadline: Deadline,
     ) -> None:
-        """Raises StoreError if the shards of a box of cells are not there: zeros are then no
-        answer.
+        """Raises StoreError if zeros that were read come from a shard that is not there. Zeros of
+        these arrays are written, so they are no reason for it.
+
+        Args:
+            spec: Of the array that was read.
+            data: What was read, from `low` on.
+            low: (z, y, x) first item.
+            high: (z, y, x) one past the last item.
+            unit: Voxels along a side of an item.
+            deadline: Of the read.
         """
         import tensorstore as ts
 
-        per = self._layout.shard // CELL
+        per = self._layout.shard // unit
         spans = [range(a // per, (b - 1) // per + 1) for a, b in zip(low, high, strict=True)]
         for place in itertools.product(*spans):
-            key = (level, *place)
-            if key in self._seen:
-                continue
-            path = f"gvtorch/cells/{level}"
-            where = f"{self.location}: cells of level {level}, shard {place}"
-            store = deadline.wait(
-                ts.KvStore.open(child(self._root, path), context=context()), where
+            key = (spec["path"], *place)
+            part = tuple(
+                slice(max(0, at * per - a), (at + 1) * per - a)
+                for at, a in zip(place, low, strict=True)
             )
-            name = "c/" + "/".join(map(str, place)) + "/0/0"
-            found = deadline.wait(store.read(name, byte_range=slice(0, 1)), where)
-            if found.state != "value":
+            if key in self._seen or data[part].any():
+                continue
+            where = f"{self.location}/{spec['path']}: shard {place} z y x"
+            folder = child(self._root, spec["path"])
+            store = deadline.wait(ts.KvStore.open(folder, context=context()), where)
+            rank = len(spec["metadata"]["shape"])
+            before = ["0"] if rank == 4 else []  # (c, z, y, x)
+            name = "/".join(["c", *before, *map(str, place), *["0"] * (rank - 3 - len(before))])
+            if deadline.wait(store.read(name, byte_range=slice(0, 1)), where).state != "value":
                 raise StoreError(f"{where}: missing chunk")
             self._seen.add(key)
 
@@ -426,8 +458,8 @@ def needed_cells(cells: np.ndarray, threshold: float | None) -> np.ndarray:
     """(z, y, x, 3, c) -> (z, y, x) bool: neither CONSTANT nor EMPTY."""
     low, high = cells[..., 0, :], cells[..., 1, :]
     needed = (low != high).any(-1)
-    if threshold is not None:
-        needed &= (high > threshold).any(-1)
+    if threshold is not None:  # in float32, as the tree compares
+        needed &= (high.astype(np.float32) > np.float32(threshold)).any(-1)
     return needed
 
 
