@@ -1,0 +1,355 @@
+"""Scenes streamed from a store: the same bits as in memory, and what happens when reads fail."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import DEVICES, shared
+from test_store import Handler, served  # noqa: F401
+
+import gvtorch as gv
+from gvtorch.io.convert import convert
+from gvtorch.io.store import Store
+from gvtorch.producers.stored import HostCache
+from gvtorch.production import ProductionError
+
+VESSELS = gv.TransferFunction.preset("vessels", 0, 255)
+GRAY = gv.TransferFunction.preset("gray", 0, 255)
+PARTS = ("color", "alpha", "depth", "samples")
+
+
+def camera(size=48, **place) -> gv.Camera:
+    return gv.Camera.orbit(**{"distance": 1.4, **place}, width=size, height=size)
+
+
+def assert_same_picture(actual: gv.Picture, expected: gv.Picture) -> None:
+    for name in PARTS:
+        assert torch.equal(getattr(actual, name), getattr(expected, name)), name
+    assert expected.alpha.max() > 0.3, "the test must see something"
+
+
+@pytest.fixture(scope="session")
+def cloud() -> gv.Volume:
+    """Smooth noise in a ball, nothing around it; no extent is a multiple of anything."""
+    generator = torch.Generator().manual_seed(5)
+    coarse = torch.rand((1, 1, 9, 8, 11), generator=generator)
+    fine = torch.nn.functional.interpolate(coarse, (75, 67, 90), mode="trilinear")[0, 0]
+    axes = [torch.linspace(-1, 1, n) for n in fine.shape]
+    radius = torch.stack(torch.meshgrid(*axes, indexing="ij")).norm(dim=0)
+    values = (fine * (1 - radius).clamp(min=0) * 400).clamp(max=255)
+    return gv.Volume(values.to(torch.uint8), (1.0, 1.5, 0.8), (3.0, 4.0, 5.0))
+
+
+@pytest.fixture(scope="session")
+def whole(tmp_path_factory, cloud) -> Path:
+    folder = tmp_path_factory.mktemp("stores") / "cloud.zarr"
+    convert(cloud, folder)
+    return folder
+
+
+@pytest.fixture
+def store(tmp_path, whole) -> Path:
+    """A copy that may be damaged."""
+    return Path(shutil.copytree(whole, tmp_path / "cloud.zarr"))
+
+
+@pytest.mark.parametrize("loading", ["straight", "levels"])
+@pytest.mark.parametrize("scan", ["aneurism", "stent", "tooth", "cloud"])
+def test_a_small_pool_over_a_store_gives_the_picture_of_the_volume(
+    request, tmp_path, compiled, scan, loading
+):
+    if scan == "tooth":
+        volume = gv.read_volume(shared("volumes/tooth_103x94x161_uint8.raw.gz"))
+    else:
+        volume = request.getfixturevalue(scan)
+    device, view = DEVICES[compiled], camera()
+    shader = gv.TransferFunction.preset("gray", *volume.value_range)
+    resident = gv.render(gv.N3Tree.from_volume(volume, device=device), view, shader)
+    convert(volume, tmp_path / "a.zarr", block=32 if loading == "straight" else 64)
+    bricks = int(1.25 * resident.stats.bricks_used) + 8
+    options = {"brick_pool": bricks * 1000 * volume.data.element_size(), "device": device}
+    producer = gv.StoredProducer(tmp_path / "a.zarr", host_cache="3 MB")
+    with gv.Engine(producer, loading=loading, **options) as engine:
+        picture = engine.render(view, shader)
+        engine.validate()
+        assert picture.stats.converged and picture.stats.failed == 0
+        assert_same_picture(picture, resident)
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize(("brick_size", "border"), [(4, 1), (8, 0), (8, 2), (12, 1), (16, 1)])
+def test_any_brick_size_and_border_can_be_streamed(whole, cloud, brick_size, border):
+    view, options = camera(32), {"brick_size": brick_size, "border": border}
+    with gv.Engine(gv.StoredProducer(whole), **options) as engine:
+        picture = engine.render(view, GRAY)
+        assert picture.stats.converged and picture.stats.failed == 0
+    expected = gv.render(gv.N3Tree.from_volume(cloud, brick_size, border), view, GRAY)
+    # Where a brick is no whole number of cells, fewer regions are known to be uniform.
+    assert (picture.color - expected.color).abs().max() < 1e-4
+    assert expected.alpha.max() > 0.3
+
+
+@pytest.mark.backend("cpp")
+def test_a_threshold_is_kept_by_the_store(tmp_path, cloud):
+    convert(cloud, tmp_path / "a.zarr", threshold=60)
+    tree = gv.N3Tree.from_volume(cloud, threshold=60)
+    with gv.Engine(gv.StoredProducer(tmp_path / "a.zarr")) as engine:
+        picture = engine.render(camera(), GRAY)
+    assert_same_picture(picture, gv.render(tree, camera(), GRAY))
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("loading", ["straight", "levels"])
+def test_the_order_in_which_reads_come_back_does_not_matter(whole, cloud, monkeypatch, loading):
+    """Every read is late by chance, in four threads."""
+    resident = gv.render(gv.N3Tree.from_volume(cloud), camera(), GRAY)
+    pick = random.Random(11)
+    for name in ("read_blocks", "read_cells"):
+        read = getattr(Store, name)
+
+        def late(self, *arguments, read=read, **options):
+            time.sleep(pick.uniform(0, 0.01))
+            return read(self, *arguments, **options)
+
+        monkeypatch.setattr(Store, name, late)
+    bricks = int(1.3 * resident.stats.bricks_used)
+    for _ in range(3):
+        producer = gv.StoredProducer(whole, host_cache="100 kB")
+        with gv.Engine(producer, brick_pool=bricks * 1000, loading=loading) as engine:
+            picture = engine.render(camera(), GRAY)
+            engine.validate()
+            assert picture.stats.converged
+            assert_same_picture(picture, resident)
+
+
+@pytest.mark.backend("cpp")
+def test_what_a_transfer_function_does_not_show_is_not_read(whole, monkeypatch):
+    read, seen = Store.read_blocks, []
+
+    def count(self, level, zyx, **options):
+        seen.append(len(zyx))
+        return read(self, level, zyx, **options)
+
+    monkeypatch.setattr(Store, "read_blocks", count)
+    loads = []
+    for opacity in ([(0, 0), (1, 0.2)], [(120, 0), (121, 0.2)], [(254, 0), (255, 0.2)]):
+        seen.clear()
+        with gv.Engine(gv.StoredProducer(whole)) as engine:
+            shader = gv.TransferFunction.from_points(opacity)
+            stats = engine.render(camera(), shader, lod="finest").stats
+        loads.append((stats.produced["bricks"], sum(seen)))
+    assert loads[0] > loads[1] > loads[2], loads
+    assert loads[2][0] < 0.2 * loads[0][0]
+
+
+@pytest.mark.backend("cpp")
+def test_a_block_is_read_once_while_the_host_cache_holds_it(whole, monkeypatch):
+    read, seen = Store.read_blocks, []
+
+    def count(self, level, zyx, **options):
+        seen.extend((level, *place) for place in np.asarray(zyx).tolist())
+        return read(self, level, zyx, **options)
+
+    monkeypatch.setattr(Store, "read_blocks", count)
+    with gv.Engine(gv.StoredProducer(whole), brick_pool="400 kB") as engine:
+        for azimuth in (0, 90, 180, 270):
+            engine.render(camera(24, azimuth=azimuth), GRAY, max_frames=40, lod="finest")
+        assert engine.frames > 8
+    assert len(seen) == len(set(seen)) > 20
+
+
+def test_the_host_cache_is_bounded_and_drops_the_oldest():
+    cache, reads = HostCache(1000), []
+
+    def read(missing):
+        reads.append(missing)
+        return {key: np.zeros(300, np.uint8) for key in missing}
+
+    keys = [("block", 0, 0, 0, n) for n in range(5)]
+    for key in (*keys[:3], keys[0], keys[3]):  # 0 is used again, so 1 is the oldest
+        cache.get([key], read)
+        assert cache.nbytes <= 1000
+    cache.get([keys[0], keys[2], keys[3]], read)
+    assert reads == [[keys[0]], [keys[1]], [keys[2]], [keys[3]]]
+    assert cache.get([keys[4]], lambda missing: dict.fromkeys(missing, "damaged")) == ["damaged"]
+    with pytest.raises(RuntimeError, match="odd"):
+        cache.get([keys[4]], lambda missing: (_ for _ in ()).throw(RuntimeError("odd")))
+    assert isinstance(cache.get([keys[4]], read)[0], np.ndarray), "errors are not kept"
+
+
+def blocks(store: Path, level: int = 0) -> list[Path]:
+    folder = store / f"gvtorch/blocks/{level}/c"
+    return sorted(file for file in folder.rglob("*") if file.is_file())
+
+
+def missing(store: Path) -> str:
+    blocks(store)[0].unlink()
+    return "missing chunk"
+
+
+def corrupt(store: Path) -> str:
+    file = blocks(store)[0]
+    content = bytearray(file.read_bytes())
+    content[200:230] = bytes(30)
+    file.write_bytes(content)
+    return "block ("
+
+
+def gone(store: Path) -> str:
+    shutil.rmtree(store)
+    return "cloud.zarr"
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("fault", [missing, corrupt, gone])
+@pytest.mark.parametrize("loading", ["straight", "levels"])
+def test_a_damaged_store_gives_a_complete_coarser_picture(store, cloud, fault, loading):
+    expected = gv.render(gv.N3Tree.from_volume(cloud), camera(), GRAY, lod="finest")
+    with gv.Engine(gv.StoredProducer(store, timeout=5), loading=loading, patience=9) as engine:
+        engine.frame(camera(), GRAY, lod="finest")  # the damage comes while it runs
+        reason = fault(store)
+        picture = engine.render(camera(), GRAY, lod="finest")
+        engine.validate()
+        stats = picture.stats
+        assert stats.converged and stats.failed == len(engine.failures) > 0
+        assert reason in engine.failures[0].message and str(store) in engine.failures[0].message
+        assert "\n" not in str(engine.failures[0])
+        shown = (picture.alpha > 0.02).float().mean()
+        assert shown > 0.6 * (expected.alpha > 0.02).float().mean(), "complete, if coarse"
+        if fault is not gone:
+            assert (picture.color - expected.color).square().mean().sqrt() < 0.1
+
+
+@pytest.mark.backend("cpp")
+def test_strict_raises_the_first_fault(store):
+    with gv.Engine(gv.StoredProducer(store), strict=True) as engine:
+        reason = missing(store)
+        with pytest.raises(ProductionError, match=reason) as caught:
+            engine.render(camera(), GRAY, lod="finest")
+        assert "tree 'scene', depth 4, node (" in str(caught.value)
+
+
+@pytest.mark.backend("cpp")
+def test_a_store_that_errors_now_and_then_recovers(whole, monkeypatch):
+    """Every third read fails once; what failed is asked for again when told so."""
+    with gv.Engine(gv.StoredProducer(whole)) as engine:
+        expected = engine.render(camera(), GRAY)
+    read, calls = Store.read_blocks, []
+
+    def flaky(self, level, zyx, **options):
+        calls.append(1)
+        if len(calls) % 3 == 0:
+            raise OSError("the network is down")
+        return read(self, level, zyx, **options)
+
+    monkeypatch.setattr(Store, "read_blocks", flaky)
+    with gv.Engine(gv.StoredProducer(whole)) as engine:
+        picture = engine.render(camera(), GRAY)
+        assert picture.stats.failed > 0
+        assert any("the network is down" in one.message for one in engine.failures)
+        for _ in range(50):
+            if not engine.failures:
+                break
+            engine.forget_failures()
+            picture = engine.render(camera(), GRAY)
+        assert_same_picture(picture, expected)
+
+
+@pytest.mark.backend("cpp")
+def test_a_store_that_stalls_does_not_hang(served, whole):  # noqa: F811
+    """A server that takes its time from one moment on."""
+    with gv.Engine(gv.StoredProducer(f"{served}/{whole.name}", timeout=0.3), patience=5) as engine:
+        engine.frame(camera(16), GRAY)
+        Handler.delay = 2.0
+        start = time.monotonic()
+        picture = engine.render(camera(16), GRAY)
+        assert time.monotonic() - start < 20
+        assert picture.stats.failed > 0 and picture.alpha.max() > 0.05
+        assert "no answer within 0.3 s" in engine.failures[0].message
+        engine.validate()
+
+
+@pytest.mark.backend("cpp")
+def test_a_foreign_image_is_streamed_as_well(tmp_path, cloud):
+    """A plain OME-Zarr pyramid, its coarse levels missing: no cells, no bordered blocks."""
+    import zarr
+
+    group = zarr.open_group(tmp_path / "plain.zarr", mode="w", zarr_format=2)
+    values = cloud.data[..., 0].numpy()
+    group.create_array("0", data=values, chunks=(20, 33, 41))
+    spacing = list(cloud.spacing[::-1])
+    transform = [{"type": "scale", "scale": spacing}]
+    transform.append({"type": "translation", "translation": list(cloud.origin[::-1])})
+    group.attrs["multiscales"] = [
+        {
+            "version": "0.4",
+            "axes": [{"name": n, "type": "space"} for n in "zyx"],
+            "datasets": [{"path": "0", "coordinateTransformations": transform}],
+        }
+    ]
+    resident = gv.render(gv.N3Tree.from_volume(cloud), camera(), GRAY)
+    pictures = []
+    for pool in ("9 MB", 1000 * int(1.3 * resident.stats.bricks_used + 300)):
+        with gv.Engine(gv.StoredProducer(tmp_path / "plain.zarr"), brick_pool=pool) as engine:
+            picture = engine.render(camera(), GRAY)
+            engine.validate()
+            assert picture.stats.converged and picture.stats.failed == 0
+            pictures.append(picture)
+    assert_same_picture(*pictures)
+    assert (pictures[0].color - resident.color).abs().max() < 1e-4
+
+
+@pytest.mark.backend("cpp")
+def test_a_store_of_1024_cubed_from_small_pools(tmp_path):
+    """A generated volume of 1 GiB: pools of a sixteenth give the picture of pools that hold all."""
+    raw = np.lib.format.open_memmap(
+        tmp_path / "big.npy", mode="w+", dtype=np.uint8, shape=(1024,) * 3
+    )
+    pick = np.random.default_rng(2)
+    for _ in range(60):
+        center, radius = pick.uniform(100, 924, 3), pick.uniform(10, 90)
+        low = np.maximum(center - radius - 1, 0).astype(int)
+        high = np.minimum(center + radius + 2, 1024).astype(int)
+        box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        axes = np.ogrid[box]
+        distance = sum((a - c) ** 2 for a, c in zip(axes, center, strict=True)) ** 0.5
+        ball = (np.clip(radius - distance, 0, 8) * 25).astype(np.uint8)
+        raw[box] = np.maximum(raw[box], ball)
+    raw.flush()
+    del raw
+    folder = tmp_path / "big.zarr"
+    convert(tmp_path / "big.npy", folder)
+    (tmp_path / "big.npy").unlink()
+    views = [camera(64, distance=d, azimuth=a) for d, a in ((1.3, 20), (0.3, 200))]
+    with gv.Engine(gv.StoredProducer(folder), brick_pool="900 MB", node_pool="40 MB") as engine:
+        expected = [engine.render(view, GRAY) for view in views]
+        assert not any(engine.render(view, GRAY).stats.evicted["bricks"] for view in views)
+    most = max(picture.stats.bricks_used for picture in expected)
+    assert most * 1000 < 64e6
+    for loading in ("straight", "levels"):
+        options = {"brick_pool": int(1.3 * most) * 1000, "node_pool": "4 MB", "loading": loading}
+        with gv.Engine(gv.StoredProducer(folder, host_cache="40 MB"), **options) as engine:
+            for view, picture in zip(views, expected, strict=True):
+                assert_same_picture(engine.render(view, GRAY), picture)
+            engine.validate()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda p: gv.StoredProducer(p / "none.zarr"), "none.zarr"),
+        (lambda p: gv.StoredProducer(p, host_cache="x"), "host_cache must be bytes"),
+        (lambda p: gv.StoredProducer(p, timeout=0), "timeout must be finite and > 0"),
+        (lambda p: gv.StoredProducer(p, workers=0), "workers must be an int >= 1"),
+    ],
+)
+def test_bad_arguments_are_named(tmp_path, call, message):
+    with pytest.raises((ValueError, OSError)) as caught:
+        call(tmp_path)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
