@@ -176,8 +176,11 @@ class Levels:
         tile = pool_mean(self._inside(level - 1, low, high, deadline), 2)
         with self._lock:
             self._tiles[key] = tile
-            while len(self._tiles) > 1 and len(self._tiles) * tile.nbytes > _KEPT:
-                self._tiles.popitem(last=False)
+            size = sum(kept.nbytes for kept in self._tiles.values())
+            while len(self._tiles) > 1 and size > _KEPT:
+                # The finest level's oldest: coarse tiles are few, and cost most to make again.
+                victim = min(self._tiles, key=lambda key: key[0])
+                size -= self._tiles.pop(victim).nbytes
         return tile
 
 
