@@ -1,4 +1,4 @@
-"""The command line: `gvtorch info`, `gvtorch render` and `gvtorch convert`.
+"""The command line: `gvtorch info`, `render`, `fly` and `convert`.
 
 torch is imported inside the commands, so that `--help` answers at once. A mistake of the user ends
 in one line on standard error and status 2.
@@ -11,7 +11,6 @@ import io
 import json
 import re
 import sys
-import threading
 import time
 import warnings
 from collections.abc import Iterator
@@ -22,44 +21,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg
 
+from .common import Bar, Source, is_store
+from .view import Fly, Render
+
 if TYPE_CHECKING:
     from concurrent.futures import Executor
-
-    from ..pool import N3Tree
-    from ..rendering import Camera, TransferFunction
-    from ..volume import Volume
-
-
-@dataclass(frozen=True, kw_only=True)
-class Source:
-    """How to read the volume where the file does not tell."""
-
-    shape: Annotated[str | None, arg(metavar="X,Y,Z")] = None
-    """RAW: voxels; else taken from the name *_XxYxZ_dtype.raw"""
-    dtype: Annotated[str | None, arg(metavar="TYPE")] = None
-    """RAW: a NumPy dtype, as in int16 or >i2"""
-    spacing: Annotated[str | None, arg(metavar="X,Y,Z")] = None
-    """voxel size in world units"""
-    key: Annotated[str | None, arg(metavar="NAME")] = None
-    """NPZ: which array"""
-    nan: Annotated[float | None, arg(metavar="VALUE")] = None
-    """value for voxels that are NaN or infinite"""
-
-    def read(self, path: Path) -> Volume:
-        """Reads the volume at `path`."""
-        from ..io import read_volume
-
-        return read_volume(path, **self.options())
-
-    def options(self) -> dict[str, Any]:
-        """The options as arguments of `read_volume` and `convert`."""
-        return {
-            "shape": _numbers("--shape", self.shape, 3, int) if self.shape else None,
-            "dtype": self.dtype,
-            "spacing": _numbers("--spacing", self.spacing, 3, float) if self.spacing else None,
-            "key": self.key,
-            "nan": self.nan,
-        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +42,7 @@ class Info:
         """Prints the answer."""
         if self.path is None:
             content = installation()
-        elif _is_store(self.path):
+        elif is_store(self.path):
             from ..io import Store
 
             content = Store.open(self.path).describe()
@@ -90,113 +56,6 @@ class Info:
             print(json.dumps(content))
         else:
             _print_table(content)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Render:
-    """Render a volume file to a picture."""
-
-    path: Positional[Annotated[Path, arg(metavar="PATH")]]
-    """the volume: RAW, NPY, NPZ, NIfTI, NRRD, TIFF or FITS"""
-    output: Annotated[Path, arg(aliases=["-o"], metavar="OUT.png")]
-    """the picture"""
-    npz: Annotated[Path | None, arg(metavar="OUT.npz")] = None
-    """float32 color, alpha and depth"""
-    stats: Annotated[Path | None, arg(metavar="FILE.json")] = None
-    """milliseconds, rays, samples, nodes, bricks, bytes"""
-    camera: Annotated[str, arg(metavar="CAMERA")] = "orbit:30,20,2.4"
-    """orbit:AZIMUTH,ELEVATION,DISTANCE (degrees, and largest sides of the box) or
-    look:ex,ey,ez,tx,ty,tz (world units)"""
-    up: Annotated[str, arg(metavar="X,Y,Z")] = "0,1,0"
-    """what a look camera takes for up"""
-    fov: Annotated[float, arg(metavar="DEG")] = 30.0
-    """vertical field of view"""
-    size: Annotated[str, arg(metavar="WxH")] = "512x512"
-    """pixels"""
-    tf: Annotated[str, arg(metavar="FILE|PRESET")] = "gray"
-    """transfer function: a JSON file, or a preset over the data's range: gray, hot, vessels, bone,
-    tissue"""
-    step: Annotated[float, arg(metavar="VOXELS")] = 0.5
-    """distance between samples"""
-    lod: Literal["auto", "finest"] = "auto"
-    """auto: voxels as wide as a pixel's cone; finest: the data as it is"""
-    background: Annotated[str, arg(metavar="R,G,B")] = "0,0,0"
-    """linear, 0 to 1"""
-    stop_alpha: Annotated[float, arg(metavar="ALPHA")] = 0.99
-    """a ray ends at this alpha; 1 integrates to the end"""
-    brick_size: Annotated[int, arg(metavar="VOXELS")] = 8
-    """side of a brick"""
-    border: Annotated[int, arg(metavar="VOXELS")] = 1
-    """voxels around a brick"""
-    threshold: Annotated[float | None, arg(metavar="VALUE")] = None
-    """regions with no value above it are never drawn"""
-    backend: Literal["auto", "reference", "cpp", "cuda"] = "auto"
-    """what traces the rays"""
-    source: tyro.conf.OmitArgPrefixes[Source] = Source()
-
-    def run(self) -> None:
-        """Reads, builds the tree, renders, writes."""
-        width, height = _size(self.size)
-        background = _numbers("--background", self.background, 3, float)
-        if self.output.suffix != ".png":
-            raise ValueError(f"--output must end in .png, got {str(self.output)!r}")
-        if self.npz is not None and self.npz.suffix != ".npz":
-            raise ValueError(f"--npz must end in .npz, got {str(self.npz)!r}")
-        for file in (self.output, self.npz, self.stats):
-            if file is not None and not file.parent.is_dir():
-                raise FileNotFoundError(f"folder not found: {file.parent}")
-        camera = parse_camera(self.camera, self.up, self.fov, width, height)
-        with Bar() as bar:
-            bar("reading", 0, 0)
-            volume = self.source.read(self.path)
-            shader = self._shader(volume)
-            tree = self._tree(volume, bar)
-            from ..rendering import render
-
-            picture = render(
-                *(tree, camera, shader),
-                progress=bar,
-                step=self.step,
-                lod=self.lod,
-                background=tuple(background),
-                stop_alpha=self.stop_alpha,
-                backend=self.backend,
-            )
-        picture.save(self.output)
-        if self.npz is not None:
-            picture.save(self.npz)
-        if self.stats is not None:
-            content = {**picture.stats.as_dict(), "extent": volume.extent}
-            self.stats.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-        stats = picture.stats
-        print(
-            f"{self.output}: {width}x{height}, {stats.samples / 1e6:.1f} M samples in "
-            f"{stats.milliseconds:.0f} ms ({stats.backend})"
-        )
-
-    def _tree(self, volume: Volume, bar: Bar) -> N3Tree:
-        import torch
-
-        from ..ops import available
-        from ..ops.trace import choose_backend
-        from ..pool import N3Tree
-
-        wants_cuda = self.backend == "cuda" or (self.backend == "auto" and not available()["cuda"])
-        device = torch.device("cuda" if wants_cuda else "cpu")
-        choose_backend(self.backend, device)
-        return N3Tree.from_volume(
-            *(volume, self.brick_size, self.border),
-            threshold=self.threshold,
-            device=device,
-            progress=bar,
-        )
-
-    def _shader(self, volume: Volume) -> TransferFunction:
-        from ..rendering import TransferFunction
-
-        if self.tf.endswith(".json") or Path(self.tf).is_file():
-            return TransferFunction.from_json(self.tf)
-        return TransferFunction.preset(self.tf, *volume.value_range)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,71 +124,6 @@ class Convert:
             yield client.get_executor()
 
 
-class Bar:
-    """A progress bar on standard error that shows itself once the work has taken a second."""
-
-    def __init__(self, *, speed: bool = False) -> None:
-        """Shows nothing yet. With `speed` what is done counts bytes."""
-        from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            Progress,
-            ProgressColumn,
-            TextColumn,
-            TimeRemainingColumn,
-            TransferSpeedColumn,
-        )
-
-        rate: tuple[ProgressColumn, ...] = (TransferSpeedColumn(),) if speed else ()
-        columns = (TextColumn("{task.description}"), BarColumn(), *rate, TimeRemainingColumn())
-        console = Console(stderr=True)
-        self._progress = Progress(
-            *columns, console=console, transient=True, disable=not console.is_terminal
-        )
-        self._tasks: dict[str, Any] = {}
-        self._timer = threading.Timer(1.0, self._progress.start)
-        self._timer.daemon = True
-
-    def __enter__(self) -> Bar:
-        """Starts the clock."""
-        self._timer.start()
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        """Takes the bar away."""
-        self._timer.cancel()
-        self._timer.join()
-        if self._progress.live.is_started:
-            self._progress.stop()
-
-    def __call__(self, what: str, done: int, total: int) -> None:
-        """Shows that `done` of `total` (0: unknown) parts of `what` are done."""
-        if what not in self._tasks:
-            for task in self._tasks.values():
-                self._progress.update(task, visible=False)
-            self._tasks[what] = self._progress.add_task(what, total=total or None)
-        self._progress.update(self._tasks[what], completed=done, total=total or None)
-
-
-def parse_camera(text: str, up: str, fov: float, width: int, height: int) -> Camera:
-    """Makes a camera from `orbit:AZ,EL,DIST` or `look:ex,ey,ez,tx,ty,tz`.
-
-    Raises:
-        ValueError: The text is neither, or a number is out of its range.
-    """
-    from ..rendering import Camera
-
-    kind, _, rest = text.partition(":")
-    if kind == "orbit":
-        azimuth, elevation, distance = _numbers("--camera orbit", rest, 3, float)
-        return Camera.orbit(azimuth, elevation, distance, fov, width, height)
-    if kind == "look":
-        values = _numbers("--camera look", rest, 6, float)
-        upward = _numbers("--up", up, 3, float)
-        return Camera.look_at(values[:3], values[3:], upward, fov, width, height)
-    raise ValueError(f"--camera must be orbit:AZ,EL,DIST or look:ex,ey,ez,tx,ty,tz, got {text!r}")
-
-
 def installation() -> dict[str, Any]:
     """Returns versions, what each backend can do here, and the devices."""
     import platform
@@ -350,12 +144,6 @@ def installation() -> dict[str, Any]:
             *(f"cuda:{i} ({torch.cuda.get_device_name(i)})" for i in cards),
         ],
     }
-
-
-def _is_store(path: str) -> bool:
-    return (
-        "://" in path or path.rstrip("/").endswith(".zarr") or (Path(path) / "zarr.json").exists()
-    )
 
 
 def _readable(content: dict[str, Any]) -> dict[str, Any]:
@@ -400,31 +188,13 @@ def _sparkline(counts: list[int]) -> str:
     return "".join(" ▁▂▃▄▅▆▇█"[math.ceil(8 * math.log1p(count) / most)] for count in counts)
 
 
-def _numbers(name: str, text: str, count: int, kind: type) -> list[Any]:
-    try:
-        values = [kind(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != count:
-        wanted = "whole numbers" if kind is int else "numbers"
-        raise ValueError(f"{name} must be {count} {wanted} with commas between them, got {text!r}")
-    return values
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.lower().partition("x")
-    if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
-        raise ValueError(f"--size must be WIDTHxHEIGHT in pixels, got {text!r}")
-    return int(width), int(height)
-
-
 def main(args: list[str] | None = None) -> None:
     """Runs the command line and ends the process."""
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
             command = tyro.extras.subcommand_cli_from_dict(
-                {"info": Info, "render": Render, "convert": Convert},
+                {"info": Info, "render": Render, "fly": Fly, "convert": Convert},
                 args=args,
                 prog="gvtorch",
                 description="GigaVoxels on PyTorch tensors.",

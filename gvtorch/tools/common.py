@@ -1,0 +1,126 @@
+"""What several commands share: how a volume is read, numbers in flags, the progress bar."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import arg
+
+if TYPE_CHECKING:
+    from ..volume import Volume
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """How to read the volume where the file does not tell."""
+
+    shape: Annotated[str | None, arg(metavar="X,Y,Z")] = None
+    """RAW: voxels; else taken from the name *_XxYxZ_dtype.raw"""
+    dtype: Annotated[str | None, arg(metavar="TYPE")] = None
+    """RAW: a NumPy dtype, as in int16 or >i2"""
+    spacing: Annotated[str | None, arg(metavar="X,Y,Z")] = None
+    """voxel size in world units"""
+    key: Annotated[str | None, arg(metavar="NAME")] = None
+    """NPZ: which array"""
+    nan: Annotated[float | None, arg(metavar="VALUE")] = None
+    """value for voxels that are NaN or infinite"""
+
+    def read(self, path: Path) -> Volume:
+        """Reads the volume at `path`."""
+        from ..io import read_volume
+
+        return read_volume(path, **self.options())
+
+    def options(self) -> dict[str, Any]:
+        """The options as arguments of `read_volume` and `convert`."""
+        return {
+            "shape": numbers("--shape", self.shape, 3, int) if self.shape else None,
+            "dtype": self.dtype,
+            "spacing": numbers("--spacing", self.spacing, 3, float) if self.spacing else None,
+            "key": self.key,
+            "nan": self.nan,
+        }
+
+
+class Bar:
+    """A progress bar on standard error that shows itself once the work has taken a second."""
+
+    def __init__(self, *, speed: bool = False) -> None:
+        """Shows nothing yet. With `speed` what is done counts bytes."""
+        from rich.console import Console
+        from rich.progress import (
+            BarColumn,
+            Progress,
+            ProgressColumn,
+            TextColumn,
+            TimeRemainingColumn,
+            TransferSpeedColumn,
+        )
+
+        rate: tuple[ProgressColumn, ...] = (TransferSpeedColumn(),) if speed else ()
+        columns = (TextColumn("{task.description}"), BarColumn(), *rate, TimeRemainingColumn())
+        console = Console(stderr=True)
+        self._progress = Progress(
+            *columns, console=console, transient=True, disable=not console.is_terminal
+        )
+        self._tasks: dict[str, Any] = {}
+        self._timer = threading.Timer(1.0, self._progress.start)
+        self._timer.daemon = True
+
+    def __enter__(self) -> Bar:
+        """Starts the clock."""
+        self._timer.start()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        """Takes the bar away."""
+        self._timer.cancel()
+        self._timer.join()
+        if self._progress.live.is_started:
+            self._progress.stop()
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        """Shows that `done` of `total` (0: unknown) parts of `what` are done."""
+        if what not in self._tasks:
+            for task in self._tasks.values():
+                self._progress.update(task, visible=False)
+            self._tasks[what] = self._progress.add_task(what, total=total or None)
+        self._progress.update(self._tasks[what], completed=done, total=total or None)
+
+
+def is_store(path: str) -> bool:
+    """Tells a store or an OME-Zarr image, a folder or a URL, from a volume file."""
+    return (
+        "://" in path or path.rstrip("/").endswith(".zarr") or (Path(path) / "zarr.json").exists()
+    )
+
+
+def numbers(name: str, text: str, count: int, kind: type) -> list[Any]:
+    """Returns `count` numbers out of a flag's text.
+
+    Raises:
+        ValueError: They are more, fewer, or no numbers.
+    """
+    try:
+        values = [kind(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count:
+        wanted = "whole numbers" if kind is int else "numbers"
+        raise ValueError(f"{name} must be {count} {wanted} with commas between them, got {text!r}")
+    return values
+
+
+def size(text: str) -> tuple[int, int]:
+    """Returns width and height out of WIDTHxHEIGHT.
+
+    Raises:
+        ValueError: The text is something else.
+    """
+    width, _, height = text.lower().partition("x")
+    if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
+        raise ValueError(f"--size must be WIDTHxHEIGHT in pixels, got {text!r}")
+    return int(width), int(height)

@@ -1,0 +1,385 @@
+"""`gvtorch render` and `gvtorch fly`: a volume or a store to a picture, or to many.
+
+A volume file is built into a tree in memory; a store is streamed by the engine.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from tyro.conf import Positional, arg
+
+from .common import Bar, Source, is_store, numbers, size
+
+if TYPE_CHECKING:
+    import torch
+
+    from ..engine import Engine
+    from ..frame import FrameStats
+    from ..rendering import Camera, Picture, TransferFunction
+    from ..rendering.path import CameraPath
+
+_RANGE_VOXELS = 128**3  # of a foreign image that are read to learn its range
+
+
+@dataclass(frozen=True, kw_only=True)
+class Look:
+    """How it is shown."""
+
+    fov: Annotated[float, arg(metavar="DEG")] = 30.0
+    """vertical field of view"""
+    size: Annotated[str, arg(metavar="WxH")] = "512x512"
+    """pixels"""
+    tf: Annotated[str, arg(metavar="FILE|PRESET")] = "gray"
+    """transfer function: a JSON file, or a preset over the data's range: gray, hot, vessels, bone,
+    tissue"""
+    step: Annotated[float, arg(metavar="VOXELS")] = 0.5
+    """distance between samples"""
+    lod: Literal["auto", "finest"] = "auto"
+    """auto: voxels as wide as a pixel's cone; finest: the data as it is"""
+    background: Annotated[str, arg(metavar="R,G,B")] = "0,0,0"
+    """linear, 0 to 1"""
+    stop_alpha: Annotated[float, arg(metavar="ALPHA")] = 0.99
+    """a ray ends at this alpha; 1 integrates to the end"""
+    component: Annotated[int, arg(metavar="N")] = 0
+    """which number of a voxel is shown"""
+    brick_size: Annotated[int, arg(metavar="VOXELS")] = 8
+    """side of a brick"""
+    border: Annotated[int, arg(metavar="VOXELS")] = 1
+    """voxels around a brick"""
+    backend: Literal["auto", "reference", "cpp", "cuda"] = "auto"
+    """what traces the rays"""
+
+    def options(self) -> dict[str, Any]:
+        """Fields of `RenderOptions`."""
+        return {
+            "step": self.step,
+            "lod": self.lod,
+            "background": tuple(numbers("--background", self.background, 3, float)),
+            "stop_alpha": self.stop_alpha,
+            "component": self.component,
+            "backend": self.backend,
+        }
+
+    def device(self) -> torch.device:
+        """CUDA where the backend runs there."""
+        import torch
+
+        from ..ops import available
+        from ..ops.trace import choose_backend
+
+        wants_cuda = self.backend == "cuda" or (self.backend == "auto" and not available()["cuda"])
+        device = torch.device("cuda" if wants_cuda else "cpu")
+        choose_backend(self.backend, device)
+        return device
+
+    def shader(self, low: float, high: float) -> TransferFunction:
+        """Reads the transfer function, or spans a preset over the range."""
+        from ..rendering import TransferFunction
+
+        if self.tf.endswith(".json") or Path(self.tf).is_file():
+            return TransferFunction.from_json(self.tf)
+        return TransferFunction.preset(self.tf, low, high)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Streaming:
+    """Stores: what is kept, and how it is loaded."""
+
+    node_pool: Annotated[str, arg(metavar="BYTES")] = "8 MB"
+    """memory of node tiles"""
+    brick_pool: Annotated[str, arg(metavar="BYTES")] = "256 MB"
+    """memory of bricks, on the device that renders"""
+    host_cache: Annotated[str, arg(metavar="BYTES")] = "512 MB"
+    """memory of decoded blocks"""
+    mode: Literal["interactive", "balanced", "converge"] | None = None
+    """one frame, a few, or until nothing is missing"""
+    max_frames: Annotated[int, arg(metavar="N")] = 1000
+    """most frames of a picture that converges"""
+    loading: Literal["straight", "levels"] = "straight"
+    """to the wanted level at once, or level by level"""
+    time: Annotated[int, arg(metavar="N")] = 0
+    """time point"""
+    image: Annotated[str | None, arg(metavar="NAME")] = None
+    """which image, where a store has several"""
+    strict: tyro.conf.FlagCreatePairsOff[bool] = False
+    """a block that can't be read ends the work"""
+
+    def given(self) -> list[str]:
+        """Flags that differ from what they are if left out."""
+        plain = vars(Streaming())
+        return [f"--{n.replace('_', '-')}" for n, v in vars(self).items() if v != plain[n]]
+
+    @contextmanager
+    def open(self, path: str, look: Look) -> Iterator[tuple[Engine, TransferFunction]]:
+        """Opens a store: the engine over it, and the transfer function."""
+        from ..engine import Engine
+        from ..io import Store
+        from ..producers import StoredProducer
+
+        store = Store.open(path, image=self.image, time=self.time)
+        producer = StoredProducer(store, host_cache=self.host_cache)
+        shader = look.shader(*value_range(store))
+        with Engine(
+            producer,
+            node_pool=self.node_pool,
+            brick_pool=self.brick_pool,
+            brick_size=look.brick_size,
+            border=look.border,
+            loading=self.loading,
+            strict=self.strict,
+            device=look.device(),
+        ) as engine:
+            yield engine, shader
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render:
+    """Render a volume or a store to a picture."""
+
+    path: Positional[Annotated[str, arg(metavar="PATH")]]
+    """a volume (RAW, NPY, NPZ, NIfTI, NRRD, TIFF or FITS), or a store (folder or URL)"""
+    output: Annotated[Path, arg(aliases=["-o"], metavar="OUT.png")]
+    """the picture"""
+    npz: Annotated[Path | None, arg(metavar="OUT.npz")] = None
+    """float32 color, alpha and depth"""
+    stats: Annotated[Path | None, arg(metavar="FILE.json")] = None
+    """milliseconds, rays, samples, nodes, bricks, bytes; of stores requests and misses too"""
+    camera: Annotated[str, arg(metavar="CAMERA")] = "orbit:30,20,2.4"
+    """orbit:AZIMUTH,ELEVATION,DISTANCE (degrees, and largest sides of the box) or
+    look:ex,ey,ez,tx,ty,tz (world units)"""
+    up: Annotated[str, arg(metavar="X,Y,Z")] = "0,1,0"
+    """what a look camera takes for up"""
+    threshold: Annotated[float | None, arg(metavar="VALUE")] = None
+    """volumes: regions with no value above it are never drawn"""
+    look: tyro.conf.OmitArgPrefixes[Look] = Look()
+    streaming: tyro.conf.OmitArgPrefixes[Streaming] = Streaming()
+    source: tyro.conf.OmitArgPrefixes[Source] = Source()
+
+    def run(self) -> None:
+        """Reads, renders, writes."""
+        width, height = size(self.look.size)
+        _check_suffix("--output", self.output, ".png")
+        if self.npz is not None:
+            _check_suffix("--npz", self.npz, ".npz")
+        for file in (self.output, self.npz, self.stats):
+            if file is not None and not file.parent.is_dir():
+                raise FileNotFoundError(f"folder not found: {file.parent}")
+        camera = parse_camera(self.camera, self.up, self.look.fov, width, height)
+        options = self.look.options()
+        with Bar() as bar:
+            bar("reading", 0, 0)
+            if is_store(self.path):
+                picture, extent = self._stream(camera, options, bar)
+            else:
+                picture, extent = self._resident(camera, options, bar)
+        picture.save(self.output)
+        if self.npz is not None:
+            picture.save(self.npz)
+        if self.stats is not None:
+            content = {**picture.stats.as_dict(), "extent": extent}
+            self.stats.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        print(f"{self.output}: {width}x{height}, {told(picture)}")
+
+    def _resident(
+        self, camera: Camera, options: dict[str, Any], bar: Bar
+    ) -> tuple[Picture, tuple[int, ...]]:
+        """Builds the whole tree of a volume file."""
+        from ..pool import N3Tree
+        from ..rendering import render
+
+        if self.streaming.given():
+            raise ValueError(
+                f"{self.streaming.given()[0]} is for stores; "
+                f"make one: gvtorch convert {self.path} STORE.zarr"
+            )
+        volume = self.source.read(Path(self.path))
+        shader, look = self.look.shader(*volume.value_range), self.look
+        tree = N3Tree.from_volume(
+            *(volume, look.brick_size, look.border),
+            threshold=self.threshold,
+            device=look.device(),
+            progress=bar,
+        )
+        return render(tree, camera, shader, progress=bar, **options), volume.extent
+
+    def _stream(
+        self, camera: Camera, options: dict[str, Any], bar: Bar
+    ) -> tuple[Picture, tuple[int, ...]]:
+        """Streams a store."""
+        if self.threshold is not None:
+            raise ValueError("--threshold is for volumes; a store's is set by gvtorch convert")
+        streaming = self.streaming
+        with streaming.open(self.path, self.look) as (engine, shader):
+            picture = engine.render(
+                *(camera, shader, streaming.mode or "converge"),
+                max_frames=streaming.max_frames,
+                progress=bar,
+                **options,
+            )
+            _tell_failures(engine)
+            (plant,) = engine.plants.values()
+            return picture, plant.tree.extent
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fly:
+    """Fly through a store: a picture a frame, and what each cost."""
+
+    path: Positional[Annotated[str, arg(metavar="STORE.zarr")]]
+    """the store, a folder or a URL"""
+    output: Annotated[Path, arg(aliases=["-o"], metavar="DIR|OUT.mp4")]
+    """a folder for 0000.png, 0001.png, ..., or a video"""
+    flight: Annotated[str, arg(name="path", metavar="orbit|FILE.json")] = "orbit"
+    """once around, or keys [{"eye": [x, y, z], "target": [x, y, z], "up": ..., "fov": ...}]"""
+    frames: Annotated[int, arg(metavar="N")] = 100
+    """number of pictures"""
+    fps: Annotated[int, arg(metavar="N")] = 25
+    """pictures a second of a video"""
+    orbit: Annotated[str, arg(metavar="AZ,EL,DIST")] = "30,20,2.4"
+    """where an orbit starts: degrees, and largest sides of the box"""
+    stats: Annotated[Path | None, arg(metavar="FILE.jsonl")] = None
+    """one JSON line a frame; stats.jsonl beside the pictures if left out"""
+    look: tyro.conf.OmitArgPrefixes[Look] = Look()
+    streaming: tyro.conf.OmitArgPrefixes[Streaming] = Streaming()
+
+    def run(self) -> None:
+        """Renders frame after frame."""
+        from .. import check
+        from .video import Video
+
+        width, height = size(self.look.size)
+        check.whole("fly", "--frames", self.frames, low=1)
+        check.whole("fly", "--fps", self.fps, low=1, high=1000)
+        options, is_video = self.look.options(), self.output.suffix == ".mp4"
+        if not self.output.parent.is_dir():
+            raise FileNotFoundError(f"folder not found: {self.output.parent}")
+        if self.output.suffix and not is_video:
+            raise ValueError(f"--output must be a folder or end in .mp4, got {str(self.output)!r}")
+        start = numbers("--orbit", self.orbit, 3, float)
+        with ExitStack() as stack:
+            bar = stack.enter_context(Bar())
+            bar("reading", 0, 0)
+            engine, shader = stack.enter_context(self.streaming.open(self.path, self.look))
+            path = self._path(engine, start)
+            video = None
+            if is_video:
+                video = stack.enter_context(Video(self.output, width, height, fps=self.fps))
+            else:
+                self.output.mkdir(exist_ok=True)
+            lines = stack.enter_context(self._stats_file().open("w", encoding="utf-8"))
+            for number in range(self.frames):
+                place = number / max(1, self.frames - 1 + (self.flight == "orbit"))
+                picture = engine.render(
+                    *(path.camera(place, width, height), shader),
+                    self.streaming.mode or "balanced",
+                    max_frames=self.streaming.max_frames,
+                    **options,
+                )
+                lines.write(json.dumps({"picture": number, **picture.stats.as_dict()}) + "\n")
+                if video is not None:
+                    video.add(picture)
+                else:
+                    picture.save(self.output / f"{number:04d}.png")
+                bar("frames", number + 1, self.frames)
+            _tell_failures(engine)
+            report = engine.report()
+        from rich.console import Console
+
+        Console().print(report)
+        print(f"{self.output}: {self.frames} pictures; what each cost: {self._stats_file()}")
+
+    def _stats_file(self) -> Path:
+        if self.stats is not None:
+            return self.stats
+        if self.output.suffix == ".mp4":
+            return self.output.with_suffix(".jsonl")
+        return self.output / "stats.jsonl"
+
+    def _path(self, engine: Engine, start: list[float]) -> CameraPath:
+        from ..rendering.path import CameraPath
+
+        if self.flight != "orbit":
+            return CameraPath.from_json(self.flight)
+        azimuth, elevation, distance = start
+        return CameraPath.orbit(
+            engine.box, azimuth=azimuth, elevation=elevation, distance=distance, fov=self.look.fov
+        )
+
+
+def parse_camera(text: str, up: str, fov: float, width: int, height: int) -> Camera:
+    """Makes a camera from `orbit:AZ,EL,DIST` or `look:ex,ey,ez,tx,ty,tz`.
+
+    Raises:
+        ValueError: The text is neither, or a number is out of its range.
+    """
+    from ..rendering import Camera
+
+    kind, _, rest = text.partition(":")
+    if kind == "orbit":
+        azimuth, elevation, distance = numbers("--camera orbit", rest, 3, float)
+        return Camera.orbit(azimuth, elevation, distance, fov, width, height)
+    if kind == "look":
+        values = numbers("--camera look", rest, 6, float)
+        upward = numbers("--up", up, 3, float)
+        return Camera.look_at(values[:3], values[3:], upward, fov, width, height)
+    raise ValueError(f"--camera must be orbit:AZ,EL,DIST or look:ex,ey,ez,tx,ty,tz, got {text!r}")
+
+
+def value_range(store: Any) -> tuple[float, float]:
+    """Smallest and largest value of a store. Other people's images do not tell: of them the finest
+    level of at most 128^3 voxels is read, which blurs the extremes a little.
+    """
+    if store.value_range is not None:
+        return (
+            min(low for low, _ in store.value_range),
+            max(high for _, high in store.value_range),
+        )
+    level = 0
+    while level + 1 < store.levels:
+        x, y, z = store.level_extent(level)
+        if x * y * z <= _RANGE_VOXELS:
+            break
+        level += 1
+    data = store.read_region(level, (0, 0, 0), store.level_extent(level)[::-1])
+    return (float(data.min()), float(data.max()))
+
+
+def told(picture: Picture) -> str:
+    """What a picture cost, in a few words."""
+    from ..frame import FrameStats
+
+    stats = picture.stats
+    text = f"{stats.samples / 1e6:.1f} M samples in {stats.milliseconds:.0f} ms ({stats.backend})"
+    if not isinstance(stats, FrameStats):
+        return text
+    bricks = f"{stats.bricks_used} bricks of {stats.bricks}"
+    return f"{text}, {stats.frames} frames, {bricks}{_shortfall(stats)}"
+
+
+def _shortfall(stats: FrameStats) -> str:
+    if stats.capacity_exceeded:
+        return "; the pools are too small for this picture, parts of it are coarser"
+    if stats.failed:
+        return f"; {stats.failed} nodes failed, parts of it are coarser"
+    return "" if stats.converged else "; not converged"
+
+
+def _tell_failures(engine: Engine) -> None:
+    import sys
+
+    for failure in engine.failures[:3]:
+        print(f"gvtorch: {failure}", file=sys.stderr)
+    if len(engine.failures) > 3:
+        print(f"gvtorch: {engine.production.failed} nodes failed in all", file=sys.stderr)
+
+
+def _check_suffix(flag: str, path: Path, suffix: str) -> None:
+    if path.suffix != suffix:
+        raise ValueError(f"{flag} must end in {suffix}, got {str(path)!r}")
