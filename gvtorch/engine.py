@@ -37,6 +37,7 @@ from .rendering.renderer import (
 )
 from .report import Report
 from .stage import Progress, collect_timings, no_progress, stage
+from .turns import Turns
 from .volume import movable
 
 Scene = Producer | Mapping[str, Producer]
@@ -147,12 +148,24 @@ class Engine:
             ProductionError: A node can't be produced, and the engine is strict.
         """
         chosen = render_options("frame", camera, options)
+        hits, stats = self._pass(camera, shader, chosen, progress)
+        return develop(hits, camera, chosen.background, stats), stats
+
+    def _pass(
+        self,
+        camera: Camera,
+        shader: Shaders,
+        chosen: RenderOptions,
+        progress: Progress,
+        again: tuple[Hits, Tensor] | None = None,
+    ) -> tuple[Hits, FrameStats]:
+        """One frame: what `frame` does, for all rays or for some of them once more."""
         start = time.perf_counter()
         stats = self._begin(chosen)
         with collect_timings() if self.options.monitor else nullcontext(stats.stages) as timings:
             trace = self._tracer(shader, chosen)
-            world = camera.placed(self.box)
-            hits = trace_camera(world, self.device, trace, chosen.dtype, progress)  # 1, 2
+            world, device = camera.placed(self.box), self.device
+            hits = trace_camera(world, device, trace, chosen.dtype, progress, again=again)  # 1, 2
             with stage("requests"):
                 wishes = self.cache.requests(min(_LISTED, self.cache.nodes.child_tn.numel()))  # 3
             with stage("lru"):
@@ -167,16 +180,15 @@ class Engine:
                 answers = self.production.answers([*self.plants.values()], served)  # 6
             with stage("write"):
                 self.production.write(answers, stats)  # 7
-            with stage("picture"):
+            with stage("count"):
                 self._count(stats, hits, wishes)
-                picture = develop(hits, camera, chosen.background, stats)
         stats.deferred, stats.capacity_exceeded = deferred, stats.capacity_exceeded or exceeded
         stats.converged = not (len(wishes) or wishes.overflow or late)
         stats.stages = dict(timings)
         stats.milliseconds = 1e3 * (time.perf_counter() - start)
         if self.options.monitor:
             self._report.add(stats)
-        return picture, stats
+        return hits, stats
 
     def render(
         self,
@@ -195,16 +207,19 @@ class Engine:
             camera: See `frame`.
             shader: See `frame`.
             mode: interactive: one frame; balanced: `productions` frames, of which the last is
-                shown; converge: until a frame misses nothing that can be served.
+                shown; converge: until no ray misses anything that can be served. Rays that miss
+                nothing are done; where the pools are too small for all rays, groups of them take
+                turns, so that any pool that holds what one ray needs gives the whole picture.
             productions: Frames of a balanced picture.
             max_frames: Most frames of a converged picture; `stats.converged` tells whether they
                 were enough.
-            progress: Told how many frames are done, and how many rays of the first.
+            progress: Told how many rays of a converging picture are done.
             **options: Fields of `RenderOptions`.
 
         Returns:
-            The last frame's picture; its `stats` add up produced, evicted, bytes and milliseconds
-            over all frames.
+            The picture; its `stats` add up milliseconds, produced, evicted and bytes over all
+            frames, tell the most tiles and bricks that one frame used, and else the last frame.
+            `capacity_exceeded` tells that rays had to take turns, or that some got nothing.
 
         Raises:
             ValueError: The mode is unknown, or see `frame`.
@@ -217,23 +232,33 @@ class Engine:
             raise ValueError(
                 f"render: mode must be 'interactive', 'balanced' or 'converge', got {mode!r}"
             )
-        total, failed = FrameStats(), self.production.failed
+        chosen = render_options("render", camera, options)
+        turns = Turns(len(camera) * camera.height * camera.width, self.device)
+        total, hits = FrameStats(), None
         for number in range(1, limits[mode] + 1):
-            picture, stats = self.frame(camera, shader, **options)
+            again = (hits, turns.now) if mode == "converge" and hits is not None else None
+            hits, stats = self._pass(camera, shader, chosen, no_progress, again)
             _add_up(total, stats)
-            progress("frames", number, 0)
-            if stats.converged:
+            if mode == "converge":
+                turns.take(hits.missed, stats, total.failed)
+                progress("rays", turns.done, turns.count)
+                if turns.over:
+                    break
+                if turns.stuck and stats.pending:
+                    self.production.wait()
+            elif stats.converged:
                 break
-            moved = sum(stats.produced.values()) + stats.stale > 0 or stats.failed > failed
-            failed = stats.failed
-            if mode == "converge" and not moved:
-                if not stats.pending:
-                    break  # nothing more can be served: the pools are too small
-                self.production.wait()
-        total.frames = number
-        summed = ("frames", "milliseconds", "stages", "produced", "evicted", "bytes_uploaded")
-        merged: dict[str, Any] = {name: getattr(total, name) for name in summed}
-        return dataclasses.replace(picture, stats=dataclasses.replace(stats, **merged))
+            total.failed = stats.failed
+        assert hits is not None
+        if mode == "converge":
+            total.converged, total.capacity_exceeded = turns.whole, turns.crowded
+        else:
+            total.converged = stats.converged
+            total.capacity_exceeded = stats.capacity_exceeded
+        total.frames, total.rays = number, turns.count
+        total.samples = int(hits.samples.sum(dtype=torch.int64))
+        summed = {name: getattr(total, name) for name in _SUMMED}
+        return develop(hits, camera, chosen.background, dataclasses.replace(stats, **summed))
 
     @property
     def box(self) -> Tensor:
@@ -451,9 +476,17 @@ def _brick_bytes(channels: Mapping[str, Channel], options: EngineOptions) -> int
     return (size + 2 * border) ** 3 * sum(channel.nbytes for channel in channels.values())
 
 
+_SUMMED = (
+    *("frames", "milliseconds", "stages", "rays", "samples", "tiles_used", "bricks_used"),
+    *("produced", "evicted", "bytes_uploaded", "converged", "capacity_exceeded"),
+)
+
+
 def _add_up(total: FrameStats, stats: FrameStats) -> None:
     total.milliseconds += stats.milliseconds
     total.bytes_uploaded += stats.bytes_uploaded
+    total.tiles_used = max(total.tiles_used, stats.tiles_used)
+    total.bricks_used = max(total.bricks_used, stats.bricks_used)
     for name in ("stages", "produced", "evicted"):
         sums = getattr(total, name)
         for key, value in getattr(stats, name).items():

@@ -25,6 +25,7 @@ class Hits:
     alpha: Tensor  # (r, 1)
     depth: Tensor  # (r, 1) distance along the ray in world units, +inf where nothing was hit
     samples: Tensor  # (r,) int32, places at which the shader was evaluated
+    missed: Tensor  # (r,) bool, something that the ray saw was not there
 
 
 @dataclass(kw_only=True)

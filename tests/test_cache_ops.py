@@ -49,7 +49,7 @@ def test_compact_requests_lists_open_wishes_and_keeps_pending_ones(
 @fixed
 @given(data=st.data(), size=st.integers(1, 60))
 def test_lru_equals_a_python_list_over_random_traces(backend, data, size):
-    """Frames use slots at random and take some: the model is a list that moves what is used back."""
+    """Frames use slots at random and take some: the model is a list, used slots moved back."""
     device = DEVICES[backend]
     order = torch.arange(size, dtype=torch.int32, device=device)
     stamp = torch.full((size,), -1, dtype=torch.int32, device=device)

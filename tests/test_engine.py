@@ -18,6 +18,7 @@ import gvtorch as gv
 from gvtorch import config
 from gvtorch.cache import LRU, Scheduler
 from gvtorch.cache.requests import Requests
+from gvtorch.turns import Turns
 
 VESSELS = gv.TransferFunction.preset("vessels", 0, 255)
 AORTA = gv.TransferFunction.from_points([(140, 0), (400, 0.25), (900, 0.95)])
@@ -111,35 +112,82 @@ def test_many_views_from_one_small_pool(aneurism, lod):
 
 
 @pytest.mark.parametrize("loading", ["straight", "levels"])
-def test_a_pool_that_is_too_small_still_shows_the_whole_scene(aneurism, compiled, loading):
+@pytest.mark.parametrize("pool", ["brick_pool", "node_pool"])
+def test_where_pools_are_too_small_rays_take_turns(aneurism, compiled, loading, pool):
+    """Converged pictures are those of the whole tree, though no frame can hold all they need."""
     device, view = DEVICES[compiled], camera(64, distance=1.2)
     whole = gv.render(gv.N3Tree.from_volume(aneurism, device=device), view, VESSELS)
-    errors = []
-    for share in (0.05, 0.3, 0.8, 1.3):
-        pool = int(share * working_set(whole)) * 1000
-        options = {"brick_pool": pool, "device": device, "loading": loading}
+    slots, size = (working_set(whole), 1000) if pool == "brick_pool" else (tiles(whole), 8 * 11)
+    for share in (0.3, 0.8, 1.3):
+        options = {pool: int(share * slots) * size, "device": device, "loading": loading}
         with gv.Engine(gv.VolumeProducer(aneurism), **options) as engine:
-            picture = engine.render(view, VESSELS, max_frames=200)
+            picture = engine.render(view, VESSELS)
             engine.validate()
-            assert picture.stats.frames < 200, "the loop ends"
-            assert picture.stats.capacity_exceeded == (share < 1)
-            assert picture.stats.converged == (share > 1)
-            assert (picture.alpha > 0).float().mean() > 0.5 * (whole.alpha > 0).float().mean()
+            assert picture.stats.converged
+            assert picture.stats.capacity_exceeded == (share < 0.5) or 0.5 < share < 1
+            assert_same_picture(picture, whole)
+
+
+@pytest.mark.parametrize("loading", ["straight", "levels"])
+@pytest.mark.parametrize("pool", ["brick_pool", "node_pool"])
+def test_a_frame_from_too_small_pools_is_complete_and_coarser(aneurism, compiled, loading, pool):
+    """Whole frames, until nothing moves any more: the error falls as the pool grows."""
+    device, view = DEVICES[compiled], camera(64, distance=1.2)
+    whole = gv.render(gv.N3Tree.from_volume(aneurism, device=device), view, VESSELS)
+    slots, size = (working_set(whole), 1000) if pool == "brick_pool" else (tiles(whole), 8 * 11)
+    errors = []
+    for share in (0.1, 0.3, 0.6, 1.3):
+        options = {pool: int(share * slots) * size, "device": device, "loading": loading}
+        with gv.Engine(gv.VolumeProducer(aneurism), **options) as engine:
+            for _ in range(200):
+                picture, stats = engine.frame(view, VESSELS)
+                if not any(stats.produced.values()):
+                    break
+            engine.validate()
+            assert not any(stats.produced.values()), "it comes to rest"
+            assert stats.capacity_exceeded == (share < 1) == (not stats.converged)
+            shown = (picture.alpha > 0).float().mean()
+            assert shown > 0.8 * (whole.alpha > 0).float().mean()
             errors.append(float((picture.color - whole.color).square().mean().sqrt()))
     assert errors == sorted(errors, reverse=True) and errors[-1] == 0 < errors[2] < errors[0]
 
 
+def tiles(picture: gv.Picture) -> int:
+    return picture.stats.tiles_used
+
+
 @pytest.mark.backend("cpp")
-def test_a_node_pool_that_is_too_small_ends_as_well(aneurism):
-    whole = gv.render(gv.N3Tree.from_volume(aneurism), camera(), VESSELS)
-    used = whole.stats.tiles_used
-    for tiles in (16, used // 2, used + 8):
-        with gv.Engine(gv.VolumeProducer(aneurism), node_pool=tiles * 8 * 11) as engine:
-            picture = engine.render(camera(), VESSELS, max_frames=300)
+def test_a_pool_that_holds_almost_nothing_ends_too(aneurism):
+    for options in ({"brick_pool": 2000}, {"node_pool": 16 * 8 * 11}):
+        with gv.Engine(gv.VolumeProducer(aneurism), **options) as engine:
+            picture = engine.render(camera(24, distance=0.8), VESSELS, max_frames=150)
             engine.validate()
-            assert picture.stats.frames < 300
-            assert picture.stats.capacity_exceeded == (tiles < used)
-            assert picture.alpha.max() > 0.3
+            assert picture.stats.capacity_exceeded and picture.stats.frames <= 150
+            assert not picture.stats.converged and torch.isfinite(picture.color).all()
+
+
+def test_rays_take_turns_by_halves():
+    turns = Turns(16, torch.device("cpu"))
+    full = gv.FrameStats(capacity_exceeded=True, produced={"bricks": 0})
+    everyone = torch.ones(16, dtype=torch.bool)
+    for expected in (8, 4, 2, 1):
+        turns.take(everyone, full, 0)
+        assert int(turns.now.sum()) == expected and turns.crowded and not turns.over
+    turns.take(~turns.now, full, 0)  # the one ray is done
+    assert turns.done == 1 and int(turns.now.sum()) == 2
+    turns.take(~turns.now, full, 0)
+    assert turns.done == 3 and int(turns.now.sum()) == 4
+    loaded = gv.FrameStats(produced={"bricks": 5})
+    turns.take(everyone, loaded, 0)
+    assert int(turns.now.sum()) == 4, "what moves goes on"
+    turns.take(everyone, gv.FrameStats(converged=True), 0)
+    assert turns.done == 7, "what can't be served is not waited for"
+    turns.take(~turns.now, loaded, 0)
+    turns.take(~turns.now, loaded, 0)
+    assert turns.over and turns.whole and turns.done == 16
+    turns = Turns(1, torch.device("cpu"))
+    turns.take(everyone[:1], full, 0)
+    assert turns.over and not turns.whole, "a ray that does not fit alone is given up"
 
 
 class Checked(gv.Engine):

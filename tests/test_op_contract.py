@@ -63,9 +63,10 @@ def test_fake_gives_shapes_without_data(blobs, compiled):
     values = arguments(tree, 5)
     with FakeTensorMode() as mode:
         fake = [mode.from_tensor(v) if isinstance(v, torch.Tensor) else v for v in values.values()]
-        color, alpha, depth, samples = torch.ops.gvtorch.trace_rays(*fake)
+        color, alpha, depth, samples, missed = torch.ops.gvtorch.trace_rays(*fake)
     assert color.shape == (5, 3) and alpha.shape == depth.shape == (5, 1)
-    assert samples.shape == (5,) and samples.dtype == torch.int32
+    assert samples.shape == missed.shape == (5,)
+    assert samples.dtype == torch.int32 and missed.dtype == torch.bool
 
 
 def test_torchscript_saves_and_loads(tracer, rays):
@@ -101,7 +102,7 @@ def test_the_checked_function_compiles(blobs, compiled):
     origin, direction = fixed.pop("origin_r3"), fixed.pop("direction_r3")
 
     def shoot(origin: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
-        color, alpha, _, _ = trace_rays(origin * 1.0, direction, backend=compiled, **fixed)
+        color, alpha, *_ = trace_rays(origin * 1.0, direction, backend=compiled, **fixed)
         return color + alpha
 
     fast = torch.compile(shoot, fullgraph=True, backend="aot_eager")

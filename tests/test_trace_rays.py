@@ -70,6 +70,7 @@ def assert_equal(tree, backend, rays, shader=SHADER, **options):
     expected, expected_marks = run(tree, "reference", rays, shader, **options)
     actual, marks = run(tree, backend, rays, shader, **options)
     assert torch.equal(actual["samples"], expected["samples"])
+    assert torch.equal(actual["missed"], expected["missed"])
     for name, mark in marks.items():
         assert torch.equal(mark, expected_marks[name]), name
     tolerance = 1e-5 if expected["color"].dtype == torch.float32 else 1e-12

@@ -209,8 +209,9 @@ class Tree:
 
     def mark(
         self, found: Place, wanted: Tensor, blends: Tensor, cone: Tensor, seen: Tensor
-    ) -> None:
-        """Stamps the bricks that answer where something is seen; requests what is not there.
+    ) -> Tensor:
+        """Stamps the bricks that answer where something is seen; requests what is not there, and
+        returns (r,) bool whether it did.
 
         Straight to the wanted level, or level by level: then a brick is there before its node is
         subdivided.
@@ -227,6 +228,7 @@ class Tree:
         self.request(found.node[short], found.depth[short], cone[short], REQUEST_SUBDIVIDE)
         self.request(found.node[missing], found.depth[missing], cone[missing], REQUEST_LOAD)
         self.request(parent[above], found.depth[above] - 1, cone[above], REQUEST_LOAD)
+        return short | missing | above
 
     def request(self, node: Tensor, depth: Tensor, cone: Tensor, kind: int) -> None:
         """Joins wishes into the request words: kinds by OR, priorities by maximum.
@@ -482,7 +484,7 @@ def trace_rays(
     stop_alpha: float,
     depth_alpha: float,
     by_level: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Twin of `torch.ops.gvtorch.trace_rays`; arguments as in `gvtorch.ops.trace_rays`.
 
     Writes request_tn, stamp_t and stamp_b in place.
@@ -527,7 +529,7 @@ def trace_rays(
         samples = samples + shaded.to(torch.int32)
         active = at.inside() & (sum_.clear > stop_clear)
         arrived = active & (whole | ~visit.stays(at))
-    return sum_.color, (1 - sum_.clear)[:, None], sum_.depth[:, None], samples
+    return sum_.color, (1 - sum_.clear)[:, None], sum_.depth[:, None], samples, visit.missed
 
 
 @dataclass
@@ -542,6 +544,7 @@ class Visit:
     mixed: Tensor  # (r,) bool: two nodes answer
     nothing: Tensor  # (r,) bool: no node answers, or only EMPTY ones
     uniform: Tensor  # (r,) bool: one value answers all over the node
+    missed: Tensor  # (r,) bool: here or before, something that was seen was not there
 
     @classmethod
     def none(cls, origin_r3: Tensor, tree: Tree) -> Visit:
@@ -555,7 +558,8 @@ class Visit:
             *(word, corner, number + 1, word, corner, number + 1),
         )
         place = Place(*(field.clone() for field in vars(place).values()))
-        return cls(place, number, number, number, number, number > 0, number > 0, number > 0)
+        no = number > 0
+        return cls(place, number, number, number, number, no, no, no, no)
 
     def look_up(
         self,
@@ -584,7 +588,8 @@ class Visit:
         unseen = bricks.unseen(found.node, transfer) & (
             ~blends | (found.depth < wanted) | bricks.unseen(found.parent.clamp(min=0), transfer)
         )
-        tree.mark(found, wanted, blends, cone, ~unseen)
+        missed = tree.mark(found, wanted, blends, cone, ~unseen)
+        self.missed = self.missed.index_put((which,), self.missed[which] | missed)
 
         for name, field in vars(found).items():
             getattr(self.place, name)[which] = field

@@ -18,13 +18,16 @@ def available() -> dict[str, str]:
     return {"reference": "", **_reasons}
 
 
-def _fake_trace_rays(origin_r3: Tensor, *_args: object) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _fake_trace_rays(
+    origin_r3: Tensor, *_args: object
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     rays = origin_r3.shape[0]
     return (
         origin_r3.new_empty((rays, 3)),
         origin_r3.new_empty((rays, 1)),
         origin_r3.new_empty((rays, 1)),
         origin_r3.new_empty((rays,), dtype=torch.int32),
+        origin_r3.new_empty((rays,), dtype=torch.bool),
     )
 
 

@@ -65,7 +65,7 @@ def trace_rays(
     depth_alpha: float = config.DEPTH_ALPHA,
     by_level: bool = False,
     backend: Backend = "auto",
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Traces rays through a tree and shades what they meet with a transfer function.
 
     Mutates `request_tn` (what rays missed), `stamp_t` and `stamp_b` (what rays used). Every tensor
@@ -107,7 +107,7 @@ def trace_rays(
 
     Returns:
         color (r, 3) premultiplied linear RGB, alpha (r, 1), depth (r, 1) world units or +inf,
-        samples (r,) int32.
+        samples (r,) int32, missed (r,) bool: something that the ray saw was not there.
 
     Raises:
         ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.

@@ -136,7 +136,7 @@ class TreeTracer(torch.nn.Module):
             range.to(torch.float64),
             self.bounds[1].to(torch.float64),
         )
-        color, alpha, depth, samples = torch.ops.gvtorch.trace_rays(
+        color, alpha, depth, samples, _ = torch.ops.gvtorch.trace_rays(
             start.to(torch.float32).contiguous(),
             along.to(torch.float32).contiguous(),
             width.to(torch.float32).contiguous(),

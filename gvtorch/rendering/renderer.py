@@ -5,9 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
 from .. import check, config
 from ..frame import Hits, Rays, RenderStats
@@ -130,14 +132,13 @@ def develop(
     hits: Hits, camera: Camera, background: tuple[float, float, float], stats: RenderStats
 ) -> Picture:
     """Puts the hits of a camera's rays over the background, in the camera's shape."""
-    color, alpha, depth, samples = vars(hits).values()
-    color += (1 - alpha) * torch.tensor(background, dtype=color.dtype, device=color.device)
+    behind = torch.tensor(background, dtype=hits.color.dtype, device=hits.color.device)
     shape = (len(camera), camera.height, camera.width)
     images = {
-        "color": color.reshape(*shape, 3),
-        "alpha": alpha.reshape(*shape, 1),
-        "depth": depth.reshape(*shape, 1),
-        "samples": samples.reshape(*shape, 1),
+        "color": (hits.color + (1 - hits.alpha) * behind).reshape(*shape, 3),
+        "alpha": hits.alpha.reshape(*shape, 1),
+        "depth": hits.depth.reshape(*shape, 1),
+        "samples": hits.samples.reshape(*shape, 1),
     }
     if not camera.batched:
         images = {name: image[0] for name, image in images.items()}
@@ -146,12 +147,12 @@ def develop(
 
 def _room(device: torch.device, dtype: torch.dtype, pixels: int) -> Hits:
     """Takes the memory of a picture before the first ray: too large a one fails at once."""
-    check.memory(
-        "render", f"a picture of {pixels} pixels", pixels * (5 * dtype.itemsize + 4), device
-    )
+    size = pixels * (8 * dtype.itemsize + 5)  # the colour twice
+    check.memory("render", f"a picture of {pixels} pixels", size, device)
     widths = {"color": (3,), "alpha": (1,), "depth": (1,)}
     reals = {n: torch.empty((pixels, *w), dtype=dtype, device=device) for n, w in widths.items()}
-    return Hits(**reals, samples=torch.empty(pixels, dtype=torch.int32, device=device))
+    samples = torch.empty(pixels, dtype=torch.int32, device=device)
+    return Hits(**reals, samples=samples, missed=torch.empty_like(samples, dtype=torch.bool))
 
 
 def trace_camera(
@@ -160,32 +161,54 @@ def trace_camera(
     trace_rays: Callable[[Rays], Hits],
     dtype: torch.dtype,
     progress: Progress,
+    *,
+    again: tuple[Hits, Tensor] | None = None,
 ) -> Hits:
     """Traces all rays of a camera, or of a batch, block after block: rays take more memory than
     the picture they make.
+
+    Args:
+        camera: Placed in the world.
+        device: Where the rays are traced.
+        trace_rays: Traces world rays.
+        dtype: Of the hits.
+        progress: Told how many rows are done.
+        again: Hits of an earlier pass, which are overwritten, and which (pixels,) bool of them
+            are traced once more.
     """
-    hits = _room(device, dtype, len(camera) * camera.height * camera.width)
-    done = 0
-    for part in _trace_blocks(camera, device, trace_rays, progress):
+    count = len(camera) * camera.height * camera.width
+    hits, where = again if again is not None else (_room(device, dtype, count), None)
+    for start, end, rays in _blocks(camera, device, progress):
+        which = None if where is None else where[start:end].nonzero()[:, 0]
+        if which is not None and not len(which):
+            continue
+        with stage("rays"):
+            wanted = rays()
+            if which is not None and len(which) < end - start:
+                wanted = Rays(**{name: ray[which] for name, ray in vars(wanted).items()})
+        with stage("trace"):
+            part = trace_rays(wanted)
         for name, field in vars(part).items():
-            vars(hits)[name][done : done + field.shape[0]] = field
-        done += part.alpha.shape[0]
+            target = vars(hits)[name][start:end]
+            if which is None:
+                target.copy_(field)
+            else:
+                target[which] = field
     return hits
 
 
-def _trace_blocks(
-    camera: Camera, device: torch.device, trace_rays: Callable[[Rays], Hits], progress: Progress
-) -> Iterator[Hits]:
+def _blocks(
+    camera: Camera, device: torch.device, progress: Progress
+) -> Iterator[tuple[int, int, Callable[[], Rays]]]:
+    """First and last pixel of blocks of rows, and what makes their rays."""
     rows = max(1, _RAYS_A_BLOCK[device.type] // camera.width)
     done, total = 0, len(camera) * camera.height
     for index in range(len(camera)):
         one = camera[index]
         for top in range(0, camera.height, rows):
             end = min(top + rows, camera.height)
-            with stage("rays"):
-                rays = one.rays(device, (top, end))
-            with stage("trace"):
-                yield trace_rays(rays)
+            first, last = (done * camera.width, (done + end - top) * camera.width)
+            yield first, last, partial(one.rays, device, (top, end))
             done += end - top
             progress("rays", done, total)
 
@@ -270,12 +293,12 @@ class Tracer:
             origin, direction, cone, rays.range.to(torch.float64), high
         )
         columns = (origin, direction, cone, limits)
-        color, alpha, depth, samples = trace_rays(
+        color, alpha, depth, samples, missed = trace_rays(
             *(column.to(options.dtype).contiguous() for column in columns),
             **self.arguments,
         )
         depth = depth + moved.to(options.dtype)
-        return Hits(color=color, alpha=alpha, depth=depth, samples=samples)
+        return Hits(color=color, alpha=alpha, depth=depth, samples=samples, missed=missed)
 
 
 def composite_trees(tracers: list[Tracer], rays: Rays) -> Hits:
@@ -300,6 +323,7 @@ def composite_trees(tracers: list[Tracer], rays: Rays) -> Hits:
         alpha=total_alpha,
         depth=depths.amin(0),
         samples=fields["samples"].sum(0, dtype=torch.int32),
+        missed=fields["missed"].any(0),
     )
 
 

@@ -31,7 +31,7 @@ constexpr const char* kTraceRaysSchema =
     "Tensor table_m4, Tensor domain_3, Tensor opaque_m, Tensor frame_1, "
     "int branching, int root, int max_depth, int border, int component, "
     "float root_voxel, float step, float stop_alpha, float depth_alpha, bool by_level"
-    ") -> (Tensor color_r3, Tensor alpha_r1, Tensor depth_r1, Tensor samples_r)";
+    ") -> (Tensor color_r3, Tensor alpha_r1, Tensor depth_r1, Tensor samples_r, Tensor missed_r)";
 constexpr const char* kCompactRequestsSchema =
     "compact_requests(Tensor(a!) request_tn, int capacity) -> (Tensor node_k, Tensor word_k, Tensor count_2)";
 constexpr const char* kLruPartitionSchema =
@@ -85,7 +85,7 @@ void with_voxel_type(ScalarType dtype, const Body& body) {
 }
 
 template <class Device>
-std::tuple<Tensor, Tensor, Tensor, Tensor> trace_rays(
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> trace_rays(
     const Tensor& origin_r3, const Tensor& direction_r3, const Tensor& cone_r2, const Tensor& range_r2,
     const Tensor& bounds_23, const Tensor& child_tn, const Tensor& brick_tn, const Tensor& request_tn,
     const Tensor& stamp_t, const Tensor& bricks_bzyxc, const Tensor& constant_tnc, const Tensor& range_tn2c,
@@ -147,6 +147,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> trace_rays(
   Tensor alpha_r1 = torch::stable::new_empty(origin_r3, {rays, 1});
   Tensor depth_r1 = torch::stable::new_empty(origin_r3, {rays, 1});
   Tensor samples_r = torch::stable::new_empty(origin_r3, {rays}, word);
+  Tensor missed_r = torch::stable::new_empty(origin_r3, {rays}, ScalarType::Bool);
 
   const auto run = [&](auto scalar) {
     using T = decltype(scalar);
@@ -167,7 +168,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> trace_rays(
           {real_in(table_m4), real_in(domain_3), word_in(opaque_m), static_cast<int32_t>(table_m4.size(0))},
           {static_cast<T>(root_voxel), static_cast<T>(step), static_cast<T>(stop_alpha), static_cast<T>(depth_alpha),
            by_level},
-          {real_out(color_r3), real_out(alpha_r1), real_out(depth_r1), word_out(samples_r)},
+          {real_out(color_r3), real_out(alpha_r1), real_out(depth_r1), word_out(samples_r),
+           static_cast<bool*>(missed_r.mutable_data_ptr())},
           word_in(frame_1)};
       for_each<Device>(origin_r3, rays, body);
     });
@@ -177,7 +179,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> trace_rays(
   } else {
     run(float{});
   }
-  return {color_r3, alpha_r1, depth_r1, samples_r};
+  return {color_r3, alpha_r1, depth_r1, samples_r, missed_r};
 }
 
 inline const int32_t* words_in(const Tensor& tensor) { return static_cast<const int32_t*>(tensor.const_data_ptr()); }

@@ -76,6 +76,7 @@ struct HitView {
   T* alpha_r1;
   T* depth_r1;
   int32_t* samples_r;
+  bool* missed_r;
 };
 
 // The fixed sequence of intervals of one ray. While the length stays the same, an interval's start is a product,
@@ -133,6 +134,7 @@ struct Accumulator {
   T clear = 1;  // transmittance
   T depth = static_cast<T>(INFINITY);
   bool hit = false;
+  bool missed = false;  // something that was seen was not there
 };
 
 template <class T>
@@ -192,6 +194,7 @@ struct TraceRay {
     hits.alpha_r1[ray] = 1 - sum.clear;
     hits.depth_r1[ray] = sum.depth;
     hits.samples_r[ray] = samples;
+    hits.missed_r[ray] = sum.missed;
   }
 
   // Slab test (Kay and Kajiya, "Ray tracing complex scenes", 1986).
@@ -258,7 +261,7 @@ struct TraceRay {
     const Place<T> place = descend(tree, position, wanted, *frame_1);
     const T exit = leave(origin, direction, place);
     const bool clear = unseen(place.node, shader) && (!blend || place.depth < wanted || unseen(place.parent, shader));
-    if (!clear) mark_missing(place, wanted, blend, cone);
+    if (!clear && mark_missing(place, wanted, blend, cone)) sum.missed = true;
 
     // The two levels that blend; below the finest level, or where both are the same node, only one is read.
     const Holder<T> fine = place.fine;
@@ -309,17 +312,18 @@ struct TraceRay {
                               static_cast<T>(bricks.range_tn2c[row + bricks.channels]));
   }
 
-  // Straight to the wanted level, or level by level: then a brick is there before its node is subdivided.
-  GV_HD void mark_missing(const Place<T>& place, int32_t wanted, bool blend, T cone) const {
+  // Asks for what is not there, and tells whether it did. Straight to the wanted level, or level by level: then a
+  // brick is there before its node is subdivided.
+  GV_HD bool mark_missing(const Place<T>& place, int32_t wanted, bool blend, T cone) const {
     const bool absent = tree.brick_tn[place.node] == kAbsent;
     const bool deeper = place.depth < wanted && tree.child_tn[place.node] == kAbsent;
+    const bool above = blend && place.depth == wanted && tree.brick_tn[place.parent] == kAbsent;
     if (deeper && !(options.by_level && absent)) request(place.node, place.depth, cone, kSubdivide);
     if (absent && (options.by_level || !deeper || place.fine.node < 0)) {
       request(place.node, place.depth, cone, kLoad);
     }
-    if (blend && place.depth == wanted && tree.brick_tn[place.parent] == kAbsent) {
-      request(place.parent, place.depth - 1, cone, kLoad);
-    }
+    if (above) request(place.parent, place.depth - 1, cone, kLoad);
+    return absent || deeper || above;
   }
 };
 
