@@ -163,6 +163,8 @@ class Engine:
         start = time.perf_counter()
         stats = self._begin(chosen)
         with collect_timings() if self.options.monitor else nullcontext(stats.stages) as timings:
+            with stage("write"):
+                self.production.write(self.production.late(), stats)
             trace = self._tracer(shader, chosen)
             world, device = camera.placed(self.box), self.device
             hits = trace_camera(world, device, trace, chosen.dtype, progress, again=again)  # 1, 2
@@ -177,7 +179,7 @@ class Engine:
                     served = self.cache.stand_ins(wishes, served, room)
             late = sum(self.production.pending.values())
             with stage("produce"):
-                answers = self.production.answers([*self.plants.values()], served)  # 6
+                answers = self.production.ask([*self.plants.values()], served)  # 6
             with stage("write"):
                 self.production.write(answers, stats)  # 7
             with stage("count"):
@@ -233,7 +235,8 @@ class Engine:
                 f"render: mode must be 'interactive', 'balanced' or 'converge', got {mode!r}"
             )
         chosen = render_options("render", camera, options)
-        turns = Turns(len(camera) * camera.height * camera.width, self.device)
+        count = len(camera) * camera.height * camera.width
+        turns = Turns(count, camera.width, self.device)
         total, hits = FrameStats(), None
         for number in range(1, limits[mode] + 1):
             again = (hits, turns.now) if mode == "converge" and hits is not None else None
@@ -241,11 +244,13 @@ class Engine:
             _add_up(total, stats)
             if mode == "converge":
                 turns.take(hits.missed, stats, total.failed)
+                if number == limits[mode] - 1:
+                    turns.everyone()
                 progress("rays", turns.done, turns.count)
                 if turns.over:
                     break
-                if turns.stuck and stats.pending:
-                    self.production.wait()
+                if stats.pending:  # another pass would not see more; it may take as long as one
+                    self.production.wait(stats.milliseconds / 1e3)
             elif stats.converged:
                 break
             total.failed = stats.failed

@@ -56,8 +56,12 @@ class FrameStats(RenderStats):
     frames: int = 1  # frames that this picture took
     requests: dict[str, int] = field(default_factory=dict)  # wishes by kind: load, subdivide
     misses: int = 0  # nodes that rays missed, those whose answer is on its way counted too
-    produced: dict[str, int] = field(default_factory=dict)  # tiles, bricks, constant nodes
-    evicted: dict[str, int] = field(default_factory=dict)  # tiles, bricks that others replaced
+    produced: dict[str, int] = field(  # node tiles, bricks, nodes that need no brick
+        default_factory=lambda: {"tiles": 0, "bricks": 0, "constant": 0}
+    )
+    evicted: dict[str, int] = field(  # replaced by others
+        default_factory=lambda: {"tiles": 0, "bricks": 0}
+    )
     bytes_uploaded: int = 0  # voxels moved into the brick pool
     stale: int = 0  # answers that came when their node was gone
     pending: int = 0  # answers on their way

@@ -134,8 +134,8 @@ class Production:
             for kind in KINDS.values()
         }
 
-    def answers(self, plants: list[Plant], chosen: Requests) -> list[tuple[Job, Regions | Bricks]]:
-        """Asks for what was chosen; returns the answers that are here, late ones first."""
+    def late(self) -> list[tuple[Job, Regions | Bricks]]:
+        """Returns the answers that came since the last call; gives up those that do not come."""
         done: list[tuple[Job, Regions | Bricks]] = []
         waiting, self._waiting = self._waiting, []
         for item in waiting:
@@ -146,6 +146,11 @@ class Production:
                 self._fail(item.job, f"no answer within {self.patience:g} s")
             else:
                 self._waiting.append(item)
+        return done
+
+    def ask(self, plants: list[Plant], chosen: Requests) -> list[tuple[Job, Regions | Bricks]]:
+        """Asks for what was chosen; returns the answers that are here at once."""
+        done: list[tuple[Job, Regions | Bricks]] = []
         tree = self.cache.nodes.tree_t[chosen.node // self.cache.nodes.nodes_per_tile]
         for kind in KINDS.values():
             for number, plant in enumerate(plants):
@@ -155,10 +160,7 @@ class Production:
         return done
 
     def write(self, answers: list[tuple[Job, Regions | Bricks]], stats: FrameStats) -> None:
-        """Writes answers into the pools and counts what they did."""
-        for name in ("tiles", "bricks"):
-            stats.produced[name] = stats.evicted[name] = 0
-        stats.produced["constant"] = 0
+        """Writes answers into the pools and adds up what they did."""
         for job, answer in answers:
             if isinstance(answer, Bricks):
                 written = self._write_bricks(job, answer)
@@ -175,13 +177,16 @@ class Production:
                 assert written.lost is not None
                 self.cache.mark_pending(job.node[written.lost], job.kind, False)
 
-    def wait(self) -> None:
-        """Waits until an answer is here, or until patience with the oldest ends."""
+    def wait(self, more: float = 0.0) -> None:
+        """Waits until an answer is here, or until patience with the oldest ends; then up to `more`
+        seconds for the others.
+        """
         if self._waiting:
             oldest = min(item.since for item in self._waiting)
             left = max(0.0, self.patience - (time.monotonic() - oldest))
             futures = [item.future for item in self._waiting]
             wait_for(futures, timeout=left + 1e-3, return_when=FIRST_COMPLETED)
+            wait_for(futures, timeout=more)
 
     def forget_failures(self) -> None:
         """Lets what failed be asked for again."""

@@ -166,8 +166,20 @@ def test_a_pool_that_holds_almost_nothing_ends_too(aneurism):
             assert not picture.stats.converged and torch.isfinite(picture.color).all()
 
 
-def test_rays_take_turns_by_halves():
-    turns = Turns(16, torch.device("cpu"))
+def test_scouts_go_first():
+    turns = Turns(64, 8, torch.device("cpu"))
+    assert turns.now.all()
+    turns.take(torch.ones(64, dtype=torch.bool), gv.FrameStats(produced={"bricks": 3}), 0)
+    assert turns.now.nonzero()[:, 0].tolist() == [0, 4, 32, 36]
+    turns.take(torch.zeros(64, dtype=torch.bool), gv.FrameStats(), 0)
+    assert turns.done == 4 and int(turns.now.sum()) == 60
+    turns.everyone()
+    assert torch.equal(turns.now, ~torch.isin(torch.arange(64), torch.tensor([0, 4, 32, 36])))
+
+
+def test_rays_take_turns_by_halves(monkeypatch):
+    monkeypatch.setattr("gvtorch.turns._STRIDE", 1)
+    turns = Turns(16, 16, torch.device("cpu"))
     full = gv.FrameStats(capacity_exceeded=True, produced={"bricks": 0})
     everyone = torch.ones(16, dtype=torch.bool)
     for expected in (8, 4, 2, 1):
@@ -185,7 +197,7 @@ def test_rays_take_turns_by_halves():
     turns.take(~turns.now, loaded, 0)
     turns.take(~turns.now, loaded, 0)
     assert turns.over and turns.whole and turns.done == 16
-    turns = Turns(1, torch.device("cpu"))
+    turns = Turns(1, 1, torch.device("cpu"))
     turns.take(everyone[:1], full, 0)
     assert turns.over and not turns.whole, "a ray that does not fit alone is given up"
 
@@ -197,8 +209,16 @@ class Checked(gv.Engine):
         nodes, bricks = self.cache.nodes, self.cache.bricks
         roots = len(self.plants)
         locked = nodes.brick_tn[:roots, 0].clone()
-        before = bricks.owner_b.clone(), nodes.parent_t.clone(), nodes.tree_t.clone()
+        before = []
+        requests = self.cache.requests
+
+        def after_tracing(capacity):
+            before.extend((bricks.owner_b.clone(), nodes.parent_t.clone()))
+            return requests(capacity)
+
+        self.cache.requests = after_tracing
         picture, stats = super().frame(*args, **options)
+        self.cache.requests = requests
         self.validate()
         used_b = bricks.stamp_b == self.frames
         used_t = nodes.stamp_t == self.frames

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -178,37 +177,39 @@ def trace_camera(
     """
     count = len(camera) * camera.height * camera.width
     hits, where = again if again is not None else (_room(device, dtype, count), None)
-    for start, end, rays in _blocks(camera, device, progress):
-        which = None if where is None else where[start:end].nonzero()[:, 0]
+    width = camera.width
+    for start, one, top, end in _blocks(camera, device, progress):
+        pixels = slice(start + top * width, start + end * width)
+        which = None if where is None else where[pixels].nonzero()[:, 0]
         if which is not None and not len(which):
             continue
         with stage("rays"):
-            wanted = rays()
-            if which is not None and len(which) < end - start:
-                wanted = Rays(**{name: ray[which] for name, ray in vars(wanted).items()})
-        with stage("trace"):
-            part = trace_rays(wanted)
-        for name, field in vars(part).items():
-            target = vars(hits)[name][start:end]
             if which is None:
-                target.copy_(field)
-            else:
-                target[which] = field
+                rays = one.rays(device, (top, end))
+            else:  # the rows that hold them, then they alone
+                first, last = int(which[0]) // width, int(which[-1]) // width
+                rays = one.rays(device, (top + first, top + last + 1))
+                rows = {name: ray[which - first * width] for name, ray in vars(rays).items()}
+                rays = Rays(**rows)
+        with stage("trace"):
+            part = trace_rays(rays)
+        for name, field in vars(part).items():
+            target = vars(hits)[name][pixels]
+            target[slice(None) if which is None else which] = field
     return hits
 
 
 def _blocks(
     camera: Camera, device: torch.device, progress: Progress
-) -> Iterator[tuple[int, int, Callable[[], Rays]]]:
-    """First and last pixel of blocks of rows, and what makes their rays."""
+) -> Iterator[tuple[int, Camera, int, int]]:
+    """Blocks of rows: a camera's first pixel, the camera, its first row and one past the last."""
     rows = max(1, _RAYS_A_BLOCK[device.type] // camera.width)
     done, total = 0, len(camera) * camera.height
     for index in range(len(camera)):
         one = camera[index]
         for top in range(0, camera.height, rows):
             end = min(top + rows, camera.height)
-            first, last = (done * camera.width, (done + end - top) * camera.width)
-            yield first, last, partial(one.rays, device, (top, end))
+            yield index * camera.height * camera.width, one, top, end
             done += end - top
             progress("rays", done, total)
 

@@ -364,8 +364,10 @@ def told(picture: Picture) -> str:
 
 
 def _shortfall(stats: FrameStats) -> str:
-    if stats.capacity_exceeded:
+    if stats.capacity_exceeded and not stats.converged:
         return "; the pools are too small for this picture, parts of it are coarser"
+    if stats.capacity_exceeded:
+        return " (the pools are too small for all at once: rays took turns)"
     if stats.failed:
         return f"; {stats.failed} nodes failed, parts of it are coarser"
     return "" if stats.converged else "; not converged"
