@@ -17,9 +17,13 @@ export GVTORCH_CUDA_ARCHS ?= $(or $(NATIVE),90)
 .PHONY: demo test lint format wheel clean
 .DELETE_ON_ERROR:
 
+# The scan as a store on disk, seen through a brick pool an eighth of its size in bricks.
+SCAN := examples/data/stent_256x128x128_int16.npz
 demo: $(VENV)/ready
 	@mkdir -p out
-	$(BIN)/gvtorch render examples/data/stent_256x128x128_int16.npz --tf examples/data/stent.json \
+	@rm -rf out/stent.zarr
+	$(BIN)/gvtorch convert $(SCAN) out/stent.zarr
+	$(BIN)/gvtorch render out/stent.zarr --brick-pool "2.2 MB" --tf examples/data/stent.json \
 	  --camera look:-260,-340,190,63.5,63.5,127.5 --up 0,0,1 --background 0.02,0.02,0.03 -o out/demo.png
 	@echo "The picture: $(CURDIR)/out/demo.png"
 

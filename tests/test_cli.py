@@ -6,6 +6,7 @@ import gzip
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -203,3 +204,144 @@ def test_a_wrong_flag_gets_status_2(small):
 def test_package_runs_as_a_module():
     assert "usage: gvtorch" in gvtorch("--help").stdout
     assert (ROOT / "gvtorch" / "py.typed").exists()
+
+
+@pytest.fixture(scope="module")
+def scan_store(tmp_path_factory) -> Path:
+    """A ball of 40 x 48 x 56 voxels as a store, made by the command."""
+    folder = tmp_path_factory.mktemp("store")
+    z, y, x = np.mgrid[-1:1:56j, -1:1:48j, -1:1:40j]
+    np.save(folder / "ball.npy", (255 * np.clip(1.2 - x**2 - y**2 - z**2, 0, 1)).astype(np.uint8))
+    run = gvtorch("convert", folder / "ball.npy", folder / "ball.zarr", "--spacing", "1,1,2")
+    assert run.returncode == 0, run.stderr
+    return folder / "ball.zarr"
+
+
+@pytest.mark.backend("cpp")
+def test_a_store_renders_as_its_volume_does(scan_store, tmp_path):
+    """Through a pool of a few bricks, in every mode, with what it cost."""
+    arrays = {}
+    look = ("--size", "64x48", "--tf", "gray", "--camera", "orbit:30,20,1.5")
+    small_pool = ("--brick-pool", "40 kB", "--node-pool", "20 kB", "--loading", "levels")
+    for name, path, extra in (
+        ("volume", scan_store.with_name("ball.npy"), ("--spacing", "1,1,2")),
+        ("store", scan_store, ()),
+        ("small", scan_store, small_pool),
+        ("once", scan_store, ("--mode", "interactive")),
+    ):
+        out, npz, stats = (tmp_path / f"{name}.{end}" for end in ("png", "npz", "json"))
+        run = gvtorch(
+            *("render", path, "-o", out, "--npz", npz, "--stats", stats, *look, *extra),
+        )
+        assert run.returncode == 0, run.stderr
+        arrays[name] = np.load(npz)
+        content = json.loads(stats.read_text())
+        assert content["extent"] == [40, 48, 56]
+        if name != "volume":
+            assert content["converged"] == (name != "once") and content["failed"] == 0
+            assert {"requests", "misses", "produced", "evicted", "miss_rate"} <= set(content)
+        if name == "small":
+            assert "rays took turns" in run.stdout and content["bricks"] == 40
+    for name in ("store", "small"):
+        for part in ("color", "alpha", "depth"):
+            assert np.array_equal(arrays[name][part], arrays["volume"][part])
+    assert not np.array_equal(arrays["once"]["color"], arrays["volume"]["color"])
+    assert arrays["volume"]["alpha"].max() > 0.9
+
+
+@pytest.mark.backend("cpp")
+def test_fly_writes_pictures_and_what_each_cost(scan_store, tmp_path):
+    folder = tmp_path / "flight"
+    args = ("--frames", "4", "--size", "32x24", "--tf", "gray", "--mode", "converge")
+    run = gvtorch("fly", scan_store, "-o", folder, *args)
+    assert run.returncode == 0, run.stderr
+    assert "trace, ms" in run.stdout and "4 pictures" in run.stdout
+    pictures = sorted(folder.glob("*.png"))
+    assert [file.name for file in pictures] == [f"{n:04d}.png" for n in range(4)]
+    assert pictures[0].read_bytes() != pictures[1].read_bytes(), "the camera moves"
+    lines = [json.loads(line) for line in (folder / "stats.jsonl").read_text().splitlines()]
+    assert [line["picture"] for line in lines] == [0, 1, 2, 3]
+    assert all(line["converged"] and line["milliseconds"] > 0 for line in lines)
+
+
+@pytest.mark.backend("cpp")
+def test_fly_along_keys_to_a_video(scan_store, tmp_path):
+    av = pytest.importorskip("av")
+    keys = [
+        {"eye": [20, 24, 200], "target": [20, 24, 56], "fov": 40},
+        {"eye": [90, 24, 160], "target": [20, 24, 56]},
+        {"eye": [120, 60, 56], "target": [20, 24, 56], "up": [0, 1, 0.2]},
+    ]
+    (tmp_path / "path.json").write_text(json.dumps(keys))
+    out = tmp_path / "flight.mp4"
+    args = ("--path", tmp_path / "path.json", "--frames", "6", "--size", "64x48", "--fps", "12")
+    run = gvtorch("fly", scan_store, "-o", out, "--tf", "gray", *args)
+    assert run.returncode == 0, run.stderr
+    with av.open(str(out)) as file:
+        frames = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+        assert file.streams.video[0].average_rate == 12
+    assert len(frames) == 6 and frames[0].shape == (48, 64, 3)
+    assert frames[-1].max() > 100 and not np.array_equal(frames[0], frames[-1])
+    assert len(out.with_suffix(".jsonl").read_text().splitlines()) == 6
+    assert not list(tmp_path.glob(".*")), "nothing half-written is left"
+
+
+def keys_file(folder: Path, text: str) -> Path:
+    (folder / "keys.json").write_text(text)
+    return folder / "keys.json"
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda t, s: ["fly", s, "-o", t / "a.avi"], "--output must be a folder or end in .mp4"),
+        (lambda t, s: ["fly", s, "-o", t / "x" / "a.mp4"], "folder not found"),
+        (lambda t, s: ["fly", s, "-o", t / "a.mp4", "--size", "33x20"], "--size must be even"),
+        (lambda t, s: ["fly", s, "-o", t / "a", "--frames", "0"], "--frames must be an int >= 1"),
+        (lambda t, s: ["fly", t / "no.zarr", "-o", t / "a"], "no.zarr"),
+        (lambda t, s: ["fly", s, "-o", t / "a", "--path", "k.json"], "camera path not found"),
+        (
+            lambda t, s: ["fly", s, "-o", t / "a", "--path", keys_file(t, "[1]")],
+            'must be a list of keys {"eye": ..., "target": ...}',
+        ),
+        (
+            lambda t, s: ["fly", s, "-o", t / "a", "--path", keys_file(t, '[{"eye": [1, 2]}]')],
+            "key 0: 'target' is missing",
+        ),
+        (
+            lambda t, s: [
+                *("fly", s, "-o", t / "a", "--path"),
+                keys_file(t, '[{"eye": [1, 2], "target": [0, 0, 0]}]'),
+            ],
+            "eye must be three numbers, got 2",
+        ),
+        (
+            lambda t, s: ["render", s, "-o", t / "a.png", "--brick-pool", "x"],
+            'brick_pool must be bytes, as in "256 MB"',
+        ),
+        (lambda t, s: ["render", s, "-o", t / "a.png", "--brick-pool", "1 kB"], "at least 2"),
+        (lambda t, s: ["render", s, "-o", t / "a.png", "--max-frames", "0"], "max_frames must"),
+        (lambda t, s: ["render", s, "-o", t / "a.png", "--time", "3"], "time"),
+        (
+            lambda t, s: ["render", s, "-o", t / "a.png", "--threshold", "3"],
+            "set by gvtorch convert",
+        ),
+        (
+            lambda t, s: [
+                "render",
+                s.with_name("ball.npy"),
+                "-o",
+                t / "a.png",
+                "--mode",
+                "balanced",
+            ],
+            "--mode is for stores; make one: gvtorch convert",
+        ),
+    ],
+)
+def test_mistakes_with_stores_get_one_line(scan_store, tmp_path, make, message):
+    run = gvtorch(*make(tmp_path, scan_store))
+    lines = run.stderr.splitlines()
+    assert run.returncode == 2 and len(lines) == 1, run.stderr
+    assert lines[0].startswith("gvtorch: error: ") and message in lines[0]
+    assert not list(tmp_path.glob("*.png")) and not list(tmp_path.glob("*.mp4"))
