@@ -25,82 +25,9 @@ from ..config import (
     REQUEST_PRIORITY,
     REQUEST_SUBDIVIDE,
 )
+from .exact import clamp, divide, exp2_exact, larger, log2_exact, smaller
 
 INF = math.inf
-
-
-# --- numbers
-# ----------------------------------------------------------------------------------------------
-
-
-def clamp(value: Tensor, low: float | Tensor, high: float | Tensor) -> Tensor:
-    """Clamps; NaN ends at the lower bound."""
-    low, high = torch.as_tensor(low).to(value), torch.as_tensor(high).to(value)
-    raised = torch.where(value > low, value, low)
-    return torch.where(raised < high, raised, high)
-
-
-def divide(a: Tensor | float, b: Tensor | float, like: Tensor) -> Tensor:
-    """Returns a / b, rounded once: torch turns a number on either side into a product with a
-    reciprocal."""
-    return torch.div(torch.as_tensor(a).to(like), torch.as_tensor(b).to(like).expand(like.shape))
-
-
-def smaller(a: Tensor, b: Tensor) -> Tensor:
-    """Returns b where it is smaller, else a."""
-    return torch.where(b < a, b, a)
-
-
-def larger(a: Tensor, b: Tensor) -> Tensor:
-    """Returns b where it is larger, else a."""
-    return torch.where(b > a, b, a)
-
-
-def log2_exact(value: Tensor) -> Tensor:
-    """Base-2 logarithm of positive normal floats, from + - * / alone (float64: torch.log2).
-
-    Source: Abramowitz and Stegun, "Handbook of Mathematical Functions", 1964, 4.1.27.
-    """
-    if value.dtype == torch.float64:
-        return torch.log2(value)
-    bits = value.contiguous().view(torch.int32)
-    exponent = ((bits >> 23) - 127).to(torch.float32)
-    mantissa = ((bits & 0x007FFFFF) | 0x3F800000).view(torch.float32)
-    high = mantissa > 1.41421356
-    mantissa = torch.where(high, mantissa * 0.5, mantissa)
-    exponent = torch.where(high, exponent + 1, exponent)
-    s = (mantissa - 1) / (mantissa + 1)
-    z = s * s
-    series = torch.full_like(z, 0.320598898)
-    for coefficient in (0.412198583, 0.577078016, 0.961796694, 2.885390082):
-        series = series * z + coefficient
-    return exponent + series * s
-
-
-def exp2_exact(value: Tensor) -> Tensor:
-    """2 to the power of a float below 127, from + - * alone; 0 below -126 (float64: torch.exp2).
-
-    Source: Abramowitz and Stegun, "Handbook of Mathematical Functions", 1964, 4.2.1.
-    """
-    if value.dtype == torch.float64:
-        return torch.exp2(value)
-    tiny = ~(value > -126)
-    x = torch.where(tiny, 0.0, smaller(value, torch.full_like(value, 126.0)))
-    whole = torch.floor(x + 0.5)
-    f = x - whole
-    series = torch.full_like(f, 1.52527338e-5)
-    for coefficient in (
-        1.54035304e-4,
-        1.33335581e-3,
-        9.61812911e-3,
-        5.55041087e-2,
-        2.40226507e-1,
-        6.93147181e-1,
-        1.0,
-    ):
-        series = series * f + coefficient
-    power = ((whole.to(torch.int32) + 127) << 23).view(torch.float32)
-    return torch.where(tiny, 0.0, series * power)
 
 
 # --- the intervals of a ray
