@@ -73,8 +73,11 @@ class FrameStats(RenderStats):
 
     @property
     def miss_rate(self) -> float:
-        """Missed nodes over missed nodes and bricks used."""
-        return self.misses / max(1, self.misses + self.bricks_used)
+        """Bricks asked for over bricks asked for and bricks used. A brick on its way is asked for
+        once, and counts once.
+        """
+        asked = self.requests.get("load", 0)
+        return asked / max(1, asked + self.bricks_used)
 
     def as_dict(self) -> dict[str, object]:
         """Returns plain values, ready for JSON."""

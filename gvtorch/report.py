@@ -35,7 +35,7 @@ class Report:
         seconds = sum(stats.milliseconds for stats in frames) / 1e3
         names = dict.fromkeys(name for stats in frames for name in stats.stages)
         used = sum(stats.bricks_used for stats in frames)
-        missed = sum(stats.misses for stats in frames)
+        missed = sum(stats.requests.get("load", 0) for stats in frames)
 
         def rate(amount: float) -> float:
             return amount / seconds if seconds > 0 else 0.0
