@@ -1,11 +1,11 @@
 """Miss rate of a fly-through: a moving camera, one frame a picture, nothing fetched ahead.
 
 The protocol is that of the original's Mandelbulb flight; the volume is a made-up one of the same
-kind: a solid with holes at every scale, so that rays end at surfaces and new ones come into view. The
-rate is bricks asked for over bricks asked for and bricks used, summed over the flight; "unserved" is
-the share of frames' nodes that were not there yet, those on their way counted again in each frame.
-Bricks of 8^3 and a border hold 1,000 bytes here, and 4,000 in the original: its 512 MB are 128 MB
-here. How fast the camera moves decides: 1,200 frames are 20 s at 60 frames a second.
+kind: a solid with holes at every scale, so that rays end at surfaces and new ones come into view.
+The rate is bricks asked for over bricks asked for and bricks used, summed over the flight;
+"unserved" is the share of nodes that were not there yet, those on their way counted again in each
+frame. Bricks of 8^3 and a border hold 1,000 bytes here, and 4,000 in the original: its 512 MB are
+128 MB here. How fast the camera moves decides: 1,200 frames are 20 s at 60 frames a second.
 """
 
 from __future__ import annotations
