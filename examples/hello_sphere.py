@@ -3,9 +3,8 @@
 65,536 voxels along a side would be 1,100 TB; the picture needs a few MB of them.
 """
 
-import argparse
-
 import torch
+import tyro
 
 import gvtorch as gv
 
@@ -26,15 +25,15 @@ class Sphere(gv.Producer):
         return {"value": inside * (0.7 + 0.3 * bands)}
 
 
-parser = argparse.ArgumentParser()
-parser.add_argument("--output", default="hello_sphere.png")
-parser.add_argument("--device", default="cpu")
-arguments = parser.parse_args()
+def main(output: str = "hello_sphere.png", device: str = "cpu", size: int = 400) -> None:
+    """Renders the sphere."""
+    engine = gv.Engine(Sphere(65536, box=((-1, -1, -1), (1, 1, 1))), device=device)
+    look = gv.TransferFunction.from_points(
+        [(0, 0), (0.4, 0.9)], [(0.4, 0.1, 0.2, 0.7), (1, 1, 0.8, 0.4)], reference=0.06
+    )
+    picture = engine.render(gv.Camera.orbit(distance=2, width=size, height=size), look)
+    picture.save(output)
+    print(f"{output}: {picture.stats.frames} frames, {picture.stats.bricks_used} bricks")
 
-engine = gv.Engine(Sphere(65536, box=((-1, -1, -1), (1, 1, 1))), device=arguments.device)
-look = gv.TransferFunction.from_points(
-    [(0, 0), (0.4, 0.9)], [(0.4, 0.1, 0.2, 0.7), (1, 1, 0.8, 0.4)], reference=0.06
-)
-picture = engine.render(gv.Camera.orbit(distance=2, width=400, height=400), look)
-picture.save(arguments.output)
-print(f"{arguments.output}: {picture.stats.frames} frames, {picture.stats.bricks_used} bricks")
+
+tyro.cli(main)

@@ -22,10 +22,13 @@ def no_progress(what: str, done: int, total: int) -> None:
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Names a step: adds its milliseconds to the open `timings()` and shows it to torch's
-    profiler.
+    """Names a step: adds its milliseconds to the open `collect_timings()` and shows it to torch's
+    profiler. It does nothing where neither listens.
     """
     timings = _timings.get()
+    if timings is None and not torch.autograd._profiler_enabled():
+        yield
+        return
     with torch.profiler.record_function(f"gvtorch.{name}"):
         if timings is None:
             yield

@@ -482,3 +482,14 @@ def test_trees_must_agree_on_channels(blobs):
     other = gv.Volume((blobs.data * 9).to(torch.uint8))
     with pytest.raises(ValueError, match="trees disagree on channel 'value'"):
         gv.Engine({"a": gv.VolumeProducer(blobs), "b": gv.VolumeProducer(other)})
+
+
+@pytest.mark.backend("cpp")
+def test_stages_show_in_the_profiler_and_cost_nothing_without_listeners(blobs):
+    shader = gv.TransferFunction.preset("gray", 0, 1)
+    with gv.Engine(gv.VolumeProducer(blobs), brick_size=4, monitor=False) as engine:
+        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as seen:
+            engine.frame(camera(8), shader)
+        names = {event.key for event in seen.key_averages()}
+        steps = ("rays", "trace", "requests", "lru", "schedule", "produce", "write")
+        assert {f"gvtorch.{name}" for name in steps} <= names

@@ -22,5 +22,9 @@ def test_example_writes_a_picture(example, tmp_path):
     assert 20 <= len(example.read_text().splitlines()) <= 120
 
 
+def test_a_producer_of_ones_own_takes_at_most_40_lines():
+    assert len((ROOT / "examples" / "hello_sphere.py").read_text().splitlines()) <= 40
+
+
 def test_there_are_examples():
     assert EXAMPLES
