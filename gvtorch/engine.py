@@ -61,7 +61,7 @@ class EngineOptions:
     load_budget: int = 4096  # most bricks a frame
     subdivide_budget: int = 4096  # most node tiles a frame
     time_budget: float | None = None  # most milliseconds of production a frame
-    patience: float = 30.0  # seconds until an answer that does not come is given up
+    patience: float = 120.0  # seconds until an answer that does not come is given up
     strict: bool = False  # raise when something can't be produced
     monitor: bool = True  # time the stages and remember the last frames, for `report`
 
@@ -190,6 +190,7 @@ class Engine:
         stats.milliseconds = 1e3 * (time.perf_counter() - start)
         if self.options.monitor:
             self._report.add(stats)
+        self.production.raise_if_strict()
         return hits, stats
 
     def render(

@@ -115,7 +115,7 @@ class Production:
     Attributes:
         failures: The last failures, by name.
         failed: Number of nodes that failed.
-        strict: A failure raises `ProductionError`.
+        strict: A failure raises `ProductionError` at the end of its frame.
     """
 
     def __init__(self, cache: Cache, scheduler: Scheduler, patience: float, strict: bool) -> None:
@@ -125,6 +125,7 @@ class Production:
         self.failures: deque[Failure] = deque(maxlen=_KEPT_FAILURES)
         self.failed = 0
         self._waiting: list[_Waiting] = []
+        self._first: tuple[Failure, BaseException | None] | None = None
 
     @property
     def pending(self) -> dict[int, int]:
@@ -137,15 +138,14 @@ class Production:
     def late(self) -> list[tuple[Job, Regions | Bricks]]:
         """Returns the answers that came since the last call; gives up those that do not come."""
         done: list[tuple[Job, Regions | Bricks]] = []
-        waiting, self._waiting = self._waiting, []
-        for item in waiting:
+        for item in list(self._waiting):
             if item.future.done():
+                self._waiting.remove(item)
                 self._settle(item.job, item.future.result, done)
             elif time.monotonic() - item.since > self.patience:
+                self._waiting.remove(item)
                 item.future.cancel()
                 self._fail(item.job, f"no answer within {self.patience:g} s")
-            else:
-                self._waiting.append(item)
         return done
 
     def ask(self, plants: list[Plant], chosen: Requests) -> list[tuple[Job, Regions | Bricks]]:
@@ -187,6 +187,15 @@ class Production:
             futures = [item.future for item in self._waiting]
             wait_for(futures, timeout=left + 1e-3, return_when=FIRST_COMPLETED)
             wait_for(futures, timeout=more)
+
+    def raise_if_strict(self) -> None:
+        """Raises `ProductionError` for the first failure since the last call, if strict: at the end
+        of a frame, when the pools are in order.
+        """
+        first, self._first = self._first, None
+        if self.strict and first is not None:
+            failure, cause = first
+            raise ProductionError(str(failure)) from cause
 
     def forget_failures(self) -> None:
         """Lets what failed be asked for again."""
@@ -279,8 +288,7 @@ class Production:
             failure = Failure(tree=job.plant.name, kind=kind, loc=tuple(loc), message=text)
             self.failures.append(failure)
         self.failed += len(job)
-        if self.strict:
-            raise ProductionError(str(self.failures[-1])) from cause
+        self._first = self._first or (self.failures[-1], cause)
 
     def _write_tiles(self, job: Job, answer: Regions) -> Written:
         return self.cache.write_tiles(

@@ -39,7 +39,8 @@ def test_compact_requests_lists_open_wishes_and_keeps_pending_ones(
         if kinds:
             expected.append((index, kinds | before & config.REQUEST_PRIORITY))
     kept = expected[:capacity]
-    assert counts.tolist() == [len(kept), len(expected)]
+    wished = sum(1 for before in request_words[:count] if before & (LOAD | SUBDIVIDE))
+    assert counts.tolist() == [len(kept), len(expected), wished]
     assert list(zip(node.tolist(), word.tolist(), strict=True))[: len(kept)] == kept
     assert set(node.tolist()[len(kept) :]) <= {-1}
     left = [before & (LOAD | SUBDIVIDE) << PENDING for before in request_words[:count]]
@@ -134,7 +135,7 @@ def test_nothing_to_do(backend):
     device = DEVICES[backend]
     none, frame = int32([], device), int32([1], device)
     request = torch.zeros((1, 8), dtype=torch.int32, device=device)
-    assert ops.compact_requests(request, 4, backend=backend)[2].tolist() == [0, 0]
+    assert ops.compact_requests(request, 4, backend=backend)[2].tolist() == [0, 0, 0]
     assert int(ops.lru_partition(none, none, frame, backend=backend)[1]) == 0
     ops.unlink(request, none, 0, backend=backend)
     ops.link(request, request.clone(), none, none, LOAD, backend=backend)

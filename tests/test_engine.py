@@ -493,3 +493,55 @@ def test_stages_show_in_the_profiler_and_cost_nothing_without_listeners(blobs):
         names = {event.key for event in seen.key_averages()}
         steps = ("rays", "trace", "requests", "lru", "schedule", "produce", "write")
         assert {f"gvtorch.{name}" for name in steps} <= names
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("branching", [2, 3, 4])
+@pytest.mark.parametrize("dtype", ["uint16", "int8", "int16", "float16", "bfloat16"])
+def test_every_dtype_and_branching_streams_the_same_bits(dtype, branching):
+    """The second number of a second channel, through pools that must give bricks away."""
+    z, y, x = np.mgrid[-1:1:40j, -1:1:30j, -1:1:50j]
+    kind = getattr(torch, dtype)
+    ball = torch.from_numpy(np.clip(1 - x * x - y * y - z * z, 0, 1) * 100).to(kind)
+    raw = ball.view(torch.int16) if kind == torch.uint16 else ball
+    pair = torch.stack((torch.zeros_like(raw), raw), -1).view(kind)
+    volumes = {"first": gv.Volume(ball), "second": gv.Volume(pair)}
+    shader = gv.TransferFunction.preset("gray", 0, 100)
+    look = {"channel": "second", "component": 1}
+    tree = gv.N3Tree.from_volume(volumes, 4, branching=branching)
+    whole = gv.render(tree, camera(distance=1.5), shader, **look)
+    producer = gv.VolumeProducer(volumes)
+    producer.branching = branching
+    pool = int(0.5 * working_set(whole)) * 6**3 * 3 * kind.itemsize
+    with gv.Engine(producer, brick_size=4, brick_pool=pool) as engine:
+        picture = engine.render(camera(distance=1.5), shader, **look)
+        engine.validate()
+        assert picture.stats.converged and picture.stats.evicted["bricks"] > 0
+        assert_same_picture(picture, whole)
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("extent", [(1, 1, 1), (3, 2, 5), (8, 8, 8), (9, 8, 8), (300, 1, 2)])
+def test_volumes_of_a_brick_and_less(extent):
+    x, y, z = extent
+    values = torch.arange(x * y * z).reshape(z, y, x).to(torch.int16) * 3 + 100
+    volume = gv.Volume(values, spacing=(1, 2, 0.5))
+    shader = gv.TransferFunction.from_points([(0, 0.2), (2000, 0.9)])
+    with gv.Engine(gv.VolumeProducer(volume)) as engine:
+        picture = engine.render(camera(24), shader)
+        engine.validate()
+        assert picture.stats.converged
+        expected = gv.render(gv.N3Tree.from_volume(volume), camera(24), shader)
+        for name in PARTS:
+            assert torch.equal(getattr(picture, name), getattr(expected, name)), name
+        assert expected.alpha.max() > 0
+
+
+@pytest.mark.backend("cpp")
+def test_a_batch_of_cameras_converges_as_one_picture(aneurism):
+    views = gv.Camera.orbit(torch.tensor([0.0, 50.0, 100.0]), 20, 1.3, width=40, height=30)
+    whole = gv.render(gv.N3Tree.from_volume(aneurism), views, VESSELS)
+    with gv.Engine(gv.VolumeProducer(aneurism), brick_pool=250 * 1000) as engine:
+        picture = engine.render(views, VESSELS)
+        assert picture.stats.converged and picture.color.shape == (3, 30, 40, 3)
+        assert_same_picture(picture, whole)

@@ -43,9 +43,8 @@ def collect(nodes: NodePool, capacity: int) -> Requests:
         nodes: The pool; its request words are cleared but for what is pending.
         capacity: Most nodes listed.
     """
-    misses = int((nodes.request_tn & (REQUEST_LOAD | REQUEST_SUBDIVIDE)).count_nonzero())
     node_k, word_k, count = compact_requests(nodes.request_tn, capacity)
-    kept, found = count.tolist()
+    kept, found, misses = count.tolist()
     node, word = node_k[:kept].to(torch.int64), word_k[:kept]
     rows = [(word & kind).nonzero()[:, 0] for kind in KINDS.values()]
     which = torch.cat(rows)

@@ -34,7 +34,8 @@ def compact_requests(
 
     Returns:
         node_k (capacity,) node indices, rising, -1 behind them; word_k (capacity,) kinds and
-        priority; count_2 (2,) int64: requests listed, requests found.
+        priority; count_3 (3,) int64: nodes listed, nodes that could be listed, nodes with a wish,
+        pending or not.
 
     Raises:
         ValueError: request_tn is no contiguous (t, n) int32, or capacity < 1.

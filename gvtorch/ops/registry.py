@@ -33,7 +33,7 @@ def _fake_trace_rays(
 
 def _fake_compact_requests(request_tn: Tensor, capacity: int) -> tuple[Tensor, Tensor, Tensor]:
     words = request_tn.new_empty((capacity,))
-    return words, torch.empty_like(words), request_tn.new_empty((2,), dtype=torch.int64)
+    return words, torch.empty_like(words), request_tn.new_empty((3,), dtype=torch.int64)
 
 
 def _fake_lru_partition(order_k: Tensor, stamp_s: Tensor, frame_1: Tensor) -> tuple[Tensor, Tensor]:

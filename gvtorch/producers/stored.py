@@ -24,7 +24,7 @@ from ..pool.pyramid import pool_mean, round_to
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 
 _TILE = 32  # cells along a side of what is read at once
-_GROUP = 512  # most blocks held at a time beside the cache
+_GROUP_BYTES = 32 * 10**6  # of blocks held at a time beside the cache
 _CHANNEL = "value"
 
 Key = tuple[str, int, int, int, int]  # what, level, z, y, x
@@ -222,8 +222,10 @@ class StoredProducer(Producer):
                 return dict.fromkeys(missing, str(error))
             return {key: wrong.get(i) or data[i].copy() for i, key in enumerate(missing)}
 
-        for begin in range(0, len(blocks), _GROUP):
-            part = blocks[begin : begin + _GROUP].tolist()
+        nbytes = (store.block + 2 * store.border) ** 3 * store.width * out.itemsize
+        group = max(1, _GROUP_BYTES // nbytes)
+        for begin in range(0, len(blocks), group):
+            part = blocks[begin : begin + group].tolist()
             found = self._cache.get([("block", level, *place) for place in part], read)
             for number, block in enumerate(found, begin):
                 for index in order[starts[number] : starts[number + 1]]:

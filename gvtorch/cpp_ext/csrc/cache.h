@@ -38,11 +38,20 @@ struct PutRequest {
   }
 };
 
-// found -> (kept, found).
+struct KeepWish {
+  const int32_t* request_tn;
+  GV_HD bool operator()(int64_t node) const { return (request_tn[node] & kKinds) != 0; }
+};
+
+struct PutNothing {
+  GV_HD void operator()(int64_t, int64_t) const {}
+};
+
+// (-, found, wished) -> (kept, found, wished).
 struct CapCount {
-  int64_t* count_2;
+  int64_t* count_3;
   int64_t capacity;
-  GV_HD void operator()(int64_t) const { count_2[0] = smaller(count_2[1], capacity); }
+  GV_HD void operator()(int64_t) const { count_3[0] = smaller(count_3[1], capacity); }
 };
 
 struct ClearWishes {

@@ -33,7 +33,7 @@ constexpr const char* kTraceRaysSchema =
     "float root_voxel, float step, float stop_alpha, float depth_alpha, bool by_level"
     ") -> (Tensor color_r3, Tensor alpha_r1, Tensor depth_r1, Tensor samples_r, Tensor missed_r)";
 constexpr const char* kCompactRequestsSchema =
-    "compact_requests(Tensor(a!) request_tn, int capacity) -> (Tensor node_k, Tensor word_k, Tensor count_2)";
+    "compact_requests(Tensor(a!) request_tn, int capacity) -> (Tensor node_k, Tensor word_k, Tensor count_3)";
 constexpr const char* kLruPartitionSchema =
     "lru_partition(Tensor order_k, Tensor stamp_s, Tensor frame_1) -> (Tensor order_k, Tensor unused_1)";
 constexpr const char* kUnlinkSchema = "unlink(Tensor(a!) pointer, Tensor slot_k, int slots, int divisor) -> ()";
@@ -191,15 +191,16 @@ std::tuple<Tensor, Tensor, Tensor> compact_requests(const Tensor& request_tn, in
   STD_TORCH_CHECK(capacity >= 1 && request_tn.numel() <= INT32_MAX, "gvtorch: capacity or request_tn out of range");
   Tensor node_k = torch::stable::new_empty(request_tn, {capacity});
   Tensor word_k = torch::stable::new_zeros(request_tn, {capacity});
-  Tensor count_2 = torch::stable::new_zeros(request_tn, {2}, ScalarType::Long);
+  Tensor count_3 = torch::stable::new_zeros(request_tn, {3}, ScalarType::Long);
   torch::stable::fill_(node_k, -1);
   const int64_t nodes = request_tn.numel();
-  auto* count = static_cast<int64_t*>(count_2.mutable_data_ptr());
+  auto* count = static_cast<int64_t*>(count_3.mutable_data_ptr());
   compact<Device>(request_tn, nodes, KeepOpenRequest{words_in(request_tn)},
                   PutRequest{words_in(request_tn), words_out(node_k), words_out(word_k), capacity}, count + 1);
+  compact<Device>(request_tn, nodes, KeepWish{words_in(request_tn)}, PutNothing{}, count + 2);
   for_each<Device>(request_tn, 1, CapCount{count, capacity});
   for_each<Device>(request_tn, nodes, ClearWishes{words_out(request_tn)});
-  return {node_k, word_k, count_2};
+  return {node_k, word_k, count_3};
 }
 
 template <class Device>
