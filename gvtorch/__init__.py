@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .io import read_volume
     from .pool import BrickPool, Channel, N3Tree, NodePool
     from .producers import Bricks, Nodes, Producer, Region, Regions, StoredProducer, VolumeProducer
+    from .production import ProductionError
     from .rendering import Camera, Picture, RenderOptions, TransferFunction, TreeTracer, render
     from .volume import Volume
 
@@ -28,6 +29,7 @@ _HOME = {
     "FrameStats": ".frame",
     "Nodes": ".producers",
     "Producer": ".producers",
+    "ProductionError": ".production",
     "Region": ".producers",
     "Regions": ".producers",
     "StoredProducer": ".producers",
@@ -60,6 +62,7 @@ __all__ = [
     "Nodes",
     "Picture",
     "Producer",
+    "ProductionError",
     "Rays",
     "Region",
     "Regions",

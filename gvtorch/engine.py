@@ -72,6 +72,11 @@ class EngineOptions:
                 f"Engine: loading must be 'straight' or 'levels', got {self.loading!r}"
             )
         check.number("Engine", "patience", self.patience, low=0, open_low=True)
+        for name in ("load_budget", "subdivide_budget"):
+            check.whole("Engine", name, getattr(self, name), low=1)
+        for name in ("strict", "monitor"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"Engine: {name} must be bool, got {getattr(self, name)!r}")
 
 
 class Engine:
@@ -101,7 +106,7 @@ class Engine:
             known = ", ".join(EngineOptions.__dataclass_fields__)
             raise ValueError(f"Engine: unknown option {unknown[0]!r}; known: {known}")
         self.options = EngineOptions(**options)
-        self.device = torch.device(self.options.device)
+        self.device = _device(self.options.device)
         producers = dict(scene) if isinstance(scene, Mapping) else {"scene": scene}
         nodes, bricks = _pools(producers, self.options, self.device)
         self.cache = Cache(nodes, bricks, len(producers))
@@ -116,7 +121,7 @@ class Engine:
         self.production = Production(
             self.cache, scheduler, self.options.patience, self.options.strict
         )
-        self.frames = 0
+        self.frames, self._closed = 0, False
         self._frame_1 = torch.zeros(1, dtype=torch.int32, device=self.device)
         self._report = Report()
         self.plants: dict[str, Plant] = {}
@@ -176,7 +181,8 @@ class Engine:
                 room = self._room()
                 served, deferred, exceeded = self.scheduler.choose(wishes, room)  # 5
                 if exceeded:
-                    served = self.cache.stand_ins(wishes, served, room)
+                    coarser = self.cache.stand_ins(wishes, room)
+                    served, deferred, _ = self.scheduler.choose(coarser, room)
             late = sum(self.production.pending.values())
             with stage("produce"):
                 answers = self.production.ask([*self.plants.values()], served)  # 6
@@ -212,7 +218,8 @@ class Engine:
             mode: interactive: one frame; balanced: `productions` frames, of which the last is
                 shown; converge: until no ray misses anything that can be served. Rays that miss
                 nothing are done; where the pools are too small for all rays, groups of them take
-                turns, so that any pool that holds what one ray needs gives the whole picture.
+                turns, so that pools that hold what one ray needs, and the coarser bricks that
+                stand in for it on the way, give the whole picture.
             productions: Frames of a balanced picture.
             max_frames: Most frames of a converged picture; `stats.converged` tells whether they
                 were enough.
@@ -254,6 +261,8 @@ class Engine:
                     self.production.wait(stats.milliseconds / 1e3)
             elif stats.converged:
                 break
+            elif stats.pending and number < limits[mode]:  # as long as another frame would take
+                self.production.wait(limit=stats.milliseconds / 1e3)
             total.failed = stats.failed
         assert hits is not None
         if mode == "converge":
@@ -316,9 +325,11 @@ class Engine:
 
     def close(self) -> None:
         """Lets go of what is on its way, and of the producers' files and threads."""
+        self._closed = True
         self.production.close()
         for plant in self.plants.values():
             plant.producer.close()
+            plant.producer.layout = None
 
     def __enter__(self) -> Engine:
         """Returns itself; leaving the block closes it."""
@@ -330,6 +341,8 @@ class Engine:
 
     def _begin(self, options: RenderOptions) -> FrameStats:
         """Counts the frame up: what is stamped with its number is in use."""
+        if self._closed:
+            raise ValueError("Engine: it is closed")
         self.frames += 1
         self._frame_1.fill_(self.frames)
         for plant in self.plants.values():
@@ -342,7 +355,12 @@ class Engine:
         for name, plant in self.plants.items():
             one: Any = shader.get(name) if isinstance(shader, Mapping) else shader
             check_type("frame", f"shader of tree {name!r}", one, TransferFunction)
-            channel = options.channel or next(iter(plant.producer.channels))
+            known = plant.producer.channels
+            channel = options.channel or next(iter(known))
+            if channel not in known:
+                raise ValueError(
+                    f"frame: tree {name!r} has no channel {channel!r}; it has {', '.join(known)}"
+                )
             tracers.append(
                 Tracer(
                     plant.tree,
@@ -379,8 +397,14 @@ class Engine:
         while options.brick_size * producer.branching**depth < max(producer.extent):
             depth += 1
         layout = layout_of(producer, depth, options.brick_size, options.border, self.device)
+        if producer.layout is not None:
+            raise ValueError(
+                f"Engine: the producer of tree {name!r} serves another engine: "
+                "close that one, or make another producer"
+            )
         producer.to(self.device)
         producer.prepare(layout)
+        producer.layout = layout
         tree = N3Tree(
             *(nodes, bricks),
             depth=depth,
@@ -409,17 +433,22 @@ class Engine:
         number = index // nodes.nodes_per_tile
         regions = checked_regions(self._now(plant.producer.classify(root)), root, plant.producer)
         _raise_first(regions.errors)
-        for words, values in ((nodes.constants, regions.constants), (nodes.ranges, regions.ranges)):
-            for channel, tensor in values.items():
-                movable(words[channel])[number, 0] = movable(tensor)[0]
-        kind = Region(int(regions.kind[0]))
+        for channel, tensor in regions.ranges.items():
+            movable(nodes.ranges[channel])[number, 0] = movable(tensor)[0]
+        kind, constants = Region(int(regions.kind[0])), regions.constants
+        if kind in (Region.DATA, Region.DATA_MAX_DEPTH):
+            bricks = checked_bricks(self._now(plant.producer.fill(root)), root, plant.producer)
+            _raise_first(bricks.errors)
+            assert bricks.kind is not None
+            if int(bricks.kind[0]) not in (Region.DATA, Region.DATA_MAX_DEPTH):
+                kind, constants = Region(int(bricks.kind[0])), bricks.constants
         if kind == Region.ALIAS:
             raise ValueError("the root can't be an ALIAS")
+        for channel, tensor in constants.items():
+            movable(nodes.constants[channel])[number, 0] = movable(tensor)[0]
         if kind in (Region.EMPTY, Region.CONSTANT):
             nodes.brick_tn.view(-1)[index] = EMPTY if kind == Region.EMPTY else CONSTANT
             return
-        bricks = checked_bricks(self._now(plant.producer.fill(root)), root, plant.producer)
-        _raise_first(bricks.errors)
         slot = torch.tensor([number], dtype=torch.int32, device=self.device)
         self.cache.put_bricks(slot, slot.to(torch.int64) * nodes.nodes_per_tile, bricks.data)
         if plant.layout.depth > 0 and kind != Region.DATA_MAX_DEPTH:
@@ -427,6 +456,16 @@ class Engine:
 
     def _now(self, answer: Any) -> Any:
         return answer.result(self.options.patience) if hasattr(answer, "result") else answer
+
+
+def _device(device: torch.device | str) -> torch.device:
+    try:
+        found = torch.device(device)
+    except (RuntimeError, TypeError):
+        raise ValueError(f"Engine: device must name a device, got {device!r}") from None
+    if found.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError("Engine: device 'cuda' can't be used here: torch sees no CUDA device")
+    return found
 
 
 def _raise_first(errors: Mapping[int, str]) -> None:
@@ -443,6 +482,9 @@ def _pools(
         raise ValueError("Engine: scene must have at least one producer")
     for name, producer in producers.items():
         check_type("Engine", f"tree {name!r}", producer, Producer)
+        if "channels" not in vars(producer):
+            kind = type(producer).__name__
+            raise ValueError(f"Engine: {kind}.__init__ must call super().__init__(extent, ...)")
         for channel, what in producer.channels.items():
             if channels.setdefault(channel, what) != what:
                 raise ValueError(

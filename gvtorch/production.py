@@ -33,6 +33,8 @@ from .producers.answer import checked_bricks, checked_regions
 from .volume import movable
 
 _KEPT_FAILURES = 1000  # named; all are counted
+_MOST_RAISES = 256  # calls in one frame that may raise before whole batches are given up
+_LONGEST = 1e6  # seconds
 
 
 class ProductionError(RuntimeError):
@@ -56,7 +58,7 @@ class Failure:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Plant:
     """A tree and what makes it grow."""
 
@@ -66,7 +68,7 @@ class Plant:
     layout: Layout
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Job:
     """Items asked for together."""
 
@@ -74,17 +76,24 @@ class Job:
     kind: int
     node: Tensor  # (k,) int64: nodes to fill, or to subdivide
     loc: Tensor  # (k, 4) their places
+    same: Tensor | None = None  # (k, 4) places that are filled in their stead: they are aliases
 
     def __len__(self) -> int:
         return len(self.node)
 
     def __getitem__(self, index: slice | Tensor) -> Job:
-        return Job(self.plant, self.kind, self.node[index], self.loc[index])
+        same = None if self.same is None else self.same[index]
+        return Job(self.plant, self.kind, self.node[index], self.loc[index], same)
+
+    @property
+    def bricks(self) -> Nodes:
+        """What a producer is asked to fill."""
+        return Nodes(self.loc if self.same is None else self.same, self.plant.layout)
 
     def ask(self) -> Any:
         """Calls the producer."""
         if self.kind == REQUEST_LOAD:
-            return self.plant.producer.fill(Nodes(self.loc, self.plant.layout))
+            return self.plant.producer.fill(self.bricks)
         return self.plant.producer.classify(self.children())
 
     def children(self) -> Nodes:
@@ -98,11 +107,11 @@ class Job:
     def check(self, answer: Any) -> Regions | Bricks:
         """Checks an answer; see producers/answer.py."""
         if self.kind == REQUEST_LOAD:
-            return checked_bricks(answer, Nodes(self.loc, self.plant.layout), self.plant.producer)
+            return checked_bricks(answer, self.bricks, self.plant.producer)
         return checked_regions(answer, self.children(), self.plant.producer)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Waiting:
     job: Job
     future: Future
@@ -114,7 +123,6 @@ class Production:
 
     Attributes:
         failures: The last failures, by name.
-        failed: Number of nodes that failed.
         strict: A failure raises `ProductionError` at the end of its frame.
     """
 
@@ -123,9 +131,15 @@ class Production:
         self.cache, self.scheduler = cache, scheduler
         self.patience, self.strict = patience, strict
         self.failures: deque[Failure] = deque(maxlen=_KEPT_FAILURES)
-        self.failed = 0
+        self._failed: set[tuple[Any, ...]] = set()  # tree, kind, x, y, z, depth
+        self._raised = self._skipped = 0
         self._waiting: list[_Waiting] = []
         self._first: tuple[Failure, BaseException | None] | None = None
+
+    @property
+    def failed(self) -> int:
+        """Number of nodes that failed."""
+        return len(self._failed)
 
     @property
     def pending(self) -> dict[int, int]:
@@ -141,29 +155,48 @@ class Production:
         for item in list(self._waiting):
             if item.future.done():
                 self._waiting.remove(item)
+                seconds = time.monotonic() - item.since
+                self.scheduler.learn(item.job.kind, len(item.job), 1e3 * seconds)
                 self._settle(item.job, item.future.result, done)
-            elif time.monotonic() - item.since > self.patience:
+            elif time.monotonic() - item.since > self._patience(item.job):
                 self._waiting.remove(item)
                 item.future.cancel()
-                self._fail(item.job, f"no answer within {self.patience:g} s")
+                self._fail(item.job, f"no answer within {self._patience(item.job):g} s")
         return done
 
     def ask(self, plants: list[Plant], chosen: Requests) -> list[tuple[Job, Regions | Bricks]]:
         """Asks for what was chosen; returns the answers that are here at once."""
+        self._raised = 0
         done: list[tuple[Job, Regions | Bricks]] = []
         tree = self.cache.nodes.tree_t[chosen.node // self.cache.nodes.nodes_per_tile]
         for kind in KINDS.values():
             for number, plant in enumerate(plants):
                 node = chosen.node[(chosen.kind == kind) & (tree == number)]
-                if len(node):
-                    self._submit(Job(plant, kind, node, plant.tree.loc(node)), done)
+                job = self._without_failed(Job(plant, kind, node, plant.tree.loc(node)))
+                if len(job):
+                    self._submit(job, done)
         return done
+
+    def _without_failed(self, job: Job) -> Job:
+        """Leaves out what failed before its tile was given away: it is marked again."""
+        if not self._failed:
+            return job
+        name, kind = job.plant.name, job.kind
+        bad = [(name, kind, *loc) in self._failed for loc in job.loc.tolist()]
+        failed = torch.tensor(bad, dtype=torch.bool, device=job.node.device)
+        if any(bad):
+            self._mark(job[failed])
+            self._skipped += sum(bad)
+        return job[~failed]
 
     def write(self, answers: list[tuple[Job, Regions | Bricks]], stats: FrameStats) -> None:
         """Writes answers into the pools and adds up what they did."""
-        for job, answer in answers:
+        stats.stale, self._skipped = stats.stale + self._skipped, 0
+        queue = deque(answers)
+        while queue:
+            job, answer = queue.popleft()
             if isinstance(answer, Bricks):
-                written = self._write_bricks(job, answer)
+                written = self._write_bricks(job, answer, queue)
             else:
                 written = self._write_tiles(job, answer)
             name = "bricks" if job.kind == REQUEST_LOAD else "tiles"
@@ -173,20 +206,23 @@ class Production:
             stats.stale += written.stale
             stats.bytes_uploaded += written.nbytes
             stats.capacity_exceeded |= written.unplaced > 0
-            if written.unplaced:
-                assert written.lost is not None
+            if written.lost is not None and bool(written.lost.any()):
                 self.cache.mark_pending(job.node[written.lost], job.kind, False)
 
-    def wait(self, more: float = 0.0) -> None:
-        """Waits until an answer is here, or until patience with the oldest ends; then up to `more`
-        seconds for the others.
+    def wait(self, more: float = 0.0, limit: float = _LONGEST) -> None:
+        """Waits until an answer is here, or until patience ends, at most `limit` seconds; then up
+        to `more` seconds for the others.
         """
         if self._waiting:
-            oldest = min(item.since for item in self._waiting)
-            left = max(0.0, self.patience - (time.monotonic() - oldest))
+            ends = min(item.since + self._patience(item.job) for item in self._waiting)
+            left = min(limit, max(0.0, ends - time.monotonic()) + 1e-3)
             futures = [item.future for item in self._waiting]
-            wait_for(futures, timeout=left + 1e-3, return_when=FIRST_COMPLETED)
+            wait_for(futures, timeout=left, return_when=FIRST_COMPLETED)
             wait_for(futures, timeout=more)
+
+    def _patience(self, job: Job) -> float:
+        own = job.plant.producer.patience
+        return self.patience if own is None else own
 
     def raise_if_strict(self) -> None:
         """Raises `ProductionError` for the first failure since the last call, if strict: at the end
@@ -200,7 +236,7 @@ class Production:
     def forget_failures(self) -> None:
         """Lets what failed be asked for again."""
         self.failures.clear()
-        self.failed = 0
+        self._failed.clear()
         for kind in KINDS.values():
             everything = torch.arange(
                 self.cache.nodes.request_tn.numel(), device=self.cache.nodes.request_tn.device
@@ -247,7 +283,8 @@ class Production:
         try:
             answer = result()
         except Exception as error:
-            if len(job) == 1:
+            self._raised += 1
+            if len(job) == 1 or self._raised > _MOST_RAISES:
                 self._fail(job, f"{type(error).__name__}: {error}", error)
                 return
             half = len(job) // 2
@@ -287,7 +324,7 @@ class Production:
         for loc in job.loc.tolist():
             failure = Failure(tree=job.plant.name, kind=kind, loc=tuple(loc), message=text)
             self.failures.append(failure)
-        self.failed += len(job)
+            self._failed.add((job.plant.name, job.kind, *loc))
         self._first = self._first or (self.failures[-1], cause)
 
     def _write_tiles(self, job: Job, answer: Regions) -> Written:
@@ -295,27 +332,39 @@ class Production:
             job.plant.tree, job.node, job.loc, children_of(job, answer, self.cache)
         )
 
-    def _write_bricks(self, job: Job, answer: Bricks) -> Written:
+    def _write_bricks(
+        self, job: Job, answer: Bricks, queue: deque[tuple[Job, Regions | Bricks]]
+    ) -> Written:
         tree, kind = job.plant.tree, answer.kind
         assert kind is not None
         alias = kind == Region.ALIAS
         if answer.alias is not None:
-            target = tree.find(answer.alias)
-            words = self.cache.nodes.brick_tn.view(-1)
-            there = alias & (target >= 0) & (words[target.clamp(min=0)] != ABSENT)
-            self.cache.share_bricks(tree, job.node[there], job.loc[there], target[there])
-            alone = alias & ~there
-            if alone.any():  # what it is the same as is not here: a brick of its own
-                copies = Job(job.plant, job.kind, job.node[alone], answer.alias[alone])
-                own = copies.check(copies.ask())
-                assert isinstance(own, Bricks)
-                for name, values in own.data.items():
-                    movable(answer.data[name])[alone] = movable(values)
-                alias = there
-        job, answer, kind = job[~alias], _select(answer, ~alias), kind[~alias]
+            self._write_aliases(job[alias], answer.alias[alias], queue)
+            job, answer, kind = job[~alias], _select(answer, ~alias), kind[~alias]
         word = torch.zeros_like(kind, dtype=torch.int32)
         word[kind == Region.CONSTANT], word[kind == Region.EMPTY] = CONSTANT, EMPTY
         return self.cache.write_bricks(tree, job.node, job.loc, word, answer.data, answer.constants)
+
+    def _write_aliases(
+        self, job: Job, same: Tensor, queue: deque[tuple[Job, Regions | Bricks]]
+    ) -> None:
+        """Shares the bricks of the nodes that others are the same as; where such a node is not
+        here, its brick is made for the other alone.
+        """
+        tree = job.plant.tree
+        target = tree.find(same)
+        words = self.cache.nodes.brick_tn.view(-1)
+        there = (target >= 0) & (words[target.clamp(min=0)] != ABSENT)
+        self.cache.share_bricks(tree, job.node[there], job.loc[there], target[there])
+        if bool(there.all()):
+            return
+        if job.same is not None:
+            self._fail(job[~there], "an ALIAS of an ALIAS whose brick is not here")
+            return
+        done: list[tuple[Job, Regions | Bricks]] = []
+        alone = job[~there]
+        self._submit(Job(alone.plant, alone.kind, alone.node, alone.loc, same[~there]), done)
+        queue.extend(done)
 
 
 def children_of(job: Job, answer: Regions, cache: Cache) -> Children:
@@ -336,6 +385,10 @@ def children_of(job: Job, answer: Regions, cache: Cache) -> Children:
     def by_tile(values: Tensor) -> Tensor:
         return values.unflatten(0, (count, -1))
 
+    constants = dict(answer.constants)
+    for name, words in cache.nodes.constants.items():  # also what another tree left in these tiles
+        if name not in constants:
+            constants[name] = words.new_zeros((len(kind), words.shape[-1]))
     ranges = dict(answer.ranges)
     for name in cache.nodes.ranges:
         if name in ranges:
@@ -349,7 +402,7 @@ def children_of(job: Job, answer: Regions, cache: Cache) -> Children:
     return Children(
         child=by_tile(child),
         brick=by_tile(brick),
-        constants={name: by_tile(values) for name, values in answer.constants.items()},
+        constants={name: by_tile(values) for name, values in constants.items()},
         ranges={name: by_tile(values) for name, values in ranges.items()},
         is_alias=by_tile(kind == Region.ALIAS),
         alias=None if answer.alias is None else by_tile(answer.alias),

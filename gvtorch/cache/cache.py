@@ -39,7 +39,7 @@ class Written:
     stale: int = 0  # answers whose node is gone, or served already
     unplaced: int = 0  # answers for which no slot was free
     nbytes: int = 0  # voxels moved into the pool
-    lost: Tensor | None = field(default=None, repr=False)  # (k,) bool, neither written nor stale
+    lost: Tensor | None = field(default=None, repr=False)  # (k,) bool, to be asked for again
 
 
 class Cache:
@@ -73,20 +73,19 @@ class Cache:
         """For each kind, the slots that may be taken in this frame."""
         return {kind: lru.unused for kind, lru in self.lru.items()}
 
-    def stand_ins(self, wishes: Requests, served: Requests, room: dict[int, int]) -> Requests:
-        """Where slots are too few for all wishes: serves coarser bricks in their place, so that
+    def stand_ins(self, wishes: Requests, room: dict[int, int]) -> Requests:
+        """Where slots are too few for all wishes: asks for coarser bricks in their place, so that
         what is not served is drawn from a near ancestor and not from the root.
 
         Wishes are moved up the tree, the deepest first, until there are at most as many nodes as
-        slots. Where those nodes have bricks already, `served` stays as it is.
+        slots. Where those nodes have bricks already, the wishes stay as they are.
 
         Args:
             wishes: All wishes of the frame.
-            served: What the scheduler chose of them.
             room: For each kind, how many slots are free to take.
 
         Returns:
-            `served`, or its subdivisions and the loads of the coarser nodes.
+            `wishes`, or their subdivisions and the loads of the coarser nodes.
         """
         nodes, most = self.nodes, room[REQUEST_LOAD]
         subdivide = wishes.kind == REQUEST_SUBDIVIDE
@@ -98,7 +97,7 @@ class Cache:
             depth = nodes.loc_t4[tile, 3]
             deepest = depth.max()
             if most == 0 or deepest == 0:
-                return served
+                return wishes
             parent = nodes.parent_t[tile].to(torch.int64)
             node = torch.where(depth == deepest, parent, node).unique()
             node = node[node >= 0]  # a shared tile whose owner is gone knows no way up
@@ -106,8 +105,8 @@ class Cache:
         pending = nodes.request_tn.view(-1)[node] & REQUEST_LOAD << REQUEST_PENDING_SHIFT
         node = node[(words == ABSENT) & (pending == 0)]
         if not len(node):
-            return served
-        keep = served[served.kind == REQUEST_SUBDIVIDE]
+            return wishes
+        keep = wishes[subdivide]
         zeros = torch.zeros_like(node, dtype=torch.int32)
         return Requests(
             node=torch.cat((keep.node, node)),
@@ -146,16 +145,19 @@ class Cache:
         wanted = self.wanted(tree, node, loc, REQUEST_SUBDIVIDE)
         place = wanted.nonzero()[:, 0]
         done.stale = len(node) - len(place)
-        lru = self.lru[REQUEST_SUBDIVIDE]
+        lru, pool, per_tile = self.lru[REQUEST_SUBDIVIDE], self.nodes, self.nodes.nodes_per_tile
         fits = place[: lru.unused]
         done.unplaced = len(place) - len(fits)
-        done.lost = torch.zeros_like(wanted)
-        done.lost[place[lru.unused :]] = True
+        tile_k = lru.take(len(fits))
+        # An answer that is late may be for nodes that are in no use any more: where their own tile
+        # is among those given away, they have to wait.
+        fits = fits[~torch.isin(node[fits] // per_tile, tile_k)]
+        tile_k = tile_k[: len(fits)]
+        done.lost = wanted.clone()
+        done.lost[fits] = False
         done.items = len(fits)
         if not len(fits):
             return done
-        pool, per_tile = self.nodes, self.nodes.nodes_per_tile
-        tile_k = lru.take(len(fits))
         tile = tile_k.to(torch.int64)
         done.evicted = int((pool.parent_t[tile] >= 0).sum())
         unlink(pool.child_tn, tile_k, pool.capacity)
@@ -240,10 +242,9 @@ class Cache:
         done.lost = torch.zeros_like(wanted)
         done.lost[full[lru.unused :]] = True
         if len(bare):
-            for name, values in constants.items():
-                movable(self.nodes.constants[name]).flatten(0, 1)[node[bare]] = movable(values)[
-                    bare
-                ]
+            for name, words in self.nodes.constants.items():
+                value = movable(constants[name])[bare] if name in constants else 0
+                movable(words).flatten(0, 1)[node[bare]] = value
             self._link_bricks(node[bare], word[bare])
             child = self.nodes.child_tn.view(-1)
             child[node[bare]] = torch.where(
@@ -252,7 +253,9 @@ class Cache:
         if len(fits):
             slot_k = lru.take(len(fits))
             done.evicted = int((pool.owner_b[slot_k.to(torch.int64)] >= 0).sum())
-            done.nbytes = self.put_bricks(slot_k, node[fits], {n: d[fits] for n, d in data.items()})
+            everything = len(fits) == len(node)
+            chosen = data if everything else {name: d[fits] for name, d in data.items()}
+            done.nbytes = self.put_bricks(slot_k, node[fits], chosen)
         return done
 
     def share_bricks(self, tree: N3Tree, node: Tensor, loc: Tensor, target: Tensor) -> None:

@@ -53,6 +53,7 @@ class Scheduler:
             check.number("Engine", "time_budget", milliseconds, low=0, open_low=True)
         self.milliseconds = milliseconds
         self.rate: dict[int, float | None] = dict.fromkeys(self.most)
+        self._budget = dict(self.most)
 
     def choose(self, requests: Requests, room: dict[int, int]) -> tuple[Requests, int, bool]:
         """Returns the wishes to serve, most wanted first.
@@ -68,7 +69,7 @@ class Scheduler:
         deferred, exceeded = 0, False
         for kind, most in self.most.items():
             which = (requests.kind == kind).nonzero()[:, 0]
-            budget = min(most, self._in_time(kind))
+            budget = self._budget[kind] = min(most, self._in_time(kind))
             deferred += max(0, min(len(which), room[kind]) - budget)
             exceeded |= len(which) > room[kind]
             which = which[self.rank(requests[which])]
@@ -84,8 +85,10 @@ class Scheduler:
         return (level * (REQUEST_PRIORITY + 1) + small).argsort(stable=True)
 
     def learn(self, kind: int, items: int, milliseconds: float) -> None:
-        """Learns the throughput from a batch that took `milliseconds`."""
-        if items < _LEARN_FROM or milliseconds <= 0:
+        """Learns the throughput from a batch that took `milliseconds`. Small ones tell little,
+        unless the budget itself made them small.
+        """
+        if items < min(_LEARN_FROM, self._budget[kind]) or milliseconds <= 0:
             return
         seen, known = items / milliseconds, self.rate[kind]
         self.rate[kind] = seen if known is None else known + _LEARN_RATE * (seen - known)

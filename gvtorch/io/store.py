@@ -36,7 +36,7 @@ from .layout import (
 from .levels import Deadline, Levels, StoreError
 from .opening import find_image, open_arrays
 
-_OPEN_TIMEOUT = 60.0  # seconds
+_OPEN_TIMEOUT = 20.0  # seconds
 _BATCH = 256  # blocks read at once; more only makes memory travel
 _AHEAD = 2  # batches on their way
 _GROUP = 4  # blocks along a side of a group that may be read as one region

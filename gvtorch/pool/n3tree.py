@@ -178,6 +178,12 @@ class N3Tree:
             used = used[~shared[used]]
             if used.unique().numel() != used.numel():
                 raise ValueError(f"N3Tree: a {name} has two owners")
+        parent, places = self.nodes.parent_t.to(torch.int64), self.nodes.loc_t4.to(torch.int64)
+        tile = ((parent >= 0) & (self.nodes.tree_t == self.number)).nonzero()[:, 0]
+        above = self.loc(parent[tile])
+        above[:, 3] += 1
+        if not torch.equal(places[tile], above):
+            raise ValueError("N3Tree: a tile's place is not that of its parent")
 
     @classmethod
     def from_volume(
@@ -217,7 +223,7 @@ class N3Tree:
         Source: Crassin et al., "GigaVoxels", I3D 2009, section 3; docs/design.md, section 2.
         """
         volumes = dict(volume) if isinstance(volume, Mapping) else {"value": volume}
-        first = _check_channels(volumes)
+        first = check_channels("from_volume", volumes)
         check.whole("from_volume", "branching", branching, low=2, high=16)
         if threshold is not None:
             threshold = check.number("from_volume", "threshold", threshold)
@@ -247,13 +253,14 @@ class N3Tree:
         return tree
 
 
-def _check_channels(volumes: Mapping[str, Volume]) -> Volume:
+def check_channels(where: str, volumes: Mapping[str, Volume]) -> Volume:
+    """Returns the first of some volumes, all of which must have one extent, spacing and origin."""
     if not volumes:
-        raise ValueError("from_volume: volume must name at least one channel")
+        raise ValueError(f"{where}: volume must name at least one channel")
     for name, volume in volumes.items():
         if not isinstance(volume, Volume):
             raise ValueError(
-                f"from_volume: volume must be a Volume (gv.Volume(data, spacing)), "
+                f"{where}: volume must be a Volume (gv.Volume(data, spacing)), "
                 f"got {type(volume).__name__} for channel {name!r}"
             )
     first, *others = volumes.values()
@@ -262,7 +269,7 @@ def _check_channels(volumes: Mapping[str, Volume]) -> Volume:
             *(first.extent, first.spacing, first.origin),
         ):
             raise ValueError(
-                f"from_volume: channels must share extent, spacing and origin: {first} and {volume}"
+                f"{where}: channels must share extent, spacing and origin: {first} and {volume}"
             )
     return first
 

@@ -33,7 +33,8 @@ def checked_regions(answer: Any, nodes: Nodes, producer: Producer) -> Regions:
         name: _by_channel(where, name, getattr(answer, name), (count, *shape), producer, device)
         for name, shape in shapes.items()
     }
-    alias = _alias(where, answer.alias, kind, device)
+    _need_constants(where, kind, fields["constants"], producer)
+    alias = _alias(where, answer.alias, kind, nodes.layout, errors)
     for values in fields.values():
         _refuse_nan(values, errors)
     return Regions(kind=kind, alias=alias, errors=errors, **fields)
@@ -64,7 +65,8 @@ def checked_bricks(answer: Any, nodes: Nodes, producer: Producer) -> Bricks:
     constants = _by_channel(where, "constants", answer.constants, (count,), producer, device)
     _refuse_nan(data, errors)
     _refuse_nan(constants, errors)
-    alias = _alias(where, answer.alias, kind, device)
+    _need_constants(where, kind, constants, producer)
+    alias = _alias(where, answer.alias, kind, layout, errors)
     return Bricks(data=data, kind=kind, constants=constants, alias=alias, errors=errors)
 
 
@@ -135,15 +137,33 @@ def _by_channel(
     return result
 
 
-def _alias(where: str, alias: Any, kind: Tensor, device: torch.device) -> Tensor | None:
-    if not bool((kind == Region.ALIAS).any()):
+def _need_constants(
+    where: str, kind: Tensor, constants: Mapping[str, Tensor], producer: Producer
+) -> None:
+    missing = sorted(set(producer.channels) - set(constants))
+    if missing and bool((kind == Region.CONSTANT).any()):
+        raise ValueError(f"{where}: constants must hold channel {missing[0]!r} of CONSTANT items")
+
+
+def _alias(
+    where: str, alias: Any, kind: Tensor, layout: Layout, errors: dict[int, str]
+) -> Tensor | None:
+    is_alias = kind == Region.ALIAS
+    if not bool(is_alias.any()):
         return None
     if not isinstance(alias, Tensor) or alias.shape != (len(kind), 4):
         raise ValueError(
             f"{where}: alias must be ({len(kind)}, 4) where an item is ALIAS, "
             f"got {check.describe(alias)}"
         )
-    return alias.to(device=device, dtype=torch.int64)
+    alias = alias.to(device=layout.device, dtype=torch.int64)
+    depth = alias[:, 3]
+    nodes = float(layout.branching) ** depth.clamp(0, layout.depth).to(torch.float64)
+    inside = ((alias[:, :3] >= 0) & (alias[:, :3] < nodes[:, None])).all(1)
+    wrong = is_alias & ~(inside & (depth >= 0) & (depth <= layout.depth))
+    for index in wrong.nonzero()[:, 0].tolist():
+        errors.setdefault(index, f"alias {tuple(alias[index].tolist())} is no node of this tree")
+    return alias
 
 
 def _refuse_nan(values: Mapping[str, Tensor], errors: dict[int, str]) -> None:

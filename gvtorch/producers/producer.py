@@ -153,7 +153,12 @@ class Producer(torch.nn.Module):
         branching: N of its tree.
         channels: What a voxel holds, by name.
         value_range: For each channel its smallest and largest value, where they are known.
+        patience: Seconds until an answer that does not come is given up; None: the engine's.
+        layout: How the engine that it serves cuts its world; None while it serves none.
     """
+
+    patience: float | None = None
+    layout: Layout | None = None
 
     def __init__(
         self,
@@ -202,6 +207,9 @@ class Producer(torch.nn.Module):
         self.origin = check.triple(where, "origin", origin)
         self.branching = check.whole(where, "branching", branching, low=2, high=16)
         self.channels = dict(channels) if channels is not None else {"value": Channel()}
+        for name, channel in self.channels.items():
+            if not isinstance(channel, Channel):
+                raise ValueError(f"{where}: channels[{name!r}] must be a Channel, got {channel!r}")
         self.value_range = dict(value_range or {})
 
     def prepare(self, layout: Layout) -> None:

@@ -12,6 +12,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,11 +28,13 @@ _TILE = 32  # cells along a side of what is read at once
 _GROUP_BYTES = 32 * 10**6  # of blocks held at a time beside the cache
 _CHANNEL = "value"
 
-Key = tuple[str, int, int, int, int]  # what, level, z, y, x
+Key = tuple[str, int, int, int, int, int]  # what, level, z, y, x, border
 
 
 class StoredProducer(Producer):
     """Streams a `gvtorch convert` store, or any OME-Zarr image. Its channel is "value"."""
+
+    patience = float("inf")  # reads end by themselves, by `timeout`
 
     def __init__(
         self,
@@ -48,7 +51,8 @@ class StoredProducer(Producer):
 
         Args:
             store: An open store, a folder or a URL.
-            host_cache: Bytes of decoded blocks and cells kept in host memory.
+            host_cache: Bytes of decoded blocks and cells kept in host memory; reads that run hold
+                up to 64 MB more in each thread.
             timeout: Seconds until a read is given up.
             workers: Threads that read.
             image: Which image, see `Store.open`.
@@ -76,6 +80,7 @@ class StoredProducer(Producer):
         )
         self.store, self.timeout = store, self_timeout
         self._cache = HostCache(limit)
+        self._closed = threading.Event()
         self._threads = ThreadPoolExecutor(workers, thread_name_prefix="gvtorch-store")
 
     def classify(self, nodes: Nodes) -> Regions | Future:
@@ -90,6 +95,7 @@ class StoredProducer(Producer):
 
     def close(self) -> None:
         """Ends the threads; reads that run are not waited for."""
+        self._closed.set()
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     def _classify(self, nodes: Nodes) -> Regions:
@@ -152,7 +158,7 @@ class StoredProducer(Producer):
         def read(missing: list[Key]) -> dict[Key, np.ndarray | str]:
             found: dict[Key, np.ndarray | str] = {}
             for key in missing:
-                begin = np.array(key[2:]) * _TILE
+                begin = np.array(key[2:5]) * _TILE
                 end = np.minimum(begin + _TILE, grid)
                 try:
                     found[key] = store.read_cells(
@@ -162,7 +168,7 @@ class StoredProducer(Producer):
                     found[key] = str(error)
             return found
 
-        keys: list[Key] = [("cells", level, *tile) for tile in tiles.tolist()]
+        keys: list[Key] = [("cells", level, *tile, 0) for tile in tiles.tolist()]
         for number, tile in enumerate(self._cache.get(keys, read)):
             rows = np.flatnonzero(which.reshape(-1) == number)
             if isinstance(tile, str):
@@ -180,13 +186,13 @@ class StoredProducer(Producer):
         dtype = np.dtype(str(store.dtype).removeprefix("torch."))
         out = np.zeros((len(loc), side, side, side, store.width), dtype)
         errors: dict[int, str] = {}
-        in_blocks = store.block % layout.brick_size == 0 and layout.border <= store.border
-        blocks = (level < store.levels) & in_blocks
-        for row in np.flatnonzero(~blocks).tolist():
-            self._fill_from_region(out, row, loc[row], int(level[row]), layout, errors)
-        for here in np.unique(level[blocks]):
-            rows = np.flatnonzero(blocks & (level == here))
-            self._fill_from_blocks(out, rows, loc[rows, 2::-1], int(here), layout, errors)
+        cuts = self._cuts(layout)
+        for here in np.unique(level):
+            rows = np.flatnonzero(level == here)
+            if here < store.levels:
+                self._cut(out, rows, loc[rows, 2::-1], int(here), cuts, errors)
+            else:
+                self._fill_beyond(out, rows, loc[rows, 2::-1], int(here), layout, errors)
         data = torch.from_numpy(out)
         if store.has_blocks:
             return Bricks(data={_CHANNEL: data}, errors=errors)
@@ -196,7 +202,73 @@ class StoredProducer(Producer):
         constants = {_CHANNEL: data[:, 0, 0, 0]}
         return Bricks(data={_CHANNEL: data}, kind=kind, constants=constants, errors=errors)
 
-    def _fill_from_blocks(
+    def _cuts(self, layout: Layout) -> _Cuts:
+        """Bricks are cut out of the store's blocks where they fit in with their border, else out of
+        regions of about that size.
+        """
+        store, size = self.store, layout.brick_size
+        if store.block % size == 0 and layout.border <= store.border:
+            return _Cuts("block", size, store.block // size, store.border - layout.border)
+        return _Cuts("region", size, max(1, 2 * store.block // size), 0)
+
+    def _read(self, level: int, side: int, keys: list[Key]) -> dict[Key, np.ndarray | str]:
+        """Blocks, or regions of `side` voxels whose border is part of them."""
+        store, places = self.store, np.array([key[2:5] for key in keys], np.int64)
+        if keys[0][0] == "block":
+            data, wrong = store.read_blocks(level, places, timeout=self.timeout)
+            return {key: wrong.get(i) or data[i].copy() for i, key in enumerate(keys)}
+        border, found = keys[0][5], dict[Key, np.ndarray | str]()
+        for key, place in zip(keys, places, strict=True):
+            low = place * side - border
+            high = low + side + 2 * border
+            found[key] = store.read_region(level, low.tolist(), high.tolist(), timeout=self.timeout)
+        return found
+
+    def _cut(
+        self,
+        out: np.ndarray,
+        rows: np.ndarray,
+        zyx: np.ndarray,
+        level: int,
+        cuts: _Cuts,
+        errors: dict[int, str],
+    ) -> None:
+        """Cuts bricks of one level out of larger cubes, a group of cubes at a time. After a read
+        that does not come in time, the others of this batch are not waited for.
+        """
+        cubes, which = np.unique(zyx // cuts.bricks, axis=0, return_inverse=True)
+        order = np.argsort(which.reshape(-1), kind="stable")
+        starts = np.searchsorted(which.reshape(-1)[order], np.arange(len(cubes) + 1))
+        corner = zyx % cuts.bricks * cuts.size + cuts.offset
+        side, late = out.shape[1], ""
+        border = (side - cuts.size) // 2 + cuts.offset
+
+        def read(missing: list[Key]) -> dict[Key, np.ndarray | str]:
+            nonlocal late
+            if self._closed.is_set() or late:
+                return dict.fromkeys(missing, late or f"{self.store.location}: closed")
+            try:
+                return self._read(level, cuts.bricks * cuts.size, missing)
+            except TimeoutError as error:
+                late = str(error)
+                return dict.fromkeys(missing, late)
+            except (OSError, ValueError) as error:
+                return dict.fromkeys(missing, str(error))
+
+        cube_side = cuts.bricks * cuts.size + 2 * border
+        group = max(1, _GROUP_BYTES // (cube_side**3 * self.store.width * out.itemsize))
+        for begin in range(0, len(cubes), group):
+            part = cubes[begin : begin + group].tolist()
+            found = self._cache.get([(cuts.what, level, *at, border) for at in part], read)
+            for number, cube in enumerate(found, begin):
+                for index in order[starts[number] : starts[number + 1]]:
+                    if isinstance(cube, str):
+                        errors[int(rows[index])] = cube
+                        continue
+                    z, y, x = corner[index]
+                    out[rows[index]] = cube[z : z + side, y : y + side, x : x + side]
+
+    def _fill_beyond(
         self,
         out: np.ndarray,
         rows: np.ndarray,
@@ -205,66 +277,33 @@ class StoredProducer(Producer):
         layout: Layout,
         errors: dict[int, str],
     ) -> None:
-        """Cuts bricks of one level out of blocks, a group of blocks at a time."""
-        store, size = self.store, layout.brick_size
-        per_block = store.block // size
-        blocks, which = np.unique(zyx // per_block, axis=0, return_inverse=True)
-        order = np.argsort(which.reshape(-1), kind="stable")
-        starts = np.searchsorted(which.reshape(-1)[order], np.arange(len(blocks) + 1))
-        corner = zyx % per_block * size + (store.border - layout.border)
-        side = out.shape[1]
-
-        def read(missing: list[Key]) -> dict[Key, np.ndarray | str]:
-            places = np.array([key[2:] for key in missing], np.int64)
-            try:
-                data, wrong = store.read_blocks(level, places, timeout=self.timeout)
-            except (OSError, ValueError) as error:
-                return dict.fromkeys(missing, str(error))
-            return {key: wrong.get(i) or data[i].copy() for i, key in enumerate(missing)}
-
-        nbytes = (store.block + 2 * store.border) ** 3 * store.width * out.itemsize
-        group = max(1, _GROUP_BYTES // nbytes)
-        for begin in range(0, len(blocks), group):
-            part = blocks[begin : begin + group].tolist()
-            found = self._cache.get([("block", level, *place) for place in part], read)
-            for number, block in enumerate(found, begin):
-                for index in order[starts[number] : starts[number + 1]]:
-                    if isinstance(block, str):
-                        errors[int(rows[index])] = block
-                        continue
-                    z, y, x = corner[index]
-                    out[rows[index]] = block[z : z + side, y : y + side, x : x + side]
-
-    def _fill_from_region(
-        self,
-        out: np.ndarray,
-        row: int,
-        loc: np.ndarray,
-        level: int,
-        layout: Layout,
-        errors: dict[int, str],
-    ) -> None:
-        """Makes a brick that does not fit into blocks, or is coarser than the store's levels."""
-        low = loc[2::-1] * layout.brick_size - layout.border
-        high = low + out.shape[1]
+        """Makes bricks of levels coarser than the store's out of its last one, a few voxels."""
+        last = self.store.levels - 1
+        shape = self.store.level_extent(last)[::-1]
         try:
-            if level < self.store.levels:
-                out[row] = self.store.read_region(
-                    level, low.tolist(), high.tolist(), timeout=self.timeout
-                )
-                return
-            last = self.store.levels - 1
-            shape = self.store.level_extent(last)[::-1]
             values = self.store.read_region(last, (0, 0, 0), shape, timeout=self.timeout)
         except (OSError, ValueError) as error:
-            errors[row] = str(error)
+            errors.update(dict.fromkeys(rows.tolist(), str(error)))
             return
         for _ in range(level - last):
             values = pool_mean(values, 2)
-        z, y, x = (
-            np.arange(a, b).clip(0, n - 1) for a, b, n in zip(low, high, values.shape, strict=False)
-        )
-        out[row] = values[np.ix_(z, y, x)]
+        reach = np.arange(out.shape[1]) - layout.border
+        for row, place in zip(rows, zyx, strict=True):
+            z, y, x = (
+                (at * layout.brick_size + reach).clip(0, n - 1)
+                for at, n in zip(place, values.shape, strict=False)
+            )
+            out[row] = values[np.ix_(z, y, x)]
+
+
+@dataclass(frozen=True)
+class _Cuts:
+    """How bricks lie in the cubes that they are cut from."""
+
+    what: str  # block, or region
+    size: int  # voxels along a side of a brick
+    bricks: int  # along a side of a cube
+    offset: int  # voxels from a cube's stored corner to its first brick's
 
 
 class HostCache:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from .. import check
 from ..pool import Channel, cut_bricks
+from ..pool.n3tree import check_channels
 from ..pool.pyramid import Level, build_levels, round_to
 from ..volume import Volume, movable
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
@@ -30,15 +31,7 @@ class VolumeProducer(Producer):
             ValueError: Channels differ in extent, spacing or origin.
         """
         volumes = dict(volume) if isinstance(volume, Mapping) else {"value": volume}
-        first = next(iter(volumes.values()))
-        for other in volumes.values():
-            if (other.extent, other.spacing, other.origin) != (
-                *(first.extent, first.spacing, first.origin),
-            ):
-                raise ValueError(
-                    f"VolumeProducer: channels must share extent, spacing and origin: "
-                    f"{first} and {other}"
-                )
+        first = check_channels("VolumeProducer", volumes)
         super().__init__(
             first.extent,
             channels={n: Channel(v.data.dtype, v.data.shape[3]) for n, v in volumes.items()},

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg
 
-from .common import Bar, Source, is_store
+from .common import Bar, Source, is_store, refuse_for_store
 from .view import Fly, Render
 
 if TYPE_CHECKING:
@@ -45,6 +45,7 @@ class Info:
         elif is_store(self.path):
             from ..io import Store
 
+            refuse_for_store(self.source)
             content = Store.open(self.path).describe()
         else:
             from ..io.formats import describe
@@ -215,6 +216,9 @@ def main(args: list[str] | None = None) -> None:
         print(f"gvtorch: error: {text}", file=sys.stderr)
         sys.exit(2)
     except RuntimeError as error:
+        if type(error).__name__ == "ProductionError":
+            print(f"gvtorch: error: {' '.join(str(error).split())}", file=sys.stderr)
+            sys.exit(2)
         if "alloc" not in str(error) and "memory" not in str(error):
             raise
         text = " ".join(str(error).split())

@@ -93,9 +93,22 @@ class Bar:
 
 def is_store(path: str) -> bool:
     """Tells a store or an OME-Zarr image, a folder or a URL, from a volume file."""
-    return (
-        "://" in path or path.rstrip("/").endswith(".zarr") or (Path(path) / "zarr.json").exists()
-    )
+    marks = ("zarr.json", ".zattrs", ".zgroup")
+    known = any((Path(path) / mark).exists() for mark in marks)
+    return "://" in path or path.rstrip("/").endswith(".zarr") or known
+
+
+def given(options: Any) -> list[str]:
+    """Flags of a group of options that differ from what they are if left out."""
+    plain = vars(type(options)())
+    return [f"--{n.replace('_', '-')}" for n, v in vars(options).items() if v != plain[n]]
+
+
+def refuse_for_store(source: Source) -> None:
+    """Raises ValueError where flags tell how to read a volume file, but a store was named."""
+    flags = given(source)
+    if flags:
+        raise ValueError(f"{flags[0]} is for volume files; a store tells it itself")
 
 
 def numbers(name: str, text: str, count: int, kind: type) -> list[Any]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg
 
-from .common import Bar, Source, is_store, numbers, size
+from .common import Bar, Source, given, is_store, numbers, refuse_for_store, size
 
 if TYPE_CHECKING:
     import torch
@@ -111,11 +111,6 @@ class Streaming:
     strict: tyro.conf.FlagCreatePairsOff[bool] = False
     """a block that can't be read ends the work"""
 
-    def given(self) -> list[str]:
-        """Flags that differ from what they are if left out."""
-        plain = vars(Streaming())
-        return [f"--{n.replace('_', '-')}" for n, v in vars(self).items() if v != plain[n]]
-
     @contextmanager
     def open(self, path: str, look: Look) -> Iterator[tuple[Engine, TransferFunction]]:
         """Opens a store: the engine over it, and the transfer function."""
@@ -194,10 +189,10 @@ class Render:
         from ..pool import N3Tree
         from ..rendering import render
 
-        if self.streaming.given():
+        flags = given(self.streaming)
+        if flags:
             raise ValueError(
-                f"{self.streaming.given()[0]} is for stores; "
-                f"make one: gvtorch convert {self.path} STORE.zarr"
+                f"{flags[0]} is for stores; make one: gvtorch convert {self.path} STORE.zarr"
             )
         volume = self.source.read(Path(self.path))
         shader, look = self.look.shader(*volume.value_range), self.look
@@ -215,6 +210,7 @@ class Render:
         """Streams a store."""
         if self.threshold is not None:
             raise ValueError("--threshold is for volumes; a store's is set by gvtorch convert")
+        refuse_for_store(self.source)
         streaming = self.streaming
         with streaming.open(self.path, self.look) as (engine, shader):
             picture = engine.render(

@@ -56,7 +56,10 @@ struct CapCount {
 
 struct ClearWishes {
   int32_t* request_tn;
-  GV_HD void operator()(int64_t node) const { request_tn[node] &= kPending; }
+  GV_HD void operator()(int64_t node) const {
+    const int32_t word = request_tn[node];
+    if ((word & ~kPending) != 0) request_tn[node] = word & kPending;
+  }
 };
 
 struct KeepByUse {
