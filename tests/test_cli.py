@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -286,6 +287,13 @@ def test_fly_along_keys_to_a_video(scan_store, tmp_path):
     assert not list(tmp_path.glob(".*")), "nothing half-written is left"
 
 
+def broken_root(folder: Path, store: Path) -> Path:
+    copy = shutil.copytree(store, folder / "broken.zarr")
+    levels = sorted((copy / "gvtorch/blocks").glob("[0-9]*"))
+    shutil.rmtree(levels[-1] / "c")
+    return copy
+
+
 def keys_file(folder: Path, text: str) -> Path:
     (folder / "keys.json").write_text(text)
     return folder / "keys.json"
@@ -322,6 +330,9 @@ def keys_file(folder: Path, text: str) -> Path:
         (lambda t, s: ["render", s, "-o", t / "a.png", "--brick-pool", "1 kB"], "at least 2"),
         (lambda t, s: ["render", s, "-o", t / "a.png", "--max-frames", "0"], "max_frames must"),
         (lambda t, s: ["render", s, "-o", t / "a.png", "--time", "3"], "time"),
+        (lambda t, s: ["render", s, "-o", t / "a.png", "--key", "a"], "--key is for volume files"),
+        (lambda t, s: ["info", s, "--shape", "1,2,3"], "--shape is for volume files"),
+        (lambda t, s: ["render", broken_root(t, s), "-o", t / "a.png"], "root of tree 'scene'"),
         (
             lambda t, s: ["render", s, "-o", t / "a.png", "--threshold", "3"],
             "set by gvtorch convert",

@@ -6,6 +6,7 @@ import gc
 import random
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -323,9 +324,11 @@ def test_the_time_budget_learns_what_fits():
     first, deferred, _ = scheduler.choose(asked, room)
     assert 0 < len(first) < 1000 and deferred == 1000 - len(first)
     scheduler.learn(config.REQUEST_LOAD, 10, 1e-6)  # too few to tell
-    for _ in range(30):
+    scheduler.learn(config.REQUEST_LOAD, 64, 1000.0)  # a slow start
+    assert len(scheduler.choose(asked, room)[0]) == 1
+    for _ in range(40):
         scheduler.learn(config.REQUEST_LOAD, 100, 1.0)  # 100 bricks a millisecond
-    assert len(scheduler.choose(asked, room)[0]) == 200, "half of the time is for bricks"
+    assert len(scheduler.choose(asked, room)[0]) >= 199, "half of the time is for bricks"
 
 
 @pytest.mark.backend("cpp")
@@ -409,7 +412,7 @@ def test_a_wandering_camera_leaves_memory_flat(blobs):
     pick = random.Random(7)
     shader = gv.TransferFunction.preset("gray", 0, 1)
     options = {"brick_size": 4, "brick_pool": 60 * 6**3 * 4, "node_pool": 40 * 8 * 20}
-    azimuth, distance, live, evicted = 0.0, 1.0, [], 0
+    azimuth, distance, live, pages, evicted = 0.0, 1.0, [], [], 0
     with gv.Engine(gv.VolumeProducer(blobs), **options) as engine:
         for number in range(10_000):
             azimuth += pick.gauss(0, 6)
@@ -421,8 +424,10 @@ def test_a_wandering_camera_leaves_memory_flat(blobs):
                 engine.validate()
                 gc.collect()
                 live.append(sum(isinstance(one, torch.Tensor) for one in gc.get_objects()))
+                pages.append(int(Path("/proc/self/statm").read_text().split()[1]))
         engine.validate()
         assert len(live) == 4 and max(live) - min(live) <= 8, live
+        assert (pages[-1] - pages[0]) * 4096 < 20e6, "resident memory is flat"
         assert evicted > 1000 and len(engine.production.failures) == 0
 
 
@@ -459,6 +464,14 @@ def test_report_tells_stages_rates_and_occupancy(blobs):
         (lambda v: engine(v, order="best"), "order must be 'coarse' or 'fine'"),
         (lambda v: engine(v, time_budget=-1), "time_budget must be finite and > 0"),
         (lambda v: engine(v, patience=0), "patience must be finite and > 0"),
+        (lambda v: engine(v, load_budget="many"), "load_budget must be an int >= 1"),
+        (lambda v: engine(v, device="gpu"), "device must name a device, got 'gpu'"),
+        (lambda v: engine(v, strict="no"), "strict must be bool, got 'no'"),
+        (lambda v: gv.VolumeProducer(v.data), "VolumeProducer: volume must be a Volume"),
+        (lambda v: gv.VolumeProducer({}), "VolumeProducer: volume must name at least one"),
+        (lambda v: gv.Producer(4, channels={"a": torch.uint8}), "channels['a'] must be a Channel"),
+        (lambda v: gv.Engine(type("Lazy", (gv.Producer,), {"__init__": nothing})()), "super()"),
+        (lambda v: engine(v).frame(camera(), VESSELS, channel="b"), "has no channel 'b'; it has"),
         (lambda v: engine(v, cache="1 MB"), "unknown option 'cache'; known: node_pool"),
         (lambda v: engine(v).frame(None, VESSELS), "camera must be a Camera, got NoneType"),
         (lambda v: engine(v).frame(camera(), None), "must be a TransferFunction, got NoneType"),
@@ -472,6 +485,10 @@ def test_bad_arguments_are_named(blobs, call, message):
     with pytest.raises(ValueError) as caught:
         call(blobs)
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def nothing(self) -> None:
+    torch.nn.Module.__init__(self)
 
 
 def engine(volume: gv.Volume, **options) -> gv.Engine:

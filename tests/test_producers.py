@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 
@@ -355,3 +356,221 @@ def test_bad_producers_are_named(call, message):
     with pytest.raises(ValueError) as caught:
         call()
     assert message in str(caught.value)
+
+
+class Held(gv.VolumeProducer):
+    """Keeps its answers back until `go`, which gives them in an order of its own."""
+
+    def __init__(self, volume, seed=0):
+        super().__init__(volume)
+        self.held, self.hold, self.random = [], True, random.Random(seed)
+
+    def later(self, answer, nodes):
+        if not self.hold or (nodes.depth == 0).any():
+            return answer(nodes)
+        self.held.append((future := Future(), answer, nodes))
+        return future
+
+    def go(self):
+        self.random.shuffle(self.held)
+        for future, answer, nodes in self.held:
+            future.set_result(answer(nodes))
+        self.held.clear()
+
+    def classify(self, nodes):
+        return self.later(super().classify, nodes)
+
+    def fill(self, nodes):
+        return self.later(super().fill, nodes)
+
+
+@pytest.mark.backend("cpp")
+def test_late_answers_never_land_in_the_wrong_place():
+    """Tiles come late, when their nodes are in no use, into pools of a few tiles: a node's own tile
+    may be the one that is given away for another node of the same answer."""
+    volume = gv.Volume(torch.rand((64, 64, 64), generator=torch.Generator().manual_seed(0)))
+    tree = gv.N3Tree.from_volume(volume, 4)
+    haze = gv.TransferFunction.from_points([(0, 0.0), (1, 0.02)])
+    pick = random.Random(3)
+    for trial in range(12):
+        producer, tiles = Held(volume, trial), pick.randint(12, 80)
+        with gv.Engine(producer, brick_size=4, brick_pool="8 MB", node_pool=tiles * 160) as engine:
+            for _ in range(20):
+                eye, target = ([pick.uniform(0, 64) for _ in range(3)] for _ in range(2))
+                view = gv.Camera.look_at(eye, target, (0, 1, 0), 30, 8, 8)
+                engine.frame(view, haze)
+                if pick.random() < 0.4:
+                    producer.go()
+                engine.validate()
+            producer.hold = False
+            producer.go()
+            picture = engine.render(view, haze)
+            engine.validate()
+            if picture.stats.converged:
+                assert torch.equal(picture.color, gv.render(tree, view, haze).color)
+
+
+def test_validate_finds_a_tile_in_the_wrong_place(blobs):
+    tree = gv.N3Tree.from_volume(blobs, 4)
+    tree.nodes.loc_t4[3, 0] += 1
+    with pytest.raises(ValueError, match="a tile's place is not that of its parent"):
+        tree.validate()
+
+
+@pytest.mark.backend("cpp")
+def test_a_later_job_may_answer_before_an_earlier_one(blobs):
+    producer = Held(blobs)
+    with gv.Engine(producer, brick_size=4, loading="levels") as engine:
+        views = [camera(8, azimuth=azimuth, distance=0.5) for azimuth in (0, 90, 180)]
+        for view in views:
+            engine.frame(view, GRAY)
+            first, *others = producer.held
+            producer.held = others
+            producer.go()
+            producer.held = [first]
+        _, stats = engine.frame(views[-1], GRAY)
+        assert stats.pending > 0 and stats.frame == 4
+        producer.hold = False
+        producer.go()
+        assert engine.render(views[-1], GRAY).stats.converged
+        assert engine.production.failed == 0
+
+
+@pytest.mark.backend("cpp")
+def test_constants_do_not_depend_on_what_was_there_before(blobs):
+    """A producer that gives EMPTY nodes no constant shares pools with one that gives some: what it
+    shows is the same before and after."""
+
+    class Bare(Ball):
+        def classify(self, nodes):
+            outside = nodes.center.norm(dim=1) - nodes.radius > 0.7
+            return torch.where(outside, gv.Region.EMPTY, gv.Region.DATA)
+
+    other = gv.VolumeProducer(gv.Volume(blobs.data + 1, blobs.spacing, (900.0, 0.0, 0.0)))
+    views = [
+        gv.Camera.look_at((0, 0, 4), (0, 0, 0), (0, 1, 0), 40, 16, 16),
+        gv.Camera.look_at((920, 10, 140), (920, 10, 20), (0, 1, 0), 40, 16, 16),
+    ]
+    options = {"brick_size": 4, "brick_pool": "600 kB", "node_pool": 60 * 160}
+    with gv.Engine({"bare": Bare(64), "other": other}, **options) as engine:
+        before = engine.render(views[0], GRAY)
+        for _ in range(3):
+            engine.render(views[1], GRAY, max_frames=60)
+            after = engine.render(views[0], GRAY)
+            assert torch.equal(after.color, before.color) and before.alpha.max() > 0.3
+
+
+class Twins(Ball):
+    """The right half of the finest level is the same as the left one, by `fill`."""
+
+    how = "now"
+
+    def fill(self, nodes):
+        data = super().fill(nodes)["value"]
+        side = 2**nodes.layout.depth
+        right = (nodes.depth == nodes.layout.depth) & (nodes.loc[:, 0] >= side // 2)
+        same = torch.full_like(nodes.loc, 2**40)  # rows that are no alias may hold anything
+        same[right] = nodes.loc[right] - torch.tensor([side // 2, 0, 0, 0])
+        if self.how == "bad" and right.any():
+            same[right] = torch.tensor([0, 0, side, nodes.layout.depth])
+        if self.how == "nan":
+            left = (nodes.depth == nodes.layout.depth) & ~right
+            data[left] = float("nan")
+        if self.how == "raises" and not right.any() and (nodes.depth > 2).any():
+            raise OSError("no such brick")
+        kind = torch.where(right, gv.Region.ALIAS, gv.Region.DATA)
+        answer = gv.Bricks(data={"value": data}, kind=kind, alias=same)
+        if self.how != "later":
+            return answer
+        future: Future = Future()
+        future.set_result(answer)
+        return future
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("how", ["now", "later"])
+def test_a_brick_may_be_the_same_as_one_that_is_not_here(how):
+    """The camera sees the right half alone: its bricks are made from the left one's places."""
+    view = gv.Camera.look_at((0.6, 0.1, 2.5), (0.6, 0.1, 0), (0, 1, 0), 14, 24, 24)
+    twins = Twins()
+    twins.how = how
+    with gv.Engine(twins, **SIZE) as engine:
+        picture = engine.render(view, GRAY, lod="finest")
+        engine.validate()
+        assert picture.stats.converged and picture.stats.failed == 0
+        assert picture.alpha.max() > 0.2
+        whole = gv.Camera.look_at((0, 0, 5), (0, 0, 0), (0, 1, 0), 28, 32, 32)
+        engine.render(whole, GRAY, lod="finest")
+        engine.validate()
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [("bad", "is no node of this tree"), ("nan", "NaN"), ("raises", "OSError: no such brick")],
+)
+def test_aliases_fail_as_other_answers_do(how, message):
+    twins = Twins()
+    twins.how = how
+    with gv.Engine(twins, **SIZE) as engine:
+        picture = engine.render(camera(), GRAY, lod="finest")
+        engine.validate()
+        assert picture.stats.converged and picture.stats.failed > 0
+        assert torch.isfinite(picture.color).all()
+        assert any(message in failure.message for failure in engine.failures)
+
+
+@pytest.mark.backend("cpp")
+def test_a_root_may_be_constant_by_fill():
+    class Flat(gv.Producer):
+        def fill(self, nodes):
+            side = nodes.layout.brick_size + 2
+            kind = torch.full((len(nodes),), gv.Region.CONSTANT)
+            value = {"value": torch.full((len(nodes), 1), 0.7)}
+            data = {"value": torch.zeros((len(nodes), side, side, side))}
+            return gv.Bricks(data=data, kind=kind, constants=value)
+
+    for extent in (8, 64):
+        with gv.Engine(Flat(extent)) as engine:
+            assert engine.render(camera(8), GRAY).alpha.max() > 0.9
+
+
+@pytest.mark.backend("cpp")
+def test_what_failed_counts_once_even_when_its_tile_comes_back():
+    options = {**SIZE, "node_pool": 14 * 160}
+    seen = set()
+    with gv.Engine(Broken("names"), **options) as engine:
+        for _ in range(4):
+            for azimuth in (30, 45, 60):
+                view = camera(12, elevation=35, azimuth=azimuth, distance=0.8)
+                stats = engine.render(view, GRAY, lod="finest", max_frames=200).stats
+        seen = {failure.loc for failure in engine.failures}
+        assert stats.failed == len(seen) == len(engine.failures) > 0
+
+
+@pytest.mark.backend("cpp")
+def test_a_producer_that_always_raises_is_not_asked_for_ever():
+    calls = []
+
+    class Never(Ball):
+        def fill(self, nodes):
+            if (nodes.depth == 0).any():
+                return super().fill(nodes)
+            calls.append(len(nodes))
+            raise RuntimeError("out of order")
+
+    with gv.Engine(Never(256), **{**SIZE, "node_pool": "4 MB"}) as engine:
+        picture = engine.render(camera(64), GRAY, lod="finest")
+        assert picture.stats.failed > 2000 and len(calls) < 0.6 * picture.stats.failed
+        assert picture.stats.converged and picture.alpha.max() > 0.1
+
+
+def test_a_producer_serves_one_engine_at_a_time(blobs):
+    producer = gv.VolumeProducer(blobs)
+    with gv.Engine(producer, brick_size=4):
+        with pytest.raises(ValueError, match="serves another engine"):
+            gv.Engine(producer, brick_size=8)
+    with gv.Engine(producer, brick_size=8) as engine:
+        assert engine.frame(camera(8), GRAY)[0].alpha.max() > 0
+    with pytest.raises(ValueError, match="Engine: it is closed"):
+        engine.render(camera(8), GRAY)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import runpy
 import shutil
 import time
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES, shared
+from conftest import DEVICES, ROOT, shared
 from test_store import Handler, served  # noqa: F401
 
 import gvtorch as gv
@@ -19,6 +20,7 @@ from gvtorch.io.store import Store
 from gvtorch.producers.stored import HostCache
 from gvtorch.production import ProductionError
 
+Memory = runpy.run_path(str(ROOT / "benchmarks" / "store.py"))["Memory"]
 VESSELS = gv.TransferFunction.preset("vessels", 0, 255)
 GRAY = gv.TransferFunction.preset("gray", 0, 255)
 PARTS = ("color", "alpha", "depth", "samples")
@@ -307,7 +309,9 @@ def test_a_foreign_image_is_streamed_as_well(tmp_path, cloud):
 
 @pytest.mark.backend("cpp")
 def test_a_store_of_1024_cubed_from_small_pools(tmp_path):
-    """A generated volume of 1 GiB: pools of a sixteenth give the picture of pools that hold all."""
+    """A generated volume of 1 GiB, converted in less than 2 GB: pools of a sixteenth give the
+    picture of pools that hold all.
+    """
     raw = np.lib.format.open_memmap(
         tmp_path / "big.npy", mode="w+", dtype=np.uint8, shape=(1024,) * 3
     )
@@ -324,7 +328,9 @@ def test_a_store_of_1024_cubed_from_small_pools(tmp_path):
     raw.flush()
     del raw
     folder = tmp_path / "big.zarr"
-    convert(tmp_path / "big.npy", folder)
+    with Memory() as memory:
+        convert(tmp_path / "big.npy", folder)
+    assert memory.most < 2e9, "this process, all that the tests left in it, and the workers"
     (tmp_path / "big.npy").unlink()
     views = [camera(64, distance=d, azimuth=a) for d, a in ((1.3, 20), (0.3, 200))]
     with gv.Engine(gv.StoredProducer(folder), brick_pool="900 MB", node_pool="40 MB") as engine:

@@ -220,8 +220,13 @@ class StoredProducer(Producer):
         border, found = keys[0][5], dict[Key, np.ndarray | str]()
         for key, place in zip(keys, places, strict=True):
             low = place * side - border
-            high = low + side + 2 * border
-            found[key] = store.read_region(level, low.tolist(), high.tolist(), timeout=self.timeout)
+            high = (low + side + 2 * border).tolist()
+            try:
+                found[key] = store.read_region(level, low.tolist(), high, timeout=self.timeout)
+            except TimeoutError:
+                raise
+            except (OSError, ValueError) as error:
+                found[key] = str(error)
         return found
 
     def _cut(
