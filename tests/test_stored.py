@@ -21,7 +21,6 @@ from gvtorch.producers.stored import HostCache
 from gvtorch.production import ProductionError
 
 Memory = runpy.run_path(str(ROOT / "benchmarks" / "store.py"))["Memory"]
-VESSELS = gv.TransferFunction.preset("vessels", 0, 255)
 GRAY = gv.TransferFunction.preset("gray", 0, 255)
 PARTS = ("color", "alpha", "depth", "samples")
 
@@ -330,7 +329,7 @@ def test_a_store_of_1024_cubed_from_small_pools(tmp_path):
     folder = tmp_path / "big.zarr"
     with Memory() as memory:
         convert(tmp_path / "big.npy", folder)
-    assert memory.most < 2e9, "this process, all that the tests left in it, and the workers"
+    assert 1e8 < memory.most < 2e9, "this process, all that the tests left in it, and the workers"
     (tmp_path / "big.npy").unlink()
     views = [camera(64, distance=d, azimuth=a) for d, a in ((1.3, 20), (0.3, 200))]
     with gv.Engine(gv.StoredProducer(folder), brick_pool="900 MB", node_pool="40 MB") as engine:
