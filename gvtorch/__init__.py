@@ -11,7 +11,7 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from .engine import Engine
+    from .engine import Engine, EngineOptions
     from .frame import FrameStats, Hits, Rays
     from .io import read_volume
     from .pool import BrickPool, Channel, N3Tree, NodePool
@@ -26,6 +26,7 @@ _HOME = {
     "BrickPool": ".pool",
     "Bricks": ".producers",
     "Engine": ".engine",
+    "EngineOptions": ".engine",
     "FrameStats": ".frame",
     "Nodes": ".producers",
     "Producer": ".producers",
@@ -55,6 +56,7 @@ __all__ = [
     "Camera",
     "Channel",
     "Engine",
+    "EngineOptions",
     "FrameStats",
     "Hits",
     "N3Tree",

@@ -125,8 +125,12 @@ class Engine:
         self._frame_1 = torch.zeros(1, dtype=torch.int32, device=self.device)
         self._report = Report()
         self.plants: dict[str, Plant] = {}
-        for number, (name, producer) in enumerate(producers.items()):
-            self.plants[name] = self._plant(number, name, producer)
+        try:
+            for number, (name, producer) in enumerate(producers.items()):
+                self.plants[name] = self._plant(number, name, producer)
+        except Exception:
+            self.close()
+            raise
 
     def frame(
         self,
@@ -404,7 +408,6 @@ class Engine:
             )
         producer.to(self.device)
         producer.prepare(layout)
-        producer.layout = layout
         tree = N3Tree(
             *(nodes, bricks),
             depth=depth,
@@ -422,10 +425,12 @@ class Engine:
         try:
             self._fill_root(plant, root)
         except Exception as error:
+            producer.close()
             reason = str(error) or type(error).__name__
             raise ProductionError(
                 f"Engine: the root of tree {name!r} can't be made: {reason}"
             ) from error
+        producer.layout = layout  # it serves this engine now
         return plant
 
     def _fill_root(self, plant: Plant, root: Nodes) -> None:
