@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -171,7 +171,8 @@ class Engine:
         """One frame: what `frame` does, for all rays or for some of them once more."""
         start = time.perf_counter()
         stats = self._begin(chosen)
-        with collect_timings() if self.options.monitor else nullcontext(stats.stages) as timings:
+        timer = collect_timings() if self.options.monitor else nullcontext(stats.stages)
+        with self._unbroken(), timer as timings:
             with stage("write"):
                 self.production.write(self.production.late(), stats)
             trace = self._tracer(shader, chosen)
@@ -342,6 +343,15 @@ class Engine:
     def __exit__(self, *_error: object) -> None:
         """Closes it."""
         self.close()
+
+    @contextmanager
+    def _unbroken(self) -> Iterator[None]:
+        """Leaves nothing marked as on its way that is not, whatever breaks a frame off."""
+        try:
+            yield
+        except BaseException:
+            self.production.mark_anew()
+            raise
 
     def _begin(self, options: RenderOptions) -> FrameStats:
         """Counts the frame up: what is stamped with its number is in use."""

@@ -154,10 +154,10 @@ class Production:
         done: list[tuple[Job, Regions | Bricks]] = []
         for item in list(self._waiting):
             if item.future.done():
-                self._waiting.remove(item)
                 seconds = time.monotonic() - item.since
                 self.scheduler.learn(item.job.kind, len(item.job), 1e3 * seconds)
                 self._settle(item.job, item.future.result, done)
+                self._waiting.remove(item)
             elif time.monotonic() - item.since > self._patience(item.job):
                 self._waiting.remove(item)
                 item.future.cancel()
@@ -237,6 +237,12 @@ class Production:
         """Lets what failed be asked for again."""
         self.failures.clear()
         self._failed.clear()
+        self.mark_anew()
+
+    def mark_anew(self) -> None:
+        """Marks as pending what is on its way and nothing else: after a frame that was broken off,
+        or to forget failures.
+        """
         for kind in KINDS.values():
             everything = torch.arange(
                 self.cache.nodes.request_tn.numel(), device=self.cache.nodes.request_tn.device

@@ -574,3 +574,53 @@ def test_a_producer_serves_one_engine_at_a_time(blobs):
         assert engine.frame(camera(8), GRAY)[0].alpha.max() > 0
     with pytest.raises(ValueError, match="Engine: it is closed"):
         engine.render(camera(8), GRAY)
+
+
+class Unready(Future):
+    """Done when it is looked at for the second time."""
+
+    def __init__(self, answer):
+        super().__init__()
+        self.answer, self.looks = answer, 0
+
+    def done(self):
+        self.looks += 1
+        return self.looks > 1
+
+    def result(self, timeout=None):
+        return self.answer()
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("later", [False, True])
+def test_a_frame_that_is_broken_off_loses_nothing(later):
+    """Ctrl-C in the middle of production, as in a notebook: the next picture is whole. Where
+    answers are late, bricks are here and tiles are being looked at."""
+    broken = []
+
+    class Stopped(Ball):
+        def classify(self, nodes):
+            def answer():
+                if (nodes.depth == nodes.layout.depth).any() and len(broken) < 3:
+                    broken.append(len(nodes))
+                    raise KeyboardInterrupt
+                return torch.full((len(nodes),), gv.Region.DATA)
+
+            root = (nodes.depth == 0).any()
+            return Unready(answer) if later and not root else answer()
+
+        def fill(self, nodes):
+            data = super().fill(nodes)
+            return Unready(lambda: data) if later and not (nodes.depth == 0).any() else data
+
+    view, options = camera(distance=1.0), {**SIZE, "loading": "levels"}
+    with gv.Engine(Ball(64), **options) as plain, gv.Engine(Stopped(64), **options) as engine:
+        for _ in range(3):
+            with pytest.raises(KeyboardInterrupt):
+                for azimuth in range(0, 180, 4):
+                    engine.frame(camera(8, distance=1.0, azimuth=azimuth), GRAY, lod="finest")
+        engine.production.wait = lambda *_, **__: None  # nothing wakes an Unready
+        picture = engine.render(view, GRAY, lod="finest")
+        engine.validate()
+        assert picture.stats.converged and picture.stats.failed == 0 and len(broken) == 3
+        assert torch.equal(picture.color, plain.render(view, GRAY, lod="finest").color)
