@@ -52,11 +52,13 @@ def write_volume(file: Path, side: int) -> None:
 
 
 class Memory:
-    """Largest memory of this process and its children together, while it runs (Linux)."""
+    """Largest memory of this process and its children together, while it runs, and the first that
+    was seen (Linux).
+    """
 
     def __init__(self) -> None:
         """Starts at nothing."""
-        self.most, self._ends = 0, threading.Event()
+        self.most, self.first, self._ends = 0, 0, threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
     def __enter__(self) -> Memory:
@@ -81,6 +83,7 @@ class Memory:
                         total += next(int(line.split()[1]) for line in lines if "Pss:" in line)
                 except OSError:
                     continue
+            self.first = self.first or total * 1024
             self.most = max(self.most, total * 1024)
 
 

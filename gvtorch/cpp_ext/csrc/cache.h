@@ -25,6 +25,7 @@ struct KeepOpenRequest {
 
 // Lists a request; what a full list has no place for is only counted.
 struct PutRequest {
+  static constexpr bool kDense = false;  // few of the indices are kept
   const int32_t* request_tn;
   int32_t* node_k;
   int32_t* word_k;
@@ -44,6 +45,7 @@ struct KeepWish {
 };
 
 struct PutNothing {
+  static constexpr bool kDense = false;
   GV_HD void operator()(int64_t, int64_t) const {}
 };
 
@@ -62,19 +64,26 @@ struct ClearWishes {
   }
 };
 
-struct KeepByUse {
+struct FlagUse {
   const int32_t* order_k;
   const int32_t* stamp_s;
   int64_t slots;
   const int32_t* frame_1;
-  bool used;
-  GV_HD bool operator()(int64_t index) const {
+  uint8_t* used_k;
+  GV_HD void operator()(int64_t index) const {
     const int32_t slot = order_k[index];
-    return (slot >= 0 && slot < slots && stamp_s[slot] == *frame_1) == used;
+    used_k[index] = slot >= 0 && slot < slots && stamp_s[slot] == *frame_1;
   }
 };
 
+struct KeepByUse {
+  const uint8_t* used_k;
+  uint8_t used;
+  GV_HD bool operator()(int64_t index) const { return used_k[index] == used; }
+};
+
 struct PutSlot {
+  static constexpr bool kDense = true;
   const int32_t* order_k;
   int32_t* out_k;
   const int64_t* first;

@@ -214,8 +214,12 @@ std::tuple<Tensor, Tensor> lru_partition(const Tensor& order_k, const Tensor& st
   Tensor unused_1 = torch::stable::new_zeros(order_k, {2}, ScalarType::Long);
   auto* count = static_cast<int64_t*>(unused_1.mutable_data_ptr());
   const int64_t size = order_k.numel();
-  for (const bool used : {false, true}) {
-    const KeepByUse keep{words_in(order_k), words_in(stamp_s), stamp_s.numel(), words_in(frame_1), used};
+  Tensor used_k = torch::stable::new_empty(order_k, {size}, ScalarType::Byte);
+  auto* flags = static_cast<uint8_t*>(used_k.mutable_data_ptr());
+  for_each<Device>(order_k, size,
+                   FlagUse{words_in(order_k), words_in(stamp_s), stamp_s.numel(), words_in(frame_1), flags});
+  for (const uint8_t used : {0, 1}) {
+    const KeepByUse keep{flags, used};
     const PutSlot put{words_in(order_k), words_out(sorted_k), used ? count : count + 1};
     compact<Device>(order_k, size, keep, put, used ? count + 1 : count);
   }
