@@ -240,24 +240,18 @@ class Engine:
             ValueError: The mode is unknown, or see `frame`.
             ProductionError: See `frame`.
         """
-        check.whole("render", "productions", productions, low=1)
-        check.whole("render", "max_frames", max_frames, low=1)
-        limits = {"interactive": 1, "balanced": productions, "converge": max_frames}
-        if mode not in limits:
-            raise ValueError(
-                f"render: mode must be 'interactive', 'balanced' or 'converge', got {mode!r}"
-            )
+        most = _most_frames(mode, productions, max_frames)
         chosen = render_options("render", camera, options)
         count = len(camera) * camera.height * camera.width
         turns = Turns(count, camera.width, self.device)
         total, hits = FrameStats(), None
-        for number in range(1, limits[mode] + 1):
+        for number in range(1, most + 1):
             again = (hits, turns.now) if mode == "converge" and hits is not None else None
             hits, stats = self._pass(camera, shader, chosen, no_progress, again)
             _add_up(total, stats)
             if mode == "converge":
                 turns.take(hits.missed, stats, total.failed)
-                if number == limits[mode] - 1:
+                if number == most - 1:
                     turns.everyone()
                 progress("rays", turns.done, turns.count)
                 if turns.over:
@@ -266,7 +260,7 @@ class Engine:
                     self.production.wait(stats.milliseconds / 1e3)
             elif stats.converged:
                 break
-            elif stats.pending and number < limits[mode]:  # as long as another frame would take
+            elif stats.pending and number < most:  # as long as another frame would take
                 self.production.wait(limit=stats.milliseconds / 1e3)
             total.failed = stats.failed
         assert hits is not None
@@ -471,6 +465,17 @@ class Engine:
 
     def _now(self, answer: Any) -> Any:
         return answer.result(self.options.patience) if hasattr(answer, "result") else answer
+
+
+def _most_frames(mode: str, productions: int, max_frames: int) -> int:
+    check.whole("render", "productions", productions, low=1)
+    check.whole("render", "max_frames", max_frames, low=1)
+    limits = {"interactive": 1, "balanced": productions, "converge": max_frames}
+    if mode not in limits:
+        raise ValueError(
+            f"render: mode must be 'interactive', 'balanced' or 'converge', got {mode!r}"
+        )
+    return limits[mode]
 
 
 def _device(device: torch.device | str) -> torch.device:

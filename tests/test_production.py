@@ -1,0 +1,348 @@
+"""Production: late answers, answers that fail, and frames that are broken off."""
+
+from __future__ import annotations
+
+import random
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import pytest
+import torch
+from test_producers import GRAY, SIZE, Ball, camera
+
+import gvtorch as gv
+from gvtorch import config
+from gvtorch.production import ProductionError
+
+
+class Broken(Ball):
+    """Fails in one way for nodes in one corner of the finest level."""
+
+    def __init__(self, how):
+        super().__init__()
+        self.how = how
+
+    def bad(self, nodes):
+        return (nodes.loc[:, :3] >= 4).all(1) & (nodes.depth == nodes.layout.depth)
+
+    def fill(self, nodes):
+        data, bad = super().fill(nodes)["value"], self.bad(nodes)
+        if not bad.any():
+            return {"value": data}
+        if self.how == "raises":
+            raise RuntimeError("the disk is on fire")
+        if self.how == "raises later":
+            future: Future = Future()
+            future.set_exception(RuntimeError("the disk is on fire"))
+            return future
+        if self.how == "never answers":
+            return Future()
+        if self.how == "nan":
+            data[bad] = float("nan")
+            return {"value": data}
+        if self.how == "names":
+            wrong = {int(i): "chunk 7 is damaged" for i in bad.nonzero()[:, 0]}
+            return gv.Bricks(data={"value": data}, errors=wrong)
+        return {"shape": {"value": data[:, 1:]}, "dtype": {"value": data.double()}}.get(
+            self.how, {"colour": data}
+        )
+
+
+REASONS = {
+    "raises": "RuntimeError: the disk is on fire",
+    "raises later": "RuntimeError: the disk is on fire",
+    "never answers": "no answer within 0.2 s",
+    "nan": "channel 'value' holds NaN or infinite values",
+    "names": "chunk 7 is damaged",
+    "shape": "Broken.fill: data['value'] must be (",
+    "dtype": "float32, got",
+    "channel": "Broken.fill: channel 'value' is missing",
+}
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("how", REASONS)
+def test_what_fails_is_named_and_takes_nobody_with_it(how):
+    """The picture stays complete, coarser where bricks failed; each failure is named once."""
+    view = camera(elevation=35, azimuth=45)
+    with gv.Engine(Ball(), **SIZE) as whole, gv.Engine(Broken(how), patience=0.2, **SIZE) as engine:
+        expected = whole.render(view, GRAY, lod="finest")
+        start = time.monotonic()
+        picture = engine.render(view, GRAY, lod="finest")
+        assert time.monotonic() - start < 30
+        engine.validate()
+        stats = picture.stats
+        assert stats.converged and stats.failed == len(engine.failures) > 0
+        assert len({failure.loc for failure in engine.failures}) == stats.failed
+        failure = engine.failures[0]
+        assert failure.kind == "load" and failure.tree == "scene" and failure.loc[3] == 3
+        assert REASONS[how] in failure.message, failure
+        x, y, z, _ = failure.loc
+        assert f"depth 3, node ({x}, {y}, {z}), load: " in str(failure)
+        if how in ("raises", "nan", "names"):  # a whole batch of the wrong shape is lost
+            assert all(min(failure.loc[:3]) >= 4 for failure in engine.failures)
+        assert (picture.color - expected.color).abs().max() < 0.2
+        assert not torch.equal(picture.color, expected.color)
+        again = engine.render(view, GRAY, lod="finest")
+        assert again.stats.failed == stats.failed, "what failed is not asked for again"
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("how", REASONS)
+def test_a_strict_engine_raises_what_failed(how):
+    with gv.Engine(Broken(how), patience=0.2, strict=True, **SIZE) as engine:
+        with pytest.raises(ProductionError) as caught:
+            engine.render(camera(elevation=35, azimuth=45), GRAY, lod="finest")
+        assert REASONS[how] in str(caught.value) and "depth 3, node" in str(caught.value)
+        engine.validate()
+        engine.production.strict = False
+        picture = engine.render(camera(elevation=35, azimuth=45), GRAY, lod="finest")
+        assert picture.stats.converged and picture.alpha.max() > 0.3, "and it goes on"
+
+
+@pytest.mark.backend("cpp")
+def test_failures_can_be_forgotten_and_are_then_asked_for_again():
+    view, broken = camera(elevation=35, azimuth=45), Broken("raises")
+    with gv.Engine(Ball(), **SIZE) as whole, gv.Engine(broken, **SIZE) as engine:
+        assert engine.render(view, GRAY, lod="finest").stats.failed > 0
+        broken.how = "nothing"
+        broken.bad = lambda nodes: torch.zeros(len(nodes), dtype=torch.bool)
+        engine.forget_failures()
+        picture = engine.render(view, GRAY, lod="finest")
+        assert picture.stats.failed == 0 and engine.failures == []
+        assert torch.equal(picture.color, whole.render(view, GRAY, lod="finest").color)
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (lambda n: None, "classify: must return Regions or a tensor, got NoneType"),
+        (lambda n: torch.zeros(3), "classify: kind must be (8,) of Region, got (3,) float32"),
+        (lambda n: torch.full((len(n),), 9), "9 is no Region"),
+        (lambda n: torch.full((len(n),), 4), "classify: alias must be (8, 4)"),
+        (
+            lambda n: gv.Regions(kind=torch.full((len(n),), 2), ranges={"value": torch.zeros(2)}),
+            "classify: ranges['value'] must be (8, 2, 1) float32",
+        ),
+        (
+            lambda n: gv.Regions(kind=torch.full((len(n),), 2), constants={"red": torch.zeros(8)}),
+            "classify: constants has channel 'red'; the producer has value",
+        ),
+    ],
+)
+def test_wrong_regions_are_named(answer, message):
+    class Wrong(Ball):
+        def classify(self, nodes):
+            return answer(nodes) if (nodes.depth > 0).any() else super().classify(nodes)
+
+    with gv.Engine(Wrong(), **SIZE) as engine:
+        picture = engine.render(camera(), GRAY)
+        assert picture.stats.failed >= 1 and message in engine.failures[0].message
+        assert engine.failures[0].kind == "subdivide" and picture.alpha.max() > 0.1
+
+
+@pytest.mark.parametrize("how", ["raises", "nan", "never answers"])
+def test_a_root_that_cannot_be_made_is_an_error_at_once(how):
+    class Rootless(Broken):
+        def bad(self, nodes):
+            return nodes.depth == 0
+
+    with pytest.raises(ProductionError, match="the root of tree 'scene' can't be made: "):
+        gv.Engine(Rootless(how), patience=0.1, **SIZE)
+
+
+@pytest.mark.backend("cpp")
+def test_an_answer_for_a_node_that_is_gone_is_dropped():
+    """Futures that come after their tile was evicted do no harm."""
+    slow = ThreadPoolExecutor(1)
+
+    class Slow(Ball):
+        def fill(self, nodes):
+            if (nodes.depth == 0).any():
+                return super().fill(nodes)
+            data = super().fill(nodes)
+            return slow.submit(lambda: (time.sleep(0.02), data)[1])
+
+    options = {**SIZE, "node_pool": 12 * 8 * 20}
+    with gv.Engine(Slow(128), **options) as engine:
+        for azimuth in range(0, 360, 20):
+            engine.frame(camera(8, azimuth=azimuth, distance=0.4), GRAY)
+            engine.validate()
+        picture = engine.render(camera(distance=9.0), GRAY)
+        engine.validate()
+        assert picture.stats.failed == 0
+    slow.shutdown()
+
+
+def test_pending_wishes_are_not_listed_twice(backend):
+    asked = []
+
+    class Never(Ball):
+        def fill(self, nodes):
+            if (nodes.depth == 0).any():
+                return super().fill(nodes)
+            asked.append(nodes.loc)
+            return Future()
+
+    device = "cuda" if backend == "cuda" else "cpu"
+    with gv.Engine(Never(), device=device, **SIZE) as engine:
+        for _ in range(6):
+            _, stats = engine.frame(camera(8), GRAY, backend=backend)
+        everything = torch.cat(asked)
+        assert len(everything.unique(dim=0)) == len(everything) == stats.pending
+        assert stats.misses >= stats.pending > 0 and not stats.converged
+        request = engine.cache.nodes.request_tn
+        bits = config.REQUEST_LOAD << config.REQUEST_PENDING_SHIFT
+        assert int((request & bits).count_nonzero()) == stats.pending
+
+
+class Held(gv.VolumeProducer):
+    """Keeps its answers back until `go`, which gives them in an order of its own."""
+
+    def __init__(self, volume, seed=0):
+        super().__init__(volume)
+        self.held, self.hold, self.random = [], True, random.Random(seed)
+
+    def later(self, answer, nodes):
+        if not self.hold or (nodes.depth == 0).any():
+            return answer(nodes)
+        self.held.append((future := Future(), answer, nodes))
+        return future
+
+    def go(self):
+        self.random.shuffle(self.held)
+        for future, answer, nodes in self.held:
+            future.set_result(answer(nodes))
+        self.held.clear()
+
+    def classify(self, nodes):
+        return self.later(super().classify, nodes)
+
+    def fill(self, nodes):
+        return self.later(super().fill, nodes)
+
+
+@pytest.mark.backend("cpp")
+def test_late_answers_never_land_in_the_wrong_place():
+    """Tiles come late, when their nodes are in no use, into pools of a few tiles: a node's own tile
+    may be the one that is given away for another node of the same answer."""
+    volume = gv.Volume(torch.rand((64, 64, 64), generator=torch.Generator().manual_seed(0)))
+    tree = gv.N3Tree.from_volume(volume, 4)
+    haze = gv.TransferFunction.from_points([(0, 0.0), (1, 0.02)])
+    pick = random.Random(3)
+    for trial in range(12):
+        producer, tiles = Held(volume, trial), pick.randint(12, 80)
+        with gv.Engine(producer, brick_size=4, brick_pool="8 MB", node_pool=tiles * 160) as engine:
+            for _ in range(20):
+                eye, target = ([pick.uniform(0, 64) for _ in range(3)] for _ in range(2))
+                view = gv.Camera.look_at(eye, target, (0, 1, 0), 30, 8, 8)
+                engine.frame(view, haze)
+                if pick.random() < 0.4:
+                    producer.go()
+                engine.validate()
+            producer.hold = False
+            producer.go()
+            picture = engine.render(view, haze)
+            engine.validate()
+            if picture.stats.converged:
+                assert torch.equal(picture.color, gv.render(tree, view, haze).color)
+
+
+@pytest.mark.backend("cpp")
+def test_a_later_job_may_answer_before_an_earlier_one(blobs):
+    producer = Held(blobs)
+    with gv.Engine(producer, brick_size=4, loading="levels") as engine:
+        views = [camera(8, azimuth=azimuth, distance=0.5) for azimuth in (0, 90, 180)]
+        for view in views:
+            engine.frame(view, GRAY)
+            first, *others = producer.held
+            producer.held = others
+            producer.go()
+            producer.held = [first]
+        _, stats = engine.frame(views[-1], GRAY)
+        assert stats.pending > 0 and stats.frame == 4
+        producer.hold = False
+        producer.go()
+        assert engine.render(views[-1], GRAY).stats.converged
+        assert engine.production.failed == 0
+
+
+@pytest.mark.backend("cpp")
+def test_what_failed_counts_once_even_when_its_tile_comes_back():
+    options = {**SIZE, "node_pool": 14 * 160}
+    seen = set()
+    with gv.Engine(Broken("names"), **options) as engine:
+        for _ in range(4):
+            for azimuth in (30, 45, 60):
+                view = camera(12, elevation=35, azimuth=azimuth, distance=0.8)
+                stats = engine.render(view, GRAY, lod="finest", max_frames=200).stats
+        seen = {failure.loc for failure in engine.failures}
+        assert stats.failed == len(seen) == len(engine.failures) > 0
+
+
+@pytest.mark.backend("cpp")
+def test_a_producer_that_always_raises_is_not_asked_for_ever():
+    calls = []
+
+    class Never(Ball):
+        def fill(self, nodes):
+            if (nodes.depth == 0).any():
+                return super().fill(nodes)
+            calls.append(len(nodes))
+            raise RuntimeError("out of order")
+
+    with gv.Engine(Never(256), **{**SIZE, "node_pool": "4 MB"}) as engine:
+        picture = engine.render(camera(64), GRAY, lod="finest")
+        assert picture.stats.failed > 2000 and len(calls) < 0.6 * picture.stats.failed
+        assert picture.stats.converged and picture.alpha.max() > 0.1
+
+
+class Unready(Future):
+    """Done when it is looked at for the second time."""
+
+    def __init__(self, answer):
+        super().__init__()
+        self.answer, self.looks = answer, 0
+
+    def done(self):
+        self.looks += 1
+        return self.looks > 1
+
+    def result(self, timeout=None):
+        return self.answer()
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("later", [False, True])
+def test_a_frame_that_is_broken_off_loses_nothing(later):
+    """Ctrl-C in the middle of production, as in a notebook: the next picture is whole. Where
+    answers are late, bricks are here and tiles are being looked at."""
+    broken = []
+
+    class Stopped(Ball):
+        def classify(self, nodes):
+            def answer():
+                if (nodes.depth == nodes.layout.depth).any() and len(broken) < 3:
+                    broken.append(len(nodes))
+                    raise KeyboardInterrupt
+                return torch.full((len(nodes),), gv.Region.DATA)
+
+            root = (nodes.depth == 0).any()
+            return Unready(answer) if later and not root else answer()
+
+        def fill(self, nodes):
+            data = super().fill(nodes)
+            return Unready(lambda: data) if later and not (nodes.depth == 0).any() else data
+
+    view, options = camera(distance=1.0), {**SIZE, "loading": "levels"}
+    with gv.Engine(Ball(64), **options) as plain, gv.Engine(Stopped(64), **options) as engine:
+        for _ in range(3):
+            with pytest.raises(KeyboardInterrupt):
+                for azimuth in range(0, 180, 4):
+                    engine.frame(camera(8, distance=1.0, azimuth=azimuth), GRAY, lod="finest")
+        engine.production.wait = lambda *_, **__: None  # nothing wakes an Unready
+        picture = engine.render(view, GRAY, lod="finest")
+        engine.validate()
+        assert picture.stats.converged and picture.stats.failed == 0 and len(broken) == 3
+        assert torch.equal(picture.color, plain.render(view, GRAY, lod="finest").color)
