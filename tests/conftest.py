@@ -101,9 +101,11 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
     """With GVTORCH_REQUIRE=cpp,io a run in which no test passed on the C++ backend has failed, and
-    so has one whose reader tests were skipped because a format's library is missing.
+    so has one whose tests were skipped because a format's, the video's or the cluster's library is
+    missing.
     """
     libraries = ("nibabel", "nrrd", "tifffile", "imagecodecs", "astropy")
+    libraries += ("av", "distributed", "zarr", "yaozarrs", "ome_zarr_models")
     _ran["io"] = int(all(importlib.util.find_spec(name) for name in libraries))
     needed = os.environ.get("GVTORCH_REQUIRE", "")
     if needed and exitstatus == 0 and not all(_ran[name] for name in needed.split(",")):

@@ -235,6 +235,7 @@ class Checked(gv.Engine):
 @given(data=st.data())
 @pytest.mark.backend("cpp")
 def test_pools_stay_in_order_over_random_frames(blobs, data):
+    """`Checked` asserts after every frame."""
     branching = data.draw(st.sampled_from([2, 3]))
     loading = data.draw(st.sampled_from(["straight", "levels"]))
     producer = Late(blobs, most=0.001) if data.draw(st.booleans()) else gv.VolumeProducer(blobs)

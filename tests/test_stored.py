@@ -130,6 +130,26 @@ def test_the_order_in_which_reads_come_back_does_not_matter(whole, cloud, monkey
 
 
 @pytest.mark.backend("cpp")
+@pytest.mark.parametrize("channels", [None, [2, 0]])
+def test_channels_of_a_store_are_components(tmp_path, cloud, channels):
+    """Three channels on disk, all or two of them in an order of one's own."""
+    values = cloud.data[..., 0]
+    three = torch.stack((values // 4, values // 2, values), -1)
+    volume = gv.Volume(three, cloud.spacing, cloud.origin)
+    convert(volume, tmp_path / "a.zarr")
+    picked = gv.Volume(three[..., channels] if channels else three, cloud.spacing, cloud.origin)
+    tree = gv.N3Tree.from_volume(picked)
+    for component in range(picked.data.shape[3]):
+        expected = gv.render(tree, camera(24), GRAY, component=component)
+        producer = gv.StoredProducer(tmp_path / "a.zarr", channels=channels)
+        with gv.Engine(producer) as engine:
+            picture = engine.render(camera(24), GRAY, component=component)
+        for name in PARTS:
+            assert torch.equal(getattr(picture, name), getattr(expected, name)), name
+        assert expected.alpha.max() > 0.05
+
+
+@pytest.mark.backend("cpp")
 def test_what_a_transfer_function_does_not_show_is_not_read(whole, monkeypatch):
     read, seen = Store.read_blocks, []
 
