@@ -15,6 +15,7 @@ import gvtorch as gv
 from gvtorch import config
 from gvtorch.ops import reference
 from gvtorch.rendering.renderer import Tracer, trace
+from gvtorch.rendering.shader import interval_levels
 
 SHADER = gv.TransferFunction.from_points(
     opacity=[(0, 0), (0.2, 0), (0.6, 0.4), (1, 1)],
@@ -34,7 +35,8 @@ def on(tree: gv.N3Tree, device: str) -> gv.N3Tree:
         border=tree.bricks.border,
         device=device,
     )
-    origin = tuple((tree.box[0] + 0.5 * torch.tensor(tree.spacing)).tolist())
+    half = 0.5 * torch.tensor(tree.spacing, dtype=torch.float64)
+    origin = tuple((tree.box[0] + half).tolist())
     copy = gv.N3Tree(
         *(nodes, bricks), depth=tree.depth, extent=tree.extent, spacing=tree.spacing, origin=origin
     )
@@ -51,7 +53,7 @@ def run(tree, backend, rays, shader=SHADER, **options):
     """Everything `trace_rays` writes, on the CPU."""
     device = DEVICES[backend]
     copy = on(tree, device)
-    moved = gv.Rays(**{n: t.to(device) for n, t in vars(rays).items()})
+    moved = rays.to(device)
     hits = trace(copy, moved, shader, gv.RenderOptions(backend=backend, **options))
     result = {n: t.cpu() for n, t in vars(hits).items()}
     marks = {
@@ -278,10 +280,10 @@ def test_strange_rays_end(blobs, backend):
 def test_no_rays(blobs, backend):
     tree = gv.N3Tree.from_volume(blobs, 4)
     rays = camera_rays(tree)
-    none = gv.Rays(**{n: t[:0] for n, t in vars(rays).items()})
+    none = rays[:0]
     device = DEVICES[backend]
     hits = trace(
-        on(tree, device), gv.Rays(**{n: t.to(device) for n, t in vars(none).items()}), SHADER
+        on(tree, device), none.to(device), SHADER
     )
     assert hits.color.shape == (0, 3) and hits.samples.shape == (0,)
 
@@ -308,21 +310,26 @@ def test_logarithm_and_power_are_accurate():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"origin_r3": torch.zeros(4, 2)}, "origin_r3 must be (4, 3) float32 on cpu, got (4, 2)"),
-        ({"direction_r3": torch.zeros(4, 3).double()}, "direction_r3 must be (4, 3) float32"),
         (
-            {"origin_r3": torch.zeros(4, 3, dtype=torch.int32)},
-            "origin_r3 must be (r, 3) float32 or",
+            {"origin_r3": torch.zeros(4, 2).double()},
+            "origin_r3 must be (4, 3) float64 on cpu, got (4, 2)",
+        ),
+        ({"direction_r3": torch.zeros(4, 3)}, "direction_r3 must be (4, 3) float64"),
+        (
+            {"table_lm4": torch.zeros(1, 4, 4, dtype=torch.int32)},
+            "table_lm4 must be (l, m, 4) float32 or float64",
         ),
         ({"cone_r2": torch.zeros(5, 2)}, "cone_r2 must be (4, 2)"),
         (
-            {"table_m4": torch.zeros(1, 4), "opaque_m": torch.zeros(1, dtype=torch.int32)},
-            "table_m4 needs at least 2 rows",
+            {"table_lm4": torch.zeros(1, 1, 4), "opaque_m": torch.zeros(1, dtype=torch.int32)},
+            "table_lm4 needs at least 1 length and 2 rows",
         ),
         ({"opaque_m": torch.zeros(3)}, "opaque_m must be"),
         ({"range_tn2c": torch.zeros(3)}, "range_tn2c must be"),
         ({"frame_1": torch.zeros(1)}, "frame_1 must be (1,) int32"),
-        ({"direction_r3": torch.zeros(3, 4).T}, "direction_r3 must be contiguous"),
+        ({"width": 3}, "4 rays are no whole rows of 3 pixels"),
+        ({"cone_scale": -1.0}, "cone_scale must be"),
+        ({"direction_r3": torch.zeros(3, 4).double().T}, "direction_r3 must be contiguous"),
         ({"branching": 1}, "branching must be an int >= 2"),
         ({"root": -1}, "root must be an int >= 0"),
         ({"component": 1}, "component must be an int >= 0 and <= 0"),
@@ -339,19 +346,25 @@ def test_bad_arguments_have_one_clear_message(blobs, change, message):
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
-def arguments(tree: gv.N3Tree, rays: int, shader: gv.TransferFunction = SHADER) -> dict:
+def arguments(
+    tree: gv.N3Tree, rays: int, shader: gv.TransferFunction = SHADER, dtype=torch.float32
+) -> dict:
     """Keyword arguments of the op for parallel rays through the middle of a tree."""
     device = tree.device
-    table, domain, opaque = shader.table(min(tree.spacing), torch.float32, device)
-    origin = torch.full((rays, 3), 0.25, device=device)
-    direction = torch.tensor([[0.3, 0.2, 1.0]], device=device).repeat(rays, 1) / 60
+    step = 0.5 * min(tree.spacing)
+    levels = interval_levels(tree.root_voxel, step)
+    table = shader.table(min(tree.spacing), step, levels, dtype, device)
     channel = tree.channel_names[0]
+    real = {"dtype": torch.float64, "device": device}
+    size = tree.box[1] - tree.box[0]
+    part = 0.25 + torch.linspace(0, 0.1, rays, dtype=torch.float64)[:, None]
+    direction = torch.tensor([0.3, 0.2, 1.0]) / torch.tensor([0.3, 0.2, 1.0]).norm()
     return {
-        "origin_r3": origin + torch.linspace(0, 0.1, rays, device=device)[:, None],
-        "direction_r3": direction,
-        "cone_r2": torch.tensor([[0.5, 0.02]], device=device).repeat(rays, 1),
-        "range_r2": torch.tensor([[0.0, 1e9]], device=device).repeat(rays, 1),
-        "bounds_23": tree.bounds(torch.float32),
+        "origin_r3": (tree.box[0] + part * size).to(device),
+        "direction_r3": direction.to(**real).repeat(rays, 1),
+        "cone_r2": torch.tensor([[0.5, 0.02]], **real).repeat(rays, 1),
+        "range_r2": torch.tensor([[0.0, 1e9]], **real).repeat(rays, 1),
+        "place_33": tree.place,
         "child_tn": tree.nodes.child_tn,
         "brick_tn": tree.nodes.brick_tn,
         "request_tn": tree.nodes.request_tn,
@@ -360,17 +373,17 @@ def arguments(tree: gv.N3Tree, rays: int, shader: gv.TransferFunction = SHADER) 
         "constant_tnc": tree.nodes.constants[channel],
         "range_tn2c": tree.nodes.ranges[channel],
         "stamp_b": tree.bricks.stamp_b,
-        "table_m4": table,
-        "domain_3": domain,
-        "opaque_m": opaque,
+        **vars(table),
         "frame_1": torch.tensor([3], dtype=torch.int32, device=device),
+        "width": 0,
         "branching": tree.branching,
         "root": tree.root,
         "max_depth": tree.depth,
         "border": tree.bricks.border,
         "component": 0,
+        "cone_scale": 1.0,
         "root_voxel": tree.root_voxel,
-        "step": 0.5 * min(tree.spacing),
+        "step": step,
         "stop_alpha": 0.99,
         "depth_alpha": 0.1,
         "by_level": False,
@@ -432,7 +445,7 @@ def run_by_level(tree, rays, shader, lod, by_level):
 def test_level_by_level_asks_for_a_brick_before_its_children(blobs, backend):
     tree = on(gv.N3Tree.from_volume(blobs, 4), DEVICES[backend])
     rays = camera_rays(tree, 8, distance=1.3)
-    rays = gv.Rays(**{n: t.to(tree.device) for n, t in vars(rays).items()})
+    rays = rays.to(tree.device)
     tree.nodes.child_tn.view(-1)[tree.root] = config.ABSENT
     tree.nodes.brick_tn.view(-1)[tree.root] = config.ABSENT
     kinds = {}

@@ -14,14 +14,18 @@ import gvtorch as gv
 from gvtorch.rendering.shader import PRESETS
 
 
+def table_of(function, spacing=1.0, step=1.0, levels=1, dtype=torch.float32):
+    return function.table(spacing, step, levels, dtype, "cpu")
+
+
 def look_up(function: gv.TransferFunction, value: np.ndarray) -> np.ndarray:
     """What the kernel does with the table, in float64."""
-    table, domain, _ = function.table(1.0, torch.float64, "cpu")
-    low, high, _ = domain.tolist()
-    place = np.clip((value - low) / (high - low) * (len(table) - 1), 0, len(table) - 1)
-    cell = np.minimum(np.floor(place), len(table) - 2).astype(int)
+    table = table_of(function, dtype=torch.float64)
+    rows = table.table_lm4[0].numpy()
+    low, high = table.domain_2.tolist()
+    place = np.clip((value - low) / (high - low) * (len(rows) - 1), 0, len(rows) - 1)
+    cell = np.minimum(np.floor(place), len(rows) - 2).astype(int)
     weight = (place - cell)[:, None]
-    rows = table.numpy()
     return rows[cell] + weight * (rows[cell + 1] - rows[cell])
 
 
@@ -41,23 +45,46 @@ def test_the_table_is_the_function_when_corners_are_whole_numbers(corners, seed)
     np.testing.assert_allclose(look_up(function, value), function(value), atol=1e-9)
 
 
-def test_tables_stay_small_for_plain_corners():
+def test_tables_have_corners_on_rows_and_a_thousand_rows_or_so():
     function = gv.TransferFunction.from_points([(0, 0), (40, 0), (60, 0.5), (255, 1)])
-    table, *_ = function.table(1.0, torch.float32, "cpu")
-    assert table.shape == (52, 4)
+    assert table_of(function).table_lm4.shape == (1, 51 * 21 + 1, 4)
+
+
+def test_each_length_of_interval_has_its_alpha():
+    function = gv.TransferFunction.from_points([(0, 0), (1, 0.5), (2, 1)], reference=3)
+    value = np.linspace(0, 2, 2049)
+    assert table_of(function, step=0.75, levels=5).table_lm4.shape == (5, 1025, 4)
+    for level in range(5):
+        alpha = table_of(function, step=0.75, levels=5, dtype=torch.float64).table_lm4[level, :, 3]
+        exact = 1 - (1 - function(value[::2])[:, 3]) ** (0.75 * 2**level / 3)
+        np.testing.assert_allclose(alpha.numpy(), exact, atol=1e-12)
+
+
+def test_long_tables_have_fewer_lengths():
+    function = gv.TransferFunction.from_points([(0, 0), (1, 0.5), (2, 0), (1e6, 0)])
+    levels, rows, _ = table_of(function, levels=20).table_lm4.shape
+    assert rows == 10**6 + 1 and levels == 4
+
+
+def test_an_edited_function_has_another_table_and_the_same_one_is_kept():
+    function = gv.TransferFunction.from_points([(0, 0), (1, 0.5)])
+    first = table_of(function)
+    assert table_of(function) is first
+    function.opacity[1, 1] = 0.25
+    assert table_of(function).table_lm4[0, -1, 3] == 0.25
 
 
 def test_corners_without_a_shared_grid_are_sampled_finely():
     points = [(0.0, 0.0), (2**-0.5, 0.9), (1.1**0.5, 0.1), (1.2345678, 1.0)]
     function = gv.TransferFunction.from_points(points)
     value = np.linspace(-0.1, 1.3, 10001)
-    assert np.abs(look_up(function, value) - function(value)).max() < 1e-4
+    assert np.abs(look_up(function, value) - function(value)).max() < 1e-3
 
 
 def test_corners_too_close_for_any_table_are_refused():
     function = gv.TransferFunction.from_points([(0, 0), (1e-3, 0.5), (2e-3, 0), (1e6, 0)])
     with pytest.raises(ValueError, match=r"values .* are too close for a table of"):
-        function.table(1.0, torch.float32, "cpu")
+        table_of(function)
 
 
 def test_far_corners_on_a_fine_grid_are_exact():
@@ -78,12 +105,11 @@ def test_one_point_is_a_constant():
 
 
 def test_reference_is_the_smallest_spacing_unless_given():
-    points = [(0, 0), (1, 1)]
-    assert (
-        gv.TransferFunction(points, [(0, 1, 1, 1)]).table(0.25, torch.float32, "cpu")[1][2] == 0.25
-    )
-    own = gv.TransferFunction(points, [(0, 1, 1, 1)], reference=3)
-    assert own.table(0.25, torch.float32, "cpu")[1][2] == 3
+    points = [(0, 0), (1, 0.5)]
+    for reference, expected in ((None, 0.25), (3, 3)):
+        function = gv.TransferFunction(points, [(0, 1, 1, 1)], reference)
+        alpha = float(table_of(function, spacing=0.25, step=0.125).table_lm4[0, -1, 3])
+        assert alpha == pytest.approx(1 - 0.5 ** (0.125 / expected))
 
 
 def test_json_round_trip(tmp_path):

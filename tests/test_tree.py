@@ -139,8 +139,8 @@ def test_box_runs_from_face_to_face(blobs):
     tree = gv.N3Tree.from_volume(blobs)
     low, high = tree.box.tolist()
     assert low == pytest.approx([4.5, -3.4, 1.25]) and high == pytest.approx([49.5, 19.8, 56.75])
-    point, _ = tree.to_tree(tree.box.clone(), torch.ones(2, 3, dtype=torch.float64))
-    assert torch.allclose(point, tree.bounds(torch.float64))
+    corner, size, far = tree.place
+    assert torch.equal(corner, tree.box[0]) and torch.allclose(corner + far * size, tree.box[1])
 
 
 def test_channels_keep_dtype_and_width(blobs):

@@ -15,10 +15,12 @@ from __future__ import annotations
 
 import hashlib
 import os
+import platform
 import shlex
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from setuptools.command.bdist_wheel import bdist_wheel
@@ -26,6 +28,15 @@ from setuptools.command.build_ext import build_ext
 
 ARCHS = "75;80;86;89;90;100;120"
 TARGET_VERSION = "0x020b000000000000"  # torch 2.11, the oldest that may load the libraries
+# The CPU's kernels are compiled once for each; the processor chooses when the library is loaded.
+INSTRUCTION_SETS = {
+    "baseline": [],
+    "avx2": ["-mavx2", "-mf16c"],
+    "avx512": [
+        *("-mavx2", "-mf16c", "-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl"),
+        *("-mprefer-vector-width=512", "-Wno-maybe-uninitialized"),  # GCC's own header warns
+    ],
+}
 FOLDER = Path("gvtorch") / "cpp_ext"
 
 
@@ -45,42 +56,44 @@ def find_nvcc() -> str | None:
     return nvcc
 
 
-def commands(output: Path) -> dict[Path, list[str]]:
-    """Returns the compiler call of each library, by the library's path under `output`."""
+def commands(output: Path) -> dict[Path, list[list[str]]]:
+    """Returns the compiler calls of each library, by the library's path under `output`; all but the
+    last, which links, may run side by side.
+    """
     import torch
 
     root = Path(torch.__file__).parent
     source = FOLDER / "csrc"
     # Contraction stays off: a fused multiply-add would round other than the torch twin does.
-    shared = ["-std=c++17", "-O3", "-shared", f"-DTORCH_TARGET_VERSION={TARGET_VERSION}"]
+    shared = ["-std=c++17", "-O3", f"-DTORCH_TARGET_VERSION={TARGET_VERSION}"]
     include = ["-isystem", str(root / "include")]
-    link = [f"-L{root / 'lib'}", "-ltorch", "-ltorch_cpu"]
+    link = ["-shared", f"-L{root / 'lib'}", "-ltorch", "-ltorch_cpu"]
     cxx = [*shlex.split(os.environ.get("CXX", "g++")), *shared, "-fPIC", "-Wall", "-Wextra"]
-    cxx += [
-        "-ffp-contract=off",
-        "-fno-math-errno",
-        "-fvisibility=hidden",
-        *include,
-        str(source / "cpu.cpp"),
-    ]
-    calls = {output / "libgvtorch_cpu.so": [*cxx, "-Wl,--no-as-needed", *link, "-pthread"]}
+    cxx += ["-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden", "-Wno-psabi"]
+    x86 = platform.machine().lower() in ("x86_64", "amd64")
+    parts = {"cpu": (["-DGV_X86"] if x86 else []) + include}
+    for name, flags in INSTRUCTION_SETS.items():
+        if x86 or name == "baseline":
+            parts[f"lanes_{name}"] = [f"-DGV_NAMESPACE={name}", *flags]
+    objects = [str(output / f"{name}.o") for name in parts]
+    calls = {
+        output / "libgvtorch_cpu.so": [
+            *(
+                [*cxx, *flags, "-c", str(source / f"{name.split('_')[0]}.cpp"), "-o", target]
+                for (name, flags), target in zip(parts.items(), objects, strict=True)
+            ),
+            [cxx[0], *objects, "-Wl,--no-as-needed", *link, "-pthread"],
+        ]
+    }
     nvcc = find_nvcc()
     if nvcc is not None:
         archs = os.environ.get("GVTORCH_CUDA_ARCHS", ARCHS).split(";")
         codes = [f"-gencode=arch=compute_{a},code=sm_{a}" for a in archs]
         codes.append(f"-gencode=arch=compute_{archs[-1]},code=compute_{archs[-1]}")
-        call = [
-            nvcc,
-            *shared,
-            "-DUSE_CUDA",
-            "-fmad=false",
-            "-Xcompiler=-fPIC,-fvisibility=hidden",
-            "--threads=2",
-            *codes,
-            *include,
-        ]
+        call = [nvcc, *shared, "-DUSE_CUDA", "-fmad=false"]
+        call += ["-Xcompiler=-fPIC,-fvisibility=hidden", "--threads=2", *codes, *include]
         call += [str(source / "cuda.cu"), "-Xlinker=--no-as-needed", *link, "-cudart=static"]
-        calls[output / "libgvtorch_cuda.so"] = call
+        calls[output / "libgvtorch_cuda.so"] = [call]
     return calls
 
 
@@ -90,15 +103,22 @@ def compile_libraries(output: Path) -> list[Path]:
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
     output.mkdir(parents=True, exist_ok=True)
     libraries = []
-    for library, call in commands(output).items():
+    for library, calls in commands(output).items():
         stamp = library.with_suffix(".stamp")
-        state = digest + " " + shlex.join(call)
+        state = digest + " " + " ; ".join(shlex.join(call) for call in calls)
         if not (library.exists() and stamp.exists() and stamp.read_text() == state):
-            print("gvtorch:", shlex.join([*call, "-o", str(library)]), file=sys.stderr, flush=True)
-            subprocess.run([*call, "-o", str(library)], check=True)
+            *parts, last = calls
+            with ThreadPoolExecutor(os.cpu_count()) as pool:
+                list(pool.map(_run, parts))
+            _run([*last, "-o", str(library)])
             stamp.write_text(state)
         libraries.append(library)
     return libraries
+
+
+def _run(call: list[str]) -> None:
+    print("gvtorch:", shlex.join(call), file=sys.stderr, flush=True)
+    subprocess.run(call, check=True)
 
 
 class BuildExt(build_ext):

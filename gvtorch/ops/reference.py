@@ -13,6 +13,7 @@ docs/design.md, section 3.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -30,63 +31,169 @@ from .exact import clamp, divide, exp2_exact, larger, log2_exact, smaller
 INF = math.inf
 
 
-# --- the intervals of a ray
-# -------------------------------------------------------------------------------
+# --- rays
+# -----------------------------------------------------------------------------------------
+
+
+@dataclass
+class Beam:
+    """Rays in tree units, begun where they enter the scene; distances stay world lengths."""
+
+    origin: Tensor  # (r, 3)
+    direction: Tensor  # (r, 3)
+    high: Tensor  # (3,) corner of the scene; its low corner is 0
+    cone_near: Tensor  # (r,)
+    cone_growth: Tensor  # (r,)
+    first: Tensor  # (r,)
+    last: Tensor  # (r,)
+    moved: Tensor  # (r,) distance from the camera to the origin
+
+    @classmethod
+    def enter(
+        cls,
+        origin_r3: Tensor,
+        direction_r3: Tensor,
+        cone_r2: Tensor,
+        range_r2: Tensor,
+        place_33: Tensor,
+        cone_scale: float,
+        real: torch.dtype,
+    ) -> Beam:
+        """Brings world rays into the tree in float64, then rounds them to `real`."""
+        corner, size, high = place_33
+        origin, direction = (origin_r3 - corner) / size, direction_r3 / size
+        low_t, high_t = -origin / direction, (high - origin) / direction
+        near = torch.full_like(origin[:, 0], -INF)
+        for axis in range(3):
+            entry = larger(near, smaller(low_t[:, axis], high_t[:, axis]))
+            near = torch.where(direction[:, axis] != 0, entry, near)
+        moved = torch.where((near > 0) & (near < INF), near, 0.0)
+        growth = cone_r2[:, 1] * cone_scale
+        columns = (
+            origin + moved[:, None] * direction,
+            direction,
+            high,
+            cone_r2[:, 0] * cone_scale + growth * moved,
+            growth,
+            range_r2[:, 0] - moved,
+            range_r2[:, 1] - moved,
+            moved,
+        )
+        beam = cls(*(column.to(real) for column in columns))
+        beam.clip()
+        return beam
+
+    def clip(self) -> None:
+        """Cuts the distances at the scene (slab test, Kay and Kajiya, 1986); what no face bounds is
+        closed.
+        """
+        first, last = self.first, self.last
+        for axis in range(3):
+            origin, direction = self.origin[:, axis], self.direction[:, axis]
+            a, b = -origin / direction, (self.high[axis] - origin) / direction
+            flat = direction == 0
+            beside = flat & ~((origin >= 0) & (origin <= self.high[axis]))
+            last = torch.where(beside, first, last)
+            first = torch.where(flat, first, larger(first, smaller(a, b)))
+            last = torch.where(flat, last, smaller(last, larger(a, b)))
+        self.first, self.last = first, torch.where(last < INF, last, first)
+
+    def at(self, which: Tensor, t: Tensor) -> Tensor:
+        """(k, 3) places of some rays inside the root cube: a place on the scene's high face belongs
+        to the scene.
+        """
+        inside = self.high * torch.tensor(0.9999999).to(self.high)
+        return clamp(self.origin[which] + t[:, None] * self.direction[which], 0, inside)
+
+    def leave(self, which: Tensor, corner: Tensor, size: Tensor) -> Tensor:
+        """(k,) distances at which some rays leave boxes (+inf without a direction)."""
+        origin, direction = self.origin[which], self.direction[which]
+        face = torch.where(direction > 0, corner + size[:, None], corner)
+        inverse = divide(1.0, direction, direction)
+        t = torch.where(direction == 0, INF, (face - origin) * inverse)
+        inf = torch.full_like(size, INF)
+        return smaller(smaller(smaller(inf, t[:, 0]), t[:, 1]), t[:, 2])
+
+
+_MOST_INTERVALS = 2**23  # counted in a float32
 
 
 @dataclass
 class Intervals:
-    """The fixed sequence of intervals; each has its value taken in the middle. See trace.h."""
+    """Where each ray stands in its fixed sequence of intervals, which are step * 2^level long, the
+    longest not longer than the cone is wide where they start. See ray.h.
+    """
 
-    cone_near: Tensor  # (r,) world units
-    cone_growth: Tensor  # (r,) per world unit
-    step: Tensor  # () world units
+    near: Tensor  # (r,) cone, world units
+    growth: Tensor  # (r,) per world unit
     stop: Tensor  # (r,) world units
-    base: Tensor  # (r,)
-    length: Tensor  # (r,)
+    length_l: Tensor  # (l,) world units
+    level: Tensor  # (r,) int64
+    base: Tensor  # (r,) where the level was chosen
     count: Tensor  # (r,) intervals since base, as a float
     start: Tensor  # (r,)
-    end: Tensor  # (r,)
-    middle: Tensor  # (r,)
 
     @classmethod
-    def begin(cls, first: Tensor, last: Tensor, cone_r2: Tensor, step: float) -> Intervals:
+    def begin(cls, beam: Beam, step: float, levels: int) -> Intervals:
         """Stands at the first interval of every ray."""
-        near, growth = cone_r2[:, 0], cone_r2[:, 1]
-        step_t = torch.tensor(step, dtype=first.dtype, device=first.device)
-        length = larger(near + growth * first, step_t)
-        zero = torch.zeros_like(first)
-        at = cls(near, growth, step_t, last, first, length, zero, first, first, first)
-        at.start, at.end, at.middle = at._placed(first, length)
+        first = beam.first
+        length = [torch.tensor(step, dtype=first.dtype).to(first)]
+        for _ in range(levels - 1):
+            length.append(length[-1] + length[-1])
+        level, count = torch.zeros_like(first, dtype=torch.int64), torch.zeros_like(first)
+        lengths = torch.stack(length)
+        at = cls(
+            beam.cone_near, beam.cone_growth, beam.last, lengths, level, first, count, first
+        )
+        at._choose_level(first == first)
         return at
 
-    def _placed(self, start: Tensor, length: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        end = smaller(start + length, self.stop)
-        return start, end, start + (end - start) * 0.5
+    @property
+    def length(self) -> Tensor:
+        """(r,) of whole intervals."""
+        return self.length_l[self.level]
+
+    @property
+    def whole_end(self) -> Tensor:
+        """(r,) where the next interval starts."""
+        return self.base + (self.count + 1) * self.length
+
+    @property
+    def cut(self) -> Tensor:
+        """(r,) bool: the last interval, which ends at the far side."""
+        return ~(self.whole_end <= self.stop)
+
+    @property
+    def middle(self) -> Tensor:
+        """(r,) where values are taken."""
+        cut = self.start + (self.stop - self.start) * 0.5
+        return torch.where(self.cut, cut, self.base + (self.count + 0.5) * self.length)
 
     def cone(self, t: Tensor) -> Tensor:
         """Width of the cone at distance t."""
-        return self.cone_near + self.cone_growth * t
+        return self.near + self.growth * t
 
     def inside(self) -> Tensor:
         """(r,) bool: the interval lies before the far side."""
-        return self.start < self.stop
+        return (self.start < self.stop) & (self.count < _MOST_INTERVALS)
 
     def next(self, move: Tensor) -> None:
         """Goes to the next interval where `move` (r,) is true."""
-        count = self.count + 1
-        at = self.base + count * self.length
-        stuck = ~(at > self.start)  # the step is below the resolution of the dtype
-        wanted = larger(self.cone(at), self.step)
-        changed = wanted != self.length
-        start, end, middle = self._placed(at, torch.where(changed, wanted, self.length))
-        go = move & ~stuck
-        self.base = torch.where(go & changed, at, self.base)
-        self.count = torch.where(go, torch.where(changed, 0.0, count), self.count)
-        self.length = torch.where(go & changed, wanted, self.length)
-        self.start = torch.where(go, start, torch.where(move & stuck, self.stop, self.start))
-        self.end = torch.where(go, end, self.end)
-        self.middle = torch.where(go, middle, self.middle)
+        start = self.whole_end
+        self.count = torch.where(move, self.count + 1, self.count)
+        self.start = torch.where(move, start, self.start)
+        self._choose_level(move)
+
+    def _choose_level(self, move: Tensor) -> None:
+        width = self.cone(self.start)
+        top = len(self.length_l) - 1
+        short, long = self.level > 0, self.level < top
+        fits = (~short | ~(width < self.length)) & (~long | ~(width >= self.length + self.length))
+        level = (width[:, None] >= self.length_l[1:]).sum(1)
+        change = move & ~fits
+        self.base = torch.where(change, self.start, self.base)
+        self.count = torch.where(change, 0.0, self.count)
+        self.level = torch.where(change, level, self.level)
 
 
 # --- the tree
@@ -102,6 +209,7 @@ class Place:
     depth: Tensor  # (r,)
     node: Tensor  # (r,) last node reached
     parent: Tensor  # (r,)
+    hidden: Tensor  # (r,) bool: nothing in the node or below it is seen
     fine_node: Tensor  # (r,)
     fine_corner: Tensor  # (r, 3)
     fine_size: Tensor  # (r,)
@@ -172,15 +280,19 @@ class Tree:
         self.request_n[wished] = kinds | torch.maximum(word & REQUEST_PRIORITY, most)
 
 
-def descend(position_r3: Tensor, wanted_r: Tensor, tree: Tree) -> Place:
-    """Descends from the root to the wanted depth, or as far as tiles exist; stamps the tiles."""
+def descend(
+    position_r3: Tensor, wanted_r: Tensor, tree: Tree, hides: Callable[[Tensor], Tensor]
+) -> Place:
+    """Descends from the root to the wanted depth, or as far as tiles exist and something is seen;
+    stamps the tiles.
+    """
     n = tree.branching
     local, corner = position_r3, torch.zeros_like(position_r3)
     size = torch.ones_like(position_r3[:, 0])
     node = torch.full_like(wanted_r, tree.root)
     nobody = torch.full_like(node, -1)
     place = Place(
-        *(corner, size, torch.zeros_like(node), node, nobody),
+        *(corner, size, torch.zeros_like(node), node, nobody, hides(node)),
         *(nobody, corner, size, nobody, corner, size),
     )
     going = torch.ones_like(node, dtype=torch.bool)
@@ -196,7 +308,7 @@ def descend(position_r3: Tensor, wanted_r: Tensor, tree: Tree) -> Place:
         place.coarse_size = torch.where(above, place.size, place.coarse_size)
 
         tile = tree.child_n[place.node].to(torch.int64)
-        going = going & (place.depth < wanted_r) & (tile >= 0)
+        going = going & (place.depth < wanted_r) & (tile >= 0) & ~place.hidden
         if not going.any():
             break
         size = divide(place.size, n, place.size)
@@ -211,17 +323,8 @@ def descend(position_r3: Tensor, wanted_r: Tensor, tree: Tree) -> Place:
         place.parent = torch.where(going, place.node, place.parent)
         place.node = torch.where(going, tile * tree.nodes_per_tile + child, place.node)
         place.depth = torch.where(going, place.depth + 1, place.depth)
+        place.hidden = torch.where(going, hides(place.node), place.hidden)
     return place
-
-
-def exit_distance(
-    origin_r3: Tensor, direction_r3: Tensor, corner_r3: Tensor, size_r: Tensor
-) -> Tensor:
-    """Distance at which a ray leaves a box (+inf without a direction)."""
-    face = torch.where(direction_r3 > 0, corner_r3 + size_r[:, None], corner_r3)
-    t = torch.where(direction_r3 == 0, INF, (face - origin_r3) / direction_r3)
-    inf = torch.full_like(size_r, INF)
-    return smaller(smaller(smaller(inf, t[:, 0]), t[:, 1]), t[:, 2])
 
 
 def wanted_depth(cone: Tensor, tree: Tree) -> tuple[Tensor, Tensor, Tensor]:
@@ -254,7 +357,7 @@ class Bricks:
 
     def unseen(self, node: Tensor, transfer: Transfer) -> Tensor:
         """(r,) bool: all in reach of the nodes' bricks, and of the nodes below, is transparent."""
-        real = transfer.table_m4.dtype
+        real = transfer.table_lm4.dtype
         ends = self.range_n2c[node, :, self.component].to(real)
         return transfer.transparent(ends[:, 0], ends[:, 1])
 
@@ -303,6 +406,9 @@ class Bricks:
 # -----------------------------------------------------------------------------------------------
 
 
+_TINY = 1.1754944e-38  # smallest normal float32: what lets less through is opaque
+
+
 @dataclass
 class Accumulator:
     """Front-to-back sums of every ray."""
@@ -310,22 +416,57 @@ class Accumulator:
     color: Tensor  # (r, 3) premultiplied
     clear: Tensor  # (r,) transmittance
     depth: Tensor  # (r,)
-    hit: Tensor  # (r,) bool
+
+    def add(
+        self, rgba: Tensor, start: Tensor, length: Tensor, hit_clear: Tensor, where: Tensor
+    ) -> None:
+        """Adds an interval where `where` is true. Depth is where, inside it, the transmittance fell
+        to hit_clear, as if it were of one value.
+        """
+        kept = 1 - rgba[:, 3]
+        share = self.clear * rgba[:, 3]
+        left = self.clear * kept
+        color = self.color + share[:, None] * rgba[:, :3]
+        hit = where & (left < hit_clear) & (self.clear >= hit_clear)
+        solid = ~(kept > _TINY)
+        part = log2_exact(torch.where(hit, hit_clear / self.clear, 1.0))
+        part = part / log2_exact(torch.where(hit & ~solid, kept, 0.5))
+        part = torch.where(solid, 0.0, clamp(part, 0, 1))
+        self.depth = torch.where(hit, start + part * length, self.depth)
+        self.color = torch.where(where[:, None], color, self.color)
+        self.clear = torch.where(where, left, self.clear)
 
 
 @dataclass
 class Transfer:
     """The transfer function: rows at even distances over a domain."""
 
-    table_m4: Tensor
-    domain_3: Tensor  # value of the first row, of the last row, reference length
+    table_lm4: Tensor  # linear RGB, alpha of an interval of step * 2^l
+    domain_2: Tensor  # value of the first row, of the last row
     opaque_m: Tensor  # rows with an opacity up to this one
 
     def place(self, value: Tensor) -> Tensor:
         """Row of a value, with a fraction."""
-        low, high, _ = self.domain_3.unbind(0)
-        rows = self.table_m4.shape[0]
-        return clamp((value - low) * divide(rows - 1, high - low, high), 0, rows - 1)
+        low, high = self.domain_2.unbind(0)
+        last = self.table_lm4.shape[1] - 1
+        return clamp((value - low) * divide(last, high - low, high), 0, last)
+
+    def look_up(self, value: Tensor, level: Tensor) -> Tensor:
+        """(r, 4) linear RGB and the alpha of an interval of each ray's level."""
+        place = self.place(value)
+        most = torch.full_like(place, self.table_lm4.shape[1] - 2)
+        row = smaller(torch.floor(place), most)
+        weight, row = place - row, row.to(torch.int64)
+        a, b = self.table_lm4[level, row], self.table_lm4[level, row + 1]
+        return a + weight[:, None] * (b - a)
+
+    def piece(self, value: Tensor, lengths: Tensor) -> Tensor:
+        """(r, 4) linear RGB and the alpha of any number of shortest intervals."""
+        rgba = self.look_up(value, torch.zeros_like(value, dtype=torch.int64))
+        kept = 1 - rgba[:, 3]
+        solid = ~(kept > _TINY)
+        alpha = 1 - exp2_exact(log2_exact(torch.where(solid, 0.5, kept)) * lengths)
+        return torch.cat((rgba[:, :3], torch.where(solid, 1.0, alpha)[:, None]), 1)
 
     def transparent(self, smallest: Tensor, largest: Tensor) -> Tensor:
         """Bool: no value between the two is seen. They are taken a little apart, since
@@ -339,46 +480,6 @@ class Transfer:
         return self.opaque_m[end] == before
 
 
-def composite(
-    sum_: Accumulator,
-    value: Tensor,
-    start: Tensor,
-    length: Tensor,
-    transfer: Transfer,
-    hit_clear: Tensor,
-    where: Tensor,
-) -> None:
-    """Adds an interval of `length` with one value, seen through the transfer function, where
-    `where` is true.
-
-    Opacity is per reference length: 1 - (1 - a)^(length / reference).
-    """
-    reference = transfer.domain_3[2]
-    place = transfer.place(value)
-    last_cell = transfer.table_m4.shape[0] - 2
-    cell = smaller(torch.floor(place), torch.full_like(place, last_cell))
-    weight = place - cell
-    row = cell.to(torch.int64)
-    r0, r1 = transfer.table_m4[row], transfer.table_m4[row + 1]
-    rgba = r0 + weight[:, None] * (r1 - r0)
-    opacity = rgba[:, 3]
-
-    add = where & (opacity > 0)
-    opaque = opacity >= 1
-    decay = log2_exact(torch.where(opaque | ~add, 0.5, 1 - opacity))
-    kept = torch.where(opaque, 0.0, exp2_exact(decay * (length / reference)))
-    clear = sum_.clear * kept
-    share = sum_.clear - clear
-    sum_.color = torch.where(add[:, None], sum_.color + share[:, None] * rgba[:, :3], sum_.color)
-    first = add & ~sum_.hit & (clear < hit_clear)
-    safe = torch.where(first, sum_.clear, 1.0)
-    into = torch.where(opaque, 0.0, log2_exact(hit_clear / safe) / decay * reference)
-    into = clamp(into, torch.zeros_like(length), length)
-    sum_.depth = torch.where(first, start + into, sum_.depth)
-    sum_.hit = sum_.hit | first
-    sum_.clear = torch.where(add, clear, sum_.clear)
-
-
 # --- the op
 # -------------------------------------------------------------------------------------------
 
@@ -388,7 +489,7 @@ def trace_rays(
     direction_r3: Tensor,
     cone_r2: Tensor,
     range_r2: Tensor,
-    bounds_23: Tensor,
+    place_33: Tensor,
     child_tn: Tensor,
     brick_tn: Tensor,
     request_tn: Tensor,
@@ -397,15 +498,17 @@ def trace_rays(
     constant_tnc: Tensor,
     range_tn2c: Tensor,
     stamp_b: Tensor,
-    table_m4: Tensor,
-    domain_3: Tensor,
+    table_lm4: Tensor,
+    domain_2: Tensor,
     opaque_m: Tensor,
     frame_1: Tensor,
+    width: int,
     branching: int,
     root: int,
     max_depth: int,
     border: int,
     component: int,
+    cone_scale: float,
     root_voxel: float,
     step: float,
     stop_alpha: float,
@@ -414,49 +517,58 @@ def trace_rays(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Twin of `torch.ops.gvtorch.trace_rays`; arguments as in `gvtorch.ops.trace_rays`.
 
-    Writes request_tn, stamp_t and stamp_b in place.
+    Writes request_tn, stamp_t and stamp_b in place. `width` orders the rays, which changes nothing.
     """
-    first, last = _clip(origin_r3, direction_r3, range_r2, bounds_23)
-    stop_clear = 1 - torch.tensor(stop_alpha, dtype=origin_r3.dtype).to(origin_r3)
-    hit_clear = 1 - torch.tensor(depth_alpha, dtype=origin_r3.dtype).to(origin_r3)
-    top_voxel = torch.tensor(root_voxel, dtype=origin_r3.dtype).to(origin_r3)
-    # A place on the scene's high face belongs to the scene.
-    inside_3 = bounds_23[1] * torch.tensor(0.9999999, dtype=bounds_23.dtype).to(bounds_23)
-    at = Intervals.begin(first, last, cone_r2, step)
+    real = table_lm4.dtype
+    beam = Beam.enter(
+        *(origin_r3, direction_r3, cone_r2, range_r2, place_33), cone_scale, real
+    )
+
+    def number(value: float) -> Tensor:
+        return torch.tensor(value, dtype=real).to(table_lm4)
+
+    stop_clear, hit_clear = 1 - number(stop_alpha), 1 - number(depth_alpha)
+    at = Intervals.begin(beam, step, table_lm4.shape[0])
     tree = Tree(
         *(child_tn.view(-1), brick_tn.view(-1), request_tn.view(-1), stamp_t, stamp_b, frame_1[0]),
-        *(top_voxel, branching, child_tn.shape[1], root, max_depth, by_level),
+        *(number(root_voxel), branching, child_tn.shape[1], root, max_depth, by_level),
     )
     values = constant_tnc.flatten(0, 1), range_tn2c.flatten(0, 1)
     bricks = Bricks(bricks_bzyxc, *values, border, component)
-    transfer = Transfer(table_m4, domain_3, opaque_m)
-    visit = Visit.none(origin_r3, tree)
-    zero = torch.zeros_like(first)
-    sum_ = Accumulator(torch.zeros_like(origin_r3), zero + 1, zero + INF, zero > 0)
+    transfer = Transfer(table_lm4, domain_2, opaque_m)
+    visit = Visit.none(beam, tree)
+    zero = torch.zeros_like(beam.first)
+    sum_ = Accumulator(torch.zeros_like(beam.origin), zero + 1, zero + INF)
     samples = torch.zeros_like(zero, dtype=torch.int32)
 
     active = at.inside() & (sum_.clear > stop_clear)
     arrived = active  # rays that stand in a node they have not looked up yet
     while active.any():
         if arrived.any():
-            visit.look_up(arrived, origin_r3, direction_r3, inside_3, at, tree, bricks, transfer)
-        value = visit.value(active, origin_r3, direction_r3, at, tree, bricks)
+            visit.look_up(arrived, beam, at, tree, bricks, transfer)
+        value = visit.value(active, beam, at, tree, bricks)
 
         # A node of one value, or of none, is left in one go; else one interval is taken.
         whole = active & (visit.uniform | visit.nothing)
-        entry, one = at.start, at.end - at.start
+        entry, level, length, cut = at.start, at.level, at.length, at.cut
         at.next(active)
         leaving = whole & visit.stays(at)
         while leaving.any():
             at.next(leaving)
             leaving = whole & visit.stays(at)
-        length = torch.where(whole, smaller(at.start, at.stop) - entry, one)
+        piece = visit.uniform | cut
+        length = torch.where(piece, smaller(at.start, at.stop) - entry, length)
+        lengths = divide(length, number(step), length)
+        rgba = torch.where(
+            piece[:, None], transfer.piece(value, lengths), transfer.look_up(value, level)
+        )
         shaded = active & ~visit.nothing
-        composite(sum_, value, entry, length, transfer, hit_clear, shaded)
+        sum_.add(rgba, entry, length, hit_clear, shaded)
         samples = samples + shaded.to(torch.int32)
         active = at.inside() & (sum_.clear > stop_clear)
         arrived = active & (whole | ~visit.stays(at))
-    return sum_.color, (1 - sum_.clear)[:, None], sum_.depth[:, None], samples, visit.missed
+    depth = sum_.depth + beam.moved
+    return sum_.color, (1 - sum_.clear)[:, None], depth[:, None], samples, visit.missed
 
 
 @dataclass
@@ -468,32 +580,29 @@ class Visit:
     cone_low: Tensor  # (r,) the visit ends where the cone is below this
     cone_high: Tensor  # (r,) or not below this
     voxel: Tensor  # (r,) world size of a voxel at the wanted depth
+    blend: Tensor  # (r,) 1 / (voxel above - voxel)
     mixed: Tensor  # (r,) bool: two nodes answer
     nothing: Tensor  # (r,) bool: no node answers, or only EMPTY ones
     uniform: Tensor  # (r,) bool: one value answers all over the node
     missed: Tensor  # (r,) bool: here or before, something that was seen was not there
 
     @classmethod
-    def none(cls, origin_r3: Tensor, tree: Tree) -> Visit:
+    def none(cls, beam: Beam, tree: Tree) -> Visit:
         """Stands in no node: every field is filled by `look_up` before it is read."""
-        rays = origin_r3.shape[0]
-        number = origin_r3.new_zeros(rays)
-        word = torch.full((rays,), tree.root, dtype=torch.int64, device=origin_r3.device)
-        corner = torch.zeros_like(origin_r3)
+        number = torch.zeros_like(beam.first)
+        word = torch.full_like(number, tree.root, dtype=torch.int64)
+        corner, no = torch.zeros_like(beam.origin), number > 0
         place = Place(
-            *(corner, number, word, word, word),
+            *(corner, number, word, word, word, no),
             *(word, corner, number + 1, word, corner, number + 1),
         )
         place = Place(*(field.clone() for field in vars(place).values()))
-        no = number > 0
-        return cls(place, number, number, number, number, no, no, no, no)
+        return cls(place, number, number, number, number, number, no, no, no, no)
 
     def look_up(
         self,
         arrived: Tensor,
-        origin_r3: Tensor,
-        direction_r3: Tensor,
-        inside_3: Tensor,
+        beam: Beam,
         at: Intervals,
         tree: Tree,
         bricks: Bricks,
@@ -501,28 +610,27 @@ class Visit:
     ) -> None:
         """Finds the node of the rays that arrived; marks what they use and what they miss."""
         which = arrived.nonzero()[:, 0]
-        cone, middle = at.cone(at.middle)[which], at.middle[which]
+        middle = at.middle[which]
+        cone = at.cone(at.middle)[which]
         wanted, fits, above = wanted_depth(cone, tree)
-        position = origin_r3[which] + middle[:, None] * direction_r3[which]
-        position = clamp(position, 0, inside_3)
-        found = descend(position, wanted, tree)
+        position = beam.at(which, middle)
+        found = descend(position, wanted, tree, lambda node: bricks.unseen(node, transfer))
         reaches = fits <= cone
         blends = reaches & (wanted > 0)
         alone = ~blends | (found.coarse_node < 0)
         found.coarse_node = torch.where(alone, found.fine_node, found.coarse_node)
         found.coarse_corner = torch.where(alone[:, None], found.fine_corner, found.coarse_corner)
         found.coarse_size = torch.where(alone, found.fine_size, found.coarse_size)
-        unseen = bricks.unseen(found.node, transfer) & (
-            ~blends | (found.depth < wanted) | bricks.unseen(found.parent.clamp(min=0), transfer)
-        )
+        unseen = found.hidden & ((found.depth < wanted) | ~blends)
         missed = tree.mark(found, wanted, blends, cone, ~unseen)
         self.missed = self.missed.index_put((which,), self.missed[which] | missed)
 
         for name, field in vars(found).items():
             getattr(self.place, name)[which] = field
-        leave = exit_distance(origin_r3[which], direction_r3[which], found.corner, found.size)
+        leave = beam.leave(which, found.corner, found.size)
         low = torch.where(reaches, fits, -INF)
         high = torch.where(reaches, above, fits)
+        blend = divide(1.0, above - fits, fits)
         fine, coarse = found.fine_node.clamp(min=0), found.coarse_node.clamp(min=0)
         fine_brick, coarse_brick = tree.brick_n[fine], tree.brick_n[coarse]
         empty = (fine_brick == EMPTY) & (coarse_brick == EMPTY)
@@ -533,51 +641,28 @@ class Visit:
         mixed = found.fine_node != found.coarse_node
         for name, now in (
             *(("exit", leave), ("cone_low", low), ("cone_high", high), ("voxel", fits)),
-            *(("mixed", mixed), ("nothing", nothing), ("uniform", uniform)),
+            *(("blend", blend), ("mixed", mixed), ("nothing", nothing), ("uniform", uniform)),
         ):
             setattr(self, name, getattr(self, name).index_put((which,), now))
 
     def stays(self, at: Intervals) -> Tensor:
         """(r,) bool: the interval's middle still lies in the node, and wants the same levels."""
-        cone = at.cone(at.middle)
+        middle = at.middle
+        cone = at.cone(middle)
         fits = (cone >= self.cone_low) & (cone < self.cone_high)
-        return at.inside() & (at.middle < self.exit) & fits
+        return at.inside() & (middle < self.exit) & fits
 
     def value(
-        self,
-        active: Tensor,
-        origin_r3: Tensor,
-        direction_r3: Tensor,
-        at: Intervals,
-        tree: Tree,
-        bricks: Bricks,
+        self, active: Tensor, beam: Beam, at: Intervals, tree: Tree, bricks: Bricks
     ) -> Tensor:
-        """Value at the interval's middle: the node's and its parent's, by weight log_N(cone /
-        voxel)."""
-        p, ray = self.place, (origin_r3, direction_r3, at.middle)
+        """Value at the interval's middle: the node's and its parent's, whose weight grows from 0
+        where the cone is as wide as the node's voxels to 1 where it is as wide as its parent's.
+        """
+        p, middle = self.place, at.middle
+        ray = (beam.origin, beam.direction, middle)
         value = bricks.sample(tree.brick_n, p.fine_node, p.fine_corner, p.fine_size, *ray)
-        blend = active & self.mixed
-        if not blend.any():
+        if not (active & self.mixed).any():
             return value
         other = bricks.sample(tree.brick_n, p.coarse_node, p.coarse_corner, p.coarse_size, *ray)
-        ratio = torch.where(blend, at.cone(at.middle) / self.voxel, 1.0)
-        levels = log2_exact(torch.full_like(ratio, tree.branching))
-        weight = clamp(log2_exact(ratio) / levels, 0, 1)
+        weight = clamp((at.cone(middle) - self.voxel) * self.blend, 0, 1)
         return torch.where(self.mixed, value + weight * (other - value), value)
-
-
-def _clip(
-    origin_r3: Tensor, direction_r3: Tensor, range_r2: Tensor, bounds_23: Tensor
-) -> tuple[Tensor, Tensor]:
-    """First and last distance of each ray inside the bounds (slab test, Kay and Kajiya, 1986)."""
-    first, last = range_r2[:, 0], range_r2[:, 1]
-    for axis in range(3):
-        origin, direction = origin_r3[:, axis], direction_r3[:, axis]
-        low, high = bounds_23[0, axis], bounds_23[1, axis]
-        a, b = (low - origin) / direction, (high - origin) / direction
-        flat = direction == 0
-        beside = flat & ~((origin >= low) & (origin <= high))
-        last = torch.where(beside, first, last)
-        first = torch.where(flat, first, larger(first, smaller(a, b)))
-        last = torch.where(flat, last, smaller(last, larger(a, b)))
-    return first, torch.where(last < INF, last, first)

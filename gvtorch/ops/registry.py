@@ -18,16 +18,14 @@ def available() -> dict[str, str]:
     return {"reference": "", **_reasons}
 
 
-def _fake_trace_rays(
-    origin_r3: Tensor, *_args: object
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    rays = origin_r3.shape[0]
+def _fake_trace_rays(*args: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    rays, table_lm4 = args[0].shape[0], args[13]
     return (
-        origin_r3.new_empty((rays, 3)),
-        origin_r3.new_empty((rays, 1)),
-        origin_r3.new_empty((rays, 1)),
-        origin_r3.new_empty((rays,), dtype=torch.int32),
-        origin_r3.new_empty((rays,), dtype=torch.bool),
+        table_lm4.new_empty((rays, 3)),
+        table_lm4.new_empty((rays, 1)),
+        table_lm4.new_empty((rays, 1)),
+        table_lm4.new_empty((rays,), dtype=torch.int32),
+        table_lm4.new_empty((rays,), dtype=torch.bool),
     )
 
 

@@ -40,7 +40,7 @@ def trace_rays(
     direction_r3: Tensor,
     cone_r2: Tensor,
     range_r2: Tensor,
-    bounds_23: Tensor,
+    place_33: Tensor,
     child_tn: Tensor,
     brick_tn: Tensor,
     request_tn: Tensor,
@@ -49,16 +49,18 @@ def trace_rays(
     constant_tnc: Tensor,
     range_tn2c: Tensor,
     stamp_b: Tensor,
-    table_m4: Tensor,
-    domain_3: Tensor,
+    table_lm4: Tensor,
+    domain_2: Tensor,
     opaque_m: Tensor,
     frame_1: Tensor,
     *,
+    width: int = 0,
     branching: int,
     root: int,
     max_depth: int,
     border: int,
     component: int,
+    cone_scale: float,
     root_voxel: float,
     step: float,
     stop_alpha: float = config.STOP_ALPHA,
@@ -69,15 +71,17 @@ def trace_rays(
     """Traces rays through a tree and shades what they meet with a transfer function.
 
     Mutates `request_tn` (what rays missed), `stamp_t` and `stamp_b` (what rays used). Every tensor
-    is contiguous and on one device; reals are all float32 or all float64, words int32.
+    is contiguous and on one device; rays are float64, words int32. The table's dtype, float32 or
+    float64, is the one in which rays are traced.
 
     Args:
-        origin_r3: (r, 3) ray origins, tree units.
-        direction_r3: (r, 3) tree units per world unit.
+        origin_r3: (r, 3) ray origins, world units.
+        direction_r3: (r, 3) ray directions of unit length.
         cone_r2: (r, 2) cone width at distance 0 and its growth, world units; zeros ask for the
             finest level.
         range_r2: (r, 2) first and last distance, world units.
-        bounds_23: (2, 3) the part of the root cube that is drawn, tree units.
+        place_33: (3, 3) float64: low corner of the scene and size of the root cube in the world,
+            high corner of the scene in tree units.
         child_tn: (t, n) tile of a node's children, or ABSENT, TERMINAL.
         brick_tn: (t, n) a node's brick slot, or ABSENT, EMPTY, CONSTANT.
         request_tn: (t, n) request words, written.
@@ -88,16 +92,19 @@ def trace_rays(
         range_tn2c: (t, n, 2, c) smallest and largest value in reach of the node's brick, same
             dtype: a node that shows nothing is neither sampled nor requested.
         stamp_b: (b,) last frame that used a brick, written.
-        table_m4: (m, 4) transfer function: linear RGB and opacity per reference length, m >= 2.
-        domain_3: (3,) value of the first row, value of the last row, reference length in world
-            units.
+        table_lm4: (l, m, 4) transfer function: linear RGB, and the alpha of an interval of
+            step * 2^l; m >= 2. Its memory begins at a multiple of 16 bytes.
+        domain_2: (2,) value of the first row, value of the last row.
         opaque_m: (m,) int32, how many rows of the table up to this one have an opacity.
         frame_1: (1,) int32 number of this frame.
+        width: Pixels of a row, if the rays are whole rows of a picture (which are then traced in
+            tiles), else 0.
         branching: N, nodes of a tile along an axis.
         root: Index of the root node.
         max_depth: Depth of the finest level.
         border: Voxels of border on each side of a brick.
         component: Which of the c values the transfer function reads.
+        cone_scale: Factor on cones.
         root_voxel: World size of a depth-0 voxel: a cone this wide wants depth 0.
         step: World length of the shortest interval between samples.
         stop_alpha: A ray ends at this alpha; 1 integrates to the end.
@@ -106,7 +113,7 @@ def trace_rays(
         backend: auto, reference, cpp or cuda.
 
     Returns:
-        color (r, 3) premultiplied linear RGB, alpha (r, 1), depth (r, 1) world units or +inf,
+        In the table's dtype: color (r, 3) premultiplied linear RGB, alpha (r, 1), depth (r, 1) world units or +inf,
         samples (r,) int32, missed (r,) bool: something that the ray saw was not there.
 
     Raises:
@@ -115,10 +122,11 @@ def trace_rays(
     Source: Crassin, Neyret, Lefebvre, Eisemann, "GigaVoxels", I3D 2009, sections 3 and 4.
     """
     where, device = "trace_rays", origin_r3.device
-    real = origin_r3.dtype
+    real = table_lm4.dtype
     if real not in (torch.float32, torch.float64):
         raise ValueError(
-            f"{where}: origin_r3 must be (r, 3) float32 or float64, got {check.describe(origin_r3)}"
+            f"{where}: table_lm4 must be (l, m, 4) float32 or float64, "
+            f"got {check.describe(table_lm4)}"
         )
     check.whole(where, "branching", branching, low=2, high=16)
     rays, (tiles, nodes) = origin_r3.shape[0], child_tn.shape
@@ -127,11 +135,11 @@ def trace_rays(
     if voxel not in CHANNEL_DTYPES:
         raise ValueError(f"{where}: bricks_bzyxc has dtype {voxel}, which no channel can have")
     for name, tensor, shape, dtype in (
-        ("origin_r3", origin_r3, (rays, 3), real),
-        ("direction_r3", direction_r3, (rays, 3), real),
-        ("cone_r2", cone_r2, (rays, 2), real),
-        ("range_r2", range_r2, (rays, 2), real),
-        ("bounds_23", bounds_23, (2, 3), real),
+        ("origin_r3", origin_r3, (rays, 3), torch.float64),
+        ("direction_r3", direction_r3, (rays, 3), torch.float64),
+        ("cone_r2", cone_r2, (rays, 2), torch.float64),
+        ("range_r2", range_r2, (rays, 2), torch.float64),
+        ("place_33", place_33, (3, 3), torch.float64),
         ("child_tn", child_tn, (tiles, nodes), torch.int32),
         ("brick_tn", brick_tn, (tiles, nodes), torch.int32),
         ("request_tn", request_tn, (tiles, nodes), torch.int32),
@@ -140,9 +148,9 @@ def trace_rays(
         ("constant_tnc", constant_tnc, (tiles, nodes, channels), voxel),
         ("range_tn2c", range_tn2c, (tiles, nodes, 2, channels), voxel),
         ("stamp_b", stamp_b, (bricks,), torch.int32),
-        ("table_m4", table_m4, ("m", 4), real),
-        ("domain_3", domain_3, (3,), real),
-        ("opaque_m", opaque_m, (table_m4.shape[0],), torch.int32),
+        ("table_lm4", table_lm4, ("l", "m", 4), real),
+        ("domain_2", domain_2, (2,), real),
+        ("opaque_m", opaque_m, (table_lm4.shape[1],), torch.int32),
         ("frame_1", frame_1, (1,), torch.int32),
     ):
         check.tensor(where, name, tensor, shape, dtype, device)
@@ -150,23 +158,31 @@ def trace_rays(
             raise ValueError(f"{where}: {name} must be contiguous")
     if nodes < branching**3:
         raise ValueError(f"{where}: child_tn must hold {branching}^3 nodes a tile, got {nodes}")
-    if table_m4.shape[0] < 2:
-        raise ValueError(f"{where}: table_m4 needs at least 2 rows, got {table_m4.shape[0]}")
+    if table_lm4.shape[0] < 1 or table_lm4.shape[1] < 2:
+        raise ValueError(
+            f"{where}: table_lm4 needs at least 1 length and 2 rows, "
+            f"got {check.describe(table_lm4)}"
+        )
+    check.whole(where, "width", width, low=0)
+    if width and rays % width:
+        raise ValueError(f"{where}: {rays} rays are no whole rows of {width} pixels")
     check.whole(where, "root", root, low=0, high=tiles * nodes - 1)
     check.whole(where, "max_depth", max_depth, low=0, high=62)
     check.whole(where, "border", border, low=0, high=(side - 1) // 2)
     check.whole(where, "component", component, low=0, high=channels - 1)
     for name, number in (("root_voxel", root_voxel), ("step", step)):
         check.number(where, name, number, low=0, open_low=True)
+    check.number(where, "cone_scale", cone_scale, low=0)
     for name, number in (("stop_alpha", stop_alpha), ("depth_alpha", depth_alpha)):
         check.number(where, name, number, low=0, high=1)
 
     args = (
-        *(origin_r3, direction_r3, cone_r2, range_r2, bounds_23),
+        *(origin_r3, direction_r3, cone_r2, range_r2, place_33),
         *(child_tn, brick_tn, request_tn, stamp_t, bricks_bzyxc, constant_tnc, range_tn2c),
-        *(stamp_b, table_m4, domain_3, opaque_m, frame_1),
-        *(branching, root, max_depth, border, component),
-        *(float(root_voxel), float(step), float(stop_alpha), float(depth_alpha), by_level),
+        *(stamp_b, table_lm4, domain_2, opaque_m, frame_1),
+        *(width, branching, root, max_depth, border, component),
+        *(float(cone_scale), float(root_voxel), float(step)),
+        *(float(stop_alpha), float(depth_alpha), by_level),
     )
     if choose_backend(backend, device) == "reference":
         return reference.trace_rays(*args)

@@ -75,6 +75,7 @@ class N3Tree:
         self.box = torch.tensor([low, high], dtype=torch.float64)
         self.value_range = dict(value_range or {})
         self.frame = 0
+        self._place: Tensor | None = None
 
     @property
     def device(self) -> torch.device:
@@ -113,19 +114,16 @@ class N3Tree:
         """Memory of both pools."""
         return self.nodes.nbytes + self.bricks.nbytes
 
-    def to_tree(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Takes world points (r, 3) and directions (r, 3) to tree units, in float64."""
-        box = self.box.to(points.device)
-        size = torch.tensor(self.spacing, dtype=torch.float64, device=points.device) * self.side
-        origin = (points.to(torch.float64) - box[0]) / size
-        direction = directions.to(torch.float64) / size
-        return origin, direction
-
-    def bounds(self, dtype: torch.dtype) -> Tensor:
-        """(2, 3) the part of the root cube that the scene fills, tree units."""
-        low = torch.zeros(3, dtype=dtype)
-        high = torch.tensor([n / self.side for n in self.extent], dtype=dtype)
-        return torch.stack((low, high)).to(self.device)
+    @property
+    def place(self) -> Tensor:
+        """(3, 3) float64: the scene's low corner in the world, the world size of the root cube, and
+        the scene's high corner in tree units (its low corner is 0).
+        """
+        if self._place is None or self._place.device != self.device:
+            size = torch.tensor(self.spacing, dtype=torch.float64) * self.side
+            high = torch.tensor(self.extent, dtype=torch.float64) / self.side
+            self._place = torch.stack((self.box[0], size, high)).to(self.device)
+        return self._place
 
     def loc(self, node: Tensor) -> Tensor:
         """Returns (k, 4) int64 x, y, z, depth of nodes (k,) of this tree."""

@@ -300,6 +300,7 @@ class Camera:
             direction=direction,
             cone=torch.stack((zero, growth), 1),
             range=torch.stack((zero, zero + math.inf), 1),
+            width=self.width,
         )
 
 

@@ -15,37 +15,14 @@ from .. import check, config
 from ..ops import available
 from ..ops.trace import most_intervals
 from ..pool import N3Tree
-from .shader import TransferFunction
-
-
-def approach(
-    origin: Tensor, direction: Tensor, cone: Tensor, range: Tensor, high: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Moves ray origins to where they enter the scene, so that float32 is fine from any distance.
-
-    Args:
-        origin: (r, 3) float64, tree units.
-        direction: (r, 3) float64, tree units per world unit.
-        cone: (r, 2) float64, width at the origin and growth.
-        range: (r, 2) float64, first and last distance.
-        high: (3,) float64, the scene's high corner in tree units; its low corner is 0.
-
-    Returns:
-        The new origin, cone and range, and the distance moved (r, 1), to be added to depths.
-    """
-    near = torch.minimum(-origin / direction, (high - origin) / direction).amax(1, keepdim=True)
-    moved = torch.where(torch.isfinite(near) & (near > 0), near, torch.zeros_like(near))
-    cone = torch.cat((cone[:, :1] + cone[:, 1:] * moved, cone[:, 1:]), 1)
-    return origin + moved * direction, cone, range - moved, moved
+from .shader import TransferFunction, interval_levels
 
 
 class TreeTracer(torch.nn.Module):
     """Traces world rays through a resident tree. Pools are buffers: `.to(device)` moves them."""
 
     if TYPE_CHECKING:  # TorchScript would read these as attributes of its own
-        corner: Tensor
-        size: Tensor
-        bounds: Tensor
+        place: Tensor
 
     def __init__(
         self,
@@ -86,13 +63,12 @@ class TreeTracer(torch.nn.Module):
         check.number(where, "stop_alpha", stop_alpha, low=0, high=1, open_low=True)
         check.number(where, "depth_alpha", depth_alpha, low=0, high=1)
         most_intervals(float((tree.box[1] - tree.box[0]).norm()), step * min(tree.spacing))
-        table, domain, opaque = shader.table(min(tree.spacing), torch.float32, tree.device)
-        size = torch.tensor(tree.spacing, dtype=torch.float64) * tree.side
+        step = step * min(tree.spacing)
+        levels = interval_levels(tree.root_voxel, step)
+        table = shader.table(min(tree.spacing), step, levels, torch.float32, tree.device)
         nodes, bricks = tree.nodes, tree.bricks
         for name, tensor in (
-            ("corner", tree.box[0].to(tree.device)),
-            ("size", size.to(tree.device)),
-            ("bounds", tree.bounds(torch.float32)),
+            ("place", tree.place),
             ("child", nodes.child_tn),
             ("brick", nodes.brick_tn),
             ("request", nodes.request_tn),
@@ -101,16 +77,16 @@ class TreeTracer(torch.nn.Module):
             ("constant", nodes.constants[channel]),
             ("value_range", nodes.ranges[channel]),
             ("stamp_brick", bricks.stamp_b.clone()),
-            ("table", table),
-            ("domain", domain),
-            ("opaque", opaque),
+            ("table", table.table_lm4),
+            ("domain", table.domain_2),
+            ("opaque", table.opaque_m),
             ("frame", torch.zeros(1, dtype=torch.int32, device=tree.device)),
         ):
             self.register_buffer(name, tensor)
         self.branching, self.root, self.depth = tree.branching, tree.root, tree.depth
         self.flatness = float(tree.flatness)
         self.border, self.component = bricks.border, component
-        self.root_voxel, self.step = float(tree.root_voxel), step * min(tree.spacing)
+        self.root_voxel, self.step = float(tree.root_voxel), step
         self.stop_alpha, self.depth_alpha = float(stop_alpha), float(depth_alpha)
 
     def forward(
@@ -128,20 +104,12 @@ class TreeTracer(torch.nn.Module):
         Returns:
             color (r, 3) premultiplied, alpha (r, 1), depth (r, 1), samples (r,) int32.
         """
-        along = direction.to(torch.float64) / self.size
-        start, width, limits, moved = approach(
-            (origin.to(torch.float64) - self.corner) / self.size,
-            along,
-            cone.to(torch.float64) * self.flatness,
-            range.to(torch.float64),
-            self.bounds[1].to(torch.float64),
-        )
         color, alpha, depth, samples, _ = torch.ops.gvtorch.trace_rays(
-            start.to(torch.float32).contiguous(),
-            along.to(torch.float32).contiguous(),
-            width.to(torch.float32).contiguous(),
-            limits.to(torch.float32).contiguous(),
-            self.bounds,
+            origin.to(torch.float64).contiguous(),
+            direction.to(torch.float64).contiguous(),
+            cone.to(torch.float64).contiguous(),
+            range.to(torch.float64).contiguous(),
+            self.place,
             self.child,
             self.brick,
             self.request,
@@ -154,15 +122,17 @@ class TreeTracer(torch.nn.Module):
             self.domain,
             self.opaque,
             self.frame,
+            0,
             self.branching,
             self.root,
             self.depth,
             self.border,
             self.component,
+            self.flatness,
             self.root_voxel,
             self.step,
             self.stop_alpha,
             self.depth_alpha,
             False,
         )
-        return color, alpha, depth + moved.to(torch.float32), samples
+        return color, alpha, depth, samples

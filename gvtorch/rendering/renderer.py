@@ -17,9 +17,8 @@ from ..ops.trace import Backend, choose_backend, most_intervals
 from ..pool import N3Tree
 from ..stage import Progress, collect_timings, no_progress, stage
 from .camera import Camera
-from .module import approach
 from .picture import Picture
-from .shader import TransferFunction
+from .shader import TransferFunction, interval_levels
 
 _RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that progress shows
 
@@ -189,8 +188,7 @@ def trace_camera(
             else:  # the rows that hold them, then they alone
                 first, last = int(which[0]) // width, int(which[-1]) // width
                 rays = one.rays(device, (top + first, top + last + 1))
-                rows = {name: ray[which - first * width] for name, ray in vars(rays).items()}
-                rays = Rays(**rows)
+                rays = rays[which - first * width]
         with stage("trace"):
             part = trace_rays(rays)
         for name, field in vars(part).items():
@@ -254,10 +252,12 @@ class Tracer:
             raise ValueError(f"render: unknown channel {channel!r}; the tree has {known}")
         step = options.step * min(tree.spacing)
         most_intervals(float((tree.box[1] - tree.box[0]).norm()), step)
-        self.tree, self.options = tree, options
-        table, domain, opaque = shader.table(min(tree.spacing), options.dtype, tree.device)
+        self.tree = tree
+        scale = options.cone_scale * tree.flatness if options.lod == "auto" else 0.0
+        levels = interval_levels(tree.root_voxel, step) if scale else 1
+        table = shader.table(min(tree.spacing), step, levels, options.dtype, tree.device)
         self.arguments: dict[str, Any] = {
-            "bounds_23": tree.bounds(options.dtype),
+            "place_33": tree.place,
             "child_tn": tree.nodes.child_tn,
             "brick_tn": tree.nodes.brick_tn,
             "request_tn": tree.nodes.request_tn,
@@ -266,15 +266,14 @@ class Tracer:
             "constant_tnc": tree.nodes.constants[channel],
             "range_tn2c": tree.nodes.ranges[channel],
             "stamp_b": tree.bricks.stamp_b,
-            "table_m4": table,
-            "domain_3": domain,
-            "opaque_m": opaque,
+            **vars(table),
             "frame_1": torch.tensor([tree.frame], dtype=torch.int32, device=tree.device),
             "branching": tree.branching,
             "root": tree.root,
             "max_depth": tree.depth,
             "border": tree.bricks.border,
             "component": options.component,
+            "cone_scale": scale,
             "root_voxel": tree.root_voxel,
             "step": step,
             "stop_alpha": options.stop_alpha,
@@ -285,20 +284,12 @@ class Tracer:
 
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays in world units."""
-        options = self.options
-        scale = options.cone_scale * self.tree.flatness if options.lod == "auto" else 0.0
-        origin, direction = self.tree.to_tree(rays.origin, rays.direction)
-        cone = rays.cone.to(torch.float64) * scale
-        high = self.arguments["bounds_23"][1].to(torch.float64)
-        origin, cone, limits, moved = approach(
-            origin, direction, cone, rays.range.to(torch.float64), high
-        )
-        columns = (origin, direction, cone, limits)
+        columns = (rays.origin, rays.direction, rays.cone, rays.range)
         color, alpha, depth, samples, missed = trace_rays(
-            *(column.to(options.dtype).contiguous() for column in columns),
+            *(column.to(torch.float64).contiguous() for column in columns),
+            width=rays.width,
             **self.arguments,
         )
-        depth = depth + moved.to(options.dtype)
         return Hits(color=color, alpha=alpha, depth=depth, samples=samples, missed=missed)
 
 

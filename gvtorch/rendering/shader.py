@@ -9,8 +9,10 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -42,7 +44,11 @@ PRESETS: dict[str, tuple[Points, Points]] = {
     ),
 }
 
-_MOST_CELLS = 2**20 - 1
+# Cells of a table: at least; where corners don't fall on rows, at least; how many of them two corners are then apart;
+# most where corners fall on rows and rows could be fewer; most at all.
+_FEWEST_CELLS, _FEWEST_SAMPLED, _CELLS_APART, _MANY_CELLS, _MOST_CELLS = 2**10, 2**12, 16, 2**16, 2**20
+_MOST_BYTES = 64 * 2**20  # of a table in float32
+_KEPT_TABLES = 4
 
 
 class TransferFunction:
@@ -63,6 +69,7 @@ class TransferFunction:
                 "TransferFunction", "reference", reference, low=0, open_low=True
             )
         self.reference = reference
+        self._tables: dict[tuple[Any, ...], Table] = {}
 
     @classmethod
     def from_points(
@@ -136,48 +143,100 @@ class TransferFunction:
         return np.stack([*channels, np.interp(value, *self.opacity.T)], axis=-1)
 
     def table(
-        self, smallest_spacing: float, dtype: torch.dtype, device: torch.device | str
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns the function as the kernel reads it: rows at even distances, and their domain.
+        self,
+        smallest_spacing: float,
+        step: float,
+        levels: int,
+        dtype: torch.dtype,
+        device: torch.device | str,
+    ) -> Table:
+        """Returns the function as the kernel reads it: rows at even distances over a domain.
 
-        The number of rows is chosen so that every corner point falls on a row: then the table is
-        the function, not a sampling of it. Points that share no grid of 2^20 rows are sampled on
-        that grid.
+        Rows are laid so that every corner point falls on one, where that takes no more than 2^16
+        cells; else so densely that no two corners share 16 cells. Between rows, colour and alpha are
+        linear.
 
-        Returns:
-            table (m, 4); domain (3,): value of the first row, of the last row, reference length;
-            opaque (m,) int32: how many rows up to this one have an opacity.
+        Args:
+            smallest_spacing: World units; opacity's reference length where none was given.
+            step: World length of the shortest interval.
+            levels: How many lengths of intervals, each twice the one before; fewer where tables
+                would take more than 64 MB.
+            dtype: Of table and domain.
+            device: Where they lie. The last tables are kept: asking again costs nothing.
+
+        Raises:
+            ValueError: Two points are too close to each other.
         """
+        number = self.reference or smallest_spacing
+        key = (self.opacity.tobytes(), self.color.tobytes(), number, step, levels, dtype, str(device))
+        if key not in self._tables:
+            table = self._make_table(step / number, levels, dtype, torch.device(device))
+            if len(self._tables) == _KEPT_TABLES:
+                self._tables.pop(next(iter(self._tables)))
+            self._tables[key] = table
+        return self._tables[key]
+
+    def _make_table(
+        self, length: float, levels: int, dtype: torch.dtype, device: torch.device
+    ) -> Table:
+        """`length`: of the shortest interval, in reference lengths."""
         corners = np.unique(np.concatenate((self.opacity[:, 0], self.color[:, 0])))
         low, high = float(corners[0]), float(corners[-1])
         if high == low:
             high = low + max(1.0, abs(low))
-        cells = _shared_grid((corners - low) / (high - low))
-        gaps = np.diff(corners)
-        if len(gaps) and float(gaps.min()) < 0.999 * (high - low) / cells:
-            at = int(gaps.argmin())
+        cells = _grid((corners - low) / (high - low))
+        if cells is None:
+            gap = np.diff(corners)
+            at = int(gap.argmin())
             raise ValueError(
                 f"TransferFunction: values {corners[at]:g} and {corners[at + 1]:g} are too close "
-                f"for a table of {cells + 1} rows from {low:g} to {high:g}"
+                f"for a table of {_MOST_CELLS + 1} rows from {low:g} to {high:g}"
             )
         rows = self(low + (high - low) * np.arange(cells + 1) / cells)
-        domain = torch.tensor([low, high, self.reference or smallest_spacing], dtype=dtype)
-        table = torch.tensor(rows, dtype=dtype, device=device)
-        opaque = (table[:, 3] > 0).cumsum(0, dtype=torch.int32)
-        return table, domain.to(device), opaque
+        levels = max(1, min(levels, _MOST_BYTES // (16 * len(rows))))
+        lengths = length * 2.0 ** np.arange(levels)
+        with np.errstate(divide="ignore"):
+            alpha = -np.expm1(lengths[:, None] * np.log1p(-rows[:, 3]))
+        table = np.concatenate(
+            (np.broadcast_to(rows[:, :3], (levels, *rows[:, :3].shape)), alpha[..., None]), 2
+        )
+        return Table(
+            table_lm4=torch.tensor(table, dtype=dtype, device=device),
+            domain_2=torch.tensor([low, high], dtype=dtype, device=device),
+            opaque_m=torch.tensor(
+                np.cumsum(rows[:, 3] > 0), dtype=torch.int32, device=device
+            ),
+        )
 
 
-def _shared_grid(places: np.ndarray) -> int:
-    """Fewest cells of [0, 1] such that every place is a cell's end; the most there may be if there
-    is none.
-    """
-    cells = 1
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """A transfer function as the kernel reads it."""
+
+    table_lm4: Tensor  # (l, m, 4) linear RGB, alpha of an interval of step * 2^l
+    domain_2: Tensor  # (2,) value of the first row, of the last row
+    opaque_m: Tensor  # (m,) int32, how many rows up to this one have an opacity
+
+
+def interval_levels(root_voxel: float, step: float) -> int:
+    """Returns how many lengths of intervals a tree needs: up to that of a voxel of its root."""
+    return max(1, math.ceil(math.log2(root_voxel / step)) + 1)
+
+
+def _grid(places: np.ndarray) -> int | None:
+    """A number of cells of [0, 1] fine enough for corners at these places; None: there is none."""
+    exact = 1
     for place in places:
         fraction = Fraction(float(place)).limit_denominator(_MOST_CELLS)
-        cells = math.lcm(cells, fraction.denominator)
-        if abs(float(fraction) - place) > 1e-9 or cells > _MOST_CELLS:
-            return _MOST_CELLS
-    return cells
+        exact = math.lcm(exact, fraction.denominator)
+        if abs(float(fraction) - place) > 1e-9 or exact > _MOST_CELLS:
+            exact = 0
+            break
+    gap = float(np.diff(places, append=2.0).min())
+    dense = max(_FEWEST_SAMPLED, 2 ** math.ceil(math.log2(_CELLS_APART / gap)))
+    if exact and (exact <= _MANY_CELLS or dense > _MOST_CELLS):
+        return exact * math.ceil(_FEWEST_CELLS / exact)
+    return dense if dense <= _MOST_CELLS else None
 
 
 def _points(name: str, points: Points, width: int) -> np.ndarray:

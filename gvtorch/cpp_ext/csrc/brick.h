@@ -8,6 +8,7 @@
 #include "tree.h"
 
 namespace gvtorch {
+inline namespace GV_NAMESPACE {
 
 template <class Voxel>
 struct BrickView {
@@ -15,6 +16,7 @@ struct BrickView {
   const Voxel* constant_tnc;
   const Voxel* range_tn2c;  // smallest and largest value in reach of the node's brick
   int32_t* stamp_b;
+  int64_t bricks;
   int32_t side;  // B + 2 * border
   int32_t border;
   int32_t channels;
@@ -22,57 +24,59 @@ struct BrickView {
 };
 
 // One brick (or constant) seen along one ray: voxel coordinate = offset + t * slope.
-template <class T>
+template <class T, class Voxel>
 struct BrickRay {
-  int64_t base = -1;  // index of the brick's first voxel; < 0: `constant` everywhere
+  const Voxel* voxels = nullptr;  // the brick's first voxel; null: `constant` everywhere
+  bool last = false;              // nothing may be read behind the brick
   T constant = 0;
   Vec3<T> offset{0, 0, 0};
   Vec3<T> slope{0, 0, 0};
 };
 
-template <class T, class Voxel>
-GV_HD BrickRay<T> aim(const BrickView<Voxel>& view, const Holder<T>& holder, Vec3<T> origin, Vec3<T> direction) {
-  BrickRay<T> ray;
+template <class T, class Voxel, class Number>
+GV_HD BrickRay<T, Voxel> aim(const BrickView<Voxel>& view, const Levels<T>& levels, const Holder& holder,
+                             const Number& digits, Vec3<T> origin, Vec3<T> direction) {
+  BrickRay<T, Voxel> ray;
   if (holder.brick < 0) {
-    if (holder.node >= 0) {
-      ray.constant = static_cast<T>(view.constant_tnc[holder.node * view.channels + view.component]);
-    }
+    if (holder.node >= 0) ray.constant = number<T>(view.constant_tnc[holder.node * view.channels + view.component]);
     return ray;
   }
   const int64_t volume = static_cast<int64_t>(view.side) * view.side * view.side;
-  ray.base = holder.brick * volume * view.channels + view.component;
-  const T scale = static_cast<T>(view.side - 2 * view.border) / holder.size;
+  ray.voxels = view.bricks_bzyxc + (holder.brick * volume * view.channels + view.component);
+  ray.last = holder.brick + 1 == view.bricks;
+  const T scale = levels.scale[holder.depth];
+  const Vec3<T> corner = digits.corner(holder.depth, levels);
   const T first = static_cast<T>(view.border) - static_cast<T>(0.5);
   for (int axis = 0; axis < 3; ++axis) {
-    ray.offset[axis] = (origin[axis] - holder.corner[axis]) * scale + first;
+    ray.offset[axis] = (origin[axis] - corner[axis]) * scale + first;
     ray.slope[axis] = direction[axis] * scale;
   }
   return ray;
 }
 
 template <class T, class Voxel>
-GV_HD T sample(const BrickView<Voxel>& view, const BrickRay<T>& ray, T t) {
-  if (ray.base < 0) return ray.constant;
-  int64_t index[3];
+GV_HD T sample(const BrickView<Voxel>& view, const BrickRay<T, Voxel>& ray, T t) {
+  if (ray.voxels == nullptr) return ray.constant;
+  int32_t index[3];
   T weight[3];
   const T last = static_cast<T>(view.side - 1);
   for (int axis = 0; axis < 3; ++axis) {
     const T place = clamp(ray.offset[axis] + t * ray.slope[axis], static_cast<T>(0), last);
-    const int32_t cell = smaller(floor_int(place), view.side - 2);
+    const int32_t cell = smaller(static_cast<int32_t>(place), view.side - 2);
     index[axis] = cell;
     weight[axis] = place - static_cast<T>(cell);
   }
-  const int64_t step_x = view.channels;
-  const int64_t step_y = step_x * view.side;
-  const int64_t step_z = step_y * view.side;
-  const Voxel* corner = view.bricks_bzyxc + ray.base + index[2] * step_z + index[1] * step_y + index[0] * step_x;
+  const int32_t step_x = view.channels;
+  const int32_t step_y = step_x * view.side;
+  const int32_t step_z = step_y * view.side;
+  const Voxel* corner = ray.voxels + (index[2] * step_z + index[1] * step_y + index[0] * step_x);
   T plane[2];
   for (int z = 0; z < 2; ++z) {
     T row[2];
     for (int y = 0; y < 2; ++y) {
-      const Voxel* pair = corner + z * step_z + y * step_y;
-      const T left = static_cast<T>(pair[0]);
-      const T right = static_cast<T>(pair[step_x]);
+      const Voxel* pair = corner + (z * step_z + y * step_y);
+      const T left = number<T>(pair[0]);
+      const T right = number<T>(pair[step_x]);
       row[y] = left + weight[0] * (right - left);
     }
     plane[z] = row[0] + weight[1] * (row[1] - row[0]);
@@ -80,4 +84,5 @@ GV_HD T sample(const BrickView<Voxel>& view, const BrickRay<T>& ray, T t) {
   return plane[0] + weight[2] * (plane[1] - plane[0]);
 }
 
+}  // namespace GV_NAMESPACE
 }  // namespace gvtorch

@@ -10,6 +10,7 @@
 #include "hd.h"
 
 namespace gvtorch {
+inline namespace GV_NAMESPACE {
 
 // Pending bits stand above the kind bits: asked for, answer not here yet. Such a wish is not listed again.
 constexpr int32_t kPendingShift = 2;
@@ -128,4 +129,5 @@ struct WritePointer {
   }
 };
 
+}  // namespace GV_NAMESPACE
 }  // namespace gvtorch

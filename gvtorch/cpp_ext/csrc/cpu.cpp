@@ -6,9 +6,53 @@
 #include <algorithm>
 #include <atomic>
 #include <cstdint>
+#include <cstdlib>
+#include <cstring>
 #include <vector>
 
+#include "trace.h"
+
 namespace gvtorch {
+
+// lanes.cpp, compiled once for each instruction set.
+namespace baseline {
+void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end);
+}
+#ifdef GV_X86
+namespace avx2 {
+void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end);
+}
+namespace avx512 {
+void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end);
+}
+#endif
+
+// The widest instructions that this processor has; GVTORCH_CPU=baseline, avx2 or avx512 asks for fewer.
+struct Processor {
+  const char* name = "baseline";
+  decltype(&baseline::trace_chunk) trace_chunk = &baseline::trace_chunk;
+  Processor() {
+#ifdef GV_X86
+    const char* asked = std::getenv("GVTORCH_CPU");
+    const auto allows = [&](const char* set) { return asked == nullptr || std::strcmp(asked, set) == 0; };
+    __builtin_cpu_init();
+    const bool wide = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("f16c");
+    if (allows("avx512") && wide && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl")) {
+      name = "avx512";
+      trace_chunk = &avx512::trace_chunk;
+    } else if ((allows("avx512") || allows("avx2")) && wide) {
+      name = "avx2";
+      trace_chunk = &avx2::trace_chunk;
+    }
+#endif
+  }
+};
+
+inline const Processor& processor() {
+  static const Processor found;
+  return found;
+}
 
 struct Cpu {};
 
@@ -62,6 +106,22 @@ void compact(const torch::stable::Tensor& like, int64_t count, const Keep& keep,
       },
       1);
   *kept = first[chunks];
+}
+
+template <class Device>
+void trace(const torch::stable::Tensor& like, const TraceArgs& args, bool wide) {
+  constexpr int64_t kChunk = 256;
+  const int64_t count = RayOrder{args.rays, args.width}.count();
+  if (wide) {
+    with_voxel(args.voxel, [&](auto voxel) {
+      for_each<Device>(like, count, TraceRay<double, decltype(voxel)>(args), kChunk);
+    });
+    return;
+  }
+  const auto chunk = [&](int64_t number) {
+    processor().trace_chunk(args, number * kChunk, std::min(count, (number + 1) * kChunk));
+  };
+  for_each<Device>(like, (count + kChunk - 1) / kChunk, chunk, 1);
 }
 
 }  // namespace gvtorch

@@ -11,6 +11,8 @@
 #include <cstdint>
 #include <cub/device/device_scan.cuh>
 
+#include "trace.h"
+
 namespace gvtorch {
 
 struct Cuda {};
@@ -35,6 +37,19 @@ void for_each(const torch::stable::Tensor& like, int64_t count, const Functor& f
   run_functor<<<grid, kBlock, 0, static_cast<cudaStream_t>(stream)>>>(functor, count);
   const cudaError_t status = cudaGetLastError();
   STD_TORCH_CHECK(status == cudaSuccess, "gvtorch: kernel launch failed: ", cudaGetErrorString(status));
+}
+
+template <class Device>
+void trace(const torch::stable::Tensor& like, const TraceArgs& args, bool wide) {
+  with_voxel(args.voxel, [&](auto voxel) {
+    using Voxel = decltype(voxel);
+    const int64_t count = RayOrder{args.rays, args.width}.count();
+    if (wide) {
+      for_each<Device>(like, count, TraceRay<double, Voxel>(args));
+    } else {
+      for_each<Device>(like, count, TraceRay<float, Voxel>(args));
+    }
+  });
 }
 
 template <class Keep>

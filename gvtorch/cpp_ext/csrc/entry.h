@@ -9,8 +9,6 @@
 #include <torch/csrc/stable/ops.h>
 #include <torch/csrc/stable/tensor.h>
 #include <torch/headeronly/core/ScalarType.h>
-#include <torch/headeronly/util/BFloat16.h>
-#include <torch/headeronly/util/Half.h>
 
 #include <tuple>
 
@@ -25,12 +23,12 @@ using torch::stable::Tensor;
 // (a!) request words, (b!) tile stamps, (c!) brick stamps are written in place.
 constexpr const char* kTraceRaysSchema =
     "trace_rays("
-    "Tensor origin_r3, Tensor direction_r3, Tensor cone_r2, Tensor range_r2, Tensor bounds_23, "
+    "Tensor origin_r3, Tensor direction_r3, Tensor cone_r2, Tensor range_r2, Tensor place_33, "
     "Tensor child_tn, Tensor brick_tn, Tensor(a!) request_tn, Tensor(b!) stamp_t, "
     "Tensor bricks_bzyxc, Tensor constant_tnc, Tensor range_tn2c, Tensor(c!) stamp_b, "
-    "Tensor table_m4, Tensor domain_3, Tensor opaque_m, Tensor frame_1, "
-    "int branching, int root, int max_depth, int border, int component, "
-    "float root_voxel, float step, float stop_alpha, float depth_alpha, bool by_level"
+    "Tensor table_lm4, Tensor domain_2, Tensor opaque_m, Tensor frame_1, "
+    "int width, int branching, int root, int max_depth, int border, int component, "
+    "float cone_scale, float root_voxel, float step, float stop_alpha, float depth_alpha, bool by_level"
     ") -> (Tensor color_r3, Tensor alpha_r1, Tensor depth_r1, Tensor samples_r, Tensor missed_r)";
 constexpr const char* kCompactRequestsSchema =
     "compact_requests(Tensor(a!) request_tn, int capacity) -> (Tensor node_k, Tensor word_k, Tensor count_3)";
@@ -51,88 +49,89 @@ inline void require_numel(const Tensor& tensor, const char* name, int64_t expect
                   tensor.numel());
 }
 
-inline void require_float(ScalarType dtype) {
-  STD_TORCH_CHECK(dtype == ScalarType::Float || dtype == ScalarType::Double,
-                  "gvtorch: rays must be float32 or float64");
-}
-
-template <class T>
-constexpr ScalarType scalar_type_of() {
-  return sizeof(T) == 8 ? ScalarType::Double : ScalarType::Float;
-}
-
-// Calls `body(Voxel{})` with the C++ type of a channel's dtype.
-template <class Body>
-void with_voxel_type(ScalarType dtype, const Body& body) {
+inline VoxelType voxel_type(ScalarType dtype) {
   switch (dtype) {
     case ScalarType::Byte:
-      return body(uint8_t{});
+      return VoxelType::kUInt8;
     case ScalarType::Char:
-      return body(int8_t{});
+      return VoxelType::kInt8;
     case ScalarType::Short:
-      return body(int16_t{});
+      return VoxelType::kInt16;
     case ScalarType::UInt16:
-      return body(uint16_t{});
+      return VoxelType::kUInt16;
     case ScalarType::Half:
-      return body(torch::headeronly::Half{});
+      return VoxelType::kHalf;
     case ScalarType::BFloat16:
-      return body(torch::headeronly::BFloat16{});
+      return VoxelType::kBFloat16;
     case ScalarType::Float:
-      return body(float{});
+      return VoxelType::kFloat;
     default:
       STD_TORCH_CHECK(false, "gvtorch: this channel dtype has no kernel");
   }
 }
 
+inline const int32_t* words_in(const Tensor& tensor) { return static_cast<const int32_t*>(tensor.const_data_ptr()); }
+inline int32_t* words_out(const Tensor& tensor) { return static_cast<int32_t*>(tensor.mutable_data_ptr()); }
+
 template <class Device>
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> trace_rays(
     const Tensor& origin_r3, const Tensor& direction_r3, const Tensor& cone_r2, const Tensor& range_r2,
-    const Tensor& bounds_23, const Tensor& child_tn, const Tensor& brick_tn, const Tensor& request_tn,
+    const Tensor& place_33, const Tensor& child_tn, const Tensor& brick_tn, const Tensor& request_tn,
     const Tensor& stamp_t, const Tensor& bricks_bzyxc, const Tensor& constant_tnc, const Tensor& range_tn2c,
-    const Tensor& stamp_b, const Tensor& table_m4, const Tensor& domain_3, const Tensor& opaque_m,
-    const Tensor& frame_1, int64_t branching, int64_t root, int64_t max_depth, int64_t border, int64_t component,
-    double root_voxel, double step, double stop_alpha, double depth_alpha, bool by_level) {
-  const ScalarType real = origin_r3.scalar_type();
+    const Tensor& stamp_b, const Tensor& table_lm4, const Tensor& domain_2, const Tensor& opaque_m,
+    const Tensor& frame_1, int64_t width, int64_t branching, int64_t root, int64_t max_depth, int64_t border,
+    int64_t component, double cone_scale, double root_voxel, double step, double stop_alpha, double depth_alpha,
+    bool by_level) {
+  const ScalarType real = table_lm4.scalar_type();
   const ScalarType word = ScalarType::Int;
   const ScalarType voxel = bricks_bzyxc.scalar_type();
-  require_float(real);
+  STD_TORCH_CHECK(real == ScalarType::Float || real == ScalarType::Double,
+                  "gvtorch: table_lm4 must be float32 or float64");
   STD_TORCH_CHECK(origin_r3.dim() == 2 && origin_r3.size(1) == 3, "gvtorch: origin_r3 must be (r, 3)");
-  STD_TORCH_CHECK(bricks_bzyxc.dim() == 5 && bricks_bzyxc.size(1) >= 2 &&
+  STD_TORCH_CHECK(bricks_bzyxc.dim() == 5 && bricks_bzyxc.size(1) >= 2 && bricks_bzyxc.size(1) <= 1024 &&
                       bricks_bzyxc.size(1) == bricks_bzyxc.size(2) && bricks_bzyxc.size(2) == bricks_bzyxc.size(3),
                   "gvtorch: bricks_bzyxc must be (b, s, s, s, c) with s >= 2");
   const int64_t rays = origin_r3.size(0);
   const int64_t side = bricks_bzyxc.size(1);
   const int64_t channels = bricks_bzyxc.size(4);
+  STD_TORCH_CHECK(side * side * side * channels <= INT32_MAX / 8, "gvtorch: a brick is too large");
   STD_TORCH_CHECK(child_tn.dim() == 2, "gvtorch: child_tn must be (t, n)");
   const int64_t nodes = child_tn.numel();
   const int64_t nodes_per_tile = child_tn.size(1);
-  STD_TORCH_CHECK(branching >= 2 && branching <= 16 && max_depth >= 0 && max_depth <= 62 &&
+  STD_TORCH_CHECK(branching >= 2 && branching <= 16 && max_depth >= 0 && max_depth < kMostLevels &&
                       nodes_per_tile >= branching * branching * branching && nodes_per_tile <= INT32_MAX,
                   "gvtorch: tree out of range");
   STD_TORCH_CHECK(root >= 0 && root < nodes, "gvtorch: root is not a node");
   STD_TORCH_CHECK(border >= 0 && side > 2 * border && component >= 0 && component < channels,
                   "gvtorch: border or component out of range");
   STD_TORCH_CHECK(step > 0 && root_voxel > 0, "gvtorch: step and root_voxel must be positive");
+  STD_TORCH_CHECK(width >= 0 && (width == 0 || rays % width == 0), "gvtorch: rays are no rows of this width");
+  STD_TORCH_CHECK(table_lm4.dim() == 3 && table_lm4.size(0) >= 1 && table_lm4.size(1) >= 2 &&
+                      table_lm4.size(1) <= INT32_MAX,
+                  "gvtorch: table_lm4 must be (l, m, 4) with m >= 2");
 
   for (const auto& [tensor, name, numel] :
        {std::tuple<const Tensor&, const char*, int64_t>{origin_r3, "origin_r3", 3 * rays},
         {direction_r3, "direction_r3", 3 * rays},
         {cone_r2, "cone_r2", 2 * rays},
         {range_r2, "range_r2", 2 * rays},
-        {bounds_23, "bounds_23", 6},
-        {table_m4, "table_m4", table_m4.size(0) * 4},
-        {domain_3, "domain_3", 3}}) {
-    require(tensor, name, origin_r3, real);
+        {place_33, "place_33", 9}}) {
+    require(tensor, name, origin_r3, ScalarType::Double);
     require_numel(tensor, name, numel);
   }
-  STD_TORCH_CHECK(table_m4.size(0) >= 2, "gvtorch: table_m4 needs two rows");
+  require(table_lm4, "table_lm4", origin_r3, real);
+  require_numel(table_lm4, "table_lm4", table_lm4.size(0) * table_lm4.size(1) * 4);
+  STD_TORCH_CHECK(reinterpret_cast<uintptr_t>(table_lm4.const_data_ptr()) % 16 == 0,
+                  "gvtorch: table_lm4 must begin at a multiple of 16 bytes");
+  require(domain_2, "domain_2", origin_r3, real);
+  require_numel(domain_2, "domain_2", 2);
   for (const auto& [tensor, name, numel] :
        {std::tuple<const Tensor&, const char*, int64_t>{child_tn, "child_tn", nodes},
         {brick_tn, "brick_tn", nodes},
         {request_tn, "request_tn", nodes},
         {stamp_t, "stamp_t", child_tn.size(0)},
         {stamp_b, "stamp_b", bricks_bzyxc.size(0)},
-        {opaque_m, "opaque_m", table_m4.size(0)},
+        {opaque_m, "opaque_m", table_lm4.size(1)},
         {frame_1, "frame_1", 1}}) {
     require(tensor, name, origin_r3, word);
     require_numel(tensor, name, numel);
@@ -143,47 +142,59 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> trace_rays(
   require(range_tn2c, "range_tn2c", origin_r3, voxel);
   require_numel(range_tn2c, "range_tn2c", 2 * nodes * channels);
 
-  Tensor color_r3 = torch::stable::new_empty(origin_r3, {rays, 3});
-  Tensor alpha_r1 = torch::stable::new_empty(origin_r3, {rays, 1});
-  Tensor depth_r1 = torch::stable::new_empty(origin_r3, {rays, 1});
-  Tensor samples_r = torch::stable::new_empty(origin_r3, {rays}, word);
-  Tensor missed_r = torch::stable::new_empty(origin_r3, {rays}, ScalarType::Bool);
+  Tensor color_r3 = torch::stable::new_empty(table_lm4, {rays, 3});
+  Tensor alpha_r1 = torch::stable::new_empty(table_lm4, {rays, 1});
+  Tensor depth_r1 = torch::stable::new_empty(table_lm4, {rays, 1});
+  Tensor samples_r = torch::stable::new_empty(table_lm4, {rays}, word);
+  Tensor missed_r = torch::stable::new_empty(table_lm4, {rays}, ScalarType::Bool);
 
-  const auto run = [&](auto scalar) {
-    using T = decltype(scalar);
-    with_voxel_type(voxel, [&](auto stored) {
-      using Voxel = decltype(stored);
-      const auto real_in = [](const Tensor& tensor) { return static_cast<const T*>(tensor.const_data_ptr()); };
-      const auto real_out = [](const Tensor& tensor) { return static_cast<T*>(tensor.mutable_data_ptr()); };
-      const auto word_in = [](const Tensor& tensor) { return static_cast<const int32_t*>(tensor.const_data_ptr()); };
-      const auto word_out = [](const Tensor& tensor) { return static_cast<int32_t*>(tensor.mutable_data_ptr()); };
-      const TraceRay<T, Voxel> body{
-          {real_in(origin_r3), real_in(direction_r3), real_in(cone_r2), real_in(range_r2), real_in(bounds_23)},
-          {word_in(child_tn), word_in(brick_tn), word_out(request_tn), word_out(stamp_t), root,
-           static_cast<int32_t>(branching), static_cast<int32_t>(nodes_per_tile), static_cast<int32_t>(max_depth)},
-          {static_cast<const Voxel*>(bricks_bzyxc.const_data_ptr()),
-           static_cast<const Voxel*>(constant_tnc.const_data_ptr()),
-           static_cast<const Voxel*>(range_tn2c.const_data_ptr()), word_out(stamp_b), static_cast<int32_t>(side),
-           static_cast<int32_t>(border), static_cast<int32_t>(channels), static_cast<int32_t>(component)},
-          {real_in(table_m4), real_in(domain_3), word_in(opaque_m), static_cast<int32_t>(table_m4.size(0))},
-          {static_cast<T>(root_voxel), static_cast<T>(step), static_cast<T>(stop_alpha), static_cast<T>(depth_alpha),
-           by_level},
-          {real_out(color_r3), real_out(alpha_r1), real_out(depth_r1), word_out(samples_r),
-           static_cast<bool*>(missed_r.mutable_data_ptr())},
-          word_in(frame_1)};
-      for_each<Device>(origin_r3, rays, body);
-    });
-  };
-  if (real == ScalarType::Double) {
-    run(double{});
-  } else {
-    run(float{});
-  }
+  const auto world = [](const Tensor& tensor) { return static_cast<const double*>(tensor.const_data_ptr()); };
+  TraceArgs args{};
+  args.origin_r3 = world(origin_r3);
+  args.direction_r3 = world(direction_r3);
+  args.cone_r2 = world(cone_r2);
+  args.range_r2 = world(range_r2);
+  args.place_33 = world(place_33);
+  args.child_tn = words_in(child_tn);
+  args.brick_tn = words_in(brick_tn);
+  args.request_tn = words_out(request_tn);
+  args.stamp_t = words_out(stamp_t);
+  args.bricks_bzyxc = bricks_bzyxc.const_data_ptr();
+  args.constant_tnc = constant_tnc.const_data_ptr();
+  args.range_tn2c = range_tn2c.const_data_ptr();
+  args.stamp_b = words_out(stamp_b);
+  args.table_lm4 = table_lm4.const_data_ptr();
+  args.domain_2 = domain_2.const_data_ptr();
+  args.opaque_m = words_in(opaque_m);
+  args.frame_1 = words_in(frame_1);
+  args.color_r3 = color_r3.mutable_data_ptr();
+  args.alpha_r1 = alpha_r1.mutable_data_ptr();
+  args.depth_r1 = depth_r1.mutable_data_ptr();
+  args.samples_r = words_out(samples_r);
+  args.missed_r = static_cast<bool*>(missed_r.mutable_data_ptr());
+  args.rays = rays;
+  args.width = width;
+  args.root = root;
+  args.bricks = bricks_bzyxc.size(0);
+  args.voxel = voxel_type(voxel);
+  args.nodes_per_tile = static_cast<int32_t>(nodes_per_tile);
+  args.branching = static_cast<int32_t>(branching);
+  args.max_depth = static_cast<int32_t>(max_depth);
+  args.side = static_cast<int32_t>(side);
+  args.border = static_cast<int32_t>(border);
+  args.channels = static_cast<int32_t>(channels);
+  args.component = static_cast<int32_t>(component);
+  args.rows = static_cast<int32_t>(table_lm4.size(1));
+  args.levels = static_cast<int32_t>(table_lm4.size(0));
+  args.cone_scale = cone_scale;
+  args.root_voxel = root_voxel;
+  args.step = step;
+  args.stop_alpha = stop_alpha;
+  args.depth_alpha = depth_alpha;
+  args.by_level = by_level;
+  trace<Device>(origin_r3, args, real == ScalarType::Double);
   return {color_r3, alpha_r1, depth_r1, samples_r, missed_r};
 }
-
-inline const int32_t* words_in(const Tensor& tensor) { return static_cast<const int32_t*>(tensor.const_data_ptr()); }
-inline int32_t* words_out(const Tensor& tensor) { return static_cast<int32_t*>(tensor.mutable_data_ptr()); }
 
 template <class Device>
 std::tuple<Tensor, Tensor, Tensor> compact_requests(const Tensor& request_tn, int64_t capacity) {

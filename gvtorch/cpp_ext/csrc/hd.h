@@ -13,6 +13,12 @@
 #include <cstdint>
 #include <cstring>
 
+// The CPU's kernels are compiled once for each instruction set, each in a namespace of its own: a function that the
+// linker merges would else run instructions that a machine does not have.
+#ifndef GV_NAMESPACE
+#define GV_NAMESPACE plain
+#endif
+
 #ifdef __CUDACC__
 #define GV_HD __host__ __device__ __forceinline__
 #else
@@ -20,6 +26,7 @@
 #endif
 
 namespace gvtorch {
+inline namespace GV_NAMESPACE {
 
 template <class T>
 struct Vec3 {
@@ -52,12 +59,38 @@ GV_HD int32_t floor_int(T value) {
   return whole - (static_cast<T>(whole) > value ? 1 : 0);
 }
 
+// 16-bit floats as they are stored; every one of them is a float.
+struct Half {
+  uint16_t bits;
+};
+struct BFloat16 {
+  uint16_t bits;
+};
+
 template <class To, class From>
 GV_HD To bit_cast(From value) {
   static_assert(sizeof(To) == sizeof(From));
   To out;
   memcpy(&out, &value, sizeof(out));
   return out;
+}
+
+// Voxel to number. Halves by moving their bits and scaling, which is exact for denormals too.
+template <class T, class Voxel>
+GV_HD T number(Voxel voxel) {
+  return static_cast<T>(voxel);
+}
+template <class T>
+GV_HD T number(BFloat16 voxel) {
+  return static_cast<T>(bit_cast<float>(static_cast<uint32_t>(voxel.bits) << 16));
+}
+template <class T>
+GV_HD T number(Half voxel) {
+  const uint32_t sign = static_cast<uint32_t>(voxel.bits & 0x8000) << 16;
+  const uint32_t magnitude = voxel.bits & 0x7fff;
+  const float scaled = bit_cast<float>(magnitude << 13) * 5.192296858534828e33f;  // 2^112: the biases' difference
+  const uint32_t bits = magnitude < 0x7c00 ? bit_cast<uint32_t>(scaled) : (magnitude << 13) | 0x7f800000;
+  return static_cast<T>(bit_cast<float>(sign | bits));
 }
 
 // Base-2 logarithm of a positive, normal float.
@@ -135,4 +168,5 @@ GV_HD void post_request(int32_t* word, int32_t wish) {
 #endif
 }
 
+}  // namespace GV_NAMESPACE
 }  // namespace gvtorch

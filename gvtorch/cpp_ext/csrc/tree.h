@@ -9,18 +9,39 @@
 //   brick_tn    >= 0 brick slot | kAbsent: not loaded yet | kEmpty | kConstant: one value, see constant_tnc
 //   request_tn  what rays wish for it, see post_request in hd.h
 //
-// Tree units: the root is the cube [0,1]^3. Restarting from the root for every node needs no stack
-// (Horn et al., "Interactive k-d tree GPU raytracing", I3D 2007, kd-restart; Crassin, PhD thesis 2011, 6.1).
+// Tree units: the root is the cube [0,1]^3. A descent that restarts from the root needs no stack (Horn et al.,
+// "Interactive k-d tree GPU raytracing", I3D 2007, kd-restart; Crassin, PhD thesis 2011, 6.1); one that keeps its last
+// path starts where the two places part.
 #pragma once
 
 #include "hd.h"
 
 namespace gvtorch {
+inline namespace GV_NAMESPACE {
 
 constexpr int32_t kAbsent = -1;
 constexpr int32_t kTerminal = -2;
 constexpr int32_t kEmpty = -2;
 constexpr int32_t kConstant = -3;
+constexpr int32_t kMostLevels = 63;
+
+// Numbers of each depth, divided down from the root's.
+template <class T>
+struct Levels {
+  T voxel[kMostLevels];  // world size of a voxel
+  T size[kMostLevels];   // tree units: a node's box
+  T scale[kMostLevels];  // voxels a tree unit
+
+  Levels(T root_voxel, T brick, int32_t branching) {
+    voxel[0] = root_voxel;
+    size[0] = 1;
+    for (int32_t depth = 0; depth < kMostLevels; ++depth) {
+      if (depth > 0) voxel[depth] = voxel[depth - 1] / static_cast<T>(branching);
+      if (depth > 0) size[depth] = size[depth - 1] / static_cast<T>(branching);
+      scale[depth] = brick / size[depth];
+    }
+  }
+};
 
 struct TreeView {
   const int32_t* child_tn;
@@ -31,61 +52,174 @@ struct TreeView {
   int32_t branching;  // N
   int32_t nodes_per_tile;
   int32_t max_depth;
+
+  // Bits of a digit, where N is a power of two and a place's digits fit a word; else 0.
+  GV_HD int32_t digit_bits() const {
+    const int32_t bits = branching == 2 ? 1 : branching == 4 ? 2 : branching == 8 ? 3 : branching == 16 ? 4 : 0;
+    return bits * max_depth <= 30 ? bits : 0;
+  }
 };
 
-// A node whose brick answers for a place, and its box in tree units. node < 0: nobody answers.
-template <class T>
+// A node whose brick answers for a place. node < 0: nobody answers.
 struct Holder {
   int64_t node = -1;
   int32_t brick = kAbsent;
-  Vec3<T> corner{0, 0, 0};
-  T size = 1;
+  int32_t depth = 0;
 };
 
-// Where a descent ended: the box in which the same descent gives the same answer, the wanted level's holder and
-// the holder of the level above it (they blend), and the node indices a request may name.
-template <class T>
+// Where a descent ended: the wanted level's holder and the holder of the level above it (they blend), and what a
+// request may name. The same descent ends in the same node all over the node's box.
 struct Place {
-  Vec3<T> corner{0, 0, 0};
-  T size = 1;
-  int32_t depth = 0;
   int64_t node = -1;
   int64_t parent = -1;
-  Holder<T> fine;
-  Holder<T> coarse;
+  int32_t depth = 0;
+  int32_t brick = kAbsent;  // words of the node
+  int32_t tile = kAbsent;
+  bool hidden = false;  // nothing in the node or below it is seen
+  Holder fine;
+  Holder coarse;
 };
 
-// Descends to `wanted` depth or as far as tiles exist; stamps every tile on the way with `frame`.
+// The digits of a place in base N, from the root down. Any N: each digit from what the one above left over.
 template <class T>
-GV_HD Place<T> descend(const TreeView& tree, Vec3<T> position, int32_t wanted, int32_t frame) {
-  const T branching = static_cast<T>(tree.branching);
-  Place<T> place;
-  place.node = tree.root;
-  Vec3<T> local = position;
-  for (;;) {
-    store_stamp(&tree.stamp_t[place.node / tree.nodes_per_tile], frame);
-    const int32_t brick = tree.brick_tn[place.node];
-    if (brick != kAbsent) {
-      place.fine = Holder<T>{place.node, brick, place.corner, place.size};
-      if (place.depth < wanted) place.coarse = place.fine;
-    }
-    const int32_t tile = tree.child_tn[place.node];
-    if (place.depth == wanted || tile < 0) return place;
+struct Digits {
+  static constexpr bool kRandomAccess = false;
+  Vec3<T> position, local;
+  int32_t branching;
 
-    place.size = place.size / branching;
-    int64_t child = 0;
-    for (int axis = 2; axis >= 0; --axis) {
-      const T scaled = local[axis] * branching;
-      const int32_t whole = clamp(floor_int(scaled), 0, tree.branching - 1);
-      const T digit = static_cast<T>(whole);
-      local[axis] = scaled - digit;
-      place.corner[axis] = place.corner[axis] + digit * place.size;
-      child = child * tree.branching + whole;
-    }
-    place.parent = place.node;
-    place.node = static_cast<int64_t>(tile) * tree.nodes_per_tile + child;
-    place.depth = place.depth + 1;
+  GV_HD Digits(const TreeView& tree, Vec3<T> position)
+      : position(position), local(position), branching(tree.branching) {}
+  GV_HD int32_t step(Vec3<T>& left, int axis) const {
+    const T scaled = left[axis] * static_cast<T>(branching);
+    const int32_t digit = clamp(floor_int(scaled), 0, branching - 1);
+    left[axis] = scaled - static_cast<T>(digit);
+    return digit;
   }
+  // Which child of the node at level - 1; asked for level after level.
+  GV_HD int32_t child(int32_t) {
+    const int32_t z = step(local, 2), y = step(local, 1), x = step(local, 0);
+    return (z * branching + y) * branching + x;
+  }
+  // Low corner of the node at a level.
+  GV_HD Vec3<T> corner(int32_t level, const Levels<T>& levels) const {
+    Vec3<T> left = position;
+    Vec3<T> sum{0, 0, 0};
+    for (int32_t depth = 1; depth <= level; ++depth) {
+      for (int axis = 0; axis < 3; ++axis) {
+        sum[axis] = sum[axis] + static_cast<T>(step(left, axis)) * levels.size[depth];
+      }
+    }
+    return sum;
+  }
+};
+
+// N a power of two: all digits are the bits of one number, and every corner is exact.
+template <class T>
+struct BitDigits {
+  static constexpr bool kRandomAccess = true;
+  Vec3<int32_t> cell;
+  int32_t bits, top;
+
+  GV_HD BitDigits(const TreeView& tree, Vec3<T> position)
+      : bits(tree.digit_bits()), top(tree.digit_bits() * tree.max_depth) {
+    const T cells = static_cast<T>(1 << top);
+    for (int axis = 0; axis < 3; ++axis) cell[axis] = static_cast<int32_t>(position[axis] * cells);
+  }
+  GV_HD int32_t child(int32_t level) const {
+    const int32_t shift = top - level * bits;
+    const int32_t mask = (1 << bits) - 1;
+    const int32_t y = (cell.y >> shift) & mask;
+    return (((cell.z >> shift) & mask) << (2 * bits)) | (y << bits) | ((cell.x >> shift) & mask);
+  }
+  GV_HD Vec3<T> corner(int32_t level, const Levels<T>& levels) const {
+    const int32_t shift = top - level * bits;
+    const T size = levels.size[level];
+    return {static_cast<T>(cell.x >> shift) * size, static_cast<T>(cell.y >> shift) * size,
+            static_cast<T>(cell.z >> shift) * size};
+  }
+};
+
+// No memory of the last descent.
+struct NoPath {
+  static constexpr bool kKept = false;
+};
+
+// The nodes of the last descent, for a thread that traces ray after ray through a tree that does not change.
+struct KeptPath {
+  static constexpr bool kKept = true;
+  struct Step {
+    int64_t node;
+    int32_t brick, tile;
+    bool hidden;
+  };
+  Step steps[kMostLevels];
+  Vec3<int32_t> cell{0, 0, 0};
+  int32_t depth = -1;
+
+  // The deepest level whose node is known for these digits; -1: none.
+  template <class T>
+  GV_HD int32_t shared(const BitDigits<T>& digits) const {
+    const int32_t parted = (cell.x ^ digits.cell.x) | (cell.y ^ digits.cell.y) | (cell.z ^ digits.cell.z);
+    if (parted == 0) return depth;
+    int32_t high = 0;  // bits from the highest one that differs
+    for (int32_t rest = parted; rest != 0; rest >>= 1) ++high;
+    return smaller(depth, (digits.top - high) / digits.bits);
+  }
+};
+
+// Descends to `wanted` depth, or as far as tiles exist and something is seen; stamps every tile on the way.
+template <class Number, class Hides, class Path>
+GV_HD Place descend(const TreeView& tree, Number& digits, int32_t wanted, int32_t frame, const Hides& hides,
+                    Path& path) {
+  Place place;
+  place.node = tree.root;
+  int32_t known = -1;
+  if constexpr (Path::kKept && Number::kRandomAccess) {
+    known = smaller(path.shared(digits), wanted);
+    path.cell = digits.cell;
+    if (known >= 0) {
+      const KeptPath::Step& step = path.steps[known];
+      place.depth = known;
+      place.node = step.node;
+      place.brick = step.brick;
+      place.tile = step.tile;
+      place.hidden = step.hidden;
+    }
+  }
+  for (;;) {
+    if (place.depth > known) {
+      store_stamp(&tree.stamp_t[place.node / tree.nodes_per_tile], frame);
+      place.brick = tree.brick_tn[place.node];
+      place.tile = tree.child_tn[place.node];
+      place.hidden = hides(place.node);
+      if constexpr (Path::kKept && Number::kRandomAccess) {
+        path.steps[place.depth] = {place.node, place.brick, place.tile, place.hidden};
+      }
+    }
+    if constexpr (!(Path::kKept && Number::kRandomAccess)) {
+      if (place.brick != kAbsent) {
+        if (place.depth < wanted) place.coarse = {place.node, place.brick, place.depth};
+        place.fine = {place.node, place.brick, place.depth};
+      }
+    }
+    if (place.depth == wanted || place.tile < 0 || place.hidden) break;
+    place.depth = place.depth + 1;
+    place.parent = place.node;
+    place.node = static_cast<int64_t>(place.tile) * tree.nodes_per_tile + digits.child(place.depth);
+  }
+  if constexpr (Path::kKept && Number::kRandomAccess) {
+    path.depth = place.depth;
+    if (place.depth > 0) place.parent = path.steps[place.depth - 1].node;
+    int32_t level = place.depth;
+    while (level > 0 && path.steps[level].brick == kAbsent) --level;
+    if (path.steps[level].brick != kAbsent) place.fine = {path.steps[level].node, path.steps[level].brick, level};
+    while (level > 0 && (level >= wanted || path.steps[level].brick == kAbsent)) --level;
+    if (level < wanted && path.steps[level].brick != kAbsent) {
+      place.coarse = {path.steps[level].node, path.steps[level].brick, level};
+    }
+  }
+  return place;
 }
 
+}  // namespace GV_NAMESPACE
 }  // namespace gvtorch

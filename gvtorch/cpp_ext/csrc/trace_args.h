@@ -1,0 +1,29 @@
+// The arguments of `trace_rays` as plain pointers and numbers: what entry.h hands to the kernels, however they were
+// compiled. No function stands here, so this header means the same in every file.
+#pragma once
+
+#include <cstdint>
+
+namespace gvtorch {
+
+enum class VoxelType { kUInt8, kInt8, kInt16, kUInt16, kHalf, kBFloat16, kFloat };
+
+struct TraceArgs {
+  const double *origin_r3, *direction_r3, *cone_r2, *range_r2, *place_33;
+  const int32_t *child_tn, *brick_tn;
+  int32_t *request_tn, *stamp_t;
+  const void *bricks_bzyxc, *constant_tnc, *range_tn2c;
+  int32_t* stamp_b;
+  const void *table_lm4, *domain_2;
+  const int32_t *opaque_m, *frame_1;
+  void *color_r3, *alpha_r1, *depth_r1;
+  int32_t* samples_r;
+  bool* missed_r;
+  int64_t rays, width, root, bricks;
+  VoxelType voxel;
+  int32_t nodes_per_tile, branching, max_depth, side, border, channels, component, rows, levels;
+  double cone_scale, root_voxel, step, stop_alpha, depth_alpha;
+  bool by_level;
+};
+
+}  // namespace gvtorch
