@@ -38,7 +38,7 @@ GV_HD BrickRay<T, Voxel> aim(const BrickView<Voxel>& view, const Levels<T>& leve
                              const Number& digits, Vec3<T> origin, Vec3<T> direction) {
   BrickRay<T, Voxel> ray;
   if (holder.brick < 0) {
-    if (holder.node >= 0) ray.constant = number<T>(view.constant_tnc[holder.node * view.channels + view.component]);
+    if (holder.node >= 0) ray.constant = number<T>(view.constant_tnc[static_cast<int64_t>(holder.node) * view.channels + view.component]);
     return ray;
   }
   const int64_t volume = static_cast<int64_t>(view.side) * view.side * view.side;

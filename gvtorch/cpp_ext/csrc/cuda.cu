@@ -17,8 +17,13 @@ namespace gvtorch {
 
 struct Cuda {};
 
+#ifndef GV_TRY_MIN
+#define GV_TRY_MIN 8
+#endif
+// 8 blocks of 128 on a multiprocessor leave 64 registers to a thread: waiting for memory is what tracing must hide.
+constexpr int kBlock = 128;
 template <class Functor>
-__global__ void run_functor(Functor functor, int64_t count) {
+__global__ void __launch_bounds__(kBlock, GV_TRY_MIN) run_functor(Functor functor, int64_t count) {
   const int64_t stride = static_cast<int64_t>(gridDim.x) * blockDim.x;
   for (int64_t index = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x; index < count; index += stride) {
     functor(index);
@@ -28,7 +33,6 @@ __global__ void run_functor(Functor functor, int64_t count) {
 template <class Device, class Functor>
 void for_each(const torch::stable::Tensor& like, int64_t count, const Functor& functor) {
   if (count == 0) return;
-  constexpr int64_t kBlock = 128;
   const torch::stable::accelerator::DeviceGuard guard(like.get_device_index());
   void* stream = nullptr;
   TORCH_ERROR_CODE_CHECK(aoti_torch_get_current_cuda_stream(like.get_device_index(), &stream));
@@ -39,15 +43,25 @@ void for_each(const torch::stable::Tensor& like, int64_t count, const Functor& f
   STD_TORCH_CHECK(status == cudaSuccess, "gvtorch: kernel launch failed: ", cudaGetErrorString(status));
 }
 
+template <class Device, class T, class Voxel>
+void trace_as(const torch::stable::Tensor& like, TraceArgs args) {
+  using torch::headeronly::ScalarType;
+  torch::stable::Tensor hidden_tn = torch::stable::new_empty(like, {args.nodes}, ScalarType::Byte);
+  auto* hidden = static_cast<uint8_t*>(hidden_tn.mutable_data_ptr());
+  args.hidden_tn = hidden;
+  const TraceRay<T, Voxel> body(args);
+  for_each<Device>(like, args.nodes, HideNode<T, Voxel>{body.bricks, body.transfer, hidden});
+  for_each<Device>(like, body.order.count(), body);
+}
+
 template <class Device>
 void trace(const torch::stable::Tensor& like, const TraceArgs& args, bool wide) {
   with_voxel(args.voxel, [&](auto voxel) {
     using Voxel = decltype(voxel);
-    const int64_t count = RayOrder{args.rays, args.width}.count();
     if (wide) {
-      for_each<Device>(like, count, TraceRay<double, Voxel>(args));
+      trace_as<Device, double, Voxel>(like, args);
     } else {
-      for_each<Device>(like, count, TraceRay<float, Voxel>(args));
+      trace_as<Device, float, Voxel>(like, args);
     }
   });
 }

@@ -101,6 +101,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> trace_rays(
   STD_TORCH_CHECK(branching >= 2 && branching <= 16 && max_depth >= 0 && max_depth < kMostLevels &&
                       nodes_per_tile >= branching * branching * branching && nodes_per_tile <= INT32_MAX,
                   "gvtorch: tree out of range");
+  STD_TORCH_CHECK(nodes <= INT32_MAX, "gvtorch: too many nodes in one pool");
   STD_TORCH_CHECK(root >= 0 && root < nodes, "gvtorch: root is not a node");
   STD_TORCH_CHECK(border >= 0 && side > 2 * border && component >= 0 && component < channels,
                   "gvtorch: border or component out of range");
@@ -174,8 +175,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> trace_rays(
   args.missed_r = static_cast<bool*>(missed_r.mutable_data_ptr());
   args.rays = rays;
   args.width = width;
-  args.root = root;
+  args.root = static_cast<int32_t>(root);
   args.bricks = bricks_bzyxc.size(0);
+  args.nodes = nodes;
   args.voxel = voxel_type(voxel);
   args.nodes_per_tile = static_cast<int32_t>(nodes_per_tile);
   args.branching = static_cast<int32_t>(branching);

@@ -38,6 +38,9 @@ struct Vec3 {
 // Comparisons are written so that a NaN ends at the lower bound: an index made from the result is always valid.
 template <class T>
 GV_HD T clamp(T value, T low, T high) {
+#ifdef __CUDA_ARCH__
+  if constexpr (static_cast<T>(0.5) != 0) return fmin(fmax(value, low), high);
+#endif
   const T raised = value > low ? value : low;
   return raised < high ? raised : high;
 }
@@ -73,6 +76,15 @@ GV_HD To bit_cast(From value) {
   To out;
   memcpy(&out, &value, sizeof(out));
   return out;
+}
+
+// Bits of a positive number, up to the highest one that is set.
+GV_HD int32_t bit_width(int32_t value) {
+#ifdef __CUDA_ARCH__
+  return 32 - __clz(value);
+#else
+  return 32 - __builtin_clz(static_cast<uint32_t>(value));
+#endif
 }
 
 // Voxel to number. Halves by moving their bits and scaling, which is exact for denormals too.

@@ -84,12 +84,12 @@ struct OneByOne {
   template <class T, class Voxel>
   GV_HD static int32_t march(const BrickView<Voxel>& bricks, const Transfer<T>& transfer, const Run<T, Voxel>& run,
                              const Intervals<T>& at, int32_t count, Accumulator<T>& sum) {
-    for (int32_t i = 0; i < count; ++i) {
-      const T number = at.count + static_cast<T>(i);
+    const T end = at.count + static_cast<T>(count);
+    for (T number = at.count; number < end; number = number + 1) {
       const T t = at.middle_of(number);
       const Row<T> row = transfer.look_up(transfer.find(value(bricks, run, at, t)), at.level);
       sum.add(row, at.start_of(number), at.length, run.hit_clear);
-      if (!(sum.clear > run.stop_clear)) return i + 1;
+      if (!(sum.clear > run.stop_clear)) return static_cast<int32_t>(number - at.count) + 1;
     }
     return count;
   }
@@ -99,6 +99,23 @@ struct OneByOne {
     if (!run.mixed) return fine;
     const T weight = clamp((at.cone(t) - run.voxel) * run.blend, static_cast<T>(0), static_cast<T>(1));
     return fine + weight * (sample(bricks, run.coarse, t) - fine);
+  }
+};
+
+// Which nodes show nothing: worked out before the rays go, where many threads would each do it again.
+template <class T, class Voxel>
+struct HideNode {
+  BrickView<Voxel> bricks;
+  TransferView<T> transfer;
+  uint8_t* hidden_tn;
+
+  GV_HD void operator()(int64_t node) const {
+    hidden_tn[node] = hidden(bricks, Transfer<T>(transfer), static_cast<int32_t>(node)) ? 1 : 0;
+  }
+  // Everything in reach of the node's brick, and so of every node below it, is transparent.
+  GV_HD static bool hidden(const BrickView<Voxel>& bricks, const Transfer<T>& transfer, int32_t node) {
+    const int64_t row = int64_t{2} * node * bricks.channels + bricks.component;
+    return transfer.transparent(number<T>(bricks.range_tn2c[row]), number<T>(bricks.range_tn2c[row + bricks.channels]));
   }
 };
 
@@ -113,12 +130,21 @@ struct TraceRay {
   TraceOptions<T> options;
   HitView<T> hits;
   const int32_t* frame_1;
+  const uint8_t* hidden_tn;  // null: every ray works it out
 
   explicit TraceRay(const TraceArgs& args)
       : rays{args.origin_r3, args.direction_r3, args.cone_r2, args.range_r2, args.place_33, args.cone_scale},
         order{args.rays, args.width},
-        tree{args.child_tn,  args.brick_tn,       args.request_tn, args.stamp_t, args.root,
-             args.branching, args.nodes_per_tile, args.max_depth},
+        tree{args.child_tn,
+             args.brick_tn,
+             args.request_tn,
+             args.stamp_t,
+             args.root,
+             args.root / args.nodes_per_tile,
+             args.branching,
+             args.nodes_per_tile,
+             args.max_depth,
+             digit_bits_of(args.branching, args.max_depth)},
         levels(static_cast<T>(args.root_voxel), static_cast<T>(args.side - 2 * args.border), args.branching),
         bricks{static_cast<const Voxel*>(args.bricks_bzyxc),
                static_cast<const Voxel*>(args.constant_tnc),
@@ -135,7 +161,8 @@ struct TraceRay {
                 args.by_level},
         hits{static_cast<T*>(args.color_r3), static_cast<T*>(args.alpha_r1), static_cast<T*>(args.depth_r1),
              args.samples_r, args.missed_r},
-        frame_1(args.frame_1) {}
+        frame_1(args.frame_1),
+        hidden_tn(args.hidden_tn) {}
 
   GV_HD void operator()(int64_t index) const {
     NoPath path;
@@ -153,7 +180,7 @@ struct TraceRay {
     const T stop_clear = 1 - options.stop_alpha;
     int32_t samples = 0;
     int32_t wanted = 0;
-    const bool powers = tree.digit_bits() > 0;
+    const bool powers = tree.digit_bits > 0;
     while (at.inside() && sum.clear > stop_clear) {
       samples += powers ? visit<BitDigits<T>>(ray, shader, path, at, wanted, sum)
                         : visit<Digits<T>>(ray, shader, path, at, wanted, sum);
@@ -184,7 +211,10 @@ struct TraceRay {
     const T cone_low = reached ? voxel : -infinity;
     const T cone_high = reached ? above : voxel;
 
-    const auto hides = [&](int64_t node) { return hidden(node, shader); };
+    const auto hides = [&](int32_t node) {
+      if (hidden_tn != nullptr) return hidden_tn[node] != 0;
+      return HideNode<T, Voxel>::hidden(bricks, shader, node);
+    };
     Number digits(tree, ray.at(middle));
     const Place place = descend(tree, digits, wanted, *frame_1, hides, path);
     const T exit = ray.leave(digits.corner(place.depth, levels), levels.size[place.depth]);
@@ -201,13 +231,14 @@ struct TraceRay {
       leave(at, exit, cone_low, cone_high);
       return 0;
     }
-    const Run<T, Voxel> run{aim(bricks, levels, fine, digits, ray.origin, ray.direction),
-                            aim(bricks, levels, coarse, digits, ray.origin, ray.direction),
-                            coarse.node != fine.node,
-                            voxel,
-                            1 / (above - voxel),
-                            1 - options.stop_alpha,
-                            1 - options.depth_alpha};
+    Run<T, Voxel> run;
+    run.fine = run.coarse = aim(bricks, levels, fine, digits, ray.origin, ray.direction);
+    run.mixed = coarse.node != fine.node;
+    if (run.mixed) run.coarse = aim(bricks, levels, coarse, digits, ray.origin, ray.direction);
+    run.voxel = voxel;
+    run.blend = 1 / (above - voxel);
+    run.stop_clear = 1 - options.stop_alpha;
+    run.hit_clear = 1 - options.depth_alpha;
     const bool uniform = run.fine.voxels == nullptr && run.coarse.voxels == nullptr;
     if (uniform && run.fine.constant == run.coarse.constant) {  // one interval, in closed form
       const T entry = at.start;
@@ -251,12 +282,6 @@ struct TraceRay {
     sum.add(row, start, end - start, run.hit_clear);
   }
 
-  // Everything in reach of the node's brick, and so of every node below it, is transparent.
-  GV_HD bool hidden(int64_t node, const Transfer<T>& shader) const {
-    const int64_t row = 2 * node * bricks.channels + bricks.component;
-    return shader.transparent(number<T>(bricks.range_tn2c[row]), number<T>(bricks.range_tn2c[row + bricks.channels]));
-  }
-
   // Asks for what is not there, and tells whether it did. Straight to the wanted level, or level by level: then a
   // brick is there before its node is subdivided.
   GV_HD bool mark_missing(const Place& place, int32_t wanted, bool blend, T cone) const {
@@ -272,7 +297,7 @@ struct TraceRay {
   }
 
   // Priority: how wide one voxel of the node is on the screen, in sixteenths of a pixel.
-  GV_HD void request(int64_t node, int32_t depth, T cone, int32_t kind) const {
+  GV_HD void request(int32_t node, int32_t depth, T cone, int32_t kind) const {
     const T most = static_cast<T>(kPriorityMask);
     const T priority = cone > 0 ? smaller(levels.voxel[depth] / cone * 16, most) : most;
     post_request(&tree.request_tn[node], kind | static_cast<int32_t>(priority));

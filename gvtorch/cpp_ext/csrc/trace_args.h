@@ -18,10 +18,11 @@ struct TraceArgs {
   const int32_t *opaque_m, *frame_1;
   void *color_r3, *alpha_r1, *depth_r1;
   int32_t* samples_r;
+  const uint8_t* hidden_tn;
   bool* missed_r;
-  int64_t rays, width, root, bricks;
+  int64_t rays, width, bricks, nodes;
   VoxelType voxel;
-  int32_t nodes_per_tile, branching, max_depth, side, border, channels, component, rows, levels;
+  int32_t root, nodes_per_tile, branching, max_depth, side, border, channels, component, rows, levels;
   double cone_scale, root_voxel, step, stop_alpha, depth_alpha;
   bool by_level;
 };

@@ -48,21 +48,21 @@ struct TreeView {
   const int32_t* brick_tn;
   int32_t* request_tn;
   int32_t* stamp_t;
-  int64_t root;
+  int32_t root, root_tile;
   int32_t branching;  // N
   int32_t nodes_per_tile;
   int32_t max_depth;
-
-  // Bits of a digit, where N is a power of two and a place's digits fit a word; else 0.
-  GV_HD int32_t digit_bits() const {
-    const int32_t bits = branching == 2 ? 1 : branching == 4 ? 2 : branching == 8 ? 3 : branching == 16 ? 4 : 0;
-    return bits * max_depth <= 30 ? bits : 0;
-  }
+  int32_t digit_bits;  // where N is a power of two and all digits of a place fit a word, else 0
 };
+
+inline int32_t digit_bits_of(int32_t branching, int32_t max_depth) {
+  const int32_t bits = branching == 2 ? 1 : branching == 4 ? 2 : branching == 8 ? 3 : branching == 16 ? 4 : 0;
+  return bits * max_depth <= 30 ? bits : 0;
+}
 
 // A node whose brick answers for a place. node < 0: nobody answers.
 struct Holder {
-  int64_t node = -1;
+  int32_t node = -1;
   int32_t brick = kAbsent;
   int32_t depth = 0;
 };
@@ -70,8 +70,8 @@ struct Holder {
 // Where a descent ended: the wanted level's holder and the holder of the level above it (they blend), and what a
 // request may name. The same descent ends in the same node all over the node's box.
 struct Place {
-  int64_t node = -1;
-  int64_t parent = -1;
+  int32_t node = -1;
+  int32_t parent = -1;
   int32_t depth = 0;
   int32_t brick = kAbsent;  // words of the node
   int32_t tile = kAbsent;
@@ -121,7 +121,7 @@ struct BitDigits {
   int32_t bits, top;
 
   GV_HD BitDigits(const TreeView& tree, Vec3<T> position)
-      : bits(tree.digit_bits()), top(tree.digit_bits() * tree.max_depth) {
+      : bits(tree.digit_bits), top(tree.digit_bits * tree.max_depth) {
     const T cells = static_cast<T>(1 << top);
     for (int axis = 0; axis < 3; ++axis) cell[axis] = static_cast<int32_t>(position[axis] * cells);
   }
@@ -147,10 +147,8 @@ struct NoPath {
 // The nodes of the last descent, for a thread that traces ray after ray through a tree that does not change.
 struct KeptPath {
   static constexpr bool kKept = true;
-  struct Step {
-    int64_t node;
-    int32_t brick, tile;
-    bool hidden;
+  struct alignas(16) Step {
+    int32_t node, brick, tile, hidden;
   };
   Step steps[kMostLevels];
   Vec3<int32_t> cell{0, 0, 0};
@@ -161,8 +159,7 @@ struct KeptPath {
   GV_HD int32_t shared(const BitDigits<T>& digits) const {
     const int32_t parted = (cell.x ^ digits.cell.x) | (cell.y ^ digits.cell.y) | (cell.z ^ digits.cell.z);
     if (parted == 0) return depth;
-    int32_t high = 0;  // bits from the highest one that differs
-    for (int32_t rest = parted; rest != 0; rest >>= 1) ++high;
+    const int32_t high = bit_width(parted);
     return smaller(depth, (digits.top - high) / digits.bits);
   }
 };
@@ -183,17 +180,18 @@ GV_HD Place descend(const TreeView& tree, Number& digits, int32_t wanted, int32_
       place.node = step.node;
       place.brick = step.brick;
       place.tile = step.tile;
-      place.hidden = step.hidden;
+      place.hidden = step.hidden != 0;
     }
   }
+  int32_t own_tile = tree.root_tile;  // of the node
   for (;;) {
     if (place.depth > known) {
-      store_stamp(&tree.stamp_t[place.node / tree.nodes_per_tile], frame);
+      store_stamp(&tree.stamp_t[own_tile], frame);
       place.brick = tree.brick_tn[place.node];
       place.tile = tree.child_tn[place.node];
       place.hidden = hides(place.node);
       if constexpr (Path::kKept && Number::kRandomAccess) {
-        path.steps[place.depth] = {place.node, place.brick, place.tile, place.hidden};
+        path.steps[place.depth] = {place.node, place.brick, place.tile, place.hidden ? 1 : 0};
       }
     }
     if constexpr (!(Path::kKept && Number::kRandomAccess)) {
@@ -205,7 +203,8 @@ GV_HD Place descend(const TreeView& tree, Number& digits, int32_t wanted, int32_
     if (place.depth == wanted || place.tile < 0 || place.hidden) break;
     place.depth = place.depth + 1;
     place.parent = place.node;
-    place.node = static_cast<int64_t>(place.tile) * tree.nodes_per_tile + digits.child(place.depth);
+    own_tile = place.tile;
+    place.node = own_tile * tree.nodes_per_tile + digits.child(place.depth);
   }
   if constexpr (Path::kKept && Number::kRandomAccess) {
     path.depth = place.depth;
