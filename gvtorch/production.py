@@ -144,6 +144,7 @@ class Production:
     Attributes:
         failures: The last failures, by name.
         strict: A failure raises `ProductionError` at the end of its frame.
+        staging: The way of bricks from the host to a CUDA device; None where they are there.
     """
 
     def __init__(self, cache: Cache, scheduler: Scheduler, patience: float, strict: bool) -> None:
@@ -155,12 +156,12 @@ class Production:
         self._raised = self._skipped = 0
         self._waiting: list[_Waiting] = []
         self._held: list[tuple[Job, Bricks]] = []  # the staging ring had no room
-        self._staging: Staging | None = None
+        self.staging: Staging | None = None
         pool = cache.bricks
         if pool.stamp_b.device.type == "cuda":
             brick = sum(bricks[:1].nbytes for bricks in pool.bricks.values())
             most = scheduler.most[REQUEST_LOAD] * brick
-            self._staging = Staging(most, brick, pool.stamp_b.device)
+            self.staging = Staging(most, brick, pool.stamp_b.device)
         self._first: tuple[Failure, BaseException | None] | None = None
 
     @property
@@ -194,10 +195,17 @@ class Production:
         """Asks for what was chosen; returns the answers that are here at once."""
         self._raised = 0
         done: list[tuple[Job, Answer]] = []
+        if not len(chosen):
+            return done
         tree = self.cache.nodes.tree_t[chosen.node // self.cache.nodes.nodes_per_tile]
-        for kind in KINDS.values():
-            for number, plant in enumerate(plants):
-                node = chosen.node[(chosen.kind == kind) & (tree == number)]
+        groups = [(kind, number) for kind in KINDS.values() for number in range(len(plants))]
+        masks = torch.stack([(chosen.kind == kind) & (tree == number) for kind, number in groups])
+        counts = masks.sum(1).tolist()
+        for (kind, number), mask, count in zip(groups, masks, counts, strict=True):
+            plant, node = plants[number], chosen.node
+            if 0 < count < len(node):
+                node = node[torch.nonzero_static(mask, size=count)[:, 0]]
+            if count:
                 job = self._without_failed(Job(plant, kind, node, plant.tree.loc(node)))
                 if len(job):
                     self._submit(job, done)
@@ -311,7 +319,7 @@ class Production:
         """A future that is done once bricks from the host are checked and on their way: all that is
         left to the frame is to write them.
         """
-        staging = self._staging
+        staging = self.staging
         if staging is None or job.kind != REQUEST_LOAD:
             return asked
         ahead: Future = Future()
@@ -410,9 +418,9 @@ class Production:
                 word = upload(word.to(torch.int32), device)
                 values = {name: upload(rows, device) for name, rows in answer.constants.items()}
                 return self.cache.write_uniform(tree, job.node, job.loc, word, values)
-            if self._staging is None or not on_host(answer.data):
+            if self.staging is None or not on_host(answer.data):
                 return self.cache.write_bricks(tree, job.node, job.loc, answer.data)
-            answer = _Sent(self._staging.send(answer.data))
+            answer = _Sent(self.staging.send(answer.data))
         sent = answer.shipment.sent
         if sent < len(job):
             rest = job[sent:]

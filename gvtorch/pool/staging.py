@@ -22,7 +22,7 @@ from torch import Tensor
 from .. import check
 
 _MOST = 256 * 10**6  # bytes of a ring
-_CHUNKS = (4 * 10**6, 32 * 10**6)  # bytes of a chunk: fewer are all overhead, more overlap less
+_CHUNKS = (4 * 10**6, 16 * 10**6)  # bytes of a chunk: fewer are all overhead, more overlap less
 _ALIGN = 16  # bytes: where a channel begins in a chunk
 _WORDS = {8: torch.int64, 4: torch.int32, 2: torch.int16, 1: torch.uint8}
 
