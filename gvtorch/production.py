@@ -421,15 +421,17 @@ class Production:
             if self.staging is None or not on_host(answer.data):
                 return self.cache.write_bricks(tree, job.node, job.loc, answer.data)
             answer = _Sent(self.staging.send(answer.data))
-        sent = answer.shipment.sent
-        if sent < len(job):
-            rest = job[sent:]
-            self._mark(rest)
-            kind = torch.full((len(rest),), Region.DATA)
-            self._held.append((rest, Bricks(data=answer.shipment.rest, kind=kind)))
-        if not sent:
-            return Written()
-        return self.cache.write_bricks(tree, job.node[:sent], job.loc[:sent], answer.shipment.parts)
+        shipment = answer.shipment
+        sent = shipment.sent
+        if sent == len(job):
+            return self.cache.write_bricks(tree, job.node, job.loc, shipment.parts)
+        rest = job[sent:]
+        self._mark(rest)
+        kind = torch.full((len(rest),), Region.DATA)
+        self._held.append((rest, Bricks(data=shipment.rest, kind=kind)))
+        if sent:
+            queue.appendleft((job[:sent], _Sent(Shipment(shipment.parts, sent, {}))))
+        return Written()
 
     def _write_aliases(self, job: Job, same: Tensor, queue: deque[tuple[Job, Answer]]) -> None:
         """Shares the bricks of the nodes that others are the same as; where such a node is not
@@ -539,7 +541,9 @@ def _send_ahead(job: Job, answer: Any, staging: Staging) -> Any:
         return answer  # the frame tells of it
     if not isinstance(checked, Bricks):
         return answer
-    if checked.errors or any(what is not Region.DATA for what, *_ in _groups(job, checked)):
+    assert checked.kind is not None
+    voxels = (checked.kind == Region.DATA) | (checked.kind == Region.DATA_MAX_DEPTH)
+    if checked.errors or not bool(voxels.all()):
         return answer
     return _Sent(staging.send(checked.data))
 

@@ -3,7 +3,8 @@ memory, copied on a stream of their own while the device renders, and written in
 the stream that renders, which waits for the copy by an event.
 
 The host waits for nothing: where the ring is full, fewer bricks are sent, and the others are sent
-later. Gathering is one call a channel and chunk, in torch's threads; a chunk is one copy.
+later. Gathering is one call a channel and chunk, in torch's threads, and so is copying. Bricks that
+lie in pinned memory already are copied from where they are.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from torch import Tensor
 from .. import check
 
 _MOST = 256 * 10**6  # bytes of a ring
-_CHUNKS = (4 * 10**6, 16 * 10**6)  # bytes of a chunk: fewer are all overhead, more overlap less
+_CHUNKS = (2 * 10**6, 16 * 10**6)  # bytes of a chunk: fewer are all overhead, more overlap less
 _ALIGN = 16  # bytes: where a channel begins in a chunk
 _WORDS = {8: torch.int64, 4: torch.int32, 2: torch.int16, 1: torch.uint8}
 
@@ -140,7 +141,7 @@ def joined(data: Voxels | Sequence[Part], device: torch.device) -> dict[str, Ten
 
 def upload(tensor: Tensor, device: torch.device) -> Tensor:
     """Returns a small tensor on the device; the host waits for nothing."""
-    if device.type != "cuda" or tensor.device.type != "cpu":
+    if device.type != "cuda" or tensor.device.type != "cpu" or tensor.numel() == 0:
         return tensor.to(device)
     return tensor.pin_memory().to(device, non_blocking=True)
 
@@ -162,6 +163,7 @@ class _Span:
         self.copied: Any = None  # events, once they are recorded
         self.read: Any = None
         self.reader: Callable[[], Any] | None = None
+        self.source: Any = None  # pinned memory that is copied from must live until then
 
     def free(self) -> bool:
         if self.reader is None or (self.copied is not None and not self.copied.query()):
@@ -220,9 +222,9 @@ class Staging:
             device: Where bricks go; on the CPU, for tests, nothing is pinned.
         """
         least, most = _CHUNKS
-        room = brick_bytes + 64 * _ALIGN
-        self.chunk = max(room, min(most, max(least, payload // 4)))
-        self.nbytes = max(2 * self.chunk, min(_MOST, 2 * payload))
+        room = brick_bytes + 64 * _ALIGN  # as many channels, and more
+        self.chunk = max(room, min(most, max(least, payload // 8)))
+        self.nbytes = max(4 * self.chunk, min(_MOST, 2 * payload))
         self._device = device
         self._spans: deque[_Span] = deque()
         self._lock = threading.Lock()
@@ -255,28 +257,35 @@ class Staging:
     def _send(self, span: _Span, begin: int, end: int, chunk: Voxels, sizes: Sequence[int]) -> Part:
         assert self._host is not None and self._target is not None
         offset, landed = span.begin, {}
+        copies: list[tuple[Tensor, Tensor]] = []  # to, from
         try:
             for (name, rows), size in zip(chunk.items(), sizes, strict=True):
-                shape, dtype = rows.shape, rows.dtype
-                nbytes = (end - begin) * _row_bytes(rows)
-                at = slice(offset, offset + nbytes)
-                here = self._host[at].view(dtype).view(shape)
+                at = slice(offset, offset + (end - begin) * _row_bytes(rows))
+                offset += size
+                to = landed[name] = self._target[at].view(rows.dtype).view(rows.shape)
+                if isinstance(rows, Tensor) and rows.is_contiguous() and self._is_pinned(rows):
+                    copies.append((to, rows))
+                    continue
+                here = self._host[at].view(rows.dtype).view(rows.shape)
                 if isinstance(rows, Rows):
                     rows.gather_into(here)
                 else:
                     here.copy_(rows)
-                landed[name] = self._target[at].view(dtype).view(shape)
-                offset += size
-            whole = slice(span.begin, offset)
+                copies.append((to, here))
             with torch.cuda.stream(self._stream) if self._stream else nullcontext():
-                self._target[whole].copy_(self._host[whole], non_blocking=True)
+                for to, here in copies:
+                    to.copy_(here, non_blocking=True)
                 span.copied = self._stream.record_event() if self._stream else _Now()
+            span.source = chunk
             part = Part(begin, end, landed, span)
         except BaseException:
             span.reader = _nobody
             raise
         span.reader = weakref.ref(part)
         return part
+
+    def _is_pinned(self, rows: Tensor) -> bool:
+        return self._stream is not None and rows.is_pinned()
 
     def _take(self, nbytes: int) -> _Span | None:
         """The next bytes of the ring, or None where they are not free."""

@@ -86,6 +86,7 @@ class Nodes:
     def __init__(self, loc: Tensor, layout: Layout) -> None:
         """Holds the places."""
         self.loc, self.layout = loc, layout
+        self._known: dict[str, Tensor] = {}  # made when first asked for; torch.compile follows it
 
     def __len__(self) -> int:
         """Number of nodes."""
@@ -100,11 +101,13 @@ class Nodes:
         """(k,) int64, 0 for the root."""
         return self.loc[:, 3]
 
-    @functools.cached_property
+    @property
     def scale(self) -> Tensor:
         """(k,) float64, finest voxels along a side of one of the node's voxels."""
-        base = torch.full_like(self.loc[:, 3], self.layout.branching, dtype=torch.float64)
-        return base ** (self.layout.depth - self.loc[:, 3])
+        if "scale" not in self._known:
+            base = torch.full_like(self.loc[:, 3], self.layout.branching, dtype=torch.float64)
+            self._known["scale"] = base ** (self.layout.depth - self.loc[:, 3])
+        return self._known["scale"]
 
     @property
     def voxel_size(self) -> Tensor:
@@ -131,30 +134,35 @@ class Nodes:
         side = self.layout.brick_size + 2 * self.layout.border - 1
         return (self.voxel_size * (0.5 * side)).norm(dim=1)
 
-    @functools.cached_property
+    @property
     def axes(self) -> tuple[Tensor, Tensor, Tensor]:
         """float32 world places of the voxel centres along x (k, 1, 1, s), y (k, 1, s, 1) and
-        z (k, s, 1, 1), border included. What is made of them broadcasts to (k, z, y, x), and takes
-        a hundredth of the memory traffic of `positions`: compile it, and a brick is one write.
+        z (k, s, 1, 1), border included. What is made of them broadcasts to (k, z, y, x), and they
+        take a hundredth of the memory traffic of `positions`: a compiled function of them writes
+        each brick once and reads next to nothing.
         """
         x, y, z = self._places.unbind(1)
         return x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]
 
-    @functools.cached_property
+    @property
     def positions(self) -> Tensor:
         """(k, z, y, x, 3) float32 world places of the voxel centres, x y z, border included."""
-        side = len(self.layout.reach)
-        grid = self.layout.grid.to(self.loc.device)
-        places = self._places.flatten(1).index_select(1, grid)
-        return places.view(-1, side, side, side, 3)
+        if "positions" not in self._known:
+            side = len(self.layout.reach)
+            places = self._places.flatten(1).index_select(1, self.layout.grid.to(self.loc.device))
+            self._known["positions"] = places.view(-1, side, side, side, 3)
+        return self._known["positions"]
 
-    @functools.cached_property
+    @property
     def _places(self) -> Tensor:
         """(k, 3, s) float32 world places of the voxel centres along each axis."""
-        reach = self.layout.reach.to(self.loc.device)
-        voxel = self.loc[:, :3, None] * self.layout.brick_size + reach
-        finest = (voxel + 0.5) * self.scale[:, None, None] - 0.5
-        return self._world(finest.mT).mT.to(torch.float32).contiguous()
+        if "places" not in self._known:
+            reach = self.layout.reach.to(self.loc.device)
+            voxel = self.loc[:, :3, None] * self.layout.brick_size + reach
+            finest = (voxel + 0.5) * self.scale[:, None, None] - 0.5
+            places = self._world(finest.mT).mT.to(torch.float32).contiguous()
+            self._known["places"] = places
+        return self._known["places"]
 
     def _world(self, finest: Tensor) -> Tensor:
         spacing, origin = (
@@ -180,7 +188,8 @@ class Bricks:
 
     Bricks may lie on the engine's device or in host memory, whatever the device: those are sent
     through pinned memory while the engine renders. Bricks that lie ready are best named by the rows
-    of a `BrickTable`.
+    of a `BrickTable`; those that lie in pinned memory themselves are copied from there a little
+    later, so a producer must leave them as they are.
     """
 
     data: Voxels  # (k, z, y, x, c) for each channel, border included
