@@ -284,6 +284,30 @@ def test_slots_hold_what_the_producer_made(device, where):
         assert_slots_hold_what_the_producer_made(engine, nodes)
 
 
+@pytest.mark.parametrize("device", [pytest.param("cuda", marks=pytest.mark.backend("cuda"))])
+@pytest.mark.parametrize("where", ["host", "device"])
+def test_the_host_waits_a_few_times_a_batch_whatever_its_size(device, where, recwarn):
+    if available()["cuda"]:
+        pytest.skip(f"backend cuda: {available()['cuda']}")
+    producer = Numbered()
+    producer.where = where
+    with grown(producer, device) as engine:
+        nodes = finest(engine)
+        serve(engine, nodes[:10], config.REQUEST_LOAD)
+        counts = []
+        for size in (10, 1000):
+            batch, nodes = nodes[-size:], nodes[:-size]
+            recwarn.clear()
+            torch.cuda.set_sync_debug_mode("warn")
+            try:
+                stats = serve(engine, batch, config.REQUEST_LOAD)
+            finally:
+                torch.cuda.set_sync_debug_mode("default")
+            assert stats.produced["bricks"] == size
+            counts.append(sum("synchroniz" in str(one.message) for one in recwarn))
+        assert counts[0] == counts[1] <= 6, counts
+
+
 def batches(nodes) -> list[torch.Tensor]:
     pick, some, begin = random.Random(1), [], 0
     while begin < len(nodes):
