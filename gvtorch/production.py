@@ -403,9 +403,7 @@ class Production:
         if isinstance(answer, Bricks):
             groups = _groups(job, answer)
             if len(groups) > 1:
-                queue.extendleft(
-                    (one, part) for _, one, part in groups
-                )  # the last, aliases, comes first
+                queue.extendleft((one, part) for _, one, part in groups)  # aliases come first
                 return Written()
             what = groups[0][0]
             if what is Region.ALIAS:
@@ -427,8 +425,7 @@ class Production:
             return self.cache.write_bricks(tree, job.node, job.loc, shipment.parts)
         rest = job[sent:]
         self._mark(rest)
-        kind = torch.full((len(rest),), Region.DATA)
-        self._held.append((rest, Bricks(data=shipment.rest, kind=kind)))
+        self._held.append((rest, Bricks(data=shipment.rest)))
         if sent:
             queue.appendleft((job[:sent], _Sent(Shipment(shipment.parts, sent, {}))))
         return Written()
@@ -507,7 +504,8 @@ def _groups(job: Job, answer: Bricks) -> list[tuple[Region, Job, Bricks]]:
     An answer on a device is looked at once.
     """
     kind = answer.kind
-    assert kind is not None
+    if kind is None:
+        return [(Region.DATA, job, answer)]
     empty, constant, data, last, alias = count_kinds(kind).tolist()
     counts = {Region.DATA: data + last, Region.CONSTANT: empty + constant, Region.ALIAS: alias}
     found = [what for what, count in counts.items() if count]
@@ -541,9 +539,9 @@ def _send_ahead(job: Job, answer: Any, staging: Staging) -> Any:
         return answer  # the frame tells of it
     if not isinstance(checked, Bricks):
         return answer
-    assert checked.kind is not None
-    voxels = (checked.kind == Region.DATA) | (checked.kind == Region.DATA_MAX_DEPTH)
-    if checked.errors or not bool(voxels.all()):
+    kind = checked.kind
+    voxels = len(job) if kind is None else int(count_kinds(kind)[Region.DATA : Region.ALIAS].sum())
+    if checked.errors or voxels < len(job):
         return answer
     return _Sent(staging.send(checked.data))
 

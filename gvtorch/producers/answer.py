@@ -50,7 +50,7 @@ def checked_regions(answer: Any, nodes: Nodes, producer: Producer) -> Regions:
 
 def checked_bricks(answer: Any, nodes: Nodes, producer: Producer) -> Bricks:
     """Returns `Bricks` in which items that hold NaN are errors. Voxels stay where they are, all on
-    the host or none.
+    the host or none; no kind told means that all are DATA.
 
     Raises:
         ValueError: The answer is of the wrong type, shape or dtype.
@@ -62,8 +62,7 @@ def checked_bricks(answer: Any, nodes: Nodes, producer: Producer) -> Bricks:
         raise ValueError(f"{where}: must return Bricks or a dict of tensors, got {_name(answer)}")
     layout, count = nodes.layout, len(nodes)
     errors = _known_errors(where, answer.errors, count)
-    whole = torch.full((count,), Region.DATA) if answer.kind is None else answer.kind
-    kind = _kind(where, whole, count)
+    kind = None if answer.kind is None else _kind(where, answer.kind, count)
     side = layout.brick_size + 2 * layout.border
     missing = sorted(set(producer.channels) - set(answer.data))
     if missing:
@@ -75,7 +74,7 @@ def checked_bricks(answer: Any, nodes: Nodes, producer: Producer) -> Bricks:
     constants = _by_channel(where, "constants", answer.constants, (count,), producer)
     counts = _refuse_bad(kind, (data, constants), errors)
     _need_constants(where, counts, constants, producer)
-    alias = _alias(where, answer.alias, kind, counts, layout, errors)
+    alias = None if kind is None else _alias(where, answer.alias, kind, counts, layout, errors)
     return Bricks(data=data, kind=kind, constants=constants, alias=alias, errors=errors)
 
 
@@ -180,12 +179,15 @@ def _alias(
 
 
 def _refuse_bad(
-    kind: Tensor, fields: Sequence[Mapping[str, Tensor | Rows]], errors: dict[int, str]
+    kind: Tensor | None,
+    fields: Sequence[Mapping[str, Tensor | Rows]],
+    errors: dict[int, str],
 ) -> list[int]:
     """Names items of no kind, and those that hold NaN or infinite values. Tables have been checked.
 
     Returns:
-        How many items are of each kind. What lies on a device is read from it at once.
+        How many items are of each kind, none where no kind was told. What lies on a device is read
+        from it at once.
     """
     floats = [
         (channel, values)
@@ -194,8 +196,9 @@ def _refuse_bad(
         if isinstance(values, Tensor) and values.is_floating_point() and values.numel()
     ]
     sums = [torch.isfinite(values.sum(dtype=torch.float32)) for _, values in floats]
-    counts, *finite = _read([count_kinds(kind), *(flag[None] for flag in sums)])
-    if sum(counts) < len(kind):
+    kinds = torch.zeros(len(Region), dtype=torch.int64) if kind is None else count_kinds(kind)
+    counts, *finite = _read([kinds, *(flag[None] for flag in sums)])
+    if kind is not None and sum(counts) < len(kind):
         for index in ((kind < Region.EMPTY) | (kind > Region.ALIAS)).nonzero()[:, 0].tolist():
             errors[index] = f"{int(kind[index])} is no Region"
     for (channel, values), (whole,) in zip(floats, finite, strict=True):
