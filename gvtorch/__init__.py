@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .engine import Engine, EngineOptions
     from .frame import FrameStats, Hits, Rays
     from .io import read_volume
-    from .pool import BrickPool, Channel, N3Tree, NodePool
+    from .pool import BrickPool, BrickTable, Channel, N3Tree, NodePool
     from .producers import Bricks, Nodes, Producer, Region, Regions, StoredProducer, VolumeProducer
     from .production import ProductionError
     from .rendering import Camera, Picture, RenderOptions, TransferFunction, TreeTracer, render
@@ -24,6 +24,7 @@ __version__ = "0.1.0"
 
 _HOME = {
     "BrickPool": ".pool",
+    "BrickTable": ".pool",
     "Bricks": ".producers",
     "Engine": ".engine",
     "EngineOptions": ".engine",
@@ -52,6 +53,7 @@ _HOME = {
 
 __all__ = [
     "BrickPool",
+    "BrickTable",
     "Bricks",
     "Camera",
     "Channel",

@@ -448,9 +448,9 @@ class Engine:
         if kind in (Region.DATA, Region.DATA_MAX_DEPTH):
             bricks = checked_bricks(self._now(plant.producer.fill(root)), root, plant.producer)
             _raise_first(bricks.errors)
-            assert bricks.kind is not None
-            if int(bricks.kind[0]) not in (Region.DATA, Region.DATA_MAX_DEPTH):
-                kind, constants = Region(int(bricks.kind[0])), bricks.constants
+            found = kind if bricks.kind is None else Region(int(bricks.kind[0]))
+            if found not in (Region.DATA, Region.DATA_MAX_DEPTH):
+                kind, constants = found, bricks.constants
         if kind == Region.ALIAS:
             raise ValueError("the root can't be an ALIAS")
         for channel, tensor in constants.items():

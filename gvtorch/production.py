@@ -2,17 +2,19 @@
 
 It joins producers, which know places, and the cache, which knows slots. An item that fails is
 counted and named, is not asked for again, and takes nobody with it: its ancestors go on standing in
-for it.
+for it. Bricks in host memory go to a CUDA device through `Staging`: those that come later are sent
+by the thread that answers, and those that find no room are held back until the next frame.
 """
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future
 from concurrent.futures import wait as wait_for
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -27,9 +29,10 @@ from .config import (
     TERMINAL,
 )
 from .frame import FrameStats
-from .pool import N3Tree
+from .pool import N3Tree, Rows, Staging
+from .pool.staging import Shipment, on_host, upload
 from .producers import Bricks, Layout, Nodes, Producer, Region, Regions
-from .producers.answer import checked_bricks, checked_regions
+from .producers.answer import checked_bricks, checked_regions, count_kinds
 from .volume import movable
 
 _KEPT_FAILURES = 1000  # named; all are counted
@@ -82,6 +85,8 @@ class Job:
         return len(self.node)
 
     def __getitem__(self, index: slice | Tensor) -> Job:
+        if isinstance(index, Tensor):
+            index = upload(index, self.node.device)
         same = None if self.same is None else self.same[index]
         return Job(self.plant, self.kind, self.node[index], self.loc[index], same)
 
@@ -94,27 +99,42 @@ class Job:
         """Calls the producer."""
         if self.kind == REQUEST_LOAD:
             return self.plant.producer.fill(self.bricks)
-        return self.plant.producer.classify(self.children())
+        return self.plant.producer.classify(self.children)
 
+    @cached_property
     def children(self) -> Nodes:
         """All children of all nodes, node after node."""
         n = self.plant.layout.branching
         child = torch.arange(n**3, device=self.loc.device)
         digits = torch.stack((child % n, child // n % n, child // n**2, torch.ones_like(child)), 1)
-        factor = torch.tensor([n, n, n, 1], device=self.loc.device)
-        return Nodes(((self.loc * factor)[:, None] + digits).flatten(0, 1), self.plant.layout)
+        low = torch.cat((self.loc[:, :3] * n, self.loc[:, 3:]), 1)
+        return Nodes((low[:, None] + digits).flatten(0, 1), self.plant.layout)
 
-    def check(self, answer: Any) -> Regions | Bricks:
+    def check(self, answer: Any) -> Answer:
         """Checks an answer; see producers/answer.py."""
+        if isinstance(answer, _Sent):
+            return answer
         if self.kind == REQUEST_LOAD:
             return checked_bricks(answer, self.bricks, self.plant.producer)
-        return checked_regions(answer, self.children(), self.plant.producer)
+        return checked_regions(answer, self.children, self.plant.producer)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sent:
+    """Voxels that were checked, found right, and are on their way to the device."""
+
+    shipment: Shipment
+    errors: Mapping[int, str] = field(default_factory=dict)
+
+
+Answer = Regions | Bricks | _Sent
 
 
 @dataclass(frozen=True, eq=False)
 class _Waiting:
     job: Job
-    future: Future
+    asked: Future  # the producer's
+    future: Future  # of its answer, which may be on its way to the device already
     since: float  # time.monotonic()
 
 
@@ -124,6 +144,7 @@ class Production:
     Attributes:
         failures: The last failures, by name.
         strict: A failure raises `ProductionError` at the end of its frame.
+        staging: The way of bricks from the host to a CUDA device; None where they are there.
     """
 
     def __init__(self, cache: Cache, scheduler: Scheduler, patience: float, strict: bool) -> None:
@@ -134,6 +155,13 @@ class Production:
         self._failed: set[tuple[Any, ...]] = set()  # tree, kind, x, y, z, depth
         self._raised = self._skipped = 0
         self._waiting: list[_Waiting] = []
+        self._held: list[tuple[Job, Bricks]] = []  # the staging ring had no room
+        self.staging: Staging | None = None
+        pool = cache.bricks
+        if pool.stamp_b.device.type == "cuda":
+            brick = sum(bricks[:1].nbytes for bricks in pool.bricks.values())
+            most = scheduler.most[REQUEST_LOAD] * brick
+            self.staging = Staging(most, brick, pool.stamp_b.device)
         self._first: tuple[Failure, BaseException | None] | None = None
 
     @property
@@ -144,14 +172,13 @@ class Production:
     @property
     def pending(self) -> dict[int, int]:
         """For each kind, the items whose answers are on their way."""
-        return {
-            kind: sum(len(w.job) for w in self._waiting if w.job.kind == kind)
-            for kind in KINDS.values()
-        }
+        jobs = self._under_way()
+        return {kind: sum(len(j) for j in jobs if j.kind == kind) for kind in KINDS.values()}
 
-    def late(self) -> list[tuple[Job, Regions | Bricks]]:
+    def late(self) -> list[tuple[Job, Answer]]:
         """Returns the answers that came since the last call; gives up those that do not come."""
-        done: list[tuple[Job, Regions | Bricks]] = []
+        done: list[tuple[Job, Answer]] = [*self._held]
+        self._held.clear()
         for item in list(self._waiting):
             if item.future.done():
                 seconds = time.monotonic() - item.since
@@ -160,18 +187,25 @@ class Production:
                 self._waiting.remove(item)
             elif time.monotonic() - item.since > self._patience(item.job):
                 self._waiting.remove(item)
-                item.future.cancel()
+                item.asked.cancel()
                 self._fail(item.job, f"no answer within {self._patience(item.job):g} s")
         return done
 
-    def ask(self, plants: list[Plant], chosen: Requests) -> list[tuple[Job, Regions | Bricks]]:
+    def ask(self, plants: list[Plant], chosen: Requests) -> list[tuple[Job, Answer]]:
         """Asks for what was chosen; returns the answers that are here at once."""
         self._raised = 0
-        done: list[tuple[Job, Regions | Bricks]] = []
+        done: list[tuple[Job, Answer]] = []
+        if not len(chosen):
+            return done
         tree = self.cache.nodes.tree_t[chosen.node // self.cache.nodes.nodes_per_tile]
-        for kind in KINDS.values():
-            for number, plant in enumerate(plants):
-                node = chosen.node[(chosen.kind == kind) & (tree == number)]
+        groups = [(kind, number) for kind in KINDS.values() for number in range(len(plants))]
+        masks = torch.stack([(chosen.kind == kind) & (tree == number) for kind, number in groups])
+        counts = masks.sum(1).tolist()
+        for (kind, number), mask, count in zip(groups, masks, counts, strict=True):
+            plant, node = plants[number], chosen.node
+            if 0 < count < len(node):
+                node = node[torch.nonzero_static(mask, size=count)[:, 0]]
+            if count:
                 job = self._without_failed(Job(plant, kind, node, plant.tree.loc(node)))
                 if len(job):
                     self._submit(job, done)
@@ -189,16 +223,16 @@ class Production:
             self._skipped += sum(bad)
         return job[~failed]
 
-    def write(self, answers: list[tuple[Job, Regions | Bricks]], stats: FrameStats) -> None:
+    def write(self, answers: list[tuple[Job, Answer]], stats: FrameStats) -> None:
         """Writes answers into the pools and adds up what they did."""
         stats.stale, self._skipped = stats.stale + self._skipped, 0
         queue = deque(answers)
         while queue:
             job, answer = queue.popleft()
-            if isinstance(answer, Bricks):
-                written = self._write_bricks(job, answer, queue)
-            else:
+            if isinstance(answer, Regions):
                 written = self._write_tiles(job, answer)
+            else:
+                written = self._write_bricks(job, answer, queue)
             name = "bricks" if job.kind == REQUEST_LOAD else "tiles"
             stats.produced[name] += written.items
             stats.produced["constant"] += written.constant
@@ -206,14 +240,14 @@ class Production:
             stats.stale += written.stale
             stats.bytes_uploaded += written.nbytes
             stats.capacity_exceeded |= written.unplaced > 0
-            if written.lost is not None and bool(written.lost.any()):
+            if written.lost is not None:
                 self.cache.mark_pending(job.node[written.lost], job.kind, False)
 
     def wait(self, more: float = 0.0, limit: float = _LONGEST) -> None:
         """Waits until an answer is here, or until patience ends, at most `limit` seconds; then up
         to `more` seconds for the others.
         """
-        if self._waiting:
+        if self._waiting and not self._held:
             ends = min(item.since + self._patience(item.job) for item in self._waiting)
             left = min(limit, max(0.0, ends - time.monotonic()) + 1e-3)
             futures = [item.future for item in self._waiting]
@@ -248,17 +282,21 @@ class Production:
                 self.cache.nodes.request_tn.numel(), device=self.cache.nodes.request_tn.device
             )
             self.cache.mark_pending(everything, kind, False)
-            for item in self._waiting:
-                if item.job.kind == kind:
-                    self._mark(item.job)
+            for job in self._under_way():
+                if job.kind == kind:
+                    self._mark(job)
 
     def close(self) -> None:
         """Forgets what is on its way."""
         for item in self._waiting:
-            item.future.cancel()
+            item.asked.cancel()
         self._waiting.clear()
+        self._held.clear()
 
-    def _submit(self, job: Job, done: list[tuple[Job, Regions | Bricks]]) -> None:
+    def _under_way(self) -> list[Job]:
+        return [item.job for item in self._waiting] + [job for job, _ in self._held]
+
+    def _submit(self, job: Job, done: list[tuple[Job, Answer]]) -> None:
         start = time.perf_counter()
         later: list[Future] = []
 
@@ -272,15 +310,34 @@ class Production:
         self._settle(job, ask, done, later)
         if later:
             self._mark(job)
-            self._waiting.append(_Waiting(job, later[0], time.monotonic()))
+            future = self._sent_ahead(job, later[0])
+            self._waiting.append(_Waiting(job, later[0], future, time.monotonic()))
         else:
             self.scheduler.learn(job.kind, len(job), 1e3 * (time.perf_counter() - start))
+
+    def _sent_ahead(self, job: Job, asked: Future) -> Future:
+        """A future that is done once bricks from the host are checked and on their way: all that is
+        left to the frame is to write them.
+        """
+        staging = self.staging
+        if staging is None or job.kind != REQUEST_LOAD:
+            return asked
+        ahead: Future = Future()
+
+        def go(asked: Future) -> None:
+            try:
+                ahead.set_result(_send_ahead(job, asked.result(), staging))
+            except BaseException as error:
+                ahead.set_exception(error)
+
+        asked.add_done_callback(go)
+        return ahead
 
     def _settle(
         self,
         job: Job,
         result: Callable[[], Any],
-        done: list[tuple[Job, Regions | Bricks]],
+        done: list[tuple[Job, Answer]],
         later: list[Future] | None = None,
     ) -> None:
         """Takes an answer. A producer that raises is asked again for each half of the batch, so
@@ -306,15 +363,16 @@ class Production:
             return
         bad = sorted(checked.errors)
         if bad:
-            per_item = 1 if job.kind == REQUEST_LOAD else len(job.children()) // len(job)
+            per_item = 1 if job.kind == REQUEST_LOAD else len(job.children) // len(job)
             named: dict[int, str] = {}
             for index in bad:
                 named.setdefault(index // per_item, checked.errors[index])
             for item, message in named.items():
                 self._fail(job[item : item + 1], message)
-            keep = torch.ones(len(job), dtype=torch.bool, device=job.node.device)
+            keep = torch.ones(len(job), dtype=torch.bool)
             keep[list(named)] = False
-            job, checked = job[keep], _select(checked, keep.repeat_interleave(per_item))
+            rows = keep.repeat_interleave(per_item).nonzero()[:, 0]
+            job, checked = job[keep.nonzero()[:, 0]], _select(checked, rows)
         if len(job):
             done.append((job, checked))
 
@@ -339,21 +397,40 @@ class Production:
         )
 
     def _write_bricks(
-        self, job: Job, answer: Bricks, queue: deque[tuple[Job, Regions | Bricks]]
+        self, job: Job, answer: Bricks | _Sent, queue: deque[tuple[Job, Answer]]
     ) -> Written:
-        tree, kind = job.plant.tree, answer.kind
-        assert kind is not None
-        alias = kind == Region.ALIAS
-        if answer.alias is not None:
-            self._write_aliases(job[alias], answer.alias[alias], queue)
-            job, answer, kind = job[~alias], _select(answer, ~alias), kind[~alias]
-        word = torch.zeros_like(kind, dtype=torch.int32)
-        word[kind == Region.CONSTANT], word[kind == Region.EMPTY] = CONSTANT, EMPTY
-        return self.cache.write_bricks(tree, job.node, job.loc, word, answer.data, answer.constants)
+        tree, device = job.plant.tree, job.node.device
+        if isinstance(answer, Bricks):
+            groups = _groups(job, answer)
+            if len(groups) > 1:
+                queue.extendleft((one, part) for _, one, part in groups)  # aliases come first
+                return Written()
+            what = groups[0][0]
+            if what is Region.ALIAS:
+                assert answer.alias is not None
+                self._write_aliases(job, upload(answer.alias, device), queue)
+                return Written()
+            if what is Region.CONSTANT:
+                assert answer.kind is not None
+                word = torch.where(answer.kind == Region.CONSTANT, CONSTANT, EMPTY)
+                word = upload(word.to(torch.int32), device)
+                values = {name: upload(rows, device) for name, rows in answer.constants.items()}
+                return self.cache.write_uniform(tree, job.node, job.loc, word, values)
+            if self.staging is None or not on_host(answer.data):
+                return self.cache.write_bricks(tree, job.node, job.loc, answer.data)
+            answer = _Sent(self.staging.send(answer.data))
+        shipment = answer.shipment
+        sent = shipment.sent
+        if sent == len(job):
+            return self.cache.write_bricks(tree, job.node, job.loc, shipment.parts)
+        rest = job[sent:]
+        self._mark(rest)
+        self._held.append((rest, Bricks(data=shipment.rest)))
+        if sent:
+            queue.appendleft((job[:sent], _Sent(Shipment(shipment.parts, sent, {}))))
+        return Written()
 
-    def _write_aliases(
-        self, job: Job, same: Tensor, queue: deque[tuple[Job, Regions | Bricks]]
-    ) -> None:
+    def _write_aliases(self, job: Job, same: Tensor, queue: deque[tuple[Job, Answer]]) -> None:
         """Shares the bricks of the nodes that others are the same as; where such a node is not
         here, its brick is made for the other alone.
         """
@@ -367,7 +444,7 @@ class Production:
         if job.same is not None:
             self._fail(job[~there], "an ALIAS of an ALIAS whose brick is not here")
             return
-        done: list[tuple[Job, Regions | Bricks]] = []
+        done: list[tuple[Job, Answer]] = []
         alone = job[~there]
         self._submit(Job(alone.plant, alone.kind, alone.node, alone.loc, same[~there]), done)
         queue.extend(done)
@@ -376,12 +453,11 @@ class Production:
 def children_of(job: Job, answer: Regions, cache: Cache) -> Children:
     """Turns a producer's regions into the words of tiles."""
     layout, count = job.plant.layout, len(job)
-    nodes = job.children()
+    nodes = job.children
     kind = answer.kind
     step = nodes.scale * layout.brick_size
     low = nodes.loc[:, :3] * step[:, None]
-    extent = torch.tensor(layout.extent, dtype=torch.float64, device=low.device)
-    kind = torch.where((low >= extent).any(1), Region.EMPTY, kind)
+    kind = torch.where((low >= layout.extent_3).any(1), Region.EMPTY, kind)
     leaf = (kind == Region.EMPTY) | (kind == Region.CONSTANT) | (kind == Region.DATA_MAX_DEPTH)
     leaf |= nodes.depth >= layout.depth
     child = torch.where(leaf, TERMINAL, ABSENT).to(torch.int32)
@@ -417,20 +493,69 @@ def children_of(job: Job, answer: Regions, cache: Cache) -> Children:
 
 def unknown_range(cache: Cache, name: str, count: int) -> Tensor:
     """(k, 2, c) all that a channel can hold."""
-    channel = cache.bricks.channels[name]
-    ends = torch.tensor(channel.limits, dtype=torch.float64).to(channel.dtype)
-    device = cache.nodes.child_tn.device
-    return ends.to(device)[None, :, None].expand(count, 2, channel.width)
+    channel, device = cache.bricks.channels[name], cache.nodes.child_tn.device
+    shape = (count, channel.width)
+    ends = [torch.full(shape, end, dtype=channel.dtype, device=device) for end in channel.limits]
+    return torch.stack([movable(end) for end in ends], 1).view(channel.dtype)
 
 
-def _select(answer: Any, keep: Tensor) -> Any:
-    """The items of an answer that `keep` names, errors left out."""
+def _groups(job: Job, answer: Bricks) -> list[tuple[Region, Job, Bricks]]:
+    """The items that are written in one way: DATA for voxels, CONSTANT for what needs none, ALIAS.
+    An answer on a device is looked at once.
+    """
+    kind = answer.kind
+    if kind is None:
+        return [(Region.DATA, job, answer)]
+    empty, constant, data, last, alias = count_kinds(kind).tolist()
+    counts = {Region.DATA: data + last, Region.CONSTANT: empty + constant, Region.ALIAS: alias}
+    found = [what for what, count in counts.items() if count]
+    if len(found) == 1:
+        return [(found[0], job, answer)]
+    masks = {
+        Region.DATA: (kind == Region.DATA) | (kind == Region.DATA_MAX_DEPTH),
+        Region.CONSTANT: (kind == Region.EMPTY) | (kind == Region.CONSTANT),
+        Region.ALIAS: kind == Region.ALIAS,
+    }
+    groups = []
+    for what in found:
+        rows = torch.nonzero_static(masks[what], size=counts[what])[:, 0]
+        groups.append((what, job[rows], _select(answer, rows)))
+    return groups
+
+
+def _send_ahead(job: Job, answer: Any, staging: Staging) -> Any:
+    """Checks an answer and sends it; returns it as it is unless it is voxels from the host and
+    nothing else, all of them right.
+    """
+    data = answer.data if isinstance(answer, Bricks) else answer
+    if not isinstance(data, Mapping) or not all(
+        isinstance(rows, Rows) or (isinstance(rows, Tensor) and rows.device.type == "cpu")
+        for rows in data.values()
+    ):
+        return answer
+    try:
+        checked = job.check(answer)
+    except ValueError:
+        return answer  # the frame tells of it
+    if not isinstance(checked, Bricks):
+        return answer
+    kind = checked.kind
+    voxels = len(job) if kind is None else int(count_kinds(kind)[Region.DATA : Region.ALIAS].sum())
+    if checked.errors or voxels < len(job):
+        return answer
+    return _Sent(staging.send(checked.data))
+
+
+def _select(answer: Any, row: Tensor) -> Any:
+    """The items of an answer that `row` (m,) names, errors left out."""
 
     def rows(value: Any) -> Any:
+        if isinstance(value, Rows):
+            return value[row]
         if isinstance(value, Tensor):
-            return value[keep]
+            return movable(value)[row.to(value.device)].view(value.dtype)
         if isinstance(value, dict):
-            return {name: tensor[keep] for name, tensor in value.items()}
+            return {name: rows(tensor) for name, tensor in value.items()}
         return value
 
     fields = {name: rows(value) for name, value in vars(answer).items() if name != "errors"}

@@ -8,7 +8,7 @@ Source: Crassin et al., "GigaVoxels", I3D 2009, section 5.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -24,6 +24,7 @@ from ..config import (
 )
 from ..ops import link, unlink
 from ..pool import BrickPool, N3Tree, NodePool
+from ..pool.staging import Part, Voxels, joined, on_device, wide_rows
 from ..volume import movable
 from .lru import LRU
 from .requests import Requests, collect
@@ -141,25 +142,26 @@ class Cache:
             loc: (k, 4) their places.
             children: What the (k, n) children hold.
         """
-        done = Written()
-        wanted = self.wanted(tree, node, loc, REQUEST_SUBDIVIDE)
-        place = wanted.nonzero()[:, 0]
-        done.stale = len(node) - len(place)
         lru, pool, per_tile = self.lru[REQUEST_SUBDIVIDE], self.nodes, self.nodes.nodes_per_tile
-        fits = place[: lru.unused]
-        done.unplaced = len(place) - len(fits)
-        tile_k = lru.take(len(fits))
+        wanted = self.wanted(tree, node, loc, REQUEST_SUBDIVIDE)
+        first = wanted & (wanted.cumsum(0) <= lru.unused)
+        tile_k = lru.order[: min(len(node), lru.unused)]
         # An answer that is late may be for nodes that are in no use any more: where their own tile
         # is among those given away, they have to wait.
-        fits = fits[~torch.isin(node[fits] // per_tile, tile_k)]
-        tile_k = tile_k[: len(fits)]
-        done.lost = wanted.clone()
-        done.lost[fits] = False
-        done.items = len(fits)
-        if not len(fits):
+        leaving = torch.zeros(pool.capacity, dtype=torch.bool, device=node.device)
+        leaving[tile_k.to(torch.int64)] = _among_first(tile_k, first.sum())
+        fit = first & ~leaving[node // per_tile]
+        used = (pool.parent_t[tile_k.to(torch.int64)] >= 0) & _among_first(tile_k, fit.sum())
+        counts = torch.stack([rows.sum() for rows in (wanted, first, fit, used)]).tolist()
+        lasting, taken, items, evicted = counts
+        done = Written(items=items, evicted=evicted)
+        done.stale, done.unplaced = len(node) - lasting, lasting - taken
+        done.lost = wanted & ~fit if items < lasting else None
+        tile_k = lru.take(taken)[:items]
+        if not items:
             return done
+        fits = _places(fit, items)
         tile = tile_k.to(torch.int64)
-        done.evicted = int((pool.parent_t[tile] >= 0).sum())
         unlink(pool.child_tn, tile_k, pool.capacity)
         unlink(pool.parent_t, tile_k, pool.capacity, per_tile)
         unlink(self.bricks.owner_b, tile_k, pool.capacity, per_tile)
@@ -212,13 +214,7 @@ class Cache:
         self.bricks.shared_b[slots[slots >= 0].to(torch.int64)] = True
 
     def write_bricks(
-        self,
-        tree: N3Tree,
-        node: Tensor,
-        loc: Tensor,
-        word: Tensor,
-        data: Mapping[str, Tensor],
-        constants: Mapping[str, Tensor],
+        self, tree: N3Tree, node: Tensor, loc: Tensor, data: Voxels | Sequence[Part]
     ) -> Written:
         """Gives nodes their bricks.
 
@@ -226,36 +222,59 @@ class Cache:
             tree: Whose nodes they are.
             node: (k,) int64 nodes, each once.
             loc: (k, 4) their places.
-            word: (k,) int32: 0 where there are voxels, EMPTY or CONSTANT where none are needed.
-            data: For each channel (k, z, y, x, c).
-            constants: For each channel (k, c).
+            data: For each channel (k, z, y, x, c), or what is on its way to the device.
         """
-        done = Written()
+        lru = self.lru[REQUEST_LOAD]
         wanted = self.wanted(tree, node, loc, REQUEST_LOAD)
-        done.stale = len(node) - int(wanted.sum())
-        lru, pool = self.lru[REQUEST_LOAD], self.bricks
-        bare = (wanted & (word < 0)).nonzero()[:, 0]
-        full = (wanted & (word >= 0)).nonzero()[:, 0]
-        fits = full[: lru.unused]
-        done.items, done.constant = len(fits), len(bare)
-        done.unplaced = len(full) - len(fits)
-        done.lost = torch.zeros_like(wanted)
-        done.lost[full[lru.unused :]] = True
-        if len(bare):
-            for name, words in self.nodes.constants.items():
-                value = movable(constants[name])[bare] if name in constants else 0
-                movable(words).flatten(0, 1)[node[bare]] = value
-            self._link_bricks(node[bare], word[bare])
-            child = self.nodes.child_tn.view(-1)
-            child[node[bare]] = torch.where(
-                child[node[bare]] == ABSENT, TERMINAL, child[node[bare]]
-            )
-        if len(fits):
-            slot_k = lru.take(len(fits))
-            done.evicted = int((pool.owner_b[slot_k.to(torch.int64)] >= 0).sum())
-            everything = len(fits) == len(node)
-            chosen = data if everything else {name: d[fits] for name, d in data.items()}
-            done.nbytes = self.put_bricks(slot_k, node[fits], chosen)
+        slot = lru.order[: min(len(node), lru.unused)].to(torch.int64)
+        used = (self.bricks.owner_b[slot] >= 0) & _among_first(slot, wanted.sum())
+        lasting, evicted = torch.stack((wanted.sum(), used.sum())).tolist()
+        items = min(lasting, lru.unused)
+        done = Written(items=items, evicted=evicted)
+        done.stale, done.unplaced = len(node) - lasting, lasting - items
+        if items < lasting:
+            done.lost = wanted & (wanted.cumsum(0) > items)
+        if not items:
+            return done
+        slot_k = lru.take(items)
+        if items == len(node):
+            done.nbytes = self.put_bricks(slot_k, node, data)
+        else:
+            fits = _places(wanted, lasting)[:items]
+            whole = joined(data, node.device)
+            some = {name: movable(rows)[fits].view(rows.dtype) for name, rows in whole.items()}
+            done.nbytes = self.put_bricks(slot_k, node[fits], some)
+        return done
+
+    def write_uniform(
+        self, tree: N3Tree, node: Tensor, loc: Tensor, word: Tensor, constants: Mapping[str, Tensor]
+    ) -> Written:
+        """Tells nodes that they need no bricks.
+
+        Args:
+            tree: Whose nodes they are.
+            node: (k,) int64 nodes, each once.
+            loc: (k, 4) their places.
+            word: (k,) int32 EMPTY or CONSTANT.
+            constants: For each channel (k, c); of channels that are left out it is 0.
+        """
+        wanted = self.wanted(tree, node, loc, REQUEST_LOAD)
+        lasting = int(wanted.sum())
+        done = Written(constant=lasting, stale=len(node) - lasting)
+        if not lasting:
+            return done
+        rows = _places(wanted, lasting)
+        node, word = node[rows], word[rows]
+        for name, words in self.nodes.constants.items():
+            flat = movable(words).flatten(0, 1)
+            if name in constants:
+                flat[node] = movable(constants[name])[rows]
+            else:
+                flat.index_fill_(0, node, 0)
+        self._link_bricks(node, word)
+        child = self.nodes.child_tn.view(-1)
+        below = child[node]
+        child[node] = torch.where(below == ABSENT, TERMINAL, below)
         return done
 
     def share_bricks(self, tree: N3Tree, node: Tensor, loc: Tensor, target: Tensor) -> None:
@@ -276,8 +295,13 @@ class Cache:
             flat[node] = flat[target]
         self._link_bricks(node, word)
 
-    def put_bricks(self, slot_k: Tensor, node: Tensor, data: Mapping[str, Tensor]) -> int:
+    def put_bricks(self, slot_k: Tensor, node: Tensor, data: Voxels | Sequence[Part]) -> int:
         """Writes voxels into slots, which lose what they held, and links nodes to them.
+
+        Args:
+            slot_k: (k,) int32 slots, each once.
+            node: (k,) int64 nodes.
+            data: For each channel (k, z, y, x, c), or what is on its way to the device.
 
         Returns:
             Bytes moved.
@@ -285,16 +309,28 @@ class Cache:
         pool, slot = self.bricks, slot_k.to(torch.int64)
         unlink(self.nodes.brick_tn, slot_k, pool.capacity)
         nbytes = 0
-        for name, bricks in pool.bricks.items():
-            if name in data:
-                movable(bricks).index_copy_(0, slot, movable(data[name]))
-                nbytes += data[name].nbytes
-            else:
-                movable(bricks)[slot] = 0  # a tree without this channel
+        if isinstance(data, Mapping):
+            there = {name: on_device(rows, slot.device) for name, rows in data.items()}
+            nbytes += self._fill_slots(slot, there)
+        else:
+            for part in data:
+                with part as landed:
+                    nbytes += self._fill_slots(slot[part.begin : part.end], landed)
         pool.owner_b[slot] = node.to(torch.int32)
-        pool.stamp_b[slot], pool.shared_b[slot] = -1, False
+        pool.stamp_b.index_fill_(0, slot, -1)
+        pool.shared_b.index_fill_(0, slot, False)
         self._link_bricks(node, slot_k)
         return nbytes
+
+    def _fill_slots(self, slot: Tensor, data: Mapping[str, Tensor]) -> int:
+        """Writes voxels that are on the device; returns how many bytes they are."""
+        for name, bricks in self.bricks.bricks.items():
+            if name in data:
+                to, rows = wide_rows(bricks, data[name])
+                to.index_copy_(0, slot, rows)
+            else:
+                wide_rows(bricks)[0].index_fill_(0, slot, 0)  # a tree without this channel
+        return sum(rows.nbytes for name, rows in data.items() if name in self.bricks.bricks)
 
     def _link_bricks(self, node: Tensor, word: Tensor) -> None:
         node_k, word_k = node.to(torch.int32), word.to(torch.int32)
@@ -324,6 +360,16 @@ class Cache:
             named = pointer[pointer >= 0].to(torch.int64)
             if bool(((owner[named] < 0) & ~shared[named]).any()):
                 raise ValueError(f"Cache: a pointer leads to a {what} that nobody owns")
+
+
+def _places(keep: Tensor, count: int) -> Tensor:
+    """(count,) int64 where `keep` is true; the host knows how often that is."""
+    return torch.nonzero_static(keep, size=count)[:, 0]
+
+
+def _among_first(rows: Tensor, count: Tensor) -> Tensor:
+    """(k,) bool: whether a row is one of the first `count`, a number on the device."""
+    return torch.arange(len(rows), device=rows.device) < count
 
 
 @dataclass(frozen=True, kw_only=True)

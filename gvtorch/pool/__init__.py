@@ -4,5 +4,15 @@ from .brick_pool import BrickPool, cut_bricks
 from .channel import Channel
 from .n3tree import N3Tree
 from .node_pool import NodePool
+from .staging import BrickTable, Rows, Staging
 
-__all__ = ["BrickPool", "Channel", "N3Tree", "NodePool", "cut_bricks"]
+__all__ = [
+    "BrickPool",
+    "BrickTable",
+    "Channel",
+    "N3Tree",
+    "NodePool",
+    "Rows",
+    "Staging",
+    "cut_bricks",
+]

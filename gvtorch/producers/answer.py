@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from .. import check
-from ..pool import Channel
-from ..volume import movable
+from ..pool import Channel, Rows
+from ..pool.staging import on_device, on_host, upload
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 
 
@@ -27,21 +27,30 @@ def checked_regions(answer: Any, nodes: Nodes, producer: Producer) -> Regions:
         raise ValueError(f"{where}: must return Regions or a tensor, got {_name(answer)}")
     count, device = len(nodes), nodes.layout.device
     errors = _known_errors(where, answer.errors, count)
-    kind = _kind(where, answer.kind, count, device, errors)
+    kind = _kind(where, answer.kind, count)
     shapes = {"constants": (), "ranges": (2,)}
     fields = {
-        name: _by_channel(where, name, getattr(answer, name), (count, *shape), producer, device)
+        name: _by_channel(where, name, getattr(answer, name), (count, *shape), producer)
         for name, shape in shapes.items()
     }
-    _need_constants(where, kind, fields["constants"], producer)
-    alias = _alias(where, answer.alias, kind, nodes.layout, errors)
-    for values in fields.values():
-        _refuse_nan(values, errors)
-    return Regions(kind=kind, alias=alias, errors=errors, **fields)
+    counts = _refuse_bad(kind, [*fields.values()], errors)
+    _need_constants(where, counts, fields["constants"], producer)
+    alias = _alias(where, answer.alias, kind, counts, nodes.layout, errors)
+    there = {
+        name: {channel: upload(values, device) for channel, values in by_channel.items()}
+        for name, by_channel in fields.items()
+    }
+    return Regions(
+        kind=upload(kind, device),
+        alias=None if alias is None else upload(alias, device),
+        errors=errors,
+        **there,
+    )
 
 
 def checked_bricks(answer: Any, nodes: Nodes, producer: Producer) -> Bricks:
-    """Returns `Bricks` on the layout's device, in which items that hold NaN are errors.
+    """Returns `Bricks` in which items that hold NaN are errors. Voxels stay where they are, all on
+    the host or none; no kind told means that all are DATA.
 
     Raises:
         ValueError: The answer is of the wrong type, shape or dtype.
@@ -51,23 +60,28 @@ def checked_bricks(answer: Any, nodes: Nodes, producer: Producer) -> Bricks:
         answer = Bricks(data=answer)
     if not isinstance(answer, Bricks):
         raise ValueError(f"{where}: must return Bricks or a dict of tensors, got {_name(answer)}")
-    layout = nodes.layout
-    count, device = len(nodes), layout.device
+    layout, count = nodes.layout, len(nodes)
     errors = _known_errors(where, answer.errors, count)
-    whole = torch.full((count,), Region.DATA) if answer.kind is None else answer.kind
-    kind = _kind(where, whole, count, device, errors)
+    kind = None if answer.kind is None else _kind(where, answer.kind, count)
     side = layout.brick_size + 2 * layout.border
     missing = sorted(set(producer.channels) - set(answer.data))
     if missing:
         raise ValueError(f"{where}: channel {missing[0]!r} is missing")
     shape = (count, side, side, side)
-    data = _by_channel(where, "data", answer.data, shape, producer, device)
-    constants = _by_channel(where, "constants", answer.constants, (count,), producer, device)
-    _refuse_nan(data, errors)
-    _refuse_nan(constants, errors)
-    _need_constants(where, kind, constants, producer)
-    alias = _alias(where, answer.alias, kind, layout, errors)
+    data = _by_channel(where, "data", answer.data, shape, producer)
+    if any(on_host({name: rows}) != on_host(data) for name, rows in data.items()):
+        data = {name: on_device(rows, layout.device) for name, rows in data.items()}
+    constants = _by_channel(where, "constants", answer.constants, (count,), producer)
+    counts = _refuse_bad(kind, (data, constants), errors)
+    _need_constants(where, counts, constants, producer)
+    alias = None if kind is None else _alias(where, answer.alias, kind, counts, layout, errors)
     return Bricks(data=data, kind=kind, constants=constants, alias=alias, errors=errors)
+
+
+def count_kinds(kind: Tensor) -> Tensor:
+    """Returns (5,) int64: how many items are EMPTY, CONSTANT, DATA, DATA_MAX_DEPTH and ALIAS."""
+    codes = torch.arange(len(Region), device=kind.device)
+    return (kind == codes[:, None]).sum(1)
 
 
 def layout_of(
@@ -96,26 +110,19 @@ def _known_errors(where: str, errors: Mapping[int, str], count: int) -> dict[int
     return dict(errors)
 
 
-def _kind(
-    where: str, kind: Any, count: int, device: torch.device, errors: dict[int, str]
-) -> Tensor:
+def _kind(where: str, kind: Any, count: int) -> Tensor:
     if not isinstance(kind, Tensor) or kind.shape != (count,) or kind.is_floating_point():
         raise ValueError(f"{where}: kind must be ({count},) of Region, got {check.describe(kind)}")
-    kind = kind.to(device=device, dtype=torch.int64)
-    wrong = (kind < Region.EMPTY) | (kind > Region.ALIAS)
-    for index in wrong.nonzero()[:, 0].tolist():
-        errors[index] = f"{int(kind[index])} is no Region"
-    return kind
+    return kind.to(torch.int64)
 
 
 def _by_channel(
     where: str,
     name: str,
-    values: Mapping[str, Tensor],
+    values: Mapping[str, Any],
     shape: tuple[int, ...],
     producer: Producer,
-    device: torch.device,
-) -> dict[str, Tensor]:
+) -> dict[str, Any]:
     result = {}
     for channel, value in values.items():
         if channel not in producer.channels:
@@ -125,7 +132,8 @@ def _by_channel(
         wanted = (*shape, what.width)
         plain = isinstance(value, Tensor) and what.width == 1 and value.shape == shape
         tensor = value[..., None] if plain else value
-        fits = isinstance(tensor, Tensor) and tensor.shape == wanted and tensor.dtype == what.dtype
+        known_type = isinstance(tensor, Tensor) or (isinstance(tensor, Rows) and name == "data")
+        fits = known_type and tensor.shape == wanted and tensor.dtype == what.dtype
         if not fits:
             sizes = ", ".join(str(size) for size in wanted)
             dtype = str(what.dtype).removeprefix("torch.")
@@ -133,45 +141,82 @@ def _by_channel(
                 f"{where}: {name}[{channel!r}] must be ({sizes}) {dtype}, "
                 f"got {check.describe(tensor)}"
             )
-        result[channel] = movable(tensor.detach()).to(device).view(what.dtype)
+        result[channel] = tensor.detach() if isinstance(tensor, Tensor) else tensor
     return result
 
 
 def _need_constants(
-    where: str, kind: Tensor, constants: Mapping[str, Tensor], producer: Producer
+    where: str, counts: Sequence[int], constants: Mapping[str, Tensor], producer: Producer
 ) -> None:
     missing = sorted(set(producer.channels) - set(constants))
-    if missing and bool((kind == Region.CONSTANT).any()):
+    if missing and counts[Region.CONSTANT]:
         raise ValueError(f"{where}: constants must hold channel {missing[0]!r} of CONSTANT items")
 
 
 def _alias(
-    where: str, alias: Any, kind: Tensor, layout: Layout, errors: dict[int, str]
+    where: str,
+    alias: Any,
+    kind: Tensor,
+    counts: Sequence[int],
+    layout: Layout,
+    errors: dict[int, str],
 ) -> Tensor | None:
-    is_alias = kind == Region.ALIAS
-    if not bool(is_alias.any()):
+    if not counts[Region.ALIAS]:
         return None
     if not isinstance(alias, Tensor) or alias.shape != (len(kind), 4):
         raise ValueError(
             f"{where}: alias must be ({len(kind)}, 4) where an item is ALIAS, "
             f"got {check.describe(alias)}"
         )
-    alias = alias.to(device=layout.device, dtype=torch.int64)
+    alias = alias.to(device=kind.device, dtype=torch.int64)
     depth = alias[:, 3]
     nodes = float(layout.branching) ** depth.clamp(0, layout.depth).to(torch.float64)
     inside = ((alias[:, :3] >= 0) & (alias[:, :3] < nodes[:, None])).all(1)
-    wrong = is_alias & ~(inside & (depth >= 0) & (depth <= layout.depth))
+    wrong = (kind == Region.ALIAS) & ~(inside & (depth >= 0) & (depth <= layout.depth))
     for index in wrong.nonzero()[:, 0].tolist():
         errors.setdefault(index, f"alias {tuple(alias[index].tolist())} is no node of this tree")
     return alias
 
 
-def _refuse_nan(values: Mapping[str, Tensor], errors: dict[int, str]) -> None:
-    for channel, tensor in values.items():
-        if not tensor.is_floating_point() or tensor.numel() == 0:
+def _refuse_bad(
+    kind: Tensor | None,
+    fields: Sequence[Mapping[str, Tensor | Rows]],
+    errors: dict[int, str],
+) -> list[int]:
+    """Names items of no kind, and those that hold NaN or infinite values. Tables have been checked.
+
+    Returns:
+        How many items are of each kind, none where no kind was told. What lies on a device is read
+        from it at once.
+    """
+    floats = [
+        (channel, values)
+        for by_channel in fields
+        for channel, values in by_channel.items()
+        if isinstance(values, Tensor) and values.is_floating_point() and values.numel()
+    ]
+    sums = [torch.isfinite(values.sum(dtype=torch.float32)) for _, values in floats]
+    kinds = torch.zeros(len(Region), dtype=torch.int64) if kind is None else count_kinds(kind)
+    counts, *finite = _read([kinds, *(flag[None] for flag in sums)])
+    if kind is not None and sum(counts) < len(kind):
+        for index in ((kind < Region.EMPTY) | (kind > Region.ALIAS)).nonzero()[:, 0].tolist():
+            errors[index] = f"{int(kind[index])} is no Region"
+    for (channel, values), (whole,) in zip(floats, finite, strict=True):
+        if whole:
             continue
-        if bool(torch.isfinite(tensor.sum(dtype=torch.float32))):
-            continue
-        bad = ~torch.isfinite(tensor).flatten(1).all(1)
+        bad = ~torch.isfinite(values).flatten(1).all(1)
         for index in bad.nonzero()[:, 0].tolist():
             errors.setdefault(index, f"channel {channel!r} holds NaN or infinite values")
+    return counts
+
+
+def _read(values: Sequence[Tensor]) -> list[list[int]]:
+    """Small tensors of integers as lists: one transfer for each device."""
+    result: dict[int, list[int]] = {}
+    for device in {value.device for value in values}:
+        here = [index for index, value in enumerate(values) if value.device == device]
+        flat = torch.cat([values[index].to(torch.int64) for index in here]).tolist()
+        for index in here:
+            size = len(values[index])
+            result[index], flat = flat[:size], flat[size:]
+    return [result[index] for index in range(len(values))]

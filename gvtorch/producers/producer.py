@@ -18,6 +18,7 @@ from torch import Tensor
 
 from .. import check
 from ..pool import Channel
+from ..pool.staging import Voxels
 
 
 class Region(IntEnum):
@@ -43,6 +44,35 @@ class Layout:
     origin: tuple[float, float, float]  # world place of the centre of voxel 0
     device: torch.device
 
+    @functools.cached_property
+    def spacing_3(self) -> Tensor:
+        """(3,) float64 `spacing` on the device."""
+        return torch.tensor(self.spacing, dtype=torch.float64, device=self.device)
+
+    @functools.cached_property
+    def origin_3(self) -> Tensor:
+        """(3,) float64 `origin` on the device."""
+        return torch.tensor(self.origin, dtype=torch.float64, device=self.device)
+
+    @functools.cached_property
+    def extent_3(self) -> Tensor:
+        """(3,) float64 `extent` on the device."""
+        return torch.tensor(self.extent, dtype=torch.float64, device=self.device)
+
+    @functools.cached_property
+    def reach(self) -> Tensor:
+        """(s,) int64 voxels along a side of a brick, -border to brick_size + border - 1."""
+        return torch.arange(-self.border, self.brick_size + self.border, device=self.device)
+
+    @functools.cached_property
+    def grid(self) -> Tensor:
+        """(s * s * s * 3,) int64: where each component of each voxel's place stands among the
+        3 * s places along the axes.
+        """
+        at = torch.arange(len(self.reach), device=self.device)
+        z, y, x = torch.meshgrid(at, at, at, indexing="ij")
+        return torch.stack((x, y + len(at), z + 2 * len(at)), -1).flatten()
+
 
 class Nodes:
     """A batch of nodes of one tree, by place.
@@ -56,6 +86,7 @@ class Nodes:
     def __init__(self, loc: Tensor, layout: Layout) -> None:
         """Holds the places."""
         self.loc, self.layout = loc, layout
+        self._known: dict[str, Tensor] = {}  # made when first asked for; torch.compile follows it
 
     def __len__(self) -> int:
         """Number of nodes."""
@@ -70,16 +101,18 @@ class Nodes:
         """(k,) int64, 0 for the root."""
         return self.loc[:, 3]
 
-    @functools.cached_property
+    @property
     def scale(self) -> Tensor:
         """(k,) float64, finest voxels along a side of one of the node's voxels."""
-        base = torch.full_like(self.loc[:, 3], self.layout.branching, dtype=torch.float64)
-        return base ** (self.layout.depth - self.loc[:, 3])
+        if "scale" not in self._known:
+            base = torch.full_like(self.loc[:, 3], self.layout.branching, dtype=torch.float64)
+            self._known["scale"] = base ** (self.layout.depth - self.loc[:, 3])
+        return self._known["scale"]
 
     @property
     def voxel_size(self) -> Tensor:
         """(k, 3) float64 world size of one of the node's voxels."""
-        return self.scale[:, None] * self._vector(self.layout.spacing)
+        return self.scale[:, None] * self.layout.spacing_3.to(self.loc.device)
 
     @property
     def box(self) -> Tensor:
@@ -101,24 +134,41 @@ class Nodes:
         side = self.layout.brick_size + 2 * self.layout.border - 1
         return (self.voxel_size * (0.5 * side)).norm(dim=1)
 
-    @functools.cached_property
+    @property
+    def axes(self) -> tuple[Tensor, Tensor, Tensor]:
+        """float32 world places of the voxel centres along x (k, 1, 1, s), y (k, 1, s, 1) and
+        z (k, s, 1, 1), border included. What is made of them broadcasts to (k, z, y, x), and they
+        take a hundredth of the memory traffic of `positions`: a compiled function of them writes
+        each brick once and reads next to nothing.
+        """
+        x, y, z = self._places.unbind(1)
+        return x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]
+
+    @property
     def positions(self) -> Tensor:
         """(k, z, y, x, 3) float32 world places of the voxel centres, x y z, border included."""
-        side = torch.arange(
-            -self.layout.border, self.layout.brick_size + self.layout.border, device=self.loc.device
-        )
-        voxel = self.loc[:, :3, None] * self.layout.brick_size + side  # (k, 3, s)
-        finest = (voxel + 0.5) * self.scale[:, None, None] - 0.5
-        x, y, z = self._world(finest.movedim(1, -1)).to(torch.float32).unbind(-1)
-        s = len(side)
-        axes = (x[:, None, None, :], y[:, None, :, None], z[:, :, None, None])
-        return torch.stack([axis.expand(-1, s, s, s) for axis in axes], -1)
+        if "positions" not in self._known:
+            side = len(self.layout.reach)
+            places = self._places.flatten(1).index_select(1, self.layout.grid.to(self.loc.device))
+            self._known["positions"] = places.view(-1, side, side, side, 3)
+        return self._known["positions"]
 
-    def _vector(self, values: Sequence[float]) -> Tensor:
-        return torch.tensor(values, dtype=torch.float64, device=self.loc.device)
+    @property
+    def _places(self) -> Tensor:
+        """(k, 3, s) float32 world places of the voxel centres along each axis."""
+        if "places" not in self._known:
+            reach = self.layout.reach.to(self.loc.device)
+            voxel = self.loc[:, :3, None] * self.layout.brick_size + reach
+            finest = (voxel + 0.5) * self.scale[:, None, None] - 0.5
+            places = self._world(finest.mT).mT.to(torch.float32).contiguous()
+            self._known["places"] = places
+        return self._known["places"]
 
     def _world(self, finest: Tensor) -> Tensor:
-        return finest * self._vector(self.layout.spacing) + self._vector(self.layout.origin)
+        spacing, origin = (
+            v.to(finest.device) for v in (self.layout.spacing_3, self.layout.origin_3)
+        )
+        return finest * spacing + origin
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,9 +184,15 @@ class Regions:
 
 @dataclass(frozen=True, kw_only=True)
 class Bricks:
-    """Answer of `fill`: the voxels of k bricks, or why a brick has none."""
+    """Answer of `fill`: the voxels of k bricks, or why a brick has none.
 
-    data: Mapping[str, Tensor]  # (k, z, y, x, c) for each channel, border included
+    Bricks may lie on the engine's device or in host memory, whatever the device: those are sent
+    through pinned memory while the engine renders. Bricks that lie ready are best named by the rows
+    of a `BrickTable`; those that lie in pinned memory themselves are copied from there a little
+    later, so a producer must leave them as they are.
+    """
+
+    data: Voxels  # (k, z, y, x, c) for each channel, border included
     kind: Tensor | None = None  # (k,) of `Region`; all DATA if left out
     constants: Mapping[str, Tensor] = field(default_factory=dict)  # (k, c)
     alias: Tensor | None = None  # (k, 4) loc

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.lib.stride_tricks import as_strided
 
 from .. import check
 from ..io.store import Store
@@ -266,12 +267,13 @@ class StoredProducer(Producer):
             part = cubes[begin : begin + group].tolist()
             found = self._cache.get([(cuts.what, level, *at, border) for at in part], read)
             for number, cube in enumerate(found, begin):
-                for index in order[starts[number] : starts[number + 1]]:
-                    if isinstance(cube, str):
-                        errors[int(rows[index])] = cube
-                        continue
-                    z, y, x = corner[index]
-                    out[rows[index]] = cube[z : z + side, y : y + side, x : x + side]
+                here = order[starts[number] : starts[number + 1]]
+                if isinstance(cube, str):
+                    errors.update(dict.fromkeys(rows[here].tolist(), cube))
+                    continue
+                last = tuple(n - side + 1 for n in cube.shape[:3])
+                shape, strides = (*last, *out.shape[1:]), (*cube.strides[:3], *cube.strides)
+                out[rows[here]] = as_strided(cube, shape, strides)[tuple(corner[here].T)]
 
     def _fill_beyond(
         self,
