@@ -149,6 +149,15 @@ class Production:
             for kind in KINDS.values()
         }
 
+    @property
+    def due(self) -> bool:
+        """Whether an answer has come, or its patience has ended."""
+        now = time.monotonic()
+        return any(
+            item.future.done() or now - item.since > self._patience(item.job)
+            for item in self._waiting
+        )
+
     def late(self) -> list[tuple[Job, Regions | Bricks]]:
         """Returns the answers that came since the last call; gives up those that do not come."""
         done: list[tuple[Job, Regions | Bricks]] = []
