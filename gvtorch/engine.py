@@ -414,8 +414,12 @@ class Engine:
         self._frame_1.fill_(self.frames)
         for plant in self.plants.values():
             plant.tree.frame = self.frames
-        backend = choose_backend(options.backend, self.device)
-        return FrameStats(frame=self.frames, backend=backend)
+        return FrameStats(
+            frame=self.frames,
+            backend=choose_backend(options.backend, self.device),
+            pending=sum(self.production.pending.values()),
+            failed=self.production.failed,
+        )
 
     def _tracer(self, shader: Shaders, options: RenderOptions) -> Callable[[Rays], Hits]:
         tracers = []

@@ -134,5 +134,6 @@ class FrameStats(RenderStats):
 
 _LATE = {
     *("milliseconds", "stages", "samples", "tiles_used", "bricks_used"),
-    *("requests", "misses", "overflow", "converged", "__dict__"),
+    *("requests", "misses", "overflow", "converged"),
+    *("__dict__", "__getstate__"),  # vars, and copies
 }
