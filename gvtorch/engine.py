@@ -90,7 +90,7 @@ class Engine:
         )
         self.frames, self._closed = 0, False
         self._frame_1 = torch.zeros(1, dtype=torch.int32, device=self.device)
-        self._sent: deque[_Sent] = deque()  # frames whose counts are on their way
+        self._traced: deque[_Traced] = deque()  # frames whose counts are on their way
         self._steady = False
         self._report = Report()
         self.plants: dict[str, Plant] = {}
@@ -158,13 +158,13 @@ class Engine:
         missed something, an answer is due, or the host is too far ahead.
         """
         last = None
-        while self._sent and (
-            self._sent[0].counts.here
-            or (wait or len(self._sent) > _AHEAD or self.production.due)
+        while self._traced and (
+            self._traced[0].counts.here
+            or (wait or len(self._traced) > _AHEAD or self.production.due)
             or (last is not None and last.numbers.listed > 0)
         ):
             last = self._next_counts()
-        if not self._sent:
+        if not self._traced:
             if last is not None:
                 self.cache.make_room(last.numbers.tiles_unused, last.numbers.bricks_unused)
                 if last.numbers.listed:
@@ -175,11 +175,11 @@ class Engine:
         stats.pending = sum(self.production.pending.values())
         stats.failed = self.production.failed
 
-    def _next_counts(self) -> _Sent:
+    def _next_counts(self) -> _Traced:
         """Takes the counts of the oldest frame under way; waits until they are here."""
-        sent = self._sent.popleft()
-        self._steady = sent.stats.converged
-        return sent
+        traced = self._traced.popleft()
+        self._steady = traced.stats.converged
+        return traced
 
     def _serve(self, wishes: Requests, stats: FrameStats) -> None:
         """Chooses wishes, asks for them, and writes the answers that are here at once."""
@@ -212,9 +212,9 @@ class Engine:
         stats.rays, stats.nodes, stats.bricks = rays, nodes.child_tn.numel(), bricks.capacity
         stats.bytes = nodes.nbytes + bricks.nbytes
         self.cache.make_room(0, 0)
-        sent = _Sent(stats, listed, Counts(numbers), stats.pending)
-        stats.later(sent.arrive)
-        self._sent.append(sent)
+        traced = _Traced(stats, listed, Counts(numbers), stats.pending)
+        stats.later(traced.arrive)
+        self._traced.append(traced)
 
     @contextmanager
     def _timed(self, stats: FrameStats) -> Iterator[None]:
@@ -328,9 +328,9 @@ class Engine:
     @property
     def steady(self) -> bool:
         """Whether the last frame whose counts are here missed nothing; nobody waits."""
-        for sent in self._sent:
-            if sent.counts.here:
-                self._steady = sent.stats.converged
+        for traced in self._traced:
+            if traced.counts.here:
+                self._steady = traced.stats.converged
         return self._steady
 
     @property
@@ -502,7 +502,7 @@ class FrameGraph:
             with stage("replay"):
                 self._graph.replay()
             engine._send(stats, shape[0] * shape[1] * shape[2], *self._left)
-        while len(engine._sent) > _AHEAD:
+        while len(engine._traced) > _AHEAD:
             engine._next_counts()
         if engine.options.monitor:
             engine._report.add(stats)
@@ -525,8 +525,8 @@ class _Numbers(NamedTuple):
 
 
 @dataclass(eq=False)
-class _Sent:
-    """A frame whose counts are on their way."""
+class _Traced:
+    """A traced frame whose counts are on their way."""
 
     stats: FrameStats
     listed: Listed

@@ -142,14 +142,6 @@ class Production:
         return len(self._failed)
 
     @property
-    def pending(self) -> dict[int, int]:
-        """For each kind, the items whose answers are on their way."""
-        return {
-            kind: sum(len(w.job) for w in self._waiting if w.job.kind == kind)
-            for kind in KINDS.values()
-        }
-
-    @property
     def due(self) -> bool:
         """Whether an answer has come, or its patience has ended."""
         now = time.monotonic()
@@ -157,6 +149,14 @@ class Production:
             item.future.done() or now - item.since > self._patience(item.job)
             for item in self._waiting
         )
+
+    @property
+    def pending(self) -> dict[int, int]:
+        """For each kind, the items whose answers are on their way."""
+        return {
+            kind: sum(len(w.job) for w in self._waiting if w.job.kind == kind)
+            for kind in KINDS.values()
+        }
 
     def late(self) -> list[tuple[Job, Regions | Bricks]]:
         """Returns the answers that came since the last call; gives up those that do not come."""
