@@ -8,24 +8,22 @@ Detailed Voxel Rendering", I3D 2009; Crassin, PhD thesis 2011.
 from __future__ import annotations
 
 import dataclasses
-import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import Any, Literal
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from . import check
-from .cache import KINDS, Cache, Scheduler
-from .config import ABSENT, CONSTANT, EMPTY, TERMINAL
-from .frame import FrameStats, Hits, Rays
+from .cache import KINDS, Cache, Listed, Requests, Scheduler
+from .frame import Counts, FrameStats, Hits, Rays
 from .ops.trace import choose_backend
-from .pool import BrickPool, Channel, N3Tree, NodePool
-from .producers import Nodes, Producer, Region
-from .producers.answer import checked_bricks, checked_regions, layout_of
-from .production import Failure, Plant, Production, ProductionError
+from .producers import Producer
+from .production import Failure, Plant, Production
 from .rendering import Camera, Picture, RenderOptions, TransferFunction
 from .rendering.renderer import (
     Tracer,
@@ -36,47 +34,16 @@ from .rendering.renderer import (
     trace_camera,
 )
 from .report import Report
-from .stage import Progress, collect_timings, no_progress, stage
+from .scene import EngineOptions, brick_bytes, checked_device, make_plant, make_pools
+from .stage import Progress, collect_timings, mark, milliseconds, no_progress, stage
 from .turns import Turns
-from .volume import movable
 
 Scene = Producer | Mapping[str, Producer]
 Shaders = TransferFunction | Mapping[str, TransferFunction]
 
 _LISTED = 1 << 17  # most nodes with a wish that one frame lists
 _PAYLOAD = 256 * 10**6  # most bytes of voxels produced in one frame
-
-
-@dataclass(frozen=True, kw_only=True)
-class EngineOptions:
-    """How the engine keeps its scene."""
-
-    node_pool: int | str = "8 MB"  # bytes of node words, constants and ranges
-    brick_pool: int | str = "256 MB"  # bytes of voxels
-    device: torch.device | str = "cpu"
-    brick_size: int = 8  # voxels along a side, without the border
-    border: int = 1  # voxels around a brick; from 1 on no seam shows
-    loading: Literal["straight", "levels"] = "straight"  # to the wanted level, or one by one
-    order: Literal["coarse", "fine"] = "coarse"  # which levels are served first
-    load_budget: int = 4096  # most bricks a frame
-    subdivide_budget: int = 4096  # most node tiles a frame
-    time_budget: float | None = None  # most milliseconds of production a frame
-    patience: float = 120.0  # seconds until an answer that does not come is given up
-    strict: bool = False  # raise when something can't be produced
-    monitor: bool = True  # time the stages and remember the last frames, for `report`
-
-    def __post_init__(self) -> None:
-        """Checks what the pools and the scheduler do not check themselves."""
-        if self.loading not in ("straight", "levels"):
-            raise ValueError(
-                f"Engine: loading must be 'straight' or 'levels', got {self.loading!r}"
-            )
-        check.number("Engine", "patience", self.patience, low=0, open_low=True)
-        for name in ("load_budget", "subdivide_budget"):
-            check.whole("Engine", name, getattr(self, name), low=1)
-        for name in ("strict", "monitor"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"Engine: {name} must be bool, got {getattr(self, name)!r}")
+_AHEAD = 3  # most frames that the host may be ahead of the device
 
 
 class Engine:
@@ -106,14 +73,14 @@ class Engine:
             known = ", ".join(EngineOptions.__dataclass_fields__)
             raise ValueError(f"Engine: unknown option {unknown[0]!r}; known: {known}")
         self.options = EngineOptions(**options)
-        self.device = _device(self.options.device)
+        self.device = checked_device(self.options.device)
         producers = dict(scene) if isinstance(scene, Mapping) else {"scene": scene}
-        nodes, bricks = _pools(producers, self.options, self.device)
+        nodes, bricks = make_pools(producers, self.options, self.device)
         self.cache = Cache(nodes, bricks, len(producers))
-        brick_bytes = _brick_bytes(bricks.channels, self.options)
+        most_loads = max(1, _PAYLOAD // brick_bytes(bricks.channels, self.options))
         scheduler = Scheduler(
             order=self.options.order,
-            loads=min(self.options.load_budget, max(1, _PAYLOAD // brick_bytes)),
+            loads=min(self.options.load_budget, most_loads),
             subdivisions=self.options.subdivide_budget,
             milliseconds=self.options.time_budget,
         )
@@ -123,11 +90,13 @@ class Engine:
         )
         self.frames, self._closed = 0, False
         self._frame_1 = torch.zeros(1, dtype=torch.int32, device=self.device)
+        self._traced: deque[_Traced] = deque()  # frames whose counts are on their way
+        self._steady = False
         self._report = Report()
         self.plants: dict[str, Plant] = {}
         try:
             for number, (name, producer) in enumerate(producers.items()):
-                self.plants[name] = self._plant(number, name, producer)
+                self.plants[name] = make_plant(self.cache, self.options, number, name, producer)
         except Exception:
             self.close()
             raise
@@ -140,7 +109,9 @@ class Engine:
         progress: Progress = no_progress,
         **options: Any,
     ) -> tuple[Picture, FrameStats]:
-        """Renders one picture from what is there, then produces what it missed.
+        """Produces what the last picture missed, then renders one from what is there.
+
+        On CUDA nobody waits for the device: the picture is on its way when this returns.
 
         Args:
             camera: One camera or a batch; an orbit camera stands around the scene's box.
@@ -169,40 +140,96 @@ class Engine:
         again: tuple[Hits, Tensor] | None = None,
     ) -> tuple[Hits, FrameStats]:
         """One frame: what `frame` does, for all rays or for some of them once more."""
-        start = time.perf_counter()
         stats = self._begin(chosen)
-        timer = collect_timings() if self.options.monitor else nullcontext(stats.stages)
-        with self._unbroken(), timer as timings:
-            with stage("write"):
-                self.production.write(self.production.late(), stats)
+        with self._unbroken(), self._timed(stats):
+            self._catch_up(stats)  # 1, 2, 3, 4
             trace = self._tracer(shader, chosen)
             world, device = camera.placed(self.box), self.device
-            hits = trace_camera(world, device, trace, chosen.dtype, progress, again=again)  # 1, 2
-            with stage("requests"):
-                wishes = self.cache.requests(min(_LISTED, self.cache.nodes.child_tn.numel()))  # 3
-            with stage("lru"):
-                self.cache.sort_by_use(self._frame_1)  # 4
-            with stage("schedule"):
-                room = self._room()
-                served, deferred, exceeded = self.scheduler.choose(wishes, room)  # 5
-                if exceeded:
-                    coarser = self.cache.stand_ins(wishes, room)
-                    served, deferred, _ = self.scheduler.choose(coarser, room)
-            late = sum(self.production.pending.values())
-            with stage("produce"):
-                answers = self.production.ask([*self.plants.values()], served)  # 6
-            with stage("write"):
-                self.production.write(answers, stats)  # 7
-            with stage("count"):
-                self._count(stats, hits, wishes)
-        stats.deferred, stats.capacity_exceeded = deferred, stats.capacity_exceeded or exceeded
-        stats.converged = not (len(wishes) or wishes.overflow or late)
-        stats.stages = dict(timings)
-        stats.milliseconds = 1e3 * (time.perf_counter() - start)
+            hits = trace_camera(world, device, trace, chosen.dtype, progress, again=again)  # 5, 6
+            self._send(stats, hits.alpha.shape[0], *self._collect(hits))  # 7, 8
         if self.options.monitor:
             self._report.add(stats)
         self.production.raise_if_strict()
         return hits, stats
+
+    def _catch_up(self, stats: FrameStats, wait: bool = False) -> None:
+        """Serves what the last frame missed and writes the answers that came, once its counts are
+        here. Where they are not, the frame goes on without, unless an earlier one is known to have
+        missed something, an answer is due, or the host is too far ahead.
+        """
+        last = None
+        while self._traced and (
+            self._traced[0].counts.here
+            or (wait or len(self._traced) > _AHEAD or self.production.due)
+            or (last is not None and last.numbers.listed > 0)
+        ):
+            last = self._next_counts()
+        if not self._traced:
+            if last is not None:
+                self.cache.make_room(last.numbers.tiles_unused, last.numbers.bricks_unused)
+                if last.numbers.listed:
+                    # Nothing was written since it was traced: its nodes are those that rays saw.
+                    self._serve(last.listed.read(self.cache.nodes, last.numbers), stats)
+            with stage("write"):
+                self.production.write(self.production.late(), stats)
+        stats.pending = sum(self.production.pending.values())
+        stats.failed = self.production.failed
+
+    def _next_counts(self) -> _Traced:
+        """Takes the counts of the oldest frame under way; waits until they are here."""
+        traced = self._traced.popleft()
+        self._steady = traced.stats.converged
+        return traced
+
+    def _serve(self, wishes: Requests, stats: FrameStats) -> None:
+        """Chooses wishes, asks for them, and writes the answers that are here at once."""
+        with stage("schedule"):
+            pending = self.production.pending
+            room = {kind: max(0, n - pending[kind]) for kind, n in self.cache.room().items()}
+            served, stats.deferred, exceeded = self.scheduler.choose(wishes, room)
+            if exceeded:
+                coarser = self.cache.stand_ins(wishes, room)
+                served, stats.deferred, _ = self.scheduler.choose(coarser, room)
+            stats.capacity_exceeded |= exceeded
+        with stage("produce"):
+            answers = self.production.ask([*self.plants.values()], served)
+        with stage("write"):
+            self.production.write(answers, stats)
+
+    def _collect(self, hits: Hits) -> tuple[Listed, Tensor]:
+        """What a traced frame leaves on the device: the wishes, and (10,) int64 `_Numbers`."""
+        with stage("requests"):
+            listed = self.cache.requests(min(_LISTED, self.cache.nodes.child_tn.numel()))
+        with stage("lru"):
+            use = self.cache.sort_by_use(self._frame_1)
+        with stage("count"):
+            samples = hits.samples.sum(dtype=torch.int64).view(1)
+            return listed, torch.cat((listed.count, use, samples))
+
+    def _send(self, stats: FrameStats, rays: int, listed: Listed, numbers: Tensor) -> None:
+        """Sends a frame's counts to the host; until they are here no slot may be taken."""
+        nodes, bricks = self.cache.nodes, self.cache.bricks
+        stats.rays, stats.nodes, stats.bricks = rays, nodes.child_tn.numel(), bricks.capacity
+        stats.bytes = nodes.nbytes + bricks.nbytes
+        self.cache.make_room(0, 0)
+        traced = _Traced(stats, listed, Counts(numbers), stats.pending)
+        stats.later(traced.arrive)
+        self._traced.append(traced)
+
+    @contextmanager
+    def _timed(self, stats: FrameStats) -> Iterator[None]:
+        """Adds the time of a block to a frame's; of each stage, too, if the engine is monitored."""
+        start = mark(self.device)
+        with collect_timings(self.device) if self.options.monitor else nullcontext() as timings:
+            yield
+        end = mark(self.device)
+
+        def arrive() -> None:
+            stats.milliseconds += milliseconds(start, end)
+            if timings is not None:
+                _add(stats.stages, timings.as_dict())
+
+        stats.later(arrive)
 
     def render(
         self,
@@ -220,11 +247,11 @@ class Engine:
         Args:
             camera: See `frame`.
             shader: See `frame`.
-            mode: interactive: one frame; balanced: `productions` frames, of which the last is
-                shown; converge: until no ray misses anything that can be served. Rays that miss
-                nothing are done; where the pools are too small for all rays, groups of them take
-                turns, so that pools that hold what one ray needs, and the coarser bricks that
-                stand in for it on the way, give the whole picture.
+            mode: interactive: one frame, as `frame` gives it; balanced: `productions` frames, of
+                which the last is shown; converge: until no ray misses anything that can be served.
+                Rays that miss nothing are done; where the pools are too small for all rays, groups
+                of them take turns, so that pools that hold what one ray needs, and the coarser
+                bricks that stand in for it on the way, give the whole picture.
             productions: Frames of a balanced picture.
             max_frames: Most frames of a converged picture; `stats.converged` tells whether they
                 were enough.
@@ -242,12 +269,17 @@ class Engine:
         """
         most = _most_frames(mode, productions, max_frames)
         chosen = render_options("render", camera, options)
+        if mode == "interactive":
+            return self.frame(camera, shader, **options)[0]
         count = len(camera) * camera.height * camera.width
         turns = Turns(count, camera.width, self.device)
         total, hits = FrameStats(), None
         for number in range(1, most + 1):
             again = (hits, turns.now) if mode == "converge" and hits is not None else None
             hits, stats = self._pass(camera, shader, chosen, no_progress, again)
+            with self._unbroken(), self._timed(stats):
+                self._catch_up(stats, wait=True)
+            self.production.raise_if_strict()
             _add_up(total, stats)
             if mode == "converge":
                 turns.take(hits.missed, stats, total.failed)
@@ -270,9 +302,36 @@ class Engine:
             total.converged = stats.converged
             total.capacity_exceeded = stats.capacity_exceeded
         total.frames, total.rays = number, turns.count
-        total.samples = int(hits.samples.sum(dtype=torch.int64))
+        total.samples = stats.samples
         summed = {name: getattr(total, name) for name in _SUMMED}
         return develop(hits, camera, chosen.background, dataclasses.replace(stats, **summed))
+
+    def capture(self, camera: Camera, shader: Shaders, **options: Any) -> FrameGraph:
+        """Records a frame as a CUDA graph, for cameras of this number and size.
+
+        Renders a frame first, as `frame` does.
+
+        Args:
+            camera: See `frame`.
+            shader: See `frame`.
+            **options: Fields of `RenderOptions`.
+
+        Raises:
+            ValueError: The engine is on no CUDA device, or see `frame`.
+            ProductionError: See `frame`.
+        """
+        if self.device.type != "cuda":
+            raise ValueError(f"Engine.capture: the engine must be on CUDA, it is on {self.device}")
+        self.frame(camera, shader, **options)  # loads what is loaded at first use
+        return FrameGraph(self, camera, shader, render_options("capture", camera, options))
+
+    @property
+    def steady(self) -> bool:
+        """Whether the last frame whose counts are here missed nothing; nobody waits."""
+        for traced in self._traced:
+            if traced.counts.here:
+                self._steady = traced.stats.converged
+        return self._steady
 
     @property
     def box(self) -> Tensor:
@@ -355,8 +414,12 @@ class Engine:
         self._frame_1.fill_(self.frames)
         for plant in self.plants.values():
             plant.tree.frame = self.frames
-        backend = choose_backend(options.backend, self.device)
-        return FrameStats(frame=self.frames, backend=backend)
+        return FrameStats(
+            frame=self.frames,
+            backend=choose_backend(options.backend, self.device),
+            pending=sum(self.production.pending.values()),
+            failed=self.production.failed,
+        )
 
     def _tracer(self, shader: Shaders, options: RenderOptions) -> Callable[[Rays], Hits]:
         tracers = []
@@ -369,102 +432,119 @@ class Engine:
                 raise ValueError(
                     f"frame: tree {name!r} has no channel {channel!r}; it has {', '.join(known)}"
                 )
+            chosen = dataclasses.replace(options, channel=channel)
+            by_level = self.options.loading == "levels"
             tracers.append(
-                Tracer(
-                    plant.tree,
-                    one,
-                    dataclasses.replace(options, channel=channel),
-                    by_level=self.options.loading == "levels",
-                )
+                Tracer(plant.tree, one, chosen, by_level=by_level, frame_1=self._frame_1)
             )
         if len(tracers) == 1:
             return tracers[0]
         return lambda rays: composite_trees(tracers, rays)
 
-    def _room(self) -> dict[int, int]:
-        pending = self.production.pending
-        return {kind: max(0, n - pending[kind]) for kind, n in self.cache.room().items()}
 
-    def _count(self, stats: FrameStats, hits: Hits, wishes: Any) -> None:
-        nodes, bricks = self.cache.nodes, self.cache.bricks
-        stats.rays = hits.alpha.shape[0]
-        stats.samples = int(hits.samples.sum(dtype=torch.int64))
-        stats.nodes, stats.bricks = nodes.child_tn.numel(), bricks.capacity
-        stats.bytes = nodes.nbytes + bricks.nbytes
-        stats.tiles_used = int((nodes.stamp_t == self.frames).sum())
-        stats.bricks_used = int((bricks.stamp_b == self.frames).sum())
-        stats.requests = {name: int((wishes.kind == kind).sum()) for name, kind in KINDS.items()}
-        stats.misses, stats.overflow = wishes.misses, wishes.overflow
-        stats.pending = sum(self.production.pending.values())
-        stats.failed = self.production.failed
+class FrameGraph:
+    """A frame as one CUDA graph, which costs the host a single call. `Engine.capture` makes it.
 
-    def _plant(self, number: int, name: str, producer: Producer) -> Plant:
-        """Makes a tree with its root node, which stays for ever."""
-        options, nodes, bricks = self.options, self.cache.nodes, self.cache.bricks
-        depth = 0
-        while options.brick_size * producer.branching**depth < max(producer.extent):
-            depth += 1
-        layout = layout_of(producer, depth, options.brick_size, options.border, self.device)
-        if producer.layout is not None:
-            raise ValueError(
-                f"Engine: the producer of tree {name!r} serves another engine: "
-                "close that one, or make another producer"
+    A replay is the frame that `Engine.frame` would render, but it produces nothing. Where the
+    engine is not steady any more, something was missed or an answer is on its way, and
+    `Engine.frame` goes on until it is::
+
+        render = graph.replay if engine.steady else partial(engine.frame, shader=shader)
+        picture, stats = render(camera)
+    """
+
+    def __init__(
+        self, engine: Engine, camera: Camera, shader: Shaders, options: RenderOptions
+    ) -> None:
+        """Records the frame; see `Engine.capture`."""
+        self._engine, self._options = engine, options
+        self._camera = camera.placed(engine.box)
+        self._numbers = self._camera.numbers(engine.device)  # a replay writes its camera here
+        self._trace = engine._tracer(shader, options)
+        self._graph = torch.cuda.CUDAGraph()
+        with (
+            torch.cuda.device(engine.device),
+            torch.cuda.graph(self._graph, capture_error_mode="thread_local"),
+        ):
+            hits = trace_camera(
+                *(self._camera, engine.device, self._trace, options.dtype, no_progress),
+                numbers=self._numbers,
             )
-        producer.to(self.device)
-        producer.prepare(layout)
-        tree = N3Tree(
-            *(nodes, bricks),
-            depth=depth,
-            extent=producer.extent,
-            spacing=producer.spacing,
-            origin=producer.origin,
-            root=number * nodes.nodes_per_tile,
-            branching=producer.branching,
-            value_range=producer.value_range,
+            self._left = engine._collect(hits)
+            self._picture = develop(hits, camera, options.background, FrameStats())
+
+    def replay(self, camera: Camera) -> tuple[Picture, FrameStats]:
+        """Renders a frame; nobody waits for the device.
+
+        Args:
+            camera: As many cameras of the same size as were captured.
+
+        Returns:
+            The picture, which the next replay overwrites, and what it cost; see `Engine.frame`.
+
+        Raises:
+            ValueError: The camera differs in number or size, or the engine is closed.
+        """
+        check_type("replay", "camera", camera, Camera)
+        shape, own = (
+            (len(one), one.height, one.width, one.batched) for one in (camera, self._camera)
         )
-        nodes.child_tn[number], nodes.brick_tn[number] = TERMINAL, EMPTY
-        nodes.tree_t[number] = number
-        plant = Plant(name, tree, producer, layout)
-        root = Nodes(torch.zeros((1, 4), dtype=torch.int64, device=self.device), layout)
-        try:
-            self._fill_root(plant, root)
-        except Exception as error:
-            producer.close()
-            reason = str(error) or type(error).__name__
-            raise ProductionError(
-                f"Engine: the root of tree {name!r} can't be made: {reason}"
-            ) from error
-        producer.layout = layout  # it serves this engine now
-        return plant
+        if shape != own:
+            raise ValueError(
+                f"replay: camera must be {own[0]} of {own[2]}x{own[1]} pixels as captured, "
+                f"got {shape[0]} of {shape[2]}x{shape[1]}"
+            )
+        engine = self._engine
+        stats = engine._begin(self._options)
+        with torch.cuda.device(engine.device), engine._timed(stats):
+            self._numbers.copy_(camera.placed(engine.box).numbers(engine.device))
+            with stage("replay"):
+                self._graph.replay()
+            engine._send(stats, shape[0] * shape[1] * shape[2], *self._left)
+        while len(engine._traced) > _AHEAD:
+            engine._next_counts()
+        if engine.options.monitor:
+            engine._report.add(stats)
+        return dataclasses.replace(self._picture, stats=stats), stats
 
-    def _fill_root(self, plant: Plant, root: Nodes) -> None:
-        nodes, index = self.cache.nodes, plant.tree.root
-        number = index // nodes.nodes_per_tile
-        regions = checked_regions(self._now(plant.producer.classify(root)), root, plant.producer)
-        _raise_first(regions.errors)
-        for channel, tensor in regions.ranges.items():
-            movable(nodes.ranges[channel])[number, 0] = movable(tensor)[0]
-        kind, constants = Region(int(regions.kind[0])), regions.constants
-        if kind in (Region.DATA, Region.DATA_MAX_DEPTH):
-            bricks = checked_bricks(self._now(plant.producer.fill(root)), root, plant.producer)
-            _raise_first(bricks.errors)
-            found = kind if bricks.kind is None else Region(int(bricks.kind[0]))
-            if found not in (Region.DATA, Region.DATA_MAX_DEPTH):
-                kind, constants = found, bricks.constants
-        if kind == Region.ALIAS:
-            raise ValueError("the root can't be an ALIAS")
-        for channel, tensor in constants.items():
-            movable(nodes.constants[channel])[number, 0] = movable(tensor)[0]
-        if kind in (Region.EMPTY, Region.CONSTANT):
-            nodes.brick_tn.view(-1)[index] = EMPTY if kind == Region.EMPTY else CONSTANT
-            return
-        slot = torch.tensor([number], dtype=torch.int32, device=self.device)
-        self.cache.put_bricks(slot, slot.to(torch.int64) * nodes.nodes_per_tile, bricks.data)
-        if plant.layout.depth > 0 and kind != Region.DATA_MAX_DEPTH:
-            nodes.child_tn.view(-1)[index] = ABSENT
 
-    def _now(self, answer: Any) -> Any:
-        return answer.result(self.options.patience) if hasattr(answer, "result") else answer
+class _Numbers(NamedTuple):
+    """What the host is told of a frame."""
+
+    listed: int  # nodes
+    found: int
+    misses: int
+    load: int  # wishes of each kind
+    subdivide: int
+    tiles_unused: int
+    tiles_used: int
+    bricks_unused: int
+    bricks_used: int
+    samples: int
+
+
+@dataclass(eq=False)
+class _Traced:
+    """A traced frame whose counts are on their way."""
+
+    stats: FrameStats
+    listed: Listed
+    counts: Counts
+    late: int  # answers that were on their way while it was traced
+
+    @cached_property
+    def numbers(self) -> _Numbers:
+        """The counts; waits until they are here."""
+        return _Numbers(*self.counts.read())
+
+    def arrive(self) -> None:
+        """Completes the statistics."""
+        stats, numbers = self.stats, self.numbers
+        stats.requests = {name: getattr(numbers, name) for name in KINDS}
+        stats.misses, stats.overflow = numbers.misses, numbers.found - numbers.listed
+        stats.tiles_used, stats.bricks_used = numbers.tiles_used, numbers.bricks_used
+        stats.samples = numbers.samples
+        stats.converged = not (numbers.found or self.late)
 
 
 def _most_frames(mode: str, productions: int, max_frames: int) -> int:
@@ -476,72 +556,6 @@ def _most_frames(mode: str, productions: int, max_frames: int) -> int:
             f"render: mode must be 'interactive', 'balanced' or 'converge', got {mode!r}"
         )
     return limits[mode]
-
-
-def _device(device: torch.device | str) -> torch.device:
-    try:
-        found = torch.device(device)
-    except (RuntimeError, TypeError):
-        raise ValueError(f"Engine: device must name a device, got {device!r}") from None
-    if found.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError("Engine: device 'cuda' can't be used here: torch sees no CUDA device")
-    return found
-
-
-def _raise_first(errors: Mapping[int, str]) -> None:
-    for message in errors.values():
-        raise ValueError(message)
-
-
-def _pools(
-    producers: Mapping[str, Producer], options: EngineOptions, device: torch.device
-) -> tuple[NodePool, BrickPool]:
-    """Makes both pools, of as many slots as their bytes hold."""
-    channels: dict[str, Channel] = {}
-    if not producers:
-        raise ValueError("Engine: scene must have at least one producer")
-    for name, producer in producers.items():
-        check_type("Engine", f"tree {name!r}", producer, Producer)
-        if "channels" not in vars(producer):
-            kind = type(producer).__name__
-            raise ValueError(f"Engine: {kind}.__init__ must call super().__init__(extent, ...)")
-        for channel, what in producer.channels.items():
-            if channels.setdefault(channel, what) != what:
-                raise ValueError(
-                    f"Engine: trees disagree on channel {channel!r}: {channels[channel]} and {what}"
-                )
-    branching = max(producer.branching for producer in producers.values())
-    node_bytes = 8 + 3 * sum(channel.nbytes for channel in channels.values())
-    roots, capacity = len(producers), {}
-    for name, slot in (
-        ("node_pool", branching**3 * node_bytes),
-        ("brick_pool", _brick_bytes(channels, options)),
-    ):
-        size = check.nbytes("Engine", name, getattr(options, name))
-        capacity[name] = size // slot
-        least = roots + 1 + (branching if name == "node_pool" else 0)
-        if capacity[name] < least:
-            raise ValueError(
-                f"Engine: {name} of {size} bytes holds {capacity[name]} slots of {slot} bytes, "
-                f"at least {least} are needed ({least * slot} bytes)"
-            )
-        check.memory("Engine", name, size, device)
-    nodes = NodePool(capacity["node_pool"], channels, branching=branching, device=device)
-    bricks = BrickPool(
-        capacity["brick_pool"],
-        channels,
-        brick_size=options.brick_size,
-        border=options.border,
-        device=device,
-    )
-    return nodes, bricks
-
-
-def _brick_bytes(channels: Mapping[str, Channel], options: EngineOptions) -> int:
-    where = "Engine"
-    size = check.whole(where, "brick_size", options.brick_size, low=2, high=256)
-    border = check.whole(where, "border", options.border, low=0, high=16)
-    return (size + 2 * border) ** 3 * sum(channel.nbytes for channel in channels.values())
 
 
 _SUMMED = (
@@ -556,6 +570,9 @@ def _add_up(total: FrameStats, stats: FrameStats) -> None:
     total.tiles_used = max(total.tiles_used, stats.tiles_used)
     total.bricks_used = max(total.bricks_used, stats.bricks_used)
     for name in ("stages", "produced", "evicted"):
-        sums = getattr(total, name)
-        for key, value in getattr(stats, name).items():
-            sums[key] = sums.get(key, 0) + value
+        _add(getattr(total, name), getattr(stats, name))
+
+
+def _add(sums: dict[str, Any], more: Mapping[str, Any]) -> None:
+    for key, value in more.items():
+        sums[key] = sums.get(key, 0) + value

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -44,6 +46,30 @@ class Hits:
     missed: Tensor  # (r,) bool, something that the ray saw was not there
 
 
+class Counts:
+    """Numbers on their way from a device to the host, which does not wait for them."""
+
+    def __init__(self, numbers: Tensor) -> None:
+        """Sends (k,) int64 numbers off: by a copy to pinned memory, where the device is CUDA."""
+        self._numbers, self._event = numbers, None
+        if numbers.is_cuda:
+            self._numbers = torch.empty(numbers.shape, dtype=numbers.dtype, pin_memory=True)
+            self._numbers.copy_(numbers, non_blocking=True)
+            self._event = torch.cuda.Event()
+            self._event.record(torch.cuda.current_stream(numbers.device))
+
+    @property
+    def here(self) -> bool:
+        """Whether they have come."""
+        return self._event is None or self._event.query()
+
+    def read(self) -> list[int]:
+        """Returns them; waits until they have come."""
+        if self._event is not None:
+            self._event.synchronize()
+        return self._numbers.tolist()
+
+
 @dataclass(kw_only=True)
 class RenderStats:
     """What a picture cost."""
@@ -66,7 +92,12 @@ class RenderStats:
 
 @dataclass(kw_only=True)
 class FrameStats(RenderStats):
-    """What a frame of the engine cost, and what it asked for."""
+    """What a frame of the engine cost, and what it asked for.
+
+    What rays used and missed, and times, are known when the device has come to the frame's end:
+    who reads one of these first waits for that frame, nobody else does. What was produced is what
+    this call wrote: for wishes of the frame before, and answers that came late.
+    """
 
     frame: int = 0  # number of the frame, from 1
     frames: int = 1  # frames that this picture took
@@ -87,6 +118,21 @@ class FrameStats(RenderStats):
     capacity_exceeded: bool = False  # a wish found no slot that this frame had not used itself
     converged: bool = False  # nothing that could be served was missing
 
+    def later(self, arrive: Callable[[], None]) -> None:
+        """Calls `arrive`, which sets fields that come late, before one of them is read."""
+        object.__getattribute__(self, "__dict__").setdefault("_late", []).append(arrive)
+
+    def settle(self) -> None:
+        """Waits for what comes late."""
+        for arrive in object.__getattribute__(self, "__dict__").pop("_late", ()):
+            arrive()
+
+    def __getattribute__(self, name: str) -> Any:
+        """Fetches what comes late."""
+        if name in _LATE:
+            object.__getattribute__(self, "settle")()
+        return object.__getattribute__(self, name)
+
     @property
     def miss_rate(self) -> float:
         """Bricks asked for over bricks asked for and bricks used. A brick on its way is asked for
@@ -98,3 +144,10 @@ class FrameStats(RenderStats):
     def as_dict(self) -> dict[str, object]:
         """Returns plain values, ready for JSON."""
         return {**asdict(self), "miss_rate": self.miss_rate}
+
+
+_LATE = {
+    *("milliseconds", "stages", "samples", "tiles_used", "bricks_used"),
+    *("requests", "misses", "overflow", "converged"),
+    *("__dict__", "__getstate__"),  # vars, and copies
+}

@@ -170,6 +170,15 @@ class Production:
         return len(self._failed)
 
     @property
+    def due(self) -> bool:
+        """Whether an answer has come, or waits for room on the way, or its patience has ended."""
+        now = time.monotonic()
+        return bool(self._held) or any(
+            item.future.done() or now - item.since > self._patience(item.job)
+            for item in self._waiting
+        )
+
+    @property
     def pending(self) -> dict[int, int]:
         """For each kind, the items whose answers are on their way."""
         jobs = self._under_way()

@@ -1,4 +1,8 @@
-"""Names for the steps of a frame: `with stage("trace"):` feeds timer and profiler."""
+"""Names for the steps of a frame: `with stage("trace"):` feeds timer and profiler.
+
+Times are differences of marks. On CUDA a mark is an event in the stream, so that taking the time
+makes nobody wait; only who reads it does.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +16,56 @@ import torch
 #: Told (what, done, total) by work that can be long; the command line draws its progress bar from
 #: it.
 Progress = Callable[[str, int, int], None]
-
-_timings: ContextVar[dict[str, float] | None] = ContextVar("gvtorch_timings", default=None)
+Mark = float | torch.cuda.Event
 
 
 def no_progress(what: str, done: int, total: int) -> None:
     """Listens to nothing."""
 
 
+def mark(device: torch.device) -> Mark:
+    """Notes the time: the host's, or on CUDA the moment at which the device comes to this place."""
+    if device.type != "cuda":
+        return time.perf_counter()
+    event = torch.cuda.Event(enable_timing=True)
+    event.record(torch.cuda.current_stream(device))
+    return event
+
+
+def milliseconds(start: Mark, end: Mark) -> float:
+    """Returns the time between two marks of one device; waits until it has come to the second."""
+    if isinstance(start, float) or isinstance(end, float):
+        return 1e3 * (end - start)  # type: ignore[operator]
+    end.synchronize()
+    return start.elapsed_time(end)
+
+
+class Timings:
+    """Times of stages on one device."""
+
+    def __init__(self, device: torch.device) -> None:
+        """Has measured nothing yet."""
+        self.device = device
+        self._spans: list[tuple[str, Mark, Mark]] = []
+
+    def add(self, name: str, start: Mark, end: Mark) -> None:
+        """Takes note of a stage."""
+        self._spans.append((name, start, end))
+
+    def as_dict(self) -> dict[str, float]:
+        """Returns milliseconds by stage; waits until the device has come to the last one's end."""
+        total: dict[str, float] = {}
+        for name, start, end in self._spans:
+            total[name] = total.get(name, 0.0) + milliseconds(start, end)
+        return total
+
+
+_timings: ContextVar[Timings | None] = ContextVar("gvtorch_timings", default=None)
+
+
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Names a step: adds its milliseconds to the open `collect_timings()` and shows it to torch's
+    """Names a step: adds its time to the open `collect_timings()` and shows it to torch's
     profiler. It does nothing where neither listens.
     """
     timings = _timings.get()
@@ -33,20 +76,17 @@ def stage(name: str) -> Iterator[None]:
         if timings is None:
             yield
             return
-        start = time.perf_counter()
+        start = mark(timings.device)
         try:
             yield
         finally:
-            if torch.cuda.is_initialized():
-                torch.cuda.synchronize()
-            elapsed = 1e3 * (time.perf_counter() - start)
-            timings[name] = timings.get(name, 0.0) + elapsed
+            timings.add(name, start, mark(timings.device))
 
 
 @contextmanager
-def collect_timings() -> Iterator[dict[str, float]]:
-    """Yields a dict that fills with milliseconds by stage while the block runs."""
-    timings: dict[str, float] = {}
+def collect_timings(device: torch.device) -> Iterator[Timings]:
+    """Yields what gathers the times of stages while the block runs."""
+    timings = Timings(device)
     token = _timings.set(timings)
     try:
         yield timings

@@ -23,6 +23,7 @@ class Turns:
 
     Attributes:
         count: Number of rays.
+        done: Rays that need no more passes.
         now: (count,) bool, to be traced next.
         over: Nothing is left to trace, or tracing does not help.
         stuck: The last pass moved nothing.
@@ -44,17 +45,12 @@ class Turns:
         self._size = count
         self.now = self._open.clone()
         self.over = self.stuck = self.crowded = False
-        self._given_up = 0
-
-    @property
-    def done(self) -> int:
-        """Rays that need no more passes."""
-        return self.count - int(self._open.sum())
+        self.done = self._given_up = 0
 
     @property
     def whole(self) -> bool:
         """Every ray got all that could be served."""
-        return not self._given_up and not bool(self._open.any())
+        return not self._given_up and self.done == self.count
 
     def take(self, missed: Tensor, stats: FrameStats, failed: int) -> None:
         """Learns what a pass did.
@@ -67,23 +63,26 @@ class Turns:
         # Where nothing could be served, what is missing has failed: these rays are as good as ever.
         finished = self.now if stats.converged else self.now & ~missed
         self._open &= ~finished
-        moved = sum(stats.produced.values()) + stats.stale > 0 or stats.failed > failed
-        self.stuck = not moved and not bool(finished.any())
         left = self.now & self._open
+        sums = torch.stack([rays.sum() for rays in (finished, left, self._open)])
+        just_done, remaining, unfinished = sums.tolist()  # the one wait
+        moved = sum(stats.produced.values()) + stats.stale > 0 or stats.failed > failed
+        self.stuck = not moved and not just_done
+        self.done = self.count - unfinished
         if self.stuck and not stats.pending:
             if not stats.capacity_exceeded:
                 self.over = True
                 return
             self.crowded = True
-            self._size = int(left.sum()) // 2
+            self._size = remaining // 2
             if self._size == 0:  # one ray alone does not fit
                 self._given_up += 1
                 self._open &= ~left
-                self._size = 1
-                left = torch.zeros_like(left)
-        elif not left.any():
+                self.done += remaining
+                self._size, remaining = 1, 0
+        elif not remaining:
             self._size = min(self.count, 2 * self._size)
-        self._choose(left if left.any() else self._open)
+        self._choose(left if remaining else self._open)
 
     def everyone(self) -> None:
         """Lets all rays that are not done be traced next: the last pass that there is time for."""
@@ -91,6 +90,6 @@ class Turns:
 
     def _choose(self, group: Tensor) -> None:
         scouts = group & self._scouts
-        first = scouts if scouts.any() else group
+        first = torch.where(scouts.any(), scouts, group)
         self.now = first & (first.cumsum(0) <= self._size)
-        self.over = not bool(self._open.any())
+        self.over = self.done == self.count

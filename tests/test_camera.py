@@ -7,8 +7,10 @@ import math
 import pytest
 import torch
 from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.depth import unproject_meshgrid
 
 import gvtorch as gv
+from gvtorch.rendering import renderer
 
 BOX = torch.tensor([[1.0, 2.0, 3.0], [5.0, 4.0, 4.0]], dtype=torch.float64)
 
@@ -114,6 +116,51 @@ def test_batches_broadcast():
     assert len(camera) == 2 and camera.rays().origin.shape == (24, 3)
     single = camera[1].rays()
     assert torch.equal(single.direction, camera.rays().direction[12:])
+
+
+def test_rays_are_those_of_kornia_to_rounding():
+    camera = gv.Camera.look_at((3, 2, 5), (0.5, 0, 0), fov=35, width=13, height=8)
+    moved = camera.Ks.clone()
+    moved[:, :2, 2] -= 0.5
+    local = unproject_meshgrid(8, 13, moved, normalize_points=True, dtype=torch.float64)
+    expected = local.reshape(-1, 3) @ camera.viewmats[0, :3, :3]
+    rays = camera.rays()
+    assert (rays.direction - expected).abs().max() <= 2**-51 and rays.width == 13
+    assert torch.equal(rays.range, torch.tensor([[0, math.inf]]).double().expand(104, 2))
+
+
+def test_rows_are_counted_through_the_batch():
+    camera = gv.Camera.orbit([0, 40, 80], 10, [2.0, 1.0, 3.0], 30, 6, 5).placed(BOX)
+    whole = camera.rays()
+    for first, end in ((0, 15), (3, 4), (4, 11), (14, 15)):
+        part = camera.rays(rows=(first, end))
+        for name, field in vars(part).items():
+            if name != "width":
+                assert torch.equal(field, getattr(whole, name)[6 * first : 6 * end]), name
+
+
+def test_small_cameras_share_calls(monkeypatch):
+    """Blocks of rays span cameras, and their size does not change the picture."""
+    volume = gv.Volume(torch.arange(16**3).reshape(16, 16, 16).to(torch.int16))
+    tree, shader = gv.N3Tree.from_volume(volume), gv.TransferFunction.preset("gray", 0, 4096)
+    cameras = gv.Camera.orbit(torch.linspace(0, 300, 20), 20, 1.5, width=16, height=16)
+    calls: list[int] = []
+
+    def told(what, done, total):
+        calls.append(done)
+
+    one_call = gv.render(tree, cameras, shader, progress=told)
+    assert calls == [320] and one_call.alpha.max() > 0.3
+    calls.clear()
+    monkeypatch.setitem(renderer._RAYS_A_BLOCK, "cpu", 1000)  # 62 rows, in the middle of a camera
+    parts = gv.render(tree, cameras, shader, progress=told)
+    assert calls == [62, 124, 186, 248, 310, 320]
+    for index in range(20):
+        alone = gv.render(tree, cameras[index], shader)
+        for name in ("color", "alpha", "depth", "samples"):
+            expected = getattr(one_call, name)[index]
+            assert torch.equal(getattr(parts, name)[index], expected)
+            assert torch.equal(getattr(alone, name), expected.reshape(getattr(alone, name).shape))
 
 
 @pytest.mark.parametrize(

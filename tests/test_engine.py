@@ -140,9 +140,10 @@ def test_a_frame_from_too_small_pools_is_complete_and_coarser(aneurism, compiled
     for share in (0.1, 0.3, 0.6, 1.3):
         options = {pool: int(share * slots) * size, "device": device, "loading": loading}
         with gv.Engine(gv.VolumeProducer(aneurism), **options) as engine:
-            for _ in range(200):
+            for number in range(200):
                 picture, stats = engine.frame(view, VESSELS)
-                if not any(stats.produced.values()):
+                stats.settle()
+                if number and not any(stats.produced.values()):
                     break
             engine.validate()
             assert not any(stats.produced.values()), "it comes to rest"
@@ -204,29 +205,24 @@ def test_rays_take_turns_by_halves(monkeypatch):
 
 
 class Checked(gv.Engine):
-    """Looks after every frame at what the frame may have done."""
+    """Looks after every frame at what the frame may have done: what the picture before used is
+    still there.
+    """
 
     def frame(self, *args, **options):
         nodes, bricks = self.cache.nodes, self.cache.bricks
         roots = len(self.plants)
         locked = nodes.brick_tn[:roots, 0].clone()
-        before = []
-        requests = self.cache.requests
-
-        def after_tracing(capacity):
-            before.extend((bricks.owner_b.clone(), nodes.parent_t.clone()))
-            return requests(capacity)
-
-        self.cache.requests = after_tracing
+        before = [bricks.owner_b.clone(), nodes.parent_t.clone()]
+        used_b = (bricks.stamp_b == self.frames) & (before[0] >= 0)
+        used_t = (nodes.stamp_t == self.frames) & (before[1] >= 0)
         picture, stats = super().frame(*args, **options)
-        self.cache.requests = requests
         self.validate()
-        used_b = bricks.stamp_b == self.frames
-        used_t = nodes.stamp_t == self.frames
         assert torch.equal(bricks.owner_b[used_b], before[0][used_b]), "a brick in use was taken"
         assert torch.equal(nodes.parent_t[used_t], before[1][used_t]), "a tile in use was taken"
         assert torch.equal(nodes.brick_tn[:roots, 0], locked), "a root was touched"
-        assert int(stats.tiles_used) == int(used_t.sum())
+        assert stats.tiles_used == int((nodes.stamp_t == self.frames).sum())
+        assert stats.bricks_used == int((bricks.stamp_b == self.frames).sum())
         assert not (nodes.request_tn & config.REQUEST_KINDS).any(), "wishes are cleared"
         return picture, stats
 
@@ -286,7 +282,7 @@ def test_twins_and_kernels_drive_the_engine_alike(blobs, seed, loading):
 def test_lru_takes_from_the_front_and_refuses_more_than_is_unused():
     lru = LRU(6, 2, torch.device("cpu"))
     stamp = torch.tensor([9, 9, 9, 1, 9, 1], dtype=torch.int32)
-    lru.sort(stamp, torch.tensor([9], dtype=torch.int32))
+    lru.unused = int(lru.sort(stamp, torch.tensor([9], dtype=torch.int32)))
     assert lru.order.tolist() == [3, 5, 2, 4] and lru.unused == 2
     assert lru.take(1).tolist() == [3] and lru.order.tolist() == [5, 2, 4, 3]
     with pytest.raises(ValueError, match="2 slots wanted, 1 are unused"):
@@ -507,7 +503,8 @@ def test_stages_show_in_the_profiler_and_cost_nothing_without_listeners(blobs):
     shader = gv.TransferFunction.preset("gray", 0, 1)
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4, monitor=False) as engine:
         with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as seen:
-            engine.frame(camera(8), shader)
+            for _ in range(2):
+                engine.frame(camera(8), shader)
         names = {event.key for event in seen.key_averages()}
         steps = ("rays", "trace", "requests", "lru", "schedule", "produce", "write")
         assert {f"gvtorch.{name}" for name in steps} <= names

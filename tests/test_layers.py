@@ -19,6 +19,7 @@ FLOORS = [
     {"io"},
     {"cache", "producers", "rendering"},
     {"production", "turns"},
+    {"scene"},
     {"engine"},
     {"tools"},
 ]
@@ -54,7 +55,7 @@ def modules() -> list[Path]:
     files = [
         p for p in PACKAGE.rglob("*.py") if p.name not in ("__main__.py",) and p.parent != PACKAGE
     ]
-    alone = FLOORS[0] | {"production", "turns", "engine"}
+    alone = FLOORS[0] | {"production", "turns", "scene", "engine"}
     return files + [PACKAGE / f"{name}.py" for name in sorted(alone)]
 
 

@@ -2,7 +2,7 @@
 
 from .cache import Cache, Children, Written
 from .lru import LRU
-from .requests import KINDS, Requests
+from .requests import KINDS, Listed, Requests
 from .scheduler import Scheduler
 
-__all__ = ["KINDS", "LRU", "Cache", "Children", "Requests", "Scheduler", "Written"]
+__all__ = ["KINDS", "LRU", "Cache", "Children", "Listed", "Requests", "Scheduler", "Written"]

@@ -27,7 +27,7 @@ from ..pool import BrickPool, N3Tree, NodePool
 from ..pool.staging import Part, Voxels, joined, on_device, wide_rows
 from ..volume import movable
 from .lru import LRU
-from .requests import Requests, collect
+from .requests import Listed, Requests, collect
 
 
 @dataclass
@@ -61,17 +61,34 @@ class Cache:
             REQUEST_LOAD: LRU(bricks.capacity, roots, device),
         }
 
-    def requests(self, capacity: int) -> Requests:
+    def requests(self, capacity: int) -> Listed:
         """Takes the frame's wishes out of the node pool."""
         return collect(self.nodes, capacity)
 
-    def sort_by_use(self, frame: Tensor) -> None:
-        """Makes what `frame` (1,) did not use available."""
-        self.lru[REQUEST_SUBDIVIDE].sort(self.nodes.stamp_t, frame)
-        self.lru[REQUEST_LOAD].sort(self.bricks.stamp_b, frame)
+    def sort_by_use(self, frame: Tensor) -> Tensor:
+        """Orders tiles and bricks by use in `frame` (1,); nobody waits for the device.
+
+        Returns:
+            (4,) int64 tiles unused and used, bricks unused and used; `make_room` is told the unused
+            ones, once the host knows them.
+        """
+        counts = []
+        for kind, stamp in (
+            (REQUEST_SUBDIVIDE, self.nodes.stamp_t),
+            (REQUEST_LOAD, self.bricks.stamp_b),
+        ):
+            lru = self.lru[kind]
+            unused, size = lru.sort(stamp, frame), len(lru.order)
+            locked = (stamp[: len(stamp) - size] == frame).sum()
+            counts += [unused, locked + size - unused]
+        return torch.cat(counts)
+
+    def make_room(self, tiles: int, bricks: int) -> None:
+        """Lets as many slots be taken as the last frame did not use."""
+        self.lru[REQUEST_SUBDIVIDE].unused, self.lru[REQUEST_LOAD].unused = tiles, bricks
 
     def room(self) -> dict[int, int]:
-        """For each kind, the slots that may be taken in this frame."""
+        """For each kind, the slots that may be taken."""
         return {kind: lru.unused for kind, lru in self.lru.items()}
 
     def stand_ins(self, wishes: Requests, room: dict[int, int]) -> Requests:

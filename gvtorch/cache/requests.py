@@ -1,7 +1,10 @@
-"""Requests: what rays asked for in one frame, as a list."""
+"""Requests: what rays asked for in one frame. `Listed` is on the device, `Requests` for the host,
+once it knows how many there are.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -36,30 +39,44 @@ class Requests:
         return Requests(**rows, misses=self.misses, overflow=self.overflow)
 
 
-def collect(nodes: NodePool, capacity: int) -> Requests:
-    """Takes the wishes out of a pool's request words.
+@dataclass(frozen=True, kw_only=True)
+class Listed:
+    """Nodes with a wish, as `ops.compact_requests` leaves them on the device."""
+
+    node: Tensor  # (capacity,) int32 node indices, -1 behind the last
+    word: Tensor  # (capacity,) int32 kinds and priority, 0 behind the last
+    count: Tensor  # (5,) int64 nodes listed, that could be listed, with a wish; wishes of each kind
+
+    def read(self, nodes: NodePool, count: Sequence[int]) -> Requests:
+        """Returns the wishes, given the pool and the (5,) counts as the host has got them."""
+        kept, found, misses, *_ = count
+        node, word = self.node[:kept].to(torch.int64), self.word[:kept]
+        rows = [(word & kind).nonzero()[:, 0] for kind in KINDS.values()]
+        which = torch.cat(rows)
+        kind = torch.cat(
+            [
+                torch.full_like(row, k, dtype=torch.int32)
+                for row, k in zip(rows, KINDS.values(), strict=True)
+            ]
+        )
+        node = node[which]
+        return Requests(
+            node=node,
+            kind=kind,
+            depth=nodes.loc_t4[node // nodes.nodes_per_tile, 3].to(torch.int64),
+            priority=word[which] & REQUEST_PRIORITY,
+            misses=misses,
+            overflow=found - kept,
+        )
+
+
+def collect(nodes: NodePool, capacity: int) -> Listed:
+    """Takes the wishes out of a pool's request words; nobody waits for the device.
 
     Args:
         nodes: The pool; its request words are cleared but for what is pending.
         capacity: Most nodes listed.
     """
-    node_k, word_k, count = compact_requests(nodes.request_tn, capacity)
-    kept, found, misses = count.tolist()
-    node, word = node_k[:kept].to(torch.int64), word_k[:kept]
-    rows = [(word & kind).nonzero()[:, 0] for kind in KINDS.values()]
-    which = torch.cat(rows)
-    kind = torch.cat(
-        [
-            torch.full_like(row, k, dtype=torch.int32)
-            for row, k in zip(rows, KINDS.values(), strict=True)
-        ]
-    )
-    node = node[which]
-    return Requests(
-        node=node,
-        kind=kind,
-        depth=nodes.loc_t4[node // nodes.nodes_per_tile, 3].to(torch.int64),
-        priority=word[which] & REQUEST_PRIORITY,
-        misses=misses,
-        overflow=found - kept,
-    )
+    node, word, count = compact_requests(nodes.request_tn, capacity)
+    kinds = [(word & kind).ne(0).sum().view(1) for kind in KINDS.values()]
+    return Listed(node=node, word=word, count=torch.cat((count, *kinds)))

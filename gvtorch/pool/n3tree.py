@@ -131,8 +131,7 @@ class N3Tree:
         above = self.nodes.loc_t4[node // per_tile].to(torch.int64)
         child = node % per_tile
         digits = torch.stack((child % n, child // n % n, child // n**2, torch.zeros_like(child)), 1)
-        factor = torch.tensor([n, n, n, 1], device=node.device)
-        return above * factor + digits
+        return torch.cat((above[:, :3] * n, above[:, 3:]), 1) + digits
 
     def find(self, loc: Tensor) -> Tensor:
         """Returns (k,) int64 node indices of places (k, 4) x, y, z, depth; -1 where there is none

@@ -264,44 +264,75 @@ class Camera:
         placed.batched = self.batched
         return placed
 
-    def rays(self, device: torch.device | str = "cpu", rows: tuple[int, int] | None = None) -> Rays:
-        """Returns the rays through pixel centres, camera by camera, row by row, in float64.
-
-        Args:
-            device: Where they are made.
-            rows: First row and the row after the last; all rows if left out.
+    def numbers(self, device: torch.device | str = "cpu") -> Tensor:
+        """Returns (n, 20) float64, what `pixel_rays` reads; on CUDA the copy makes nobody wait.
 
         Raises:
             ValueError: The camera is relative to a box: call `placed(box)` first.
         """
         if self.frame is not Frame.WORLD:
             raise ValueError("Camera.rays: an orbit camera has no place yet, call placed(tree.box)")
-        from kornia.geometry.depth import unproject_meshgrid
+        rotation, translation = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3]
+        focal, centre = self.Ks[:, (0, 1), (0, 1)], self.Ks[:, :2, 2] - 0.5
+        position = -(translation[:, None] @ rotation)[:, 0]  # -R^T t
+        zero = torch.zeros_like(focal[:, :1])
+        cone = torch.cat((zero, 1 / focal.min(1, keepdim=True).values), 1)
+        range_ = torch.cat((zero, zero + math.inf), 1)
+        parts = (rotation.flatten(1), position, focal, centre, cone, range_)
+        numbers, device = torch.cat(parts, 1), torch.device(device)
+        if device.type == "cuda":
+            return numbers.pin_memory().to(device, non_blocking=True)
+        return numbers.to(device)
 
-        top, end = rows or (0, self.height)
-        view, Ks = self.viewmats.to(device), self.Ks.to(device)
-        moved = Ks.clone()
-        moved[:, :2, 2] -= torch.tensor([0.5, 0.5 + top], dtype=Ks.dtype, device=Ks.device)
-        local = unproject_meshgrid(
-            *(end - top, self.width, moved),
-            normalize_points=True,
-            device=view.device,
-            dtype=view.dtype,
-        )
-        rotation, translation = view[:, :3, :3], view[:, :3, 3]
-        direction = (local.reshape(len(self), -1, 3) @ rotation).reshape(-1, 3)
-        position = -(translation[:, None] @ rotation)  # (n, 1, 3): -R^T t
-        pixels = self.width * (end - top)
-        origin = position.expand(-1, pixels, -1).reshape(-1, 3)
-        growth = (1 / Ks[:, (0, 1), (0, 1)].min(1).values)[:, None].expand(-1, pixels).reshape(-1)
-        zero = torch.zeros_like(growth)
-        return Rays(
-            origin=origin,
-            direction=direction,
-            cone=torch.stack((zero, growth), 1),
-            range=torch.stack((zero, zero + math.inf), 1),
-            width=self.width,
-        )
+    def rays(self, device: torch.device | str = "cpu", rows: tuple[int, int] | None = None) -> Rays:
+        """Returns the rays through pixel centres, camera by camera, row by row, in float64.
+
+        Args:
+            device: Where they are made.
+            rows: First row and the row after the last, counted through the batch; all if left out.
+
+        Raises:
+            ValueError: The camera is relative to a box: call `placed(box)` first.
+        """
+        everything = (0, len(self) * self.height)
+        return pixel_rays(self.numbers(device), self.width, self.height, rows or everything)
+
+
+def pixel_rays(numbers: Tensor, width: int, height: int, rows: tuple[int, int]) -> Rays:
+    """Returns the rays through the pixel centres of whole rows; nobody waits for the device.
+
+    Args:
+        numbers: (n, 20) float64, a row a camera: world-to-camera rotation (9), position (3), focal
+            lengths and principal point (2, 2; pixel centres at integers), cone (2), range (2).
+        width: Pixels.
+        height: Pixels.
+        rows: First row and the row after the last, counted through the batch.
+    """
+    first, end = rows
+    row = torch.arange(first, end, device=numbers.device)  # (y,)
+    if len(numbers) > 1:
+        numbers, row = numbers[row // height], row % height  # one for each row
+    rotation, position = numbers[:, :9].unflatten(1, (3, 3)), numbers[:, 9:12]  # (k, 3, 3), (k, 3)
+    (fx, fy), (cx, cy) = numbers[:, 12:14].unbind(1), numbers[:, 14:16].unbind(1)
+    column = torch.arange(width, dtype=torch.float64, device=numbers.device)
+    x, y = (column - cx[:, None]) / fx[:, None], (row - cy) / fy  # (k, w), (y,)
+    length = (x * x + (y * y + 1)[:, None]).sqrt_()  # (y, w)
+    across, down = x[..., None] * rotation[:, None, 0], y[:, None] * rotation[:, 1] + rotation[:, 2]
+    direction = (across + down[:, None]).div_(length[..., None])  # (y, w, 3)
+
+    def spread(values: Tensor) -> Tensor:
+        """(r, c) of (k, c): one camera's is not copied."""
+        if len(values) == 1:
+            return values.expand(length.numel(), -1)
+        return values[:, None].expand(-1, width, -1).reshape(length.numel(), -1)
+
+    return Rays(
+        origin=spread(position),
+        direction=direction.reshape(-1, 3),
+        cone=spread(numbers[:, 16:18]),
+        range=spread(numbers[:, 18:20]),
+        width=width,
+    )
 
 
 def _numbers(where: str, name: str, value: Any) -> Tensor:

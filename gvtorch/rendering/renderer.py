@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -16,7 +16,7 @@ from ..ops import trace_rays
 from ..ops.trace import Backend, choose_backend, most_intervals
 from ..pool import N3Tree
 from ..stage import Progress, collect_timings, no_progress, stage
-from .camera import Camera
+from .camera import Camera, pixel_rays
 from .picture import Picture
 from .shader import TransferFunction, interval_levels
 
@@ -87,15 +87,13 @@ def render(
     for name, value, kind in (("tree", tree, N3Tree), ("shader", shader, TransferFunction)):
         check_type("render", name, value, kind)
     start = time.perf_counter()
-    with collect_timings() as timings:
+    with collect_timings(tree.device) as timings:
         with stage("prepare"):
             tree.frame += 1
             tracer = Tracer(tree, shader, chosen)
         hits = trace_camera(camera.placed(tree.box), tree.device, tracer, chosen.dtype, progress)
         with stage("picture"):
             stats = RenderStats(
-                milliseconds=1e3 * (time.perf_counter() - start),
-                stages=timings,
                 backend=choose_backend(chosen.backend, tree.device),
                 rays=hits.alpha.shape[0],
                 samples=int(hits.samples.sum(dtype=torch.int64)),
@@ -105,7 +103,10 @@ def render(
                 tiles_used=int((tree.nodes.stamp_t == tree.frame).sum()),
                 bricks_used=int((tree.bricks.stamp_b == tree.frame).sum()),
             )
-            return develop(hits, camera, chosen.background, stats)
+            picture = develop(hits, camera, chosen.background, stats)
+    stats.stages = timings.as_dict()
+    stats.milliseconds = 1e3 * (time.perf_counter() - start)
+    return picture
 
 
 def render_options(where: str, camera: Camera, options: dict[str, Any]) -> RenderOptions:
@@ -130,7 +131,7 @@ def develop(
     hits: Hits, camera: Camera, background: tuple[float, float, float], stats: RenderStats
 ) -> Picture:
     """Puts the hits of a camera's rays over the background, in the camera's shape."""
-    behind = torch.tensor(background, dtype=hits.color.dtype, device=hits.color.device)
+    behind = _constants(background, hits.color)
     shape = (len(camera), camera.height, camera.width)
     images = {
         "color": (hits.color + (1 - hits.alpha) * behind).reshape(*shape, 3),
@@ -143,10 +144,13 @@ def develop(
     return Picture(**images, stats=stats)
 
 
+def _constants(numbers: Sequence[float], like: Tensor) -> Tensor:
+    """(k,) numbers as arguments of kernels: nothing is copied, so nobody waits for the device."""
+    return torch.stack([torch.full((), n, dtype=like.dtype, device=like.device) for n in numbers])
+
+
 def _room(device: torch.device, dtype: torch.dtype, pixels: int) -> Hits:
-    """Takes the memory of a picture before the first ray: too large a one fails at once."""
-    size = pixels * (8 * dtype.itemsize + 5)  # the colour twice
-    check.memory("render", f"a picture of {pixels} pixels", size, device)
+    """Takes the memory of a picture."""
     widths = {"color": (3,), "alpha": (1,), "depth": (1,)}
     reals = {n: torch.empty((pixels, *w), dtype=dtype, device=device) for n, w in widths.items()}
     samples = torch.empty(pixels, dtype=torch.int32, device=device)
@@ -161,9 +165,10 @@ def trace_camera(
     progress: Progress,
     *,
     again: tuple[Hits, Tensor] | None = None,
+    numbers: Tensor | None = None,
 ) -> Hits:
-    """Traces all rays of a camera, or of a batch, block after block: rays take more memory than
-    the picture they make.
+    """Traces all rays of a camera, or of a batch, block after block of whole rows: rays take more
+    memory than the picture they make.
 
     Args:
         camera: Placed in the world.
@@ -173,43 +178,51 @@ def trace_camera(
         progress: Told how many rows are done.
         again: Hits of an earlier pass, which are overwritten, and which (pixels,) bool of them
             are traced once more.
+        numbers: What `camera.numbers` gave, where it lies on the device already.
+
+    Raises:
+        ValueError: The picture is larger than the device's memory.
     """
-    count = len(camera) * camera.height * camera.width
-    hits, where = again if again is not None else (_room(device, dtype, count), None)
-    width = camera.width
-    for start, one, top, end in _blocks(camera, device, progress):
-        pixels = slice(start + top * width, start + end * width)
-        which = None if where is None else where[pixels].nonzero()[:, 0]
-        if which is not None and not len(which):
-            continue
+    rows, width = len(camera) * camera.height, camera.width
+    block = max(1, _RAYS_A_BLOCK[device.type] // width)
+    size = rows * width * (8 * dtype.itemsize + 5)  # the colour twice
+    check.memory("render", f"a picture of {rows * width} pixels", size, device)
+    numbers = camera.numbers(device) if numbers is None else numbers
+    hits, where = again or (None, None)
+    if hits is None and rows > block:
+        hits = _room(device, dtype, rows * width)  # too large a one fails before the first ray
+    for top in range(0, rows, block):
+        end = min(top + block, rows)
+        pixels: slice | Tensor = slice(top * width, end * width)
         with stage("rays"):
-            if which is None:
-                rays = one.rays(device, (top, end))
-            else:  # the rows that hold them, then they alone
-                first, last = int(which[0]) // width, int(which[-1]) // width
-                rays = one.rays(device, (top + first, top + last + 1))
-                rays = rays[which - first * width]
-        with stage("trace"):
-            part = trace_rays(rays)
-        for name, field in vars(part).items():
-            target = vars(hits)[name][pixels]
-            target[slice(None) if which is None else which] = field
+            if where is None:
+                rays = pixel_rays(numbers, width, camera.height, (top, end))
+            else:
+                which = where[pixels].nonzero()[:, 0]
+                rays = _some_rays(numbers, camera, top, which)
+                pixels = which + top * width
+        if len(rays.origin):
+            with stage("trace"):
+                part = trace_rays(rays)
+            if hits is None:
+                hits = part  # the only block
+            else:
+                for name, field in vars(part).items():
+                    vars(hits)[name][pixels] = field
+        progress("rays", end, rows)
+    assert hits is not None
     return hits
 
 
-def _blocks(
-    camera: Camera, device: torch.device, progress: Progress
-) -> Iterator[tuple[int, Camera, int, int]]:
-    """Blocks of rows: a camera's first pixel, the camera, its first row and one past the last."""
-    rows = max(1, _RAYS_A_BLOCK[device.type] // camera.width)
-    done, total = 0, len(camera) * camera.height
-    for index in range(len(camera)):
-        one = camera[index]
-        for top in range(0, camera.height, rows):
-            end = min(top + rows, camera.height)
-            yield index * camera.height * camera.width, one, top, end
-            done += end - top
-            progress("rays", done, total)
+def _some_rays(numbers: Tensor, camera: Camera, top: int, which: Tensor) -> Rays:
+    """Rays of the pixels `which` (k,), rising, counted from row `top`: the rows that hold them are
+    made, then they alone are kept.
+    """
+    width = camera.width
+    ends = torch.stack((which[0], which[-1])).tolist() if len(which) else (0, -1)
+    first, last = (end // width for end in ends)
+    rays = pixel_rays(numbers, width, camera.height, (top + first, top + last + 1))
+    return rays[which - first * width]
 
 
 def trace(
@@ -243,8 +256,11 @@ class Tracer:
         options: RenderOptions,
         *,
         by_level: bool = False,
+        frame_1: Tensor | None = None,
     ) -> None:
-        """Lays the op's arguments ready; see `trace` and, for `by_level`, `trace_rays`."""
+        """Lays the op's arguments ready; see `trace` and, for `by_level`, `trace_rays`. `frame_1`
+        (1,) int32 is the frame's number on the device, if it lies there already.
+        """
         choose_backend(options.backend, tree.device)
         channel = options.channel or tree.channel_names[0]
         if channel not in tree.bricks.bricks:
@@ -253,6 +269,8 @@ class Tracer:
         step = options.step * min(tree.spacing)
         most_intervals(float((tree.box[1] - tree.box[0]).norm()), step)
         self.tree = tree
+        if frame_1 is None:
+            frame_1 = torch.full((1,), tree.frame, dtype=torch.int32, device=tree.device)
         scale = options.cone_scale * tree.flatness if options.lod == "auto" else 0.0
         levels = interval_levels(tree.root_voxel, step) if scale else 1
         table = shader.table(min(tree.spacing), step, levels, options.dtype, tree.device)
@@ -267,7 +285,7 @@ class Tracer:
             "range_tn2c": tree.nodes.ranges[channel],
             "stamp_b": tree.bricks.stamp_b,
             **vars(table),
-            "frame_1": torch.tensor([tree.frame], dtype=torch.int32, device=tree.device),
+            "frame_1": frame_1,
             "branching": tree.branching,
             "root": tree.root,
             "max_depth": tree.depth,
@@ -321,7 +339,7 @@ def composite_trees(tracers: list[Tracer], rays: Rays) -> Hits:
 
 def _entry(box: torch.Tensor, rays: Rays) -> torch.Tensor:
     """(r,) distance at which rays enter a world box, +inf where they pass it by."""
-    low, high = box.to(rays.origin)
+    low, high = _constants(box.flatten().tolist(), rays.origin).view(2, 3)
     a, b = (low - rays.origin) / rays.direction, (high - rays.origin) / rays.direction
     first, last = torch.fmin(a, b).amax(1), torch.fmax(a, b).amin(1)
     return torch.where(first <= last, first.clamp(min=0), torch.inf)
