@@ -20,6 +20,7 @@ FLOORS = [
     {"cache", "producers", "rendering"},
     {"production", "turns"},
     {"engine"},
+    {"bench"},
     {"tools"},
 ]
 #: On the ground floor, what stands on what.
