@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-_HIDDEN = ("scene", "brick_size", "border")  # said by the case already
+_HIDDEN = ("scene", "brick_size", "border", "stages")  # for plots and programs
 _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"))
 
 

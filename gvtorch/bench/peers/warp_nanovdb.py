@@ -47,7 +47,7 @@ def _march(
     ray = wp.tid()
     origin, direction = origins[ray], directions[ray]
     t, last = limits[ray][0], limits[ray][1]
-    clear = 1.0
+    clear = wp.float32(1.0)
     color = wp.vec3(0.0, 0.0, 0.0)
     while t < last and clear > 1.0 - stop:
         length = wp.min(step, last - t)
