@@ -24,6 +24,15 @@ WORKLOADS = {
     "convert": "a volume file to a store",
     "blocks": "random blocks with border out of a store, beside tensorstore and zarr",
 }
+#: What else does the same, by the names of `--peers`, and what must be installed for it.
+PEERS = {
+    "grid_sample": "torch",
+    "warp": "warp-lang",
+    "drjit": "drjit",
+    "vtk": "vtk",
+    "tensorstore": "zarr",  # which writes the chunks that are read
+    "zarr": "zarr",
+}
 _HOME = {
     **{"march": "march", "first_hit": "march", "bricks": "march", "frame": "frames"},
     **{"stream": "frames", "lru": "cache", "compact": "cache", "produce": "produce"},
@@ -35,11 +44,15 @@ def run(name: str, settings: Settings) -> Record:
     """Runs a workload.
 
     Raises:
-        ValueError: There is no such workload, the device can't be used, or no case has `only` in
-            its name.
+        ValueError: There is no such workload or peer, or no case has `only` in its name.
     """
-    if name not in WORKLOADS:
-        raise ValueError(f"bench: unknown workload {name!r}; known: {', '.join(WORKLOADS)}")
+    for what, wanted, known in (
+        ("workload", (name,), WORKLOADS),
+        ("peer", settings.peers or (), PEERS),
+    ):
+        unknown = sorted(set(wanted) - set(known))
+        if unknown:
+            raise ValueError(f"bench: unknown {what} {unknown[0]!r}; known: {', '.join(known)}")
     from .record import Record
 
     record = Record(name, settings)

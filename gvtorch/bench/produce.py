@@ -35,7 +35,7 @@ def ripples(positions: Tensor) -> Tensor:
 
 
 def produce(record: Record) -> None:
-    """`fill` of a batch of bricks of 8^3 and a border of 1, at random places of the finest level."""
+    """`fill` of bricks of 8^3 and a border of 1, at random places of the finest level."""
     settings = record.settings
     count = {"cpu": 1 << 11, "cuda": 1 << 16}[settings.device.type] >> (4 * settings.quick)
     case = f"{count:,} bricks of 10^3 voxels"

@@ -12,12 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .. import __file__ as package
 from ..io import read_volume
 from ..rendering import Camera, TransferFunction
 from ..volume import Volume
 
-SCAN = Path(package).parent.parent / "examples" / "data" / "aneurism_256x256x256_uint8.raw.gz"
+SCAN = Path(__file__).parents[2] / "examples" / "data" / "aneurism_256x256x256_uint8.raw.gz"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,6 +22,7 @@ import numpy as np
 
 from ..io import Store
 from ..io.convert import convert as convert_volume
+from . import PEERS
 from .record import Record, clock, spread
 
 _BLOCK = 32
@@ -80,7 +81,7 @@ def blocks(record: Record) -> None:
         for count, case in cases.items():
             median = 0.0
             for who, read in readers.items():
-                if who == "zarr-python" and count > 64:
+                if who == "zarr" and count > 64:
                     continue
                 settings.tell(f"{case}: {who}")
                 timing = clock(functools.partial(_read, read, rng, grid, count), settings)
@@ -88,7 +89,7 @@ def blocks(record: Record) -> None:
                 rate = 1e3 * count / timing.median
                 more = {} if who == "gvtorch" else {"times": timing.median / median}
                 record.add(case, who, timing, blocks_per_second=rate, **more)
-    record.note("peers read aligned chunks of the same size and gather; zarr-python 64 at once")
+    record.note("peers read aligned chunks of the same size and gather; zarr, 64 at most")
 
 
 def _read(read: Reader, rng: np.random.Generator, grid: np.ndarray, count: int) -> None:
@@ -114,14 +115,11 @@ def _readers(record: Record, folder: Path, store: Store) -> Iterator[tuple[str, 
     """Who reads, ours first, and how."""
     yield "gvtorch", lambda zyx: store.read_blocks(0, zyx)
     wanted = record.settings.peers
+    here = importlib.util.find_spec("zarr") is not None
     for name in ("tensorstore", "zarr"):
         if wanted is None or name in wanted:
-            record.peers[name] = (
-                "ran"
-                if importlib.util.find_spec("zarr")
-                else ("not installed (zarr, which writes the chunks that are read)")
-            )
-    if "ran" not in record.peers.values():
+            record.peers[name] = "ran" if here else f"not installed ({PEERS[name]})"
+    if not here or not record.peers:
         return
     import tensorstore as ts
     import zarr
@@ -140,7 +138,7 @@ def _readers(record: Record, folder: Path, store: Store) -> Iterator[tuple[str, 
         yield "tensorstore", batch
     if "zarr" in record.peers:
         plain = zarr.open_array(aligned, mode="r")
-        yield "zarr-python", lambda zyx: _gather(lambda place: plain[place], zyx, side)
+        yield "zarr", lambda zyx: _gather(lambda place: plain[place], zyx, side)
 
 
 def _write_aligned(path: Path, store: Store) -> None:

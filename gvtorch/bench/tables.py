@@ -63,7 +63,8 @@ def title(record: dict[str, Any]) -> str:
 def file_name(record: dict[str, Any]) -> str:
     """Returns the name under which a record is kept: one a workload and machine."""
     name = "".join(c if c.isalnum() else "-" for c in record["machine"]["name"].lower())
-    return f"{record['workload']}.{'-'.join(part for part in name.split('-') if part)}.json"
+    machine = "-".join(part for part in name.split("-") if part)
+    return f"{record['workload']}.{machine}{'.quick' if record['quick'] else ''}.json"
 
 
 def rich_table(record: dict[str, Any]) -> Any:

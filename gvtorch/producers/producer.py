@@ -7,7 +7,6 @@ It never sees pools, slots or the order of use: nodes are named by place. Source
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
@@ -56,6 +55,7 @@ class Nodes:
     def __init__(self, loc: Tensor, layout: Layout) -> None:
         """Holds the places."""
         self.loc, self.layout = loc, layout
+        self._positions: Tensor | None = None
 
     def __len__(self) -> int:
         """Number of nodes."""
@@ -70,7 +70,7 @@ class Nodes:
         """(k,) int64, 0 for the root."""
         return self.loc[:, 3]
 
-    @functools.cached_property
+    @property
     def scale(self) -> Tensor:
         """(k,) float64, finest voxels along a side of one of the node's voxels."""
         base = torch.full_like(self.loc[:, 3], self.layout.branching, dtype=torch.float64)
@@ -101,9 +101,14 @@ class Nodes:
         side = self.layout.brick_size + 2 * self.layout.border - 1
         return (self.voxel_size * (0.5 * side)).norm(dim=1)
 
-    @functools.cached_property
+    @property
     def positions(self) -> Tensor:
         """(k, z, y, x, 3) float32 world places of the voxel centres, x y z, border included."""
+        if self._positions is None:  # a cached_property would keep torch.compile out
+            self._positions = self._voxel_centers()
+        return self._positions
+
+    def _voxel_centers(self) -> Tensor:
         side = torch.arange(
             -self.layout.border, self.layout.brick_size + self.layout.border, device=self.loc.device
         )
