@@ -21,7 +21,8 @@ from .scenes import Scene, aneurism, fog_dense, worn
 #: Stages of a frame that are the cache's: what a resident tree has no need of.
 CACHE = ("requests", "lru", "schedule", "produce", "write", "count")
 _MOST = 1000  # frames until something must have converged
-_POOLS = {"node_pool": "256 MB", "brick_pool": "512 MB"}
+_POOLS = {"node_pool": "16 MB", "brick_pool": "384 MB"}  # hold all of 512^3 uint8
+_QUICK = {"node_pool": "1 MB", "brick_pool": "2 MB"}
 
 
 def frame(record: Record) -> None:
@@ -49,7 +50,8 @@ def _steady(record: Record, scene: Scene, size: tuple[int, int]) -> None:
     for monitor in (False, True):
         settings.tell(f"{case}: monitor {monitor}")
         producer = VolumeProducer(scene.volume)
-        options: dict[str, Any] = {**_POOLS, "device": settings.device, "monitor": monitor}
+        options: dict[str, Any] = {"device": settings.device, "monitor": monitor}
+        options |= _QUICK if settings.quick else {}
         with Engine(producer, **options) as engine:
             picture = _converge(engine, camera, scene.shader)
             timing, stats = _clock_frames(engine, camera, scene.shader, settings)
@@ -110,7 +112,8 @@ def _cold(record: Record, scene: Scene, size: tuple[int, int], budget: int) -> N
     for number in range(settings.repeats + 1):
         settings.tell(f"{case}: {number}")
         producer = VolumeProducer(scene.volume)
-        options: dict[str, Any] = {**_POOLS, **budgets, "device": settings.device}
+        pools = _QUICK if settings.quick else _POOLS
+        options: dict[str, Any] = {**pools, **budgets, "device": settings.device}
         with Engine(producer, monitor=False, **options) as engine:
             synchronize(settings.device)
             start = time.perf_counter()
@@ -204,7 +207,8 @@ def _pour(side: int, pinned: bool, device: torch.device) -> tuple[float, int]:
     """Returns milliseconds of producing and writing, and bytes moved, until all is there."""
     shader = TransferFunction.from_points([(0, 0), (255, 1e-4)])
     camera = Camera.orbit(30, 20, 2.0, 35, 256, 256)
-    options: dict[str, Any] = {"load_budget": _ROWS, "subdivide_budget": _ROWS, **_POOLS}
+    pools = _POOLS if side > 64 else _QUICK
+    options: dict[str, Any] = {"load_budget": _ROWS, "subdivide_budget": _ROWS, **pools}
     milliseconds, moved = 0.0, 0
     with Engine(Ready(side, pinned), device=device, **options) as engine:
         for _ in range(_MOST):

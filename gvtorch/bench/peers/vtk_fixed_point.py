@@ -36,7 +36,7 @@ class Marcher(Peer):
     differs = (
         "15-bit fixed point, interpolated values rounded to whole numbers; the box ends at the "
         "outermost voxel centres, half a voxel earlier; rays are sampled from planes of their own; "
-        "a ray ends when its colour is all but opaque, not at alpha 0.99"
+        "a ray ends at alpha 0.992"
     )
 
     @classmethod
