@@ -14,6 +14,7 @@ from conftest import DEVICES, ROOT
 import gvtorch as gv
 from gvtorch import bench
 from gvtorch.bench import peers, scenes, tables
+from gvtorch.bench import record as record_module
 from gvtorch.bench.record import Record, Settings, clock
 
 QUICK = {"quick": True, "repeats": 1}
@@ -136,6 +137,16 @@ def test_a_figure_that_takes_long_is_made_of_fewer_timings():
     assert calls == ["p", "run", "run"] * 4 and timing.repeats == 3
     hasty = Settings(device=CPU.device, repeats=3, seconds=0)
     assert clock(lambda: None, hasty).repeats == 1
+
+
+def test_a_busy_machine_is_noted(monkeypatch):
+    for others, noted in ((0.0, False), (1000.0, True)):
+        seconds = iter((0.0, others))
+        monkeypatch.setattr(record_module, "_busy_seconds", lambda s=seconds: next(s))
+        record = Record("lru", CPU)
+        with record_module.elsewhere(record):
+            pass
+        assert any("Other processes took" in note for note in record.notes) is noted
 
 
 def test_the_command_lists_and_names_mistakes():

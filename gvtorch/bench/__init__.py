@@ -53,10 +53,11 @@ def run(name: str, settings: Settings) -> Record:
         unknown = sorted(set(wanted) - set(known))
         if unknown:
             raise ValueError(f"bench: unknown {what} {unknown[0]!r}; known: {', '.join(known)}")
-    from .record import Record
+    from .record import Record, elsewhere
 
     record = Record(name, settings)
-    getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)(record)
+    with elsewhere(record):
+        getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)(record)
     if not record.rows:
         raise ValueError(f"bench: no case of {name} has {settings.only!r} in its name")
     return record

@@ -4,11 +4,13 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import re
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,8 @@ import torch
 
 from .. import __version__, check
 from ..ops.trace import choose_backend
+
+_DISTURBED = 0.05  # share of the cores that others may take unnoticed
 
 
 def silent(_what: str) -> None:
@@ -165,6 +169,36 @@ class Record:
             "peers": self.peers,
             "notes": self.notes,
         }
+
+
+@contextmanager
+def elsewhere(record: Record) -> Iterator[None]:
+    """Notes it where other processes took a part of the cores while a workload ran (Linux)."""
+    start, busy, own = time.perf_counter(), _busy_seconds(), _own_seconds()
+    yield
+    others = _busy_seconds() - busy - (_own_seconds() - own)
+    share = others / (time.perf_counter() - start) / (os.cpu_count() or 1)
+    if share > _DISTURBED:
+        record.note(
+            f"Other processes took {share:.0%} of this machine's cores meanwhile: the times are "
+            "longer than they need be"
+        )
+
+
+def _busy_seconds() -> float:
+    """What all processes took of all cores since the machine started; 0 where it is not told."""
+    try:
+        user, nice, system, _idle, _wait, irq, softirq, steal, *_ = (
+            int(ticks) for ticks in Path("/proc/stat").read_text().split("\n")[0].split()[1:]
+        )
+    except (OSError, ValueError):
+        return 0.0
+    return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
+
+
+def _own_seconds() -> float:
+    """What this process and its children that ended took."""
+    return sum(os.times()[:4])
 
 
 def machine(device: torch.device) -> dict[str, Any]:

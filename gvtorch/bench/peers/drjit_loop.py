@@ -10,14 +10,16 @@ from torch import Tensor
 from .peer import Peer, Task, bake, spans
 
 _ROWS = 255 * 16 + 1
+_LLVM = dr.has_backend(dr.JitBackend.LLVM) and ".".join(map(str, dr.detail.llvm_version()))
 
 
 class Marcher(Peer):
     """Dr.Jit's vectorised kernel, on all threads."""
 
     differs = (
-        "float32 voxels in a texture, nothing is skipped; opacity from the nearest of 4081 rows, "
-        "linear in the last interval"
+        f"compiled by LLVM {_LLVM} (newer ones make it faster: DRJIT_LIBLLVM_PATH); float32 voxels "
+        "in a texture, nothing is skipped; opacity from the nearest of 4081 rows, linear in the "
+        "last interval"
     )
 
     @classmethod
@@ -25,7 +27,7 @@ class Marcher(Peer):
         """It needs LLVM, and is asked on the CPU only."""
         if device.type != "cpu":
             return "compared on the CPU only"
-        if not dr.has_backend(dr.JitBackend.LLVM):
+        if not _LLVM:
             return "no LLVM library was found (DRJIT_LIBLLVM_PATH names one)"
         return ""
 
