@@ -85,6 +85,7 @@ def _bars(pyplot: Any, record: dict[str, Any]) -> Any:
         color = f"C{names.index(row['who']) % 10}"
         axes.barh(place, row["ms"], color=color, xerr=error, ecolor="0.4")
     axes.set_yticks(range(len(rows)), [f"{row['case']}: {row['who']}" for row in rows], fontsize=7)
+    axes.margins(y=0.01)
     axes.set_xscale("log")
     axes.set_xlabel("milliseconds")
     axes.grid(axis="x", alpha=0.3)
@@ -106,6 +107,7 @@ def _sweep(pyplot: Any, record: dict[str, Any]) -> Any:
         grid[0][column].set_title(scene, fontsize=9)
         for axes in grid[:, column]:
             axes.set_xscale("log", base=2)
+            axes.set_xticks((4, 8, 16, 32), ("4", "8", "16", "32"))
             axes.set_ylim(bottom=0)
             axes.grid(alpha=0.3)
         grid[1][column].set_xlabel("brick size, voxels")

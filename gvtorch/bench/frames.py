@@ -85,7 +85,7 @@ def _stages(stats: list[FrameStats]) -> dict[str, Any]:
     medians = {n: statistics.median(one.stages.get(n, 0.0) for one in stats) for n in names}
     cache = sum(medians.get(name, 0.0) for name in CACHE)
     return {
-        "trace_ms": medians["trace"],
+        "trace_ms": medians.get("trace", 0.0),
         "cache_ms": cache,
         "cache_share": cache / sum(medians.values()),
         "stages": medians,
@@ -214,7 +214,7 @@ def _pour(side: int, pinned: bool, device: torch.device) -> tuple[float, int]:
         for _ in range(_MOST):
             _, stats = engine.frame(camera, shader, lod="finest", step=2.0)
             if stats.bytes_uploaded:
-                milliseconds += sum(stats.stages[name] for name in ("produce", "write"))
+                milliseconds += sum(stats.stages.get(name, 0.0) for name in ("produce", "write"))
                 moved += stats.bytes_uploaded
             if stats.converged:
                 return milliseconds, moved

@@ -76,6 +76,7 @@ class Marcher(Peer):
         tiles = wp.array(_tiles(voxels), dtype=int, device=self.device)
         self.volume = wp.Volume.allocate_by_tiles(tiles, 1.0, 0.0, device=self.device)
         source = wp.array(voxels, dtype=wp.uint8, device=self.device)
+        wp.synchronize_device(self.device)  # Warp fills arrays on a stream of its own
         self._launch(_store, (len(tiles), *(_TILE,) * 3), [self.volume.id, source, tiles])
         rays = task.rays
         self.kept = [
@@ -94,6 +95,7 @@ class Marcher(Peer):
         scale, step = (_ROWS - 1) / 255, task.scene.step
         self.inputs = [self.volume.id, origins, directions, limits, table, scale, step]
         self.inputs += [task.stop_alpha, self.out]
+        wp.synchronize_device(self.device)
 
     def render(self) -> None:
         """Launches the kernel."""
