@@ -107,7 +107,7 @@ def _cold(record: Record, scene: Scene, size: tuple[int, int], budget: int) -> N
     side = scene.volume.extent[0]
     case = f"cold start, {scene.name} {side}^3, {size[0]}x{size[1]}, {budget:,} bricks a frame"
     budgets = {"load_budget": budget, "subdivide_budget": budget}
-    times, frames, bricks, moved = [], 0, 0, 0
+    times, frames, bricks, moved, converged = [], 0, 0, 0, False
     began = time.perf_counter()
     for number in range(settings.repeats + 1):
         settings.tell(f"{case}: {number}")
@@ -127,6 +127,8 @@ def _cold(record: Record, scene: Scene, size: tuple[int, int], budget: int) -> N
             times.append(1e3 * (time.perf_counter() - start))
         if number and time.perf_counter() - began > settings.seconds:
             break
+    if not converged:
+        record.note(f"{case}: it did not converge within {_MOST} frames")
     timing = spread(times[1:])
     rate = 1e3 * bricks / timing.median
     record.add(
