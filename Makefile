@@ -1,6 +1,7 @@
 # make demo   sets up .venv, renders the bundled CT scan, prints where the picture lies
 # make test   sets up .venv, runs every test
 # make lint   ruff, mypy, clang-format
+# make bench  every workload on this machine, beside peers: docs/performance (ARGS=--quick: tiny sizes)
 # make wheel  one wheel for every Python >= 3.11 and every torch >= 2.11, in dist/
 #
 # Torch is pinned in pyproject.toml ([build-system] requires) and nowhere else, the rest in .ci/constraints.txt.
@@ -14,7 +15,7 @@ NATIVE := $(shell nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/de
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint .ci/constraints.txt
 export GVTORCH_CUDA_ARCHS ?= $(or $(NATIVE),90)
 
-.PHONY: demo test lint format wheel clean
+.PHONY: demo test lint format bench wheel clean
 .DELETE_ON_ERROR:
 
 # The scan as a store on disk, seen through a brick pool an eighth of its size in bricks.
@@ -41,6 +42,10 @@ format: $(VENV)/ready
 	$(BIN)/ruff format .
 	$(BIN)/clang-format -i $(wildcard gvtorch/cpp_ext/csrc/*) tests/cpp/render.cpp
 
+bench: $(VENV)/bench
+	for device in cpu $(if $(NATIVE),cuda); do $(BIN)/gvtorch bench all --device $$device -o docs/performance $(ARGS) || exit; done
+	$(BIN)/python benchmarks/plots.py
+
 wheel: $(VENV)/ready
 	$(BIN)/python -m build --wheel --no-isolation
 
@@ -55,4 +60,8 @@ $(VENV)/torch: pyproject.toml .ci/constraints.txt
 
 $(VENV)/ready: $(VENV)/torch $(wildcard gvtorch/cpp_ext/csrc/*) gvtorch/cpp_ext/build.py
 	$(PIP) --no-build-isolation -e ".[dev]"
+	@touch $@
+
+$(VENV)/bench: $(VENV)/ready
+	$(PIP) --no-build-isolation -e ".[dev,bench]"
 	@touch $@

@@ -22,6 +22,7 @@ from rich.progress import track
 from rich.table import Table
 
 import gvtorch as gv
+from gvtorch.bench.scenes import worn_planes
 from gvtorch.io import convert
 from gvtorch.rendering.path import CameraPath
 
@@ -41,19 +42,10 @@ class Settings:
 
 
 def write_volume(file: Path, side: int) -> None:
-    """Writes a sphere worn by gyroids of five scales as RAW, plane by plane."""
-    line = np.linspace(-1, 1, side, dtype=np.float32)
-    y, x = line[:, None], line[None, :]
+    """Writes the worn sphere as RAW, plane by plane."""
     with file.open("wb") as out:
-        for z in line:
-            worn = np.zeros((side, side), np.float32)
-            for octave in range(5):
-                k = 7.0 * 2.1**octave
-                gyroid = np.sin(k * x) * np.cos(k * y) + np.sin(k * y) * np.cos(k * z)
-                gyroid += np.sin(k * z) * np.cos(k * x)
-                worn += gyroid / 1.9**octave
-            inside = 0.9 - np.sqrt(x * x + y * y + z * z) + 0.12 * worn
-            out.write(np.clip(128 + 20 * side / 8 * inside, 0, 255).astype(np.uint8).tobytes())
+        for plane in worn_planes(side):
+            out.write(plane.tobytes())
 
 
 def flight(side: int) -> CameraPath:

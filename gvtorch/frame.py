@@ -18,7 +18,9 @@ class Rays:
     direction: Tensor  # (r, 3), unit length
     cone: Tensor  # (r, 2) width at the origin, growth of the width per unit distance
     range: Tensor  # (r, 2) first and last distance along the ray; +inf is allowed for the last
-    width: int = 0  # pixels of a row, if these are whole rows of a picture; they are traced in tiles
+    width: int = (
+        0  # pixels of a row, if these are whole rows of a picture; they are traced in tiles
+    )
 
     def __getitem__(self, index: Tensor | slice) -> Rays:
         """Some of the rays, which are no rows any more."""
@@ -30,9 +32,7 @@ class Rays:
         """The rays on a device."""
         columns = (self.origin, self.direction, self.cone, self.range)
         origin, direction, cone, limits = (column.to(device) for column in columns)
-        return Rays(
-            origin=origin, direction=direction, cone=cone, range=limits, width=self.width
-        )
+        return Rays(origin=origin, direction=direction, cone=cone, range=limits, width=self.width)
 
 
 @dataclass(frozen=True, kw_only=True)

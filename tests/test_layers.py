@@ -21,6 +21,7 @@ FLOORS = [
     {"production", "turns"},
     {"scene"},
     {"engine"},
+    {"bench"},
     {"tools"},
 ]
 #: On the ground floor, what stands on what.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import runpy
 import shutil
 import time
 from pathlib import Path
@@ -11,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES, ROOT, shared
+from conftest import DEVICES, shared
 from test_store import Handler, served  # noqa: F401
 
 import gvtorch as gv
+from gvtorch.bench.storage import Memory
 from gvtorch.io.convert import convert
 from gvtorch.io.store import Store
 from gvtorch.producers.stored import HostCache
 from gvtorch.production import ProductionError
 
-Memory = runpy.run_path(str(ROOT / "benchmarks" / "store.py"))["Memory"]
 GRAY = gv.TransferFunction.preset("gray", 0, 255)
 PARTS = ("color", "alpha", "depth", "samples")
 

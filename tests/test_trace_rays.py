@@ -282,9 +282,7 @@ def test_no_rays(blobs, backend):
     rays = camera_rays(tree)
     none = rays[:0]
     device = DEVICES[backend]
-    hits = trace(
-        on(tree, device), none.to(device), SHADER
-    )
+    hits = trace(on(tree, device), none.to(device), SHADER)
     assert hits.color.shape == (0, 3) and hits.samples.shape == (0,)
 
 

@@ -142,9 +142,7 @@ class Intervals:
             length.append(length[-1] + length[-1])
         level, count = torch.zeros_like(first, dtype=torch.int64), torch.zeros_like(first)
         lengths = torch.stack(length)
-        at = cls(
-            beam.cone_near, beam.cone_growth, beam.last, lengths, level, first, count, first
-        )
+        at = cls(beam.cone_near, beam.cone_growth, beam.last, lengths, level, first, count, first)
         at._choose_level(first == first)
         return at
 
@@ -520,9 +518,7 @@ def trace_rays(
     Writes request_tn, stamp_t and stamp_b in place. `width` orders the rays, which changes nothing.
     """
     real = table_lm4.dtype
-    beam = Beam.enter(
-        *(origin_r3, direction_r3, cone_r2, range_r2, place_33), cone_scale, real
-    )
+    beam = Beam.enter(*(origin_r3, direction_r3, cone_r2, range_r2, place_33), cone_scale, real)
 
     def number(value: float) -> Tensor:
         return torch.tensor(value, dtype=real).to(table_lm4)

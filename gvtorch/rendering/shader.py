@@ -46,7 +46,13 @@ PRESETS: dict[str, tuple[Points, Points]] = {
 
 # Cells of a table: at least; where corners don't fall on rows, at least; how many of them two corners are then apart;
 # most where corners fall on rows and rows could be fewer; most at all.
-_FEWEST_CELLS, _FEWEST_SAMPLED, _CELLS_APART, _MANY_CELLS, _MOST_CELLS = 2**10, 2**12, 16, 2**16, 2**20
+_FEWEST_CELLS, _FEWEST_SAMPLED, _CELLS_APART, _MANY_CELLS, _MOST_CELLS = (
+    2**10,
+    2**12,
+    16,
+    2**16,
+    2**20,
+)
 _MOST_BYTES = 64 * 2**20  # of a table in float32
 _KEPT_TABLES = 4
 
@@ -168,7 +174,15 @@ class TransferFunction:
             ValueError: Two points are too close to each other.
         """
         number = self.reference or smallest_spacing
-        key = (self.opacity.tobytes(), self.color.tobytes(), number, step, levels, dtype, str(device))
+        key = (
+            self.opacity.tobytes(),
+            self.color.tobytes(),
+            number,
+            step,
+            levels,
+            dtype,
+            str(device),
+        )
         if key not in self._tables:
             table = self._make_table(step / number, levels, dtype, torch.device(device))
             if len(self._tables) == _KEPT_TABLES:
@@ -203,9 +217,7 @@ class TransferFunction:
         return Table(
             table_lm4=torch.tensor(table, dtype=dtype, device=device),
             domain_2=torch.tensor([low, high], dtype=dtype, device=device),
-            opaque_m=torch.tensor(
-                np.cumsum(rows[:, 3] > 0), dtype=torch.int32, device=device
-            ),
+            opaque_m=torch.tensor(np.cumsum(rows[:, 3] > 0), dtype=torch.int32, device=device),
         )
 
 

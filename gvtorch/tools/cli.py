@@ -1,4 +1,4 @@
-"""The command line: `gvtorch info`, `render`, `fly` and `convert`.
+"""The command line: `gvtorch info`, `render`, `fly`, `convert` and `bench`.
 
 torch is imported inside the commands, so that `--help` answers at once. A mistake of the user ends
 in one line on standard error and status 2.
@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg
 
+from .bench import Bench
 from .common import Bar, Source, is_store, refuse_for_store
 from .view import Fly, Render
 
@@ -195,7 +196,10 @@ def main(args: list[str] | None = None) -> None:
     try:
         with contextlib.redirect_stderr(said):
             command = tyro.extras.subcommand_cli_from_dict(
-                {"info": Info, "render": Render, "fly": Fly, "convert": Convert},
+                {
+                    **{"info": Info, "render": Render, "fly": Fly, "convert": Convert},
+                    "bench": Bench,
+                },
                 args=args,
                 prog="gvtorch",
                 description="GigaVoxels on PyTorch tensors.",

@@ -1,0 +1,63 @@
+"""Workloads whose speed is kept: what they do, how they are run and what they give.
+
+Nothing here needs torch until a workload runs, so that the command line can list them at once.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .record import Record, Settings
+
+#: What each workload does; it is the function of that name in the module of `_HOME`.
+WORKLOADS = {
+    "march": "rays through resident trees: fog, shell, clouds and a scan, beside peers",
+    "first_hit": "the first opaque voxel of a thin shell, 1920x1080, beside peers",
+    "bricks": "marching with brick sizes 4 to 32 and borders 0 to 2, and their memory",
+    "frame": "the engine: a steady frame and the cache's share of it, a cold start",
+    "lru": "1 M slots ordered by use, beside torch.sort",
+    "compact": "wishes listed out of 8 M nodes, beside torch.nonzero",
+    "produce": "10^3-voxel bricks made by a torch producer, eager and compiled",
+    "stream": "10^3-voxel bricks from host memory into the pool, beside a plain copy",
+    "convert": "a volume file to a store",
+    "blocks": "random blocks with border out of a store, beside tensorstore and zarr",
+}
+#: What else does the same, by the names of `--peers`, and what must be installed for it.
+PEERS = {
+    "grid_sample": "torch",
+    "warp": "warp-lang",
+    "drjit": "drjit",
+    "vtk": "vtk",
+    "tensorstore": "zarr",  # which writes the chunks that are read
+    "zarr": "zarr",
+}
+_HOME = {
+    **{"march": "march", "first_hit": "march", "bricks": "march", "frame": "frames"},
+    **{"stream": "frames", "lru": "cache", "compact": "cache", "produce": "produce"},
+    **{"convert": "storage", "blocks": "storage"},
+}
+
+
+def run(name: str, settings: Settings) -> Record:
+    """Runs a workload.
+
+    Raises:
+        ValueError: There is no such workload or peer, or no case has `only` in its name.
+    """
+    for what, wanted, known in (
+        ("workload", (name,), WORKLOADS),
+        ("peer", settings.peers or (), PEERS),
+    ):
+        unknown = sorted(set(wanted) - set(known))
+        if unknown:
+            raise ValueError(f"bench: unknown {what} {unknown[0]!r}; known: {', '.join(known)}")
+    from .record import Record, elsewhere
+
+    record = Record(name, settings)
+    with elsewhere(record):
+        getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)(record)
+    if not record.rows:
+        raise ValueError(f"bench: no case of {name} has {settings.only!r} in its name")
+    return record

@@ -1,0 +1,85 @@
+"""The cache's ops alone, beside what torch has for the same: `lru` and `compact`."""
+
+from __future__ import annotations
+
+import itertools
+
+import torch
+
+from ..config import REQUEST_KINDS, REQUEST_LOAD
+from ..ops import compact_requests, lru_partition
+from .record import Record, clock
+
+_WISHES = 1000  # of all nodes
+
+
+def lru(record: Record) -> None:
+    """Slots in the order of their last use, half of them used in this frame."""
+    settings = record.settings
+    slots = 1 << (12 if settings.quick else 20)
+    case = f"{slots:,} slots, half used"
+    if not record.wants(case):
+        return
+    generator = torch.Generator().manual_seed(1)
+    stamp = torch.randint(0, 99, (slots,), generator=generator, dtype=torch.int32)
+    order = torch.sort(stamp, stable=True).indices.to(torch.int32).to(settings.device)
+    stamp[torch.randperm(slots, generator=generator)[: slots // 2]] = 100
+    stamp = stamp.to(settings.device)
+    frame = torch.tensor([100], dtype=torch.int32, device=settings.device)
+    calls = 20 if settings.device.type == "cuda" else 1
+
+    ours = clock(lambda: lru_partition(order, stamp, frame), settings, calls=calls)
+    theirs = clock(lambda: torch.sort(stamp, stable=True), settings, calls=calls)
+    ordered, unused = lru_partition(order, stamp, frame)
+    free = int(unused)
+    same = torch.equal(ordered[:free].long(), torch.sort(stamp, stable=True).indices[:free])
+    rate = 1e3 * slots / ours.median
+    record.add(case, "gvtorch", ours, slots_per_second=rate)
+    record.add(
+        *(case, "torch.sort", theirs),
+        slots_per_second=1e3 * slots / theirs.median,
+        times=theirs.median / ours.median,
+        same=same,
+    )
+    record.note("same: the slots that may be taken come in the same order.")
+
+
+def compact(record: Record) -> None:
+    """Few wishes out of many request words, which are cleared. Each call has words of its own."""
+    settings = record.settings
+    nodes = 1 << (12 if settings.quick else 23)
+    case = f"{nodes:,} nodes, {_WISHES:,} wishes"
+    if not record.wants(case):
+        return
+    generator = torch.Generator().manual_seed(2)
+    words = torch.zeros(nodes, dtype=torch.int32)
+    words[torch.randperm(nodes, generator=generator)[:_WISHES]] = REQUEST_LOAD | 77
+    words = words.view(-1, 8).to(settings.device)
+    count = 16 if settings.device.type == "cuda" else 4
+    copies = [words.clone() for _ in range(count)]
+    turn = itertools.cycle(copies)
+
+    def refill() -> None:
+        for copy in copies:
+            copy.copy_(words)
+
+    def peer() -> torch.Tensor:
+        return torch.nonzero(next(turn).view(-1) & REQUEST_KINDS)
+
+    capacity = 1 << 17
+    ours = clock(
+        lambda: compact_requests(next(turn), capacity), settings, calls=count, prepare=refill
+    )
+    theirs = clock(peer, settings, calls=count, prepare=refill)
+    refill()
+    wished = peer()[:, 0]
+    node, _, counts = compact_requests(copies[0], capacity)
+    same = torch.equal(node[: int(counts[0])].long(), wished)
+    for who, timing in (("gvtorch", ours), ("torch.nonzero", theirs)):
+        more = {} if who == "gvtorch" else {"times": timing.median / ours.median, "same": same}
+        rate = 1e3 * words.nbytes / timing.median
+        record.add(case, who, timing, words_bytes_per_second=rate, **more)
+    record.note(
+        "words bytes / s: the request words, 4 bytes a node, over the time; torch.nonzero lists "
+        "nodes and clears no words, and waits for the count"
+    )

@@ -1,0 +1,223 @@
+"""The engine with its cache: `frame`, steady and from a cold start, and `stream`, bricks from host
+memory into the pool.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from typing import Any
+
+import torch
+
+from ..engine import Engine
+from ..frame import FrameStats
+from ..pool import Channel, N3Tree
+from ..producers import Bricks, Nodes, Producer, VolumeProducer
+from ..rendering import Camera, TransferFunction, render
+from .record import Record, Settings, Timing, clock, spread, synchronize
+from .scenes import Scene, aneurism, fog_dense, worn
+
+#: Stages of a frame that are the cache's: what a resident tree has no need of.
+CACHE = ("requests", "lru", "schedule", "produce", "write", "count")
+_MOST = 1000  # frames until something must have converged
+_POOLS = {"node_pool": "16 MB", "brick_pool": "384 MB"}  # hold all of 512^3 uint8
+_QUICK = {"node_pool": "1 MB", "brick_pool": "2 MB"}
+
+
+def frame(record: Record) -> None:
+    """Steady frames beside a resident tree, then cold starts."""
+    quick = record.settings.quick
+    width, height = (24, 16) if quick else (1920, 1080)
+    try:
+        scene = aneurism(32 if quick else 256)
+    except FileNotFoundError:
+        scene = fog_dense(32 if quick else 256)
+        record.note("the scan comes with the source and is not here: fog takes its place")
+    if record.wants("steady"):
+        _steady(record, scene, (width, height))
+    if record.wants("cold start"):
+        record.settings.tell("frame: making the worn sphere")
+        scene = worn(32 if quick else 512)
+        for budget in (4096, 65536):
+            _cold(record, scene, (width, height), budget)
+
+
+def _steady(record: Record, scene: Scene, size: tuple[int, int]) -> None:
+    settings, camera = record.settings, scene.camera(*size)
+    case = f"steady, {scene.name}, {size[0]}x{size[1]}"
+    medians = {}
+    for monitor in (False, True):
+        settings.tell(f"{case}: monitor {monitor}")
+        producer = VolumeProducer(scene.volume)
+        options: dict[str, Any] = {"device": settings.device, "monitor": monitor}
+        options |= _QUICK if settings.quick else {}
+        with Engine(producer, **options) as engine:
+            picture = _converge(engine, camera, scene.shader)
+            timing, stats = _clock_frames(engine, camera, scene.shader, settings)
+        cost = _stages(stats[1:]) if monitor else {}
+        if not stats[-1].converged or any(s.requests["load"] for s in stats):
+            record.note(f"{case}: it was not steady")
+        medians[monitor] = timing.median
+        record.add(case, "gvtorch, monitored" if monitor else "gvtorch", timing, **cost)
+    settings.tell(f"{case}: resident")
+    tree = N3Tree.from_volume(scene.volume, device=settings.device)
+    timing = clock(lambda: render(tree, camera, scene.shader), settings)
+    apart = float((render(tree, camera, scene.shader).color - picture).abs().max())
+    times = timing.median / medians[False]
+    record.add(case, "resident tree", timing, times=times, max_difference=apart)
+    record.note(
+        "cache share: the stages " + ", ".join(CACHE) + " of a monitored frame, which waits for "
+        "the device after each stage"
+    )
+
+
+def _clock_frames(
+    engine: Engine, camera: Camera, shader: TransferFunction, settings: Settings
+) -> tuple[Timing, list[FrameStats]]:
+    stats: list[FrameStats] = []
+    timing = clock(lambda: stats.append(engine.frame(camera, shader)[1]), settings)
+    return timing, stats
+
+
+def _stages(stats: list[FrameStats]) -> dict[str, Any]:
+    names = dict.fromkeys(name for one in stats for name in one.stages)
+    medians = {n: statistics.median(one.stages.get(n, 0.0) for one in stats) for n in names}
+    cache = sum(medians.get(name, 0.0) for name in CACHE)
+    return {
+        "trace_ms": medians.get("trace", 0.0),
+        "cache_ms": cache,
+        "cache_share": cache / sum(medians.values()),
+        "stages": medians,
+    }
+
+
+def _converge(engine: Engine, camera: Camera, shader: TransferFunction) -> torch.Tensor:
+    """Renders frames until one misses nothing; returns its colour."""
+    for _ in range(_MOST):
+        picture, stats = engine.frame(camera, shader)
+        if stats.converged:
+            return picture.color
+    raise ValueError(f"bench: nothing converged within {_MOST} frames")
+
+
+def _cold(record: Record, scene: Scene, size: tuple[int, int], budget: int) -> None:
+    """From an engine that holds the root alone to a frame that misses nothing."""
+    settings, camera = record.settings, scene.camera(*size)
+    side = scene.volume.extent[0]
+    case = f"cold start, {scene.name} {side}^3, {size[0]}x{size[1]}, {budget:,} bricks a frame"
+    budgets = {"load_budget": budget, "subdivide_budget": budget}
+    times, frames, bricks, moved, converged = [], 0, 0, 0, False
+    began = time.perf_counter()
+    for number in range(settings.repeats + 1):
+        settings.tell(f"{case}: {number}")
+        producer = VolumeProducer(scene.volume)
+        pools = _QUICK if settings.quick else _POOLS
+        options: dict[str, Any] = {**pools, **budgets, "device": settings.device}
+        with Engine(producer, monitor=False, **options) as engine:
+            synchronize(settings.device)
+            start = time.perf_counter()
+            frames = bricks = moved = 0
+            converged = False
+            while not converged and frames < _MOST:
+                _, stats = engine.frame(camera, scene.shader)
+                converged, frames = stats.converged, frames + 1
+                bricks, moved = bricks + stats.produced["bricks"], moved + stats.bytes_uploaded
+            synchronize(settings.device)
+            times.append(1e3 * (time.perf_counter() - start))
+        if number and time.perf_counter() - began > settings.seconds:
+            break
+    if not converged:
+        record.note(f"{case}: it did not converge within {_MOST} frames")
+    timing = spread(times[1:])
+    rate = 1e3 * bricks / timing.median
+    record.add(
+        *(case, "gvtorch", timing),
+        frames=frames,
+        bricks=bricks,
+        moved_bytes=moved,
+        bricks_per_second=rate,
+    )
+
+
+class Ready(Producer):
+    """Bricks that lie in host memory already: `fill` hands out rows of one tensor."""
+
+    def __init__(self, side: int, pinned: bool) -> None:
+        """Makes as many rows as one frame may ask for."""
+        super().__init__(side, channels={"value": Channel(torch.uint8)})
+        rows = torch.arange(_ROWS, dtype=torch.int32).remainder(251).to(torch.uint8)
+        bricks = rows[:, None, None, None, None].expand(_ROWS, 10, 10, 10, 1).contiguous()
+        self.bricks = bricks.pin_memory() if pinned else bricks
+
+    def fill(self, nodes: Nodes) -> Bricks:
+        """Hands out the first rows."""
+        return Bricks(data={"value": self.bricks[: len(nodes)]})
+
+
+_ROWS = 1 << 16
+
+
+def stream(record: Record) -> None:
+    """All bricks of a scene, which its producer has ready, into an engine's pool; time is that of
+    the stages produce and write. Beside it, one large copy from the same kind of memory.
+    """
+    settings = record.settings
+    side = 64 if settings.quick else 512
+    device = settings.device
+    for pinned in (False, True) if device.type == "cuda" else (False,):
+        kind = "pinned" if pinned else "pageable"
+        case = f"10^3-voxel bricks, {kind} memory"
+        if not record.wants(case):
+            continue
+        settings.tell(f"stream: {kind}")
+        copied = _copy_rate(record, pinned)
+        times, moved = [], 0
+        began = time.perf_counter()
+        for _ in range(settings.repeats + 1):
+            milliseconds, moved = _pour(side, pinned, device)
+            times.append(milliseconds)
+            if len(times) > 1 and time.perf_counter() - began > settings.seconds:
+                break
+        timing: Timing = spread(times[1:])
+        rate = 1e3 * moved / timing.median
+        record.add(
+            *(case, "gvtorch", timing),
+            moved_bytes=moved,
+            bytes_per_second=rate,
+            copy_share=rate / copied[1],
+        )
+        record.add(
+            *(case, f"one {kind} copy", copied[0]),
+            moved_bytes=copied[2],
+            bytes_per_second=copied[1],
+        )
+    record.note("ms: over all frames of a cold start, monitored; copy share: of the copy's rate")
+
+
+def _copy_rate(record: Record, pinned: bool) -> tuple[Timing, float, int]:
+    settings = record.settings
+    size = 1 << (20 if settings.quick else 28)
+    source = torch.ones(size, dtype=torch.uint8)
+    source = source.pin_memory() if pinned else source
+    target = torch.zeros(size, dtype=torch.uint8, device=settings.device)
+    timing = clock(lambda: target.copy_(source, non_blocking=pinned), settings)
+    return timing, 1e3 * size / timing.median, size
+
+
+def _pour(side: int, pinned: bool, device: torch.device) -> tuple[float, int]:
+    """Returns milliseconds of producing and writing, and bytes moved, until all is there."""
+    shader = TransferFunction.from_points([(0, 0), (255, 1e-4)])
+    camera = Camera.orbit(30, 20, 2.0, 35, 256, 256)
+    pools = _POOLS if side > 64 else _QUICK
+    options: dict[str, Any] = {"load_budget": _ROWS, "subdivide_budget": _ROWS, **pools}
+    milliseconds, moved = 0.0, 0
+    with Engine(Ready(side, pinned), device=device, **options) as engine:
+        for _ in range(_MOST):
+            _, stats = engine.frame(camera, shader, lod="finest", step=2.0)
+            if stats.bytes_uploaded:
+                milliseconds += sum(stats.stages.get(name, 0.0) for name in ("produce", "write"))
+                moved += stats.bytes_uploaded
+            if stats.converged:
+                return milliseconds, moved
+    raise ValueError(f"bench: nothing converged within {_MOST} frames")

@@ -1,0 +1,232 @@
+"""Rays through resident trees, beside peers that render the same picture: `march`, `first_hit`,
+and `bricks`, the sweep of brick sizes.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from ..frame import Hits, RenderStats
+from ..io.machine import memory_free
+from ..pool import N3Tree
+from ..rendering import Camera, Picture, RenderOptions
+from ..rendering.renderer import trace
+from .peers import Peer, Task, find
+from .record import Record, Settings, Timing, clock, once
+from .scenes import SCENES, Scene, shell_sparse
+
+_STOP = 0.99
+Size = tuple[int, int]
+
+
+def march(record: Record) -> None:
+    """All scenes at two sizes, the finest level and levels by cone, and the peers."""
+    quick = record.settings.quick
+    sizes = [(24, 16)] if quick else [(512, 512), (1920, 1080)]
+    peers = find(record)
+    for name, make in SCENES.items():
+        wanted = [size for size in sizes if record.wants(_case(name, size))]
+        if name == "clouds":
+            wanted = wanted[:1]
+        if not wanted:
+            continue
+        record.settings.tell(f"march: making {name}")
+        try:
+            scene = make(32 if quick else 256)
+        except FileNotFoundError:
+            record.note(f"{name}: left out, its file comes with the source and is not here")
+            continue
+        tree = N3Tree.from_volume(scene.volume, device=record.settings.device)
+        for size in wanted:
+            _compare(record, scene, tree, size, peers, ("finest", "auto"))
+    record.note(
+        "auto: levels by cone. Differences are from the finest level's picture, over colour and "
+        "alpha. op_ms: the compiled op alone; ms: moving rays to the tree and the table as well."
+    )
+
+
+def first_hit(record: Record) -> None:
+    """A shell that is opaque at once: a ray ends in the first voxel it meets."""
+    quick = record.settings.quick
+    size = (24, 16) if quick else (1920, 1080)
+    scene = replace(shell_sparse(32 if quick else 256), name="first hit")
+    peers = find(record)
+    if record.wants(_case(scene.name, size)):
+        tree = N3Tree.from_volume(scene.volume, device=record.settings.device)
+        _compare(record, scene, tree, size, peers, ("finest",))
+
+
+def bricks(record: Record) -> None:
+    """The finest level of three scenes for every brick size and border."""
+    quick, device = record.settings.quick, record.settings.device
+    size = (24, 16) if quick else (512, 512)
+    for name in ("fog dense", "shell sparse", "aneurism"):
+        scene, first = None, None
+        for brick_size in (4, 8, 16, 32):
+            for border in (1, 0, 2):  # 1 first: the others are compared with it
+                case = f"{name}, {brick_size}^3 + {border}"
+                if not record.wants(case):
+                    continue
+                record.settings.tell(f"bricks: {case}")
+                scene = scene or SCENES[name](32 if quick else 256)
+                needed = _tree_bytes(scene, brick_size, border)
+                if needed > _memory_free(device):
+                    record.note(f"{case}: left out, the tree may take {needed / 1e9:.1f} GB")
+                    continue
+                tree = N3Tree.from_volume(scene.volume, brick_size, border, device=device)
+                camera = scene.camera(*size)
+                run = _tracing(tree, scene, camera, "finest", device)
+                hits = run()
+                picture = _rgba(hits)
+                first = picture if first is None else first
+                timing = clock(run, record.settings)
+                sizes = {"scene": name, "brick_size": brick_size, "border": border}
+                memory = {"tree_bytes": tree.nbytes, "bricks": tree.bricks.capacity}
+                figures = sizes | _rates(hits, timing) | _difference(picture, first) | memory
+                record.add(case, "gvtorch", timing, **figures)
+    record.note("Differences are from the picture of the scene's first row.")
+
+
+def _case(name: str, size: Size) -> str:
+    return f"{name}, {size[0]}x{size[1]}"
+
+
+def _compare(
+    record: Record,
+    scene: Scene,
+    tree: N3Tree,
+    size: Size,
+    peers: dict[str, type[Peer]],
+    lods: tuple[str, ...],
+) -> None:
+    """Adds a row for each level of detail, then one for each peer."""
+    settings, case = record.settings, _case(scene.name, size)
+    device, camera = settings.device, scene.camera(*size)
+    finest, median = torch.empty(0), 0.0
+    for lod in lods:
+        who = "gvtorch" if lod == "finest" else f"gvtorch {lod}"
+        settings.tell(f"{case}: {who}")
+        run = _tracing(tree, scene, camera, lod, device)
+        hits = run()
+        timing = clock(run, settings)
+        figures = _rates(hits, timing) | {"op_ms": op_milliseconds(run, settings)}
+        picture = _rgba(hits)
+        if lod == "finest":
+            finest, median = picture, timing.median
+        else:
+            figures |= {"times": timing.median / median} | _difference(picture, finest)
+        record.add(case, who, timing, **figures)
+        _save(record, picture, f"{case} {who}", size)
+    rays = camera.rays(device)
+    task = Task(scene=scene, camera=camera, rays=rays, stop_alpha=_STOP, device=device)
+    for name, kind in peers.items():
+        settings.tell(f"{case}: {name}")
+        peer = kind(task)
+        timing = clock(peer.render, settings)
+        picture = peer.picture().cpu()
+        figures = {"rays_per_second": 1e3 * len(picture) / timing.median}
+        figures |= {"times": timing.median / median} | _difference(picture, finest)
+        record.add(case, name, timing, **figures)
+        _save(record, picture, f"{case} {name}", size)
+
+
+def _tracing(
+    tree: N3Tree, scene: Scene, camera: Camera, lod: str, device: torch.device
+) -> Callable[[], Hits]:
+    """Returns the call that is timed; rays are made before."""
+    rays = camera.rays(device)
+    options = RenderOptions(lod=lod, step=scene.step, stop_alpha=_STOP)  # type: ignore[arg-type]
+    return lambda: trace(tree, rays, scene.shader, options)
+
+
+def _rates(hits: Hits, timing: Timing) -> dict[str, Any]:
+    samples = int(hits.samples.sum(dtype=torch.int64))
+    return {
+        "samples": samples,
+        "samples_per_second": 1e3 * samples / timing.median,
+        "rays_per_second": 1e3 * len(hits.samples) / timing.median,
+    }
+
+
+def _rgba(hits: Hits) -> Tensor:
+    return torch.cat((hits.color, hits.alpha), 1).float().cpu()
+
+
+def _difference(picture: Tensor, other: Tensor) -> dict[str, float]:
+    apart = (picture - other).double().abs()
+    return {
+        "max_difference": float(apart.max()),
+        "mean_difference": float(apart.mean()),
+        "rms_difference": float(apart.square().mean().sqrt()),
+    }
+
+
+def op_milliseconds(run: Callable[[], object], settings: Settings) -> float | None:
+    """Median milliseconds inside the op `trace_rays`; None where it is not called."""
+    with _Watch(settings.device) as watch:
+        began = time.perf_counter()
+        for _ in range(settings.repeats):
+            run()
+            if time.perf_counter() - began > settings.seconds:
+                break
+    return statistics.median(watch.times) if watch.times else None
+
+
+class _Watch(TorchDispatchMode):
+    """Takes the time of the op whenever it is called."""
+
+    def __init__(self, device: torch.device) -> None:
+        super().__init__()
+        self.device = device
+        self.times: list[float] = []
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        answer: list[Any] = []
+
+        def call() -> None:
+            answer[:] = [func(*args, **(kwargs or {}))]
+
+        if func.name() == "gvtorch::trace_rays":
+            self.times.append(once(call, self.device))
+        else:
+            call()
+        return answer[0]
+
+
+def _tree_bytes(scene: Scene, brick_size: int, border: int) -> int:
+    """At most: all bricks of all levels, and the float32 pyramid that they are cut from."""
+    x, y, z = scene.volume.extent
+    brick = (brick_size + 2 * border) ** 3
+    cells = -(-x // brick_size) * -(-y // brick_size) * -(-z // brick_size)
+    return (brick + 100) * cells * 8 // 7 + 40 * x * y * z
+
+
+def _memory_free(device: torch.device) -> int:
+    free = memory_free()
+    return min(free, torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else free
+
+
+def _save(record: Record, picture: Tensor, name: str, size: Size) -> None:
+    folder = record.settings.pictures
+    if folder is None:
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    image = picture.reshape(size[1], size[0], 4)
+    nothing = torch.zeros_like(image[..., 3:])
+    Picture(
+        color=image[..., :3],
+        alpha=image[..., 3:],
+        depth=nothing,
+        samples=nothing.int(),
+        stats=RenderStats(),
+    ).save(folder / f"{name.replace(', ', ' ').replace(' ', '_')}.png")

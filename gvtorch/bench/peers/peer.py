@@ -1,0 +1,76 @@
+"""What a peer is asked, and what it answers."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...frame import Rays
+from ...rendering import Camera, TransferFunction
+from ..scenes import Scene
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """A picture to render. The scene's voxels are cubes of 1 world unit, voxel 0 is at 0."""
+
+    scene: Scene
+    camera: Camera
+    rays: Rays  # of the camera, on the device
+    stop_alpha: float
+    device: torch.device
+
+
+class Peer(ABC):
+    """A renderer, made ready for a task; what making takes is not timed."""
+
+    #: What it renders otherwise than the task says, and where it runs, in a sentence.
+    differs: str
+
+    @classmethod
+    def refuses(cls, device: torch.device) -> str:
+        """Tells why it can't run on a device, or nothing."""
+        return ""
+
+    @abstractmethod
+    def __init__(self, task: Task) -> None:
+        """Takes the scene to where it is rendered."""
+
+    @abstractmethod
+    def render(self) -> None:
+        """Renders once, all of what is timed."""
+
+    @abstractmethod
+    def picture(self) -> Tensor:
+        """Returns the last picture: (r, 4) float32, premultiplied colour and alpha, row by row."""
+
+
+def spans(task: Task) -> Tensor:
+    """(r, 2) distances at which the rays enter and leave the scene's box, float64; the first is
+    not below 0, and not below the last where a ray misses the box.
+    """
+    box = task.scene.box.to(task.device)
+    a, b = ((corner - task.rays.origin) / task.rays.direction for corner in box)
+    first, last = torch.minimum(a, b).amax(1).clamp(min=0), torch.maximum(a, b).amin(1)
+    return torch.stack((first, torch.maximum(first, last)), 1)
+
+
+def bake(shader: TransferFunction, step: float, rows: int) -> np.ndarray:
+    """Samples a transfer function over [0, 255].
+
+    Args:
+        shader: The function; its reference length is 1 world unit if it names none.
+        step: World units that an opacity is for.
+        rows: How many rows; 255 k + 1 rows hit every value that is a multiple of 1 / k.
+
+    Returns:
+        (rows, 4) float64 colour, not premultiplied, and opacity of a step.
+    """
+    table = shader(np.linspace(0, 255, rows))
+    with np.errstate(divide="ignore"):
+        table[:, 3] = -np.expm1(np.log1p(-table[:, 3]) * step / (shader.reference or 1.0))
+    return table

@@ -1,0 +1,222 @@
+"""What a workload is told (`Settings`), how it takes times (`clock`), and what it gives
+(`Record`).
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from .. import __version__, check
+from ..ops.trace import choose_backend
+
+_DISTURBED = 0.05  # share of the cores that others may take unnoticed
+
+
+def silent(_what: str) -> None:
+    """Tells nobody."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How workloads are run."""
+
+    device: torch.device
+    quick: bool = False  # tiny sizes: to see that all works, no figures to keep
+    repeats: int = 7  # of each figure
+    seconds: float = 10.0  # a figure whose repeats take longer is made of fewer, one at least
+    peers: tuple[str, ...] | None = None  # None: all that are installed
+    only: str = ""  # cases whose name holds it
+    pictures: Path | None = None  # a folder for the pictures that were compared
+    tell: Callable[[str], None] = silent  # told what is done now
+
+    def __post_init__(self) -> None:
+        """Checks numbers and device."""
+        check.whole("bench", "repeats", self.repeats, low=1)
+        check.number("bench", "seconds", self.seconds, low=0)
+        if self.device.type == "cuda":
+            choose_backend("cuda", self.device)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timing:
+    """Milliseconds of one call."""
+
+    median: float
+    low: float
+    high: float
+    repeats: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns the columns of a row."""
+        spread = {"ms": self.median, "ms_low": self.low, "ms_high": self.high}
+        return {**spread, "repeats": self.repeats}
+
+
+def clock(
+    run: Callable[[], object],
+    settings: Settings,
+    *,
+    calls: int = 1,
+    prepare: Callable[[], object] | None = None,
+) -> Timing:
+    """Times a call after one to warm up: CUDA events on the device, else the wall clock.
+
+    Args:
+        run: What is timed.
+        settings: Device, repeats, seconds.
+        calls: Calls in a row that are timed together; the figures are of one.
+        prepare: Called before each timing, and not timed.
+    """
+    device = settings.device
+    times: list[float] = []
+    began = 0.0
+    for number in range(settings.repeats + 1):
+        if prepare is not None:
+            prepare()
+        synchronize(device)
+        times.append(once(run, device, calls) / calls)
+        if number == 0:
+            times.clear()  # the warm-up
+            began = time.perf_counter()
+        elif time.perf_counter() - began > settings.seconds:
+            break
+    return spread(times)
+
+
+def spread(milliseconds: list[float]) -> Timing:
+    """Returns median, smallest and largest of some times."""
+    return Timing(
+        median=statistics.median(milliseconds),
+        low=min(milliseconds),
+        high=max(milliseconds),
+        repeats=len(milliseconds),
+    )
+
+
+def once(run: Callable[[], object], device: torch.device, calls: int = 1) -> float:
+    """Returns the milliseconds of some calls in a row."""
+    if device.type == "cuda":
+        first, last = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        with torch.cuda.device(device):
+            first.record()
+            for _ in range(calls):
+                run()
+            last.record()
+        last.synchronize()
+        return first.elapsed_time(last)
+    start = time.perf_counter()
+    for _ in range(calls):
+        run()
+    return 1e3 * (time.perf_counter() - start)
+
+
+def synchronize(device: torch.device) -> None:
+    """Waits until a CUDA device has nothing left to do."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+class Record:
+    """What a workload measured on a machine.
+
+    Attributes:
+        workload: Its name.
+        rows: A row for each case and who did it, of plain values; None where there is no figure.
+        peers: For each peer that was wanted, "ran" or why it did not.
+        notes: What a reader must know, a sentence each.
+    """
+
+    def __init__(self, workload: str, settings: Settings) -> None:
+        """Has measured nothing yet."""
+        self.workload, self.settings = workload, settings
+        self.rows: list[dict[str, Any]] = []
+        self.peers: dict[str, str] = {}
+        self.notes: list[str] = []
+
+    def wants(self, case: str) -> bool:
+        """Tells whether a case is to be run."""
+        return self.settings.only in case
+
+    def add(self, case: str, who: str, timing: Timing | None = None, **figures: Any) -> None:
+        """Takes a row."""
+        self.rows.append(
+            {"case": case, "who": who, **(timing.as_dict() if timing else {}), **figures}
+        )
+
+    def note(self, sentence: str) -> None:
+        """Takes a note, once."""
+        if sentence not in self.notes:
+            self.notes.append(sentence)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns plain values, ready for JSON."""
+        return {
+            "workload": self.workload,
+            "machine": machine(self.settings.device),
+            "quick": self.settings.quick,
+            "rows": self.rows,
+            "peers": self.peers,
+            "notes": self.notes,
+        }
+
+
+@contextmanager
+def elsewhere(record: Record) -> Iterator[None]:
+    """Notes it where other processes took a part of the cores while a workload ran (Linux)."""
+    start, busy, own = time.perf_counter(), _busy_seconds(), _own_seconds()
+    yield
+    others = _busy_seconds() - busy - (_own_seconds() - own)
+    share = others / (time.perf_counter() - start) / (os.cpu_count() or 1)
+    if share > _DISTURBED:
+        record.note(
+            f"Other processes took {share:.0%} of this machine's cores meanwhile: the times are "
+            "longer than they need be"
+        )
+
+
+def _busy_seconds() -> float:
+    """What all processes took of all cores since the machine started; 0 where it is not told."""
+    try:
+        user, nice, system, _idle, _wait, irq, softirq, steal, *_ = (
+            int(ticks) for ticks in Path("/proc/stat").read_text().split("\n")[0].split()[1:]
+        )
+    except (OSError, ValueError):
+        return 0.0
+    return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
+
+
+def _own_seconds() -> float:
+    """What this process and its children that ended took."""
+    return sum(os.times()[:4])
+
+
+def machine(device: torch.device) -> dict[str, Any]:
+    """Names what a workload runs on."""
+    known = {"torch": torch.__version__, "gvtorch": __version__}
+    backend = choose_backend("auto", device)
+    if device.type == "cuda":
+        return {"name": torch.cuda.get_device_name(device), "backend": backend, **known}
+    threads = torch.get_num_threads()
+    name = f"{_processor()}, {threads} thread{'s' if threads > 1 else ''}"
+    return {"name": name, "backend": backend, **known}
+
+
+def _processor() -> str:
+    try:
+        text = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        text = ""
+    found = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
+    name = found[1] if found else platform.processor() or platform.machine()
+    return " ".join(re.sub(r"\((R|TM)\)|\bProcessor\b|\bCPU\b", "", name).split())

@@ -1,0 +1,197 @@
+"""Stores: `convert`, a volume file to a store, and `blocks`, random bordered blocks out of one,
+beside what Zarr does without stored borders in the same run.
+
+The volume is made up: waves and noise in a ball, zero around it. The peers keep aligned chunks of
+the same voxels and gather each bordered block from them and their neighbours.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import os
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..io import Store
+from ..io.convert import convert as convert_volume
+from . import PEERS
+from .record import Record, clock, spread
+
+_BLOCK = 32
+Reader = Callable[[np.ndarray], object]
+
+
+def convert(record: Record) -> None:
+    """A RAW file to a store, all cores; the file lies in the page cache."""
+    settings = record.settings
+    side = 64 if settings.quick else 1024
+    case = f"{side}^3 uint8"
+    if not record.wants(case):
+        return
+    with tempfile.TemporaryDirectory() as name:
+        raw, path = _raw(Path(name), side), Path(name) / "ball.zarr"
+        times: list[float] = []
+        most = 0
+        began = time.perf_counter()
+        while not times or (
+            len(times) < settings.repeats and time.perf_counter() - began < settings.seconds
+        ):
+            settings.tell(f"convert {case}: {len(times) + 1}")
+            shutil.rmtree(path, ignore_errors=True)
+            with Memory() as memory:
+                start = time.perf_counter()
+                convert_volume(raw, path)
+                times.append(1e3 * (time.perf_counter() - start))
+            most = max(most, memory.most)
+        timing = spread(times)
+        record.add(
+            *(case, "gvtorch", timing),
+            source_bytes_per_second=1e3 * side**3 / timing.median,
+            memory_bytes=most,
+            disk_bytes=Store.open(path).describe()["disk bytes"],
+        )
+    record.note("memory: the most that this process and its workers held together, not warmed up")
+
+
+def blocks(record: Record) -> None:
+    """Random blocks that hold data, so many at once."""
+    settings = record.settings
+    side = 64 if settings.quick else 1024
+    counts = (8,) if settings.quick else (64, 256, 1024, 4096)
+    cases = {count: f"{count:,} blocks of {_BLOCK}^3 and border" for count in counts}
+    cases = {count: case for count, case in cases.items() if record.wants(case)}
+    if not cases:
+        return
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        settings.tell("blocks: making a store")
+        store = convert_volume(_raw(folder, side), folder / "ball.zarr")
+        readers = dict(_readers(record, folder, store))
+        cells = store.read_cells(0, (0, 0, 0), store.cell_grid(0))
+        grid = np.argwhere((cells[..., 0, 0] != cells[..., 1, 0])[::4, ::4, ::4])
+        rng = np.random.default_rng(4)
+        for count, case in cases.items():
+            median = 0.0
+            for who, read in readers.items():
+                if who == "zarr" and count > 64:
+                    continue
+                settings.tell(f"{case}: {who}")
+                timing = clock(functools.partial(_read, read, rng, grid, count), settings)
+                median = median or timing.median
+                rate = 1e3 * count / timing.median
+                more = {} if who == "gvtorch" else {"times": timing.median / median}
+                record.add(case, who, timing, blocks_per_second=rate, **more)
+    record.note("peers read aligned chunks of the same size and gather; zarr, 64 at most")
+
+
+def _read(read: Reader, rng: np.random.Generator, grid: np.ndarray, count: int) -> None:
+    read(grid[rng.integers(0, len(grid), count)])
+
+
+def _raw(folder: Path, side: int) -> Path:
+    """Writes the volume plane by plane."""
+    file = folder / f"ball_{side}x{side}x{side}_uint8.raw"
+    noise = np.random.default_rng(0).random((side, side), dtype=np.float32) * 6
+    y, x = np.ogrid[:side, :side]
+    centre, radius = side / 2, 0.58 * side
+    with file.open("wb") as out:
+        for z in range(side):
+            wave = np.sin(x / 9) * np.sin(y / 8) * np.sin(z / 7)
+            plane = 100 + 50 * wave + np.roll(noise, 37 * z, 1)
+            plane[(x - centre) ** 2 + (y - centre) ** 2 + (z - centre) ** 2 > radius**2] = 0
+            out.write(plane.astype(np.uint8).tobytes())
+    return file
+
+
+def _readers(record: Record, folder: Path, store: Store) -> Iterator[tuple[str, Reader]]:
+    """Who reads, ours first, and how."""
+    yield "gvtorch", lambda zyx: store.read_blocks(0, zyx)
+    wanted = record.settings.peers
+    here = importlib.util.find_spec("zarr") is not None
+    for name in ("tensorstore", "zarr"):
+        if wanted is None or name in wanted:
+            record.peers[name] = "ran" if here else f"not installed ({PEERS[name]})"
+    if not here or not record.peers:
+        return
+    import tensorstore as ts
+    import zarr
+
+    side = store.extent[0]
+    aligned = folder / "aligned.zarr"
+    _write_aligned(aligned, store)
+    if "tensorstore" in record.peers:
+        spec = {"driver": "zarr3", "kvstore": {"driver": "file", "path": f"{aligned}/"}}
+        array = ts.open(spec).result()
+
+        def batch(zyx: np.ndarray) -> None:
+            for future in _gather(lambda place: array[place].read(), zyx, side):
+                future.result()
+
+        yield "tensorstore", batch
+    if "zarr" in record.peers:
+        plain = zarr.open_array(aligned, mode="r")
+        yield "zarr", lambda zyx: _gather(lambda place: plain[place], zyx, side)
+
+
+def _write_aligned(path: Path, store: Store) -> None:
+    """Writes the finest level with aligned chunks and no borders, many to a shard."""
+    import zarr
+
+    x, y, z = store.extent
+    shard = min(256, x)
+    array = zarr.create_array(
+        path, shape=(z, y, x), dtype="uint8", chunks=(_BLOCK,) * 3, shards=(shard,) * 3
+    )
+    for k in range(0, z, shard):
+        array[k : k + shard] = store.read_region(0, (k, 0, 0), (min(k + shard, z), y, x))[..., 0]
+
+
+def _gather(read: Callable[[tuple[slice, ...]], Any], zyx: np.ndarray, side: int) -> list[Any]:
+    """Reads bordered blocks as regions; those at the volume's faces come out smaller."""
+    low = np.maximum(zyx * _BLOCK - 1, 0)
+    high = np.minimum((zyx + 1) * _BLOCK + 1, side)
+    return [read(tuple(map(slice, a, b))) for a, b in zip(low.tolist(), high.tolist(), strict=True)]
+
+
+class Memory:
+    """Largest memory of this process and its children together, while it runs, and the first that
+    was seen (Linux).
+    """
+
+    def __init__(self) -> None:
+        """Starts at nothing."""
+        self.most, self.first, self._ends = 0, 0, threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+
+    def __enter__(self) -> Memory:
+        """Starts to look."""
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Ends."""
+        self._ends.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while not self._ends.wait(0.05):
+            own = str(os.getpid())
+            total = 0
+            for folder in Path("/proc").glob("[0-9]*"):
+                try:
+                    parent = (folder / "stat").read_text().rsplit(")", 1)[1].split()[1]
+                    if own in (folder.name, parent):
+                        lines = (folder / "smaps_rollup").read_text().splitlines()
+                        total += next(int(line.split()[1]) for line in lines if "Pss:" in line)
+                except OSError:
+                    continue
+            self.first = self.first or total * 1024
+            self.most = max(self.most, total * 1024)

@@ -1,0 +1,93 @@
+"""`gvtorch bench`: measures workloads on this machine."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional, arg
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bench:
+    """Measure a workload on this machine, beside what else does the same."""
+
+    name: Positional[Annotated[str | None, arg(metavar="NAME")]] = None
+    """a workload, or all; without it the workloads are listed"""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """print JSON, an object a line for each workload"""
+    output: Annotated[Path | None, arg(aliases=["-o"], metavar="FOLDER")] = None
+    """also keep the JSON there, a file for each workload and machine"""
+    device: Annotated[str, arg(metavar="DEVICE")] = "cpu"
+    """cpu, cuda or cuda:1"""
+    quick: tyro.conf.FlagCreatePairsOff[bool] = False
+    """tiny sizes: to see that all works"""
+    repeats: Annotated[int, arg(metavar="N")] = 7
+    """timings of each figure, after one to warm up"""
+    seconds: Annotated[float, arg(metavar="S")] = 10.0
+    """a figure that takes longer is made of fewer timings"""
+    only: Annotated[str, arg(metavar="TEXT")] = ""
+    """cases that have it in their name"""
+    peers: Annotated[str | None, arg(metavar="NAME,NAME")] = None
+    """which other renderers; none for none, all that are installed if left out"""
+    pictures: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """keep the pictures that were compared"""
+
+    def run(self) -> None:
+        """Runs and prints."""
+        from ..bench import WORKLOADS
+
+        if self.name is None:
+            for name, what in WORKLOADS.items():
+                print(f"{name:10} {what}")
+            return
+        names = [*WORKLOADS] if self.name == "all" else [self.name]
+        if names[0] not in WORKLOADS:
+            known = ", ".join((*WORKLOADS, "all"))
+            raise ValueError(f"bench: unknown workload {self.name!r}; known: {known}")
+        for name in names:
+            self._one(name)
+
+    def _one(self, name: str) -> None:
+        import torch
+        from rich.console import Console
+
+        from ..bench import run, tables
+        from ..bench.record import Settings
+
+        try:
+            device = torch.device(self.device)
+        except RuntimeError:
+            raise ValueError(f"--device must be cpu, cuda or cuda:N, got {self.device!r}") from None
+        peers = None if self.peers is None else tuple(p for p in self.peers.split(",") if p)
+        errors = Console(stderr=True)
+        with errors.status(name) as status:
+            settings = Settings(
+                device=device,
+                quick=self.quick,
+                repeats=self.repeats,
+                seconds=self.seconds,
+                peers=() if peers == ("none",) else peers,
+                only=self.only,
+                pictures=self.pictures,
+                tell=status.update,
+            )
+            content = run(name, settings).as_dict()
+        if self.output is not None:
+            self.output.mkdir(parents=True, exist_ok=True)
+            text = json.dumps(content, indent=1) + "\n"
+            (self.output / tables.file_name(content)).write_text(text, encoding="utf-8")
+        if self.json:
+            print(json.dumps(content), flush=True)
+            return
+        console = Console(width=None if sys.stdout.isatty() else 200)
+        console.print(tables.rich_table(content))
+        for peer, why in content["peers"].items():
+            if why != "ran":
+                console.print(f"{peer}: {why}", highlight=False, markup=False)
+        for note in content["notes"]:
+            console.print(note, highlight=False, markup=False)

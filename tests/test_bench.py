@@ -1,0 +1,189 @@
+"""Workloads: each runs and gives finite figures, peers agree, what is missing is named."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+
+import pytest
+import torch
+from conftest import DEVICES, ROOT
+
+import gvtorch as gv
+from gvtorch import bench
+from gvtorch.bench import peers, scenes, tables
+from gvtorch.bench import record as record_module
+from gvtorch.bench.record import Record, Settings, clock
+
+QUICK = {"quick": True, "repeats": 1}
+CPU = Settings(device=torch.device("cpu"), **QUICK)
+#: What the rows of a workload must tell, beside the times.
+FIGURES = {
+    "march": {"samples", "samples_per_second", "rays_per_second", "op_ms", "rms_difference"},
+    "first_hit": {"rays_per_second", "max_difference", "mean_difference", "times"},
+    "bricks": {"samples_per_second", "tree_bytes", "brick_size", "border"},
+    "frame": {"cache_share", "cache_ms", "stages", "frames", "bricks", "max_difference"},
+    "lru": {"slots_per_second", "times", "same"},
+    "compact": {"words_bytes_per_second", "times", "same"},
+    "produce": {"bricks_per_second", "voxels_per_second"},
+    "stream": {"bytes_per_second", "copy_share", "moved_bytes"},
+    "convert": {"source_bytes_per_second", "memory_bytes", "disk_bytes"},
+    "blocks": {"blocks_per_second"},
+}
+
+
+def gvtorch(*args: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "gvtorch", "bench", *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def figures(value) -> list[float]:
+    """All numbers inside a row."""
+    if isinstance(value, dict):
+        return [number for item in value.values() for number in figures(item)]
+    return [] if value is None or isinstance(value, (str, bool)) else [value]
+
+
+@pytest.mark.filterwarnings("default")  # of torch.compile's own making
+@pytest.mark.parametrize("name", bench.WORKLOADS)
+def test_a_workload_gives_finite_figures_as_json(name, compiled):
+    device = torch.device(DEVICES[compiled])
+    chosen = Settings(device=device, peers=("grid_sample", "zarr", "tensorstore"), **QUICK)
+    content = json.loads(json.dumps(bench.run(name, chosen).as_dict(), allow_nan=False))
+    assert content["workload"] == name and content["quick"] is True
+    assert content["machine"]["name"] and content["machine"]["backend"] == compiled
+    rows = content["rows"]
+    assert FIGURES[name] <= {field for row in rows for field in row}
+    for row in rows:
+        assert row["case"] and row["who"] and row["repeats"] >= 1
+        assert 0 < row["ms_low"] <= row["ms"] <= row["ms_high"]
+        assert all(math.isfinite(number) for number in figures(row)), row
+        assert row.get("same", True) is True
+    assert len({(row["case"], row["who"]) for row in rows}) == len(rows)
+    assert len(tables.markdown(content).splitlines()) >= 2 + len(rows)
+
+
+@pytest.mark.backend("cpp")
+def test_grid_sample_agrees_with_the_picture():
+    """Without early stop both integrate the same samples; with it one may take one more."""
+    scene = scenes.clouds(48)
+    camera = scene.camera(40, 30)
+    tree = gv.N3Tree.from_volume(scene.volume)
+    marcher = peers.find(Record("march", Settings(device=CPU.device, peers=("grid_sample",))))
+    for stop, bound in ((1.0, 1e-5), (0.99, 1e-2)):
+        options = {"step": scene.step, "lod": "finest", "stop_alpha": stop}
+        picture = gv.render(tree, camera, scene.shader, **options)
+        task = peers.Task(
+            scene=scene, camera=camera, rays=camera.rays(), stop_alpha=stop, device=CPU.device
+        )
+        peer = marcher["grid_sample"](task)
+        peer.render()
+        actual = peer.picture().reshape(30, 40, 4)
+        assert (actual[..., :3] - picture.color).abs().max() < bound
+        assert (actual[..., 3:] - picture.alpha).abs().max() < bound
+    assert picture.alpha.max() > 0.9 and picture.alpha.min() < 0.1
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize(
+    ("name", "bound"), [("grid_sample", 1e-3), ("warp", 1e-3), ("drjit", 1e-3), ("vtk", 2e-2)]
+)
+def test_a_peer_renders_the_same_picture(name, bound):
+    record = bench.run("first_hit", Settings(device=CPU.device, peers=(name,), **QUICK))
+    if record.peers[name] != "ran":
+        pytest.skip(f"{name}: {record.peers[name]}")
+    row = record.rows[-1]
+    assert row["who"] == name and row["rms_difference"] < bound
+    assert any(note.startswith(f"{name}: ") for note in record.notes)
+
+
+@pytest.mark.backend("cpp")
+def test_a_peer_that_is_missing_is_named(monkeypatch):
+    for module in ("warp", "drjit", "vtkmodules", "vtkmodules.vtkRenderingOpenGL2"):
+        monkeypatch.setitem(sys.modules, module, None)
+    for module in ("warp_nanovdb", "drjit_loop", "vtk_fixed_point"):
+        monkeypatch.delitem(sys.modules, f"gvtorch.bench.peers.{module}", raising=False)
+    chosen = Settings(device=CPU.device, only="clouds", peers=("warp", "drjit", "vtk"), **QUICK)
+    record = bench.run("march", chosen)
+    assert record.peers == {
+        "warp": "not installed (warp-lang)",
+        "drjit": "not installed (drjit)",
+        "vtk": "not installed (vtk)",
+    }
+    assert {row["who"] for row in record.rows} == {"gvtorch", "gvtorch auto"}
+    assert "- vtk: not installed (vtk)." in tables.markdown(record.as_dict())
+
+
+def test_scenes_are_what_their_names_say():
+    dense, sparse = (
+        gv.N3Tree.from_volume(make(64).volume) for make in (scenes.fog_dense, scenes.fog_sparse)
+    )
+    assert dense.bricks.capacity == 1 + 8 + 64 + 512 and sparse.bricks.capacity < 300
+    dense, sparse = (
+        gv.N3Tree.from_volume(make(64).volume) for make in (scenes.shell_dense, scenes.shell_sparse)
+    )
+    assert dense.bricks.capacity == 1 + 8 + 64 + 512 and sparse.bricks.capacity < 500
+    clouds = scenes.clouds(64)
+    shown = clouds.shader(clouds.volume.data[..., 0].numpy())[..., 3] > 0
+    assert abs(1 - shown.mean() - 0.68) < 0.01
+
+
+def test_a_figure_that_takes_long_is_made_of_fewer_timings():
+    calls: list[str] = []
+    patient = Settings(device=CPU.device, repeats=3)
+    timing = clock(lambda: calls.append("run"), patient, calls=2, prepare=lambda: calls.append("p"))
+    assert calls == ["p", "run", "run"] * 4 and timing.repeats == 3
+    hasty = Settings(device=CPU.device, repeats=3, seconds=0)
+    assert clock(lambda: None, hasty).repeats == 1
+
+
+def test_a_busy_machine_is_noted(monkeypatch):
+    for others, noted in ((0.0, False), (1000.0, True)):
+        seconds = iter((0.0, others))
+        monkeypatch.setattr(record_module, "_busy_seconds", lambda s=seconds: next(s))
+        record = Record("lru", CPU)
+        with record_module.elsewhere(record):
+            pass
+        assert any("Other processes took" in note for note in record.notes) is noted
+
+
+def test_the_command_lists_and_names_mistakes():
+    listed = gvtorch()
+    assert listed.returncode == 0
+    assert [line.split()[0] for line in listed.stdout.splitlines()] == [*bench.WORKLOADS]
+    for args, words in (
+        (["nonsense"], "unknown workload 'nonsense'; known: march"),
+        (["lru", "--peers", "nobody"], "unknown peer 'nobody'; known: grid_sample"),
+        (["lru", "--device", "teapot"], "--device must be cpu, cuda or cuda:N"),
+        (["lru", "--quick", "--only", "nothing"], "no case of lru has 'nothing' in its name"),
+        (["lru", "--repeats", "0"], "repeats must be an int >= 1"),
+    ):
+        run = gvtorch(*args)
+        assert run.returncode == 2 and words in run.stderr, run.stderr
+        assert len(run.stderr.strip().splitlines()) == 1 and not run.stdout
+
+
+@pytest.mark.backend("cpp")
+def test_the_command_prints_json_and_plots_write_the_page(tmp_path):
+    run = gvtorch("lru", "--quick", "--repeats", 1, "--json", "-o", tmp_path)
+    assert run.returncode == 0, run.stderr
+    content = json.loads(run.stdout)
+    (file,) = tmp_path.glob("lru.*.quick.json")
+    assert json.loads(file.read_text()) == content
+
+    page = tmp_path / "page.md"
+    script = ROOT / "benchmarks" / "plots.py"
+    marks = [line.split('"')[1] for line in script.read_text().splitlines() if '"<!--' in line]
+    page.write_text(f"before\n{marks[0]}\nold\n{marks[1]}\nafter\n")
+    command = [sys.executable, script, "--records", tmp_path, "--page", page]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 1 and "no records" in run.stderr, "quick sizes are no figures"
+    (tmp_path / "lru.json").write_text(json.dumps({**content, "quick": False}))
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    text = page.read_text()
+    assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
+    assert "| torch.sort |" in text and content["machine"]["name"] in text
+    assert (tmp_path / "lru.png").exists() == (f"{tmp_path.name}/lru.png" in text)
