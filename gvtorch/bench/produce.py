@@ -50,7 +50,9 @@ def produce(record: Record) -> None:
     loc = loc.to(settings.device)
 
     def eager() -> Tensor:
-        return producer.fill(Nodes(loc, layout)).data["value"]
+        bricks = producer.fill(Nodes(loc, layout)).data["value"]
+        assert isinstance(bricks, Tensor)
+        return bricks
 
     compiled = torch.compile(eager, fullgraph=True, dynamic=False)
     expected = eager()

@@ -143,7 +143,7 @@ class Intervals:
         level, count = torch.zeros_like(first, dtype=torch.int64), torch.zeros_like(first)
         lengths = torch.stack(length)
         at = cls(beam.cone_near, beam.cone_growth, beam.last, lengths, level, first, count, first)
-        at._choose_level(first == first)
+        at._choose_level(torch.ones_like(first, dtype=torch.bool))
         return at
 
     @property

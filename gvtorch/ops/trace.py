@@ -113,8 +113,9 @@ def trace_rays(
         backend: auto, reference, cpp or cuda.
 
     Returns:
-        In the table's dtype: color (r, 3) premultiplied linear RGB, alpha (r, 1), depth (r, 1) world units or +inf,
-        samples (r,) int32, missed (r,) bool: something that the ray saw was not there.
+        color (r, 3) premultiplied linear RGB, alpha (r, 1), depth (r, 1) world units or +inf, all in
+        the table's dtype; samples (r,) int32, missed (r,) bool: something that the ray saw was not
+        there.
 
     Raises:
         ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.

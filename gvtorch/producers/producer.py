@@ -7,6 +7,7 @@ It never sees pools, slots or the order of use: nodes are named by place. Source
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field

@@ -44,8 +44,8 @@ PRESETS: dict[str, tuple[Points, Points]] = {
     ),
 }
 
-# Cells of a table: at least; where corners don't fall on rows, at least; how many of them two corners are then apart;
-# most where corners fall on rows and rows could be fewer; most at all.
+# Cells of a table: at least; at least, where corners don't fall on rows; how many of them two corners
+# are then apart; most where corners fall on rows and there could be fewer; most at all.
 _FEWEST_CELLS, _FEWEST_SAMPLED, _CELLS_APART, _MANY_CELLS, _MOST_CELLS = (
     2**10,
     2**12,
@@ -159,8 +159,8 @@ class TransferFunction:
         """Returns the function as the kernel reads it: rows at even distances over a domain.
 
         Rows are laid so that every corner point falls on one, where that takes no more than 2^16
-        cells; else so densely that no two corners share 16 cells. Between rows, colour and alpha are
-        linear.
+        cells; else so densely that no two corners share 16 cells. Between rows, colour and alpha
+        are linear.
 
         Args:
             smallest_spacing: World units; opacity's reference length where none was given.
