@@ -113,7 +113,7 @@ def trace_rays(
         backend: auto, reference, cpp or cuda.
 
     Returns:
-        color (r, 3) premultiplied linear RGB, alpha (r, 1), depth (r, 1) world units or +inf, all in
+        color (r, 3) premultiplied linear RGB, alpha (r, 1), depth (r, 1) world units or +inf, in
         the table's dtype; samples (r,) int32, missed (r,) bool: something that the ray saw was not
         there.
 

@@ -44,7 +44,7 @@ PRESETS: dict[str, tuple[Points, Points]] = {
     ),
 }
 
-# Cells of a table: at least; at least, where corners don't fall on rows; how many of them two corners
+# Cells of a table: at least; at least, where corners fall beside rows; how many of them two corners
 # are then apart; most where corners fall on rows and there could be fewer; most at all.
 _FEWEST_CELLS, _FEWEST_SAMPLED, _CELLS_APART, _MANY_CELLS, _MOST_CELLS = (
     2**10,

@@ -1,9 +1,12 @@
 // The cache's four ops on bare words: what rays asked for becomes a list, slots are ordered by use, pointers to
 // slots that change hands are cleared, new pointers are written.
 //
-// Equal to ops/reference_cache.py in every integer. `for_each` and `compact` are the only things that a device
-// brings (cpu.cpp, cuda.cu); `compact(n, keep, put, count)` calls put(index, rank) for the indices that keep accepts,
-// ranks rising with the index, and writes their number.
+// Equal to ops/reference_cache.py in every integer. What a device brings (cpu.cpp, cuda.cu), each with the number of
+// indices that keep accepts:
+//   for_each(n, body)            body(index)
+//   count(n, keep, kept)
+//   compact(n, keep, put, kept)  put(index, rank) for the indices that keep accepts, ranks rising with the index
+//   split(n, keep, put, kept)    put(index, rank) for all: those that keep accepts first, then the others
 // Method: Crassin et al., "GigaVoxels", I3D 2009, section 5 (usage stamps, LRU by compaction, request lists).
 #pragma once
 
@@ -26,7 +29,6 @@ struct KeepOpenRequest {
 
 // Lists a request; what a full list has no place for is only counted.
 struct PutRequest {
-  static constexpr bool kDense = false;  // few of the indices are kept
   const int32_t* request_tn;
   int32_t* node_k;
   int32_t* word_k;
@@ -45,11 +47,6 @@ struct KeepWish {
   GV_HD bool operator()(int64_t node) const { return (request_tn[node] & kKinds) != 0; }
 };
 
-struct PutNothing {
-  static constexpr bool kDense = false;
-  GV_HD void operator()(int64_t, int64_t) const {}
-};
-
 // (-, found, wished) -> (kept, found, wished).
 struct CapCount {
   int64_t* count_3;
@@ -65,30 +62,42 @@ struct ClearWishes {
   }
 };
 
-struct FlagUse {
-  const int32_t* order_k;
+// Stamps as one bit a slot, eight to an index: the order of use visits slots at random, and bits fit near caches.
+struct PackUse {
   const int32_t* stamp_s;
   int64_t slots;
   const int32_t* frame_1;
-  uint8_t* used_k;
+  uint8_t* bits;
   GV_HD void operator()(int64_t index) const {
-    const int32_t slot = order_k[index];
-    used_k[index] = slot >= 0 && slot < slots && stamp_s[slot] == *frame_1;
+    const int32_t frame = *frame_1;
+    const int64_t first = 8 * index;
+    const int64_t here = smaller<int64_t>(8, slots - first);
+    int32_t word = 0;
+    for (int64_t slot = 0; slot < here; ++slot) word |= (stamp_s[first + slot] == frame ? 1 : 0) << slot;
+    bits[index] = static_cast<uint8_t>(word);
   }
 };
 
-struct KeepByUse {
+struct FlagUse {
+  const int32_t* order_k;
+  const uint8_t* bits;
+  uint64_t slots;
+  uint8_t* used_k;
+  GV_HD void operator()(int64_t index) const {
+    const auto slot = static_cast<uint32_t>(order_k[index]);  // a negative one is out of range
+    used_k[index] = slot < slots ? (bits[slot / 8] >> (slot % 8)) & 1 : 0;
+  }
+};
+
+struct KeepUnused {
   const uint8_t* used_k;
-  uint8_t used;
-  GV_HD bool operator()(int64_t index) const { return used_k[index] == used; }
+  GV_HD bool operator()(int64_t index) const { return used_k[index] == 0; }
 };
 
 struct PutSlot {
-  static constexpr bool kDense = true;
   const int32_t* order_k;
   int32_t* out_k;
-  const int64_t* first;
-  GV_HD void operator()(int64_t index, int64_t rank) const { out_k[*first + rank] = order_k[index]; }
+  GV_HD void operator()(int64_t index, int64_t rank) const { out_k[rank] = order_k[index]; }
 };
 
 struct MarkSlot {

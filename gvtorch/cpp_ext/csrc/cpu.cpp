@@ -71,41 +71,67 @@ void for_each(const torch::stable::Tensor&, int64_t count, const Functor& functo
   });
 }
 
-// Calls put(index, rank) for every index that `keep` accepts, ranks in order; writes their number. Threads count
-// chunks, then place them: ranks do not depend on the number of threads.
+// The primitives of cache.h. Threads count chunks, then place them: ranks do not depend on the number of threads.
+struct Chunks {
+  static constexpr int64_t kSize = 1 << 14;
+  std::vector<int64_t> first;  // kept before each chunk, and in all
+
+  template <class Keep>
+  Chunks(const torch::stable::Tensor& like, int64_t count, const Keep& keep)
+      : first(static_cast<size_t>((count + kSize - 1) / kSize) + 1, 0) {
+    for_each<Cpu>(
+        like, static_cast<int64_t>(first.size()) - 1,
+        [&](int64_t chunk) {
+          const int64_t end = std::min(count, (chunk + 1) * kSize);
+          int32_t found = 0;
+          for (int64_t index = chunk * kSize; index < end; ++index) found += keep(index) ? 1 : 0;
+          first[chunk + 1] = found;
+        },
+        1);
+    for (size_t chunk = 1; chunk < first.size(); ++chunk) first[chunk] += first[chunk - 1];
+  }
+  // body(begin, end, chunk) for each chunk.
+  template <class Body>
+  void place(const torch::stable::Tensor& like, int64_t count, const Body& body) const {
+    for_each<Cpu>(
+        like, static_cast<int64_t>(first.size()) - 1,
+        [&](int64_t chunk) { body(chunk * kSize, std::min(count, (chunk + 1) * kSize), chunk); }, 1);
+  }
+};
+
+template <class Device, class Keep>
+void count(const torch::stable::Tensor& like, int64_t size, const Keep& keep, int64_t* kept) {
+  *kept = Chunks(like, size, keep).first.back();
+}
+
 template <class Device, class Keep, class Put>
 void compact(const torch::stable::Tensor& like, int64_t count, const Keep& keep, const Put& put, int64_t* kept) {
-  constexpr int64_t kChunk = 1 << 14;
-  const int64_t chunks = (count + kChunk - 1) / kChunk;
-  std::vector<int64_t> first(static_cast<size_t>(chunks) + 1, 0);
-  for_each<Device>(
-      like, chunks,
-      [&](int64_t chunk) {
-        const int64_t end = std::min(count, (chunk + 1) * kChunk);
-        int32_t found = 0;
-        for (int64_t index = chunk * kChunk; index < end; ++index) found += keep(index) ? 1 : 0;
-        first[chunk + 1] = found;
-      },
-      1);
-  for (int64_t chunk = 0; chunk < chunks; ++chunk) first[chunk + 1] += first[chunk];
-  for_each<Device>(
-      like, chunks,
-      [&](int64_t chunk) {
-        if (first[chunk] == first[chunk + 1]) return;
-        const int64_t end = std::min(count, (chunk + 1) * kChunk);
-        int64_t rank = first[chunk];
-        for (int64_t index = chunk * kChunk; index < end; ++index) {
-          if constexpr (Put::kDense) {  // written anyway, and over again until the kept one comes
-            if (rank == first[chunk + 1]) return;
-            put(index, rank);
-            rank += keep(index) ? 1 : 0;
-          } else if (keep(index)) {
-            put(index, rank++);
-          }
-        }
-      },
-      1);
-  *kept = first[chunks];
+  const Chunks chunks(like, count, keep);
+  chunks.place(like, count, [&](int64_t begin, int64_t end, int64_t chunk) {
+    int64_t rank = chunks.first[chunk];
+    if (rank == chunks.first[chunk + 1]) return;
+    for (int64_t index = begin; index < end; ++index) {
+      if (keep(index)) put(index, rank++);
+    }
+  });
+  *kept = chunks.first.back();
+}
+
+template <class Device, class Keep, class Put>
+void split(const torch::stable::Tensor& like, int64_t count, const Keep& keep, const Put& put, int64_t* kept) {
+  const Chunks chunks(like, count, keep);
+  const int64_t total = chunks.first.back();
+  chunks.place(like, count, [&](int64_t begin, int64_t end, int64_t chunk) {
+    int64_t rank = chunks.first[chunk];
+    int64_t behind = total + begin - rank;
+    for (int64_t index = begin; index < end; ++index) {
+      const int64_t mask = -static_cast<int64_t>(keep(index));  // no branch: half of them would be guessed wrong
+      put(index, behind + ((rank - behind) & mask));
+      rank -= mask;
+      behind += 1 + mask;
+    }
+  });
+  *kept = total;
 }
 
 template <class Device>

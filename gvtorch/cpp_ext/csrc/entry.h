@@ -210,7 +210,7 @@ std::tuple<Tensor, Tensor, Tensor> compact_requests(const Tensor& request_tn, in
   auto* count = static_cast<int64_t*>(count_3.mutable_data_ptr());
   compact<Device>(request_tn, nodes, KeepOpenRequest{words_in(request_tn)},
                   PutRequest{words_in(request_tn), words_out(node_k), words_out(word_k), capacity}, count + 1);
-  compact<Device>(request_tn, nodes, KeepWish{words_in(request_tn)}, PutNothing{}, count + 2);
+  gvtorch::count<Device>(request_tn, nodes, KeepWish{words_in(request_tn)}, count + 2);
   for_each<Device>(request_tn, 1, CapCount{count, capacity});
   for_each<Device>(request_tn, nodes, ClearWishes{words_out(request_tn)});
   return {node_k, word_k, count_3};
@@ -224,19 +224,18 @@ std::tuple<Tensor, Tensor> lru_partition(const Tensor& order_k, const Tensor& st
   }
   require_numel(frame_1, "frame_1", 1);
   Tensor sorted_k = torch::stable::new_empty(order_k, {order_k.numel()});
-  Tensor unused_1 = torch::stable::new_zeros(order_k, {2}, ScalarType::Long);
-  auto* count = static_cast<int64_t*>(unused_1.mutable_data_ptr());
+  Tensor unused_1 = torch::stable::new_zeros(order_k, {1}, ScalarType::Long);
+  auto* unused = static_cast<int64_t*>(unused_1.mutable_data_ptr());
   const int64_t size = order_k.numel();
   Tensor used_k = torch::stable::new_empty(order_k, {size}, ScalarType::Byte);
   auto* flags = static_cast<uint8_t*>(used_k.mutable_data_ptr());
-  for_each<Device>(order_k, size,
-                   FlagUse{words_in(order_k), words_in(stamp_s), stamp_s.numel(), words_in(frame_1), flags});
-  for (const uint8_t used : {0, 1}) {
-    const KeepByUse keep{flags, used};
-    const PutSlot put{words_in(order_k), words_out(sorted_k), used ? count : count + 1};
-    compact<Device>(order_k, size, keep, put, used ? count + 1 : count);
-  }
-  return {sorted_k, torch::stable::narrow(unused_1, 0, 0, 1)};
+  const int64_t slots = stamp_s.numel();
+  Tensor used_s = torch::stable::new_empty(order_k, {(slots + 7) / 8}, ScalarType::Byte);
+  auto* bits = static_cast<uint8_t*>(used_s.mutable_data_ptr());
+  for_each<Device>(order_k, (slots + 7) / 8, PackUse{words_in(stamp_s), slots, words_in(frame_1), bits});
+  for_each<Device>(order_k, size, FlagUse{words_in(order_k), bits, static_cast<uint64_t>(slots), flags});
+  split<Device>(order_k, size, KeepUnused{flags}, PutSlot{words_in(order_k), words_out(sorted_k)}, unused);
+  return {sorted_k, unused_1};
 }
 
 template <class Device>
