@@ -153,6 +153,22 @@ GV_HD void store_stamp(int32_t* word, int32_t stamp) {
 #endif
 }
 
+// A byte that several threads may fill with the same value.
+GV_HD uint8_t load_byte(const uint8_t* byte) {
+#ifdef __CUDA_ARCH__
+  return *byte;
+#else
+  return __atomic_load_n(byte, __ATOMIC_RELAXED);
+#endif
+}
+GV_HD void store_byte(uint8_t* byte, uint8_t value) {
+#ifdef __CUDA_ARCH__
+  *byte = value;
+#else
+  __atomic_store_n(byte, value, __ATOMIC_RELAXED);
+#endif
+}
+
 // Joins `wish` into a request word: kind bits (above kPriorityMask) by OR, priority by maximum. Commutative, so
 // the word does not depend on the order of the rays.
 constexpr int32_t kPriorityMask = 0xffff;

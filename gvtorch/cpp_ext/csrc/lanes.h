@@ -133,6 +133,13 @@ GV_HD Floats sample_lanes(const BrickView<Voxel>& view, const BrickRay<float, Vo
   return plane[0] + weight[2] * (plane[1] - plane[0]);
 }
 
+GV_HD Quad blend_rows(const Row<float>* row, float weight) {
+  Quad a, b;
+  memcpy(&a, row, sizeof(a));
+  memcpy(&b, row + 1, sizeof(b));
+  return a + weight * (b - a);
+}
+
 struct Lanes {
   template <class Voxel>
   GV_HD static int32_t march(const BrickView<Voxel>& bricks, const Transfer<float>& transfer,
@@ -164,26 +171,39 @@ struct Lanes {
       const Floats weight = place - to_floats(cell);
       memcpy(weights, &weight, sizeof(weight));
 
+      // Four at a time without a look at the sum; where the ray ended or its depth was passed, once more with care.
       const int32_t here = count - taken < kLanes ? count - taken : kLanes;
-      for (int32_t i = 0; i < here; ++i) {
-        Quad a, b;
-        memcpy(&a, rows_m + rows[i], sizeof(a));
-        memcpy(&b, rows_m + rows[i] + 1, sizeof(b));
-        const Quad row = a + weights[i] * (b - a);
-        const float share = clear * row[3];
-        const float left = clear * (1.0f - row[3]);
-        color = color + share * row;
-        if (left < run.hit_clear && clear >= run.hit_clear) {
-          sum.clear = clear;
-          sum.depth = at.start_of(at.count + static_cast<float>(taken + i)) + sum.reach(row[3], run.hit_clear) * at.length;
+      for (int32_t i = 0; i < here; i += 4) {
+        const int32_t some = here - i < 4 ? here - i : 4;
+        const Quad before = color;
+        const float clear_before = clear;
+        for (int32_t j = 0; j < 4; ++j) {
+          const Quad row = blend_rows(rows_m + rows[i + j], weights[i + j]);
+          const float alpha = j < some ? row[3] : 0.0f;
+          color = color + clear * alpha * row;
+          clear = clear * (1.0f - alpha);
         }
-        clear = left;
-        if (!(clear > run.stop_clear)) {
-          count = taken + i + 1;
-          break;
+        if (clear > run.stop_clear && (clear >= run.hit_clear || clear_before < run.hit_clear)) continue;
+        color = before;
+        clear = clear_before;
+        for (int32_t j = 0; j < some; ++j) {
+          const Quad row = blend_rows(rows_m + rows[i + j], weights[i + j]);
+          const float left = clear * (1.0f - row[3]);
+          if (left < run.hit_clear && clear >= run.hit_clear) {
+            sum.clear = clear;
+            const float number_here = at.count + static_cast<float>(taken + i + j);
+            sum.depth = at.start_of(number_here) + sum.reach(row[3], run.hit_clear) * at.length;
+          }
+          color = color + clear * row[3] * row;
+          clear = left;
+          if (!(clear > run.stop_clear)) {
+            count = taken + i + j + 1;
+            goto ended;
+          }
         }
       }
     }
+  ended:
     sum.red = color[0];
     sum.green = color[1];
     sum.blue = color[2];

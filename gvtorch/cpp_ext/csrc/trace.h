@@ -102,7 +102,10 @@ struct OneByOne {
   }
 };
 
-// Which nodes show nothing: worked out before the rays go, where many threads would each do it again.
+// Which nodes show nothing: worked out before the rays go on a GPU, where many threads would each do it again; on the
+// CPU, where most nodes are never visited, when the first ray comes.
+constexpr uint8_t kUnknown = 0, kShown = 1, kHidden = 2;
+
 template <class T, class Voxel>
 struct HideNode {
   BrickView<Voxel> bricks;
@@ -110,7 +113,7 @@ struct HideNode {
   uint8_t* hidden_tn;
 
   GV_HD void operator()(int64_t node) const {
-    hidden_tn[node] = hidden(bricks, Transfer<T>(transfer), static_cast<int32_t>(node)) ? 1 : 0;
+    hidden_tn[node] = hidden(bricks, Transfer<T>(transfer), static_cast<int32_t>(node)) ? kHidden : kShown;
   }
   // Everything in reach of the node's brick, and so of every node below it, is transparent.
   GV_HD static bool hidden(const BrickView<Voxel>& bricks, const Transfer<T>& transfer, int32_t node) {
@@ -130,7 +133,7 @@ struct TraceRay {
   TraceOptions<T> options;
   HitView<T> hits;
   const int32_t* frame_1;
-  const uint8_t* hidden_tn;  // null: every ray works it out
+  uint8_t* hidden_tn;
 
   explicit TraceRay(const TraceArgs& args)
       : rays{args.origin_r3, args.direction_r3, args.cone_r2, args.range_r2, args.place_33, args.cone_scale},
@@ -212,18 +215,22 @@ struct TraceRay {
     const T cone_high = reached ? above : voxel;
 
     const auto hides = [&](int32_t node) {
-      if (hidden_tn != nullptr) return hidden_tn[node] != 0;
-      return HideNode<T, Voxel>::hidden(bricks, shader, node);
+      uint8_t known = load_byte(&hidden_tn[node]);
+      if (known == kUnknown) {
+        known = HideNode<T, Voxel>::hidden(bricks, shader, node) ? kHidden : kShown;
+        store_byte(&hidden_tn[node], known);
+      }
+      return known == kHidden;
     };
     Number digits(tree, ray.at(middle));
-    const Place place = descend(tree, digits, wanted, *frame_1, hides, path);
+    const Place place = descend(tree, digits, wanted, blend, *frame_1, hides, path);
     const T exit = ray.leave(digits.corner(place.depth, levels), levels.size[place.depth]);
     const bool clear = place.hidden && (place.depth < wanted || !blend);
     if (!clear && mark_missing(place, wanted, blend, cone)) sum.missed = true;
 
     // The two levels that blend; below the finest level, or where both are the same node, only one is read.
     const Holder fine = place.fine;
-    const Holder coarse = blend && place.coarse.node >= 0 ? place.coarse : fine;
+    const Holder coarse = place.coarse.node >= 0 ? place.coarse : fine;
     const bool nothing = clear || fine.node < 0 || (fine.brick == kEmpty && coarse.brick == kEmpty);
     if (!clear && fine.brick >= 0) store_stamp(&bricks.stamp_b[fine.brick], *frame_1);
     if (!clear && coarse.brick >= 0) store_stamp(&bricks.stamp_b[coarse.brick], *frame_1);

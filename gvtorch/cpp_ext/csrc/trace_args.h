@@ -18,7 +18,7 @@ struct TraceArgs {
   const int32_t *opaque_m, *frame_1;
   void *color_r3, *alpha_r1, *depth_r1;
   int32_t* samples_r;
-  const uint8_t* hidden_tn;
+  uint8_t* hidden_tn;  // scratch, see HideNode
   bool* missed_r;
   int64_t rays, width, bricks, nodes;
   VoxelType voxel;

@@ -165,9 +165,10 @@ struct KeptPath {
 };
 
 // Descends to `wanted` depth, or as far as tiles exist and something is seen; stamps every tile on the way.
+// The coarse holder is looked for where two levels blend.
 template <class Number, class Hides, class Path>
-GV_HD Place descend(const TreeView& tree, Number& digits, int32_t wanted, int32_t frame, const Hides& hides,
-                    Path& path) {
+GV_HD Place descend(const TreeView& tree, Number& digits, int32_t wanted, bool blend, int32_t frame,
+                    const Hides& hides, Path& path) {
   Place place;
   place.node = tree.root;
   int32_t known = -1;
@@ -196,7 +197,7 @@ GV_HD Place descend(const TreeView& tree, Number& digits, int32_t wanted, int32_
     }
     if constexpr (!(Path::kKept && Number::kRandomAccess)) {
       if (place.brick != kAbsent) {
-        if (place.depth < wanted) place.coarse = {place.node, place.brick, place.depth};
+        if (blend && place.depth < wanted) place.coarse = {place.node, place.brick, place.depth};
         place.fine = {place.node, place.brick, place.depth};
       }
     }
@@ -212,8 +213,8 @@ GV_HD Place descend(const TreeView& tree, Number& digits, int32_t wanted, int32_
     int32_t level = place.depth;
     while (level > 0 && path.steps[level].brick == kAbsent) --level;
     if (path.steps[level].brick != kAbsent) place.fine = {path.steps[level].node, path.steps[level].brick, level};
-    while (level > 0 && (level >= wanted || path.steps[level].brick == kAbsent)) --level;
-    if (level < wanted && path.steps[level].brick != kAbsent) {
+    while (blend && level > 0 && (level >= wanted || path.steps[level].brick == kAbsent)) --level;
+    if (blend && level < wanted && path.steps[level].brick != kAbsent) {
       place.coarse = {path.steps[level].node, path.steps[level].brick, level};
     }
   }
