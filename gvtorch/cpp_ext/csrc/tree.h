@@ -160,7 +160,8 @@ struct KeptPath {
     const int32_t parted = (cell.x ^ digits.cell.x) | (cell.y ^ digits.cell.y) | (cell.z ^ digits.cell.z);
     if (parted == 0) return depth;
     const int32_t high = bit_width(parted);
-    return smaller(depth, (digits.top - high) / digits.bits);
+    const int32_t equal = digits.top - high;
+    return smaller(depth, digits.bits == 1 ? equal : equal / digits.bits);
   }
 };
 
