@@ -38,7 +38,8 @@ GV_HD BrickRay<T, Voxel> aim(const BrickView<Voxel>& view, const Levels<T>& leve
                              const Number& digits, Vec3<T> origin, Vec3<T> direction) {
   BrickRay<T, Voxel> ray;
   if (holder.brick < 0) {
-    if (holder.node >= 0) ray.constant = number<T>(view.constant_tnc[static_cast<int64_t>(holder.node) * view.channels + view.component]);
+    if (holder.node >= 0)
+      ray.constant = number<T>(view.constant_tnc[static_cast<int64_t>(holder.node) * view.channels + view.component]);
     return ray;
   }
   const int64_t volume = static_cast<int64_t>(view.side) * view.side * view.side;
@@ -54,21 +55,23 @@ GV_HD BrickRay<T, Voxel> aim(const BrickView<Voxel>& view, const Levels<T>& leve
   return ray;
 }
 
-template <class T, class Voxel>
+// kSide > 0: a brick of one channel and that side, so that eight addresses are one address and seven constants.
+template <int32_t kSide = 0, class T, class Voxel>
 GV_HD T sample(const BrickView<Voxel>& view, const BrickRay<T, Voxel>& ray, T t) {
   if (ray.voxels == nullptr) return ray.constant;
+  const int32_t side = kSide > 0 ? kSide : view.side;
   int32_t index[3];
   T weight[3];
-  const T last = static_cast<T>(view.side - 1);
+  const T last = static_cast<T>(side - 1);
   for (int axis = 0; axis < 3; ++axis) {
     const T place = clamp(ray.offset[axis] + t * ray.slope[axis], static_cast<T>(0), last);
-    const int32_t cell = smaller(static_cast<int32_t>(place), view.side - 2);
+    const int32_t cell = smaller(static_cast<int32_t>(place), side - 2);
     index[axis] = cell;
     weight[axis] = place - static_cast<T>(cell);
   }
-  const int32_t step_x = view.channels;
-  const int32_t step_y = step_x * view.side;
-  const int32_t step_z = step_y * view.side;
+  const int32_t step_x = kSide > 0 ? 1 : view.channels;
+  const int32_t step_y = step_x * side;
+  const int32_t step_z = step_y * side;
   const Voxel* corner = ray.voxels + (index[2] * step_z + index[1] * step_y + index[0] * step_x);
   T plane[2];
   for (int z = 0; z < 2; ++z) {

@@ -1,12 +1,13 @@
 // The cache's four ops on bare words: what rays asked for becomes a list, slots are ordered by use, pointers to
 // slots that change hands are cleared, new pointers are written.
 //
-// Equal to ops/reference_cache.py in every integer. What a device brings (cpu.cpp, cuda.cu), each with the number of
-// indices that keep accepts:
-//   for_each(n, body)            body(index)
-//   count(n, keep, kept)
-//   compact(n, keep, put, kept)  put(index, rank) for the indices that keep accepts, ranks rising with the index
-//   split(n, keep, put, kept)    put(index, rank) for all: those that keep accepts first, then the others
+// Equal to ops/reference_cache.py in every integer. What a device brings (cpu.cpp, cuda.cu):
+//   for_each(n, body)     body(index)
+//   compact(n, list)      list.flags(index) says whether an index is listed and whether it is touched at all, and
+//                         list.put(index, rank) is called for those that are, ranks rising with the index,
+//                         list.touch(index) for all that are touched, list.blank(rank) for every place left over,
+//                         list.total(listed, seen) once
+//   split(n, keep, put, kept)  put(index, rank) for all: those that keep accepts first, then the others
 // Method: Crassin et al., "GigaVoxels", I3D 2009, section 5 (usage stamps, LRU by compaction, request lists).
 #pragma once
 
@@ -22,43 +23,39 @@ constexpr int32_t kPending = kKinds << kPendingShift;
 
 GV_HD int32_t open_kinds(int32_t word) { return word & kKinds & ~(word >> kPendingShift); }
 
-struct KeepOpenRequest {
-  const int32_t* request_tn;
-  GV_HD bool operator()(int64_t node) const { return open_kinds(request_tn[node]) != 0; }
-};
+constexpr int32_t kListed = 1;   // it is to be put
+constexpr int32_t kSeen = 2;     // it is only counted
+constexpr int32_t kTouched = 4;  // it is to be touched
 
-// Lists a request; what a full list has no place for is only counted.
-struct PutRequest {
-  const int32_t* request_tn;
+// Lists requests and clears wishes; what a full list has no place for is only counted.
+struct ListRequests {
+  int32_t* request_tn;
   int32_t* node_k;
   int32_t* word_k;
+  int64_t* count_3;  // kept, found, wished
   int64_t capacity;
-  GV_HD void operator()(int64_t node, int64_t rank) const {
+
+  GV_HD int32_t flags(int64_t node) const {
+    const int32_t word = request_tn[node];
+    return (open_kinds(word) != 0 ? kListed : 0) | ((word & kKinds) != 0 ? kSeen : 0) |
+           ((word & ~kPending) != 0 ? kTouched : 0);
+  }
+  GV_HD void put(int64_t node, int64_t rank) const {
     if (rank >= capacity) return;
     const int32_t word = request_tn[node];
-    const int32_t kinds = open_kinds(word);
     node_k[rank] = static_cast<int32_t>(node);
-    word_k[rank] = kinds | (word & kPriorityMask);
+    word_k[rank] = open_kinds(word) | (word & kPriorityMask);
   }
-};
-
-struct KeepWish {
-  const int32_t* request_tn;
-  GV_HD bool operator()(int64_t node) const { return (request_tn[node] & kKinds) != 0; }
-};
-
-// (-, found, wished) -> (kept, found, wished).
-struct CapCount {
-  int64_t* count_3;
-  int64_t capacity;
-  GV_HD void operator()(int64_t) const { count_3[0] = smaller(count_3[1], capacity); }
-};
-
-struct ClearWishes {
-  int32_t* request_tn;
-  GV_HD void operator()(int64_t node) const {
-    const int32_t word = request_tn[node];
-    if ((word & ~kPending) != 0) request_tn[node] = word & kPending;
+  GV_HD void touch(int64_t node) const { request_tn[node] &= kPending; }
+  GV_HD int64_t places() const { return capacity; }
+  GV_HD void blank(int64_t rank) const {
+    node_k[rank] = -1;
+    word_k[rank] = 0;
+  }
+  GV_HD void total(int64_t listed, int64_t seen) const {
+    count_3[0] = smaller(listed, capacity);
+    count_3[1] = listed;
+    count_3[2] = seen;
   }
 };
 
@@ -92,6 +89,18 @@ struct FlagUse {
 struct KeepUnused {
   const uint8_t* used_k;
   GV_HD bool operator()(int64_t index) const { return used_k[index] == 0; }
+};
+
+// The same from the stamps, for a device that reads at random without waiting.
+struct KeepUnstamped {
+  const int32_t* order_k;
+  const int32_t* stamp_s;
+  uint64_t slots;
+  const int32_t* frame_1;
+  GV_HD bool operator()(int64_t index) const {
+    const auto slot = static_cast<uint32_t>(order_k[index]);
+    return !(slot < slots && stamp_s[slot] == *frame_1);
+  }
 };
 
 struct PutSlot {

@@ -10,6 +10,7 @@
 #include <cstring>
 #include <vector>
 
+#include "cache.h"
 #include "trace.h"
 
 namespace gvtorch {
@@ -54,7 +55,9 @@ inline const Processor& processor() {
   return found;
 }
 
-struct Cpu {};
+struct Cpu {
+  static constexpr bool kReadsAtRandom = false;
+};
 
 // Threads draw `share` neighbouring indices at a time from a counter: long rays do not leave a thread idle. Nothing
 // that a functor writes depends on which thread ran it.
@@ -76,18 +79,13 @@ struct Chunks {
   static constexpr int64_t kSize = 1 << 14;
   std::vector<int64_t> first;  // kept before each chunk, and in all
 
-  template <class Keep>
-  Chunks(const torch::stable::Tensor& like, int64_t count, const Keep& keep)
+  // found(begin, end): how many are kept.
+  template <class Found>
+  Chunks(const torch::stable::Tensor& like, int64_t count, const Found& found)
       : first(static_cast<size_t>((count + kSize - 1) / kSize) + 1, 0) {
     for_each<Cpu>(
         like, static_cast<int64_t>(first.size()) - 1,
-        [&](int64_t chunk) {
-          const int64_t end = std::min(count, (chunk + 1) * kSize);
-          int32_t found = 0;
-          for (int64_t index = chunk * kSize; index < end; ++index) found += keep(index) ? 1 : 0;
-          first[chunk + 1] = found;
-        },
-        1);
+        [&](int64_t chunk) { first[chunk + 1] = found(chunk * kSize, std::min(count, (chunk + 1) * kSize)); }, 1);
     for (size_t chunk = 1; chunk < first.size(); ++chunk) first[chunk] += first[chunk - 1];
   }
   // body(begin, end, chunk) for each chunk.
@@ -99,27 +97,43 @@ struct Chunks {
   }
 };
 
-template <class Device, class Keep>
-void count(const torch::stable::Tensor& like, int64_t size, const Keep& keep, int64_t* kept) {
-  *kept = Chunks(like, size, keep).first.back();
-}
-
-template <class Device, class Keep, class Put>
-void compact(const torch::stable::Tensor& like, int64_t count, const Keep& keep, const Put& put, int64_t* kept) {
-  const Chunks chunks(like, count, keep);
+template <class Device, class List>
+void compact(const torch::stable::Tensor& like, int64_t count, const List& list) {
+  std::atomic<int64_t> seen{0};
+  std::vector<uint8_t> touched(static_cast<size_t>((count + Chunks::kSize - 1) / Chunks::kSize), 0);
+  const Chunks chunks(like, count, [&](int64_t begin, int64_t end) {
+    int32_t listed = 0, counted = 0, any = 0;
+    for (int64_t index = begin; index < end; ++index) {
+      const int32_t flags = list.flags(index);
+      listed += flags & kListed;
+      counted += (flags & kSeen) / kSeen;
+      any |= flags;
+    }
+    touched[begin / Chunks::kSize] = (any & kTouched) != 0;
+    seen += counted;
+    return listed;
+  });
   chunks.place(like, count, [&](int64_t begin, int64_t end, int64_t chunk) {
     int64_t rank = chunks.first[chunk];
-    if (rank == chunks.first[chunk + 1]) return;
+    if (!touched[chunk]) return;
     for (int64_t index = begin; index < end; ++index) {
-      if (keep(index)) put(index, rank++);
+      const int32_t flags = list.flags(index);
+      if ((flags & kListed) != 0) list.put(index, rank++);
+      if ((flags & kTouched) != 0) list.touch(index);
     }
   });
-  *kept = chunks.first.back();
+  const int64_t total = chunks.first.back();
+  for (int64_t rank = total; rank < list.places(); ++rank) list.blank(rank);
+  list.total(total, seen);
 }
 
 template <class Device, class Keep, class Put>
 void split(const torch::stable::Tensor& like, int64_t count, const Keep& keep, const Put& put, int64_t* kept) {
-  const Chunks chunks(like, count, keep);
+  const Chunks chunks(like, count, [&](int64_t begin, int64_t end) {
+    int32_t found = 0;
+    for (int64_t index = begin; index < end; ++index) found += keep(index) ? 1 : 0;
+    return found;
+  });
   const int64_t total = chunks.first.back();
   chunks.place(like, count, [&](int64_t begin, int64_t end, int64_t chunk) {
     int64_t rank = chunks.first[chunk];
@@ -141,9 +155,8 @@ void trace(const torch::stable::Tensor& like, TraceArgs args, bool wide) {
   args.hidden_tn = static_cast<uint8_t*>(hidden_tn.mutable_data_ptr());
   const int64_t count = RayOrder{args.rays, args.width}.count();
   if (wide) {
-    with_voxel(args.voxel, [&](auto voxel) {
-      for_each<Device>(like, count, TraceRay<double, decltype(voxel)>(args), kChunk);
-    });
+    with_voxel(args.voxel,
+               [&](auto voxel) { for_each<Device>(like, count, TraceRay<double, decltype(voxel)>(args), kChunk); });
     return;
   }
   const auto chunk = [&](int64_t number) {

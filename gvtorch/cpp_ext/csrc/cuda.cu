@@ -7,21 +7,23 @@
 #include <torch/csrc/stable/tensor.h>
 
 #include <cstdint>
-#include <cub/device/device_scan.cuh>
+#include <cub/block/block_reduce.cuh>
+#include <cub/block/block_scan.cuh>
 
+#include "cache.h"
 #include "trace.h"
 
 namespace gvtorch {
 
-struct Cuda {};
+struct Cuda {
+  static constexpr bool kReadsAtRandom = true;
+};
 
-#ifndef GV_TRY_MIN
-#define GV_TRY_MIN 8
-#endif
-// 8 blocks of 128 on a multiprocessor leave 64 registers to a thread: waiting for memory is what tracing must hide.
+// That many blocks on a multiprocessor leave 64 registers to a thread: waiting for memory is what tracing must hide.
 constexpr int kBlock = 128;
+constexpr int kBlocksAtOnce = 8;
 template <class Functor>
-__global__ void __launch_bounds__(kBlock, GV_TRY_MIN) run_functor(Functor functor, int64_t count) {
+__global__ void __launch_bounds__(kBlock, kBlocksAtOnce) run_functor(Functor functor, int64_t count) {
   const int64_t stride = static_cast<int64_t>(gridDim.x) * blockDim.x;
   for (int64_t index = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x; index < count; index += stride) {
     functor(index);
@@ -64,113 +66,179 @@ void trace(const torch::stable::Tensor& like, const TraceArgs& args, bool wide) 
   });
 }
 
-// The primitives of cache.h. Blocks count chunks, a scan tells where each begins, and blocks place them; a chunk of
-// which nothing is kept is not read again.
+// The primitives of cache.h in three kernels: blocks count chunks, one block adds the counts up, and blocks place
+// their chunks. What a chunk has nothing of is not read again.
 constexpr int kThreads = 256;
-constexpr int64_t kChunk = 16 * kThreads;
+constexpr int kScanThreads = 1024;
+constexpr int64_t kChunk = 8 * kThreads;
 
-template <class Keep>
-__global__ void __launch_bounds__(kThreads) count_chunks(Keep keep, int64_t count, int32_t* found_c, int64_t* sum) {
-  __shared__ int32_t total;
-  if (threadIdx.x == 0) total = 0;
+// Found in each chunk, in the chunks before it, seen, touched; the totals of found and seen stand behind the last.
+struct ChunkCounts {
+  int32_t *found, *first, *seen, *touched;
+  int64_t* total_2;
+};
+
+__device__ __forceinline__ int32_t warp_sum(int32_t value) {
+  for (int offset = 16; offset > 0; offset /= 2) value += __shfl_xor_sync(0xffffffff, value, offset);
+  return value;
+}
+
+template <class Flags>
+__global__ void __launch_bounds__(kThreads) count_chunks(Flags flags, int64_t count, ChunkCounts counts) {
+  __shared__ int32_t sum[3];
+  if (threadIdx.x < 3) sum[threadIdx.x] = 0;
   __syncthreads();
   const int64_t first = blockIdx.x * kChunk + threadIdx.x;
-  int32_t found = 0;
+  int32_t found = 0, seen = 0, any = 0;
 #pragma unroll
   for (int64_t offset = 0; offset < kChunk; offset += kThreads) {
-    if (first + offset < count && keep(first + offset)) ++found;
+    const int32_t here = first + offset < count ? flags(first + offset) : 0;
+    found += here & kListed;
+    seen += (here & kSeen) / kSeen;
+    any |= here;
   }
-  found = __reduce_add_sync(0xffffffff, found);
-  if (threadIdx.x % 32 == 0 && found > 0) atomicAdd(&total, found);
+  found = warp_sum(found);
+  seen = warp_sum(seen);
+  any = __any_sync(0xffffffff, any & kTouched) ? kTouched : 0;
+  if (threadIdx.x % 32 == 0) {
+    if (found > 0) atomicAdd(&sum[0], found);
+    if (seen > 0) atomicAdd(&sum[1], seen);
+    if (any != 0) atomicOr(&sum[2], any);
+  }
   __syncthreads();
   if (threadIdx.x != 0) return;
-  if (found_c != nullptr) found_c[blockIdx.x] = total;
-  if (sum != nullptr && total > 0) atomicAdd(reinterpret_cast<unsigned long long*>(sum), total);
+  counts.found[blockIdx.x] = sum[0];
+  counts.seen[blockIdx.x] = sum[1];
+  counts.touched[blockIdx.x] = sum[2];
 }
 
-template <bool kAll, class Keep, class Put>
-__global__ void __launch_bounds__(kThreads)
-    place_chunks(Keep keep, Put put, int64_t count, const int32_t* found_c, const int32_t* first_c, int64_t* kept) {
-  __shared__ int32_t before[kThreads / 32 + 1];  // kept in the warps before each, and in all
+__global__ void __launch_bounds__(kScanThreads) add_chunks(ChunkCounts counts, int64_t chunks) {
+  using Scan = cub::BlockScan<int32_t, kScanThreads>;
+  using Reduce = cub::BlockReduce<int64_t, kScanThreads>;
+  __shared__ typename Scan::TempStorage scratch;
+  __shared__ typename Reduce::TempStorage reduce_scratch;
+  int64_t before = 0;
+  int64_t seen = 0;
+  for (int64_t start = 0; start < chunks; start += kScanThreads) {
+    const int64_t chunk = start + threadIdx.x;
+    const int32_t found = chunk < chunks ? counts.found[chunk] : 0;
+    if (chunk < chunks) seen += counts.seen[chunk];
+    int32_t rank = 0, here = 0;
+    Scan(scratch).ExclusiveSum(found, rank, here);
+    if (chunk < chunks) counts.first[chunk] = static_cast<int32_t>(before + rank);
+    before += here;
+    __syncthreads();
+  }
+  seen = Reduce(reduce_scratch).Sum(seen);
+  if (threadIdx.x != 0) return;
+  counts.total_2[0] = before;
+  counts.total_2[1] = seen;
+}
+
+// body(index, flags, rank) for the indices of the block's chunk; rank: listed ones before it.
+template <class Flags, class Body>
+__device__ void visit_chunk(const Flags& flags, int64_t count, int64_t rank, const Body& body) {
+  __shared__ int32_t before[kThreads / 32];  // listed in each warp
   const int warp = threadIdx.x / 32;
   const int lane = threadIdx.x % 32;
-  const int64_t total = int64_t{first_c[gridDim.x - 1]} + found_c[gridDim.x - 1];
-  if (blockIdx.x == 0 && threadIdx.x == 0) *kept = total;
-  if (!kAll && found_c[blockIdx.x] == 0) return;
-  int64_t rank = first_c[blockIdx.x];
   for (int64_t offset = 0; offset < kChunk; offset += kThreads) {
     const int64_t index = blockIdx.x * kChunk + offset + threadIdx.x;
-    const bool keeps = index < count && keep(index);
-    const unsigned votes = __ballot_sync(0xffffffff, keeps);
-    if (lane == 0) before[warp + 1] = __popc(votes);
-    if (threadIdx.x == 0) before[0] = 0;
+    const int32_t here = index < count ? flags(index) : 0;
+    const unsigned votes = __ballot_sync(0xffffffff, (here & kListed) != 0);
+    if (lane == 0) before[warp] = __popc(votes);
     __syncthreads();
-    if (threadIdx.x == 0) {
-      for (int other = 1; other <= kThreads / 32; ++other) before[other] += before[other - 1];
+    int64_t own = rank + __popc(votes & ((1u << lane) - 1));
+    for (int other = 0; other < kThreads / 32; ++other) {
+      if (other < warp) own += before[other];
+      rank += before[other];
     }
-    __syncthreads();
-    const int64_t own = rank + before[warp] + __popc(votes & ((1u << lane) - 1));
-    if (keeps) {
-      put(index, own);
-    } else if (kAll && index < count) {
-      put(index, total + index - own);
-    }
-    rank += before[kThreads / 32];
+    if (index < count) body(index, here, own);
     __syncthreads();
   }
 }
 
-// The grid of a pass over chunks, and the stream it runs on.
+template <class List>
+struct ListFlags {
+  List list;
+  __device__ int32_t operator()(int64_t index) const { return list.flags(index); }
+};
+
+template <class Keep>
+struct KeepFlags {
+  Keep keep;
+  __device__ int32_t operator()(int64_t index) const { return keep(index) ? kListed | kTouched : kTouched; }
+};
+
+template <class List>
+__global__ void __launch_bounds__(kThreads) place_listed(List list, int64_t count, ChunkCounts counts) {
+  const int64_t threads = static_cast<int64_t>(gridDim.x) * kThreads;
+  const int64_t thread = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+  for (int64_t rank = counts.total_2[0] + thread; rank < list.places(); rank += threads) list.blank(rank);
+  if (thread == 0) list.total(counts.total_2[0], counts.total_2[1]);
+  if (counts.touched[blockIdx.x] == 0) return;
+  visit_chunk(ListFlags<List>{list}, count, counts.first[blockIdx.x], [&](int64_t index, int32_t flags, int64_t rank) {
+    if ((flags & kListed) != 0) list.put(index, rank);
+    if ((flags & kTouched) != 0) list.touch(index);
+  });
+}
+
+template <class Keep, class Put>
+__global__ void __launch_bounds__(kThreads)
+    place_split(Keep keep, Put put, int64_t count, ChunkCounts counts, int64_t* kept) {
+  const int64_t total = counts.total_2[0];
+  if (blockIdx.x == 0 && threadIdx.x == 0) *kept = total;
+  visit_chunk(KeepFlags<Keep>{keep}, count, counts.first[blockIdx.x], [&](int64_t index, int32_t flags, int64_t rank) {
+    put(index, (flags & kListed) != 0 ? rank : total + index - rank);
+  });
+}
+
+// The memory and the stream of the three kernels.
 struct Pass {
   torch::stable::accelerator::DeviceGuard guard;
-  cudaStream_t stream = nullptr;
-  unsigned chunks;
+  int64_t chunks;
+  torch::stable::Tensor words;
+  ChunkCounts counts;
+  cudaStream_t stream;
+
   Pass(const torch::stable::Tensor& like, int64_t count)
-      : guard(like.get_device_index()), chunks(static_cast<unsigned>((count + kChunk - 1) / kChunk)) {
+      : guard(like.get_device_index()),
+        chunks((count + kChunk - 1) / kChunk > 0 ? (count + kChunk - 1) / kChunk : 1),
+        words(torch::stable::new_empty(like, {2 + 2 * chunks}, torch::headeronly::ScalarType::Long)) {
     void* current = nullptr;
     TORCH_ERROR_CODE_CHECK(aoti_torch_get_current_cuda_stream(like.get_device_index(), &current));
     stream = static_cast<cudaStream_t>(current);
+    counts.total_2 = static_cast<int64_t*>(words.mutable_data_ptr());
+    counts.found = reinterpret_cast<int32_t*>(counts.total_2 + 2);
+    counts.first = counts.found + chunks;
+    counts.seen = counts.first + chunks;
+    counts.touched = counts.seen + chunks;
   }
-  static void check(cudaError_t status) {
+  unsigned blocks() const { return static_cast<unsigned>(chunks); }
+  template <class Flags>
+  void count(const Flags& flags, int64_t size) const {
+    count_chunks<<<blocks(), kThreads, 0, stream>>>(flags, size, counts);
+    add_chunks<<<1, kScanThreads, 0, stream>>>(counts, chunks);
+  }
+  static void check() {
+    const cudaError_t status = cudaGetLastError();
     STD_TORCH_CHECK(status == cudaSuccess, "gvtorch: kernel launch failed: ", cudaGetErrorString(status));
   }
 };
 
-template <class Device, class Keep>
-void count(const torch::stable::Tensor& like, int64_t size, const Keep& keep, int64_t* kept) {
-  if (size == 0) return;  // the counts are zero already
-  const Pass pass(like, size);
-  count_chunks<<<pass.chunks, kThreads, 0, pass.stream>>>(keep, size, nullptr, kept);
-  Pass::check(cudaGetLastError());
-}
-
-template <bool kAll, class Keep, class Put>
-void place(const torch::stable::Tensor& like, int64_t count, const Keep& keep, const Put& put, int64_t* kept) {
-  using torch::headeronly::ScalarType;
-  if (count == 0) return;
+template <class Device, class List>
+void compact(const torch::stable::Tensor& like, int64_t count, const List& list) {
   const Pass pass(like, count);
-  torch::stable::Tensor words = torch::stable::new_empty(like, {2, pass.chunks}, ScalarType::Int);
-  auto* found_c = static_cast<int32_t*>(words.mutable_data_ptr());
-  int32_t* first_c = found_c + pass.chunks;
-  count_chunks<<<pass.chunks, kThreads, 0, pass.stream>>>(keep, count, found_c, nullptr);
-  Pass::check(cudaGetLastError());
-  size_t bytes = 0;
-  Pass::check(cub::DeviceScan::ExclusiveSum(nullptr, bytes, found_c, first_c, pass.chunks, pass.stream));
-  torch::stable::Tensor scratch = torch::stable::new_empty(like, {static_cast<int64_t>(bytes)}, ScalarType::Byte);
-  Pass::check(cub::DeviceScan::ExclusiveSum(scratch.mutable_data_ptr(), bytes, found_c, first_c, pass.chunks,
-                                            pass.stream));
-  place_chunks<kAll><<<pass.chunks, kThreads, 0, pass.stream>>>(keep, put, count, found_c, first_c, kept);
-  Pass::check(cudaGetLastError());
-}
-
-template <class Device, class Keep, class Put>
-void compact(const torch::stable::Tensor& like, int64_t count, const Keep& keep, const Put& put, int64_t* kept) {
-  place<false>(like, count, keep, put, kept);
+  pass.count(ListFlags<List>{list}, count);
+  place_listed<<<pass.blocks(), kThreads, 0, pass.stream>>>(list, count, pass.counts);
+  Pass::check();
 }
 
 template <class Device, class Keep, class Put>
 void split(const torch::stable::Tensor& like, int64_t count, const Keep& keep, const Put& put, int64_t* kept) {
-  place<true>(like, count, keep, put, kept);
+  const Pass pass(like, count);
+  pass.count(KeepFlags<Keep>{keep}, count);
+  place_split<<<pass.blocks(), kThreads, 0, pass.stream>>>(keep, put, count, pass.counts, kept);
+  Pass::check();
 }
 
 }  // namespace gvtorch

@@ -107,9 +107,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> trace_rays(
                   "gvtorch: border or component out of range");
   STD_TORCH_CHECK(step > 0 && root_voxel > 0, "gvtorch: step and root_voxel must be positive");
   STD_TORCH_CHECK(width >= 0 && (width == 0 || rays % width == 0), "gvtorch: rays are no rows of this width");
-  STD_TORCH_CHECK(table_lm4.dim() == 3 && table_lm4.size(0) >= 1 && table_lm4.size(1) >= 2 &&
-                      table_lm4.size(1) <= INT32_MAX,
-                  "gvtorch: table_lm4 must be (l, m, 4) with m >= 2");
+  STD_TORCH_CHECK(
+      table_lm4.dim() == 3 && table_lm4.size(0) >= 1 && table_lm4.size(1) >= 2 && table_lm4.size(1) <= INT32_MAX,
+      "gvtorch: table_lm4 must be (l, m, 4) with m >= 2");
 
   for (const auto& [tensor, name, numel] :
        {std::tuple<const Tensor&, const char*, int64_t>{origin_r3, "origin_r3", 3 * rays},
@@ -203,16 +203,11 @@ std::tuple<Tensor, Tensor, Tensor> compact_requests(const Tensor& request_tn, in
   require(request_tn, "request_tn", request_tn, ScalarType::Int);
   STD_TORCH_CHECK(capacity >= 1 && request_tn.numel() <= INT32_MAX, "gvtorch: capacity or request_tn out of range");
   Tensor node_k = torch::stable::new_empty(request_tn, {capacity});
-  Tensor word_k = torch::stable::new_zeros(request_tn, {capacity});
-  Tensor count_3 = torch::stable::new_zeros(request_tn, {3}, ScalarType::Long);
-  torch::stable::fill_(node_k, -1);
-  const int64_t nodes = request_tn.numel();
+  Tensor word_k = torch::stable::new_empty(request_tn, {capacity});
+  Tensor count_3 = torch::stable::new_empty(request_tn, {3}, ScalarType::Long);
   auto* count = static_cast<int64_t*>(count_3.mutable_data_ptr());
-  compact<Device>(request_tn, nodes, KeepOpenRequest{words_in(request_tn)},
-                  PutRequest{words_in(request_tn), words_out(node_k), words_out(word_k), capacity}, count + 1);
-  gvtorch::count<Device>(request_tn, nodes, KeepWish{words_in(request_tn)}, count + 2);
-  for_each<Device>(request_tn, 1, CapCount{count, capacity});
-  for_each<Device>(request_tn, nodes, ClearWishes{words_out(request_tn)});
+  compact<Device>(request_tn, request_tn.numel(),
+                  ListRequests{words_out(request_tn), words_out(node_k), words_out(word_k), count, capacity});
   return {node_k, word_k, count_3};
 }
 
@@ -224,17 +219,23 @@ std::tuple<Tensor, Tensor> lru_partition(const Tensor& order_k, const Tensor& st
   }
   require_numel(frame_1, "frame_1", 1);
   Tensor sorted_k = torch::stable::new_empty(order_k, {order_k.numel()});
-  Tensor unused_1 = torch::stable::new_zeros(order_k, {1}, ScalarType::Long);
+  Tensor unused_1 = torch::stable::new_empty(order_k, {1}, ScalarType::Long);
   auto* unused = static_cast<int64_t*>(unused_1.mutable_data_ptr());
   const int64_t size = order_k.numel();
-  Tensor used_k = torch::stable::new_empty(order_k, {size}, ScalarType::Byte);
-  auto* flags = static_cast<uint8_t*>(used_k.mutable_data_ptr());
   const int64_t slots = stamp_s.numel();
-  Tensor used_s = torch::stable::new_empty(order_k, {(slots + 7) / 8}, ScalarType::Byte);
-  auto* bits = static_cast<uint8_t*>(used_s.mutable_data_ptr());
-  for_each<Device>(order_k, (slots + 7) / 8, PackUse{words_in(stamp_s), slots, words_in(frame_1), bits});
-  for_each<Device>(order_k, size, FlagUse{words_in(order_k), bits, static_cast<uint64_t>(slots), flags});
-  split<Device>(order_k, size, KeepUnused{flags}, PutSlot{words_in(order_k), words_out(sorted_k)}, unused);
+  const PutSlot put{words_in(order_k), words_out(sorted_k)};
+  if constexpr (Device::kReadsAtRandom) {
+    const KeepUnstamped keep{words_in(order_k), words_in(stamp_s), static_cast<uint64_t>(slots), words_in(frame_1)};
+    split<Device>(order_k, size, keep, put, unused);
+  } else {
+    Tensor used_k = torch::stable::new_empty(order_k, {size}, ScalarType::Byte);
+    Tensor used_s = torch::stable::new_empty(order_k, {(slots + 7) / 8}, ScalarType::Byte);
+    auto* flags = static_cast<uint8_t*>(used_k.mutable_data_ptr());
+    auto* bits = static_cast<uint8_t*>(used_s.mutable_data_ptr());
+    for_each<Device>(order_k, (slots + 7) / 8, PackUse{words_in(stamp_s), slots, words_in(frame_1), bits});
+    for_each<Device>(order_k, size, FlagUse{words_in(order_k), bits, static_cast<uint64_t>(slots), flags});
+    split<Device>(order_k, size, KeepUnused{flags}, put, unused);
+  }
   return {sorted_k, unused_1};
 }
 

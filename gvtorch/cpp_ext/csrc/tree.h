@@ -167,8 +167,8 @@ struct KeptPath {
 // Descends to `wanted` depth, or as far as tiles exist and something is seen; stamps every tile on the way.
 // The coarse holder is looked for where two levels blend.
 template <class Number, class Hides, class Path>
-GV_HD Place descend(const TreeView& tree, Number& digits, int32_t wanted, bool blend, int32_t frame,
-                    const Hides& hides, Path& path) {
+GV_HD Place descend(const TreeView& tree, Number& digits, int32_t wanted, bool blend, int32_t frame, const Hides& hides,
+                    Path& path) {
   Place place;
   place.node = tree.root;
   int32_t known = -1;
