@@ -16,7 +16,7 @@ STOP_ALPHA = 0.99
 #: The depth of a ray is where its alpha passes this; rays that stay below have depth +inf.
 DEPTH_ALPHA = 0.1
 
-#: Interval length in voxels of the finest level.
+#: Shortest interval, in voxels of the finest level.
 STEP = 0.5
 
 #: Most voxels that a volume read at once may have (2^31).

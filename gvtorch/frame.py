@@ -18,9 +18,7 @@ class Rays:
     direction: Tensor  # (r, 3), unit length
     cone: Tensor  # (r, 2) width at the origin, growth of the width per unit distance
     range: Tensor  # (r, 2) first and last distance along the ray; +inf is allowed for the last
-    width: int = (
-        0  # pixels of a row, if these are whole rows of a picture; they are traced in tiles
-    )
+    width: int = 0  # pixels of a row, if these are whole rows of a picture: traced in tiles
 
     def __getitem__(self, index: Tensor | slice) -> Rays:
         """Some of the rays, which are no rows any more."""

@@ -90,7 +90,7 @@ def trace_rays(
         constant_tnc: (t, n, c) the value of CONSTANT nodes (and the mean of EMPTY ones), same
             dtype.
         range_tn2c: (t, n, 2, c) smallest and largest value in reach of the node's brick, same
-            dtype: a node that shows nothing is neither sampled nor requested.
+            dtype: a node that shows nothing is neither entered, sampled nor requested.
         stamp_b: (b,) last frame that used a brick, written.
         table_lm4: (l, m, 4) transfer function: linear RGB, and the alpha of an interval of
             step * 2^l; m >= 2. Its memory begins at a multiple of 16 bytes.

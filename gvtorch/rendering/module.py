@@ -42,7 +42,7 @@ class TreeTracer(torch.nn.Module):
             shader: The transfer function.
             channel: Name of the channel it reads; the first if left out.
             component: Which number of the channel.
-            step: Interval length in voxels of the finest level.
+            step: Shortest interval, in voxels of the finest level.
             stop_alpha: A ray ends at this alpha.
             depth_alpha: Depth is where alpha passes this.
 
@@ -95,14 +95,14 @@ class TreeTracer(torch.nn.Module):
         """Traces rays in world units.
 
         Args:
-            origin: (r, 3) float32.
-            direction: (r, 3) float32, unit length.
-            cone: (r, 2) float32, width at the origin and growth per unit distance; zeros for the
-                finest level.
-            range: (r, 2) float32, first and last distance.
+            origin: (r, 3) float32 or float64, as the others: rays enter the tree in float64.
+            direction: (r, 3) unit length.
+            cone: (r, 2) width at the origin and growth per unit distance; zeros for the finest
+                level.
+            range: (r, 2) first and last distance.
 
         Returns:
-            color (r, 3) premultiplied, alpha (r, 1), depth (r, 1), samples (r,) int32.
+            color (r, 3) premultiplied, alpha (r, 1), depth (r, 1), all float32; samples (r,) int32.
         """
         color, alpha, depth, samples, _ = torch.ops.gvtorch.trace_rays(
             origin.to(torch.float64).contiguous(),

@@ -27,7 +27,7 @@ _RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that p
 class RenderOptions:
     """How a picture is made."""
 
-    step: float = config.STEP  # interval length in voxels of the finest level
+    step: float = config.STEP  # shortest interval, in voxels of the finest level
     lod: Literal["auto", "finest"] = "auto"  # auto: voxels as wide as the pixel cone
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # linear RGB
     stop_alpha: float = config.STOP_ALPHA  # a ray ends here; 1 integrates to the end

@@ -60,6 +60,9 @@ _KEPT_TABLES = 4
 class TransferFunction:
     """Two piecewise linear functions of a value in data units; constant beyond their end points.
 
+    Attributes may be edited: the next picture is made with them (a `TreeTracer` or a captured
+    frame keeps those it was made with).
+
     Attributes:
         opacity: (k, 2) float64 points (value, alpha per reference length).
         color: (k, 4) float64 points (value, linear r, g, b).
@@ -159,8 +162,8 @@ class TransferFunction:
         """Returns the function as the kernel reads it: rows at even distances over a domain.
 
         Rows are laid so that every corner point falls on one, where that takes no more than 2^16
-        cells; else so densely that no two corners share 16 cells. Between rows, colour and alpha
-        are linear.
+        cells; else so densely that corners are at least 16 cells apart. There are at least 1,024
+        cells. Between rows, colour and alpha are linear.
 
         Args:
             smallest_spacing: World units; opacity's reference length where none was given.
