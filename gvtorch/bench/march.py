@@ -49,7 +49,7 @@ def march(record: Record) -> None:
             _compare(record, scene, tree, size, peers, ("finest", "auto"))
     record.note(
         "auto: levels by cone. Differences are from the finest level's picture, over colour and "
-        "alpha. op_ms: the compiled op alone; ms: moving rays to the tree and the table as well."
+        "alpha. op_ms: the compiled op alone; ms: the whole of `trace`."
     )
 
 
