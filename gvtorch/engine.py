@@ -114,7 +114,9 @@ class Engine:
     ) -> tuple[Picture, FrameStats]:
         """Produces what the last picture missed, then renders one from what is there.
 
-        On CUDA nobody waits for the device: the picture is on its way when this returns.
+        While something is missing, a few rays go ahead of the picture, so that the tree grows by
+        more than a level a frame (`EngineOptions.scout_rounds`), and the host waits for them. Else,
+        on CUDA, nobody waits for the device: the picture is on its way when this returns.
 
         Args:
             camera: One camera or a batch; an orbit camera stands around the scene's box.
@@ -196,9 +198,10 @@ class Engine:
             written = sum(stats.produced.values())
             if hits is None:
                 hits = empty_hits(self.device, view[-1], count)
-                last = self._missed
-                known = last is not None and len(last) == count
-                hits.missed.copy_(last) if known else hits.missed.fill_(True)
+                if self._missed is not None and len(self._missed) == count:
+                    hits.missed.copy_(self._missed)
+                else:  # a picture of another size
+                    hits.missed.fill_(True)
             where = scouts(hits.missed, camera.width)
             trace_camera(*view, no_progress, again=(hits, where))
             listed, sent = self._collect(hits.samples[:0])

@@ -33,7 +33,7 @@ class EngineOptions:
     load_budget: int = 4096  # most bricks a frame
     subdivide_budget: int = 4096  # most node tiles a frame
     time_budget: float | None = None  # most milliseconds of production a frame
-    scout_rounds: int = 2  # rays sent ahead, so often a frame, while things are missing; 0: never
+    scout_rounds: int = 2  # rounds of a sixteenth of the rays before a frame that missed something
     patience: float = 120.0  # seconds until an answer that does not come is given up
     strict: bool = False  # raise when something can't be produced
     monitor: bool = True  # time the stages and remember the last frames, for `report`
