@@ -30,16 +30,18 @@ from .rendering.renderer import (
     check_type,
     composite_trees,
     develop,
+    empty_hits,
     render_options,
     trace_camera,
 )
 from .report import Report
 from .scene import EngineOptions, brick_bytes, checked_device, make_plant, make_pools
 from .stage import Progress, collect_timings, mark, milliseconds, no_progress, stage
-from .turns import Turns
+from .turns import Turns, scouts
 
 Scene = Producer | Mapping[str, Producer]
 Shaders = TransferFunction | Mapping[str, TransferFunction]
+_View = tuple[Camera, torch.device, Callable[[Rays], Hits], torch.dtype]  # of `trace_camera`
 
 _LISTED = 1 << 17  # most nodes with a wish that one frame lists
 _PAYLOAD = 256 * 10**6  # most bytes of voxels produced in one frame
@@ -91,6 +93,7 @@ class Engine:
         self.frames, self._closed = 0, False
         self._frame_1 = torch.zeros(1, dtype=torch.int32, device=self.device)
         self._traced: deque[_Traced] = deque()  # frames whose counts are on their way
+        self._missed: Tensor | None = None  # (r,) bool, of the last picture's rays
         self._steady = False
         self._report = Report()
         self.plants: dict[str, Plant] = {}
@@ -111,7 +114,9 @@ class Engine:
     ) -> tuple[Picture, FrameStats]:
         """Produces what the last picture missed, then renders one from what is there.
 
-        On CUDA nobody waits for the device: the picture is on its way when this returns.
+        While something is missing, a few rays go ahead of the picture, so that the tree grows by
+        more than a level a frame (`EngineOptions.scout_rounds`), and the host waits for them. Else,
+        on CUDA, nobody waits for the device: the picture is on its way when this returns.
 
         Args:
             camera: One camera or a batch; an orbit camera stands around the scene's box.
@@ -144,9 +149,12 @@ class Engine:
         with self._unbroken(), self._timed(stats):
             self._catch_up(stats)  # 1, 2, 3, 4
             trace = self._tracer(shader, chosen)
-            world, device = camera.placed(self.box), self.device
-            hits = trace_camera(world, device, trace, chosen.dtype, progress, again=again)  # 5, 6
-            self._send(stats, hits.alpha.shape[0], *self._collect(hits))  # 7, 8
+            view = camera.placed(self.box), self.device, trace, chosen.dtype
+            if again is None:
+                self._scout(view, stats)
+            self._count_up()
+            hits = trace_camera(*view, progress, again=again)  # 5, 6
+            self._send(stats, hits, *self._collect(hits.samples))  # 7, 8
         if self.options.monitor:
             self._report.add(stats)
         self.production.raise_if_strict()
@@ -167,13 +175,40 @@ class Engine:
         if not self._traced:
             if last is not None:
                 self.cache.make_room(last.numbers.tiles_unused, last.numbers.bricks_unused)
+                self.scheduler.begin()
                 if last.numbers.listed:
                     # Nothing was written since it was traced: its nodes are those that rays saw.
                     self._serve(last.listed.read(self.cache.nodes, last.numbers), stats)
             with stage("write"):
                 self.production.write(self.production.late(), stats)
-        stats.pending = sum(self.production.pending.values())
-        stats.failed = self.production.failed
+
+    def _scout(self, view: _View, stats: FrameStats) -> None:
+        """Sends rays ahead of the picture: while answers are written at once, some of those that
+        missed something are traced again, and what they miss next is served within this frame.
+
+        They count as rays of the last picture: what any of these used, and what was written since,
+        stays. What is too much for budgets or pools is left to the whole picture.
+        """
+        camera, written = view[0], 0
+        count = len(camera) * camera.height * camera.width
+        hits = None
+        for _ in range(self.options.scout_rounds):
+            if sum(stats.produced.values()) == written or stats.capacity_exceeded:
+                break  # there is nothing more to see, or no room for it
+            written = sum(stats.produced.values())
+            if hits is None:
+                hits = empty_hits(self.device, view[-1], count)
+                if self._missed is not None and len(self._missed) == count:
+                    hits.missed.copy_(self._missed)
+                else:  # a picture of another size
+                    hits.missed.fill_(True)
+            where = scouts(hits.missed, camera.width)
+            trace_camera(*view, no_progress, again=(hits, where))
+            listed, sent = self._collect(hits.samples[:0])
+            numbers = _Numbers(*sent.tolist())  # a frame that misses something waits anyway
+            _add(stats.requests, {name: getattr(numbers, name) for name in KINDS})
+            self.cache.make_room(numbers.tiles_unused, numbers.bricks_unused)
+            self._serve(listed.read(self.cache.nodes, numbers), stats)
 
     def _next_counts(self) -> _Traced:
         """Takes the counts of the oldest frame under way; waits until they are here."""
@@ -186,31 +221,35 @@ class Engine:
         with stage("schedule"):
             pending = self.production.pending
             room = {kind: max(0, n - pending[kind]) for kind, n in self.cache.room().items()}
-            served, stats.deferred, exceeded = self.scheduler.choose(wishes, room)
+            served, deferred, exceeded = self.scheduler.choose(wishes, room)
             if exceeded:
                 coarser = self.cache.stand_ins(wishes, room)
-                served, stats.deferred, _ = self.scheduler.choose(coarser, room)
+                served, deferred, _ = self.scheduler.choose(coarser, room)
+            stats.deferred += deferred
             stats.capacity_exceeded |= exceeded
         with stage("produce"):
             answers = self.production.ask([*self.plants.values()], served)
         with stage("write"):
             self.production.write(answers, stats)
 
-    def _collect(self, hits: Hits) -> tuple[Listed, Tensor]:
-        """What a traced frame leaves on the device: the wishes, and (10,) int64 `_Numbers`."""
+    def _collect(self, samples: Tensor) -> tuple[Listed, Tensor]:
+        """What a traced frame leaves on the device: the wishes, and (10,) int64 `_Numbers`, the
+        sum of (r,) samples among them.
+        """
         with stage("requests"):
             listed = self.cache.requests(min(_LISTED, self.cache.nodes.child_tn.numel()))
         with stage("lru"):
             use = self.cache.sort_by_use(self._frame_1)
         with stage("count"):
-            samples = hits.samples.sum(dtype=torch.int64).view(1)
-            return listed, torch.cat((listed.count, use, samples))
+            total = samples.sum(dtype=torch.int64).view(1)
+            return listed, torch.cat((listed.count, use, total))
 
-    def _send(self, stats: FrameStats, rays: int, listed: Listed, numbers: Tensor) -> None:
+    def _send(self, stats: FrameStats, hits: Hits, listed: Listed, numbers: Tensor) -> None:
         """Sends a frame's counts to the host; until they are here no slot may be taken."""
         nodes, bricks = self.cache.nodes, self.cache.bricks
-        stats.rays, stats.nodes, stats.bricks = rays, nodes.child_tn.numel(), bricks.capacity
-        stats.bytes = nodes.nbytes + bricks.nbytes
+        stats.nodes, stats.bricks = nodes.child_tn.numel(), bricks.capacity
+        stats.rays, stats.bytes = len(hits.missed), nodes.nbytes + bricks.nbytes
+        self._missed = hits.missed
         self.cache.make_room(0, 0)
         traced = _Traced(stats, listed, Counts(numbers), stats.pending)
         stats.later(traced.arrive)
@@ -407,19 +446,23 @@ class Engine:
             raise
 
     def _begin(self, options: RenderOptions) -> FrameStats:
-        """Counts the frame up: what is stamped with its number is in use."""
+        """The statistics of the next frame."""
         if self._closed:
             raise ValueError("Engine: it is closed")
-        self.frames += 1
-        self._frame_1.fill_(self.frames)
-        for plant in self.plants.values():
-            plant.tree.frame = self.frames
         return FrameStats(
-            frame=self.frames,
+            frame=self.frames + 1,
             backend=choose_backend(options.backend, self.device),
             pending=sum(self.production.pending.values()),
             failed=self.production.failed,
         )
+
+    def _count_up(self) -> None:
+        """Starts a picture: what is stamped with its number is in use."""
+        self.frames += 1
+        self.cache.frame = self.frames
+        self._frame_1.fill_(self.frames)
+        for plant in self.plants.values():
+            plant.tree.frame = self.frames
 
     def _tracer(self, shader: Shaders, options: RenderOptions) -> Callable[[Rays], Hits]:
         tracers = []
@@ -470,7 +513,7 @@ class FrameGraph:
                 *(self._camera, engine.device, self._trace, options.dtype, no_progress),
                 numbers=self._numbers,
             )
-            self._left = engine._collect(hits)
+            self._hits, self._left = hits, engine._collect(hits.samples)
             self._picture = develop(hits, camera, options.background, FrameStats())
 
     def replay(self, camera: Camera) -> tuple[Picture, FrameStats]:
@@ -497,10 +540,11 @@ class FrameGraph:
         engine = self._engine
         stats = engine._begin(self._options)
         with torch.cuda.device(engine.device), engine._timed(stats):
+            engine._count_up()
             self._numbers.copy_(camera.placed(engine.box).numbers(engine.device))
             with stage("replay"):
                 self._graph.replay()
-            engine._send(stats, shape[0] * shape[1] * shape[2], *self._left)
+            engine._send(stats, self._hits, *self._left)
         while len(engine._traced) > _AHEAD:
             engine._next_counts()
         if engine.options.monitor:
@@ -540,7 +584,7 @@ class _Traced:
     def arrive(self) -> None:
         """Completes the statistics."""
         stats, numbers = self.stats, self.numbers
-        stats.requests = {name: getattr(numbers, name) for name in KINDS}
+        _add(stats.requests, {name: getattr(numbers, name) for name in KINDS})
         stats.misses, stats.overflow = numbers.misses, numbers.found - numbers.listed
         stats.tiles_used, stats.bricks_used = numbers.tiles_used, numbers.bricks_used
         stats.samples = numbers.samples

@@ -94,7 +94,9 @@ class FrameStats(RenderStats):
 
     What rays used and missed, and times, are known when the device has come to the frame's end:
     who reads one of these first waits for that frame, nobody else does. What was produced is what
-    this call wrote: for wishes of the frame before, and answers that came late.
+    this call wrote: for wishes of the frame before, for those of scouts that went ahead of the
+    picture, and answers that came late. Requests and deferred count the scouts' wishes too; use,
+    misses and samples are those of the picture alone.
     """
 
     frame: int = 0  # number of the frame, from 1

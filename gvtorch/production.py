@@ -214,6 +214,7 @@ class Production:
             plant, node = plants[number], chosen.node
             if 0 < count < len(node):
                 node = node[torch.nonzero_static(mask, size=count)[:, 0]]
+            self.scheduler.spent[kind] += count
             if count:
                 job = self._without_failed(Job(plant, kind, node, plant.tree.loc(node)))
                 if len(job):
@@ -251,6 +252,7 @@ class Production:
             stats.capacity_exceeded |= written.unplaced > 0
             if written.lost is not None:
                 self.cache.mark_pending(job.node[written.lost], job.kind, False)
+        stats.pending, stats.failed = sum(self.pending.values()), self.failed
 
     def wait(self, more: float = 0.0, limit: float = _LONGEST) -> None:
         """Waits until an answer is here, or until patience ends, at most `limit` seconds; then up

@@ -33,6 +33,7 @@ class EngineOptions:
     load_budget: int = 4096  # most bricks a frame
     subdivide_budget: int = 4096  # most node tiles a frame
     time_budget: float | None = None  # most milliseconds of production a frame
+    scout_rounds: int = 2  # rounds of a sixteenth of the rays before a frame that missed something
     patience: float = 120.0  # seconds until an answer that does not come is given up
     strict: bool = False  # raise when something can't be produced
     monitor: bool = True  # time the stages and remember the last frames, for `report`
@@ -46,6 +47,7 @@ class EngineOptions:
         check.number("Engine", "patience", self.patience, low=0, open_low=True)
         for name in ("load_budget", "subdivide_budget"):
             check.whole("Engine", name, getattr(self, name), low=1)
+        check.whole("Engine", "scout_rounds", self.scout_rounds, low=0)
         for name in ("strict", "monitor"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"Engine: {name} must be bool, got {getattr(self, name)!r}")

@@ -19,7 +19,7 @@ import gvtorch as gv
 from gvtorch import config
 from gvtorch.cache import LRU, Scheduler
 from gvtorch.cache.requests import Requests
-from gvtorch.turns import Turns
+from gvtorch.turns import Turns, scouts
 
 VESSELS = gv.TransferFunction.preset("vessels", 0, 255)
 AORTA = gv.TransferFunction.from_points([(140, 0), (400, 0.25), (900, 0.95)])
@@ -243,6 +243,7 @@ def test_pools_stay_in_order_over_random_frames(blobs, data):
         "load_budget": data.draw(st.integers(1, 200)),
         "subdivide_budget": data.draw(st.integers(1, 50)),
         "order": data.draw(st.sampled_from(["coarse", "fine"])),
+        "scout_rounds": data.draw(st.integers(0, 4)),
     }
     shader = gv.TransferFunction.preset("gray", 0, 1)
     with Checked(producer, loading=loading, **options) as engine:
@@ -254,6 +255,99 @@ def test_pools_stay_in_order_over_random_frames(blobs, data):
             )
             lod = data.draw(st.sampled_from(["auto", "finest"]))
             engine.frame(view, shader, lod=lod)
+
+
+def test_scouts_are_few():
+    """All that missed something, if they are a sixteenth, else one of 4 x 4 pixels."""
+    missed = torch.zeros(8, 16, dtype=torch.bool)
+    missed[3, 1:9] = True
+    assert torch.equal(scouts(missed.flatten(), 16), missed.flatten())
+    missed[:5, :5] = True
+    sent = scouts(missed.flatten(), 16).view(8, 16)
+    assert sent.nonzero().tolist() == [[0, 0], [0, 4], [4, 0], [4, 4]]
+
+
+@pytest.mark.parametrize("loading", ["straight", "levels"])
+def test_scouts_save_frames(aneurism, compiled, loading):
+    """The same picture from the same bricks; what each round asked for adds up."""
+    device, view = DEVICES[compiled], camera(96, distance=1.2)
+    whole = gv.render(gv.N3Tree.from_volume(aneurism, device=device), view, VESSELS)
+    frames, bricks = [], []
+    for rounds in (0, 1, 3):
+        options = {"scout_rounds": rounds, "loading": loading, "device": device}
+        with Checked(gv.VolumeProducer(aneurism), **options) as engine:
+            total = {"load": 0, "subdivide": 0, "bricks": 0, "tiles": 0, "constant": 0}
+            converged = False
+            while not converged:
+                picture, stats = engine.frame(view, VESSELS)
+                converged = stats.converged
+                for name, number in {**stats.requests, **stats.produced}.items():
+                    total[name] += number
+            assert_same_picture(picture, whole)
+            assert total["load"] == total["bricks"] + total["constant"]
+            assert total["subdivide"] == total["tiles"], "each was asked for once"
+            frames.append(engine.frames)
+            bricks.append(total["bricks"])
+    assert frames[2] < frames[1] < frames[0] and frames[2] <= 0.6 * frames[0]
+    assert max(bricks) <= 1.05 * min(bricks)
+
+
+class Watched(Checked):
+    """Looks after every round of a frame: what was written within the frame is still there, and so
+    is what scouts used.
+    """
+
+    def __init__(self, *args, **options):
+        super().__init__(*args, **options)
+        self.rounds = self.evicted = 0
+
+    def frame(self, *args, **options):
+        nodes, bricks = self.cache.nodes, self.cache.bricks
+        self.start = [bricks.owner_b.clone(), nodes.parent_t.clone()]
+        self.round = 0
+        return super().frame(*args, **options)
+
+    def _serve(self, wishes, stats):
+        nodes, bricks = self.cache.nodes, self.cache.bricks
+        before = [bricks.owner_b.clone(), nodes.parent_t.clone()]
+        kept = [
+            (now >= 0) & ((now != start) | (stamp == self.frames))
+            for now, start, stamp in zip(
+                before, self.start, (bricks.stamp_b, nodes.stamp_t), strict=True
+            )
+        ]
+        evicted = sum(stats.evicted.values())
+        super()._serve(wishes, stats)
+        for now, old, keep in zip((bricks.owner_b, nodes.parent_t), before, kept, strict=True):
+            assert torch.equal(now[keep], old[keep])
+        if self.round:
+            self.rounds += 1
+            self.evicted += sum(stats.evicted.values()) - evicted
+        self.round += 1
+
+
+@pytest.mark.parametrize("loading", ["straight", "levels"])
+def test_scouts_take_nothing_that_is_in_use(blobs, compiled, loading):
+    """From pools of a few slots; budgets hold for all rounds of a frame together."""
+    pick = random.Random(5)
+    shader = gv.TransferFunction.preset("gray", 0, 1)
+    rounds = evicted = 0
+    for trial in range(8):
+        slots, tiles_ = pick.choice([(pick.randint(8, 60), 200), (200, pick.randint(10, 60))])
+        most = pick.choice([3, 20, 1000])
+        options = {"brick_pool": slots * 6**3 * 4, "node_pool": tiles_ * 8 * 20, "brick_size": 4}
+        budgets = {"load_budget": most, "subdivide_budget": most, "scout_rounds": 1 + trial % 4}
+        where = {"device": DEVICES[compiled], "loading": loading}
+        with Watched(gv.VolumeProducer(blobs), **options, **budgets, **where) as engine:
+            azimuth, distance = 0.0, 1.0
+            for _ in range(60):
+                azimuth += pick.gauss(0, 20)
+                distance = min(3.0, max(0.2, distance * np.exp(pick.gauss(0, 0.2))))
+                view = camera(12, azimuth=azimuth % 360 - 180, distance=distance)
+                _, stats = engine.frame(view, shader)
+                assert max(stats.produced["bricks"], stats.produced["tiles"]) <= most
+            rounds, evicted = rounds + engine.rounds, evicted + engine.evicted
+    assert rounds > 100 and evicted > 20
 
 
 @settings(max_examples=10, deadline=None)
@@ -462,6 +556,7 @@ def test_report_tells_stages_rates_and_occupancy(blobs):
         (lambda v: engine(v, time_budget=-1), "time_budget must be finite and > 0"),
         (lambda v: engine(v, patience=0), "patience must be finite and > 0"),
         (lambda v: engine(v, load_budget="many"), "load_budget must be an int >= 1"),
+        (lambda v: engine(v, scout_rounds=-1), "scout_rounds must be an int >= 0"),
         (lambda v: engine(v, device="gpu"), "device must name a device, got 'gpu'"),
         (lambda v: engine(v, strict="no"), "strict must be bool, got 'no'"),
         (lambda v: gv.VolumeProducer(v.data), "VolumeProducer: volume must be a Volume"),

@@ -13,6 +13,7 @@ from test_engine import PARTS, VESSELS, Checked, Late, assert_same_picture, came
 from test_production import Held
 
 import gvtorch as gv
+import gvtorch.engine
 from gvtorch.frame import Counts
 from gvtorch.ops import available
 
@@ -26,6 +27,20 @@ def cuda() -> str:
     if reason:
         pytest.skip(f"backend cuda: {reason}")
     return "cuda"
+
+
+@pytest.fixture
+def traced(monkeypatch):
+    """Lists for each pass over a camera's rays whether it was one over scouts."""
+    passes: list[bool] = []
+    trace = gvtorch.engine.trace_camera
+
+    def note(*args, again=None, **options):
+        passes.append(again is not None)
+        return trace(*args, again=again, **options)
+
+    monkeypatch.setattr(gvtorch.engine, "trace_camera", note)
+    return passes
 
 
 @pytest.fixture
@@ -130,6 +145,30 @@ def test_a_stalled_producer_stalls_no_frame(slow, blobs):
         assert sum(stats.produced.values()) > 0
         producer.hold = False
         assert engine.render(camera(8), HAZE).stats.converged
+
+
+@pytest.mark.backend("cpp")
+def test_scouts_go_only_where_something_was_written(traced, blobs):
+    """Neither in a steady frame nor while a store is stalled: nobody waits for answers."""
+    producer = Held(blobs)
+    with gv.Engine(producer, brick_size=4) as engine:
+        for _ in range(10):
+            _, stats = engine.frame(camera(), HAZE)
+        assert stats.pending > 0 and traced == [False] * 10
+        traced.clear()
+        producer.go()
+        _, stats = engine.frame(camera(), HAZE)
+        assert stats.pending > 0 and traced == [True, False], "what they ask for does not come"
+        producer.hold = False
+        producer.go()
+        traced.clear()
+        engine.frame(camera(), HAZE)
+        assert traced == [True, True, False]
+        while not stats.converged:
+            _, stats = engine.frame(camera(), HAZE)
+        traced.clear()
+        engine.frame(camera(), HAZE)
+        assert traced == [False]
 
 
 @pytest.mark.backend("cpp")

@@ -50,11 +50,12 @@ class Cache:
         nodes: The node pool.
         bricks: The brick pool.
         lru: For REQUEST_SUBDIVIDE the order of tiles, for REQUEST_LOAD that of bricks.
+        frame: Number of the last picture; what is written counts as used in it.
     """
 
     def __init__(self, nodes: NodePool, bricks: BrickPool, roots: int) -> None:
         """Locks the first `roots` tiles and bricks."""
-        self.nodes, self.bricks = nodes, bricks
+        self.nodes, self.bricks, self.frame = nodes, bricks, 0
         device = nodes.child_tn.device
         self.lru = {
             REQUEST_SUBDIVIDE: LRU(nodes.capacity, roots, device),
@@ -187,7 +188,7 @@ class Cache:
         pool.child_tn[tile], pool.brick_tn[tile] = TERMINAL, EMPTY
         pool.child_tn[tile, :width] = children.child[fits]
         pool.brick_tn[tile, :width] = children.brick[fits]
-        pool.request_tn[tile], pool.stamp_t[tile], pool.shared_t[tile] = 0, -1, False
+        pool.request_tn[tile], pool.stamp_t[tile], pool.shared_t[tile] = 0, self.frame, False
         pool.loc_t4[tile] = loc[fits].to(torch.int32)
         pool.loc_t4[tile, 3] += 1
         pool.parent_t[tile] = node[fits].to(torch.int32)
@@ -334,7 +335,7 @@ class Cache:
                 with part as landed:
                     nbytes += self._fill_slots(slot[part.begin : part.end], landed)
         pool.owner_b[slot] = node.to(torch.int32)
-        pool.stamp_b.index_fill_(0, slot, -1)
+        pool.stamp_b.index_fill_(0, slot, self.frame)
         pool.shared_b.index_fill_(0, slot, False)
         self._link_bricks(node, slot_k)
         return nbytes

@@ -20,6 +20,7 @@ class Scheduler:
 
     Attributes:
         rate: For each kind, items a millisecond, learned from what production took; None at first.
+        spent: For each kind, items that were asked for in this frame, which are off its budget.
     """
 
     def __init__(
@@ -53,7 +54,12 @@ class Scheduler:
             check.number("Engine", "time_budget", milliseconds, low=0, open_low=True)
         self.milliseconds = milliseconds
         self.rate: dict[int, float | None] = dict.fromkeys(self.most)
+        self.spent = dict.fromkeys(self.most, 0)
         self._budget = dict(self.most)
+
+    def begin(self) -> None:
+        """Starts a frame: its budgets are whole."""
+        self.spent = dict.fromkeys(self.most, 0)
 
     def choose(self, requests: Requests, room: dict[int, int]) -> tuple[Requests, int, bool]:
         """Returns the wishes to serve, most wanted first.
@@ -69,7 +75,8 @@ class Scheduler:
         deferred, exceeded = 0, False
         for kind, most in self.most.items():
             which = (requests.kind == kind).nonzero()[:, 0]
-            budget = self._budget[kind] = min(most, self._in_time(kind))
+            self._budget[kind] = min(most, self._in_time(kind))
+            budget = max(0, self._budget[kind] - self.spent[kind])
             deferred += max(0, min(len(which), room[kind]) - budget)
             exceeded |= len(which) > room[kind]
             which = which[self.rank(requests[which])]

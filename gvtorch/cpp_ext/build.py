@@ -75,7 +75,8 @@ def commands(output: Path) -> dict[Path, list[list[str]]]:
     for name, flags in INSTRUCTION_SETS.items():
         if x86 or name == "baseline":
             # Packing scalars of a struct into vectors only makes the descent wait for its own stores.
-            parts[f"lanes_{name}"] = [f"-DGV_NAMESPACE={name}", "-fno-tree-slp-vectorize", *flags]
+            own = [f"-DGV_NAMESPACE={name}", "-fno-tree-slp-vectorize"]
+            parts[f"lanes_{name}"] = [*own, *flags]
     objects = [str(output / f"{name}.o") for name in parts]
     calls = {
         output / "libgvtorch_cpu.so": [

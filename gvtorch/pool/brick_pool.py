@@ -17,7 +17,8 @@ class BrickPool:
 
     Attributes:
         bricks: For each channel (b, z, y, x, c), sides of brick_size + 2 * border.
-        stamp_b: (b,) last frame in which a ray sampled the brick, -1 for never.
+        stamp_b: (b,) last frame in which a ray sampled the brick, or after which it was written;
+            -1 for never.
         owner_b: (b,) node index that the brick belongs to, -1 for free.
         shared_b: (b,) bool, other nodes may point to the brick as well (instancing).
     """

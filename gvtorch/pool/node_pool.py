@@ -27,7 +27,8 @@ class NodePool:
             own nodes; node x at that depth = loc x * N + child x.
         parent_t: (t,) node index whose children this tile holds, -1 for a root tile.
         tree_t: (t,) number of the tree that owns the tile.
-        stamp_t: (t,) last frame in which a ray passed through, -1 for never.
+        stamp_t: (t,) last frame in which a ray passed through, or after which it was
+            written, -1 for never.
         shared_t: (t,) bool, other nodes may point to the tile as well (instancing, recursion).
         constants: For each channel (t, n, c): the value of CONSTANT nodes, the mean of EMPTY ones.
         ranges: For each channel (t, n, 2, c): smallest and largest value in reach of the node's

@@ -149,7 +149,7 @@ def _constants(numbers: Sequence[float], like: Tensor) -> Tensor:
     return torch.stack([torch.full((), n, dtype=like.dtype, device=like.device) for n in numbers])
 
 
-def _room(device: torch.device, dtype: torch.dtype, pixels: int) -> Hits:
+def empty_hits(device: torch.device, dtype: torch.dtype, pixels: int) -> Hits:
     """Takes the memory of a picture."""
     widths = {"color": (3,), "alpha": (1,), "depth": (1,)}
     reals = {n: torch.empty((pixels, *w), dtype=dtype, device=device) for n, w in widths.items()}
@@ -190,7 +190,7 @@ def trace_camera(
     numbers = camera.numbers(device) if numbers is None else numbers
     hits, where = again or (None, None)
     if hits is None and rows > block:
-        hits = _room(device, dtype, rows * width)  # too large a one fails before the first ray
+        hits = empty_hits(device, dtype, rows * width)  # too large a one fails before the first ray
     for top in range(0, rows, block):
         end = min(top + block, rows)
         pixels: slice | Tensor = slice(top * width, end * width)
