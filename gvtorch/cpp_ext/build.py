@@ -74,7 +74,7 @@ def commands(output: Path) -> dict[Path, list[list[str]]]:
     parts = {"cpu": (["-DGV_X86"] if x86 else []) + include}
     for name, flags in INSTRUCTION_SETS.items():
         if x86 or name == "baseline":
-            # Packing scalars of a struct into vectors only makes the descent wait for its own stores.
+            # Scalars of a struct packed into vectors make the descent wait for its own stores.
             own = [f"-DGV_NAMESPACE={name}", "-fno-tree-slp-vectorize"]
             parts[f"lanes_{name}"] = [*own, *flags]
     objects = [str(output / f"{name}.o") for name in parts]
