@@ -184,31 +184,24 @@ struct Lanes {
           clear = clear * (1.0f - alpha);
         }
         if (clear > run.stop_clear && (clear >= run.hit_clear || clear_before < run.hit_clear)) continue;
-        color = before;
-        clear = clear_before;
+        store(before, clear_before, sum);
         for (int32_t j = 0; j < some; ++j) {
-          const Quad row = blend_rows(rows_m + rows[i + j], weights[i + j]);
-          const float left = clear * (1.0f - row[3]);
-          if (left < run.hit_clear && clear >= run.hit_clear) {
-            sum.clear = clear;
-            const float number_here = at.count + static_cast<float>(taken + i + j);
-            sum.depth = at.start_of(number_here) + sum.reach(row[3], run.hit_clear) * at.length;
-          }
-          color = color + clear * row[3] * row;
-          clear = left;
-          if (!(clear > run.stop_clear)) {
-            count = taken + i + j + 1;
-            goto ended;
-          }
+          const Row<float> row = transfer.look_up({rows[i + j], weights[i + j]}, at.level);
+          sum.add(row, at.start_of(at.count + static_cast<float>(taken + i + j)), at.length, run.hit_clear);
+          if (!(sum.clear > run.stop_clear)) return taken + i + j + 1;
         }
+        color = Quad{sum.red, sum.green, sum.blue, 0};
+        clear = sum.clear;
       }
     }
-  ended:
+    store(color, clear, sum);
+    return count;
+  }
+  GV_HD static void store(Quad color, float clear, Accumulator<float>& sum) {
     sum.red = color[0];
     sum.green = color[1];
     sum.blue = color[2];
     sum.clear = clear;
-    return count;
   }
 };
 
