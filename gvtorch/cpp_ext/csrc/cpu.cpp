@@ -76,7 +76,7 @@ void for_each(const torch::stable::Tensor&, int64_t count, const Functor& functo
 
 // The primitives of cache.h. Threads count chunks, then place them: ranks do not depend on the number of threads.
 struct Chunks {
-  static constexpr int64_t kSize = 1 << 14;
+  static constexpr int64_t kSize = 1 << 11;
   std::vector<int64_t> first;  // kept before each chunk, and in all
 
   // found(begin, end): how many are kept.
