@@ -76,7 +76,7 @@ def commands(output: Path) -> dict[Path, list[list[str]]]:
         if x86 or name == "baseline":
             # Scalars of a struct packed into vectors make the descent wait for its own stores.
             own = [f"-DGV_NAMESPACE={name}", "-fno-tree-slp-vectorize"]
-            parts[f"lanes_{name}"] = [*own, *flags]
+            parts[f"packet_{name}"] = [*own, *flags]
     objects = [str(output / f"{name}.o") for name in parts]
     calls = {
         output / "libgvtorch_cpu.so": [

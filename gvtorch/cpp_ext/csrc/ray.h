@@ -120,6 +120,7 @@ struct Intervals {
         start(ray.first) {
     choose_level();
   }
+  Intervals() = default;
   GV_HD T cone(T t) const { return near + growth * t; }
   GV_HD T start_of(T number) const { return base + number * length; }
   GV_HD T middle_of(T number) const { return base + (number + static_cast<T>(0.5)) * length; }
@@ -127,7 +128,6 @@ struct Intervals {
   // The last interval, which ends at the far side.
   GV_HD bool cut() const { return !(start_of(count + 1) <= stop); }
   GV_HD T middle() const { return cut() ? start + (stop - start) * static_cast<T>(0.5) : middle_of(count); }
-  GV_HD T end() const { return smaller(start_of(count + 1), stop); }
 
   GV_HD bool fits(T width) const {
     return (level == 0 || !(width < length)) && (level == top || !(width >= length + length));

@@ -63,8 +63,9 @@ struct RayOrder {
     if (width == 0) return index;
     const int64_t tile = index / 32;
     const int64_t tiles = (width + 7) / 8;
-    const int64_t x = tile % tiles * 8 + index % 8;
-    const int64_t y = tile / tiles * 4 + index / 8 % 4;
+    const int32_t bits = static_cast<int32_t>(index % 32);  // of x and y in turn, so that a half is a square
+    const int64_t x = tile % tiles * 8 + ((bits & 1) | (bits >> 1 & 2) | (bits >> 2 & 4));
+    const int64_t y = tile / tiles * 4 + ((bits >> 1 & 1) | (bits >> 2 & 2));
     return x < width && y * width < rays ? y * width + x : -1;
   }
 };
@@ -140,7 +141,7 @@ struct HideNode {
   }
 };
 
-template <class T, class Voxel, class March = OneByOne>
+template <class T, class Voxel>
 struct TraceRay {
   RayView rays;
   RayOrder order;
@@ -266,6 +267,12 @@ struct TraceRay {
       add_piece(shader, run, run.fine.constant, entry, smaller(at.start, at.stop), sum);
       return 1;
     }
+    return march_node(shader, run, at, exit, cone_low, cone_high, sum);
+  }
+
+  // All intervals of a node that are still to come. Returns the samples taken.
+  GV_HD int32_t march_node(const Transfer<T>& shader, const Run<T, Voxel>& run, Intervals<T>& at, T exit, T cone_low,
+                           T cone_high, Accumulator<T>& sum) const {
     int32_t samples = 0;
     do {
       if (at.cut()) {
@@ -275,7 +282,7 @@ struct TraceRay {
         return samples + 1;
       }
       const int32_t alike = at.run(exit, cone_low, cone_high);
-      const int32_t taken = March::march(bricks, shader, run, at, alike, sum);
+      const int32_t taken = OneByOne::march(bricks, shader, run, at, alike, sum);
       samples += taken;
       at.skip(taken);
     } while (sum.clear > run.stop_clear && stays(at, exit, cone_low, cone_high));
