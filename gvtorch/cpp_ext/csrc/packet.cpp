@@ -5,15 +5,23 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
+template <class Voxel, bool kFar>
+void trace_packets(const TraceRay<float, Voxel>& kernel, int64_t begin, int64_t end) {
+  Packet<Voxel, kFar> packet(kernel);
+  for (int64_t index = begin; index < end; index += kLanes) packet.trace(index, smaller(index + kLanes, end));
+}
+
 void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end) {
   with_voxel(args.voxel, [&](auto voxel) {
-    const TraceRay<float, decltype(voxel)> kernel(args);
-    if (Packet<decltype(voxel)>::takes(kernel)) {
-      Packet<decltype(voxel)> packet(kernel);
-      for (int64_t index = begin; index < end; index += kLanes) packet.trace(index, smaller(index + kLanes, end));
-    } else {
+    using Voxel = decltype(voxel);
+    const TraceRay<float, Voxel> kernel(args);
+    if (!Packet<Voxel, false>::takes(kernel)) {
       KeptPath path;
       for (int64_t index = begin; index < end; ++index) kernel.trace(index, path);
+    } else if (Packet<Voxel, false>::stride_of(kernel.bricks) * kernel.bricks.bricks > INT32_MAX) {
+      trace_packets<Voxel, true>(kernel, begin, end);
+    } else {
+      trace_packets<Voxel, false>(kernel, begin, end);
     }
   });
 }

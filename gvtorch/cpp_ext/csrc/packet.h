@@ -81,10 +81,11 @@ struct PacketBrick {
   Floats offset[3], slope[3];
   Floats constant;
   Mask stored;
-  Ints brick;
+  Ints brick;  // its first byte in the pool, or its number where that takes 64 bits
 };
 
-template <class Voxel>
+// kFar: offsets in the pool need 64 bits.
+template <class Voxel, bool kFar>
 struct Packet {
   using Kernel = TraceRay<float, Voxel>;
   static constexpr int32_t kBytes = sizeof(Voxel);
@@ -94,7 +95,6 @@ struct Packet {
   const float stop_clear, hit_clear;
   const int32_t frame;
   const int64_t stride;  // bytes of a brick
-  const bool far;        // offsets in the pool need 64 bits
 
   // Rays.
   Floats origin[3], direction[3], inverse[3], moved;
@@ -117,14 +117,19 @@ struct Packet {
   Ints fine_node, coarse_node;
 
   // Accumulator.
-  Floats red, green, blue, clear, depth;
+  Quad color[kLanes];  // of each lane: red, green, blue, and a number that means nothing
+  Floats clear, depth;
   Ints samples;
   Mask missed;
 
-  // What packets are made for. Loads of 4 bytes may reach behind a voxel, but never behind the pool.
+  // What packets are made for. Loads of 4 bytes may reach behind a voxel, but never behind the pool; places in a brick
+  // are counted in a float.
   static bool takes(const Kernel& kernel) {
-    const int64_t voxels = int64_t{kernel.bricks.side} * kernel.bricks.side * kernel.bricks.side;
-    return kernel.tree.digit_bits > 0 && kernel.bricks.bricks > 1 && voxels * kBytes >= 4;
+    const int64_t bytes = stride_of(kernel.bricks);
+    return kernel.tree.digit_bits > 0 && kernel.bricks.bricks > 1 && bytes >= 4 && bytes < 1 << 24;
+  }
+  static int64_t stride_of(const BrickView<Voxel>& view) {
+    return int64_t{kBytes} * view.side * view.side * view.side * view.channels;
   }
 
   explicit Packet(const Kernel& kernel)
@@ -133,8 +138,7 @@ struct Packet {
         stop_clear(1 - kernel.options.stop_alpha),
         hit_clear(1 - kernel.options.depth_alpha),
         frame(*kernel.frame_1),
-        stride(int64_t{kBytes} * kernel.bricks.side * kernel.bricks.side * kernel.bricks.side * kernel.bricks.channels),
-        far(stride * kernel.bricks.bricks > INT32_MAX) {
+        stride(stride_of(kernel.bricks)) {
     path_depth = Ints{} - 1;
     for (int axis = 0; axis < 3; ++axis) cell[axis] = Ints{};
   }
@@ -157,7 +161,7 @@ struct Packet {
   GV_HD void load(int64_t begin, int64_t end, int64_t* numbers) {
     alive = Mask{};
     left = wanted = samples = missed = rows = mixed = Ints{};
-    red = green = blue = number = exit = cone_low = cone_high = voxel = blend_scale = moved = Floats{};
+    number = exit = cone_low = cone_high = voxel = blend_scale = moved = Floats{};
     clear = Floats{} + 1.0f;
     depth = Floats{} + INFINITY;
     fine.stored = coarse.stored = Mask{};
@@ -174,6 +178,7 @@ struct Packet {
       fine.offset[axis] = fine.slope[axis] = coarse.offset[axis] = coarse.slope[axis] = Floats{};
     }
     for (int lane = 0; lane < kLanes; ++lane) {
+      color[lane] = Quad{};
       numbers[lane] = begin + lane < end ? kernel.order(begin + lane) : -1;
       if (numbers[lane] < 0) continue;
       const Ray<float> ray(kernel.rays, numbers[lane]);
@@ -197,9 +202,9 @@ struct Packet {
     for (int lane = 0; lane < kLanes; ++lane) {
       const int64_t ray = numbers[lane];
       if (ray < 0) continue;
-      kernel.hits.color_r3[3 * ray] = red[lane];
-      kernel.hits.color_r3[3 * ray + 1] = green[lane];
-      kernel.hits.color_r3[3 * ray + 2] = blue[lane];
+      kernel.hits.color_r3[3 * ray] = color[lane][0];
+      kernel.hits.color_r3[3 * ray + 1] = color[lane][1];
+      kernel.hits.color_r3[3 * ray + 2] = color[lane][2];
       kernel.hits.alpha_r1[ray] = 1 - clear[lane];
       kernel.hits.depth_r1[ray] = depth[lane] + moved[lane];
       kernel.hits.samples_r[ray] = samples[lane];
@@ -426,7 +431,7 @@ struct Packet {
       ray.slope[axis] = which ? (stored ? slope : Floats{}) : ray.slope[axis];
     }
     ray.stored = which ? stored : ray.stored;
-    ray.brick = which ? (stored ? brick : Ints{}) : ray.brick;
+    ray.brick = which ? (stored ? (kFar ? brick : brick * static_cast<int32_t>(stride)) : Ints{}) : ray.brick;
     const BrickView<Voxel>& bricks = kernel.bricks;
     for_lanes(which & ~stored, [&](int lane) {
       const int64_t node = path_node[holder_depth[lane]][lane] & INT32_MAX;
@@ -436,7 +441,7 @@ struct Packet {
 
   // Begins the run of intervals that are alike; lanes that need care are done with the node at once.
   GV_HD void begin_run(Mask which) {
-    const int32_t last = static_cast<int32_t>(kernel.bricks.bricks - 1);
+    const int32_t last = static_cast<int32_t>((kernel.bricks.bricks - 1) * (kFar ? 1 : stride));
     const Mask end = (fine.stored & (fine.brick == last)) | (mixed & coarse.stored & (coarse.brick == last));
     const Mask careful = which & (at.cut() | end);
     if (any(careful)) {
@@ -450,9 +455,13 @@ struct Packet {
     rows = which ? at.level * (shader.rows * static_cast<int32_t>(sizeof(Row<float>))) : rows;
   }
 
-  // One interval of all lanes that march; returns those that go on.
+  // One interval of all lanes that march; returns those whose run goes on. Nothing that leads to the next sample waits
+  // for this one's colour: a lane that has seen enough marches on in vain to the end of its run.
   GV_HD Mask march(Mask which) {
     const Floats t = at.middle_of(number);
+    const Floats begin = at.start_of(number);
+    number = number - to_floats(which);
+    left = left + which;
     Floats value = sample(fine, t);
     if (any(mixed & which)) {
       const Floats weight = clamp((at.cone(t) - voxel) * blend_scale, Floats{}, Floats{} + 1.0f);
@@ -462,25 +471,30 @@ struct Packet {
     const Ints row = smaller(truncated(place), Ints{} + (shader.rows - 2));
     const Floats weight = place - to_floats(row);
     const Ints entry = rows + row * static_cast<int32_t>(sizeof(Row<float>));
-    const Floats alpha = which ? column(entry, 3, weight) : Floats{};
+    const Mask seeing = which & (clear > stop_clear);
+    const Floats alpha = seeing ? column(entry, 3, weight) : Floats{};
+    samples = samples - seeing;
     if (any(alpha > 0.0f)) {
       const Floats share = clear * alpha;
       const Floats rest = clear * (1.0f - alpha);
-      red = red + share * column(entry, 0, weight);
-      green = green + share * column(entry, 1, weight);
-      blue = blue + share * column(entry, 2, weight);
-      const Mask passed = which & (rest < hit_clear) & (clear >= hit_clear);
+      for (int lane = 0; lane < kLanes; ++lane) {
+        color[lane] = color[lane] + share[lane] * blend_rows(entry[lane], weight[lane]);
+      }
+      const Mask passed = (rest < hit_clear) & (clear >= hit_clear);
       if (any(passed)) for_lanes(passed, [&](int lane) {
-        const float part = accumulator(lane).reach(alpha[lane], hit_clear);
-        depth[lane] = at.start_of(number)[lane] + part * at.length[lane];
+        depth[lane] = begin[lane] + accumulator(lane).reach(alpha[lane], hit_clear) * at.length[lane];
       });
       clear = rest;
     }
-    number = number - to_floats(which);
-    samples = samples - which;
-    left = left + which;
-    left = which & ~(clear > stop_clear) ? Ints{} : left;
     return which & (left > 0);
+  }
+
+  GV_HD Quad blend_rows(int32_t entry, float weight) const {
+    const char* row = reinterpret_cast<const char*>(shader.table_lm) + entry;
+    Quad a, b;
+    memcpy(&a, row, sizeof(a));
+    memcpy(&b, row + sizeof(a), sizeof(b));
+    return a + weight * (b - a);
   }
 
   // One number of the table, between two rows.
@@ -494,18 +508,18 @@ struct Packet {
   // Twin of `sample` in brick.h.
   GV_HD Floats sample(const PacketBrick& ray, Floats t) const {
     const BrickView<Voxel>& view = kernel.bricks;
-    const Floats last = Floats{} + static_cast<float>(view.side - 1);
-    Ints index[3];
-    Floats weight[3];
-    for (int axis = 0; axis < 3; ++axis) {
-      const Floats place = clamp(ray.offset[axis] + t * ray.slope[axis], Floats{}, last);
-      index[axis] = smaller(truncated(place), Ints{} + (view.side - 2));
-      weight[axis] = place - to_floats(index[axis]);
-    }
     const int32_t step_x = view.channels * kBytes;
     const int32_t step_y = step_x * view.side;
     const int32_t step_z = step_y * view.side;
-    const Ints corner = index[2] * step_z + index[1] * step_y + index[0] * step_x;
+    const Floats last = Floats{} + static_cast<float>(view.side - 1);
+    Floats cell[3], weight[3];
+    for (int axis = 0; axis < 3; ++axis) {
+      const Floats place = clamp(ray.offset[axis] + t * ray.slope[axis], Floats{}, last);
+      cell[axis] = smaller(to_floats(truncated(place)), last - 1.0f);
+      weight[axis] = place - cell[axis];
+    }
+    const Ints corner = truncated(cell[2] * static_cast<float>(step_z) + cell[1] * static_cast<float>(step_y) +
+                                  cell[0] * static_cast<float>(step_x));
     Floats plane[2];
     for (int z = 0; z < 2; ++z) {
       const Floats near = sample_row(ray.brick, corner + z * step_z, step_x, weight[0]);
@@ -531,7 +545,7 @@ struct Packet {
 
   GV_HD Ints load_words(Ints brick, Ints offset) const {
     const char* base = reinterpret_cast<const char*>(kernel.bricks.bricks_bzyxc + kernel.bricks.component);
-    if (!far) return gather(base, brick * static_cast<int32_t>(stride) + offset);
+    if (!kFar) return gather(base, brick + offset);
     Ints word;
     for (int lane = 0; lane < kLanes; ++lane) {
       int32_t one;
@@ -543,12 +557,10 @@ struct Packet {
 
   // A lane as TraceRay's own structs.
   GV_HD Accumulator<float> accumulator(int lane) const {
-    return {red[lane], green[lane], blue[lane], clear[lane], depth[lane], missed[lane] != 0};
+    return {color[lane][0], color[lane][1], color[lane][2], clear[lane], depth[lane], missed[lane] != 0};
   }
   GV_HD void put(int lane, const Accumulator<float>& sum) {
-    red[lane] = sum.red;
-    green[lane] = sum.green;
-    blue[lane] = sum.blue;
+    color[lane] = Quad{sum.red, sum.green, sum.blue, 0};
     clear[lane] = sum.clear;
     depth[lane] = sum.depth;
   }
@@ -556,7 +568,7 @@ struct Packet {
     BrickRay<float, Voxel> one;
     one.constant = ray.constant[lane];
     if (!ray.stored[lane]) return one;
-    one.voxels = kernel.bricks.bricks_bzyxc + kernel.bricks.component + ray.brick[lane] * (stride / kBytes);
+    one.voxels = kernel.bricks.bricks_bzyxc + kernel.bricks.component + ray.brick[lane] * (kFar ? stride : 1) / kBytes;
     for (int axis = 0; axis < 3; ++axis) {
       one.offset[axis] = ray.offset[axis][lane];
       one.slope[axis] = ray.slope[axis][lane];

@@ -21,6 +21,7 @@ constexpr int kLanes = 4;
 #endif
 typedef float Floats __attribute__((vector_size(kLanes * 4)));
 typedef int32_t Ints __attribute__((vector_size(kLanes * 4)));
+typedef float Quad __attribute__((vector_size(16)));
 using Mask = Ints;  // -1 or 0 in each lane
 
 GV_HD Floats to_floats(Ints value) { return __builtin_convertvector(value, Floats); }
@@ -32,13 +33,33 @@ GV_HD Ints lane_numbers() {
   return lane;
 }
 
-GV_HD Floats smaller(Floats a, Floats b) { return b < a ? b : a; }
-GV_HD Ints smaller(Ints a, Ints b) { return b < a ? b : a; }
-GV_HD Ints larger(Ints a, Ints b) { return a < b ? b : a; }
-GV_HD Floats clamp(Floats value, Floats low, Floats high) {
-  const Floats raised = value > low ? value : low;
-  return raised < high ? raised : high;
+// Comparisons as in hd.h: which of two comes out where one is no number is the same.
+GV_HD Floats smaller(Floats a, Floats b) {
+#if defined(__AVX512F__)
+  return (Floats)_mm512_min_ps((__m512)b, (__m512)a);
+#elif defined(__AVX2__)
+  return (Floats)_mm256_min_ps((__m256)b, (__m256)a);
+#elif defined(__SSE2__)
+  return (Floats)_mm_min_ps((__m128)b, (__m128)a);
+#else
+  return b < a ? b : a;
+#endif
 }
+GV_HD Floats larger(Floats a, Floats b) {
+#if defined(__AVX512F__)
+  return (Floats)_mm512_max_ps((__m512)b, (__m512)a);
+#elif defined(__AVX2__)
+  return (Floats)_mm256_max_ps((__m256)b, (__m256)a);
+#elif defined(__SSE2__)
+  return (Floats)_mm_max_ps((__m128)b, (__m128)a);
+#else
+  return b > a ? b : a;
+#endif
+}
+GV_HD Ints smaller(Ints a, Ints b) { return b < a ? b : a; }
+GV_HD Ints larger(Ints a, Ints b) { return b > a ? b : a; }
+// value > low ? value : low, then raised < high ? raised : high.
+GV_HD Floats clamp(Floats value, Floats low, Floats high) { return smaller(high, larger(low, value)); }
 GV_HD Ints floor_int(Floats value) {
   const Ints whole = truncated(value);
   return whole + (to_floats(whole) > value);
