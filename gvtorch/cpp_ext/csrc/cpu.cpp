@@ -151,7 +151,8 @@ void split(const torch::stable::Tensor& like, int64_t count, const Keep& keep, c
 template <class Device>
 void trace(const torch::stable::Tensor& like, TraceArgs args, bool wide) {
   constexpr int64_t kChunk = 256;
-  torch::stable::Tensor hidden_tn = torch::stable::new_zeros(like, {args.nodes + 3}, torch::headeronly::ScalarType::Byte);
+  torch::stable::Tensor hidden_tn =
+      torch::stable::new_zeros(like, {args.nodes + 3}, torch::headeronly::ScalarType::Byte);
   args.hidden_tn = static_cast<uint8_t*>(hidden_tn.mutable_data_ptr());
   const int64_t count = RayOrder{args.rays, args.width}.count();
   if (wide) {

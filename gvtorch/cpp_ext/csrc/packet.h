@@ -117,7 +117,7 @@ struct Packet {
   Ints fine_node, coarse_node;
 
   // Accumulator.
-  Quad color[kLanes];  // of each lane: red, green, blue, and a number that means nothing
+  Floats red, green, blue;
   Floats clear, depth;
   Ints samples;
   Mask missed;
@@ -161,7 +161,7 @@ struct Packet {
   GV_HD void load(int64_t begin, int64_t end, int64_t* numbers) {
     alive = Mask{};
     left = wanted = samples = missed = rows = mixed = Ints{};
-    number = exit = cone_low = cone_high = voxel = blend_scale = moved = Floats{};
+    red = green = blue = number = exit = cone_low = cone_high = voxel = blend_scale = moved = Floats{};
     clear = Floats{} + 1.0f;
     depth = Floats{} + INFINITY;
     fine.stored = coarse.stored = Mask{};
@@ -178,7 +178,6 @@ struct Packet {
       fine.offset[axis] = fine.slope[axis] = coarse.offset[axis] = coarse.slope[axis] = Floats{};
     }
     for (int lane = 0; lane < kLanes; ++lane) {
-      color[lane] = Quad{};
       numbers[lane] = begin + lane < end ? kernel.order(begin + lane) : -1;
       if (numbers[lane] < 0) continue;
       const Ray<float> ray(kernel.rays, numbers[lane]);
@@ -202,9 +201,9 @@ struct Packet {
     for (int lane = 0; lane < kLanes; ++lane) {
       const int64_t ray = numbers[lane];
       if (ray < 0) continue;
-      kernel.hits.color_r3[3 * ray] = color[lane][0];
-      kernel.hits.color_r3[3 * ray + 1] = color[lane][1];
-      kernel.hits.color_r3[3 * ray + 2] = color[lane][2];
+      kernel.hits.color_r3[3 * ray] = red[lane];
+      kernel.hits.color_r3[3 * ray + 1] = green[lane];
+      kernel.hits.color_r3[3 * ray + 2] = blue[lane];
       kernel.hits.alpha_r1[ray] = 1 - clear[lane];
       kernel.hits.depth_r1[ray] = depth[lane] + moved[lane];
       kernel.hits.samples_r[ray] = samples[lane];
@@ -290,8 +289,9 @@ struct Packet {
     Mask nothing = which & (clears | (fine_brick == kAbsent) | ((fine_brick == kEmpty) & (coarse_brick == kEmpty)));
 
     const Mask seen = which & ~clears;
-    const Mask lacks = seen & ((brick == kAbsent) | ((reach < wanted) & (tile == kAbsent)) |
-                               (blend & (reach == wanted) & (own_lane(path_brick, larger(reach - 1, Ints{})) == kAbsent)));
+    const Mask lacks =
+        seen & ((brick == kAbsent) | ((reach < wanted) & (tile == kAbsent)) |
+                (blend & (reach == wanted) & (own_lane(path_brick, larger(reach - 1, Ints{})) == kAbsent)));
     if (any(lacks)) {
       missed = missed | lacks;
       for_lanes(lacks, [&](int lane) {
@@ -477,24 +477,17 @@ struct Packet {
     if (any(alpha > 0.0f)) {
       const Floats share = clear * alpha;
       const Floats rest = clear * (1.0f - alpha);
-      for (int lane = 0; lane < kLanes; ++lane) {
-        color[lane] = color[lane] + share[lane] * blend_rows(entry[lane], weight[lane]);
-      }
+      red = red + share * column(entry, 0, weight);
+      green = green + share * column(entry, 1, weight);
+      blue = blue + share * column(entry, 2, weight);
       const Mask passed = (rest < hit_clear) & (clear >= hit_clear);
-      if (any(passed)) for_lanes(passed, [&](int lane) {
-        depth[lane] = begin[lane] + accumulator(lane).reach(alpha[lane], hit_clear) * at.length[lane];
-      });
+      if (any(passed))
+        for_lanes(passed, [&](int lane) {
+          depth[lane] = begin[lane] + accumulator(lane).reach(alpha[lane], hit_clear) * at.length[lane];
+        });
       clear = rest;
     }
     return which & (left > 0);
-  }
-
-  GV_HD Quad blend_rows(int32_t entry, float weight) const {
-    const char* row = reinterpret_cast<const char*>(shader.table_lm) + entry;
-    Quad a, b;
-    memcpy(&a, row, sizeof(a));
-    memcpy(&b, row + sizeof(a), sizeof(b));
-    return a + weight * (b - a);
   }
 
   // One number of the table, between two rows.
@@ -557,10 +550,12 @@ struct Packet {
 
   // A lane as TraceRay's own structs.
   GV_HD Accumulator<float> accumulator(int lane) const {
-    return {color[lane][0], color[lane][1], color[lane][2], clear[lane], depth[lane], missed[lane] != 0};
+    return {red[lane], green[lane], blue[lane], clear[lane], depth[lane], missed[lane] != 0};
   }
   GV_HD void put(int lane, const Accumulator<float>& sum) {
-    color[lane] = Quad{sum.red, sum.green, sum.blue, 0};
+    red[lane] = sum.red;
+    green[lane] = sum.green;
+    blue[lane] = sum.blue;
     clear[lane] = sum.clear;
     depth[lane] = sum.depth;
   }
@@ -576,8 +571,13 @@ struct Packet {
     return one;
   }
   GV_HD Run<float, Voxel> run_of(int lane) const {
-    return {brick_of(fine, lane), brick_of(coarse, lane), mixed[lane] != 0, voxel[lane],
-            blend_scale[lane],    stop_clear,             hit_clear};
+    return {brick_of(fine, lane),
+            brick_of(coarse, lane),
+            mixed[lane] != 0,
+            voxel[lane],
+            blend_scale[lane],
+            stop_clear,
+            hit_clear};
   }
   __attribute__((noinline)) void march_alone(int lane) {
     Intervals<float> one;

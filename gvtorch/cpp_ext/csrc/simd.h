@@ -21,7 +21,6 @@ constexpr int kLanes = 4;
 #endif
 typedef float Floats __attribute__((vector_size(kLanes * 4)));
 typedef int32_t Ints __attribute__((vector_size(kLanes * 4)));
-typedef float Quad __attribute__((vector_size(16)));
 using Mask = Ints;  // -1 or 0 in each lane
 
 GV_HD Floats to_floats(Ints value) { return __builtin_convertvector(value, Floats); }
