@@ -17,7 +17,16 @@ if TYPE_CHECKING:
     from .pool import BrickPool, BrickTable, Channel, N3Tree, NodePool
     from .producers import Bricks, Nodes, Producer, Region, Regions, StoredProducer, VolumeProducer
     from .production import ProductionError
-    from .rendering import Camera, Picture, RenderOptions, TransferFunction, TreeTracer, render
+    from .rendering import (
+        Camera,
+        ModuleShader,
+        Picture,
+        RenderOptions,
+        TransferFunction,
+        TransferModule,
+        TreeTracer,
+        render,
+    )
     from .volume import Volume
 
 __version__ = "0.1.0"
@@ -39,12 +48,14 @@ _HOME = {
     "Camera": ".rendering",
     "Channel": ".pool",
     "Hits": ".frame",
+    "ModuleShader": ".rendering",
     "N3Tree": ".pool",
     "NodePool": ".pool",
     "Picture": ".rendering",
     "Rays": ".frame",
     "RenderOptions": ".rendering",
     "TransferFunction": ".rendering",
+    "TransferModule": ".rendering",
     "TreeTracer": ".rendering",
     "Volume": ".volume",
     "read_volume": ".io",
@@ -61,6 +72,7 @@ __all__ = [
     "EngineOptions",
     "FrameStats",
     "Hits",
+    "ModuleShader",
     "N3Tree",
     "NodePool",
     "Nodes",
@@ -73,6 +85,7 @@ __all__ = [
     "RenderOptions",
     "StoredProducer",
     "TransferFunction",
+    "TransferModule",
     "TreeTracer",
     "Volume",
     "VolumeProducer",

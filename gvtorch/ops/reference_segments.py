@@ -203,9 +203,7 @@ def sample_bricks(
     return torch.stack(values, 1)
 
 
-def _box(
-    position: Tensor, depth: Tensor, branching: int, max_depth: int
-) -> tuple[Tensor, Tensor]:
+def _box(position: Tensor, depth: Tensor, branching: int, max_depth: int) -> tuple[Tensor, Tensor]:
     """Low corners (k, 3) and sides (k,) of the nodes at a depth in which places lie."""
     corner, local, size = torch.zeros_like(position), position, torch.ones_like(position[:, 0])
     for level in range(1, max_depth + 1):

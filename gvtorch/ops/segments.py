@@ -15,7 +15,7 @@ from ..volume import CHANNEL_DTYPES
 from . import reference_segments
 from .trace import Backend, choose_backend
 
-_SEGMENT_BYTES = 64  # at most, in float64
+_SEGMENT_BYTES = 84  # at most, in float64
 
 
 class Segments(NamedTuple):
@@ -169,15 +169,16 @@ def trace_segments(
         *(width, branching, root, max_depth, border, component, levels, limit),
         *(float(cone_scale), float(root_voxel), float(step), by_level, by_node),
     )
-    if choose_backend(backend, device) == "reference":
-        (count, state, missed), found = reference_segments.walk_segments(*args)
+    with torch.no_grad():
+        if choose_backend(backend, device) == "reference":
+            (count, state, missed), found = reference_segments.walk_segments(*args)
+            return Segments(*found, count, state, missed)
+        count, state, missed = torch.ops.gvtorch.count_segments(*args)
+        ends = count[:, 0].cumsum(0, dtype=torch.int64)
+        total = int(ends[-1]) if rays else 0
+        check.memory(where, f"a list of {total} segments", total * _SEGMENT_BYTES, device)
+        found = torch.ops.gvtorch.write_segments(*args, ends - count[:, 0], total)
         return Segments(*found, count, state, missed)
-    count, state, missed = torch.ops.gvtorch.count_segments(*args)
-    ends = count[:, 0].cumsum(0, dtype=torch.int64)
-    total = int(ends[-1]) if rays else 0
-    check.memory(where, f"a list of {total} segments", total * _SEGMENT_BYTES, device)
-    found = torch.ops.gvtorch.write_segments(*args, ends - count[:, 0], total)
-    return Segments(*found, count, state, missed)
 
 
 class Samples(NamedTuple):

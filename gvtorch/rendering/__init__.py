@@ -2,8 +2,18 @@
 
 from .camera import Camera
 from .module import TreeTracer
+from .module_shader import ModuleShader, TransferModule
 from .picture import Picture
 from .renderer import RenderOptions, render
 from .shader import TransferFunction
 
-__all__ = ["Camera", "Picture", "RenderOptions", "TransferFunction", "TreeTracer", "render"]
+__all__ = [
+    "Camera",
+    "ModuleShader",
+    "Picture",
+    "RenderOptions",
+    "TransferFunction",
+    "TransferModule",
+    "TreeTracer",
+    "render",
+]

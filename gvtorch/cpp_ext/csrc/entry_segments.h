@@ -28,7 +28,7 @@ constexpr const char* kCountSegmentsSchema =
     "count_segments(" GV_WALK_SCHEMA ") -> (Tensor count_r3, Tensor state_r3, Tensor missed_r)";
 constexpr const char* kWriteSegmentsSchema =
     "write_segments(" GV_WALK_SCHEMA
-    ", Tensor first_r, int total) -> (Tensor ray_s, Tensor node_s2, Tensor brick_s2, Tensor depth_s3, "
+    ", Tensor first_r, SymInt total) -> (Tensor ray_s, Tensor node_s2, Tensor brick_s2, Tensor depth_s3, "
     "Tensor interval_s3, Tensor t0_s, Tensor t1_s, Tensor distance_s3)";
 constexpr const char* kSampleBricksSchema = "sample_bricks(" GV_SAMPLE_SCHEMA ") -> Tensor value_kc";
 constexpr const char* kSampleBricksBackwardSchema =
