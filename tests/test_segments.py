@@ -138,7 +138,7 @@ def test_segments_are_what_trace_rays_samples(blobs, backend, lod, distance):
     walked = {**drawn, **{name: drawn[name].clone() for name in MARKS}}
     *_, samples, missed = trace_rays(**drawn)
     segments = trace_segments(**walking(walked))
-    assert torch.equal(segments.count[:, 1], samples) and samples.max() > 10
+    assert torch.equal(segments.counts[:, 1], samples) and samples.max() > 10
     assert torch.equal(segments.missed, missed) and missed.any()
     for name in MARKS:
         assert torch.equal(walked[name], drawn[name]), name
@@ -209,7 +209,7 @@ def test_parts_of_a_walk_are_the_walk(blobs, backend):
     order = joined[0].argsort(stable=True)
     for name, values in zip(LISTED, joined, strict=True):
         assert torch.equal(values[order], getattr(whole, name)), name
-    assert torch.equal(sum(part.count for part in parts), whole.count)
+    assert torch.equal(sum(part.counts for part in parts), whole.counts)
 
 
 def test_distances_cover_the_box(blobs, backend):
@@ -364,7 +364,7 @@ def test_opcheck(walk):
     ops = torch.ops.gvtorch
     args = positional(traced)
     torch.library.opcheck(ops.count_segments.default, tuple(args))
-    first = (segments.count[:, 0].cumsum(0) - segments.count[:, 0]).long()
+    first = (segments.counts[:, 0].cumsum(0) - segments.counts[:, 0]).long()
     torch.library.opcheck(ops.write_segments.default, (*args, first, len(segments.ray_index)))
     reads = [v for n, v in sampling(traced, segments, samples).items() if n != "backend"]
     reads[5] = reads[5].clone().requires_grad_()
@@ -404,7 +404,7 @@ class Emission(torch.nn.Module):
 def test_scripts_compiles_and_exports(walk):
     traced, segments, samples = walk
     reads = [v for n, v in sampling(traced, segments, samples).items() if n != "backend"]
-    clear = torch.ones(len(segments.count), device=reads[0].device)
+    clear = torch.ones(len(segments.counts), device=reads[0].device)
     module, inputs = Emission(reads[15:]), (reads[:15], samples.offset, clear)
     expected = module(*inputs)
     assert expected.max() > 0.3

@@ -75,7 +75,7 @@ def _fake_composite(
 def _fake_composite_backward(
     grad_sum_rc: Tensor, grad_left_r: Tensor, alpha_k: Tensor, feature_kc: Tensor, *_args: Any
 ) -> tuple[Tensor, Tensor, Tensor]:
-    return tuple(torch.empty_like(like) for like in (alpha_k, feature_kc, grad_left_r))
+    return torch.empty_like(alpha_k), torch.empty_like(feature_kc), torch.empty_like(grad_left_r)
 
 
 def _save_samples(ctx: Any, inputs: tuple, output: Tensor) -> None:

@@ -34,7 +34,7 @@ class Segments(NamedTuple):
     t0: Tensor  # (s,) world distance from the camera at which the first interval starts
     t1: Tensor  # (s,) and at which the last one ends
     distance: Tensor  # (s, 3) from where the ray enters the box: base of the numbers, end, look-up
-    count: Tensor  # (r, 3) int32 segments, samples and nodes visited of each ray
+    counts: Tensor  # (r, 3) int32 segments, samples and nodes visited of each ray
     state: Tensor  # (r, 3) where each ray goes on: base, number and level of its next interval
     missed: Tensor  # (r,) bool, something that the ray saw was not there
 
@@ -171,14 +171,14 @@ def trace_segments(
     )
     with torch.no_grad():
         if choose_backend(backend, device) == "reference":
-            (count, state, missed), found = reference_segments.walk_segments(*args)
-            return Segments(*found, count, state, missed)
+            counted, found = reference_segments.walk_segments(*args)
+            return Segments._make((*found, *counted))
         count, state, missed = torch.ops.gvtorch.count_segments(*args)
         ends = count[:, 0].cumsum(0, dtype=torch.int64)
         total = int(ends[-1]) if rays else 0
         check.memory(where, f"a list of {total} segments", total * _SEGMENT_BYTES, device)
         found = torch.ops.gvtorch.write_segments(*args, ends - count[:, 0], total)
-        return Segments(*found, count, state, missed)
+        return Segments._make((*found, count, state, missed))
 
 
 class Samples(NamedTuple):
@@ -196,8 +196,8 @@ def list_samples(segments: Segments) -> Samples:
         ValueError: They are more than int32 can count, or the device has memory for.
     """
     count, device = segments.interval[:, 1].to(torch.int64), segments.interval.device
-    offset = torch.zeros(len(segments.count) + 1, dtype=torch.int64, device=device)
-    torch.cumsum(segments.count[:, 1], 0, dtype=torch.int64, out=offset[1:])
+    offset = torch.zeros(len(segments.counts) + 1, dtype=torch.int64, device=device)
+    torch.cumsum(segments.counts[:, 1], 0, dtype=torch.int64, out=offset[1:])
     total = int(offset[-1])
     check.memory("list_samples", f"a list of {total} samples", 8 * total, device)
     check.whole("list_samples", "the number of samples", total, low=0, high=2**31 - 1)

@@ -135,11 +135,14 @@ class TransferModule(torch.nn.Module):
         return rgb, alpha_a + (place - row) * (alpha_b - alpha_a)
 
 
+Columns = tuple[Tensor, Tensor, Tensor, Tensor]  # rays in float64: origin, direction, cone, range
+
+
 @dataclass(frozen=True)
 class Batch:
     """Samples of rays that were walked, and what can be read there."""
 
-    columns: tuple[Tensor, ...]  # rays in float64: origin, direction, cone, range
+    columns: Columns
     tree: N3Tree
     arguments: dict[str, Any]  # of `trace_segments`
     channel: str
@@ -154,13 +157,13 @@ class Batch:
                 known = ", ".join(self.tree.channel_names)
                 raise ValueError(f"ModuleShader: unknown channel {name!r}; the tree has {known}")
             s = self.segments
-            value = sample_bricks(
+            reads = (
                 *(*self.columns, self.arguments["place_33"]),
                 *(self.tree.bricks.bricks[name], self.tree.nodes.constants[name]),
                 *(s.ray_index, s.node, s.brick, s.depth, s.interval, s.distance),
                 *(self.listed.segment, self.listed.number),
-                **{name: self.arguments[name] for name in _SHAPE},
             )
+            value = sample_bricks(*reads, **{one: self.arguments[one] for one in _SHAPE})
             found.append(value)
         return found[0] if len(found) == 1 else torch.cat(found, 1)
 
@@ -252,10 +255,7 @@ def march(
     walk = {name: arguments[name] for name in _WALK}
     walk |= {"levels": arguments["table_lm4"].shape[0], "limit": limit, "by_node": by_node}
     real, count = arguments["domain_2"].dtype, len(rays.origin)
-    columns = tuple(
-        column.to(torch.float64).contiguous()
-        for column in (rays.origin, rays.direction, rays.cone, rays.range)
-    )
+    columns = _wide(rays)
     stop_alpha, hit_clear = arguments["stop_alpha"], 1 - arguments["depth_alpha"]
     like = arguments["domain_2"]
     sums = Marched(
@@ -267,9 +267,9 @@ def march(
     )
     which, state, width = torch.arange(count, device=like.device), None, rays.width
     while len(which):
-        segments = trace_segments(*columns, state_r3=state, width=width, **walk)
+        segments = trace_segments(*columns, **walk, state_r3=state, width=width)
         sums.missed[which] |= segments.missed
-        sums.count[which, 1] += segments.count[:, 2]
+        sums.count[which, 1] += segments.counts[:, 2]
         batch = Batch(columns, tree, walk, channel, segments, list_samples(segments))
         if not len(batch.segment):
             break  # all have ended
@@ -291,11 +291,20 @@ def march(
             place = (batch.moved + batch.starts).to(real) + part * batch.lengths[:, 0]
             found = torch.where(hit, place, torch.inf)
             sums.depth = sums.depth.scatter_reduce(0, ray, found, "amin")
-            going = (segments.count[:, 1] >= limit) & (left > 1 - stop_alpha)
+            going = (segments.counts[:, 1] >= limit) & (left > 1 - stop_alpha)
             on = going.nonzero()[:, 0]
-        columns = tuple(column[on] for column in columns)
+        origin, direction, cone, limits = columns
+        columns = (origin[on], direction[on], cone[on], limits[on])
         which, state, width = which[on], segments.state[on], 0
     return sums
+
+
+def _wide(rays: Rays) -> Columns:
+    origin, direction, cone, limits = (
+        column.to(torch.float64).contiguous()
+        for column in (rays.origin, rays.direction, rays.cone, rays.range)
+    )
+    return origin, direction, cone, limits
 
 
 class ModuleTracer:
