@@ -19,12 +19,14 @@ if TYPE_CHECKING:
     from .production import ProductionError
     from .rendering import (
         Camera,
+        Cost,
         ModuleShader,
         Picture,
         RenderOptions,
         TransferFunction,
         TransferModule,
         TreeTracer,
+        cost,
         render,
     )
     from .volume import Volume
@@ -47,6 +49,7 @@ _HOME = {
     "VolumeProducer": ".producers",
     "Camera": ".rendering",
     "Channel": ".pool",
+    "Cost": ".rendering",
     "Hits": ".frame",
     "ModuleShader": ".rendering",
     "N3Tree": ".pool",
@@ -58,6 +61,7 @@ _HOME = {
     "TransferModule": ".rendering",
     "TreeTracer": ".rendering",
     "Volume": ".volume",
+    "cost": ".rendering",
     "read_volume": ".io",
     "render": ".rendering",
 }
@@ -68,6 +72,7 @@ __all__ = [
     "Bricks",
     "Camera",
     "Channel",
+    "Cost",
     "Engine",
     "EngineOptions",
     "FrameStats",
@@ -89,6 +94,7 @@ __all__ = [
     "TreeTracer",
     "Volume",
     "VolumeProducer",
+    "cost",
     "read_volume",
     "render",
 ]

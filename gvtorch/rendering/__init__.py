@@ -1,6 +1,7 @@
 """Cameras, transfer functions, the renderer and the pictures it makes."""
 
 from .camera import Camera
+from .cost import Cost, cost
 from .module import TreeTracer
 from .module_shader import ModuleShader, TransferModule
 from .picture import Picture
@@ -9,11 +10,13 @@ from .shader import TransferFunction
 
 __all__ = [
     "Camera",
+    "Cost",
     "ModuleShader",
     "Picture",
     "RenderOptions",
     "TransferFunction",
     "TransferModule",
     "TreeTracer",
+    "cost",
     "render",
 ]
