@@ -63,7 +63,7 @@ def test_lod_is_the_depth_that_the_cone_wants(blobs, compiled):
         wide = gv.Camera.orbit(30, 20, distance, width=24, height=24)
         assert gv.cost(tree, wide, SHADER).lod.nan_to_num().max() < tree.depth + 1e-5
     assert max(means) - min(means) < 0.5, "the same picture wants the same levels"
-    far = gv.cost(tree, gv.Camera.orbit(30, 20, 60, width=24, height=24), SHADER).lod
+    far = gv.cost(tree, gv.Camera.orbit(30, 20, 60, 3, 24, 24), SHADER).lod
     assert (~far.isnan()).any() and far.nan_to_num().max() < min(means) - 1
 
 

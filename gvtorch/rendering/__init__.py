@@ -1,7 +1,7 @@
 """Cameras, transfer functions, the renderer and the pictures it makes."""
 
 from .camera import Camera
-from .cost import Cost, cost
+from .costs import Cost, cost
 from .module import TreeTracer
 from .module_shader import ModuleShader, TransferModule
 from .picture import Picture

@@ -168,7 +168,7 @@ class _Counter:
         return (sums.count[:, 0], sums.count[:, 1], *means)
 
     def shade(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """One, depth of the node, whether it has a brick, the brick's age and its fill; and alpha."""
+        """One, depth of the node, whether it has a brick, its age, its fill; and alpha."""
         values = batch.values(None)[:, self.component, None]
         _, alpha = self.module(values, batch.positions, batch.directions, batch.lengths)
         slot = batch.segments.brick[batch.segment, 0].to(torch.int64)
