@@ -152,8 +152,7 @@ class _Counter:
         }
         self.channel = options.channel or tree.channel_names[0]
         self.component = options.component
-        self.spacing = min(tree.spacing)
-        self.module = TransferModule(shader, self.spacing).to(tree.device)
+        self.module = TransferModule(shader, min(tree.spacing)).to(tree.device)
         self.fill_b = torch.full_like(tree.bricks.born_b, -1, dtype=torch.float32)
 
     def __call__(self, rays: Rays) -> tuple[Tensor, ...]:
@@ -170,13 +169,13 @@ class _Counter:
     def shade(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """One, depth of the node, whether it has a brick, its age, its fill; and alpha."""
         values = batch.values(None)[:, self.component, None]
-        _, alpha = self.module(values, batch.positions, batch.directions, batch.lengths)
+        _, alpha = self.module(values, values, values, batch.lengths)  # it reads no places
         slot = batch.segments.brick[batch.segment, 0].to(torch.int64)
         has, known = slot >= 0, slot.clamp(min=0)
         if not self.tree.bricks.capacity:
             age = fill = torch.zeros_like(alpha[:, 0])
         else:
-            self._fill(slot[has].unique())
+            self._fill(slot[has & (alpha[:, 0] > 0)])
             age, fill = self.tree.frame - self.tree.bricks.born_b[known], self.fill_b[known]
         depth = batch.segments.depth[batch.segment, 0]
         columns = (torch.ones_like(depth), depth, has, age * has, fill * has)
@@ -184,12 +183,13 @@ class _Counter:
 
     def _fill(self, slots: Tensor) -> None:
         """Works out how full bricks are, once for each."""
+        wanted = torch.zeros_like(self.fill_b, dtype=torch.bool)
+        wanted[slots] = True
+        fresh = (wanted & (self.fill_b < 0)).nonzero()[:, 0]
         border, size = self.tree.bricks.border, self.tree.bricks.brick_size
         inner = slice(border, border + size)
         pool = self.tree.bricks.bricks[self.channel]
-        for part in slots[self.fill_b[slots] < 0].split(_BRICKS_AT_ONCE):
+        for part in fresh.split(_BRICKS_AT_ONCE):
             bricks = movable(pool)[part].view(pool.dtype)[:, inner, inner, inner]
-            voxels = bricks[..., self.component].reshape(-1, 1).float()
-            lengths = torch.full_like(voxels, self.spacing)
-            _, alpha = self.module(voxels, voxels, voxels, lengths)
-            self.fill_b[part] = (alpha > 0).float().view(len(part), size**3).mean(1)
+            voxels = bricks[..., self.component].flatten(1).float()
+            self.fill_b[part] = self.module.shows(voxels).float().mean(1)

@@ -118,6 +118,12 @@ class TransferModule(torch.nn.Module):
         self.scale = (len(table.opaque_m) - 1) / (high - self.low)
         self.rows = torch.nn.Parameter(table.table_lm4[0].clone())
 
+    def shows(self, values: Tensor) -> Tensor:
+        """Bool of the same shape: a value has an opacity."""
+        place = ((values - self.low) * self.scale).clamp(0, len(self.rows) - 1)
+        opaque = self.rows[:, 3] > 0
+        return opaque[place.floor().long()] | opaque[place.ceil().long()]
+
     def forward(
         self, values: Tensor, positions: Tensor, directions: Tensor, lengths: Tensor
     ) -> tuple[Tensor, Tensor]:
@@ -199,17 +205,17 @@ class Batch:
 
     @cached_property
     def moved(self) -> Tensor:
-        """(k,) float64 distances from the camera to where the rays enter the tree's box."""
+        """(r,) float64 distances from the camera to where rays enter the tree's box."""
         corner, size, high = self.arguments["place_33"]
         origin, direction = self.columns[:2]
         a, b = (corner - origin) / direction, (corner + size * high - origin) / direction
         near = torch.where(direction != 0, torch.fmin(a, b), -torch.inf).amax(1)
-        return torch.where((near > 0) & (near < torch.inf), near, 0.0)[self.ray]
+        return torch.where((near > 0) & (near < torch.inf), near, 0.0)
 
     @cached_property
     def positions(self) -> Tensor:
         """(k, 3) world places of the samples, the middles of their intervals."""
-        t = self.moved + self.starts + 0.5 * self.lengths[:, 0]
+        t = self.moved[self.ray] + self.starts + 0.5 * self.lengths[:, 0]
         origin, direction = (column[self.ray] for column in self.columns[:2])
         return (origin + t[:, None] * direction).to(self.starts.dtype)
 
@@ -283,14 +289,12 @@ def march(
         sums.total = sums.total.index_add(0, which, total)
         sums.clear = sums.clear.index_put((which,), left)
         with torch.no_grad():
-            ray = which[batch.ray]
-            sums.count[:, 0].index_add_(0, ray, (before > 0).to(torch.int32))
-            hit = (before >= hit_clear) & (before * (1 - alpha) < hit_clear)
-            part = torch.log(hit_clear / before) / torch.log1p(-alpha)
-            part = torch.where(alpha < 1, part.clamp(0, 1), 0.0)
-            place = (batch.moved + batch.starts).to(real) + part * batch.lengths[:, 0]
-            found = torch.where(hit, place, torch.inf)
-            sums.depth = sums.depth.scatter_reduce(0, ray, found, "amin")
+            sums.count[:, 0].index_add_(0, which[batch.ray], (before > 0).to(torch.int32))
+            hit = ((before >= hit_clear) & (before * (1 - alpha) < hit_clear)).nonzero()[:, 0]
+            part = torch.log(hit_clear / before[hit]) / torch.log1p(-alpha[hit])
+            part = torch.where(alpha[hit] < 1, part.clamp(0, 1), 0.0)
+            place = batch.starts[hit] + part * batch.lengths[hit, 0] + batch.moved[batch.ray[hit]]
+            sums.depth[which[batch.ray[hit]]] = place.to(real)
             going = (segments.counts[:, 1] >= limit) & (left > 1 - stop_alpha)
             on = going.nonzero()[:, 0]
         origin, direction, cone, limits = columns
