@@ -12,23 +12,29 @@ import tyro
 import gvtorch as gv
 
 SCAN = Path(__file__).parent / "data" / "aneurism_256x256x256_uint8.raw.gz"
-ROWS, STEPS, RATE = 24, 60, 0.15
-TRAINING = {"lod": "auto", "step": 2.0}
+ROWS, STEPS, RATE = 24, 60, 0.2
+TRAINING = {"step": 1.0}
 
 
 class Learned(torch.nn.Module):
-    """Rows of colour and extinction at even distances of values, and straight lines between."""
+    """Rows of colour and log extinction at even distances of values, and straight lines between."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.rows = torch.nn.Parameter(torch.tensor([0.0, 0.0, 0.0, -5.0]).repeat(ROWS, 1))
+        start = torch.tensor([0.0, 0.0, 0.0, -4.0])  # gray, and a thin haze
+        self.rows = torch.nn.Parameter(start.repeat(ROWS, 1))
 
     def forward(self, values, positions, directions, lengths):
         place = (values / 255 * (ROWS - 1)).clamp(0, ROWS - 1)
         row = place.long().clamp(max=ROWS - 2)[:, 0]
         look = self.rows[row] + (place - row[:, None]) * (self.rows[row + 1] - self.rows[row])
-        extinction = torch.nn.functional.softplus(look[:, 3:])
+        extinction = torch.exp(look[:, 3:])
         return look[:, :3].sigmoid(), 1 - torch.exp(-extinction * lengths)
+
+
+def shown(color: torch.Tensor) -> torch.Tensor:
+    """About what a display makes of linear light: dark differences count."""
+    return (color + 1e-4).sqrt()
 
 
 @dataclass
@@ -36,7 +42,7 @@ class Settings:
     """Learns from views of the bundled aneurism; shows before, after and target of a new one."""
 
     output: Path = Path("learn_a_shader.png")
-    size: int = 192
+    size: int = 160
     device: str = "cpu"
 
 
@@ -46,7 +52,7 @@ def main(settings: Settings) -> None:
     target = gv.TransferFunction.preset("vessels", 0, 255)
     module = Learned().to(tree.device)
     shader = gv.ModuleShader(module)
-    small = max(8, settings.size // 6)
+    small = max(8, settings.size // 5)
     views = gv.Camera.orbit([0, 75, 150, 225], [10, -20, 30, -5], 1.6, 30, small, small)
     pictures = [gv.render(tree, views[i], target, **TRAINING).color for i in range(len(views))]
     optimizer = torch.optim.Adam(module.parameters(), lr=RATE)
@@ -60,11 +66,11 @@ def main(settings: Settings) -> None:
     for step in range(STEPS):
         at = step % len(views)
         color = gv.render(tree, views[at], shader, **TRAINING).color
-        loss = (color - pictures[at]).square().mean()
+        loss = (shown(color) - shown(pictures[at])).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        losses.append(float(loss))
+        losses.append(float(loss.detach()))
         if step % 10 == 0:
             print(f"step {step:3d}  loss {losses[-1]:.5f}")
     first, last = (sum(part) / len(part) for part in (losses[: len(views)], losses[-len(views) :]))
