@@ -239,3 +239,10 @@ def test_memory_is_bounded_by_the_samples_shaded_at_once(blobs):
     picture = gv.render(tree, camera, gv.ModuleShader(count, samples=4096), stop_alpha=1.0)
     longest = 2 * math.ceil(8 * math.sqrt(3) * max(tree.spacing) / min(tree.spacing))
     assert max(sizes) <= 4096 + 64 * longest and sum(sizes) >= picture.stats.samples > 40000
+
+
+@pytest.mark.backend("cpp")
+def test_a_frame_with_a_module_is_not_captured(blobs):
+    with gv.Engine(gv.VolumeProducer(blobs), node_pool="1 MB", brick_pool="4 MB") as engine:
+        with pytest.raises(ValueError, match="a ModuleShader can't be recorded"):
+            engine.capture(gv.Camera.orbit(width=8, height=8), twin(SOFT, blobs.spacing))
