@@ -17,7 +17,18 @@ if TYPE_CHECKING:
     from .pool import BrickPool, BrickTable, Channel, N3Tree, NodePool
     from .producers import Bricks, Nodes, Producer, Region, Regions, StoredProducer, VolumeProducer
     from .production import ProductionError
-    from .rendering import Camera, Picture, RenderOptions, TransferFunction, TreeTracer, render
+    from .rendering import (
+        Camera,
+        Cost,
+        ModuleShader,
+        Picture,
+        RenderOptions,
+        TransferFunction,
+        TransferModule,
+        TreeTracer,
+        cost,
+        render,
+    )
     from .volume import Volume
 
 __version__ = "0.1.0"
@@ -38,15 +49,19 @@ _HOME = {
     "VolumeProducer": ".producers",
     "Camera": ".rendering",
     "Channel": ".pool",
+    "Cost": ".rendering",
     "Hits": ".frame",
+    "ModuleShader": ".rendering",
     "N3Tree": ".pool",
     "NodePool": ".pool",
     "Picture": ".rendering",
     "Rays": ".frame",
     "RenderOptions": ".rendering",
     "TransferFunction": ".rendering",
+    "TransferModule": ".rendering",
     "TreeTracer": ".rendering",
     "Volume": ".volume",
+    "cost": ".rendering",
     "read_volume": ".io",
     "render": ".rendering",
 }
@@ -57,10 +72,12 @@ __all__ = [
     "Bricks",
     "Camera",
     "Channel",
+    "Cost",
     "Engine",
     "EngineOptions",
     "FrameStats",
     "Hits",
+    "ModuleShader",
     "N3Tree",
     "NodePool",
     "Nodes",
@@ -73,9 +90,11 @@ __all__ = [
     "RenderOptions",
     "StoredProducer",
     "TransferFunction",
+    "TransferModule",
     "TreeTracer",
     "Volume",
     "VolumeProducer",
+    "cost",
     "read_volume",
     "render",
 ]

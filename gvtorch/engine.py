@@ -24,15 +24,15 @@ from .frame import Counts, FrameStats, Hits, Rays
 from .ops.trace import choose_backend
 from .producers import Producer
 from .production import Failure, Plant, Production
-from .rendering import Camera, Picture, RenderOptions, TransferFunction
+from .rendering import Camera, ModuleShader, Picture, RenderOptions, TransferFunction
 from .rendering.renderer import (
-    Tracer,
     check_type,
     composite_trees,
     develop,
     empty_hits,
     render_options,
     trace_camera,
+    tracer_of,
 )
 from .report import Report
 from .scene import EngineOptions, brick_bytes, checked_device, make_plant, make_pools
@@ -40,7 +40,8 @@ from .stage import Progress, collect_timings, mark, milliseconds, no_progress, s
 from .turns import Turns, scouts
 
 Scene = Producer | Mapping[str, Producer]
-Shaders = TransferFunction | Mapping[str, TransferFunction]
+Shader = TransferFunction | ModuleShader
+Shaders = Shader | Mapping[str, Shader]
 _View = tuple[Camera, torch.device, Callable[[Rays], Hits], torch.dtype]  # of `trace_camera`
 
 _LISTED = 1 << 17  # most nodes with a wish that one frame lists
@@ -356,9 +357,14 @@ class Engine:
             **options: Fields of `RenderOptions`.
 
         Raises:
-            ValueError: The engine is on no CUDA device, or see `frame`.
+            ValueError: The engine is on no CUDA device, a shader is a module, or see `frame`.
             ProductionError: See `frame`.
         """
+        shaders = shader.values() if isinstance(shader, Mapping) else (shader,)
+        if any(isinstance(one, ModuleShader) for one in shaders):
+            raise ValueError(
+                "Engine.capture: a ModuleShader can't be recorded: the host waits in it"
+            )
         if self.device.type != "cuda":
             raise ValueError(f"Engine.capture: the engine must be on CUDA, it is on {self.device}")
         self.frame(camera, shader, **options)  # loads what is loaded at first use
@@ -468,7 +474,8 @@ class Engine:
         tracers = []
         for name, plant in self.plants.items():
             one: Any = shader.get(name) if isinstance(shader, Mapping) else shader
-            check_type("frame", f"shader of tree {name!r}", one, TransferFunction)
+            if not isinstance(one, ModuleShader):
+                check_type("frame", f"shader of tree {name!r}", one, TransferFunction)
             known = plant.producer.channels
             channel = options.channel or next(iter(known))
             if channel not in known:
@@ -477,9 +484,8 @@ class Engine:
                 )
             chosen = dataclasses.replace(options, channel=channel)
             by_level = self.options.loading == "levels"
-            tracers.append(
-                Tracer(plant.tree, one, chosen, by_level=by_level, frame_1=self._frame_1)
-            )
+            frame = {"by_level": by_level, "frame_1": self._frame_1}
+            tracers.append(tracer_of(plant.tree, one, chosen, **frame))
         if len(tracers) == 1:
             return tracers[0]
         return lambda rays: composite_trees(tracers, rays)

@@ -117,6 +117,21 @@ def test_raw_options(tmp_path):
 
 
 @pytest.mark.backend("cpp")
+def test_cost_pictures(small, tmp_path):
+    """Each is another picture; the NPZ and the statistics stay those of the picture."""
+    found = {}
+    for show in ("picture", "samples", "nodes", "lod", "age", "fill"):
+        out, npz = tmp_path / f"{show}.png", tmp_path / f"{show}.npz"
+        run = gvtorch("render", small, "-o", out, "--npz", npz, "--show", show, "--size", "16x16")
+        assert run.returncode == 0, run.stderr
+        found[show] = out.read_bytes()
+        assert npz.read_bytes() == (tmp_path / "picture.npz").read_bytes()
+    assert len(set(found.values())) >= 4, "age and lod of one level are flat"
+    wrong = gvtorch("render", small, "-o", tmp_path / "x.png", "--show", "heat")
+    assert wrong.returncode == 2 and "heat" in wrong.stderr
+
+
+@pytest.mark.backend("cpp")
 def test_all_empty_volume_renders_the_background(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros((4, 5, 6), np.float32))
     args = ("--npz", tmp_path / "a.npz", "--size", "8x8", "--background", "0.5,0,0")

@@ -336,6 +336,7 @@ class Cache:
                     nbytes += self._fill_slots(slot[part.begin : part.end], landed)
         pool.owner_b[slot] = node.to(torch.int32)
         pool.stamp_b.index_fill_(0, slot, self.frame)
+        pool.born_b.index_fill_(0, slot, self.frame + 1)
         pool.shared_b.index_fill_(0, slot, False)
         self._link_bricks(node, slot_k)
         return nbytes

@@ -3,6 +3,20 @@ archives and exported programs that hold `gvtorch::` ops can be loaded."""
 
 from .cache import compact_requests, link, lru_partition, unlink
 from .registry import available
+from .segments import Samples, Segments, composite, list_samples, sample_bricks, trace_segments
 from .trace import trace_rays
 
-__all__ = ["available", "compact_requests", "link", "lru_partition", "trace_rays", "unlink"]
+__all__ = [
+    "Samples",
+    "Segments",
+    "available",
+    "compact_requests",
+    "composite",
+    "link",
+    "list_samples",
+    "lru_partition",
+    "sample_bricks",
+    "trace_rays",
+    "trace_segments",
+    "unlink",
+]

@@ -19,6 +19,7 @@ class BrickPool:
         bricks: For each channel (b, z, y, x, c), sides of brick_size + 2 * border.
         stamp_b: (b,) last frame in which a ray sampled the brick, or after which it was written;
             -1 for never.
+        born_b: (b,) first frame that could draw the brick, 0 for those that were there before.
         owner_b: (b,) node index that the brick belongs to, -1 for free.
         shared_b: (b,) bool, other nodes may point to the brick as well (instancing).
     """
@@ -57,6 +58,7 @@ class BrickPool:
             for name, c in channels.items()
         }
         self.stamp_b = torch.full((capacity,), -1, dtype=torch.int32, device=device)
+        self.born_b = torch.zeros((capacity,), dtype=torch.int32, device=device)
         self.owner_b = torch.full((capacity,), -1, dtype=torch.int32, device=device)
         self.shared_b = torch.zeros((capacity,), dtype=torch.bool, device=device)
 
@@ -64,8 +66,8 @@ class BrickPool:
     def fields(self) -> dict[str, Tensor]:
         """All tensors by name; channels as `bricks.NAME`."""
         channels = {f"bricks.{name}": tensor for name, tensor in self.bricks.items()}
-        words = {"stamp_b": self.stamp_b, "owner_b": self.owner_b, "shared_b": self.shared_b}
-        return channels | words
+        names = ("stamp_b", "born_b", "owner_b", "shared_b")
+        return channels | {name: getattr(self, name) for name in names}
 
     @property
     def capacity(self) -> int:

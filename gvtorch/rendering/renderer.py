@@ -17,6 +17,7 @@ from ..ops.trace import Backend, choose_backend, most_intervals
 from ..pool import N3Tree
 from ..stage import Progress, collect_timings, no_progress, stage
 from .camera import Camera, pixel_rays
+from .module_shader import ModuleShader, ModuleTracer
 from .picture import Picture
 from .shader import TransferFunction, interval_levels
 
@@ -62,7 +63,7 @@ class RenderOptions:
 def render(
     tree: N3Tree,
     camera: Camera,
-    shader: TransferFunction,
+    shader: TransferFunction | ModuleShader,
     *,
     progress: Progress = no_progress,
     **options: Any,
@@ -73,7 +74,7 @@ def render(
         tree: What to render, on the device that renders it; its stamps and request words are
             written.
         camera: One camera or a batch; an orbit camera stands around the tree's box.
-        shader: The transfer function, in data units.
+        shader: The transfer function, in data units, or a module.
         progress: Told how many rays are done.
         **options: Fields of `RenderOptions`.
 
@@ -84,13 +85,12 @@ def render(
         ValueError: An option is unknown or out of its range, or the backend can't be used.
     """
     chosen = render_options("render", camera, options)
-    for name, value, kind in (("tree", tree, N3Tree), ("shader", shader, TransferFunction)):
-        check_type("render", name, value, kind)
+    check_type("render", "tree", tree, N3Tree)
     start = time.perf_counter()
     with collect_timings(tree.device) as timings:
         with stage("prepare"):
             tree.frame += 1
-            tracer = Tracer(tree, shader, chosen)
+            tracer = tracer_of(tree, shader, chosen)
         hits = trace_camera(camera.placed(tree.box), tree.device, tracer, chosen.dtype, progress)
         with stage("picture"):
             stats = RenderStats(
@@ -226,14 +226,17 @@ def _some_rays(numbers: Tensor, camera: Camera, top: int, which: Tensor) -> Rays
 
 
 def trace(
-    tree: N3Tree, rays: Rays, shader: TransferFunction, options: RenderOptions | None = None
+    tree: N3Tree,
+    rays: Rays,
+    shader: TransferFunction | ModuleShader,
+    options: RenderOptions | None = None,
 ) -> Hits:
     """Traces any world rays through a tree as one frame.
 
     Args:
         tree: The tree; its stamps and request words are written.
         rays: Rays in world units, on the tree's device.
-        shader: The transfer function.
+        shader: The transfer function, or a module.
         options: Lod, step and the like; `background` is not used.
 
     Returns:
@@ -243,7 +246,26 @@ def trace(
         ValueError: The channel is unknown, the step too short, or the backend can't be used.
     """
     tree.frame += 1
-    return Tracer(tree, shader, options or RenderOptions())(rays)
+    return tracer_of(tree, shader, options or RenderOptions())(rays)
+
+
+def tracer_of(
+    tree: N3Tree,
+    shader: TransferFunction | ModuleShader,
+    options: RenderOptions,
+    **frame: Any,
+) -> Tracer | ModuleTracer:
+    """Returns what traces a frame of a tree with a shader; `frame` as for `Tracer`.
+
+    Raises:
+        ValueError: It is no shader, or see `Tracer`.
+    """
+    if isinstance(shader, ModuleShader):
+        walls = Tracer(tree, shader.walls, options, **frame)
+        channel = options.channel or tree.channel_names[0]
+        return ModuleTracer(tree, shader, walls.arguments, channel)
+    check_type("render", "shader", shader, TransferFunction)
+    return Tracer(tree, shader, options, **frame)
 
 
 class Tracer:
@@ -311,7 +333,7 @@ class Tracer:
         return Hits(color=color, alpha=alpha, depth=depth, samples=samples, missed=missed)
 
 
-def composite_trees(tracers: list[Tracer], rays: Rays) -> Hits:
+def composite_trees(tracers: Sequence[Tracer | ModuleTracer], rays: Rays) -> Hits:
     """Traces rays through several trees and puts them one over the other, nearest box first.
 
     Right wherever boxes do not overlap along a ray; where they do, the nearer box as a whole comes

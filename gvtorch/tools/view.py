@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from ..engine import Engine
     from ..frame import FrameStats
+    from ..pool import N3Tree
     from ..rendering import Camera, Picture, TransferFunction
     from ..rendering.path import CameraPath
 
@@ -149,6 +150,9 @@ class Render:
     camera: Annotated[str, arg(metavar="CAMERA")] = "orbit:30,20,2.4"
     """orbit:AZIMUTH,ELEVATION,DISTANCE (degrees, and largest sides of the box) or
     look:ex,ey,ez,tx,ty,tz (world units)"""
+    show: Literal["picture", "samples", "nodes", "lod", "age", "fill"] = "picture"
+    """the picture, or what each ray cost: samples, nodes visited; or what it saw: depth of the
+    nodes, age of the bricks in frames, share of their voxels that is not transparent"""
     up: Annotated[str, arg(metavar="X,Y,Z")] = "0,1,0"
     """what a look camera takes for up"""
     threshold: Annotated[float | None, arg(metavar="VALUE")] = None
@@ -171,10 +175,10 @@ class Render:
         with Bar() as bar:
             bar("reading", 0, 0)
             if is_store(self.path):
-                picture, extent = self._stream(camera, options, bar)
+                picture, shown, extent = self._stream(camera, options, bar)
             else:
-                picture, extent = self._resident(camera, options, bar)
-        picture.save(self.output)
+                picture, shown, extent = self._resident(camera, options, bar)
+        shown.save(self.output)
         if self.npz is not None:
             picture.save(self.npz)
         if self.stats is not None:
@@ -184,7 +188,7 @@ class Render:
 
     def _resident(
         self, camera: Camera, options: dict[str, Any], bar: Bar
-    ) -> tuple[Picture, tuple[int, ...]]:
+    ) -> tuple[Picture, Picture, tuple[int, ...]]:
         """Builds the whole tree of a volume file."""
         from ..pool import N3Tree
         from ..rendering import render
@@ -202,11 +206,26 @@ class Render:
             device=look.device(),
             progress=bar,
         )
-        return render(tree, camera, shader, progress=bar, **options), volume.extent
+        picture = render(tree, camera, shader, progress=bar, **options)
+        return picture, self._shown(picture, tree, camera, shader, options), volume.extent
+
+    def _shown(
+        self,
+        picture: Picture,
+        tree: N3Tree,
+        camera: Camera,
+        shader: TransferFunction,
+        options: dict[str, Any],
+    ) -> Picture:
+        from ..rendering import cost
+
+        if self.show == "picture":
+            return picture
+        return cost(tree, camera, shader, **options).picture(self.show)
 
     def _stream(
         self, camera: Camera, options: dict[str, Any], bar: Bar
-    ) -> tuple[Picture, tuple[int, ...]]:
+    ) -> tuple[Picture, Picture, tuple[int, ...]]:
         """Streams a store."""
         if self.threshold is not None:
             raise ValueError("--threshold is for volumes; a store's is set by gvtorch convert")
@@ -221,7 +240,8 @@ class Render:
             )
             _tell_failures(engine)
             (plant,) = engine.plants.values()
-            return picture, plant.tree.extent
+            shown = self._shown(picture, plant.tree, camera, shader, options)
+            return picture, shown, plant.tree.extent
 
 
 @dataclass(frozen=True, kw_only=True)

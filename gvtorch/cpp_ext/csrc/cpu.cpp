@@ -169,6 +169,7 @@ void trace(const torch::stable::Tensor& like, TraceArgs args, bool wide) {
 }  // namespace gvtorch
 
 #include "entry.h"
+#include "entry_segments.h"
 
 STABLE_TORCH_LIBRARY(gvtorch, library) {
   library.def(gvtorch::kTraceRaysSchema);
@@ -176,6 +177,7 @@ STABLE_TORCH_LIBRARY(gvtorch, library) {
   library.def(gvtorch::kLruPartitionSchema);
   library.def(gvtorch::kUnlinkSchema);
   library.def(gvtorch::kLinkSchema);
+  gvtorch::define_segments(library);
 }
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) {
@@ -184,4 +186,5 @@ STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) {
   library.impl("lru_partition", TORCH_BOX(&gvtorch::lru_partition<gvtorch::Cpu>));
   library.impl("unlink", TORCH_BOX(&gvtorch::unlink<gvtorch::Cpu>));
   library.impl("link", TORCH_BOX(&gvtorch::link<gvtorch::Cpu>));
+  GV_IMPLEMENT_SEGMENTS(library, gvtorch::Cpu);
 }

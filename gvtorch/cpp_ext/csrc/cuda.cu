@@ -244,6 +244,7 @@ void split(const torch::stable::Tensor& like, int64_t count, const Keep& keep, c
 }  // namespace gvtorch
 
 #include "entry.h"
+#include "entry_segments.h"
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch, CUDA, library) {
   library.impl("trace_rays", TORCH_BOX(&gvtorch::trace_rays<gvtorch::Cuda>));
@@ -251,4 +252,5 @@ STABLE_TORCH_LIBRARY_IMPL(gvtorch, CUDA, library) {
   library.impl("lru_partition", TORCH_BOX(&gvtorch::lru_partition<gvtorch::Cuda>));
   library.impl("unlink", TORCH_BOX(&gvtorch::unlink<gvtorch::Cuda>));
   library.impl("link", TORCH_BOX(&gvtorch::link<gvtorch::Cuda>));
+  GV_IMPLEMENT_SEGMENTS(library, gvtorch::Cuda);
 }

@@ -1,0 +1,51 @@
+"""What a picture costs: samples and nodes of each ray, and the level, age and fill of the bricks it
+saw, while a camera turns around a scan that is streamed."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import tyro
+
+import gvtorch as gv
+
+SCAN = Path(__file__).parent / "data" / "aneurism_256x256x256_uint8.raw.gz"
+FRAMES, DEGREES = 10, 9.0
+IMAGES = ("samples", "nodes", "lod", "age", "fill")
+
+
+@dataclass
+class Settings:
+    """Renders the bundled aneurism and its cost pictures: the picture and samples per ray, nodes
+    visited and level of detail, age and fill of the bricks."""
+
+    output: Path = Path("cost.png")
+    size: int = 200
+    device: str = "cpu"
+
+
+def main(settings: Settings) -> None:
+    """Turns the camera, then counts what the last frame did."""
+    volume = gv.read_volume(SCAN)
+    shader = gv.TransferFunction.preset("vessels", *volume.value_range)
+    options = {"brick_pool": "32 MB", "load_budget": 400, "device": settings.device}
+    with gv.Engine(gv.VolumeProducer(volume), **options) as engine:
+        for frame in range(FRAMES):
+            azimuth = 30 + DEGREES * frame
+            camera = gv.Camera.orbit(azimuth, 20, 0.75, 60, settings.size, settings.size)
+            picture, _ = engine.frame(camera, shader)
+        tree = engine.plants["scene"].tree
+        cost = gv.cost(tree, camera, shader)
+    for name in IMAGES:
+        image = getattr(cost, name).float()
+        seen = image[~image.isnan()]
+        print(f"{name:8s} mean {float(seen.mean()):7.2f}  most {float(seen.max()):7.2f}")
+    panels = [picture.color.cpu(), *(cost.picture(name).color for name in IMAGES)]
+    rows = [torch.cat(panels[at : at + 3], 1) for at in (0, 3)]
+    dataclasses.replace(picture, color=torch.cat(rows, 0)).save(settings.output)
+    print(f"{settings.output}: {cost.stats.milliseconds:.0f} ms")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings))

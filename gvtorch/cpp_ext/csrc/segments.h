@@ -1,0 +1,452 @@
+// Segments: the runs of intervals that rays take in the bricks they pass, for shaders that are no kernel. Rays are
+// walked as in trace.h (the same visits, marks and intervals), but nothing is shaded: what a sample needs is written
+// down. SampleBricks then reads any channel at any sample, to the bit as the renderer does; CompositeRay adds up.
+//
+// A segment is all the whole intervals of one visit that have one length and one base, or one piece of any length: the
+// last interval of a ray, cut at the far side, or a region of one value. Lists have exact sizes: rays are walked twice,
+// to count and to write. A ray may be walked by parts: `limit` samples, at least one visit, and on from `state_r3`.
+#pragma once
+
+#include "trace.h"
+
+namespace gvtorch {
+inline namespace GV_NAMESPACE {
+
+constexpr int32_t kPiece = -1;  // level of a piece
+
+template <class T>
+struct Segment {
+  Holder fine, coarse;
+  int32_t wanted = 0;            // depth that the cone asked for
+  int32_t first = 0, count = 0;  // number of the first interval since base, intervals
+  int32_t level = kPiece;        // intervals are step * 2^level long, or kPiece
+  // Distances from where the ray enters the scene; seen: where the nodes were looked up.
+  T base = 0, start = 0, end = 0, seen = 0;
+};
+
+template <class T>
+struct SegmentView {
+  int32_t *ray_s, *node_s2, *brick_s2, *depth_s3, *interval_s3;
+  T *t0_s, *t1_s, *distance_s3;
+
+  GV_HD void write(int64_t place, int64_t ray, const Segment<T>& segment, T moved) const {
+    ray_s[place] = static_cast<int32_t>(ray);
+    node_s2[2 * place] = segment.fine.node;
+    node_s2[2 * place + 1] = segment.coarse.node;
+    brick_s2[2 * place] = segment.fine.brick;
+    brick_s2[2 * place + 1] = segment.coarse.brick;
+    depth_s3[3 * place] = segment.fine.depth;
+    depth_s3[3 * place + 1] = segment.coarse.depth;
+    depth_s3[3 * place + 2] = segment.wanted;
+    interval_s3[3 * place] = segment.first;
+    interval_s3[3 * place + 1] = segment.count;
+    interval_s3[3 * place + 2] = segment.level;
+    t0_s[place] = segment.start + moved;
+    t1_s[place] = segment.end + moved;
+    distance_s3[3 * place] = segment.base;
+    distance_s3[3 * place + 1] = segment.end;
+    distance_s3[3 * place + 2] = segment.seen;
+  }
+};
+
+struct Walked {
+  int32_t segments = 0, samples = 0, visits = 0;
+  bool missed = false;
+};
+
+// Walks a ray, and calls emit(segment) for what it samples.
+template <class T, class Voxel>
+struct WalkRay {
+  TraceRay<T, Voxel> trace;
+  const T* state_r3;  // base, count and level that each ray goes on with; null: rays begin
+  int32_t limit;      // a ray pauses behind the visit in which it has taken so many samples; 0: it goes to its end
+  bool by_node;       // a region is of one value only where one node answers
+
+  GV_HD Intervals<T> begin(const Ray<T>& ray, int64_t number) const {
+    Intervals<T> at(ray, trace.options.step, trace.transfer.levels);
+    if (state_r3 == nullptr) return at;
+    at.base = state_r3[3 * number];
+    at.count = state_r3[3 * number + 1];
+    at.level = static_cast<int32_t>(clamp(state_r3[3 * number + 2], static_cast<T>(0), static_cast<T>(at.top)));
+    at.length = at.step;
+    for (int32_t level = 0; level < at.level; ++level) at.length = at.length + at.length;
+    at.shortness = 1 / at.length;
+    at.start = at.start_of(at.count);
+    return at;
+  }
+
+  template <class Emit>
+  GV_HD Walked walk(const Ray<T>& ray, Intervals<T>& at, Emit& emit) const {
+    const Transfer<T> shader(trace.transfer);
+    Walked walked;
+    int32_t wanted = 0;
+    const bool powers = trace.tree.digit_bits > 0;
+    while (at.inside() && (limit == 0 || walked.samples < limit)) {
+      if (powers) {
+        visit<BitDigits<T>>(ray, shader, at, wanted, walked, emit);
+      } else {
+        visit<Digits<T>>(ray, shader, at, wanted, walked, emit);
+      }
+    }
+    return walked;
+  }
+
+  // One node, as TraceRay::visit takes it.
+  template <class Number, class Emit>
+  GV_HD void visit(const Ray<T>& ray, const Transfer<T>& shader, Intervals<T>& at, int32_t& wanted, Walked& walked,
+                   Emit& emit) const {
+    const T infinity = static_cast<T>(INFINITY);
+    const Levels<T>& levels = trace.levels;
+    const T middle = at.middle();
+    const T cone = at.cone(middle);
+    while (wanted < trace.tree.max_depth && levels.voxel[wanted] > cone) ++wanted;
+    while (wanted > 0 && !(levels.voxel[wanted - 1] > cone)) --wanted;
+    const T voxel = levels.voxel[wanted];
+    const T above = wanted > 0 ? levels.voxel[wanted - 1] : infinity;
+    const bool reached = voxel <= cone;
+    const bool blend = reached && wanted > 0;
+    const T cone_low = reached ? voxel : -infinity;
+    const T cone_high = reached ? above : voxel;
+
+    const auto hides = [&](int32_t node) {
+      uint8_t known = load_byte(&trace.hidden_tn[node]);
+      if (known == kUnknown) {
+        known = HideNode<T, Voxel>::hidden(trace.bricks, shader, node) ? kHidden : kShown;
+        store_byte(&trace.hidden_tn[node], known);
+      }
+      return known == kHidden;
+    };
+    Number digits(trace.tree, ray.at(middle));
+    NoPath path;
+    const Place place = descend(trace.tree, digits, wanted, blend, *trace.frame_1, hides, path);
+    const T exit = ray.leave(digits.corner(place.depth, levels), levels.size[place.depth]);
+    const bool clear = place.hidden && (place.depth < wanted || !blend);
+    if (!clear && trace.mark_missing(place, wanted, blend, cone)) walked.missed = true;
+    ++walked.visits;
+
+    Segment<T> segment;
+    segment.wanted = wanted;
+    segment.seen = middle;
+    segment.fine = place.fine;
+    segment.coarse = place.coarse.node >= 0 ? place.coarse : place.fine;
+    const Holder &fine = segment.fine, &coarse = segment.coarse;
+    if (!clear && fine.brick >= 0) store_stamp(&trace.bricks.stamp_b[fine.brick], *trace.frame_1);
+    if (!clear && coarse.brick >= 0) store_stamp(&trace.bricks.stamp_b[coarse.brick], *trace.frame_1);
+    if (clear || fine.node < 0 || (fine.brick == kEmpty && coarse.brick == kEmpty)) {
+      trace.leave(at, exit, cone_low, cone_high);
+      return;
+    }
+    const auto put = [&] {
+      emit(segment);
+      ++walked.segments;
+      walked.samples += segment.count;
+      segment.count = 0;
+    };
+    const auto piece = [&](T start, T end) {
+      segment.base = segment.start = start;
+      segment.end = end;
+      segment.first = 0;
+      segment.count = 1;
+      segment.level = kPiece;
+      put();
+    };
+    if (uniform(fine, coarse)) {
+      const T entry = at.start;
+      trace.leave(at, exit, cone_low, cone_high);
+      piece(entry, smaller(at.start, at.stop));
+      return;
+    }
+    do {
+      if (at.cut()) {
+        if (segment.count > 0) put();
+        piece(at.start, at.stop);
+        at.skip(1);
+        return;
+      }
+      if (segment.count > 0 && (at.base != segment.base || at.level != segment.level)) put();
+      if (segment.count == 0) {
+        segment.base = at.base;
+        segment.start = at.start;
+        segment.first = static_cast<int32_t>(at.count);
+        segment.level = at.level;
+      }
+      const int32_t alike = at.run(exit, cone_low, cone_high);
+      segment.count += alike;
+      segment.end = at.start_of(at.count + static_cast<T>(alike));
+      at.skip(alike);
+    } while (trace.stays(at, exit, cone_low, cone_high));
+    put();
+  }
+
+  GV_HD bool uniform(const Holder& fine, const Holder& coarse) const {
+    if (fine.brick >= 0 || coarse.brick >= 0) return false;
+    return by_node ? fine.node == coarse.node : constant(fine) == constant(coarse);
+  }
+  GV_HD T constant(const Holder& holder) const {
+    const auto& bricks = trace.bricks;
+    return number<T>(bricks.constant_tnc[static_cast<int64_t>(holder.node) * bricks.channels + bricks.component]);
+  }
+};
+
+template <class T, class Walk>
+struct CountSegments {
+  Walk walk;
+  int32_t* count_r3;  // segments, samples, visits
+  T* state_r3;
+  bool* missed_r;
+
+  GV_HD void operator()(int64_t index) const {
+    const int64_t ray_number = walk.trace.order(index);
+    if (ray_number < 0) return;
+    const Ray<T> ray(walk.trace.rays, ray_number);
+    Intervals<T> at = walk.begin(ray, ray_number);
+    const auto ignore = [](const Segment<T>&) {};
+    const Walked walked = walk.walk(ray, at, ignore);
+    count_r3[3 * ray_number] = walked.segments;
+    count_r3[3 * ray_number + 1] = walked.samples;
+    count_r3[3 * ray_number + 2] = walked.visits;
+    state_r3[3 * ray_number] = at.base;
+    state_r3[3 * ray_number + 1] = at.count;
+    state_r3[3 * ray_number + 2] = static_cast<T>(at.level);
+    missed_r[ray_number] = walked.missed;
+  }
+};
+
+template <class T, class Walk>
+struct WriteSegments {
+  Walk walk;
+  const int64_t* first_r;  // where each ray's segments begin
+  int64_t total;
+  SegmentView<T> out;
+
+  GV_HD void operator()(int64_t index) const {
+    const int64_t ray_number = walk.trace.order(index);
+    if (ray_number < 0) return;
+    const Ray<T> ray(walk.trace.rays, ray_number);
+    Intervals<T> at = walk.begin(ray, ray_number);
+    int64_t place = first_r[ray_number];
+    const auto write = [&](const Segment<T>& segment) {
+      if (place >= 0 && place < total) out.write(place, ray_number, segment, ray.moved);
+      ++place;
+    };
+    walk.walk(ray, at, write);
+  }
+};
+
+// Adds to a sum that other threads add to as well.
+template <class T>
+GV_HD void add_to(T* sum, T value) {
+#ifdef __CUDA_ARCH__
+  atomicAdd(sum, value);
+#else
+  T seen = *sum;
+  T next = seen + value;
+  while (!__atomic_compare_exchange(sum, &seen, &next, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) next = seen + value;
+#endif
+}
+
+// What a sample of a segment reads: the bricks (or constants) of two nodes, and the weight of the coarse one.
+template <class T, class Voxel>
+struct AimSample {
+  RayView rays;
+  TreeView tree;  // its shape alone
+  Levels<T> levels;
+  BrickView<Voxel> bricks;
+  SegmentView<T> segments;  // read
+  const int32_t *segment_k, *number_k;
+  int64_t ray_count, segment_count, node_count;
+  T step;
+
+  struct Aimed {
+    BrickRay<T, Voxel> fine, coarse;
+    Holder fine_holder, coarse_holder;
+    T t, weight;
+    bool known = false;  // all that the segment names exists
+  };
+
+  GV_HD Aimed operator()(int64_t k) const {
+    const bool powers = tree.digit_bits > 0;
+    return powers ? aim_at<BitDigits<T>>(k) : aim_at<Digits<T>>(k);
+  }
+  template <class Number>
+  GV_HD Aimed aim_at(int64_t k) const {
+    Aimed aimed;
+    const int64_t segment = segment_k[k];
+    if (segment < 0 || segment >= segment_count) return aimed;
+    const int32_t wanted = segments.depth_s3[3 * segment + 2];
+    const int64_t ray_number = segments.ray_s[segment];
+    for (int which = 0; which < 2; ++which) {
+      Holder& holder = which == 0 ? aimed.fine_holder : aimed.coarse_holder;
+      holder = {segments.node_s2[2 * segment + which], segments.brick_s2[2 * segment + which],
+                segments.depth_s3[3 * segment + which]};
+      if (holder.node < 0 || holder.node >= node_count || holder.brick >= bricks.bricks || holder.depth < 0 ||
+          holder.depth > tree.max_depth)
+        return aimed;
+    }
+    if (ray_number < 0 || ray_number >= ray_count || wanted < 0 || wanted > tree.max_depth) return aimed;
+    aimed.known = true;
+    const Ray<T> ray(rays, ray_number);
+    Number digits(tree, ray.at(segments.distance_s3[3 * segment + 2]));
+    aimed.fine = aimed.coarse = aim(bricks, levels, aimed.fine_holder, digits, ray.origin, ray.direction);
+    aimed.t = place(segment, number_k[k]);
+    aimed.weight = 0;
+    if (aimed.coarse_holder.node != aimed.fine_holder.node) {
+      aimed.coarse = aim(bricks, levels, aimed.coarse_holder, digits, ray.origin, ray.direction);
+      const T voxel = levels.voxel[wanted];
+      const T blend = 1 / ((wanted > 0 ? levels.voxel[wanted - 1] : static_cast<T>(INFINITY)) - voxel);
+      const T cone = ray.cone_near + ray.cone_growth * aimed.t;
+      aimed.weight = clamp((cone - voxel) * blend, static_cast<T>(0), static_cast<T>(1));
+    }
+    return aimed;
+  }
+  // The middle of a segment's interval.
+  GV_HD T place(int64_t segment, int32_t number) const {
+    const int32_t level = segments.interval_s3[3 * segment + 2];
+    const T base = segments.distance_s3[3 * segment];
+    const T end = segments.distance_s3[3 * segment + 1];
+    if (level < 0) return base + (end - base) * static_cast<T>(0.5);
+    T length = step;
+    for (int32_t power = 0; power < smaller(level, kMostLevels); ++power) length = length + length;
+    const int32_t count = segments.interval_s3[3 * segment] + number;
+    return base + (static_cast<T>(count) + static_cast<T>(0.5)) * length;
+  }
+};
+
+template <class T, class Voxel>
+struct SampleBricks {
+  AimSample<T, Voxel> aim_sample;
+  T* value_kc;
+
+  GV_HD void operator()(int64_t k) const {
+    auto aimed = aim_sample(k);
+    const BrickView<Voxel>& bricks = aim_sample.bricks;
+    const bool mixed = aimed.coarse_holder.node != aimed.fine_holder.node;
+    for (int32_t channel = 0; channel < bricks.channels; ++channel) {
+      T value = 0;
+      if (aimed.known) {
+        value = read(aimed.fine, aimed.fine_holder, aimed.t, channel);
+        if (mixed) value = value + aimed.weight * (read(aimed.coarse, aimed.coarse_holder, aimed.t, channel) - value);
+      }
+      value_kc[k * bricks.channels + channel] = value;
+    }
+  }
+  GV_HD T read(BrickRay<T, Voxel> ray, const Holder& holder, T t, int32_t channel) const {
+    const BrickView<Voxel>& bricks = aim_sample.bricks;
+    if (ray.voxels == nullptr)
+      return number<T>(bricks.constant_tnc[static_cast<int64_t>(holder.node) * bricks.channels + channel]);
+    ray.voxels += channel;
+    return sample(bricks, ray, t);
+  }
+};
+
+// The gradient of SampleBricks: each sample adds to the voxels (or constants) it was made of.
+template <class T, class Voxel>
+struct SpreadGradient {
+  AimSample<T, Voxel> aim_sample;
+  const T* grad_kc;
+  T *grad_bzyxc, *grad_tnc;
+
+  GV_HD void operator()(int64_t k) const {
+    const auto aimed = aim_sample(k);
+    if (!aimed.known) return;
+    const bool mixed = aimed.coarse_holder.node != aimed.fine_holder.node;
+    spread(aimed.fine, aimed.fine_holder, aimed.t, k, 1 - aimed.weight);
+    if (mixed) spread(aimed.coarse, aimed.coarse_holder, aimed.t, k, aimed.weight);
+  }
+  GV_HD void spread(const BrickRay<T, Voxel>& ray, const Holder& holder, T t, int64_t k, T share) const {
+    const BrickView<Voxel>& bricks = aim_sample.bricks;
+    const T* grad_c = grad_kc + k * bricks.channels;
+    if (ray.voxels == nullptr) {
+      T* constant = grad_tnc + static_cast<int64_t>(holder.node) * bricks.channels;
+      for (int32_t channel = 0; channel < bricks.channels; ++channel)
+        add_to(constant + channel, share * grad_c[channel]);
+      return;
+    }
+    int64_t corner[3];
+    T weight[3];
+    for (int axis = 0; axis < 3; ++axis) {
+      const T place = clamp(ray.offset[axis] + t * ray.slope[axis], static_cast<T>(0), static_cast<T>(bricks.side - 1));
+      const int32_t cell = smaller(static_cast<int32_t>(place), bricks.side - 2);
+      corner[axis] = cell;
+      weight[axis] = place - static_cast<T>(cell);
+    }
+    const int64_t first = static_cast<int64_t>(holder.brick) * bricks.side * bricks.side * bricks.side;
+    for (int which = 0; which < 8; ++which) {
+      const int dx = which & 1, dy = which >> 1 & 1, dz = which >> 2;
+      const T part = share * (dx ? weight[0] : 1 - weight[0]) * (dy ? weight[1] : 1 - weight[1]) *
+                     (dz ? weight[2] : 1 - weight[2]);
+      const int64_t voxel = first + ((corner[2] + dz) * bricks.side + corner[1] + dy) * bricks.side + corner[0] + dx;
+      for (int32_t channel = 0; channel < bricks.channels; ++channel) {
+        add_to(grad_bzyxc + voxel * bricks.channels + channel, part * grad_c[channel]);
+      }
+    }
+  }
+};
+
+// Samples of rays, packed, each ray's in a row from front to back.
+struct PackedView {
+  const int64_t* offset_r;  // (r + 1,)
+  int64_t count;
+  int32_t channels;
+
+  GV_HD int64_t begin(int64_t ray) const { return clamp<int64_t>(offset_r[ray], 0, count); }
+  GV_HD int64_t end(int64_t ray) const { return clamp<int64_t>(offset_r[ray + 1], 0, count); }
+};
+
+// Front to back: feature = sum of clear * alpha * feature, where clear is what the samples before let through.
+// A ray ends where no more than `stop_clear` is left; what lies behind has a `before` of 0. stop_clear 0: all count.
+template <class T>
+struct CompositeRay {
+  PackedView packed;
+  const T *alpha_k, *feature_kc, *clear_r;
+  T stop_clear;
+  T *sum_rc, *left_r, *before_k;
+
+  GV_HD void operator()(int64_t ray) const {
+    T clear = clear_r[ray];
+    T* sum_c = sum_rc + ray * packed.channels;
+    for (int32_t channel = 0; channel < packed.channels; ++channel) sum_c[channel] = 0;
+    for (int64_t k = packed.begin(ray); k < packed.end(ray); ++k) {
+      const bool ended = stop_clear > 0 && !(clear > stop_clear);
+      before_k[k] = ended ? 0 : clear;
+      if (ended) continue;
+      const T share = clear * alpha_k[k];
+      for (int32_t channel = 0; channel < packed.channels; ++channel) {
+        sum_c[channel] = sum_c[channel] + share * feature_kc[k * packed.channels + channel];
+      }
+      clear = clear * (1 - alpha_k[k]);
+    }
+    left_r[ray] = clear;
+  }
+};
+
+// The gradient of CompositeRay, from back to front. With S the sum and L the light left behind a sample, both of what
+// enters it: S' = alpha f + (1 - alpha) S, L' = (1 - alpha) L. No division, so an alpha of 1 is nothing special.
+template <class T>
+struct CompositeGradient {
+  PackedView packed;
+  const T *alpha_k, *feature_kc, *before_k, *grad_sum_rc, *grad_left_r;
+  T stop_clear;
+  T *grad_alpha_k, *grad_feature_kc, *grad_clear_r;
+
+  GV_HD void operator()(int64_t ray) const {
+    const int64_t begin = packed.begin(ray), end = packed.end(ray);
+    T behind = grad_left_r[ray];  // gradient of the light that enters the samples behind
+    for (int64_t k = end - 1; k >= begin; --k) {
+      const T before = before_k[k], alpha = alpha_k[k];
+      T own = 0;  // gradient of the light that the sample takes
+      for (int32_t channel = 0; channel < packed.channels; ++channel) {
+        const T grad = grad_sum_rc[ray * packed.channels + channel];
+        own = own + grad * feature_kc[k * packed.channels + channel];
+        grad_feature_kc[k * packed.channels + channel] = before * alpha * grad;
+      }
+      const bool counts = before > 0 || !(stop_clear > 0);
+      grad_alpha_k[k] = counts ? before * (own - behind) : 0;
+      if (counts) behind = alpha * own + (1 - alpha) * behind;
+    }
+    grad_clear_r[ray] = behind;
+  }
+};
+
+}  // namespace GV_NAMESPACE
+}  // namespace gvtorch

@@ -1,0 +1,248 @@
+"""`ModuleShader`: a transfer function as a module draws what the kernel draws; modules see what
+they are told they see; gradients reach parameters and voxels.
+"""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from conftest import DATA, DEVICES
+from test_trace_rays import SHADER
+
+import gvtorch as gv
+
+SOFT = gv.TransferFunction.from_points(  # never quite opaque: a power of 0 has no slope
+    opacity=[(0, 0), (0.2, 0), (0.6, 0.4), (1, 0.95)],
+    color=[(0, 1, 0, 0), (0.5, 0.2, 0.8, 0.1), (1, 1, 1, 1)],
+)
+
+
+def twin(shader: gv.TransferFunction, spacing, device="cpu", **options) -> gv.ModuleShader:
+    return gv.ModuleShader(gv.TransferModule(shader, min(spacing)).to(device), **options)
+
+
+def assert_same_picture(module: gv.Picture, fused: gv.Picture, *, tolerance=1e-4) -> None:
+    assert fused.alpha.max() > 0.5, "the test must see something"
+    assert (module.color - fused.color).abs().max() < tolerance
+    assert (module.alpha - fused.alpha).abs().max() < tolerance
+    assert torch.equal(torch.isinf(module.depth), torch.isinf(fused.depth))
+    hit = torch.isfinite(fused.depth)
+    assert (module.depth - fused.depth)[hit].abs().max() < 1e-2
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("brick_size", [4, 8, 16])
+@pytest.mark.parametrize("lod", ["auto", "finest"])
+@pytest.mark.parametrize("distance", [0.4, 1.3, 5.0])
+def test_a_transfer_function_as_module_equals_the_fused_one(
+    blobs, compiled, brick_size, lod, distance
+):
+    tree = gv.N3Tree.from_volume(blobs, brick_size, device=DEVICES[compiled])
+    camera = gv.Camera.orbit(30, 20, distance, width=24, height=24)
+    for shader in (twin(SOFT, tree.spacing, tree.device), twin(SOFT, tree.spacing, tree.device,
+                                                               hidden_by=SOFT)):  # fmt: skip
+        fused = gv.render(tree, camera, SOFT, lod=lod)
+        if distance < 1:
+            assert (gv.render(tree, camera, shader, lod=lod).color - fused.color).abs().max() < 1e-4
+        else:
+            assert_same_picture(gv.render(tree, camera, shader, lod=lod), fused)
+
+
+@torch.no_grad()
+def test_a_module_equals_the_fused_one_on_scans(aneurism, stent, compiled):
+    vessels = gv.TransferFunction.preset("vessels", *aneurism.value_range)
+    for volume, shader in (
+        (aneurism, vessels),
+        (stent, gv.TransferFunction.from_json(DATA / "stent.json")),
+    ):
+        tree = gv.N3Tree.from_volume(volume, device=DEVICES[compiled])
+        module = twin(shader, tree.spacing, tree.device, hidden_by=shader, samples=1 << 16)
+        camera = gv.Camera.orbit(30, 20, 1.6, width=64, height=64)
+        assert_same_picture(gv.render(tree, camera, module), gv.render(tree, camera, shader))
+
+
+@torch.no_grad()
+def test_a_module_streams_what_the_fused_shader_streams(blobs, compiled):
+    """The same bricks are asked for, and the converged pictures are the same."""
+    camera = gv.Camera.orbit(30, 20, 1.3, width=24, height=24)
+    found = {}
+    for name in ("fused", "module"):
+        with gv.Engine(
+            gv.VolumeProducer(blobs), brick_size=4, node_pool="1 MB", brick_pool="4 MB",
+            device=DEVICES[compiled],
+        ) as engine:  # fmt: skip
+            spacing = next(iter(engine.plants.values())).tree.spacing
+            shader = twin(SOFT, spacing, engine.device, hidden_by=SOFT)
+            picture = engine.render(camera, SOFT if name == "fused" else shader)
+            engine.validate()
+            found[name] = (picture, int((engine.cache.bricks.owner_b >= 0).sum()))
+            assert picture.stats.converged
+    assert_same_picture(found["module"][0], found["fused"][0])
+    assert found["fused"][1] <= found["module"][1] <= 1.2 * found["fused"][1], (
+        "a ray that ends inside a part has walked a little farther"
+    )
+
+
+@torch.no_grad()
+def test_modules_and_transfer_functions_share_a_scene(blobs):
+    camera = gv.Camera.orbit(30, 20, 1.3, width=16, height=16)
+    far = gv.Volume(blobs.data, blobs.spacing, (105.0, -3.0, 2.0))
+    scene = {"a": gv.VolumeProducer(blobs), "b": gv.VolumeProducer(far)}
+    with gv.Engine(scene, brick_size=4, node_pool="1 MB", brick_pool="4 MB") as engine:
+        both = engine.render(camera, {"a": SOFT, "b": SOFT})
+        mixed = engine.render(camera, {"a": SOFT, "b": twin(SOFT, blobs.spacing)})
+    assert_same_picture(mixed, both)
+
+
+@torch.no_grad()
+def test_the_module_sees_places_directions_and_lengths(blobs, backend):
+    """A module that knows where it is draws a ball that no voxel holds."""
+    volume = gv.Volume(torch.rand(16, 16, 16, generator=torch.Generator().manual_seed(0)))
+    tree = gv.N3Tree.from_volume(volume, 8, device=DEVICES[backend])
+    centre, seen = tree.box.mean(0).to(tree.device), []
+
+    def ball(values, positions, directions, lengths):
+        seen.append((positions, directions, lengths))
+        inside = ((positions - centre).norm(dim=1, keepdim=True) < 5).to(values)
+        alpha = 1 - torch.exp(-0.3 * lengths * inside)
+        return directions.abs(), alpha.to(values)
+
+    camera = gv.Camera.orbit(0, 0, 4, width=33, height=33, fov=30)
+    picture = gv.render(tree, camera, gv.ModuleShader(ball), lod="finest", backend=backend,
+                        step=0.25, stop_alpha=1.0)  # fmt: skip
+    middle = picture.alpha[16, 16, 0]
+    assert abs(float(middle) - (1 - math.exp(-0.3 * 10))) < 0.01, "its diameter is 10"
+    colour = picture.color[16, 16] / middle
+    assert (colour - torch.tensor([0.0, 0.0, 1.0]).to(colour)).abs().max() < 0.05
+    for positions, directions, lengths in seen:
+        assert (directions.norm(dim=1) - 1).abs().max() < 1e-5
+        assert positions.min() > -0.6 and positions.max() < 15.6 and lengths.max() <= 0.2501
+    assert picture.alpha[0, 0] == 0
+
+
+@torch.no_grad()
+def test_a_far_camera_costs_no_precision(blobs):
+    """Places come from where the ray enters the box: float32 would lose them out there."""
+    volume = gv.Volume(torch.ones(8, 8, 8))
+    tree, found = gv.N3Tree.from_volume(volume, 8), []
+
+    def note(values, positions, directions, lengths):
+        found.append((positions[:, 2], lengths))
+        return values.expand(-1, 3), torch.zeros_like(lengths)
+
+    noise = gv.Volume(torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(0)))
+    tree = gv.N3Tree.from_volume(noise, 8)
+    camera = gv.Camera.look_at((3.5, 3.5, 1e8), (3.5, 3.5, 3.5), (0, 1, 0), 1e-8, 1, 1)
+    gv.render(tree, camera, gv.ModuleShader(note), lod="finest")
+    place, length = (torch.cat(column) for column in zip(*found, strict=True))
+    expected = 7.5 - 0.5 * (torch.arange(16) + 0.5)
+    assert (place - expected).abs().max() < 1e-5 and (length - 0.5).abs().max() < 1e-5
+
+
+@torch.no_grad()
+def test_several_channels_stand_side_by_side(blobs, compiled):
+    other = gv.Volume(torch.cat((1 - blobs.data, blobs.data * 3), -1), blobs.spacing, blobs.origin)
+    tree = gv.N3Tree.from_volume({"a": blobs, "b": other}, 4, device=DEVICES[compiled])
+    seen = []
+
+    def look(values, positions, directions, lengths):
+        seen.append(values)
+        return values, torch.full_like(lengths, 0.02)
+
+    camera = gv.Camera.orbit(width=16, height=16, distance=1.5)
+    gv.render(tree, camera, gv.ModuleShader(look, ["a", "b"]))
+    values = torch.cat(seen)
+    assert values.shape[1] == 3 and values[:, 0].max() > 0.5
+    assert (values[:, 0] + values[:, 1] - 1).abs().max() < 1e-5
+    assert (values[:, 2] - 3 * values[:, 0]).abs().max() < 1e-5
+
+
+def test_gradients_reach_parameters_and_voxels(blobs, compiled):
+    """Against differences of the picture."""
+    tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
+    camera = gv.Camera.orbit(width=8, height=8, distance=1.3)
+    module = gv.TransferModule(SOFT, min(tree.spacing)).to(tree.device)
+    shader = gv.ModuleShader(module)
+    weight = torch.linspace(-1, 1, 8 * 8 * 3, device=tree.device).reshape(8, 8, 3)
+
+    def loss() -> torch.Tensor:
+        return (gv.render(tree, camera, shader, dtype=torch.float64).color * weight).sum()
+
+    pool = tree.bricks.bricks["value"].requires_grad_()
+    loss().backward()
+    smooth = (module.rows[:, 3:] > 0.05) & (module.rows[:, 3:] < 0.9)  # away from the clamps
+    for leaf, where in ((module.rows, smooth.expand(-1, 4)), (pool, torch.ones_like(pool) > 0)):
+        grad = leaf.grad
+        at = int((grad.abs() * where).argmax())
+        with torch.no_grad():
+            flat, ends = leaf.view(-1), []
+            own = float(flat[at])
+            for sign in (1, -1):
+                flat[at] = own + sign * 1e-3
+                ends.append(float(loss()))
+            flat[at] = own
+        slope = (ends[0] - ends[1]) / 2e-3
+        assert abs(slope) > 1e-2 and abs(float(grad.view(-1)[at]) - slope) < 0.02 * abs(slope)
+
+
+@pytest.mark.backend("cpp")
+def test_mistakes_have_one_clear_message(blobs):
+    tree = gv.N3Tree.from_volume(blobs, 8)
+    camera = gv.Camera.orbit(width=8, height=8, distance=1.3)
+
+    def wide(values, *_rest):
+        return values.expand(-1, 4), values
+
+    def much(values, *_rest):
+        return values.expand(-1, 3), values + 5
+
+    def nan(values, *_rest):
+        return values.expand(-1, 3), values * math.nan
+
+    for shader, message in (
+        (gv.ModuleShader(wide), "ModuleShader: the module's colour must be ("),
+        (gv.ModuleShader(much), "the module's alpha must lie in [0, 1]"),
+        (gv.ModuleShader(nan), "the module's alpha must lie in [0, 1]"),
+        (gv.ModuleShader(wide, ["heat"]), "unknown channel 'heat'; the tree has value"),
+        ("bright", "shader must be a TransferFunction"),
+    ):
+        with pytest.raises(ValueError) as caught:
+            gv.render(tree, camera, shader)
+        assert message in str(caught.value) and "\n" not in str(caught.value)
+    for args, message in (
+        ((3,), "module must be callable"),
+        ((wide, "value"), "channels must be names"),
+        ((wide, []), "channels must be names"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            gv.ModuleShader(*args)
+    with pytest.raises(ValueError, match="hidden_by must be a TransferFunction"):
+        gv.ModuleShader(wide, hidden_by=wide)
+    with pytest.raises(ValueError, match="samples must be an int >= 64"):
+        gv.ModuleShader(wide, samples=1)
+
+
+@torch.no_grad()
+@pytest.mark.backend("cpp")
+def test_memory_is_bounded_by_the_samples_shaded_at_once(blobs):
+    tree = gv.N3Tree.from_volume(blobs, 8)
+    sizes = []
+    fused = gv.TransferModule(SHADER, min(tree.spacing))
+
+    def count(values, *rest):
+        sizes.append(len(values))
+        return fused(values, *rest)
+
+    camera = gv.Camera.orbit(width=64, height=64, distance=1.3)
+    picture = gv.render(tree, camera, gv.ModuleShader(count, samples=4096), stop_alpha=1.0)
+    longest = 2 * math.ceil(8 * math.sqrt(3) * max(tree.spacing) / min(tree.spacing))
+    assert max(sizes) <= 4096 + 64 * longest and sum(sizes) >= picture.stats.samples > 40000
+
+
+@pytest.mark.backend("cpp")
+def test_a_frame_with_a_module_is_not_captured(blobs):
+    with gv.Engine(gv.VolumeProducer(blobs), node_pool="1 MB", brick_pool="4 MB") as engine:
+        with pytest.raises(ValueError, match="a ModuleShader can't be recorded"):
+            engine.capture(gv.Camera.orbit(width=8, height=8), twin(SOFT, blobs.spacing))
