@@ -17,7 +17,16 @@ if TYPE_CHECKING:
     from .pool import BrickPool, BrickTable, Channel, N3Tree, NodePool
     from .producers import Bricks, Nodes, Producer, Region, Regions, StoredProducer, VolumeProducer
     from .production import ProductionError
-    from .rendering import Camera, Picture, RenderOptions, TransferFunction, TreeTracer, render
+    from .rendering import (
+        Camera,
+        Layer,
+        Picture,
+        RenderOptions,
+        TransferFunction,
+        TreeTracer,
+        opengl,
+        render,
+    )
     from .volume import Volume
 
 __version__ = "0.1.0"
@@ -39,6 +48,7 @@ _HOME = {
     "Camera": ".rendering",
     "Channel": ".pool",
     "Hits": ".frame",
+    "Layer": ".rendering",
     "N3Tree": ".pool",
     "NodePool": ".pool",
     "Picture": ".rendering",
@@ -47,6 +57,7 @@ _HOME = {
     "TransferFunction": ".rendering",
     "TreeTracer": ".rendering",
     "Volume": ".volume",
+    "opengl": ".rendering",
     "read_volume": ".io",
     "render": ".rendering",
 }
@@ -61,6 +72,7 @@ __all__ = [
     "EngineOptions",
     "FrameStats",
     "Hits",
+    "Layer",
     "N3Tree",
     "NodePool",
     "Nodes",
@@ -76,6 +88,7 @@ __all__ = [
     "TreeTracer",
     "Volume",
     "VolumeProducer",
+    "opengl",
     "read_volume",
     "render",
 ]
