@@ -54,8 +54,8 @@ def trilinear(data, index_xyz):
 def march(
     data, spacing, origin, rays, transfer, reference, step, stop_alpha=1.0, first=0.0, last=np.inf
 ):
-    """Returns color (r, 3), alpha (r,), depth (r,) of a dense (z, y, x) array, between the distances
-    first and last (numbers or (r,)).
+    """Returns color (r, 3), alpha (r,), depth (r,) of a dense (z, y, x) array, from distance
+    first to last, numbers or (r,).
     """
     eye, direction = rays
     spacing, origin = np.array(spacing), np.array(origin)

