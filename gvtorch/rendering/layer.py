@@ -110,7 +110,8 @@ class Layer:
 
 def _flat(image: Tensor, device: torch.device) -> Tensor:
     """(p, c) of (..., h, w, c): a view, where it lies on the device."""
-    return image.reshape(-1, image.shape[-1]).to(device, non_blocking=True)
+    flat = image.reshape(-1, image.shape[-1])
+    return flat.to(device, non_blocking=device.type == "cuda")  # the CPU would not wait for it
 
 
 @dataclass(frozen=True)
