@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from .rendering import (
         Camera,
         Cost,
+        Layer,
         ModuleShader,
         Picture,
         RenderOptions,
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
         TransferModule,
         TreeTracer,
         cost,
+        opengl,
         render,
     )
     from .volume import Volume
@@ -52,6 +54,7 @@ _HOME = {
     "Cost": ".rendering",
     "Hits": ".frame",
     "ModuleShader": ".rendering",
+    "Layer": ".rendering",
     "N3Tree": ".pool",
     "NodePool": ".pool",
     "Picture": ".rendering",
@@ -62,6 +65,7 @@ _HOME = {
     "TreeTracer": ".rendering",
     "Volume": ".volume",
     "cost": ".rendering",
+    "opengl": ".rendering",
     "read_volume": ".io",
     "render": ".rendering",
 }
@@ -77,6 +81,7 @@ __all__ = [
     "EngineOptions",
     "FrameStats",
     "Hits",
+    "Layer",
     "ModuleShader",
     "N3Tree",
     "NodePool",
@@ -95,6 +100,7 @@ __all__ = [
     "Volume",
     "VolumeProducer",
     "cost",
+    "opengl",
     "read_volume",
     "render",
 ]

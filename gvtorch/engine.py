@@ -42,7 +42,7 @@ from .turns import Turns, scouts
 Scene = Producer | Mapping[str, Producer]
 Shader = TransferFunction | ModuleShader
 Shaders = Shader | Mapping[str, Shader]
-_View = tuple[Camera, torch.device, Callable[[Rays], Hits], torch.dtype]  # of `trace_camera`
+_View = tuple[Camera, torch.device, Callable[[Rays], Hits], RenderOptions]  # of `trace_camera`
 
 _LISTED = 1 << 17  # most nodes with a wish that one frame lists
 _PAYLOAD = 256 * 10**6  # most bytes of voxels produced in one frame
@@ -135,7 +135,7 @@ class Engine:
         """
         chosen = render_options("frame", camera, options)
         hits, stats = self._pass(camera, shader, chosen, progress)
-        return develop(hits, camera, chosen.background, stats), stats
+        return develop(hits, camera, chosen, stats), stats
 
     def _pass(
         self,
@@ -150,7 +150,7 @@ class Engine:
         with self._unbroken(), self._timed(stats):
             self._catch_up(stats)  # 1, 2, 3, 4
             trace = self._tracer(shader, chosen)
-            view = camera.placed(self.box), self.device, trace, chosen.dtype
+            view = camera.placed(self.box), self.device, trace, chosen
             if again is None:
                 self._scout(view, stats)
             self._count_up()
@@ -198,7 +198,7 @@ class Engine:
                 break  # there is nothing more to see, or no room for it
             written = sum(stats.produced.values())
             if hits is None:
-                hits = empty_hits(self.device, view[-1], count)
+                hits = empty_hits(self.device, view[-1].dtype, count)
                 if self._missed is not None and len(self._missed) == count:
                     hits.missed.copy_(self._missed)
                 else:  # a picture of another size
@@ -344,7 +344,7 @@ class Engine:
         total.frames, total.rays = number, turns.count
         total.samples = stats.samples
         summed = {name: getattr(total, name) for name in _SUMMED}
-        return develop(hits, camera, chosen.background, dataclasses.replace(stats, **summed))
+        return develop(hits, camera, chosen, dataclasses.replace(stats, **summed))
 
     def capture(self, camera: Camera, shader: Shaders, **options: Any) -> FrameGraph:
         """Records a frame as a CUDA graph, for cameras of this number and size.
@@ -354,10 +354,12 @@ class Engine:
         Args:
             camera: See `frame`.
             shader: See `frame`.
-            **options: Fields of `RenderOptions`.
+            **options: Fields of `RenderOptions`; a replay reads the layer's tensors where they
+                lie.
 
         Raises:
-            ValueError: The engine is on no CUDA device, a shader is a module, or see `frame`.
+            ValueError: The engine is on no CUDA device, the layer is on another, a shader is a
+                module, or see `frame`.
             ProductionError: See `frame`.
         """
         shaders = shader.values() if isinstance(shader, Mapping) else (shader,)
@@ -367,8 +369,11 @@ class Engine:
             )
         if self.device.type != "cuda":
             raise ValueError(f"Engine.capture: the engine must be on CUDA, it is on {self.device}")
+        chosen = render_options("capture", camera, options)
+        if chosen.layer is not None:
+            chosen.layer.check_device("capture", self.device)
         self.frame(camera, shader, **options)  # loads what is loaded at first use
-        return FrameGraph(self, camera, shader, render_options("capture", camera, options))
+        return FrameGraph(self, camera, shader, chosen)
 
     @property
     def steady(self) -> bool:
@@ -516,11 +521,11 @@ class FrameGraph:
             torch.cuda.graph(self._graph, capture_error_mode="thread_local"),
         ):
             hits = trace_camera(
-                *(self._camera, engine.device, self._trace, options.dtype, no_progress),
+                *(self._camera, engine.device, self._trace, options, no_progress),
                 numbers=self._numbers,
             )
             self._hits, self._left = hits, engine._collect(hits.samples)
-            self._picture = develop(hits, camera, options.background, FrameStats())
+            self._picture = develop(hits, camera, options, FrameStats())
 
     def replay(self, camera: Camera) -> tuple[Picture, FrameStats]:
         """Renders a frame; nobody waits for the device.

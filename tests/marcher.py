@@ -51,15 +51,19 @@ def trilinear(data, index_xyz):
     return value
 
 
-def march(data, spacing, origin, rays, transfer, reference, step, stop_alpha=1.0):
-    """Returns color (r, 3), alpha (r,), depth (r,) of a dense (z, y, x) array."""
+def march(
+    data, spacing, origin, rays, transfer, reference, step, stop_alpha=1.0, first=0.0, last=np.inf
+):
+    """Returns color (r, 3), alpha (r,), depth (r,) of a dense (z, y, x) array, from distance
+    first to last, numbers or (r,).
+    """
     eye, direction = rays
     spacing, origin = np.array(spacing), np.array(origin)
     box = box_of(data.shape, spacing, origin)
     with np.errstate(divide="ignore", invalid="ignore"):
         a, b = (box[0] - eye) / direction, (box[1] - eye) / direction
-    near = np.maximum(np.nanmax(np.minimum(a, b), axis=1), 0)
-    far = np.nanmin(np.maximum(a, b), axis=1)
+    near = np.maximum(np.nanmax(np.minimum(a, b), axis=1), first)
+    far = np.minimum(np.nanmin(np.maximum(a, b), axis=1), last)
     color, clear = np.zeros_like(direction), np.ones(len(direction))
     depth = np.full(len(direction), np.inf)
     for k in range(int(np.ceil(np.clip(far - near, 0, None).max() / step)) + 1):

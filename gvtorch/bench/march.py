@@ -227,6 +227,7 @@ def _save(record: Record, picture: Tensor, name: str, size: Size) -> None:
         color=image[..., :3],
         alpha=image[..., 3:],
         depth=nothing,
+        nearest=nothing,
         samples=nothing.int(),
         stats=RenderStats(),
     ).save(folder / f"{name.replace(', ', ' ').replace(' ', '_')}.png")

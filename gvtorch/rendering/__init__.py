@@ -1,7 +1,9 @@
 """Cameras, transfer functions, the renderer and the pictures it makes."""
 
+from . import opengl
 from .camera import Camera
 from .costs import Cost, cost
+from .layer import Layer
 from .module import TreeTracer
 from .module_shader import ModuleShader, TransferModule
 from .picture import Picture
@@ -11,6 +13,7 @@ from .shader import TransferFunction
 __all__ = [
     "Camera",
     "Cost",
+    "Layer",
     "ModuleShader",
     "Picture",
     "RenderOptions",
@@ -18,5 +21,6 @@ __all__ = [
     "TransferModule",
     "TreeTracer",
     "cost",
+    "opengl",
     "render",
 ]

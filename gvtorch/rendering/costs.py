@@ -76,6 +76,7 @@ class Cost:
             color=color,
             alpha=known.float(),
             depth=nothing,
+            nearest=nothing,
             samples=self.samples.cpu(),
             stats=self.stats,
         )

@@ -20,7 +20,8 @@ class Picture:
 
     color: Tensor  # (h, w, 3) linear RGB over the background
     alpha: Tensor  # (h, w, 1)
-    depth: Tensor  # (h, w, 1) world units along the ray, +inf where nothing was hit
+    depth: Tensor  # (h, w, 1) of the voxels, world units along the ray, +inf where nothing was hit
+    nearest: Tensor  # (h, w, 1) likewise, of voxels and layer: the nearer of both
     samples: Tensor  # (h, w, 1) int32
     stats: RenderStats
 

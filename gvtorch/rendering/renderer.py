@@ -17,6 +17,7 @@ from ..ops.trace import Backend, choose_backend, most_intervals
 from ..pool import N3Tree
 from ..stage import Progress, collect_timings, no_progress, stage
 from .camera import Camera, pixel_rays
+from .layer import Layer
 from .module_shader import ModuleShader, ModuleTracer
 from .picture import Picture
 from .shader import TransferFunction, interval_levels
@@ -36,6 +37,7 @@ class RenderOptions:
     cone_scale: float = config.CONE_OVERESTIMATE  # widens the pixel cone
     channel: str | None = None  # name of the channel the shader reads; None: the first
     component: int = 0  # which number of the channel
+    layer: Layer | None = None  # what another renderer drew: voxels go before and behind it
     backend: Backend = "auto"
     dtype: torch.dtype = torch.float32  # float64 for trees deeper than about 2^16 voxels
 
@@ -56,6 +58,8 @@ class RenderOptions:
             )
         check.number(where, "cone_scale", self.cone_scale, low=0, open_low=True)
         check.whole(where, "component", self.component, low=0)
+        if self.layer is not None:
+            check_type(where, "layer", self.layer, Layer)
         if self.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"{where}: dtype must be float32 or float64, got {self.dtype}")
 
@@ -91,7 +95,7 @@ def render(
         with stage("prepare"):
             tree.frame += 1
             tracer = tracer_of(tree, shader, chosen)
-        hits = trace_camera(camera.placed(tree.box), tree.device, tracer, chosen.dtype, progress)
+        hits = trace_camera(camera.placed(tree.box), tree.device, tracer, chosen, progress)
         with stage("picture"):
             stats = RenderStats(
                 backend=choose_backend(chosen.backend, tree.device),
@@ -103,7 +107,7 @@ def render(
                 tiles_used=int((tree.nodes.stamp_t == tree.frame).sum()),
                 bricks_used=int((tree.bricks.stamp_b == tree.frame).sum()),
             )
-            picture = develop(hits, camera, chosen.background, stats)
+            picture = develop(hits, camera, chosen, stats)
     stats.stages = timings.as_dict()
     stats.milliseconds = 1e3 * (time.perf_counter() - start)
     return picture
@@ -118,7 +122,10 @@ def render_options(where: str, camera: Camera, options: dict[str, Any]) -> Rende
             f"{where}: unknown option {unknown[0]!r}; "
             f"known: {', '.join(RenderOptions.__dataclass_fields__)}"
         )
-    return RenderOptions(**options)
+    chosen = RenderOptions(**options)
+    if chosen.layer is not None:
+        chosen.layer.check_pixels(where, camera)
+    return chosen
 
 
 def check_type(where: str, name: str, value: Any, kind: type) -> None:
@@ -127,16 +134,18 @@ def check_type(where: str, name: str, value: Any, kind: type) -> None:
         raise ValueError(f"{where}: {name} must be a {kind.__name__}, got {type(value).__name__}")
 
 
-def develop(
-    hits: Hits, camera: Camera, background: tuple[float, float, float], stats: RenderStats
-) -> Picture:
+def develop(hits: Hits, camera: Camera, options: RenderOptions, stats: RenderStats) -> Picture:
     """Puts the hits of a camera's rays over the background, in the camera's shape."""
-    behind = _constants(background, hits.color)
+    behind, nearest = _constants(options.background, hits.color), hits.depth
+    if options.layer is not None:
+        layer = options.layer.distance(hits.depth.device).to(hits.depth.dtype)
+        nearest = torch.minimum(hits.depth, layer)
     shape = (len(camera), camera.height, camera.width)
     images = {
         "color": (hits.color + (1 - hits.alpha) * behind).reshape(*shape, 3),
         "alpha": hits.alpha.reshape(*shape, 1),
         "depth": hits.depth.reshape(*shape, 1),
+        "nearest": nearest.reshape(*shape, 1),
         "samples": hits.samples.reshape(*shape, 1),
     }
     if not camera.batched:
@@ -161,7 +170,7 @@ def trace_camera(
     camera: Camera,
     device: torch.device,
     trace_rays: Callable[[Rays], Hits],
-    dtype: torch.dtype,
+    options: RenderOptions,
     progress: Progress,
     *,
     again: tuple[Hits, Tensor] | None = None,
@@ -174,7 +183,7 @@ def trace_camera(
         camera: Placed in the world.
         device: Where the rays are traced.
         trace_rays: Traces world rays.
-        dtype: Of the hits.
+        options: The dtype of the hits, and the layer that they are mixed with.
         progress: Told how many rows are done.
         again: Hits of an earlier pass, which are overwritten, and which (pixels,) bool of them
             are traced once more.
@@ -185,12 +194,15 @@ def trace_camera(
     """
     rows, width = len(camera) * camera.height, camera.width
     block = max(1, _RAYS_A_BLOCK[device.type] // width)
-    size = rows * width * (8 * dtype.itemsize + 5)  # the colour twice
+    size = rows * width * (8 * options.dtype.itemsize + 5)  # the colour twice
     check.memory("render", f"a picture of {rows * width} pixels", size, device)
     numbers = camera.numbers(device) if numbers is None else numbers
+    layer = None if options.layer is None else options.layer.pixels(device)
     hits, where = again or (None, None)
     if hits is None and rows > block:
-        hits = empty_hits(device, dtype, rows * width)  # too large a one fails before the first ray
+        hits = empty_hits(
+            device, options.dtype, rows * width
+        )  # too large a one fails before the first ray
     for top in range(0, rows, block):
         end = min(top + block, rows)
         pixels: slice | Tensor = slice(top * width, end * width)
@@ -203,7 +215,10 @@ def trace_camera(
                 pixels = which + top * width
         if len(rays.origin):
             with stage("trace"):
-                part = trace_rays(rays)
+                if layer is None:
+                    part = trace_rays(rays)
+                else:
+                    part = layer[pixels].trace(trace_rays, rays, options.stop_alpha)
             if hits is None:
                 hits = part  # the only block
             else:

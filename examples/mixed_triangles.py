@@ -1,0 +1,119 @@
+"""Triangles and voxels in one picture: VTK's OpenGL draws rings and a disk that cross a scan.
+
+VTK gets our camera; its colours and its depth buffer come back as a layer.
+"""
+
+import math
+import sys
+from ctypes.util import find_library
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import tyro
+from kornia.color import rgb_to_linear_rgb
+
+import gvtorch as gv
+
+try:
+    import vtk
+    from vtk.util.numpy_support import vtk_to_numpy
+except ImportError as error:
+    sys.exit(f"mixed_triangles needs VTK: pip install 'gvtorch[triangles]' ({error})")
+if sys.platform == "linux" and not (find_library("EGL") or find_library("OSMesa")):
+    sys.exit("mixed_triangles needs OpenGL: a GPU's driver with EGL, or Mesa's EGL or OSMesa")
+
+DATA = Path(__file__).parent / "data"
+EYE, TARGET, UP = (-260.0, -340.0, 190.0), (63.5, 63.5, 127.5), (0.0, 0.0, 1.0)
+BACKGROUND = (0.02, 0.02, 0.03)
+RINGS = [(74, 62, 180), (80, 58, 140), (76, 54, 100)]  # centres, around the vessel
+DISK = (64, 64, 58)
+
+
+def actor(source, place, color) -> vtk.vtkActor:
+    """Triangles of a source at a place."""
+    mapper, result = vtk.vtkPolyDataMapper(), vtk.vtkActor()
+    mapper.SetInputConnection(source.GetOutputPort())
+    mapper.ScalarVisibilityOff()
+    result.SetMapper(mapper)
+    result.SetPosition(*place)
+    result.GetProperty().SetColor(*color)
+    result.GetProperty().SetAmbient(0.35)
+    return result
+
+
+def rasterise(actors, camera: gv.Camera, near: float, far: float) -> gv.Layer:
+    """Draws triangles for the pixels of a camera that stands in the world."""
+    vtk.vtkObject.GlobalWarningDisplayOff()  # VTK tells which displays it did not find
+    renderer, window = vtk.vtkRenderer(), vtk.vtkRenderWindow()
+    window.SetOffScreenRendering(True)
+    window.SetMultiSamples(0)  # a pixel has one depth
+    window.SetSize(camera.width, camera.height)
+    window.AddRenderer(renderer)
+    for each in actors:
+        renderer.AddActor(each)
+    projection, modelview = gv.opengl.matrices(camera, near, far)
+    _, up, back = modelview[:3, :3]
+    place = -(modelview[:3, :3].T @ modelview[:3, 3])
+    view = renderer.GetActiveCamera()
+    view.SetPosition(*place.tolist())
+    view.SetFocalPoint(*(place - back).tolist())
+    view.SetViewUp(*up.tolist())
+    view.SetClippingRange(near, far)
+    matrix = vtk.vtkMatrix4x4()
+    matrix.DeepCopy(projection.flatten().tolist())
+    view.SetExplicitProjectionTransformMatrix(matrix)
+    view.UseExplicitProjectionTransformMatrixOn()
+    window.Render()
+
+    depth, color = vtk.vtkFloatArray(), vtk.vtkUnsignedCharArray()
+    corners = (0, 0, camera.width - 1, camera.height - 1)
+    window.GetZbufferData(*corners, depth)
+    window.GetPixelData(*corners, 0, color, 0)
+    images = []
+    for array in (depth, color):  # OpenGL's rows go up
+        image = torch.from_numpy(vtk_to_numpy(array).copy())
+        images.append(image.reshape(camera.height, camera.width, -1).flip(0))
+    linear = rgb_to_linear_rgb(images[1].movedim(-1, 0) / 255).movedim(0, -1)
+    return gv.Layer(linear, gv.opengl.ray_distance(images[0], projection))
+
+
+@dataclass
+class Settings:
+    """Renders the bundled stent with rings around it."""
+
+    output: Path = Path("mixed_triangles.png")
+    size: int = 512
+    device: str = "cpu"
+
+
+def main(settings: Settings) -> None:
+    """Draws the triangles, then the voxels before and around them."""
+    size, device = settings.size, settings.device
+    camera = gv.Camera.look_at(EYE, TARGET, UP, fov=30, width=size, height=size)
+    torus = vtk.vtkParametricTorus()
+    torus.SetRingRadius(34)
+    torus.SetCrossSectionRadius(3)
+    ring, disk = vtk.vtkParametricFunctionSource(), vtk.vtkDiskSource()
+    ring.SetParametricFunction(torus)
+    ring.SetUResolution(200)
+    ring.SetVResolution(40)
+    disk.SetInnerRadius(0)
+    disk.SetOuterRadius(70)
+    disk.SetCircumferentialResolution(200)
+    actors = [actor(ring, place, (0.2, 0.75, 0.55)) for place in RINGS]
+    actors.append(actor(disk, DISK, (0.3, 0.5, 0.9)))
+    layer = rasterise(actors, camera, near=200, far=1000)
+
+    volume = gv.read_volume(DATA / "stent_256x128x128_int16.npz")
+    tree = gv.N3Tree.from_volume(volume, device=device)
+    shader = gv.TransferFunction.from_json(DATA / "stent.json")
+    picture = gv.render(tree, camera, shader, background=BACKGROUND, layer=layer)
+    picture.save(settings.output)
+    drawn = layer.depth < math.inf
+    before = drawn & (picture.depth.cpu() < layer.depth)
+    print(f"{settings.output}: {drawn.sum()} pixels of triangles, voxels before {before.sum()}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings))
