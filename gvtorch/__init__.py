@@ -17,12 +17,33 @@ if TYPE_CHECKING:
     from .pool import BrickPool, BrickTable, Channel, N3Tree, NodePool
     from .producers import Bricks, Nodes, Producer, Region, Regions, StoredProducer, VolumeProducer
     from .production import ProductionError
-    from .rendering import Camera, Picture, RenderOptions, TransferFunction, TreeTracer, render
+    from .rendering import (
+        Backdrop,
+        Camera,
+        CustomCamera,
+        Environment,
+        Gradient,
+        Picture,
+        Progressive,
+        RenderOptions,
+        TransferFunction,
+        TreeTracer,
+        read_image,
+        render,
+        render_tiles,
+    )
     from .volume import Volume
 
 __version__ = "0.1.0"
 
 _HOME = {
+    "Backdrop": ".rendering",
+    "CustomCamera": ".rendering",
+    "Environment": ".rendering",
+    "Gradient": ".rendering",
+    "Progressive": ".rendering",
+    "read_image": ".rendering",
+    "render_tiles": ".rendering",
     "BrickPool": ".pool",
     "BrickTable": ".pool",
     "Bricks": ".producers",
@@ -52,14 +73,18 @@ _HOME = {
 }
 
 __all__ = [
+    "Backdrop",
     "BrickPool",
     "BrickTable",
     "Bricks",
     "Camera",
     "Channel",
+    "CustomCamera",
     "Engine",
     "EngineOptions",
+    "Environment",
     "FrameStats",
+    "Gradient",
     "Hits",
     "N3Tree",
     "NodePool",
@@ -67,6 +92,7 @@ __all__ = [
     "Picture",
     "Producer",
     "ProductionError",
+    "Progressive",
     "Rays",
     "Region",
     "Regions",
@@ -76,8 +102,10 @@ __all__ = [
     "TreeTracer",
     "Volume",
     "VolumeProducer",
+    "read_image",
     "read_volume",
     "render",
+    "render_tiles",
 ]
 
 
