@@ -83,6 +83,9 @@ def pixel_rays(
             cone = cone * stretch if distorted else cone
         else:
             local, inside = _panorama(x, y)
+            # A pixel spans 1 / fy radians down, and along its circle of latitude cos / fx.
+            span = torch.maximum(y.cos() / fx, 1 / fy) * torch.minimum(fx, fy)
+            cone = cone * span[:, None].expand(-1, width).reshape(-1, 1)
         turned = (local[..., i, None] * rotation[:, None, i] for i in range(3))
         direction = sum(turned, torch.zeros_like(local)).reshape(-1, 3)
         limits = torch.where(inside.reshape(-1, 1), limits, 0.0)  # an empty range closes a ray

@@ -1,9 +1,10 @@
 """`Progressive`: pictures of a camera at rest that get better from frame to frame.
 
-Each frame moves the centres of all pixels by a part of a pixel, along Roberts' R2 sequence, which
-fills the pixel evenly whenever one stops; the mean of the frames converges to the picture as seen
-through square pixels. Source: Roberts, "The unreasonable effectiveness of quasirandom sequences",
-2018, section on R_d sequences.
+Each frame moves the centres of all pixels by a part of a pixel: to the centre first, then to places
+of Roberts' R2 sequence and, every other frame, to the same place on the other side of the centre. So
+the pixel is filled evenly whenever one stops, and what changes linearly across it cancels out
+(antithetic sampling). The mean of the frames converges to the picture through square pixels. Source:
+Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018.
 """
 
 from __future__ import annotations
@@ -26,10 +27,9 @@ _PLASTIC = 1.32471795724474602596  # the real root of x^3 = x + 1
 
 
 def jitter(index: int) -> tuple[float, float]:
-    """Returns the place (x, y) of a sample in its pixel, [-1/2, 1/2) from the centre; sample 0 lies
-    on the centre.
-    """
-    x, y = ((0.5 + index / _PLASTIC**power) % 1 - 0.5 for power in (1, 2))
+    """Returns the place (x, y) of a sample in its pixel, [-1/2, 1/2] from the centre."""
+    pair, side = (index + 1) // 2, 1 if index % 2 else -1
+    x, y = (side * ((0.5 + pair / _PLASTIC**power) % 1 - 0.5) for power in (1, 2))
     return x, y
 
 
