@@ -1,4 +1,4 @@
-"""Backgrounds, tone curves, sRGB, and the files that pictures are written to and images read from."""
+"""Backgrounds, tone curves, sRGB, and files of pictures, written and read."""
 
 from __future__ import annotations
 

@@ -1,10 +1,11 @@
 """`Progressive`: pictures of a camera at rest that get better from frame to frame.
 
-Each frame moves the centres of all pixels by a part of a pixel: to the centre first, then to places
-of Roberts' R2 sequence and, every other frame, to the same place on the other side of the centre. So
-the pixel is filled evenly whenever one stops, and what changes linearly across it cancels out
-(antithetic sampling). The mean of the frames converges to the picture through square pixels. Source:
-Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018.
+The first frame looks through the centres of the pixels, each other one through a place beside them:
+places of Roberts' R2 sequence and, every other frame, the same place on the other side. So a pixel is
+filled evenly whenever one stops, and what changes linearly across it cancels out (antithetic
+sampling). The mean of the frames converges to the picture through square pixels.
+
+Source: Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018.
 """
 
 from __future__ import annotations
