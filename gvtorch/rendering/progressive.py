@@ -1,8 +1,8 @@
 """`Progressive`: pictures of a camera at rest that get better from frame to frame.
 
 The first frame looks through the centres of the pixels, each other one through a place beside them:
-places of Roberts' R2 sequence and, every other frame, the same place on the other side. So a pixel is
-filled evenly whenever one stops, and what changes linearly across it cancels out (antithetic
+places of Roberts' R2 sequence and, every other frame, the same place on the other side. So a pixel
+is filled evenly whenever one stops, and what changes linearly across it cancels out (antithetic
 sampling). The mean of the frames converges to the picture through square pixels.
 
 Source: Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018.
