@@ -1,5 +1,5 @@
-"""From scene light to the display: a picture before a bright sky, refined with 16 rays a pixel, shown
-clipped, with Reinhard's curve and with a filmic one; and transparent, as a PNG with alpha."""
+"""From scene light to the display: a picture before a bright sky, of 16 rays a pixel, shown clipped,
+with Reinhard's curve and with a filmic one; and transparent, as a PNG with alpha."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,7 +24,7 @@ class Settings:
 
 
 def sky(height: int = 512) -> torch.Tensor:
-    """An equirectangular map: dusk, with a sun twelve times as bright as white, over dark ground."""
+    """An equirectangular map: dusk, a sun twelve times as bright as white, and dark ground."""
     up = torch.linspace(1, -1, height)[:, None, None]
     across = torch.linspace(-1, 1, 2 * height)[None, :, None]
     dusk = torch.tensor([0.9, 0.35, 0.12]) * (-9 * up.abs()).exp()

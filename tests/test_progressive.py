@@ -98,6 +98,10 @@ def test_a_camera_that_moves_begins_anew(blobs, model):
     progressive.reset()
     progressive.frame(views[1])
     assert progressive.count == 1
+    rays = views[0].rays()
+    for count in (1, 2):
+        progressive.frame(rays)
+        assert progressive.count == count
 
 
 @pytest.mark.backend("cpp")

@@ -58,6 +58,7 @@ class Progressive:
     def reset(self) -> None:
         """Begins anew; to be called where the scene or its shader changed."""
         self.count = 0
+        self._given: Camera | Rays | None = None
         self._camera: Camera | None = None
 
     def frame(self, camera: Camera | Rays) -> Picture:
@@ -69,11 +70,13 @@ class Progressive:
             `missed` tells which pixels have seen no frame without a miss. The first is the plain
             picture to the last bit.
         """
-        camera = as_camera("Progressive", camera)
-        if self._camera is None or not camera.same(self._camera):
-            self.reset()
-            self._camera = camera
-        made = self._render(camera.shifted(*jitter(self.count)) if self.count else camera)
+        if self._camera is None or camera is not self._given:
+            own = as_camera("Progressive", camera)
+            if self._camera is None or not own.same(self._camera):
+                self.reset()
+            self._given, self._camera = camera, own
+        view = self._camera
+        made = self._render(view.shifted(*jitter(self.count)) if self.count else view)
         picture: Picture = made[0] if isinstance(made, tuple) else made
         light = torch.cat((picture.color, picture.alpha), -1).double()
         missed = picture.missed

@@ -1,4 +1,4 @@
-"""How `gvtorch render` and `gvtorch fly` make a file of what was rendered."""
+"""What stands behind a picture on the command line, and how `gvtorch render` develops it."""
 
 from __future__ import annotations
 
