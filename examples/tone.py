@@ -1,4 +1,4 @@
-"""From scene light to the display: a picture before a bright sky, of 16 rays a pixel, shown clipped,
+"""From scene light to the display: a picture before a bright sky, 16 rays a pixel, shown clipped,
 with Reinhard's curve and with a filmic one; and transparent, as a PNG with alpha."""
 
 from dataclasses import dataclass, replace
