@@ -1,4 +1,4 @@
-"""`Camera`: one or a batch, with one of the lenses of `lens.py`, and the rays through their pixels.
+"""`Camera`: one or a batch, with one of the lenses of `projection.py`, and the rays through their pixels.
 
 Conventions: camera axes are OpenCV's (x right, y down, z forward); pixel (i, j) covers [i, i + 1)
 x [j, j + 1) of the image plane, its centre is at +0.5 (so do gsplat and nerfstudio; kornia puts
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from .. import check
 from ..frame import Rays
-from .lens import MODELS, CameraModel, default_fov, last_rising_angle, pixel_rays
+from .projection import MODELS, CameraModel, default_fov, last_rising_angle, pixel_rays
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..check import describe, whole
 from ..frame import Rays
 from .camera import Camera, Frame, sent
-from .lens import neighbour_cones, ray_step
+from .projection import neighbour_cones, ray_step
 
 
 class CustomCamera(Camera):

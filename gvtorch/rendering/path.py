@@ -16,7 +16,7 @@ from torch import Tensor
 
 from .. import check
 from .camera import Camera
-from .lens import CameraModel, default_fov
+from .projection import CameraModel, default_fov
 
 _KEYS = {"eye", "target", "up", "fov"}
 

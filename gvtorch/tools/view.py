@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from ..engine import Engine
     from ..frame import FrameStats, RenderStats
     from ..rendering import Camera, Picture, TransferFunction
-    from ..rendering.lens import CameraModel
     from ..rendering.path import CameraPath
+    from ..rendering.projection import CameraModel
 
 _RANGE_VOXELS = 128**3  # of a foreign image that are read to learn its range
 

@@ -1,4 +1,4 @@
-"""Lenses: from pixels to rays, on the device, for every camera model.
+"""Projections: from pixels to rays, on the device, for every camera model.
 
 A lens turns a place of the image plane, x = (u - cx) / fx and y = (v - cy) / fy, into a ray:
 

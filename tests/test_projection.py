@@ -12,7 +12,7 @@ from kornia.geometry.camera import distort_points_kannala_brandt, project_points
 
 import gvtorch as gv
 from gvtorch.ops import available
-from gvtorch.rendering.lens import distort, last_rising_angle, undistort
+from gvtorch.rendering.projection import distort, last_rising_angle, undistort
 
 MODELS = ["pinhole", "ortho", "fisheye", "panorama"]
 HAZE = gv.TransferFunction.preset("gray", 0, 1)
