@@ -1,4 +1,4 @@
-"""`Camera`: one or a batch, with one of the lenses of `projection.py`, and the rays through their pixels.
+"""`Camera`: one or a batch, with a lens of `projection.py`, and the rays through their pixels.
 
 Conventions: camera axes are OpenCV's (x right, y down, z forward); pixel (i, j) covers [i, i + 1)
 x [j, j + 1) of the image plane, its centre is at +0.5 (so do gsplat and nerfstudio; kornia puts
