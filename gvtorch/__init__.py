@@ -18,24 +18,38 @@ if TYPE_CHECKING:
     from .producers import Bricks, Nodes, Producer, Region, Regions, StoredProducer, VolumeProducer
     from .production import ProductionError
     from .rendering import (
+        Backdrop,
         Camera,
         Cost,
+        CustomCamera,
+        Environment,
+        Gradient,
         Layer,
         ModuleShader,
         Picture,
+        Progressive,
         RenderOptions,
         TransferFunction,
         TransferModule,
         TreeTracer,
         cost,
         opengl,
+        read_image,
         render,
+        render_tiles,
     )
     from .volume import Volume
 
 __version__ = "0.1.0"
 
 _HOME = {
+    "Backdrop": ".rendering",
+    "CustomCamera": ".rendering",
+    "Environment": ".rendering",
+    "Gradient": ".rendering",
+    "Progressive": ".rendering",
+    "read_image": ".rendering",
+    "render_tiles": ".rendering",
     "BrickPool": ".pool",
     "BrickTable": ".pool",
     "Bricks": ".producers",
@@ -71,15 +85,19 @@ _HOME = {
 }
 
 __all__ = [
+    "Backdrop",
     "BrickPool",
     "BrickTable",
     "Bricks",
     "Camera",
     "Channel",
     "Cost",
+    "CustomCamera",
     "Engine",
     "EngineOptions",
+    "Environment",
     "FrameStats",
+    "Gradient",
     "Hits",
     "Layer",
     "ModuleShader",
@@ -89,6 +107,7 @@ __all__ = [
     "Picture",
     "Producer",
     "ProductionError",
+    "Progressive",
     "Rays",
     "Region",
     "Regions",
@@ -101,8 +120,10 @@ __all__ = [
     "VolumeProducer",
     "cost",
     "opengl",
+    "read_image",
     "read_volume",
     "render",
+    "render_tiles",
 ]
 
 

@@ -25,6 +25,7 @@ from .ops.trace import choose_backend
 from .producers import Producer
 from .production import Failure, Plant, Production
 from .rendering import Camera, ModuleShader, Picture, RenderOptions, TransferFunction
+from .rendering.custom import as_camera
 from .rendering.renderer import (
     check_type,
     composite_trees,
@@ -107,7 +108,7 @@ class Engine:
 
     def frame(
         self,
-        camera: Camera,
+        camera: Camera | Rays,
         shader: Shaders,
         *,
         progress: Progress = no_progress,
@@ -120,7 +121,8 @@ class Engine:
         on CUDA, nobody waits for the device: the picture is on its way when this returns.
 
         Args:
-            camera: One camera or a batch; an orbit camera stands around the scene's box.
+            camera: One camera or a batch; an orbit camera stands around the scene's box. Or rays in
+                world units; see `gvtorch.render`.
             shader: The transfer function, or one for each tree by name.
             progress: Told how many rays are done.
             **options: Fields of `RenderOptions`.
@@ -133,9 +135,10 @@ class Engine:
             ValueError: An argument is of the wrong type or out of its range.
             ProductionError: A node can't be produced, and the engine is strict.
         """
+        camera = as_camera("frame", camera)
         chosen = render_options("frame", camera, options)
         hits, stats = self._pass(camera, shader, chosen, progress)
-        return develop(hits, camera, chosen, stats), stats
+        return develop(hits, camera.placed(self.box), chosen, stats), stats
 
     def _pass(
         self,
@@ -273,7 +276,7 @@ class Engine:
 
     def render(
         self,
-        camera: Camera,
+        camera: Camera | Rays,
         shader: Shaders,
         mode: Literal["interactive", "balanced", "converge"] = "converge",
         *,
@@ -308,6 +311,7 @@ class Engine:
             ProductionError: See `frame`.
         """
         most = _most_frames(mode, productions, max_frames)
+        camera = as_camera("render", camera)
         chosen = render_options("render", camera, options)
         if mode == "interactive":
             return self.frame(camera, shader, **options)[0]
@@ -344,9 +348,10 @@ class Engine:
         total.frames, total.rays = number, turns.count
         total.samples = stats.samples
         summed = {name: getattr(total, name) for name in _SUMMED}
-        return develop(hits, camera, chosen, dataclasses.replace(stats, **summed))
+        stats = dataclasses.replace(stats, **summed)
+        return develop(hits, camera.placed(self.box), chosen, stats)
 
-    def capture(self, camera: Camera, shader: Shaders, **options: Any) -> FrameGraph:
+    def capture(self, camera: Camera | Rays, shader: Shaders, **options: Any) -> FrameGraph:
         """Records a frame as a CUDA graph, for cameras of this number and size.
 
         Renders a frame first, as `frame` does.
@@ -369,10 +374,11 @@ class Engine:
             )
         if self.device.type != "cuda":
             raise ValueError(f"Engine.capture: the engine must be on CUDA, it is on {self.device}")
+        camera = as_camera("capture", camera)
         chosen = render_options("capture", camera, options)
         if chosen.layer is not None:
             chosen.layer.check_device("capture", self.device)
-        self.frame(camera, shader, **options)  # loads what is loaded at first use
+        self.frame(camera, shader, **vars(chosen))  # loads what is loaded at first use
         return FrameGraph(self, camera, shader, chosen)
 
     @property
@@ -513,7 +519,7 @@ class FrameGraph:
         """Records the frame; see `Engine.capture`."""
         self._engine, self._options = engine, options
         self._camera = camera.placed(engine.box)
-        self._numbers = self._camera.numbers(engine.device)  # a replay writes its camera here
+        self._numbers = self._camera.numbers(engine.device).clone()  # a replay's camera goes here
         self._trace = engine._tracer(shader, options)
         self._graph = torch.cuda.CUDAGraph()
         with (
@@ -525,9 +531,9 @@ class FrameGraph:
                 numbers=self._numbers,
             )
             self._hits, self._left = hits, engine._collect(hits.samples)
-            self._picture = develop(hits, camera, options, FrameStats())
+            self._picture = develop(hits, self._camera, options, FrameStats(), self._numbers)
 
-    def replay(self, camera: Camera) -> tuple[Picture, FrameStats]:
+    def replay(self, camera: Camera | Rays) -> tuple[Picture, FrameStats]:
         """Renders a frame; nobody waits for the device.
 
         Args:
@@ -539,14 +545,12 @@ class FrameGraph:
         Raises:
             ValueError: The camera differs in number or size, or the engine is closed.
         """
-        check_type("replay", "camera", camera, Camera)
-        shape, own = (
-            (len(one), one.height, one.width, one.batched) for one in (camera, self._camera)
-        )
-        if shape != own:
+        camera = as_camera("replay", camera)
+        form, own = camera.form, self._camera.form
+        if form != own:
             raise ValueError(
-                f"replay: camera must be {own[0]} of {own[2]}x{own[1]} pixels as captured, "
-                f"got {shape[0]} of {shape[2]}x{shape[1]}"
+                f"replay: camera must be {own[0]} of {own[2]}x{own[1]} pixels as captured "
+                f"({own[4]}), got {form[0]} of {form[2]}x{form[1]} ({form[4]})"
             )
         engine = self._engine
         stats = engine._begin(self._options)

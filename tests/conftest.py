@@ -104,7 +104,7 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
     so has one whose tests were skipped because a format's, the video's or the cluster's library is
     missing.
     """
-    libraries = ("nibabel", "nrrd", "tifffile", "imagecodecs", "astropy")
+    libraries = ("nibabel", "nrrd", "tifffile", "imagecodecs", "astropy", "OpenEXR")
     libraries += ("av", "distributed", "zarr", "yaozarrs", "ome_zarr_models")
     _ran["io"] = int(all(importlib.util.find_spec(name) for name in libraries))
     needed = os.environ.get("GVTORCH_REQUIRE", "")

@@ -16,7 +16,8 @@ from ..ops.trace import choose_backend
 from ..pool import N3Tree
 from ..stage import Progress, no_progress
 from ..volume import movable
-from .camera import Camera, pixel_rays
+from .camera import Camera
+from .custom import as_camera
 from .module_shader import Batch, TransferModule, march
 from .picture import Picture
 from .renderer import RenderOptions, Tracer, check_type, render_options
@@ -85,7 +86,7 @@ class Cost:
 @torch.no_grad()
 def cost(
     tree: N3Tree,
-    camera: Camera,
+    camera: Camera | Rays,
     shader: TransferFunction,
     *,
     progress: Progress = no_progress,
@@ -106,6 +107,7 @@ def cost(
     Raises:
         ValueError: See `render`.
     """
+    camera = as_camera("cost", camera)
     chosen = render_options("cost", camera, options)
     check_type("cost", "tree", tree, N3Tree)
     check_type("cost", "shader", shader, TransferFunction)
@@ -118,7 +120,7 @@ def cost(
     parts = []
     for top in range(0, rows, block):
         end = min(top + block, rows)
-        parts.append(counter(pixel_rays(numbers, width, placed.height, (top, end))))
+        parts.append(counter(placed.pixel_rays(numbers, (top, end))))
         progress("rays", end, rows)
     shape = (len(placed), placed.height, width, 1)
     names = ("samples", "nodes", "lod", "age", "fill")

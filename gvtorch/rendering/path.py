@@ -16,6 +16,7 @@ from torch import Tensor
 
 from .. import check
 from .camera import Camera
+from .projection import CameraModel, default_fov
 
 _KEYS = {"eye", "target", "up", "fov"}
 
@@ -55,7 +56,7 @@ class CameraPath:
             rows.append([check.triple("CameraPath", name, value) for value in values])
         if len(fov) != count:
             raise ValueError(f"CameraPath: fov must have {count} numbers, got {len(fov)}")
-        angles = [[check.number("CameraPath", "fov", angle, low=0, high=179)] for angle in fov]
+        angles = [[check.number("CameraPath", "fov", angle, low=0, high=360)] for angle in fov]
         parts = [torch.tensor(part, dtype=torch.float64) for part in (*rows, angles)]
         self._keys = torch.cat(parts, 1)  # (k, 10)
 
@@ -63,15 +64,19 @@ class CameraPath:
     def orbit(
         cls,
         box: Tensor,
+        model: CameraModel = "pinhole",
+        fov: float | None = None,
         *,
         azimuth: float = 30.0,
         elevation: float = 20.0,
         distance: float = 2.4,
-        fov: float = 30.0,
     ) -> CameraPath:
-        """Goes once around a box; see `Camera.orbit` for the numbers."""
+        """Goes once around a box; see `Camera.orbit` for the numbers. The model tells the field of
+        view that is left out.
+        """
+        fov = default_fov(model) if fov is None else fov
         turn = azimuth + torch.linspace(0, 360, 37)
-        cameras = Camera.orbit(turn, elevation, distance, fov, 1, 1).placed(box)
+        cameras = Camera.orbit(turn, elevation, distance, width=1, height=1).placed(box)
         rotation, move = cameras.viewmats[:, :3, :3], cameras.viewmats[:, :3, 3:]
         eye = -(rotation.mT @ move)[..., 0]
         center = box.mean(0).expand_as(eye)
@@ -113,13 +118,14 @@ class CameraPath:
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
 
-    def camera(self, at: float, width: int, height: int) -> Camera:
+    def camera(self, at: float, width: int, height: int, model: CameraModel = "pinhole") -> Camera:
         """Returns the camera at a place of the path.
 
         Args:
             at: 0 for the first key, 1 for the last; keys are evenly spaced.
             width: Pixels.
             height: Pixels.
+            model: Name of the lens.
         """
         at = check.number("CameraPath", "at", at, low=0, high=1)
         last = len(self._keys) - 1
@@ -130,4 +136,5 @@ class CameraPath:
         a, b, c, d = self._keys[index]
         # Cubic through b and c, whose slopes there are those of their neighbours' chords.
         line = b + 0.5 * t * (c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a)))
-        return Camera.look_at(line[:3], line[3:6], line[6:9], float(line[9]), width, height)
+        eye, target, up, fov = line[:3], line[3:6], line[6:9], float(line[9])
+        return Camera.look_at(eye, target, up, fov, width, height, model)

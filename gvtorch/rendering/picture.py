@@ -2,72 +2,98 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ..frame import RenderStats
+from .image import display_pixels, write_image, write_png
+from .tone import ToneCurve, tone_map
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
     """Float pictures of one camera (h, w, c) or of a batch (n, h, w, c)."""
 
-    color: Tensor  # (h, w, 3) linear RGB over the background
+    color: Tensor  # (h, w, 3) linear RGB over the background; premultiplied if transparent
     alpha: Tensor  # (h, w, 1)
     depth: Tensor  # (h, w, 1) of the voxels, world units along the ray, +inf where nothing was hit
     nearest: Tensor  # (h, w, 1) likewise, of voxels and layer: the nearer of both
     samples: Tensor  # (h, w, 1) int32
+    missed: Tensor | None = None  # (h, w, 1) bool, something that the ray saw was not there
+    transparent: bool = False  # there is no background
     stats: RenderStats
 
-    def to_srgb8(self) -> Tensor:
-        """Returns the colour as a display wants it: sRGB-encoded uint8 on the CPU, same shape."""
-        from kornia.color import linear_rgb_to_rgb
+    def tone_map(
+        self, curve: ToneCurve = "aces", *, exposure: float = 0.0, white: float = 4.0
+    ) -> Picture:
+        """Returns the picture with its light mapped to what a display shows, still linear.
 
-        planes = self.color.detach().to("cpu", torch.float32).movedim(-1, -3).clamp(0, 1)
-        return (
-            (linear_rgb_to_rgb(planes) * 255).round().to(torch.uint8).movedim(-3, -1).contiguous()
-        )
-
-    def save(self, path: str | Path) -> None:
-        """Writes a PNG (sRGB; a batch side by side) or an NPZ of float32 color, alpha and depth.
-
-        The file appears whole or not at all.
+        Args:
+            curve: none (clipped), reinhard or aces.
+            exposure: Stops.
+            white: Smallest luminance that Reinhard's curve shows as 1.
 
         Raises:
-            ValueError: The path ends in neither .png nor .npz.
-            FileNotFoundError: The folder does not exist.
+            ValueError: See `tone.tone_map`.
         """
-        path = Path(path)
-        if path.suffix not in (".png", ".npz"):
-            raise ValueError(f"save: path must end in .png or .npz, got {str(path)!r}")
-        if not path.parent.is_dir():
-            raise FileNotFoundError(f"save: folder not found: {path.parent}")
-        handle, name = tempfile.mkstemp(suffix=path.suffix, dir=path.parent)
-        os.close(handle)
-        try:
-            if path.suffix == ".png":
-                _write_png(Path(name), self.to_srgb8())
-            else:
-                arrays = {
-                    n: getattr(self, n).detach().cpu().float() for n in ("color", "alpha", "depth")
-                }
-                np.savez(name, **{n: array.numpy() for n, array in arrays.items()})
-            os.chmod(name, 0o666 & ~_umask())
-            os.replace(name, path)
-        finally:
-            Path(name).unlink(missing_ok=True)
+        if not self.transparent:
+            return replace(self, color=tone_map(self.color, curve, exposure=exposure, white=white))
+        straight = tone_map(self.straight(), curve, exposure=exposure, white=white)
+        return replace(self, color=straight * self.alpha)
+
+    def straight(self) -> Tensor:
+        """Returns the colour (h, w, 3), not premultiplied; 0 where there is nothing."""
+        if not self.transparent:
+            return self.color
+        return torch.where(self.alpha > 0, self.color / self.alpha, 0.0)
+
+    def to_srgb8(self) -> Tensor:
+        """Returns the colour as a display wants it: sRGB-encoded uint8 on the CPU, same shape. A
+        transparent picture is shown over black. NaN is black.
+        """
+        return torch.from_numpy(display_pixels(self.color, None, 8))
+
+    def layers(self) -> dict[str, np.ndarray]:
+        """Returns color, alpha and depth (float32) and samples (int32) as arrays."""
+        layers = {name: getattr(self, name) for name in ("color", "alpha", "depth")}
+        layers = {name: layer.float() for name, layer in layers.items()}
+        layers["samples"] = self.samples
+        return {name: layer.detach().cpu().numpy() for name, layer in layers.items()}
+
+    def save(self, path: str | Path, *, bits: int | None = None) -> None:
+        """Writes a file, which appears whole or not at all. A batch is laid side by side, but in
+        NumPy's files.
+
+        - .png: sRGB, 8 or 16 bits; with straight alpha if the picture is transparent.
+        - .tif: the same, or 32 bits: linear float, premultiplied (BigTIFF, Deflate).
+        - .exr: linear, 32 or 16 bits float: R G B A (premultiplied), Z (depth), samples.
+        - .npy: (h, w, 6) float32: color, alpha, depth, samples.
+        - .npz: float32 color, alpha and depth, int32 samples.
+
+        Args:
+            path: The file; its ending tells the kind.
+            bits: Of a number; 8 for .png and .tif, 32 for .exr if left out.
+
+        Raises:
+            ValueError: The ending or the number of bits is unknown.
+            FileNotFoundError: The folder does not exist.
+            ImportError: The library for this kind of file is missing.
+        """
+        write_image(Path(path), self.layers(), transparent=self.transparent, bits=bits)
 
     def _repr_png_(self) -> bytes:
         """Shows the picture in a notebook."""
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "picture.png"
-            _write_png(path, self.to_srgb8())
+            write_png(path, self.layers(), transparent=self.transparent)
             return path.read_bytes()
 
     def __repr__(self) -> str:
@@ -75,17 +101,3 @@ class Picture:
         *_, height, width, _ = self.color.shape
         count = "" if self.color.dim() == 3 else f"{self.color.shape[0]} x "
         return f"Picture({count}{width}x{height}, {self.stats.milliseconds:.0f} ms)"
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
-def _write_png(path: Path, image: Tensor) -> None:
-    from kornia_rs.io import write_image_png_u8
-
-    if image.dim() == 4:
-        image = torch.cat(tuple(image), dim=1)
-    write_image_png_u8(str(path), image.numpy(), "rgb")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -16,7 +16,9 @@ from ..ops import trace_rays
 from ..ops.trace import Backend, choose_backend, most_intervals
 from ..pool import N3Tree
 from ..stage import Progress, collect_timings, no_progress, stage
-from .camera import Camera, pixel_rays
+from .background import Background, checked_background
+from .camera import Camera
+from .custom import as_camera
 from .layer import Layer
 from .module_shader import ModuleShader, ModuleTracer
 from .picture import Picture
@@ -31,7 +33,8 @@ class RenderOptions:
 
     step: float = config.STEP  # shortest interval, in voxels of the finest level
     lod: Literal["auto", "finest"] = "auto"  # auto: voxels as wide as the pixel cone
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # linear RGB
+    # A colour (linear RGB), an object of `background.py`, an image (h, w, 3) or None: transparent.
+    background: tuple[float, float, float] | Background | Tensor | None = (0.0, 0.0, 0.0)
     stop_alpha: float = config.STOP_ALPHA  # a ray ends here; 1 integrates to the end
     depth_alpha: float = config.DEPTH_ALPHA  # depth is where alpha passes this
     cone_scale: float = config.CONE_OVERESTIMATE  # widens the pixel cone
@@ -47,8 +50,7 @@ class RenderOptions:
         check.number(where, "step", self.step, low=0, open_low=True)
         if self.lod not in ("auto", "finest"):
             raise ValueError(f"{where}: lod must be 'auto' or 'finest', got {self.lod!r}")
-        for part in check.triple(where, "background", self.background):
-            check.number(where, "background", part, low=0, high=1)
+        checked_background(where, self.background)
         check.number(where, "stop_alpha", self.stop_alpha, low=0, high=1, open_low=True)
         check.number(where, "depth_alpha", self.depth_alpha, low=0, high=1)
         if self.depth_alpha >= self.stop_alpha:
@@ -66,7 +68,7 @@ class RenderOptions:
 
 def render(
     tree: N3Tree,
-    camera: Camera,
+    camera: Camera | Rays,
     shader: TransferFunction | ModuleShader,
     *,
     progress: Progress = no_progress,
@@ -77,7 +79,8 @@ def render(
     Args:
         tree: What to render, on the device that renders it; its stamps and request words are
             written.
-        camera: One camera or a batch; an orbit camera stands around the tree's box.
+        camera: One camera or a batch; an orbit camera stands around the tree's box. Or rays in
+            world units, which make a picture as wide as they tell, or of one row.
         shader: The transfer function, in data units, or a module.
         progress: Told how many rays are done.
         **options: Fields of `RenderOptions`.
@@ -88,6 +91,7 @@ def render(
     Raises:
         ValueError: An option is unknown or out of its range, or the backend can't be used.
     """
+    camera = as_camera("render", camera)
     chosen = render_options("render", camera, options)
     check_type("render", "tree", tree, N3Tree)
     start = time.perf_counter()
@@ -95,7 +99,8 @@ def render(
         with stage("prepare"):
             tree.frame += 1
             tracer = tracer_of(tree, shader, chosen)
-        hits = trace_camera(camera.placed(tree.box), tree.device, tracer, chosen, progress)
+        placed = camera.placed(tree.box)
+        hits = trace_camera(placed, tree.device, tracer, chosen, progress)
         with stage("picture"):
             stats = RenderStats(
                 backend=choose_backend(chosen.backend, tree.device),
@@ -107,15 +112,14 @@ def render(
                 tiles_used=int((tree.nodes.stamp_t == tree.frame).sum()),
                 bricks_used=int((tree.bricks.stamp_b == tree.frame).sum()),
             )
-            picture = develop(hits, camera, chosen, stats)
+            picture = develop(hits, placed, chosen, stats)
     stats.stages = timings.as_dict()
     stats.milliseconds = 1e3 * (time.perf_counter() - start)
     return picture
 
 
 def render_options(where: str, camera: Camera, options: dict[str, Any]) -> RenderOptions:
-    """Checks a user's camera and options."""
-    check_type(where, "camera", camera, Camera)
+    """Checks a user's options, for a camera."""
     unknown = sorted(set(options) - set(RenderOptions.__dataclass_fields__))
     if unknown:
         raise ValueError(
@@ -125,7 +129,10 @@ def render_options(where: str, camera: Camera, options: dict[str, Any]) -> Rende
     chosen = RenderOptions(**options)
     if chosen.layer is not None:
         chosen.layer.check_pixels(where, camera)
-    return chosen
+    background = checked_background(where, chosen.background)
+    if isinstance(background, Background):
+        background.check(where, camera)
+    return replace(chosen, background=background)
 
 
 def check_type(where: str, name: str, value: Any, kind: type) -> None:
@@ -134,23 +141,44 @@ def check_type(where: str, name: str, value: Any, kind: type) -> None:
         raise ValueError(f"{where}: {name} must be a {kind.__name__}, got {type(value).__name__}")
 
 
-def develop(hits: Hits, camera: Camera, options: RenderOptions, stats: RenderStats) -> Picture:
-    """Puts the hits of a camera's rays over the background, in the camera's shape."""
-    behind, nearest = _constants(options.background, hits.color), hits.depth
+def develop(
+    hits: Hits,
+    camera: Camera,
+    options: RenderOptions,
+    stats: RenderStats,
+    numbers: Tensor | None = None,
+) -> Picture:
+    """Puts the hits of a camera's rays over the background, in the camera's shape.
+
+    Args:
+        hits: Of all pixels.
+        camera: Placed in the world.
+        options: What `render_options` gave.
+        stats: What the picture cost.
+        numbers: What `camera.numbers` gave, where it lies on the device already.
+    """
+    color, nearest = hits.color, hits.depth
+    background: Any = options.background
+    if isinstance(background, Background):
+        numbers = camera.numbers(color.device) if numbers is None else numbers
+        color = color + (1 - hits.alpha) * background.behind(camera, numbers, color.dtype)
+    elif background is not None:
+        color = color + (1 - hits.alpha) * _constants(background, color)
     if options.layer is not None:
         layer = options.layer.distance(hits.depth.device).to(hits.depth.dtype)
         nearest = torch.minimum(hits.depth, layer)
     shape = (len(camera), camera.height, camera.width)
     images = {
-        "color": (hits.color + (1 - hits.alpha) * behind).reshape(*shape, 3),
+        "color": color.reshape(*shape, 3),
         "alpha": hits.alpha.reshape(*shape, 1),
         "depth": hits.depth.reshape(*shape, 1),
         "nearest": nearest.reshape(*shape, 1),
         "samples": hits.samples.reshape(*shape, 1),
+        "missed": hits.missed.reshape(*shape, 1),
     }
     if not camera.batched:
         images = {name: image[0] for name, image in images.items()}
-    return Picture(**images, stats=stats)
+    return Picture(**images, transparent=background is None, stats=stats)
 
 
 def _constants(numbers: Sequence[float], like: Tensor) -> Tensor:
@@ -208,7 +236,7 @@ def trace_camera(
         pixels: slice | Tensor = slice(top * width, end * width)
         with stage("rays"):
             if where is None:
-                rays = pixel_rays(numbers, width, camera.height, (top, end))
+                rays = camera.pixel_rays(numbers, (top, end))
             else:
                 which = where[pixels].nonzero()[:, 0]
                 rays = _some_rays(numbers, camera, top, which)
@@ -236,7 +264,7 @@ def _some_rays(numbers: Tensor, camera: Camera, top: int, which: Tensor) -> Rays
     width = camera.width
     ends = torch.stack((which[0], which[-1])).tolist() if len(which) else (0, -1)
     first, last = (end // width for end in ends)
-    rays = pixel_rays(numbers, width, camera.height, (top + first, top + last + 1))
+    rays = camera.pixel_rays(numbers, (top + first, top + last + 1))
     return rays[which - first * width]
 
 

@@ -6,9 +6,10 @@ A volume file is built into a tree in memory; a store is streamed by the engine.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -16,15 +17,16 @@ import tyro
 from tyro.conf import Positional, arg
 
 from .common import Bar, Source, given, is_store, numbers, refuse_for_store, size
+from .image import KINDS, STRIPS, Develop, parse_background
 
 if TYPE_CHECKING:
     import torch
 
     from ..engine import Engine
-    from ..frame import FrameStats
-    from ..pool import N3Tree
-    from ..rendering import Camera, Picture, TransferFunction
+    from ..frame import FrameStats, RenderStats
+    from ..rendering import Camera, Cost, Picture, TransferFunction
     from ..rendering.path import CameraPath
+    from ..rendering.projection import CameraModel
 
 _RANGE_VOXELS = 128**3  # of a foreign image that are read to learn its range
 
@@ -33,8 +35,10 @@ _RANGE_VOXELS = 128**3  # of a foreign image that are read to learn its range
 class Look:
     """How it is shown."""
 
-    fov: Annotated[float, arg(metavar="DEG")] = 30.0
-    """vertical field of view"""
+    camera_model: Literal["pinhole", "ortho", "fisheye", "panorama"] = "pinhole"
+    """lens: ortho is parallel, fisheye equidistant, panorama equirectangular"""
+    fov: Annotated[float | None, arg(metavar="DEG")] = None
+    """vertical field of view; 30, or 180 of a fisheye or panorama, if left out"""
     size: Annotated[str, arg(metavar="WxH")] = "512x512"
     """pixels"""
     tf: Annotated[str, arg(metavar="FILE|PRESET")] = "gray"
@@ -44,8 +48,9 @@ class Look:
     """distance between samples"""
     lod: Literal["auto", "finest"] = "auto"
     """auto: voxels as wide as a pixel's cone; finest: the data as it is"""
-    background: Annotated[str, arg(metavar="R,G,B")] = "0,0,0"
-    """linear, 0 to 1"""
+    background: Annotated[str, arg(metavar="R,G,B|FILE")] = "0,0,0"
+    """linear, 0 to 1; R,G,B/R,G,B from top to bottom; transparent; or an environment map, PNG, EXR,
+    TIFF or NPY"""
     stop_alpha: Annotated[float, arg(metavar="ALPHA")] = 0.99
     """a ray ends at this alpha; 1 integrates to the end"""
     component: Annotated[int, arg(metavar="N")] = 0
@@ -62,7 +67,7 @@ class Look:
         return {
             "step": self.step,
             "lod": self.lod,
-            "background": tuple(numbers("--background", self.background, 3, float)),
+            "background": parse_background(self.background),
             "stop_alpha": self.stop_alpha,
             "component": self.component,
             "backend": self.backend,
@@ -142,9 +147,11 @@ class Render:
     path: Positional[Annotated[str, arg(metavar="PATH")]]
     """a volume (RAW, NPY, NPZ, NIfTI, NRRD, TIFF or FITS), or a store (folder or URL)"""
     output: Annotated[Path, arg(aliases=["-o"], metavar="OUT.png")]
-    """the picture"""
+    """the picture: .png, .exr, .tif, .npy or .npz; .tif and .npy may be larger than memory"""
+    bits: Annotated[int | None, arg(metavar="N")] = None
+    """of a number in the file: 8 or 16 of .png, and 32 (float) of .tif; 32 or 16 of .exr"""
     npz: Annotated[Path | None, arg(metavar="OUT.npz")] = None
-    """float32 color, alpha and depth"""
+    """float32 color, alpha and depth, int32 samples"""
     stats: Annotated[Path | None, arg(metavar="FILE.json")] = None
     """milliseconds, rays, samples, nodes, bricks, bytes; of stores requests and misses too"""
     camera: Annotated[str, arg(metavar="CAMERA")] = "orbit:30,20,2.4"
@@ -160,38 +167,62 @@ class Render:
     look: tyro.conf.OmitArgPrefixes[Look] = Look()
     streaming: tyro.conf.OmitArgPrefixes[Streaming] = Streaming()
     source: tyro.conf.OmitArgPrefixes[Source] = Source()
+    develop: tyro.conf.OmitArgPrefixes[Develop] = Develop()
 
     def run(self) -> None:
         """Reads, renders, writes."""
+        from ..rendering.image import checked_path
+
         width, height = size(self.look.size)
-        _check_suffix("--output", self.output, ".png")
+        _check_suffix("--output", self.output, *KINDS)
         if self.npz is not None:
+            if self.output.suffix in STRIPS:
+                raise ValueError(f"--npz holds a whole picture: not with {self.output.suffix}")
             _check_suffix("--npz", self.npz, ".npz")
         for file in (self.output, self.npz, self.stats):
             if file is not None and not file.parent.is_dir():
                 raise FileNotFoundError(f"folder not found: {file.parent}")
-        camera = parse_camera(self.camera, self.up, self.look.fov, width, height)
+        checked_path("--output", self.output, self.bits, KINDS)
+        model = self.look.camera_model
+        camera = parse_camera(self.camera, self.up, self.look.fov, width, height, model)
         options = self.look.options()
         with Bar() as bar:
             bar("reading", 0, 0)
             if is_store(self.path):
-                picture, shown, extent = self._stream(camera, options, bar)
+                stats, extent = self._stream(camera, options, bar)
             else:
-                picture, shown, extent = self._resident(camera, options, bar)
-        shown.save(self.output)
+                stats, extent = self._resident(camera, options, bar)
+        if self.stats is not None:
+            content = {**stats.as_dict(), "extent": extent}
+            self.stats.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        print(f"{self.output}: {width}x{height}, {told(stats)}")
+
+    def _take(
+        self,
+        render: Callable[..., Picture],
+        cost: Callable[[Camera], Cost],
+        camera: Camera,
+        bar: Bar,
+    ) -> RenderStats:
+        """Renders and writes the files, strip by strip where the kind of file lets it."""
+        from ..rendering import render_tiles
+
+        if self.output.suffix in STRIPS and self.show == "picture":
+            developed = self.develop.wrap(render)
+            return render_tiles(developed, camera, self.output, bits=self.bits, progress=bar)
+        picture = self.develop.wrap(partial(render, progress=bar))(camera)
+        shown = picture if self.show == "picture" else cost(camera).picture(self.show)
+        shown.save(self.output, bits=self.bits)
         if self.npz is not None:
             picture.save(self.npz)
-        if self.stats is not None:
-            content = {**picture.stats.as_dict(), "extent": extent}
-            self.stats.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-        print(f"{self.output}: {width}x{height}, {told(picture)}")
+        return picture.stats
 
     def _resident(
         self, camera: Camera, options: dict[str, Any], bar: Bar
-    ) -> tuple[Picture, Picture, tuple[int, ...]]:
+    ) -> tuple[RenderStats, tuple[int, ...]]:
         """Builds the whole tree of a volume file."""
         from ..pool import N3Tree
-        from ..rendering import render
+        from ..rendering import cost, render
 
         flags = given(self.streaming)
         if flags:
@@ -206,42 +237,33 @@ class Render:
             device=look.device(),
             progress=bar,
         )
-        picture = render(tree, camera, shader, progress=bar, **options)
-        return picture, self._shown(picture, tree, camera, shader, options), volume.extent
-
-    def _shown(
-        self,
-        picture: Picture,
-        tree: N3Tree,
-        camera: Camera,
-        shader: TransferFunction,
-        options: dict[str, Any],
-    ) -> Picture:
-        from ..rendering import cost
-
-        if self.show == "picture":
-            return picture
-        return cost(tree, camera, shader, **options).picture(self.show)
+        stats = self._take(
+            partial(render, tree, shader=shader, **options),
+            partial(cost, tree, shader=shader, **options),
+            *(camera, bar),
+        )
+        return stats, volume.extent
 
     def _stream(
         self, camera: Camera, options: dict[str, Any], bar: Bar
-    ) -> tuple[Picture, Picture, tuple[int, ...]]:
+    ) -> tuple[RenderStats, tuple[int, ...]]:
         """Streams a store."""
+        from ..rendering import cost
+
         if self.threshold is not None:
             raise ValueError("--threshold is for volumes; a store's is set by gvtorch convert")
         refuse_for_store(self.source)
         streaming = self.streaming
         with streaming.open(self.path, self.look) as (engine, shader):
-            picture = engine.render(
-                *(camera, shader, streaming.mode or "converge"),
-                max_frames=streaming.max_frames,
-                progress=bar,
-                **options,
+            (plant,) = engine.plants.values()
+            mode, most = streaming.mode or "converge", streaming.max_frames
+            stats = self._take(
+                partial(engine.render, shader=shader, mode=mode, max_frames=most, **options),
+                partial(cost, plant.tree, shader=shader, **options),
+                *(camera, bar),
             )
             _tell_failures(engine)
-            (plant,) = engine.plants.values()
-            shown = self._shown(picture, plant.tree, camera, shader, options)
-            return picture, shown, plant.tree.extent
+            return stats, plant.tree.extent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -293,7 +315,7 @@ class Fly:
             for number in range(self.frames):
                 place = number / max(1, self.frames - 1 + (self.flight == "orbit"))
                 picture = engine.render(
-                    *(path.camera(place, width, height), shader),
+                    *(path.camera(place, width, height, self.look.camera_model), shader),
                     self.streaming.mode or "balanced",
                     max_frames=self.streaming.max_frames,
                     **options,
@@ -325,11 +347,21 @@ class Fly:
             return CameraPath.from_json(self.flight)
         azimuth, elevation, distance = start
         return CameraPath.orbit(
-            engine.box, azimuth=azimuth, elevation=elevation, distance=distance, fov=self.look.fov
+            *(engine.box, self.look.camera_model, self.look.fov),
+            azimuth=azimuth,
+            elevation=elevation,
+            distance=distance,
         )
 
 
-def parse_camera(text: str, up: str, fov: float, width: int, height: int) -> Camera:
+def parse_camera(
+    text: str,
+    up: str,
+    fov: float | None,
+    width: int,
+    height: int,
+    model: CameraModel = "pinhole",
+) -> Camera:
     """Makes a camera from `orbit:AZ,EL,DIST` or `look:ex,ey,ez,tx,ty,tz`.
 
     Raises:
@@ -340,11 +372,11 @@ def parse_camera(text: str, up: str, fov: float, width: int, height: int) -> Cam
     kind, _, rest = text.partition(":")
     if kind == "orbit":
         azimuth, elevation, distance = numbers("--camera orbit", rest, 3, float)
-        return Camera.orbit(azimuth, elevation, distance, fov, width, height)
+        return Camera.orbit(azimuth, elevation, distance, fov, width, height, model)
     if kind == "look":
         values = numbers("--camera look", rest, 6, float)
         upward = numbers("--up", up, 3, float)
-        return Camera.look_at(values[:3], values[3:], upward, fov, width, height)
+        return Camera.look_at(values[:3], values[3:], upward, fov, width, height, model)
     raise ValueError(f"--camera must be orbit:AZ,EL,DIST or look:ex,ey,ez,tx,ty,tz, got {text!r}")
 
 
@@ -367,11 +399,10 @@ def value_range(store: Any) -> tuple[float, float]:
     return (float(data.min()), float(data.max()))
 
 
-def told(picture: Picture) -> str:
+def told(stats: RenderStats) -> str:
     """What a picture cost, in a few words."""
     from ..frame import FrameStats
 
-    stats = picture.stats
     text = f"{stats.samples / 1e6:.1f} M samples in {stats.milliseconds:.0f} ms ({stats.backend})"
     if not isinstance(stats, FrameStats):
         return text
@@ -398,6 +429,6 @@ def _tell_failures(engine: Engine) -> None:
         print(f"gvtorch: {engine.production.failed} nodes failed in all", file=sys.stderr)
 
 
-def _check_suffix(flag: str, path: Path, suffix: str) -> None:
-    if path.suffix != suffix:
-        raise ValueError(f"{flag} must end in {suffix}, got {str(path)!r}")
+def _check_suffix(flag: str, path: Path, *kinds: str) -> None:
+    if path.suffix not in kinds:
+        raise ValueError(f"{flag} must end in {', '.join(kinds)}, got {str(path)!r}")

@@ -1,0 +1,258 @@
+"""Image files: layers of a picture to PNG, TIFF, EXR and NumPy, and images back as linear light.
+
+PNG and integer TIFF hold sRGB and, where there is alpha, straight colour (PNG specification,
+section 12.3); EXR, NumPy and float TIFF hold linear light, premultiplied (OpenEXR technical
+introduction).
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .tone import finite, from_srgb, to_srgb
+
+if TYPE_CHECKING:
+    Layers = dict[str, np.ndarray]  # color (h, w, 3), alpha, depth, samples (h, w, 1)
+
+_BITS = {".png": (8, 16), ".tif": (8, 16, 32), ".exr": (32, 16), ".npy": (32,), ".npz": (32,)}
+
+
+def checked_path(where: str, path: Path, bits: int | None, known: tuple[str, ...]) -> int:
+    """Returns the bits of a number in a file to be written.
+
+    Raises:
+        ValueError: The ending is not among those known, or has no such number of bits.
+        FileNotFoundError: The folder does not exist.
+    """
+    if path.suffix not in known:
+        wanted = f"{', '.join(known[:-1])} or {known[-1]}"
+        raise ValueError(f"{where}: path must end in {wanted}, got {str(path)!r}")
+    choice = _BITS[path.suffix]
+    if bits is not None and bits not in choice:
+        numbers = " or ".join(str(n) for n in choice)
+        raise ValueError(f"{where}: {path.suffix} has {numbers} bits, got {bits!r}")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{where}: folder not found: {path.parent}")
+    return choice[0] if bits is None else bits
+
+
+def write_image(path: Path, layers: Layers, *, transparent: bool, bits: int | None = None) -> None:
+    """Writes a picture's layers; see `Picture.save`."""
+    bits = checked_path("save", path, bits, (".png", ".npz", ".npy", ".exr", ".tif"))
+    with whole_file(path) as part:
+        if path.suffix == ".npz":
+            np.savez(part, **layers)  # type: ignore[arg-type]
+        elif path.suffix == ".npy":
+            np.save(part, stacked(layers))
+        elif path.suffix == ".exr":
+            _write_exr(part, layers, bits)
+        elif path.suffix == ".tif":
+            image = tiff_pixels(side_by_side(layers), transparent, bits)
+            write_tiff(part, image.shape, image.dtype, iter([image]), len(image))
+        else:
+            write_png(part, layers, transparent=transparent, bits=bits)
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A place to write to, which takes the file's name once the block ends well."""
+    handle, name = tempfile.mkstemp(suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    try:
+        yield Path(name)
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(name, 0o666 & ~mask)
+        os.replace(name, path)
+    finally:
+        Path(name).unlink(missing_ok=True)
+
+
+def side_by_side(layers: Layers) -> Layers:
+    """The pictures of a batch as one."""
+    return {
+        name: np.concatenate(layer, 1) if layer.ndim == 4 else layer
+        for name, layer in layers.items()
+    }
+
+
+def stacked(layers: Layers) -> np.ndarray:
+    """All layers as one array (..., 6) float32."""
+    names = ("color", "alpha", "depth", "samples")
+    return np.concatenate([layers[name].astype(np.float32) for name in names], -1)
+
+
+def display_pixels(color: Tensor, alpha: Tensor | None, bits: int) -> np.ndarray:
+    """Returns sRGB (..., 3), or with alpha straight sRGB and alpha (..., 4), as uint8 or uint16.
+
+    Args:
+        color: (..., 3) linear RGB, premultiplied if there is alpha.
+        alpha: (..., 1).
+        bits: 8 or 16.
+    """
+    color = color.detach().to("cpu", torch.float32 if bits == 8 else torch.float64)
+    if alpha is None:
+        parts = to_srgb(color)
+    else:
+        alpha = finite(alpha.detach().to(color)).clamp(max=1)
+        straight = torch.where(alpha > 0, color / alpha, 0.0)
+        parts = torch.cat((to_srgb(straight), alpha), -1)
+    whole = (parts * (2**bits - 1)).round()
+    return whole.contiguous().numpy().astype(np.uint8 if bits == 8 else np.uint16)
+
+
+def tiff_pixels(layers: Layers, transparent: bool, bits: int) -> np.ndarray:
+    """Returns what a TIFF or PNG holds: (h, w, 3), or (h, w, 4) if transparent."""
+    color, alpha = (torch.from_numpy(layers[name]) for name in ("color", "alpha"))
+    if bits == 32:
+        return torch.cat((color, alpha) if transparent else (color,), -1).numpy()
+    return display_pixels(color, alpha if transparent else None, bits)
+
+
+def write_png(path: Path, layers: Layers, *, transparent: bool, bits: int = 8) -> None:
+    """Writes sRGB, with straight alpha if transparent."""
+    from kornia_rs.io import write_image_png_u8, write_image_png_u16
+
+    image = np.ascontiguousarray(tiff_pixels(side_by_side(layers), transparent, bits))
+    write = write_image_png_u8 if bits == 8 else write_image_png_u16
+    write(str(path), image, "rgba" if transparent else "rgb")
+
+
+def write_tiff(
+    path: Path,
+    shape: tuple[int, ...],
+    dtype: np.dtype[Any],
+    strips: Iterator[np.ndarray],
+    rows: int,
+) -> None:
+    """Writes a BigTIFF as its strips of rows come.
+
+    Args:
+        path: The file.
+        shape: (h, w, c) of the whole image; c is 3, or 4 with alpha.
+        dtype: Of its numbers.
+        strips: Arrays (rows, w, c), the last of what is left.
+        rows: Of a strip.
+
+    Raises:
+        ImportError: tifffile is missing.
+    """
+    try:
+        import tifffile
+    except ImportError:
+        raise ImportError(".tif needs tifffile: pip install 'gvtorch[image]'") from None
+    kind = "assocalpha" if dtype.kind == "f" else "unassalpha"
+    with tifffile.TiffWriter(path, bigtiff=True) as file:
+        file.write(
+            (zlib.compress(strip.tobytes()) for strip in strips),
+            shape=shape,
+            dtype=dtype,
+            rowsperstrip=rows,
+            photometric="rgb",
+            extrasamples=[kind] if shape[-1] == 4 else None,
+            compression="zlib",
+            metadata=None,
+        )
+
+
+def _openexr() -> Any:
+    try:
+        import OpenEXR
+    except ImportError:
+        raise ImportError(".exr needs OpenEXR: pip install 'gvtorch[image]'") from None
+    return OpenEXR
+
+
+def _write_exr(path: Path, layers: Layers, bits: int) -> None:
+    OpenEXR, layers = _openexr(), side_by_side(layers)
+    kind = np.float16 if bits == 16 else np.float32
+    light = np.concatenate((layers["color"], layers["alpha"]), -1)
+    if bits == 16:
+        light = np.clip(light, -65504, 65504)  # the largest half
+    channels = {
+        name: np.ascontiguousarray(light[..., index].astype(kind))
+        for index, name in enumerate("RGBA")
+    }
+    channels["Z"] = np.ascontiguousarray(layers["depth"][..., 0])
+    channels["samples"] = np.ascontiguousarray(layers["samples"][..., 0].astype(np.uint32))
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, channels).write(str(path))
+
+
+def read_image(path: str | Path) -> Tensor:
+    """Reads a PNG (8 or 16 bits, sRGB), EXR, TIFF or NPY as linear light.
+
+    Returns:
+        (h, w, c) float32; c is 3, or 4 with alpha: straight from PNG and integer TIFF, whose colour
+        is decoded from sRGB, else as the file has it.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The ending is unknown, or the file holds something else.
+        ImportError: The library for this kind of file is missing.
+    """
+    path = Path(path)
+    if path.suffix not in _READERS:
+        raise ValueError(f"read_image: path must end in {', '.join(_READERS)}, got {str(path)!r}")
+    if not path.is_file():
+        raise FileNotFoundError(f"image not found: {path}")
+    try:
+        pixels = _READERS[path.suffix](path)
+    except ImportError:
+        raise
+    except Exception as error:
+        raise ValueError(f"{path}: can't be read: {error}") from None
+    if pixels.ndim != 3 or pixels.shape[-1] < 3 or pixels.dtype.kind not in "uf":
+        raise ValueError(f"{path}: must hold (h, w, 3) numbers, got {pixels.shape} {pixels.dtype}")
+    pixels = pixels[..., :4]
+    if pixels.dtype.kind == "f":
+        return torch.from_numpy(pixels.astype(np.float32))
+    image = torch.from_numpy(pixels.astype(np.float64) / np.iinfo(pixels.dtype).max)
+    return torch.cat((from_srgb(image[..., :3]), image[..., 3:]), -1).float()
+
+
+def _read_png(path: Path) -> np.ndarray:
+    from kornia_rs.io import read_image_png_u8, read_image_png_u16
+
+    head = path.read_bytes()[:26]
+    if len(head) < 26 or head[:8] != b"\x89PNG\r\n\x1a\n":
+        raise ValueError("no PNG")
+    bits, kind = head[24], head[25]  # of the IHDR chunk
+    modes = {0: "mono", 2: "rgb", 6: "rgba"}
+    if bits not in (8, 16) or kind not in modes:
+        raise ValueError("a PNG must have 8 or 16 bits and no palette")
+    read = read_image_png_u8 if bits == 8 else read_image_png_u16
+    pixels = read(str(path), modes[kind])
+    return np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, -1) if kind == 0 else pixels
+
+
+def _read_exr(path: Path) -> np.ndarray:
+    channels = _openexr().File(str(path), separate_channels=True).channels()
+    names = "RGBA" if "A" in channels else "RGB"
+    return np.stack([channels[name].pixels for name in names], -1)
+
+
+def _read_tiff(path: Path) -> np.ndarray:
+    try:
+        import tifffile
+    except ImportError:
+        raise ImportError(".tif needs tifffile: pip install 'gvtorch[image]'") from None
+    return tifffile.imread(path)
+
+
+_READERS: dict[str, Callable[[Path], np.ndarray]] = {
+    ".png": _read_png,
+    ".exr": _read_exr,
+    ".npy": np.load,
+    ".tif": _read_tiff,
+}

@@ -1,0 +1,89 @@
+"""Cameras, backgrounds, tone curves, refinement and files of the command line."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from test_cli import gvtorch, small  # noqa: F401
+
+import gvtorch as gv
+
+LOOK = ("--size", "24x16", "--tf", "hot", "--camera", "orbit:20,10,0.8")
+
+
+def picture(path, camera, **options) -> gv.Picture:
+    volume = gv.read_volume(path)
+    shader = gv.TransferFunction.preset("hot", *volume.value_range)
+    return gv.render(gv.N3Tree.from_volume(volume), camera, shader, **options)
+
+
+def run(*args: object) -> None:
+    done = gvtorch("render", *args, *LOOK)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("model", ["ortho", "fisheye", "panorama"])
+def test_camera_models(small, tmp_path, model):  # noqa: F811
+    run(small, "-o", tmp_path / "a.npy", "--camera-model", model, "--fov", "100")
+    camera = gv.Camera.orbit(20, 10, 0.8, 100, 24, 16, model)
+    expected = picture(small, camera)
+    np.testing.assert_allclose(np.load(tmp_path / "a.npy")[..., :3], expected.color, atol=1e-6)
+    assert expected.alpha.max() > 0
+
+
+@pytest.mark.backend("cpp")
+def test_backgrounds_tone_and_samples(small, tmp_path):  # noqa: F811
+    camera = gv.Camera.orbit(20, 10, 0.8, None, 24, 16)
+    sky = torch.rand(8, 16, 3)
+    np.save(tmp_path / "sky.npy", sky.numpy())
+    sky = gv.Environment(sky)
+    for text, background in (
+        (tmp_path / "sky.npy", sky),
+        ("1,0,0/0,0,1", gv.Gradient((1, 0, 0), (0, 0, 1))),
+        ("transparent", None),
+    ):
+        run(small, "-o", tmp_path / "a.npz", "--background", text)
+        expected = picture(small, camera, background=background)
+        np.testing.assert_allclose(np.load(tmp_path / "a.npz")["color"], expected.color, atol=1e-6)
+    run(
+        *(small, "-o", tmp_path / "a.png", "--bits", "16", "--background", tmp_path / "sky.npy"),
+        *("--samples", "5", "--tone", "aces", "--exposure", "0.5"),
+    )
+    render = partial(picture, small, background=sky)
+    expected = gv.Progressive(render).refine(camera, 5).tone_map("aces", exposure=0.5)
+    torch.testing.assert_close(gv.read_image(tmp_path / "a.png"), expected.color, atol=1e-4, rtol=0)
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize(
+    ("name", "bits"), [("a.tif", "8"), ("a.tif", "32"), ("a.exr", "16"), ("a.png", "8")]
+)
+def test_files_of_every_kind(small, tmp_path, name, bits):  # noqa: F811
+    run(small, "-o", tmp_path / name, "--bits", bits, "--stats", tmp_path / "a.json")
+    expected = picture(small, gv.Camera.orbit(20, 10, 0.8, None, 24, 16))
+    found = gv.read_image(tmp_path / name)[..., :3]
+    torch.testing.assert_close(found, expected.color, atol=0.01, rtol=0)
+    assert '"rays": 384' in (tmp_path / "a.json").read_text()
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["-o", "a.jpg"], "--output must end in .png, .exr, .npy, .npz, .tif, got 'a.jpg'"),
+        (["-o", "a.png", "--bits", "7"], ".png has 8 or 16 bits, got 7"),
+        (["-o", "a.tif", "--npz", "a.npz"], "--npz holds a whole picture: not with .tif"),
+        (["-o", "a.png", "--samples", "0"], "--samples must be an int >= 1, got 0"),
+        (["-o", "a.png", "--exposure", "nan"], "exposure must be finite"),
+        (["-o", "a.png", "--background", "sky.exr"], "image not found: sky.exr"),
+        (["-o", "a.png", "--background", "1,1,1/0"], "--background must be 3 numbers"),
+        (["-o", "a.png", "--camera-model", "panorama", "--fov", "200"], "fov must be finite"),
+    ],
+)
+def test_a_mistake_gets_one_line(small, tmp_path, args, message):  # noqa: F811
+    done = gvtorch("render", small, *args, cwd=tmp_path)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
+    assert message in done.stderr and not list(tmp_path.iterdir())
