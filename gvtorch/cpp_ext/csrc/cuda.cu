@@ -247,6 +247,7 @@ void split(const torch::stable::Tensor& like, int64_t count, const Keep& keep, c
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch, CUDA, library) {
   library.impl("trace_rays", TORCH_BOX(&gvtorch::trace_rays<gvtorch::Cuda>));
+  library.impl("shade_rays", TORCH_BOX(&gvtorch::shade_rays<gvtorch::Cuda>));
   library.impl("compact_requests", TORCH_BOX(&gvtorch::compact_requests<gvtorch::Cuda>));
   library.impl("lru_partition", TORCH_BOX(&gvtorch::lru_partition<gvtorch::Cuda>));
   library.impl("unlink", TORCH_BOX(&gvtorch::unlink<gvtorch::Cuda>));
