@@ -24,9 +24,10 @@ from .frame import Counts, FrameStats, Hits, Rays
 from .ops.trace import choose_backend
 from .producers import Producer
 from .production import Failure, Plant, Production
-from .rendering import Camera, Picture, RenderOptions, TransferFunction
+from .rendering import Camera, Picture, RenderOptions
 from .rendering.renderer import (
     Tracer,
+    check_shader,
     check_type,
     composite_trees,
     develop,
@@ -34,13 +35,14 @@ from .rendering.renderer import (
     render_options,
     trace_camera,
 )
+from .rendering.shaders import AnyShader, Shader
 from .report import Report
 from .scene import EngineOptions, brick_bytes, checked_device, make_plant, make_pools
 from .stage import Progress, collect_timings, mark, milliseconds, no_progress, stage
 from .turns import Turns, scouts
 
 Scene = Producer | Mapping[str, Producer]
-Shaders = TransferFunction | Mapping[str, TransferFunction]
+Shaders = AnyShader | Mapping[str, AnyShader]
 _View = tuple[Camera, torch.device, Callable[[Rays], Hits], torch.dtype]  # of `trace_camera`
 
 _LISTED = 1 << 17  # most nodes with a wish that one frame lists
@@ -120,7 +122,7 @@ class Engine:
 
         Args:
             camera: One camera or a batch; an orbit camera stands around the scene's box.
-            shader: The transfer function, or one for each tree by name.
+            shader: The transfer function or another fused shader, or one for each tree by name.
             progress: Told how many rays are done.
             **options: Fields of `RenderOptions`.
 
@@ -468,13 +470,14 @@ class Engine:
         tracers = []
         for name, plant in self.plants.items():
             one: Any = shader.get(name) if isinstance(shader, Mapping) else shader
-            check_type("frame", f"shader of tree {name!r}", one, TransferFunction)
+            check_shader("frame", f"shader of tree {name!r}", one)
             known = plant.producer.channels
             channel = options.channel or next(iter(known))
-            if channel not in known:
-                raise ValueError(
-                    f"frame: tree {name!r} has no channel {channel!r}; it has {', '.join(known)}"
-                )
+            for needed in (channel, *(one.channels if isinstance(one, Shader) else ())):
+                if needed not in known:
+                    raise ValueError(
+                        f"frame: tree {name!r} has no channel {needed!r}; it has {', '.join(known)}"
+                    )
             chosen = dataclasses.replace(options, channel=channel)
             by_level = self.options.loading == "levels"
             tracers.append(

@@ -382,7 +382,9 @@ class Bricks:
         scale = divide(side - 2 * self.border, size, size)
         offset = (origin_r3 - corner) * scale[:, None] + (self.border - 0.5)
         place = offset + t[:, None] * (direction_r3 * scale[:, None])
-        place = torch.stack([p + d if d else p for p, d in zip(place.unbind(1), shift, strict=True)], 1)
+        place = torch.stack(
+            [p + d if d else p for p, d in zip(place.unbind(1), shift, strict=True)], 1
+        )
         place = clamp(place, 0, side - 1)
         cell = smaller(torch.floor(place), torch.full_like(place, side - 2))
         wx, wy, wz = (place - cell).unbind(1)
@@ -617,8 +619,8 @@ def walk(
     step: Tensor,
     stop_clear: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Takes every ray from the scene's near side to its far side; returns (r,) samples and (r,) bool
-    whether something was missed.
+    """Takes every ray from the scene's near side to its far side; returns (r,) samples, and (r,)
+    bool whether something was missed.
     """
     visit = Visit.none(beam, tree)
     samples = torch.zeros_like(beam.first, dtype=torch.int32)

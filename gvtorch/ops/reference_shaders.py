@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from .exact import clamp, divide, exp2_exact, larger, log2_exact
+from .exact import clamp, divide, exp2_exact, larger, log2_exact, sqrt_exact
 from .reference import (
     INF,
     Accumulator,
@@ -42,7 +42,7 @@ def unit(v: Tensor) -> Tensor:
     most = larger(larger(x, y), z)
     known = (most > 0) & (most < INF)
     scaled = v / torch.where(known, most, 1.0)[:, None]
-    length = torch.sqrt(dot(scaled, scaled))
+    length = sqrt_exact(dot(scaled, scaled))
     return torch.where(known[:, None], scaled / length[:, None], 0.0)
 
 

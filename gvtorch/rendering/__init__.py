@@ -1,9 +1,38 @@
-"""Cameras, transfer functions, the renderer and the pictures it makes."""
+"""Cameras, shaders, lights, the renderer and the pictures it makes."""
 
 from .camera import Camera
+from .lights import DirectionalLight, Headlight, PointLight
 from .module import TreeTracer
 from .picture import Picture
 from .renderer import RenderOptions, render
 from .shader import TransferFunction
+from .shaders import (
+    DistanceField,
+    Features,
+    Isosurface,
+    Lit,
+    PreIntegrated,
+    Projection,
+    Shader,
+    StoredColor,
+)
 
-__all__ = ["Camera", "Picture", "RenderOptions", "TransferFunction", "TreeTracer", "render"]
+__all__ = [
+    "Camera",
+    "DirectionalLight",
+    "DistanceField",
+    "Features",
+    "Headlight",
+    "Isosurface",
+    "Lit",
+    "Picture",
+    "PointLight",
+    "PreIntegrated",
+    "Projection",
+    "RenderOptions",
+    "Shader",
+    "StoredColor",
+    "TransferFunction",
+    "TreeTracer",
+    "render",
+]

@@ -23,6 +23,9 @@ class Picture:
     depth: Tensor  # (h, w, 1) world units along the ray, +inf where nothing was hit
     samples: Tensor  # (h, w, 1) int32
     stats: RenderStats
+    # What only some shaders give, else None:
+    normal: Tensor | None = None  # (h, w, 3) world, towards the eye, of unit length or 0
+    features: Tensor | None = None  # (h, w, c)
 
     def to_srgb8(self) -> Tensor:
         """Returns the colour as a display wants it: sRGB-encoded uint8 on the CPU, same shape."""
@@ -34,7 +37,8 @@ class Picture:
         )
 
     def save(self, path: str | Path) -> None:
-        """Writes a PNG (sRGB; a batch side by side) or an NPZ of float32 color, alpha and depth.
+        """Writes a PNG (sRGB; a batch side by side) or an NPZ of float32 color, alpha, depth,
+        and normal and features where they are.
 
         The file appears whole or not at all.
 
@@ -53,9 +57,9 @@ class Picture:
             if path.suffix == ".png":
                 _write_png(Path(name), self.to_srgb8())
             else:
-                arrays = {
-                    n: getattr(self, n).detach().cpu().float() for n in ("color", "alpha", "depth")
-                }
+                names = ("color", "alpha", "depth", "normal", "features")
+                fields = {n: getattr(self, n) for n in names if getattr(self, n) is not None}
+                arrays = {n: field.detach().cpu().float() for n, field in fields.items()}
                 np.savez(name, **{n: array.numpy() for n, array in arrays.items()})
             os.chmod(name, 0o666 & ~_umask())
             os.replace(name, path)
