@@ -550,10 +550,10 @@ def trace_rays(
     values = constant_tnc.flatten(0, 1), range_tn2c.flatten(0, 1)
     bricks = Bricks(bricks_bzyxc, *values, border, component)
     shader = Plain(Transfer(table_lm4, domain_2, opaque_m), Accumulator.begin(beam), hit_clear)
-    samples, missed = walk(beam, at, tree, bricks, shader, number(step), 1 - number(stop_alpha))
+    samples, visit = walk(beam, at, tree, bricks, shader, number(step), 1 - number(stop_alpha))
     sum_ = shader.sum
     depth = sum_.depth + beam.moved
-    return sum_.color, (1 - sum_.clear)[:, None], depth[:, None], samples, missed
+    return sum_.color, (1 - sum_.clear)[:, None], depth[:, None], samples, visit.missed
 
 
 @dataclass
@@ -618,9 +618,9 @@ def walk(
     shader: Shader,
     step: Tensor,
     stop_clear: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """Takes every ray from the scene's near side to its far side; returns (r,) samples, and (r,)
-    bool whether something was missed.
+) -> tuple[Tensor, Visit]:
+    """Takes every ray from the scene's near side to its far side; returns (r,) samples, and the
+    last visits, which know what was missed.
     """
     visit = Visit.none(beam, tree)
     samples = torch.zeros_like(beam.first, dtype=torch.int32)
@@ -649,7 +649,7 @@ def walk(
         samples = samples + shaded.to(torch.int32)
         active = at.inside() & (shader.sum.clear > stop_clear)
         arrived = active & (whole | ~visit.stays(at))
-    return samples, visit.missed
+    return samples, visit
 
 
 @dataclass
@@ -688,11 +688,14 @@ class Visit:
         tree: Tree,
         bricks: Bricks,
         shader: Shader,
+        t: Tensor | None = None,
     ) -> None:
-        """Finds the node of the rays that arrived; marks what they use and what they miss."""
+        """Finds the node of the rays that arrived, in the middle of their intervals or at distance
+        t (r,); marks what they use and what they miss.
+        """
         which = arrived.nonzero()[:, 0]
-        middle = at.middle[which]
-        cone = at.cone(at.middle)[which]
+        t = at.middle if t is None else t
+        middle, cone = t[which], at.cone(t)[which]
         wanted, fits, above = wanted_depth(cone, tree)
         position = beam.at(which, middle)
 

@@ -225,14 +225,15 @@ class Isosurface(Shade):
     """The first place where the value passes a level."""
 
     def begin(self) -> None:
-        """No side is known."""
+        """No side is known, and nothing found."""
+        self.found = torch.zeros_like(self.moved, dtype=torch.bool)
         self.before = torch.zeros_like(self.moved)
         self.before_end = torch.full_like(self.moved, -INF)
 
     def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
         """See `reference.Shader`."""
         level = self.parameter[12]
-        return (_above(high) < level) | (_below(low) >= level)
+        return ((_above(high) < level) | (_below(low) >= level)) & ~self.found[which]
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
         """See `reference.Shader`."""
@@ -254,19 +255,20 @@ class Isosurface(Shade):
             far, far_value = torch.where(same, far, middle), torch.where(same, far_value, value)
         rise = torch.where(crosses, far_value - near_value, 1.0)
         t = near + clamp((level - near_value) / rise, 0, 1) * (far - near)
-        self._hit(torch.where(early, piece.start, t), probe, early | crosses)
+        hit = early | crosses
+        self.sum.clear = torch.where(hit, 0.0, self.sum.clear)
+        self.sum.depth = torch.where(hit, torch.where(early, piece.start, t), self.sum.depth)
 
-    def _hit(self, t: Tensor, probe: Probe, where: Tensor) -> None:
+    def surface(self, t: Tensor, probe: Probe) -> None:
+        """Shades the places t (r,) that were found; `probe` stands in their nodes."""
         normal = self.normal_at(probe, t)
         value = self.parameter[12].expand_as(t)
         if self.others:
             value = probe.number(self.others[self.other_component], t)
         row = self.transfer.look_up(value, torch.zeros_like(t, dtype=torch.int64))
         color = self.shade(row[:, :3], normal, t)
-        self.sum.color = torch.where(where[:, None], color, self.sum.color)
-        self.sum.clear = torch.where(where, 0.0, self.sum.clear)
-        self.sum.depth = torch.where(where, t, self.sum.depth)
-        self.normal = torch.where(where[:, None], normal, self.normal)
+        self.sum.color = torch.where(self.found[:, None], color, 0.0)
+        self.normal = torch.where(self.found[:, None], normal, 0.0)
 
 
 class Projection(Shade):
@@ -306,7 +308,7 @@ class Projection(Shade):
         value = mean if self.parameter[12] == MEAN else self.found
         row = self.transfer.look_up(value, torch.zeros_like(value, dtype=torch.int64))
         self.sum.color = torch.where(seen[:, None], row[:, :3], 0.0)
-        self.sum.clear = torch.where(seen, 0.0, 1.0)
+        self.sum.clear = torch.where(seen, 0.0, self.sum.clear)
         self.sum.depth = torch.where(seen, self.at, INF)
         self.features = torch.where(seen, value, 0.0)[:, None]
 
@@ -411,11 +413,17 @@ def shade_rays(
     )
     if isinstance(shade, (Isosurface, Projection)):
         shade.begin()
-    samples, missed = walk(beam, at, tree, channel, shade, number(step), 1 - number(stop_alpha))
+    samples, visit = walk(beam, at, tree, channel, shade, number(step), 1 - number(stop_alpha))
+    if isinstance(shade, Isosurface):
+        shade.found = shade.sum.depth < INF
+        t = torch.where(shade.found, shade.sum.depth, 0.0)
+        visit.look_up(shade.found, beam, at, tree, channel, shade, t)
+        probe = Probe(visit, shade.found, beam, at.near, at.growth, tree, channel)
+        shade.surface(t, probe)
     shade.done()
     depth, alpha = shade.sum.depth + beam.moved, 1 - shade.sum.clear
     return (
-        *(shade.sum.color, alpha[:, None], depth[:, None], samples, missed),
+        *(shade.sum.color, alpha[:, None], depth[:, None], samples, visit.missed),
         *(unit(shade.normal), shade.features),
     )
 

@@ -13,6 +13,7 @@ struct ShadeRay : Walk<T> {
   using Walk<T>::options;
   using Walk<T>::hits;
   using Sum = typename Shader::Sum;
+  static constexpr int kBlocksAtOnce = 4;  // on a multiprocessor of CUDA: 128 registers
   Shader shader;
   Channels channels;
   const void* range_tn2c;
@@ -53,6 +54,11 @@ struct ShadeRay : Walk<T> {
     while (at.inside() && sum.clear > stop_clear) {
       samples +=
           powers ? visit<BitDigits<T>>(ray, sight, at, wanted, sum) : visit<Digits<T>>(ray, sight, at, wanted, sum);
+    }
+    if constexpr (Shader::kSurface) {
+      if (sum.depth < static_cast<T>(INFINITY)) {
+        powers ? surface<BitDigits<T>>(ray, sight, at, wanted, sum) : surface<Digits<T>>(ray, sight, at, wanted, sum);
+      }
     }
     shader.done(sum);
     const Vec3<T> normal = unit(sum.normal);
@@ -128,6 +134,17 @@ struct ShadeRay : Walk<T> {
       if (last) return samples;
     } while (sum.clear > stop_clear && this->stays(at, visit));
     return samples;
+  }
+
+  // The place where depth was set may lie half an interval beside the node that found it.
+  template <class Number>
+  GV_HD void surface(const Ray<T>& ray, const Sight<T>& sight, const Intervals<T>& at, int32_t& wanted,
+                     Sum& sum) const {
+    Number digits(tree, ray.at(sum.depth));
+    NoPath path;
+    const auto hides = [](int32_t) { return false; };
+    const Visit<T> visit = this->find(ray, digits, at.cone(sum.depth), hides, stamp_b, path, wanted, sum.missed);
+    shader.surface(Probe<T>(channels, sight, this->rays, ray, this->levels, visit, digits), sum);
   }
 
   GV_HD static void cut(Piece<T>& piece) {

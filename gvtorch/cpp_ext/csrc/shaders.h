@@ -9,6 +9,7 @@
 //   struct Sum : ShadeSum<T>                      what it keeps of a ray; `clear` at 1 - stop_alpha ends the ray
 //   hides(low, high, sum)                         true: no value in [low, high] changes the sum. The node is left out
 //   add(piece, probe, sum)                        adds an interval; `probe` reads any channel at any distance
+//   kSurface, surface(probe, sum)                 where depth was set: `probe` then stands in the node of that place
 //   done(sum)                                     after the last interval
 //
 // An interval lies in the node in which its middle lies. Its ends may stand up to half an interval outside; they are
@@ -122,7 +123,7 @@ struct Light {
 // The transfer function, lit.
 template <class T>
 struct Lit {
-  static constexpr bool kEnds = false, kSeesEmpty = false;
+  static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false;
   using Sum = ShadeSum<T>;
   TransferView<T> transfer;
   Light<T> light;
@@ -148,7 +149,7 @@ struct Lit {
 // length, whether colours are premultiplied, whether they are lit.
 template <class T>
 struct StoredColor {
-  static constexpr bool kEnds = false, kSeesEmpty = false;
+  static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false;
   using Sum = ShadeSum<T>;
   Light<T> light;
 
@@ -178,7 +179,7 @@ struct StoredColor {
 // A table over the values at both ends of an interval, (l, m, m): premultiplied colour and alpha.
 template <class T>
 struct PreIntegrated {
-  static constexpr bool kEnds = true, kSeesEmpty = false;
+  static constexpr bool kEnds = true, kSeesEmpty = false, kSurface = false;
   using Sum = ShadeSum<T>;
   TransferView<T> transfer;
   T step;
@@ -224,7 +225,7 @@ struct PreIntegrated {
 // interval ended is kept, so that no crossing is lost between two nodes that round differently.
 template <class T>
 struct Isosurface {
-  static constexpr bool kEnds = true, kSeesEmpty = false;
+  static constexpr bool kEnds = true, kSeesEmpty = false, kSurface = true;
   struct Sum : ShadeSum<T> {
     T before = 0;
     T before_end = static_cast<T>(-INFINITY);
@@ -242,7 +243,7 @@ struct Isosurface {
   GV_HD void add(const Piece<T>& piece, const Probe<T>& probe, Sum& sum) const {
     const T level = iso();
     const bool below = piece.front < level;
-    if (sum.before_end == piece.start && (sum.before < level) != below) return hit(piece.start, probe, sum);
+    if (sum.before_end == piece.start && (sum.before < level) != below) return hit(piece.start, sum);
     if (below != (piece.back < level)) {
       T near = piece.start, far = piece.end, near_value = piece.front, far_value = piece.back;
 #ifdef __CUDA_ARCH__
@@ -258,16 +259,13 @@ struct Isosurface {
         far_value = same ? far_value : value;
       }
       const T part = clamp((level - near_value) / (far_value - near_value), static_cast<T>(0), static_cast<T>(1));
-      return hit(near + part * (far - near), probe, sum);
+      return hit(near + part * (far - near), sum);
     }
     sum.before = piece.back;
     sum.before_end = piece.end;
   }
-  GV_HD void done(Sum&) const {}
-
- private:
-  GV_HD T iso() const { return light.parameter_54[12]; }
-  GV_HD void hit(T t, const Probe<T>& probe, Sum& sum) const {
+  GV_HD void surface(const Probe<T>& probe, Sum& sum) const {
+    const T t = sum.depth;
     const Vec3<T> n = light.normal(probe, t);
     const T value = probe.channels.other.given() ? probe.number_at(probe.channels.other, color_component, t) : iso();
     const Transfer<T> colors(transfer);
@@ -275,8 +273,14 @@ struct Isosurface {
     sum.red = row.red;
     sum.green = row.green;
     sum.blue = row.blue;
-    sum.clear = 0;
     sum.normal = n;
+  }
+  GV_HD void done(Sum&) const {}
+
+ private:
+  GV_HD T iso() const { return light.parameter_54[12]; }
+  GV_HD static void hit(T t, Sum& sum) {
+    sum.clear = 0;
     sum.depth = t;
   }
 };
@@ -285,7 +289,7 @@ struct Isosurface {
 // parameters tells which. A node that can't change a maximum or minimum is left out.
 template <class T>
 struct Projection {
-  static constexpr bool kEnds = false, kSeesEmpty = true;
+  static constexpr bool kEnds = false, kSeesEmpty = true, kSurface = false;
   static constexpr int32_t kMaximum = 0, kMinimum = 1, kMean = 2;
   struct Sum : ShadeSum<T> {
     T found = 0;   // extreme so far, or sum of value * length
@@ -333,7 +337,7 @@ struct Projection {
 // All numbers of a second channel, composited with the transfer function's alpha. Sums lie in the output: any number.
 template <class T>
 struct Features {
-  static constexpr bool kEnds = false, kSeesEmpty = false;
+  static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false;
   using Sum = ShadeSum<T>;
   TransferView<T> transfer;
   T step;
