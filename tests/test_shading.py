@@ -209,6 +209,28 @@ def test_thin_shells_do_not_alias_at_step_1(backend):
     assert np.abs(finer["color"] - expected).max() < 0.02
 
 
+def test_an_interval_that_leaves_the_table_counts_its_parts(backend):
+    """A shell passed in a small part of an interval has the alpha of that part, and what is beyond
+    the function's end points has that of the rest.
+    """
+    slope = 0.3
+    ramp = (np.arange(24, dtype=np.float32) * slope)[:, None, None] * np.ones(
+        (1, 40, 40), np.float32
+    )
+    tree = gv.N3Tree.from_volume(gv.Volume(ramp), 8, device=DEVICES[backend])
+    rays = parallel(9, 5.0, DEVICES[backend], (0, 0.0, 1.0))
+    for behind in (0.0, 0.05):
+        points = [(3.0, 0), (3.001, 0.9), (3.019, 0.9), (3.02, behind)]
+        shell = gv.TransferFunction.from_points(points, [(3.0, 1, 0.5, 0.1)])
+        density = -np.log1p(-shell(np.linspace(3.0, 3.02, 100001))[:, 3]).mean()
+        rest = -np.log1p(-behind) * (23.5 - 3.02 / slope)
+        expected = -np.expm1(-density * 0.02 / slope - rest)
+        for step in (1.0, 2.0):
+            hits = shoot(tree, rays, gv.PreIntegrated(shell), backend, step=step, stop_alpha=1.0)
+            assert np.abs(hits["alpha"] - expected).max() < 3e-3
+            assert np.abs(hits["color"][:, 1] - 0.5 * expected).max() < 3e-3
+
+
 def test_pre_integration_on_a_step_function(backend):
     """Opaque red above 0.5, clear below: along a ramp the alpha of what lies above is closed."""
     step = gv.TransferFunction.from_points(

@@ -192,10 +192,32 @@ class PreIntegrated(Shade):
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
         """See `reference.Shader`."""
-        (row, row_weight), (column, column_weight) = (
-            self._cell(probe.value(t)) for t in (piece.start, piece.end)
-        )
+        lengths = torch.where(piece.odd, piece.lengths, 1.0)
         level = torch.where(piece.odd, 0, piece.level)
+        ends = probe.value(piece.start), probe.value(piece.end)
+        low, high = self.transfer.domain_2
+        front, back = (clamp(value, low, high) for value in ends)
+        row = self._pair(front, back, level)
+        inside = (front == back) | ((front == ends[0]) & (back == ends[1]))
+        rise = ends[1] - ends[0]
+        share = lengths / torch.where(inside, 1.0, larger(rise, -rise))
+
+        def of(rows: Tensor, rise: Tensor) -> Tensor:
+            return _part(rows, share * larger(rise, -rise))
+
+        mixed = of(row, back - front)
+        mixed = _over(of(self._pair(front, front, level), front - ends[0]), mixed)
+        mixed = _over(mixed, of(self._pair(back, back, level), ends[1] - back))
+        rgba = torch.where(inside[:, None], _part(row, lengths), mixed)
+        alpha = rgba[:, 3]
+        color = self.sum.color + self.sum.clear[:, None] * rgba[:, :3]
+        color = torch.where(where[:, None], color, self.sum.color)
+        self.composite(torch.cat((torch.zeros_like(color), alpha[:, None]), 1), piece, where)
+        self.sum.color = color
+
+    def _pair(self, front: Tensor, back: Tensor, level: Tensor) -> Tensor:
+        """(r, 4) of an interval of a length of the table, from one value to another."""
+        (row, row_weight), (column, column_weight) = self._cell(front), self._cell(back)
         table = self.transfer.table_lm4
 
         def mix(a: Tensor, b: Tensor, weight: Tensor) -> Tensor:
@@ -205,15 +227,7 @@ class PreIntegrated(Shade):
             mix(table[level, r, column], table[level, r, column + 1], column_weight)
             for r in (row, row + 1)
         )
-        rgba = mix(near, far, row_weight)
-        whole = rgba[:, 3]
-        odd = piece.odd & (whole > 0)
-        alpha = torch.where(odd, _stretch(whole, piece.lengths), whole)
-        part = torch.where(odd, alpha / torch.where(odd, whole, 1.0), 1.0)
-        color = self.sum.color + self.sum.clear[:, None] * (rgba[:, :3] * part[:, None])
-        color = torch.where(where[:, None], color, self.sum.color)
-        self.composite(torch.cat((torch.zeros_like(color), alpha[:, None]), 1), piece, where)
-        self.sum.color = color
+        return mix(near, far, row_weight)
 
     def _cell(self, value: Tensor) -> tuple[Tensor, Tensor]:
         place = self.transfer.place(value)
@@ -442,3 +456,17 @@ def _stretch(alpha: Tensor, lengths: Tensor) -> Tensor:
     solid = ~(kept > _TINY)
     part = 1 - exp2_exact(log2_exact(torch.where(solid, 0.5, kept)) * lengths)
     return torch.where(solid, 1.0, part)
+
+
+def _part(rows: Tensor, lengths: Tensor) -> Tensor:
+    """(r, 4) premultiplied colour and alpha of the same values over another length."""
+    whole = rows[:, 3]
+    changed = (whole > 0) & (lengths != 1)
+    alpha = torch.where(lengths > 0, _stretch(whole, lengths), 0.0)
+    scale = alpha / torch.where(changed, whole, 1.0)
+    scaled = torch.cat((rows[:, :3] * scale[:, None], alpha[:, None]), 1)
+    return torch.where(changed[:, None], scaled, rows)
+
+
+def _over(a: Tensor, b: Tensor) -> Tensor:
+    return a + (1 - a[:, 3:]) * b

@@ -176,7 +176,8 @@ struct StoredColor {
   GV_HD void done(Sum&) const {}
 };
 
-// A table over the values at both ends of an interval, (l, m, m): premultiplied colour and alpha.
+// A table over the values at both ends of an interval, (l, m, m): premultiplied colour and alpha. Beyond its domain the
+// function is constant: the parts of an interval that lie there are added before and behind.
 template <class T>
 struct PreIntegrated {
   static constexpr bool kEnds = true, kSeesEmpty = false, kSurface = false;
@@ -188,22 +189,21 @@ struct PreIntegrated {
 
   GV_HD bool hides(T low, T high, const Sum&) const { return Transfer<T>(transfer).transparent(low, high); }
   GV_HD void add(const Piece<T>& piece, const Probe<T>&, Sum& sum) const {
-    const Transfer<T> places(transfer);
-    const Cell<T> front = places.find(piece.front);
-    const Cell<T> back = places.find(piece.back);
-    const int64_t rows = transfer.rows;
+    const T lengths = piece.level < 0 ? piece.length / step : static_cast<T>(1);
     const int64_t level = piece.level < 0 ? 0 : piece.level;
-    const Row<T>* corner = transfer.table_lm + ((level * rows + front.row) * rows + back.row);
-    const Row<T> near = mix(corner[0], corner[1], back.weight);
-    const Row<T> far = mix(corner[rows], corner[rows + 1], back.weight);
-    Row<T> row = mix(near, far, front.weight);
-    if (piece.level < 0 && row.alpha > 0) {
-      const T whole = row.alpha;
-      row.alpha = stretch(whole, piece.length / step);
-      const T part = row.alpha / whole;
-      row.red = row.red * part;
-      row.green = row.green * part;
-      row.blue = row.blue * part;
+    const Transfer<T> places(transfer);
+    const T low = transfer.domain_2[0];
+    const T high = transfer.domain_2[1];
+    const T front = clamp(piece.front, low, high);
+    const T back = clamp(piece.back, low, high);
+    Row<T> row = pair(places, front, back, level);
+    if (front == back || (front == piece.front && back == piece.back)) {
+      row = part(row, lengths);
+    } else {
+      const T share = lengths / size_of(piece.back - piece.front);
+      row = part(row, share * size_of(back - front));
+      row = over(part(pair(places, front, front, level), share * size_of(front - piece.front)), row);
+      row = over(row, part(pair(places, back, back, level), share * size_of(piece.back - back)));
     }
     const T red = sum.red + sum.clear * row.red;
     const T green = sum.green + sum.clear * row.green;
@@ -213,6 +213,27 @@ struct PreIntegrated {
     sum.green = green;
     sum.blue = blue;
   }
+  // What an interval of a length of the table shows, from one value to another.
+  GV_HD Row<T> pair(const Transfer<T>& places, T in_front, T behind, int64_t level) const {
+    const Cell<T> front = places.find(in_front);
+    const Cell<T> back = places.find(behind);
+    const int64_t rows = transfer.rows;
+    const Row<T>* corner = transfer.table_lm + ((level * rows + front.row) * rows + back.row);
+    return mix(mix(corner[0], corner[1], back.weight), mix(corner[rows], corner[rows + 1], back.weight), front.weight);
+  }
+  // The same values over another length.
+  GV_HD static Row<T> part(Row<T> row, T lengths) {
+    if (!(row.alpha > 0) || lengths == 1) return row;
+    if (!(lengths > 0)) return {0, 0, 0, 0};
+    const T alpha = stretch(row.alpha, lengths);
+    const T scale = alpha / row.alpha;
+    return {row.red * scale, row.green * scale, row.blue * scale, alpha};
+  }
+  GV_HD static Row<T> over(Row<T> a, Row<T> b) {
+    const T kept = 1 - a.alpha;
+    return {a.red + kept * b.red, a.green + kept * b.green, a.blue + kept * b.blue, a.alpha + kept * b.alpha};
+  }
+  GV_HD static T size_of(T value) { return larger(value, -value); }
   GV_HD static Row<T> mix(const Row<T>& a, const Row<T>& b, T weight) {
     return {a.red + weight * (b.red - a.red), a.green + weight * (b.green - a.green),
             a.blue + weight * (b.blue - a.blue), a.alpha + weight * (b.alpha - a.alpha)};
