@@ -1,5 +1,5 @@
-"""One scan, fused shaders. From left to right, above: plain, lit, isosurface, maximum; below: a thin
-shell by the plain function at step 1, the same pre-integrated, plain at step 0.02, and the mean.
+"""One scan, fused shaders. From left to right, above: plain, lit, isosurface, maximum; below: a
+thin shell by the plain function at step 1, the same pre-integrated, plain at step 0.02; the mean.
 """
 
 from dataclasses import dataclass

@@ -17,9 +17,20 @@ struct ChannelView {
 };
 
 template <class T>
-GV_HD T read_number(const void* numbers, VoxelType type, int64_t index) {
+GV_CALL T read_number(const void* numbers, VoxelType type, int64_t index) {
   T out = 0;
   with_voxel(type, [&](auto voxel) { out = number<T>(static_cast<const decltype(voxel)*>(numbers)[index]); });
+  return out;
+}
+
+// A call, not inlined: shaders read in many places, and each would hold the code of seven dtypes.
+template <class T>
+GV_CALL T read_brick(const ChannelView& channel, int64_t first, int32_t side, Vec3<T> at) {
+  T out = 0;
+  with_voxel(channel.type, [&](auto voxel) {
+    using Voxel = decltype(voxel);
+    out = trilinear(static_cast<const Voxel*>(channel.bricks_bzyxc) + first, side, channel.width, at);
+  });
   return out;
 }
 
@@ -145,12 +156,7 @@ struct Probe {
     }
     const int64_t volume = static_cast<int64_t>(channels.side) * channels.side * channels.side;
     const int64_t first = spot.brick * volume * channel.width + component;
-    T out = 0;
-    with_voxel(channel.type, [&](auto voxel) {
-      using Voxel = decltype(voxel);
-      out = trilinear(static_cast<const Voxel*>(channel.bricks_bzyxc) + first, channels.side, channel.width, at);
-    });
-    return out;
+    return read_brick(channel, first, channels.side, at);
   }
   GV_HD Vec3<T> differences(const Spot<T>& spot, T t) const {
     Vec3<T> slope{0, 0, 0};
