@@ -23,14 +23,13 @@ GV_CALL T read_number(const void* numbers, VoxelType type, int64_t index) {
   return out;
 }
 
-// A call, not inlined: shaders read in many places, and each would hold the code of seven dtypes.
+// A call, not inlined: shaders read in many places, and each would hold the code of seven dtypes. Its arguments are
+// values, for an address would put the whole kernel's arguments on the stack.
 template <class T>
-GV_CALL T read_brick(const ChannelView& channel, int64_t first, int32_t side, Vec3<T> at) {
+GV_CALL T read_brick(const void* voxels, VoxelType type, int32_t width, int64_t first, int32_t side, Vec3<T> at) {
   T out = 0;
-  with_voxel(channel.type, [&](auto voxel) {
-    using Voxel = decltype(voxel);
-    out = trilinear(static_cast<const Voxel*>(channel.bricks_bzyxc) + first, side, channel.width, at);
-  });
+  with_voxel(
+      type, [&](auto voxel) { out = trilinear(static_cast<const decltype(voxel)*>(voxels) + first, side, width, at); });
   return out;
 }
 
@@ -156,7 +155,7 @@ struct Probe {
     }
     const int64_t volume = static_cast<int64_t>(channels.side) * channels.side * channels.side;
     const int64_t first = spot.brick * volume * channel.width + component;
-    return read_brick(channel, first, channels.side, at);
+    return read_brick(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, at);
   }
   GV_HD Vec3<T> differences(const Spot<T>& spot, T t) const {
     Vec3<T> slope{0, 0, 0};
