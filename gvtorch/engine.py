@@ -24,10 +24,11 @@ from .frame import Counts, FrameStats, Hits, Rays
 from .ops.trace import choose_backend
 from .producers import Producer
 from .production import Failure, Plant, Production
-from .rendering import Camera, ModuleShader, Picture, RenderOptions, TransferFunction
+from .rendering import Camera, ModuleShader, Picture, RenderOptions
 from .rendering.custom import as_camera
 from .rendering.renderer import (
-    check_type,
+    AnyShader,
+    check_shader,
     composite_trees,
     develop,
     empty_hits,
@@ -35,14 +36,14 @@ from .rendering.renderer import (
     trace_camera,
     tracer_of,
 )
+from .rendering.shaders import Shader
 from .report import Report
 from .scene import EngineOptions, brick_bytes, checked_device, make_plant, make_pools
 from .stage import Progress, collect_timings, mark, milliseconds, no_progress, stage
 from .turns import Turns, scouts
 
 Scene = Producer | Mapping[str, Producer]
-Shader = TransferFunction | ModuleShader
-Shaders = Shader | Mapping[str, Shader]
+Shaders = AnyShader | Mapping[str, AnyShader]
 _View = tuple[Camera, torch.device, Callable[[Rays], Hits], RenderOptions]  # of `trace_camera`
 
 _LISTED = 1 << 17  # most nodes with a wish that one frame lists
@@ -123,7 +124,7 @@ class Engine:
         Args:
             camera: One camera or a batch; an orbit camera stands around the scene's box. Or rays in
                 world units; see `gvtorch.render`.
-            shader: The transfer function, or one for each tree by name.
+            shader: The transfer function or another shader, or one for each tree by name.
             progress: Told how many rays are done.
             **options: Fields of `RenderOptions`.
 
@@ -486,13 +487,14 @@ class Engine:
         for name, plant in self.plants.items():
             one: Any = shader.get(name) if isinstance(shader, Mapping) else shader
             if not isinstance(one, ModuleShader):
-                check_type("frame", f"shader of tree {name!r}", one, TransferFunction)
+                check_shader("frame", f"shader of tree {name!r}", one)
             known = plant.producer.channels
             channel = options.channel or next(iter(known))
-            if channel not in known:
-                raise ValueError(
-                    f"frame: tree {name!r} has no channel {channel!r}; it has {', '.join(known)}"
-                )
+            for needed in (channel, *(one.channels if isinstance(one, Shader) else ())):
+                if needed not in known:
+                    raise ValueError(
+                        f"frame: tree {name!r} has no channel {needed!r}; it has {', '.join(known)}"
+                    )
             chosen = dataclasses.replace(options, channel=channel)
             by_level = self.options.loading == "levels"
             frame = {"by_level": by_level, "frame_1": self._frame_1}

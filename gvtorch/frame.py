@@ -42,6 +42,9 @@ class Hits:
     depth: Tensor  # (r, 1) distance along the ray in world units, +inf where nothing was hit
     samples: Tensor  # (r,) int32, places at which the shader was evaluated
     missed: Tensor  # (r,) bool, something that the ray saw was not there
+    # What only some shaders give, else None:
+    normal: Tensor | None = None  # (r, 3) world, towards the eye, of unit length or 0
+    features: Tensor | None = None  # (r, c)
 
 
 class Counts:

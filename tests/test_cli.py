@@ -58,6 +58,27 @@ def small(tmp_path_factory):
 
 
 @pytest.mark.backend("cpp")
+@pytest.mark.parametrize("shader", ["lit", "preintegrated", "isosurface", "maximum"])
+def test_render_takes_other_shaders(small, tmp_path, shader):
+    level = ("--value", 100) if shader == "isosurface" else ()
+    arrays = {}
+    for name in ("plain", shader):
+        file, flags = tmp_path / f"{name}.npz", level if name == shader else ()
+        look = ("--size", "24x24", "--tf", "gray", "--npz", file, "--shader", name, *flags)
+        run = gvtorch("render", small, "-o", tmp_path / "a.png", *look)
+        assert run.returncode == 0, run.stderr
+        arrays[name] = np.load(file)
+    assert "normal" in arrays[shader] and "normal" not in arrays["plain"]
+    assert arrays[shader]["color"].max() > 0.1
+    assert np.abs(arrays[shader]["color"] - arrays["plain"]["color"]).max() > 1e-3
+
+
+def test_an_isosurface_needs_its_value(small, tmp_path):
+    run = gvtorch("render", small, "-o", tmp_path / "a.png", "--shader", "isosurface")
+    assert run.returncode == 2 and "--value and --shader isosurface" in run.stderr
+
+
+@pytest.mark.backend("cpp")
 @pytest.mark.parametrize("camera", ["orbit:10,20,1.5", "look:-12,-10,-40,12,10,8"])
 def test_render_writes_picture_arrays_and_stats(small, tmp_path, camera):
     out, npz, stats = (tmp_path / name for name in ("a.png", "a.npz", "a.json"))

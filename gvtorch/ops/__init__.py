@@ -4,6 +4,7 @@ archives and exported programs that hold `gvtorch::` ops can be loaded."""
 from .cache import compact_requests, link, lru_partition, unlink
 from .registry import available
 from .segments import Samples, Segments, composite, list_samples, sample_bricks, trace_segments
+from .shade import shade_rays
 from .trace import trace_rays
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "list_samples",
     "lru_partition",
     "sample_bricks",
+    "shade_rays",
     "trace_rays",
     "trace_segments",
     "unlink",

@@ -32,6 +32,11 @@ def larger(a: Tensor, b: Tensor) -> Tensor:
     return torch.where(b > a, b, a)
 
 
+def sqrt_exact(value: Tensor) -> Tensor:
+    """Square root, rounded once in float32: torch's own may be an ulp beside it on the CPU."""
+    return torch.sqrt(value.to(torch.float64)).to(value.dtype)
+
+
 def log2_exact(value: Tensor) -> Tensor:
     """Base-2 logarithm of positive normal floats, from + - * / alone (float64: torch.log2).
 

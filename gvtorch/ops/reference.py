@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -353,11 +354,10 @@ class Bricks:
     border: int
     component: int
 
-    def unseen(self, node: Tensor, transfer: Transfer) -> Tensor:
-        """(r,) bool: all in reach of the nodes' bricks, and of the nodes below, is transparent."""
-        real = transfer.table_lm4.dtype
-        ends = self.range_n2c[node, :, self.component].to(real)
-        return transfer.transparent(ends[:, 0], ends[:, 1])
+    def ends(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
+        """(r,) smallest and largest value in reach of the nodes' bricks, and of the nodes below."""
+        low, high = self.range_n2c[node, :, self.component].to(real).unbind(1)
+        return low, high
 
     def sample(
         self,
@@ -368,8 +368,11 @@ class Bricks:
         origin_r3: Tensor,
         direction_r3: Tensor,
         t: Tensor,
+        shift: tuple[float, float, float] = (0, 0, 0),
     ) -> Tensor:
-        """Trilinear value of each ray's node at distance t; its constant where it has no brick."""
+        """Trilinear value of each ray's node at distance t, `shift` voxels beside the ray; its
+        constant where it has no brick.
+        """
         real, known = origin_r3.dtype, node.clamp(min=0)
         constant = torch.where(node >= 0, self.constant_nc[known, self.component].to(real), 0.0)
         slot = torch.where(node >= 0, brick_n[known].to(torch.int64), -1)
@@ -378,7 +381,11 @@ class Bricks:
         side = self.bricks_bzyxc.shape[1]
         scale = divide(side - 2 * self.border, size, size)
         offset = (origin_r3 - corner) * scale[:, None] + (self.border - 0.5)
-        place = clamp(offset + t[:, None] * (direction_r3 * scale[:, None]), 0, side - 1)
+        place = offset + t[:, None] * (direction_r3 * scale[:, None])
+        place = torch.stack(
+            [p + d if d else p for p, d in zip(place.unbind(1), shift, strict=True)], 1
+        )
+        place = clamp(place, 0, side - 1)
         cell = smaller(torch.floor(place), torch.full_like(place, side - 2))
         wx, wy, wz = (place - cell).unbind(1)
         x, y, z = cell.to(torch.int64).unbind(1)
@@ -414,6 +421,12 @@ class Accumulator:
     color: Tensor  # (r, 3) premultiplied
     clear: Tensor  # (r,) transmittance
     depth: Tensor  # (r,)
+
+    @classmethod
+    def begin(cls, beam: Beam) -> Accumulator:
+        """Nothing yet."""
+        zero = torch.zeros_like(beam.first)
+        return cls(torch.zeros_like(beam.origin), zero + 1, zero + INF)
 
     def add(
         self, rgba: Tensor, start: Tensor, length: Tensor, hit_clear: Tensor, where: Tensor
@@ -465,6 +478,11 @@ class Transfer:
         solid = ~(kept > _TINY)
         alpha = 1 - exp2_exact(log2_exact(torch.where(solid, 0.5, kept)) * lengths)
         return torch.cat((rgba[:, :3], torch.where(solid, 1.0, alpha)[:, None]), 1)
+
+    def interval(self, value: Tensor, piece: Piece) -> Tensor:
+        """(r, 4) linear RGB and the alpha of an interval."""
+        odd, whole = self.piece(value, piece.lengths), self.look_up(value, piece.level)
+        return torch.where(piece.odd[:, None], odd, whole)
 
     def transparent(self, smallest: Tensor, largest: Tensor) -> Tensor:
         """Bool: no value between the two is seen. They are taken a little apart, since
@@ -523,7 +541,7 @@ def trace_rays(
     def number(value: float) -> Tensor:
         return torch.tensor(value, dtype=real).to(table_lm4)
 
-    stop_clear, hit_clear = 1 - number(stop_alpha), 1 - number(depth_alpha)
+    hit_clear = 1 - number(depth_alpha)
     at = Intervals.begin(beam, step, table_lm4.shape[0])
     tree = Tree(
         *(child_tn.view(-1), brick_tn.view(-1), request_tn.view(-1), stamp_t, stamp_b, frame_1[0]),
@@ -531,40 +549,107 @@ def trace_rays(
     )
     values = constant_tnc.flatten(0, 1), range_tn2c.flatten(0, 1)
     bricks = Bricks(bricks_bzyxc, *values, border, component)
-    transfer = Transfer(table_lm4, domain_2, opaque_m)
-    visit = Visit.none(beam, tree)
-    zero = torch.zeros_like(beam.first)
-    sum_ = Accumulator(torch.zeros_like(beam.origin), zero + 1, zero + INF)
-    samples = torch.zeros_like(zero, dtype=torch.int32)
+    shader = Plain(Transfer(table_lm4, domain_2, opaque_m), Accumulator.begin(beam), hit_clear)
+    samples, visit = walk(beam, at, tree, bricks, shader, number(step), 1 - number(stop_alpha))
+    sum_ = shader.sum
+    depth = sum_.depth + beam.moved
+    return sum_.color, (1 - sum_.clear)[:, None], depth[:, None], samples, visit.missed
 
-    active = at.inside() & (sum_.clear > stop_clear)
+
+@dataclass
+class Piece:
+    """An interval of every ray: whole, or of any length."""
+
+    start: Tensor  # (r,)
+    end: Tensor  # (r,)
+    middle: Tensor  # (r,)
+    length: Tensor  # (r,)
+    level: Tensor  # (r,) int64, of its whole interval
+    lengths: Tensor  # (r,) shortest intervals in it
+    odd: Tensor  # (r,) bool: no whole interval
+
+
+class Shader(Protocol):
+    """What a ray makes of the values it meets; see csrc/shaders.h."""
+
+    sum: Accumulator
+    sees_empty: bool
+
+    def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        """(k,) bool: nothing between two values (k,) changes the sums of the rays `which` (k,)."""
+
+    def same(self, bricks: Bricks, fine: Tensor, coarse: Tensor) -> Tensor:
+        """(k,) bool: two nodes without bricks hold the same numbers."""
+
+    def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
+        """Adds an interval where `where` (r,) is true."""
+
+
+@dataclass
+class Plain:
+    """The transfer function."""
+
+    transfer: Transfer
+    sum: Accumulator
+    hit_clear: Tensor
+    sees_empty: bool = False
+
+    def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        """See `Shader`."""
+        return self.transfer.transparent(low, high)
+
+    def same(self, bricks: Bricks, fine: Tensor, coarse: Tensor) -> Tensor:
+        """See `Shader`."""
+        values = bricks.constant_nc[:, bricks.component]
+        return values[fine] == values[coarse]
+
+    def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
+        """See `Shader`."""
+        value = probe.value(piece.middle)
+        rgba = self.transfer.interval(value, piece)
+        self.sum.add(rgba, piece.start, piece.length, self.hit_clear, where)
+
+
+def walk(
+    beam: Beam,
+    at: Intervals,
+    tree: Tree,
+    bricks: Bricks,
+    shader: Shader,
+    step: Tensor,
+    stop_clear: Tensor,
+) -> tuple[Tensor, Visit]:
+    """Takes every ray from the scene's near side to its far side; returns (r,) samples, and the
+    last visits, which know what was missed.
+    """
+    visit = Visit.none(beam, tree)
+    samples = torch.zeros_like(beam.first, dtype=torch.int32)
+    active = at.inside() & (shader.sum.clear > stop_clear)
     arrived = active  # rays that stand in a node they have not looked up yet
     while active.any():
         if arrived.any():
-            visit.look_up(arrived, beam, at, tree, bricks, transfer)
-        value = visit.value(active, beam, at, tree, bricks)
+            visit.look_up(arrived, beam, at, tree, bricks, shader)
+        probe = Probe(visit, active, beam, at.near, at.growth, tree, bricks)
 
         # A node of one value, or of none, is left in one go; else one interval is taken.
         whole = active & (visit.uniform | visit.nothing)
-        entry, level, length, cut = at.start, at.level, at.length, at.cut
+        start, middle, level, length, cut = at.start, at.middle, at.level, at.length, at.cut
         at.next(active)
         leaving = whole & visit.stays(at)
         while leaving.any():
             at.next(leaving)
             leaving = whole & visit.stays(at)
-        piece = visit.uniform | cut
-        length = torch.where(piece, smaller(at.start, at.stop) - entry, length)
-        lengths = divide(length, number(step), length)
-        rgba = torch.where(
-            piece[:, None], transfer.piece(value, lengths), transfer.look_up(value, level)
-        )
+        end = smaller(at.start, at.stop)
+        odd = visit.uniform | cut
+        length = torch.where(odd, end - start, length)
+        middle = torch.where(visit.uniform, start + length * 0.5, middle)
+        lengths = divide(length, step, length)
         shaded = active & ~visit.nothing
-        sum_.add(rgba, entry, length, hit_clear, shaded)
+        shader.add(Piece(start, end, middle, length, level, lengths, odd), probe, shaded)
         samples = samples + shaded.to(torch.int32)
-        active = at.inside() & (sum_.clear > stop_clear)
+        active = at.inside() & (shader.sum.clear > stop_clear)
         arrived = active & (whole | ~visit.stays(at))
-    depth = sum_.depth + beam.moved
-    return sum_.color, (1 - sum_.clear)[:, None], depth[:, None], samples, visit.missed
+    return samples, visit
 
 
 @dataclass
@@ -602,15 +687,22 @@ class Visit:
         at: Intervals,
         tree: Tree,
         bricks: Bricks,
-        transfer: Transfer,
+        shader: Shader,
+        t: Tensor | None = None,
     ) -> None:
-        """Finds the node of the rays that arrived; marks what they use and what they miss."""
+        """Finds the node of the rays that arrived, in the middle of their intervals or at distance
+        t (r,); marks what they use and what they miss.
+        """
         which = arrived.nonzero()[:, 0]
-        middle = at.middle[which]
-        cone = at.cone(at.middle)[which]
+        t = at.middle if t is None else t
+        middle, cone = t[which], at.cone(t)[which]
         wanted, fits, above = wanted_depth(cone, tree)
         position = beam.at(which, middle)
-        found = descend(position, wanted, tree, lambda node: bricks.unseen(node, transfer))
+
+        def hides(node: Tensor) -> Tensor:
+            return shader.hides(which, *bricks.ends(node, middle.dtype))
+
+        found = descend(position, wanted, tree, hides)
         reaches = fits <= cone
         blends = reaches & (wanted > 0)
         alone = ~blends | (found.coarse_node < 0)
@@ -630,9 +722,8 @@ class Visit:
         fine, coarse = found.fine_node.clamp(min=0), found.coarse_node.clamp(min=0)
         fine_brick, coarse_brick = tree.brick_n[fine], tree.brick_n[coarse]
         empty = (fine_brick == EMPTY) & (coarse_brick == EMPTY)
-        nothing = unseen | (found.fine_node < 0) | empty
-        values = bricks.constant_nc[:, bricks.component]
-        same = values[fine] == values[coarse]
+        nothing = unseen | (found.fine_node < 0) | (empty & (not shader.sees_empty))
+        same = shader.same(bricks, fine, coarse)
         uniform = ~nothing & (fine_brick < 0) & (coarse_brick < 0) & same
         mixed = found.fine_node != found.coarse_node
         for name, now in (
@@ -648,17 +739,49 @@ class Visit:
         fits = (cone >= self.cone_low) & (cone < self.cone_high)
         return at.inside() & (middle < self.exit) & fits
 
-    def value(
-        self, active: Tensor, beam: Beam, at: Intervals, tree: Tree, bricks: Bricks
-    ) -> Tensor:
-        """Value at the interval's middle: the node's and its parent's, whose weight grows from 0
-        where the cone is as wide as the node's voxels to 1 where it is as wide as its parent's.
+
+@dataclass
+class Probe:
+    """What a shader may ask of the tree at places of its rays."""
+
+    visit: Visit
+    active: Tensor  # (r,) bool
+    beam: Beam
+    near: Tensor  # (r,) cone
+    growth: Tensor  # (r,)
+    tree: Tree
+    bricks: Bricks
+
+    def value(self, t: Tensor) -> Tensor:
+        """(r,) values at distances t (r,)."""
+        return self.number(self.bricks, t)
+
+    def number(self, bricks: Bricks, t: Tensor) -> Tensor:
+        """(r,) numbers of any channel at distances t (r,)."""
+        return self.blend(t, lambda node, corner, size: self.read(bricks, node, corner, size, t))
+
+    def blend(self, t: Tensor, ask: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Tensor:
+        """What the node says and what its parent says, whose weight grows from 0 where the cone is
+        as wide as the node's voxels to 1 where it is as wide as its parent's. `ask(node, corner,
+        size)` gives (r,).
         """
-        p, middle = self.place, at.middle
-        ray = (beam.origin, beam.direction, middle)
-        value = bricks.sample(tree.brick_n, p.fine_node, p.fine_corner, p.fine_size, *ray)
-        if not (active & self.mixed).any():
+        visit, p = self.visit, self.visit.place
+        value = ask(p.fine_node, p.fine_corner, p.fine_size)
+        if not (self.active & visit.mixed).any():
             return value
-        other = bricks.sample(tree.brick_n, p.coarse_node, p.coarse_corner, p.coarse_size, *ray)
-        weight = clamp((at.cone(middle) - self.voxel) * self.blend, 0, 1)
-        return torch.where(self.mixed, value + weight * (other - value), value)
+        other = ask(p.coarse_node, p.coarse_corner, p.coarse_size)
+        weight = clamp((self.near + self.growth * t - visit.voxel) * visit.blend, 0, 1)
+        return torch.where(visit.mixed, value + weight * (other - value), value)
+
+    def read(
+        self,
+        bricks: Bricks,
+        node: Tensor,
+        corner: Tensor,
+        size: Tensor,
+        t: Tensor,
+        shift: tuple[float, float, float] = (0, 0, 0),
+    ) -> Tensor:
+        """(r,) numbers of nodes, `shift` voxels beside the rays."""
+        ray = self.beam.origin, self.beam.direction, t
+        return bricks.sample(self.tree.brick_n, node, corner, size, *ray, shift)

@@ -8,7 +8,17 @@ import torch
 from torch import Tensor
 
 from .exact import clamp, divide, smaller
-from .reference import Beam, Bricks, Intervals, Transfer, Tree, Visit, wanted_depth
+from .reference import (
+    Accumulator,
+    Beam,
+    Bricks,
+    Intervals,
+    Plain,
+    Transfer,
+    Tree,
+    Visit,
+    wanted_depth,
+)
 
 _PIECE = -1  # level of an interval of any length
 
@@ -64,6 +74,7 @@ def walk_segments(
     values = constant_tnc.flatten(0, 1), range_tn2c.flatten(0, 1)
     bricks = Bricks(bricks_bzyxc, *values, border, component)
     transfer = Transfer(domain_2.new_zeros((1, len(opaque_m), 4)), domain_2, opaque_m)
+    shader = Plain(transfer, Accumulator.begin(beam), domain_2[0])  # asked what it hides alone
     visit = Visit.none(beam, tree)
     seen = torch.zeros_like(beam.first)
     samples, visits = torch.zeros_like(at.level), torch.zeros_like(at.level)
@@ -73,7 +84,7 @@ def walk_segments(
     arrived = active
     while active.any():
         if arrived.any():
-            visit.look_up(arrived, beam, at, tree, bricks, transfer)
+            visit.look_up(arrived, beam, at, tree, bricks, shader)
             if by_node:
                 visit.uniform = visit.uniform & ~visit.mixed
             visits = visits + arrived.to(torch.int64)

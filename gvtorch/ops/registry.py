@@ -31,6 +31,15 @@ def _fake_trace_rays(*args: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Ten
     )
 
 
+def _fake_shade_rays(*args: Any) -> tuple[Tensor, ...]:
+    rays, table, features = args[0].shape[0], args[13], args[23]
+    return (
+        *_fake_trace_rays(*args),
+        table.new_empty((rays, 3)),
+        table.new_empty((rays, features)),
+    )
+
+
 def _fake_compact_requests(request_tn: Tensor, capacity: int) -> tuple[Tensor, Tensor, Tensor]:
     words = request_tn.new_empty((capacity,))
     return words, torch.empty_like(words), request_tn.new_empty((3,), dtype=torch.int64)
@@ -114,6 +123,7 @@ def _fake_in_place(*_args: object) -> None:
 _reasons = cpp_ext.load()
 if not _reasons["cpp"]:
     torch.library.register_fake("gvtorch::trace_rays", _fake_trace_rays)
+    torch.library.register_fake("gvtorch::shade_rays", _fake_shade_rays)
     torch.library.register_fake("gvtorch::compact_requests", _fake_compact_requests)
     torch.library.register_fake("gvtorch::lru_partition", _fake_lru_partition)
     torch.library.register_fake("gvtorch::unlink", _fake_in_place)

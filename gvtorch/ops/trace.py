@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -122,7 +123,64 @@ def trace_rays(
 
     Source: Crassin, Neyret, Lefebvre, Eisemann, "GigaVoxels", I3D 2009, sections 3 and 4.
     """
-    where, device = "trace_rays", origin_r3.device
+    tensors = {
+        "origin_r3": origin_r3,
+        "direction_r3": direction_r3,
+        "cone_r2": cone_r2,
+        "range_r2": range_r2,
+        "place_33": place_33,
+        "child_tn": child_tn,
+        "brick_tn": brick_tn,
+        "request_tn": request_tn,
+        "stamp_t": stamp_t,
+        "bricks_bzyxc": bricks_bzyxc,
+        "constant_tnc": constant_tnc,
+        "range_tn2c": range_tn2c,
+        "stamp_b": stamp_b,
+        "table_lm4": table_lm4,
+        "domain_2": domain_2,
+        "opaque_m": opaque_m,
+        "frame_1": frame_1,
+    }
+    numbers = (
+        *(width, branching, root, max_depth, border, component),
+        *(cone_scale, root_voxel, step, stop_alpha, depth_alpha),
+    )
+    check_arguments("trace_rays", tensors, numbers, ("l", "m", 4))
+    args = (
+        *(origin_r3, direction_r3, cone_r2, range_r2, place_33),
+        *(child_tn, brick_tn, request_tn, stamp_t, bricks_bzyxc, constant_tnc, range_tn2c),
+        *(stamp_b, table_lm4, domain_2, opaque_m, frame_1),
+        *(width, branching, root, max_depth, border, component),
+        *(float(cone_scale), float(root_voxel), float(step)),
+        *(float(stop_alpha), float(depth_alpha), by_level),
+    )
+    if choose_backend(backend, origin_r3.device) == "reference":
+        return reference.trace_rays(*args)
+    return torch.ops.gvtorch.trace_rays(*args)
+
+
+def check_arguments(
+    where: str,
+    tensors: Mapping[str, Tensor],
+    numbers: tuple[Any, ...],
+    table_shape: tuple[int | str, ...],
+) -> None:
+    """Raises ValueError unless what both ray ops have in common is right.
+
+    Args:
+        where: The op.
+        tensors: The 17 tensors of `trace_rays`, by name.
+        numbers: width, branching, root, max_depth, border, component, cone_scale, root_voxel, step,
+            stop_alpha, depth_alpha.
+        table_shape: What the table must be.
+    """
+    origin_r3, child_tn, bricks_bzyxc = (
+        tensors[name] for name in ("origin_r3", "child_tn", "bricks_bzyxc")
+    )
+    table_lm4, device = tensors["table_lm4"], origin_r3.device
+    width, branching, root, max_depth, border, component, *reals = numbers
+    cone_scale, root_voxel, step, stop_alpha, depth_alpha = reals
     real = table_lm4.dtype
     if real not in (torch.float32, torch.float64):
         raise ValueError(
@@ -135,27 +193,27 @@ def trace_rays(
     channels, voxel = bricks_bzyxc.shape[-1], bricks_bzyxc.dtype
     if voxel not in CHANNEL_DTYPES:
         raise ValueError(f"{where}: bricks_bzyxc has dtype {voxel}, which no channel can have")
-    for name, tensor, shape, dtype in (
-        ("origin_r3", origin_r3, (rays, 3), torch.float64),
-        ("direction_r3", direction_r3, (rays, 3), torch.float64),
-        ("cone_r2", cone_r2, (rays, 2), torch.float64),
-        ("range_r2", range_r2, (rays, 2), torch.float64),
-        ("place_33", place_33, (3, 3), torch.float64),
-        ("child_tn", child_tn, (tiles, nodes), torch.int32),
-        ("brick_tn", brick_tn, (tiles, nodes), torch.int32),
-        ("request_tn", request_tn, (tiles, nodes), torch.int32),
-        ("stamp_t", stamp_t, (tiles,), torch.int32),
-        ("bricks_bzyxc", bricks_bzyxc, (bricks, side, side, side, channels), voxel),
-        ("constant_tnc", constant_tnc, (tiles, nodes, channels), voxel),
-        ("range_tn2c", range_tn2c, (tiles, nodes, 2, channels), voxel),
-        ("stamp_b", stamp_b, (bricks,), torch.int32),
-        ("table_lm4", table_lm4, ("l", "m", 4), real),
-        ("domain_2", domain_2, (2,), real),
-        ("opaque_m", opaque_m, (table_lm4.shape[1],), torch.int32),
-        ("frame_1", frame_1, (1,), torch.int32),
+    for name, shape, dtype in (
+        ("origin_r3", (rays, 3), torch.float64),
+        ("direction_r3", (rays, 3), torch.float64),
+        ("cone_r2", (rays, 2), torch.float64),
+        ("range_r2", (rays, 2), torch.float64),
+        ("place_33", (3, 3), torch.float64),
+        ("child_tn", (tiles, nodes), torch.int32),
+        ("brick_tn", (tiles, nodes), torch.int32),
+        ("request_tn", (tiles, nodes), torch.int32),
+        ("stamp_t", (tiles,), torch.int32),
+        ("bricks_bzyxc", (bricks, side, side, side, channels), voxel),
+        ("constant_tnc", (tiles, nodes, channels), voxel),
+        ("range_tn2c", (tiles, nodes, 2, channels), voxel),
+        ("stamp_b", (bricks,), torch.int32),
+        ("table_lm4", table_shape, real),
+        ("domain_2", (2,), real),
+        ("opaque_m", (table_lm4.shape[1],), torch.int32),
+        ("frame_1", (1,), torch.int32),
     ):
-        check.tensor(where, name, tensor, shape, dtype, device)
-        if not tensor.is_contiguous():
+        check.tensor(where, name, tensors[name], shape, dtype, device)
+        if not tensors[name].is_contiguous():
             raise ValueError(f"{where}: {name} must be contiguous")
     if nodes < branching**3:
         raise ValueError(f"{where}: child_tn must hold {branching}^3 nodes a tile, got {nodes}")
@@ -176,18 +234,6 @@ def trace_rays(
     check.number(where, "cone_scale", cone_scale, low=0)
     for name, number in (("stop_alpha", stop_alpha), ("depth_alpha", depth_alpha)):
         check.number(where, name, number, low=0, high=1)
-
-    args = (
-        *(origin_r3, direction_r3, cone_r2, range_r2, place_33),
-        *(child_tn, brick_tn, request_tn, stamp_t, bricks_bzyxc, constant_tnc, range_tn2c),
-        *(stamp_b, table_lm4, domain_2, opaque_m, frame_1),
-        *(width, branching, root, max_depth, border, component),
-        *(float(cone_scale), float(root_voxel), float(step)),
-        *(float(stop_alpha), float(depth_alpha), by_level),
-    )
-    if choose_backend(backend, device) == "reference":
-        return reference.trace_rays(*args)
-    return torch.ops.gvtorch.trace_rays(*args)
 
 
 def most_intervals(length: float, step: float) -> int:

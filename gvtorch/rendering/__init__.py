@@ -1,4 +1,4 @@
-"""Cameras, transfer functions, the renderer and the pictures it makes."""
+"""Cameras, shaders, the renderer and the pictures it makes."""
 
 from . import opengl
 from .background import Backdrop, Environment, Gradient
@@ -7,12 +7,23 @@ from .costs import Cost, cost
 from .custom import CustomCamera
 from .image import read_image
 from .layer import Layer
+from .lights import DirectionalLight, Headlight, PointLight
 from .module import TreeTracer
 from .module_shader import ModuleShader, TransferModule
 from .picture import Picture
 from .progressive import Progressive
 from .renderer import RenderOptions, render
 from .shader import TransferFunction
+from .shaders import (
+    DistanceField,
+    Features,
+    Isosurface,
+    Lit,
+    PreIntegrated,
+    Projection,
+    Shader,
+    StoredColor,
+)
 from .tiles import render_tiles
 
 __all__ = [
@@ -20,13 +31,24 @@ __all__ = [
     "Camera",
     "Cost",
     "CustomCamera",
+    "DirectionalLight",
+    "DistanceField",
     "Environment",
+    "Features",
     "Gradient",
+    "Headlight",
+    "Isosurface",
     "Layer",
+    "Lit",
     "ModuleShader",
     "Picture",
+    "PointLight",
+    "PreIntegrated",
     "Progressive",
+    "Projection",
     "RenderOptions",
+    "Shader",
+    "StoredColor",
     "TransferFunction",
     "TransferModule",
     "TreeTracer",

@@ -22,6 +22,7 @@ from .module_shader import Batch, TransferModule, march
 from .picture import Picture
 from .renderer import RenderOptions, Tracer, check_type, render_options
 from .shader import TransferFunction
+from .shaders import FusedShader
 
 Image = Literal["samples", "nodes", "lod", "age", "fill"]
 
@@ -87,7 +88,7 @@ class Cost:
 def cost(
     tree: N3Tree,
     camera: Camera | Rays,
-    shader: TransferFunction,
+    shader: FusedShader,
     *,
     progress: Progress = no_progress,
     **options: Any,

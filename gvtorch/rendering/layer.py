@@ -158,8 +158,15 @@ class LayerPixels:
         start = torch.where(onward, torch.maximum(near, stop), near)
         end = torch.where(onward, torch.maximum(start, far), start)
         behind = trace_rays(dataclasses.replace(rays, range=torch.cat((start, end), 1)))
+        normal, features = mixed.normal, mixed.features
+        if normal is not None and behind.normal is not None:
+            normal = torch.where(front.depth < torch.inf, normal, behind.normal)
+        if features is not None and behind.features is not None:
+            features = features + (1 - mixed.alpha) * behind.features
         return dataclasses.replace(
             mixed,
+            normal=normal,
+            features=features,
             color=mixed.color + (1 - mixed.alpha) * behind.color,
             alpha=mixed.alpha + (1 - mixed.alpha) * behind.alpha,
             depth=torch.minimum(front.depth, behind.depth),

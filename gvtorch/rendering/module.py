@@ -1,4 +1,4 @@
-"""`TreeTracer`: a tree and a transfer function as one `nn.Module` of plain tensors and one op.
+"""`TreeTracer`: a tree and a shader as one `nn.Module` of plain tensors and one op.
 
 It can be scripted, saved and loaded (also from C++), exported and compiled. Programs that load an
 archive import `gvtorch.ops` first; C++ programs open `libgvtorch_cpu.so`.
@@ -6,7 +6,7 @@ archive import `gvtorch.ops` first; C++ programs open `libgvtorch_cpu.so`.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -15,19 +15,27 @@ from .. import check, config
 from ..ops import available
 from ..ops.trace import most_intervals
 from ..pool import N3Tree
-from .shader import TransferFunction, interval_levels
+from .renderer import check_shader
+from .shader import interval_levels
+from .shaders import FusedShader, Intervals, Shader
 
 
 class TreeTracer(torch.nn.Module):
-    """Traces world rays through a resident tree. Pools are buffers: `.to(device)` moves them."""
+    """Traces world rays through a resident tree. Pools are buffers: `.to(device)` moves them.
+
+    Light and material of a lit shader are the buffer `parameter`, laid out as `parameter_54` of
+    `ops.shade_rays`; it may be edited.
+    """
 
     if TYPE_CHECKING:  # TorchScript would read these as attributes of its own
         place: Tensor
+        normals: Tensor
+        others: Tensor
 
     def __init__(
         self,
         tree: N3Tree,
-        shader: TransferFunction,
+        shader: FusedShader,
         *,
         channel: str | None = None,
         component: int = 0,
@@ -39,7 +47,7 @@ class TreeTracer(torch.nn.Module):
 
         Args:
             tree: The tree.
-            shader: The transfer function.
+            shader: The transfer function, or another fused shader.
             channel: Name of the channel it reads; the first if left out.
             component: Which number of the channel.
             step: Shortest interval, in voxels of the finest level.
@@ -53,7 +61,10 @@ class TreeTracer(torch.nn.Module):
         super().__init__()
         if available()["cpp"]:
             raise RuntimeError(f"TreeTracer needs the compiled op: {available()['cpp']}")
-        channel = channel or tree.channel_names[0]
+        check_shader("TreeTracer", "shader", shader)
+        own = shader if isinstance(shader, Shader) else None
+        channel = (own and own.channel) or channel or tree.channel_names[0]
+        component = own.component if own and own.component is not None else component
         if channel not in tree.bricks.bricks:
             known = ", ".join(tree.channel_names)
             raise ValueError(f"TreeTracer: unknown channel {channel!r}; the tree has {known}")
@@ -65,7 +76,14 @@ class TreeTracer(torch.nn.Module):
         most_intervals(float((tree.box[1] - tree.box[0]).norm()), step * min(tree.spacing))
         step = step * min(tree.spacing)
         levels = interval_levels(tree.root_voxel, step)
-        table = shader.table(min(tree.spacing), step, levels, torch.float32, tree.device)
+        spacing, real = min(tree.spacing), torch.float32
+        lengths = Intervals(smallest_spacing=spacing, step=step, levels=levels, dtype=real)
+        if isinstance(shader, Shader):
+            laid = shader.arguments(where, tree, lengths)
+            laid["parameter"] = shader.parameters(tree, real)
+        else:
+            laid = vars(shader.table(spacing, step, levels, real, tree.device))
+        nothing = torch.zeros(0, device=tree.device)
         nodes, bricks = tree.nodes, tree.bricks
         for name, tensor in (
             ("place", tree.place),
@@ -77,9 +95,14 @@ class TreeTracer(torch.nn.Module):
             ("constant", nodes.constants[channel]),
             ("value_range", nodes.ranges[channel]),
             ("stamp_brick", bricks.stamp_b.clone()),
-            ("table", table.table_lm4),
-            ("domain", table.domain_2),
-            ("opaque", table.opaque_m),
+            ("table", laid["table_lm4"]),
+            ("domain", laid["domain_2"]),
+            ("opaque", laid["opaque_m"]),
+            ("parameter", laid.get("parameter", nothing)),
+            ("normals", _given(laid, "normal_bzyxc", nothing)),
+            ("normal_constant", _given(laid, "normal_tnc", nothing)),
+            ("others", _given(laid, "other_bzyxc", nothing)),
+            ("other_constant", _given(laid, "other_tnc", nothing)),
             ("frame", torch.zeros(1, dtype=torch.int32, device=tree.device)),
         ):
             self.register_buffer(name, tensor)
@@ -88,6 +111,9 @@ class TreeTracer(torch.nn.Module):
         self.border, self.component = bricks.border, component
         self.root_voxel, self.step = float(tree.root_voxel), step
         self.stop_alpha, self.depth_alpha = float(stop_alpha), float(depth_alpha)
+        self.shader = int(laid.get("shader", -1))  # -1: the plain transfer function
+        self.features = int(laid.get("features", 0))
+        self.other_component = int(laid.get("other_component", 0))
 
     def forward(
         self, origin: Tensor, direction: Tensor, cone: Tensor, range: Tensor
@@ -104,11 +130,61 @@ class TreeTracer(torch.nn.Module):
         Returns:
             color (r, 3) premultiplied, alpha (r, 1), depth (r, 1), all float32; samples (r,) int32.
         """
-        color, alpha, depth, samples, _ = torch.ops.gvtorch.trace_rays(
+        color, alpha, depth, samples, _, _ = self.hits(origin, direction, cone, range)
+        return color, alpha, depth, samples
+
+    @torch.jit.export
+    def hits(
+        self, origin: Tensor, direction: Tensor, cone: Tensor, range: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """As `forward`, and returns also normal (r, 3) and features (r, c), (0, 3) and (0, 0) where
+        the shader gives none.
+        """
+        rays = (
             origin.to(torch.float64).contiguous(),
             direction.to(torch.float64).contiguous(),
             cone.to(torch.float64).contiguous(),
             range.to(torch.float64).contiguous(),
+        )
+        if self.shader < 0:
+            color, alpha, depth, samples, _ = torch.ops.gvtorch.trace_rays(
+                rays[0],
+                rays[1],
+                rays[2],
+                rays[3],
+                self.place,
+                self.child,
+                self.brick,
+                self.request,
+                self.stamp_tile,
+                self.bricks,
+                self.constant,
+                self.value_range,
+                self.stamp_brick,
+                self.table,
+                self.domain,
+                self.opaque,
+                self.frame,
+                0,
+                self.branching,
+                self.root,
+                self.depth,
+                self.border,
+                self.component,
+                self.flatness,
+                self.root_voxel,
+                self.step,
+                self.stop_alpha,
+                self.depth_alpha,
+                False,
+            )
+            return color, alpha, depth, samples, color.new_zeros((0, 3)), color.new_zeros((0, 0))
+        with_normals, with_others = self.normals.numel() > 0, self.others.numel() > 0
+        color, alpha, depth, samples, _, normal, features = torch.ops.gvtorch.shade_rays(
+            rays[0],
+            rays[1],
+            rays[2],
+            rays[3],
             self.place,
             self.child,
             self.brick,
@@ -122,6 +198,14 @@ class TreeTracer(torch.nn.Module):
             self.domain,
             self.opaque,
             self.frame,
+            self.parameter,
+            self.normals if with_normals else None,
+            self.normal_constant if with_normals else None,
+            self.others if with_others else None,
+            self.other_constant if with_others else None,
+            self.shader,
+            self.features,
+            self.other_component,
             0,
             self.branching,
             self.root,
@@ -135,4 +219,9 @@ class TreeTracer(torch.nn.Module):
             self.depth_alpha,
             False,
         )
-        return color, alpha, depth, samples
+        return color, alpha, depth, samples, normal, features
+
+
+def _given(laid: dict[str, Any], name: str, nothing: Tensor) -> Tensor:
+    found = laid.get(name)
+    return nothing if found is None else found

@@ -30,6 +30,9 @@ class Picture:
     missed: Tensor | None = None  # (h, w, 1) bool, something that the ray saw was not there
     transparent: bool = False  # there is no background
     stats: RenderStats
+    # What only some shaders give, else None:
+    normal: Tensor | None = None  # (h, w, 3) world, towards the eye, of unit length or 0
+    features: Tensor | None = None  # (h, w, c)
 
     def tone_map(
         self, curve: ToneCurve = "aces", *, exposure: float = 0.0, white: float = 4.0
@@ -62,9 +65,12 @@ class Picture:
         return torch.from_numpy(display_pixels(self.color, None, 8))
 
     def layers(self) -> dict[str, np.ndarray]:
-        """Returns color, alpha and depth (float32) and samples (int32) as arrays."""
-        layers = {name: getattr(self, name) for name in ("color", "alpha", "depth")}
-        layers = {name: layer.float() for name, layer in layers.items()}
+        """Returns color, alpha, depth, and normal and features where they are (float32), and
+        samples (int32) as arrays.
+        """
+        names = ("color", "alpha", "depth", "normal", "features")
+        given = {name: getattr(self, name) for name in names}
+        layers = {name: layer.float() for name, layer in given.items() if layer is not None}
         layers["samples"] = self.samples
         return {name: layer.detach().cpu().numpy() for name, layer in layers.items()}
 
@@ -76,7 +82,7 @@ class Picture:
         - .tif: the same, or 32 bits: linear float, premultiplied (BigTIFF, Deflate).
         - .exr: linear, 32 or 16 bits float: R G B A (premultiplied), Z (depth), samples.
         - .npy: (h, w, 6) float32: color, alpha, depth, samples.
-        - .npz: float32 color, alpha and depth, int32 samples.
+        - .npz: float32 color, alpha and depth, int32 samples; normal and features where they are.
 
         Args:
             path: The file; its ending tells the kind.

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .. import check, config
 from ..frame import Hits, Rays, RenderStats
-from ..ops import trace_rays
+from ..ops import shade_rays, trace_rays
 from ..ops.trace import Backend, choose_backend, most_intervals
 from ..pool import N3Tree
 from ..stage import Progress, collect_timings, no_progress, stage
@@ -23,7 +23,9 @@ from .layer import Layer
 from .module_shader import ModuleShader, ModuleTracer
 from .picture import Picture
 from .shader import TransferFunction, interval_levels
+from .shaders import FusedShader, Intervals, Projection, Shader
 
+AnyShader = FusedShader | ModuleShader
 _RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that progress shows
 
 
@@ -69,7 +71,7 @@ class RenderOptions:
 def render(
     tree: N3Tree,
     camera: Camera | Rays,
-    shader: TransferFunction | ModuleShader,
+    shader: AnyShader,
     *,
     progress: Progress = no_progress,
     **options: Any,
@@ -81,7 +83,7 @@ def render(
             written.
         camera: One camera or a batch; an orbit camera stands around the tree's box. Or rays in
             world units, which make a picture as wide as they tell, or of one row.
-        shader: The transfer function, in data units, or a module.
+        shader: The transfer function, in data units, or another shader.
         progress: Told how many rays are done.
         **options: Fields of `RenderOptions`.
 
@@ -141,6 +143,12 @@ def check_type(where: str, name: str, value: Any, kind: type) -> None:
         raise ValueError(f"{where}: {name} must be a {kind.__name__}, got {type(value).__name__}")
 
 
+def check_shader(where: str, name: str, value: Any) -> None:
+    """Raises ValueError unless a user's argument is a transfer function or another fused shader."""
+    if not isinstance(value, Shader):
+        check_type(where, name, value, TransferFunction)
+
+
 def develop(
     hits: Hits,
     camera: Camera,
@@ -176,6 +184,10 @@ def develop(
         "samples": hits.samples.reshape(*shape, 1),
         "missed": hits.missed.reshape(*shape, 1),
     }
+    for name in ("normal", "features"):
+        field = getattr(hits, name)
+        if field is not None:
+            images[name] = field.reshape(*shape, field.shape[1])
     if not camera.batched:
         images = {name: image[0] for name, image in images.items()}
     return Picture(**images, transparent=background is None, stats=stats)
@@ -251,6 +263,10 @@ def trace_camera(
                 hits = part  # the only block
             else:
                 for name, field in vars(part).items():
+                    if field is None:
+                        continue
+                    if vars(hits)[name] is None:
+                        vars(hits)[name] = field.new_empty((rows * width, *field.shape[1:]))
                     vars(hits)[name][pixels] = field
         progress("rays", end, rows)
     assert hits is not None
@@ -269,17 +285,14 @@ def _some_rays(numbers: Tensor, camera: Camera, top: int, which: Tensor) -> Rays
 
 
 def trace(
-    tree: N3Tree,
-    rays: Rays,
-    shader: TransferFunction | ModuleShader,
-    options: RenderOptions | None = None,
+    tree: N3Tree, rays: Rays, shader: AnyShader, options: RenderOptions | None = None
 ) -> Hits:
     """Traces any world rays through a tree as one frame.
 
     Args:
         tree: The tree; its stamps and request words are written.
         rays: Rays in world units, on the tree's device.
-        shader: The transfer function, or a module.
+        shader: The transfer function, or another shader.
         options: Lod, step and the like; `background` is not used.
 
     Returns:
@@ -294,7 +307,7 @@ def trace(
 
 def tracer_of(
     tree: N3Tree,
-    shader: TransferFunction | ModuleShader,
+    shader: AnyShader,
     options: RenderOptions,
     **frame: Any,
 ) -> Tracer | ModuleTracer:
@@ -307,7 +320,9 @@ def tracer_of(
         walls = Tracer(tree, shader.walls, options, **frame)
         channel = options.channel or tree.channel_names[0]
         return ModuleTracer(tree, shader, walls.arguments, channel)
-    check_type("render", "shader", shader, TransferFunction)
+    check_shader("render", "shader", shader)
+    if isinstance(shader, Projection) and options.layer and options.layer.alpha is not None:
+        raise ValueError("render: a projection can't be mixed with a translucent layer")
     return Tracer(tree, shader, options, **frame)
 
 
@@ -317,7 +332,7 @@ class Tracer:
     def __init__(
         self,
         tree: N3Tree,
-        shader: TransferFunction,
+        shader: FusedShader,
         options: RenderOptions,
         *,
         by_level: bool = False,
@@ -327,7 +342,8 @@ class Tracer:
         (1,) int32 is the frame's number on the device, if it lies there already.
         """
         choose_backend(options.backend, tree.device)
-        channel = options.channel or tree.channel_names[0]
+        own = shader if isinstance(shader, Shader) else None
+        channel = (own and own.channel) or options.channel or tree.channel_names[0]
         if channel not in tree.bricks.bricks:
             known = ", ".join(tree.channel_names)
             raise ValueError(f"render: unknown channel {channel!r}; the tree has {known}")
@@ -338,7 +354,15 @@ class Tracer:
             frame_1 = torch.full((1,), tree.frame, dtype=torch.int32, device=tree.device)
         scale = options.cone_scale * tree.flatness if options.lod == "auto" else 0.0
         levels = interval_levels(tree.root_voxel, step) if scale else 1
-        table = shader.table(min(tree.spacing), step, levels, options.dtype, tree.device)
+        intervals = Intervals(
+            smallest_spacing=min(tree.spacing), step=step, levels=levels, dtype=options.dtype
+        )
+        if isinstance(shader, TransferFunction):
+            table = vars(shader.table(min(tree.spacing), step, levels, options.dtype, tree.device))
+        else:
+            table = shader.arguments("render", tree, intervals)
+        component = own.component if own and own.component is not None else options.component
+        self.shader, self.dtype = own, options.dtype
         self.arguments: dict[str, Any] = {
             "place_33": tree.place,
             "child_tn": tree.nodes.child_tn,
@@ -349,13 +373,13 @@ class Tracer:
             "constant_tnc": tree.nodes.constants[channel],
             "range_tn2c": tree.nodes.ranges[channel],
             "stamp_b": tree.bricks.stamp_b,
-            **vars(table),
+            **table,
             "frame_1": frame_1,
             "branching": tree.branching,
             "root": tree.root,
             "max_depth": tree.depth,
             "border": tree.bricks.border,
-            "component": options.component,
+            "component": component,
             "cone_scale": scale,
             "root_voxel": tree.root_voxel,
             "step": step,
@@ -368,12 +392,23 @@ class Tracer:
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays in world units."""
         columns = (rays.origin, rays.direction, rays.cone, rays.range)
-        color, alpha, depth, samples, missed = trace_rays(
-            *(column.to(torch.float64).contiguous() for column in columns),
-            width=rays.width,
-            **self.arguments,
+        origin, direction, cone, limits = (c.to(torch.float64).contiguous() for c in columns)
+        given = {"width": rays.width, **self.arguments}
+        if self.shader is None:
+            fields = trace_rays(origin, direction, cone, limits, **given)
+            return Hits(**dict(zip(_FIELDS, fields, strict=False)))
+        found = shade_rays(
+            origin_r3=origin,
+            direction_r3=direction,
+            cone_r2=cone,
+            range_r2=limits,
+            parameter_54=self.shader.parameters(self.tree, self.dtype),
+            **given,
         )
-        return Hits(color=color, alpha=alpha, depth=depth, samples=samples, missed=missed)
+        return Hits(**dict(zip(_FIELDS, found, strict=True)))
+
+
+_FIELDS = ("color", "alpha", "depth", "samples", "missed", "normal", "features")
 
 
 def composite_trees(tracers: Sequence[Tracer | ModuleTracer], rays: Rays) -> Hits:
@@ -385,17 +420,29 @@ def composite_trees(tracers: Sequence[Tracer | ModuleTracer], rays: Rays) -> Hit
     near = torch.stack([_entry(tracer.tree.box, rays) for tracer in tracers])  # (m, r)
     order = near.argsort(dim=0, stable=True)
     hits = [tracer(rays) for tracer in tracers]
-    fields = {name: torch.stack([vars(one)[name] for one in hits]) for name in vars(hits[0])}
+    fields = {name: torch.stack([vars(one)[name] for one in hits]) for name in _FIELDS[:5]}
     which = order[:, :, None]
-    color, alpha = (fields[n].gather(0, which.expand_as(fields[n])) for n in ("color", "alpha"))
+    over = {name: fields[name] for name in ("color", "alpha")}
+    for name in ("normal", "features"):
+        given = [vars(one)[name] for one in hits if vars(one)[name] is not None]
+        if given and len({field.shape[1] for field in given}) > 1:
+            raise ValueError("render: trees must give as many features each")
+        if given:
+            none = torch.zeros_like(given[0])
+            found = [vars(one)[name] for one in hits]
+            over[name] = torch.stack([none if field is None else field for field in found])
+    if "normal" in over:
+        over["normal"] = over["normal"] * over["alpha"]
+    over = {name: field.gather(0, which.expand_as(field)) for name, field in over.items()}
     depths = fields["depth"].gather(0, which)
-    total_color, total_alpha = color[0], alpha[0]
+    total = {name: field[0] for name, field in over.items()}
     for behind in range(1, len(tracers)):
-        total_color = total_color + (1 - total_alpha) * color[behind]
-        total_alpha = total_alpha + (1 - total_alpha) * alpha[behind]
+        clear = 1 - total["alpha"]
+        total = {name: total[name] + clear * field[behind] for name, field in over.items()}
+    if "normal" in total:
+        total["normal"] = torch.nn.functional.normalize(total["normal"], dim=1)
     return Hits(
-        color=total_color,
-        alpha=total_alpha,
+        **total,
         depth=depths.amin(0),
         samples=fields["samples"].sum(0, dtype=torch.int32),
         missed=fields["missed"].any(0),

@@ -238,6 +238,26 @@ def interval_levels(root_voxel: float, step: float) -> int:
     return max(1, math.ceil(math.log2(root_voxel / step)) + 1)
 
 
+def corner_cells(
+    transfer: TransferFunction, fewest: int, most: int
+) -> tuple[float, float, int, float]:
+    """Returns the first and last value of a coarse table, its cells, and the smallest distance of
+    two corner points as a part of it. Corners fall on rows where `most` cells allow it.
+    """
+    corners = np.unique(np.concatenate((transfer.opacity[:, 0], transfer.color[:, 0])))
+    low, high = float(corners[0]), float(corners[-1])
+    if high == low:
+        high = low + max(1.0, abs(low))
+    places = (corners - low) / (high - low)
+    gap = float(np.diff(places, append=2.0).min())
+    exact = 1
+    for place in places:
+        exact = math.lcm(exact, Fraction(float(place)).limit_denominator(most).denominator)
+        if exact > most:
+            return low, high, most, gap
+    return low, high, exact * math.ceil(fewest / exact), gap
+
+
 def _grid(places: np.ndarray) -> int | None:
     """A number of cells of [0, 1] fine enough for corners at these places; None: there is none."""
     exact = 1

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from ..engine import Engine
     from ..frame import FrameStats, RenderStats
-    from ..rendering import Camera, Cost, Picture, TransferFunction
+    from ..rendering import Camera, Cost, Picture, Shader, TransferFunction
     from ..rendering.path import CameraPath
     from ..rendering.projection import CameraModel
 
@@ -44,6 +44,12 @@ class Look:
     tf: Annotated[str, arg(metavar="FILE|PRESET")] = "gray"
     """transfer function: a JSON file, or a preset over the data's range: gray, hot, vessels, bone,
     tissue"""
+    shader: Literal["plain", "lit", "preintegrated", "isosurface", "maximum", "minimum", "mean"] = (
+        "plain"
+    )
+    """what is made of the values"""
+    value: Annotated[float | None, arg(metavar="VALUE")] = None
+    """of the isosurface"""
     step: Annotated[float, arg(metavar="VOXELS")] = 0.5
     """distance between samples"""
     lod: Literal["auto", "finest"] = "auto"
@@ -85,13 +91,23 @@ class Look:
         choose_backend(self.backend, device)
         return device
 
-    def shader(self, low: float, high: float) -> TransferFunction:
-        """Reads the transfer function, or spans a preset over the range."""
-        from ..rendering import TransferFunction
+    def chosen(self, low: float, high: float) -> TransferFunction | Shader:
+        """Returns the shader asked for, its transfer function read or spanned over the range."""
+        from ..rendering import Isosurface, Lit, PreIntegrated, Projection, TransferFunction
 
         if self.tf.endswith(".json") or Path(self.tf).is_file():
-            return TransferFunction.from_json(self.tf)
-        return TransferFunction.preset(self.tf, low, high)
+            transfer = TransferFunction.from_json(self.tf)
+        else:
+            transfer = TransferFunction.preset(self.tf, low, high)
+        if (self.value is None) == (self.shader == "isosurface"):
+            raise ValueError("--value and --shader isosurface belong together")
+        if self.shader == "isosurface":
+            return Isosurface(float(self.value or 0))
+        if self.shader in ("maximum", "minimum", "mean"):
+            return Projection(self.shader, transfer)
+        if self.shader == "plain":
+            return transfer
+        return Lit(transfer) if self.shader == "lit" else PreIntegrated(transfer)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +134,7 @@ class Streaming:
     """a block that can't be read ends the work"""
 
     @contextmanager
-    def open(self, path: str, look: Look) -> Iterator[tuple[Engine, TransferFunction]]:
+    def open(self, path: str, look: Look) -> Iterator[tuple[Engine, TransferFunction | Shader]]:
         """Opens a store: the engine over it, and the transfer function."""
         from ..engine import Engine
         from ..io import Store
@@ -126,7 +142,7 @@ class Streaming:
 
         store = Store.open(path, image=self.image, time=self.time)
         producer = StoredProducer(store, host_cache=self.host_cache)
-        shader = look.shader(*value_range(store))
+        shader = look.chosen(*value_range(store))
         with Engine(
             producer,
             node_pool=self.node_pool,
@@ -230,7 +246,7 @@ class Render:
                 f"{flags[0]} is for stores; make one: gvtorch convert {self.path} STORE.zarr"
             )
         volume = self.source.read(Path(self.path))
-        shader, look = self.look.shader(*volume.value_range), self.look
+        shader, look = self.look.chosen(*volume.value_range), self.look
         tree = N3Tree.from_volume(
             *(volume, look.brick_size, look.border),
             threshold=self.threshold,

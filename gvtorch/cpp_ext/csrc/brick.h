@@ -5,10 +5,35 @@
 // long as border >= 1: both interpolate the same two voxels. A place beyond the stored centres is clamped.
 #pragma once
 
+#include "trace_args.h"
 #include "tree.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
+
+// Calls body(Voxel{}) with the C++ type of a channel's voxels.
+#ifdef __CUDACC__
+#pragma nv_exec_check_disable
+#endif
+template <class Body>
+GV_HD void with_voxel(VoxelType type, const Body& body) {
+  switch (type) {
+    case VoxelType::kUInt8:
+      return body(uint8_t{});
+    case VoxelType::kInt8:
+      return body(int8_t{});
+    case VoxelType::kInt16:
+      return body(int16_t{});
+    case VoxelType::kUInt16:
+      return body(uint16_t{});
+    case VoxelType::kHalf:
+      return body(Half{});
+    case VoxelType::kBFloat16:
+      return body(BFloat16{});
+    case VoxelType::kFloat:
+      return body(float{});
+  }
+}
 
 template <class Voxel>
 struct BrickView {
@@ -55,24 +80,24 @@ GV_HD BrickRay<T, Voxel> aim(const BrickView<Voxel>& view, const Levels<T>& leve
   return ray;
 }
 
+// Value at a place of a brick, in voxels from the centre of its first one; a place beyond the last is clamped.
 // kSide > 0: a brick of one channel and that side, so that eight addresses are one address and seven constants.
 template <int32_t kSide = 0, class T, class Voxel>
-GV_HD T sample(const BrickView<Voxel>& view, const BrickRay<T, Voxel>& ray, T t) {
-  if (ray.voxels == nullptr) return ray.constant;
-  const int32_t side = kSide > 0 ? kSide : view.side;
+GV_HD T trilinear(const Voxel* voxels, int32_t any_side, int32_t channels, Vec3<T> at) {
+  const int32_t side = kSide > 0 ? kSide : any_side;
   int32_t index[3];
   T weight[3];
   const T last = static_cast<T>(side - 1);
   for (int axis = 0; axis < 3; ++axis) {
-    const T place = clamp(ray.offset[axis] + t * ray.slope[axis], static_cast<T>(0), last);
+    const T place = clamp(at[axis], static_cast<T>(0), last);
     const int32_t cell = smaller(static_cast<int32_t>(place), side - 2);
     index[axis] = cell;
     weight[axis] = place - static_cast<T>(cell);
   }
-  const int32_t step_x = kSide > 0 ? 1 : view.channels;
+  const int32_t step_x = kSide > 0 ? 1 : channels;
   const int32_t step_y = step_x * side;
   const int32_t step_z = step_y * side;
-  const Voxel* corner = ray.voxels + (index[2] * step_z + index[1] * step_y + index[0] * step_x);
+  const Voxel* corner = voxels + (index[2] * step_z + index[1] * step_y + index[0] * step_x);
   T plane[2];
   for (int z = 0; z < 2; ++z) {
     T row[2];
@@ -85,6 +110,13 @@ GV_HD T sample(const BrickView<Voxel>& view, const BrickRay<T, Voxel>& ray, T t)
     plane[z] = row[0] + weight[1] * (row[1] - row[0]);
   }
   return plane[0] + weight[2] * (plane[1] - plane[0]);
+}
+
+template <int32_t kSide = 0, class T, class Voxel>
+GV_HD T sample(const BrickView<Voxel>& view, const BrickRay<T, Voxel>& ray, T t) {
+  if (ray.voxels == nullptr) return ray.constant;
+  const Vec3<T> at{ray.offset.x + t * ray.slope.x, ray.offset.y + t * ray.slope.y, ray.offset.z + t * ray.slope.z};
+  return trilinear<kSide>(ray.voxels, view.side, view.channels, at);
 }
 
 }  // namespace GV_NAMESPACE

@@ -173,6 +173,7 @@ void trace(const torch::stable::Tensor& like, TraceArgs args, bool wide) {
 
 STABLE_TORCH_LIBRARY(gvtorch, library) {
   library.def(gvtorch::kTraceRaysSchema);
+  library.def(gvtorch::kShadeRaysSchema);
   library.def(gvtorch::kCompactRequestsSchema);
   library.def(gvtorch::kLruPartitionSchema);
   library.def(gvtorch::kUnlinkSchema);
@@ -182,6 +183,7 @@ STABLE_TORCH_LIBRARY(gvtorch, library) {
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) {
   library.impl("trace_rays", TORCH_BOX(&gvtorch::trace_rays<gvtorch::Cpu>));
+  library.impl("shade_rays", TORCH_BOX(&gvtorch::shade_rays<gvtorch::Cpu>));
   library.impl("compact_requests", TORCH_BOX(&gvtorch::compact_requests<gvtorch::Cpu>));
   library.impl("lru_partition", TORCH_BOX(&gvtorch::lru_partition<gvtorch::Cpu>));
   library.impl("unlink", TORCH_BOX(&gvtorch::unlink<gvtorch::Cpu>));

@@ -9,6 +9,7 @@
 #include <cstdint>
 #include <cub/block/block_reduce.cuh>
 #include <cub/block/block_scan.cuh>
+#include <type_traits>
 
 #include "cache.h"
 #include "trace.h"
@@ -21,9 +22,13 @@ struct Cuda {
 
 // That many blocks on a multiprocessor leave 64 registers to a thread: waiting for memory is what tracing must hide.
 constexpr int kBlock = 128;
+// Functors that shade ask for fewer: their values in registers are more than their loads.
+template <class Functor, class = void>
 constexpr int kBlocksAtOnce = 8;
 template <class Functor>
-__global__ void __launch_bounds__(kBlock, kBlocksAtOnce) run_functor(Functor functor, int64_t count) {
+constexpr int kBlocksAtOnce<Functor, std::void_t<decltype(Functor::kBlocksAtOnce)>> = Functor::kBlocksAtOnce;
+template <class Functor>
+__global__ void __launch_bounds__(kBlock, kBlocksAtOnce<Functor>) run_functor(Functor functor, int64_t count) {
   const int64_t stride = static_cast<int64_t>(gridDim.x) * blockDim.x;
   for (int64_t index = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x; index < count; index += stride) {
     functor(index);
@@ -248,6 +253,7 @@ void split(const torch::stable::Tensor& like, int64_t count, const Keep& keep, c
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch, CUDA, library) {
   library.impl("trace_rays", TORCH_BOX(&gvtorch::trace_rays<gvtorch::Cuda>));
+  library.impl("shade_rays", TORCH_BOX(&gvtorch::shade_rays<gvtorch::Cuda>));
   library.impl("compact_requests", TORCH_BOX(&gvtorch::compact_requests<gvtorch::Cuda>));
   library.impl("lru_partition", TORCH_BOX(&gvtorch::lru_partition<gvtorch::Cuda>));
   library.impl("unlink", TORCH_BOX(&gvtorch::unlink<gvtorch::Cuda>));

@@ -10,9 +10,11 @@
 #include <torch/csrc/stable/tensor.h>
 #include <torch/headeronly/core/ScalarType.h>
 
+#include <optional>
 #include <tuple>
 
 #include "cache.h"
+#include "shade_rays.h"
 #include "trace.h"
 
 namespace gvtorch {
@@ -30,6 +32,19 @@ constexpr const char* kTraceRaysSchema =
     "int width, int branching, int root, int max_depth, int border, int component, "
     "float cone_scale, float root_voxel, float step, float stop_alpha, float depth_alpha, bool by_level"
     ") -> (Tensor color_r3, Tensor alpha_r1, Tensor depth_r1, Tensor samples_r, Tensor missed_r)";
+// As trace_rays; the table is (l, m, m, 4) where the shader integrates. Tensor shape of features: (r, features).
+constexpr const char* kShadeRaysSchema =
+    "shade_rays("
+    "Tensor origin_r3, Tensor direction_r3, Tensor cone_r2, Tensor range_r2, Tensor place_33, "
+    "Tensor child_tn, Tensor brick_tn, Tensor(a!) request_tn, Tensor(b!) stamp_t, "
+    "Tensor bricks_bzyxc, Tensor constant_tnc, Tensor range_tn2c, Tensor(c!) stamp_b, "
+    "Tensor table, Tensor domain_2, Tensor opaque_m, Tensor frame_1, "
+    "Tensor parameter_54, Tensor? normal_bzyxc, Tensor? normal_tnc, Tensor? other_bzyxc, Tensor? other_tnc, "
+    "int shader, int features, int other_component, "
+    "int width, int branching, int root, int max_depth, int border, int component, "
+    "float cone_scale, float root_voxel, float step, float stop_alpha, float depth_alpha, bool by_level"
+    ") -> (Tensor color_r3, Tensor alpha_r1, Tensor depth_r1, Tensor samples_r, Tensor missed_r, "
+    "Tensor normal_r3, Tensor features_rc)";
 constexpr const char* kCompactRequestsSchema =
     "compact_requests(Tensor(a!) request_tn, int capacity) -> (Tensor node_k, Tensor word_k, Tensor count_3)";
 constexpr const char* kLruPartitionSchema =
@@ -73,15 +88,21 @@ inline VoxelType voxel_type(ScalarType dtype) {
 inline const int32_t* words_in(const Tensor& tensor) { return static_cast<const int32_t*>(tensor.const_data_ptr()); }
 inline int32_t* words_out(const Tensor& tensor) { return static_cast<int32_t*>(tensor.mutable_data_ptr()); }
 
-template <class Device>
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> trace_rays(
-    const Tensor& origin_r3, const Tensor& direction_r3, const Tensor& cone_r2, const Tensor& range_r2,
-    const Tensor& place_33, const Tensor& child_tn, const Tensor& brick_tn, const Tensor& request_tn,
-    const Tensor& stamp_t, const Tensor& bricks_bzyxc, const Tensor& constant_tnc, const Tensor& range_tn2c,
-    const Tensor& stamp_b, const Tensor& table_lm4, const Tensor& domain_2, const Tensor& opaque_m,
-    const Tensor& frame_1, int64_t width, int64_t branching, int64_t root, int64_t max_depth, int64_t border,
-    int64_t component, double cone_scale, double root_voxel, double step, double stop_alpha, double depth_alpha,
-    bool by_level) {
+// What a traced ray gives.
+struct HitTensors {
+  Tensor color_r3, alpha_r1, depth_r1, samples_r, missed_r;
+};
+
+// Checks what both ray ops have in common and puts it into `args`. `integrates`: the table is (l, m, m, 4).
+inline HitTensors lay_ready(TraceArgs& args, bool integrates, const Tensor& origin_r3, const Tensor& direction_r3,
+                            const Tensor& cone_r2, const Tensor& range_r2, const Tensor& place_33,
+                            const Tensor& child_tn, const Tensor& brick_tn, const Tensor& request_tn,
+                            const Tensor& stamp_t, const Tensor& bricks_bzyxc, const Tensor& constant_tnc,
+                            const Tensor& range_tn2c, const Tensor& stamp_b, const Tensor& table_lm4,
+                            const Tensor& domain_2, const Tensor& opaque_m, const Tensor& frame_1, int64_t width,
+                            int64_t branching, int64_t root, int64_t max_depth, int64_t border, int64_t component,
+                            double cone_scale, double root_voxel, double step, double stop_alpha, double depth_alpha,
+                            bool by_level) {
   const ScalarType real = table_lm4.scalar_type();
   const ScalarType word = ScalarType::Int;
   const ScalarType voxel = bricks_bzyxc.scalar_type();
@@ -108,7 +129,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> trace_rays(
   STD_TORCH_CHECK(step > 0 && root_voxel > 0, "gvtorch: step and root_voxel must be positive");
   STD_TORCH_CHECK(width >= 0 && (width == 0 || rays % width == 0), "gvtorch: rays are no rows of this width");
   STD_TORCH_CHECK(
-      table_lm4.dim() == 3 && table_lm4.size(0) >= 1 && table_lm4.size(1) >= 2 && table_lm4.size(1) <= INT32_MAX,
+      table_lm4.dim() >= 3 && table_lm4.size(0) >= 1 && table_lm4.size(1) >= 2 && table_lm4.size(1) <= INT32_MAX,
       "gvtorch: table_lm4 must be (l, m, 4) with m >= 2");
 
   for (const auto& [tensor, name, numel] :
@@ -121,7 +142,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> trace_rays(
     require_numel(tensor, name, numel);
   }
   require(table_lm4, "table_lm4", origin_r3, real);
-  require_numel(table_lm4, "table_lm4", table_lm4.size(0) * table_lm4.size(1) * 4);
+  const int64_t rows = integrates ? table_lm4.size(1) * table_lm4.size(1) : table_lm4.size(1);
+  STD_TORCH_CHECK(table_lm4.dim() == (integrates ? 4 : 3), "gvtorch: table_lm4 has the wrong number of dimensions");
+  require_numel(table_lm4, "table_lm4", table_lm4.size(0) * rows * 4);
   STD_TORCH_CHECK(reinterpret_cast<uintptr_t>(table_lm4.const_data_ptr()) % 16 == 0,
                   "gvtorch: table_lm4 must begin at a multiple of 16 bytes");
   require(domain_2, "domain_2", origin_r3, real);
@@ -143,14 +166,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> trace_rays(
   require(range_tn2c, "range_tn2c", origin_r3, voxel);
   require_numel(range_tn2c, "range_tn2c", 2 * nodes * channels);
 
-  Tensor color_r3 = torch::stable::new_empty(table_lm4, {rays, 3});
-  Tensor alpha_r1 = torch::stable::new_empty(table_lm4, {rays, 1});
-  Tensor depth_r1 = torch::stable::new_empty(table_lm4, {rays, 1});
-  Tensor samples_r = torch::stable::new_empty(table_lm4, {rays}, word);
-  Tensor missed_r = torch::stable::new_empty(table_lm4, {rays}, ScalarType::Bool);
-
+  HitTensors found{torch::stable::new_empty(table_lm4, {rays, 3}), torch::stable::new_empty(table_lm4, {rays, 1}),
+                   torch::stable::new_empty(table_lm4, {rays, 1}), torch::stable::new_empty(table_lm4, {rays}, word),
+                   torch::stable::new_empty(table_lm4, {rays}, ScalarType::Bool)};
   const auto world = [](const Tensor& tensor) { return static_cast<const double*>(tensor.const_data_ptr()); };
-  TraceArgs args{};
   args.origin_r3 = world(origin_r3);
   args.direction_r3 = world(direction_r3);
   args.cone_r2 = world(cone_r2);
@@ -168,11 +187,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> trace_rays(
   args.domain_2 = domain_2.const_data_ptr();
   args.opaque_m = words_in(opaque_m);
   args.frame_1 = words_in(frame_1);
-  args.color_r3 = color_r3.mutable_data_ptr();
-  args.alpha_r1 = alpha_r1.mutable_data_ptr();
-  args.depth_r1 = depth_r1.mutable_data_ptr();
-  args.samples_r = words_out(samples_r);
-  args.missed_r = static_cast<bool*>(missed_r.mutable_data_ptr());
+  args.color_r3 = found.color_r3.mutable_data_ptr();
+  args.alpha_r1 = found.alpha_r1.mutable_data_ptr();
+  args.depth_r1 = found.depth_r1.mutable_data_ptr();
+  args.samples_r = words_out(found.samples_r);
+  args.missed_r = static_cast<bool*>(found.missed_r.mutable_data_ptr());
   args.rays = rays;
   args.width = width;
   args.root = static_cast<int32_t>(root);
@@ -194,8 +213,104 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> trace_rays(
   args.stop_alpha = stop_alpha;
   args.depth_alpha = depth_alpha;
   args.by_level = by_level;
-  trace<Device>(origin_r3, args, real == ScalarType::Double);
-  return {color_r3, alpha_r1, depth_r1, samples_r, missed_r};
+  return found;
+}
+
+template <class Device>
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> trace_rays(
+    const Tensor& origin_r3, const Tensor& direction_r3, const Tensor& cone_r2, const Tensor& range_r2,
+    const Tensor& place_33, const Tensor& child_tn, const Tensor& brick_tn, const Tensor& request_tn,
+    const Tensor& stamp_t, const Tensor& bricks_bzyxc, const Tensor& constant_tnc, const Tensor& range_tn2c,
+    const Tensor& stamp_b, const Tensor& table_lm4, const Tensor& domain_2, const Tensor& opaque_m,
+    const Tensor& frame_1, int64_t width, int64_t branching, int64_t root, int64_t max_depth, int64_t border,
+    int64_t component, double cone_scale, double root_voxel, double step, double stop_alpha, double depth_alpha,
+    bool by_level) {
+  TraceArgs args{};
+  const HitTensors found = lay_ready(args, false, origin_r3, direction_r3, cone_r2, range_r2, place_33, child_tn,
+                                     brick_tn, request_tn, stamp_t, bricks_bzyxc, constant_tnc, range_tn2c, stamp_b,
+                                     table_lm4, domain_2, opaque_m, frame_1, width, branching, root, max_depth, border,
+                                     component, cone_scale, root_voxel, step, stop_alpha, depth_alpha, by_level);
+  trace<Device>(origin_r3, args, table_lm4.scalar_type() == ScalarType::Double);
+  return {found.color_r3, found.alpha_r1, found.depth_r1, found.samples_r, found.missed_r};
+}
+
+// A second channel of the same pool, with `width` numbers a voxel (0: any); null where there is none.
+inline void lay_channel(const std::optional<Tensor>& bricks_bzyxc, const std::optional<Tensor>& constant_tnc,
+                        const char* name, int64_t width, const Tensor& like_bzyxc, int64_t nodes, const void*& bricks,
+                        const void*& constants, VoxelType& voxel, int32_t& numbers) {
+  STD_TORCH_CHECK(bricks_bzyxc.has_value() == constant_tnc.has_value(), "gvtorch: ", name,
+                  " needs bricks and constants");
+  if (!bricks_bzyxc.has_value()) return;
+  const ScalarType dtype = bricks_bzyxc->scalar_type();
+  STD_TORCH_CHECK(
+      bricks_bzyxc->dim() == 5 && bricks_bzyxc->size(4) >= 1 && (width == 0 || bricks_bzyxc->size(4) == width),
+      "gvtorch: ", name, " has the wrong shape");
+  const int64_t channels = bricks_bzyxc->size(4);
+  for (int axis = 0; axis < 4; ++axis) {
+    STD_TORCH_CHECK(bricks_bzyxc->size(axis) == like_bzyxc.size(axis), "gvtorch: ", name, " has other bricks");
+  }
+  const int64_t side = like_bzyxc.size(1);
+  STD_TORCH_CHECK(side * side * side * channels <= INT32_MAX / 8, "gvtorch: a brick is too large");
+  require(*bricks_bzyxc, name, like_bzyxc, dtype);
+  require(*constant_tnc, name, like_bzyxc, dtype);
+  require_numel(*constant_tnc, name, nodes * channels);
+  bricks = bricks_bzyxc->const_data_ptr();
+  constants = constant_tnc->const_data_ptr();
+  voxel = voxel_type(dtype);
+  numbers = static_cast<int32_t>(channels);
+}
+
+template <class Device>
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> shade_rays(
+    const Tensor& origin_r3, const Tensor& direction_r3, const Tensor& cone_r2, const Tensor& range_r2,
+    const Tensor& place_33, const Tensor& child_tn, const Tensor& brick_tn, const Tensor& request_tn,
+    const Tensor& stamp_t, const Tensor& bricks_bzyxc, const Tensor& constant_tnc, const Tensor& range_tn2c,
+    const Tensor& stamp_b, const Tensor& table_lm4, const Tensor& domain_2, const Tensor& opaque_m,
+    const Tensor& frame_1, const Tensor& parameter_54, const std::optional<Tensor>& normal_bzyxc,
+    const std::optional<Tensor>& normal_tnc, const std::optional<Tensor>& other_bzyxc,
+    const std::optional<Tensor>& other_tnc, int64_t shader, int64_t features, int64_t other_component, int64_t width,
+    int64_t branching, int64_t root, int64_t max_depth, int64_t border, int64_t component, double cone_scale,
+    double root_voxel, double step, double stop_alpha, double depth_alpha, bool by_level) {
+  STD_TORCH_CHECK(shader >= 0 && shader < kShaderKinds, "gvtorch: shader is unknown");
+  ShadeArgs args{};
+  args.shader = static_cast<ShaderKind>(shader);
+  const HitTensors found =
+      lay_ready(args, args.shader == ShaderKind::kPreIntegrated, origin_r3, direction_r3, cone_r2, range_r2, place_33,
+                child_tn, brick_tn, request_tn, stamp_t, bricks_bzyxc, constant_tnc, range_tn2c, stamp_b, table_lm4,
+                domain_2, opaque_m, frame_1, width, branching, root, max_depth, border, component, cone_scale,
+                root_voxel, step, stop_alpha, depth_alpha, by_level);
+  const ScalarType real = table_lm4.scalar_type();
+  int32_t three = 0;
+  lay_channel(normal_bzyxc, normal_tnc, "normal_bzyxc", 3, bricks_bzyxc, args.nodes, args.normal_bzyxc, args.normal_tnc,
+              args.normal_voxel, three);
+  lay_channel(other_bzyxc, other_tnc, "other_bzyxc", 0, bricks_bzyxc, args.nodes, args.other_bzyxc, args.other_tnc,
+              args.other_voxel, args.other_channels);
+  const bool projects = args.shader == ShaderKind::kProjection;
+  STD_TORCH_CHECK(args.shader != ShaderKind::kFeatures || other_bzyxc.has_value(), "gvtorch: other_bzyxc is missing");
+  STD_TORCH_CHECK(args.shader != ShaderKind::kStoredColor || (args.channels == 4 && component == 3),
+                  "gvtorch: bricks_bzyxc must hold red, green, blue and opacity");
+  STD_TORCH_CHECK(features == (args.shader == ShaderKind::kFeatures ? args.other_channels
+                               : projects                           ? 1
+                                                                    : 0),
+                  "gvtorch: features is not what the shader gives");
+  STD_TORCH_CHECK(!other_bzyxc.has_value() || (other_component >= 0 && other_component < args.other_channels),
+                  "gvtorch: other_component out of range");
+  require(parameter_54, "parameter_54", origin_r3, real);
+  require_numel(parameter_54, "parameter_54", 20);
+  Tensor normal_r3 = torch::stable::new_empty(table_lm4, {args.rays, 3});
+  Tensor features_rc = torch::stable::new_empty(table_lm4, {args.rays, features});
+  args.other_component = static_cast<int32_t>(other_component);
+  args.features = static_cast<int32_t>(features);
+  args.parameter_54 = parameter_54.const_data_ptr();
+  args.normal_r3 = normal_r3.mutable_data_ptr();
+  args.features_rc = features_rc.mutable_data_ptr();
+  const auto run = [&](const auto& body) { for_each<Device>(origin_r3, body.order.count(), body); };
+  if (real == ScalarType::Double) {
+    with_shader<double>(args.shader, args, run);
+  } else {
+    with_shader<float>(args.shader, args, run);
+  }
+  return {found.color_r3, found.alpha_r1, found.depth_r1, found.samples_r, found.missed_r, normal_r3, features_rc};
 }
 
 template <class Device>

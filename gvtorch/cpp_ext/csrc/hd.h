@@ -21,8 +21,10 @@
 
 #ifdef __CUDACC__
 #define GV_HD __host__ __device__ __forceinline__
+#define GV_CALL __host__ __device__ __noinline__
 #else
 #define GV_HD inline __attribute__((always_inline))
+#define GV_CALL __attribute__((noinline))
 #endif
 
 namespace gvtorch {

@@ -388,11 +388,7 @@ struct Packet {
   GV_HD Mask hidden(Mask here, Ints node) const {
     const Ints known = gather(kernel.hidden_tn, node) & 0xff;
     Mask hides = here & (known == kHidden);
-    for_lanes(here & (known == kUnknown), [&](int lane) {
-      const bool one = HideNode<float, Voxel>::hidden(kernel.bricks, shader, node[lane]);
-      store_byte(&kernel.hidden_tn[node[lane]], one ? kHidden : kShown);
-      hides[lane] = one ? -1 : 0;
-    });
+    for_lanes(here & (known == kUnknown), [&](int lane) { hides[lane] = kernel.hides(shader, node[lane]) ? -1 : 0; });
     return hides;
   }
 
@@ -593,7 +589,11 @@ struct Packet {
     one.count = at.count[lane];
     one.start = at.start[lane];
     Accumulator<float> sum = accumulator(lane);
-    samples[lane] += kernel.march_node(shader, run_of(lane), one, exit[lane], cone_low[lane], cone_high[lane], sum);
+    Visit<float> visit;
+    visit.exit = exit[lane];
+    visit.cone_low = cone_low[lane];
+    visit.cone_high = cone_high[lane];
+    samples[lane] += kernel.march_node(shader, run_of(lane), visit, one, sum);
     at.level[lane] = one.level;
     at.base[lane] = one.base;
     at.length[lane] = one.length;

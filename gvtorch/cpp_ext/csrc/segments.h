@@ -95,45 +95,21 @@ struct WalkRay {
   template <class Number, class Emit>
   GV_HD void visit(const Ray<T>& ray, const Transfer<T>& shader, Intervals<T>& at, int32_t& wanted, Walked& walked,
                    Emit& emit) const {
-    const T infinity = static_cast<T>(INFINITY);
-    const Levels<T>& levels = trace.levels;
+    const auto hides = [&](int32_t node) { return trace.hides(shader, node); };
     const T middle = at.middle();
-    const T cone = at.cone(middle);
-    while (wanted < trace.tree.max_depth && levels.voxel[wanted] > cone) ++wanted;
-    while (wanted > 0 && !(levels.voxel[wanted - 1] > cone)) --wanted;
-    const T voxel = levels.voxel[wanted];
-    const T above = wanted > 0 ? levels.voxel[wanted - 1] : infinity;
-    const bool reached = voxel <= cone;
-    const bool blend = reached && wanted > 0;
-    const T cone_low = reached ? voxel : -infinity;
-    const T cone_high = reached ? above : voxel;
-
-    const auto hides = [&](int32_t node) {
-      uint8_t known = load_byte(&trace.hidden_tn[node]);
-      if (known == kUnknown) {
-        known = HideNode<T, Voxel>::hidden(trace.bricks, shader, node) ? kHidden : kShown;
-        store_byte(&trace.hidden_tn[node], known);
-      }
-      return known == kHidden;
-    };
     Number digits(trace.tree, ray.at(middle));
     NoPath path;
-    const Place place = descend(trace.tree, digits, wanted, blend, *trace.frame_1, hides, path);
-    const T exit = ray.leave(digits.corner(place.depth, levels), levels.size[place.depth]);
-    const bool clear = place.hidden && (place.depth < wanted || !blend);
-    if (!clear && trace.mark_missing(place, wanted, blend, cone)) walked.missed = true;
+    const Visit<T> found =
+        trace.find(ray, digits, at.cone(middle), hides, trace.bricks.stamp_b, path, wanted, walked.missed);
     ++walked.visits;
-
     Segment<T> segment;
     segment.wanted = wanted;
     segment.seen = middle;
-    segment.fine = place.fine;
-    segment.coarse = place.coarse.node >= 0 ? place.coarse : place.fine;
+    segment.fine = found.fine;
+    segment.coarse = found.coarse;
     const Holder &fine = segment.fine, &coarse = segment.coarse;
-    if (!clear && fine.brick >= 0) store_stamp(&trace.bricks.stamp_b[fine.brick], *trace.frame_1);
-    if (!clear && coarse.brick >= 0) store_stamp(&trace.bricks.stamp_b[coarse.brick], *trace.frame_1);
-    if (clear || fine.node < 0 || (fine.brick == kEmpty && coarse.brick == kEmpty)) {
-      trace.leave(at, exit, cone_low, cone_high);
+    if (found.clear || fine.node < 0 || (fine.brick == kEmpty && coarse.brick == kEmpty)) {
+      trace.leave(at, found);
       return;
     }
     const auto put = [&] {
@@ -152,7 +128,7 @@ struct WalkRay {
     };
     if (uniform(fine, coarse)) {
       const T entry = at.start;
-      trace.leave(at, exit, cone_low, cone_high);
+      trace.leave(at, found);
       piece(entry, smaller(at.start, at.stop));
       return;
     }
@@ -170,11 +146,11 @@ struct WalkRay {
         segment.first = static_cast<int32_t>(at.count);
         segment.level = at.level;
       }
-      const int32_t alike = at.run(exit, cone_low, cone_high);
+      const int32_t alike = at.run(found.exit, found.cone_low, found.cone_high);
       segment.count += alike;
       segment.end = at.start_of(at.count + static_cast<T>(alike));
       at.skip(alike);
-    } while (trace.stays(at, exit, cone_low, cone_high));
+    } while (trace.stays(at, found));
     put();
   }
 

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "hd.h"
+#include "trace_args.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
@@ -19,6 +20,13 @@ struct TransferView {
   const int32_t* opaque_m;  // rows with an opacity up to this one, itself included
   int32_t rows;
   int32_t levels;
+
+  explicit TransferView(const TraceArgs& args)
+      : table_lm(static_cast<const Row<T>*>(args.table_lm4)),
+        domain_2(static_cast<const T*>(args.domain_2)),
+        opaque_m(args.opaque_m),
+        rows(args.rows),
+        levels(args.levels) {}
 };
 
 // Where a value stands in the table: between two rows.

@@ -6,69 +6,11 @@
 // Rendering", I3D 2009, sections 3 and 4; Crassin, PhD thesis 2011, chapter 6.
 #pragma once
 
-#include "brick.h"
-#include "ray.h"
 #include "shade.h"
-#include "trace_args.h"
+#include "walk.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
-
-template <class T>
-struct TraceOptions {
-  T step;  // world length of the shortest interval
-  T stop_alpha;
-  T depth_alpha;
-  bool by_level;  // a node's brick is asked for before its children
-};
-
-template <class T>
-struct HitView {
-  T* color_r3;
-  T* alpha_r1;
-  T* depth_r1;
-  int32_t* samples_r;
-  bool* missed_r;
-};
-
-// Calls body(Voxel{}) with the C++ type of a channel's voxels.
-template <class Body>
-void with_voxel(VoxelType type, const Body& body) {
-  switch (type) {
-    case VoxelType::kUInt8:
-      return body(uint8_t{});
-    case VoxelType::kInt8:
-      return body(int8_t{});
-    case VoxelType::kInt16:
-      return body(int16_t{});
-    case VoxelType::kUInt16:
-      return body(uint16_t{});
-    case VoxelType::kHalf:
-      return body(Half{});
-    case VoxelType::kBFloat16:
-      return body(BFloat16{});
-    case VoxelType::kFloat:
-      return body(float{});
-  }
-}
-
-// Rays of a picture are taken in tiles of 8 x 4 pixels, which share bricks; others in order.
-struct RayOrder {
-  int64_t rays;
-  int64_t width;  // pixels of a row; 0: no picture
-
-  GV_HD int64_t count() const { return width == 0 ? rays : (width + 7) / 8 * ((rays / width + 3) / 4) * 32; }
-  // The ray at a place of the order; -1: none.
-  GV_HD int64_t operator()(int64_t index) const {
-    if (width == 0) return index;
-    const int64_t tile = index / 32;
-    const int64_t tiles = (width + 7) / 8;
-    const int32_t bits = static_cast<int32_t>(index % 32);  // of x and y in turn, so that a half is a square
-    const int64_t x = tile % tiles * 8 + ((bits & 1) | (bits >> 1 & 2) | (bits >> 2 & 4));
-    const int64_t y = tile / tiles * 4 + ((bits >> 1 & 1) | (bits >> 2 & 2));
-    return x < width && y * width < rays ? y * width + x : -1;
-  }
-};
 
 // What all samples of a run have in common. Where two levels blend, `coarse` gets the weight
 // (cone - voxel) * blend, linear from the one's voxel to the other's.
@@ -142,27 +84,17 @@ struct HideNode {
 };
 
 template <class T, class Voxel>
-struct TraceRay {
-  RayView rays;
-  RayOrder order;
-  TreeView tree;
-  Levels<T> levels;
+struct TraceRay : Walk<T> {
+  using Walk<T>::tree;
+  using Walk<T>::levels;
+  using Walk<T>::options;
+  using Walk<T>::hits;
   BrickView<Voxel> bricks;
   TransferView<T> transfer;
-  TraceOptions<T> options;
-  HitView<T> hits;
-  const int32_t* frame_1;
   uint8_t* hidden_tn;
 
   explicit TraceRay(const TraceArgs& args)
-      : rays{args.origin_r3, args.direction_r3, args.cone_r2, args.range_r2, args.place_33, args.cone_scale},
-        order{args.rays, args.width},
-        tree{args.child_tn,   args.brick_tn,
-             args.request_tn, args.stamp_t,
-             args.root,       args.root / args.nodes_per_tile,
-             args.branching,  args.nodes_per_tile,
-             args.max_depth,  digit_bits_of(args.branching, args.max_depth)},
-        levels(static_cast<T>(args.root_voxel), static_cast<T>(args.side - 2 * args.border), args.branching),
+      : Walk<T>(args),
         bricks{static_cast<const Voxel*>(args.bricks_bzyxc),
                static_cast<const Voxel*>(args.constant_tnc),
                static_cast<const Voxel*>(args.range_tn2c),
@@ -172,13 +104,7 @@ struct TraceRay {
                args.border,
                args.channels,
                args.component},
-        transfer{static_cast<const Row<T>*>(args.table_lm4), static_cast<const T*>(args.domain_2), args.opaque_m,
-                 args.rows, args.levels},
-        options{static_cast<T>(args.step), static_cast<T>(args.stop_alpha), static_cast<T>(args.depth_alpha),
-                args.by_level},
-        hits{static_cast<T*>(args.color_r3), static_cast<T*>(args.alpha_r1), static_cast<T*>(args.depth_r1),
-             args.samples_r, args.missed_r},
-        frame_1(args.frame_1),
+        transfer(args),
         hidden_tn(args.hidden_tn) {}
 
   GV_HD void operator()(int64_t index) const {
@@ -188,9 +114,9 @@ struct TraceRay {
 
   template <class Path>
   GV_HD void trace(int64_t index, Path& path) const {
-    const int64_t number = order(index);
+    const int64_t number = this->order(index);
     if (number < 0) return;
-    const Ray<T> ray(rays, number);
+    const Ray<T> ray(this->rays, number);
     Intervals<T> at(ray, options.step, transfer.levels);
     const Transfer<T> shader(transfer);
     Accumulator<T> sum;
@@ -211,68 +137,51 @@ struct TraceRay {
     hits.missed_r[number] = sum.missed;
   }
 
+  // Whether a node shows nothing, looked at once.
+  GV_HD bool hides(const Transfer<T>& shader, int32_t node) const {
+    uint8_t known = load_byte(&hidden_tn[node]);
+    if (known == kUnknown) {
+      known = HideNode<T, Voxel>::hidden(bricks, shader, node) ? kHidden : kShown;
+      store_byte(&hidden_tn[node], known);
+    }
+    return known == kHidden;
+  }
+
   // One node: finds it, marks it, and takes all intervals whose middle lies in it. Returns the samples taken.
   template <class Number, class Path>
   GV_HD int32_t visit(const Ray<T>& ray, const Transfer<T>& shader, Path& path, Intervals<T>& at, int32_t& wanted,
                       Accumulator<T>& sum) const {
-    // Level of detail: the first depth whose voxel fits into the cone.
-    const T infinity = static_cast<T>(INFINITY);
+    const auto hides = [&](int32_t node) { return this->hides(shader, node); };
     const T middle = at.middle();
-    const T cone = at.cone(middle);
-    while (wanted < tree.max_depth && levels.voxel[wanted] > cone) ++wanted;
-    while (wanted > 0 && !(levels.voxel[wanted - 1] > cone)) --wanted;
-    const T voxel = levels.voxel[wanted];
-    const T above = wanted > 0 ? levels.voxel[wanted - 1] : infinity;
-    const bool reached = voxel <= cone;
-    const bool blend = reached && wanted > 0;
-    const T cone_low = reached ? voxel : -infinity;
-    const T cone_high = reached ? above : voxel;
-
-    const auto hides = [&](int32_t node) {
-      uint8_t known = load_byte(&hidden_tn[node]);
-      if (known == kUnknown) {
-        known = HideNode<T, Voxel>::hidden(bricks, shader, node) ? kHidden : kShown;
-        store_byte(&hidden_tn[node], known);
-      }
-      return known == kHidden;
-    };
     Number digits(tree, ray.at(middle));
-    const Place place = descend(tree, digits, wanted, blend, *frame_1, hides, path);
-    const T exit = ray.leave(digits.corner(place.depth, levels), levels.size[place.depth]);
-    const bool clear = place.hidden && (place.depth < wanted || !blend);
-    if (!clear && mark_missing(place, wanted, blend, cone)) sum.missed = true;
-
-    // The two levels that blend; below the finest level, or where both are the same node, only one is read.
-    const Holder fine = place.fine;
-    const Holder coarse = place.coarse.node >= 0 ? place.coarse : fine;
-    const bool nothing = clear || fine.node < 0 || (fine.brick == kEmpty && coarse.brick == kEmpty);
-    if (!clear && fine.brick >= 0) store_stamp(&bricks.stamp_b[fine.brick], *frame_1);
-    if (!clear && coarse.brick >= 0) store_stamp(&bricks.stamp_b[coarse.brick], *frame_1);
-    if (nothing) {
-      leave(at, exit, cone_low, cone_high);
+    const Visit<T> visit = this->find(ray, digits, at.cone(middle), hides, bricks.stamp_b, path, wanted, sum.missed);
+    const Holder& fine = visit.fine;
+    const Holder& coarse = visit.coarse;
+    if (visit.clear || fine.node < 0 || (fine.brick == kEmpty && coarse.brick == kEmpty)) {
+      this->leave(at, visit);
       return 0;
     }
     Run<T, Voxel> run;
     run.fine = run.coarse = aim(bricks, levels, fine, digits, ray.origin, ray.direction);
     run.mixed = coarse.node != fine.node;
     if (run.mixed) run.coarse = aim(bricks, levels, coarse, digits, ray.origin, ray.direction);
-    run.voxel = voxel;
-    run.blend = 1 / (above - voxel);
+    run.voxel = visit.voxel;
+    run.blend = 1 / (visit.above - visit.voxel);
     run.stop_clear = 1 - options.stop_alpha;
     run.hit_clear = 1 - options.depth_alpha;
     const bool uniform = run.fine.voxels == nullptr && run.coarse.voxels == nullptr;
     if (uniform && run.fine.constant == run.coarse.constant) {  // one interval, in closed form
       const T entry = at.start;
-      leave(at, exit, cone_low, cone_high);
+      this->leave(at, visit);
       add_piece(shader, run, run.fine.constant, entry, smaller(at.start, at.stop), sum);
       return 1;
     }
-    return march_node(shader, run, at, exit, cone_low, cone_high, sum);
+    return march_node(shader, run, visit, at, sum);
   }
 
   // All intervals of a node that are still to come. Returns the samples taken.
-  GV_HD int32_t march_node(const Transfer<T>& shader, const Run<T, Voxel>& run, Intervals<T>& at, T exit, T cone_low,
-                           T cone_high, Accumulator<T>& sum) const {
+  GV_HD int32_t march_node(const Transfer<T>& shader, const Run<T, Voxel>& run, const Visit<T>& visit, Intervals<T>& at,
+                           Accumulator<T>& sum) const {
     int32_t samples = 0;
     do {
       if (at.cut()) {
@@ -281,24 +190,12 @@ struct TraceRay {
         at.skip(1);
         return samples + 1;
       }
-      const int32_t alike = at.run(exit, cone_low, cone_high);
+      const int32_t alike = at.run(visit.exit, visit.cone_low, visit.cone_high);
       const int32_t taken = OneByOne::march(bricks, shader, run, at, alike, sum);
       samples += taken;
       at.skip(taken);
-    } while (sum.clear > run.stop_clear && stays(at, exit, cone_low, cone_high));
+    } while (sum.clear > run.stop_clear && this->stays(at, visit));
     return samples;
-  }
-
-  GV_HD static bool stays(const Intervals<T>& at, T exit, T cone_low, T cone_high) {
-    const T middle = at.middle();
-    const T cone = at.cone(middle);
-    return at.inside() && middle < exit && cone >= cone_low && cone < cone_high;
-  }
-
-  // Goes to the first interval behind the node.
-  GV_HD static void leave(Intervals<T>& at, T exit, T cone_low, T cone_high) {
-    do at.skip(at.cut() ? 1 : at.run(exit, cone_low, cone_high));
-    while (stays(at, exit, cone_low, cone_high));
   }
 
   // Adds an interval of any length.
@@ -307,27 +204,6 @@ struct TraceRay {
     Row<T> row = shader.look_up(shader.find(value), 0);
     row.alpha = stretch(row.alpha, (end - start) / options.step);
     sum.add(row, start, end - start, run.hit_clear);
-  }
-
-  // Asks for what is not there, and tells whether it did. Straight to the wanted level, or level by level: then a
-  // brick is there before its node is subdivided.
-  GV_HD bool mark_missing(const Place& place, int32_t wanted, bool blend, T cone) const {
-    const bool absent = place.brick == kAbsent;
-    const bool deeper = place.depth < wanted && place.tile == kAbsent;
-    const bool above = blend && place.depth == wanted && tree.brick_tn[place.parent] == kAbsent;
-    if (deeper && !(options.by_level && absent)) request(place.node, place.depth, cone, kSubdivide);
-    if (absent && (options.by_level || !deeper || place.fine.node < 0)) {
-      request(place.node, place.depth, cone, kLoad);
-    }
-    if (above) request(place.parent, place.depth - 1, cone, kLoad);
-    return absent || deeper || above;
-  }
-
-  // Priority: how wide one voxel of the node is on the screen, in sixteenths of a pixel.
-  GV_HD void request(int32_t node, int32_t depth, T cone, int32_t kind) const {
-    const T most = static_cast<T>(kPriorityMask);
-    const T priority = cone > 0 ? smaller(levels.voxel[depth] / cone * 16, most) : most;
-    post_request(&tree.request_tn[node], kind | static_cast<int32_t>(priority));
   }
 };
 

@@ -27,4 +27,18 @@ struct TraceArgs {
   bool by_level;
 };
 
+// The shaders of `shade_rays`, numbered as in rendering/shaders.py.
+enum class ShaderKind { kLit, kPreIntegrated, kStoredColor, kIsosurface, kProjection, kFeatures };
+constexpr int64_t kShaderKinds = 6;
+
+// The arguments of `shade_rays`: those of `trace_rays`, and what shaders read and give beside.
+struct ShadeArgs : TraceArgs {
+  ShaderKind shader;
+  const void *normal_bzyxc, *normal_tnc, *other_bzyxc, *other_tnc;  // null: there is no such channel
+  VoxelType normal_voxel, other_voxel;
+  int32_t other_channels, other_component, features;
+  const void* parameter_54;
+  void *normal_r3, *features_rc;
+};
+
 }  // namespace gvtorch

@@ -1,0 +1,192 @@
+// What a shader may ask of the tree at a place of its ray: values of any channel, of any dtype, and gradients. Two
+// levels blend as in trace.h. The dtype is a switch at run time, the same for all threads.
+#pragma once
+
+#include "walk.h"
+
+namespace gvtorch {
+inline namespace GV_NAMESPACE {
+
+struct ChannelView {
+  const void* bricks_bzyxc;  // null: there is no such channel
+  const void* constant_tnc;
+  VoxelType type;
+  int32_t width;  // numbers a voxel
+
+  GV_HD bool given() const { return bricks_bzyxc != nullptr; }
+};
+
+template <class T>
+GV_CALL T read_number(const void* numbers, VoxelType type, int64_t index) {
+  T out = 0;
+  with_voxel(type, [&](auto voxel) { out = number<T>(static_cast<const decltype(voxel)*>(numbers)[index]); });
+  return out;
+}
+
+// A call, not inlined: shaders read in many places, and each would hold the code of seven dtypes. Its arguments are
+// values, for an address would put the whole kernel's arguments on the stack.
+template <class T>
+GV_CALL T read_brick(const void* voxels, VoxelType type, int32_t width, int64_t first, int32_t side, Vec3<T> at) {
+  T out = 0;
+  with_voxel(
+      type, [&](auto voxel) { out = trilinear(static_cast<const decltype(voxel)*>(voxels) + first, side, width, at); });
+  return out;
+}
+
+template <class T>
+GV_HD T dot(Vec3<T> a, Vec3<T> b) {
+  return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
+// A vector of length 1, or 0 where there is no direction.
+template <class T>
+GV_HD Vec3<T> unit(Vec3<T> v) {
+  const T most = larger(larger(larger(v.x, -v.x), larger(v.y, -v.y)), larger(v.z, -v.z));
+  if (!(most > 0 && most < static_cast<T>(INFINITY))) return {0, 0, 0};
+  const Vec3<T> scaled{v.x / most, v.y / most, v.z / most};
+  const T length = sqrt(dot(scaled, scaled));
+  return {scaled.x / length, scaled.y / length, scaled.z / length};
+}
+
+// One node seen along one ray: place in its brick, in voxels = offset + t * slope.
+template <class T>
+struct Spot {
+  int32_t node, brick;
+  T scale;  // voxels a tree unit
+  Vec3<T> offset, slope;
+
+  GV_HD Vec3<T> at(T t) const { return {offset.x + t * slope.x, offset.y + t * slope.y, offset.z + t * slope.z}; }
+};
+
+// The eye's ray in the world.
+template <class T>
+struct Sight {
+  Vec3<T> origin, direction;
+  T moved;  // distance from the camera to where t counts from
+
+  GV_HD Sight(const RayView& rays, int64_t index, T moved) : moved(moved) {
+    for (int axis = 0; axis < 3; ++axis) {
+      origin[axis] = static_cast<T>(rays.origin_r3[3 * index + axis]);
+      direction[axis] = static_cast<T>(rays.direction_r3[3 * index + axis]);
+    }
+  }
+  GV_HD Vec3<T> at(T t) const {
+    const T far = t + moved;
+    return {origin.x + far * direction.x, origin.y + far * direction.y, origin.z + far * direction.z};
+  }
+};
+
+struct Channels {
+  ChannelView value, normal, other;
+  int32_t side, border;
+  int32_t component;  // of `value`
+};
+
+template <class T>
+struct Probe {
+  const Channels& channels;
+  const Sight<T>& sight;
+  Spot<T> fine, coarse;
+  bool mixed;
+  T near, growth;  // cone
+  T voxel, blend;  // weight of the coarse node: (cone - voxel) * blend
+  Vec3<T> cube;    // world size of the root cube
+
+  template <class Number>
+  GV_HD Probe(const Channels& channels, const Sight<T>& sight, const RayView& rays, const Ray<T>& ray,
+              const Levels<T>& levels, const Visit<T>& visit, const Number& digits)
+      : channels(channels),
+        sight(sight),
+        fine(spot(levels, visit.fine, digits, ray)),
+        coarse(fine),
+        mixed(visit.coarse.node != visit.fine.node),
+        near(ray.cone_near),
+        growth(ray.cone_growth),
+        voxel(visit.voxel),
+        blend(1 / (visit.above - visit.voxel)) {
+    if (mixed) coarse = spot(levels, visit.coarse, digits, ray);
+    for (int axis = 0; axis < 3; ++axis) cube[axis] = static_cast<T>(rays.place_33[3 + axis]);
+  }
+
+  // The shader's own value at distance t.
+  GV_HD T value(T t) const { return number_at(channels.value, channels.component, t); }
+
+  // A number of a channel at distance t.
+  GV_HD T number_at(const ChannelView& channel, int32_t component, T t) const {
+    const T value = read(channel, component, fine, fine.at(t));
+    if (!mixed) return value;
+    return value + weight(t) * (read(channel, component, coarse, coarse.at(t)) - value);
+  }
+
+  // Gradient of the value at distance t, per world unit: differences over one voxel, half a voxel to each side, which a
+  // border of 1 just holds. Neighbours read the same voxels at the face they share, so no seam shows.
+  GV_HD Vec3<T> gradient(T t) const {
+    Vec3<T> slope = differences(fine, t);
+    if (!mixed) return slope;
+    const Vec3<T> other = differences(coarse, t);
+    const T part = weight(t);
+    for (int axis = 0; axis < 3; ++axis) slope[axis] = slope[axis] + part * (other[axis] - slope[axis]);
+    return slope;
+  }
+
+  // No node that answers has a brick, and all numbers of both are equal: one value all over the visit.
+  GV_HD bool uniform() const {
+    if (fine.brick >= 0 || coarse.brick >= 0) return false;
+    return !mixed || (same(channels.value) && same(channels.normal) && same(channels.other));
+  }
+
+ private:
+  template <class Number>
+  GV_HD Spot<T> spot(const Levels<T>& levels, const Holder& holder, const Number& digits, const Ray<T>& ray) const {
+    Spot<T> spot{holder.node, holder.brick, levels.scale[holder.depth], {0, 0, 0}, {0, 0, 0}};
+    const Vec3<T> corner = digits.corner(holder.depth, levels);
+    const T first = static_cast<T>(channels.border) - static_cast<T>(0.5);
+    for (int axis = 0; axis < 3; ++axis) {
+      spot.offset[axis] = (ray.origin[axis] - corner[axis]) * spot.scale + first;
+      spot.slope[axis] = ray.direction[axis] * spot.scale;
+    }
+    return spot;
+  }
+  GV_HD T weight(T t) const { return clamp((near + growth * t - voxel) * blend, static_cast<T>(0), static_cast<T>(1)); }
+  GV_HD T read(const ChannelView& channel, int32_t component, const Spot<T>& spot, Vec3<T> at) const {
+    if (spot.brick < 0) {
+      return read_number<T>(channel.constant_tnc, channel.type,
+                            static_cast<int64_t>(spot.node) * channel.width + component);
+    }
+    const int64_t volume = static_cast<int64_t>(channels.side) * channels.side * channels.side;
+    const int64_t first = spot.brick * volume * channel.width + component;
+    return read_brick(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, at);
+  }
+  GV_HD Vec3<T> differences(const Spot<T>& spot, T t) const {
+    Vec3<T> slope{0, 0, 0};
+    if (spot.brick < 0) return slope;
+    const Vec3<T> at = spot.at(t);
+#ifdef __CUDA_ARCH__
+#pragma unroll 1
+#endif
+    for (int axis = 0; axis < 3; ++axis) {
+      T ends[2];
+      for (int end = 0; end < 2; ++end) {
+        Vec3<T> beside = at;
+        beside[axis] = at[axis] + (end == 0 ? static_cast<T>(-0.5) : static_cast<T>(0.5));
+        ends[end] = read(channels.value, channels.component, spot, beside);
+      }
+      slope[axis] = (ends[1] - ends[0]) * (spot.scale / cube[axis]);
+    }
+    return slope;
+  }
+  GV_HD bool same(const ChannelView& channel) const {
+    if (!channel.given()) return true;
+    for (int32_t component = 0; component < channel.width; ++component) {
+      const int64_t a = static_cast<int64_t>(fine.node) * channel.width + component;
+      const int64_t b = static_cast<int64_t>(coarse.node) * channel.width + component;
+      if (read_number<T>(channel.constant_tnc, channel.type, a) !=
+          read_number<T>(channel.constant_tnc, channel.type, b))
+        return false;
+    }
+    return true;
+  }
+};
+
+}  // namespace GV_NAMESPACE
+}  // namespace gvtorch

@@ -1,0 +1,177 @@
+// ShadeRay: one ray through the tree with any shader of shaders.h. As TraceRay (trace.h), but dtypes are switches at
+// run time, and each interval goes to the shader.
+#pragma once
+
+#include "shaders.h"
+
+namespace gvtorch {
+inline namespace GV_NAMESPACE {
+
+template <class T, class Shader>
+struct ShadeRay : Walk<T> {
+  using Walk<T>::tree;
+  using Walk<T>::options;
+  using Walk<T>::hits;
+  using Sum = typename Shader::Sum;
+  static constexpr int kBlocksAtOnce = 4;  // on a multiprocessor of CUDA: 128 registers
+  Shader shader;
+  Channels channels;
+  const void* range_tn2c;
+  int32_t* stamp_b;
+  int32_t lengths, features;
+  T *normal_r3, *features_rc;
+
+  explicit ShadeRay(const ShadeArgs& args)
+      : Walk<T>(args),
+        shader(args),
+        channels{{args.bricks_bzyxc, args.constant_tnc, args.voxel, args.channels},
+                 {args.normal_bzyxc, args.normal_tnc, args.normal_voxel, 3},
+                 {args.other_bzyxc, args.other_tnc, args.other_voxel, args.other_channels},
+                 args.side,
+                 args.border,
+                 args.component},
+        range_tn2c(args.range_tn2c),
+        stamp_b(args.stamp_b),
+        lengths(args.levels),
+        features(args.features),
+        normal_r3(static_cast<T*>(args.normal_r3)),
+        features_rc(static_cast<T*>(args.features_rc)) {}
+
+  GV_HD void operator()(int64_t index) const {
+    const int64_t number = this->order(index);
+    if (number < 0) return;
+    const Ray<T> ray(this->rays, number);
+    const Sight<T> sight(this->rays, number, ray.moved);
+    Intervals<T> at(ray, options.step, lengths);
+    Sum sum;
+    sum.hit_clear = 1 - options.depth_alpha;
+    sum.feature_c = features_rc + number * features;
+    for (int32_t c = 0; c < features; ++c) sum.feature_c[c] = 0;
+    const T stop_clear = 1 - options.stop_alpha;
+    int32_t samples = 0;
+    int32_t wanted = 0;
+    const bool powers = tree.digit_bits > 0;
+    while (at.inside() && sum.clear > stop_clear) {
+      samples +=
+          powers ? visit<BitDigits<T>>(ray, sight, at, wanted, sum) : visit<Digits<T>>(ray, sight, at, wanted, sum);
+    }
+    if constexpr (Shader::kSurface) {
+      if (sum.depth < static_cast<T>(INFINITY)) {
+        powers ? surface<BitDigits<T>>(ray, sight, at, wanted, sum) : surface<Digits<T>>(ray, sight, at, wanted, sum);
+      }
+    }
+    shader.done(sum);
+    const Vec3<T> normal = unit(sum.normal);
+    hits.color_r3[3 * number] = sum.red;
+    hits.color_r3[3 * number + 1] = sum.green;
+    hits.color_r3[3 * number + 2] = sum.blue;
+    hits.alpha_r1[number] = 1 - sum.clear;
+    hits.depth_r1[number] = sum.depth + ray.moved;
+    hits.samples_r[number] = samples;
+    hits.missed_r[number] = sum.missed;
+    normal_r3[3 * number] = normal.x;
+    normal_r3[3 * number + 1] = normal.y;
+    normal_r3[3 * number + 2] = normal.z;
+  }
+
+ private:
+  template <class Number>
+  GV_HD int32_t visit(const Ray<T>& ray, const Sight<T>& sight, Intervals<T>& at, int32_t& wanted, Sum& sum) const {
+    const auto hides = [&](int32_t node) {
+      const int64_t row = int64_t{2} * node * channels.value.width + channels.component;
+      return shader.hides(read_number<T>(range_tn2c, channels.value.type, row),
+                          read_number<T>(range_tn2c, channels.value.type, row + channels.value.width), sum);
+    };
+    const T middle = at.middle();
+    Number digits(tree, ray.at(middle));
+    NoPath path;
+    const Visit<T> visit = this->find(ray, digits, at.cone(middle), hides, stamp_b, path, wanted, sum.missed);
+    const bool empty = !Shader::kSeesEmpty && visit.fine.brick == kEmpty && visit.coarse.brick == kEmpty;
+    if (visit.clear || visit.fine.node < 0 || empty) {
+      this->leave(at, visit);
+      return 0;
+    }
+    const Probe<T> probe(channels, sight, this->rays, ray, this->levels, visit, digits);
+    Piece<T> piece;
+    if (probe.uniform()) {  // one interval
+      piece.start = at.start;
+      this->leave(at, visit);
+      piece.end = smaller(at.start, at.stop);
+      cut(piece);
+      piece.value = piece.front = piece.back = probe.value(piece.middle);
+      shader.add(piece, probe, sum);
+      return 1;
+    }
+    const T stop_clear = 1 - options.stop_alpha;
+    int32_t samples = 0;
+    do {
+      const bool last = at.cut();
+      const int32_t alike = last ? 1 : at.run(visit.exit, visit.cone_low, visit.cone_high);
+      int32_t taken = 0;
+      if (Shader::kEnds) piece.back = probe.value(at.start);
+      do {
+        const T number = at.count + static_cast<T>(taken);
+        piece.start = at.start_of(number);
+        piece.end = last ? at.stop : at.start_of(number + 1);
+        if (last) {
+          cut(piece);
+        } else {
+          piece.level = at.level;
+          piece.length = at.length;
+          piece.middle = at.middle_of(number);
+        }
+        if (Shader::kEnds) {
+          piece.front = piece.back;
+          piece.back = probe.value(piece.end);
+        } else {
+          piece.value = probe.value(piece.middle);
+        }
+        shader.add(piece, probe, sum);
+        ++taken;
+      } while (taken < alike && sum.clear > stop_clear);
+      samples += taken;
+      at.skip(taken);
+      if (last) return samples;
+    } while (sum.clear > stop_clear && this->stays(at, visit));
+    return samples;
+  }
+
+  // The place where depth was set may lie half an interval beside the node that found it.
+  template <class Number>
+  GV_HD void surface(const Ray<T>& ray, const Sight<T>& sight, const Intervals<T>& at, int32_t& wanted,
+                     Sum& sum) const {
+    Number digits(tree, ray.at(sum.depth));
+    NoPath path;
+    const auto hides = [](int32_t) { return false; };
+    const Visit<T> visit = this->find(ray, digits, at.cone(sum.depth), hides, stamp_b, path, wanted, sum.missed);
+    shader.surface(Probe<T>(channels, sight, this->rays, ray, this->levels, visit, digits), sum);
+  }
+
+  GV_HD static void cut(Piece<T>& piece) {
+    piece.level = -1;
+    piece.length = piece.end - piece.start;
+    piece.middle = piece.start + piece.length * static_cast<T>(0.5);
+  }
+};
+
+// Calls body(Shader) with the shader of a kind.
+template <class T, class Body>
+void with_shader(ShaderKind kind, const ShadeArgs& args, const Body& body) {
+  switch (kind) {
+    case ShaderKind::kLit:
+      return body(ShadeRay<T, Lit<T>>(args));
+    case ShaderKind::kPreIntegrated:
+      return body(ShadeRay<T, PreIntegrated<T>>(args));
+    case ShaderKind::kStoredColor:
+      return body(ShadeRay<T, StoredColor<T>>(args));
+    case ShaderKind::kIsosurface:
+      return body(ShadeRay<T, Isosurface<T>>(args));
+    case ShaderKind::kProjection:
+      return body(ShadeRay<T, Projection<T>>(args));
+    case ShaderKind::kFeatures:
+      return body(ShadeRay<T, Features<T>>(args));
+  }
+}
+
+}  // namespace GV_NAMESPACE
+}  // namespace gvtorch

@@ -1,0 +1,122 @@
+"""`shade_rays`: rays through an N3 tree with any of the fused shaders, checked and sent to a
+backend.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .. import check, config
+from . import reference_shaders
+from .reference_shaders import FEATURES, PRE_INTEGRATED, PROJECTION, STORED_COLOR
+from .trace import Backend, check_arguments, choose_backend
+
+_TENSORS = (
+    *("origin_r3", "direction_r3", "cone_r2", "range_r2", "place_33"),
+    *("child_tn", "brick_tn", "request_tn", "stamp_t"),
+    *("bricks_bzyxc", "constant_tnc", "range_tn2c", "stamp_b"),
+    *("table_lm4", "domain_2", "opaque_m", "frame_1"),
+)
+_NUMBERS = ("branching", "root", "max_depth", "border", "component")
+
+
+def shade_rays(
+    *,
+    shader: int,
+    parameter_54: Tensor,
+    normal_bzyxc: Tensor | None = None,
+    normal_tnc: Tensor | None = None,
+    other_bzyxc: Tensor | None = None,
+    other_tnc: Tensor | None = None,
+    features: int = 0,
+    other_component: int = 0,
+    width: int = 0,
+    cone_scale: float,
+    root_voxel: float,
+    step: float,
+    stop_alpha: float = config.STOP_ALPHA,
+    depth_alpha: float = config.DEPTH_ALPHA,
+    by_level: bool = False,
+    backend: Backend = "auto",
+    **shared: Any,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Traces rays through a tree and shades what they meet with a fused shader.
+
+    Args:
+        shader: 0 lit transfer function, 1 pre-integrated, 2 stored colour, 3 isosurface, 4
+            projection, 5 features: as numbered in `reference_shaders`, told in csrc/shaders.h.
+        parameter_54: (5, 4) in the table's dtype. Row 0: the light's x, y, z (its place, or the way
+            it shines) and its kind (0 headlight, 1 directional, 2 point). 1: its red, green, blue,
+            and ambient. 2: diffuse, specular, shininess, 0. 3: the shader's own - stored colour:
+            scale, reference length, premultiplied (0, 1), lit (0, 1); isosurface: the level;
+            projection: 0 maximum, 1 minimum, 2 mean. 4: scale and offset of stored normals, 0, 0.
+        normal_bzyxc: (b, s, s, s, 3) channel of normals; None takes the gradient's.
+        normal_tnc: (t, n, 3) its constants.
+        other_bzyxc: (b, s, s, s, c) a second channel: the value that colours an isosurface, or
+            features.
+        other_tnc: (t, n, c) its constants.
+        features: How many the shader gives: c for features, 1 (the value) for projections, else 0.
+        other_component: Which number of the second channel colours an isosurface.
+        width: See `trace_rays`, as all that follow and all tensors not named here. Where the shader
+            integrates, the table is (l, m, m, 4): premultiplied colour and alpha by the value in
+            front (rows) and behind.
+
+    Returns:
+        color, alpha, depth, samples, missed as `trace_rays`; normal (r, 3) in the world, towards
+        the eye, unit or zero; features (r, c).
+
+    Raises:
+        ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.
+
+    Source: Blinn, SIGGRAPH 1977; Engel, Kraus, Ertl, Graphics Hardware 2001.
+    """
+    where = "shade_rays"
+    unknown = sorted(set(shared) ^ {*_TENSORS, *_NUMBERS})
+    if unknown:
+        raise ValueError(f"{where}: argument {unknown[0]!r} is missing or unknown")
+    tensors = {name: shared[name] for name in _TENSORS}
+    whole = tuple(shared[name] for name in _NUMBERS)
+    reals = (cone_scale, root_voxel, step, stop_alpha, depth_alpha)
+    check.whole(where, "shader", shader, low=0, high=FEATURES)
+    rows = tensors["table_lm4"].shape[1] if tensors["table_lm4"].dim() > 1 else 0
+    square = ("l", rows, rows, 4) if shader == PRE_INTEGRATED else ("l", "m", 4)
+    check_arguments(where, tensors, (width, *whole, *reals), square)
+    table, like = tensors["table_lm4"], tensors["bricks_bzyxc"]
+    device = table.device
+    check.tensor(where, "parameter_54", parameter_54, (5, 4), table.dtype, device)
+    for name, bricks, constants, count in (
+        ("normal", normal_bzyxc, normal_tnc, 3),
+        ("other", other_bzyxc, other_tnc, "c"),
+    ):
+        if (bricks is None) != (constants is None):
+            raise ValueError(f"{where}: {name}_bzyxc and {name}_tnc belong together")
+        if bricks is None or constants is None:
+            continue
+        check.tensor(where, f"{name}_bzyxc", bricks, (*like.shape[:4], count), bricks.dtype, device)
+        shape = (*tensors["child_tn"].shape, bricks.shape[4])
+        check.tensor(where, f"{name}_tnc", constants, shape, bricks.dtype, device)
+        if not (bricks.is_contiguous() and constants.is_contiguous()):
+            raise ValueError(f"{where}: {name}_bzyxc and {name}_tnc must be contiguous")
+    if shader == STORED_COLOR and (like.shape[4] != 4 or shared["component"] != 3):
+        raise ValueError(f"{where}: stored colour needs a channel of 4 numbers and component 3")
+    if shader == FEATURES and other_bzyxc is None:
+        raise ValueError(f"{where}: features need other_bzyxc")
+    others = 0 if other_bzyxc is None else other_bzyxc.shape[4]
+    given = {FEATURES: others, PROJECTION: 1}.get(shader, 0)
+    check.whole(where, "features", features, low=given, high=given)
+    check.whole(where, "other_component", other_component, low=0, high=max(0, others - 1))
+
+    args = (
+        *tensors.values(),
+        *(parameter_54.contiguous(), normal_bzyxc, normal_tnc, other_bzyxc, other_tnc),
+        *(shader, features, other_component, width),
+        *whole,
+        *(float(real) for real in reals),
+        by_level,
+    )
+    if choose_backend(backend, device) == "reference":
+        return reference_shaders.shade_rays(*args)
+    return torch.ops.gvtorch.shade_rays(*args)

@@ -1,0 +1,140 @@
+"""Lights and how a surface takes them: what the lit shaders hand to the kernel.
+
+Each number may be a float or a tensor, and may be edited between frames; tensors are read when a
+frame is traced, so nothing is built again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .. import check
+
+Number = float | Tensor
+Triple = Sequence[float] | Tensor
+
+
+@dataclass
+class Headlight:
+    """A light at the eye of each ray."""
+
+    color: Triple = (1.0, 1.0, 1.0)  # linear RGB
+    kind = 0
+
+    def __post_init__(self) -> None:
+        """Checks the colour."""
+        _checked("Headlight", "color", self.color, low=0.0)
+
+    @property
+    def place(self) -> Triple:
+        """Nowhere in the world."""
+        return (0.0, 0.0, 0.0)
+
+
+@dataclass
+class DirectionalLight:
+    """A light far away."""
+
+    direction: Triple  # the way it shines, world; of any length but 0
+    color: Triple = (1.0, 1.0, 1.0)  # linear RGB
+    kind = 1
+
+    def __post_init__(self) -> None:
+        """Checks direction and colour."""
+        _checked("DirectionalLight", "direction", self.direction, zero=False)
+        _checked("DirectionalLight", "color", self.color, low=0.0)
+
+    @property
+    def place(self) -> Triple:
+        """The way it shines."""
+        return self.direction
+
+
+@dataclass
+class PointLight:
+    """A light at a place. Its strength does not fall with the distance."""
+
+    position: Triple  # world
+    color: Triple = (1.0, 1.0, 1.0)  # linear RGB
+    kind = 2
+
+    def __post_init__(self) -> None:
+        """Checks position and colour."""
+        _checked("PointLight", "position", self.position)
+        _checked("PointLight", "color", self.color, low=0.0)
+
+    @property
+    def place(self) -> Triple:
+        """Where it stands."""
+        return self.position
+
+
+Light = Headlight | DirectionalLight | PointLight
+
+
+@dataclass(kw_only=True)
+class Material:
+    """How a place answers light (Blinn, 1977): base colour * (ambient + diffuse * cosine * light)
+    + specular * cosine^shininess * light.
+    """
+
+    light: Light
+    ambient: Number
+    diffuse: Number
+    specular: Number
+    shininess: Number
+
+    def __post_init__(self) -> None:
+        """Checks every number that the host can see."""
+        if not isinstance(self.light, (Headlight, DirectionalLight, PointLight)):
+            raise ValueError(
+                "shader: light must be a Headlight, DirectionalLight or PointLight, "
+                f"got {type(self.light).__name__}"
+            )
+        for name in ("ambient", "diffuse", "specular", "shininess"):
+            value = getattr(self, name)
+            if not (isinstance(value, Tensor) and value.numel() == 1):
+                check.number("shader", name, value, low=0)
+
+    def rows(self) -> tuple[Any, ...]:
+        """The first three rows of `parameter_54`, see `shade_rays`."""
+        return (
+            *(self.light.place, self.light.kind),
+            *(self.light.color, self.ambient),
+            *(self.diffuse, self.specular, self.shininess, 0.0),
+        )
+
+
+def pack(parts: Sequence[Any], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Joins numbers, triples and tensors to one (k,) tensor on the device. Numbers go as arguments
+    of kernels, tensors of the device stay there: nobody waits, and a CUDA graph reads them anew.
+    """
+    out: list[Tensor] = []
+    for part in parts:
+        if isinstance(part, Tensor) and part.device == device:
+            out.append(part.detach().reshape(-1).to(dtype))
+            continue
+        numbers = part.reshape(-1).tolist() if isinstance(part, Tensor) else part
+        for number in numbers if isinstance(numbers, Sequence) else (numbers,):
+            out.append(torch.full((1,), float(number), dtype=dtype, device=device))
+    return torch.cat(out)
+
+
+def _checked(
+    where: str, name: str, value: Any, *, low: float | None = None, zero: bool = True
+) -> None:
+    if isinstance(value, Tensor) and value.is_cuda:
+        if value.shape != (3,):
+            raise ValueError(f"{where}: {name} must be (3,), got {check.describe(value)}")
+        return
+    numbers = check.triple(where, name, value)
+    if low is not None:
+        for number in numbers:
+            check.number(where, name, number, low=low)
+    if not zero and not any(numbers):
+        raise ValueError(f"{where}: {name} must not be zero")

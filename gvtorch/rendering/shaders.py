@@ -1,0 +1,413 @@
+"""The fused shaders beside the plain transfer function: each lays ready what `shade_rays` reads.
+
+What a shader does with an interval is told in csrc/shaders.h. All attributes may be edited: the
+next picture is made with them, and nothing is compiled.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from .. import check
+from ..ops import reference_shaders as kinds
+from ..pool import Channel, N3Tree
+from .lights import Headlight, Light, Material, Number, Triple, pack
+from .preintegrated import integrated_table
+from .shader import Table, TransferFunction
+
+_KEPT_TABLES = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Intervals:
+    """How rays are cut, and in which dtype they are traced."""
+
+    smallest_spacing: float  # world units; the reference length where none was given
+    step: float  # world length of the shortest interval
+    levels: int  # lengths of intervals, each twice the one before
+    dtype: torch.dtype
+
+
+class Shader(ABC):
+    """A fused shader.
+
+    Attributes:
+        channel: Name of the channel whose value it reads; None: that of the options.
+        component: Which number of it; None: that of the options.
+        normals: Name of a channel of 3 numbers that holds normals; None: the gradient's.
+        other: Name of the second channel it reads, or None.
+        other_component: Which number of it colours a surface.
+    """
+
+    kind: int
+    channel: str | None = None
+    component: int | None = None
+    normals: str | None = None
+    other: str | None = None
+    other_component: int = 0
+
+    @abstractmethod
+    def table(self, tree: N3Tree, intervals: Intervals) -> Table:
+        """Returns the colours as the kernel reads them, on the tree's device."""
+
+    def own(self, tree: N3Tree) -> tuple[Any, ...]:
+        """Returns the four numbers of row 3 of `parameter_54`, see `shade_rays`."""
+        return (0.0, 0.0, 0.0, 0.0)
+
+    def material(self) -> Material:
+        """Returns light and material; shaders without a light have any."""
+        return _UNLIT
+
+    def features(self, tree: N3Tree) -> int:
+        """Returns how many features it gives."""
+        return 0
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the channels that it names itself."""
+        return tuple(n for n in (self.channel, self.normals, self.other) if n is not None)
+
+    def parameters(self, tree: N3Tree, dtype: torch.dtype) -> Tensor:
+        """Returns `parameter_54`, with lights and materials as they are now."""
+        scale, offset = 1.0, 0.0
+        if self.normals is not None:
+            scale = 1 / _unit_of(tree.bricks.channels[self.normals].dtype)
+            if tree.bricks.channels[self.normals].dtype in (torch.uint8, torch.uint16):
+                scale, offset = 2 * scale, -1.0
+        parts = (*self.material().rows(), *self.own(tree), scale, offset, 0.0, 0.0)
+        return pack(parts, dtype, tree.device).reshape(5, 4)
+
+    def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> dict[str, Any]:
+        """Returns the arguments of `shade_rays` that stay the same from call to call.
+
+        Raises:
+            ValueError: A channel that it names is not there, or of the wrong width.
+        """
+        for name in self.channels:
+            if name not in tree.bricks.bricks:
+                known = ", ".join(tree.channel_names)
+                raise ValueError(f"{where}: unknown channel {name!r}; the tree has {known}")
+        if self.normals is not None and tree.bricks.channels[self.normals].width != 3:
+            width = tree.bricks.channels[self.normals].width
+            raise ValueError(
+                f"{where}: normals need 3 numbers a voxel, {self.normals!r} has {width}"
+            )
+        if self.other is not None:
+            width = tree.bricks.channels[self.other].width
+            check.whole(
+                where, "component of the colour", self.other_component, low=0, high=width - 1
+            )
+        bricks, constants = tree.bricks.bricks, tree.nodes.constants
+        return {
+            **vars(self.table(tree, intervals)),
+            "shader": self.kind,
+            "normal_bzyxc": None if self.normals is None else bricks[self.normals],
+            "normal_tnc": None if self.normals is None else constants[self.normals],
+            "other_bzyxc": None if self.other is None else bricks[self.other],
+            "other_tnc": None if self.other is None else constants[self.other],
+            "features": self.features(tree),
+            "other_component": self.other_component,
+        }
+
+
+class _Lighted(Shader):
+    """A shader with a light and a material; see `Material` and csrc/shaders.h."""
+
+    def __init__(
+        self,
+        *,
+        normals: str | None = None,
+        light: Light | None = None,
+        ambient: Number = 0.2,
+        diffuse: Number = 0.8,
+        specular: Number = 0.3,
+        shininess: Number = 40.0,
+    ) -> None:
+        """Takes light and material.
+
+        Args:
+            normals: Name of a channel of 3 numbers that holds normals (unsigned integers stand for
+                -1 to 1); the gradient's if left out.
+            light: A `Headlight` if left out.
+            ambient: Factor of the base colour.
+            diffuse: Factor of base colour, light and cosine.
+            specular: Factor of the highlight.
+            shininess: Exponent of the highlight.
+
+        Raises:
+            ValueError: A number is negative or not finite.
+        """
+        self.normals, self.light = normals, light or Headlight()
+        self.ambient, self.diffuse = ambient, diffuse
+        self.specular, self.shininess = specular, shininess
+        self.material()
+
+    def material(self) -> Material:
+        """Returns light and material, checked."""
+        return Material(
+            light=self.light,
+            ambient=self.ambient,
+            diffuse=self.diffuse,
+            specular=self.specular,
+            shininess=self.shininess,
+        )
+
+
+class Lit(_Lighted):
+    """The transfer function, lit by Blinn and Phong on both sides of a surface."""
+
+    kind = kinds.LIT
+
+    def __init__(self, transfer: TransferFunction, **light: Any) -> None:
+        """Takes a transfer function, and `normals`, `light`, `ambient`, `diffuse`, `specular` and
+        `shininess` as in `Isosurface`.
+        """
+        super().__init__(**light)
+        self.transfer = _transfer("Lit", transfer)
+
+    def table(self, tree: N3Tree, intervals: Intervals) -> Table:
+        """See `Shader`."""
+        return _plain_table(self.transfer, tree, intervals)
+
+
+class PreIntegrated(Shader):
+    """The transfer function, integrated over what lies between two samples: thin shells in the
+    function need no finer steps.
+    """
+
+    kind = kinds.PRE_INTEGRATED
+
+    def __init__(self, transfer: TransferFunction) -> None:
+        """Takes a transfer function."""
+        self.transfer = _transfer("PreIntegrated", transfer)
+        self._tables: dict[tuple[Any, ...], Table] = {}
+
+    def table(self, tree: N3Tree, intervals: Intervals) -> Table:
+        """See `Shader`. The last tables are kept."""
+        transfer = self.transfer
+        reference = transfer.reference or intervals.smallest_spacing
+        key = (
+            *(transfer.opacity.tobytes(), transfer.color.tobytes(), reference),
+            *(intervals.step, intervals.levels, intervals.dtype, str(tree.device)),
+        )
+        if key not in self._tables:
+            length = intervals.step / reference
+            table = integrated_table(
+                transfer, length, intervals.levels, intervals.dtype, tree.device
+            )
+            if len(self._tables) == _KEPT_TABLES:
+                self._tables.pop(next(iter(self._tables)))
+            self._tables[key] = table
+        return self._tables[key]
+
+
+class StoredColor(_Lighted):
+    """Colour and opacity as each voxel holds them: a channel of 4 numbers, linear red, green, blue
+    and opacity per reference length. Integers stand for 0 to 1.
+    """
+
+    kind = kinds.STORED_COLOR
+    component = 3
+
+    def __init__(
+        self,
+        channel: str,
+        *,
+        reference: float | None = None,
+        premultiplied: bool = False,
+        lit: bool = False,
+        **light: Any,
+    ) -> None:
+        """Takes the channel's name.
+
+        Args:
+            channel: The channel.
+            reference: World units; the smallest spacing if left out.
+            premultiplied: Whether colours are stored times opacity. Then coarse levels keep the
+                colours of what is opaque; else air's colour mixes in.
+            lit: Whether it is lit; so it is where `normals` are named.
+            **light: `normals`, `light`, `ambient`, `diffuse`, `specular`, `shininess` as in
+                `Isosurface`; without `normals`, they are the gradient's of the opacity.
+
+        Raises:
+            ValueError: The reference length is not positive, or see `Isosurface`.
+        """
+        super().__init__(**light)
+        if reference is not None:
+            check.number("StoredColor", "reference", reference, low=0, open_low=True)
+        self.channel, self.reference, self.premultiplied = channel, reference, premultiplied
+        self.lit = lit or self.normals is not None
+
+    def table(self, tree: N3Tree, intervals: Intervals) -> Table:
+        """Says how many lengths of intervals there are; its colours are not read."""
+        return _one_color((1.0, 1.0, 1.0), tree, intervals)
+
+    def own(self, tree: N3Tree) -> tuple[Any, ...]:
+        """See `Shader`."""
+        scale = 1 / _unit_of(tree.bricks.channels[str(self.channel)].dtype)
+        reference = self.reference or min(tree.spacing)
+        return (scale, reference, float(self.premultiplied), float(self.lit))
+
+    def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> dict[str, Any]:
+        """See `Shader`."""
+        known = tree.bricks.channels.get(str(self.channel), Channel(width=4))
+        if known.width != 4:
+            raise ValueError(
+                f"{where}: stored colour needs 4 numbers a voxel, "
+                f"{self.channel!r} has {known.width}"
+            )
+        return super().arguments(where, tree, intervals)
+
+
+class Isosurface(_Lighted):
+    """The first place where the value passes a level, opaque and lit; to a tenth of a voxel."""
+
+    kind = kinds.ISOSURFACE
+
+    def __init__(
+        self,
+        value: Number,
+        color: Triple | TransferFunction = (0.8, 0.8, 0.8),
+        *,
+        color_channel: str | None = None,
+        color_component: int = 0,
+        **light: Any,
+    ) -> None:
+        """Takes the level and how the surface looks.
+
+        Args:
+            value: The level, in data units.
+            color: Linear red, green, blue, or a transfer function of the second channel's value.
+            color_channel: Name of the second channel, for a transfer function.
+            color_component: Which number of it.
+            **light: normals: name of a channel of 3 numbers that holds normals (unsigned integers
+                stand for -1 to 1), the gradient's if left out. light: a `Headlight` if left out.
+                ambient, diffuse, specular: factors, 0.2, 0.8 and 0.3. shininess: exponent, 40.
+
+        Raises:
+            ValueError: A number is out of its range, or channel and colour do not fit.
+        """
+        super().__init__(**light)
+        if not isinstance(value, Tensor):
+            check.number("Isosurface", "value", value)
+        if isinstance(color, TransferFunction) != (color_channel is not None):
+            raise ValueError("Isosurface: a transfer function and color_channel belong together")
+        if not isinstance(color, (TransferFunction, Tensor)):
+            for part in check.triple("Isosurface", "color", color):
+                check.number("Isosurface", "color", part, low=0, high=1)
+        self.value, self.color = value, color
+        self.other, self.other_component = color_channel, color_component
+
+    def table(self, tree: N3Tree, intervals: Intervals) -> Table:
+        """See `Shader`."""
+        if isinstance(self.color, TransferFunction):
+            return _plain_table(self.color, tree, intervals)
+        return _one_color(self.color, tree, intervals)
+
+    def own(self, tree: N3Tree) -> tuple[Any, ...]:
+        """See `Shader`."""
+        return (self.value, 0.0, 0.0, 0.0)
+
+
+class DistanceField(Isosurface):
+    """The surface of a signed distance field: where the distance is `offset`, 0 if left out."""
+
+    def __init__(
+        self,
+        color: Triple | TransferFunction = (0.8, 0.8, 0.8),
+        *,
+        offset: Number = 0.0,
+        **look: Any,
+    ) -> None:
+        """Takes how the surface looks, see `Isosurface`; `offset` is in the field's own unit."""
+        super().__init__(offset, color, **look)
+
+
+class Projection(Shader):
+    """The maximum, minimum or mean of the value along each ray, coloured by the transfer function's
+    colours and opaque. `Hits.features` (r, 1) holds the value itself (0 beside the box), depth
+    where the extreme is or, for the mean, where the ray enters.
+    """
+
+    kind = kinds.PROJECTION
+
+    def __init__(
+        self, which: Literal["maximum", "minimum", "mean"], transfer: TransferFunction
+    ) -> None:
+        """Takes which one, and the colours.
+
+        Raises:
+            ValueError: There is no such projection.
+        """
+        if which not in ("maximum", "minimum", "mean"):
+            raise ValueError(
+                f"Projection: which must be 'maximum', 'minimum' or 'mean', got {which!r}"
+            )
+        self.which, self.transfer = which, _transfer("Projection", transfer)
+
+    def table(self, tree: N3Tree, intervals: Intervals) -> Table:
+        """See `Shader`."""
+        return _plain_table(self.transfer, tree, intervals)
+
+    def own(self, tree: N3Tree) -> tuple[Any, ...]:
+        """See `Shader`."""
+        return (("maximum", "minimum", "mean").index(self.which), 0.0, 0.0, 0.0)
+
+    def features(self, tree: N3Tree) -> int:
+        """The value."""
+        return 1
+
+
+class Features(Shader):
+    """All numbers of a channel, composited front to back with the transfer function's alpha: they
+    come out as `Hits.features` (r, c). Any number of them.
+    """
+
+    kind = kinds.FEATURES
+
+    def __init__(self, transfer: TransferFunction, channel: str) -> None:
+        """Takes the transfer function of the density, and the name of the features' channel."""
+        self.transfer, self.other = _transfer("Features", transfer), channel
+
+    def table(self, tree: N3Tree, intervals: Intervals) -> Table:
+        """See `Shader`."""
+        return _plain_table(self.transfer, tree, intervals)
+
+    def features(self, tree: N3Tree) -> int:
+        """As many as the channel holds."""
+        return tree.bricks.channels[str(self.other)].width
+
+
+FusedShader = TransferFunction | Shader
+_UNLIT = Material(light=Headlight(), ambient=1.0, diffuse=0.0, specular=0.0, shininess=1.0)
+
+
+def _transfer(where: str, transfer: Any) -> TransferFunction:
+    if not isinstance(transfer, TransferFunction):
+        kind = type(transfer).__name__
+        raise ValueError(f"{where}: transfer must be a TransferFunction, got {kind}")
+    return transfer
+
+
+def _plain_table(transfer: TransferFunction, tree: N3Tree, intervals: Intervals) -> Table:
+    i = intervals
+    return transfer.table(i.smallest_spacing, i.step, i.levels, i.dtype, tree.device)
+
+
+def _one_color(color: Triple, tree: N3Tree, intervals: Intervals) -> Table:
+    row = pack((color, 1.0), intervals.dtype, tree.device)
+    return Table(
+        table_lm4=row.expand(intervals.levels, 2, 4).contiguous(),
+        domain_2=pack((0.0, 1.0), intervals.dtype, tree.device),
+        opaque_m=torch.arange(1, 3, dtype=torch.int32, device=tree.device),
+    )
+
+
+def _unit_of(dtype: torch.dtype) -> float:
+    """The number that stands for 1."""
+    return 1.0 if dtype.is_floating_point else float(torch.iinfo(dtype).max)

@@ -1,0 +1,277 @@
+"""The fused shaders: reference = C++ = CUDA, the op's contract, and golden images."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+import torch
+from conftest import DEVICES, ROOT
+from test_op_contract import world_rays
+from test_trace_rays import SHADER, assert_equal, camera_rays, forget, on, run
+
+import gvtorch as gv
+from gvtorch.ops import shade_rays
+from gvtorch.rendering.renderer import Tracer
+
+GOLDEN = ROOT / "tests" / "golden_shaders.npz"
+POINT = gv.PointLight((0.0, 40.0, 60.0), (1.0, 0.9, 0.8))
+SHADERS = {
+    "lit": gv.Lit(SHADER),
+    "lit by stored normals": gv.Lit(SHADER, normals="normal", light=POINT),
+    "pre-integrated": gv.PreIntegrated(SHADER),
+    "stored colour": gv.StoredColor("rgba"),
+    "stored colour lit": gv.StoredColor(
+        "premultiplied", premultiplied=True, light=gv.DirectionalLight((1, -1, -1)), lit=True
+    ),
+    "isosurface": gv.Isosurface(0.5, (0.9, 0.4, 0.2), light=POINT),
+    "coloured isosurface": gv.Isosurface(0.4, SHADER, color_channel="rgba", color_component=1),
+    "distance field": gv.DistanceField(offset=0.3),
+    "maximum": gv.Projection("maximum", SHADER),
+    "minimum": gv.Projection("minimum", SHADER),
+    "mean": gv.Projection("mean", SHADER),
+    "features": gv.Features(SHADER, "rgba"),
+}
+
+
+@pytest.fixture(scope="module")
+def channels(blobs) -> dict[str, gv.Volume]:
+    """The blobs with a colour and a normal in each voxel, both of 8 bits."""
+    value = blobs.data[..., 0]
+    z, y, x = torch.meshgrid(*(torch.linspace(0, 1, n) for n in value.shape), indexing="ij")
+    rgba = torch.stack((x, y, z, value), -1)
+    normal = torch.stack(torch.gradient(value)[::-1], -1)
+    normal = torch.nn.functional.normalize(normal, dim=-1) * 0.5 + 0.5
+    place = blobs.spacing, blobs.origin
+    return {
+        "value": blobs,
+        "rgba": gv.Volume((rgba * 255).round().to(torch.uint8), *place),
+        "premultiplied": gv.Volume(
+            torch.cat((rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]), -1), *place
+        ),
+        "normal": gv.Volume((normal * 255).round().to(torch.uint8), *place),
+    }
+
+
+@pytest.fixture(scope="module")
+def tree(channels) -> gv.N3Tree:
+    return gv.N3Tree.from_volume(channels, 4)
+
+
+def assert_same_fields(tree, backend, rays, shader, **options):
+    """Hits and marks of the twin and of a backend: integers exactly, floats to rounding."""
+    expected, marks = assert_equal(tree, backend, rays, shader, **options)
+    actual, _ = run(tree, backend, rays, shader, **options)
+    tolerance = 1e-5 if expected["color"].dtype == torch.float32 else 1e-12
+    for name in ("normal", "features"):
+        torch.testing.assert_close(actual[name], expected[name], rtol=tolerance, atol=tolerance)
+    return expected, actual, marks
+
+
+@pytest.mark.parametrize("lod", ["finest", "auto"])
+@pytest.mark.parametrize("name", SHADERS)
+def test_compiled_equals_reference(tree, compiled, name, lod):
+    for distance in (0.2, 1.3, 6.0):
+        rays = camera_rays(tree, 16, distance=distance)
+        found, actual, _ = assert_same_fields(tree, compiled, rays, SHADERS[name], lod=lod)
+        if compiled == "cpp":
+            for field in ("color", "alpha", "depth", "normal", "features"):
+                assert torch.equal(actual[field], found[field]), field
+        if distance == 1.3:
+            assert found["alpha"].max() > 0.3, "the test must see something"
+
+
+@pytest.mark.parametrize("branching", [2, 3])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", SHADERS)
+def test_compiled_equals_reference_for_steps_and_dtypes(channels, compiled, name, dtype, branching):
+    tree = gv.N3Tree.from_volume(channels, 4, branching=branching)
+    for step in (0.4, 2.3):
+        rays = camera_rays(tree, 10)
+        assert_same_fields(tree, compiled, rays, SHADERS[name], dtype=dtype, step=step)
+
+
+@pytest.mark.parametrize(
+    "dtype", ["uint8", "int8", "int16", "uint16", "float16", "bfloat16", "float32"]
+)
+def test_every_channel_dtype(blobs, compiled, dtype):
+    data = (blobs.data * 100).to(getattr(torch, dtype))
+    tree = gv.N3Tree.from_volume(gv.Volume(data), 4)
+    rays = camera_rays(tree, 12)
+    found, *_ = assert_same_fields(tree, compiled, rays, gv.Isosurface(50))
+    assert found["alpha"].max() == 1 and found["normal"].norm(dim=1).max() > 0.99
+
+
+@pytest.mark.parametrize("name", SHADERS)
+def test_missing_nodes_give_equal_pictures_and_requests(tree, compiled, name):
+    for seed, share in ((1, 0.3), (2, 0.7)):
+        holes = forget(tree, share, seed)
+        rays = camera_rays(holes, 12, distance=1.4)
+        *_, marks = assert_same_fields(holes, compiled, rays, SHADERS[name])
+        assert marks["request"].any()
+
+
+@pytest.mark.parametrize("threshold", [None, 0.2])
+@pytest.mark.parametrize("name", SHADERS)
+def test_what_ranges_hide_changes_no_bit(channels, name, threshold):
+    known = gv.N3Tree.from_volume(channels, 4, threshold=threshold)
+    unknown = on(known, "cpu")
+    for channel, ranges in unknown.nodes.ranges.items():
+        ranges[:, :, 0], ranges[:, :, 1] = known.bricks.channels[channel].limits
+    rays = camera_rays(known, 16, distance=1.6)
+    for lod in ("finest", "auto"):
+        options = gv.RenderOptions(lod=lod)
+        few, many = (vars(Tracer(t, SHADERS[name], options)(rays)) for t in (known, unknown))
+        assert few["samples"].sum() <= many["samples"].sum()
+        for field in ("color", "alpha", "depth", "normal", "features"):
+            assert torch.equal(few[field], many[field]), field
+    if name in ("isosurface", "maximum", "lit"):
+        assert few["samples"].sum() < many["samples"].sum()
+
+
+def test_lights_are_tensors_that_may_be_edited(tree):
+    position, ambient = torch.tensor([0.0, 40.0, 60.0]), torch.tensor(0.1)
+    shader = gv.Isosurface(0.5, light=gv.PointLight(position), ambient=ambient)
+    tracer = Tracer(tree, shader, gv.RenderOptions())
+    rays = camera_rays(tree, 16)
+    before = tracer(rays).color
+    position[:] = torch.tensor([60.0, -40.0, 0.0])
+    moved = tracer(rays).color
+    assert (moved - before).abs().max() > 0.1
+    ambient.fill_(0.5)
+    assert (tracer(rays).color - moved).max() > 0.2
+
+
+@pytest.mark.parametrize("name", SHADERS)
+def test_an_engine_draws_the_same(channels, name):
+    shader = SHADERS[name]
+    camera = gv.Camera.orbit(width=24, height=18, distance=1.5)
+    resident = gv.render(gv.N3Tree.from_volume(channels, 8), camera, shader)
+    with gv.Engine(gv.VolumeProducer(channels), brick_size=8) as engine:
+        picture = engine.render(camera, shader)
+    assert picture.stats.converged
+    assert (picture.color - resident.color).abs().max() < 2e-3
+    assert picture.normal.shape == (18, 24, 3)
+    assert picture.features.shape[:2] == (18, 24)
+    torch.testing.assert_close(picture.features, resident.features, atol=2e-3, rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", SHADERS)
+def test_golden_image(tree, name):
+    """64 x 64 of colour and alpha; the largest error is printed."""
+    camera = gv.Camera.orbit(width=64, height=64, distance=1.4)
+    picture = gv.render(tree, camera, SHADERS[name])
+    expected = torch.from_numpy(np.load(GOLDEN)[name].astype(np.float32))
+    actual = torch.cat((picture.color, picture.alpha), -1)
+    error = float((actual - expected).abs().max())
+    print(f"{name}: {error:.2e}")
+    assert error < 2e-3, "float16 keeps 1e-3 of the colours"
+
+
+# --- the op's contract
+
+
+def module(tree, name, compiled) -> tuple[gv.TreeTracer, tuple[torch.Tensor, ...]]:
+    tree = on(tree, DEVICES[compiled])
+    return gv.TreeTracer(tree, SHADERS[name]), world_rays(tree.box, 33, tree.device)
+
+
+def assert_all_same(actual, expected):
+    assert len(actual) == len(expected) == 6
+    for a, b in zip(actual, expected, strict=True):
+        assert torch.equal(a.cpu(), b.cpu())
+    assert expected[1].max() > 0.2
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", SHADERS)
+def test_script_compile_and_export(tree, compiled, name):
+    torch._dynamo.reset()  # each tracer is a module of its own
+    tracer, rays = module(tree, name, compiled)
+    plain = tracer(*rays)
+    expected = tracer.hits(*rays)
+    for a, b in zip(plain, expected, strict=False):
+        assert torch.equal(a, b)
+    file = io.BytesIO()
+    torch.jit.save(torch.jit.script(tracer), file)
+    file.seek(0)
+    assert_all_same(torch.jit.load(file).hits(*rays), expected)
+    fast = torch.compile(tracer.hits, fullgraph=True, backend="aot_eager")
+    assert_all_same(fast(*rays), expected)
+    program = torch.export.export(tracer, rays).module()
+    assert all(torch.equal(a, b) for a, b in zip(program(*rays), plain, strict=True))
+
+
+def op_arguments(tree, shader, dtype) -> dict:
+    """The checked function's arguments for the rays of a camera."""
+    rays = camera_rays(tree, 3).to(tree.device)
+    tracer = Tracer(tree, shader, gv.RenderOptions(dtype=dtype))
+    columns = ("origin_r3", "direction_r3", "cone_r2", "range_r2")
+    values = (rays.origin, rays.direction, rays.cone, rays.range)
+    parameters = tracer.shader.parameters(tree, dtype)
+    columns = dict(zip(columns, (v.double().contiguous() for v in values), strict=True))
+    return {**columns, **tracer.arguments, "parameter_54": parameters}
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", SHADERS)
+def test_opcheck(tree, compiled, name, dtype):
+    tree = on(tree, DEVICES[compiled])
+    given = op_arguments(tree, SHADERS[name], dtype)
+    given |= {"width": 0, "table": given.pop("table_lm4")}
+    op = torch.ops.gvtorch.shade_rays.default
+    torch.library.opcheck(op, tuple(given[a.name] for a in op._schema.arguments))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: gv.Lit(SHADER, ambient=-1), "ambient must be finite and >= 0"),
+        (lambda: gv.Lit("bone"), "Lit: transfer must be a TransferFunction, got str"),
+        (lambda: gv.Lit(SHADER, light=3), "light must be a Headlight"),
+        (lambda: gv.DirectionalLight((0, 0, 0)), "direction must not be zero"),
+        (lambda: gv.PointLight((0, 0, float("nan"))), "position must be finite"),
+        (lambda: gv.Projection("median", SHADER), "which must be 'maximum'"),
+        (lambda: gv.Isosurface(float("nan")), "value must be finite"),
+        (lambda: gv.Isosurface(1, SHADER), "color_channel belong together"),
+        (lambda: gv.StoredColor("rgba", reference=0), "reference must be finite and > 0"),
+    ],
+)
+def test_bad_shaders_have_one_clear_message(make, message):
+    with pytest.raises(ValueError) as caught:
+        make()
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("shader", "message"),
+    [
+        (gv.Lit(SHADER, normals="n"), "unknown channel 'n'; the tree has value, rgba"),
+        (gv.Lit(SHADER, normals="rgba"), "normals need 3 numbers a voxel, 'rgba' has 4"),
+        (gv.StoredColor("normal"), "stored colour needs 4 numbers a voxel, 'normal' has 3"),
+        (gv.Features(SHADER, "f"), "unknown channel 'f'"),
+        (gv.Isosurface(1, SHADER, color_channel="rgba", color_component=4), "must be an int >= 0"),
+    ],
+)
+def test_a_missing_channel_is_one_clear_error(tree, shader, message):
+    with pytest.raises(ValueError, match="render") as caught:
+        gv.render(tree, gv.Camera.orbit(width=4, height=4), shader)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_the_op_checks_its_arguments(tree):
+    good = op_arguments(tree, SHADERS["features"], torch.float32)
+    shade_rays(**good)
+    for change, message in (
+        ({"shader": 9}, "shader must be an int >= 0 and <= 5"),
+        ({"features": 3}, "features must be an int >= 4"),
+        ({"parameter_54": torch.zeros(5)}, r"parameter_54 must be \(5, 4\)"),
+        ({"other_tnc": None}, "belong together"),
+        ({"other_bzyxc": None, "other_tnc": None}, "features need other_bzyxc"),
+        ({"frame": 1}, "argument 'frame' is missing or unknown"),
+        ({"shader": 1}, "table_lm4 must be"),
+        ({"shader": 2}, "stored colour needs a channel of 4 numbers"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            shade_rays(**{**good, **change})
