@@ -111,7 +111,8 @@ def cost(
     camera = as_camera("cost", camera)
     chosen = render_options("cost", camera, options)
     check_type("cost", "tree", tree, N3Tree)
-    check_type("cost", "shader", shader, TransferFunction)
+    if not isinstance(shader, TransferFunction):
+        raise ValueError(f"cost: shader must be a TransferFunction, got {type(shader).__name__}")
     start = time.perf_counter()
     placed = camera.placed(tree.box)
     counter = _Counter(tree, shader, chosen)
