@@ -17,7 +17,16 @@ if TYPE_CHECKING:
     from .pool import BrickPool, BrickTable, Channel, N3Tree, NodePool
     from .producers import Bricks, Nodes, Producer, Region, Regions, StoredProducer, VolumeProducer
     from .production import ProductionError
-    from .rendering import Camera, Picture, RenderOptions, TransferFunction, TreeTracer, render
+    from .rendering import (
+        Camera,
+        Clip,
+        Picture,
+        RenderOptions,
+        ThinLens,
+        TransferFunction,
+        TreeTracer,
+        render,
+    )
     from .volume import Volume
 
 __version__ = "0.1.0"
@@ -38,12 +47,14 @@ _HOME = {
     "VolumeProducer": ".producers",
     "Camera": ".rendering",
     "Channel": ".pool",
+    "Clip": ".rendering",
     "Hits": ".frame",
     "N3Tree": ".pool",
     "NodePool": ".pool",
     "Picture": ".rendering",
     "Rays": ".frame",
     "RenderOptions": ".rendering",
+    "ThinLens": ".rendering",
     "TransferFunction": ".rendering",
     "TreeTracer": ".rendering",
     "Volume": ".volume",
@@ -57,6 +68,7 @@ __all__ = [
     "Bricks",
     "Camera",
     "Channel",
+    "Clip",
     "Engine",
     "EngineOptions",
     "FrameStats",
@@ -72,6 +84,7 @@ __all__ = [
     "Regions",
     "RenderOptions",
     "StoredProducer",
+    "ThinLens",
     "TransferFunction",
     "TreeTracer",
     "Volume",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,13 +20,15 @@ from torch import Tensor
 
 from . import check
 from .cache import KINDS, Cache, Listed, Requests, Scheduler
-from .frame import Counts, FrameStats, Hits, Rays
+from .frame import Counts, FrameStats, Hits
 from .ops.trace import choose_backend
 from .producers import Producer
 from .production import Failure, Plant, Production
 from .rendering import Camera, Picture, RenderOptions, TransferFunction
+from .rendering.pieces import Trace
 from .rendering.renderer import (
     Tracer,
+    around,
     check_type,
     composite_trees,
     develop,
@@ -41,7 +43,7 @@ from .turns import Turns, scouts
 
 Scene = Producer | Mapping[str, Producer]
 Shaders = TransferFunction | Mapping[str, TransferFunction]
-_View = tuple[Camera, torch.device, Callable[[Rays], Hits], torch.dtype]  # of `trace_camera`
+_View = tuple[Camera, torch.device, Trace, torch.dtype]  # of `trace_camera`
 
 _LISTED = 1 << 17  # most nodes with a wish that one frame lists
 _PAYLOAD = 256 * 10**6  # most bytes of voxels produced in one frame
@@ -464,8 +466,8 @@ class Engine:
         for plant in self.plants.values():
             plant.tree.frame = self.frames
 
-    def _tracer(self, shader: Shaders, options: RenderOptions) -> Callable[[Rays], Hits]:
-        tracers = []
+    def _tracer(self, shader: Shaders, options: RenderOptions) -> Trace:
+        box, trees = self.box, []
         for name, plant in self.plants.items():
             one: Any = shader.get(name) if isinstance(shader, Mapping) else shader
             check_type("frame", f"shader of tree {name!r}", one, TransferFunction)
@@ -477,12 +479,11 @@ class Engine:
                 )
             chosen = dataclasses.replace(options, channel=channel)
             by_level = self.options.loading == "levels"
-            tracers.append(
-                Tracer(plant.tree, one, chosen, by_level=by_level, frame_1=self._frame_1)
-            )
-        if len(tracers) == 1:
-            return tracers[0]
-        return lambda rays: composite_trees(tracers, rays)
+            tracer = Tracer(plant.tree, one, chosen, by_level=by_level, frame_1=self._frame_1)
+            trees.append((plant.tree.box, around(tracer, chosen, box)))
+        if len(trees) == 1:
+            return trees[0][1]
+        return lambda rays: composite_trees(trees, rays)
 
 
 class FrameGraph:

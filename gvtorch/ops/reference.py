@@ -512,6 +512,7 @@ def trace_rays(
     stop_alpha: float,
     depth_alpha: float,
     by_level: bool,
+    clear_r: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Twin of `torch.ops.gvtorch.trace_rays`; arguments as in `gvtorch.ops.trace_rays`.
 
@@ -534,7 +535,8 @@ def trace_rays(
     transfer = Transfer(table_lm4, domain_2, opaque_m)
     visit = Visit.none(beam, tree)
     zero = torch.zeros_like(beam.first)
-    sum_ = Accumulator(torch.zeros_like(beam.origin), zero + 1, zero + INF)
+    clear = zero + 1 if clear_r is None else clear_r.to(real)
+    sum_ = Accumulator(torch.zeros_like(beam.origin), clear, zero + INF)
     samples = torch.zeros_like(zero, dtype=torch.int32)
 
     active = at.inside() & (sum_.clear > stop_clear)

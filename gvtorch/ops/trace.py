@@ -66,6 +66,7 @@ def trace_rays(
     stop_alpha: float = config.STOP_ALPHA,
     depth_alpha: float = config.DEPTH_ALPHA,
     by_level: bool = False,
+    clear_r: Tensor | None = None,
     backend: Backend = "auto",
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Traces rays through a tree and shades what they meet with a transfer function.
@@ -110,6 +111,8 @@ def trace_rays(
         stop_alpha: A ray ends at this alpha; 1 integrates to the end.
         depth_alpha: Depth is where alpha passes this.
         by_level: A node's brick is requested before its children; else the wanted level at once.
+        clear_r: (r,) float64 transmittance with which each ray begins, for a ray that is traced in
+            pieces; 1 if left out. Colour is what this piece adds, alpha is the ray's so far.
         backend: auto, reference, cpp or cuda.
 
     Returns:
@@ -157,6 +160,9 @@ def trace_rays(
         check.tensor(where, name, tensor, shape, dtype, device)
         if not tensor.is_contiguous():
             raise ValueError(f"{where}: {name} must be contiguous")
+    if clear_r is not None:
+        check.tensor(where, "clear_r", clear_r, (rays,), torch.float64, device)
+        clear_r = clear_r.contiguous()
     if nodes < branching**3:
         raise ValueError(f"{where}: child_tn must hold {branching}^3 nodes a tile, got {nodes}")
     if table_lm4.shape[0] < 1 or table_lm4.shape[1] < 2:
@@ -183,7 +189,7 @@ def trace_rays(
         *(stamp_b, table_lm4, domain_2, opaque_m, frame_1),
         *(width, branching, root, max_depth, border, component),
         *(float(cone_scale), float(root_voxel), float(step)),
-        *(float(stop_alpha), float(depth_alpha), by_level),
+        *(float(stop_alpha), float(depth_alpha), by_level, clear_r),
     )
     if choose_backend(backend, device) == "reference":
         return reference.trace_rays(*args)

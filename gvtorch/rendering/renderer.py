@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -17,7 +17,10 @@ from ..ops.trace import Backend, choose_backend, most_intervals
 from ..pool import N3Tree
 from ..stage import Progress, collect_timings, no_progress, stage
 from .camera import Camera, pixel_rays
+from .clip import Clip, Clipped
+from .lens import ThinLens, ThroughLens
 from .picture import Picture
+from .pieces import Trace
 from .shader import TransferFunction, interval_levels
 
 _RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that progress shows
@@ -35,6 +38,8 @@ class RenderOptions:
     cone_scale: float = config.CONE_OVERESTIMATE  # widens the pixel cone
     channel: str | None = None  # name of the channel the shader reads; None: the first
     component: int = 0  # which number of the channel
+    clip: Clip | None = None  # the region of interest; None: everything
+    lens: ThinLens | None = None  # depth of field; None: all is sharp
     backend: Backend = "auto"
     dtype: torch.dtype = torch.float32  # float64 for trees deeper than about 2^16 voxels
 
@@ -55,6 +60,11 @@ class RenderOptions:
             )
         check.number(where, "cone_scale", self.cone_scale, low=0, open_low=True)
         check.whole(where, "component", self.component, low=0)
+        for name, value, kind in (("clip", self.clip, Clip), ("lens", self.lens, ThinLens)):
+            if value is not None:
+                check_type(where, name, value, kind)
+        if self.lens is not None and self.lod == "finest":
+            raise ValueError(f"{where}: a lens blurs by level of detail: lod must be 'auto'")
         if self.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"{where}: dtype must be float32 or float64, got {self.dtype}")
 
@@ -90,8 +100,8 @@ def render(
     with collect_timings(tree.device) as timings:
         with stage("prepare"):
             tree.frame += 1
-            tracer = Tracer(tree, shader, chosen)
-        hits = trace_camera(camera.placed(tree.box), tree.device, tracer, chosen.dtype, progress)
+            trace = around(Tracer(tree, shader, chosen), chosen, tree.box)
+        hits = trace_camera(camera.placed(tree.box), tree.device, trace, chosen.dtype, progress)
         with stage("picture"):
             stats = RenderStats(
                 backend=choose_backend(chosen.backend, tree.device),
@@ -160,7 +170,7 @@ def empty_hits(device: torch.device, dtype: torch.dtype, pixels: int) -> Hits:
 def trace_camera(
     camera: Camera,
     device: torch.device,
-    trace_rays: Callable[[Rays], Hits],
+    trace_rays: Trace,
     dtype: torch.dtype,
     progress: Progress,
     *,
@@ -243,7 +253,21 @@ def trace(
         ValueError: The channel is unknown, the step too short, or the backend can't be used.
     """
     tree.frame += 1
-    return Tracer(tree, shader, options or RenderOptions())(rays)
+    chosen = options or RenderOptions()
+    return around(Tracer(tree, shader, chosen), chosen, tree.box)(rays)
+
+
+def around(tracer: Tracer, options: RenderOptions, box: Tensor) -> Trace:
+    """Returns a tree's tracer with what the options put around it: the lens, then the clip; `box`
+    (2, 3) is the scene's.
+    """
+    trace: Trace = tracer
+    if options.lens is not None:
+        trace = ThroughLens(trace, options.lens.placed(box), options.cone_scale)
+    if options.clip is not None:
+        step = tracer.arguments["step"]
+        trace = Clipped(trace, options.clip, box, step=step, depth_alpha=options.depth_alpha)
+    return trace
 
 
 class Tracer:
@@ -306,26 +330,28 @@ class Tracer:
         color, alpha, depth, samples, missed = trace_rays(
             *(column.to(torch.float64).contiguous() for column in columns),
             width=rays.width,
+            clear_r=None if rays.clear is None else rays.clear.to(torch.float64),
             **self.arguments,
         )
         return Hits(color=color, alpha=alpha, depth=depth, samples=samples, missed=missed)
 
 
-def composite_trees(tracers: list[Tracer], rays: Rays) -> Hits:
-    """Traces rays through several trees and puts them one over the other, nearest box first.
+def composite_trees(trees: list[tuple[Tensor, Trace]], rays: Rays) -> Hits:
+    """Traces rays through several trees, each a (2, 3) box and what traces it, and puts them one
+    over the other, nearest box first.
 
     Right wherever boxes do not overlap along a ray; where they do, the nearer box as a whole comes
     first.
     """
-    near = torch.stack([_entry(tracer.tree.box, rays) for tracer in tracers])  # (m, r)
+    near = torch.stack([_entry(box, rays) for box, _ in trees])  # (m, r)
     order = near.argsort(dim=0, stable=True)
-    hits = [tracer(rays) for tracer in tracers]
+    hits = [trace(rays) for _, trace in trees]
     fields = {name: torch.stack([vars(one)[name] for one in hits]) for name in vars(hits[0])}
     which = order[:, :, None]
     color, alpha = (fields[n].gather(0, which.expand_as(fields[n])) for n in ("color", "alpha"))
     depths = fields["depth"].gather(0, which)
     total_color, total_alpha = color[0], alpha[0]
-    for behind in range(1, len(tracers)):
+    for behind in range(1, len(trees)):
         total_color = total_color + (1 - total_alpha) * color[behind]
         total_alpha = total_alpha + (1 - total_alpha) * alpha[behind]
     return Hits(

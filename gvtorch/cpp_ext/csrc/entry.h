@@ -10,6 +10,7 @@
 #include <torch/csrc/stable/tensor.h>
 #include <torch/headeronly/core/ScalarType.h>
 
+#include <optional>
 #include <tuple>
 
 #include "cache.h"
@@ -28,7 +29,8 @@ constexpr const char* kTraceRaysSchema =
     "Tensor bricks_bzyxc, Tensor constant_tnc, Tensor range_tn2c, Tensor(c!) stamp_b, "
     "Tensor table_lm4, Tensor domain_2, Tensor opaque_m, Tensor frame_1, "
     "int width, int branching, int root, int max_depth, int border, int component, "
-    "float cone_scale, float root_voxel, float step, float stop_alpha, float depth_alpha, bool by_level"
+    "float cone_scale, float root_voxel, float step, float stop_alpha, float depth_alpha, bool by_level, "
+    "Tensor? clear_r=None"
     ") -> (Tensor color_r3, Tensor alpha_r1, Tensor depth_r1, Tensor samples_r, Tensor missed_r)";
 constexpr const char* kCompactRequestsSchema =
     "compact_requests(Tensor(a!) request_tn, int capacity) -> (Tensor node_k, Tensor word_k, Tensor count_3)";
@@ -81,7 +83,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> trace_rays(
     const Tensor& stamp_b, const Tensor& table_lm4, const Tensor& domain_2, const Tensor& opaque_m,
     const Tensor& frame_1, int64_t width, int64_t branching, int64_t root, int64_t max_depth, int64_t border,
     int64_t component, double cone_scale, double root_voxel, double step, double stop_alpha, double depth_alpha,
-    bool by_level) {
+    bool by_level, const std::optional<Tensor>& clear_r) {
   const ScalarType real = table_lm4.scalar_type();
   const ScalarType word = ScalarType::Int;
   const ScalarType voxel = bricks_bzyxc.scalar_type();
@@ -120,6 +122,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> trace_rays(
     require(tensor, name, origin_r3, ScalarType::Double);
     require_numel(tensor, name, numel);
   }
+  if (clear_r.has_value()) {
+    require(*clear_r, "clear_r", origin_r3, ScalarType::Double);
+    require_numel(*clear_r, "clear_r", rays);
+  }
   require(table_lm4, "table_lm4", origin_r3, real);
   require_numel(table_lm4, "table_lm4", table_lm4.size(0) * table_lm4.size(1) * 4);
   STD_TORCH_CHECK(reinterpret_cast<uintptr_t>(table_lm4.const_data_ptr()) % 16 == 0,
@@ -156,6 +162,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> trace_rays(
   args.cone_r2 = world(cone_r2);
   args.range_r2 = world(range_r2);
   args.place_33 = world(place_33);
+  args.clear_r = clear_r.has_value() ? world(*clear_r) : nullptr;
   args.child_tn = words_in(child_tn);
   args.brick_tn = words_in(brick_tn);
   args.request_tn = words_out(request_tn);

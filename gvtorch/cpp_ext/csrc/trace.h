@@ -154,7 +154,8 @@ struct TraceRay {
   uint8_t* hidden_tn;
 
   explicit TraceRay(const TraceArgs& args)
-      : rays{args.origin_r3, args.direction_r3, args.cone_r2, args.range_r2, args.place_33, args.cone_scale},
+      : rays{args.origin_r3, args.direction_r3, args.cone_r2, args.range_r2, args.place_33, args.cone_scale,
+             args.clear_r},
         order{args.rays, args.width},
         tree{args.child_tn,   args.brick_tn,
              args.request_tn, args.stamp_t,
@@ -193,6 +194,7 @@ struct TraceRay {
     Intervals<T> at(ray, options.step, transfer.levels);
     const Transfer<T> shader(transfer);
     Accumulator<T> sum;
+    if (rays.clear_r != nullptr) sum.clear = static_cast<T>(rays.clear_r[number]);
     const T stop_clear = 1 - options.stop_alpha;
     int32_t samples = 0;
     int32_t wanted = 0;
