@@ -226,6 +226,8 @@ def _face(name: str, numbers: Any) -> Face:
 
 def _box(name: str, numbers: Any) -> list[Face]:
     """The six faces of a box."""
+    if not hasattr(numbers, "__len__"):
+        raise ValueError(f"Clip: {name} must be two corners or a (4, 4) matrix, got {numbers!r}")
     if len(numbers) == 2:
         low, high = _matrix(name, numbers, (2, 3))
         if not bool((low < high).all()):

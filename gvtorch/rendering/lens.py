@@ -25,8 +25,8 @@ from .pieces import Trace, trace_pieces
 
 #: Width of the cone over the diameter of the disc. Voxels half as wide as a disc, read trilinearly,
 #: spread as much as it does (variance v^2 / 4, the disc 1 / 16). The pixel's cone comes on top, and
-#: blurred density makes what is opaque grow: pictures agree best with a third.
-_CONE_OF_DISC = 1 / 3
+#: blurred density makes what is opaque grow: pictures agree best with this.
+_CONE_OF_DISC = 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
