@@ -72,7 +72,7 @@ def test_pieces_hold_what_is_kept_and_nothing_else(boxes, cuts, seed):
                 made.append((np.array(centre) - half, np.array(centre) + half))
         return [box if isinstance(box, torch.Tensor) else tuple(map(tuple, box)) for box in made]
 
-    kept, cut, plane = some(boxes, 1.0), some(cuts, 0.6), (0.3, -0.4, 0.5, 0.3)
+    kept, cut, plane = some(boxes, 1.0), some(cuts, 0.6), (0.3, -0.4, 0.5, 0.6)
     clip = gv.Clip(planes=[plane], boxes=kept, without=cut)
     rays = rays_through(200, seed)
     pieces = Clipped(lambda _: None, clip, UNIT, step=0.1, depth_alpha=0.1).pieces(rays)
