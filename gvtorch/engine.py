@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,8 +26,10 @@ from .producers import Producer
 from .production import Failure, Plant, Production
 from .rendering import Camera, ModuleShader, Picture, RenderOptions
 from .rendering.custom import as_camera
+from .rendering.pieces import Trace
 from .rendering.renderer import (
     AnyShader,
+    around,
     check_shader,
     composite_trees,
     develop,
@@ -44,7 +46,7 @@ from .turns import Turns, scouts
 
 Scene = Producer | Mapping[str, Producer]
 Shaders = AnyShader | Mapping[str, AnyShader]
-_View = tuple[Camera, torch.device, Callable[[Rays], Hits], RenderOptions]  # of `trace_camera`
+_View = tuple[Camera, torch.device, Trace, RenderOptions]  # of `trace_camera`
 
 _LISTED = 1 << 17  # most nodes with a wish that one frame lists
 _PAYLOAD = 256 * 10**6  # most bytes of voxels produced in one frame
@@ -482,8 +484,8 @@ class Engine:
         for plant in self.plants.values():
             plant.tree.frame = self.frames
 
-    def _tracer(self, shader: Shaders, options: RenderOptions) -> Callable[[Rays], Hits]:
-        tracers = []
+    def _tracer(self, shader: Shaders, options: RenderOptions) -> Trace:
+        box, trees = self.box, []
         for name, plant in self.plants.items():
             one: Any = shader.get(name) if isinstance(shader, Mapping) else shader
             if not isinstance(one, ModuleShader):
@@ -498,10 +500,11 @@ class Engine:
             chosen = dataclasses.replace(options, channel=channel)
             by_level = self.options.loading == "levels"
             frame = {"by_level": by_level, "frame_1": self._frame_1}
-            tracers.append(tracer_of(plant.tree, one, chosen, **frame))
-        if len(tracers) == 1:
-            return tracers[0]
-        return lambda rays: composite_trees(tracers, rays)
+            tracer = tracer_of(plant.tree, one, chosen, **frame)
+            trees.append((plant.tree.box, around(tracer, chosen, box)))
+        if len(trees) == 1:
+            return trees[0][1]
+        return lambda rays: composite_trees(trees, rays)
 
 
 class FrameGraph:

@@ -19,18 +19,23 @@ class Rays:
     cone: Tensor  # (r, 2) width at the origin, growth of the width per unit distance
     range: Tensor  # (r, 2) first and last distance along the ray; +inf is allowed for the last
     width: int = 0  # pixels of a row, if these are whole rows of a picture: traced in tiles
+    clear: Tensor | None = None  # (r,) transmittance at the first distance; None: 1
 
     def __getitem__(self, index: Tensor | slice) -> Rays:
         """Some of the rays, which are no rows any more."""
-        columns = (self.origin, self.direction, self.cone, self.range)
-        origin, direction, cone, limits = (column[index] for column in columns)
-        return Rays(origin=origin, direction=direction, cone=cone, range=limits)
+        return self._each(lambda column: column[index], 0)
 
     def to(self, device: torch.device | str) -> Rays:
         """The rays on a device."""
+        return self._each(lambda column: column.to(device), self.width)
+
+    def _each(self, change: Callable[[Tensor], Tensor], width: int) -> Rays:
         columns = (self.origin, self.direction, self.cone, self.range)
-        origin, direction, cone, limits = (column.to(device) for column in columns)
-        return Rays(origin=origin, direction=direction, cone=cone, range=limits, width=self.width)
+        origin, direction, cone, limits = (change(column) for column in columns)
+        clear = None if self.clear is None else change(self.clear)
+        return Rays(
+            origin=origin, direction=direction, cone=cone, range=limits, width=width, clear=clear
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

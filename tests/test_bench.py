@@ -25,6 +25,7 @@ FIGURES = {
     "first_hit": {"rays_per_second", "max_difference", "mean_difference", "times"},
     "bricks": {"samples_per_second", "tree_bytes", "brick_size", "border"},
     "frame": {"cache_share", "cache_ms", "stages", "frames", "bricks", "max_difference"},
+    "lens": {"aperture", "bricks", "moved_bytes", "brick_bytes", "samples"},
     "lru": {"slots_per_second", "times", "same"},
     "compact": {"words_bytes_per_second", "times", "same"},
     "produce": {"bricks_per_second", "voxels_per_second"},

@@ -205,6 +205,12 @@ TF = '{"opacity": [[5, 0], [1, 1]]}'
         (lambda t, s: [s, "--step", "0"], "step must be finite and > 0"),
         (lambda t, s: [s, "--step", "1e-9"], "intervals"),
         (lambda t, s: [s, "--background", "1,1"], "--background must be 3 numbers"),
+        (lambda t, s: [s, "--clip", "ball:1"], "--clip must hold plane:, box:, cut: or caps"),
+        (lambda t, s: [s, "--clip", "plane:1,0,0"], "--clip plane must be 4 numbers"),
+        (lambda t, s: [s, "--clip", "plane:nan,0,0,1"], "planes[0] must be finite"),
+        (lambda t, s: [s, "--clip", "box:0,0,0,1,0,1"], "boxes[0] must have its low corner below"),
+        (lambda t, s: [s, "--lens", "0.1"], "--lens must be 2 numbers"),
+        (lambda t, s: [s, "--lens", "0.1,0"], "focus must be finite and > 0"),
         (lambda t, s: [s, "--brick-size", "1"], "brick_size must be an int >= 2"),
         (lambda t, s: [s, "--threshold", "nan"], "threshold must be finite"),
         (lambda t, s: [s, "--backend", "cuda"], "backend 'cuda' can't be used here"),
@@ -224,6 +230,24 @@ def test_a_mistake_gets_one_line_and_status_2(small, tmp_path, make, message):
     assert run.returncode == 2 and len(lines) == 1, run.stderr
     assert lines[0].startswith("gvtorch: error: ") and message in lines[0]
     assert not (tmp_path / "a.png").exists()
+
+
+def test_flags_clip_and_blur(small, tmp_path):
+    """The middle of the picture shows the volume, unless all of it is cut away."""
+    alpha = {}
+    for name, flags in (
+        ("all", []),
+        ("half", ["--clip", "plane:1,0,0,0;caps"]),
+        ("none", ["--clip", "box:-1,-1,-1,1,1,1;cut:-1,-1,-1,1,1,1"]),
+        ("blurred", ["--lens", "0.5,2.4"]),
+    ):
+        file = tmp_path / f"{name}.npz"
+        args = ("--npz", file, "--size", "24x24", *flags, "-o", tmp_path / "a.png")
+        assert gvtorch("render", small, *args).returncode == 0
+        alpha[name] = np.load(file)["alpha"]
+    assert alpha["none"].max() == 0 < alpha["all"].max()
+    assert 0.1 < (alpha["half"] > 0).sum() / (alpha["all"] > 0).sum() < 0.9
+    assert np.abs(alpha["blurred"] - alpha["all"]).max() > 0.001
 
 
 def test_a_wrong_flag_gets_status_2(small):

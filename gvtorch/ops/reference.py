@@ -423,10 +423,11 @@ class Accumulator:
     depth: Tensor  # (r,)
 
     @classmethod
-    def begin(cls, beam: Beam) -> Accumulator:
-        """Nothing yet."""
+    def begin(cls, beam: Beam, clear_r: Tensor | None = None) -> Accumulator:
+        """Nothing yet, but for what a ray lost before."""
         zero = torch.zeros_like(beam.first)
-        return cls(torch.zeros_like(beam.origin), zero + 1, zero + INF)
+        clear = zero + 1 if clear_r is None else clear_r.to(zero.dtype)
+        return cls(torch.zeros_like(beam.origin), clear, zero + INF)
 
     def add(
         self, rgba: Tensor, start: Tensor, length: Tensor, hit_clear: Tensor, where: Tensor
@@ -530,6 +531,7 @@ def trace_rays(
     stop_alpha: float,
     depth_alpha: float,
     by_level: bool,
+    clear_r: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Twin of `torch.ops.gvtorch.trace_rays`; arguments as in `gvtorch.ops.trace_rays`.
 
@@ -549,9 +551,9 @@ def trace_rays(
     )
     values = constant_tnc.flatten(0, 1), range_tn2c.flatten(0, 1)
     bricks = Bricks(bricks_bzyxc, *values, border, component)
-    shader = Plain(Transfer(table_lm4, domain_2, opaque_m), Accumulator.begin(beam), hit_clear)
+    sum_ = Accumulator.begin(beam, clear_r)
+    shader = Plain(Transfer(table_lm4, domain_2, opaque_m), sum_, hit_clear)
     samples, visit = walk(beam, at, tree, bricks, shader, number(step), 1 - number(stop_alpha))
-    sum_ = shader.sum
     depth = sum_.depth + beam.moved
     return sum_.color, (1 - sum_.clear)[:, None], depth[:, None], samples, visit.missed
 

@@ -387,6 +387,7 @@ def shade_rays(
     stop_alpha: float,
     depth_alpha: float,
     by_level: bool,
+    clear_r: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Twin of `torch.ops.gvtorch.shade_rays`; arguments as in `gvtorch.ops.shade_rays`."""
     real = table.dtype
@@ -420,7 +421,7 @@ def shade_rays(
         along=direction_r3.to(real),
         moved=beam.moved,
         cube=place_33[1].to(real),
-        sum=Accumulator.begin(beam),
+        sum=Accumulator.begin(beam, clear_r),
         normal=torch.zeros_like(beam.origin),
         features=beam.first.new_zeros((len(beam.first), features)),
         hit_clear=1 - number(depth_alpha),

@@ -40,6 +40,7 @@ def shade_rays(
     stop_alpha: float = config.STOP_ALPHA,
     depth_alpha: float = config.DEPTH_ALPHA,
     by_level: bool = False,
+    clear_r: Tensor | None = None,
     backend: Backend = "auto",
     **shared: Any,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -83,7 +84,7 @@ def shade_rays(
     check.whole(where, "shader", shader, low=0, high=FEATURES)
     rows = tensors["table_lm4"].shape[1] if tensors["table_lm4"].dim() > 1 else 0
     square = ("l", rows, rows, 4) if shader == PRE_INTEGRATED else ("l", "m", 4)
-    check_arguments(where, tensors, (width, *whole, *reals), square)
+    check_arguments(where, tensors, (width, *whole, *reals), square, clear_r)
     table, like = tensors["table_lm4"], tensors["bricks_bzyxc"]
     device = table.device
     check.tensor(where, "parameter_54", parameter_54, (5, 4), table.dtype, device)
@@ -115,7 +116,7 @@ def shade_rays(
         *(shader, features, other_component, width),
         *whole,
         *(float(real) for real in reals),
-        by_level,
+        *(by_level, clear_r),
     )
     if choose_backend(backend, device) == "reference":
         return reference_shaders.shade_rays(*args)

@@ -67,6 +67,7 @@ def trace_rays(
     stop_alpha: float = config.STOP_ALPHA,
     depth_alpha: float = config.DEPTH_ALPHA,
     by_level: bool = False,
+    clear_r: Tensor | None = None,
     backend: Backend = "auto",
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Traces rays through a tree and shades what they meet with a transfer function.
@@ -111,6 +112,8 @@ def trace_rays(
         stop_alpha: A ray ends at this alpha; 1 integrates to the end.
         depth_alpha: Depth is where alpha passes this.
         by_level: A node's brick is requested before its children; else the wanted level at once.
+        clear_r: (r,) float64 transmittance with which each ray begins, for a ray that is traced in
+            pieces; 1 if left out. Colour is what this piece adds, alpha is the ray's so far.
         backend: auto, reference, cpp or cuda.
 
     Returns:
@@ -146,14 +149,14 @@ def trace_rays(
         *(width, branching, root, max_depth, border, component),
         *(cone_scale, root_voxel, step, stop_alpha, depth_alpha),
     )
-    check_arguments("trace_rays", tensors, numbers, ("l", "m", 4))
+    check_arguments("trace_rays", tensors, numbers, ("l", "m", 4), clear_r)
     args = (
         *(origin_r3, direction_r3, cone_r2, range_r2, place_33),
         *(child_tn, brick_tn, request_tn, stamp_t, bricks_bzyxc, constant_tnc, range_tn2c),
         *(stamp_b, table_lm4, domain_2, opaque_m, frame_1),
         *(width, branching, root, max_depth, border, component),
         *(float(cone_scale), float(root_voxel), float(step)),
-        *(float(stop_alpha), float(depth_alpha), by_level),
+        *(float(stop_alpha), float(depth_alpha), by_level, clear_r),
     )
     if choose_backend(backend, origin_r3.device) == "reference":
         return reference.trace_rays(*args)
@@ -165,6 +168,7 @@ def check_arguments(
     tensors: Mapping[str, Tensor],
     numbers: tuple[Any, ...],
     table_shape: tuple[int | str, ...],
+    clear_r: Tensor | None,
 ) -> None:
     """Raises ValueError unless what both ray ops have in common is right.
 
@@ -174,6 +178,7 @@ def check_arguments(
         numbers: width, branching, root, max_depth, border, component, cone_scale, root_voxel, step,
             stop_alpha, depth_alpha.
         table_shape: What the table must be.
+        clear_r: See `trace_rays`.
     """
     origin_r3, child_tn, bricks_bzyxc = (
         tensors[name] for name in ("origin_r3", "child_tn", "bricks_bzyxc")
@@ -215,6 +220,10 @@ def check_arguments(
         check.tensor(where, name, tensors[name], shape, dtype, device)
         if not tensors[name].is_contiguous():
             raise ValueError(f"{where}: {name} must be contiguous")
+    if clear_r is not None:
+        check.tensor(where, "clear_r", clear_r, (rays,), torch.float64, device)
+        if not clear_r.is_contiguous():
+            raise ValueError(f"{where}: clear_r must be contiguous")
     if nodes < branching**3:
         raise ValueError(f"{where}: child_tn must hold {branching}^3 nodes a tile, got {nodes}")
     if table_lm4.shape[0] < 1 or table_lm4.shape[1] < 2:

@@ -3,10 +3,12 @@
 from . import opengl
 from .background import Backdrop, Environment, Gradient
 from .camera import Camera
+from .clip import Clip
 from .costs import Cost, cost
 from .custom import CustomCamera
 from .image import read_image
 from .layer import Layer
+from .lens import ThinLens
 from .lights import DirectionalLight, Headlight, PointLight
 from .module import TreeTracer
 from .module_shader import ModuleShader, TransferModule
@@ -29,6 +31,7 @@ from .tiles import render_tiles
 __all__ = [
     "Backdrop",
     "Camera",
+    "Clip",
     "Cost",
     "CustomCamera",
     "DirectionalLight",
@@ -49,6 +52,7 @@ __all__ = [
     "RenderOptions",
     "Shader",
     "StoredColor",
+    "ThinLens",
     "TransferFunction",
     "TransferModule",
     "TreeTracer",

@@ -32,6 +32,14 @@ class Frame(Enum):
     WORLD = "world"  # world units
     BOX = "box"  # the scene's box: its centre is 0 and its largest side 1
 
+    @classmethod
+    def of(cls, where: str, value: Frame | str) -> Frame:
+        """Returns the frame of this name; raises ValueError where there is none."""
+        try:
+            return cls(value)
+        except ValueError:
+            raise ValueError(f"{where}: frame must be 'world' or 'box', got {value!r}") from None
+
 
 class Camera:
     """Cameras that share width, height and lens.

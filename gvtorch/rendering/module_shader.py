@@ -266,7 +266,7 @@ def march(
     like = arguments["domain_2"]
     sums = Marched(
         total=like.new_zeros((count, features)),
-        clear=like.new_ones(count),
+        clear=like.new_ones(count) if rays.clear is None else rays.clear.to(like.dtype),
         depth=like.new_full((count,), torch.inf),
         count=like.new_zeros((count, 2), dtype=torch.int32),
         missed=like.new_zeros(count, dtype=torch.bool),
@@ -327,7 +327,8 @@ class ModuleTracer:
             return self._block(rays)
         parts = [self._block(rays[at : at + size]) for at in range(0, count, size)]
         names = vars(parts[0])
-        return Hits(**{n: torch.cat([getattr(part, n) for part in parts]) for n in names})
+        joined = {n: [getattr(part, n) for part in parts] for n in names}
+        return Hits(**{n: torch.cat(all_) for n, all_ in joined.items() if all_[0] is not None})
 
     def _block(self, rays: Rays) -> Hits:
         own = (self.tree, self.arguments, self.channel, self.shader.shade, 3)

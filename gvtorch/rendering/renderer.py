@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -18,10 +18,13 @@ from ..pool import N3Tree
 from ..stage import Progress, collect_timings, no_progress, stage
 from .background import Background, checked_background
 from .camera import Camera
+from .clip import Clip, Clipped
 from .custom import as_camera
 from .layer import Layer
+from .lens import ThinLens, ThroughLens
 from .module_shader import ModuleShader, ModuleTracer
 from .picture import Picture
+from .pieces import Trace
 from .shader import TransferFunction, interval_levels
 from .shaders import FusedShader, Intervals, Projection, Shader
 
@@ -43,6 +46,8 @@ class RenderOptions:
     channel: str | None = None  # name of the channel the shader reads; None: the first
     component: int = 0  # which number of the channel
     layer: Layer | None = None  # what another renderer drew: voxels go before and behind it
+    clip: Clip | None = None  # the region of interest; None: everything
+    lens: ThinLens | None = None  # depth of field; None: all is sharp
     backend: Backend = "auto"
     dtype: torch.dtype = torch.float32  # float64 for trees deeper than about 2^16 voxels
 
@@ -62,8 +67,15 @@ class RenderOptions:
             )
         check.number(where, "cone_scale", self.cone_scale, low=0, open_low=True)
         check.whole(where, "component", self.component, low=0)
-        if self.layer is not None:
-            check_type(where, "layer", self.layer, Layer)
+        for name, value, kind in (
+            ("clip", self.clip, Clip),
+            ("layer", self.layer, Layer),
+            ("lens", self.lens, ThinLens),
+        ):
+            if value is not None:
+                check_type(where, name, value, kind)
+        if self.lens is not None and self.lod == "finest":
+            raise ValueError(f"{where}: a lens blurs by level of detail: lod must be 'auto'")
         if self.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"{where}: dtype must be float32 or float64, got {self.dtype}")
 
@@ -100,9 +112,9 @@ def render(
     with collect_timings(tree.device) as timings:
         with stage("prepare"):
             tree.frame += 1
-            tracer = tracer_of(tree, shader, chosen)
+            trace = around(tracer_of(tree, shader, chosen), chosen, tree.box)
         placed = camera.placed(tree.box)
-        hits = trace_camera(placed, tree.device, tracer, chosen, progress)
+        hits = trace_camera(placed, tree.device, trace, chosen, progress)
         with stage("picture"):
             stats = RenderStats(
                 backend=choose_backend(chosen.backend, tree.device),
@@ -209,7 +221,7 @@ def empty_hits(device: torch.device, dtype: torch.dtype, pixels: int) -> Hits:
 def trace_camera(
     camera: Camera,
     device: torch.device,
-    trace_rays: Callable[[Rays], Hits],
+    trace_rays: Trace,
     options: RenderOptions,
     progress: Progress,
     *,
@@ -302,7 +314,8 @@ def trace(
         ValueError: The channel is unknown, the step too short, or the backend can't be used.
     """
     tree.frame += 1
-    return tracer_of(tree, shader, options or RenderOptions())(rays)
+    chosen = options or RenderOptions()
+    return around(tracer_of(tree, shader, chosen), chosen, tree.box)(rays)
 
 
 def tracer_of(
@@ -321,9 +334,32 @@ def tracer_of(
         channel = options.channel or tree.channel_names[0]
         return ModuleTracer(tree, shader, walls.arguments, channel)
     check_shader("render", "shader", shader)
-    if isinstance(shader, Projection) and options.layer and options.layer.alpha is not None:
-        raise ValueError("render: a projection can't be mixed with a translucent layer")
     return Tracer(tree, shader, options, **frame)
+
+
+def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -> Trace:
+    """Returns a tree's tracer with what the options put around it: the lens, then the clip; `box`
+    (2, 3) is the scene's.
+
+    Raises:
+        ValueError: The shader is a projection, which sees a ray in one go, and the options cut rays
+            into pieces.
+    """
+    trace: Trace = tracer
+    cuts = {
+        "lens": options.lens is not None,
+        "clip with caps or several pieces": options.clip is not None and not options.clip.whole,
+        "translucent layer": options.layer is not None and options.layer.alpha is not None,
+    }
+    if isinstance(tracer.shader, Projection) and any(cuts.values()):
+        name = next(name for name, cut in cuts.items() if cut)
+        raise ValueError(f"render: a projection sees a ray in one go, so it has no {name}")
+    if options.lens is not None:
+        trace = ThroughLens(trace, options.lens.placed(box), options.cone_scale)
+    if options.clip is not None:
+        step = tracer.arguments["step"]
+        trace = Clipped(trace, options.clip, box, step=step, depth_alpha=options.depth_alpha)
+    return trace
 
 
 class Tracer:
@@ -393,7 +429,8 @@ class Tracer:
         """Traces rays in world units."""
         columns = (rays.origin, rays.direction, rays.cone, rays.range)
         origin, direction, cone, limits = (c.to(torch.float64).contiguous() for c in columns)
-        given = {"width": rays.width, **self.arguments}
+        clear = None if rays.clear is None else rays.clear.to(torch.float64).contiguous()
+        given = {"width": rays.width, "clear_r": clear, **self.arguments}
         if self.shader is None:
             fields = trace_rays(origin, direction, cone, limits, **given)
             return Hits(**dict(zip(_FIELDS, fields, strict=False)))
@@ -411,15 +448,16 @@ class Tracer:
 _FIELDS = ("color", "alpha", "depth", "samples", "missed", "normal", "features")
 
 
-def composite_trees(tracers: Sequence[Tracer | ModuleTracer], rays: Rays) -> Hits:
-    """Traces rays through several trees and puts them one over the other, nearest box first.
+def composite_trees(trees: Sequence[tuple[Tensor, Trace]], rays: Rays) -> Hits:
+    """Traces rays through several trees, each a (2, 3) box and what traces it, and puts them one
+    over the other, nearest box first.
 
     Right wherever boxes do not overlap along a ray; where they do, the nearer box as a whole comes
     first.
     """
-    near = torch.stack([_entry(tracer.tree.box, rays) for tracer in tracers])  # (m, r)
+    near = torch.stack([_entry(box, rays) for box, _ in trees])  # (m, r)
     order = near.argsort(dim=0, stable=True)
-    hits = [tracer(rays) for tracer in tracers]
+    hits = [trace(rays) for _, trace in trees]
     fields = {name: torch.stack([vars(one)[name] for one in hits]) for name in _FIELDS[:5]}
     which = order[:, :, None]
     over = {name: fields[name] for name in ("color", "alpha")}
@@ -436,7 +474,7 @@ def composite_trees(tracers: Sequence[Tracer | ModuleTracer], rays: Rays) -> Hit
     over = {name: field.gather(0, which.expand_as(field)) for name, field in over.items()}
     depths = fields["depth"].gather(0, which)
     total = {name: field[0] for name, field in over.items()}
-    for behind in range(1, len(tracers)):
+    for behind in range(1, len(trees)):
         clear = 1 - total["alpha"]
         total = {name: total[name] + clear * field[behind] for name, field in over.items()}
     if "normal" in total:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from ..engine import Engine
     from ..frame import FrameStats, RenderStats
-    from ..rendering import Camera, Cost, Picture, Shader, TransferFunction
+    from ..rendering import Camera, Clip, Cost, Picture, Shader, ThinLens, TransferFunction
     from ..rendering.path import CameraPath
     from ..rendering.projection import CameraModel
 
@@ -59,6 +59,13 @@ class Look:
     TIFF or NPY"""
     stop_alpha: Annotated[float, arg(metavar="ALPHA")] = 0.99
     """a ray ends at this alpha; 1 integrates to the end"""
+    clip: Annotated[str | None, arg(metavar="KIND:NUMBERS;...")] = None
+    """what is kept: plane:A,B,C,D where A x + B y + C z + D >= 0; box:X,Y,Z,X,Y,Z (low corner, high
+    corner); cut:X,Y,Z,X,Y,Z goes; caps draws the cut as a surface; in largest sides of the box,
+    its centre is 0"""
+    lens: Annotated[str | None, arg(metavar="APERTURE,FOCUS")] = None
+    """depth of field: diameter of the lens and distance that is sharp, in largest sides of the
+    box"""
     component: Annotated[int, arg(metavar="N")] = 0
     """which number of a voxel is shown"""
     brick_size: Annotated[int, arg(metavar="VOXELS")] = 8
@@ -75,6 +82,8 @@ class Look:
             "lod": self.lod,
             "background": parse_background(self.background),
             "stop_alpha": self.stop_alpha,
+            "clip": parse_clip(self.clip) if self.clip else None,
+            "lens": parse_lens(self.lens) if self.lens else None,
             "component": self.component,
             "backend": self.backend,
         }
@@ -394,6 +403,38 @@ def parse_camera(
         upward = numbers("--up", up, 3, float)
         return Camera.look_at(values[:3], values[3:], upward, fov, width, height, model)
     raise ValueError(f"--camera must be orbit:AZ,EL,DIST or look:ex,ey,ez,tx,ty,tz, got {text!r}")
+
+
+def parse_clip(text: str) -> Clip:
+    """Makes a clip from items such as `plane:0,0,1,0;cut:0,0,0,1,1,1;caps`.
+
+    Raises:
+        ValueError: An item is of no known kind, or its numbers are refused by `Clip`.
+    """
+    from ..rendering import Clip
+
+    found: dict[str, list[Any]] = {"plane": [], "box": [], "cut": []}
+    caps = False
+    for item in text.split(";"):
+        kind, _, rest = item.strip().partition(":")
+        if kind == "caps" and not rest:
+            caps = True
+        elif kind in found:
+            values = numbers(f"--clip {kind}", rest, 4 if kind == "plane" else 6, float)
+            found[kind].append(values if kind == "plane" else (values[:3], values[3:]))
+        else:
+            raise ValueError(f"--clip must hold plane:, box:, cut: or caps, got {item.strip()!r}")
+    return Clip(
+        planes=found["plane"], boxes=found["box"], without=found["cut"], frame="box", caps=caps
+    )
+
+
+def parse_lens(text: str) -> ThinLens:
+    """Makes a lens from `APERTURE,FOCUS`."""
+    from ..rendering import ThinLens
+
+    aperture, focus = numbers("--lens", text, 2, float)
+    return ThinLens(aperture=aperture, focus=focus, frame="box")
 
 
 def value_range(store: Any) -> tuple[float, float]:

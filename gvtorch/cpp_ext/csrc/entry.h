@@ -30,7 +30,8 @@ constexpr const char* kTraceRaysSchema =
     "Tensor bricks_bzyxc, Tensor constant_tnc, Tensor range_tn2c, Tensor(c!) stamp_b, "
     "Tensor table_lm4, Tensor domain_2, Tensor opaque_m, Tensor frame_1, "
     "int width, int branching, int root, int max_depth, int border, int component, "
-    "float cone_scale, float root_voxel, float step, float stop_alpha, float depth_alpha, bool by_level"
+    "float cone_scale, float root_voxel, float step, float stop_alpha, float depth_alpha, bool by_level, "
+    "Tensor? clear_r=None"
     ") -> (Tensor color_r3, Tensor alpha_r1, Tensor depth_r1, Tensor samples_r, Tensor missed_r)";
 // As trace_rays; the table is (l, m, m, 4) where the shader integrates. Tensor shape of features: (r, features).
 constexpr const char* kShadeRaysSchema =
@@ -42,7 +43,8 @@ constexpr const char* kShadeRaysSchema =
     "Tensor parameter_54, Tensor? normal_bzyxc, Tensor? normal_tnc, Tensor? other_bzyxc, Tensor? other_tnc, "
     "int shader, int features, int other_component, "
     "int width, int branching, int root, int max_depth, int border, int component, "
-    "float cone_scale, float root_voxel, float step, float stop_alpha, float depth_alpha, bool by_level"
+    "float cone_scale, float root_voxel, float step, float stop_alpha, float depth_alpha, bool by_level, "
+    "Tensor? clear_r=None"
     ") -> (Tensor color_r3, Tensor alpha_r1, Tensor depth_r1, Tensor samples_r, Tensor missed_r, "
     "Tensor normal_r3, Tensor features_rc)";
 constexpr const char* kCompactRequestsSchema =
@@ -102,7 +104,7 @@ inline HitTensors lay_ready(TraceArgs& args, bool integrates, const Tensor& orig
                             const Tensor& domain_2, const Tensor& opaque_m, const Tensor& frame_1, int64_t width,
                             int64_t branching, int64_t root, int64_t max_depth, int64_t border, int64_t component,
                             double cone_scale, double root_voxel, double step, double stop_alpha, double depth_alpha,
-                            bool by_level) {
+                            bool by_level, const std::optional<Tensor>& clear_r) {
   const ScalarType real = table_lm4.scalar_type();
   const ScalarType word = ScalarType::Int;
   const ScalarType voxel = bricks_bzyxc.scalar_type();
@@ -141,6 +143,10 @@ inline HitTensors lay_ready(TraceArgs& args, bool integrates, const Tensor& orig
     require(tensor, name, origin_r3, ScalarType::Double);
     require_numel(tensor, name, numel);
   }
+  if (clear_r.has_value()) {
+    require(*clear_r, "clear_r", origin_r3, ScalarType::Double);
+    require_numel(*clear_r, "clear_r", rays);
+  }
   require(table_lm4, "table_lm4", origin_r3, real);
   const int64_t rows = integrates ? table_lm4.size(1) * table_lm4.size(1) : table_lm4.size(1);
   STD_TORCH_CHECK(table_lm4.dim() == (integrates ? 4 : 3), "gvtorch: table_lm4 has the wrong number of dimensions");
@@ -175,6 +181,7 @@ inline HitTensors lay_ready(TraceArgs& args, bool integrates, const Tensor& orig
   args.cone_r2 = world(cone_r2);
   args.range_r2 = world(range_r2);
   args.place_33 = world(place_33);
+  args.clear_r = clear_r.has_value() ? world(*clear_r) : nullptr;
   args.child_tn = words_in(child_tn);
   args.brick_tn = words_in(brick_tn);
   args.request_tn = words_out(request_tn);
@@ -224,12 +231,12 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> trace_rays(
     const Tensor& stamp_b, const Tensor& table_lm4, const Tensor& domain_2, const Tensor& opaque_m,
     const Tensor& frame_1, int64_t width, int64_t branching, int64_t root, int64_t max_depth, int64_t border,
     int64_t component, double cone_scale, double root_voxel, double step, double stop_alpha, double depth_alpha,
-    bool by_level) {
+    bool by_level, const std::optional<Tensor>& clear_r) {
   TraceArgs args{};
-  const HitTensors found = lay_ready(args, false, origin_r3, direction_r3, cone_r2, range_r2, place_33, child_tn,
-                                     brick_tn, request_tn, stamp_t, bricks_bzyxc, constant_tnc, range_tn2c, stamp_b,
-                                     table_lm4, domain_2, opaque_m, frame_1, width, branching, root, max_depth, border,
-                                     component, cone_scale, root_voxel, step, stop_alpha, depth_alpha, by_level);
+  const HitTensors found = lay_ready(
+      args, false, origin_r3, direction_r3, cone_r2, range_r2, place_33, child_tn, brick_tn, request_tn, stamp_t,
+      bricks_bzyxc, constant_tnc, range_tn2c, stamp_b, table_lm4, domain_2, opaque_m, frame_1, width, branching, root,
+      max_depth, border, component, cone_scale, root_voxel, step, stop_alpha, depth_alpha, by_level, clear_r);
   trace<Device>(origin_r3, args, table_lm4.scalar_type() == ScalarType::Double);
   return {found.color_r3, found.alpha_r1, found.depth_r1, found.samples_r, found.missed_r};
 }
@@ -270,7 +277,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> shade_rays(
     const std::optional<Tensor>& normal_tnc, const std::optional<Tensor>& other_bzyxc,
     const std::optional<Tensor>& other_tnc, int64_t shader, int64_t features, int64_t other_component, int64_t width,
     int64_t branching, int64_t root, int64_t max_depth, int64_t border, int64_t component, double cone_scale,
-    double root_voxel, double step, double stop_alpha, double depth_alpha, bool by_level) {
+    double root_voxel, double step, double stop_alpha, double depth_alpha, bool by_level,
+    const std::optional<Tensor>& clear_r) {
   STD_TORCH_CHECK(shader >= 0 && shader < kShaderKinds, "gvtorch: shader is unknown");
   ShadeArgs args{};
   args.shader = static_cast<ShaderKind>(shader);
@@ -278,7 +286,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> shade_rays(
       lay_ready(args, args.shader == ShaderKind::kPreIntegrated, origin_r3, direction_r3, cone_r2, range_r2, place_33,
                 child_tn, brick_tn, request_tn, stamp_t, bricks_bzyxc, constant_tnc, range_tn2c, stamp_b, table_lm4,
                 domain_2, opaque_m, frame_1, width, branching, root, max_depth, border, component, cone_scale,
-                root_voxel, step, stop_alpha, depth_alpha, by_level);
+                root_voxel, step, stop_alpha, depth_alpha, by_level, clear_r);
   const ScalarType real = table_lm4.scalar_type();
   int32_t three = 0;
   lay_channel(normal_bzyxc, normal_tnc, "normal_bzyxc", 3, bricks_bzyxc, args.nodes, args.normal_bzyxc, args.normal_tnc,

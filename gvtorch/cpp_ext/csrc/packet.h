@@ -55,6 +55,11 @@ struct PacketIntervals {
     Floats limit = smaller(exit, stop);
     const Floats longest = level == top ? high : length + length;
     limit = growth > 0.0f ? smaller(limit, (smaller(high, longest) - near) / growth) : limit;
+    const Mask narrows = growth < 0.0f;
+    if (any(narrows)) {
+      const Floats shortest = level == 0 ? low : length;
+      limit = narrows ? smaller(limit, (larger(low, shortest) - near) / growth) : limit;
+    }
     const Floats most = static_cast<float>(kMostIntervals) - count;
     Ints alike = floor_int(clamp((limit - start) * shortness + 1.0f, Floats{} + 1.0f, most));
     for (;;) {
@@ -191,6 +196,7 @@ struct Packet {
       at.start[lane] = at.base[lane] = ray.first;
       at.stop[lane] = ray.last;
       moved[lane] = ray.moved;
+      clear[lane] = static_cast<float>(kernel.rays.clear(numbers[lane]));
       alive[lane] = -1;
     }
     at.choose_level(alive);

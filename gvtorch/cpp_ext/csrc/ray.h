@@ -18,6 +18,9 @@ struct RayView {
   const double* range_r2;      // world: first and last distance
   const double* place_33;      // world: low corner of the scene, size of the root cube; tree units: its high corner
   double cone_scale;
+  const double* clear_r = nullptr;  // transmittance with which a ray begins; null: 1
+
+  GV_HD double clear(int64_t index) const { return clear_r == nullptr ? 1.0 : clear_r[index]; }
 };
 
 // One ray in tree units (a distance along it stays a world length), begun where it enters the scene: float32 then
@@ -151,10 +154,12 @@ struct Intervals {
     choose_level();
   }
   // How many intervals from this one on are alike: whole, of one length, their middles before `exit`, the cone there in
-  // [low, high). At least 1. All bounds are monotone along the ray, so the last one tells for all.
+  // [low, high). At least 1. All bounds are monotone along the ray, also where the cone narrows, so the last one tells
+  // for all.
   GV_HD int32_t run(T exit, T low, T high) const {
     T limit = smaller(exit, stop);
     if (growth > 0) limit = smaller(limit, (smaller(high, level == top ? high : length + length) - near) / growth);
+    if (growth < 0) limit = smaller(limit, (larger(low, level == 0 ? low : length) - near) / growth);
     const T most = static_cast<T>(kMostIntervals);
     int32_t alike = floor_int(clamp((limit - start) * shortness + 1, static_cast<T>(1), most - count));
     while (alike > 1 && !same(count + static_cast<T>(alike - 1), exit, low, high)) --alike;

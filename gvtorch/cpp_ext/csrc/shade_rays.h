@@ -44,6 +44,7 @@ struct ShadeRay : Walk<T> {
     const Sight<T> sight(this->rays, number, ray.moved);
     Intervals<T> at(ray, options.step, lengths);
     Sum sum;
+    sum.clear = static_cast<T>(this->rays.clear(number));
     sum.hit_clear = 1 - options.depth_alpha;
     sum.feature_c = features_rc + number * features;
     for (int32_t c = 0; c < features; ++c) sum.feature_c[c] = 0;

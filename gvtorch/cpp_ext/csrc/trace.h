@@ -120,6 +120,7 @@ struct TraceRay : Walk<T> {
     Intervals<T> at(ray, options.step, transfer.levels);
     const Transfer<T> shader(transfer);
     Accumulator<T> sum;
+    sum.clear = static_cast<T>(this->rays.clear(number));
     const T stop_clear = 1 - options.stop_alpha;
     int32_t samples = 0;
     int32_t wanted = 0;

@@ -9,7 +9,7 @@ namespace gvtorch {
 enum class VoxelType { kUInt8, kInt8, kInt16, kUInt16, kHalf, kBFloat16, kFloat };
 
 struct TraceArgs {
-  const double *origin_r3, *direction_r3, *cone_r2, *range_r2, *place_33;
+  const double *origin_r3, *direction_r3, *cone_r2, *range_r2, *place_33, *clear_r;
   const int32_t *child_tn, *brick_tn;
   int32_t *request_tn, *stamp_t;
   const void *bricks_bzyxc, *constant_tnc, *range_tn2c;

@@ -65,7 +65,8 @@ struct Walk {
   const int32_t* frame_1;
 
   explicit Walk(const TraceArgs& args)
-      : rays{args.origin_r3, args.direction_r3, args.cone_r2, args.range_r2, args.place_33, args.cone_scale},
+      : rays{args.origin_r3, args.direction_r3, args.cone_r2, args.range_r2,
+             args.place_33,  args.cone_scale,   args.clear_r},
         order{args.rays, args.width},
         tree{args.child_tn,   args.brick_tn,
              args.request_tn, args.stamp_t,

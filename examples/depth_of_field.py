@@ -1,0 +1,71 @@
+"""Depth of field: a lens of three apertures, beside 256 pinholes all over the widest."""
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+import tyro
+from kornia.metrics import ssim
+
+import gvtorch as gv
+from gvtorch.rendering.renderer import trace
+
+SCAN = Path(__file__).parent / "data" / "aneurism_256x256x256_uint8.raw.gz"
+OPACITY = [(20, 0), (60, 0.04), (255, 0.25)]
+COLOR = [(20, 0.6, 0.1, 0.05), (120, 0.9, 0.5, 0.3), (255, 1, 1, 0.8)]
+FOCUS, APERTURES = 1.3, (0.05, 0.1, 0.2)  # largest sides of the box
+PINHOLES = 256
+
+
+@dataclass
+class Settings:
+    """Renders the bundled aneurism."""
+
+    output: Path = Path("depth_of_field.png")
+    size: int = 192
+    device: str = "cpu"
+
+
+def thin_lens(
+    tree: gv.N3Tree, camera: gv.Camera, shader: gv.TransferFunction, aperture: float
+) -> torch.Tensor:
+    """Mean colour of rays from all over the lens through the point in focus."""
+    placed = camera.placed(tree.box)
+    rays, side = placed.rays(tree.device), float((tree.box[1] - tree.box[0]).max())
+    right, down = placed.viewmats[0, :2, :3].to(tree.device)
+    sharp, total = rays.origin + FOCUS * side * rays.direction, torch.zeros_like(rays.origin)
+    for number in range(PINHOLES):
+        radius = side * aperture / 2 * math.sqrt((number + 0.5) / PINHOLES)
+        turn = number * math.pi * (3 - math.sqrt(5))
+        origin = rays.origin + radius * (math.cos(turn) * right + math.sin(turn) * down)
+        direction = torch.nn.functional.normalize(sharp - origin)
+        total += trace(tree, replace(rays, origin=origin, direction=direction), shader).color
+    return (total / PINHOLES).reshape(camera.height, camera.width, 3).float()
+
+
+def main(settings: Settings) -> None:
+    """Renders four pictures, side by side, and tells how alike lens and pinholes are."""
+    tree = gv.N3Tree.from_volume(gv.read_volume(SCAN), device=settings.device)
+    shader = gv.TransferFunction.from_points(OPACITY, COLOR)
+    camera = gv.Camera.orbit(30, 20, 1.5, 32, settings.size, settings.size)
+    colors, expected = [], thin_lens(tree, camera, shader, APERTURES[-1])
+    for aperture in APERTURES:
+        lens = gv.ThinLens(aperture=aperture, focus=FOCUS, frame="box")
+        picture = gv.render(tree, camera, shader, lens=lens)
+        stats = picture.stats
+        print(
+            f"aperture {aperture:g}: {stats.samples} samples, {stats.bricks_used} bricks, "
+            f"{stats.milliseconds:.0f} ms"
+        )
+        colors.append(picture.color)
+    planes = (one.movedim(-1, 0)[None].clamp(0, 1) for one in (colors[-1], expected))
+    alike = float(ssim(*planes, window_size=11).mean())
+    print(f"aperture {aperture:g} and {PINHOLES} pinholes: SSIM {alike:.3f}")
+    layers = {n: getattr(picture, n).expand(4, -1, -1, -1) for n in ("alpha", "depth", "samples")}
+    replace(picture, color=torch.stack([*colors, expected]), **layers).save(settings.output)
+    print(settings.output)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings))

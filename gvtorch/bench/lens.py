@@ -1,0 +1,60 @@
+"""`lens`: what depth of field costs in the engine, aperture by aperture."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from ..engine import Engine
+from ..producers import VolumeProducer
+from ..rendering import Camera, ThinLens
+from .record import Record, clock
+from .scenes import worn
+
+_APERTURES = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8)  # largest sides of the box
+_FOCUS = 0.9  # a little before the middle
+
+
+def lens(record: Record) -> None:
+    """Steady frames of the worn sphere from near by, and what is loaded until then."""
+    settings = record.settings
+    side, (width, height) = (32, (24, 16)) if settings.quick else (512, (1280, 720))
+    settings.tell("lens: making the worn sphere")
+    scene = worn(side)
+    camera = Camera.orbit(30, 20, 1.1, 45, width, height)
+    pools = ("1 MB", "2 MB") if settings.quick else ("16 MB", "384 MB")
+    for aperture in _APERTURES:
+        case = f"aperture {aperture:g}, {scene.name} {side}^3, {width}x{height}"
+        if not record.wants(case):
+            continue
+        settings.tell(case)
+        view = ThinLens(aperture=aperture, focus=_FOCUS, frame="box") if aperture else None
+        producer = VolumeProducer(scene.volume)
+        with Engine(
+            producer,
+            node_pool=pools[0],
+            brick_pool=pools[1],
+            device=settings.device,
+            monitor=False,
+        ) as engine:
+            see = partial(engine.frame, camera, scene.shader, lens=view)
+            loaded, moved, converged = 0, 0, False
+            while not converged:
+                _, stats = see()
+                loaded, moved = loaded + stats.produced["bricks"], moved + stats.bytes_uploaded
+                converged = stats.converged
+            timing = clock(see, settings)
+            _, last = see()
+            one = engine.memory()["brick_pool"] // engine.cache.bricks.capacity
+        record.add(
+            *(case, "gvtorch", timing),
+            aperture=aperture,
+            samples=last.samples,
+            bricks=last.bricks_used,
+            brick_bytes=last.bricks_used * one,
+            loaded=loaded,
+            moved_bytes=moved,
+        )
+    record.note(
+        "aperture: diameter of the lens in sides of the box, focused at 0.9 of them, 0: no lens; "
+        "bricks: used by a steady frame; loaded: from an empty engine to the whole picture"
+    )

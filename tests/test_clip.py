@@ -1,0 +1,397 @@
+"""`Clip`: which pieces of a ray are kept, that the rest costs nothing, and caps."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from conftest import DEVICES
+from test_trace_rays import SHADER, assert_equal, camera_rays, forget, run
+
+import gvtorch as gv
+from gvtorch.rendering.clip import Clipped
+from gvtorch.rendering.renderer import trace
+
+UNIT = torch.tensor([[-0.5] * 3, [0.5] * 3], dtype=torch.float64)
+
+
+def turned(degrees: float, size: float, centre: tuple[float, float, float]) -> torch.Tensor:
+    """The matrix of a cube that is turned about z and then about x."""
+    a = math.radians(degrees)
+    about_z = torch.tensor(
+        [[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1]]
+    )
+    about_x = torch.tensor(
+        [[1, 0, 0], [0, math.cos(a), -math.sin(a)], [0, math.sin(a), math.cos(a)]]
+    )
+    axes = size * (about_x @ about_z).double()
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3] = axes
+    matrix[:3, 3] = torch.tensor(centre, dtype=torch.float64) - axes.sum(1) / 2
+    return matrix
+
+
+def inside(box, places: np.ndarray) -> np.ndarray:
+    """Whether (k, 3) places lie in a box: straight from its definition."""
+    if len(box) == 2:
+        low, high = np.array(box)
+        return ((places >= low) & (places <= high)).all(1)
+    own = (places - box[:3, 3].numpy()) @ np.linalg.inv(box[:3, :3].numpy()).T
+    return ((own >= 0) & (own <= 1)).all(1)
+
+
+def rays_through(count: int, seed: int) -> gv.Rays:
+    generator = torch.Generator().manual_seed(seed)
+    origin, to = torch.rand(2, count, 3, generator=generator, dtype=torch.float64) * 4 - 2
+    direction = torch.nn.functional.normalize(to * 0.3 - origin)
+    direction[0] = torch.tensor([0.0, 0.0, 1.0])
+    limits = torch.tensor([0.0, torch.inf], dtype=torch.float64).repeat(count, 1)
+    return gv.Rays(origin=origin, direction=direction, cone=limits * 0, range=limits)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("boxes", range(4))
+@pytest.mark.parametrize("cuts", range(4))
+def test_pieces_hold_what_is_kept_and_nothing_else(boxes, cuts, seed):
+    generator = np.random.default_rng([boxes, cuts, seed])
+
+    def some(count: int, scale: float) -> list:
+        made = []
+        for _ in range(count):
+            centre = tuple(generator.uniform(-0.6, 0.6, 3))
+            if generator.random() < 0.5:
+                made.append(
+                    turned(generator.uniform(0, 90), scale * generator.uniform(0.3, 1), centre)
+                )
+            else:
+                half = scale * generator.uniform(0.1, 0.6, 3)
+                made.append((np.array(centre) - half, np.array(centre) + half))
+        return [box if isinstance(box, torch.Tensor) else tuple(map(tuple, box)) for box in made]
+
+    kept, cut, plane = some(boxes, 1.0), some(cuts, 0.6), (0.3, -0.4, 0.5, 0.6)
+    clip = gv.Clip(planes=[plane], boxes=kept, without=cut)
+    rays = rays_through(200, seed)
+    pieces = Clipped(lambda _: None, clip, UNIT, step=0.1, depth_alpha=0.1).pieces(rays)
+    assert len(pieces) == max(1, boxes) + cuts
+    spans = torch.stack(pieces).numpy()  # (k, r, 2)
+    assert (spans[..., 0] <= spans[..., 1]).all()
+    t = np.arange(0.0005, 5, 0.013)
+    places = rays.origin.numpy()[:, None] + t[:, None] * rays.direction.numpy()[:, None]
+    flat = places.reshape(-1, 3)
+    wanted = shown(clip, flat)
+    within = (spans[..., :1] < t) & (t < spans[..., 1:])  # (k, r, t)
+    assert (within.sum(0) <= 1).all(), "pieces do not overlap"
+    assert np.array_equal(within.any(0).ravel(), wanted)
+    real = spans[..., 0] < spans[..., 1]
+    for one, two in itertools.pairwise(spans):  # nearest first, none that touch
+        both = (one[:, 0] < one[:, 1]) & (two[:, 0] < two[:, 1])
+        assert (one[both, 1] < two[both, 0]).all()
+    assert wanted.any() and real.any()
+
+
+def test_boxes_that_touch_are_one_piece():
+    clip = gv.Clip(boxes=[((-1, -1, -1), (0.3, 1, 1)), ((0.3, -1, -1), (1, 1, 1))], frame="box")
+    box = torch.tensor([[3.0, 4, 5], [3.7, 5.3, 5.9]], dtype=torch.float64)
+    rays = rays_through(100, 1)
+    rays = dataclasses.replace(rays, origin=rays.origin + torch.tensor([3.3, 4.6, 5.4]))
+    first, second = Clipped(lambda _: None, clip, box, step=0.1, depth_alpha=0.1).pieces(rays)
+    assert (first[:, 0] < first[:, 1]).sum() > 50
+    assert torch.equal(second[:, 0], second[:, 1])
+
+
+CLIPS = {
+    "plane": gv.Clip(planes=[(-1, 0, 0, 30.0)]),
+    "box": gv.Clip(boxes=[((9.0, 1.0, 8.0), (33.0, 14.0, 50.0))]),
+    "turned": gv.Clip(boxes=[turned(35, 24.0, (27, 8, 29))]),
+    "cut": gv.Clip(without=[((17.0, 2.0, 3.0), (30.0, 16.0, 60.0))]),
+    "union": gv.Clip(boxes=[((0, -9, 0), (18, 30, 60)), ((30, -9, 0), (60, 30, 60))]),
+    "all": gv.Clip(
+        planes=[(0, 1, 0, -1.0)],
+        boxes=[((0, -9, 0), (26, 30, 60)), turned(20, 22.0, (40, 8, 30))],
+        without=[((9, 0, 0), (14, 11, 60)), ((35, 4, 20), (44, 10, 40))],
+    ),
+}
+
+
+@pytest.mark.parametrize("caps", [False, True])
+@pytest.mark.parametrize("name", CLIPS)
+def test_compiled_equals_reference_clipped(blobs, compiled, name, caps):
+    tree = gv.N3Tree.from_volume(blobs, 4)
+    clip = dataclasses.replace(CLIPS[name], caps=caps)
+    result, _ = assert_equal(tree, compiled, camera_rays(tree, distance=1.2), clip=clip)
+    whole, _ = run(tree, compiled, camera_rays(tree, distance=1.2))
+    assert 0.3 < result["alpha"].max() and 0.05 < (whole["alpha"] - result["alpha"]).abs().max()
+
+
+@pytest.mark.parametrize("lod", ["finest", "auto"])
+@pytest.mark.parametrize("name", CLIPS)
+def test_a_medium_of_one_value_has_its_closed_form(backend, name, lod):
+    """Alpha follows from the length that is kept, depth from where that length is enough."""
+    volume = gv.Volume(torch.full((37, 29, 45), 0.5), (1.0, 0.8, 1.5), (5.0, -3.0, 2.0))
+    tree = gv.N3Tree.from_volume(volume, 8, device=DEVICES[backend])
+    shader = gv.TransferFunction.from_points([(0, 0.01)], [(0, 1, 0.5, 0.2)], reference=1.0)
+    rays = camera_rays(tree, 20, distance=1.2)
+    options = gv.RenderOptions(clip=CLIPS[name], stop_alpha=1.0, lod=lod, backend=backend)
+    hits = trace(tree, rays.to(tree.device), shader, options)
+    step = 0.01
+    t = 20 + step * (np.arange(10000) + 0.5)
+    places = rays.origin.numpy()[:, None] + t[:, None] * rays.direction.numpy()[:, None]
+    low, high = tree.box.numpy()
+    kept = ((places >= low) & (places <= high)).all(-1)
+    kept &= shown(CLIPS[name], places.reshape(-1, 3)).reshape(kept.shape)
+    length = step * kept.cumsum(1)
+    alpha = 1 - 0.99 ** length[:, -1]
+    np.testing.assert_allclose(hits.alpha[:, 0].cpu(), alpha, atol=6e-4)
+    np.testing.assert_allclose(
+        hits.color.cpu(), alpha[:, None] * np.array([1, 0.5, 0.2]), atol=6e-4
+    )
+    enough = length >= math.log(0.9) / math.log(0.99)
+    depth = np.where(enough.any(1), t[enough.argmax(1)], np.inf)
+    sure = np.abs(alpha - 0.1) > 1e-3
+    actual = hits.depth[:, 0].cpu().numpy()
+    assert np.array_equal(np.isfinite(actual)[sure], np.isfinite(depth)[sure])
+    both = sure & np.isfinite(depth)
+    np.testing.assert_allclose(actual[both], depth[both], atol=0.1)
+    assert both.sum() > 20
+
+
+def shown(clip: gv.Clip, places: np.ndarray) -> np.ndarray:
+    """Whether (k, 3) places are kept."""
+    seen = np.ones(len(places), dtype=bool)
+    for *normal, offset in clip.planes:
+        seen &= places @ np.array(normal) + offset >= 0
+    if len(clip.boxes):
+        seen &= np.any([inside(box, places) for box in clip.boxes], axis=0)
+    for box in clip.without:
+        seen &= ~inside(box, places)
+    return seen
+
+
+@pytest.mark.parametrize("name", CLIPS)
+def test_nothing_that_is_clipped_is_sampled_or_asked_for(blobs, backend, name):
+    """By stamps of bricks and tiles, and by the nodes that have a request."""
+    clip = dataclasses.replace(CLIPS[name], caps=True)
+    tree = gv.N3Tree.from_volume(blobs, 2)
+    thin = gv.TransferFunction.from_points([(0, 0.001), (1, 0.002)])
+    rays = camera_rays(tree, 60, distance=1.1)
+    gone = wholly_clipped(tree, clip)
+    assert len(gone) > 50, "the test must clip something"
+    _, whole = run(tree, backend, rays, thin, lod="finest")
+    _, marks = run(tree, backend, rays, thin, lod="finest", clip=clip)
+    for used, sees_gone in ((whole, True), (marks, False)):
+        owner = tree.nodes.brick_tn.flatten()
+        bricks = {n for n in gone if owner[n] >= 0 and used["brick"][owner[n]] == 1}
+        parent = tree.nodes.parent_t
+        tiles = {t for t in range(len(parent)) if int(parent[t]) in gone and used["tile"][t] == 1}
+        assert bool(bricks) == sees_gone and bool(tiles) == sees_gone
+    assert (marks["brick"] == 1).sum() > 10
+    poor = forget(tree, 0.4, 7)
+    _, marks = run(poor, backend, rays, thin, lod="finest", clip=clip)
+    asked = set(marks["request"].flatten().nonzero()[:, 0].tolist())
+    assert asked and not asked & gone
+    _, marks = run(poor, backend, rays, thin, lod="finest")
+    assert set(marks["request"].flatten().nonzero()[:, 0].tolist()) & gone
+
+
+def wholly_clipped(tree: gv.N3Tree, clip: gv.Clip) -> set[int]:
+    """Nodes whose box, a hair smaller, lies beyond a plane, in a box that is cut away, or, for each
+    box that is kept, beyond a face of it.
+    """
+    gone: set[int] = set()
+    n, size = tree.branching, np.array(tree.spacing) * tree.side
+    for tile in range(tree.nodes.capacity):
+        x, y, z, depth = tree.nodes.loc_t4[tile].tolist()
+        if depth < 1:
+            continue
+        for child in range(n**3):
+            place = np.array([x * n + child % n, y * n + child // n % n, z * n + child // n**2])
+            bits = np.array([[c & 1, c >> 1 & 1, c >> 2] for c in range(8)])
+            bits = bits * 0.998 + 0.001
+            corners = tree.box[0].numpy() + (place + bits) * size / n**depth
+            beyond = any(
+                (corners @ np.array(normal) + offset < 0).all() for *normal, offset in clip.planes
+            )
+            beyond |= any(inside(box, corners).all() for box in clip.without)
+            beyond |= len(clip.boxes) > 0 and all(beside(box, corners) for box in clip.boxes)
+            if beyond:
+                gone.add(tile * tree.nodes.nodes_per_tile + child)
+    return gone
+
+
+def beside(box, corners: np.ndarray) -> bool:
+    """Whether all corners lie beyond one face of the box."""
+    if len(box) == 2:
+        low, high = np.array(box)
+        return bool((corners < low).all(0).any() or (corners > high).all(0).any())
+    own = (corners - box[:3, 3].numpy()) @ np.linalg.inv(box[:3, :3].numpy()).T
+    return bool((own < 0).all(0).any() or (own > 1).all(0).any())
+
+
+def test_a_ray_that_has_ended_takes_no_sample_behind_a_gap(backend):
+    volume = gv.Volume(torch.linspace(0.9, 1, 32).expand(32, 32, 32).contiguous())
+    tree = gv.N3Tree.from_volume(volume, 8, device=DEVICES[backend])
+    shader = gv.TransferFunction.from_points([(0, 0.9), (1, 0.9)])
+    near = gv.Clip(boxes=[((-1, -1, 20), (40, 40, 40))])
+    both = gv.Clip(boxes=[((-1, -1, 20), (40, 40, 40)), ((-1, -1, -1), (40, 40, 10))])
+    camera = gv.Camera.orbit(0, 0, 2.0, 20, 8, 8)
+    one, two = (gv.render(tree, camera, shader, clip=c, backend=backend) for c in (near, both))
+    assert one.stats.samples == two.stats.samples > 0
+    assert torch.equal(one.color, two.color)
+
+
+CUT = gv.Clip(planes=[(0, 0, -1, 20.0)], caps=True, cap_light=0.6)  # what lies at z > 20 is gone
+
+
+@pytest.mark.parametrize("opacity", [1.0, 0.25])
+def test_a_cap_has_the_colour_of_the_cut_and_faces_the_eye(backend, opacity):
+    """Lambert, with the light at the eye, on a plane: colour * (1 - s + s cos), at the cut."""
+    data = torch.zeros(32, 32, 32)
+    data[:, :, 16:] = 1.0  # empty on the left, solid on the right
+    tree = gv.N3Tree.from_volume(gv.Volume(data), 8, device=DEVICES[backend])
+    shader = gv.TransferFunction.from_points([(0, 0), (0.9, 0), (1, 0.02)], [(0, 1, 0.5, 0.2)])
+    clip = dataclasses.replace(CUT, cap_opacity=opacity)
+    camera = gv.Camera.orbit(20, 30, 2.2, 30, 32, 32)
+    options = {"lod": "finest", "backend": backend, "stop_alpha": 1.0}
+    cap = gv.render(tree, camera, shader, clip=clip, **options)
+    bare = gv.render(tree, camera, shader, clip=dataclasses.replace(clip, caps=False), **options)
+    rays = camera.placed(tree.box).rays()
+    t = (20 - rays.origin[:, 2]) / rays.direction[:, 2]
+    at = rays.origin + t[:, None] * rays.direction
+    margin = 1.0
+    face = ((at[:, :2] > -0.5 + margin) & (at[:, :2] < 31.5 - margin)).all(1)
+    solid, empty = face & (at[:, 0] > 17.5), face & (at[:, 0] < 10)
+    assert solid.sum() > 20 and empty.sum() > 20
+    light = 1 - 0.6 + 0.6 * rays.direction[:, 2].abs()
+    rgb = torch.tensor([1, 0.5, 0.2], dtype=torch.float64)
+    color, alpha, depth = (
+        getattr(cap, n).cpu().double().flatten(0, 1) for n in ("color", "alpha", "depth")
+    )
+    behind = bare.alpha.cpu().double().flatten(0, 1)
+    wanted = opacity * light[:, None] * rgb + (1 - opacity) * behind * rgb
+    torch.testing.assert_close(color[solid], wanted[solid], rtol=0, atol=2e-3)
+    torch.testing.assert_close(
+        alpha[solid], (opacity + (1 - opacity) * behind)[solid], rtol=0, atol=1e-5
+    )
+    torch.testing.assert_close(depth[solid, 0], t[solid], rtol=0, atol=1e-4)
+    torch.testing.assert_close(alpha[empty], behind[empty], rtol=0, atol=1e-6)
+
+
+def test_what_is_not_cut_has_no_cap(backend):
+    """The camera looks at faces of the volume, and the cut is on its far side."""
+    tree = gv.N3Tree.from_volume(gv.Volume(torch.rand(16, 16, 16)), 8, device=DEVICES[backend])
+    clip = gv.Clip(planes=[(0, 0, 1, -4.0)])
+    camera = gv.Camera.orbit(10, 10, 2.2, 30, 12, 12)
+    bare, cap = (
+        gv.render(tree, camera, SHADER, backend=backend, clip=dataclasses.replace(clip, caps=caps))
+        for caps in (False, True)
+    )
+    torch.testing.assert_close(cap.color, bare.color, rtol=0, atol=1e-6)
+    assert cap.stats.samples == bare.stats.samples
+
+
+def test_the_face_that_is_shaded_is_the_one_that_was_crossed():
+    """A corner is cut away: each ray that goes through it leaves it by one of three faces."""
+    clip = gv.Clip(without=[((0, 0, 0), (2, 2, 2))], frame="box")
+    clipped = Clipped(lambda _: None, clip, UNIT, step=0.1, depth_alpha=0.1)
+    origin = torch.tensor([[1.0, 0.9, 1.1]], dtype=torch.float64).expand(64, 3)
+    to = torch.rand(64, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64) * 0.5
+    to[:22, 0], to[22:44, 1], to[44:, 2] = 0, 0, 0
+    direction = torch.nn.functional.normalize(to - origin)
+    limits = torch.tensor([0.0, torch.inf], dtype=torch.float64).expand(64, 2)
+    rays = gv.Rays(origin=origin, direction=direction, cone=limits, range=limits)
+    entry = clipped.pieces(rays)[0][:, 0]
+    torch.testing.assert_close(entry, (to - origin).norm(dim=1))
+    axis = torch.tensor([0] * 22 + [1] * 22 + [2] * 20)
+    facing = clipped._facing(rays, entry)
+    torch.testing.assert_close(facing, direction.gather(1, axis[:, None]).abs()[:, 0])
+
+
+def test_the_engine_loads_only_what_is_kept(blobs, compiled):
+    clip, camera = CLIPS["cut"], gv.Camera.orbit(width=24, height=24, distance=1.2)
+    produced, pictures = [], []
+    for region in (None, clip):
+        engine = gv.Engine(
+            *(gv.VolumeProducer(blobs),),
+            brick_size=4,
+            node_pool="1 MB",
+            brick_pool="4 MB",
+            device=DEVICES[compiled],
+        )
+        with engine:
+            picture = engine.render(camera, SHADER, clip=region)
+            assert picture.stats.converged
+            produced.append(picture.stats.produced["bricks"])
+            pictures.append(picture)
+    tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
+    same = gv.render(tree, camera, SHADER, clip=clip)
+    torch.testing.assert_close(pictures[1].color, same.color, rtol=0, atol=1e-6)
+    assert produced[1] < produced[0]
+
+
+def test_a_clip_is_for_each_of_several_trees(blobs, compiled):
+    """Two volumes side by side, cut by one plane: the same as each alone, put side by side."""
+    other = gv.Volume(blobs.data, blobs.spacing, (60.0, -3.0, 2.0))
+    scene = {"one": gv.VolumeProducer(blobs), "two": gv.VolumeProducer(other)}
+    camera = gv.Camera.look_at((55, 10, 190), (55, 8, 29), fov=40, width=48, height=24)
+    clip = gv.Clip(planes=[(0, 0, -1, 24.0)], caps=True)
+    with gv.Engine(scene, node_pool="1 MB", brick_pool="8 MB", device=DEVICES[compiled]) as engine:
+        both = engine.render(camera, SHADER, clip=clip)
+    alone = [
+        gv.render(gv.N3Tree.from_volume(v, device=DEVICES[compiled]), camera, SHADER, clip=clip)
+        for v in (blobs, other)
+    ]
+    torch.testing.assert_close(both.color, alone[0].color + alone[1].color, rtol=0, atol=1e-5)
+    assert both.alpha[:, :24].max() > 0.9 and both.alpha[:, 24:].max() > 0.9
+
+
+def test_without_clip_and_lens_pictures_keep_every_bit(blobs, compiled):
+    tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
+    camera = gv.Camera.orbit(width=16, height=16, distance=1.2)
+    plain = gv.render(tree, camera, SHADER)
+    wide = gv.render(tree, camera, SHADER, clip=gv.Clip())
+    far = gv.render(tree, camera, SHADER, clip=gv.Clip(planes=[(1, 0, 0, 1e6)]))
+    for name in ("color", "alpha", "depth", "samples"):
+        assert torch.equal(getattr(plain, name), getattr(wide, name))
+        assert torch.equal(getattr(plain, name), getattr(far, name))
+
+
+def test_clip_and_lens_go_together(blobs, compiled):
+    tree = gv.N3Tree.from_volume(blobs, 4)
+    lens = gv.ThinLens(aperture=0.1, focus=1.2, frame="box")
+    clip = dataclasses.replace(CLIPS["all"], caps=True)
+    rays = camera_rays(tree, distance=1.2)
+    result, _ = assert_equal(tree, compiled, rays, clip=clip, lens=lens)
+    assert result["alpha"].max() > 0.9
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"planes": [(1, 0, 0, math.nan)]}, r"planes\[0\] must be finite"),
+        ({"planes": [(1, 0, 0, 1), (0, 0, 0, 1)]}, r"planes\[1\] has a normal of length 0"),
+        ({"planes": [(1, 0, 0)]}, r"planes\[0\] must be \(1, 4\)"),
+        ({"planes": (1, 0, 0, 0)}, r"planes\[0\] must be"),
+        ({"boxes": [((0, 0, 0), (1, -1, 1))]}, r"boxes\[0\] must have its low corner below"),
+        ({"boxes": [((0, 0, 0), (1, math.inf, 1))]}, r"boxes\[0\] must be finite"),
+        ({"without": [torch.zeros(4, 4)]}, r"without\[0\] must be an affine matrix"),
+        ({"without": [torch.zeros(3, 3)]}, r"without\[0\] must be \(4, 4\)"),
+        ({"boxes": ["ab"]}, r"boxes\[0\] must be"),
+        ({"boxes": [3]}, r"boxes\[0\] must be"),
+        ({"frame": "moon"}, "frame must be 'world' or 'box', got 'moon'"),
+        ({"cap_opacity": 0.0}, "cap_opacity must be finite and > 0"),
+        ({"cap_light": 1.5}, "cap_light must be finite and >= 0 and <= 1"),
+    ],
+)
+def test_a_wrong_clip_is_one_clear_error(options, message):
+    with pytest.raises(ValueError, match=message):
+        gv.Clip(**options)
+
+
+def test_a_clip_that_is_none(blobs):
+    tree = gv.N3Tree.from_volume(blobs, 4)
+    with pytest.raises(ValueError, match="clip must be a Clip, got list"):
+        gv.render(tree, gv.Camera.orbit(width=4, height=4), SHADER, clip=[])
