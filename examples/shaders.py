@@ -2,7 +2,7 @@
 thin shell by the plain function at step 1, the same pre-integrated, plain at step 0.02; the mean.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -54,12 +54,7 @@ def main(settings: Settings) -> None:
     for row in rows:
         pictures = [gv.render(tree, camera, s, step=step, lod="finest") for s, step in row]
         images.append(torch.cat([picture.color for picture in pictures], dim=1))
-    color = torch.cat(images)
-    grid = gv.Picture(
-        **{"color": color, "alpha": color[..., :1], "depth": color[..., :1]},
-        **{"samples": color[..., :1], "stats": pictures[-1].stats},
-    )
-    grid.save(settings.output)
+    replace(pictures[-1], color=torch.cat(images)).save(settings.output)
     print(f"{settings.output}: {sum(map(len, rows))} pictures")
 
 

@@ -135,7 +135,7 @@ def test_rows_are_counted_through_the_batch():
     for first, end in ((0, 15), (3, 4), (4, 11), (14, 15)):
         part = camera.rays(rows=(first, end))
         for name, field in vars(part).items():
-            if name != "width":
+            if isinstance(field, torch.Tensor):
                 assert torch.equal(field, getattr(whole, name)[6 * first : 6 * end]), name
 
 

@@ -39,6 +39,7 @@ def made(color: torch.Tensor, alpha: torch.Tensor | None = None) -> gv.Picture:
         color=color,
         alpha=one if alpha is None else alpha,
         depth=one * math.inf,
+        nearest=one * math.inf,
         samples=one.int(),
         transparent=alpha is not None,
         stats=RenderStats(),
@@ -316,11 +317,17 @@ def test_a_missing_library_is_named_and_leaves_no_file(tmp_path, monkeypatch, en
     assert not list(tmp_path.iterdir())
 
 
-def test_a_failed_write_keeps_the_old_file(tmp_path):
+def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "a.npz"
     good = made(torch.rand(4, 4, 3))
     good.save(path)
     before = path.read_bytes()
-    with pytest.raises(AttributeError):
-        dataclasses.replace(good, depth=None).save(path)
+
+    def full(part, **_layers):
+        part.write_bytes(before[:100])
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(OSError, match="No space left"):
+        good.save(path)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]

@@ -219,7 +219,7 @@ def op_arguments(tree, shader, dtype) -> dict:
 def test_opcheck(tree, compiled, name, dtype):
     tree = on(tree, DEVICES[compiled])
     given = op_arguments(tree, SHADERS[name], dtype)
-    given |= {"width": 0, "table": given.pop("table_lm4")}
+    given |= {"width": 0, "table": given.pop("table_lm4"), "clear_r": None}
     op = torch.ops.gvtorch.shade_rays.default
     torch.library.opcheck(op, tuple(given[a.name] for a in op._schema.arguments))
 
