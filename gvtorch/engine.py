@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
+from functools import cached_property
 from typing import Any, Literal
 
 import torch
@@ -134,10 +135,10 @@ class Engine:
             ValueError: An argument is of the wrong type or out of its range.
             ProductionError: A node can't be produced, and the engine is strict.
         """
-        camera = as_camera("frame", camera)
+        camera = as_camera("frame", camera).placed(self.box)
         chosen = render_options("frame", camera, options)
         hits, stats = self._pass(camera, shader, chosen, progress)
-        return develop(hits, camera.placed(self.box), chosen, stats), stats
+        return develop(hits, camera, chosen, stats), stats
 
     def _pass(
         self,
@@ -152,7 +153,7 @@ class Engine:
         with self._unbroken(), self._timed(stats):
             self._catch_up(stats)  # 1, 2, 3, 4
             trace = self._tracer(shader, chosen)
-            view = camera.placed(self.box), self.device, trace, chosen
+            view = camera, self.device, trace, chosen
             if again is None:
                 self._scout(view, stats)
             self._count_up()
@@ -296,7 +297,7 @@ class Engine:
             ProductionError: See `frame`.
         """
         most = _most_frames(mode, productions, max_frames)
-        camera = as_camera("render", camera)
+        camera = as_camera("render", camera).placed(self.box)
         chosen = render_options("render", camera, options)
         if mode == "interactive":
             return self.frame(camera, shader, **options)[0]
@@ -332,7 +333,7 @@ class Engine:
             total.capacity_exceeded = stats.capacity_exceeded
         total.frames, total.rays = number, turns.count
         stats = stats.of_picture(total)
-        return develop(hits, camera.placed(self.box), chosen, stats)
+        return develop(hits, camera, chosen, stats)
 
     def capture(self, camera: Camera | Rays, shader: Shaders, **options: Any) -> FrameGraph:
         """Records a frame as a CUDA graph, for cameras of this number and size.
@@ -369,7 +370,7 @@ class Engine:
         """Whether the last frame whose counts are here missed nothing; nobody waits."""
         return self._arrivals.steady
 
-    @property
+    @cached_property
     def box(self) -> Tensor:
         """(2, 3) float64 world corners around all trees."""
         boxes = torch.stack([plant.tree.box for plant in self.plants.values()])
