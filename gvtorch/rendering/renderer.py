@@ -22,11 +22,12 @@ from .clip import Clip, Clipped
 from .custom import as_camera
 from .layer import Layer
 from .lens import ThinLens, ThroughLens
+from .lighting import Lighted, Lighting
 from .module_shader import ModuleShader, ModuleTracer
 from .picture import Picture
 from .pieces import Trace
 from .shader import TransferFunction, interval_levels
-from .shaders import FusedShader, Intervals, Projection, Shader
+from .shaders import FusedShader, Intervals, LitShader, Projection, Shader
 
 AnyShader = FusedShader | ModuleShader
 _RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that progress shows
@@ -48,6 +49,7 @@ class RenderOptions:
     layer: Layer | None = None  # what another renderer drew: voxels go before and behind it
     clip: Clip | None = None  # the region of interest; None: everything
     lens: ThinLens | None = None  # depth of field; None: all is sharp
+    lighting: Lighting | None = None  # shadows and light from all around; None: the shader's own
     backend: Backend = "auto"
     dtype: torch.dtype = torch.float32  # float64 for trees deeper than about 2^16 voxels
 
@@ -71,6 +73,7 @@ class RenderOptions:
             ("clip", self.clip, Clip),
             ("layer", self.layer, Layer),
             ("lens", self.lens, ThinLens),
+            ("lighting", self.lighting, Lighting),
         ):
             if value is not None:
                 check_type(where, name, value, kind)
@@ -338,14 +341,14 @@ def tracer_of(
 
 
 def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -> Trace:
-    """Returns a tree's tracer with what the options put around it: the lens, then the clip; `box`
-    (2, 3) is the scene's.
+    """Returns a tree's tracer with what the options put around it: the lens, then the clip, then
+    the light, whose cones go through the clip, but not through the lens; `box` (2, 3) is the
+    scene's.
 
     Raises:
         ValueError: The shader is a projection, which sees a ray in one go, and the options cut rays
-            into pieces.
+            into pieces; or it takes no light, and there is some.
     """
-    trace: Trace = tracer
     cuts = {
         "lens": options.lens is not None,
         "clip with caps or several pieces": options.clip is not None and not options.clip.whole,
@@ -354,12 +357,43 @@ def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -
     if isinstance(tracer.shader, Projection) and any(cuts.values()):
         name = next(name for name, cut in cuts.items() if cut)
         raise ValueError(f"render: a projection sees a ray in one go, so it has no {name}")
-    if options.lens is not None:
-        trace = ThroughLens(trace, options.lens.placed(box), options.cone_scale)
-    if options.clip is not None:
+
+    def clipped(trace: Trace) -> Trace:
+        if options.clip is None:
+            return trace
         step = tracer.arguments["step"]
-        trace = Clipped(trace, options.clip, box, step=step, depth_alpha=options.depth_alpha)
-    return trace
+        return Clipped(trace, options.clip, box, step=step, depth_alpha=options.depth_alpha)
+
+    def through_lens(trace: Trace) -> Trace:
+        if options.lens is None:
+            return trace
+        return ThroughLens(trace, options.lens.placed(box), options.cone_scale)
+
+    if options.lighting is None:
+        return clipped(through_lens(tracer))
+    shader = tracer.shader
+    if not isinstance(shader, LitShader):
+        kind = "TransferFunction" if shader is None else type(shader).__name__
+        raise ValueError(
+            "render: lighting needs normals: the shader must be Lit, StoredColor, Isosurface or "
+            f"DistanceField, got {kind}"
+        )
+    assert isinstance(tracer, Tracer)
+    cones = replace(options, lod="auto")
+    matter = None
+    if options.lighting.indirect:
+        half = replace(cones, depth_alpha=0.5 * options.stop_alpha)
+        matter = clipped(tracer.seeing(shader.matter(), half))
+    return Lighted(
+        clipped(through_lens(tracer.seeing(shader.unlit(), options))),
+        blocker=clipped(tracer.seeing(shader.blocker(), cones)),
+        matter=matter,
+        lighting=options.lighting.placed(box),
+        material=shader.material(),
+        voxel=max(tracer.tree.spacing),
+        cone_scale=options.cone_scale,
+        lens=options.lens and options.lens.placed(box),
+    )
 
 
 class Tracer:
@@ -395,10 +429,13 @@ class Tracer:
         )
         if isinstance(shader, TransferFunction):
             table = vars(shader.table(min(tree.spacing), step, levels, options.dtype, tree.device))
+        elif shader.kind is None:
+            table = vars(shader.table(tree, intervals))
         else:
             table = shader.arguments("render", tree, intervals)
         component = own.component if own and own.component is not None else options.component
-        self.shader, self.dtype = own, options.dtype
+        self.shader = None if own is None or own.kind is None else own
+        self.dtype = options.dtype
         self.arguments: dict[str, Any] = {
             "place_33": tree.place,
             "child_tn": tree.nodes.child_tn,
@@ -424,6 +461,11 @@ class Tracer:
             "by_level": by_level,
             "backend": options.backend,
         }
+
+    def seeing(self, shader: FusedShader, options: RenderOptions) -> Tracer:
+        """Returns what traces the same frame with another shader."""
+        frame = {name: self.arguments[name] for name in ("by_level", "frame_1")}
+        return Tracer(self.tree, shader, options, **frame)
 
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays in world units."""
