@@ -42,13 +42,14 @@ from .pieces import Trace, behind, join
 #: as its voxels are wide, and a cone that grazes takes more than its share: shadows agree best with
 #: this.
 _CONE_OF_DISC = 0.35
-#: Where secondary rays begin: so many voxels off the surface.
-_OFF = 1.5
+#: Where secondary rays begin, in voxels: those to lights so far off the surface; those all around
+#: closer, so that they stand in clefts, but begin only after a way.
+_OFF, _CLOSE, _WAY = 1.5, 0.75, 1.5
 #: Share of a hemisphere's light, cosine counted, from less than 30 degrees off the normal; the
 #: other five cones share the rest.
 _UPRIGHT = 0.25
 _TILT = math.radians(50)  # of those: the mean, cosine counted
-_FINER = 0.25  # of the cone's width, is that of the cones that go on from where it ends
+_FINER = 0.5  # of the cone's width, is that of the cones that go on from where it ends
 _WIDE = 2 * math.tan(math.radians(17))  # growth of all six; wider ones meet their own surface
 
 
@@ -240,7 +241,7 @@ class Lighted:
         blocked = torch.zeros_like(distance)
         for x, y in _disc(cones):
             aim = normalize(beam + size[:, None] * (x * right + y * up), dim=1)
-            hits = tally(self._blocker(self._cone(places, aim, growth, start, end)))
+            hits = tally(self._blocker(self._cone(places, _OFF, aim, growth, start, end)))
             blocked = blocked + hits.alpha[:, 0] / cones
         return 1 - self._lighting.shadows * blocked
 
@@ -254,11 +255,16 @@ class Lighted:
             return clear, bounced
         assert reach is not None
         trace = self._blocker if self._matter is None else self._matter
-        end = places.seen.to(torch.float64) * reach
-        spans = (torch.zeros_like(end), end / 2), (end / 2, end)
+        some = places.seen.to(torch.float64)
+        start = _WAY * some * places.width.clamp(min=self._voxel)
+        end = torch.maximum(start, reach * some)
+        middle = torch.maximum(start, reach / 2 * some)
         growth = torch.full_like(end, _WIDE)
         for weight, direction in _hemisphere(places.normal):
-            first, second = (self._cone(places, direction, growth, *span) for span in spans)
+            first, second = (
+                self._cone(places, _CLOSE, direction, growth, *span)
+                for span in ((start, middle), (middle, end))
+            )
             front = trace(first)
             hits = tally(join(front, trace(behind(second, front))))
             taken = (front.alpha + hits.alpha).to(clear) / 2
@@ -268,15 +274,21 @@ class Lighted:
         return clear, lighting.indirect * bounced
 
     def _cone(
-        self, places: _Places, direction: Tensor, growth: Tensor, start: Tensor, end: Tensor
+        self,
+        places: _Places,
+        off: float,
+        direction: Tensor,
+        growth: Tensor,
+        start: Tensor,
+        end: Tensor,
     ) -> Rays:
-        """Cones from a little above the places, as wide there as what the eye's ray saw; `growth`
+        """Cones from `off` voxels above places, as wide there as what the eye's ray saw; `growth`
         is that of the width in the world. One that ends where it starts goes nowhere.
         """
-        off = _OFF * places.width.clamp(min=self._voxel)
+        off_r1 = off * places.width.clamp(min=self._voxel)[:, None]
         cone = torch.stack((places.width, growth), 1) / self._cone_scale
         return Rays(
-            origin=places.position + off[:, None] * places.normal,
+            origin=places.position + off_r1 * places.normal,
             direction=direction,
             cone=cone,
             range=torch.stack((start, end), 1),

@@ -382,8 +382,8 @@ def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -
     cones = replace(options, lod="auto")
     matter = None
     if options.lighting.indirect:
-        half = replace(cones, depth_alpha=0.5 * options.stop_alpha)
-        matter = clipped(tracer.seeing(shader.matter(), half))
+        early = replace(cones, depth_alpha=0.25 * options.stop_alpha)
+        matter = clipped(tracer.seeing(shader.matter(), early))
     return Lighted(
         clipped(through_lens(tracer.seeing(shader.unlit(), options))),
         blocker=clipped(tracer.seeing(shader.blocker(), cones)),
