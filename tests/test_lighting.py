@@ -303,10 +303,14 @@ def corner(walls: int, backend: str, kind: str = "distance") -> tuple[gv.N3Tree,
         distance = np.minimum(distance, axis - FLOOR)
     if kind == "distance":
         return tree_of(distance, backend), gv.DistanceField((1, 1, 1), **SKY)
-    return tree_of(np.clip(0.5 - distance, 0, 1), backend), gv.Isosurface(0.5, (1, 1, 1), **SKY)
+    tree = tree_of(np.clip(0.5 - distance, 0, 1), backend)
+    if kind == "density":
+        return tree, gv.Isosurface(0.5, (1, 1, 1), **SKY)
+    opaque = gv.TransferFunction.from_points([(0.3, 0), (0.6, 0.9)])
+    return tree, gv.Lit(opaque, **SKY)
 
 
-@pytest.mark.parametrize("kind", ["distance", "density"])
+@pytest.mark.parametrize("kind", ["distance", "density", "medium"])
 @pytest.mark.parametrize("walls", [0, 1, 2])
 def test_occlusion_at_an_edge_and_in_a_corner(backend, kind, walls):
     """An edge leaves 1/2 of the sky, a corner of three planes 1/4. Six cones stand for all ways,
