@@ -185,7 +185,7 @@ def develop(
     if isinstance(background, Background):
         numbers = camera.numbers(color.device) if numbers is None else numbers
         color = color + (1 - hits.alpha) * background.behind(camera, numbers, color.dtype)
-    elif background is not None:
+    elif background is not None and any(background):
         color = color + (1 - hits.alpha) * _constants(background, color)
     if options.layer is not None:
         layer = options.layer.distance(hits.depth.device).to(hits.depth.dtype)
