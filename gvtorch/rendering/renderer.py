@@ -16,18 +16,19 @@ from ..ops import shade_rays, trace_rays
 from ..ops.trace import Backend, choose_backend, most_intervals
 from ..pool import N3Tree
 from ..stage import Progress, collect_timings, no_progress, stage
+from .around import around
 from .background import Background, checked_background
 from .camera import Camera
-from .clip import Clip, Clipped
+from .clip import Clip
 from .custom import as_camera
 from .layer import Layer
-from .lens import ThinLens, ThroughLens
-from .lighting import Lighted, Lighting
+from .lens import ThinLens
+from .lighting import Lighting
 from .module_shader import ModuleShader, ModuleTracer
 from .picture import Picture
 from .pieces import Trace
 from .shader import TransferFunction, interval_levels
-from .shaders import FusedShader, Intervals, LitShader, Projection, Shader
+from .shaders import FusedShader, Intervals, Shader
 
 AnyShader = FusedShader | ModuleShader
 _RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that progress shows
@@ -338,62 +339,6 @@ def tracer_of(
         return ModuleTracer(tree, shader, walls.arguments, channel)
     check_shader("render", "shader", shader)
     return Tracer(tree, shader, options, **frame)
-
-
-def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -> Trace:
-    """Returns a tree's tracer with what the options put around it: the lens, then the clip, then
-    the light, whose cones go through the clip, but not through the lens; `box` (2, 3) is the
-    scene's.
-
-    Raises:
-        ValueError: The shader is a projection, which sees a ray in one go, and the options cut rays
-            into pieces; or it takes no light, and there is some.
-    """
-    cuts = {
-        "lens": options.lens is not None,
-        "clip with caps or several pieces": options.clip is not None and not options.clip.whole,
-        "translucent layer": options.layer is not None and options.layer.alpha is not None,
-    }
-    if isinstance(tracer.shader, Projection) and any(cuts.values()):
-        name = next(name for name, cut in cuts.items() if cut)
-        raise ValueError(f"render: a projection sees a ray in one go, so it has no {name}")
-
-    def clipped(trace: Trace) -> Trace:
-        if options.clip is None:
-            return trace
-        step = tracer.arguments["step"]
-        return Clipped(trace, options.clip, box, step=step, depth_alpha=options.depth_alpha)
-
-    def through_lens(trace: Trace) -> Trace:
-        if options.lens is None:
-            return trace
-        return ThroughLens(trace, options.lens.placed(box), options.cone_scale)
-
-    if options.lighting is None:
-        return clipped(through_lens(tracer))
-    shader = tracer.shader
-    if not isinstance(shader, LitShader):
-        kind = "TransferFunction" if shader is None else type(shader).__name__
-        raise ValueError(
-            "render: lighting needs normals: the shader must be Lit, StoredColor, Isosurface or "
-            f"DistanceField, got {kind}"
-        )
-    assert isinstance(tracer, Tracer)
-    cones = replace(options, lod="auto")
-    matter = None
-    if options.lighting.indirect:
-        early = replace(cones, depth_alpha=0.25 * options.stop_alpha)
-        matter = clipped(tracer.seeing(shader.matter(), early))
-    return Lighted(
-        clipped(through_lens(tracer.seeing(shader.unlit(), options))),
-        blocker=clipped(tracer.seeing(shader.blocker(), cones)),
-        matter=matter,
-        lighting=options.lighting.placed(box),
-        material=shader.material(),
-        voxel=max(tracer.tree.spacing),
-        cone_scale=options.cone_scale,
-        lens=options.lens and options.lens.placed(box),
-    )
 
 
 class Tracer:

@@ -391,7 +391,7 @@ class Solid(Shader):
     def __init__(self, surface: Isosurface, color: Triple | None) -> None:
         """Takes the surface and its colour; None where its alpha alone counts."""
         self.kind = None if color is None else kinds.LIT
-        self.surface, self.color = surface, color or (0.0, 0.0, 0.0)
+        self.surface, self.color = surface, (0.0, 0.0, 0.0) if color is None else color
         self.channel, self.component = surface.channel, surface.component
         self.normals = surface.normals
 

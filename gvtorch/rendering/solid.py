@@ -14,9 +14,7 @@ from .lights import pack
 from .shader import Table
 
 _ROWS = 1025
-#: A ramp is so many intervals wide, and an interval leaves this power of the light: a cone that
-#: grazes a surface meets it in several intervals. Penumbras agree best so.
-_RAMP, _PART = 3.0, 0.25
+_RAMP = 3.0  # width of a ramp in intervals; penumbras agree best so
 
 
 def solid_table(
@@ -49,7 +47,8 @@ def solid_table(
     away_m = away_m if above else -away_m
     table = pack((color, 0.0), dtype, device).expand(levels, _ROWS, 4).clone()
     share_lm = (0.5 + away_m / (2 * half_l[:, None])).clamp(0, 1)
-    table[:, :, 3] = 1 - (1 - share_lm) ** _PART
+    # A cone that grazes a surface meets it in several intervals: each takes the fourth root.
+    table[:, :, 3] = 1 - (1 - share_lm).sqrt().sqrt()
     seen_m = (table[:, :, 3] > 0).any(0)
     return Table(
         table_lm4=table,
