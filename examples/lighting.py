@@ -20,7 +20,7 @@ VESSELS = gv.Isosurface(
 SKY, EVENING = (0.75, 0.9, 1.15), (0.5, 0.56, 0.64)
 SIDE, WALL, SOFT = 96, 5.0, 3.0  # of the room, voxels: its walls, and how far surfaces fade
 WHITE, RED, GREEN, BRASS = (0.8, 0.8, 0.8), (0.8, 0.1, 0.06), (0.12, 0.55, 0.1), (0.85, 0.7, 0.45)
-LAMP = gv.PointLight((48.0, 84.0, 54.0), (1.0, 0.95, 0.85), radius=7.0)
+LAMP = gv.PointLight((46.0, 82.0, 66.0), (1.0, 0.95, 0.85), radius=7.0)
 PAINT = gv.StoredColor(
     "rgba", premultiplied=True, light=LAMP, ambient=1.0, diffuse=1.0, specular=0.0
 )
