@@ -26,7 +26,7 @@ from .module_shader import ModuleShader, ModuleTracer
 from .picture import Picture
 from .pieces import Trace
 from .shader import TransferFunction, interval_levels
-from .shaders import FusedShader, Intervals, Projection, Shader
+from .shaders import FusedShader, Intervals, Shader
 
 AnyShader = FusedShader | ModuleShader
 _RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that progress shows
@@ -342,8 +342,7 @@ def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -
     (2, 3) is the scene's.
 
     Raises:
-        ValueError: The shader is a projection, which sees a ray in one go, and the options cut rays
-            into pieces.
+        ValueError: The shader sees a ray in one go, and the options cut rays into pieces.
     """
     trace: Trace = tracer
     cuts = {
@@ -351,9 +350,10 @@ def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -
         "clip with caps or several pieces": options.clip is not None and not options.clip.whole,
         "translucent layer": options.layer is not None and options.layer.alpha is not None,
     }
-    if isinstance(tracer.shader, Projection) and any(cuts.values()):
+    if isinstance(tracer.shader, Shader) and tracer.shader.whole and any(cuts.values()):
         name = next(name for name, cut in cuts.items() if cut)
-        raise ValueError(f"render: a projection sees a ray in one go, so it has no {name}")
+        kind = type(tracer.shader).__name__
+        raise ValueError(f"render: {kind} sees a ray in one go, so it has no {name}")
     if options.lens is not None:
         trace = ThroughLens(trace, options.lens.placed(box), options.cone_scale)
     if options.clip is not None:

@@ -37,6 +37,8 @@ class Shader(ABC):
     """A fused shader.
 
     Attributes:
+        kind: Which shader of `shade_rays`.
+        whole: It sees a ray in one go: what cuts rays into pieces refuses it.
         channel: Name of the channel whose value it reads; None: that of the options.
         component: Which number of it; None: that of the options.
         normals: Name of a channel of 3 numbers that holds normals; None: the gradient's.
@@ -44,7 +46,8 @@ class Shader(ABC):
         other_component: Which number of it colours a surface.
     """
 
-    kind: int
+    kind: int | str
+    whole: bool = False
     channel: str | None = None
     component: int | None = None
     normals: str | None = None
@@ -115,7 +118,7 @@ class Shader(ABC):
         }
 
 
-class _Lighted(Shader):
+class LitShader(Shader):
     """A shader with a light and a material; see `Material` and csrc/shaders.h."""
 
     def __init__(
@@ -158,7 +161,7 @@ class _Lighted(Shader):
         )
 
 
-class Lit(_Lighted):
+class Lit(LitShader):
     """The transfer function, lit by Blinn and Phong on both sides of a surface."""
 
     kind = kinds.LIT
@@ -172,7 +175,7 @@ class Lit(_Lighted):
 
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """See `Shader`."""
-        return _plain_table(self.transfer, tree, intervals)
+        return plain_table(self.transfer, tree, intervals)
 
 
 class PreIntegrated(Shader):
@@ -206,7 +209,7 @@ class PreIntegrated(Shader):
         return self._tables[key]
 
 
-class StoredColor(_Lighted):
+class StoredColor(LitShader):
     """Colour and opacity as each voxel holds them: a channel of 4 numbers, linear red, green, blue
     and opacity per reference length. Integers stand for 0 to 1.
     """
@@ -245,7 +248,7 @@ class StoredColor(_Lighted):
 
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """Says how many lengths of intervals there are; its colours are not read."""
-        return _one_color((1.0, 1.0, 1.0), tree, intervals)
+        return one_color((1.0, 1.0, 1.0), tree, intervals)
 
     def own(self, tree: N3Tree) -> tuple[Any, ...]:
         """See `Shader`."""
@@ -264,7 +267,7 @@ class StoredColor(_Lighted):
         return super().arguments(where, tree, intervals)
 
 
-class Isosurface(_Lighted):
+class Isosurface(LitShader):
     """The first place where the value passes a level, opaque and lit; to a tenth of a voxel."""
 
     kind = kinds.ISOSURFACE
@@ -306,8 +309,8 @@ class Isosurface(_Lighted):
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """See `Shader`."""
         if isinstance(self.color, TransferFunction):
-            return _plain_table(self.color, tree, intervals)
-        return _one_color(self.color, tree, intervals)
+            return plain_table(self.color, tree, intervals)
+        return one_color(self.color, tree, intervals)
 
     def own(self, tree: N3Tree) -> tuple[Any, ...]:
         """See `Shader`."""
@@ -335,6 +338,7 @@ class Projection(Shader):
     """
 
     kind = kinds.PROJECTION
+    whole = True
 
     def __init__(
         self, which: Literal["maximum", "minimum", "mean"], transfer: TransferFunction
@@ -352,7 +356,7 @@ class Projection(Shader):
 
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """See `Shader`."""
-        return _plain_table(self.transfer, tree, intervals)
+        return plain_table(self.transfer, tree, intervals)
 
     def own(self, tree: N3Tree) -> tuple[Any, ...]:
         """See `Shader`."""
@@ -376,7 +380,7 @@ class Features(Shader):
 
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """See `Shader`."""
-        return _plain_table(self.transfer, tree, intervals)
+        return plain_table(self.transfer, tree, intervals)
 
     def features(self, tree: N3Tree) -> int:
         """As many as the channel holds."""
@@ -394,12 +398,12 @@ def _transfer(where: str, transfer: Any) -> TransferFunction:
     return transfer
 
 
-def _plain_table(transfer: TransferFunction, tree: N3Tree, intervals: Intervals) -> Table:
+def plain_table(transfer: TransferFunction, tree: N3Tree, intervals: Intervals) -> Table:
     i = intervals
     return transfer.table(i.smallest_spacing, i.step, i.levels, i.dtype, tree.device)
 
 
-def _one_color(color: Triple, tree: N3Tree, intervals: Intervals) -> Table:
+def one_color(color: Triple, tree: N3Tree, intervals: Intervals) -> Table:
     row = pack((color, 1.0), intervals.dtype, tree.device)
     return Table(
         table_lm4=row.expand(intervals.levels, 2, 4).contiguous(),
