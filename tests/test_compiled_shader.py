@@ -259,18 +259,18 @@ def built(folder: Path) -> list[str]:
     return sorted(file.name for file in (folder / "shaders").iterdir())
 
 
-def in_processes(count: int, header: Path, **environment: str) -> list[str]:
-    """Loads `Own` in processes at the same time; what each prints, or its error's first line."""
+def in_processes(count: int, *headers: Path, **environment: str) -> list[str]:
+    """Loads `Own` of all headers in processes at the same time; the red that each shows."""
     code = (
         "import sys, torch, gvtorch as gv\n"
-        "shader = gv.CompiledShader(sys.argv[1], 'Own')\n"
+        "shaders = [gv.CompiledShader(header, 'Own') for header in sys.argv[1:]]\n"
         "tree = gv.N3Tree.from_volume(gv.Volume(torch.ones(8, 8, 8)), 8)\n"
-        "picture = gv.render(tree, gv.Camera.orbit(width=1, height=1), shader)\n"
-        "print(f'{float(picture.color[0, 0, 0]):.3f}')\n"
+        "camera = gv.Camera.orbit(width=1, height=1)\n"
+        "print(*(float(gv.render(tree, camera, shader).color[0, 0, 0]) for shader in shaders))\n"
     )
     runs = [
         subprocess.Popen(
-            [sys.executable, "-c", code, str(header)],
+            [sys.executable, "-c", code, *map(str, headers)],
             stdout=subprocess.PIPE,
             text=True,
             env={**os.environ, **environment},
@@ -294,7 +294,7 @@ def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path):
     header = write(tmp_path, body)
     header.write_text('#include "color.h"\n' + header.read_text())
     own = {"GVTORCH_CACHE": str(tmp_path / "cache"), "CXX": str(compiler)}
-    assert in_processes(2, header, **own) == ["0.250", "0.250"]
+    assert in_processes(2, header, **own) == ["0.25", "0.25"]
     calls = count.read_text()
     assert 1 <= calls.count("call") <= 2
     first = built(tmp_path / "cache")
@@ -303,10 +303,11 @@ def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path):
     moved.mkdir()
     for file in (header, tmp_path / "color.h"):
         shutil.copy(file, moved)
-    assert in_processes(1, moved / "own.h", **own) == ["0.250"]
+    assert in_processes(1, moved / "own.h", **own) == ["0.25"]
     assert count.read_text() == calls, "the same content is the same library"
     (tmp_path / "color.h").write_text("constexpr float kColor = 0.75f;\n")
-    assert in_processes(1, header, **own) == ["0.750"]
+    both = in_processes(1, moved / "own.h", header, **own)
+    assert both == ["0.25 0.75"], "two structs of one name, in one process"
     assert len(built(tmp_path / "cache")) == 2
 
 
