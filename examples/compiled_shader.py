@@ -1,5 +1,5 @@
-"""A shader of one's own in C++, examples/ink.h: a CT scan by a transfer function, and by pen and
-ink. It is compiled when it is used first; its numbers may change with each frame.
+"""A shader of one's own in C++, examples/ink.h: vessels by a transfer function, by pen and ink, and
+with other numbers. It is compiled when it is first used; numbers may change with every frame.
 """
 
 import dataclasses
@@ -13,41 +13,39 @@ import tyro
 import gvtorch as gv
 
 HERE = Path(__file__).parent
-EYE, TARGET, UP = (-230.0, -330.0, 170.0), (63.5, 63.5, 127.5), (0.0, 0.0, 1.0)
-PAPER = 0.85
-INK = gv.TransferFunction.from_points(  # vessels and bones in one dark colour
-    opacity=[(150, 0), (260, 0.3), (600, 0.9)],
-    color=[(150, 0.2, 0.08, 0.05), (600, 0.05, 0.06, 0.1)],
+PAPER = 0.9
+INK = gv.TransferFunction.from_points(
+    opacity=[(25, 0), (60, 0.9), (255, 1)], color=[(0, 0.02, 0.015, 0.02)]
 )
 
 
 @dataclass
 class Settings:
-    """Renders the bundled stent twice."""
+    """Renders the bundled aneurism three times."""
 
     output: Path = Path("compiled_shader.png")
-    size: int = 400
+    size: int = 320
     device: str = "cpu"
 
 
 def main(settings: Settings) -> None:
-    """Compiles, renders, and changes a number."""
-    volume = gv.read_volume(HERE / "data" / "stent_256x128x128_int16.npz")
+    """Compiles, renders, changes numbers, renders."""
+    volume = gv.read_volume(HERE / "data" / "aneurism_256x256x256_uint8.raw.gz")
     tree = gv.N3Tree.from_volume(volume, device=settings.device)
-    camera = gv.Camera.look_at(EYE, TARGET, UP, fov=28, width=settings.size, height=settings.size)
+    camera = gv.Camera.orbit(40, 15, 1.45, fov=30, width=settings.size, height=settings.size)
+    plain = gv.TransferFunction.preset("vessels", *volume.value_range)
+    numbers = {"steep": 20, "sharpness": 2, "wash": 0, "near": 300, "far": 540, "paper": PAPER}
     start = time.perf_counter()
-    numbers = {"sharpness": 2.0, "thinness": 0.02, "near": 300.0, "far": 560.0, "paper": PAPER}
     ink = gv.CompiledShader(HERE / "ink.h", "Ink", uniforms=numbers, transfer=INK)
-    print(f"{ink.kind} is there after {time.perf_counter() - start:.2f} s")
+    print(f"{ink.name} is there after {time.perf_counter() - start:.2f} s")
     paper = {"background": (PAPER,) * 3, "lod": "finest"}
-    plain = gv.render(tree, camera, INK, **paper)
-    pictures = [plain, gv.render(tree, camera, ink, **paper)]
-    ink.uniforms["thinness"] = 0.3  # nothing is compiled for it
+    pictures = [gv.render(tree, camera, shader, **paper) for shader in (plain, ink)]
+    ink.uniforms.update(sharpness=6, wash=0.02, far=1000)
     pictures.append(gv.render(tree, camera, ink, **paper))
     for picture in pictures:
         print(f"{picture.stats.milliseconds:.0f} ms, {picture.stats.samples} samples")
     color = torch.cat([picture.color for picture in pictures], dim=1)
-    dataclasses.replace(plain, color=color).save(settings.output)
+    dataclasses.replace(pictures[0], color=color).save(settings.output)
     print(settings.output)
 
 

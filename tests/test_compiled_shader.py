@@ -7,6 +7,7 @@ from __future__ import annotations
 import io
 import os
 import pickle
+import re
 import shutil
 import subprocess
 import sys
@@ -26,15 +27,6 @@ from gvtorch.cpp_ext import compilers, user
 HEADER = ROOT / "tests" / "cpp" / "user_shaders.h"
 BANDS = {"density": 0.4, "width": 3.0, "fade": 0.005}
 CAMERA = gv.Camera.orbit(30, 20, 1.3, width=24, height=24)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory) -> Path:
-    """A cache of its own: each struct is compiled once for all tests."""
-    with pytest.MonkeyPatch.context() as patch:
-        folder = tmp_path_factory.mktemp("cache")
-        patch.setenv("GVTORCH_CACHE", str(folder))
-        yield folder
 
 
 @pytest.fixture(scope="module")
@@ -322,8 +314,6 @@ def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path):
 )
 @pytest.mark.backend("cpp")
 def test_the_compilers_words_are_shown_as_they_are(tmp_path, cache, body, name, message):
-    import re
-
     before, header = built(cache), write(tmp_path, body)
     with pytest.raises(gv.CompileError) as caught:
         gv.CompiledShader(header, name)

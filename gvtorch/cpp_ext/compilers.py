@@ -28,7 +28,7 @@ NVCC_FLAGS = (
 
 def find_cxx() -> list[str]:
     """Returns the C++ compiler's call: CXX, which may be several words, or g++."""
-    return shlex.split(os.environ.get("CXX", "g++"))
+    return shlex.split(os.environ.get("CXX") or "g++")
 
 
 def find_nvcc() -> str | None:

@@ -7,7 +7,7 @@ is kept, in cpp_ext/user.py.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import MutableMapping
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from .lights import Number, pack
 from .shader import Table, TransferFunction
 from .shaders import Intervals, LitShader, one_color, plain_table
 
-Uniforms = Mapping[str, Number] | Tensor
+Uniforms = MutableMapping[str, Number] | Tensor
 
 
 class CompiledShader(LitShader):

@@ -74,9 +74,7 @@ struct FirstEnd : gv::UserShader<T> {
   GV_UNIFORMS(level);
   static constexpr bool kEnds = true, kSurface = true;
 
-  GV_HD bool hides(T, T high, const gv::ShadeSum<T>&) const {
-    return gv::a_little_above(high) < this->uniform(level);
-  }
+  GV_HD bool hides(T, T high, const gv::ShadeSum<T>&) const { return gv::a_little_above(high) < this->uniform(level); }
   GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
     if (piece.back < this->uniform(level)) return;
     sum.clear = 0;
