@@ -45,6 +45,9 @@ struct Interface {
   static_assert(Shader::kFeatures >= Shader::kAsOther, "kFeatures is a number, or kAsOther");
 };
 
+template struct Interface<float, UserShaderOf<float>>;
+template struct Interface<double, UserShaderOf<double>>;
+
 // See FusedShaders in entry.h.
 struct OneShader {
   using Known = UserShaderOf<float>;
@@ -60,8 +63,6 @@ struct OneShader {
   }
   template <class T, class Body>
   static void with(const ShadeArgs& args, const Body& body) {
-    using Checked = Interface<T, UserShaderOf<T>>;
-    static_assert(sizeof(Checked) > 0);
     body(ShadeRay<T, UserShaderOf<T>>(args));
   }
 };
