@@ -4,6 +4,7 @@ from . import opengl
 from .background import Backdrop, Environment, Gradient
 from .camera import Camera
 from .clip import Clip
+from .compiled_shader import CompiledShader
 from .costs import Cost, cost
 from .custom import CustomCamera
 from .image import read_image
@@ -33,6 +34,7 @@ __all__ = [
     "Backdrop",
     "Camera",
     "Clip",
+    "CompiledShader",
     "Cost",
     "CustomCamera",
     "DirectionalLight",

@@ -12,7 +12,7 @@ from .lens import ThroughLens
 from .lighting import Lighted
 from .module_shader import ModuleTracer
 from .pieces import Trace
-from .shaders import LitShader, Projection
+from .shaders import LitShader, Shader
 
 if TYPE_CHECKING:
     from .renderer import RenderOptions, Tracer
@@ -24,17 +24,18 @@ def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -
     scene's.
 
     Raises:
-        ValueError: The shader is a projection, which sees a ray in one go, and the options cut rays
-            into pieces; or it takes no light, and there is some.
+        ValueError: The shader sees a ray in one go, and the options cut rays into pieces; or it
+            takes no light, and there is some.
     """
     cuts = {
         "lens": options.lens is not None,
         "clip with caps or several pieces": options.clip is not None and not options.clip.whole,
         "translucent layer": options.layer is not None and options.layer.alpha is not None,
     }
-    if isinstance(tracer.shader, Projection) and any(cuts.values()):
+    if isinstance(tracer.shader, Shader) and tracer.shader.whole and any(cuts.values()):
         name = next(name for name, cut in cuts.items() if cut)
-        raise ValueError(f"render: a projection sees a ray in one go, so it has no {name}")
+        kind = type(tracer.shader).__name__
+        raise ValueError(f"render: {kind} sees a ray in one go, so it has no {name}")
 
     def clipped(trace: Trace) -> Trace:
         if options.clip is None:

@@ -39,8 +39,9 @@ class Shader(ABC):
     """A fused shader.
 
     Attributes:
-        kind: As numbered in `reference_shaders`; None: the plain transfer function's kernel reads
-            its table.
+        kind: Which shader of `shade_rays`; None: the plain transfer function's kernel reads its
+            table.
+        whole: It sees a ray in one go: what cuts rays into pieces refuses it.
         channel: Name of the channel whose value it reads; None: that of the options.
         component: Which number of it; None: that of the options.
         normals: Name of a channel of 3 numbers that holds normals; None: the gradient's.
@@ -48,7 +49,8 @@ class Shader(ABC):
         other_component: Which number of it colours a surface.
     """
 
-    kind: int | None
+    kind: int | str | None
+    whole: bool = False
     channel: str | None = None
     component: int | None = None
     normals: str | None = None
@@ -190,7 +192,7 @@ class Lit(LitShader):
 
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """See `Shader`."""
-        return _plain_table(self.transfer, tree, intervals)
+        return plain_table(self.transfer, tree, intervals)
 
     def blocker(self) -> FusedShader:
         """See `LitShader`."""
@@ -267,7 +269,7 @@ class StoredColor(LitShader):
 
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """Says how many lengths of intervals there are; its colours are not read."""
-        return _one_color((1.0, 1.0, 1.0), tree, intervals)
+        return one_color((1.0, 1.0, 1.0), tree, intervals)
 
     def own(self, tree: N3Tree) -> tuple[Any, ...]:
         """See `Shader`."""
@@ -341,8 +343,8 @@ class Isosurface(LitShader):
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """See `Shader`."""
         if isinstance(self.color, TransferFunction):
-            return _plain_table(self.color, tree, intervals)
-        return _one_color(self.color, tree, intervals)
+            return plain_table(self.color, tree, intervals)
+        return one_color(self.color, tree, intervals)
 
     def own(self, tree: N3Tree) -> tuple[Any, ...]:
         """See `Shader`."""
@@ -420,6 +422,7 @@ class Projection(Shader):
     """
 
     kind = kinds.PROJECTION
+    whole = True
 
     def __init__(
         self, which: Literal["maximum", "minimum", "mean"], transfer: TransferFunction
@@ -437,7 +440,7 @@ class Projection(Shader):
 
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """See `Shader`."""
-        return _plain_table(self.transfer, tree, intervals)
+        return plain_table(self.transfer, tree, intervals)
 
     def own(self, tree: N3Tree) -> tuple[Any, ...]:
         """See `Shader`."""
@@ -461,7 +464,7 @@ class Features(Shader):
 
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """See `Shader`."""
-        return _plain_table(self.transfer, tree, intervals)
+        return plain_table(self.transfer, tree, intervals)
 
     def features(self, tree: N3Tree) -> int:
         """As many as the channel holds."""
@@ -479,12 +482,12 @@ def _transfer(where: str, transfer: Any) -> TransferFunction:
     return transfer
 
 
-def _plain_table(transfer: TransferFunction, tree: N3Tree, intervals: Intervals) -> Table:
+def plain_table(transfer: TransferFunction, tree: N3Tree, intervals: Intervals) -> Table:
     i = intervals
     return transfer.table(i.smallest_spacing, i.step, i.levels, i.dtype, tree.device)
 
 
-def _one_color(color: Triple, tree: N3Tree, intervals: Intervals) -> Table:
+def one_color(color: Triple, tree: N3Tree, intervals: Intervals) -> Table:
     row = pack((color, 1.0), intervals.dtype, tree.device)
     return Table(
         table_lm4=row.expand(intervals.levels, 2, 4).contiguous(),
