@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -128,6 +129,19 @@ def test_what_ranges_hide_changes_no_bit(channels, name, threshold):
             assert torch.equal(few[field], many[field]), field
     if name in ("isosurface", "maximum", "lit"):
         assert few["samples"].sum() < many["samples"].sum()
+
+
+@pytest.mark.parametrize("name", SHADERS)
+def test_rays_that_have_lost_light_bring_back_the_rest(tree, compiled, name):
+    rays = camera_rays(tree, 16, distance=1.6)
+    dimmed = replace(rays, clear=torch.full((len(rays.origin),), 0.25))
+    for backend in ("reference", compiled):
+        options = gv.RenderOptions(stop_alpha=1.0, backend=backend)
+        tracer = Tracer(on(tree, DEVICES[compiled]), SHADERS[name], options)
+        full, rest = (tracer(some.to(DEVICES[compiled])) for some in (rays, dimmed))
+        torch.testing.assert_close(rest.color, 0.25 * full.color)
+        torch.testing.assert_close(1 - rest.alpha, 0.25 * (1 - full.alpha))
+        assert full.alpha.max() > 0.3
 
 
 def test_lights_are_tensors_that_may_be_edited(tree):
