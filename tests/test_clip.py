@@ -379,6 +379,8 @@ def test_clip_and_lens_go_together(blobs, compiled):
         ({"boxes": [((0, 0, 0), (1, math.inf, 1))]}, r"boxes\[0\] must be finite"),
         ({"without": [torch.zeros(4, 4)]}, r"without\[0\] must be an affine matrix"),
         ({"without": [torch.zeros(3, 3)]}, r"without\[0\] must be \(4, 4\)"),
+        ({"planes": 3}, "planes must be a list, got int"),
+        ({"without": None}, "without must be a list, got NoneType"),
         ({"boxes": ["ab"]}, r"boxes\[0\] must be"),
         ({"boxes": [3]}, r"boxes\[0\] must be"),
         ({"frame": "moon"}, "frame must be 'world' or 'box', got 'moon'"),

@@ -201,7 +201,16 @@ def test_mistakes_have_one_clear_message(blobs):
     def nan(values, *_rest):
         return values.expand(-1, 3), values * math.nan
 
+    def dark(values, *_rest):
+        return values.expand(-1, 3) * math.nan, values
+
+    def alone(values, *_rest):
+        return values
+
     for shader, message in (
+        (gv.ModuleShader(dark), "the module's colour must be finite"),
+        (gv.ModuleShader(alone), "the module must give colour and alpha, got Tensor"),
+        (gv.ModuleShader(lambda *four: four), "must give colour and alpha, got 4 parts"),
         (gv.ModuleShader(wide), "ModuleShader: the module's colour must be ("),
         (gv.ModuleShader(much), "the module's alpha must lie in [0, 1]"),
         (gv.ModuleShader(nan), "the module's alpha must lie in [0, 1]"),

@@ -248,6 +248,7 @@ def test_what_breaks_off_leaves_no_file(blobs, tmp_path):
         (lambda t, c: gv.Progressive(3), "render must be callable, got int"),
         (lambda t, c: gv.Progressive(print).refine(c, 0), "samples must be an int >= 1, got 0"),
         (lambda t, c: gv.Progressive(print).frame(3), "camera must be a Camera, got int"),
+        (lambda t, c: gv.render_tiles(3, c, t / "a.tif"), "render must be callable, got int"),
         (lambda t, c: gv.render_tiles(print, c, t / "a.png"), "must end in .tif or .npy, got"),
         (lambda t, c: gv.render_tiles(print, c, t / "b" / "a.tif"), "folder not found"),
         (lambda t, c: gv.render_tiles(print, c, t / "a.tif", bits=9), "8 or 16 or 32 bits, got 9"),

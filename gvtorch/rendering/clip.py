@@ -64,6 +64,10 @@ class Clip:
     @cached_property
     def _own(self) -> Faces:
         """In the units of `frame`."""
+        for name in ("planes", "boxes", "without"):
+            if not isinstance(getattr(self, name), (Sequence, Tensor)):
+                kind = type(getattr(self, name)).__name__
+                raise ValueError(f"Clip: {name} must be a list, got {kind}")
         planes = list(self.planes)
         return Faces(
             [_face(f"planes[{i}]", plane) for i, plane in enumerate(planes)],

@@ -6,6 +6,7 @@ frame is traced, so nothing is built again.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -28,7 +29,7 @@ class Headlight:
 
     def __post_init__(self) -> None:
         """Checks the colour."""
-        _checked("Headlight", "color", self.color, low=0.0)
+        check_triple("Headlight", "color", self.color, low=0.0)
 
     @property
     def place(self) -> Triple:
@@ -46,8 +47,8 @@ class DirectionalLight:
 
     def __post_init__(self) -> None:
         """Checks direction and colour."""
-        _checked("DirectionalLight", "direction", self.direction, zero=False)
-        _checked("DirectionalLight", "color", self.color, low=0.0)
+        check_triple("DirectionalLight", "direction", self.direction, zero=False)
+        check_triple("DirectionalLight", "color", self.color, low=0.0)
 
     @property
     def place(self) -> Triple:
@@ -65,8 +66,8 @@ class PointLight:
 
     def __post_init__(self) -> None:
         """Checks position and colour."""
-        _checked("PointLight", "position", self.position)
-        _checked("PointLight", "color", self.color, low=0.0)
+        check_triple("PointLight", "position", self.position)
+        check_triple("PointLight", "color", self.color, low=0.0)
 
     @property
     def place(self) -> Triple:
@@ -97,9 +98,7 @@ class Material:
                 f"got {type(self.light).__name__}"
             )
         for name in ("ambient", "diffuse", "specular", "shininess"):
-            value = getattr(self, name)
-            if not (isinstance(value, Tensor) and value.numel() == 1):
-                check.number("shader", name, value, low=0)
+            check_number("shader", name, getattr(self, name), low=0)
 
     def rows(self) -> tuple[Any, ...]:
         """The first three rows of `parameter_54`, see `shade_rays`."""
@@ -125,16 +124,38 @@ def pack(parts: Sequence[Any], dtype: torch.dtype, device: torch.device) -> Tens
     return torch.cat(out)
 
 
-def _checked(
-    where: str, name: str, value: Any, *, low: float | None = None, zero: bool = True
+def check_number(where: str, name: str, value: Any, *, low: float = -math.inf) -> None:
+    """Raises ValueError unless it is a finite number >= low, or a tensor of one; nobody waits for a
+    device, so what lies on CUDA is not looked at.
+    """
+    if isinstance(value, Tensor):
+        if value.numel() != 1:
+            got = check.describe(value)
+            raise ValueError(f"{where}: {name} must be a number or a tensor of one, got {got}")
+        if value.is_cuda:
+            return
+        value = value.item()
+    check.number(where, name, value, low=low)
+
+
+def check_triple(
+    where: str,
+    name: str,
+    value: Any,
+    *,
+    low: float = -math.inf,
+    high: float = math.inf,
+    zero: bool = True,
 ) -> None:
+    """Raises ValueError unless these are three finite numbers in [low, high], or a tensor of them,
+    as for `check_number`; `zero` tells whether all may be 0.
+    """
     if isinstance(value, Tensor) and value.is_cuda:
         if value.shape != (3,):
             raise ValueError(f"{where}: {name} must be (3,), got {check.describe(value)}")
         return
     numbers = check.triple(where, name, value)
-    if low is not None:
-        for number in numbers:
-            check.number(where, name, number, low=low)
+    for number in numbers:
+        check.number(where, name, number, low=low, high=high)
     if not zero and not any(numbers):
         raise ValueError(f"{where}: {name} must not be zero")

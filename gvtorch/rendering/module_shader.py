@@ -84,15 +84,22 @@ class ModuleShader:
         """Colour (k, 3) and alpha (k,) of samples.
 
         Raises:
-            ValueError: The module gives something of another shape or dtype, or no alpha.
+            ValueError: The module gives something of another shape or dtype, a colour that is not
+                finite, or no alpha.
         """
         given = (batch.values(self.channels), batch.positions, batch.directions, batch.lengths)
-        color, alpha = self.module(*given)
+        made = self.module(*given)
+        if not (isinstance(made, Sequence) and len(made) == 2):
+            got = f"{len(made)} parts" if isinstance(made, Sequence) else type(made).__name__
+            raise ValueError(f"ModuleShader: the module must give colour and alpha, got {got}")
+        color, alpha = made
         count, real, device = len(given[0]), given[0].dtype, given[0].device
         check.tensor("ModuleShader", "the module's colour", color, (count, 3), real, device)
         check.tensor("ModuleShader", "the module's alpha", alpha, (count, 1), real, device)
         if not bool(((alpha >= 0) & (alpha <= 1)).all()):
             raise ValueError("ModuleShader: the module's alpha must lie in [0, 1]")
+        if not bool(torch.isfinite(color).all()):
+            raise ValueError("ModuleShader: the module's colour must be finite")
         return color, alpha[:, 0]
 
 
