@@ -279,6 +279,9 @@ def march(
         missed=like.new_zeros(count, dtype=torch.bool),
     )
     which, state, width = torch.arange(count, device=like.device), None, rays.width
+    if rays.clear is not None:  # some may have ended before
+        which, width = (sums.clear > 1 - stop_alpha).nonzero()[:, 0], 0
+        columns = _some(columns, which)
     while len(which):
         segments = trace_segments(*columns, **walk, state_r3=state, width=width)
         sums.missed[which] |= segments.missed
@@ -304,8 +307,7 @@ def march(
             sums.depth[which[batch.ray[hit]]] = place.to(real)
             going = (segments.counts[:, 1] >= limit) & (left > 1 - stop_alpha)
             on = going.nonzero()[:, 0]
-        origin, direction, cone, limits = columns
-        columns = (origin[on], direction[on], cone[on], limits[on])
+        columns = _some(columns, on)
         which, state, width = which[on], segments.state[on], 0
     return sums
 
@@ -316,6 +318,11 @@ def _wide(rays: Rays) -> Columns:
         for column in (rays.origin, rays.direction, rays.cone, rays.range)
     )
     return origin, direction, cone, limits
+
+
+def _some(columns: Columns, which: Tensor) -> Columns:
+    origin, direction, cone, limits = columns
+    return origin[which], direction[which], cone[which], limits[which]
 
 
 class ModuleTracer:
