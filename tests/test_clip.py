@@ -280,6 +280,46 @@ def test_a_cap_has_the_colour_of_the_cut_and_faces_the_eye(backend, opacity):
     torch.testing.assert_close(alpha[empty], behind[empty], rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("opacity", [1.0, 0.5])
+@pytest.mark.parametrize("kind", ["isosurface", "coloured isosurface", "distance field"])
+def test_a_cut_through_a_surface_is_filled(backend, kind, opacity):
+    """Half a ball of radius 11, from before the cut: a disc, and the far half's inside behind."""
+    axis = torch.arange(40.0) - 19.5
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+    radius = (x * x + y * y + z * z).sqrt()
+    channels = {"distance": radius - 11, "height": 20 - radius, "x": x}
+    volumes = {name: gv.Volume(data) for name, data in channels.items()}
+    tree = gv.N3Tree.from_volume(volumes, 8, device=DEVICES[backend])
+    base = torch.tensor([0.2, 0.4, 0.6])
+    look = {"light": gv.DirectionalLight((0, 0, 1)), "ambient": 1.0, "specular": 0.0}
+    look["diffuse"] = 0.0  # the surface behind has the same colour everywhere
+    options = {"backend": backend, "background": None, "channel": "height"}
+    if kind == "isosurface":
+        shader = gv.Isosurface(9.0, base, **look)
+    elif kind == "coloured isosurface":
+        sides = gv.TransferFunction.from_points([(0, 1)], [(-1, 0, 0, 0), (1, *base.tolist())])
+        shader = gv.Isosurface(9.0, sides, color_channel="x", **look)
+    else:
+        shader, options["channel"] = gv.DistanceField(base, **look), "distance"
+    cut = {"planes": [(0, 0, -1, 0)], "frame": "box", "cap_light": 1.0}
+    clip = gv.Clip(**cut, caps=True, cap_opacity=opacity)
+    camera = gv.Camera.orbit(0, 0, 1.6, None, 48, 48, "ortho")
+    shown = gv.render(tree, camera, shader, clip=clip, **options)
+    bare = gv.render(tree, camera, shader, clip=gv.Clip(**cut), **options)
+    origin = camera.placed(tree.box).rays().origin[:, :2] - 19.5
+    off = origin.norm(dim=1).reshape(48, 48) - 11
+    inside, outside = off < -0.1, off > 0.1
+    right = origin[:, 0].reshape(48, 48) > 1.1
+    color, depth = shown.color.cpu(), shown.depth.cpu()[..., 0]
+    assert bool((shown.alpha.cpu()[inside] == 1).all()) and not shown.alpha.cpu()[outside].any()
+    if kind == "coloured isosurface":
+        inside = inside & right
+        assert not color[~right & (origin[:, 0].reshape(48, 48) < -1.1)].any()
+    torch.testing.assert_close(color[inside], base.expand_as(color[inside]))
+    torch.testing.assert_close(depth[inside], torch.full_like(depth[inside], 1.6 * 40))
+    assert bool((bare.depth.cpu()[..., 0][inside] > 1.6 * 40 + 1).all()), "an open shell"
+
+
 def test_what_is_not_cut_has_no_cap(backend):
     """The camera looks at faces of the volume, and the cut is on its far side."""
     tree = gv.N3Tree.from_volume(gv.Volume(torch.rand(16, 16, 16)), 8, device=DEVICES[backend])

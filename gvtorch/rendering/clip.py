@@ -100,12 +100,20 @@ class Clipped:
     """Traces what is kept of rays."""
 
     def __init__(
-        self, trace: Trace, clip: Clip, box: Tensor, *, step: float, depth_alpha: float
+        self,
+        trace: Trace,
+        clip: Clip,
+        box: Tensor,
+        *,
+        step: float,
+        depth_alpha: float,
+        slab: Trace | None = None,
     ) -> None:
         """Takes what traces the pieces, the (2, 3) box of the scene, the shortest interval in world
-        units, which is how deep a cap looks for its colour, and where alpha means depth.
+        units, which is how deep a cap looks for its colour, where alpha means depth, and what
+        traces so far behind a cut, if that is not `trace`.
         """
-        self._trace, self._clip = trace, clip
+        self._trace, self._clip, self._slab = trace, clip, slab or trace
         self._step, self._hit_clear = step, 1 - depth_alpha
         planes, boxes, self._without = clip.faces(box)
         alone = len(boxes) == 1  # then what is kept is convex
@@ -167,7 +175,7 @@ class Clipped:
         """
         first, last = piece.range.unbind(1)
         end = torch.where(first > begin, torch.minimum(first + self._step, last), first)
-        slab = self._trace(dataclasses.replace(piece, range=torch.stack((first, end), 1)))
+        slab = self._slab(dataclasses.replace(piece, range=torch.stack((first, end), 1)))
         clear = torch.ones_like(first) if piece.clear is None else piece.clear
         clear = clear.to(slab.color.dtype)
         share = clear - (1 - slab.alpha[:, 0])  # of the light, that the slab takes

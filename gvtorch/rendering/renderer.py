@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -18,6 +19,7 @@ from ..pool import N3Tree
 from ..stage import Progress, collect_timings, no_progress, stage
 from .background import Background, checked_background
 from .camera import Camera
+from .caps import SurfaceSlab
 from .clip import Clip, Clipped
 from .custom import as_camera
 from .layer import Layer
@@ -26,7 +28,7 @@ from .module_shader import ModuleShader, ModuleTracer
 from .picture import Picture
 from .pieces import Trace
 from .shader import TransferFunction, interval_levels
-from .shaders import FusedShader, Intervals, Projection, Shader
+from .shaders import FusedShader, Intervals, Isosurface, Projection, Shader
 
 AnyShader = FusedShader | ModuleShader
 _RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that progress shows
@@ -357,8 +359,12 @@ def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -
     if options.lens is not None:
         trace = ThroughLens(trace, options.lens.placed(box), options.cone_scale)
     if options.clip is not None:
-        step = tracer.arguments["step"]
-        trace = Clipped(trace, options.clip, box, step=step, depth_alpha=options.depth_alpha)
+        slab: Trace | None = None
+        filled = options.clip.caps and isinstance(tracer, Tracer)
+        if filled and isinstance(tracer.shader, Isosurface):
+            slab = SurfaceSlab(tracer.shader, partial(tracer.with_shader, options))
+        given = {"step": tracer.arguments["step"], "depth_alpha": options.depth_alpha}
+        trace = Clipped(trace, options.clip, box, slab=slab, **given)
     return trace
 
 
@@ -424,6 +430,11 @@ class Tracer:
             "by_level": by_level,
             "backend": options.backend,
         }
+
+    def with_shader(self, options: RenderOptions, shader: FusedShader) -> Tracer:
+        """Returns the tracer of the same frame with another shader."""
+        frame = {name: self.arguments[name] for name in ("by_level", "frame_1")}
+        return Tracer(self.tree, shader, options, **frame)
 
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays in world units."""

@@ -275,9 +275,12 @@ class StoredColor(_Lighted):
 
 
 class Isosurface(_Lighted):
-    """The first place where the value passes a level, opaque and lit; to a tenth of a voxel."""
+    """The first place where the value passes a level, opaque and lit; to a tenth of a voxel. Where
+    a cap cuts it, it is filled with what is not below the level.
+    """
 
     kind = kinds.ISOSURFACE
+    rises = True  # the value, from outside to inside
 
     def __init__(
         self,
@@ -323,7 +326,11 @@ class Isosurface(_Lighted):
 
 
 class DistanceField(Isosurface):
-    """The surface of a signed distance field: where the distance is `offset`, 0 if left out."""
+    """The surface of a signed distance field: where the distance is `offset`, 0 if left out. Inside
+    the distance is smaller.
+    """
+
+    rises = False
 
     def __init__(
         self,
