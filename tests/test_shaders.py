@@ -144,6 +144,30 @@ def test_rays_that_have_lost_light_bring_back_the_rest(tree, compiled, name):
         assert full.alpha.max() > 0.3
 
 
+@pytest.mark.parametrize("name", ["lit", "stored colour"])
+def test_a_region_of_one_value_is_lit_as_bricks_are(compiled, name):
+    even = {
+        "value": torch.full((20, 20, 20), 0.3),
+        "rgba": torch.full((20, 20, 20, 4), 0.2),
+        "normal": torch.tensor([1.0, 0.0, 0.0]).expand(20, 20, 20, 3),
+    }
+    light = gv.PointLight((10.0, 10.0, 10.0))  # in the middle: every place sees it elsewhere
+    shader: gv.Lit | gv.StoredColor = gv.Lit(SHADER, normals="normal", light=light)
+    if name == "stored colour":
+        shader = gv.StoredColor("rgba", normals="normal", light=light, reference=10.0)
+    found = []
+    for noise in (0.0, 1e-7):  # one region, without any brick; bricks
+        rough = {**even, "value": even["value"] + noise * torch.rand(20, 20, 20)}
+        tree = gv.N3Tree.from_volume({n: gv.Volume(data) for n, data in rough.items()}, 4)
+        assert bool(tree.bricks.capacity) is (noise > 0)
+        rays = camera_rays(tree, 12, distance=1.6)
+        _, actual, _ = assert_same_fields(tree, compiled, rays, shader, lod="finest")
+        found.append(actual)
+    assert found[0]["color"].max() > 0.05
+    for field in ("color", "alpha", "normal"):
+        torch.testing.assert_close(found[0][field], found[1][field], rtol=1e-4, atol=1e-4)
+
+
 def test_lights_are_tensors_that_may_be_edited(tree):
     position, ambient = torch.tensor([0.0, 40.0, 60.0]), torch.tensor(0.1)
     shader = gv.Isosurface(0.5, light=gv.PointLight(position), ambient=ambient)

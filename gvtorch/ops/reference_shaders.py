@@ -82,7 +82,9 @@ class Shade:
         for channel in (bricks, *self.normals[:1], *self.others[:1]):
             numbers = channel.constant_nc
             equal = equal & (numbers[fine] == numbers[coarse]).all(1)
-        return equal | (fine == coarse)
+        equal = equal | (fine == coarse)
+        # Near a light, a stored normal is lit differently wherever it stands.
+        return equal & (self.parameter[3].to(torch.int32) != POINT) if self.normals else equal
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
         """The transfer function, lit."""
