@@ -280,6 +280,25 @@ def test_a_cap_has_the_colour_of_the_cut_and_faces_the_eye(backend, opacity):
     torch.testing.assert_close(alpha[empty], behind[empty], rtol=0, atol=1e-6)
 
 
+def test_a_cap_has_features_and_a_normal(backend):
+    """All of a solid whose second channel holds 7 and 3: a cap shows them, and faces the eye."""
+    value = torch.rand(24, 24, 24, generator=torch.Generator().manual_seed(5)) * 0.1 + 0.5
+    pair = torch.tensor([7.0, 3.0]).expand(24, 24, 24, 2)
+    volumes = {"value": gv.Volume(value), "pair": gv.Volume(pair)}
+    tree = gv.N3Tree.from_volume(volumes, 8, device=DEVICES[backend])
+    thin = gv.TransferFunction.from_points([(0, 0.02)])
+    camera = gv.Camera.orbit(0, 0, 2.0, None, 20, 20, "ortho")
+    inside = camera.placed(tree.box).rays().origin[:, :2] - 11.5
+    inside = (inside.abs() < 11).all(1).view(20, 20)
+    given = {"clip": gv.Clip(planes=[(0, 0, -1, 15.0)], caps=True), "backend": backend}
+    features = gv.render(tree, camera, gv.Features(thin, "pair"), **given).features.cpu()
+    torch.testing.assert_close(features[inside], pair[0, 0, 0].expand_as(features[inside]))
+    normal = gv.render(tree, camera, gv.Lit(thin), **given).normal.cpu()
+    torch.testing.assert_close(
+        normal[inside], torch.tensor([0.0, 0, 1]).expand(normal[inside].shape)
+    )
+
+
 @pytest.mark.parametrize("opacity", [1.0, 0.5])
 @pytest.mark.parametrize("kind", ["isosurface", "coloured isosurface", "distance field"])
 def test_a_cut_through_a_surface_is_filled(backend, kind, opacity):
@@ -346,7 +365,8 @@ def test_the_face_that_is_shaded_is_the_one_that_was_crossed():
     entry = clipped.pieces(rays)[0][:, 0]
     torch.testing.assert_close(entry, (to - origin).norm(dim=1))
     axis = torch.tensor([0] * 22 + [1] * 22 + [2] * 20)
-    facing = clipped._facing(rays, entry)
+    facing, normal = clipped._facing(rays, entry)
+    torch.testing.assert_close(normal, torch.eye(3, dtype=torch.float64)[axis])
     torch.testing.assert_close(facing, direction.gather(1, axis[:, None]).abs()[:, 0])
 
 

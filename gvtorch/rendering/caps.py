@@ -13,6 +13,8 @@ from .pieces import Trace
 from .shader import TransferFunction
 from .shaders import Isosurface, Projection
 
+_WHITE = TransferFunction.from_points([(0, 1)])  # kept: its table is made once
+
 
 class SurfaceSlab:
     """Traces slabs behind cuts: opaque where the first value lies inside of a surface, in the
@@ -22,7 +24,7 @@ class SurfaceSlab:
     def __init__(self, shader: Isosurface, trace_with: Callable[[Projection], Trace]) -> None:
         """Takes the surface, and what gives the tracer of the same frame with another shader."""
         self._shader = shader
-        value = Projection("maximum", TransferFunction.from_points([(0, 1)]))
+        value = Projection("maximum", _WHITE)
         value.channel, value.component = shader.channel, shader.component
         self._value = trace_with(value)
         self._color: Trace | None = None
@@ -49,4 +51,5 @@ class SurfaceSlab:
             color=torch.where(inside, color, 0),
             alpha=torch.where(inside, hits.alpha, 1 - clear.to(hits.alpha)),
             depth=torch.where(inside, hits.depth, torch.inf),
+            features=None,
         )

@@ -171,7 +171,7 @@ class Clipped:
 
     def _cap(self, piece: Rays, begin: Tensor) -> Hits:
         """What a cut shows where it is the beginning of a piece: one interval behind it tells the
-        colour, and whether there is any.
+        colour, features if there are, and whether there is anything.
         """
         first, last = piece.range.unbind(1)
         end = torch.where(first > begin, torch.minimum(first + self._step, last), first)
@@ -180,7 +180,9 @@ class Clipped:
         clear = clear.to(slab.color.dtype)
         share = clear - (1 - slab.alpha[:, 0])  # of the light, that the slab takes
         alpha = torch.where(share > _SEEN * clear, self._clip.cap_opacity, 0.0).to(clear)
-        light = 1 - self._clip.cap_light * (1 - self._facing(piece, first))
+        facing, normal = self._facing(piece, first)
+        light = 1 - self._clip.cap_light * (1 - facing)
+        part = clear * alpha / torch.where(alpha > 0, share, 1.0)
         scale = clear * alpha * light.to(clear) / torch.where(alpha > 0, share, 1.0)
         left = clear * (1 - alpha)
         hit = (left < self._hit_clear) & (clear >= self._hit_clear)
@@ -190,13 +192,16 @@ class Clipped:
             depth=torch.where(hit, first.to(clear), torch.inf)[:, None],
             samples=slab.samples,
             missed=slab.missed,
+            normal=None if slab.normal is None else normal.to(clear) * (alpha > 0)[:, None],
+            features=None if slab.features is None else slab.features * part[:, None],
         )
 
-    def _facing(self, rays: Rays, t: Tensor) -> Tensor:
-        """(r,) cosine between the ray and the normal of the face at distance t: the nearest of
-        those through which rays come in.
+    def _facing(self, rays: Rays, t: Tensor) -> tuple[Tensor, Tensor]:
+        """(r,) cosine between the ray and the normal of the face at distance t, and (r, 3) that
+        normal, towards the eye: the nearest face of those through which rays come in.
         """
         nearest, cosine = torch.full_like(t, torch.inf), torch.ones_like(t)
+        normal = [torch.zeros_like(t)] * 3
         kept = [face for faces in ([self._planes], self._boxes) for some in faces for face in some]
         cut = [face for faces in self._without for face in faces]
         for side, faces in ((1, kept), (-1, cut)):
@@ -204,8 +209,10 @@ class Clipped:
                 height, rate = _height(face, rays)
                 away = torch.where(side * rate > 0, (height + t * rate).abs(), torch.inf)
                 cosine = torch.where(away < nearest, rate.abs(), cosine)
+                sides = zip(face, normal, strict=False)
+                normal = [torch.where(away < nearest, -side * n, known) for n, known in sides]
                 nearest = torch.minimum(away, nearest)
-        return cosine
+        return cosine, torch.stack(normal, 1)
 
 
 def _height(face: Face, rays: Rays) -> tuple[Tensor, Tensor]:
