@@ -16,6 +16,7 @@ from gvtorch import bench
 from gvtorch.bench import peers, scenes, tables
 from gvtorch.bench import record as record_module
 from gvtorch.bench.record import Record, Settings, clock
+from gvtorch.bench.shaders import LOOKS
 
 QUICK = {"quick": True, "repeats": 1}
 CPU = Settings(device=torch.device("cpu"), **QUICK)
@@ -25,6 +26,7 @@ FIGURES = {
     "first_hit": {"rays_per_second", "max_difference", "mean_difference", "times"},
     "bricks": {"samples_per_second", "tree_bytes", "brick_size", "border"},
     "frame": {"cache_share", "cache_ms", "stages", "frames", "bricks", "max_difference"},
+    "shaders": {"times", "beside", "samples_per_second", "op_ms", "max_difference"},
     "lens": {"aperture", "bricks", "moved_bytes", "brick_bytes", "samples"},
     "lru": {"slots_per_second", "times", "same"},
     "compact": {"words_bytes_per_second", "times", "same"},
@@ -64,6 +66,24 @@ def test_a_workload_gives_finite_figures_as_json(name, compiled):
         assert row.get("same", True) is True
     assert len({(row["case"], row["who"]) for row in rows}) == len(rows)
     assert len(tables.markdown(content).splitlines()) >= 2 + len(rows)
+
+
+def test_twins_and_streamed_shaders_draw_the_same(compiled):
+    chosen = Settings(device=torch.device(DEVICES[compiled]), only="aneurism", **QUICK)
+    rows = bench.run("shaders", chosen).rows
+    twins = [row for row in rows if row["who"] == "module"]
+    streamed = [row for row in rows if "engine" in row["case"]]
+    assert len(twins) == 2 and len(streamed) == len(LOOKS) == len(rows) / 2
+    assert max(row["max_difference"] for row in twins + streamed) <= 1e-4
+    for row in rows:
+        (beside,) = (r for r in rows if (r["case"], r["who"]) == (row["case"], row["beside"]))
+        assert row["times"] == row["ms"] / beside["ms"]
+
+
+def test_a_shader_is_timed_with_what_it_stands_beside():
+    chosen = Settings(device=CPU.device, only="fog dense, resident, 24x16, pre-", **QUICK)
+    names = [row["who"] for row in bench.run("shaders", chosen).rows]
+    assert names == ["plain", "plain, step 1", "pre-integrated, step 1"]
 
 
 @pytest.mark.backend("cpp")

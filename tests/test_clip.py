@@ -280,6 +280,65 @@ def test_a_cap_has_the_colour_of_the_cut_and_faces_the_eye(backend, opacity):
     torch.testing.assert_close(alpha[empty], behind[empty], rtol=0, atol=1e-6)
 
 
+def test_a_cap_has_features_and_a_normal(backend):
+    """All of a solid whose second channel holds 7 and 3: a cap shows them, and faces the eye."""
+    value = torch.rand(24, 24, 24, generator=torch.Generator().manual_seed(5)) * 0.1 + 0.5
+    pair = torch.tensor([7.0, 3.0]).expand(24, 24, 24, 2)
+    volumes = {"value": gv.Volume(value), "pair": gv.Volume(pair)}
+    tree = gv.N3Tree.from_volume(volumes, 8, device=DEVICES[backend])
+    thin = gv.TransferFunction.from_points([(0, 0.02)])
+    camera = gv.Camera.orbit(0, 0, 2.0, None, 20, 20, "ortho")
+    inside = camera.placed(tree.box).rays().origin[:, :2] - 11.5
+    inside = (inside.abs() < 11).all(1).view(20, 20)
+    given = {"clip": gv.Clip(planes=[(0, 0, -1, 15.0)], caps=True), "backend": backend}
+    features = gv.render(tree, camera, gv.Features(thin, "pair"), **given).features.cpu()
+    torch.testing.assert_close(features[inside], pair[0, 0, 0].expand_as(features[inside]))
+    normal = gv.render(tree, camera, gv.Lit(thin), **given).normal.cpu()
+    torch.testing.assert_close(
+        normal[inside], torch.tensor([0.0, 0, 1]).expand(normal[inside].shape)
+    )
+
+
+@pytest.mark.parametrize("opacity", [1.0, 0.5])
+@pytest.mark.parametrize("kind", ["isosurface", "coloured isosurface", "distance field"])
+def test_a_cut_through_a_surface_is_filled(backend, kind, opacity):
+    """Half a ball of radius 11, from before the cut: a disc, and the far half's inside behind."""
+    axis = torch.arange(40.0) - 19.5
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+    radius = (x * x + y * y + z * z).sqrt()
+    channels = {"distance": radius - 11, "height": 20 - radius, "x": x}
+    volumes = {name: gv.Volume(data) for name, data in channels.items()}
+    tree = gv.N3Tree.from_volume(volumes, 8, device=DEVICES[backend])
+    base = torch.tensor([0.2, 0.4, 0.6])
+    look = {"light": gv.DirectionalLight((0, 0, 1)), "ambient": 1.0, "specular": 0.0}
+    look["diffuse"] = 0.0  # the surface behind has the same colour everywhere
+    options = {"backend": backend, "background": None, "channel": "height"}
+    if kind == "isosurface":
+        shader = gv.Isosurface(9.0, base, **look)
+    elif kind == "coloured isosurface":
+        sides = gv.TransferFunction.from_points([(0, 1)], [(-1, 0, 0, 0), (1, *base.tolist())])
+        shader = gv.Isosurface(9.0, sides, color_channel="x", **look)
+    else:
+        shader, options["channel"] = gv.DistanceField(base, **look), "distance"
+    cut = {"planes": [(0, 0, -1, 0)], "frame": "box", "cap_light": 1.0}
+    clip = gv.Clip(**cut, caps=True, cap_opacity=opacity)
+    camera = gv.Camera.orbit(0, 0, 1.6, None, 48, 48, "ortho")
+    shown = gv.render(tree, camera, shader, clip=clip, **options)
+    bare = gv.render(tree, camera, shader, clip=gv.Clip(**cut), **options)
+    origin = camera.placed(tree.box).rays().origin[:, :2] - 19.5
+    off = origin.norm(dim=1).reshape(48, 48) - 11
+    inside, outside = off < -0.1, off > 0.1
+    right = origin[:, 0].reshape(48, 48) > 1.1
+    color, depth = shown.color.cpu(), shown.depth.cpu()[..., 0]
+    assert bool((shown.alpha.cpu()[inside] == 1).all()) and not shown.alpha.cpu()[outside].any()
+    if kind == "coloured isosurface":
+        inside = inside & right
+        assert not color[~right & (origin[:, 0].reshape(48, 48) < -1.1)].any()
+    torch.testing.assert_close(color[inside], base.expand_as(color[inside]))
+    torch.testing.assert_close(depth[inside], torch.full_like(depth[inside], 1.6 * 40))
+    assert bool((bare.depth.cpu()[..., 0][inside] > 1.6 * 40 + 1).all()), "an open shell"
+
+
 def test_what_is_not_cut_has_no_cap(backend):
     """The camera looks at faces of the volume, and the cut is on its far side."""
     tree = gv.N3Tree.from_volume(gv.Volume(torch.rand(16, 16, 16)), 8, device=DEVICES[backend])
@@ -306,7 +365,8 @@ def test_the_face_that_is_shaded_is_the_one_that_was_crossed():
     entry = clipped.pieces(rays)[0][:, 0]
     torch.testing.assert_close(entry, (to - origin).norm(dim=1))
     axis = torch.tensor([0] * 22 + [1] * 22 + [2] * 20)
-    facing = clipped._facing(rays, entry)
+    facing, normal = clipped._facing(rays, entry)
+    torch.testing.assert_close(normal, torch.eye(3, dtype=torch.float64)[axis])
     torch.testing.assert_close(facing, direction.gather(1, axis[:, None]).abs()[:, 0])
 
 
@@ -379,6 +439,8 @@ def test_clip_and_lens_go_together(blobs, compiled):
         ({"boxes": [((0, 0, 0), (1, math.inf, 1))]}, r"boxes\[0\] must be finite"),
         ({"without": [torch.zeros(4, 4)]}, r"without\[0\] must be an affine matrix"),
         ({"without": [torch.zeros(3, 3)]}, r"without\[0\] must be \(4, 4\)"),
+        ({"planes": 3}, "planes must be a list, got int"),
+        ({"without": None}, "without must be a list, got NoneType"),
         ({"boxes": ["ab"]}, r"boxes\[0\] must be"),
         ({"boxes": [3]}, r"boxes\[0\] must be"),
         ({"frame": "moon"}, "frame must be 'world' or 'box', got 'moon'"),

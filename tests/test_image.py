@@ -268,7 +268,22 @@ def test_a_batch_is_laid_side_by_side(tmp_path, tree):
         (lambda p, t: p.tone_map(exposure=math.nan), "exposure must be finite"),
         (lambda p, t: p.tone_map(white=0), "white must be finite and > 0"),
         (lambda p, t: gv.Environment(torch.full((2, 2, 3), math.nan)), "image must be finite"),
-        (lambda p, t: gv.Environment(torch.ones(3, 4)), "image must be (h, w, 3), got (3, 4)"),
+        (
+            lambda p, t: gv.Environment(torch.ones(3, 4)),
+            "image must be (h, w, 3) floats, got (3, 4)",
+        ),
+        (
+            lambda p, t: gv.Environment(torch.ones(0, 4, 3)),
+            "image must be (h, w, 3) floats, got (0",
+        ),
+        (
+            lambda p, t: gv.Backdrop(torch.full((2, 2, 3), math.nan)),
+            "Backdrop: image must be finite",
+        ),
+        (
+            lambda p, t: gv.RenderOptions(background=torch.ones(2, 2, 3, dtype=torch.uint8)),
+            "(n, h, w, 3) floats, got (2, 2, 3) uint8",
+        ),
         (
             lambda p, t: gv.Environment(torch.ones(2, 2, 3), rotation=torch.ones(3, 3)),
             "rotation must be (3, 3) and orthonormal",

@@ -4,6 +4,7 @@ analytically rasterised planes.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import marcher
@@ -127,6 +128,34 @@ def test_alpha_of_one_is_opaque_and_of_zero_nothing(compiled, blobs):
         picture = gv.render(tree, view, GRAY, layer=nothing)
         assert_same_picture(picture, plain)
         assert torch.equal(picture.nearest, plain.depth)
+
+
+def test_normals_count_by_what_each_part_takes_of_the_light(compiled, blobs):
+    tree = on(gv.N3Tree.from_volume(blobs, 8), DEVICES[compiled])
+    view = gv.Camera.orbit(30, 20, 1.3, width=24, height=20).placed(tree.box)
+    far = float((tree.box.mean(0) - view.rays().origin[0]).norm())
+    shader, color = gv.Lit(GRAY), torch.zeros(20, 24, 3)
+    alone = gv.render(tree, view, shader)
+    layers = {
+        alpha: gv.Layer(color, torch.full((20, 24, 1), far), torch.full((20, 24, 1), alpha))
+        for alpha in (0.0, 0.4)
+    }
+    clear = gv.render(tree, view, shader, layer=layers[0.0])
+    assert torch.equal(clear.normal, alone.normal) and alone.normal.any()
+    mixed = gv.render(tree, view, shader, layer=layers[0.4], stop_alpha=1.0)
+    rays = view.rays(tree.device)
+    near, behind = rays.range.clone(), rays.range.clone()
+    near[:, 1] = behind[:, 0] = far
+    options = gv.RenderOptions(stop_alpha=1.0)
+    front, back = (
+        renderer.trace(tree, dataclasses.replace(rays, range=part), shader, options)
+        for part in (near, behind)
+    )
+    share = (1 - front.alpha) * (1 - 0.4) * back.alpha
+    both = front.normal * front.alpha + back.normal * share
+    wanted = torch.nn.functional.normalize(both, dim=1).view(20, 24, 3)
+    torch.testing.assert_close(mixed.normal, wanted, rtol=0, atol=1e-5)
+    assert (mixed.normal - alone.normal).abs().max() > 0.01
 
 
 def behind_nodes(tree: gv.N3Tree, place: torch.Tensor, normal: torch.Tensor) -> torch.Tensor:

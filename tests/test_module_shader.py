@@ -4,6 +4,7 @@ they are told they see; gradients reach parameters and voxels.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
@@ -12,6 +13,7 @@ from conftest import DATA, DEVICES
 from test_trace_rays import SHADER
 
 import gvtorch as gv
+from gvtorch.rendering.renderer import tracer_of
 
 SOFT = gv.TransferFunction.from_points(  # never quite opaque: a power of 0 has no slope
     opacity=[(0, 0), (0.2, 0), (0.6, 0.4), (1, 0.95)],
@@ -187,6 +189,28 @@ def test_gradients_reach_parameters_and_voxels(blobs, compiled):
         assert abs(slope) > 1e-2 and abs(float(grad.view(-1)[at]) - slope) < 0.02 * abs(slope)
 
 
+@torch.no_grad()
+def test_rays_that_have_ended_mark_and_request_nothing(blobs, compiled):
+    device = DEVICES[compiled]
+    tree = gv.N3Tree.from_volume(blobs, 8, device=device)
+    rays = gv.Camera.orbit(width=16, height=12, distance=1.3).placed(tree.box).rays(device)
+    clear = torch.where(torch.arange(len(rays.origin)) % 2 == 0, 0.0, 0.5).to(device)
+    shader, options = twin(SOFT, blobs.spacing, device), gv.RenderOptions(stop_alpha=1.0)
+    tree.frame = 1
+    whole = tracer_of(tree, shader, options)(rays)
+    tree.frame = 2
+    hits = tracer_of(tree, shader, options)(dataclasses.replace(rays, clear=clear))
+    ended = clear == 0
+    assert not hits.samples[ended].any() and not hits.color[ended].any()
+    torch.testing.assert_close(hits.alpha[ended], 1 - clear[ended, None])
+    assert torch.equal(hits.samples[~ended], whole.samples[~ended])
+    torch.testing.assert_close(hits.color[~ended], 0.5 * whole.color[~ended])
+    tree.frame = 3
+    none = dataclasses.replace(rays, clear=torch.zeros_like(clear))
+    tracer_of(tree, shader, options)(none)
+    assert not (tree.nodes.stamp_t == 3).any() and (tree.nodes.stamp_t == 2).any()
+
+
 @pytest.mark.backend("cpp")
 def test_mistakes_have_one_clear_message(blobs):
     tree = gv.N3Tree.from_volume(blobs, 8)
@@ -201,7 +225,16 @@ def test_mistakes_have_one_clear_message(blobs):
     def nan(values, *_rest):
         return values.expand(-1, 3), values * math.nan
 
+    def dark(values, *_rest):
+        return values.expand(-1, 3) * math.nan, values
+
+    def alone(values, *_rest):
+        return values
+
     for shader, message in (
+        (gv.ModuleShader(dark), "the module's colour must be finite"),
+        (gv.ModuleShader(alone), "the module must give colour and alpha, got Tensor"),
+        (gv.ModuleShader(lambda *four: four), "must give colour and alpha, got 4 parts"),
         (gv.ModuleShader(wide), "ModuleShader: the module's colour must be ("),
         (gv.ModuleShader(much), "the module's alpha must lie in [0, 1]"),
         (gv.ModuleShader(nan), "the module's alpha must lie in [0, 1]"),

@@ -81,6 +81,20 @@ def test_the_first_frame_is_the_plain_picture_and_all_are_deterministic(blobs, b
 
 
 @pytest.mark.backend("cpp")
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize(
+    "shader", [gv.Lit(HAZE), gv.Isosurface(0.4), gv.Projection("maximum", HAZE)]
+)
+def test_what_has_no_mean_is_that_of_the_centres(blobs, shader):
+    tree, camera = gv.N3Tree.from_volume(blobs, 8), gv.Camera.orbit(width=20, height=14)
+    layer = gv.Layer(torch.zeros(14, 20, 3), torch.full((14, 20, 1), 1e3))
+    refined = gv.Progressive(partial(gv.render, tree, shader=shader, layer=layer))
+    first, last = refined.frame(camera), refined.refine(camera, 6)
+    assert not torch.equal(first.color, last.color)
+    for name in ("depth", "nearest", "normal", "features"):
+        assert torch.equal(getattr(last, name), getattr(first, name)), name
+
+
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye", "panorama", "custom"])
 def test_a_camera_that_moves_begins_anew(blobs, model):
     tree = gv.N3Tree.from_volume(blobs)
@@ -248,6 +262,7 @@ def test_what_breaks_off_leaves_no_file(blobs, tmp_path):
         (lambda t, c: gv.Progressive(3), "render must be callable, got int"),
         (lambda t, c: gv.Progressive(print).refine(c, 0), "samples must be an int >= 1, got 0"),
         (lambda t, c: gv.Progressive(print).frame(3), "camera must be a Camera, got int"),
+        (lambda t, c: gv.render_tiles(3, c, t / "a.tif"), "render must be callable, got int"),
         (lambda t, c: gv.render_tiles(print, c, t / "a.png"), "must end in .tif or .npy, got"),
         (lambda t, c: gv.render_tiles(print, c, t / "b" / "a.tif"), "folder not found"),
         (lambda t, c: gv.render_tiles(print, c, t / "a.tif", bits=9), "8 or 16 or 32 bits, got 9"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -409,6 +410,12 @@ def test_graphs_on_cuda_replay_every_model(blobs, model):
                 )
             ),
             "unit length, 4 are not",
+        ),
+        (
+            lambda: gv.CustomCamera(
+                dataclasses.replace(askew("pinhole").rays(), clear=torch.ones(140))
+            ),
+            "rays of a picture must have no clear",
         ),
         (
             lambda: gv.CustomCamera.from_directions(torch.ones(2, 3), torch.ones(5, 4, 3)),

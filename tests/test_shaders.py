@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -130,6 +131,43 @@ def test_what_ranges_hide_changes_no_bit(channels, name, threshold):
         assert few["samples"].sum() < many["samples"].sum()
 
 
+@pytest.mark.parametrize("name", SHADERS)
+def test_rays_that_have_lost_light_bring_back_the_rest(tree, compiled, name):
+    rays = camera_rays(tree, 16, distance=1.6)
+    dimmed = replace(rays, clear=torch.full((len(rays.origin),), 0.25))
+    for backend in ("reference", compiled):
+        options = gv.RenderOptions(stop_alpha=1.0, backend=backend)
+        tracer = Tracer(on(tree, DEVICES[compiled]), SHADERS[name], options)
+        full, rest = (tracer(some.to(DEVICES[compiled])) for some in (rays, dimmed))
+        torch.testing.assert_close(rest.color, 0.25 * full.color)
+        torch.testing.assert_close(1 - rest.alpha, 0.25 * (1 - full.alpha))
+        assert full.alpha.max() > 0.3
+
+
+@pytest.mark.parametrize("name", ["lit", "stored colour"])
+def test_a_region_of_one_value_is_lit_as_bricks_are(compiled, name):
+    even = {
+        "value": torch.full((20, 20, 20), 0.3),
+        "rgba": torch.full((20, 20, 20, 4), 0.2),
+        "normal": torch.tensor([1.0, 0.0, 0.0]).expand(20, 20, 20, 3),
+    }
+    light = gv.PointLight((10.0, 10.0, 10.0))  # in the middle: every place sees it elsewhere
+    shader: gv.Lit | gv.StoredColor = gv.Lit(SHADER, normals="normal", light=light)
+    if name == "stored colour":
+        shader = gv.StoredColor("rgba", normals="normal", light=light, reference=10.0)
+    found = []
+    for noise in (0.0, 1e-7):  # one region, without any brick; bricks
+        rough = {**even, "value": even["value"] + noise * torch.rand(20, 20, 20)}
+        tree = gv.N3Tree.from_volume({n: gv.Volume(data) for n, data in rough.items()}, 4)
+        assert bool(tree.bricks.capacity) is (noise > 0)
+        rays = camera_rays(tree, 12, distance=1.6)
+        _, actual, _ = assert_same_fields(tree, compiled, rays, shader, lod="finest")
+        found.append(actual)
+    assert found[0]["color"].max() > 0.05
+    for field in ("color", "alpha", "normal"):
+        torch.testing.assert_close(found[0][field], found[1][field], rtol=1e-4, atol=1e-4)
+
+
 def test_lights_are_tensors_that_may_be_edited(tree):
     position, ambient = torch.tensor([0.0, 40.0, 60.0]), torch.tensor(0.1)
     shader = gv.Isosurface(0.5, light=gv.PointLight(position), ambient=ambient)
@@ -234,6 +272,13 @@ def test_opcheck(tree, compiled, name, dtype):
         (lambda: gv.PointLight((0, 0, float("nan"))), "position must be finite"),
         (lambda: gv.Projection("median", SHADER), "which must be 'maximum'"),
         (lambda: gv.Isosurface(float("nan")), "value must be finite"),
+        (lambda: gv.Isosurface(torch.tensor(float("nan"))), "value must be finite"),
+        (lambda: gv.Isosurface(torch.zeros(2)), "value must be a number or a tensor of one, got ("),
+        (lambda: gv.Isosurface(1, torch.zeros(4)), "color must be three numbers, got 4"),
+        (lambda: gv.Isosurface(1, torch.tensor([0, 0, 2.0])), "color must be finite and >= 0 and"),
+        (lambda: gv.Lit(SHADER, ambient=torch.tensor(float("nan"))), "ambient must be finite"),
+        (lambda: gv.Features(SHADER, None), "Features: channel must be a name, got None"),
+        (lambda: gv.StoredColor(3), "StoredColor: channel must be a name, got 3"),
         (lambda: gv.Isosurface(1, SHADER), "color_channel belong together"),
         (lambda: gv.StoredColor("rgba", reference=0), "reference must be finite and > 0"),
     ],

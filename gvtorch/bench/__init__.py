@@ -16,6 +16,7 @@ WORKLOADS = {
     "march": "rays through resident trees: fog, shell, clouds and a scan, beside peers",
     "first_hit": "the first opaque voxel of a thin shell, 1920x1080, beside peers",
     "bricks": "marching with brick sizes 4 to 32 and borders 0 to 2, and their memory",
+    "shaders": "each shader beside the plain transfer function, resident and in the engine",
     "lens": "the engine through lenses: more blur, coarser levels, fewer bricks",
     "frame": "the engine: a steady frame and the cache's share of it, a cold start",
     "lru": "1 M slots ordered by use, beside torch.sort",
@@ -36,7 +37,7 @@ PEERS = {
 }
 _HOME = {
     **{"march": "march", "first_hit": "march", "bricks": "march", "frame": "frames"},
-    "lens": "lens",
+    **{"shaders": "shaders", "lens": "lens"},
     **{"stream": "frames", "lru": "cache", "compact": "cache", "produce": "produce"},
     **{"convert": "storage", "blocks": "storage"},
 }

@@ -85,12 +85,12 @@ def bricks(record: Record) -> None:
                 camera = scene.camera(*size)
                 run = _tracing(tree, scene, camera, "finest", device)
                 hits = run()
-                picture = _rgba(hits)
+                picture = rgba(hits)
                 first = picture if first is None else first
                 timing = clock(run, record.settings)
                 sizes = {"scene": name, "brick_size": brick_size, "border": border}
                 memory = {"tree_bytes": tree.nbytes, "bricks": tree.bricks.capacity}
-                figures = sizes | _rates(hits, timing) | _difference(picture, first) | memory
+                figures = sizes | rates(hits, timing) | difference(picture, first) | memory
                 record.add(case, "gvtorch", timing, **figures)
     record.note("Differences are from the picture of the scene's first row.")
 
@@ -117,12 +117,12 @@ def _compare(
         run = _tracing(tree, scene, camera, lod, device)
         hits = run()
         timing = clock(run, settings)
-        figures = _rates(hits, timing) | {"op_ms": op_milliseconds(run, settings)}
-        picture = _rgba(hits)
+        figures = rates(hits, timing) | {"op_ms": op_milliseconds(run, settings)}
+        picture = rgba(hits)
         if lod == "finest":
             finest, median = picture, timing.median
         else:
-            figures |= {"times": timing.median / median} | _difference(picture, finest)
+            figures |= {"times": timing.median / median} | difference(picture, finest)
         record.add(case, who, timing, **figures)
         _save(record, picture, f"{case} {who}", size)
     rays = camera.rays(device)
@@ -133,7 +133,7 @@ def _compare(
         timing = clock(peer.render, settings)
         picture = peer.picture().cpu()
         figures = {"rays_per_second": 1e3 * len(picture) / timing.median}
-        figures |= {"times": timing.median / median} | _difference(picture, finest)
+        figures |= {"times": timing.median / median} | difference(picture, finest)
         record.add(case, name, timing, **figures)
         _save(record, picture, f"{case} {name}", size)
 
@@ -147,20 +147,23 @@ def _tracing(
     return lambda: trace(tree, rays, scene.shader, options)
 
 
-def _rates(hits: Hits, timing: Timing) -> dict[str, Any]:
+def rates(hits: Hits | Picture, timing: Timing) -> dict[str, Any]:
+    """Returns samples, and samples and rays per second, of what one call took."""
     samples = int(hits.samples.sum(dtype=torch.int64))
     return {
         "samples": samples,
         "samples_per_second": 1e3 * samples / timing.median,
-        "rays_per_second": 1e3 * len(hits.samples) / timing.median,
+        "rays_per_second": 1e3 * hits.samples.numel() / timing.median,
     }
 
 
-def _rgba(hits: Hits) -> Tensor:
-    return torch.cat((hits.color, hits.alpha), 1).float().cpu()
+def rgba(hits: Hits | Picture) -> Tensor:
+    """Returns (r, 4) float32 colour and alpha on the CPU."""
+    return torch.cat((hits.color, hits.alpha), -1).reshape(-1, 4).float().cpu()
 
 
-def _difference(picture: Tensor, other: Tensor) -> dict[str, float]:
+def difference(picture: Tensor, other: Tensor) -> dict[str, float]:
+    """Returns how far two pictures of one shape are apart, over all their numbers."""
     apart = (picture - other).double().abs()
     return {
         "max_difference": float(apart.max()),
@@ -170,7 +173,7 @@ def _difference(picture: Tensor, other: Tensor) -> dict[str, float]:
 
 
 def op_milliseconds(run: Callable[[], object], settings: Settings) -> float | None:
-    """Median milliseconds inside the op `trace_rays`; None where it is not called."""
+    """Median milliseconds inside the op of a fused shader; None where none is called."""
     with _Watch(settings.device) as watch:
         began = time.perf_counter()
         for _ in range(settings.repeats):
@@ -181,7 +184,7 @@ def op_milliseconds(run: Callable[[], object], settings: Settings) -> float | No
 
 
 class _Watch(TorchDispatchMode):
-    """Takes the time of the op whenever it is called."""
+    """Takes the time of a fused shader's op whenever it is called."""
 
     def __init__(self, device: torch.device) -> None:
         super().__init__()
@@ -196,7 +199,7 @@ class _Watch(TorchDispatchMode):
         def call() -> None:
             answer[:] = [func(*args, **(kwargs or {}))]
 
-        if func.name() == "gvtorch::trace_rays":
+        if func.name() in ("gvtorch::trace_rays", "gvtorch::shade_rays"):
             self.times.append(once(call, self.device))
         else:
             call()

@@ -27,6 +27,7 @@ class Scene:
     volume: Volume
     shader: TransferFunction
     step: float = 0.5
+    surface: float = 128.0  # the value at which shaders that look for a surface find one
 
     @property
     def box(self) -> Tensor:
@@ -56,7 +57,8 @@ def _uint8(values: Tensor) -> Volume:
 
 def fog_dense(side: int) -> Scene:
     """Thin fog that fills the box: every brick exists and is sampled."""
-    return Scene(name="fog dense", volume=_uint8(_waves(*_grid(side))), shader=_FOG)
+    volume = _uint8(_waves(*_grid(side)))
+    return Scene(name="fog dense", volume=volume, shader=_FOG, surface=100.0)
 
 
 def fog_sparse(side: int) -> Scene:
@@ -118,7 +120,8 @@ def aneurism(side: int) -> Scene:
     data = read_volume(SCAN).data[..., 0]
     every = max(1, data.shape[0] // side)
     volume = Volume(data[::every, ::every, ::every].contiguous())
-    return Scene(name="aneurism", volume=volume, shader=TransferFunction.preset("vessels", 0, 255))
+    vessels = TransferFunction.preset("vessels", 0, 255)
+    return Scene(name="aneurism", volume=volume, shader=vessels, surface=76.0)
 
 
 def worn_planes(side: int) -> Iterator[np.ndarray]:

@@ -73,7 +73,9 @@ class Shade:
         for channel in (bricks, *self.normals[:1], *self.others[:1]):
             numbers = channel.constant_nc
             equal = equal & (numbers[fine] == numbers[coarse]).all(1)
-        return equal | (fine == coarse)
+        equal = equal | (fine == coarse)
+        # Near a light, a stored normal is lit differently wherever it stands.
+        return equal & (self.parameter[3].to(torch.int32) != POINT) if self.normals else equal
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
         """The transfer function, lit."""
@@ -232,7 +234,7 @@ class Isosurface(Shade):
     def begin(self) -> None:
         """No side is known, and nothing found."""
         self.found = torch.zeros_like(self.moved, dtype=torch.bool)
-        self.before = torch.zeros_like(self.moved)
+        self.before, self.share = torch.zeros_like(self.moved), torch.zeros_like(self.moved)
         self.before_end = torch.full_like(self.moved, -INF)
 
     def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
@@ -261,6 +263,7 @@ class Isosurface(Shade):
         rise = torch.where(crosses, far_value - near_value, 1.0)
         t = near + clamp((level - near_value) / rise, 0, 1) * (far - near)
         hit = early | crosses
+        self.share = torch.where(hit, self.sum.clear, self.share)
         self.sum.clear = torch.where(hit, 0.0, self.sum.clear)
         self.sum.depth = torch.where(hit, torch.where(early, piece.start, t), self.sum.depth)
 
@@ -271,7 +274,7 @@ class Isosurface(Shade):
         if self.others:
             value = probe.number(self.others[self.other_component], t)
         row = self.transfer.look_up(value, torch.zeros_like(t, dtype=torch.int64))
-        color = self.shade(row[:, :3], normal, t)
+        color = self.share[:, None] * self.shade(row[:, :3], normal, t)
         self.sum.color = torch.where(self.found[:, None], color, 0.0)
         self.normal = torch.where(self.found[:, None], normal, 0.0)
 
@@ -312,7 +315,8 @@ class Projection(Shade):
         mean = self.found / torch.where(seen, self.length, 1.0)
         value = mean if self.parameter[12] == MEAN else self.found
         row = self.transfer.look_up(value, torch.zeros_like(value, dtype=torch.int64))
-        self.sum.color = torch.where(seen[:, None], row[:, :3], 0.0)
+        color = self.sum.clear[:, None] * row[:, :3]
+        self.sum.color = torch.where(seen[:, None], color, 0.0)
         self.sum.clear = torch.where(seen, 0.0, self.sum.clear)
         self.sum.depth = torch.where(seen, self.at, INF)
         self.features = torch.where(seen, value, 0.0)[:, None]

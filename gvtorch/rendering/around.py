@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from .caps import SurfaceSlab
 from .clip import Clipped
-from .lens import ThroughLens
+from .lens import ThinLens, ThroughLens
 from .lighting import Lighted
 from .module_shader import ModuleTracer
 from .pieces import Trace
-from .shaders import LitShader, Shader
+from .shaders import Isosurface, LitShader, Shader
 
 if TYPE_CHECKING:
     from .renderer import RenderOptions, Tracer
@@ -37,19 +38,22 @@ def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -
         kind = type(tracer.shader).__name__
         raise ValueError(f"render: {kind} sees a ray in one go, so it has no {name}")
 
-    def clipped(trace: Trace) -> Trace:
+    def through(sight: Tracer | ModuleTracer, lens: ThinLens | None = None) -> Trace:
+        trace: Trace = sight
+        if lens is not None:
+            trace = ThroughLens(trace, lens, options.cone_scale)
         if options.clip is None:
             return trace
-        step = tracer.arguments["step"]
-        return Clipped(trace, options.clip, box, step=step, depth_alpha=options.depth_alpha)
+        slab: Trace | None = None
+        if options.clip.caps and not isinstance(sight, ModuleTracer):
+            if isinstance(sight.shader, Isosurface):
+                slab = SurfaceSlab(sight.shader, lambda shader: sight.seeing(shader, options))
+        given = {"step": tracer.arguments["step"], "depth_alpha": options.depth_alpha}
+        return Clipped(trace, options.clip, box, slab=slab, **given)
 
-    def through_lens(trace: Trace) -> Trace:
-        if options.lens is None:
-            return trace
-        return ThroughLens(trace, options.lens.placed(box), options.cone_scale)
-
+    lens = options.lens and options.lens.placed(box)
     if options.lighting is None:
-        return clipped(through_lens(tracer))
+        return through(tracer, lens)
     shader = tracer.shader
     if isinstance(tracer, ModuleTracer) or not isinstance(shader, LitShader):
         kind = "TransferFunction" if shader is None else type(shader).__name__
@@ -61,14 +65,14 @@ def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -
     matter = None
     if options.lighting.indirect:
         early = replace(cones, depth_alpha=0.25 * options.stop_alpha)
-        matter = clipped(tracer.seeing(shader.matter(), early))
+        matter = through(tracer.seeing(shader.matter(), early))
     return Lighted(
-        clipped(through_lens(tracer.seeing(shader.unlit(), options))),
-        blocker=clipped(tracer.seeing(shader.blocker(), cones)),
+        through(tracer.seeing(shader.unlit(), options), lens),
+        blocker=through(tracer.seeing(shader.blocker(), cones)),
         matter=matter,
         lighting=options.lighting.placed(box),
         material=shader.material(),
         voxel=max(tracer.tree.spacing),
         cone_scale=options.cone_scale,
-        lens=options.lens and options.lens.placed(box),
+        lens=lens,
     )

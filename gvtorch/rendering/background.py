@@ -63,10 +63,13 @@ class Backdrop(Background):
         """Takes linear RGB, (h, w, 3) or, for a batch of cameras, (n, h, w, 3). From another device
         it is uploaded once; on the device of the picture it may be edited between frames.
         """
-        if not isinstance(image, Tensor) or image.dim() not in (3, 4) or image.shape[-1] != 3:
+        if not _is_image(image) or image.dim() not in (3, 4):
             raise ValueError(
-                f"Backdrop: image must be (h, w, 3) or (n, h, w, 3), got {check.describe(image)}"
+                "Backdrop: image must be (h, w, 3) or (n, h, w, 3) floats, "
+                f"got {check.describe(image)}"
             )
+        if not (image.is_cuda or bool(torch.isfinite(image).all())):
+            raise ValueError("Backdrop: image must be finite, got NaN or infinity")
         self.image = image
         self._there: dict[torch.device, Tensor] = {}
 
@@ -105,8 +108,10 @@ class Environment(Background):
         Raises:
             ValueError: A shape is wrong, a value is NaN or infinite, or the rotation is none.
         """
-        if not isinstance(image, Tensor) or image.dim() != 3 or image.shape[-1] != 3:
-            raise ValueError(f"Environment: image must be (h, w, 3), got {check.describe(image)}")
+        if not _is_image(image) or image.dim() != 3:
+            raise ValueError(
+                f"Environment: image must be (h, w, 3) floats, got {check.describe(image)}"
+            )
         if not bool(torch.isfinite(image).all()):
             raise ValueError("Environment: image must be finite, got NaN or infinity")
         self.image = image
@@ -168,6 +173,12 @@ def checked_background(where: str, value: Any) -> Background | Color | None:
     for part in color:
         check.number(where, "background", part, low=0, high=1)
     return color
+
+
+def _is_image(value: Any) -> bool:
+    """Whether it is a tensor (..., 3) of floats, and not empty."""
+    known = isinstance(value, Tensor) and value.is_floating_point() and value.numel() > 0
+    return known and value.shape[-1] == 3
 
 
 def _color(where: str, name: str, value: Sequence[float]) -> Color:

@@ -64,6 +64,10 @@ class Clip:
     @cached_property
     def _own(self) -> Faces:
         """In the units of `frame`."""
+        for name in ("planes", "boxes", "without"):
+            if not isinstance(getattr(self, name), (Sequence, Tensor)):
+                kind = type(getattr(self, name)).__name__
+                raise ValueError(f"Clip: {name} must be a list, got {kind}")
         planes = list(self.planes)
         return Faces(
             [_face(f"planes[{i}]", plane) for i, plane in enumerate(planes)],
@@ -96,12 +100,20 @@ class Clipped:
     """Traces what is kept of rays."""
 
     def __init__(
-        self, trace: Trace, clip: Clip, box: Tensor, *, step: float, depth_alpha: float
+        self,
+        trace: Trace,
+        clip: Clip,
+        box: Tensor,
+        *,
+        step: float,
+        depth_alpha: float,
+        slab: Trace | None = None,
     ) -> None:
         """Takes what traces the pieces, the (2, 3) box of the scene, the shortest interval in world
-        units, which is how deep a cap looks for its colour, and where alpha means depth.
+        units, which is how deep a cap looks for its colour, where alpha means depth, and what
+        traces so far behind a cut, if that is not `trace`.
         """
-        self._trace, self._clip = trace, clip
+        self._trace, self._clip, self._slab = trace, clip, slab or trace
         self._step, self._hit_clear = step, 1 - depth_alpha
         planes, boxes, self._without = clip.faces(box)
         alone = len(boxes) == 1  # then what is kept is convex
@@ -159,16 +171,18 @@ class Clipped:
 
     def _cap(self, piece: Rays, begin: Tensor) -> Hits:
         """What a cut shows where it is the beginning of a piece: one interval behind it tells the
-        colour, and whether there is any.
+        colour, features if there are, and whether there is anything.
         """
         first, last = piece.range.unbind(1)
         end = torch.where(first > begin, torch.minimum(first + self._step, last), first)
-        slab = self._trace(dataclasses.replace(piece, range=torch.stack((first, end), 1)))
+        slab = self._slab(dataclasses.replace(piece, range=torch.stack((first, end), 1)))
         clear = torch.ones_like(first) if piece.clear is None else piece.clear
         clear = clear.to(slab.color.dtype)
         share = clear - (1 - slab.alpha[:, 0])  # of the light, that the slab takes
         alpha = torch.where(share > _SEEN * clear, self._clip.cap_opacity, 0.0).to(clear)
-        light = 1 - self._clip.cap_light * (1 - self._facing(piece, first))
+        facing, normal = self._facing(piece, first)
+        light = 1 - self._clip.cap_light * (1 - facing)
+        part = clear * alpha / torch.where(alpha > 0, share, 1.0)
         scale = clear * alpha * light.to(clear) / torch.where(alpha > 0, share, 1.0)
         left = clear * (1 - alpha)
         hit = (left < self._hit_clear) & (clear >= self._hit_clear)
@@ -178,13 +192,16 @@ class Clipped:
             depth=torch.where(hit, first.to(clear), torch.inf)[:, None],
             samples=slab.samples,
             missed=slab.missed,
+            normal=None if slab.normal is None else normal.to(clear) * (alpha > 0)[:, None],
+            features=None if slab.features is None else slab.features * part[:, None],
         )
 
-    def _facing(self, rays: Rays, t: Tensor) -> Tensor:
-        """(r,) cosine between the ray and the normal of the face at distance t: the nearest of
-        those through which rays come in.
+    def _facing(self, rays: Rays, t: Tensor) -> tuple[Tensor, Tensor]:
+        """(r,) cosine between the ray and the normal of the face at distance t, and (r, 3) that
+        normal, towards the eye: the nearest face of those through which rays come in.
         """
         nearest, cosine = torch.full_like(t, torch.inf), torch.ones_like(t)
+        normal = [torch.zeros_like(t)] * 3
         kept = [face for faces in ([self._planes], self._boxes) for some in faces for face in some]
         cut = [face for faces in self._without for face in faces]
         for side, faces in ((1, kept), (-1, cut)):
@@ -192,8 +209,10 @@ class Clipped:
                 height, rate = _height(face, rays)
                 away = torch.where(side * rate > 0, (height + t * rate).abs(), torch.inf)
                 cosine = torch.where(away < nearest, rate.abs(), cosine)
+                sides = zip(face, normal, strict=False)
+                normal = [torch.where(away < nearest, -side * n, known) for n, known in sides]
                 nearest = torch.minimum(away, nearest)
-        return cosine
+        return cosine, torch.stack(normal, 1)
 
 
 def _height(face: Face, rays: Rays) -> tuple[Tensor, Tensor]:

@@ -136,7 +136,8 @@ class LayerPixels:
             stop_alpha: A ray that has this alpha behind the layer does not go on.
 
         Returns:
-            Colour and alpha of both; depth of the voxels alone: before the layer, else behind it.
+            Colour and alpha of both; depth of the voxels alone: before the layer, else behind it;
+            their normal, by what each part takes of the light.
         """
         near, far = rays.range.split(1, dim=1)
         stop = self.distance.to(rays.range.dtype)
@@ -160,7 +161,10 @@ class LayerPixels:
         behind = trace_rays(dataclasses.replace(rays, range=torch.cat((start, end), 1)))
         normal, features = mixed.normal, mixed.features
         if normal is not None and behind.normal is not None:
-            normal = torch.where(front.depth < torch.inf, normal, behind.normal)
+            share = (1 - mixed.alpha) * behind.alpha  # of the light
+            both = normal * front.alpha + behind.normal * share
+            both = torch.nn.functional.normalize(both, dim=1)
+            normal = torch.where(share > 0, both, normal)
         if features is not None and behind.features is not None:
             features = features + (1 - mixed.alpha) * behind.features
         return dataclasses.replace(

@@ -50,7 +50,7 @@ class DirectionalLight:
         """Checks direction, colour and angle."""
         check_triple("DirectionalLight", "direction", self.direction, zero=False)
         check_triple("DirectionalLight", "color", self.color, low=0.0)
-        _check_number("DirectionalLight", "angle", self.angle, high=120.0)
+        check_number("DirectionalLight", "angle", self.angle, low=0, high=120.0)
 
     @property
     def place(self) -> Triple:
@@ -71,7 +71,7 @@ class PointLight:
         """Checks position, colour and radius."""
         check_triple("PointLight", "position", self.position)
         check_triple("PointLight", "color", self.color, low=0.0)
-        _check_number("PointLight", "radius", self.radius)
+        check_number("PointLight", "radius", self.radius, low=0)
 
     @property
     def place(self) -> Triple:
@@ -98,8 +98,7 @@ class Material:
         """Checks every number that the host can see."""
         check_light("shader: light", self.light)
         for name in ("ambient", "diffuse", "specular", "shininess"):
-            value = getattr(self, name)
-            _check_number("shader", name, value)
+            check_number("shader", name, getattr(self, name), low=0)
 
     def rows(self) -> tuple[Any, ...]:
         """The first three rows of `parameter_54`, see `shade_rays`."""
@@ -134,24 +133,40 @@ def check_light(what: str, value: Any) -> None:
         )
 
 
-def check_triple(
-    where: str, name: str, value: Any, *, low: float | None = None, zero: bool = True
+def check_number(
+    where: str, name: str, value: Any, *, low: float = -math.inf, high: float = math.inf
 ) -> None:
-    """Raises ValueError unless it is three finite numbers, at least `low`, not all 0 if `zero` is
-    False; of tensors on CUDA the shape alone is looked at.
+    """Raises ValueError unless it is a finite number in [low, high], or a tensor of one; nobody
+    waits for a device, so what lies on CUDA is not looked at.
+    """
+    if isinstance(value, Tensor):
+        if value.numel() != 1:
+            got = check.describe(value)
+            raise ValueError(f"{where}: {name} must be a number or a tensor of one, got {got}")
+        if value.is_cuda:
+            return
+        value = value.item()
+    check.number(where, name, value, low=low, high=high)
+
+
+def check_triple(
+    where: str,
+    name: str,
+    value: Any,
+    *,
+    low: float = -math.inf,
+    high: float = math.inf,
+    zero: bool = True,
+) -> None:
+    """Raises ValueError unless these are three finite numbers in [low, high], or a tensor of them,
+    as for `check_number`; `zero` tells whether all may be 0.
     """
     if isinstance(value, Tensor) and value.is_cuda:
         if value.shape != (3,):
             raise ValueError(f"{where}: {name} must be (3,), got {check.describe(value)}")
         return
     numbers = check.triple(where, name, value)
-    if low is not None:
-        for number in numbers:
-            check.number(where, name, number, low=low)
+    for number in numbers:
+        check.number(where, name, number, low=low, high=high)
     if not zero and not any(numbers):
         raise ValueError(f"{where}: {name} must not be zero")
-
-
-def _check_number(where: str, name: str, value: Any, *, high: float = math.inf) -> None:
-    if not (isinstance(value, Tensor) and value.numel() == 1):
-        check.number(where, name, value, low=0, high=high)

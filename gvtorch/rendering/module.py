@@ -31,7 +31,9 @@ class TreeTracer(torch.nn.Module):
     if TYPE_CHECKING:  # TorchScript would read these as attributes of its own
         place: Tensor
         normals: Tensor
+        normal_constant: Tensor
         others: Tensor
+        other_constant: Tensor
 
     def __init__(
         self,
@@ -190,7 +192,7 @@ class TreeTracer(torch.nn.Module):
                 False,
             )
             return color, alpha, depth, samples, color.new_zeros((0, 3)), color.new_zeros((0, 0))
-        with_normals, with_others = self.normals.numel() > 0, self.others.numel() > 0
+        with_normals, with_others = len(self.normal_constant) > 0, len(self.other_constant) > 0
         color, alpha, depth, samples, _, normal, features = self.shade_rays(
             rays[0],
             rays[1],

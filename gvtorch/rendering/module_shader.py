@@ -84,15 +84,22 @@ class ModuleShader:
         """Colour (k, 3) and alpha (k,) of samples.
 
         Raises:
-            ValueError: The module gives something of another shape or dtype, or no alpha.
+            ValueError: The module gives something of another shape or dtype, a colour that is not
+                finite, or no alpha.
         """
         given = (batch.values(self.channels), batch.positions, batch.directions, batch.lengths)
-        color, alpha = self.module(*given)
+        made = self.module(*given)
+        if not (isinstance(made, Sequence) and len(made) == 2):
+            got = f"{len(made)} parts" if isinstance(made, Sequence) else type(made).__name__
+            raise ValueError(f"ModuleShader: the module must give colour and alpha, got {got}")
+        color, alpha = made
         count, real, device = len(given[0]), given[0].dtype, given[0].device
         check.tensor("ModuleShader", "the module's colour", color, (count, 3), real, device)
         check.tensor("ModuleShader", "the module's alpha", alpha, (count, 1), real, device)
         if not bool(((alpha >= 0) & (alpha <= 1)).all()):
             raise ValueError("ModuleShader: the module's alpha must lie in [0, 1]")
+        if not bool(torch.isfinite(color).all()):
+            raise ValueError("ModuleShader: the module's colour must be finite")
         return color, alpha[:, 0]
 
 
@@ -272,6 +279,9 @@ def march(
         missed=like.new_zeros(count, dtype=torch.bool),
     )
     which, state, width = torch.arange(count, device=like.device), None, rays.width
+    if rays.clear is not None:  # some may have ended before
+        which, width = (sums.clear > 1 - stop_alpha).nonzero()[:, 0], 0
+        columns = _some(columns, which)
     while len(which):
         segments = trace_segments(*columns, **walk, state_r3=state, width=width)
         sums.missed[which] |= segments.missed
@@ -297,8 +307,7 @@ def march(
             sums.depth[which[batch.ray[hit]]] = place.to(real)
             going = (segments.counts[:, 1] >= limit) & (left > 1 - stop_alpha)
             on = going.nonzero()[:, 0]
-        origin, direction, cone, limits = columns
-        columns = (origin[on], direction[on], cone[on], limits[on])
+        columns = _some(columns, on)
         which, state, width = which[on], segments.state[on], 0
     return sums
 
@@ -309,6 +318,11 @@ def _wide(rays: Rays) -> Columns:
         for column in (rays.origin, rays.direction, rays.cone, rays.range)
     )
     return origin, direction, cone, limits
+
+
+def _some(columns: Columns, which: Tensor) -> Columns:
+    origin, direction, cone, limits = columns
+    return origin[which], direction[which], cone[which], limits[which]
 
 
 class ModuleTracer:

@@ -24,6 +24,7 @@ from .camera import Camera
 from .custom import as_camera
 from .picture import Picture
 
+_OF_CENTRES = ("depth", "nearest", "normal", "features")  # what has no mean
 _PLASTIC = 1.32471795724474602596  # the real root of x^3 = x + 1
 
 
@@ -65,10 +66,10 @@ class Progressive:
         """Renders one more frame, the first of a new mean if the camera moved.
 
         Returns:
-            The mean of colour and alpha so far, summed up in float64; depth is that of the pixels'
-            centres where nothing was missing, `samples` and `stats` those of this frame, and
-            `missed` tells which pixels have seen no frame without a miss. The first is the plain
-            picture to the last bit.
+            The mean of colour and alpha so far, summed up in float64; depth, nearest, normal and
+            features are those of the pixels' centres where nothing was missing, `samples` and
+            `stats` those of this frame, and `missed` tells which pixels have seen no frame without
+            a miss. The first is the plain picture to the last bit.
         """
         if self._camera is None or camera is not self._given:
             own = as_camera("Progressive", camera)
@@ -81,20 +82,22 @@ class Progressive:
         light = torch.cat((picture.color, picture.alpha), -1).double()
         missed = picture.missed
         whole = torch.ones_like(picture.alpha, dtype=torch.bool) if missed is None else ~missed
+        named = {name: getattr(picture, name) for name in _OF_CENTRES}
+        still = {name: image for name, image in named.items() if image is not None}
         if not self.count:
             self._sum, self._frames = light, whole.double()
-            self._depth = picture.depth.clone()
+            self._still = {name: image.clone() for name, image in still.items()}
         else:
             seen = self._frames > 0
             # A pixel that was never whole takes the newest frame, a whole one takes whole frames.
             self._sum = torch.where(seen, torch.where(whole, self._sum + light, self._sum), light)
-            self._depth = torch.where(seen, self._depth, picture.depth)
+            for name, image in still.items():
+                self._still[name] = torch.where(seen, self._still[name], image)
             self._frames = self._frames + whole
         self.count += 1
         color, alpha = self._mean(picture.color.dtype)
-        return replace(
-            picture, color=color, alpha=alpha, depth=self._depth, missed=self._frames == 0
-        )
+        missed = self._frames == 0
+        return replace(picture, color=color, alpha=alpha, missed=missed, **self._still)
 
     def refine(
         self, camera: Camera | Rays, samples: int, progress: Progress = no_progress

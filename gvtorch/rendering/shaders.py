@@ -17,7 +17,16 @@ from torch import Tensor
 from .. import check
 from ..ops import reference_shaders as kinds
 from ..pool import Channel, N3Tree
-from .lights import Headlight, Light, Material, Number, Triple, pack
+from .lights import (
+    Headlight,
+    Light,
+    Material,
+    Number,
+    Triple,
+    check_number,
+    check_triple,
+    pack,
+)
 from .preintegrated import integrated_table
 from .shader import Table, TransferFunction
 from .solid import solid_table
@@ -264,7 +273,8 @@ class StoredColor(LitShader):
         super().__init__(**light)
         if reference is not None:
             check.number("StoredColor", "reference", reference, low=0, open_low=True)
-        self.channel, self.reference, self.premultiplied = channel, reference, premultiplied
+        self.channel = _name("StoredColor", channel)
+        self.reference, self.premultiplied = reference, premultiplied
         self.lit = lit or self.normals is not None
 
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
@@ -301,7 +311,9 @@ class StoredColor(LitShader):
 
 
 class Isosurface(LitShader):
-    """The first place where the value passes a level, opaque and lit; to a tenth of a voxel."""
+    """The first place where the value passes a level, opaque and lit; to a tenth of a voxel. Where
+    a cap cuts it, it is filled with what is not below the level.
+    """
 
     kind = kinds.ISOSURFACE
     distance = False  # the value is a distance in world units, negative inside
@@ -330,13 +342,11 @@ class Isosurface(LitShader):
             ValueError: A number is out of its range, or channel and colour do not fit.
         """
         super().__init__(**light)
-        if not isinstance(value, Tensor):
-            check.number("Isosurface", "value", value)
+        check_number("Isosurface", "value", value)
         if isinstance(color, TransferFunction) != (color_channel is not None):
             raise ValueError("Isosurface: a transfer function and color_channel belong together")
-        if not isinstance(color, (TransferFunction, Tensor)):
-            for part in check.triple("Isosurface", "color", color):
-                check.number("Isosurface", "color", part, low=0, high=1)
+        if not isinstance(color, TransferFunction):
+            check_triple("Isosurface", "color", color, low=0, high=1)
         self.value, self.color = value, color
         self.other, self.other_component = color_channel, color_component
 
@@ -366,7 +376,9 @@ class Isosurface(LitShader):
 
 
 class DistanceField(Isosurface):
-    """The surface of a signed distance field: where the distance is `offset`, 0 if left out."""
+    """The surface of a signed distance field: where the distance is `offset`, 0 if left out. Inside
+    the distance is smaller.
+    """
 
     distance = True
 
@@ -460,7 +472,7 @@ class Features(Shader):
 
     def __init__(self, transfer: TransferFunction, channel: str) -> None:
         """Takes the transfer function of the density, and the name of the features' channel."""
-        self.transfer, self.other = _transfer("Features", transfer), channel
+        self.transfer, self.other = _transfer("Features", transfer), _name("Features", channel)
 
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """See `Shader`."""
@@ -480,6 +492,12 @@ def _transfer(where: str, transfer: Any) -> TransferFunction:
         kind = type(transfer).__name__
         raise ValueError(f"{where}: transfer must be a TransferFunction, got {kind}")
     return transfer
+
+
+def _name(where: str, channel: Any) -> str:
+    if not isinstance(channel, str):
+        raise ValueError(f"{where}: channel must be a name, got {channel!r}")
+    return channel
 
 
 def plain_table(transfer: TransferFunction, tree: N3Tree, intervals: Intervals) -> Table:

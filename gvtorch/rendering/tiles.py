@@ -55,6 +55,8 @@ def render_tiles(
         FileNotFoundError: The folder does not exist.
         ImportError: .tif without tifffile.
     """
+    if not callable(render):
+        raise ValueError(f"render_tiles: render must be callable, got {type(render).__name__}")
     path, camera = Path(path), as_camera("render_tiles", camera)
     if len(camera) != 1:
         raise ValueError(f"render_tiles: camera must be one, got a batch of {len(camera)}")

@@ -8,12 +8,12 @@ namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
 struct ChannelView {
-  const void* bricks_bzyxc;  // null: there is no such channel
-  const void* constant_tnc;
+  const void* bricks_bzyxc;  // null where there is no brick
+  const void* constant_tnc;  // null: there is no such channel
   VoxelType type;
   int32_t width;  // numbers a voxel
 
-  GV_HD bool given() const { return bricks_bzyxc != nullptr; }
+  GV_HD bool given() const { return constant_tnc != nullptr; }
 };
 
 template <class T>

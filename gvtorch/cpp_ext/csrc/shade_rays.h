@@ -16,6 +16,7 @@ struct ShadeRay : Walk<T> {
   static constexpr int kBlocksAtOnce = 4;  // on a multiprocessor of CUDA: 128 registers
   Shader shader;
   Channels channels;
+  const T* parameter_54;
   const void* range_tn2c;
   int32_t* stamp_b;
   int32_t lengths, features;
@@ -30,6 +31,7 @@ struct ShadeRay : Walk<T> {
                  args.side,
                  args.border,
                  args.component},
+        parameter_54(static_cast<const T*>(args.parameter_54)),
         range_tn2c(args.range_tn2c),
         stamp_b(args.stamp_b),
         lengths(args.levels),
@@ -94,7 +96,7 @@ struct ShadeRay : Walk<T> {
     }
     const Probe<T> probe(channels, sight, this->rays, ray, this->levels, visit, digits);
     Piece<T> piece;
-    if (probe.uniform()) {  // one interval
+    if (probe.uniform() && !shades_each_place()) {  // one interval
       piece.start = at.start;
       this->leave(at, visit);
       piece.end = smaller(at.start, at.stop);
@@ -148,6 +150,10 @@ struct ShadeRay : Walk<T> {
     shader.surface(Probe<T>(channels, sight, this->rays, ray, this->levels, visit, digits), sum);
   }
 
+  // Near a light, a stored normal is lit differently wherever it stands.
+  GV_HD bool shades_each_place() const {
+    return channels.normal.given() && static_cast<int32_t>(parameter_54[3]) == Light<T>::kPoint;
+  }
   GV_HD static void cut(Piece<T>& piece) {
     piece.level = -1;
     piece.length = piece.end - piece.start;

@@ -251,6 +251,7 @@ struct Isosurface {
   struct Sum : ShadeSum<T> {
     T before = 0;
     T before_end = static_cast<T>(-INFINITY);
+    T share = 0;  // of the light, that came to the surface
   };
   TransferView<T> transfer;
   Light<T> light;
@@ -292,9 +293,9 @@ struct Isosurface {
     const T value = probe.channels.other.given() ? probe.number_at(probe.channels.other, color_component, t) : iso();
     const Transfer<T> colors(transfer);
     const Row<T> row = light.shade(colors.look_up(colors.find(value), 0), n, probe, t);
-    sum.red = row.red;
-    sum.green = row.green;
-    sum.blue = row.blue;
+    sum.red = sum.share * row.red;
+    sum.green = sum.share * row.green;
+    sum.blue = sum.share * row.blue;
     sum.normal = n;
   }
   GV_HD void done(Sum&) const {}
@@ -302,6 +303,7 @@ struct Isosurface {
  private:
   GV_HD T iso() const { return light.parameter_54[12]; }
   GV_HD static void hit(T t, Sum& sum) {
+    sum.share = sum.clear;
     sum.clear = 0;
     sum.depth = t;
   }
@@ -347,9 +349,9 @@ struct Projection {
     const T value = kind() == kMean ? sum.found / sum.length : sum.found;
     const Transfer<T> colors(transfer);
     const Row<T> row = colors.look_up(colors.find(value), 0);
-    sum.red = row.red;
-    sum.green = row.green;
-    sum.blue = row.blue;
+    sum.red = sum.clear * row.red;
+    sum.green = sum.clear * row.green;
+    sum.blue = sum.clear * row.blue;
     sum.clear = 0;
     sum.depth = sum.at;
     sum.feature_c[0] = value;

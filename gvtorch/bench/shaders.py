@@ -1,0 +1,238 @@
+"""`shaders`: steady frames of each shader, beside the plain transfer function of the same scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from ..engine import Engine
+from ..frame import Hits
+from ..pool import N3Tree
+from ..producers import VolumeProducer
+from ..rendering import (
+    DistanceField,
+    Features,
+    Isosurface,
+    Lit,
+    ModuleShader,
+    Picture,
+    PreIntegrated,
+    Projection,
+    RenderOptions,
+    StoredColor,
+    TransferModule,
+)
+from ..rendering.renderer import AnyShader, trace
+from ..rendering.shaders import Shader
+from ..volume import Volume
+from .march import Size, difference, op_milliseconds, rates, rgba
+from .record import Record, Settings, Timing, clock
+from .scenes import Scene, aneurism, fog_dense, worn
+
+_WIDE = 16  # numbers of the widest channel
+
+
+@dataclass(frozen=True, kw_only=True)
+class Look:
+    """A shader with its options, and the look that its time is a ratio of."""
+
+    name: str
+    shader: Callable[[Scene], AnyShader]
+    options: Mapping[str, Any] = field(default_factory=dict)  # of `RenderOptions`
+    beside: str = "plain"
+    twin: bool = False  # both must draw the same picture
+
+
+def _projection(which: Literal["maximum", "minimum", "mean"]) -> Callable[[Scene], AnyShader]:
+    return lambda scene: Projection(which, scene.shader)
+
+
+def _module(scene: Scene) -> AnyShader:
+    module = TransferModule(scene.shader, min(scene.volume.spacing))
+    return ModuleShader(module, hidden_by=scene.shader)
+
+
+#: What is measured, each behind the look that it stands beside. Left out where a scene has not the
+#: channels that a shader names; modules, which take long, where it has but one.
+LOOKS = (
+    Look(name="plain", shader=lambda s: s.shader),
+    Look(name="lit", shader=lambda s: Lit(s.shader)),
+    Look(name="lit by stored normals", shader=lambda s: Lit(s.shader, normals="normal")),
+    Look(name="stored colour", shader=lambda _: StoredColor("rgba")),
+    Look(name="stored colour, lit", shader=lambda _: StoredColor("rgba", lit=True)),
+    Look(name="isosurface", shader=lambda s: Isosurface(s.surface)),
+    Look(name="distance field", shader=lambda s: DistanceField(offset=s.surface)),
+    Look(name="maximum", shader=_projection("maximum")),
+    Look(name="minimum", shader=_projection("minimum")),
+    Look(name="mean", shader=_projection("mean")),
+    Look(name="3 features", shader=lambda s: Features(s.shader, "normal")),
+    Look(name=f"{_WIDE} features", shader=lambda s: Features(s.shader, "numbers")),
+    Look(name="module", shader=_module, twin=True),
+    Look(name="plain, step 1", shader=lambda s: s.shader, options={"step": 1.0}),
+    Look(
+        name="pre-integrated, step 1",
+        shader=lambda s: PreIntegrated(s.shader),
+        options={"step": 1.0},
+        beside="plain, step 1",
+    ),
+)
+
+
+@torch.no_grad()
+def shaders(record: Record) -> None:
+    """Each look of three scenes as resident trees, and of the first in the engine."""
+    settings = record.settings
+    side, size = 256, (512, 512)
+    if settings.quick:
+        side, size = 32, (24, 16)
+    elif settings.device.type == "cuda":
+        size = (1920, 1080)  # fewer rays would not fill it
+    for make in (aneurism, fog_dense, worn):  # mostly empty, all sampled, rays that end soon
+        try:
+            scene = make(side)
+        except FileNotFoundError:
+            record.note("aneurism: left out, its file comes with the source and is not here")
+            continue
+        volumes = {"value": scene.volume}
+        if make is aneurism:
+            volumes |= _channels(scene)
+        pictures = _resident(record, scene, volumes, size)
+        if make is aneurism:
+            _streamed(record, scene, volumes, size, pictures)
+    record.note(
+        "times: of the look named beside, in the same case. Differences: of the module from the "
+        "plain picture, of the engine from the resident tree's. module: TransferModule, hidden by "
+        "its function. op_ms: the compiled op alone"
+    )
+
+
+def _resident(
+    record: Record, scene: Scene, volumes: Mapping[str, Volume], size: Size
+) -> dict[str, Tensor]:
+    """Adds the rows of a resident tree; returns the pictures by look."""
+    case = f"{scene.name}, resident, {size[0]}x{size[1]}"
+    if not _wanted(record, case):
+        return {}
+    record.settings.tell(f"{case}: making the tree")
+    tree = N3Tree.from_volume(volumes, device=record.settings.device)
+    rays = scene.camera(*size).rays(tree.device)
+
+    def frame(shader: AnyShader, **options: Any) -> Hits:
+        return trace(tree, rays, shader, RenderOptions(**options))
+
+    return _measure(record, case, scene, volumes, frame, {})
+
+
+def _streamed(
+    record: Record,
+    scene: Scene,
+    volumes: Mapping[str, Volume],
+    size: Size,
+    resident: Mapping[str, Tensor],
+) -> None:
+    """Adds the rows of an engine, each once the picture has converged."""
+    case = f"{scene.name}, engine, {size[0]}x{size[1]}"
+    if not _wanted(record, case):
+        return
+    camera, quick = scene.camera(*size), record.settings.quick
+    pools = ("1 MB", "4 MB") if quick else ("16 MB", "1 GB")
+    with Engine(
+        VolumeProducer(volumes),
+        node_pool=pools[0],
+        brick_pool=pools[1],
+        device=record.settings.device,
+        monitor=False,
+    ) as engine:
+
+        def frame(shader: AnyShader, **options: Any) -> Picture:
+            return engine.frame(camera, shader, background=None, **options)[0]
+
+        def converge(shader: AnyShader, **options: Any) -> None:
+            engine.render(camera, shader, background=None, **options)
+            if not engine.frame(camera, shader, background=None, **options)[1].converged:
+                record.note(f"{case}: it was not steady")
+
+        _measure(record, case, scene, volumes, frame, resident, converge)
+
+
+def _measure(
+    record: Record,
+    case: str,
+    scene: Scene,
+    channels: Collection[str],
+    frame: Callable[..., Hits | Picture],
+    others: Mapping[str, Tensor],
+    prepare: Callable[..., object] | None = None,
+) -> dict[str, Tensor]:
+    """Adds a row for each look that is wanted and that the channels allow.
+
+    Args:
+        record: Takes the rows.
+        case: Of the rows.
+        scene: What is shown.
+        channels: Names of those that the scene has.
+        frame: Renders one frame with a shader and options.
+        others: Pictures by look, with which those of this case are compared.
+        prepare: Called before a look is timed, as `frame` is.
+
+    Returns:
+        The pictures (r, 4) by look.
+    """
+    medians: dict[str, float] = {}
+    pictures: dict[str, Tensor] = {}
+    for look in _wanted(record, case):
+        shader = look.shader(scene)
+        needed = set(shader.channels) if isinstance(shader, Shader) else set()
+        slow = isinstance(shader, ModuleShader)
+        if not needed <= set(channels) or (slow and len(channels) == 1):
+            continue
+        record.settings.tell(f"{case}: {look.name}")
+        options = {"step": scene.step, **look.options}
+        if prepare is not None:
+            prepare(shader, **options)
+        run = partial(frame, shader, **options)
+        timing, shown = _clock(run, record.settings)
+        medians[look.name], pictures[look.name] = timing.median, rgba(shown)
+        figures = {"beside": look.beside, "times": timing.median / medians[look.beside]}
+        figures |= rates(shown, timing)
+        figures["op_ms"] = None if slow else op_milliseconds(run, record.settings)
+        other = others.get(look.name, pictures[look.beside] if look.twin else None)
+        if other is not None:
+            figures["max_difference"] = difference(pictures[look.name], other)["max_difference"]
+        record.add(case, look.name, timing, **figures)
+    return pictures
+
+
+def _clock(run: Callable[[], Hits | Picture], settings: Settings) -> tuple[Timing, Hits | Picture]:
+    """Returns the time of a call and what it gave: a module's takes long, and is not made again."""
+    given: list[Hits | Picture] = []
+
+    def call() -> None:
+        given[:] = [run()]
+
+    return clock(call, settings), given[0]
+
+
+def _wanted(record: Record, case: str) -> list[Look]:
+    """The looks of a case that are asked for, and those that they stand beside."""
+    names = {look.name for look in LOOKS if record.wants(f"{case}, {look.name}")}
+    for look in reversed(LOOKS):
+        if look.name in names:
+            names.add(look.beside)
+    return [look for look in LOOKS if look.name in names]
+
+
+def _channels(scene: Scene) -> dict[str, Volume]:
+    """Normals, colours and numbers of a scene's voxels: all is even where its value is."""
+    value = scene.volume.data[..., 0].float()
+    normal = torch.nn.functional.normalize(torch.stack(torch.gradient(value)[::-1], -1), dim=-1)
+    color = torch.from_numpy(scene.shader(value.numpy()))
+    color[..., :3] *= color[..., 3:] > 0
+    numbers = (value[..., None] * torch.arange(1.0, _WIDE + 1)).remainder(256)
+    channels = {"normal": 255 * (0.5 + 0.5 * normal), "rgba": 255 * color, "numbers": numbers}
+    return {name: Volume(data.round().to(torch.uint8)) for name, data in channels.items()}
