@@ -18,7 +18,7 @@ FLOORS = [
     {"pool"},
     {"io"},
     {"cache", "producers", "rendering"},
-    {"production", "turns"},
+    {"arrivals", "production", "turns"},
     {"scene"},
     {"engine"},
     {"bench"},
@@ -56,7 +56,7 @@ def modules() -> list[Path]:
     files = [
         p for p in PACKAGE.rglob("*.py") if p.name not in ("__main__.py",) and p.parent != PACKAGE
     ]
-    alone = FLOORS[0] | {"production", "turns", "scene", "engine"}
+    alone = FLOORS[0] | {"arrivals", "production", "turns", "scene", "engine"}
     return files + [PACKAGE / f"{name}.py" for name in sorted(alone)]
 
 

@@ -10,6 +10,7 @@ from .custom import CustomCamera
 from .image import read_image
 from .layer import Layer
 from .lens import ThinLens
+from .lighting import Lighting
 from .lights import DirectionalLight, Headlight, PointLight
 from .module import TreeTracer
 from .module_shader import ModuleShader, TransferModule
@@ -44,6 +45,7 @@ __all__ = [
     "Headlight",
     "Isosurface",
     "Layer",
+    "Lighting",
     "Lit",
     "ModuleShader",
     "Picture",

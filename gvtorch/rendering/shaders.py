@@ -7,6 +7,7 @@ next picture is made with them, and nothing is compiled.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -19,6 +20,7 @@ from ..pool import Channel, N3Tree
 from .lights import Headlight, Light, Material, Number, Triple, pack
 from .preintegrated import integrated_table
 from .shader import Table, TransferFunction
+from .solid import solid_table
 
 _KEPT_TABLES = 4
 
@@ -37,7 +39,8 @@ class Shader(ABC):
     """A fused shader.
 
     Attributes:
-        kind: Which shader of `shade_rays`.
+        kind: As numbered in `reference_shaders`, or the name of a user's op; None: the plain
+            transfer function's kernel reads its table.
         whole: It sees a ray in one go: what cuts rays into pieces refuses it.
         channel: Name of the channel whose value it reads; None: that of the options.
         component: Which number of it; None: that of the options.
@@ -46,7 +49,7 @@ class Shader(ABC):
         other_component: Which number of it colours a surface.
     """
 
-    kind: int | str
+    kind: int | str | None
     whole: bool = False
     channel: str | None = None
     component: int | None = None
@@ -160,6 +163,20 @@ class LitShader(Shader):
             shininess=self.shininess,
         )
 
+    def unlit(self) -> LitShader:
+        """Returns the same without its light: base colours, and normals."""
+        bare = copy(self)
+        bare.ambient, bare.diffuse, bare.specular = 1.0, 0.0, 0.0
+        return bare
+
+    def matter(self) -> Shader:
+        """Returns what a wide cone meets: base colours, alpha, and normals."""
+        return self.unlit()
+
+    def blocker(self) -> FusedShader:
+        """Returns what stands in the way of light: only its alpha counts."""
+        return self.matter()
+
 
 class Lit(LitShader):
     """The transfer function, lit by Blinn and Phong on both sides of a surface."""
@@ -176,6 +193,10 @@ class Lit(LitShader):
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """See `Shader`."""
         return plain_table(self.transfer, tree, intervals)
+
+    def blocker(self) -> FusedShader:
+        """See `LitShader`."""
+        return self.transfer
 
 
 class PreIntegrated(Shader):
@@ -256,6 +277,18 @@ class StoredColor(LitShader):
         reference = self.reference or min(tree.spacing)
         return (scale, reference, float(self.premultiplied), float(self.lit))
 
+    def unlit(self) -> StoredColor:
+        """See `LitShader`."""
+        bare = copy(self)
+        bare.lit, bare.ambient, bare.diffuse, bare.specular = True, 1.0, 0.0, 0.0
+        return bare
+
+    def blocker(self) -> StoredColor:
+        """See `LitShader`; it needs no normals."""
+        bare = copy(self)
+        bare.lit = False
+        return bare
+
     def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> dict[str, Any]:
         """See `Shader`."""
         known = tree.bricks.channels.get(str(self.channel), Channel(width=4))
@@ -271,6 +304,7 @@ class Isosurface(LitShader):
     """The first place where the value passes a level, opaque and lit; to a tenth of a voxel."""
 
     kind = kinds.ISOSURFACE
+    distance = False  # the value is a distance in world units, negative inside
 
     def __init__(
         self,
@@ -316,9 +350,25 @@ class Isosurface(LitShader):
         """See `Shader`."""
         return (self.value, 0.0, 0.0, 0.0)
 
+    def matter(self) -> Shader:
+        """See `LitShader`.
+
+        Raises:
+            ValueError: It has no colour of its own.
+        """
+        if isinstance(self.color, TransferFunction):
+            raise ValueError("Isosurface: indirect light needs a surface of one colour")
+        return Solid(self, self.color)
+
+    def blocker(self) -> Shader:
+        """See `LitShader`."""
+        return Solid(self, None)
+
 
 class DistanceField(Isosurface):
     """The surface of a signed distance field: where the distance is `offset`, 0 if left out."""
+
+    distance = True
 
     def __init__(
         self,
@@ -329,6 +379,40 @@ class DistanceField(Isosurface):
     ) -> None:
         """Takes how the surface looks, see `Isosurface`; `offset` is in the field's own unit."""
         super().__init__(offset, color, **look)
+
+
+class Solid(Shader):
+    """An isosurface as wide cones meet it, see `solid_table`.
+
+    Of a distance field, matter lies below the level and the value changes as places do. Else it
+    lies above, and a value changes from half of the level to three halves over four voxels.
+    """
+
+    widest = 16  # voxels, of a distance field's ramp
+
+    def __init__(self, surface: Isosurface, color: Triple | None) -> None:
+        """Takes the surface and its colour; None where its alpha alone counts."""
+        self.kind = None if color is None else kinds.LIT
+        self.surface, self.color = surface, (0.0, 0.0, 0.0) if color is None else color
+        self.channel, self.component = surface.channel, surface.component
+        self.normals = surface.normals
+
+    def table(self, tree: N3Tree, intervals: Intervals) -> Table:
+        """See `Shader`."""
+        voxel = intervals.smallest_spacing
+        value_1 = pack((self.surface.value,), intervals.dtype, tree.device)
+        if self.surface.distance:
+            most_1 = torch.full_like(value_1, self.widest / 2 * voxel)
+            slope_1 = torch.ones_like(value_1)
+        else:
+            most_1 = value_1.abs() / 2
+            slope_1 = most_1 / (2 * voxel)
+        return solid_table(
+            *(value_1, slope_1, most_1, self.color),
+            above=not self.surface.distance,
+            step=intervals.step,
+            levels=intervals.levels,
+        )
 
 
 class Projection(Shader):
