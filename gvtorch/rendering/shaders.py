@@ -39,8 +39,8 @@ class Shader(ABC):
     """A fused shader.
 
     Attributes:
-        kind: As numbered in `reference_shaders`, or the name of a user's op; None: the plain
-            transfer function's kernel reads its table.
+        kind: Which shader of `shade_rays`; None: the plain transfer function's kernel reads its
+            table.
         whole: It sees a ray in one go: what cuts rays into pieces refuses it.
         channel: Name of the channel whose value it reads; None: that of the options.
         component: Which number of it; None: that of the options.
