@@ -187,6 +187,13 @@ def test_it_goes_through_lenses_clips_layers_and_scenes(blobs):
         assert torch.equal(gv.render(tree, CAMERA, plain, **options).color, expected.color)
         with pytest.raises(ValueError, match="CompiledShader sees a ray in one go, so it has no"):
             gv.render(tree, CAMERA, mine("Highest", transfer=SHADER), **options)
+    sun = gv.Lighting(occlusion=0.5, indirect=0.5)
+    lit = mine("LitFeatures", transfer=SHADER, other="value")
+    bright, dark = (
+        gv.render(tree, CAMERA, gv.Lit(SHADER), lighting=light).color for light in (None, sun)
+    )
+    assert (bright - dark).abs().max() > 0.1
+    assert torch.equal(gv.render(tree, CAMERA, lit, lighting=sun).color, dark)
     far = gv.Volume(blobs.data, blobs.spacing, (105.0, -3.0, 2.0))
     scene = {"a": gv.VolumeProducer(blobs), "b": gv.VolumeProducer(far)}
     with gv.Engine(scene, brick_size=4, node_pool="1 MB", brick_pool="4 MB") as engine:
