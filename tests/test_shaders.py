@@ -25,6 +25,7 @@ SHADERS = {
     "stored colour lit": gv.StoredColor(
         "premultiplied", premultiplied=True, light=gv.DirectionalLight((1, -1, -1)), lit=True
     ),
+    "six directions": gv.StoredColor("six", light=POINT, lit=True),
     "isosurface": gv.Isosurface(0.5, (0.9, 0.4, 0.2), light=POINT),
     "coloured isosurface": gv.Isosurface(0.4, SHADER, color_channel="rgba", color_component=1),
     "distance field": gv.DistanceField(offset=0.3),
@@ -44,12 +45,15 @@ def channels(blobs) -> dict[str, gv.Volume]:
     normal = torch.stack(torch.gradient(value)[::-1], -1)
     normal = torch.nn.functional.normalize(normal, dim=-1) * 0.5 + 0.5
     place = blobs.spacing, blobs.origin
+    six = gv.Volume(rgba, *place).directional()
+    six.data = six.data * torch.linspace(0.6, 1.0, 24).to(six.data)  # no two of them are equal
     return {
         "value": blobs,
         "rgba": gv.Volume((rgba * 255).round().to(torch.uint8), *place),
         "premultiplied": gv.Volume(
             torch.cat((rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]), -1), *place
         ),
+        "six": six,
         "normal": gv.Volume((normal * 255).round().to(torch.uint8), *place),
     }
 
@@ -249,7 +253,10 @@ def test_bad_shaders_have_one_clear_message(make, message):
     [
         (gv.Lit(SHADER, normals="n"), "unknown channel 'n'; the tree has value, rgba"),
         (gv.Lit(SHADER, normals="rgba"), "normals need 3 numbers a voxel, 'rgba' has 4"),
-        (gv.StoredColor("normal"), "stored colour needs 4 numbers a voxel, 'normal' has 3"),
+        (
+            gv.StoredColor("normal"),
+            "needs 4 numbers a voxel, or 24 for six directions, 'normal' has 3",
+        ),
         (gv.Features(SHADER, "f"), "unknown channel 'f'"),
         (gv.Isosurface(1, SHADER, color_channel="rgba", color_component=4), "must be an int >= 0"),
     ],
@@ -271,7 +278,7 @@ def test_the_op_checks_its_arguments(tree):
         ({"other_bzyxc": None, "other_tnc": None}, "features need other_bzyxc"),
         ({"frame": 1}, "argument 'frame' is missing or unknown"),
         ({"shader": 1}, "table_lm4 must be"),
-        ({"shader": 2}, "stored colour needs a channel of 4 numbers"),
+        ({"shader": 2}, "stored colour needs a channel of 4 or 24 numbers"),
     ):
         with pytest.raises(ValueError, match=message):
             shade_rays(**{**good, **change})

@@ -164,6 +164,17 @@ class Shade:
         return base * (ambient + diffuse[:, None] * light) + specular[:, None] * light
 
 
+class Sided(Bricks):
+    """The opacity in a channel that holds red, green, blue and opacity for each of six directions,
+    or once.
+    """
+
+    def ends(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
+        """Over all directions, see `reference.Bricks`."""
+        low, high = self.range_n2c[node, :, 3::4].to(real).unbind(1)
+        return low.amin(1), high.amax(1)
+
+
 class StoredColor(Shade):
     """Colour and opacity of each voxel."""
 
@@ -174,10 +185,9 @@ class StoredColor(Shade):
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
         """See `reference.Shader`."""
         scale, reference, premultiplied, lit = self.parameter[12:16]
-        opacity = clamp(probe.value(piece.middle) * scale, 0, 1)
+        opacity = clamp(self.seen(probe, 3, piece.middle) * scale, 0, 1)
         seen = where & (opacity > 0)
-        red_green_blue = [replace(self.channel, component=i) for i in range(3)]
-        color = torch.stack([probe.number(c, piece.middle) for c in red_green_blue], 1) * scale
+        color = torch.stack([self.seen(probe, i, piece.middle) for i in range(3)], 1) * scale
         divisor = torch.where((premultiplied > 0) & seen, opacity, 1.0)
         alpha = _stretch(opacity, piece.length / reference)
         rgba = torch.cat((color / divisor[:, None], alpha[:, None]), 1)
@@ -185,6 +195,21 @@ class StoredColor(Shade):
             self.lit(rgba, piece, probe, seen)
         else:
             self.composite(rgba, piece, seen)
+
+    def seen(self, probe: Probe, number: int, t: Tensor) -> Tensor:
+        """(r,) one of the four numbers: of three directions, where the channel holds six."""
+
+        def read(component: int) -> Tensor:
+            return probe.number(replace(self.channel, component=component), t)
+
+        if self.channel.bricks_bzyxc.shape[4] == 4:
+            return read(number)
+        side = [
+            torch.where(d < 0, read(8 * axis + 4 + number), read(8 * axis + number))
+            for axis, d in enumerate(self.along.unbind(1))
+        ]
+        x, y, _ = (self.along * self.along).unbind(1)
+        return side[2] + x * (side[0] - side[2]) + y * (side[1] - side[2])
 
 
 class PreIntegrated(Shade):
@@ -409,7 +434,8 @@ def shade_rays(
         values = constants.flatten(0, 1)
         return tuple(Bricks(bricks, values, ranges, border, c) for c in range(bricks.shape[4]))
 
-    channel = Bricks(bricks_bzyxc, constant_tnc.flatten(0, 1), ranges, border, component)
+    own = Sided if shader == STORED_COLOR else Bricks
+    channel = own(bricks_bzyxc, constant_tnc.flatten(0, 1), ranges, border, component)
     shade = _KINDS[shader](
         transfer=Transfer(table, domain_2, opaque_m),
         parameter=parameter_54.reshape(-1),

@@ -101,8 +101,10 @@ def shade_rays(
         check.tensor(where, f"{name}_tnc", constants, shape, bricks.dtype, device)
         if not (bricks.is_contiguous() and constants.is_contiguous()):
             raise ValueError(f"{where}: {name}_bzyxc and {name}_tnc must be contiguous")
-    if shader == STORED_COLOR and (like.shape[4] != 4 or shared["component"] != 3):
-        raise ValueError(f"{where}: stored colour needs a channel of 4 numbers and component 3")
+    if shader == STORED_COLOR and (like.shape[4] not in (4, 24) or shared["component"] != 3):
+        raise ValueError(
+            f"{where}: stored colour needs a channel of 4 or 24 numbers and component 3"
+        )
     if shader == FEATURES and other_bzyxc is None:
         raise ValueError(f"{where}: features need other_bzyxc")
     others = 0 if other_bzyxc is None else other_bzyxc.shape[4]

@@ -208,7 +208,8 @@ class PreIntegrated(Shader):
 
 class StoredColor(_Lighted):
     """Colour and opacity as each voxel holds them: a channel of 4 numbers, linear red, green, blue
-    and opacity per reference length. Integers stand for 0 to 1.
+    and opacity per reference length. Integers stand for 0 to 1. Or 24 numbers, these for each of
+    six directions, as `Volume.directional` makes them: a ray sees those that it goes along.
     """
 
     kind = kinds.STORED_COLOR
@@ -227,12 +228,13 @@ class StoredColor(_Lighted):
 
         Args:
             channel: The channel.
-            reference: World units; the smallest spacing if left out.
-            premultiplied: Whether colours are stored times opacity. Then coarse levels keep the
-                colours of what is opaque; else air's colour mixes in.
+            reference: World units; the smallest spacing if left out, and for six directions.
+            premultiplied: Whether colours are stored times opacity, as they are for six directions.
+                Then coarse levels keep the colours of what is opaque; else air's colour mixes in.
             lit: Whether it is lit; so it is where `normals` are named.
             **light: `normals`, `light`, `ambient`, `diffuse`, `specular`, `shininess` as in
-                `Isosurface`; without `normals`, they are the gradient's of the opacity.
+                `Isosurface`; without `normals`, they are the gradient's of the opacity (towards
+                +x, where there are six directions).
 
         Raises:
             ValueError: The reference length is not positive, or see `Isosurface`.
@@ -251,15 +253,21 @@ class StoredColor(_Lighted):
         """See `Shader`."""
         scale = 1 / _unit_of(tree.bricks.channels[str(self.channel)].dtype)
         reference = self.reference or min(tree.spacing)
-        return (scale, reference, float(self.premultiplied), float(self.lit))
+        directional = tree.bricks.channels[str(self.channel)].width != 4
+        return (scale, reference, float(self.premultiplied or directional), float(self.lit))
 
     def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> dict[str, Any]:
         """See `Shader`."""
         known = tree.bricks.channels.get(str(self.channel), Channel(width=4))
-        if known.width != 4:
+        if known.width not in (4, 24):
             raise ValueError(
-                f"{where}: stored colour needs 4 numbers a voxel, "
+                f"{where}: stored colour needs 4 numbers a voxel, or 24 for six directions, "
                 f"{self.channel!r} has {known.width}"
+            )
+        if known.width == 24 and self.reference not in (None, min(tree.spacing)):
+            raise ValueError(
+                f"{where}: {self.channel!r} has six directions, so its opacity is that of the "
+                f"smallest spacing, {min(tree.spacing):g}; got reference {self.reference:g}"
             )
         return super().arguments(where, tree, intervals)
 

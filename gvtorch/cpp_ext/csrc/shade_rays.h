@@ -18,7 +18,7 @@ struct ShadeRay : Walk<T> {
   Channels channels;
   const void* range_tn2c;
   int32_t* stamp_b;
-  int32_t lengths, features;
+  int32_t lengths, features, directions;
   T *normal_r3, *features_rc;
 
   explicit ShadeRay(const ShadeArgs& args)
@@ -34,6 +34,7 @@ struct ShadeRay : Walk<T> {
         stamp_b(args.stamp_b),
         lengths(args.levels),
         features(args.features),
+        directions(args.shader == ShaderKind::kStoredColor ? args.channels / 4 : 1),
         normal_r3(static_cast<T*>(args.normal_r3)),
         features_rc(static_cast<T*>(args.features_rc)) {}
 
@@ -80,8 +81,13 @@ struct ShadeRay : Walk<T> {
   GV_HD int32_t visit(const Ray<T>& ray, const Sight<T>& sight, Intervals<T>& at, int32_t& wanted, Sum& sum) const {
     const auto hides = [&](int32_t node) {
       const int64_t row = int64_t{2} * node * channels.value.width + channels.component;
-      return shader.hides(read_number<T>(range_tn2c, channels.value.type, row),
-                          read_number<T>(range_tn2c, channels.value.type, row + channels.value.width), sum);
+      T low = read_number<T>(range_tn2c, channels.value.type, row);
+      T high = read_number<T>(range_tn2c, channels.value.type, row + channels.value.width);
+      for (int32_t other = 1; other < directions; ++other) {
+        low = smaller(low, read_number<T>(range_tn2c, channels.value.type, row + 4 * other));
+        high = larger(high, read_number<T>(range_tn2c, channels.value.type, row + channels.value.width + 4 * other));
+      }
+      return shader.hides(low, high, sum);
     };
     const T middle = at.middle();
     Number digits(tree, ray.at(middle));

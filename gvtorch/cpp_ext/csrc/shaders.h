@@ -146,7 +146,9 @@ struct Lit {
 };
 
 // Colour and opacity of each voxel; the value is the opacity. Row 3 of the parameters: scale of the numbers, reference
-// length, whether colours are premultiplied, whether they are lit.
+// length, whether colours are premultiplied, whether they are lit. A channel may hold four numbers for each of six
+// directions (Crassin et al., "Interactive indirect illumination using voxel cone tracing", CGF 2011): a ray reads
+// the three that it goes along, weighted by the squares of its direction, whose sum is 1.
 template <class T>
 struct StoredColor {
   static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false;
@@ -158,11 +160,12 @@ struct StoredColor {
   GV_HD bool hides(T, T high, const Sum&) const { return !(a_little_above(high) > 0); }
   GV_HD void add(const Piece<T>& piece, const Probe<T>& probe, Sum& sum) const {
     const T scale = light.parameter_54[12];
-    const T opacity = clamp(piece.value * scale, static_cast<T>(0), static_cast<T>(1));
+    const T value = probe.channels.value.width == 4 ? piece.value : seen(probe, 3, piece.middle);
+    const T opacity = clamp(value * scale, static_cast<T>(0), static_cast<T>(1));
     if (!(opacity > 0)) return;
     T color[3];
     for (int i = 0; i < 3; ++i) {
-      color[i] = probe.number_at(probe.channels.value, i, piece.middle) * scale;
+      color[i] = seen(probe, i, piece.middle) * scale;
       if (light.parameter_54[14] > 0) color[i] = color[i] / opacity;
     }
     Row<T> row{color[0], color[1], color[2], stretch(opacity, piece.length / light.parameter_54[13])};
@@ -172,6 +175,17 @@ struct StoredColor {
       sum.add_normal(n, sum.clear * row.alpha);
     }
     sum.add(row, piece.start, piece.length, sum.hit_clear);
+  }
+  // One of the four numbers, as it is seen along the ray: to the bit that of one direction, where all six are equal.
+  GV_HD static T seen(const Probe<T>& probe, int32_t number, T t) {
+    const ChannelView& channel = probe.channels.value;
+    if (channel.width == 4) return probe.number_at(channel, number, t);
+    const Vec3<T> d = probe.sight.direction;
+    const auto along = [&](int32_t axis) {
+      return probe.number_at(channel, 8 * axis + (d[axis] < 0 ? 4 : 0) + number, t);
+    };
+    const T z = along(2);
+    return z + d.x * d.x * (along(0) - z) + d.y * d.y * (along(1) - z);
   }
   GV_HD void done(Sum&) const {}
 };
