@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .. import check, config
 from . import reference_shaders
-from .reference_shaders import FEATURES, PRE_INTEGRATED, PROJECTION, STORED_COLOR
+from .reference_shaders import COLORS, FEATURES, PRE_INTEGRATED, PROJECTION, SHADOWED_COLOR
 from .trace import Backend, check_arguments, choose_backend
 
 _TENSORS = (
@@ -48,10 +48,12 @@ def shade_rays(
 
     Args:
         shader: 0 lit transfer function, 1 pre-integrated, 2 stored colour, 3 isosurface, 4
-            projection, 5 features: as numbered in `reference_shaders`, told in csrc/shaders.h.
+            projection, 5 features, 6 lit with shadows, 7 stored colour with shadows: as numbered in
+            `reference_shaders`, told in csrc/shaders.h.
         parameter_54: (5, 4) in the table's dtype. Row 0: the light's x, y, z (its place, or the way
             it shines) and its kind (0 headlight, 1 directional, 2 point). 1: its red, green, blue,
-            and ambient. 2: diffuse, specular, shininess, 0. 3: the shader's own - stored colour:
+            and ambient. 2: diffuse, specular, shininess, and the width of a cone to the light (its
+            growth; of a point light the width there). 3: the shader's own - stored colour:
             scale, reference length, premultiplied (0, 1), lit (0, 1); isosurface: the level;
             projection: 0 maximum, 1 minimum, 2 mean. 4: scale and offset of stored normals, 0, 0.
         normal_bzyxc: (b, s, s, s, 3) channel of normals; None takes the gradient's.
@@ -81,7 +83,7 @@ def shade_rays(
     tensors = {name: shared[name] for name in _TENSORS}
     whole = tuple(shared[name] for name in _NUMBERS)
     reals = (cone_scale, root_voxel, step, stop_alpha, depth_alpha)
-    check.whole(where, "shader", shader, low=0, high=FEATURES)
+    check.whole(where, "shader", shader, low=0, high=SHADOWED_COLOR)
     rows = tensors["table_lm4"].shape[1] if tensors["table_lm4"].dim() > 1 else 0
     square = ("l", rows, rows, 4) if shader == PRE_INTEGRATED else ("l", "m", 4)
     check_arguments(where, tensors, (width, *whole, *reals), square, clear_r)
@@ -101,7 +103,7 @@ def shade_rays(
         check.tensor(where, f"{name}_tnc", constants, shape, bricks.dtype, device)
         if not (bricks.is_contiguous() and constants.is_contiguous()):
             raise ValueError(f"{where}: {name}_bzyxc and {name}_tnc must be contiguous")
-    if shader == STORED_COLOR and (like.shape[4] not in (4, 24) or shared["component"] != 3):
+    if shader in COLORS and (like.shape[4] not in (4, 24) or shared["component"] != 3):
         raise ValueError(
             f"{where}: stored colour needs a channel of 4 or 24 numbers and component 3"
         )

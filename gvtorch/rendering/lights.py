@@ -6,6 +6,7 @@ frame is traced, so nothing is built again.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +15,11 @@ import torch
 from torch import Tensor
 
 from .. import check
+
+#: Width of a cone over that of the disc of light it stands for. What it meets reaches as far again
+#: as its voxels are wide, and a cone that grazes takes more than its share: shadows agree best with
+#: this.
+CONE_OF_DISC = 0.35
 
 Number = float | Tensor
 Triple = Sequence[float] | Tensor
@@ -25,10 +31,11 @@ class Headlight:
 
     color: Triple = (1.0, 1.0, 1.0)  # linear RGB
     kind = 0
+    width = 0.0
 
     def __post_init__(self) -> None:
         """Checks the colour."""
-        _checked("Headlight", "color", self.color, low=0.0)
+        check_triple("Headlight", "color", self.color, low=0.0)
 
     @property
     def place(self) -> Triple:
@@ -42,17 +49,26 @@ class DirectionalLight:
 
     direction: Triple  # the way it shines, world; of any length but 0
     color: Triple = (1.0, 1.0, 1.0)  # linear RGB
+    angle: Number = 0.0  # how wide it looks, degrees, for soft shadows; the sun: 0.53
     kind = 1
 
     def __post_init__(self) -> None:
-        """Checks direction and colour."""
-        _checked("DirectionalLight", "direction", self.direction, zero=False)
-        _checked("DirectionalLight", "color", self.color, low=0.0)
+        """Checks direction, colour and angle."""
+        check_triple("DirectionalLight", "direction", self.direction, zero=False)
+        check_triple("DirectionalLight", "color", self.color, low=0.0)
+        _check_number("DirectionalLight", "angle", self.angle, high=120.0)
 
     @property
     def place(self) -> Triple:
         """The way it shines."""
         return self.direction
+
+    @property
+    def width(self) -> Number:
+        """How much a cone that goes to it grows per unit of length."""
+        if isinstance(self.angle, Tensor):
+            return 2 * CONE_OF_DISC * torch.tan(torch.deg2rad(self.angle) / 2)
+        return 2 * CONE_OF_DISC * math.tan(math.radians(self.angle) / 2)
 
 
 @dataclass
@@ -61,17 +77,24 @@ class PointLight:
 
     position: Triple  # world
     color: Triple = (1.0, 1.0, 1.0)  # linear RGB
+    radius: Number = 0.0  # of the ball that shines, world units, for soft shadows
     kind = 2
 
     def __post_init__(self) -> None:
-        """Checks position and colour."""
-        _checked("PointLight", "position", self.position)
-        _checked("PointLight", "color", self.color, low=0.0)
+        """Checks position, colour and radius."""
+        check_triple("PointLight", "position", self.position)
+        check_triple("PointLight", "color", self.color, low=0.0)
+        _check_number("PointLight", "radius", self.radius)
 
     @property
     def place(self) -> Triple:
         """Where it stands."""
         return self.position
+
+    @property
+    def width(self) -> Number:
+        """Of a cone that goes to it, where it stands."""
+        return 2 * CONE_OF_DISC * self.radius
 
 
 Light = Headlight | DirectionalLight | PointLight
@@ -91,22 +114,17 @@ class Material:
 
     def __post_init__(self) -> None:
         """Checks every number that the host can see."""
-        if not isinstance(self.light, (Headlight, DirectionalLight, PointLight)):
-            raise ValueError(
-                "shader: light must be a Headlight, DirectionalLight or PointLight, "
-                f"got {type(self.light).__name__}"
-            )
+        check_light("shader: light", self.light)
         for name in ("ambient", "diffuse", "specular", "shininess"):
             value = getattr(self, name)
-            if not (isinstance(value, Tensor) and value.numel() == 1):
-                check.number("shader", name, value, low=0)
+            _check_number("shader", name, value)
 
     def rows(self) -> tuple[Any, ...]:
         """The first three rows of `parameter_54`, see `shade_rays`."""
         return (
             *(self.light.place, self.light.kind),
             *(self.light.color, self.ambient),
-            *(self.diffuse, self.specular, self.shininess, 0.0),
+            *(self.diffuse, self.specular, self.shininess, self.light.width),
         )
 
 
@@ -125,9 +143,21 @@ def pack(parts: Sequence[Any], dtype: torch.dtype, device: torch.device) -> Tens
     return torch.cat(out)
 
 
-def _checked(
+def check_light(what: str, value: Any) -> None:
+    """Raises ValueError unless it is a light."""
+    if not isinstance(value, (Headlight, DirectionalLight, PointLight)):
+        raise ValueError(
+            f"{what} must be a Headlight, DirectionalLight or PointLight, "
+            f"got {type(value).__name__}"
+        )
+
+
+def check_triple(
     where: str, name: str, value: Any, *, low: float | None = None, zero: bool = True
 ) -> None:
+    """Raises ValueError unless it is three finite numbers, at least `low`, not all 0 if `zero` is
+    False; of tensors on CUDA the shape alone is looked at.
+    """
     if isinstance(value, Tensor) and value.is_cuda:
         if value.shape != (3,):
             raise ValueError(f"{where}: {name} must be (3,), got {check.describe(value)}")
@@ -138,3 +168,8 @@ def _checked(
             check.number(where, name, number, low=low)
     if not zero and not any(numbers):
         raise ValueError(f"{where}: {name} must not be zero")
+
+
+def _check_number(where: str, name: str, value: Any, *, high: float = math.inf) -> None:
+    if not (isinstance(value, Tensor) and value.numel() == 1):
+        check.number(where, name, value, low=0, high=high)

@@ -116,7 +116,14 @@ class Shader(ABC):
 
 
 class _Lighted(Shader):
-    """A shader with a light and a material; see `Material` and csrc/shaders.h."""
+    """A shader with a light and a material; see `Material` and csrc/shaders.h.
+
+    Attributes:
+        shadows: Whether a cone goes from each sample to the light: matter on the way takes from
+            diffuse light and highlight. A `Headlight` throws no shadows.
+    """
+
+    shadows = False
 
     def __init__(
         self,
@@ -157,18 +164,28 @@ class _Lighted(Shader):
             shininess=self.shininess,
         )
 
+    def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> dict[str, Any]:
+        """See `Shader`."""
+        kind = _SHADOWED[self.kind] if self.shadows else self.kind
+        return {**super().arguments(where, tree, intervals), "shader": kind}
+
 
 class Lit(_Lighted):
     """The transfer function, lit by Blinn and Phong on both sides of a surface."""
 
     kind = kinds.LIT
 
-    def __init__(self, transfer: TransferFunction, **light: Any) -> None:
-        """Takes a transfer function, and `normals`, `light`, `ambient`, `diffuse`, `specular` and
-        `shininess` as in `Isosurface`.
+    def __init__(self, transfer: TransferFunction, *, shadows: bool = False, **light: Any) -> None:
+        """Takes a transfer function.
+
+        Args:
+            transfer: The transfer function.
+            shadows: Whether matter takes light from what lies behind it; see `_Lighted`.
+            **light: `normals`, `light`, `ambient`, `diffuse`, `specular` and `shininess` as in
+                `Isosurface`.
         """
         super().__init__(**light)
-        self.transfer = _transfer("Lit", transfer)
+        self.transfer, self.shadows = _transfer("Lit", transfer), shadows
 
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """See `Shader`."""
@@ -222,6 +239,7 @@ class StoredColor(_Lighted):
         reference: float | None = None,
         premultiplied: bool = False,
         lit: bool = False,
+        shadows: bool = False,
         **light: Any,
     ) -> None:
         """Takes the channel's name.
@@ -231,7 +249,8 @@ class StoredColor(_Lighted):
             reference: World units; the smallest spacing if left out, and for six directions.
             premultiplied: Whether colours are stored times opacity, as they are for six directions.
                 Then coarse levels keep the colours of what is opaque; else air's colour mixes in.
-            lit: Whether it is lit; so it is where `normals` are named.
+            lit: Whether it is lit; so it is where `normals` are named, and with shadows.
+            shadows: As in `Lit`.
             **light: `normals`, `light`, `ambient`, `diffuse`, `specular`, `shininess` as in
                 `Isosurface`; without `normals`, they are the gradient's of the opacity (towards
                 +x, where there are six directions).
@@ -243,7 +262,7 @@ class StoredColor(_Lighted):
         if reference is not None:
             check.number("StoredColor", "reference", reference, low=0, open_low=True)
         self.channel, self.reference, self.premultiplied = channel, reference, premultiplied
-        self.lit = lit or self.normals is not None
+        self.lit, self.shadows = lit or self.normals is not None, shadows
 
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """Says how many lengths of intervals there are; its colours are not read."""
@@ -254,7 +273,12 @@ class StoredColor(_Lighted):
         scale = 1 / _unit_of(tree.bricks.channels[str(self.channel)].dtype)
         reference = self.reference or min(tree.spacing)
         directional = tree.bricks.channels[str(self.channel)].width != 4
-        return (scale, reference, float(self.premultiplied or directional), float(self.lit))
+        return (
+            scale,
+            reference,
+            float(self.premultiplied or directional),
+            self.lit or self.shadows,
+        )
 
     def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> dict[str, Any]:
         """See `Shader`."""
@@ -392,6 +416,7 @@ class Features(Shader):
 
 
 FusedShader = TransferFunction | Shader
+_SHADOWED = {kinds.LIT: kinds.SHADOWED_LIT, kinds.STORED_COLOR: kinds.SHADOWED_COLOR}
 _UNLIT = Material(light=Headlight(), ambient=1.0, diffuse=0.0, specular=0.0, shininess=1.0)
 
 

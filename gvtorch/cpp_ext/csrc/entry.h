@@ -295,9 +295,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> shade_rays(
               args.other_voxel, args.other_channels);
   const bool projects = args.shader == ShaderKind::kProjection;
   STD_TORCH_CHECK(args.shader != ShaderKind::kFeatures || other_bzyxc.has_value(), "gvtorch: other_bzyxc is missing");
-  STD_TORCH_CHECK(args.shader != ShaderKind::kStoredColor ||
-                      ((args.channels == 4 || args.channels == 4 * kDirections) && component == 3),
-                  "gvtorch: bricks_bzyxc must hold red, green, blue and opacity");
+  STD_TORCH_CHECK(
+      !is_stored_color(args.shader) || ((args.channels == 4 || args.channels == 4 * kDirections) && component == 3),
+      "gvtorch: bricks_bzyxc must hold red, green, blue and opacity");
   STD_TORCH_CHECK(features == (args.shader == ShaderKind::kFeatures ? args.other_channels
                                : projects                           ? 1
                                                                     : 0),
