@@ -189,6 +189,14 @@ def test_a_headlight_and_no_light_at_all_throw_no_shadow(backend):
     assert torch.equal(plain.samples, shadowed.samples)
 
 
+def test_a_surface_has_no_shadows_per_sample():
+    surface = gv.Isosurface(0.5)
+    surface.shadows = True
+    tree = gv.N3Tree.from_volume(gv.Volume(fog(2)))
+    with pytest.raises(ValueError, match="render: shadows per sample are for Lit and StoredColor"):
+        gv.render(tree, gv.Camera.orbit(width=4, height=4), surface)
+
+
 def test_what_is_only_seen_in_a_shadow_is_streamed_too():
     """The thing that throws the shadow stands beside the picture."""
     value = np.zeros((64, 64, 64), np.float32)

@@ -166,6 +166,8 @@ class _Lighted(Shader):
 
     def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> dict[str, Any]:
         """See `Shader`."""
+        if self.shadows and self.kind not in _SHADOWED:
+            raise ValueError(f"{where}: shadows per sample are for Lit and StoredColor")
         kind = _SHADOWED[self.kind] if self.shadows else self.kind
         return {**super().arguments(where, tree, intervals), "shader": kind}
 

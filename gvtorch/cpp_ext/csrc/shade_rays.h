@@ -37,7 +37,7 @@ struct ShadeRay : Walk<T> {
         stamp_b(args.stamp_b),
         lengths(args.levels),
         features(args.features),
-        directions(is_stored_color(args.shader) ? args.channels / 4 : 1),
+        directions(std::is_same_v<Shader, StoredColor<T>> ? args.channels / 4 : 1),
         normal_r3(static_cast<T*>(args.normal_r3)),
         features_rc(static_cast<T*>(args.features_rc)) {}
 
