@@ -26,6 +26,11 @@ SHADERS = {
     "stored colour lit": gv.StoredColor(
         "premultiplied", premultiplied=True, light=gv.DirectionalLight((1, -1, -1)), lit=True
     ),
+    "lit with shadows": gv.Lit(SHADER, shadows=True, light=replace(POINT, radius=20.0)),
+    "colour with shadows": gv.StoredColor(
+        "six", shadows=True, light=gv.DirectionalLight((1, -1, -1), angle=9.0)
+    ),
+    "six directions": gv.StoredColor("six", light=POINT, lit=True),
     "isosurface": gv.Isosurface(0.5, (0.9, 0.4, 0.2), light=POINT),
     "coloured isosurface": gv.Isosurface(0.4, SHADER, color_channel="rgba", color_component=1),
     "distance field": gv.DistanceField(offset=0.3),
@@ -45,12 +50,15 @@ def channels(blobs) -> dict[str, gv.Volume]:
     normal = torch.stack(torch.gradient(value)[::-1], -1)
     normal = torch.nn.functional.normalize(normal, dim=-1) * 0.5 + 0.5
     place = blobs.spacing, blobs.origin
+    six = gv.Volume(rgba, *place).directional()
+    six.data = six.data * torch.linspace(0.6, 1.0, 24).to(six.data)  # no two of them are equal
     return {
         "value": blobs,
         "rgba": gv.Volume((rgba * 255).round().to(torch.uint8), *place),
         "premultiplied": gv.Volume(
             torch.cat((rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]), -1), *place
         ),
+        "six": six,
         "normal": gv.Volume((normal * 255).round().to(torch.uint8), *place),
     }
 
@@ -73,7 +81,7 @@ def assert_same_fields(tree, backend, rays, shader, **options):
 @pytest.mark.parametrize("lod", ["finest", "auto"])
 @pytest.mark.parametrize("name", SHADERS)
 def test_compiled_equals_reference(tree, compiled, name, lod):
-    for distance in (0.2, 1.3, 6.0):
+    for distance in (1.3,) if "shadows" in name else (0.2, 1.3, 6.0):  # the twin takes its time
         rays = camera_rays(tree, 16, distance=distance)
         found, actual, _ = assert_same_fields(tree, compiled, rays, SHADERS[name], lod=lod)
         if compiled == "cpp":
@@ -294,7 +302,10 @@ def test_bad_shaders_have_one_clear_message(make, message):
     [
         (gv.Lit(SHADER, normals="n"), "unknown channel 'n'; the tree has value, rgba"),
         (gv.Lit(SHADER, normals="rgba"), "normals need 3 numbers a voxel, 'rgba' has 4"),
-        (gv.StoredColor("normal"), "stored colour needs 4 numbers a voxel, 'normal' has 3"),
+        (
+            gv.StoredColor("normal"),
+            "needs 4 numbers a voxel, or 24 for six directions, 'normal' has 3",
+        ),
         (gv.Features(SHADER, "f"), "unknown channel 'f'"),
         (gv.Isosurface(1, SHADER, color_channel="rgba", color_component=4), "must be an int >= 0"),
     ],
@@ -309,14 +320,14 @@ def test_the_op_checks_its_arguments(tree):
     good = op_arguments(tree, SHADERS["features"], torch.float32)
     shade_rays(**good)
     for change, message in (
-        ({"shader": 9}, "shader must be an int >= 0 and <= 5"),
+        ({"shader": 9}, "shader must be an int >= 0 and <= 7"),
         ({"features": 3}, "features must be an int >= 4"),
         ({"parameter_54": torch.zeros(5)}, r"parameter_54 must be \(5, 4\)"),
         ({"other_tnc": None}, "belong together"),
         ({"other_bzyxc": None, "other_tnc": None}, "features need other_bzyxc"),
         ({"frame": 1}, "argument 'frame' is missing or unknown"),
         ({"shader": 1}, "table_lm4 must be"),
-        ({"shader": 2}, "stored colour needs a channel of 4 numbers"),
+        ({"shader": 2}, "stored colour needs a channel of 4 or 24 numbers"),
     ):
         with pytest.raises(ValueError, match=message):
             shade_rays(**{**good, **change})

@@ -15,9 +15,11 @@ from ..frame import Hits
 from ..pool import N3Tree
 from ..producers import VolumeProducer
 from ..rendering import (
+    DirectionalLight,
     DistanceField,
     Features,
     Isosurface,
+    Lighting,
     Lit,
     ModuleShader,
     Picture,
@@ -35,6 +37,7 @@ from .record import Record, Settings, Timing, clock
 from .scenes import Scene, aneurism, fog_dense, worn
 
 _WIDE = 16  # numbers of the widest channel
+SUN = DirectionalLight((1.0, -2.0, -1.5), angle=4.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +60,16 @@ def _module(scene: Scene) -> AnyShader:
     return ModuleShader(module, hidden_by=scene.shader)
 
 
+def _cones(name: str, *, occlusion: float = 0.0, indirect: float = 0.0) -> Look:
+    light = Lighting(lights=(SUN,), occlusion=occlusion, indirect=indirect)
+    return Look(
+        name=f"isosurface, {name}",
+        shader=lambda scene: Isosurface(scene.surface),
+        options={"lighting": light},
+        beside="isosurface",
+    )
+
+
 #: What is measured, each behind the look that it stands beside. Left out where a scene has not the
 #: channels that a shader names; modules, which take long, where it has but one.
 LOOKS = (
@@ -65,7 +78,11 @@ LOOKS = (
     Look(name="lit by stored normals", shader=lambda s: Lit(s.shader, normals="normal")),
     Look(name="stored colour", shader=lambda _: StoredColor("rgba")),
     Look(name="stored colour, lit", shader=lambda _: StoredColor("rgba", lit=True)),
+    Look(name="lit, shadows per sample", shader=lambda s: Lit(s.shader, light=SUN, shadows=True)),
     Look(name="isosurface", shader=lambda s: Isosurface(s.surface)),
+    _cones("shadow"),
+    _cones("shadow, occlusion", occlusion=1.0),
+    _cones("shadow, occlusion, bounce", occlusion=1.0, indirect=1.0),
     Look(name="distance field", shader=lambda s: DistanceField(offset=s.surface)),
     Look(name="maximum", shader=_projection("maximum")),
     Look(name="minimum", shader=_projection("minimum")),

@@ -186,6 +186,11 @@ def _source(
     origin: Sequence[float] | None,
 ) -> Source | Array:
     if isinstance(source, Volume):
+        if source.filter != "mean":
+            raise ValueError(
+                "convert: a store's levels are means: a volume seen from six directions "
+                "is rendered with N3Tree.from_volume or VolumeProducer"
+            )
         found: Source | Array = Array.of(source)
     else:
         wants = options["key"] is not None  # an .npz, or a mistake that `read_volume` tells of

@@ -17,6 +17,8 @@ from .reference_tree import Bricks, Tree
 _TINY = 1.1754944e-38  # smallest normal float32
 _BISECTIONS = 4
 (LIT, PRE_INTEGRATED, STORED_COLOR, ISOSURFACE, PROJECTION, FEATURES) = range(6)
+(SHADOWED_LIT, SHADOWED_COLOR) = range(6, 8)
+COLORS = (STORED_COLOR, SHADOWED_COLOR)
 (HEADLIGHT, DIRECTIONAL, POINT) = range(3)
 (MAXIMUM, MINIMUM, MEAN) = range(3)
 
@@ -44,6 +46,56 @@ def power(x: Tensor, exponent: Tensor) -> Tensor:
 
 
 @dataclass
+class Shadows:
+    """What cones from samples to the light go through, and what they cost."""
+
+    beam: Beam  # the eye's
+    tree: Tree
+    step: float
+    levels: int  # lengths of intervals
+    stop_clear: Tensor
+    cone_scale: Tensor
+    samples: Tensor  # (r,) int32
+    missed: Tensor  # (r,) bool
+
+    def share(
+        self,
+        shade: Shade,
+        t: Tensor,
+        way: Tensor,
+        length: Tensor,
+        growth: Tensor,
+        where: Tensor,
+    ) -> Tensor:
+        """(r,) share of a light, `length` (r,) away, that comes to places t (r,), where `where` is
+        true. A cone is as wide there as the eye's; its first interval is left out, so that a place
+        does not stand in its own shadow.
+        """
+        which = where.nonzero()[:, 0]
+        t, way = t[which], way[which]
+        eye = self.beam
+        beam = Beam(
+            origin=eye.origin[which] + t[:, None] * eye.direction[which],
+            direction=way / shade.cube,
+            high=eye.high,
+            cone_near=eye.cone_near[which] + eye.cone_growth[which] * t,
+            cone_growth=growth[which] * self.cone_scale,
+            first=torch.zeros_like(t),
+            last=length[which],
+            moved=torch.zeros_like(t),
+        )
+        beam.clip()
+        at = Intervals.begin(beam, self.step, self.levels)
+        at.next(torch.ones_like(where[which]))
+        veil = Veil(shade, way, Accumulator.begin(beam))
+        step = torch.tensor(self.step, dtype=t.dtype).to(t)
+        samples, visit = walk(beam, at, self.tree, shade.channel, veil, step, self.stop_clear)
+        self.samples[which] += samples
+        self.missed[which] |= visit.missed
+        return torch.ones_like(length).index_put((which,), veil.sum.clear)
+
+
+@dataclass
 class Shade:
     """What the shaders share: tables, parameters, channels, and the sums of every ray."""
 
@@ -61,6 +113,7 @@ class Shade:
     normal: Tensor  # (r, 3)
     features: Tensor  # (r, c)
     hit_clear: Tensor
+    shadows: Shadows | None
     sees_empty: bool = False
 
     def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
@@ -68,9 +121,15 @@ class Shade:
         return self.transfer.transparent(low, high)
 
     def same(self, bricks: Bricks, fine: Tensor, coarse: Tensor) -> Tensor:
-        """See `reference.Shader`."""
+        """See `reference.Shader`. Shadows differ from place to place."""
+        if self.shadows is not None:
+            return torch.zeros_like(fine, dtype=torch.bool)
+        return self.equal(fine, coarse)
+
+    def equal(self, fine: Tensor, coarse: Tensor) -> Tensor:
+        """(k,) bool: two nodes without bricks hold the same numbers."""
         equal = torch.ones_like(fine, dtype=torch.bool)
-        for channel in (bricks, *self.normals[:1], *self.others[:1]):
+        for channel in (self.channel, *self.normals[:1], *self.others[:1]):
             numbers = channel.constant_nc
             equal = equal & (numbers[fine] == numbers[coarse]).all(1)
         equal = equal | (fine == coarse)
@@ -82,6 +141,10 @@ class Shade:
         rgba = self.transfer.interval(probe.value(piece.middle), piece)
         self.lit(rgba, piece, probe, where)
 
+    def alpha(self, piece: Piece, probe: Probe, along: Tensor) -> Tensor:
+        """(r,) what intervals take from the light that goes along `along` (r, 3)."""
+        return self.transfer.interval(probe.value(piece.middle), piece)[:, 3]
+
     def done(self) -> None:
         """After the last interval."""
 
@@ -89,7 +152,7 @@ class Shade:
         """Adds an interval in the light."""
         seen = where & (rgba[:, 3] > 0)
         normal = self.normal_at(probe, piece.middle)
-        color = self.shade(rgba[:, :3], normal, piece.middle)
+        color = self.shade(rgba[:, :3], normal, piece.middle, seen)
         color = torch.where(seen[:, None], color, rgba[:, :3])
         share = self.sum.clear * rgba[:, 3]
         added = self.normal + share[:, None] * normal
@@ -135,26 +198,65 @@ class Shade:
         normal = unit(normal)
         return torch.where((dot(normal, self.along) > 0)[:, None], -normal, normal)
 
-    def shade(self, base: Tensor, normal: Tensor, t: Tensor) -> Tensor:
-        """(r, 3) colours in the light, by Blinn and Phong."""
+    def shade(self, base: Tensor, normal: Tensor, t: Tensor, seen: Tensor | None = None) -> Tensor:
+        """(r, 3) colours in the light, by Blinn and Phong; shadows fall where `seen` is true."""
         p, back = self.parameter, -self.along
-        ways = {
-            DIRECTIONAL: unit(-p[:3].expand_as(back)),
-            POINT: unit(p[:3] - (self.eye + (t + self.moved)[:, None] * self.along)),
-        }
-        to_light = back
-        for kind, way in ways.items():
-            to_light = torch.where(p[3].to(torch.int32) == kind, way, to_light)
+        kind = p[3].to(torch.int32)
+        way = p[:3] - (self.eye + (t + self.moved)[:, None] * self.along)
+        to_light, zero = back, torch.zeros_like(t)
+        length, growth = zero + INF, zero + p[11]
+        if kind == DIRECTIONAL:
+            to_light = unit(-p[:3].expand_as(back))
+        if kind == POINT:
+            to_light, length = unit(way), sqrt_exact(dot(way, way))
+            growth = growth / length
         bare = ~(dot(normal, normal) > 0)
-        zero = torch.zeros_like(t)
-        facing = larger(zero, dot(normal, to_light))
+        facing = torch.where(bare, 1.0, larger(zero, dot(normal, to_light)))
         half = unit(to_light - self.along)
         highlight = power(larger(zero, dot(normal, half)), p[10])
         highlight = torch.where((facing > 0) & ~bare, highlight, zero)
-        diffuse = p[8] * torch.where(bare, 1.0, facing)
+        if self.shadows is not None and seen is not None and kind != HEADLIGHT:
+            dark = seen & (facing > 0)
+            share = self.shadows.share(self, t, to_light, length, growth, dark)
+            facing, highlight = facing * share, highlight * share
+        diffuse = p[8] * facing
         specular = p[9] * highlight
         light, ambient = p[4:7], p[7]
         return base * (ambient + diffuse[:, None] * light) + specular[:, None] * light
+
+
+@dataclass
+class Veil:
+    """What a shader takes from the light that goes through: the shader of rays to a light."""
+
+    shade: Shade
+    along: Tensor  # (r, 3) world
+    sum: Accumulator
+    sees_empty: bool = False
+
+    def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        """See `reference.Shader`."""
+        return self.shade.hides(which, low, high)
+
+    def same(self, bricks: Bricks, fine: Tensor, coarse: Tensor) -> Tensor:
+        """See `reference.Shader`."""
+        return self.shade.equal(fine, coarse)
+
+    def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
+        """See `reference.Shader`."""
+        clear = self.sum.clear * (1 - self.shade.alpha(piece, probe, self.along))
+        self.sum.clear = torch.where(where, clear, self.sum.clear)
+
+
+class Sided(Bricks):
+    """The opacity in a channel that holds red, green, blue and opacity for each of six directions,
+    or once.
+    """
+
+    def ends(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
+        """Over all directions, see `reference.Bricks`."""
+        low, high = self.range_n2c[node, :, 3::4].to(real).unbind(1)
+        return low.amin(1), high.amax(1)
 
 
 class StoredColor(Shade):
@@ -167,10 +269,10 @@ class StoredColor(Shade):
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
         """See `reference.Shader`."""
         scale, reference, premultiplied, lit = self.parameter[12:16]
-        opacity = clamp(probe.value(piece.middle) * scale, 0, 1)
+        opacity = self.opacity(piece, probe, self.along)
         seen = where & (opacity > 0)
-        red_green_blue = [replace(self.channel, component=i) for i in range(3)]
-        color = torch.stack([probe.number(c, piece.middle) for c in red_green_blue], 1) * scale
+        numbers = [self.seen(probe, i, piece.middle, self.along) for i in range(3)]
+        color = torch.stack(numbers, 1) * scale
         divisor = torch.where((premultiplied > 0) & seen, opacity, 1.0)
         alpha = _stretch(opacity, piece.length / reference)
         rgba = torch.cat((color / divisor[:, None], alpha[:, None]), 1)
@@ -178,6 +280,31 @@ class StoredColor(Shade):
             self.lit(rgba, piece, probe, seen)
         else:
             self.composite(rgba, piece, seen)
+
+    def alpha(self, piece: Piece, probe: Probe, along: Tensor) -> Tensor:
+        """See `Shade`."""
+        return _stretch(self.opacity(piece, probe, along), piece.length / self.parameter[13])
+
+    def opacity(self, piece: Piece, probe: Probe, along: Tensor) -> Tensor:
+        """(r,) per reference length."""
+        return clamp(self.seen(probe, 3, piece.middle, along) * self.parameter[12], 0, 1)
+
+    def seen(self, probe: Probe, number: int, t: Tensor, along: Tensor) -> Tensor:
+        """(r,) one of the four numbers, as it is seen along rays (r, 3): of three directions, where
+        the channel holds six.
+        """
+
+        def read(component: int) -> Tensor:
+            return probe.number(replace(self.channel, component=component), t)
+
+        if self.channel.bricks_bzyxc.shape[4] == 4:
+            return read(number)
+        side = [
+            torch.where(d < 0, read(8 * axis + 4 + number), read(8 * axis + number))
+            for axis, d in enumerate(along.unbind(1))
+        ]
+        x, y, _ = (along * along).unbind(1)
+        return side[2] + x * (side[0] - side[2]) + y * (side[1] - side[2])
 
 
 class PreIntegrated(Shade):
@@ -341,6 +468,8 @@ _KINDS: dict[int, type[Shade]] = {
     ISOSURFACE: Isosurface,
     PROJECTION: Projection,
     FEATURES: Features,
+    SHADOWED_LIT: Shade,
+    SHADOWED_COLOR: StoredColor,
 }
 
 
@@ -404,7 +533,13 @@ def shade_rays(
         values = constants.flatten(0, 1)
         return tuple(Bricks(bricks, values, ranges, border, c) for c in range(bricks.shape[4]))
 
-    channel = Bricks(bricks_bzyxc, constant_tnc.flatten(0, 1), ranges, border, component)
+    own = Sided if shader in COLORS else Bricks
+    channel = own(bricks_bzyxc, constant_tnc.flatten(0, 1), ranges, border, component)
+    stop_clear = 1 - number(stop_alpha)
+    none = torch.zeros_like(beam.first, dtype=torch.int32)
+    shadows = Shadows(
+        *(beam, tree, step, table.shape[0], stop_clear, number(cone_scale), none, none > 0)
+    )
     shade = _KINDS[shader](
         transfer=Transfer(table, domain_2, opaque_m),
         parameter=parameter_54.reshape(-1),
@@ -420,10 +555,11 @@ def shade_rays(
         normal=torch.zeros_like(beam.origin),
         features=beam.first.new_zeros((len(beam.first), features)),
         hit_clear=1 - number(depth_alpha),
+        shadows=shadows if shader in (SHADOWED_LIT, SHADOWED_COLOR) else None,
     )
     if isinstance(shade, (Isosurface, Projection)):
         shade.begin()
-    samples, visit = walk(beam, at, tree, channel, shade, number(step), 1 - number(stop_alpha))
+    samples, visit = walk(beam, at, tree, channel, shade, number(step), stop_clear)
     if isinstance(shade, Isosurface):
         shade.found = shade.sum.depth < INF
         t = torch.where(shade.found, shade.sum.depth, 0.0)
@@ -433,7 +569,8 @@ def shade_rays(
     shade.done()
     depth, alpha = shade.sum.depth + beam.moved, 1 - shade.sum.clear
     return (
-        *(shade.sum.color, alpha[:, None], depth[:, None], samples, visit.missed),
+        *(shade.sum.color, alpha[:, None], depth[:, None]),
+        *(samples + shadows.samples, visit.missed | shadows.missed),
         *(unit(shade.normal), shade.features),
     )
 

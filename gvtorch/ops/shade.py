@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .. import check, config
 from . import reference_shaders
-from .reference_shaders import FEATURES, PRE_INTEGRATED, PROJECTION, STORED_COLOR
+from .reference_shaders import COLORS, FEATURES, PRE_INTEGRATED, PROJECTION, SHADOWED_COLOR
 from .trace import Backend, check_arguments, choose_backend
 
 _TENSORS = (
@@ -48,11 +48,13 @@ def shade_rays(
 
     Args:
         shader: 0 lit transfer function, 1 pre-integrated, 2 stored colour, 3 isosurface, 4
-            projection, 5 features: as numbered in `reference_shaders`, told in csrc/shaders.h. Or
-            the name of a user's op, see `cpp_ext.user`.
+            projection, 5 features, 6 lit with shadows, 7 stored colour with shadows: as numbered in
+            `reference_shaders`, told in csrc/shaders.h. Or the name of a user's op, see
+            `cpp_ext.user`.
         parameter_54: (5, 4) in the table's dtype. Row 0: the light's x, y, z (its place, or the way
             it shines) and its kind (0 headlight, 1 directional, 2 point). 1: its red, green, blue,
-            and ambient. 2: diffuse, specular, shininess, 0. 3: the shader's own - stored colour:
+            and ambient. 2: diffuse, specular, shininess, and the width of a cone to the light (its
+            growth; of a point light the width there). 3: the shader's own - stored colour:
             scale, reference length, premultiplied (0, 1), lit (0, 1); isosurface: the level;
             projection: 0 maximum, 1 minimum, 2 mean. 4: scale and offset of stored normals, 0, 0.
             For a user's op (20 + k,): the same and its own k numbers.
@@ -85,7 +87,7 @@ def shade_rays(
     whole = tuple(shared[name] for name in _NUMBERS)
     reals = (cone_scale, root_voxel, step, stop_alpha, depth_alpha)
     own = isinstance(shader, str)
-    kind = 0 if own else check.whole(where, "shader", shader, low=0, high=FEATURES)
+    kind = 0 if own else check.whole(where, "shader", shader, low=0, high=SHADOWED_COLOR)
     rows = tensors["table_lm4"].shape[1] if tensors["table_lm4"].dim() > 1 else 0
     square = ("l", rows, rows, 4) if shader == PRE_INTEGRATED else ("l", "m", 4)
     check_arguments(where, tensors, (width, *whole, *reals), square, clear_r)
@@ -106,8 +108,10 @@ def shade_rays(
         check.tensor(where, f"{name}_tnc", constants, shape, bricks.dtype, device)
         if not (bricks.is_contiguous() and constants.is_contiguous()):
             raise ValueError(f"{where}: {name}_bzyxc and {name}_tnc must be contiguous")
-    if shader == STORED_COLOR and (like.shape[4] != 4 or shared["component"] != 3):
-        raise ValueError(f"{where}: stored colour needs a channel of 4 numbers and component 3")
+    if shader in COLORS and (like.shape[4] not in (4, 24) or shared["component"] != 3):
+        raise ValueError(
+            f"{where}: stored colour needs a channel of 4 or 24 numbers and component 3"
+        )
     if shader == FEATURES and other_bzyxc is None:
         raise ValueError(f"{where}: features need other_bzyxc")
     others = 0 if other_bzyxc is None else other_bzyxc.shape[4]

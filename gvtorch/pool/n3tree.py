@@ -14,7 +14,7 @@ from ..volume import Volume, movable
 from .brick_pool import BrickPool, cut_bricks
 from .channel import Channel
 from .node_pool import NodePool
-from .pyramid import Level, build_levels, round_to
+from .pyramid import Level, round_to, volume_levels
 
 _BATCH = 4096  # bricks cut from a level at a time
 
@@ -194,7 +194,7 @@ class N3Tree:
         device: torch.device | str = "cpu",
         progress: Progress = no_progress,
     ) -> N3Tree:
-        """Builds the whole tree of a dense volume: mean-filtered levels, cut into bricks.
+        """Builds the whole tree of a dense volume: levels by the volume's filter, cut into bricks.
 
         A node is CONSTANT where all finest voxels in reach of its brick are equal, EMPTY where
         they are all at most `threshold`; neither has a brick or children.
@@ -243,7 +243,7 @@ class N3Tree:
         )
         plan.link(tree)
         for name, volume_ in volumes.items():
-            levels = build_levels(volume_.data, depth + 1, **sizes)
+            levels = volume_levels(volume_, depth + 1, **sizes)
             for done, level in enumerate(levels):
                 plan.fill(tree, name, depth - done, level)
                 progress("bricks", done + 1, depth + 1)
@@ -300,7 +300,7 @@ class _Plan:
         constant: dict[int, Tensor] = {}
         empty: dict[int, Tensor] = {}
         for name, volume in volumes.items():
-            for done, level in enumerate(build_levels(volume.data, depth + 1, **sizes)):
+            for done, level in enumerate(volume_levels(volume, depth + 1, **sizes)):
                 at = depth - done
                 flat = (level.low == level.high).all(-1)
                 below = torch.zeros_like(flat)

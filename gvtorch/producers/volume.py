@@ -11,13 +11,13 @@ from torch import Tensor
 from .. import check
 from ..pool import BrickTable, Channel, cut_bricks
 from ..pool.n3tree import check_channels
-from ..pool.pyramid import Level, build_levels, round_to
+from ..pool.pyramid import Level, round_to, volume_levels
 from ..volume import Volume, movable
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 
 
 class VolumeProducer(Producer):
-    """Cuts bricks out of the mean pyramid of a volume; the same bits as `N3Tree.from_volume`."""
+    """Cuts bricks out of the levels of a volume; the same bits as `N3Tree.from_volume`."""
 
     def __init__(
         self,
@@ -60,9 +60,7 @@ class VolumeProducer(Producer):
         """Makes all levels."""
         sizes = {"brick_size": layout.brick_size, "border": layout.border}
         for name, volume in self._volumes.items():
-            levels = build_levels(
-                volume.data, layout.depth + 1, branching=layout.branching, **sizes
-            )
+            levels = volume_levels(volume, layout.depth + 1, branching=layout.branching, **sizes)
             self._levels[name] = [*levels][::-1]
             if self._hold == "bricks":
                 self._tables[name] = BrickTable(_all_bricks(self._levels[name], layout))

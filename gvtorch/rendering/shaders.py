@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from copy import copy
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor
@@ -131,7 +131,14 @@ class Shader(ABC):
 
 
 class LitShader(Shader):
-    """A shader with a light and a material; see `Material` and csrc/shaders.h."""
+    """A shader with a light and a material; see `Material` and csrc/shaders.h.
+
+    Attributes:
+        shadows: Whether a cone goes from each sample to the light: matter on the way takes from
+            diffuse light and highlight. A `Headlight` throws no shadows.
+    """
+
+    shadows = False
 
     def __init__(
         self,
@@ -175,8 +182,17 @@ class LitShader(Shader):
     def unlit(self) -> LitShader:
         """Returns the same without its light: base colours, and normals."""
         bare = copy(self)
-        bare.ambient, bare.diffuse, bare.specular = 1.0, 0.0, 0.0
+        bare.ambient, bare.diffuse, bare.specular, bare.shadows = 1.0, 0.0, 0.0, False
         return bare
+
+    def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> dict[str, Any]:
+        """See `Shader`."""
+        given = super().arguments(where, tree, intervals)
+        if self.shadows:
+            if self.kind not in _SHADOWED:
+                raise ValueError(f"{where}: shadows per sample are for Lit and StoredColor")
+            given["shader"] = _SHADOWED[self.kind]
+        return given
 
     def matter(self) -> Shader:
         """Returns what a wide cone meets: base colours, alpha, and normals."""
@@ -192,12 +208,17 @@ class Lit(LitShader):
 
     kind = kinds.LIT
 
-    def __init__(self, transfer: TransferFunction, **light: Any) -> None:
-        """Takes a transfer function, and `normals`, `light`, `ambient`, `diffuse`, `specular` and
-        `shininess` as in `Isosurface`.
+    def __init__(self, transfer: TransferFunction, *, shadows: bool = False, **light: Any) -> None:
+        """Takes a transfer function.
+
+        Args:
+            transfer: The transfer function.
+            shadows: Whether matter takes light from what lies behind it; see `_Lighted`.
+            **light: `normals`, `light`, `ambient`, `diffuse`, `specular` and `shininess` as in
+                `Isosurface`.
         """
         super().__init__(**light)
-        self.transfer = _transfer("Lit", transfer)
+        self.transfer, self.shadows = _transfer("Lit", transfer), shadows
 
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """See `Shader`."""
@@ -241,7 +262,8 @@ class PreIntegrated(Shader):
 
 class StoredColor(LitShader):
     """Colour and opacity as each voxel holds them: a channel of 4 numbers, linear red, green, blue
-    and opacity per reference length. Integers stand for 0 to 1.
+    and opacity per reference length. Integers stand for 0 to 1. Or 24 numbers, these for each of
+    six directions, as `Volume.directional` makes them: a ray sees those that it goes along.
     """
 
     kind = kinds.STORED_COLOR
@@ -254,18 +276,21 @@ class StoredColor(LitShader):
         reference: float | None = None,
         premultiplied: bool = False,
         lit: bool = False,
+        shadows: bool = False,
         **light: Any,
     ) -> None:
         """Takes the channel's name.
 
         Args:
             channel: The channel.
-            reference: World units; the smallest spacing if left out.
-            premultiplied: Whether colours are stored times opacity. Then coarse levels keep the
-                colours of what is opaque; else air's colour mixes in.
-            lit: Whether it is lit; so it is where `normals` are named.
+            reference: World units; the smallest spacing if left out, and for six directions.
+            premultiplied: Whether colours are stored times opacity, as they are for six directions.
+                Then coarse levels keep the colours of what is opaque; else air's colour mixes in.
+            lit: Whether it is lit; so it is where `normals` are named, and with shadows.
+            shadows: As in `Lit`.
             **light: `normals`, `light`, `ambient`, `diffuse`, `specular`, `shininess` as in
-                `Isosurface`; without `normals`, they are the gradient's of the opacity.
+                `Isosurface`; without `normals`, they are the gradient's of the opacity (towards
+                +x, where there are six directions).
 
         Raises:
             ValueError: The reference length is not positive, or see `Isosurface`.
@@ -275,7 +300,7 @@ class StoredColor(LitShader):
             check.number("StoredColor", "reference", reference, low=0, open_low=True)
         self.channel = _name("StoredColor", channel)
         self.reference, self.premultiplied = reference, premultiplied
-        self.lit = lit or self.normals is not None
+        self.lit, self.shadows = lit or self.normals is not None, shadows
 
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """Says how many lengths of intervals there are; its colours are not read."""
@@ -285,27 +310,38 @@ class StoredColor(LitShader):
         """See `Shader`."""
         scale = 1 / _unit_of(tree.bricks.channels[str(self.channel)].dtype)
         reference = self.reference or min(tree.spacing)
-        return (scale, reference, float(self.premultiplied), float(self.lit))
+        directional = tree.bricks.channels[str(self.channel)].width != 4
+        return (
+            scale,
+            reference,
+            float(self.premultiplied or directional),
+            self.lit or self.shadows,
+        )
 
     def unlit(self) -> StoredColor:
         """See `LitShader`."""
-        bare = copy(self)
-        bare.lit, bare.ambient, bare.diffuse, bare.specular = True, 1.0, 0.0, 0.0
+        bare = cast("StoredColor", super().unlit())
+        bare.lit = True
         return bare
 
     def blocker(self) -> StoredColor:
         """See `LitShader`; it needs no normals."""
         bare = copy(self)
-        bare.lit = False
+        bare.lit = bare.shadows = False
         return bare
 
     def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> dict[str, Any]:
         """See `Shader`."""
         known = tree.bricks.channels.get(str(self.channel), Channel(width=4))
-        if known.width != 4:
+        if known.width not in (4, 24):
             raise ValueError(
-                f"{where}: stored colour needs 4 numbers a voxel, "
+                f"{where}: stored colour needs 4 numbers a voxel, or 24 for six directions, "
                 f"{self.channel!r} has {known.width}"
+            )
+        if known.width == 24 and self.reference not in (None, min(tree.spacing)):
+            raise ValueError(
+                f"{where}: {self.channel!r} has six directions, so its opacity is that of the "
+                f"smallest spacing, {min(tree.spacing):g}; got reference {self.reference:g}"
             )
         return super().arguments(where, tree, intervals)
 
@@ -484,6 +520,10 @@ class Features(Shader):
 
 
 FusedShader = TransferFunction | Shader
+_SHADOWED: dict[Any, int] = {
+    kinds.LIT: kinds.SHADOWED_LIT,
+    kinds.STORED_COLOR: kinds.SHADOWED_COLOR,
+}
 _UNLIT = Material(light=Headlight(), ambient=1.0, diffuse=0.0, specular=0.0, shininess=1.0)
 
 

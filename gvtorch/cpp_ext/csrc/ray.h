@@ -61,6 +61,20 @@ struct Ray {
     clip();
   }
 
+  // A cone of its own from a place inside the scene; `way` in the world.
+  GV_HD Ray(Vec3<T> place, Vec3<T> way, Vec3<T> cube, Vec3<T> high, T cone_near, T cone_growth, T last)
+      : origin(place),
+        direction{way.x / cube.x, way.y / cube.y, way.z / cube.z},
+        inverse{1 / direction.x, 1 / direction.y, 1 / direction.z},
+        high(high),
+        cone_near(cone_near),
+        cone_growth(cone_growth),
+        first(0),
+        last(last),
+        moved(0) {
+    clip();
+  }
+
   // Slab test (Kay and Kajiya, "Ray tracing complex scenes", 1986).
   // A ray that no face bounds (no direction, NaN, infinite) is closed, so that no loop runs on for ever.
   GV_HD void clip() {

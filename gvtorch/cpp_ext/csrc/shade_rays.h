@@ -1,13 +1,16 @@
 // ShadeRay: one ray through the tree with any shader of shaders.h. As TraceRay (trace.h), but dtypes are switches at
-// run time, and each interval goes to the shader.
+// run time, and each interval goes to the shader. With shadows, a cone goes from each sample to the light, through the
+// same tree; its samples, stamps and requests count as the ray's own.
 #pragma once
+
+#include <type_traits>
 
 #include "shaders.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-template <class T, class Shader>
+template <class T, class Shader, bool kShadows = false>
 struct ShadeRay : Walk<T> {
   using Walk<T>::tree;
   using Walk<T>::options;
@@ -19,7 +22,7 @@ struct ShadeRay : Walk<T> {
   const T* parameter_54;
   const void* range_tn2c;
   int32_t* stamp_b;
-  int32_t lengths, features;
+  int32_t lengths, features, directions;
   T *normal_r3, *features_rc;
 
   explicit ShadeRay(const ShadeArgs& args)
@@ -36,6 +39,7 @@ struct ShadeRay : Walk<T> {
         stamp_b(args.stamp_b),
         lengths(args.levels),
         features(args.features),
+        directions(std::is_same_v<Shader, StoredColor<T>> ? args.channels / 4 : 1),
         normal_r3(static_cast<T*>(args.normal_r3)),
         features_rc(static_cast<T*>(args.features_rc)) {}
 
@@ -55,8 +59,8 @@ struct ShadeRay : Walk<T> {
     int32_t wanted = 0;
     const bool powers = tree.digit_bits > 0;
     while (at.inside() && sum.clear > stop_clear) {
-      samples +=
-          powers ? visit<BitDigits<T>>(ray, sight, at, wanted, sum) : visit<Digits<T>>(ray, sight, at, wanted, sum);
+      samples += powers ? visit<BitDigits<T>>(shader, ray, sight, at, wanted, sum)
+                        : visit<Digits<T>>(shader, ray, sight, at, wanted, sum);
     }
     if constexpr (Shader::kSurface) {
       if (sum.depth < static_cast<T>(INFINITY)) {
@@ -78,25 +82,32 @@ struct ShadeRay : Walk<T> {
   }
 
  private:
-  template <class Number>
-  GV_HD int32_t visit(const Ray<T>& ray, const Sight<T>& sight, Intervals<T>& at, int32_t& wanted, Sum& sum) const {
+  template <class Number, class Any>
+  GV_HD int32_t visit(const Any& shader, const Ray<T>& ray, const Sight<T>& sight, Intervals<T>& at, int32_t& wanted,
+                      typename Any::Sum& sum) const {
+    constexpr bool shadows = kShadows && std::is_same_v<Any, Shader>;  // none on the way to a light
     const auto hides = [&](int32_t node) {
       const int64_t row = int64_t{2} * node * channels.value.width + channels.component;
-      return shader.hides(read_number<T>(range_tn2c, channels.value.type, row),
-                          read_number<T>(range_tn2c, channels.value.type, row + channels.value.width), sum);
+      T low = read_number<T>(range_tn2c, channels.value.type, row);
+      T high = read_number<T>(range_tn2c, channels.value.type, row + channels.value.width);
+      for (int32_t other = 1; other < directions; ++other) {
+        low = smaller(low, read_number<T>(range_tn2c, channels.value.type, row + 4 * other));
+        high = larger(high, read_number<T>(range_tn2c, channels.value.type, row + channels.value.width + 4 * other));
+      }
+      return shader.hides(low, high, sum);
     };
     const T middle = at.middle();
     Number digits(tree, ray.at(middle));
     NoPath path;
     const Visit<T> visit = this->find(ray, digits, at.cone(middle), hides, stamp_b, path, wanted, sum.missed);
-    const bool empty = !Shader::kSeesEmpty && visit.fine.brick == kEmpty && visit.coarse.brick == kEmpty;
+    const bool empty = !Any::kSeesEmpty && visit.fine.brick == kEmpty && visit.coarse.brick == kEmpty;
     if (visit.clear || visit.fine.node < 0 || empty) {
       this->leave(at, visit);
       return 0;
     }
     const Probe<T> probe(channels, sight, this->rays, ray, this->levels, visit, digits);
     Piece<T> piece;
-    if (probe.uniform() && !shades_each_place()) {  // one interval
+    if (!shadows && probe.uniform() && !shades_each_place()) {  // one interval; shadows differ within it
       piece.start = at.start;
       this->leave(at, visit);
       piece.end = smaller(at.start, at.stop);
@@ -111,7 +122,7 @@ struct ShadeRay : Walk<T> {
       const bool last = at.cut();
       const int32_t alike = last ? 1 : at.run(visit.exit, visit.cone_low, visit.cone_high);
       int32_t taken = 0;
-      if (Shader::kEnds) piece.back = probe.value(at.start);
+      if (Any::kEnds) piece.back = probe.value(at.start);
       do {
         const T number = at.count + static_cast<T>(taken);
         piece.start = at.start_of(number);
@@ -123,13 +134,19 @@ struct ShadeRay : Walk<T> {
           piece.length = at.length;
           piece.middle = at.middle_of(number);
         }
-        if (Shader::kEnds) {
+        if (Any::kEnds) {
           piece.front = piece.back;
           piece.back = probe.value(piece.end);
         } else {
           piece.value = probe.value(piece.middle);
         }
-        shader.add(piece, probe, sum);
+        if constexpr (shadows) {
+          shader.add(piece, probe, sum, [&](T t, Vec3<T> way, T length, T growth) {
+            return share_of_light<Number>(ray, probe, t, way, length, growth, samples, sum.missed);
+          });
+        } else {
+          shader.add(piece, probe, sum);
+        }
         ++taken;
       } while (taken < alike && sum.clear > stop_clear);
       samples += taken;
@@ -137,6 +154,28 @@ struct ShadeRay : Walk<T> {
       if (last) return samples;
     } while (sum.clear > stop_clear && this->stays(at, visit));
     return samples;
+  }
+
+  // How much light comes from `length` away to the place at distance t. The cone is as wide there as the ray's; its
+  // first interval is left out, so that a place does not stand in its own shadow.
+  template <class Number>
+  GV_HD T share_of_light(const Ray<T>& ray, const Probe<T>& probe, T t, Vec3<T> way, T length, T growth,
+                         int32_t& samples, bool& missed) const {
+    const Vec3<T> place{ray.origin.x + t * ray.direction.x, ray.origin.y + t * ray.direction.y,
+                        ray.origin.z + t * ray.direction.z};
+    const Ray<T> beam(place, way, probe.cube, ray.high, ray.cone_near + ray.cone_growth * t,
+                      growth * static_cast<T>(this->rays.cone_scale), length);
+    const Sight<T> sight(probe.sight.at(t), way);
+    Intervals<T> at(beam, options.step, lengths);
+    at.skip(1);
+    const Veil<T, Shader> veil{shader};
+    typename Veil<T, Shader>::Sum sum;
+    int32_t wanted = 0;
+    while (at.inside() && sum.clear > 1 - options.stop_alpha) {
+      samples += visit<Number>(veil, beam, sight, at, wanted, sum);
+    }
+    missed = missed || sum.missed;
+    return sum.clear;
   }
 
   // The place where depth was set may lie half an interval beside the node that found it.
@@ -177,6 +216,10 @@ void with_shader(ShaderKind kind, const ShadeArgs& args, const Body& body) {
       return body(ShadeRay<T, Projection<T>>(args));
     case ShaderKind::kFeatures:
       return body(ShadeRay<T, Features<T>>(args));
+    case ShaderKind::kShadowedLit:
+      return body(ShadeRay<T, Lit<T>, true>(args));
+    case ShaderKind::kShadowedColor:
+      return body(ShadeRay<T, StoredColor<T>, true>(args));
   }
 }
 

@@ -12,6 +12,11 @@
 //   kSurface, surface(probe, sum)                 where depth was set: `probe` then stands in the node of that place
 //   done(sum)                                     after the last interval
 //
+// One that shadows fall on has, beside,
+//
+//   alpha(piece, probe)                           of an interval: what it takes from the light behind it
+//   add(piece, probe, sum, shadow)                `shadow(t, way, length, growth)`: share of the light that comes there
+//
 // An interval lies in the node in which its middle lies. Its ends may stand up to half an interval outside; they are
 // read in this node all the same, where a brick's outermost voxel centres bound them. With a border of 1 and steps of
 // at most a voxel that bound is never reached, so an end is the same number from both sides; and since all that is read
@@ -72,7 +77,8 @@ GV_HD T power_of(T x, T power) {
 }
 
 // Blinn-Phong, on both sides of a surface. Rows of parameter_54: light x y z and its kind; its red green blue, ambient;
-// diffuse, specular, shininess, 0; then those that shaders name, and in the last the stored normal's scale and offset.
+// diffuse, specular, shininess, and the width of a cone to the light: its growth (directional), or the width at
+// the light (point); then those that shaders name, and in the last the stored normal's scale and offset.
 constexpr int32_t kParameters = 20;
 template <class T>
 struct Light {
@@ -94,21 +100,33 @@ struct Light {
     return n;
   }
   // Colour of a place in the light. Where there is no normal, it is lit as if it faced the light, without a highlight.
-  GV_HD Row<T> shade(Row<T> base, Vec3<T> n, const Probe<T>& probe, T t) const {
+  template <class... Shadow>
+  GV_HD Row<T> shade(Row<T> base, Vec3<T> n, const Probe<T>& probe, T t, const Shadow&... shadow) const {
     const Vec3<T> d = probe.sight.direction;
     const Vec3<T> given{parameter_54[0], parameter_54[1], parameter_54[2]};
     const int32_t kind = static_cast<int32_t>(parameter_54[3]);
     Vec3<T> to_light{-d.x, -d.y, -d.z};
+    T length = static_cast<T>(INFINITY), growth = parameter_54[11];
     if (kind == kDirectional) to_light = unit(Vec3<T>{-given.x, -given.y, -given.z});
     if (kind == kPoint) {
       const Vec3<T> place = probe.sight.at(t);
-      to_light = unit(Vec3<T>{given.x - place.x, given.y - place.y, given.z - place.z});
+      const Vec3<T> way{given.x - place.x, given.y - place.y, given.z - place.z};
+      to_light = unit(way);
+      length = sqrt(dot(way, way));
+      growth = growth / length;
     }
     T facing = 1, highlight = 0;
     if (dot(n, n) > 0) {
       facing = larger(static_cast<T>(0), dot(n, to_light));
       const Vec3<T> half = unit(Vec3<T>{to_light.x - d.x, to_light.y - d.y, to_light.z - d.z});
       if (facing > 0) highlight = power_of(larger(static_cast<T>(0), dot(n, half)), parameter_54[10]);
+    }
+    if constexpr (sizeof...(shadow) > 0) {
+      if (facing > 0 && kind != kHeadlight) {
+        const T share = (shadow(t, to_light, length, growth), ...);
+        facing = facing * share;
+        highlight = highlight * share;
+      }
     }
     const T diffuse = parameter_54[8] * facing;
     const T specular = parameter_54[9] * highlight;
@@ -133,12 +151,19 @@ struct Lit {
   explicit Lit(const ShadeArgs& args)
       : transfer(args), light{static_cast<const T*>(args.parameter_54)}, step(static_cast<T>(args.step)) {}
 
-  GV_HD bool hides(T low, T high, const Sum&) const { return Transfer<T>(transfer).transparent(low, high); }
-  GV_HD void add(const Piece<T>& piece, const Probe<T>& probe, Sum& sum) const {
+  template <class Any>
+  GV_HD bool hides(T low, T high, const Any&) const {
+    return Transfer<T>(transfer).transparent(low, high);
+  }
+  GV_HD T alpha(const Piece<T>& piece, const Probe<T>&) const {
+    return look_up(Transfer<T>(transfer), piece.value, piece, step).alpha;
+  }
+  template <class... Shadow>
+  GV_HD void add(const Piece<T>& piece, const Probe<T>& probe, Sum& sum, const Shadow&... shadow) const {
     Row<T> row = look_up(Transfer<T>(transfer), piece.value, piece, step);
     if (row.alpha > 0) {
       const Vec3<T> n = light.normal(probe, piece.middle);
-      row = light.shade(row, n, probe, piece.middle);
+      row = light.shade(row, n, probe, piece.middle, shadow...);
       sum.add_normal(n, sum.clear * row.alpha);
     }
     sum.add(row, piece.start, piece.length, sum.hit_clear);
@@ -147,7 +172,9 @@ struct Lit {
 };
 
 // Colour and opacity of each voxel; the value is the opacity. Row 3 of the parameters: scale of the numbers, reference
-// length, whether colours are premultiplied, whether they are lit.
+// length, whether colours are premultiplied, whether they are lit. A channel may hold four numbers for each of six
+// directions (Crassin et al., "Interactive indirect illumination using voxel cone tracing", CGF 2011): a ray reads
+// the three that it goes along, weighted by the squares of its direction, whose sum is 1.
 template <class T>
 struct StoredColor {
   static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false;
@@ -156,25 +183,71 @@ struct StoredColor {
 
   explicit StoredColor(const ShadeArgs& args) : light{static_cast<const T*>(args.parameter_54)} {}
 
-  GV_HD bool hides(T, T high, const Sum&) const { return !(a_little_above(high) > 0); }
-  GV_HD void add(const Piece<T>& piece, const Probe<T>& probe, Sum& sum) const {
+  template <class Any>
+  GV_HD bool hides(T, T high, const Any&) const {
+    return !(a_little_above(high) > 0);
+  }
+  GV_HD T opacity_of(const Piece<T>& piece, const Probe<T>& probe) const {
+    const T value = probe.channels.value.width == 4 ? piece.value : seen(probe, 3, piece.middle);
+    return clamp(value * light.parameter_54[12], static_cast<T>(0), static_cast<T>(1));
+  }
+  GV_HD T alpha(const Piece<T>& piece, const Probe<T>& probe) const {
+    return stretch(opacity_of(piece, probe), piece.length / light.parameter_54[13]);
+  }
+  template <class... Shadow>
+  GV_HD void add(const Piece<T>& piece, const Probe<T>& probe, Sum& sum, const Shadow&... shadow) const {
     const T scale = light.parameter_54[12];
-    const T opacity = clamp(piece.value * scale, static_cast<T>(0), static_cast<T>(1));
+    const T opacity = opacity_of(piece, probe);
     if (!(opacity > 0)) return;
     T color[3];
+#ifdef __CUDA_ARCH__
+#pragma unroll 1
+#endif
     for (int i = 0; i < 3; ++i) {
-      color[i] = probe.number_at(probe.channels.value, i, piece.middle) * scale;
+      color[i] = seen(probe, i, piece.middle) * scale;
       if (light.parameter_54[14] > 0) color[i] = color[i] / opacity;
     }
     Row<T> row{color[0], color[1], color[2], stretch(opacity, piece.length / light.parameter_54[13])};
     if (light.parameter_54[15] > 0) {
       const Vec3<T> n = light.normal(probe, piece.middle);
-      row = light.shade(row, n, probe, piece.middle);
+      row = light.shade(row, n, probe, piece.middle, shadow...);
       sum.add_normal(n, sum.clear * row.alpha);
     }
     sum.add(row, piece.start, piece.length, sum.hit_clear);
   }
+  // One of the four numbers, as it is seen along the ray: to the bit that of one direction, where all six are equal.
+  GV_HD static T seen(const Probe<T>& probe, int32_t number, T t) {
+    const ChannelView& channel = probe.channels.value;
+    const Vec3<T> d = probe.sight.direction;
+    const bool directional = channel.width > 4;
+    const T z = probe.number_at(channel, directional ? number + 16 + (d.z < 0 ? 4 : 0) : number, t);
+    T value = z;
+#ifdef __CUDA_ARCH__
+#pragma unroll 1
+#endif
+    for (int axis = 0; directional && axis < 2; ++axis) {
+      const T other = probe.number_at(channel, number + 8 * axis + (d[axis] < 0 ? 4 : 0), t);
+      value = value + d[axis] * d[axis] * (other - z);
+    }
+    return value;
+  }
   GV_HD void done(Sum&) const {}
+};
+
+// What a shader takes from the light that goes through: the shader of rays that go to a light.
+template <class T, class Shader>
+struct Veil {
+  static constexpr bool kEnds = false, kSeesEmpty = false;
+  struct Sum {
+    T clear = 1;  // transmittance
+    bool missed = false;
+  };
+  const Shader& shader;
+
+  GV_HD bool hides(T low, T high, const Sum& sum) const { return shader.hides(low, high, sum); }
+  GV_HD void add(const Piece<T>& piece, const Probe<T>& probe, Sum& sum) const {
+    sum.clear = sum.clear * (1 - shader.alpha(piece, probe));
+  }
 };
 
 // A table over the values at both ends of an interval, (l, m, m): premultiplied colour and alpha. Beyond its domain the

@@ -28,8 +28,21 @@ struct TraceArgs {
 };
 
 // The shaders of `shade_rays`, numbered as in rendering/shaders.py.
-enum class ShaderKind { kLit, kPreIntegrated, kStoredColor, kIsosurface, kProjection, kFeatures };
-constexpr int64_t kShaderKinds = 6;
+enum class ShaderKind {
+  kLit,
+  kPreIntegrated,
+  kStoredColor,
+  kIsosurface,
+  kProjection,
+  kFeatures,
+  kShadowedLit,
+  kShadowedColor
+};
+constexpr int64_t kShaderKinds = 8;
+constexpr bool is_stored_color(ShaderKind kind) {
+  return kind == ShaderKind::kStoredColor || kind == ShaderKind::kShadowedColor;
+}
+constexpr int32_t kDirections = 6;  // +x -x +y -y +z -z: a stored colour may have four numbers for each
 
 // The arguments of `shade_rays`: those of `trace_rays`, and what shaders read and give beside.
 struct ShadeArgs : TraceArgs {
