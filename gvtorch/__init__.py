@@ -11,6 +11,7 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from .cpp_ext.user import CompileError
     from .engine import Engine, EngineOptions
     from .frame import FrameStats, Hits, Rays
     from .io import read_volume
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
         Backdrop,
         Camera,
         Clip,
+        CompiledShader,
         Cost,
         CustomCamera,
         DirectionalLight,
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
         Headlight,
         Isosurface,
         Layer,
+        Lighting,
         Lit,
         ModuleShader,
         Picture,
@@ -80,6 +83,8 @@ _HOME = {
     "Channel": ".pool",
     "Cost": ".rendering",
     "Clip": ".rendering",
+    "CompileError": ".cpp_ext.user",
+    "CompiledShader": ".rendering",
     "Hits": ".frame",
     "ModuleShader": ".rendering",
     "Layer": ".rendering",
@@ -93,6 +98,7 @@ _HOME = {
     "Features": ".rendering",
     "Headlight": ".rendering",
     "Isosurface": ".rendering",
+    "Lighting": ".rendering",
     "Lit": ".rendering",
     "PointLight": ".rendering",
     "PreIntegrated": ".rendering",
@@ -118,6 +124,8 @@ __all__ = [
     "Camera",
     "Channel",
     "Clip",
+    "CompileError",
+    "CompiledShader",
     "Cost",
     "CustomCamera",
     "DirectionalLight",
@@ -132,6 +140,7 @@ __all__ = [
     "Hits",
     "Isosurface",
     "Layer",
+    "Lighting",
     "Lit",
     "ModuleShader",
     "N3Tree",

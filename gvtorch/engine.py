@@ -8,19 +8,18 @@ Detailed Voxel Rendering", I3D 2009; Crassin, PhD thesis 2011.
 from __future__ import annotations
 
 import dataclasses
-from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from . import check
-from .cache import KINDS, Cache, Listed, Requests, Scheduler
-from .frame import Counts, FrameStats, Hits, Rays
+from .arrivals import Arrivals, Numbers
+from .cache import Cache, Listed, Requests, Scheduler
+from .frame import FrameStats, Hits, Rays, add
 from .ops.trace import choose_backend
 from .producers import Producer
 from .production import Failure, Plant, Production
@@ -50,7 +49,6 @@ _View = tuple[Camera, torch.device, Trace, RenderOptions]  # of `trace_camera`
 
 _LISTED = 1 << 17  # most nodes with a wish that one frame lists
 _PAYLOAD = 256 * 10**6  # most bytes of voxels produced in one frame
-_AHEAD = 3  # most frames that the host may be ahead of the device
 
 
 class Engine:
@@ -97,9 +95,8 @@ class Engine:
         )
         self.frames, self._closed = 0, False
         self._frame_1 = torch.zeros(1, dtype=torch.int32, device=self.device)
-        self._traced: deque[_Traced] = deque()  # frames whose counts are on their way
+        self._arrivals = Arrivals()
         self._missed: Tensor | None = None  # (r,) bool, of the last picture's rays
-        self._steady = False
         self._report = Report()
         self.plants: dict[str, Plant] = {}
         try:
@@ -138,10 +135,10 @@ class Engine:
             ValueError: An argument is of the wrong type or out of its range.
             ProductionError: A node can't be produced, and the engine is strict.
         """
-        camera = as_camera("frame", camera)
+        camera = as_camera("frame", camera).placed(self.box)
         chosen = render_options("frame", camera, options)
         hits, stats = self._pass(camera, shader, chosen, progress)
-        return develop(hits, camera.placed(self.box), chosen, stats), stats
+        return develop(hits, camera, chosen, stats), stats
 
     def _pass(
         self,
@@ -156,7 +153,7 @@ class Engine:
         with self._unbroken(), self._timed(stats):
             self._catch_up(stats)  # 1, 2, 3, 4
             trace = self._tracer(shader, chosen)
-            view = camera.placed(self.box), self.device, trace, chosen
+            view = camera, self.device, trace, chosen
             if again is None:
                 self._scout(view, stats)
             self._count_up()
@@ -172,14 +169,8 @@ class Engine:
         here. Where they are not, the frame goes on without, unless an earlier one is known to have
         missed something, an answer is due, or the host is too far ahead.
         """
-        last = None
-        while self._traced and (
-            self._traced[0].counts.here
-            or (wait or len(self._traced) > _AHEAD or self.production.due)
-            or (last is not None and last.numbers.listed > 0)
-        ):
-            last = self._next_counts()
-        if not self._traced:
+        last = self._arrivals.catch_up(wait or self.production.due)
+        if not self._arrivals:
             if last is not None:
                 self.cache.make_room(last.numbers.tiles_unused, last.numbers.bricks_unused)
                 self.scheduler.begin()
@@ -212,16 +203,10 @@ class Engine:
             where = scouts(hits.missed, camera.width)
             trace_camera(*view, no_progress, again=(hits, where))
             listed, sent = self._collect(hits.samples[:0])
-            numbers = _Numbers(*sent.tolist())  # a frame that misses something waits anyway
-            _add(stats.requests, {name: getattr(numbers, name) for name in KINDS})
+            numbers = Numbers(*sent.tolist())  # a frame that misses something waits anyway
+            add(stats.requests, numbers.wishes())
             self.cache.make_room(numbers.tiles_unused, numbers.bricks_unused)
             self._serve(listed.read(self.cache.nodes, numbers), stats)
-
-    def _next_counts(self) -> _Traced:
-        """Takes the counts of the oldest frame under way; waits until they are here."""
-        traced = self._traced.popleft()
-        self._steady = traced.stats.converged
-        return traced
 
     def _serve(self, wishes: Requests, stats: FrameStats) -> None:
         """Chooses wishes, asks for them, and writes the answers that are here at once."""
@@ -240,7 +225,7 @@ class Engine:
             self.production.write(answers, stats)
 
     def _collect(self, samples: Tensor) -> tuple[Listed, Tensor]:
-        """What a traced frame leaves on the device: the wishes, and (10,) int64 `_Numbers`, the
+        """What a traced frame leaves on the device: the wishes, and (10,) int64 `Numbers`, the
         sum of (r,) samples among them.
         """
         with stage("requests"):
@@ -258,9 +243,7 @@ class Engine:
         stats.rays, stats.bytes = len(hits.missed), nodes.nbytes + bricks.nbytes
         self._missed = hits.missed
         self.cache.make_room(0, 0)
-        traced = _Traced(stats, listed, Counts(numbers), stats.pending)
-        stats.later(traced.arrive)
-        self._traced.append(traced)
+        self._arrivals.send(stats, listed, numbers)
 
     @contextmanager
     def _timed(self, stats: FrameStats) -> Iterator[None]:
@@ -273,7 +256,7 @@ class Engine:
         def arrive() -> None:
             stats.milliseconds += milliseconds(start, end)
             if timings is not None:
-                _add(stats.stages, timings.as_dict())
+                add(stats.stages, timings.as_dict())
 
         stats.later(arrive)
 
@@ -314,7 +297,7 @@ class Engine:
             ProductionError: See `frame`.
         """
         most = _most_frames(mode, productions, max_frames)
-        camera = as_camera("render", camera)
+        camera = as_camera("render", camera).placed(self.box)
         chosen = render_options("render", camera, options)
         if mode == "interactive":
             return self.frame(camera, shader, **options)[0]
@@ -327,7 +310,7 @@ class Engine:
             with self._unbroken(), self._timed(stats):
                 self._catch_up(stats, wait=True)
             self.production.raise_if_strict()
-            _add_up(total, stats)
+            total.add(stats)
             if mode == "converge":
                 turns.take(hits.missed, stats, total.failed)
                 if number == most - 1:
@@ -349,10 +332,8 @@ class Engine:
             total.converged = stats.converged
             total.capacity_exceeded = stats.capacity_exceeded
         total.frames, total.rays = number, turns.count
-        total.samples = stats.samples
-        summed = {name: getattr(total, name) for name in _SUMMED}
-        stats = dataclasses.replace(stats, **summed)
-        return develop(hits, camera.placed(self.box), chosen, stats)
+        stats = stats.of_picture(total)
+        return develop(hits, camera, chosen, stats)
 
     def capture(self, camera: Camera | Rays, shader: Shaders, **options: Any) -> FrameGraph:
         """Records a frame as a CUDA graph, for cameras of this number and size.
@@ -387,12 +368,9 @@ class Engine:
     @property
     def steady(self) -> bool:
         """Whether the last frame whose counts are here missed nothing; nobody waits."""
-        for traced in self._traced:
-            if traced.counts.here:
-                self._steady = traced.stats.converged
-        return self._steady
+        return self._arrivals.steady
 
-    @property
+    @cached_property
     def box(self) -> Tensor:
         """(2, 3) float64 world corners around all trees."""
         boxes = torch.stack([plant.tree.box for plant in self.plants.values()])
@@ -409,21 +387,7 @@ class Engine:
 
     def memory(self) -> dict[str, int]:
         """Returns bytes: what the pools hold, and the bookkeeping apart."""
-        nodes, bricks = self.cache.nodes, self.cache.bricks
-        content = (
-            nodes.child_tn,
-            nodes.brick_tn,
-            *nodes.constants.values(),
-            *nodes.ranges.values(),
-        )
-        node_bytes = sum(tensor.nbytes for tensor in content)
-        brick_bytes = sum(tensor.nbytes for tensor in bricks.bricks.values())
-        order = sum(lru.order.nbytes for lru in self.cache.lru.values())
-        return {
-            "node_pool": node_bytes,
-            "brick_pool": brick_bytes,
-            "bookkeeping": nodes.nbytes + bricks.nbytes - node_bytes - brick_bytes + order,
-        }
+        return self.cache.memory()
 
     def report(self) -> Report:
         """Returns what the last frames took: print it, or `as_dict()` for JSON."""
@@ -565,50 +529,11 @@ class FrameGraph:
             with stage("replay"):
                 self._graph.replay()
             engine._send(stats, self._hits, *self._left)
-        while len(engine._traced) > _AHEAD:
-            engine._next_counts()
+        while engine._arrivals.crowded:
+            engine._arrivals.take()
         if engine.options.monitor:
             engine._report.add(stats)
         return dataclasses.replace(self._picture, stats=stats), stats
-
-
-class _Numbers(NamedTuple):
-    """What the host is told of a frame."""
-
-    listed: int  # nodes
-    found: int
-    misses: int
-    load: int  # wishes of each kind
-    subdivide: int
-    tiles_unused: int
-    tiles_used: int
-    bricks_unused: int
-    bricks_used: int
-    samples: int
-
-
-@dataclass(eq=False)
-class _Traced:
-    """A traced frame whose counts are on their way."""
-
-    stats: FrameStats
-    listed: Listed
-    counts: Counts
-    late: int  # answers that were on their way while it was traced
-
-    @cached_property
-    def numbers(self) -> _Numbers:
-        """The counts; waits until they are here."""
-        return _Numbers(*self.counts.read())
-
-    def arrive(self) -> None:
-        """Completes the statistics."""
-        stats, numbers = self.stats, self.numbers
-        _add(stats.requests, {name: getattr(numbers, name) for name in KINDS})
-        stats.misses, stats.overflow = numbers.misses, numbers.found - numbers.listed
-        stats.tiles_used, stats.bricks_used = numbers.tiles_used, numbers.bricks_used
-        stats.samples = numbers.samples
-        stats.converged = not (numbers.found or self.late)
 
 
 def _most_frames(mode: str, productions: int, max_frames: int) -> int:
@@ -620,23 +545,3 @@ def _most_frames(mode: str, productions: int, max_frames: int) -> int:
             f"render: mode must be 'interactive', 'balanced' or 'converge', got {mode!r}"
         )
     return limits[mode]
-
-
-_SUMMED = (
-    *("frames", "milliseconds", "stages", "rays", "samples", "tiles_used", "bricks_used"),
-    *("produced", "evicted", "bytes_uploaded", "converged", "capacity_exceeded"),
-)
-
-
-def _add_up(total: FrameStats, stats: FrameStats) -> None:
-    total.milliseconds += stats.milliseconds
-    total.bytes_uploaded += stats.bytes_uploaded
-    total.tiles_used = max(total.tiles_used, stats.tiles_used)
-    total.bricks_used = max(total.bricks_used, stats.bricks_used)
-    for name in ("stages", "produced", "evicted"):
-        _add(getattr(total, name), getattr(stats, name))
-
-
-def _add(sums: dict[str, Any], more: Mapping[str, Any]) -> None:
-    for key, value in more.items():
-        sums[key] = sums.get(key, 0) + value

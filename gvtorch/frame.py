@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import torch
@@ -141,6 +141,22 @@ class FrameStats(RenderStats):
             object.__getattribute__(self, "settle")()
         return object.__getattribute__(self, name)
 
+    def add(self, stats: FrameStats) -> None:
+        """Adds a frame of the same picture: sums what it took, and keeps the most it used."""
+        self.milliseconds += stats.milliseconds
+        self.bytes_uploaded += stats.bytes_uploaded
+        self.tiles_used = max(self.tiles_used, stats.tiles_used)
+        self.bricks_used = max(self.bricks_used, stats.bricks_used)
+        for name in ("stages", "produced", "evicted"):
+            add(getattr(self, name), getattr(stats, name))
+
+    def of_picture(self, total: FrameStats) -> FrameStats:
+        """Returns the statistics of a picture: those of its last frame, this one, but for what
+        `total` added up over all its frames.
+        """
+        summed = {name: getattr(total, name) for name in _SUMMED}
+        return replace(self, **summed)
+
     @property
     def miss_rate(self) -> float:
         """Bricks asked for over bricks asked for and bricks used. A brick on its way is asked for
@@ -154,6 +170,16 @@ class FrameStats(RenderStats):
         return {**asdict(self), "miss_rate": self.miss_rate}
 
 
+def add(sums: dict[str, Any], more: Mapping[str, Any]) -> None:
+    """Adds numbers by name."""
+    for key, value in more.items():
+        sums[key] = sums.get(key, 0) + value
+
+
+_SUMMED = (
+    *("frames", "milliseconds", "stages", "rays", "tiles_used", "bricks_used"),
+    *("produced", "evicted", "bytes_uploaded", "converged", "capacity_exceeded"),
+)
 _LATE = {
     *("milliseconds", "stages", "samples", "tiles_used", "bricks_used"),
     *("requests", "misses", "overflow", "converged"),

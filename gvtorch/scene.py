@@ -61,6 +61,8 @@ def checked_device(device: torch.device | str) -> torch.device:
         raise ValueError(f"Engine: device must name a device, got {device!r}") from None
     if found.type == "cuda" and not torch.cuda.is_available():
         raise ValueError("Engine: device 'cuda' can't be used here: torch sees no CUDA device")
+    if found.type == "cuda" and found.index is None:  # as tensors name theirs
+        found = torch.device("cuda", torch.cuda.current_device())
     return found
 
 

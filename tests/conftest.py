@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,15 @@ def shared(path: str) -> Path:
         _absent.add(path)
         pytest.skip(f"shared test data is not here: {path}")
     return file
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Where compiled shaders are kept: each is compiled once for all tests, and none stays."""
+    with pytest.MonkeyPatch.context() as patch:
+        folder = tmp_path_factory.mktemp("cache")
+        patch.setenv("GVTORCH_CACHE", str(folder))
+        yield folder
 
 
 @pytest.fixture(scope="session")

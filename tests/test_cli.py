@@ -211,6 +211,11 @@ TF = '{"opacity": [[5, 0], [1, 1]]}'
         (lambda t, s: [s, "--clip", "box:0,0,0,1,0,1"], "boxes[0] must have its low corner below"),
         (lambda t, s: [s, "--lens", "0.1"], "--lens must be 2 numbers"),
         (lambda t, s: [s, "--lens", "0.1,0"], "focus must be finite and > 0"),
+        (lambda t, s: [s, "--lighting", "moon:1"], "--lighting must hold sun:, lamp:, sky:,"),
+        (lambda t, s: [s, "--lighting", "sun:0,-1,0"], "--lighting sun must be 4 numbers"),
+        (lambda t, s: [s, "--lighting", "sun:0,0,0,1"], "direction must not be zero"),
+        (lambda t, s: [s, "--lighting", "occlusion:2"], "occlusion must be finite and >= 0"),
+        (lambda t, s: [s, "--lighting", "occlusion:1"], "lighting needs normals"),
         (lambda t, s: [s, "--brick-size", "1"], "brick_size must be an int >= 2"),
         (lambda t, s: [s, "--threshold", "nan"], "threshold must be finite"),
         (lambda t, s: [s, "--backend", "cuda"], "backend 'cuda' can't be used here"),
@@ -248,6 +253,27 @@ def test_flags_clip_and_blur(small, tmp_path):
     assert alpha["none"].max() == 0 < alpha["all"].max()
     assert 0.1 < (alpha["half"] > 0).sum() / (alpha["all"] > 0).sum() < 0.9
     assert np.abs(alpha["blurred"] - alpha["all"]).max() > 0.001
+
+
+def test_flags_give_light(small, tmp_path):
+    """Each item takes light away, or brings some."""
+    mean = {}
+    sun = "sun:1,-1,0,3"
+    for name, light in (
+        ("sun", f"{sun};shadows:0"),
+        ("shadow", sun),
+        ("sky", f"{sun};shadows:0;sky:4,4,4"),
+        ("occluded", f"{sun};shadows:0;sky:4,4,4;occlusion:1;reach:0.3"),
+        ("lamp", "lamp:-50,60,0,2;shadows:0;indirect:1"),
+    ):
+        file = tmp_path / f"{name}.npz"
+        shown = ("--shader", "isosurface", "--value", "100", "--lighting", light)
+        args = ("--npz", file, "--size", "24x24", *shown, "-o", tmp_path / "a.png")
+        run = gvtorch("render", small, *args)
+        assert run.returncode == 0, run.stderr
+        mean[name] = float(np.load(file)["color"].mean())
+    assert mean["shadow"] < mean["sun"] < mean["occluded"] < mean["sky"]
+    assert mean["lamp"] > 0.01
 
 
 def test_a_wrong_flag_gets_status_2(small):

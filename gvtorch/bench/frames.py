@@ -55,11 +55,13 @@ def _steady(record: Record, scene: Scene, size: tuple[int, int]) -> None:
         with Engine(producer, **options) as engine:
             picture = _converge(engine, camera, scene.shader)
             timing, stats = _clock_frames(engine, camera, scene.shader, settings)
-        cost = _stages(stats[1:]) if monitor else {}
-        if not stats[-1].converged or any(s.requests["load"] for s in stats):
-            record.note(f"{case}: it was not steady")
-        medians[monitor] = timing.median
-        record.add(case, "gvtorch, monitored" if monitor else "gvtorch", timing, **cost)
+            if not stats[-1].converged or any(s.requests["load"] for s in stats):
+                record.note(f"{case}: it was not steady")
+            cost = _stages(stats[1:]) if monitor else {}
+            medians[monitor] = timing.median
+            record.add(case, "gvtorch, monitored" if monitor else "gvtorch", timing, **cost)
+            if settings.device.type == "cuda" and not monitor:
+                _captured(record, case, engine, camera, scene.shader)
     settings.tell(f"{case}: resident")
     tree = N3Tree.from_volume(scene.volume, device=settings.device)
     timing = clock(lambda: render(tree, camera, scene.shader), settings)
@@ -69,6 +71,26 @@ def _steady(record: Record, scene: Scene, size: tuple[int, int]) -> None:
     record.note(
         "cache share: the stages " + ", ".join(CACHE) + " of a monitored frame, which waits for "
         "the device after each stage"
+    )
+
+
+def _captured(
+    record: Record, case: str, engine: Engine, camera: Camera, shader: TransferFunction
+) -> None:
+    """The same frame as a CUDA graph, and the cache's part of it as a graph of its own."""
+    settings, calls = record.settings, 20
+    graph = engine.capture(camera, shader)
+    timing = clock(lambda: graph.replay(camera), settings, calls=calls)
+    samples = torch.zeros(1, dtype=torch.int32, device=settings.device)
+    cache = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(cache):
+        kept = engine._collect(samples)
+    cost = clock(cache.replay, settings, calls=calls).median
+    del kept  # a graph's memory stays in use until then
+    share = {"cache_ms": cost, "cache_share": cost / timing.median}
+    record.add(case, "gvtorch, captured", timing, **share)
+    record.note(
+        "captured: frames replayed as a CUDA graph; its cache share: requests, order of use"
     )
 
 

@@ -62,6 +62,22 @@ class Cache:
             REQUEST_LOAD: LRU(bricks.capacity, roots, device),
         }
 
+    def memory(self) -> dict[str, int]:
+        """Returns bytes: what the pools hold, and the bookkeeping apart."""
+        nodes, bricks = self.nodes, self.bricks
+        content = (
+            *(nodes.child_tn, nodes.brick_tn),
+            *(*nodes.constants.values(), *nodes.ranges.values()),
+        )
+        node_bytes = sum(tensor.nbytes for tensor in content)
+        brick_bytes = sum(tensor.nbytes for tensor in bricks.bricks.values())
+        order = sum(lru.order.nbytes for lru in self.lru.values())
+        return {
+            "node_pool": node_bytes,
+            "brick_pool": brick_bytes,
+            "bookkeeping": nodes.nbytes + bricks.nbytes - node_bytes - brick_bytes + order,
+        }
+
     def requests(self, capacity: int) -> Listed:
         """Takes the frame's wishes out of the node pool."""
         return collect(self.nodes, capacity)

@@ -1,9 +1,9 @@
 """Compiles the two extension libraries and makes the wheel that holds them.
 
 setuptools loads this file by itself (see `[tool.setuptools]` in pyproject.toml), so it imports
-nothing of gvtorch. Both libraries use the LibTorch Stable ABI and no Python C API: one wheel
-serves every Python >= 3.11 and every torch >= 2.11. The CUDA library is built where nvcc stands
-and is loaded only where torch has CUDA.
+nothing of gvtorch and runs compilers.py by its path. Both libraries use the LibTorch Stable ABI and
+no Python C API: one wheel serves every Python >= 3.11 and every torch >= 2.11. The CUDA library is
+built where nvcc stands and is loaded only where torch has CUDA.
 
 Environment:
     GVTORCH_CUDA        auto (default: build when nvcc is found), 0 (never), 1 (fail without nvcc)
@@ -16,18 +16,19 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import runpy
 import shlex
 import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
 
 ARCHS = "75;80;86;89;90;100;120"
-TARGET_VERSION = "0x020b000000000000"  # torch 2.11, the oldest that may load the libraries
 # The CPU's kernels are compiled once for each; the processor chooses when the library is loaded.
 INSTRUCTION_SETS = {
     "baseline": [],
@@ -38,6 +39,7 @@ INSTRUCTION_SETS = {
     ],
 }
 FOLDER = Path("gvtorch") / "cpp_ext"
+compilers = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("compilers.py"))))
 
 
 def find_nvcc() -> str | None:
@@ -47,10 +49,7 @@ def find_nvcc() -> str | None:
         raise SystemExit(f"GVTORCH_CUDA must be auto, 0 or 1, got {choice!r}")
     if choice == "0":
         return None
-    home = os.environ.get("CUDA_HOME", "/usr/local/cuda")
-    nvcc = (
-        os.environ.get("NVCC") or shutil.which("nvcc") or shutil.which("nvcc", path=f"{home}/bin")
-    )
+    nvcc: str | None = compilers.find_nvcc()
     if nvcc is None and choice == "1":
         raise SystemExit("GVTORCH_CUDA=1, but nvcc is neither on PATH nor in CUDA_HOME/bin")
     return nvcc
@@ -60,16 +59,9 @@ def commands(output: Path) -> dict[Path, list[list[str]]]:
     """Returns the compiler calls of each library, by the library's path under `output`; all but the
     last, which links, may run side by side.
     """
-    import torch
-
-    root = Path(torch.__file__).parent
     source = FOLDER / "csrc"
-    # Contraction stays off: a fused multiply-add would round other than the torch twin does.
-    shared = ["-std=c++17", "-O3", f"-DTORCH_TARGET_VERSION={TARGET_VERSION}"]
-    include = ["-isystem", str(root / "include")]
-    link = ["-shared", f"-L{root / 'lib'}", "-ltorch", "-ltorch_cpu"]
-    cxx = [*shlex.split(os.environ.get("CXX", "g++")), *shared, "-fPIC", "-Wall", "-Wextra"]
-    cxx += ["-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden", "-Wno-psabi"]
+    include, link = compilers.torch_flags()
+    cxx = [*compilers.find_cxx(), *compilers.CXX_FLAGS, "-Wall", "-Wextra"]
     x86 = platform.machine().lower() in ("x86_64", "amd64")
     parts = {"cpu": (["-DGV_X86"] if x86 else []) + include}
     for name, flags in INSTRUCTION_SETS.items():
@@ -84,17 +76,16 @@ def commands(output: Path) -> dict[Path, list[list[str]]]:
                 [*cxx, *flags, "-c", str(source / f"{name.split('_')[0]}.cpp"), "-o", target]
                 for (name, flags), target in zip(parts.items(), objects, strict=True)
             ),
-            [cxx[0], *objects, "-Wl,--no-as-needed", *link, "-pthread"],
+            [*compilers.find_cxx(), *objects, "-Wl,--no-as-needed", *link, "-pthread"],
         ]
     }
     nvcc = find_nvcc()
     if nvcc is not None:
         archs = os.environ.get("GVTORCH_CUDA_ARCHS", ARCHS).split(";")
-        codes = [f"-gencode=arch=compute_{a},code=sm_{a}" for a in archs]
+        codes = compilers.machine_codes(archs)
         codes.append(f"-gencode=arch=compute_{archs[-1]},code=compute_{archs[-1]}")
-        call = [nvcc, *shared, "-DUSE_CUDA", "-fmad=false"]
-        call += ["-Xcompiler=-fPIC,-fvisibility=hidden", "--threads=2", *codes, *include]
-        call += [str(source / "cuda.cu"), "-Xlinker=--no-as-needed", *link, "-cudart=static"]
+        call = [nvcc, *compilers.NVCC_FLAGS, "--threads=2", *codes, *include]
+        call += [str(source / "cuda.cu"), "-Xlinker=--no-as-needed", *link]
         calls[output / "libgvtorch_cuda.so"] = [call]
     return calls
 

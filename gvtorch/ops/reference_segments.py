@@ -8,17 +8,9 @@ import torch
 from torch import Tensor
 
 from .exact import clamp, divide, smaller
-from .reference import (
-    Accumulator,
-    Beam,
-    Bricks,
-    Intervals,
-    Plain,
-    Transfer,
-    Tree,
-    Visit,
-    wanted_depth,
-)
+from .reference import Accumulator, Plain, Transfer, Visit
+from .reference_rays import Beam, Intervals
+from .reference_tree import Bricks, Tree, wanted_depth
 
 _PIECE = -1  # level of an interval of any length
 

@@ -10,18 +10,9 @@ import torch
 from torch import Tensor
 
 from .exact import clamp, divide, exp2_exact, larger, log2_exact, sqrt_exact
-from .reference import (
-    INF,
-    Accumulator,
-    Beam,
-    Bricks,
-    Intervals,
-    Piece,
-    Probe,
-    Transfer,
-    Tree,
-    walk,
-)
+from .reference import Accumulator, Piece, Probe, Transfer, walk
+from .reference_rays import INF, Beam, Intervals
+from .reference_tree import Bricks, Tree
 
 _TINY = 1.1754944e-38  # smallest normal float32
 _BISECTIONS = 4

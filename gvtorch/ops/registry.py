@@ -6,6 +6,7 @@ The schema of an op stands once, in cpp_ext/csrc/entry.h.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import torch
@@ -38,6 +39,12 @@ def _fake_shade_rays(*args: Any) -> tuple[Tensor, ...]:
         table.new_empty((rays, 3)),
         table.new_empty((rays, features)),
     )
+
+
+@functools.cache
+def add_user_op(name: str) -> None:
+    """Gives the op of a user's shader, which is loaded, its fake; once."""
+    torch.library.register_fake(f"gvtorch_user::{name}", _fake_shade_rays)
 
 
 def _fake_compact_requests(request_tn: Tensor, capacity: int) -> tuple[Tensor, Tensor, Tensor]:

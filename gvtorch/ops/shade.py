@@ -1,5 +1,5 @@
-"""`shade_rays`: rays through an N3 tree with any of the fused shaders, checked and sent to a
-backend.
+"""`shade_rays`: rays through an N3 tree with any of the fused shaders or a user's own, checked and
+sent to a backend.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _NUMBERS = ("branching", "root", "max_depth", "border", "component")
 
 def shade_rays(
     *,
-    shader: int,
+    shader: int | str,
     parameter_54: Tensor,
     normal_bzyxc: Tensor | None = None,
     normal_tnc: Tensor | None = None,
@@ -44,24 +44,27 @@ def shade_rays(
     backend: Backend = "auto",
     **shared: Any,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Traces rays through a tree and shades what they meet with a fused shader.
+    """Traces rays through a tree and shades what they meet with a fused shader, or a user's.
 
     Args:
         shader: 0 lit transfer function, 1 pre-integrated, 2 stored colour, 3 isosurface, 4
             projection, 5 features, 6 lit with shadows, 7 stored colour with shadows: as numbered in
-            `reference_shaders`, told in csrc/shaders.h.
+            `reference_shaders`, told in csrc/shaders.h. Or the name of a user's op, see
+            `cpp_ext.user`.
         parameter_54: (5, 4) in the table's dtype. Row 0: the light's x, y, z (its place, or the way
             it shines) and its kind (0 headlight, 1 directional, 2 point). 1: its red, green, blue,
             and ambient. 2: diffuse, specular, shininess, and the width of a cone to the light (its
             growth; of a point light the width there). 3: the shader's own - stored colour:
             scale, reference length, premultiplied (0, 1), lit (0, 1); isosurface: the level;
             projection: 0 maximum, 1 minimum, 2 mean. 4: scale and offset of stored normals, 0, 0.
+            For a user's op (20 + k,): the same and its own k numbers.
         normal_bzyxc: (b, s, s, s, 3) channel of normals; None takes the gradient's.
         normal_tnc: (t, n, 3) its constants.
         other_bzyxc: (b, s, s, s, c) a second channel: the value that colours an isosurface, or
             features.
         other_tnc: (t, n, c) its constants.
-        features: How many the shader gives: c for features, 1 (the value) for projections, else 0.
+        features: How many the shader gives: c for features, 1 (the value) for projections, else 0;
+            a user's op checks it.
         other_component: Which number of the second channel colours an isosurface.
         width: See `trace_rays`, as all that follow and all tensors not named here. Where the shader
             integrates, the table is (l, m, m, 4): premultiplied colour and alpha by the value in
@@ -83,13 +86,15 @@ def shade_rays(
     tensors = {name: shared[name] for name in _TENSORS}
     whole = tuple(shared[name] for name in _NUMBERS)
     reals = (cone_scale, root_voxel, step, stop_alpha, depth_alpha)
-    check.whole(where, "shader", shader, low=0, high=SHADOWED_COLOR)
+    own = isinstance(shader, str)
+    kind = 0 if own else check.whole(where, "shader", shader, low=0, high=SHADOWED_COLOR)
     rows = tensors["table_lm4"].shape[1] if tensors["table_lm4"].dim() > 1 else 0
     square = ("l", rows, rows, 4) if shader == PRE_INTEGRATED else ("l", "m", 4)
     check_arguments(where, tensors, (width, *whole, *reals), square, clear_r)
     table, like = tensors["table_lm4"], tensors["bricks_bzyxc"]
     device = table.device
-    check.tensor(where, "parameter_54", parameter_54, (5, 4), table.dtype, device)
+    numbers = ("20 + k",) if own else (5, 4)
+    check.tensor(where, "parameter_54", parameter_54, numbers, table.dtype, device)
     for name, bricks, constants, count in (
         ("normal", normal_bzyxc, normal_tnc, 3),
         ("other", other_bzyxc, other_tnc, "c"),
@@ -110,18 +115,30 @@ def shade_rays(
     if shader == FEATURES and other_bzyxc is None:
         raise ValueError(f"{where}: features need other_bzyxc")
     others = 0 if other_bzyxc is None else other_bzyxc.shape[4]
-    given = {FEATURES: others, PROJECTION: 1}.get(shader, 0)
-    check.whole(where, "features", features, low=given, high=given)
+    if own:
+        check.whole(where, "features", features, low=0)
+    else:
+        given = {FEATURES: others, PROJECTION: 1}.get(kind, 0)
+        check.whole(where, "features", features, low=given, high=given)
     check.whole(where, "other_component", other_component, low=0, high=max(0, others - 1))
 
     args = (
         *tensors.values(),
         *(parameter_54.contiguous(), normal_bzyxc, normal_tnc, other_bzyxc, other_tnc),
-        *(shader, features, other_component, width),
+        *(kind, features, other_component, width),
         *whole,
         *(float(real) for real in reals),
         *(by_level, clear_r),
     )
     if choose_backend(backend, device) == "reference":
+        if own:
+            raise ValueError(f"{where}: a shader in C++ has no reference: write a ModuleShader")
         return reference_shaders.shade_rays(*args)
-    return torch.ops.gvtorch.shade_rays(*args)
+    return op_of(shader)(*args)
+
+
+def op_of(shader: int | str) -> Any:
+    """Returns the op of a shader, as `shade_rays` numbers or names it."""
+    if isinstance(shader, str):
+        return getattr(torch.ops.gvtorch_user, shader)
+    return torch.ops.gvtorch.shade_rays

@@ -4,11 +4,13 @@ from . import opengl
 from .background import Backdrop, Environment, Gradient
 from .camera import Camera
 from .clip import Clip
+from .compiled_shader import CompiledShader
 from .costs import Cost, cost
 from .custom import CustomCamera
 from .image import read_image
 from .layer import Layer
 from .lens import ThinLens
+from .lighting import Lighting
 from .lights import DirectionalLight, Headlight, PointLight
 from .module import TreeTracer
 from .module_shader import ModuleShader, TransferModule
@@ -32,6 +34,7 @@ __all__ = [
     "Backdrop",
     "Camera",
     "Clip",
+    "CompiledShader",
     "Cost",
     "CustomCamera",
     "DirectionalLight",
@@ -42,6 +45,7 @@ __all__ = [
     "Headlight",
     "Isosurface",
     "Layer",
+    "Lighting",
     "Lit",
     "ModuleShader",
     "Picture",

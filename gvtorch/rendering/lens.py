@@ -56,6 +56,10 @@ class ThinLens:
             self, aperture=self.aperture * side, focus=self.focus * side, frame=Frame.WORLD
         )
 
+    def cone(self, t: Tensor) -> Tensor:
+        """Width of the lens's cone at distances, of a lens in world units."""
+        return _CONE_OF_DISC * self.aperture / self.focus * (t - self.focus).abs()
+
 
 class ThroughLens:
     """Traces rays with the cone of a lens."""

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from .. import check, config
 from ..ops import available
+from ..ops.shade import op_of
 from ..ops.trace import most_intervals
 from ..pool import N3Tree
 from .renderer import check_shader
@@ -111,9 +112,19 @@ class TreeTracer(torch.nn.Module):
         self.border, self.component = bricks.border, component
         self.root_voxel, self.step = float(tree.root_voxel), step
         self.stop_alpha, self.depth_alpha = float(stop_alpha), float(depth_alpha)
-        self.shader = int(laid.get("shader", -1))  # -1: the plain transfer function
+        kind = laid.get("shader", -1)  # -1: the plain transfer function
+        self.shader, self.shade_rays = 0 if isinstance(kind, str) else int(kind), op_of(kind)
         self.features = int(laid.get("features", 0))
         self.other_component = int(laid.get("other_component", 0))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Names its op, which can't be pickled."""
+        return {**self.__dict__, "shade_rays": str(self.shade_rays)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Finds the op again; that of a `CompiledShader` must be loaded."""
+        namespace, name = state["shade_rays"].split(".")
+        super().__setstate__({**state, "shade_rays": getattr(getattr(torch.ops, namespace), name)})
 
     def forward(
         self, origin: Tensor, direction: Tensor, cone: Tensor, range: Tensor
@@ -180,7 +191,7 @@ class TreeTracer(torch.nn.Module):
             )
             return color, alpha, depth, samples, color.new_zeros((0, 3)), color.new_zeros((0, 0))
         with_normals, with_others = self.normals.numel() > 0, self.others.numel() > 0
-        color, alpha, depth, samples, _, normal, features = torch.ops.gvtorch.shade_rays(
+        color, alpha, depth, samples, _, normal, features = self.shade_rays(
             rays[0],
             rays[1],
             rays[2],

@@ -16,17 +16,19 @@ from ..ops import shade_rays, trace_rays
 from ..ops.trace import Backend, choose_backend, most_intervals
 from ..pool import N3Tree
 from ..stage import Progress, collect_timings, no_progress, stage
+from .around import around
 from .background import Background, checked_background
 from .camera import Camera
-from .clip import Clip, Clipped
+from .clip import Clip
 from .custom import as_camera
 from .layer import Layer
-from .lens import ThinLens, ThroughLens
+from .lens import ThinLens
+from .lighting import Lighting
 from .module_shader import ModuleShader, ModuleTracer
 from .picture import Picture
 from .pieces import Trace
 from .shader import TransferFunction, interval_levels
-from .shaders import FusedShader, Intervals, Projection, Shader
+from .shaders import FusedShader, Intervals, Shader
 
 AnyShader = FusedShader | ModuleShader
 _RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that progress shows
@@ -48,6 +50,7 @@ class RenderOptions:
     layer: Layer | None = None  # what another renderer drew: voxels go before and behind it
     clip: Clip | None = None  # the region of interest; None: everything
     lens: ThinLens | None = None  # depth of field; None: all is sharp
+    lighting: Lighting | None = None  # shadows and light from all around; None: the shader's own
     backend: Backend = "auto"
     dtype: torch.dtype = torch.float32  # float64 for trees deeper than about 2^16 voxels
 
@@ -71,6 +74,7 @@ class RenderOptions:
             ("clip", self.clip, Clip),
             ("layer", self.layer, Layer),
             ("lens", self.lens, ThinLens),
+            ("lighting", self.lighting, Lighting),
         ):
             if value is not None:
                 check_type(where, name, value, kind)
@@ -182,7 +186,7 @@ def develop(
     if isinstance(background, Background):
         numbers = camera.numbers(color.device) if numbers is None else numbers
         color = color + (1 - hits.alpha) * background.behind(camera, numbers, color.dtype)
-    elif background is not None:
+    elif background is not None and any(background):
         color = color + (1 - hits.alpha) * _constants(background, color)
     if options.layer is not None:
         layer = options.layer.distance(hits.depth.device).to(hits.depth.dtype)
@@ -337,31 +341,6 @@ def tracer_of(
     return Tracer(tree, shader, options, **frame)
 
 
-def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -> Trace:
-    """Returns a tree's tracer with what the options put around it: the lens, then the clip; `box`
-    (2, 3) is the scene's.
-
-    Raises:
-        ValueError: The shader is a projection, which sees a ray in one go, and the options cut rays
-            into pieces.
-    """
-    trace: Trace = tracer
-    cuts = {
-        "lens": options.lens is not None,
-        "clip with caps or several pieces": options.clip is not None and not options.clip.whole,
-        "translucent layer": options.layer is not None and options.layer.alpha is not None,
-    }
-    if isinstance(tracer.shader, Projection) and any(cuts.values()):
-        name = next(name for name, cut in cuts.items() if cut)
-        raise ValueError(f"render: a projection sees a ray in one go, so it has no {name}")
-    if options.lens is not None:
-        trace = ThroughLens(trace, options.lens.placed(box), options.cone_scale)
-    if options.clip is not None:
-        step = tracer.arguments["step"]
-        trace = Clipped(trace, options.clip, box, step=step, depth_alpha=options.depth_alpha)
-    return trace
-
-
 class Tracer:
     """One frame of a tree, `tree.frame`: traces any number of batches of rays."""
 
@@ -395,10 +374,13 @@ class Tracer:
         )
         if isinstance(shader, TransferFunction):
             table = vars(shader.table(min(tree.spacing), step, levels, options.dtype, tree.device))
+        elif shader.kind is None:
+            table = vars(shader.table(tree, intervals))
         else:
             table = shader.arguments("render", tree, intervals)
         component = own.component if own and own.component is not None else options.component
-        self.shader, self.dtype = own, options.dtype
+        self.shader = None if own is None or own.kind is None else own
+        self.dtype = options.dtype
         self.arguments: dict[str, Any] = {
             "place_33": tree.place,
             "child_tn": tree.nodes.child_tn,
@@ -424,6 +406,11 @@ class Tracer:
             "by_level": by_level,
             "backend": options.backend,
         }
+
+    def seeing(self, shader: FusedShader, options: RenderOptions) -> Tracer:
+        """Returns what traces the same frame with another shader."""
+        frame = {name: self.arguments[name] for name in ("by_level", "frame_1")}
+        return Tracer(self.tree, shader, options, **frame)
 
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays in world units."""

@@ -7,6 +7,7 @@ next picture is made with them, and nothing is compiled.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -19,6 +20,7 @@ from ..pool import Channel, N3Tree
 from .lights import Headlight, Light, Material, Number, Triple, pack
 from .preintegrated import integrated_table
 from .shader import Table, TransferFunction
+from .solid import solid_table
 
 _KEPT_TABLES = 4
 
@@ -37,6 +39,9 @@ class Shader(ABC):
     """A fused shader.
 
     Attributes:
+        kind: Which shader of `shade_rays`; None: the plain transfer function's kernel reads its
+            table.
+        whole: It sees a ray in one go: what cuts rays into pieces refuses it.
         channel: Name of the channel whose value it reads; None: that of the options.
         component: Which number of it; None: that of the options.
         normals: Name of a channel of 3 numbers that holds normals; None: the gradient's.
@@ -44,7 +49,8 @@ class Shader(ABC):
         other_component: Which number of it colours a surface.
     """
 
-    kind: int
+    kind: int | str | None
+    whole: bool = False
     channel: str | None = None
     component: int | None = None
     normals: str | None = None
@@ -115,7 +121,7 @@ class Shader(ABC):
         }
 
 
-class _Lighted(Shader):
+class LitShader(Shader):
     """A shader with a light and a material; see `Material` and csrc/shaders.h.
 
     Attributes:
@@ -171,8 +177,23 @@ class _Lighted(Shader):
         kind = _SHADOWED[self.kind] if self.shadows else self.kind
         return {**super().arguments(where, tree, intervals), "shader": kind}
 
+    def unlit(self) -> LitShader:
+        """Returns the same without its light: base colours, and normals."""
+        bare = copy(self)
+        bare.shadows = False
+        bare.ambient, bare.diffuse, bare.specular = 1.0, 0.0, 0.0
+        return bare
 
-class Lit(_Lighted):
+    def matter(self) -> Shader:
+        """Returns what a wide cone meets: base colours, alpha, and normals."""
+        return self.unlit()
+
+    def blocker(self) -> FusedShader:
+        """Returns what stands in the way of light: only its alpha counts."""
+        return self.matter()
+
+
+class Lit(LitShader):
     """The transfer function, lit by Blinn and Phong on both sides of a surface."""
 
     kind = kinds.LIT
@@ -182,7 +203,7 @@ class Lit(_Lighted):
 
         Args:
             transfer: The transfer function.
-            shadows: Whether matter takes light from what lies behind it; see `_Lighted`.
+            shadows: Whether matter takes light from what lies behind it; see `LitShader`.
             **light: `normals`, `light`, `ambient`, `diffuse`, `specular` and `shininess` as in
                 `Isosurface`.
         """
@@ -191,7 +212,11 @@ class Lit(_Lighted):
 
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """See `Shader`."""
-        return _plain_table(self.transfer, tree, intervals)
+        return plain_table(self.transfer, tree, intervals)
+
+    def blocker(self) -> FusedShader:
+        """See `LitShader`."""
+        return self.transfer
 
 
 class PreIntegrated(Shader):
@@ -225,7 +250,7 @@ class PreIntegrated(Shader):
         return self._tables[key]
 
 
-class StoredColor(_Lighted):
+class StoredColor(LitShader):
     """Colour and opacity as each voxel holds them: a channel of 4 numbers, linear red, green, blue
     and opacity per reference length. Integers stand for 0 to 1. Or 24 numbers, these for each of
     six directions, as `Volume.directional` makes them: a ray sees those that it goes along.
@@ -268,7 +293,7 @@ class StoredColor(_Lighted):
 
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """Says how many lengths of intervals there are; its colours are not read."""
-        return _one_color((1.0, 1.0, 1.0), tree, intervals)
+        return one_color((1.0, 1.0, 1.0), tree, intervals)
 
     def own(self, tree: N3Tree) -> tuple[Any, ...]:
         """See `Shader`."""
@@ -281,6 +306,24 @@ class StoredColor(_Lighted):
             float(self.premultiplied or directional),
             self.lit or self.shadows,
         )
+
+    def unlit(self) -> StoredColor:
+        """See `LitShader`."""
+        bare = copy(self)
+        bare.shadows, bare.lit, bare.ambient, bare.diffuse, bare.specular = (
+            False,
+            True,
+            1.0,
+            0.0,
+            0.0,
+        )
+        return bare
+
+    def blocker(self) -> StoredColor:
+        """See `LitShader`; it needs no normals."""
+        bare = copy(self)
+        bare.lit = bare.shadows = False
+        return bare
 
     def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> dict[str, Any]:
         """See `Shader`."""
@@ -298,10 +341,11 @@ class StoredColor(_Lighted):
         return super().arguments(where, tree, intervals)
 
 
-class Isosurface(_Lighted):
+class Isosurface(LitShader):
     """The first place where the value passes a level, opaque and lit; to a tenth of a voxel."""
 
     kind = kinds.ISOSURFACE
+    distance = False  # the value is a distance in world units, negative inside
 
     def __init__(
         self,
@@ -340,16 +384,32 @@ class Isosurface(_Lighted):
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """See `Shader`."""
         if isinstance(self.color, TransferFunction):
-            return _plain_table(self.color, tree, intervals)
-        return _one_color(self.color, tree, intervals)
+            return plain_table(self.color, tree, intervals)
+        return one_color(self.color, tree, intervals)
 
     def own(self, tree: N3Tree) -> tuple[Any, ...]:
         """See `Shader`."""
         return (self.value, 0.0, 0.0, 0.0)
 
+    def matter(self) -> Shader:
+        """See `LitShader`.
+
+        Raises:
+            ValueError: It has no colour of its own.
+        """
+        if isinstance(self.color, TransferFunction):
+            raise ValueError("Isosurface: indirect light needs a surface of one colour")
+        return Solid(self, self.color)
+
+    def blocker(self) -> Shader:
+        """See `LitShader`."""
+        return Solid(self, None)
+
 
 class DistanceField(Isosurface):
     """The surface of a signed distance field: where the distance is `offset`, 0 if left out."""
+
+    distance = True
 
     def __init__(
         self,
@@ -362,6 +422,40 @@ class DistanceField(Isosurface):
         super().__init__(offset, color, **look)
 
 
+class Solid(Shader):
+    """An isosurface as wide cones meet it, see `solid_table`.
+
+    Of a distance field, matter lies below the level and the value changes as places do. Else it
+    lies above, and a value changes from half of the level to three halves over four voxels.
+    """
+
+    widest = 16  # voxels, of a distance field's ramp
+
+    def __init__(self, surface: Isosurface, color: Triple | None) -> None:
+        """Takes the surface and its colour; None where its alpha alone counts."""
+        self.kind = None if color is None else kinds.LIT
+        self.surface, self.color = surface, (0.0, 0.0, 0.0) if color is None else color
+        self.channel, self.component = surface.channel, surface.component
+        self.normals = surface.normals
+
+    def table(self, tree: N3Tree, intervals: Intervals) -> Table:
+        """See `Shader`."""
+        voxel = intervals.smallest_spacing
+        value_1 = pack((self.surface.value,), intervals.dtype, tree.device)
+        if self.surface.distance:
+            most_1 = torch.full_like(value_1, self.widest / 2 * voxel)
+            slope_1 = torch.ones_like(value_1)
+        else:
+            most_1 = value_1.abs() / 2
+            slope_1 = most_1 / (2 * voxel)
+        return solid_table(
+            *(value_1, slope_1, most_1, self.color),
+            above=not self.surface.distance,
+            step=intervals.step,
+            levels=intervals.levels,
+        )
+
+
 class Projection(Shader):
     """The maximum, minimum or mean of the value along each ray, coloured by the transfer function's
     colours and opaque. `Hits.features` (r, 1) holds the value itself (0 beside the box), depth
@@ -369,6 +463,7 @@ class Projection(Shader):
     """
 
     kind = kinds.PROJECTION
+    whole = True
 
     def __init__(
         self, which: Literal["maximum", "minimum", "mean"], transfer: TransferFunction
@@ -386,7 +481,7 @@ class Projection(Shader):
 
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """See `Shader`."""
-        return _plain_table(self.transfer, tree, intervals)
+        return plain_table(self.transfer, tree, intervals)
 
     def own(self, tree: N3Tree) -> tuple[Any, ...]:
         """See `Shader`."""
@@ -410,7 +505,7 @@ class Features(Shader):
 
     def table(self, tree: N3Tree, intervals: Intervals) -> Table:
         """See `Shader`."""
-        return _plain_table(self.transfer, tree, intervals)
+        return plain_table(self.transfer, tree, intervals)
 
     def features(self, tree: N3Tree) -> int:
         """As many as the channel holds."""
@@ -418,7 +513,10 @@ class Features(Shader):
 
 
 FusedShader = TransferFunction | Shader
-_SHADOWED = {kinds.LIT: kinds.SHADOWED_LIT, kinds.STORED_COLOR: kinds.SHADOWED_COLOR}
+_SHADOWED: dict[int | str | None, int] = {
+    kinds.LIT: kinds.SHADOWED_LIT,
+    kinds.STORED_COLOR: kinds.SHADOWED_COLOR,
+}
 _UNLIT = Material(light=Headlight(), ambient=1.0, diffuse=0.0, specular=0.0, shininess=1.0)
 
 
@@ -429,12 +527,12 @@ def _transfer(where: str, transfer: Any) -> TransferFunction:
     return transfer
 
 
-def _plain_table(transfer: TransferFunction, tree: N3Tree, intervals: Intervals) -> Table:
+def plain_table(transfer: TransferFunction, tree: N3Tree, intervals: Intervals) -> Table:
     i = intervals
     return transfer.table(i.smallest_spacing, i.step, i.levels, i.dtype, tree.device)
 
 
-def _one_color(color: Triple, tree: N3Tree, intervals: Intervals) -> Table:
+def one_color(color: Triple, tree: N3Tree, intervals: Intervals) -> Table:
     row = pack((color, 1.0), intervals.dtype, tree.device)
     return Table(
         table_lm4=row.expand(intervals.levels, 2, 4).contiguous(),

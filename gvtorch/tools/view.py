@@ -18,6 +18,7 @@ from tyro.conf import Positional, arg
 
 from .common import Bar, Source, given, is_store, numbers, refuse_for_store, size
 from .image import KINDS, STRIPS, Develop, parse_background
+from .light import parse_lighting
 
 if TYPE_CHECKING:
     import torch
@@ -66,6 +67,10 @@ class Look:
     lens: Annotated[str | None, arg(metavar="APERTURE,FOCUS")] = None
     """depth of field: diameter of the lens and distance that is sharp, in largest sides of the
     box"""
+    lighting: Annotated[str | None, arg(metavar="KIND:NUMBERS;...")] = None
+    """of the lit shaders: sun:X,Y,Z,DEGREES (the way it shines, how wide it looks);
+    lamp:X,Y,Z,RADIUS (world units); sky:R,G,B; shadows:, occlusion:, indirect:, factors; reach:, of
+    the last two, in largest sides of the box"""
     component: Annotated[int, arg(metavar="N")] = 0
     """which number of a voxel is shown"""
     brick_size: Annotated[int, arg(metavar="VOXELS")] = 8
@@ -84,6 +89,7 @@ class Look:
             "stop_alpha": self.stop_alpha,
             "clip": parse_clip(self.clip) if self.clip else None,
             "lens": parse_lens(self.lens) if self.lens else None,
+            "lighting": parse_lighting(self.lighting) if self.lighting else None,
             "component": self.component,
             "backend": self.backend,
         }

@@ -1,8 +1,5 @@
 // The CPU library: defines the ops (schemas in entry.h) and runs every functor on torch's threads.
 
-#include <torch/csrc/stable/ops.h>
-#include <torch/csrc/stable/tensor.h>
-
 #include <algorithm>
 #include <atomic>
 #include <cstdint>
@@ -11,6 +8,7 @@
 #include <vector>
 
 #include "cache.h"
+#include "for_each.h"
 #include "trace.h"
 
 namespace gvtorch {
@@ -53,25 +51,6 @@ struct Processor {
 inline const Processor& processor() {
   static const Processor found;
   return found;
-}
-
-struct Cpu {
-  static constexpr bool kReadsAtRandom = false;
-};
-
-// Threads draw `share` neighbouring indices at a time from a counter: long rays do not leave a thread idle. Nothing
-// that a functor writes depends on which thread ran it.
-template <class Device, class Functor>
-void for_each(const torch::stable::Tensor&, int64_t count, const Functor& functor, int64_t share = 256) {
-  const int64_t chunks = (count + share - 1) / share;
-  const int64_t workers = std::min<int64_t>(torch::stable::get_num_threads(), chunks);
-  std::atomic<int64_t> next{0};
-  torch::stable::parallel_for(0, workers, 1, [&](int64_t, int64_t) {
-    for (int64_t chunk = next++; chunk < chunks; chunk = next++) {
-      const int64_t end = std::min(count, (chunk + 1) * share);
-      for (int64_t index = chunk * share; index < end; ++index) functor(index);
-    }
-  });
 }
 
 // The primitives of cache.h. Threads count chunks, then place them: ranks do not depend on the number of threads.

@@ -1,52 +1,14 @@
 // The CUDA library: the same functors, one thread an index. It needs the CPU library, which defines the ops.
 
-#include <cuda_runtime.h>
-#include <torch/csrc/inductor/aoti_torch/c/shim.h>
-#include <torch/csrc/stable/accelerator.h>
-#include <torch/csrc/stable/ops.h>
-#include <torch/csrc/stable/tensor.h>
-
 #include <cstdint>
 #include <cub/block/block_reduce.cuh>
 #include <cub/block/block_scan.cuh>
-#include <type_traits>
 
 #include "cache.h"
+#include "for_each.h"
 #include "trace.h"
 
 namespace gvtorch {
-
-struct Cuda {
-  static constexpr bool kReadsAtRandom = true;
-};
-
-// That many blocks on a multiprocessor leave 64 registers to a thread: waiting for memory is what tracing must hide.
-constexpr int kBlock = 128;
-// Functors that shade ask for fewer: their values in registers are more than their loads.
-template <class Functor, class = void>
-constexpr int kBlocksAtOnce = 8;
-template <class Functor>
-constexpr int kBlocksAtOnce<Functor, std::void_t<decltype(Functor::kBlocksAtOnce)>> = Functor::kBlocksAtOnce;
-template <class Functor>
-__global__ void __launch_bounds__(kBlock, kBlocksAtOnce<Functor>) run_functor(Functor functor, int64_t count) {
-  const int64_t stride = static_cast<int64_t>(gridDim.x) * blockDim.x;
-  for (int64_t index = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x; index < count; index += stride) {
-    functor(index);
-  }
-}
-
-template <class Device, class Functor>
-void for_each(const torch::stable::Tensor& like, int64_t count, const Functor& functor) {
-  if (count == 0) return;
-  const torch::stable::accelerator::DeviceGuard guard(like.get_device_index());
-  void* stream = nullptr;
-  TORCH_ERROR_CODE_CHECK(aoti_torch_get_current_cuda_stream(like.get_device_index(), &stream));
-  const int64_t blocks = (count + kBlock - 1) / kBlock;
-  const auto grid = static_cast<unsigned>(blocks < 0x7fffffff ? blocks : 0x7fffffff);
-  run_functor<<<grid, kBlock, 0, static_cast<cudaStream_t>(stream)>>>(functor, count);
-  const cudaError_t status = cudaGetLastError();
-  STD_TORCH_CHECK(status == cudaSuccess, "gvtorch: kernel launch failed: ", cudaGetErrorString(status));
-}
 
 template <class Device, class T, class Voxel>
 void trace_as(const torch::stable::Tensor& like, TraceArgs args) {
@@ -60,7 +22,7 @@ void trace_as(const torch::stable::Tensor& like, TraceArgs args) {
 }
 
 template <class Device>
-void trace(const torch::stable::Tensor& like, const TraceArgs& args, bool wide) {
+void trace(const torch::stable::Tensor& like, TraceArgs args, bool wide) {
   with_voxel(args.voxel, [&](auto voxel) {
     using Voxel = decltype(voxel);
     if (wide) {

@@ -1,5 +1,6 @@
 // Where torch meets the kernels: the schema of every op, and the step from tensors to the borrowed views of the
-// kernel headers. Included once by cpu.cpp and once by cuda.cu, each of which brings its own `for_each`.
+// kernel headers. Included once by cpu.cpp and once by cuda.cu, each of which brings its own `trace`, `compact` and
+// `split`; and by every user's shader (user_entry.h), which needs none of them.
 //
 // Only the LibTorch Stable ABI is used (torch/csrc/stable), so that one binary serves every torch >= 2.11.
 // Messages for users are made in gvtorch/ops/*.py; the checks here only keep memory safe.
@@ -14,6 +15,7 @@
 #include <tuple>
 
 #include "cache.h"
+#include "for_each.h"
 #include "shade_rays.h"
 #include "trace.h"
 
@@ -21,6 +23,13 @@ namespace gvtorch {
 
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
+
+template <class Device>
+void trace(const Tensor& like, TraceArgs args, bool wide);
+template <class Device, class List>
+void compact(const Tensor& like, int64_t count, const List& list);
+template <class Device, class Keep, class Put>
+void split(const Tensor& like, int64_t count, const Keep& keep, const Put& put, int64_t* kept);
 
 // (a!) request words, (b!) tile stamps, (c!) brick stamps are written in place.
 constexpr const char* kTraceRaysSchema =
@@ -267,7 +276,28 @@ inline void lay_channel(const std::optional<Tensor>& bricks_bzyxc, const std::op
   numbers = static_cast<int32_t>(channels);
 }
 
-template <class Device>
+// The shaders of a library: what is asked of their arguments, and `with<T>`, which calls body(ray) for one of them. A
+// user's library has a class like this one (user_entry.h).
+struct FusedShaders {
+  static bool integrates(int64_t shader) { return static_cast<ShaderKind>(shader) == ShaderKind::kPreIntegrated; }
+  static void check(const ShadeArgs& args, int64_t shader) {
+    STD_TORCH_CHECK(shader >= 0 && shader < kShaderKinds, "gvtorch: shader is unknown");
+    const auto kind = static_cast<ShaderKind>(shader);
+    STD_TORCH_CHECK(kind != ShaderKind::kFeatures || args.other_channels > 0, "gvtorch: other_bzyxc is missing");
+    const bool colored = (args.channels == 4 || args.channels == 4 * kDirections) && args.component == 3;
+    STD_TORCH_CHECK(!is_stored_color(kind) || colored, "gvtorch: bricks_bzyxc must hold red, green, blue and opacity");
+    const int32_t given = kind == ShaderKind::kFeatures ? args.other_channels : kind == ShaderKind::kProjection ? 1 : 0;
+    STD_TORCH_CHECK(args.features == given, "gvtorch: features is not what the shader gives");
+    STD_TORCH_CHECK(args.parameters == kParameters, "gvtorch: parameter_54 must hold 20 elements, got ",
+                    args.parameters);
+  }
+  template <class T, class Body>
+  static void with(const ShadeArgs& args, const Body& body) {
+    with_shader<T>(args.shader, args, body);
+  }
+};
+
+template <class Device, class Shaders = FusedShaders>
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> shade_rays(
     const Tensor& origin_r3, const Tensor& direction_r3, const Tensor& cone_r2, const Tensor& range_r2,
     const Tensor& place_33, const Tensor& child_tn, const Tensor& brick_tn, const Tensor& request_tn,
@@ -279,45 +309,38 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> shade_rays(
     int64_t branching, int64_t root, int64_t max_depth, int64_t border, int64_t component, double cone_scale,
     double root_voxel, double step, double stop_alpha, double depth_alpha, bool by_level,
     const std::optional<Tensor>& clear_r) {
-  STD_TORCH_CHECK(shader >= 0 && shader < kShaderKinds, "gvtorch: shader is unknown");
   ShadeArgs args{};
   args.shader = static_cast<ShaderKind>(shader);
   const HitTensors found =
-      lay_ready(args, args.shader == ShaderKind::kPreIntegrated, origin_r3, direction_r3, cone_r2, range_r2, place_33,
-                child_tn, brick_tn, request_tn, stamp_t, bricks_bzyxc, constant_tnc, range_tn2c, stamp_b, table_lm4,
-                domain_2, opaque_m, frame_1, width, branching, root, max_depth, border, component, cone_scale,
-                root_voxel, step, stop_alpha, depth_alpha, by_level, clear_r);
+      lay_ready(args, Shaders::integrates(shader), origin_r3, direction_r3, cone_r2, range_r2, place_33, child_tn,
+                brick_tn, request_tn, stamp_t, bricks_bzyxc, constant_tnc, range_tn2c, stamp_b, table_lm4, domain_2,
+                opaque_m, frame_1, width, branching, root, max_depth, border, component, cone_scale, root_voxel, step,
+                stop_alpha, depth_alpha, by_level, clear_r);
   const ScalarType real = table_lm4.scalar_type();
   int32_t three = 0;
   lay_channel(normal_bzyxc, normal_tnc, "normal_bzyxc", 3, bricks_bzyxc, args.nodes, args.normal_bzyxc, args.normal_tnc,
               args.normal_voxel, three);
   lay_channel(other_bzyxc, other_tnc, "other_bzyxc", 0, bricks_bzyxc, args.nodes, args.other_bzyxc, args.other_tnc,
               args.other_voxel, args.other_channels);
-  const bool projects = args.shader == ShaderKind::kProjection;
-  STD_TORCH_CHECK(args.shader != ShaderKind::kFeatures || other_bzyxc.has_value(), "gvtorch: other_bzyxc is missing");
-  STD_TORCH_CHECK(
-      !is_stored_color(args.shader) || ((args.channels == 4 || args.channels == 4 * kDirections) && component == 3),
-      "gvtorch: bricks_bzyxc must hold red, green, blue and opacity");
-  STD_TORCH_CHECK(features == (args.shader == ShaderKind::kFeatures ? args.other_channels
-                               : projects                           ? 1
-                                                                    : 0),
-                  "gvtorch: features is not what the shader gives");
   STD_TORCH_CHECK(!other_bzyxc.has_value() || (other_component >= 0 && other_component < args.other_channels),
                   "gvtorch: other_component out of range");
   require(parameter_54, "parameter_54", origin_r3, real);
-  require_numel(parameter_54, "parameter_54", 20);
+  STD_TORCH_CHECK(features >= 0 && features <= INT32_MAX, "gvtorch: features out of range");
+  args.features = static_cast<int32_t>(features);
+  STD_TORCH_CHECK(parameter_54.numel() <= INT32_MAX, "gvtorch: parameter_54 is too large");
+  args.parameters = static_cast<int32_t>(parameter_54.numel());
+  Shaders::check(args, shader);
   Tensor normal_r3 = torch::stable::new_empty(table_lm4, {args.rays, 3});
   Tensor features_rc = torch::stable::new_empty(table_lm4, {args.rays, features});
   args.other_component = static_cast<int32_t>(other_component);
-  args.features = static_cast<int32_t>(features);
   args.parameter_54 = parameter_54.const_data_ptr();
   args.normal_r3 = normal_r3.mutable_data_ptr();
   args.features_rc = features_rc.mutable_data_ptr();
   const auto run = [&](const auto& body) { for_each<Device>(origin_r3, body.order.count(), body); };
   if (real == ScalarType::Double) {
-    with_shader<double>(args.shader, args, run);
+    Shaders::template with<double>(args, run);
   } else {
-    with_shader<float>(args.shader, args, run);
+    Shaders::template with<float>(args, run);
   }
   return {found.color_r3, found.alpha_r1, found.depth_r1, found.samples_r, found.missed_r, normal_r3, features_rc};
 }

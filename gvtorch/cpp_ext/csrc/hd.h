@@ -2,7 +2,7 @@
 // two transcendental functions of the renderer.
 //
 // Kernels are functors of ONE index, `GV_HD void operator()(int64_t) const`, and are run by `for_each`
-// (cpu.cpp, cuda.cu). No header in this folder but entry.h knows torch.
+// (for_each.h). No other header in this folder but entry*.h knows torch.
 //
 // log2 and exp2 in float32 are written with + - * / and bit moves alone, always in the same order, so that the
 // torch twin (ops/reference.py), the CPU and the GPU agree to the last bit. Series: Abramowitz and Stegun,

@@ -79,6 +79,7 @@ GV_HD T power_of(T x, T power) {
 // Blinn-Phong, on both sides of a surface. Rows of parameter_54: light x y z and its kind; its red green blue, ambient;
 // diffuse, specular, shininess, and the width of a cone to the light: its growth (directional), or the width at
 // the light (point); then those that shaders name, and in the last the stored normal's scale and offset.
+constexpr int32_t kParameters = 20;
 template <class T>
 struct Light {
   static constexpr int32_t kHeadlight = 0, kDirectional = 1, kPoint = 2;

@@ -51,6 +51,7 @@ struct ShadeArgs : TraceArgs {
   VoxelType normal_voxel, other_voxel;
   int32_t other_channels, other_component, features;
   const void* parameter_54;
+  int32_t parameters;  // how many numbers there are: 20, and behind them a user's own
   void *normal_r3, *features_rc;
 };
 

@@ -1,0 +1,78 @@
+// How a functor of one index is run: `for_each<Device>(like, count, functor)` on the device of the tensor `like`. Every
+// library has it once, for the CPU where a C++ compiler reads this, for CUDA where nvcc does.
+#pragma once
+
+#ifdef __CUDACC__
+#include <cuda_runtime.h>
+#include <torch/csrc/inductor/aoti_torch/c/shim.h>
+#include <torch/csrc/stable/accelerator.h>
+#else
+#include <algorithm>
+#include <atomic>
+#endif
+#include <torch/csrc/stable/ops.h>
+#include <torch/csrc/stable/tensor.h>
+
+#include <cstdint>
+#include <type_traits>
+
+namespace gvtorch {
+
+#ifdef __CUDACC__
+
+struct Cuda {
+  static constexpr bool kReadsAtRandom = true;
+};
+
+// That many blocks on a multiprocessor leave 64 registers to a thread: waiting for memory is what tracing must hide.
+constexpr int kBlock = 128;
+// Functors that shade ask for fewer: their values in registers are more than their loads.
+template <class Functor, class = void>
+constexpr int kBlocksAtOnce = 8;
+template <class Functor>
+constexpr int kBlocksAtOnce<Functor, std::void_t<decltype(Functor::kBlocksAtOnce)>> = Functor::kBlocksAtOnce;
+template <class Functor>
+__global__ void __launch_bounds__(kBlock, kBlocksAtOnce<Functor>) run_functor(Functor functor, int64_t count) {
+  const int64_t stride = static_cast<int64_t>(gridDim.x) * blockDim.x;
+  for (int64_t index = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x; index < count; index += stride) {
+    functor(index);
+  }
+}
+
+template <class Device, class Functor>
+void for_each(const torch::stable::Tensor& like, int64_t count, const Functor& functor) {
+  if (count == 0) return;
+  const torch::stable::accelerator::DeviceGuard guard(like.get_device_index());
+  void* stream = nullptr;
+  TORCH_ERROR_CODE_CHECK(aoti_torch_get_current_cuda_stream(like.get_device_index(), &stream));
+  const int64_t blocks = (count + kBlock - 1) / kBlock;
+  const auto grid = static_cast<unsigned>(blocks < 0x7fffffff ? blocks : 0x7fffffff);
+  run_functor<<<grid, kBlock, 0, static_cast<cudaStream_t>(stream)>>>(functor, count);
+  const cudaError_t status = cudaGetLastError();
+  STD_TORCH_CHECK(status == cudaSuccess, "gvtorch: kernel launch failed: ", cudaGetErrorString(status));
+}
+
+#else
+
+struct Cpu {
+  static constexpr bool kReadsAtRandom = false;
+};
+
+// Threads draw `share` neighbouring indices at a time from a counter: long rays do not leave a thread idle. Nothing
+// that a functor writes depends on which thread ran it.
+template <class Device, class Functor>
+void for_each(const torch::stable::Tensor&, int64_t count, const Functor& functor, int64_t share = 256) {
+  const int64_t chunks = (count + share - 1) / share;
+  const int64_t workers = std::min<int64_t>(torch::stable::get_num_threads(), chunks);
+  std::atomic<int64_t> next{0};
+  torch::stable::parallel_for(0, workers, 1, [&](int64_t, int64_t) {
+    for (int64_t chunk = next++; chunk < chunks; chunk = next++) {
+      const int64_t end = std::min(count, (chunk + 1) * share);
+      for (int64_t index = chunk * share; index < end; ++index) functor(index);
+    }
+  });
+}
+
+#endif
+
+}  // namespace gvtorch

@@ -1,0 +1,94 @@
+// The library of a user's shader (user_shader.h): the op `gvtorch_user::GV_USER_OP`, with the schema of `shade_rays`.
+// The compiler gets the user's header by -include, and GV_USER_SHADER, the name of the struct in it. A C++ compiler
+// makes the op and its CPU kernel of this, nvcc the CUDA kernel.
+
+#include "user_shader.h"
+
+template <class T>
+using UserShaderOf = GV_USER_SHADER<T>;  // the name that CompiledShader was told: a template <class T> struct
+
+#include <cstring>
+#include <string>
+#include <type_traits>
+#include <utility>
+
+#include "entry.h"
+
+namespace gvtorch {
+
+// What a shader must have, told in words.
+template <class T, class Shader>
+struct Interface {
+  using Sum = typename Shader::Sum;
+  template <class S>
+  static auto adds(int) -> decltype(std::declval<const S&>().add(std::declval<const Piece<T>&>(),
+                                                                 std::declval<const Probe<T>&>(), std::declval<Sum&>()),
+                                    std::true_type());
+  template <class S>
+  static std::false_type adds(...);
+  template <class S>
+  static auto has_surface(int)
+      -> decltype(std::declval<const S&>().surface(std::declval<const Probe<T>&>(), std::declval<Sum&>()),
+                  std::true_type());
+  template <class S>
+  static std::false_type has_surface(...);
+
+  static_assert(std::is_base_of_v<UserShader<T>, Shader>, "a shader is derived from gv::UserShader<T>");
+  static_assert(std::is_constructible_v<Shader, const ShadeArgs&>,
+                "a shader is made from gv::ShadeArgs: using gv::UserShader<T>::UserShader;");
+  static_assert(std::is_trivially_copyable_v<Shader>, "a shader is copied into the kernel: plain values only");
+  static_assert(std::is_base_of_v<ShadeSum<T>, Sum>, "a shader's Sum is derived from gv::ShadeSum<T>");
+  static_assert(decltype(adds<Shader>(0))::value,
+                "a shader has GV_HD void add(const gv::Piece<T>&, const gv::Probe<T>&, Sum&) const");
+  static_assert(!Shader::kSurface || decltype(has_surface<Shader>(0))::value,
+                "a shader of kSurface has GV_HD void surface(const gv::Probe<T>&, Sum&) const");
+  static_assert(Shader::kFeatures >= Shader::kAsOther, "kFeatures is a number, or kAsOther");
+};
+
+template struct Interface<float, UserShaderOf<float>>;
+template struct Interface<double, UserShaderOf<double>>;
+
+// See FusedShaders in entry.h.
+struct OneShader {
+  using Known = UserShaderOf<float>;
+  static bool integrates(int64_t) { return false; }
+  static void check(const ShadeArgs& args, int64_t shader) {
+    constexpr int32_t features = Known::kFeatures, uniforms = Known::kUniforms;
+    STD_TORCH_CHECK(shader == 0, "gvtorch: shader must be 0");
+    const int32_t given = features == Known::kAsOther ? args.other_channels : features;
+    STD_TORCH_CHECK(args.features == given, "gvtorch: features must be ", given, ", got ", args.features);
+    const int32_t own = args.parameters - kParameters;
+    STD_TORCH_CHECK(own >= 0 && (uniforms < 0 || own == uniforms),
+                    "gvtorch: parameter_54 holds the wrong number of uniforms: ", own);
+  }
+  template <class T, class Body>
+  static void with(const ShadeArgs& args, const Body& body) {
+    body(ShadeRay<T, UserShaderOf<T>>(args));
+  }
+};
+
+}  // namespace gvtorch
+
+#define GV_TEXT_OF(name) #name
+#define GV_TEXT(name) GV_TEXT_OF(name)
+
+#ifdef __CUDACC__
+constexpr auto kShadeRays = &gvtorch::shade_rays<gvtorch::Cuda, gvtorch::OneShader>;
+
+STABLE_TORCH_LIBRARY_IMPL(gvtorch_user, CUDA, library) { library.impl(GV_TEXT(GV_USER_OP), TORCH_BOX(kShadeRays)); }
+#else
+constexpr auto kShadeRays = &gvtorch::shade_rays<gvtorch::Cpu, gvtorch::OneShader>;
+
+STABLE_TORCH_LIBRARY_FRAGMENT(gvtorch_user, library) {
+  library.def((GV_TEXT(GV_USER_OP) + std::string(std::strchr(gvtorch::kShadeRaysSchema, '('))).c_str());
+}
+
+STABLE_TORCH_LIBRARY_IMPL(gvtorch_user, CPU, library) { library.impl(GV_TEXT(GV_USER_OP), TORCH_BOX(kShadeRays)); }
+
+// What Python asks of the struct.
+#define GV_TELLS extern "C" __attribute__((visibility("default")))
+GV_TELLS int32_t gvtorch_features() { return gvtorch::OneShader::Known::kFeatures; }
+GV_TELLS int32_t gvtorch_whole() { return gvtorch::OneShader::Known::kWhole; }
+GV_TELLS int32_t gvtorch_named() { return gvtorch::OneShader::Known::kUniforms >= 0; }
+GV_TELLS const char* gvtorch_uniforms() { return gvtorch::OneShader::Known::kUniformNames; }
+#endif

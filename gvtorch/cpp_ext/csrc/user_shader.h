@@ -1,0 +1,77 @@
+// A shader of one's own, in C++: what `CompiledShader` (rendering/compiled_shader.py) compiles into an op. A header of
+// one's own holds it:
+//
+//   #include "user_shader.h"
+//
+//   template <class T>  // float or double
+//   struct Fog : gv::UserShader<T> {
+//     GV_UNIFORMS(density);  // CompiledShader("fog.h", "Fog", uniforms={"density": 0.1})
+//     using gv::UserShader<T>::UserShader;
+//
+//     GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
+//       const T alpha = 1 - exp(-this->uniform(density) * piece.value * piece.length);
+//       this->composite({1, 1, 1, alpha}, piece, sum);
+//     }
+//   };
+//
+// `add` is all that must be there. All else of a shader (see shaders.h) has a default here, and may be told anew:
+// kEnds, kSeesEmpty, kSurface and `surface`, Sum, hides, done; and kWhole and kFeatures. The struct is copied into the
+// kernel.
+#pragma once
+
+#include "shaders.h"
+
+namespace gvtorch {
+inline namespace GV_NAMESPACE {
+
+// Names the numbers that come from Python; each becomes an index of `uniform`.
+#define GV_UNIFORMS(...)                             \
+  enum Uniform : int32_t { __VA_ARGS__, kUniforms }; \
+  static constexpr const char* kUniformNames = #__VA_ARGS__
+
+template <class T>
+struct UserShader {
+  static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false;
+  static constexpr bool kWhole = false;     // a ray must not be traced in pieces, each with a Sum of its own
+  static constexpr int32_t kFeatures = 0;   // numbers of sum.feature_c, which begin with 0
+  static constexpr int32_t kAsOther = -1;   // for kFeatures: as many as the second channel holds
+  static constexpr int32_t kUniforms = -1;  // without GV_UNIFORMS: any number of them
+  static constexpr const char* kUniformNames = "";
+  using Sum = ShadeSum<T>;
+
+  TransferView<T> transfer;  // white and opaque where none was given
+  Light<T> light;
+  const T* uniform_k;
+  int32_t uniforms;         // how many
+  int32_t other_component;  // which number of the second channel was asked for
+  T step;                   // world length of the shortest interval
+
+  explicit UserShader(const ShadeArgs& args)
+      : transfer(args),
+        light{static_cast<const T*>(args.parameter_54)},
+        uniform_k(light.parameter_54 + kParameters),
+        uniforms(args.parameters - kParameters),
+        other_component(args.other_component),
+        step(static_cast<T>(args.step)) {}
+
+  GV_HD T uniform(int32_t index) const { return uniform_k[index]; }
+
+  // Colour of a value and the alpha of the interval, by the transfer function.
+  GV_HD Row<T> look_up(T value, const Piece<T>& piece) const {
+    return gvtorch::look_up(Transfer<T>(transfer), value, piece, step);
+  }
+
+  // Puts an interval behind what the ray met before: its colour, not premultiplied, and its alpha.
+  GV_HD void composite(const Row<T>& row, const Piece<T>& piece, ShadeSum<T>& sum) const {
+    sum.add(row, piece.start, piece.length, sum.hit_clear);
+  }
+
+  // What the transfer function shows nothing of.
+  GV_HD bool hides(T low, T high, const ShadeSum<T>&) const { return Transfer<T>(transfer).transparent(low, high); }
+  GV_HD void done(ShadeSum<T>&) const {}
+};
+
+}  // namespace GV_NAMESPACE
+}  // namespace gvtorch
+
+namespace gv = gvtorch;

@@ -1,0 +1,74 @@
+"""`around`: what the options put around a tree's tracer, from the inside out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from .clip import Clipped
+from .lens import ThroughLens
+from .lighting import Lighted
+from .module_shader import ModuleTracer
+from .pieces import Trace
+from .shaders import LitShader, Shader
+
+if TYPE_CHECKING:
+    from .renderer import RenderOptions, Tracer
+
+
+def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -> Trace:
+    """Returns a tree's tracer with what the options put around it: the lens, then the clip, then
+    the light, whose cones go through the clip, but not through the lens; `box` (2, 3) is the
+    scene's.
+
+    Raises:
+        ValueError: The shader sees a ray in one go, and the options cut rays into pieces; or it
+            takes no light, and there is some.
+    """
+    cuts = {
+        "lens": options.lens is not None,
+        "clip with caps or several pieces": options.clip is not None and not options.clip.whole,
+        "translucent layer": options.layer is not None and options.layer.alpha is not None,
+    }
+    if isinstance(tracer.shader, Shader) and tracer.shader.whole and any(cuts.values()):
+        name = next(name for name, cut in cuts.items() if cut)
+        kind = type(tracer.shader).__name__
+        raise ValueError(f"render: {kind} sees a ray in one go, so it has no {name}")
+
+    def clipped(trace: Trace) -> Trace:
+        if options.clip is None:
+            return trace
+        step = tracer.arguments["step"]
+        return Clipped(trace, options.clip, box, step=step, depth_alpha=options.depth_alpha)
+
+    def through_lens(trace: Trace) -> Trace:
+        if options.lens is None:
+            return trace
+        return ThroughLens(trace, options.lens.placed(box), options.cone_scale)
+
+    if options.lighting is None:
+        return clipped(through_lens(tracer))
+    shader = tracer.shader
+    if isinstance(tracer, ModuleTracer) or not isinstance(shader, LitShader):
+        kind = "TransferFunction" if shader is None else type(shader).__name__
+        raise ValueError(
+            "render: lighting needs normals: the shader must be Lit, StoredColor, Isosurface or "
+            f"DistanceField, got {kind}"
+        )
+    cones = replace(options, lod="auto")
+    matter = None
+    if options.lighting.indirect:
+        early = replace(cones, depth_alpha=0.25 * options.stop_alpha)
+        matter = clipped(tracer.seeing(shader.matter(), early))
+    return Lighted(
+        clipped(through_lens(tracer.seeing(shader.unlit(), options))),
+        blocker=clipped(tracer.seeing(shader.blocker(), cones)),
+        matter=matter,
+        lighting=options.lighting.placed(box),
+        material=shader.material(),
+        voxel=max(tracer.tree.spacing),
+        cone_scale=options.cone_scale,
+        lens=options.lens and options.lens.placed(box),
+    )

@@ -1,0 +1,104 @@
+// Shaders of tests/test_compiled_shader.py: twins of built-in ones, and one of its own.
+#pragma once
+
+#include "user_shader.h"
+
+namespace mine {
+
+// The plain transfer function.
+template <class T>
+struct Plain : gv::UserShader<T> {
+  using gv::UserShader<T>::UserShader;
+
+  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
+    this->composite(this->look_up(piece.value, piece), piece, sum);
+  }
+};
+
+// gv.Lit, which gives the features of gv.Features as well.
+template <class T>
+struct LitFeatures : gv::UserShader<T> {
+  using gv::UserShader<T>::UserShader;
+  static constexpr int32_t kFeatures = gv::UserShader<T>::kAsOther;
+
+  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>& probe, gv::ShadeSum<T>& sum) const {
+    gv::Row<T> row = this->look_up(piece.value, piece);
+    if (row.alpha > 0) {
+      const T share = sum.clear * row.alpha;
+      const gv::ChannelView& other = probe.channels.other;
+      for (int32_t c = 0; c < other.width; ++c) {
+        sum.feature_c[c] = sum.feature_c[c] + share * probe.number_at(other, c, piece.middle);
+      }
+      const gv::Vec3<T> normal = this->light.normal(probe, piece.middle);
+      row = this->light.shade(row, normal, probe, piece.middle);
+      sum.add_normal(normal, share);
+    }
+    this->composite(row, piece, sum);
+  }
+};
+
+// gv.Projection("maximum"): a Sum of its own, features, hidden by what was found, in one go.
+template <class T>
+struct Highest : gv::UserShader<T> {
+  using gv::UserShader<T>::UserShader;
+  static constexpr bool kSeesEmpty = true, kWhole = true;
+  static constexpr int32_t kFeatures = 1;
+  struct Sum : gv::ShadeSum<T> {
+    T found = -INFINITY, at = 0;
+  };
+
+  GV_HD bool hides(T, T high, const Sum& sum) const { return gv::a_little_above(high) <= sum.found; }
+  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>&, Sum& sum) const {
+    if (!(piece.value > sum.found)) return;
+    sum.found = piece.value;
+    sum.at = piece.middle;
+  }
+  GV_HD void done(Sum& sum) const {
+    if (!(sum.found > -INFINITY)) return;
+    gv::Piece<T> whole{};
+    whole.level = 0;
+    const gv::Row<T> row = this->look_up(sum.found, whole);
+    sum.red = row.red;
+    sum.green = row.green;
+    sum.blue = row.blue;
+    sum.clear = 0;
+    sum.depth = sum.at;
+    sum.feature_c[0] = sum.found;
+  }
+};
+
+// The first place above a level, without refinement: reads both ends, is coloured in the node where it lies.
+template <class T>
+struct FirstEnd : gv::UserShader<T> {
+  using gv::UserShader<T>::UserShader;
+  GV_UNIFORMS(level);
+  static constexpr bool kEnds = true, kSurface = true;
+
+  GV_HD bool hides(T, T high, const gv::ShadeSum<T>&) const { return gv::a_little_above(high) < this->uniform(level); }
+  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
+    if (piece.back < this->uniform(level)) return;
+    sum.clear = 0;
+    sum.depth = piece.end;
+  }
+  GV_HD void surface(const gv::Probe<T>& probe, gv::ShadeSum<T>& sum) const {
+    sum.red = probe.value(sum.depth);
+    sum.normal = this->light.normal(probe, sum.depth);
+  }
+};
+
+// Coloured by its place, darker with the distance from the camera.
+template <class T>
+struct Bands : gv::UserShader<T> {
+  using gv::UserShader<T>::UserShader;
+  GV_UNIFORMS(density, width, fade);
+
+  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>& probe, gv::ShadeSum<T>& sum) const {
+    const gv::Vec3<T> place = probe.sight.at(piece.middle);
+    const T light = exp(-(piece.middle + probe.sight.moved) * this->uniform(fade));
+    const T wave = static_cast<T>(0.5) + static_cast<T>(0.5) * sin(place.z / this->uniform(width));
+    const T alpha = 1 - exp(-this->uniform(density) * gv::larger(piece.value, static_cast<T>(0)) * piece.length);
+    this->composite({light * wave, light * (1 - wave), light * static_cast<T>(0.5), alpha}, piece, sum);
+  }
+};
+
+}  // namespace mine

@@ -1,0 +1,397 @@
+"""`CompiledShader`: a user's C++ is as good as what is built in, is kept by its content, and its
+mistakes are shown as the compiler tells them.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import DEVICES, ROOT
+from test_module_shader import assert_same_picture
+from test_op_contract import world_rays
+from test_shaders import POINT, op_arguments
+from test_trace_rays import SHADER, camera_rays, forget, on, run
+
+import gvtorch as gv
+from gvtorch.cpp_ext import compilers, user
+
+HEADER = ROOT / "tests" / "cpp" / "user_shaders.h"
+BANDS = {"density": 0.4, "width": 3.0, "fade": 0.005}
+CAMERA = gv.Camera.orbit(30, 20, 1.3, width=24, height=24)
+
+
+@pytest.fixture(scope="module")
+def channels(blobs) -> dict[str, gv.Volume]:
+    """The blobs with four numbers and a normal in each voxel."""
+    values = torch.rand(*blobs.data.shape[:3], 7, generator=torch.Generator().manual_seed(3))
+    place = blobs.spacing, blobs.origin
+    normal = gv.Volume(2 * values[..., :3] - 1, *place)
+    return {"value": blobs, "normal": normal, "rgba": gv.Volume(values[..., 3:], *place)}
+
+
+@pytest.fixture(scope="module")
+def tree(channels) -> gv.N3Tree:
+    return gv.N3Tree.from_volume(channels, 4)
+
+
+def mine(name: str, **options) -> gv.CompiledShader:
+    return gv.CompiledShader(HEADER, f"mine::{name}", **options)
+
+
+def assert_same(compiled: str, actual: dict, expected: dict, names) -> None:
+    """In every bit on the CPU; on CUDA another kernel may round otherwise, but for integers."""
+    for name in names:
+        if compiled == "cpp" or not expected[name].is_floating_point():
+            assert torch.equal(actual[name], expected[name]), name
+        else:
+            tolerance = 1e-5 if expected[name].dtype == torch.float32 else 1e-12
+            torch.testing.assert_close(actual[name], expected[name], rtol=tolerance, atol=tolerance)
+
+
+FIELDS = ("color", "alpha", "depth", "samples", "missed")
+
+
+# --- what it draws
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("lod", ["finest", "auto"])
+def test_a_copy_of_the_transfer_function_has_the_same_bits(tree, compiled, lod, dtype):
+    holes = forget(tree, 0.3, 1)
+    for place in (tree, holes):
+        rays = camera_rays(place, 16, distance=1.3)
+        options = {"lod": lod, "dtype": dtype}
+        expected, marks = run(place, compiled, rays, SHADER, **options)
+        actual, own_marks = run(place, compiled, rays, mine("Plain", transfer=SHADER), **options)
+        assert_same(compiled, actual, expected, FIELDS)
+        assert_same(compiled, own_marks, marks, marks)
+        assert bool(marks["request"].any()) == (place is holes)
+        assert place is holes or expected["alpha"].max() > 0.9
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_lights_normals_and_features_are_those_of_the_built_in(tree, compiled, dtype):
+    light = {"normals": "normal", "light": POINT, "ambient": 0.3}
+    rays = camera_rays(tree, 16)
+    shader = mine("LitFeatures", transfer=SHADER, other="rgba", **light)
+    actual, _ = run(tree, compiled, rays, shader, dtype=dtype)
+    lit, _ = run(tree, compiled, rays, gv.Lit(SHADER, **light), dtype=dtype)
+    assert_same(compiled, actual, lit, (*FIELDS, "normal"))
+    assert lit["alpha"].max() > 0.9 and lit["normal"].norm(dim=1).max() > 0.99
+    features, _ = run(tree, compiled, rays, gv.Features(SHADER, "rgba"), dtype=dtype)
+    assert actual["features"].shape[1] == 4
+    assert_same(compiled, actual, features, ("features",))
+
+
+def test_sums_of_ones_own_and_hiding(tree, compiled):
+    rays = camera_rays(tree, 16)
+    actual, marks = run(tree, compiled, rays, mine("Highest", transfer=SHADER))
+    expected, own_marks = run(tree, compiled, rays, gv.Projection("maximum", SHADER))
+    assert expected["features"].max() > 0.9
+    assert_same(compiled, actual, expected, (*FIELDS, "features"))
+    assert all(torch.equal(mark, own_marks[name]) for name, mark in marks.items())
+
+
+def test_ends_and_surfaces(tree, compiled):
+    """The place found is the end of the interval in which the built-in finds the crossing."""
+    rays = camera_rays(tree, 24, distance=1.2)
+    options = {"lod": "finest", "step": 0.5}
+    actual, _ = run(tree, compiled, rays, mine("FirstEnd", uniforms={"level": 0.5}), **options)
+    surface, _ = run(tree, compiled, rays, gv.Isosurface(0.5), **options)
+    hit = torch.isfinite(surface["depth"])[:, 0]
+    assert hit.sum() > 20 and torch.equal(torch.isfinite(actual["depth"])[:, 0], hit)
+    behind = (actual["depth"] - surface["depth"])[hit]
+    assert behind.min() > -1e-5 and 0.2 < behind.max() < 0.5 * min(tree.spacing) + 1e-5
+    value = actual["color"][hit, 0]
+    assert value.min() > 0.5 - 1e-6 and value.max() > 0.55, "read in the node of the place"
+    assert (actual["normal"][hit] * surface["normal"][hit]).sum(1).mean() > 0.95
+
+
+def bands_as_module(
+    eye: torch.Tensor, density: float, width: float, fade: float
+) -> gv.ModuleShader:
+    """The same formulas in torch, from places instead of distances."""
+
+    def shade(values, positions, directions, lengths):
+        light = torch.exp(-(positions - eye.to(positions)).norm(dim=1, keepdim=True) * fade)
+        wave = 0.5 + 0.5 * torch.sin(positions[:, 2:] / width)
+        color = torch.cat((light * wave, light * (1 - wave), 0.5 * light), 1)
+        return color, 1 - torch.exp(-density * values.clamp(min=0) * lengths)
+
+    return gv.ModuleShader(shade)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("lod", ["finest", "auto"])
+def test_a_shader_of_ones_own_equals_its_module_twin(blobs, compiled, lod, dtype):
+    tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
+    eye = CAMERA.placed(tree.box).rays().origin[0].to(tree.device)
+    options = {"lod": lod, "dtype": dtype}
+    picture = gv.render(tree, CAMERA, mine("Bands", uniforms=BANDS), **options)
+    assert_same_picture(gv.render(tree, CAMERA, bands_as_module(eye, **BANDS), **options), picture)
+
+
+def test_an_engine_streams_what_it_sees(channels):
+    for shader in (mine("Bands", uniforms=BANDS), mine("Highest", transfer=SHADER)):
+        resident = gv.render(gv.N3Tree.from_volume(channels, 8), CAMERA, shader)
+        with gv.Engine(gv.VolumeProducer(channels), brick_size=8) as engine:
+            _, first = engine.frame(CAMERA, shader)
+            picture = engine.render(CAMERA, shader)
+        assert first.requests and picture.stats.converged
+        assert resident.alpha.max() > 0.3
+        assert (picture.color - resident.color).abs().max() < 2e-3
+
+
+def test_uniforms_are_edited_without_a_compiler(tree, compiled, monkeypatch):
+    tree = on(tree, DEVICES[compiled])
+    width = torch.tensor(3.0, device=tree.device)
+    shader = mine("Bands", uniforms={**BANDS, "width": width})
+    whole = mine("Bands", uniforms=torch.tensor([0.4, 3.0, 0.005], device=tree.device))
+    before = gv.render(tree, CAMERA, shader)
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("a compiler was called"))
+    assert torch.equal(gv.render(tree, CAMERA, whole).color, before.color)
+    shader.uniforms["density"] = 0.1
+    thin = gv.render(tree, CAMERA, shader)
+    assert (before.alpha - thin.alpha).max() > 0.1
+    width.fill_(9.0)
+    assert (gv.render(tree, CAMERA, shader).color - thin.color).abs().max() > 0.05
+    whole.uniforms[:] = torch.tensor([0.1, 9.0, 0.005])
+    assert torch.equal(gv.render(tree, CAMERA, whole).color, gv.render(tree, CAMERA, shader).color)
+
+
+@pytest.mark.backend("cpp")
+def test_it_goes_through_lenses_clips_layers_and_scenes(blobs):
+    tree = gv.N3Tree.from_volume(blobs, 4)
+    plain = mine("Plain", transfer=SHADER)
+    layer = gv.Layer(
+        torch.full((24, 24, 3), 0.2), torch.full((24, 24, 1), 60.0), torch.full((24, 24, 1), 0.5)
+    )
+    for options in (
+        {"lens": gv.ThinLens(aperture=0.1, focus=1.3, frame="box")},
+        {"clip": gv.Clip(planes=[(0, 0, -1, 20)], caps=True)},
+        {"layer": layer},
+    ):
+        expected = gv.render(tree, CAMERA, SHADER, **options)
+        assert expected.alpha.max() > 0.3
+        assert torch.equal(gv.render(tree, CAMERA, plain, **options).color, expected.color)
+        with pytest.raises(ValueError, match="CompiledShader sees a ray in one go, so it has no"):
+            gv.render(tree, CAMERA, mine("Highest", transfer=SHADER), **options)
+    far = gv.Volume(blobs.data, blobs.spacing, (105.0, -3.0, 2.0))
+    scene = {"a": gv.VolumeProducer(blobs), "b": gv.VolumeProducer(far)}
+    with gv.Engine(scene, brick_size=4, node_pool="1 MB", brick_pool="4 MB") as engine:
+        both = engine.render(CAMERA, {"a": SHADER, "b": SHADER})
+        mixed = engine.render(CAMERA, {"a": plain, "b": SHADER})
+    assert torch.equal(mixed.color, both.color) and both.alpha.max() > 0.3
+
+
+# --- the op's contract
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", ["Bands", "LitFeatures"])
+def test_script_compile_export_and_pickle(tree, compiled, name):
+    torch._dynamo.reset()
+    tree = on(tree, DEVICES[compiled])
+    own = {"uniforms": BANDS} if name == "Bands" else {"transfer": SHADER, "other": "rgba"}
+    tracer, rays = gv.TreeTracer(tree, mine(name, **own)), world_rays(tree.box, 33, tree.device)
+    expected = tracer.hits(*rays)
+    file = io.BytesIO()
+    torch.jit.save(torch.jit.script(tracer), file)
+    file.seek(0)
+    program = torch.export.export(tracer, rays).module()
+    fast = torch.compile(tracer.hits, fullgraph=True, backend="aot_eager")
+    copy = pickle.loads(pickle.dumps(tracer))
+    for hits in (torch.jit.load(file).hits(*rays), fast(*rays), copy.hits(*rays), program(*rays)):
+        assert expected[1].max() > 0.1
+        assert all(torch.equal(a, b) for a, b in zip(hits, expected, strict=False))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", ["Bands", "LitFeatures"])
+def test_opcheck_and_memory_safety(tree, compiled, name, dtype):
+    tree = on(tree, DEVICES[compiled])
+    own = {"uniforms": BANDS} if name == "Bands" else {"transfer": SHADER, "other": "rgba"}
+    shader = mine(name, **own)
+    given = op_arguments(tree, shader, dtype)
+    given |= {"width": 0, "table": given.pop("table_lm4"), "clear_r": None, "shader": 0}
+    op = getattr(torch.ops.gvtorch_user, shader.kind).default
+    torch.library.opcheck(op, tuple(given[a.name] for a in op._schema.arguments))
+    short = given["parameter_54"][: 19 if name == "LitFeatures" else -1]
+    for change in ({"features": 3}, {"shader": 1}, {"parameter_54": short.contiguous()}):
+        with pytest.raises(RuntimeError, match="gvtorch"):
+            op(*({**given, **change}[a.name] for a in op._schema.arguments))
+
+
+# --- the compiler and the cache
+
+
+def write(folder: Path, body: str, name: str = "own.h") -> Path:
+    """A header with a struct `Own` around `body`."""
+    path = folder / name
+    path.write_text(
+        '#include "user_shader.h"\n'
+        "template <class T>\nstruct Own : gv::UserShader<T> {\n"
+        f"  using gv::UserShader<T>::UserShader;\n{body}\n}};\n"
+    )
+    return path
+
+
+ADD = """
+  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
+    this->composite({COLOR, 0, 0, 1}, piece, sum);
+  }"""
+
+
+def built(folder: Path) -> list[str]:
+    return sorted(file.name for file in (folder / "shaders").iterdir())
+
+
+def in_processes(count: int, *headers: Path, **environment: str) -> list[str]:
+    """Loads `Own` of all headers in processes at the same time; the red that each shows."""
+    code = (
+        "import sys, torch, gvtorch as gv\n"
+        "shaders = [gv.CompiledShader(header, 'Own') for header in sys.argv[1:]]\n"
+        "tree = gv.N3Tree.from_volume(gv.Volume(torch.ones(8, 8, 8)), 8)\n"
+        "camera = gv.Camera.orbit(width=1, height=1)\n"
+        "print(*(float(gv.render(tree, camera, shader).color[0, 0, 0]) for shader in shaders))\n"
+    )
+    runs = [
+        subprocess.Popen(
+            [sys.executable, "-c", code, *map(str, headers)],
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, **environment},
+        )
+        for _ in range(count)
+    ]
+    return [run.communicate(timeout=300)[0].strip() for run in runs]
+
+
+@pytest.mark.backend("cpp")
+def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path):
+    """A compiler that counts its calls: two at once give one library, a third makes none; what
+    changes the meaning makes another.
+    """
+    count, compiler = tmp_path / "calls", tmp_path / "c++"
+    real = shutil.which(compilers.find_cxx()[0])
+    compiler.write_text(f'#!/bin/sh\necho call >> {count}\nexec {real} "$@" -O0\n')
+    compiler.chmod(0o755)
+    (tmp_path / "color.h").write_text("constexpr float kColor = 0.25f;\n")
+    body = '  // #include "none.h"\n' + ADD.replace("COLOR", "kColor")
+    header = write(tmp_path, body)
+    header.write_text('#include "color.h"\n' + header.read_text())
+    own = {"GVTORCH_CACHE": str(tmp_path / "cache"), "CXX": str(compiler)}
+    assert in_processes(2, header, **own) == ["0.25", "0.25"]
+    calls = count.read_text()
+    assert 1 <= calls.count("call") <= 2
+    first = built(tmp_path / "cache")
+    assert len(first) == 1 and first[0].endswith(".so"), "nothing half-written is left"
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    for file in (header, tmp_path / "color.h"):
+        shutil.copy(file, moved)
+    assert in_processes(1, moved / "own.h", **own) == ["0.25"]
+    assert count.read_text() == calls, "the same content is the same library"
+    (tmp_path / "color.h").write_text("constexpr float kColor = 0.75f;\n")
+    both = in_processes(1, moved / "own.h", header, **own)
+    assert both == ["0.25 0.75"], "two structs of one name, in one process"
+    assert len(built(tmp_path / "cache")) == 2
+
+
+@pytest.mark.parametrize(
+    ("body", "name", "message"),
+    [
+        (ADD.replace("COLOR", "colour"), "Own", r"own.h:7:\d+: error: 'colour' was not declared"),
+        ("", "Own", "a shader has GV_HD void add(const gv::Piece<T>&, const gv::Probe<T>&, Sum&)"),
+        (ADD, "Mine", "'Mine' does not name a type"),
+    ],
+    ids=["a mistake", "no add", "no such struct"],
+)
+@pytest.mark.backend("cpp")
+def test_the_compilers_words_are_shown_as_they_are(tmp_path, cache, body, name, message):
+    before, header = built(cache), write(tmp_path, body)
+    with pytest.raises(gv.CompileError) as caught:
+        gv.CompiledShader(header, name)
+    first, *rest = str(caught.value).splitlines()
+    assert first.startswith(f"{header}: {name} did not compile for the CPU with: ")
+    assert compilers.find_cxx()[0] in first and "-ffp-contract=off" in first
+    said = "\n".join(rest).replace("\u2018", "'").replace("\u2019", "'")
+    assert re.search(message if "\\" in message else re.escape(message), said), said
+    assert built(cache) == before, "nothing of it is kept"
+
+
+@pytest.mark.backend("cpp")
+def test_without_a_compiler_or_a_folder_there_is_one_clear_line(tmp_path, monkeypatch):
+    header = write(tmp_path, ADD.replace("COLOR", "1"))
+    with monkeypatch.context() as patch:
+        patch.setenv("CXX", "no-such-compiler -O1")
+        with pytest.raises(RuntimeError) as caught:
+            gv.CompiledShader(header, "Own")
+    assert str(caught.value) == (
+        "CompiledShader: no compiler 'no-such-compiler' to compile own.h for the CPU with; "
+        "CXX names another"
+    )
+    monkeypatch.setenv("GVTORCH_CACHE", str(header))
+    with pytest.raises(RuntimeError, match=r"own.h.*; GVTORCH_CACHE names another") as caught:
+        gv.CompiledShader(header, "Own")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.backend("cpp")
+def test_mistakes_have_one_clear_message(tree, tmp_path):
+    for make, message in (
+        (lambda: gv.CompiledShader(tmp_path / "a.h", "A"), "there is no header"),
+        (
+            lambda: gv.CompiledShader(HEADER, "mine::Bands; int x"),
+            "name must be that of a C++ struct",
+        ),
+        (lambda: gv.CompiledShader(HEADER, 3), "name must be that of a C++ struct, got 3"),
+        (lambda: mine("Bands"), "uniforms must be density, width, fade, got none"),
+        (lambda: mine("Bands", uniforms={**BANDS, "x": 1}), "got density, width, fade, x"),
+        (
+            lambda: mine("Bands", uniforms={**BANDS, "fade": float("nan")}),
+            "uniform fade must be fin",
+        ),
+        (
+            lambda: mine("Bands", uniforms={**BANDS, "fade": torch.ones(2)}),
+            "fade must be one number",
+        ),
+        (lambda: mine("Bands", uniforms=torch.ones(2)), "uniforms must be (3,)"),
+        (lambda: mine("Plain", uniforms={"a": 1}), "uniforms must be a (k,) tensor, got a"),
+        (lambda: mine("Plain", transfer="bone"), "transfer must be a TransferFunction, got str"),
+        (lambda: mine("Plain", light=3), "light must be a Headlight"),
+        (lambda: gv.render(tree, CAMERA, mine("Plain", channel="heat")), "unknown channel 'heat'"),
+        (
+            lambda: gv.render(tree, CAMERA, mine("LitFeatures")),
+            "those of a second channel: name other",
+        ),
+        (lambda: gv.render(tree, CAMERA, mine("Plain"), backend="reference"), "no reference"),
+    ):
+        with pytest.raises(ValueError) as caught:
+            make()
+        assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.skipif(compilers.find_nvcc() is None, reason="nvcc is not here")
+@pytest.mark.backend("cpp")
+def test_nvcc_compiles_it(cache):
+    library = user.compiled(HEADER, "mine::Bands", "bands_for_cuda", ("90",))
+    assert library.parent == cache / "shaders" and b"bands_for_cuda" in library.read_bytes()
+
+
+@pytest.mark.backend("cpp")
+def test_cuda_gets_no_other_content_than_the_cpu_has(tmp_path):
+    edited = replace(user.load(HEADER, "mine::Plain"), header=write(tmp_path, ADD))
+    with pytest.raises(RuntimeError, match=r"own.h has changed: make the shader anew"):
+        user.load_cuda(edited)

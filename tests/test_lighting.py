@@ -1,0 +1,649 @@
+"""Shadows, occlusion and indirect light by cones, against closed forms."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from conftest import DEVICES
+from test_shading import ball, parallel, phong, sphere
+
+import gvtorch as gv
+from gvtorch.ops import available
+from gvtorch.rendering.renderer import trace
+
+MATT = {"ambient": 0.0, "diffuse": 1.0, "specular": 0.0}
+SKY = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0}
+FLOOR, SIZE = 8.0, 64
+
+
+def places(size: int = SIZE) -> tuple[np.ndarray, ...]:
+    """x, y, z of the voxels of a cube."""
+    z, y, x = np.mgrid[0:size, 0:size, 0:size].astype(np.float32)
+    return x, y, z
+
+
+def tree_of(distance: np.ndarray, backend: str) -> gv.N3Tree:
+    return gv.N3Tree.from_volume(gv.Volume(distance.astype(np.float32)), device=DEVICES[backend])
+
+
+def down(x, height: float, z, device: str, width: float = 0.5) -> gv.Rays:
+    """Rays down from a height at places (x, z)."""
+    x, z = np.broadcast_arrays(np.asarray(x, float), z)
+    origin = torch.tensor(np.stack((x, np.full_like(x, height), z), -1))
+    direction = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64).expand_as(origin).contiguous()
+    flat = torch.zeros((len(origin), 2), dtype=torch.float64)
+    cone, far = (torch.tensor(row, dtype=torch.float64) for row in ([width, 0.0], [0.0, math.inf]))
+    return gv.Rays(origin=origin, direction=direction, cone=flat + cone, range=flat + far).to(
+        device
+    )
+
+
+def light_on(tree, rays, shader, backend, *, plain=None, **lighting) -> np.ndarray:
+    """(r, 3) colours."""
+    options = gv.RenderOptions(backend=backend, lighting=gv.Lighting(**lighting), **(plain or {}))
+    return trace(tree, rays, shader, options).color.cpu().double().numpy()
+
+
+# --- the material
+
+
+@pytest.mark.parametrize("kind", ["head", "directional", "point"])
+def test_phong_on_a_sphere(backend, kind):
+    tree = ball(backend)
+    rays = parallel(15, 9.0, DEVICES[backend])
+    t, normal = sphere(rays)
+    eye = -rays.direction.cpu().numpy()
+    at = rays.origin.cpu().numpy() - t[:, None] * eye
+    tint = (1.0, 0.8, 0.5)
+    light, to_light = {
+        "head": (gv.Headlight(tint), eye),
+        "directional": (gv.DirectionalLight((2, -1, 2), tint), np.array([[-2, 1, -2]]) / 3),
+        "point": (gv.PointLight((0.0, 40.0, -20.0), tint), np.array([[0.0, 40.0, -20.0]]) - at),
+    }[kind]
+    to_light = to_light / np.linalg.norm(to_light, axis=1, keepdims=True) + 0 * normal
+    look = {"ambient": 0.1, "diffuse": 0.7, "specular": 0.4, "shininess": 12.0}
+    base = np.array([0.9, 0.5, 0.3])
+    shader = gv.DistanceField(tuple(base), **look)
+    color = light_on(tree, rays, shader, backend, lights=(light,), ambient=(1.0, 0.5, 0.2))
+    expected = phong(normal, to_light, eye, base, np.array(tint), **look)
+    expected += base * 0.1 * (np.array([1.0, 0.5, 0.2]) - 1)  # the sky's colour
+    assert expected.max() - expected.min() > 0.4
+    assert np.abs(color - expected).max() < 0.03, "a convex body casts no shadow on its lit side"
+
+
+def test_without_cones_it_is_the_shader_s_own_light(blobs, backend):
+    light = gv.PointLight((0.0, 40.0, 60.0), (1.0, 0.9, 0.8), radius=5.0)
+    camera = gv.Camera.orbit(width=16, height=16, distance=1.3)
+    tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[backend])
+    for shader in (
+        gv.Isosurface(0.5, (0.9, 0.4, 0.2), light=light, shininess=9.0),
+        gv.Isosurface(0.5, light=gv.Headlight(), specular=0.0),
+    ):
+        own = gv.render(tree, camera, shader, backend=backend)
+        for lighting in (gv.Lighting(shadows=0), gv.Lighting(shadows=0, lights=(shader.light,))):
+            same = gv.render(tree, camera, shader, backend=backend, lighting=lighting)
+            torch.testing.assert_close(same.color, own.color, rtol=0, atol=2e-5)
+            assert torch.equal(same.depth, own.depth) and torch.equal(same.normal, own.normal)
+        both = gv.Lighting(shadows=0, lights=(shader.light, shader.light), ambient=(0, 0, 0))
+        bright = gv.render(tree, camera, shader, backend=backend, lighting=both).color
+        dark = gv.render(
+            *(tree, camera, shader),
+            backend=backend,
+            lighting=dataclasses.replace(both, lights=(shader.light,)),
+        ).color
+        torch.testing.assert_close(bright, 2 * dark, rtol=0, atol=1e-5)
+    assert own.alpha.max() == 1
+
+
+def test_translucent_matter_is_lit_where_it_is_seen(blobs, backend):
+    """Where colour and gradient do not change along a ray, light by sample and by pixel agree."""
+    ramp = np.linspace(0, 1, 24, dtype=np.float32)[:, None, None] * np.ones((1, 20, 20), np.float32)
+    tree = gv.N3Tree.from_volume(gv.Volume(ramp), 4, device=DEVICES[backend])
+    transfer = gv.TransferFunction.from_points([(0, 0), (1, 0.3)], [(0, 0.9, 0.6, 0.3)])
+    shader = gv.Lit(transfer, light=gv.DirectionalLight((0.3, -0.5, 1)), shininess=7.0)
+    camera = gv.Camera.orbit(175, 10, 1.6, 20, 12, 12)
+    own = gv.render(tree, camera, shader, backend=backend)
+    same = gv.render(tree, camera, shader, backend=backend, lighting=gv.Lighting(shadows=0))
+    assert own.alpha.max() > 0.8
+    torch.testing.assert_close(same.color, own.color, rtol=0, atol=2e-3)
+
+
+# --- shadows
+
+
+CENTRE, RADIUS = np.array([32.0, 40.0, 32.0]), 9.0
+
+
+def over_floor(backend: str, kind: str = "distance") -> tuple[gv.N3Tree, gv.Shader]:
+    """A ball over a floor."""
+    x, y, z = places()
+    body = np.sqrt((x - CENTRE[0]) ** 2 + (y - CENTRE[1]) ** 2 + (z - CENTRE[2]) ** 2) - RADIUS
+    distance = np.minimum(body, y - FLOOR)
+    if kind == "distance":
+        return tree_of(distance, backend), gv.DistanceField((1, 1, 1), **MATT)
+    share = np.clip(0.5 - distance / 2, 0, 1)
+    if kind == "density":
+        return tree_of(share, backend), gv.Isosurface(0.5, (1, 1, 1), **MATT)
+    solid = gv.TransferFunction.from_points([(0, 0), (0.4, 0), (0.6, 0.9), (1, 0.9)])
+    return tree_of(share, backend), gv.Lit(solid, **MATT)
+
+
+def sun_seen(at: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """(p,) share of unit directions (p, m, 3) from places (p, 3) that the ball does not block."""
+    away = at - CENTRE
+    b = (targets * away[:, None]).sum(-1)
+    c = (away**2).sum(-1)[:, None] - RADIUS**2
+    return 1 - ((b**2 > c) & (b < 0)).mean(1)
+
+
+def disc(count: int = 4000) -> tuple[np.ndarray, np.ndarray]:
+    number = np.arange(count)
+    radius, turn = np.sqrt((number + 0.5) / count), number * np.pi * (3 - np.sqrt(5))
+    return radius * np.cos(turn), radius * np.sin(turn)
+
+
+def shadow_of(light, x: np.ndarray) -> np.ndarray:
+    """What is seen of a light that stands right above the ball, from (x, FLOOR, 32)."""
+    at = np.stack((x, np.full_like(x, FLOOR), np.full_like(x, 32.0)), -1)
+    u, v = disc()
+    if isinstance(light, gv.DirectionalLight):
+        half = math.tan(math.radians(light.angle) / 2)
+        way = np.stack((u * half, np.ones_like(u), v * half), -1)[None].repeat(len(x), 0)
+    else:
+        beam = np.array(light.position) - at
+        axis = beam / np.linalg.norm(beam, axis=1, keepdims=True)
+        side = np.cross(axis, [0.0, 0.0, 1.0])
+        side /= np.linalg.norm(side, axis=1, keepdims=True)
+        up = np.cross(axis, side)
+        spread = u[None, :, None] * side[:, None] + v[None, :, None] * up[:, None]
+        way = beam[:, None] + light.radius * spread
+    way /= np.linalg.norm(way, axis=-1, keepdims=True)
+    return sun_seen(at, way)
+
+
+def crossing(x: np.ndarray, seen: np.ndarray, share: float) -> float:
+    """Where a share of the light is reached for good, between two places."""
+    last = int(np.nonzero(seen < share)[0].max())
+    a, b = seen[last], seen[last + 1]
+    return float(x[last] + (share - a) / (b - a) * (x[last + 1] - x[last]))
+
+
+LIGHTS = {
+    "small sun": gv.DirectionalLight((0, -1, 0), angle=4.0),
+    "sun": gv.DirectionalLight((0, -1, 0), angle=10.0),
+    "lamp": gv.PointLight((32.0, 120.0, 32.0), radius=6.0),
+}
+
+
+@pytest.mark.parametrize("name", LIGHTS)
+def test_umbra_and_penumbra_of_a_ball(backend, name):
+    """Where 10%, 50% and 90% of the light come in, to less than a voxel. What one cone grazes is
+    guessed, see `solid.py`; 16 narrow ones for the same disc leave the edges where they are.
+    """
+    tree, shader = over_floor(backend)
+    light, x = LIGHTS[name], np.linspace(32, 56, 97)
+    expected = shadow_of(light, x)
+    rays = down(x, FLOOR + 8, 32.0, DEVICES[backend])
+    for cones, most, mean in ((1, 0.8, 0.055), (16, 0.6, 0.045)):
+        given = {"lights": (light,), "shadow_cones": cones}
+        seen = light_on(tree, rays, shader, backend, **given)[:, 0]
+        to_light = np.array(getattr(light, "position", (0, 1e6, 0))) - np.stack(
+            (x, np.full_like(x, FLOOR), np.full_like(x, 32.0)), -1
+        )
+        seen = seen / (to_light[:, 1] / np.linalg.norm(to_light, axis=1))
+        wrong = [crossing(x, seen, s) - crossing(x, expected, s) for s in (0.1, 0.5, 0.9)]
+        error = float(np.sqrt(((seen - expected) ** 2).mean()))
+        print(f"{name}, {cones} cones: {np.round(wrong, 2)} voxels, rms {error:.3f}")
+        assert np.abs(wrong).max() < most and error < mean
+        assert seen[0] < 0.01 and seen[-1] > 0.99
+
+
+@pytest.mark.parametrize("kind", ["distance", "density", "lit"])
+@pytest.mark.parametrize("far", [False, True])
+def test_a_light_without_a_size_casts_a_hard_shadow(backend, kind, far):
+    tree, shader = over_floor(backend, kind)
+    x = np.linspace(32, 60, 113)
+    light = gv.DirectionalLight((0, -1, 0)) if far else gv.PointLight((32.0, 120.0, 32.0))
+    edge = RADIUS if far else 112 * math.tan(math.asin(RADIUS / 80))
+    color = light_on(
+        tree, down(x, FLOOR + 8, 32.0, DEVICES[backend]), shader, backend, lights=(light,)
+    )[:, 0]
+    dark, bright = color[x < 32 + edge - 1.5], color[x > 32 + edge + 1.5]
+    assert len(dark) > 25 and len(bright) > 10
+    assert dark.max() < 0.01 and bright.min() > 0.5
+    facing = 1 if far else 112 / np.hypot(112, x[x > 32 + edge + 1.5] - 32)
+    assert np.abs(bright - facing).max() < 0.03
+
+
+def test_shadows_are_as_strong_as_they_are_told(backend):
+    tree, shader = over_floor(backend)
+    rays = down([32.0, 58.0], FLOOR + 8, 32.0, DEVICES[backend])
+    light = {"lights": (gv.DirectionalLight((0, -1, 0)),)}
+    for strength in (0.0, 0.4, 1.0):
+        color = light_on(tree, rays, shader, backend, shadows=strength, **light)
+        np.testing.assert_allclose(color[:, 0], [1 - strength, 1], atol=1e-3)
+
+
+def test_a_thin_medium_absorbs_what_it_should(backend):
+    """A cloud of opacity a per unit, h thick over an opaque floor, lets (1 - a)^h of the light
+    through, whatever the light's size.
+    """
+    _, y, _ = places(32)
+    value = np.where(y < 6, 1.0, np.where((y > 14) & (y < 22), 0.5, 0.0))
+    transfer = gv.TransferFunction.from_points([(0, 0), (0.5, 0.1), (0.9, 0.1), (1, 1)])
+    tree = tree_of(value, backend)
+    rays = down(np.linspace(13, 18, 5), 12.0, 16.0, DEVICES[backend])
+    for angle in (0.0, 8.0):
+        light = gv.DirectionalLight((0, -1, 0), angle=angle)
+        color = light_on(tree, rays, gv.Lit(transfer, **MATT), backend, lights=(light,))
+        np.testing.assert_allclose(color, 0.9**7, atol=0.02)  # voxels 15 to 21
+
+
+def test_what_is_clipped_away_casts_no_shadow(backend):
+    tree, shader = over_floor(backend)
+    rays = down([32.0, 34.0], FLOOR + 8, 32.0, DEVICES[backend])
+    for clip, seen in (
+        (gv.Clip(planes=[(0, -1, 0, 20.0)]), 1.0),
+        (gv.Clip(without=[((20, 25, 20), (45, 60, 45))]), 1.0),
+        (gv.Clip(planes=[(0, -1, 0, 40.0)]), 0.0),
+    ):
+        color = light_on(
+            *(tree, rays, shader, backend),
+            plain={"clip": clip},
+            lights=(gv.DirectionalLight((0, -1, 0)),),
+        )
+        np.testing.assert_allclose(color, seen, atol=1e-3)
+
+
+def test_a_lamp_inside_matter_lights_nothing(backend):
+    tree, shader = over_floor(backend)
+    rays = down([20.0, 32.0, 50.0], FLOOR + 8, 32.0, DEVICES[backend])
+    inside = gv.PointLight(tuple(CENTRE))
+    assert np.abs(light_on(tree, rays, shader, backend, lights=(inside,))).max() < 1e-3
+    at_the_place = gv.PointLight((20.0, FLOOR, 32.0))
+    assert np.isfinite(light_on(tree, rays, shader, backend, lights=(at_the_place,))).all()
+
+
+# --- light from all around
+
+
+def segment(height: np.ndarray) -> np.ndarray:
+    """Part of the unit disc beyond a chord: what a wall blocks of a cosine-weighted hemisphere, if
+    directions count that reach it within 1 (Nusselt's analogue).
+    """
+    s = np.clip(height, -1, 1)
+    return (np.arccos(s) - s * np.sqrt(1 - s * s)) / np.pi
+
+
+def open_sky(x: np.ndarray, z: np.ndarray | None, reach: float) -> np.ndarray:
+    """(p,) share of the sky seen from a floor, x off one wall and z off another; what lies beyond
+    half of the reach takes half.
+    """
+    seen = np.zeros(len(x))
+    u, v = disc(100_000)
+    for far in (reach / 2, reach):
+        blocked = u[None] >= x[:, None] / far
+        if z is not None:
+            blocked |= v[None] >= z[:, None] / far
+        else:
+            np.testing.assert_allclose(blocked.mean(1), segment(x / far), atol=1e-3)
+        seen += (1 - blocked.mean(1)) / 2
+    return seen
+
+
+def corner(walls: int, backend: str, kind: str = "distance") -> tuple[gv.N3Tree, gv.Shader]:
+    """A floor, and one wall or two on it."""
+    x, y, z = places()
+    distance = y - FLOOR
+    for axis in (x, z)[:walls]:
+        distance = np.minimum(distance, axis - FLOOR)
+    if kind == "distance":
+        return tree_of(distance, backend), gv.DistanceField((1, 1, 1), **SKY)
+    tree = tree_of(np.clip(0.5 - distance, 0, 1), backend)
+    if kind == "density":
+        return tree, gv.Isosurface(0.5, (1, 1, 1), **SKY)
+    opaque = gv.TransferFunction.from_points([(0.3, 0), (0.6, 0.9)])
+    return tree, gv.Lit(opaque, **SKY)
+
+
+@pytest.mark.parametrize("kind", ["distance", "density", "medium"])
+@pytest.mark.parametrize("walls", [0, 1, 2])
+def test_occlusion_at_an_edge_and_in_a_corner(backend, kind, walls):
+    """An edge leaves 1/2 of the sky, a corner of three planes 1/4. Six cones stand for all ways,
+    and each meets a wall or does not: they are right to 0.12 beside a wall, to 0.18 beside two. A
+    floor alone is not darkened.
+    """
+    tree, shader = corner(walls, backend, kind)
+    reach, away = 16.0, np.array([1.6, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0, 13.0, 18.0, 24.0])
+    x = FLOOR + away if walls else np.full_like(away, 40.0)
+    z = FLOOR + away if walls > 1 else np.full_like(away, 40.0)
+    rays = down(x, FLOOR + 20, z, DEVICES[backend])
+    whole = {"plain": {"stop_alpha": 1.0}, "reach": reach}
+    seen = light_on(tree, rays, shader, backend, occlusion=1, **whole)[:, 0]
+    expected = np.ones_like(away)
+    if walls:
+        expected = open_sky(away, away if walls > 1 else None, reach)
+    print(f"{kind}, {walls} walls: {np.round(seen, 2)}, expected {np.round(expected, 2)}")
+    assert np.abs(seen - expected).max() < (1e-4, 0.12, 0.18)[walls]
+    assert np.sqrt(((seen - expected) ** 2).mean()) < (1e-4, 0.06, 0.1)[walls]
+    if walls:
+        limit = (None, 0.5, 0.25)[walls]
+        assert (
+            abs(open_sky(np.array([1e-6]), np.array([1e-6]) if walls > 1 else None, 1.0)[0] - limit)
+            < 1e-3
+        )
+        assert seen[-1] > 0.985 and (np.diff(seen) > -0.05).all()
+    half = light_on(tree, rays, shader, backend, occlusion=0.5, **whole)[:, 0]
+    np.testing.assert_allclose(half, (1 + seen) / 2, atol=1e-5)
+
+
+def test_a_lit_wall_shines_on_the_floor(backend):
+    """A wall under a light that shines along (-1, -1, 0) sends albedo * cos 45 * its share of the
+    hemisphere, here from within the reach.
+    """
+    tree, _ = corner(1, backend)
+    base, away = np.array([0.8, 0.4, 0.2]), np.array([2.0, 3.0, 4.0, 6.0, 9.0, 14.0, 20.0, 30.0])
+    shader = gv.DistanceField(tuple(base), **MATT)
+    rays = down(FLOOR + away, FLOOR + 20, 32.0, DEVICES[backend])
+    light = {"lights": (gv.DirectionalLight((-1, -1, 0)),), "reach": 24.0}
+    direct = light_on(tree, rays, shader, backend, **light)
+    both = light_on(tree, rays, shader, backend, indirect=1, **light)
+    np.testing.assert_allclose(direct, base * math.sqrt(0.5) + 0 * both, atol=0.01)
+    bounced = both - direct
+    expected = base**2 * math.sqrt(0.5) * segment(away / 24.0)[:, None]
+    print(np.round(bounced[:, 0], 3), np.round(expected[:, 0], 3))
+    assert np.abs(bounced - expected).max() < 0.075, "of 0.2: a cone meets the wall or not"
+    assert bounced[0, 0] > 0.1 and abs(bounced[-1, 0]) < 1e-6
+    np.testing.assert_allclose(bounced[:4, 1] / bounced[:4, 0], 0.25, atol=0.01)
+    twice = light_on(tree, rays, shader, backend, indirect=2, **light) - direct
+    np.testing.assert_allclose(twice, 2 * bounced, atol=1e-5)
+    away_from_it = {**light, "lights": (gv.DirectionalLight((1, -1, 0)),)}
+    dark = light_on(tree, rays, shader, backend, indirect=1, **away_from_it)
+    plain = light_on(tree, rays, shader, backend, **away_from_it)
+    np.testing.assert_allclose(dark, plain, atol=1e-3)  # the wall's own side is in shadow
+
+
+def test_a_white_floor_turns_red_beside_a_red_wall(backend):
+    x, y, z = places(48)
+    alpha = np.clip(0.5 - np.minimum(x, y - 0.0 * z) / 2 + 4, 0, 1)
+    red = x < y
+    color = np.where(red[..., None], (0.9, 0.1, 0.1), (0.9, 0.9, 0.9))
+    volume = gv.Volume(
+        np.concatenate((color * alpha[..., None], alpha[..., None]), -1).astype(np.float32)
+    )
+    tree = gv.N3Tree.from_volume({"rgba": volume}, device=DEVICES[backend])
+    shader = gv.StoredColor("rgba", premultiplied=True, **MATT)
+    away = np.array([4.0, 7.0, 11.0, 18.0])
+    rays = down(8 + away, 30.0, 24.0, DEVICES[backend])
+    lights = (gv.DirectionalLight((-1, -1, 0)),)
+    color = light_on(tree, rays, shader, backend, lights=lights, indirect=1, reach=20.0)
+    ratio = color[:, 0] / color[:, 1]
+    assert ratio[0] > 1.1 and (np.diff(ratio) < 0).all() and ratio[-1] < ratio[0] - 0.08
+    assert color.max() < 0.9 * (math.sqrt(0.5) + 0.9 * 0.5), "no more light than comes in"
+    plain = light_on(tree, rays, shader, backend, lights=lights)
+    assert (color >= plain - 1e-6).all()
+    np.testing.assert_allclose(plain[:, 0], plain[:, 1], atol=0.02)
+
+
+# --- the frame
+
+
+LOOKS = {
+    "shadow": gv.Lighting(lights=(gv.DirectionalLight((1, -2, 0.5), angle=6),)),
+    "occlusion": gv.Lighting(occlusion=1, reach=0.3, frame="box"),
+    "indirect": gv.Lighting(
+        lights=(gv.PointLight((10.0, 60.0, 60.0), radius=3), gv.Headlight((0.2, 0.2, 0.2))),
+        occlusion=0.5,
+        indirect=1,
+        shadow_cones=2,
+    ),
+}
+SOLID = gv.TransferFunction.from_points([(0.2, 0), (0.6, 0.8)], [(0, 1, 0.3, 0.1), (1, 1, 0.9, 0)])
+SURFACES = {
+    "isosurface": gv.Isosurface(0.5, (0.9, 0.6, 0.4)),
+    "distance": gv.DistanceField((0.9, 0.6, 0.4), offset=0.5),
+    "lit": gv.Lit(SOLID, ambient=0.4),
+}
+
+
+def assert_same(one: gv.Picture, other: gv.Picture) -> None:
+    for name in ("color", "alpha", "depth", "normal", "samples", "missed"):
+        assert torch.equal(getattr(one, name), getattr(other, name)), name
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("look", LOOKS)
+@pytest.mark.parametrize("surface", SURFACES)
+def test_compiled_equals_reference(blobs, compiled, surface, look, dtype):
+    tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
+    camera = gv.Camera.orbit(20, 30, 1.2, width=9, height=8)
+    given = {"lighting": LOOKS[look], "dtype": dtype}
+    one, two = (
+        gv.render(tree, camera, SURFACES[surface], backend=backend, **given)
+        for backend in (compiled, "reference")
+    )
+    assert one.color.dtype == dtype and one.color.max() > 0.1
+    assert torch.equal(one.samples, two.samples)
+    torch.testing.assert_close(one.color, two.color, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("look", LOOKS)
+@pytest.mark.parametrize("surface", SURFACES)
+def test_a_streamed_picture_is_the_resident_one(blobs, compiled, surface, look):
+    device = DEVICES[compiled]
+    tree = gv.N3Tree.from_volume(blobs, 4, device=device)
+    camera = gv.Camera.orbit(20, 30, 1.2, width=24, height=20)
+    given = {"lighting": LOOKS[look]}
+    whole = gv.render(tree, camera, SURFACES[surface], **given)
+    with gv.Engine(gv.VolumeProducer(blobs), brick_size=4, device=device) as engine:
+        streamed = engine.render(camera, SURFACES[surface], **given)
+        assert streamed.stats.converged
+        assert_same(streamed, whole)
+        again, stats = engine.frame(camera, SURFACES[surface], **given)
+        assert stats.converged and not stats.misses
+        assert_same(again, whole)
+
+
+def test_what_is_seen_only_in_a_shadow_is_streamed_at_its_coarser_level(compiled):
+    """A ball outside the picture, whose shadow falls into it."""
+    x, y, z = places(128)
+    body = np.sqrt((x - 40) ** 2 + (y - 96) ** 2 + (z - 40) ** 2) - 12
+    value = np.clip(0.5 - np.minimum(body, y - FLOOR) / 2, 0, 1).astype(np.float32)
+    camera = gv.Camera.look_at((48, 40, 48), (40, 8, 40), (1, 0, 0), fov=40, width=40, height=40)
+    shader = gv.Isosurface(0.5, (1, 1, 1), **MATT)
+    sun = gv.DirectionalLight((0, -1, 0), angle=8)
+    found, depths = {}, {}
+    for name, lighting in (
+        ("none", gv.Lighting(lights=(sun,), shadows=0)),
+        ("shadow", gv.Lighting(lights=(sun,))),
+    ):
+        producer = gv.VolumeProducer(gv.Volume(value))
+        with gv.Engine(producer, brick_size=8, device=DEVICES[compiled]) as engine:
+            found[name] = engine.render(camera, shader, lighting=lighting)
+            assert found[name].stats.converged
+            tree = engine.plants["scene"].tree
+            depths[name] = brick_depths(tree, np.array([40, 96, 40]), 14)
+    assert found["none"].color.min() > 0.9 and found["shadow"].color.min() < 0.01
+    print("depths of the ball's bricks:", depths, "of", tree.depth)
+    assert max(depths["none"], default=0) <= 1
+    assert 1 < max(depths["shadow"]) < tree.depth
+
+
+def brick_depths(tree: gv.N3Tree, centre: np.ndarray, reach: float) -> set[int]:
+    """Depths of the bricks that lie within reach of a place, those of the root left out."""
+    depths: set[int] = set()
+    n, size = tree.branching, np.array(tree.spacing) * tree.side
+    bricks, place = tree.nodes.brick_tn.cpu(), tree.nodes.loc_t4.cpu()
+    for tile, child in zip(*np.nonzero(bricks.numpy() >= 0), strict=True):
+        x, y, z, depth = place[tile].tolist()
+        if depth < 1:
+            continue
+        corner = np.array([x * n + child % n, y * n + child // n % n, z * n + child // n**2])
+        low = tree.box[0].numpy() + corner * size / n**depth
+        if (low < centre + reach).all() and (low + size / n**depth > centre - reach).all():
+            depths.add(depth)
+    return depths
+
+
+def test_each_camera_of_a_batch_has_its_own_light(blobs, compiled):
+    tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
+    angles, given = (10.0, 80.0, 200.0), {"lighting": LOOKS["indirect"]}
+    batch = gv.Camera.orbit(list(angles), 30, 1.2, width=16, height=12)
+    many = gv.render(tree, batch, SURFACES["isosurface"], **given)
+    for number, angle in enumerate(angles):
+        one = gv.Camera.orbit(angle, 30, 1.2, width=16, height=12)
+        alone = gv.render(tree, one, SURFACES["isosurface"], **given)
+        assert torch.equal(many.color[number], alone.color)
+        assert torch.equal(many.samples[number], alone.samples)
+
+
+def test_rays_that_hit_nothing_go_no_further(blobs, backend):
+    tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[backend])
+    camera = gv.Camera.look_at((0, 0, 500), (0, 300, 500), width=12, height=12)
+    fisheye = gv.Camera.orbit(0, 0, 0.8, 180, 12, 12, "fisheye")
+    for view in (camera, fisheye):
+        plain = gv.render(tree, view, SURFACES["isosurface"], backend=backend)
+        given = {"lighting": LOOKS["indirect"], "background": (0.1, 0.2, 0.3)}
+        lit = gv.render(tree, view, SURFACES["isosurface"], backend=backend, **given)
+        nothing = plain.alpha[..., 0] == 0
+        assert nothing.sum() > 40 and torch.isfinite(lit.color).all()
+        assert torch.equal(lit.samples[nothing], plain.samples[nothing])
+        torch.testing.assert_close(
+            lit.color[nothing].cpu(), torch.tensor([0.1, 0.2, 0.3]).expand(int(nothing.sum()), 3)
+        )
+    assert (lit.samples[~nothing] > plain.samples[~nothing]).any()
+
+
+def test_lights_are_tensors_that_may_be_edited(blobs, compiled):
+    device = DEVICES[compiled]
+    tree = gv.N3Tree.from_volume(blobs, 4, device=device)
+    rays = gv.Camera.orbit(20, 30, 1.2, width=16, height=16).placed(tree.box).rays(device)
+    position, radius = (torch.tensor(n, device=device) for n in ([10.0, 60.0, 60.0], 2.0))
+    tint, ambient = torch.ones(3, device=device), torch.ones(3, device=device)
+    lighting = gv.Lighting(lights=(gv.PointLight(position, tint, radius),), ambient=ambient)
+    shader = SURFACES["isosurface"]
+
+    def look():
+        return trace(tree, rays, shader, gv.RenderOptions(lighting=lighting)).color
+
+    first = look()
+    for tensor, value in ((position, 100.0), (tint, 0.5), (ambient, 0.3), (radius, 20.0)):
+        before = look()
+        tensor.fill_(value)
+        assert (look() - before).abs().max() > 0.01
+    assert (look() - first).abs().max() > 0.1
+
+
+def test_light_goes_with_lens_clip_and_layer(blobs, compiled):
+    tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
+    camera = gv.Camera.orbit(20, 30, 1.2, width=32, height=32)
+    shader, given = SURFACES["isosurface"], {"lighting": LOOKS["shadow"]}
+    sharp = gv.render(tree, camera, shader, **given)
+    lens = gv.ThinLens(aperture=0.0, focus=1.2, frame="box")
+    seen = gv.render(tree, camera, shader, lens=lens, **given)
+    assert (seen.color - sharp.color).abs().median() < 1e-4
+    wide = dataclasses.replace(lens, aperture=0.05)
+    blurred = gv.render(tree, camera, shader, lens=wide, **given)
+    assert (blurred.color - sharp.color).abs().mean() < 0.1
+    far = torch.full((32, 32, 1), 1e3)
+    layer = gv.Layer(torch.ones(32, 32, 3), far)
+    mixed = gv.render(tree, camera, shader, layer=layer, **given)
+    torch.testing.assert_close(mixed.color, sharp.color + (1 - sharp.alpha))
+    clip = gv.Clip(planes=[(0, 0, -1, 24.0)], caps=True)
+    cut = gv.render(tree, camera, shader, clip=clip, **given)
+    assert torch.isfinite(cut.color).all() and cut.color.max() <= 1.5
+
+
+def test_two_trees_have_the_same_light(blobs, compiled):
+    other = gv.Volume(blobs.data, blobs.spacing, (60.0, -3.0, 2.0))
+    scene = {"one": gv.VolumeProducer(blobs), "two": gv.VolumeProducer(other)}
+    camera = gv.Camera.look_at((55, 10, 190), (55, 8, 29), fov=40, width=32, height=16)
+    lighting = gv.Lighting(lights=(gv.DirectionalLight((0.2, -1, -1)),), occlusion=1, reach=20.0)
+    shader, device = SURFACES["isosurface"], DEVICES[compiled]
+    with gv.Engine(scene, device=device) as engine:
+        both = engine.render(camera, shader, lighting=lighting)
+    alone = [
+        gv.render(gv.N3Tree.from_volume(v, device=device), camera, shader, lighting=lighting)
+        for v in (blobs, other)
+    ]
+    torch.testing.assert_close(both.color, alone[0].color + alone[1].color, rtol=0, atol=1e-6)
+
+
+def test_without_lighting_pictures_keep_every_bit(blobs, compiled):
+    tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
+    camera = gv.Camera.orbit(width=12, height=12, distance=1.2)
+    for shader in SURFACES.values():
+        plain = gv.render(tree, camera, shader)
+        gv.render(tree, camera, shader, lighting=LOOKS["indirect"])
+        assert_same(gv.render(tree, camera, shader, lighting=None), plain)
+
+
+@pytest.mark.backend("cuda")
+@pytest.mark.parametrize("look", LOOKS)
+def test_on_cuda_nobody_waits_and_a_graph_is_the_frame(blobs, look):
+    if available()["cuda"]:
+        pytest.skip(f"backend cuda: {available()['cuda']}")
+    camera = gv.Camera.orbit(20, 30, 1.2, width=64, height=64)
+    given = {"lighting": LOOKS[look]}
+    shader = SURFACES["isosurface"]
+    with gv.Engine(gv.VolumeProducer(blobs), brick_size=4, device="cuda") as engine:
+        whole = engine.render(camera, shader, **given)
+        engine.frame(camera, shader, **given)
+        graph = engine.capture(camera, shader, **given)
+        torch.cuda.synchronize()
+        torch.cuda.set_sync_debug_mode("error")
+        try:
+            frame, _ = engine.frame(camera, shader, **given)
+            replayed, _ = graph.replay(camera)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+        assert_same(frame, whole)
+        assert_same(replayed, whole)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: gv.Lighting(lights=(3,)), r"lights\[0\] must be a Headlight.*got int"),
+        (lambda: gv.Lighting(lights=gv.Headlight()), "must be a sequence of lights, got Headlight"),
+        (lambda: gv.Lighting(shadows=1.5), "shadows must be finite and >= 0 and <= 1"),
+        (lambda: gv.Lighting(shadow_cones=0), "shadow_cones must be an int >= 1"),
+        (lambda: gv.Lighting(occlusion=math.nan), "occlusion must be finite"),
+        (lambda: gv.Lighting(indirect=-1), "indirect must be finite and >= 0"),
+        (lambda: gv.Lighting(reach=0), "reach must be finite and > 0"),
+        (lambda: gv.Lighting(ambient=(1, math.nan, 0)), "ambient must be finite"),
+        (lambda: gv.Lighting(frame="moon"), "frame must be 'world' or 'box'"),
+        (lambda: gv.DirectionalLight((0, -1, 0), angle=-1), "angle must be finite and >= 0"),
+        (lambda: gv.DirectionalLight((0, -1, 0), angle=170), "angle must be .* <= 120"),
+        (lambda: gv.PointLight((0, 0, 0), radius=math.nan), "radius must be finite"),
+        (lambda: gv.PointLight((0, 0, 0), (1, -1, 1)), "color must be finite and >= 0"),
+        (lambda: gv.RenderOptions(lighting=1), "lighting must be a Lighting, got int"),
+    ],
+)
+def test_bad_light_has_one_clear_message(make, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+def test_a_shader_without_normals_is_one_clear_error(blobs):
+    tree, camera = gv.N3Tree.from_volume(blobs), gv.Camera.orbit(width=4, height=4)
+    module = gv.TransferModule(SOLID, 1.0)
+    for shader, kind in (
+        (SOLID, "TransferFunction"),
+        (gv.PreIntegrated(SOLID), "PreIntegrated"),
+        (gv.Projection("maximum", SOLID), "Projection"),
+        (gv.Features(SOLID, "value"), "Features"),
+        (gv.ModuleShader(module), "ModuleShader"),
+    ):
+        with pytest.raises(ValueError, match=f"lighting needs normals.* got {kind}$") as caught:
+            gv.render(tree, camera, shader, lighting=gv.Lighting())
+        assert "\n" not in str(caught.value)
+    colored = gv.Isosurface(0.5, SOLID, color_channel="value")
+    gv.render(tree, camera, colored, lighting=gv.Lighting(occlusion=1))
+    with pytest.raises(ValueError, match="indirect light needs a surface of one colour"):
+        gv.render(tree, camera, colored, lighting=gv.Lighting(indirect=1))
