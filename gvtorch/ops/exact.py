@@ -8,6 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+_TINY = 1.1754944e-38  # smallest normal float32
+
 
 def clamp(value: Tensor, low: float | Tensor, high: float | Tensor) -> Tensor:
     """Clamps; NaN ends at the lower bound."""
@@ -82,3 +84,33 @@ def exp2_exact(value: Tensor) -> Tensor:
         series = series * f + coefficient
     power = ((whole.to(torch.int32) + 127) << 23).view(torch.float32)
     return torch.where(tiny, 0.0, series * power)
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """(r,) products of (r, 3), added from x to z."""
+    product = a * b
+    return product[:, 0] + product[:, 1] + product[:, 2]
+
+
+def unit(v: Tensor) -> Tensor:
+    """(r, 3) vectors of length 1, or 0 where there is no direction."""
+    x, y, z = larger(v, -v).unbind(1)
+    most = larger(larger(x, y), z)
+    known = (most > 0) & (most < torch.inf)
+    scaled = v / torch.where(known, most, 1.0)[:, None]
+    length = sqrt_exact(dot(scaled, scaled))
+    return torch.where(known[:, None], scaled / length[:, None], 0.0)
+
+
+def power(x: Tensor, exponent: Tensor) -> Tensor:
+    """x^exponent for x in [0, 1]."""
+    known = x > _TINY
+    return torch.where(known, exp2_exact(log2_exact(torch.where(known, x, 1.0)) * exponent), 0.0)
+
+
+def stretch(alpha: Tensor, lengths: Tensor) -> Tensor:
+    """Alpha of a length, from that of length 1."""
+    kept = 1 - alpha
+    solid = ~(kept > _TINY)
+    part = 1 - exp2_exact(log2_exact(torch.where(solid, 0.5, kept)) * lengths)
+    return torch.where(solid, 1.0, part)

@@ -9,90 +9,18 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from .exact import clamp, divide, exp2_exact, larger, log2_exact, sqrt_exact
+from .exact import clamp, divide, dot, larger, power, sqrt_exact, stretch, unit
 from .reference import Accumulator, Piece, Probe, Transfer, walk
 from .reference_rays import INF, Beam, Intervals
+from .reference_shadows import Shadows
 from .reference_tree import Bricks, Tree
 
-_TINY = 1.1754944e-38  # smallest normal float32
 _BISECTIONS = 4
 (LIT, PRE_INTEGRATED, STORED_COLOR, ISOSURFACE, PROJECTION, FEATURES) = range(6)
 (SHADOWED_LIT, SHADOWED_COLOR) = range(6, 8)
 COLORS = (STORED_COLOR, SHADOWED_COLOR)
 (HEADLIGHT, DIRECTIONAL, POINT) = range(3)
 (MAXIMUM, MINIMUM, MEAN) = range(3)
-
-
-def dot(a: Tensor, b: Tensor) -> Tensor:
-    """(r,) products of (r, 3), added from x to z."""
-    product = a * b
-    return product[:, 0] + product[:, 1] + product[:, 2]
-
-
-def unit(v: Tensor) -> Tensor:
-    """(r, 3) vectors of length 1, or 0 where there is no direction."""
-    x, y, z = larger(v, -v).unbind(1)
-    most = larger(larger(x, y), z)
-    known = (most > 0) & (most < INF)
-    scaled = v / torch.where(known, most, 1.0)[:, None]
-    length = sqrt_exact(dot(scaled, scaled))
-    return torch.where(known[:, None], scaled / length[:, None], 0.0)
-
-
-def power(x: Tensor, exponent: Tensor) -> Tensor:
-    """x^exponent for x in [0, 1]."""
-    known = x > _TINY
-    return torch.where(known, exp2_exact(log2_exact(torch.where(known, x, 1.0)) * exponent), 0.0)
-
-
-@dataclass
-class Shadows:
-    """What cones from samples to the light go through, and what they cost."""
-
-    beam: Beam  # the eye's
-    tree: Tree
-    step: float
-    levels: int  # lengths of intervals
-    stop_clear: Tensor
-    cone_scale: Tensor
-    samples: Tensor  # (r,) int32
-    missed: Tensor  # (r,) bool
-
-    def share(
-        self,
-        shade: Shade,
-        t: Tensor,
-        way: Tensor,
-        length: Tensor,
-        growth: Tensor,
-        where: Tensor,
-    ) -> Tensor:
-        """(r,) share of a light, `length` (r,) away, that comes to places t (r,), where `where` is
-        true. A cone is as wide there as the eye's; its first interval is left out, so that a place
-        does not stand in its own shadow.
-        """
-        which = where.nonzero()[:, 0]
-        t, way = t[which], way[which]
-        eye = self.beam
-        beam = Beam(
-            origin=eye.origin[which] + t[:, None] * eye.direction[which],
-            direction=way / shade.cube,
-            high=eye.high,
-            cone_near=eye.cone_near[which] + eye.cone_growth[which] * t,
-            cone_growth=growth[which] * self.cone_scale,
-            first=torch.zeros_like(t),
-            last=length[which],
-            moved=torch.zeros_like(t),
-        )
-        beam.clip()
-        at = Intervals.begin(beam, self.step, self.levels)
-        at.next(torch.ones_like(where[which]))
-        veil = Veil(shade, way, Accumulator.begin(beam))
-        step = torch.tensor(self.step, dtype=t.dtype).to(t)
-        samples, visit = walk(beam, at, self.tree, shade.channel, veil, step, self.stop_clear)
-        self.samples[which] += samples
-        self.missed[which] |= visit.missed
-        return torch.ones_like(length).index_put((which,), veil.sum.clear)
 
 
 @dataclass
@@ -225,29 +153,6 @@ class Shade:
         return base * (ambient + diffuse[:, None] * light) + specular[:, None] * light
 
 
-@dataclass
-class Veil:
-    """What a shader takes from the light that goes through: the shader of rays to a light."""
-
-    shade: Shade
-    along: Tensor  # (r, 3) world
-    sum: Accumulator
-    sees_empty: bool = False
-
-    def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        """See `reference.Shader`."""
-        return self.shade.hides(which, low, high)
-
-    def same(self, bricks: Bricks, fine: Tensor, coarse: Tensor) -> Tensor:
-        """See `reference.Shader`."""
-        return self.shade.equal(fine, coarse)
-
-    def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
-        """See `reference.Shader`."""
-        clear = self.sum.clear * (1 - self.shade.alpha(piece, probe, self.along))
-        self.sum.clear = torch.where(where, clear, self.sum.clear)
-
-
 class Sided(Bricks):
     """The opacity in a channel that holds red, green, blue and opacity for each of six directions,
     or once.
@@ -274,7 +179,7 @@ class StoredColor(Shade):
         numbers = [self.seen(probe, i, piece.middle, self.along) for i in range(3)]
         color = torch.stack(numbers, 1) * scale
         divisor = torch.where((premultiplied > 0) & seen, opacity, 1.0)
-        alpha = _stretch(opacity, piece.length / reference)
+        alpha = stretch(opacity, piece.length / reference)
         rgba = torch.cat((color / divisor[:, None], alpha[:, None]), 1)
         if lit > 0:
             self.lit(rgba, piece, probe, seen)
@@ -283,7 +188,7 @@ class StoredColor(Shade):
 
     def alpha(self, piece: Piece, probe: Probe, along: Tensor) -> Tensor:
         """See `Shade`."""
-        return _stretch(self.opacity(piece, probe, along), piece.length / self.parameter[13])
+        return stretch(self.opacity(piece, probe, along), piece.length / self.parameter[13])
 
     def opacity(self, piece: Piece, probe: Probe, along: Tensor) -> Tensor:
         """(r,) per reference length."""
@@ -583,19 +488,11 @@ def _below(value: Tensor) -> Tensor:
     return value - larger(value, -value) * 2.0**-20
 
 
-def _stretch(alpha: Tensor, lengths: Tensor) -> Tensor:
-    """Alpha of a length, from that of length 1."""
-    kept = 1 - alpha
-    solid = ~(kept > _TINY)
-    part = 1 - exp2_exact(log2_exact(torch.where(solid, 0.5, kept)) * lengths)
-    return torch.where(solid, 1.0, part)
-
-
 def _part(rows: Tensor, lengths: Tensor) -> Tensor:
     """(r, 4) premultiplied colour and alpha of the same values over another length."""
     whole = rows[:, 3]
     changed = (whole > 0) & (lengths != 1)
-    alpha = torch.where(lengths > 0, _stretch(whole, lengths), 0.0)
+    alpha = torch.where(lengths > 0, stretch(whole, lengths), 0.0)
     scale = alpha / torch.where(changed, whole, 1.0)
     scaled = torch.cat((rows[:, :3] * scale[:, None], alpha[:, None]), 1)
     return torch.where(changed[:, None], scaled, rows)

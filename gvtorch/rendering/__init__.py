@@ -19,15 +19,14 @@ from .progressive import Progressive
 from .renderer import RenderOptions, render
 from .shader import TransferFunction
 from .shaders import (
-    DistanceField,
     Features,
-    Isosurface,
     Lit,
     PreIntegrated,
     Projection,
     Shader,
     StoredColor,
 )
+from .surfaces import DistanceField, Isosurface
 from .tiles import render_tiles
 
 __all__ = [

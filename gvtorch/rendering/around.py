@@ -13,7 +13,8 @@ from .lens import ThinLens, ThroughLens
 from .lighting import Lighted
 from .module_shader import ModuleTracer
 from .pieces import Trace
-from .shaders import Isosurface, LitShader, Shader
+from .shaders import LitShader, Shader
+from .surfaces import Isosurface
 
 if TYPE_CHECKING:
     from .renderer import RenderOptions, Tracer

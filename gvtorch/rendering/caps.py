@@ -11,7 +11,8 @@ from ..frame import Hits, Rays
 from .lights import pack
 from .pieces import Trace
 from .shader import TransferFunction
-from .shaders import Isosurface, Projection
+from .shaders import Projection
+from .surfaces import Isosurface
 
 _WHITE = TransferFunction.from_points([(0, 1)])  # kept: its table is made once
 

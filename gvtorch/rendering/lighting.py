@@ -26,6 +26,7 @@ from ..frame import Hits, Rays
 from .camera import Frame
 from .lens import ThinLens
 from .lights import (
+    CONE_OF_DISC,
     DirectionalLight,
     Headlight,
     Light,
@@ -38,10 +39,6 @@ from .lights import (
 )
 from .pieces import Trace, behind, join
 
-#: Width of a cone over that of the disc of light it stands for. What it meets reaches as far again
-#: as its voxels are wide, and a cone that grazes takes more than its share: shadows agree best with
-#: this.
-_CONE_OF_DISC = 0.35
 #: Where secondary rays begin, in voxels: those to lights so far off the surface; those all around
 #: closer, so that they stand in clefts, but begin only after a way.
 _OFF, _CLOSE, _WAY = 1.5, 0.75, 1.5
@@ -234,7 +231,7 @@ class Lighted:
         if isinstance(light, Headlight) or not self._lighting.shadows:
             return clear
         size = _size(light, distance)
-        growth = 2 * _CONE_OF_DISC / math.sqrt(cones) * size
+        growth = 2 * CONE_OF_DISC / math.sqrt(cones) * size
         right, up = _beside(beam)
         start = torch.zeros_like(distance)
         end = torch.where(facing & places.seen, distance, start)

@@ -284,9 +284,8 @@ struct FusedShaders {
     STD_TORCH_CHECK(shader >= 0 && shader < kShaderKinds, "gvtorch: shader is unknown");
     const auto kind = static_cast<ShaderKind>(shader);
     STD_TORCH_CHECK(kind != ShaderKind::kFeatures || args.other_channels > 0, "gvtorch: other_bzyxc is missing");
-    STD_TORCH_CHECK(
-        !is_stored_color(kind) || ((args.channels == 4 || args.channels == 4 * kDirections) && args.component == 3),
-        "gvtorch: bricks_bzyxc must hold red, green, blue and opacity");
+    const bool colored = (args.channels == 4 || args.channels == 4 * kDirections) && args.component == 3;
+    STD_TORCH_CHECK(!is_stored_color(kind) || colored, "gvtorch: bricks_bzyxc must hold red, green, blue and opacity");
     const int32_t given = kind == ShaderKind::kFeatures ? args.other_channels : kind == ShaderKind::kProjection ? 1 : 0;
     STD_TORCH_CHECK(args.features == given, "gvtorch: features is not what the shader gives");
     STD_TORCH_CHECK(args.parameters == kParameters, "gvtorch: parameter_54 must hold 20 elements, got ",
