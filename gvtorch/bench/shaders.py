@@ -206,6 +206,8 @@ def _measure(
         shader = look.shader(scene)
         needed = set(shader.channels) if isinstance(shader, Shader) else set()
         slow = isinstance(shader, ModuleShader)
+        if isinstance(shader, ModuleShader) and isinstance(shader.module, torch.nn.Module):
+            shader.module.to(record.settings.device)
         if not needed <= set(channels) or (slow and len(channels) == 1):
             continue
         record.settings.tell(f"{case}: {look.name}")

@@ -84,7 +84,7 @@ def commands(output: Path) -> dict[Path, list[list[str]]]:
         archs = os.environ.get("GVTORCH_CUDA_ARCHS", ARCHS).split(";")
         codes = compilers.machine_codes(archs)
         codes.append(f"-gencode=arch=compute_{archs[-1]},code=compute_{archs[-1]}")
-        call = [nvcc, *compilers.NVCC_FLAGS, "--threads=2", *codes, *include]
+        call = [nvcc, *compilers.NVCC_FLAGS, "--threads=0", *codes, *include]
         call += [str(source / "cuda.cu"), "-Xlinker=--no-as-needed", *link]
         calls[output / "libgvtorch_cuda.so"] = [call]
     return calls
