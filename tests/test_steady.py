@@ -144,6 +144,7 @@ def test_a_stalled_producer_stalls_no_frame(slow, blobs):
         _, stats = engine.frame(camera(8), HAZE)
         assert sum(stats.produced.values()) > 0
         producer.hold = False
+        producer.go()  # what was asked for meanwhile
         assert engine.render(camera(8), HAZE).stats.converged
 
 
