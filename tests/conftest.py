@@ -21,6 +21,7 @@ SHARED = ROOT.parent / "shared" / "data"
 DEVICES = {"reference": "cpu", "cpp": "cpu", "cuda": "cuda"}
 _ran: Counter[str] = Counter()
 _absent: set[str] = set()
+_ABSENT = "shared test data is not here: "
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -51,8 +52,7 @@ def shared(path: str) -> Path:
     """A file of the shared test data, or a skip that the summary tells of."""
     file = SHARED / path
     if not file.exists():
-        _absent.add(path)
-        pytest.skip(f"shared test data is not here: {path}")
+        pytest.skip(_ABSENT + path)
     return file
 
 
@@ -60,7 +60,8 @@ def shared(path: str) -> Path:
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Where compiled shaders are kept: each is compiled once for all tests, and none stays."""
     with pytest.MonkeyPatch.context() as patch:
-        folder = tmp_path_factory.mktemp("cache")
+        base = tmp_path_factory.getbasetemp()
+        folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
         patch.setenv("GVTORCH_CACHE", str(folder))
         yield folder
 
@@ -86,15 +87,20 @@ def blobs() -> gv.Volume:
     return gv.Volume(torch.from_numpy(value), spacing=(1.0, 0.8, 1.5), origin=(5.0, -3.0, 2.0))
 
 
-@pytest.hookimpl(hookwrapper=True)
-def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]):
-    outcome = yield
-    report = outcome.get_result()
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Notes the backends of a test, which its report takes along, from whatever process."""
+    values = getattr(item, "callspec", None)
+    names = {v for v in (values.params.values() if values else ()) if v in tuple(DEVICES)}
+    names |= {mark.args[0] for mark in item.iter_markers("backend")}
+    item.user_properties += [("backend", name) for name in sorted(names or {"no backend"})]
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    noted = [value for name, value in report.user_properties if name == "backend"]
+    if report.skipped and isinstance(report.longrepr, tuple) and _ABSENT in report.longrepr[2]:
+        _absent.add(report.longrepr[2].partition(_ABSENT)[2])
     if report.when == "call" and report.passed:
-        values = getattr(item, "callspec", None)
-        names = {v for v in (values.params.values() if values else ()) if v in tuple(DEVICES)}
-        names |= {mark.args[0] for mark in item.iter_markers("backend")}
-        _ran.update(names or {"no backend"})
+        _ran.update(noted)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
@@ -114,6 +120,8 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
     so has one whose tests were skipped because a format's, the video's or the cluster's library is
     missing.
     """
+    if hasattr(session.config, "workerinput"):
+        return  # one of several processes
     libraries = ("nibabel", "nrrd", "tifffile", "imagecodecs", "astropy", "OpenEXR")
     libraries += ("av", "distributed", "zarr", "yaozarrs", "ome_zarr_models")
     _ran["io"] = int(all(importlib.util.find_spec(name) for name in libraries))
