@@ -1,4 +1,6 @@
-"""A region of interest: a scan, cut open by a box, without and with caps on the cut."""
+"""A region of interest: a scan cut in half. Surfaces are hollow, unless caps fill the
+cut; coloured by the scan itself, they show what a slice does.
+"""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,18 +11,18 @@ import tyro
 import gvtorch as gv
 
 SCAN = Path(__file__).parent / "data" / "stent_256x128x128_int16.npz"
-EYE, TARGET, UP = (-230.0, -190.0, 300.0), (63.5, 63.5, 120.0), (0.0, 0.0, 1.0)
-OPACITY = [(0, 0.5), (200, 0.9)]  # of everything, air included: a block
+EYE, TARGET, UP = (-230.0, -170.0, 210.0), (64.0, 62.0, 138.0), (0.0, 0.0, 1.0)
+LEVEL = 160.0  # bone, and blood with contrast agent
+CUT = (1.0, 0.0, 0.0, -72.0)  # keeps where x >= 72
 COLOR = [
-    *((0, 0.16, 0.1, 0.08), (60, 0.5, 0.3, 0.2), (130, 0.75, 0.3, 0.2)),
-    *((220, 0.95, 0.75, 0.45), (400, 1, 0.95, 0.85), (1000, 0.55, 0.75, 1)),
+    *((160, 0.85, 0.6, 0.42), (200, 0.9, 0.75, 0.6), (320, 0.5, 0.15, 0.08)),
+    *((600, 1.0, 0.8, 0.5), (1200, 0.6, 0.75, 1.0)),
 ]
-CUT = ((-1, -1, 130), (62, 62, 260))  # low and high corner, world units
 
 
 @dataclass
 class Settings:
-    """Renders the bundled stent: whole, cut, and cut with caps."""
+    """Renders the bundled stent: whole, cut, and with caps."""
 
     output: Path = Path("clip.png")
     size: int = 320
@@ -30,10 +32,12 @@ class Settings:
 def main(settings: Settings) -> None:
     """Renders three pictures, side by side."""
     tree = gv.N3Tree.from_volume(gv.read_volume(SCAN), device=settings.device)
-    shader = gv.TransferFunction.from_points(OPACITY, COLOR)
-    camera = gv.Camera.look_at(EYE, TARGET, UP, 32, settings.size, settings.size)
-    clips = [None, gv.Clip(without=[CUT]), gv.Clip(without=[CUT], caps=True, cap_light=0.4)]
-    pictures = [gv.render(tree, camera, shader, clip=clip) for clip in clips]
+    colors = gv.TransferFunction.from_points([(0, 1)], COLOR)
+    shader = gv.Isosurface(LEVEL, colors, color_channel="value")
+    camera = gv.Camera.look_at(EYE, TARGET, UP, 27, settings.size, settings.size)
+    clips = [None, gv.Clip(planes=[CUT]), gv.Clip(planes=[CUT], caps=True, cap_light=0.3)]
+    sky = (0.6, 0.66, 0.75)
+    pictures = [gv.render(tree, camera, shader, clip=clip, background=sky) for clip in clips]
     for picture in pictures:
         print(f"{picture.stats.samples} samples of {picture.stats.bricks_used} bricks")
     names = ("color", "alpha", "depth", "samples")

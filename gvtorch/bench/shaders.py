@@ -49,6 +49,7 @@ class Look:
     options: Mapping[str, Any] = field(default_factory=dict)  # of `RenderOptions`
     beside: str = "plain"
     twin: bool = False  # both must draw the same picture
+    slow: bool = False  # left out of scenes with but one channel
 
 
 def _projection(which: Literal["maximum", "minimum", "mean"]) -> Callable[[Scene], AnyShader]:
@@ -71,14 +72,18 @@ def _cones(name: str, *, occlusion: float = 0.0, indirect: float = 0.0) -> Look:
 
 
 #: What is measured, each behind the look that it stands beside. Left out where a scene has not the
-#: channels that a shader names; modules, which take long, where it has but one.
+#: channels that a shader names.
 LOOKS = (
     Look(name="plain", shader=lambda s: s.shader),
     Look(name="lit", shader=lambda s: Lit(s.shader)),
     Look(name="lit by stored normals", shader=lambda s: Lit(s.shader, normals="normal")),
     Look(name="stored colour", shader=lambda _: StoredColor("rgba")),
     Look(name="stored colour, lit", shader=lambda _: StoredColor("rgba", lit=True)),
-    Look(name="lit, shadows per sample", shader=lambda s: Lit(s.shader, light=SUN, shadows=True)),
+    Look(
+        name="lit, shadows per sample",
+        shader=lambda s: Lit(s.shader, light=SUN, shadows=True),
+        slow=True,
+    ),
     Look(name="isosurface", shader=lambda s: Isosurface(s.surface)),
     _cones("shadow"),
     _cones("shadow, occlusion", occlusion=1.0),
@@ -89,7 +94,7 @@ LOOKS = (
     Look(name="mean", shader=_projection("mean")),
     Look(name="3 features", shader=lambda s: Features(s.shader, "normal")),
     Look(name=f"{_WIDE} features", shader=lambda s: Features(s.shader, "numbers")),
-    Look(name="module", shader=_module, twin=True),
+    Look(name="module", shader=_module, twin=True, slow=True),
     Look(name="plain, step 1", shader=lambda s: s.shader, options={"step": 1.0}),
     Look(
         name="pre-integrated, step 1",
@@ -205,11 +210,11 @@ def _measure(
     for look in _wanted(record, case):
         shader = look.shader(scene)
         needed = set(shader.channels) if isinstance(shader, Shader) else set()
-        slow = isinstance(shader, ModuleShader)
-        if isinstance(shader, ModuleShader) and isinstance(shader.module, torch.nn.Module):
-            shader.module.to(record.settings.device)
-        if not needed <= set(channels) or (slow and len(channels) == 1):
+        if not needed <= set(channels) or (look.slow and len(channels) == 1):
             continue
+        module = shader.module if isinstance(shader, ModuleShader) else None
+        if isinstance(module, torch.nn.Module):
+            module.to(record.settings.device)
         record.settings.tell(f"{case}: {look.name}")
         options = {"step": scene.step, **look.options}
         if prepare is not None:
@@ -219,7 +224,7 @@ def _measure(
         medians[look.name], pictures[look.name] = timing.median, rgba(shown)
         figures = {"beside": look.beside, "times": timing.median / medians[look.beside]}
         figures |= rates(shown, timing)
-        figures["op_ms"] = None if slow else op_milliseconds(run, record.settings)
+        figures["op_ms"] = None if module else op_milliseconds(run, record.settings)
         other = others.get(look.name, pictures[look.beside] if look.twin else None)
         if other is not None:
             figures["max_difference"] = difference(pictures[look.name], other)["max_difference"]
