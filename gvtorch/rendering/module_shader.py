@@ -22,6 +22,7 @@ from ..pool import N3Tree
 from .shader import TransferFunction
 
 _LIMIT = 64  # samples of a ray in one part
+_SAMPLES = {"cpu": 1 << 20, "cuda": 1 << 24}  # shaded at once
 _WALK = (
     *("place_33", "child_tn", "brick_tn", "request_tn", "stamp_t", "bricks_bzyxc"),
     *("constant_tnc", "range_tn2c", "stamp_b", "domain_2", "opaque_m", "frame_1", "branching"),
@@ -48,7 +49,8 @@ class ModuleShader:
         module: The module.
         channels: Names of the channels it reads; None: that of `RenderOptions.channel`.
         hidden_by: A transfer function: what it shows nothing of is neither sampled nor requested.
-        samples: About how many samples are shaded at once.
+        samples: About how many samples are shaded at once; None: 2^20 on the CPU and 2^24 on CUDA,
+            where each batch waits for the device.
     """
 
     def __init__(
@@ -57,7 +59,7 @@ class ModuleShader:
         channels: Sequence[str] | None = None,
         *,
         hidden_by: TransferFunction | None = None,
-        samples: int = 1 << 20,
+        samples: int | None = None,
     ) -> None:
         """See the class.
 
@@ -73,7 +75,9 @@ class ModuleShader:
             raise ValueError(f"ModuleShader: hidden_by must be a TransferFunction, got {kind}")
         self.module, self.hidden_by = module, hidden_by
         self.channels = None if channels is None else tuple(channels)
-        self.samples = check.whole("ModuleShader", "samples", samples, low=_LIMIT)
+        if samples is not None:
+            check.whole("ModuleShader", "samples", samples, low=_LIMIT)
+        self.samples = samples
 
     @property
     def walls(self) -> TransferFunction:
@@ -336,7 +340,8 @@ class ModuleTracer:
 
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays in world units, a block at a time."""
-        count, size = len(rays.origin), self.shader.samples // _LIMIT
+        samples = self.shader.samples or _SAMPLES[rays.origin.device.type]
+        count, size = len(rays.origin), samples // _LIMIT
         if count <= size:
             return self._block(rays)
         parts = [self._block(rays[at : at + size]) for at in range(0, count, size)]
