@@ -566,7 +566,10 @@ def test_report_tells_stages_rates_and_occupancy(blobs):
         (lambda v: engine(v).frame(camera(), VESSELS, channel="b"), "has no channel 'b'; it has"),
         (lambda v: engine(v, cache="1 MB"), "unknown option 'cache'; known: node_pool"),
         (lambda v: engine(v).frame(None, VESSELS), "camera must be a Camera, got NoneType"),
-        (lambda v: engine(v).frame(camera(), None), "must be a TransferFunction, got NoneType"),
+        (
+            lambda v: engine(v).frame(camera(), None),
+            "must be a TransferFunction or another shader, got None",
+        ),
         (lambda v: engine(v).frame(camera(), VESSELS, lod="x"), "lod must be 'auto'"),
         (lambda v: engine(v).render(camera(), VESSELS, "fast"), "mode must be 'interactive'"),
         (lambda v: engine(v).render(camera(), VESSELS, max_frames=0), "max_frames must be"),

@@ -318,7 +318,9 @@ def test_wrong_arguments_are_named(blobs):
     shader = gv.TransferFunction.preset("gray", 0, 1)
     with pytest.raises(ValueError, match="unknown option 'stepp'"):
         gv.render(tree, camera, shader, stepp=1)
-    with pytest.raises(ValueError, match="shader must be a TransferFunction, got str"):
+    with pytest.raises(
+        ValueError, match="shader must be a TransferFunction or another shader, got str"
+    ):
         gv.render(tree, camera, "gray")
     with pytest.raises(ValueError, match="unknown channel 'density'; the tree has value"):
         gv.render(tree, camera, shader, channel="density")

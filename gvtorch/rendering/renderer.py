@@ -161,8 +161,11 @@ def check_type(where: str, name: str, value: Any, kind: type) -> None:
 
 def check_shader(where: str, name: str, value: Any) -> None:
     """Raises ValueError unless a user's argument is a transfer function or another fused shader."""
-    if not isinstance(value, Shader):
-        check_type(where, name, value, TransferFunction)
+    if not isinstance(value, (Shader, TransferFunction)):
+        kind = type(value).__name__
+        raise ValueError(
+            f"{where}: {name} must be a TransferFunction or another shader, got {kind}"
+        )
 
 
 def develop(
