@@ -202,6 +202,19 @@ def test_strips_make_the_whole_picture(blobs, tmp_path, model, background):
 
 
 @pytest.mark.backend("cpp")
+@pytest.mark.parametrize("alpha", [None, 0.5])
+def test_strips_take_their_part_of_a_layer(blobs, tmp_path, alpha):
+    tree, camera = gv.N3Tree.from_volume(blobs), gv.Camera.orbit(30, 20, 0.9, None, 40, 50)
+    depth = torch.rand(50, 40, 1) * 40
+    opacity = None if alpha is None else torch.full_like(depth, alpha)
+    layer = gv.Layer(torch.rand(50, 40, 3), depth, opacity)
+    render = partial(gv.render, tree, shader=HAZE, layer=layer)
+    gv.render_tiles(render, camera, tmp_path / "a.npy", memory=40 * 400 * 9)
+    array = np.load(tmp_path / "a.npy")
+    np.testing.assert_allclose(array[..., :3], render(camera).color, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.backend("cpp")
 def test_an_engine_streams_strip_by_strip(blobs, tmp_path):
     camera = gv.Camera.orbit(distance=1.2, width=40, height=50)
     whole = gv.render(gv.N3Tree.from_volume(blobs, 4), camera, HAZE)

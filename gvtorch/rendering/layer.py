@@ -8,6 +8,7 @@ Source: Porter, Duff, "Compositing digital images", 1984 (over, premultiplied).
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -76,14 +77,27 @@ class Layer:
         if self.alpha is not None and not bool(((self.alpha >= 0) & (self.alpha <= 1)).all()):
             raise ValueError("Layer: alpha must be finite and >= 0 and <= 1")
 
-    def check_pixels(self, where: str, camera: Camera) -> None:
-        """Raises ValueError unless the layer has the pixels of the camera's pictures."""
+    def cut(self, where: str, camera: Camera) -> Layer:
+        """Returns the layer of the camera's pixels: where the camera takes a strip of rows, that
+        strip of the layer, whose tensors are views.
+
+        Raises:
+            ValueError: The layer has not the pixels of the camera's whole pictures.
+        """
+        top, rows = camera.window
         count = (len(camera),) if camera.batched else ()
-        wanted, got = (*count, camera.height, camera.width), tuple(self.color.shape[:-1])
+        wanted, got = (*count, rows, camera.width), tuple(self.color.shape[:-1])
+        if got == (*count, camera.height, camera.width):
+            return self
         if got != wanted:
             raise ValueError(
                 f"{where}: layer must have the camera's {wanted} pixels (rows, columns), got {got}"
             )
+        strip = copy.copy(self)  # checked already
+        for name, part in vars(self).items():
+            if part is not None:
+                object.__setattr__(strip, name, part[..., top : top + camera.height, :, :])
+        return strip
 
     def check_device(self, where: str, device: torch.device) -> None:
         """Raises ValueError unless all tensors lie on the device."""

@@ -145,12 +145,11 @@ def render_options(where: str, camera: Camera, options: dict[str, Any]) -> Rende
             f"known: {', '.join(RenderOptions.__dataclass_fields__)}"
         )
     chosen = RenderOptions(**options)
-    if chosen.layer is not None:
-        chosen.layer.check_pixels(where, camera)
     background = checked_background(where, chosen.background)
     if isinstance(background, Background):
         background.check(where, camera)
-    return replace(chosen, background=background)
+    layer = chosen.layer and chosen.layer.cut(where, camera)
+    return replace(chosen, background=background, layer=layer)
 
 
 def check_type(where: str, name: str, value: Any, kind: type) -> None:
