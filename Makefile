@@ -29,7 +29,7 @@ demo: $(VENV)/ready
 	@echo "The picture: $(CURDIR)/out/demo.png"
 
 test: $(VENV)/ready
-	GVTORCH_REQUIRE=reference,cpp,io $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal $(ARGS)
+	OMP_NUM_THREADS=1 GVTORCH_REQUIRE=reference,cpp,io $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal $(ARGS)
 
 lint: $(VENV)/ready
 	$(BIN)/ruff check .

@@ -1,4 +1,8 @@
-"""Depth of field: a lens of three apertures, beside 256 pinholes all over the widest."""
+"""Depth of field: a lens of three apertures, beside 256 pinholes all over the widest.
+
+Voxels hold the colour and opacity that the transfer function gives them: what a wide cone reads is
+then the mean of what is seen. The mean of densities would be another thing.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -27,8 +31,15 @@ class Settings:
     device: str = "cpu"
 
 
+def seen(volume: gv.Volume, function: gv.TransferFunction) -> gv.Volume:
+    """Colour, premultiplied, and opacity of every voxel."""
+    rgba = torch.from_numpy(function(volume.data[..., 0].numpy()))
+    rgba[..., :3] *= rgba[..., 3:]
+    return gv.Volume(rgba.half(), spacing=volume.spacing, origin=volume.origin)
+
+
 def thin_lens(
-    tree: gv.N3Tree, camera: gv.Camera, shader: gv.TransferFunction, aperture: float
+    tree: gv.N3Tree, camera: gv.Camera, shader: gv.StoredColor, aperture: float
 ) -> torch.Tensor:
     """Mean colour of rays from all over the lens through the point in focus."""
     placed = camera.placed(tree.box)
@@ -46,8 +57,9 @@ def thin_lens(
 
 def main(settings: Settings) -> None:
     """Renders four pictures, side by side, and tells how alike lens and pinholes are."""
-    tree = gv.N3Tree.from_volume(gv.read_volume(SCAN), device=settings.device)
-    shader = gv.TransferFunction.from_points(OPACITY, COLOR)
+    volume = seen(gv.read_volume(SCAN), gv.TransferFunction.from_points(OPACITY, COLOR))
+    tree = gv.N3Tree.from_volume(volume, device=settings.device)
+    shader = gv.StoredColor("value", premultiplied=True)
     camera = gv.Camera.orbit(30, 20, 1.5, 32, settings.size, settings.size)
     colors, expected = [], thin_lens(tree, camera, shader, APERTURES[-1])
     for aperture in APERTURES:

@@ -100,6 +100,30 @@ def test_moderate_blur_agrees_with_256_rays_through_the_lens(opacity, aperture):
     assert expected.max() > 0.15, "the test must see something"
 
 
+@pytest.mark.backend("cpp")
+def test_stored_colours_blur_as_a_lens_does_where_matter_is_opaque():
+    """What is filtered is what is seen: a transfer function of mean densities is another thing."""
+    volume, view = grains(), gv.Camera.orbit(20, 15, FOCUS, 26, 96, 96)
+    colors = [(0, 0.2, 0.4, 1), (128, 1, 0.3, 0.2), (255, 1, 0.9, 0.5)]
+    function = gv.TransferFunction.from_points([(20, 0), (60, 0.1), (255, 0.5)], colors)
+    rgba = torch.from_numpy(function(volume.data[..., 0].float().numpy())).float()
+    rgba[..., :3] *= rgba[..., 3:]
+    lens = gv.ThinLens(aperture=0.2, focus=FOCUS, frame="box")
+    agreed = {}
+    for name, tree, shader in (
+        ("density", gv.N3Tree.from_volume(volume), function),
+        (
+            "colour",
+            gv.N3Tree.from_volume(gv.Volume(rgba.half())),
+            gv.StoredColor("value", premultiplied=True),
+        ),
+    ):
+        expected = thin_lens(tree, view, shader, 0.2, 128)
+        agreed[name] = similarity(gv.render(tree, view, shader, lens=lens).color, expected)
+    print("SSIM: " + ", ".join(f"{name} {value:.4f}" for name, value in agreed.items()))
+    assert agreed["colour"] >= 0.95 > agreed["density"]
+
+
 def test_the_cone_is_the_pixels_and_the_circle_of_confusion():
     """Closed form: cone + 0.3 * aperture * |t - focus| / focus, and never below the pixel's."""
     rays = gv.Rays(
