@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -64,6 +66,21 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
         patch.setenv("GVTORCH_CACHE", str(folder))
         yield folder
+
+
+def gvtorch(*args: object, cwd=None) -> subprocess.CompletedProcess[str]:
+    """Runs the command line in a process of its own."""
+    command = [sys.executable, "-m", "gvtorch", *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False)
+
+
+@pytest.fixture(scope="session")
+def small(tmp_path_factory):
+    file = tmp_path_factory.mktemp("cli") / "ball_24x20x16_uint8.raw"
+    z, y, x = np.mgrid[0:16, 0:20, 0:24]
+    ball = np.clip(8 - np.sqrt((x - 12) ** 2 + (y - 10) ** 2 + (z - 8) ** 2), 0, 1) * 200
+    file.write_bytes(ball.astype(np.uint8).tobytes())
+    return file
 
 
 @pytest.fixture(scope="session")

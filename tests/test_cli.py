@@ -11,16 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import DATA, ROOT
+from conftest import DATA, ROOT, gvtorch
 
 import gvtorch as gv
 
 ANEURISM = DATA / "aneurism_256x256x256_uint8.raw.gz"
-
-
-def gvtorch(*args: object, cwd=None) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "gvtorch", *map(str, args)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False)
 
 
 def test_help_does_not_import_torch():
@@ -46,15 +41,6 @@ def test_info_tells_about_a_file():
     assert content["extent"] == [256, 256, 256] and content["dtype"] == "uint8"
     assert content["range"] == [0, 255] and sum(content["histogram"]) == 256**3
     assert "256, 256, 256" in gvtorch("info", ANEURISM).stdout
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    file = tmp_path_factory.mktemp("cli") / "ball_24x20x16_uint8.raw"
-    z, y, x = np.mgrid[0:16, 0:20, 0:24]
-    ball = np.clip(8 - np.sqrt((x - 12) ** 2 + (y - 10) ** 2 + (z - 8) ** 2), 0, 1) * 200
-    file.write_bytes(ball.astype(np.uint8).tobytes())
-    return file
 
 
 @pytest.mark.backend("cpp")

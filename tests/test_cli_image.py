@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from test_cli import gvtorch, small  # noqa: F401
+from conftest import gvtorch
 
 import gvtorch as gv
 
@@ -27,7 +27,7 @@ def run(*args: object) -> None:
 
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("model", ["ortho", "fisheye", "panorama"])
-def test_camera_models(small, tmp_path, model):  # noqa: F811
+def test_camera_models(small, tmp_path, model):
     run(small, "-o", tmp_path / "a.npy", "--camera-model", model, "--fov", "100")
     camera = gv.Camera.orbit(20, 10, 0.8, 100, 24, 16, model)
     expected = picture(small, camera)
@@ -36,7 +36,7 @@ def test_camera_models(small, tmp_path, model):  # noqa: F811
 
 
 @pytest.mark.backend("cpp")
-def test_backgrounds_tone_and_samples(small, tmp_path):  # noqa: F811
+def test_backgrounds_tone_and_samples(small, tmp_path):
     camera = gv.Camera.orbit(20, 10, 0.8, None, 24, 16)
     sky = torch.rand(8, 16, 3)
     np.save(tmp_path / "sky.npy", sky.numpy())
@@ -62,7 +62,7 @@ def test_backgrounds_tone_and_samples(small, tmp_path):  # noqa: F811
 @pytest.mark.parametrize(
     ("name", "bits"), [("a.tif", "8"), ("a.tif", "32"), ("a.exr", "16"), ("a.png", "8")]
 )
-def test_files_of_every_kind(small, tmp_path, name, bits):  # noqa: F811
+def test_files_of_every_kind(small, tmp_path, name, bits):
     run(small, "-o", tmp_path / name, "--bits", bits, "--stats", tmp_path / "a.json")
     expected = picture(small, gv.Camera.orbit(20, 10, 0.8, None, 24, 16))
     found = gv.read_image(tmp_path / name)[..., :3]
@@ -83,7 +83,7 @@ def test_files_of_every_kind(small, tmp_path, name, bits):  # noqa: F811
         (["-o", "a.png", "--camera-model", "panorama", "--fov", "200"], "fov must be finite"),
     ],
 )
-def test_a_mistake_gets_one_line(small, tmp_path, args, message):  # noqa: F811
+def test_a_mistake_gets_one_line(small, tmp_path, args, message):
     done = gvtorch("render", small, *args, cwd=tmp_path)
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
     assert message in done.stderr and not list(tmp_path.iterdir())

@@ -17,9 +17,7 @@ from hypothesis import strategies as st
 
 import gvtorch as gv
 from gvtorch import config
-from gvtorch.cache import LRU, Scheduler
-from gvtorch.cache.requests import Requests
-from gvtorch.turns import Turns, scouts
+from gvtorch.turns import scouts
 
 VESSELS = gv.TransferFunction.preset("vessels", 0, 255)
 AORTA = gv.TransferFunction.from_points([(140, 0), (400, 0.25), (900, 0.95)])
@@ -166,42 +164,6 @@ def test_a_pool_that_holds_almost_nothing_ends_too(aneurism):
             engine.validate()
             assert picture.stats.capacity_exceeded and picture.stats.frames <= 150
             assert not picture.stats.converged and torch.isfinite(picture.color).all()
-
-
-def test_scouts_go_first():
-    turns = Turns(64, 8, torch.device("cpu"))
-    assert turns.now.all()
-    turns.take(torch.ones(64, dtype=torch.bool), gv.FrameStats(produced={"bricks": 3}), 0)
-    assert turns.now.nonzero()[:, 0].tolist() == [0, 4, 32, 36]
-    turns.take(torch.zeros(64, dtype=torch.bool), gv.FrameStats(), 0)
-    assert turns.done == 4 and int(turns.now.sum()) == 60
-    turns.everyone()
-    assert torch.equal(turns.now, ~torch.isin(torch.arange(64), torch.tensor([0, 4, 32, 36])))
-
-
-def test_rays_take_turns_by_halves(monkeypatch):
-    monkeypatch.setattr("gvtorch.turns._STRIDE", 1)
-    turns = Turns(16, 16, torch.device("cpu"))
-    full = gv.FrameStats(capacity_exceeded=True, produced={"bricks": 0})
-    everyone = torch.ones(16, dtype=torch.bool)
-    for expected in (8, 4, 2, 1):
-        turns.take(everyone, full, 0)
-        assert int(turns.now.sum()) == expected and turns.crowded and not turns.over
-    turns.take(~turns.now, full, 0)  # the one ray is done
-    assert turns.done == 1 and int(turns.now.sum()) == 2
-    turns.take(~turns.now, full, 0)
-    assert turns.done == 3 and int(turns.now.sum()) == 4
-    loaded = gv.FrameStats(produced={"bricks": 5})
-    turns.take(everyone, loaded, 0)
-    assert int(turns.now.sum()) == 4, "what moves goes on"
-    turns.take(everyone, gv.FrameStats(converged=True), 0)
-    assert turns.done == 7, "what can't be served is not waited for"
-    turns.take(~turns.now, loaded, 0)
-    turns.take(~turns.now, loaded, 0)
-    assert turns.over and turns.whole and turns.done == 16
-    turns = Turns(1, 1, torch.device("cpu"))
-    turns.take(everyone[:1], full, 0)
-    assert turns.over and not turns.whole, "a ray that does not fit alone is given up"
 
 
 class Checked(gv.Engine):
@@ -371,55 +333,6 @@ def test_twins_and_kernels_drive_the_engine_alike(blobs, seed, loading):
             fields.append({**nodes.fields, **bricks.fields})
     for name, field in fields[0].items():
         assert torch.equal(field, fields[1][name]), name
-
-
-def test_lru_takes_from_the_front_and_refuses_more_than_is_unused():
-    lru = LRU(6, 2, torch.device("cpu"))
-    stamp = torch.tensor([9, 9, 9, 1, 9, 1], dtype=torch.int32)
-    lru.unused = int(lru.sort(stamp, torch.tensor([9], dtype=torch.int32)))
-    assert lru.order.tolist() == [3, 5, 2, 4] and lru.unused == 2
-    assert lru.take(1).tolist() == [3] and lru.order.tolist() == [5, 2, 4, 3]
-    with pytest.raises(ValueError, match="2 slots wanted, 1 are unused"):
-        lru.take(2)
-
-
-def wishes(depth, priority, kind=config.REQUEST_LOAD) -> Requests:
-    count = len(depth)
-    return Requests(
-        node=torch.arange(count),
-        kind=torch.full((count,), kind, dtype=torch.int32),
-        depth=torch.tensor(depth),
-        priority=torch.tensor(priority, dtype=torch.int32),
-        misses=count,
-        overflow=0,
-    )
-
-
-def test_the_scheduler_serves_by_level_then_by_size_and_trims():
-    asked = wishes([3, 1, 2, 1], [5, 7, 1, 9])
-    room = {config.REQUEST_LOAD: 10, config.REQUEST_SUBDIVIDE: 10}
-    for order, expected in (("coarse", [3, 1, 2, 0]), ("fine", [0, 2, 3, 1])):
-        served, deferred, exceeded = Scheduler(order=order).choose(asked, room)
-        assert served.node.tolist() == expected and deferred == 0 and not exceeded
-    served, deferred, _ = Scheduler(loads=3).choose(asked, room)
-    assert served.node.tolist() == [3, 1, 2] and deferred == 1
-    room[config.REQUEST_LOAD] = 2
-    served, deferred, exceeded = Scheduler().choose(asked, room)
-    assert served.node.tolist() == [3, 1] and exceeded
-
-
-def test_the_time_budget_learns_what_fits():
-    scheduler = Scheduler(milliseconds=4.0)
-    asked = wishes([0] * 1000, [1] * 1000)
-    room = {config.REQUEST_LOAD: 5000, config.REQUEST_SUBDIVIDE: 5000}
-    first, deferred, _ = scheduler.choose(asked, room)
-    assert 0 < len(first) < 1000 and deferred == 1000 - len(first)
-    scheduler.learn(config.REQUEST_LOAD, 10, 1e-6)  # too few to tell
-    scheduler.learn(config.REQUEST_LOAD, 64, 1000.0)  # a slow start
-    assert len(scheduler.choose(asked, room)[0]) == 1
-    for _ in range(40):
-        scheduler.learn(config.REQUEST_LOAD, 100, 1.0)  # 100 bricks a millisecond
-    assert len(scheduler.choose(asked, room)[0]) >= 199, "half of the time is for bricks"
 
 
 @pytest.mark.backend("cpp")

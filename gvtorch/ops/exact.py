@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_TINY = 1.1754944e-38  # smallest normal float32
+TINY = 1.1754944e-38  # smallest normal float32: what lets less through is opaque
 
 
 def clamp(value: Tensor, low: float | Tensor, high: float | Tensor) -> Tensor:
@@ -104,13 +104,13 @@ def unit(v: Tensor) -> Tensor:
 
 def power(x: Tensor, exponent: Tensor) -> Tensor:
     """x^exponent for x in [0, 1]."""
-    known = x > _TINY
+    known = x > TINY
     return torch.where(known, exp2_exact(log2_exact(torch.where(known, x, 1.0)) * exponent), 0.0)
 
 
 def stretch(alpha: Tensor, lengths: Tensor) -> Tensor:
     """Alpha of a length, from that of length 1."""
     kept = 1 - alpha
-    solid = ~(kept > _TINY)
+    solid = ~(kept > TINY)
     part = 1 - exp2_exact(log2_exact(torch.where(solid, 0.5, kept)) * lengths)
     return torch.where(solid, 1.0, part)

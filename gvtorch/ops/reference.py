@@ -20,11 +20,9 @@ import torch
 from torch import Tensor
 
 from ..config import EMPTY
-from .exact import clamp, divide, exp2_exact, larger, log2_exact, smaller
+from .exact import TINY, clamp, divide, larger, log2_exact, smaller, stretch
 from .reference_rays import INF, Beam, Intervals
 from .reference_tree import Bricks, Place, Tree, descend, wanted_depth
-
-_TINY = 1.1754944e-38  # smallest normal float32: what lets less through is opaque
 
 
 @dataclass
@@ -53,7 +51,7 @@ class Accumulator:
         left = self.clear * kept
         color = self.color + share[:, None] * rgba[:, :3]
         hit = where & (left < hit_clear) & (self.clear >= hit_clear)
-        solid = ~(kept > _TINY)
+        solid = ~(kept > TINY)
         part = log2_exact(torch.where(hit, hit_clear / self.clear, 1.0))
         part = part / log2_exact(torch.where(hit & ~solid, kept, 0.5))
         part = torch.where(solid, 0.0, clamp(part, 0, 1))
@@ -88,10 +86,7 @@ class Transfer:
     def piece(self, value: Tensor, lengths: Tensor) -> Tensor:
         """(r, 4) linear RGB and the alpha of any number of shortest intervals."""
         rgba = self.look_up(value, torch.zeros_like(value, dtype=torch.int64))
-        kept = 1 - rgba[:, 3]
-        solid = ~(kept > _TINY)
-        alpha = 1 - exp2_exact(log2_exact(torch.where(solid, 0.5, kept)) * lengths)
-        return torch.cat((rgba[:, :3], torch.where(solid, 1.0, alpha)[:, None]), 1)
+        return torch.cat((rgba[:, :3], stretch(rgba[:, 3], lengths)[:, None]), 1)
 
     def interval(self, value: Tensor, piece: Piece) -> Tensor:
         """(r, 4) linear RGB and the alpha of an interval."""

@@ -1,0 +1,58 @@
+"""The order of use, and which wishes are served."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gvtorch import config
+from gvtorch.cache import LRU, Requests, Scheduler
+
+
+def test_lru_takes_from_the_front_and_refuses_more_than_is_unused():
+    lru = LRU(6, 2, torch.device("cpu"))
+    stamp = torch.tensor([9, 9, 9, 1, 9, 1], dtype=torch.int32)
+    lru.unused = int(lru.sort(stamp, torch.tensor([9], dtype=torch.int32)))
+    assert lru.order.tolist() == [3, 5, 2, 4] and lru.unused == 2
+    assert lru.take(1).tolist() == [3] and lru.order.tolist() == [5, 2, 4, 3]
+    with pytest.raises(ValueError, match="2 slots wanted, 1 are unused"):
+        lru.take(2)
+
+
+def wishes(depth, priority, kind=config.REQUEST_LOAD) -> Requests:
+    count = len(depth)
+    return Requests(
+        node=torch.arange(count),
+        kind=torch.full((count,), kind, dtype=torch.int32),
+        depth=torch.tensor(depth),
+        priority=torch.tensor(priority, dtype=torch.int32),
+        misses=count,
+        overflow=0,
+    )
+
+
+def test_the_scheduler_serves_by_level_then_by_size_and_trims():
+    asked = wishes([3, 1, 2, 1], [5, 7, 1, 9])
+    room = {config.REQUEST_LOAD: 10, config.REQUEST_SUBDIVIDE: 10}
+    for order, expected in (("coarse", [3, 1, 2, 0]), ("fine", [0, 2, 3, 1])):
+        served, deferred, exceeded = Scheduler(order=order).choose(asked, room)
+        assert served.node.tolist() == expected and deferred == 0 and not exceeded
+    served, deferred, _ = Scheduler(loads=3).choose(asked, room)
+    assert served.node.tolist() == [3, 1, 2] and deferred == 1
+    room[config.REQUEST_LOAD] = 2
+    served, deferred, exceeded = Scheduler().choose(asked, room)
+    assert served.node.tolist() == [3, 1] and exceeded
+
+
+def test_the_time_budget_learns_what_fits():
+    scheduler = Scheduler(milliseconds=4.0)
+    asked = wishes([0] * 1000, [1] * 1000)
+    room = {config.REQUEST_LOAD: 5000, config.REQUEST_SUBDIVIDE: 5000}
+    first, deferred, _ = scheduler.choose(asked, room)
+    assert 0 < len(first) < 1000 and deferred == 1000 - len(first)
+    scheduler.learn(config.REQUEST_LOAD, 10, 1e-6)  # too few to tell
+    scheduler.learn(config.REQUEST_LOAD, 64, 1000.0)  # a slow start
+    assert len(scheduler.choose(asked, room)[0]) == 1
+    for _ in range(40):
+        scheduler.learn(config.REQUEST_LOAD, 100, 1.0)  # 100 bricks a millisecond
+    assert len(scheduler.choose(asked, room)[0]) >= 199, "half of the time is for bricks"
