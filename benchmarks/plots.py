@@ -74,7 +74,9 @@ def draw(file: Path, record: dict[str, Any]) -> bool:
 
 
 def _bars(pyplot: Any, record: dict[str, Any]) -> Any:
-    """Milliseconds of every row, from smallest to largest repeat, on a logarithmic axis."""
+    """Milliseconds of every row, from smallest to largest repeat; on a logarithmic axis where some
+    are far apart.
+    """
     rows = record["rows"][::-1]
     names = list(dict.fromkeys(row["who"] for row in record["rows"]))
     figure, axes = pyplot.subplots(
@@ -86,7 +88,9 @@ def _bars(pyplot: Any, record: dict[str, Any]) -> Any:
         axes.barh(place, row["ms"], color=color, xerr=error, ecolor="0.4")
     axes.set_yticks(range(len(rows)), [f"{row['case']}: {row['who']}" for row in rows], fontsize=7)
     axes.margins(y=0.01)
-    axes.set_xscale("log")
+    times = [row["ms"] for row in rows]
+    if max(times) > 20 * min(times):
+        axes.set_xscale("log")
     axes.set_xlabel("milliseconds")
     axes.grid(axis="x", alpha=0.3)
     return figure

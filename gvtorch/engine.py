@@ -18,7 +18,7 @@ from torch import Tensor
 
 from . import check
 from .arrivals import Arrivals, Numbers
-from .cache import Cache, Listed, Requests, Scheduler
+from .cache import Cache, Listed, Scheduler, Wishes
 from .frame import FrameStats, Hits, Rays, add
 from .ops.trace import choose_backend
 from .producers import Producer
@@ -176,7 +176,8 @@ class Engine:
                 self.scheduler.begin()
                 if last.numbers.listed:
                     # Nothing was written since it was traced: its nodes are those that rays saw.
-                    self._serve(last.listed.read(self.cache.nodes, last.numbers), stats)
+                    wishes = last.listed.read(self.cache.nodes, last.numbers.wishes())
+                    self._serve(wishes, stats)
             with stage("write"):
                 self.production.write(self.production.late(), stats)
 
@@ -206,9 +207,9 @@ class Engine:
             numbers = Numbers(*sent.tolist())  # a frame that misses something waits anyway
             add(stats.requests, numbers.wishes())
             self.cache.make_room(numbers.tiles_unused, numbers.bricks_unused)
-            self._serve(listed.read(self.cache.nodes, numbers), stats)
+            self._serve(listed.read(self.cache.nodes, numbers.wishes()), stats)
 
-    def _serve(self, wishes: Requests, stats: FrameStats) -> None:
+    def _serve(self, wishes: Wishes, stats: FrameStats) -> None:
         """Chooses wishes, asks for them, and writes the answers that are here at once."""
         with stage("schedule"):
             pending = self.production.pending

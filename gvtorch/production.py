@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .cache import KINDS, Cache, Children, Requests, Scheduler, Written
+from .cache import KINDS, Cache, Children, Scheduler, Written
 from .config import (
     ABSENT,
     CONSTANT,
@@ -200,26 +200,36 @@ class Production:
                 self._fail(item.job, f"no answer within {self._patience(item.job):g} s")
         return done
 
-    def ask(self, plants: list[Plant], chosen: Requests) -> list[tuple[Job, Answer]]:
-        """Asks for what was chosen; returns the answers that are here at once."""
+    def ask(self, plants: list[Plant], chosen: Mapping[int, Tensor]) -> list[tuple[Job, Answer]]:
+        """Asks for what was chosen; returns the answers that are here at once.
+
+        Args:
+            plants: All trees.
+            chosen: For each kind the (k,) int64 nodes.
+        """
         self._raised = 0
         done: list[tuple[Job, Answer]] = []
-        if not len(chosen):
-            return done
-        tree = self.cache.nodes.tree_t[chosen.node // self.cache.nodes.nodes_per_tile]
-        groups = [(kind, number) for kind in KINDS.values() for number in range(len(plants))]
-        masks = torch.stack([(chosen.kind == kind) & (tree == number) for kind, number in groups])
-        counts = masks.sum(1).tolist()
-        for (kind, number), mask, count in zip(groups, masks, counts, strict=True):
-            plant, node = plants[number], chosen.node
-            if 0 < count < len(node):
-                node = node[torch.nonzero_static(mask, size=count)[:, 0]]
-            self.scheduler.spent[kind] += count
-            if count:
+        for kind, nodes in chosen.items():
+            self.scheduler.spent[kind] += len(nodes)
+            for plant, node in self._by_plant(plants, nodes):
                 job = self._without_failed(Job(plant, kind, node, plant.tree.loc(node)))
                 if len(job):
                     self._submit(job, done)
         return done
+
+    def _by_plant(self, plants: list[Plant], node: Tensor) -> list[tuple[Plant, Tensor]]:
+        """The nodes of each tree, of those that have any."""
+        if not len(node):
+            return []
+        if len(plants) == 1:
+            return [(plants[0], node)]
+        tree = self.cache.nodes.tree_t[node // self.cache.nodes.nodes_per_tile]
+        masks = tree == torch.arange(len(plants), device=tree.device)[:, None]
+        return [
+            (plant, node[torch.nonzero_static(mask, size=count)[:, 0]])
+            for plant, mask, count in zip(plants, masks, masks.sum(1).tolist(), strict=True)
+            if count
+        ]
 
     def _without_failed(self, job: Job) -> Job:
         """Leaves out what failed before its tile was given away: it is marked again."""
@@ -385,7 +395,7 @@ class Production:
             rows = keep.repeat_interleave(per_item).nonzero()[:, 0]
             job, checked = job[keep.nonzero()[:, 0]], _select(checked, rows)
         if len(job):
-            done.append((job, checked))
+            done.append((job, _sent(job, checked, self.staging)))
 
     def _mark(self, job: Job) -> None:
         wanted = self.cache.wanted(job.plant.tree, job.node, job.loc, job.kind)
@@ -548,13 +558,20 @@ def _send_ahead(job: Job, answer: Any, staging: Staging) -> Any:
         checked = job.check(answer)
     except ValueError:
         return answer  # the frame tells of it
-    if not isinstance(checked, Bricks):
+    if not isinstance(checked, Bricks) or checked.errors:
         return answer
-    kind = checked.kind
-    voxels = len(job) if kind is None else int(count_kinds(kind)[Region.DATA : Region.ALIAS].sum())
-    if checked.errors or voxels < len(job):
+    sent = _sent(job, checked, staging)
+    return sent if isinstance(sent, _Sent) else answer
+
+
+def _sent(job: Job, answer: Answer, staging: Staging | None) -> Answer:
+    """Puts a checked answer on its way if it is voxels from the host and nothing else."""
+    if staging is None or not isinstance(answer, Bricks) or not on_host(answer.data):
         return answer
-    return _Sent(staging.send(checked.data))
+    if answer.kind is not None:
+        if int(count_kinds(answer.kind)[Region.DATA : Region.ALIAS].sum()) < len(job):
+            return answer
+    return _Sent(staging.send(answer.data))
 
 
 def _select(answer: Any, row: Tensor) -> Any:

@@ -100,6 +100,57 @@ def test_link_writes_pointers_and_takes_wishes_back(backend, data, tiles):
     assert a.view(-1).tolist() == pointer and b.view(-1).tolist() == request
 
 
+def a_pool(data, branching: int, tiles: int) -> dict[str, torch.Tensor]:
+    """Tiles at random, with more nodes a tile than the tree has children, as wider trees leave."""
+    per_tile = branching**3 + data.draw(st.sampled_from([0, 5]))
+    generator = torch.Generator().manual_seed(data.draw(st.integers(0, 2**20)))
+
+    def draw(low: int, high: int, *shape: int) -> torch.Tensor:
+        return torch.randint(low, high, shape, dtype=torch.int32, generator=generator)
+
+    return {
+        "pointer_tn": draw(-2, 2, tiles, per_tile),
+        "loc_t4": draw(0, 30, tiles, 4),
+        "parent_t": draw(-1, 2, tiles),
+        "tree_t": draw(0, 2, tiles),
+        "shared_t": draw(0, 3, tiles) == 0,
+    }
+
+
+@fixed
+@given(data=st.data(), branching=st.integers(2, 4), tiles=st.integers(1, 12))
+def test_nodes_tell_their_places_and_what_they_lack(backend, data, branching, tiles):
+    pool = a_pool(data, branching, tiles)
+    per_tile = pool["pointer_tn"].shape[1]
+    children = branching**3
+    node = [t * per_tile + c for t in range(tiles) for c in range(children)]
+    home = [(*pool["loc_t4"][n // per_tile].tolist(), n % per_tile) for n in node]
+    expected = [
+        (x * branching + c % branching, y * branching + c // branching % branching,
+         z * branching + c // branching**2, depth)
+        for x, y, z, depth, c in home
+    ]  # fmt: skip
+    there = {name: words_.to(DEVICES[backend]) for name, words_ in pool.items()}
+    node_k = torch.tensor([*node, -1, tiles * per_tile], device=DEVICES[backend])
+    loc = ops.locate(there["loc_t4"], node_k, branching, per_tile, backend=backend)
+    assert loc.tolist() == [list(place) for place in expected] + [[-1] * 4] * 2
+
+    moved = data.draw(st.sets(st.integers(0, len(node) - 1)))
+    asked = loc.clone()
+    asked[torch.tensor(sorted(moved), dtype=torch.int64, device=loc.device), 1] += 1
+    tree, root = 1, data.draw(st.sampled_from(node))
+    lacks = ops.lacking(
+        *there.values(), node_k, asked, tree, root, branching, backend=backend
+    ).tolist()
+    for row, index in enumerate(node):
+        tile = index // per_tile
+        hangs = pool["parent_t"][tile] >= 0 or pool["shared_t"][tile] or index == root
+        bare = pool["pointer_tn"].view(-1)[index] == config.ABSENT
+        own = pool["tree_t"][tile] == tree and row not in moved
+        assert lacks[row] == bool(hangs and bare and own)
+    assert lacks[len(node) :] == [False, False]
+
+
 def test_kernels_equal_twins_on_a_large_pool(compiled):
     device, generator = DEVICES[compiled], torch.Generator().manual_seed(3)
     request = torch.randint(0, 1 << 20, (200_000, 8), generator=generator, dtype=torch.int32)
@@ -117,16 +168,37 @@ def test_kernels_equal_twins_on_a_large_pool(compiled):
     actual = ops.lru_partition(*(t.to(device) for t in (order, stamp, frame)), backend=compiled)
     assert all(torch.equal(a.cpu(), e) for a, e in zip(actual, expected, strict=True))
 
+    tiles, per_tile = 150_000, 8
+    pool = [
+        torch.randint(-1, high, shape, generator=generator, dtype=torch.int32)
+        for high, shape in ((2, (tiles, per_tile)), (99, (tiles, 4)), (5, (tiles,)), (2, (tiles,)))
+    ]
+    pool.append(torch.randint(0, 2, (tiles,), generator=generator).to(torch.bool))
+    node = torch.randint(-5, tiles * per_tile + 5, (1_000_000,), generator=generator)
+    loc = reference_cache.locate(pool[1], node, 2, per_tile)
+    there = [words_.to(device) for words_ in (*pool, node, loc)]
+    actual = ops.locate(there[1], there[5], 2, per_tile, backend=compiled)
+    assert torch.equal(actual.cpu(), loc)
+    expected = reference_cache.lacking(*pool, node, loc, 1, 0, 2)
+    actual = ops.lacking(*there, 1, 0, 2, backend=compiled)
+    assert torch.equal(actual.cpu(), expected) and 0 < int(expected.sum()) < len(node)
+
 
 def test_cache_ops_pass_opcheck(compiled):
     device = DEVICES[compiled]
     request = int32([[1 << 16, 0, 3 << 16, 9 << 16]], device)
     table, frame = torch.ops.gvtorch, int32([1], device)
+    place = torch.zeros((1, 4), dtype=torch.int64, device=device)
     for op, arguments in (
         (table.compact_requests, (request, 3)),
         (table.lru_partition, (int32([2, 0, 1], device), int32([1, 0, 1], device), frame)),
         (table.unlink, (request, int32([0, -1], device), 4, 1)),
         (table.link, (request, request.clone(), frame, frame, LOAD)),
+        (table.locate, (request, frame.long(), 2, 4)),
+        (
+            table.lacking,
+            (*(request, request, frame, frame, frame.bool(), frame.long(), place), 1, 0, 2),
+        ),
     ):
         torch.library.opcheck(op.default, arguments)
 
@@ -139,6 +211,11 @@ def test_nothing_to_do(backend):
     assert int(ops.lru_partition(none, none, frame, backend=backend)[1]) == 0
     ops.unlink(request, none, 0, backend=backend)
     ops.link(request, request.clone(), none, none, LOAD, backend=backend)
+    places = torch.zeros((1, 4), dtype=torch.int32, device=device)
+    loc = ops.locate(places, none.long(), 2, 8, backend=backend)
+    pool = request, places, frame, frame, frame.bool()
+    lacks = ops.lacking(*pool, none.long(), loc, 0, 0, 2, backend=backend)
+    assert loc.shape == (0, 4) and lacks.shape == (0,)
     assert not request.any()
 
 
@@ -152,6 +229,16 @@ def test_nothing_to_do(backend):
         (lambda w: ops.unlink(w, w, 4), "slot_k must be (k,)"),
         (lambda w: ops.unlink(w, w[0], 4, 0), "divisor must be an int >= 1"),
         (lambda w: ops.link(w, w, w[0], w[0, :2], LOAD), "word_k must be (8,)"),
+        (lambda w: ops.locate(w, w[0].long(), 2, 8), "loc_t4 must be (t, 4) int32"),
+        (lambda w: ops.locate(w[:, :4].clone(), w[0], 2, 8), "node_k must be (k,) int64"),
+        (
+            lambda w: ops.locate(w[:, :4].clone(), w[0].long(), 1, 8),
+            "branching must be an int >= 2",
+        ),
+        (
+            lambda w: ops.lacking(w, w[:, :4].clone(), *[w[0]] * 3, w[0].long(), w, 0, 0, 2),
+            "parent_t must be (4,) int32",
+        ),
         (lambda w: ops.link(w, w, w[0], w[0], 3), "kind must be REQUEST_LOAD"),
         (lambda w: ops.link(w, w, w[0], w[0], LOAD, backend="gpu"), "backend must be auto"),
     ],

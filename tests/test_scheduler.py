@@ -8,6 +8,8 @@ import torch
 from gvtorch import config
 from gvtorch.cache import LRU, Requests, Scheduler
 
+LOAD, SUBDIVIDE = config.REQUEST_LOAD, config.REQUEST_SUBDIVIDE
+
 
 def test_lru_takes_from_the_front_and_refuses_more_than_is_unused():
     lru = LRU(6, 2, torch.device("cpu"))
@@ -19,40 +21,39 @@ def test_lru_takes_from_the_front_and_refuses_more_than_is_unused():
         lru.take(2)
 
 
-def wishes(depth, priority, kind=config.REQUEST_LOAD) -> Requests:
-    count = len(depth)
-    return Requests(
-        node=torch.arange(count),
-        kind=torch.full((count,), kind, dtype=torch.int32),
+def wishes(depth, priority) -> dict[int, Requests]:
+    none = torch.zeros(0, dtype=torch.int64)
+    loads = Requests(
+        node=torch.arange(len(depth)),
         depth=torch.tensor(depth),
         priority=torch.tensor(priority, dtype=torch.int32),
-        misses=count,
-        overflow=0,
     )
+    tiles = Requests(node=none, depth=none, priority=none.int())
+    return {LOAD: loads, SUBDIVIDE: tiles}
 
 
 def test_the_scheduler_serves_by_level_then_by_size_and_trims():
     asked = wishes([3, 1, 2, 1], [5, 7, 1, 9])
-    room = {config.REQUEST_LOAD: 10, config.REQUEST_SUBDIVIDE: 10}
+    room = {LOAD: 10, SUBDIVIDE: 10}
     for order, expected in (("coarse", [3, 1, 2, 0]), ("fine", [0, 2, 3, 1])):
         served, deferred, exceeded = Scheduler(order=order).choose(asked, room)
-        assert served.node.tolist() == expected and deferred == 0 and not exceeded
+        assert served[LOAD].tolist() == expected and deferred == 0 and not exceeded
     served, deferred, _ = Scheduler(loads=3).choose(asked, room)
-    assert served.node.tolist() == [3, 1, 2] and deferred == 1
-    room[config.REQUEST_LOAD] = 2
+    assert served[LOAD].tolist() == [3, 1, 2] and deferred == 1
+    room[LOAD] = 2
     served, deferred, exceeded = Scheduler().choose(asked, room)
-    assert served.node.tolist() == [3, 1] and exceeded
+    assert served[LOAD].tolist() == [3, 1] and exceeded
 
 
 def test_the_time_budget_learns_what_fits():
     scheduler = Scheduler(milliseconds=4.0)
     asked = wishes([0] * 1000, [1] * 1000)
-    room = {config.REQUEST_LOAD: 5000, config.REQUEST_SUBDIVIDE: 5000}
+    room = {LOAD: 5000, SUBDIVIDE: 5000}
     first, deferred, _ = scheduler.choose(asked, room)
-    assert 0 < len(first) < 1000 and deferred == 1000 - len(first)
-    scheduler.learn(config.REQUEST_LOAD, 10, 1e-6)  # too few to tell
-    scheduler.learn(config.REQUEST_LOAD, 64, 1000.0)  # a slow start
-    assert len(scheduler.choose(asked, room)[0]) == 1
+    assert 0 < len(first[LOAD]) < 1000 and deferred == 1000 - len(first[LOAD])
+    scheduler.learn(LOAD, 10, 1e-6)  # too few to tell
+    scheduler.learn(LOAD, 64, 1000.0)  # a slow start
+    assert len(scheduler.choose(asked, room)[0][LOAD]) == 1
     for _ in range(40):
-        scheduler.learn(config.REQUEST_LOAD, 100, 1.0)  # 100 bricks a millisecond
-    assert len(scheduler.choose(asked, room)[0]) >= 199, "half of the time is for bricks"
+        scheduler.learn(LOAD, 100, 1.0)  # 100 bricks a millisecond
+    assert len(scheduler.choose(asked, room)[0][LOAD]) >= 199, "half of the time is for bricks"

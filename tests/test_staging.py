@@ -15,7 +15,6 @@ from test_producers import GRAY, camera
 
 import gvtorch as gv
 from gvtorch import config
-from gvtorch.cache import Requests
 from gvtorch.ops import available
 from gvtorch.pool import BrickTable, Rows, Staging
 from gvtorch.pool.staging import wide_rows
@@ -232,14 +231,9 @@ def finest(engine) -> torch.Tensor:
 
 def serve(engine, node, kind) -> gv.FrameStats:
     """What a frame does for wishes, without its rays."""
-    word = torch.full_like(node, kind, dtype=torch.int32)
-    zeros = torch.zeros_like(node)
-    wishes = Requests(
-        node=node, kind=word, depth=zeros, priority=zeros.int(), misses=len(node), overflow=0
-    )
     stats = gv.FrameStats()
     engine.production.write(engine.production.late(), stats)
-    engine.production.write(engine.production.ask([*engine.plants.values()], wishes), stats)
+    engine.production.write(engine.production.ask([*engine.plants.values()], {kind: node}), stats)
     return stats
 
 

@@ -2,7 +2,17 @@
 
 from .cache import Cache, Children, Written
 from .lru import LRU
-from .requests import KINDS, Listed, Requests
+from .requests import KINDS, Listed, Requests, Wishes
 from .scheduler import Scheduler
 
-__all__ = ["KINDS", "LRU", "Cache", "Children", "Listed", "Requests", "Scheduler", "Written"]
+__all__ = [
+    "KINDS",
+    "LRU",
+    "Cache",
+    "Children",
+    "Listed",
+    "Requests",
+    "Scheduler",
+    "Wishes",
+    "Written",
+]

@@ -22,12 +22,12 @@ from ..config import (
     REQUEST_SUBDIVIDE,
     TERMINAL,
 )
-from ..ops import link, unlink
+from ..ops import lacking, link, unlink
 from ..pool import BrickPool, N3Tree, NodePool
 from ..pool.staging import Part, Voxels, joined, on_device, wide_rows
 from ..volume import movable
 from .lru import LRU
-from .requests import Listed, Requests, collect
+from .requests import Listed, Requests, Wishes, collect
 
 
 @dataclass
@@ -108,7 +108,7 @@ class Cache:
         """For each kind, the slots that may be taken."""
         return {kind: lru.unused for kind, lru in self.lru.items()}
 
-    def stand_ins(self, wishes: Requests, room: dict[int, int]) -> Requests:
+    def stand_ins(self, wishes: Wishes, room: dict[int, int]) -> Wishes:
         """Where slots are too few for all wishes: asks for coarser bricks in their place, so that
         what is not served is drawn from a near ancestor and not from the root.
 
@@ -123,10 +123,9 @@ class Cache:
             `wishes`, or their subdivisions and the loads of the coarser nodes.
         """
         nodes, most = self.nodes, room[REQUEST_LOAD]
-        subdivide = wishes.kind == REQUEST_SUBDIVIDE
-        node = wishes.node[~subdivide]
-        if int(subdivide.sum()) > room[REQUEST_SUBDIVIDE]:
-            node = torch.cat((node, wishes.node[subdivide])).unique()  # too deep for the pool
+        node, subdivide = wishes[REQUEST_LOAD].node, wishes[REQUEST_SUBDIVIDE]
+        if len(subdivide) > room[REQUEST_SUBDIVIDE]:
+            node = torch.cat((node, subdivide.node)).unique()  # too deep for the pool
         while len(node) > most:
             tile = node // nodes.nodes_per_tile
             depth = nodes.loc_t4[tile, 3]
@@ -141,18 +140,12 @@ class Cache:
         node = node[(words == ABSENT) & (pending == 0)]
         if not len(node):
             return wishes
-        keep = wishes[subdivide]
-        zeros = torch.zeros_like(node, dtype=torch.int32)
-        return Requests(
-            node=torch.cat((keep.node, node)),
-            kind=torch.cat((keep.kind, zeros + REQUEST_LOAD)),
-            depth=torch.cat(
-                (keep.depth, nodes.loc_t4[node // nodes.nodes_per_tile, 3].to(torch.int64))
-            ),
-            priority=torch.cat((keep.priority, zeros)),
-            misses=wishes.misses,
-            overflow=wishes.overflow,
+        coarser = Requests(
+            node=node,
+            depth=nodes.loc_t4[node // nodes.nodes_per_tile, 3].to(torch.int64),
+            priority=torch.zeros_like(node, dtype=torch.int32),
         )
+        return {REQUEST_LOAD: coarser, REQUEST_SUBDIVIDE: subdivide}
 
     def mark_pending(self, node: Tensor, kind: int, pending: bool = True) -> None:
         """Sets or clears the mark that an answer is on its way: the wish is not listed again."""
@@ -161,11 +154,10 @@ class Cache:
 
     def wanted(self, tree: N3Tree, node: Tensor, loc: Tensor, kind: int) -> Tensor:
         """(k,) bool: the node still stands for the place, and still lacks what was asked for."""
-        tile = node // self.nodes.nodes_per_tile
-        words = self.nodes.brick_tn if kind == REQUEST_LOAD else self.nodes.child_tn
-        linked = (self.nodes.parent_t[tile] >= 0) | self.nodes.shared_t[tile] | (node == tree.root)
-        own = (self.nodes.tree_t[tile] == tree.number) & (tree.loc(node) == loc).all(1)
-        return linked & own & (words.view(-1)[node] == ABSENT)
+        pool = self.nodes
+        words = pool.brick_tn if kind == REQUEST_LOAD else pool.child_tn
+        tiles = pool.loc_t4, pool.parent_t, pool.tree_t, pool.shared_t
+        return lacking(words, *tiles, node, loc, tree.number, tree.root, tree.branching)
 
     def write_tiles(self, tree: N3Tree, node: Tensor, loc: Tensor, children: Children) -> Written:
         """Gives nodes their children.

@@ -4,7 +4,7 @@ once it knows how many there are.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -20,23 +20,18 @@ KINDS = {"load": REQUEST_LOAD, "subdivide": REQUEST_SUBDIVIDE}
 
 @dataclass(frozen=True, kw_only=True)
 class Requests:
-    """Wishes of one frame, one row a node and kind."""
+    """Wishes of one kind, one row a node."""
 
     node: Tensor  # (k,) int64
-    kind: Tensor  # (k,) int32, REQUEST_LOAD or REQUEST_SUBDIVIDE
     depth: Tensor  # (k,) int64 of the node
     priority: Tensor  # (k,) int32 width of one of its voxels on the screen, 1/16 pixel
-    misses: int  # nodes with a wish, those that are pending counted too
-    overflow: int  # nodes with a wish for which the list had no place
 
     def __len__(self) -> int:
         """Number of wishes."""
         return self.node.shape[0]
 
-    def __getitem__(self, index: Tensor | slice) -> Requests:
-        """Some of the wishes."""
-        rows = {n: getattr(self, n)[index] for n in ("node", "kind", "depth", "priority")}
-        return Requests(**rows, misses=self.misses, overflow=self.overflow)
+
+Wishes = Mapping[int, Requests]  # by kind, REQUEST_LOAD and REQUEST_SUBDIVIDE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,27 +42,21 @@ class Listed:
     word: Tensor  # (capacity,) int32 kinds and priority, 0 behind the last
     count: Tensor  # (5,) int64 nodes listed, that could be listed, with a wish; wishes of each kind
 
-    def read(self, nodes: NodePool, count: Sequence[int]) -> Requests:
-        """Returns the wishes, given the pool and the (5,) counts as the host has got them."""
-        kept, found, misses, *_ = count
-        node, word = self.node[:kept].to(torch.int64), self.word[:kept]
-        rows = [(word & kind).nonzero()[:, 0] for kind in KINDS.values()]
-        which = torch.cat(rows)
-        kind = torch.cat(
-            [
-                torch.full_like(row, k, dtype=torch.int32)
-                for row, k in zip(rows, KINDS.values(), strict=True)
-            ]
-        )
-        node = node[which]
-        return Requests(
-            node=node,
-            kind=kind,
-            depth=nodes.loc_t4[node // nodes.nodes_per_tile, 3].to(torch.int64),
-            priority=word[which] & REQUEST_PRIORITY,
-            misses=misses,
-            overflow=found - kept,
-        )
+    def read(self, nodes: NodePool, wished: Mapping[str, int]) -> dict[int, Requests]:
+        """Returns the wishes; nobody waits for the device.
+
+        Args:
+            nodes: The pool.
+            wished: How many there are of each kind, by name, as the host has got them.
+        """
+        wishes = {}
+        for name, kind in KINDS.items():
+            row = torch.nonzero_static((self.word & kind).ne(0), size=wished[name])[:, 0]
+            node = self.node[row].to(torch.int64)
+            depth = nodes.loc_t4[node // nodes.nodes_per_tile, 3].to(torch.int64)
+            priority = self.word[row] & REQUEST_PRIORITY
+            wishes[kind] = Requests(node=node, depth=depth, priority=priority)
+        return wishes
 
 
 def collect(nodes: NodePool, capacity: int) -> Listed:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from .. import check
 from ..config import REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
-from .requests import Requests
+from .requests import Requests, Wishes
 
 _LEARN_FROM = 64  # items: smaller batches tell more about overhead than about throughput
 _LEARN_RATE = 0.3  # weight of the newest frame
@@ -61,27 +61,27 @@ class Scheduler:
         """Starts a frame: its budgets are whole."""
         self.spent = dict.fromkeys(self.most, 0)
 
-    def choose(self, requests: Requests, room: dict[int, int]) -> tuple[Requests, int, bool]:
+    def choose(self, wishes: Wishes, room: dict[int, int]) -> tuple[dict[int, Tensor], int, bool]:
         """Returns the wishes to serve, most wanted first.
 
         Args:
-            requests: All wishes of the frame.
+            wishes: All wishes of the frame.
             room: For each kind, how many slots are free to take.
 
         Returns:
-            The wishes; how many the budgets put off; whether slots were too few.
+            For each kind the (k,) int64 nodes; how many wishes the budgets put off; whether slots
+            were too few.
         """
-        kept: list[Tensor] = []
+        chosen: dict[int, Tensor] = {}
         deferred, exceeded = 0, False
         for kind, most in self.most.items():
-            which = (requests.kind == kind).nonzero()[:, 0]
+            requests = wishes[kind]
             self._budget[kind] = min(most, self._in_time(kind))
             budget = max(0, self._budget[kind] - self.spent[kind])
-            deferred += max(0, min(len(which), room[kind]) - budget)
-            exceeded |= len(which) > room[kind]
-            which = which[self.rank(requests[which])]
-            kept.append(which[: min(budget, room[kind])])
-        return requests[torch.cat(kept)], deferred, exceeded
+            deferred += max(0, min(len(requests), room[kind]) - budget)
+            exceeded |= len(requests) > room[kind]
+            chosen[kind] = requests.node[self.rank(requests)[: min(budget, room[kind])]]
+        return chosen, deferred, exceeded
 
     def rank(self, requests: Requests) -> Tensor:
         """Returns the order in which wishes are served: by level, then by size on the screen, then

@@ -1,7 +1,7 @@
 """The ops on bare tensors. Importing this package loads the compiled libraries, so that TorchScript
 archives and exported programs that hold `gvtorch::` ops can be loaded."""
 
-from .cache import compact_requests, link, lru_partition, unlink
+from .cache import compact_requests, lacking, link, locate, lru_partition, unlink
 from .registry import available
 from .segments import Samples, Segments, composite, list_samples, sample_bricks, trace_segments
 from .shade import shade_rays
@@ -13,8 +13,10 @@ __all__ = [
     "available",
     "compact_requests",
     "composite",
+    "lacking",
     "link",
     "list_samples",
+    "locate",
     "lru_partition",
     "sample_bricks",
     "shade_rays",

@@ -1,8 +1,9 @@
-"""The cache's ops, checked and sent to a backend: requests listed, slots ordered by use, pointers
-cleared and written.
+"""The cache's ops, checked and sent to a backend: requests listed, nodes located, slots ordered by
+use, pointers cleared and written.
 
-Words are int32. Lists have a fixed capacity and a count that stays on the device, so that a frame
-needs no host synchronisation; places that are not taken hold -1.
+Words and slots are int32, nodes that the host names int64. Lists of wishes have a fixed capacity
+and a count that stays on the device, so that a frame needs no host synchronisation; places that are
+not taken hold -1.
 
 Source: Crassin et al., "GigaVoxels", I3D 2009, section 5.
 """
@@ -131,8 +132,90 @@ def link(
     _home(backend, pointer_tn).link(pointer_tn, request_tn, node_k, word_k, kind)
 
 
-def _words(where: str, name: str, value: Tensor, shape: tuple, like: Tensor) -> None:
-    check.tensor(where, name, value, shape, torch.int32, like.device)
+def locate(
+    loc_t4: Tensor, node_k: Tensor, branching: int, per_tile: int, *, backend: Backend = "auto"
+) -> Tensor:
+    """Returns where nodes lie.
+
+    Args:
+        loc_t4: (t, 4) int32 x, y, z of each tile's parent, and the depth of the tile's nodes.
+        node_k: (k,) int64 node indices.
+        branching: N of the tree whose nodes they are.
+        per_tile: Nodes of a tile.
+        backend: auto, reference, cpp or cuda.
+
+    Returns:
+        (k, 4) int64 x, y, z, depth; -1 for an index that is no node's.
+
+    Raises:
+        ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.
+    """
+    where = "locate"
+    _words(where, "loc_t4", loc_t4, ("t", 4), node_k)
+    _words(where, "node_k", node_k, ("k",), node_k, torch.int64)
+    check.whole(where, "branching", branching, low=2, high=2**15 - 1)
+    check.whole(where, "per_tile", per_tile, low=1, high=2**31 - 1)
+    return _home(backend, node_k).locate(loc_t4, node_k, branching, per_tile)
+
+
+def lacking(
+    pointer_tn: Tensor,
+    loc_t4: Tensor,
+    parent_t: Tensor,
+    tree_t: Tensor,
+    shared_t: Tensor,
+    node_k: Tensor,
+    loc_k4: Tensor,
+    tree: int,
+    root: int,
+    branching: int,
+    *,
+    backend: Backend = "auto",
+) -> Tensor:
+    """Tells which nodes still stand for the places that were asked for, and still have nothing.
+
+    Args:
+        pointer_tn: (t, n) int32 child or brick words: what is asked for is ABSENT.
+        loc_t4: See `locate`.
+        parent_t: (t,) int32 the node whose children a tile holds, below 0: none.
+        tree_t: (t,) int32 number of the tree that owns each tile.
+        shared_t: (t,) bool, nodes that are the same as its parent may lead to the tile, too.
+        node_k: (k,) int64 node indices.
+        loc_k4: (k, 4) int64 the places that were asked for.
+        tree: The tree's number.
+        root: Node index of its root.
+        branching: Its N.
+        backend: auto, reference, cpp or cuda.
+
+    Returns:
+        (k,) bool: the node's tile hangs in the tree, at that place, and its word is ABSENT.
+
+    Raises:
+        ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.
+    """
+    where = "lacking"
+    _words(where, "pointer_tn", pointer_tn, ("t", "n"), node_k)
+    tiles = len(pointer_tn)
+    _words(where, "loc_t4", loc_t4, (tiles, 4), node_k)
+    _words(where, "parent_t", parent_t, (tiles,), node_k)
+    _words(where, "tree_t", tree_t, (tiles,), node_k)
+    _words(where, "shared_t", shared_t, (tiles,), node_k, torch.bool)
+    _words(where, "node_k", node_k, ("k",), node_k, torch.int64)
+    _words(where, "loc_k4", loc_k4, (len(node_k), 4), node_k, torch.int64)
+    check.whole(where, "branching", branching, low=2, high=2**15 - 1)
+    pools = (pointer_tn, loc_t4, parent_t, tree_t, shared_t)
+    return _home(backend, node_k).lacking(*pools, node_k, loc_k4, tree, root, branching)
+
+
+def _words(
+    where: str,
+    name: str,
+    value: Tensor,
+    shape: tuple,
+    like: Tensor,
+    dtype: torch.dtype = torch.int32,
+) -> None:
+    check.tensor(where, name, value, shape, dtype, like.device)
     if not value.is_contiguous():
         raise ValueError(f"{where}: {name} must be contiguous")
 

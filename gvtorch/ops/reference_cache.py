@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..config import REQUEST_KINDS, REQUEST_PENDING_SHIFT, REQUEST_PRIORITY
+from ..config import ABSENT, REQUEST_KINDS, REQUEST_PENDING_SHIFT, REQUEST_PRIORITY
 
 
 def compact_requests(request_tn: Tensor, capacity: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -46,3 +46,37 @@ def link(pointer_tn: Tensor, request_tn: Tensor, node_k: Tensor, word_k: Tensor,
     node = node_k[valid].to(torch.int64)
     pointer_tn.view(-1)[node] = word_k[valid]
     request_tn.view(-1)[node] &= ~(kind | kind << REQUEST_PENDING_SHIFT)
+
+
+def locate(loc_t4: Tensor, node_k: Tensor, branching: int, per_tile: int) -> Tensor:
+    """Twin of `torch.ops.gvtorch.locate`."""
+    known = (node_k >= 0) & (node_k < len(loc_t4) * per_tile)
+    node = torch.where(known, node_k, 0)
+    above = loc_t4.to(torch.int64)[node // per_tile]
+    child = node % per_tile
+    digits = [child // branching**axis % branching for axis in range(3)]
+    loc = torch.stack([above[:, i] * branching + d for i, d in enumerate(digits)], 1)
+    return torch.where(known[:, None], torch.cat((loc, above[:, 3:]), 1), -1)
+
+
+def lacking(
+    pointer_tn: Tensor,
+    loc_t4: Tensor,
+    parent_t: Tensor,
+    tree_t: Tensor,
+    shared_t: Tensor,
+    node_k: Tensor,
+    loc_k4: Tensor,
+    tree: int,
+    root: int,
+    branching: int,
+) -> Tensor:
+    """Twin of `torch.ops.gvtorch.lacking`."""
+    per_tile = pointer_tn.shape[1]
+    known = (node_k >= 0) & (node_k < pointer_tn.numel())
+    node = torch.where(known, node_k, 0)
+    tile = node // per_tile
+    linked = (parent_t[tile] >= 0) | shared_t[tile] | (node == root)
+    there = (locate(loc_t4, node, branching, per_tile) == loc_k4).all(1)
+    bare = pointer_tn.view(-1)[node] == ABSENT
+    return known & linked & (tree_t[tile] == tree) & there & bare

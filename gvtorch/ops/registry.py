@@ -56,6 +56,15 @@ def _fake_lru_partition(order_k: Tensor, stamp_s: Tensor, frame_1: Tensor) -> tu
     return torch.empty_like(order_k), order_k.new_empty((1,), dtype=torch.int64)
 
 
+def _fake_locate(loc_t4: Tensor, node_k: Tensor, branching: int, per_tile: int) -> Tensor:
+    return node_k.new_empty((node_k.shape[0], 4))
+
+
+def _fake_lacking(*args: Any) -> Tensor:
+    node_k = args[5]
+    return torch.empty_like(node_k, dtype=torch.bool)
+
+
 def _fake_count_segments(*args: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     rays, child_tn, domain_2 = args[0].shape[0], args[5], args[13]
     return (
@@ -135,6 +144,8 @@ if not _reasons["cpp"]:
     torch.library.register_fake("gvtorch::lru_partition", _fake_lru_partition)
     torch.library.register_fake("gvtorch::unlink", _fake_in_place)
     torch.library.register_fake("gvtorch::link", _fake_in_place)
+    torch.library.register_fake("gvtorch::locate", _fake_locate)
+    torch.library.register_fake("gvtorch::lacking", _fake_lacking)
     torch.library.register_fake("gvtorch::count_segments", _fake_count_segments)
     torch.library.register_fake("gvtorch::write_segments", _fake_write_segments)
     torch.library.register_fake("gvtorch::sample_bricks", _fake_sample_bricks)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from .. import check
 from ..config import CONSTANT, EMPTY, TERMINAL
+from ..ops import locate
 from ..stage import Progress, no_progress
 from ..volume import Volume, movable
 from .brick_pool import BrickPool, cut_bricks
@@ -127,11 +128,7 @@ class N3Tree:
 
     def loc(self, node: Tensor) -> Tensor:
         """Returns (k, 4) int64 x, y, z, depth of nodes (k,) of this tree."""
-        n, per_tile = self.branching, self.nodes.nodes_per_tile
-        above = self.nodes.loc_t4[node // per_tile].to(torch.int64)
-        child = node % per_tile
-        digits = torch.stack((child % n, child // n % n, child // n**2, torch.zeros_like(child)), 1)
-        return torch.cat((above[:, :3] * n, above[:, 3:]), 1) + digits
+        return locate(self.nodes.loc_t4, node, self.branching, self.nodes.nodes_per_tile)
 
     def find(self, loc: Tensor) -> Tensor:
         """Returns (k,) int64 node indices of places (k, 4) x, y, z, depth; -1 where there is none

@@ -1,5 +1,6 @@
-// The cache's four ops on bare words: what rays asked for becomes a list, slots are ordered by use, pointers to
-// slots that change hands are cleared, new pointers are written.
+// The cache's ops on bare words: what rays asked for becomes a list, nodes tell their places and whether they still
+// lack what they asked for, slots are ordered by use, pointers to slots that change hands are cleared, new pointers are
+// written.
 //
 // Equal to ops/reference_cache.py in every integer. What a device brings (cpu.cpp, cuda.cu):
 //   for_each(n, body)     body(index)
@@ -11,7 +12,7 @@
 // Method: Crassin et al., "GigaVoxels", I3D 2009, section 5 (usage stamps, LRU by compaction, request lists).
 #pragma once
 
-#include "hd.h"
+#include "tree.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
@@ -144,6 +145,56 @@ struct WritePointer {
     if (node < 0 || node >= nodes) return;
     pointer_tn[node] = word_k[index];
     request_tn[node] &= ~(kind | (kind << kPendingShift));
+  }
+};
+
+// Where nodes lie: x, y, z and depth of each, from those of its tile; -1 for an index that is no node's.
+struct LocateNodes {
+  const int32_t* loc_t4;
+  const int64_t* node_k;
+  int64_t* loc_k4;
+  int64_t nodes;
+  int32_t per_tile, branching;
+
+  GV_HD void operator()(int64_t index) const {
+    const int64_t node = node_k[index];
+    for (int32_t part = 0; part < 4; ++part) loc_k4[4 * index + part] = at(node, part);
+  }
+  // x, y, z or depth.
+  GV_HD int64_t at(int64_t node, int32_t part) const {
+    if (node < 0 || node >= nodes) return -1;
+    const int64_t tile = node / per_tile;
+    const int64_t above = loc_t4[4 * tile + part];
+    if (part == 3) return above;
+    auto digit = static_cast<int32_t>(node - tile * per_tile);
+    for (int32_t axis = 0; axis < part; ++axis) digit /= branching;
+    return above * branching + digit % branching;
+  }
+};
+
+// Which nodes still stand for the places that were asked for, reached from a parent or from an alias, and still have
+// nothing there.
+struct FindLacking {
+  LocateNodes places;  // its loc_k4 is not written
+  const int32_t* pointer_tn;
+  const int32_t* parent_t;
+  const int32_t* tree_t;
+  const bool* shared_t;
+  const int64_t* loc_k4;
+  bool* lacks_k;
+  int32_t tree;
+  int64_t root;
+
+  GV_HD void operator()(int64_t index) const {
+    const int64_t node = places.node_k[index];
+    bool lacks = node >= 0 && node < places.nodes;
+    if (lacks) {
+      const int64_t tile = node / places.per_tile;
+      lacks = (parent_t[tile] >= 0 || shared_t[tile] || node == root) && tree_t[tile] == tree &&
+              pointer_tn[node] == kAbsent;
+      for (int32_t part = 0; part < 4; ++part) lacks = lacks && places.at(node, part) == loc_k4[4 * index + part];
+    }
+    lacks_k[index] = lacks;
   }
 };
 

@@ -157,6 +157,8 @@ STABLE_TORCH_LIBRARY(gvtorch, library) {
   library.def(gvtorch::kLruPartitionSchema);
   library.def(gvtorch::kUnlinkSchema);
   library.def(gvtorch::kLinkSchema);
+  library.def(gvtorch::kLocateSchema);
+  library.def(gvtorch::kLackingSchema);
   gvtorch::define_segments(library);
 }
 
@@ -167,5 +169,7 @@ STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) {
   library.impl("lru_partition", TORCH_BOX(&gvtorch::lru_partition<gvtorch::Cpu>));
   library.impl("unlink", TORCH_BOX(&gvtorch::unlink<gvtorch::Cpu>));
   library.impl("link", TORCH_BOX(&gvtorch::link<gvtorch::Cpu>));
+  library.impl("locate", TORCH_BOX(&gvtorch::locate<gvtorch::Cpu>));
+  library.impl("lacking", TORCH_BOX(&gvtorch::lacking<gvtorch::Cpu>));
   GV_IMPLEMENT_SEGMENTS(library, gvtorch::Cpu);
 }

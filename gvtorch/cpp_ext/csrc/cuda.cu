@@ -220,5 +220,7 @@ STABLE_TORCH_LIBRARY_IMPL(gvtorch, CUDA, library) {
   library.impl("lru_partition", TORCH_BOX(&gvtorch::lru_partition<gvtorch::Cuda>));
   library.impl("unlink", TORCH_BOX(&gvtorch::unlink<gvtorch::Cuda>));
   library.impl("link", TORCH_BOX(&gvtorch::link<gvtorch::Cuda>));
+  library.impl("locate", TORCH_BOX(&gvtorch::locate<gvtorch::Cuda>));
+  library.impl("lacking", TORCH_BOX(&gvtorch::lacking<gvtorch::Cuda>));
   GV_IMPLEMENT_SEGMENTS(library, gvtorch::Cuda);
 }

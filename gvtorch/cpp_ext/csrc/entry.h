@@ -63,6 +63,11 @@ constexpr const char* kLruPartitionSchema =
 constexpr const char* kUnlinkSchema = "unlink(Tensor(a!) pointer, Tensor slot_k, int slots, int divisor) -> ()";
 constexpr const char* kLinkSchema =
     "link(Tensor(a!) pointer_tn, Tensor(b!) request_tn, Tensor node_k, Tensor word_k, int kind) -> ()";
+constexpr const char* kLocateSchema =
+    "locate(Tensor loc_t4, Tensor node_k, int branching, int per_tile) -> Tensor loc_k4";
+constexpr const char* kLackingSchema =
+    "lacking(Tensor pointer_tn, Tensor loc_t4, Tensor parent_t, Tensor tree_t, Tensor shared_t, Tensor node_k, "
+    "Tensor loc_k4, int tree, int root, int branching) -> Tensor lacks_k";
 
 inline void require(const Tensor& tensor, const char* name, const Tensor& like, ScalarType dtype) {
   STD_TORCH_CHECK(tensor.is_contiguous(), "gvtorch: ", name, " must be contiguous");
@@ -413,6 +418,55 @@ void link(const Tensor& pointer_tn, const Tensor& request_tn, const Tensor& node
   for_each<Device>(pointer_tn, node_k.numel(),
                    WritePointer{words_out(pointer_tn), words_out(request_tn), words_in(node_k), words_in(word_k),
                                 pointer_tn.numel(), static_cast<int32_t>(kind)});
+}
+
+inline LocateNodes places_of(const Tensor& loc_t4, const Tensor& node_k, int64_t branching, int64_t per_tile) {
+  require(loc_t4, "loc_t4", node_k, ScalarType::Int);
+  require(node_k, "node_k", node_k, ScalarType::Long);
+  require_numel(loc_t4, "loc_t4", loc_t4.numel() / 4 * 4);
+  STD_TORCH_CHECK(branching >= 2 && branching <= INT16_MAX, "gvtorch: branching out of range");
+  STD_TORCH_CHECK(per_tile >= 1 && per_tile <= INT32_MAX, "gvtorch: per_tile out of range");
+  return {words_in(loc_t4),
+          static_cast<const int64_t*>(node_k.const_data_ptr()),
+          nullptr,
+          loc_t4.numel() / 4 * per_tile,
+          static_cast<int32_t>(per_tile),
+          static_cast<int32_t>(branching)};
+}
+
+template <class Device>
+Tensor locate(const Tensor& loc_t4, const Tensor& node_k, int64_t branching, int64_t per_tile) {
+  LocateNodes places = places_of(loc_t4, node_k, branching, per_tile);
+  Tensor loc_k4 = torch::stable::new_empty(node_k, {node_k.numel(), 4});
+  places.loc_k4 = static_cast<int64_t*>(loc_k4.mutable_data_ptr());
+  for_each<Device>(node_k, node_k.numel(), places);
+  return loc_k4;
+}
+
+template <class Device>
+Tensor lacking(const Tensor& pointer_tn, const Tensor& loc_t4, const Tensor& parent_t, const Tensor& tree_t,
+               const Tensor& shared_t, const Tensor& node_k, const Tensor& loc_k4, int64_t tree, int64_t root,
+               int64_t branching) {
+  const int64_t tiles = parent_t.numel();
+  const int64_t per_tile = tiles > 0 ? pointer_tn.numel() / tiles : 1;
+  const LocateNodes places = places_of(loc_t4, node_k, branching, per_tile);
+  require(pointer_tn, "pointer_tn", node_k, ScalarType::Int);
+  require(parent_t, "parent_t", node_k, ScalarType::Int);
+  require(tree_t, "tree_t", node_k, ScalarType::Int);
+  require(shared_t, "shared_t", node_k, ScalarType::Bool);
+  require(loc_k4, "loc_k4", node_k, ScalarType::Long);
+  require_numel(pointer_tn, "pointer_tn", tiles * per_tile);
+  require_numel(loc_t4, "loc_t4", 4 * tiles);
+  require_numel(tree_t, "tree_t", tiles);
+  require_numel(shared_t, "shared_t", tiles);
+  require_numel(loc_k4, "loc_k4", 4 * node_k.numel());
+  Tensor lacks_k = torch::stable::new_empty(node_k, {node_k.numel()}, ScalarType::Bool);
+  for_each<Device>(node_k, node_k.numel(),
+                   FindLacking{places, words_in(pointer_tn), words_in(parent_t), words_in(tree_t),
+                               static_cast<const bool*>(shared_t.const_data_ptr()),
+                               static_cast<const int64_t*>(loc_k4.const_data_ptr()),
+                               static_cast<bool*>(lacks_k.mutable_data_ptr()), static_cast<int32_t>(tree), root});
+  return lacks_k;
 }
 
 }  // namespace gvtorch
