@@ -20,9 +20,10 @@ from . import check
 from .arrivals import Arrivals, Numbers
 from .cache import Cache, Listed, Scheduler, Wishes
 from .frame import FrameStats, Hits, Rays, add
+from .jobs import Plant
 from .ops.trace import choose_backend
 from .producers import Producer
-from .production import Failure, Plant, Production
+from .production import Failure, Production
 from .rendering import Camera, ModuleShader, Picture, RenderOptions
 from .rendering.custom import as_camera
 from .rendering.pieces import Trace

@@ -13,27 +13,19 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future
 from concurrent.futures import wait as wait_for
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from .cache import KINDS, Cache, Children, Scheduler, Written
-from .config import (
-    ABSENT,
-    CONSTANT,
-    EMPTY,
-    REQUEST_LOAD,
-    TERMINAL,
-)
+from .cache import KINDS, Cache, Scheduler, Written
+from .config import ABSENT, CONSTANT, EMPTY, REQUEST_LOAD
 from .frame import FrameStats
-from .pool import N3Tree, Rows, Staging
+from .jobs import Answer, Job, Plant, Sent, by_kind, children_of, select, send_ahead, shipped
+from .pool import Staging
 from .pool.staging import Shipment, on_host, upload
-from .producers import Bricks, Layout, Nodes, Producer, Region, Regions
-from .producers.answer import checked_bricks, checked_regions, count_kinds
-from .volume import movable
+from .producers import Bricks, Region, Regions
 
 _KEPT_FAILURES = 1000  # named; all are counted
 _MOST_RAISES = 256  # calls in one frame that may raise before whole batches are given up
@@ -59,75 +51,6 @@ class Failure:
         return (
             f"tree {self.tree!r}, depth {depth}, node ({x}, {y}, {z}), {self.kind}: {self.message}"
         )
-
-
-@dataclass(frozen=True, eq=False)
-class Plant:
-    """A tree and what makes it grow."""
-
-    name: str
-    tree: N3Tree
-    producer: Producer
-    layout: Layout
-
-
-@dataclass(frozen=True, eq=False)
-class Job:
-    """Items asked for together."""
-
-    plant: Plant
-    kind: int
-    node: Tensor  # (k,) int64: nodes to fill, or to subdivide
-    loc: Tensor  # (k, 4) their places
-    same: Tensor | None = None  # (k, 4) places that are filled in their stead: they are aliases
-
-    def __len__(self) -> int:
-        return len(self.node)
-
-    def __getitem__(self, index: slice | Tensor) -> Job:
-        if isinstance(index, Tensor):
-            index = upload(index, self.node.device)
-        same = None if self.same is None else self.same[index]
-        return Job(self.plant, self.kind, self.node[index], self.loc[index], same)
-
-    @property
-    def bricks(self) -> Nodes:
-        """What a producer is asked to fill."""
-        return Nodes(self.loc if self.same is None else self.same, self.plant.layout)
-
-    def ask(self) -> Any:
-        """Calls the producer."""
-        if self.kind == REQUEST_LOAD:
-            return self.plant.producer.fill(self.bricks)
-        return self.plant.producer.classify(self.children)
-
-    @cached_property
-    def children(self) -> Nodes:
-        """All children of all nodes, node after node."""
-        n = self.plant.layout.branching
-        child = torch.arange(n**3, device=self.loc.device)
-        digits = torch.stack((child % n, child // n % n, child // n**2, torch.ones_like(child)), 1)
-        low = torch.cat((self.loc[:, :3] * n, self.loc[:, 3:]), 1)
-        return Nodes((low[:, None] + digits).flatten(0, 1), self.plant.layout)
-
-    def check(self, answer: Any) -> Answer:
-        """Checks an answer; see producers/answer.py."""
-        if isinstance(answer, _Sent):
-            return answer
-        if self.kind == REQUEST_LOAD:
-            return checked_bricks(answer, self.bricks, self.plant.producer)
-        return checked_regions(answer, self.children, self.plant.producer)
-
-
-@dataclass(frozen=True, eq=False)
-class _Sent:
-    """Voxels that were checked, found right, and are on their way to the device."""
-
-    shipment: Shipment
-    errors: Mapping[int, str] = field(default_factory=dict)
-
-
-Answer = Regions | Bricks | _Sent
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,7 +270,7 @@ class Production:
 
         def go(asked: Future) -> None:
             try:
-                ahead.set_result(_send_ahead(job, asked.result(), staging))
+                ahead.set_result(send_ahead(job, asked.result(), staging))
             except BaseException as error:
                 ahead.set_exception(error)
 
@@ -393,9 +316,9 @@ class Production:
             keep = torch.ones(len(job), dtype=torch.bool)
             keep[list(named)] = False
             rows = keep.repeat_interleave(per_item).nonzero()[:, 0]
-            job, checked = job[keep.nonzero()[:, 0]], _select(checked, rows)
+            job, checked = job[keep.nonzero()[:, 0]], select(checked, rows)
         if len(job):
-            done.append((job, _sent(job, checked, self.staging)))
+            done.append((job, shipped(job, checked, self.staging)))
 
     def _mark(self, job: Job) -> None:
         wanted = self.cache.wanted(job.plant.tree, job.node, job.loc, job.kind)
@@ -418,11 +341,11 @@ class Production:
         )
 
     def _write_bricks(
-        self, job: Job, answer: Bricks | _Sent, queue: deque[tuple[Job, Answer]]
+        self, job: Job, answer: Bricks | Sent, queue: deque[tuple[Job, Answer]]
     ) -> Written:
         tree, device = job.plant.tree, job.node.device
         if isinstance(answer, Bricks):
-            groups = _groups(job, answer)
+            groups = by_kind(job, answer)
             if len(groups) > 1:
                 queue.extendleft((one, part) for _, one, part in groups)  # aliases come first
                 return Written()
@@ -439,7 +362,7 @@ class Production:
                 return self.cache.write_uniform(tree, job.node, job.loc, word, values)
             if self.staging is None or not on_host(answer.data):
                 return self.cache.write_bricks(tree, job.node, job.loc, answer.data)
-            answer = _Sent(self.staging.send(answer.data))
+            answer = Sent(self.staging.send(answer.data))
         shipment = answer.shipment
         sent = shipment.sent
         if sent == len(job):
@@ -448,7 +371,7 @@ class Production:
         self._mark(rest)
         self._held.append((rest, Bricks(data=shipment.rest)))
         if sent:
-            queue.appendleft((job[:sent], _Sent(Shipment(shipment.parts, sent, {}))))
+            queue.appendleft((job[:sent], Sent(Shipment(shipment.parts, sent, {}))))
         return Written()
 
     def _write_aliases(self, job: Job, same: Tensor, queue: deque[tuple[Job, Answer]]) -> None:
@@ -469,122 +392,3 @@ class Production:
         alone = job[~there]
         self._submit(Job(alone.plant, alone.kind, alone.node, alone.loc, same[~there]), done)
         queue.extend(done)
-
-
-def children_of(job: Job, answer: Regions, cache: Cache) -> Children:
-    """Turns a producer's regions into the words of tiles."""
-    layout, count = job.plant.layout, len(job)
-    nodes = job.children
-    kind = answer.kind
-    step = nodes.scale * layout.brick_size
-    low = nodes.loc[:, :3] * step[:, None]
-    kind = torch.where((low >= layout.extent_3).any(1), Region.EMPTY, kind)
-    leaf = (kind == Region.EMPTY) | (kind == Region.CONSTANT) | (kind == Region.DATA_MAX_DEPTH)
-    leaf |= nodes.depth >= layout.depth
-    child = torch.where(leaf, TERMINAL, ABSENT).to(torch.int32)
-    brick = torch.full_like(child, ABSENT)
-    brick[kind == Region.EMPTY], brick[kind == Region.CONSTANT] = EMPTY, CONSTANT
-
-    def by_tile(values: Tensor) -> Tensor:
-        return values.unflatten(0, (count, -1))
-
-    constants = dict(answer.constants)
-    for name, words in cache.nodes.constants.items():  # also what another tree left in these tiles
-        if name not in constants:
-            constants[name] = words.new_zeros((len(kind), words.shape[-1]))
-    ranges = dict(answer.ranges)
-    for name in cache.nodes.ranges:
-        if name in ranges:
-            continue
-        ranges[name] = unknown_range(cache, name, len(kind))
-        if name in answer.constants:
-            ends = movable(answer.constants[name])[:, None].expand(-1, 2, -1)
-            uniform = (kind == Region.CONSTANT)[:, None, None]
-            merged = torch.where(uniform, ends, movable(ranges[name]))
-            ranges[name] = merged.view(ranges[name].dtype)
-    return Children(
-        child=by_tile(child),
-        brick=by_tile(brick),
-        constants={name: by_tile(values) for name, values in constants.items()},
-        ranges={name: by_tile(values) for name, values in ranges.items()},
-        is_alias=by_tile(kind == Region.ALIAS),
-        alias=None if answer.alias is None else by_tile(answer.alias),
-    )
-
-
-def unknown_range(cache: Cache, name: str, count: int) -> Tensor:
-    """(k, 2, c) all that a channel can hold."""
-    channel, device = cache.bricks.channels[name], cache.nodes.child_tn.device
-    shape = (count, channel.width)
-    ends = [torch.full(shape, end, dtype=channel.dtype, device=device) for end in channel.limits]
-    return torch.stack([movable(end) for end in ends], 1).view(channel.dtype)
-
-
-def _groups(job: Job, answer: Bricks) -> list[tuple[Region, Job, Bricks]]:
-    """The items that are written in one way: DATA for voxels, CONSTANT for what needs none, ALIAS.
-    An answer on a device is looked at once.
-    """
-    kind = answer.kind
-    if kind is None:
-        return [(Region.DATA, job, answer)]
-    empty, constant, data, last, alias = count_kinds(kind).tolist()
-    counts = {Region.DATA: data + last, Region.CONSTANT: empty + constant, Region.ALIAS: alias}
-    found = [what for what, count in counts.items() if count]
-    if len(found) == 1:
-        return [(found[0], job, answer)]
-    masks = {
-        Region.DATA: (kind == Region.DATA) | (kind == Region.DATA_MAX_DEPTH),
-        Region.CONSTANT: (kind == Region.EMPTY) | (kind == Region.CONSTANT),
-        Region.ALIAS: kind == Region.ALIAS,
-    }
-    groups = []
-    for what in found:
-        rows = torch.nonzero_static(masks[what], size=counts[what])[:, 0]
-        groups.append((what, job[rows], _select(answer, rows)))
-    return groups
-
-
-def _send_ahead(job: Job, answer: Any, staging: Staging) -> Any:
-    """Checks an answer and sends it; returns it as it is unless it is voxels from the host and
-    nothing else, all of them right.
-    """
-    data = answer.data if isinstance(answer, Bricks) else answer
-    if not isinstance(data, Mapping) or not all(
-        isinstance(rows, Rows) or (isinstance(rows, Tensor) and rows.device.type == "cpu")
-        for rows in data.values()
-    ):
-        return answer
-    try:
-        checked = job.check(answer)
-    except ValueError:
-        return answer  # the frame tells of it
-    if not isinstance(checked, Bricks) or checked.errors:
-        return answer
-    sent = _sent(job, checked, staging)
-    return sent if isinstance(sent, _Sent) else answer
-
-
-def _sent(job: Job, answer: Answer, staging: Staging | None) -> Answer:
-    """Puts a checked answer on its way if it is voxels from the host and nothing else."""
-    if staging is None or not isinstance(answer, Bricks) or not on_host(answer.data):
-        return answer
-    if answer.kind is not None:
-        if int(count_kinds(answer.kind)[Region.DATA : Region.ALIAS].sum()) < len(job):
-            return answer
-    return _Sent(staging.send(answer.data))
-
-
-def _select(answer: Any, row: Tensor) -> Any:
-    """The items of an answer that `row` (m,) names, errors left out."""
-
-    def rows(value: Any) -> Any:
-        if isinstance(value, Rows):
-            return value[row]
-        if isinstance(value, Tensor):
-            return movable(value)[row.to(value.device)].view(value.dtype)
-        if isinstance(value, dict):
-            return {name: rows(tensor) for name, tensor in value.items()}
-        return value
-
-    fields = {name: rows(value) for name, value in vars(answer).items() if name != "errors"}
-    return type(answer)(**fields, errors={})

@@ -11,10 +11,11 @@ import torch
 from . import check
 from .cache import Cache
 from .config import ABSENT, CONSTANT, EMPTY, TERMINAL
+from .jobs import Plant
 from .pool import BrickPool, Channel, N3Tree, NodePool
 from .producers import Nodes, Producer, Region
 from .producers.answer import checked_bricks, checked_regions, layout_of
-from .production import Plant, ProductionError
+from .production import ProductionError
 from .rendering.renderer import check_type
 from .volume import movable
 

@@ -100,6 +100,66 @@ def test_link_writes_pointers_and_takes_wishes_back(backend, data, tiles):
     assert a.view(-1).tolist() == pointer and b.view(-1).tolist() == request
 
 
+@fixed
+@given(data=st.data(), slots=st.integers(1, 30))
+def test_link_bricks_gives_nodes_slots_of_their_own(backend, data, slots):
+    device, nodes = DEVICES[backend], 24
+    chosen = data.draw(st.lists(st.integers(0, nodes - 1), unique=True, max_size=slots))
+    taken = data.draw(st.permutations(range(slots)))[: len(chosen)]
+    request = data.draw(st.lists(words, min_size=nodes, max_size=nodes))
+    brick = [-1] * nodes
+    before = {"owner": [7] * slots, "stamp": [3] * slots, "born": [2] * slots}
+    there = [int32(w, device).view(-1, 8) for w in (brick, request)]
+    there += [int32(w, device) for w in before.values()]
+    there.append(torch.ones(slots, dtype=torch.bool, device=device))
+    node_k = torch.tensor([*chosen, -1, nodes], device=device)
+    ops.link_bricks(*there, node_k, int32([*taken, 0, 0], device), 9, backend=backend)
+    shared = [True] * slots
+    for node, slot in zip(chosen, taken, strict=True):
+        brick[node], shared[slot] = slot, False
+        request[node] &= ~(LOAD | LOAD << PENDING)
+        before["owner"][slot], before["stamp"][slot], before["born"][slot] = node, 9, 10
+    expected = [brick, request, *before.values(), shared]
+    assert [t.flatten().tolist() for t in there] == expected
+
+
+@fixed
+@given(data=st.data(), tiles=st.integers(2, 12), width=st.sampled_from([1, 4, 8]))
+def test_link_tiles_writes_tiles_and_hangs_them_below_nodes(backend, data, tiles, width):
+    device, per_tile = DEVICES[backend], 8
+    fresh = data.draw(st.sets(st.integers(1, tiles - 1)))
+    old = [n for n in range(tiles * per_tile) if n // per_tile not in fresh]
+    asking = data.draw(st.lists(st.sampled_from(old), unique=True, min_size=len(fresh)))
+    rows = data.draw(st.permutations(range(len(asking))))[: len(fresh)]
+    generator = torch.Generator().manual_seed(data.draw(st.integers(0, 2**20)))
+
+    def draw(*shape: int) -> torch.Tensor:
+        return torch.randint(-3, 50, shape, dtype=torch.int32, generator=generator)
+
+    request = data.draw(st.lists(words, min_size=tiles * per_tile, max_size=tiles * per_tile))
+    pool = [draw(tiles, per_tile), draw(tiles, per_tile), int32(request).view(-1, per_tile)]
+    pool += [draw(tiles, 4), draw(tiles), draw(tiles), draw(tiles)]
+    pool.append(torch.ones(tiles, dtype=torch.bool))
+    made = [draw(len(asking), width), draw(len(asking), width), torch.tensor(asking).long()]
+    made.append(draw(len(asking), 4).long())
+    there = [t.to(device) for t in pool]
+    row_k, tile_k = torch.tensor([*rows, -1]), int32([*sorted(fresh), 0])
+    given_ = [t.to(device) for t in (*made, row_k, tile_k)]
+    ops.link_tiles(*there, *given_, 5, 9, backend=backend)
+
+    child, brick, asked, loc, parent, tree, stamp, shared = pool
+    for row, tile in zip(rows, sorted(fresh), strict=True):
+        child[tile], brick[tile], asked[tile] = config.TERMINAL, config.EMPTY, 0
+        child[tile, :width], brick[tile, :width] = made[0][row], made[1][row]
+        x, y, z, depth = made[3][row].tolist()
+        loc[tile] = int32([x, y, z, depth + 1])
+        parent[tile], tree[tile], stamp[tile], shared[tile] = asking[row], 5, 9, False
+    for row, tile in zip(rows, sorted(fresh), strict=True):
+        child.view(-1)[asking[row]] = tile
+        asked.view(-1)[asking[row]] &= ~(SUBDIVIDE | SUBDIVIDE << PENDING)
+    assert [t.tolist() for t in there] == [t.tolist() for t in pool]
+
+
 def a_pool(data, branching: int, tiles: int) -> dict[str, torch.Tensor]:
     """Tiles at random, with more nodes a tile than the tree has children, as wider trees leave."""
     per_tile = branching**3 + data.draw(st.sampled_from([0, 5]))
@@ -189,11 +249,34 @@ def test_cache_ops_pass_opcheck(compiled):
     request = int32([[1 << 16, 0, 3 << 16, 9 << 16]], device)
     table, frame = torch.ops.gvtorch, int32([1], device)
     place = torch.zeros((1, 4), dtype=torch.int64, device=device)
+    row, none = torch.zeros_like(frame).long(), torch.zeros_like(frame)
     for op, arguments in (
         (table.compact_requests, (request, 3)),
         (table.lru_partition, (int32([2, 0, 1], device), int32([1, 0, 1], device), frame)),
         (table.unlink, (request, int32([0, -1], device), 4, 1)),
         (table.link, (request, request.clone(), frame, frame, LOAD)),
+        (
+            table.link_bricks,
+            (
+                request,
+                request.clone(),
+                *[frame.clone() for _ in range(3)],
+                frame.bool(),
+                row,
+                none,
+                3,
+            ),
+        ),
+        (
+            table.link_tiles,
+            (
+                *[request.clone() for _ in range(4)],
+                *[frame.clone() for _ in range(3)],
+                frame.bool(),
+                *(request, request, row, place, row, none),
+                *(1, 2),
+            ),
+        ),
         (table.locate, (request, frame.long(), 2, 4)),
         (
             table.lacking,
@@ -229,6 +312,23 @@ def test_nothing_to_do(backend):
         (lambda w: ops.unlink(w, w, 4), "slot_k must be (k,)"),
         (lambda w: ops.unlink(w, w[0], 4, 0), "divisor must be an int >= 1"),
         (lambda w: ops.link(w, w, w[0], w[0, :2], LOAD), "word_k must be (8,)"),
+        (
+            lambda w: ops.link_bricks(w, w, *[w[0]] * 3, w[0], w[0].long(), w[0], 1),
+            "shared_b must be (8,) bool",
+        ),
+        (
+            lambda w: ops.link_tiles(
+                *[w] * 3,
+                w[:, :4].clone(),
+                *[w[:, 0].clone()] * 3,
+                w[:, 0] > 0,
+                *[torch.zeros((2, 9), dtype=torch.int32)] * 2,
+                *[w[0].long()] * 4,
+                0,
+                0,
+            ),
+            "child_jw must be (8, w) int32",
+        ),
         (lambda w: ops.locate(w, w[0].long(), 2, 8), "loc_t4 must be (t, 4) int32"),
         (lambda w: ops.locate(w[:, :4].clone(), w[0], 2, 8), "node_k must be (k,) int64"),
         (

@@ -18,7 +18,8 @@ FLOORS = [
     {"pool"},
     {"io"},
     {"cache", "producers", "rendering"},
-    {"arrivals", "production", "turns"},
+    {"arrivals", "jobs", "turns"},
+    {"production"},
     {"scene"},
     {"engine"},
     {"bench"},
@@ -56,7 +57,7 @@ def modules() -> list[Path]:
     files = [
         p for p in PACKAGE.rglob("*.py") if p.name not in ("__main__.py",) and p.parent != PACKAGE
     ]
-    alone = FLOORS[0] | {"arrivals", "production", "turns", "scene", "engine"}
+    alone = FLOORS[0] | {"arrivals", "jobs", "production", "turns", "scene", "engine"}
     return files + [PACKAGE / f"{name}.py" for name in sorted(alone)]
 
 

@@ -16,13 +16,12 @@ from torch import Tensor
 
 from ..config import (
     ABSENT,
-    EMPTY,
     REQUEST_LOAD,
     REQUEST_PENDING_SHIFT,
     REQUEST_SUBDIVIDE,
     TERMINAL,
 )
-from ..ops import lacking, link, unlink
+from ..ops import lacking, link, link_bricks, link_tiles, unlink
 from ..pool import BrickPool, N3Tree, NodePool
 from ..pool.staging import Part, Voxels, joined, on_device, wide_rows
 from ..volume import movable
@@ -193,22 +192,16 @@ class Cache:
         unlink(self.bricks.owner_b, tile_k, pool.capacity, per_tile)
 
         width = children.child.shape[1]
-        pool.child_tn[tile], pool.brick_tn[tile] = TERMINAL, EMPTY
-        pool.child_tn[tile, :width] = children.child[fits]
-        pool.brick_tn[tile, :width] = children.brick[fits]
-        pool.request_tn[tile], pool.stamp_t[tile], pool.shared_t[tile] = 0, self.frame, False
-        pool.loc_t4[tile] = loc[fits].to(torch.int32)
-        pool.loc_t4[tile, 3] += 1
-        pool.parent_t[tile] = node[fits].to(torch.int32)
-        pool.tree_t[tile] = tree.number
-        for words, values in (
+        for held, values in (
             (pool.constants, children.constants),
             (pool.ranges, children.ranges),
         ):
             for name, tensor in values.items():
-                movable(words[name])[tile, :width] = movable(tensor)[fits]
-        node_k = node[fits].to(torch.int32)
-        link(pool.child_tn, pool.request_tn, node_k, tile_k, REQUEST_SUBDIVIDE)
+                movable(held[name])[tile, :width] = movable(tensor)[fits]
+        words = (pool.child_tn, pool.brick_tn, pool.request_tn)
+        tiles = (pool.loc_t4, pool.parent_t, pool.tree_t, pool.stamp_t, pool.shared_t)
+        made = (children.child.contiguous(), children.brick.contiguous(), node, loc)
+        link_tiles(*words, *tiles, *made, fits, tile_k, tree.number, self.frame)
         if children.alias is not None:
             self._share_children(tree, tile, children, fits)
         return done
@@ -342,11 +335,9 @@ class Cache:
             for part in data:
                 with part as landed:
                     nbytes += self._fill_slots(slot[part.begin : part.end], landed)
-        pool.owner_b[slot] = node.to(torch.int32)
-        pool.stamp_b.index_fill_(0, slot, self.frame)
-        pool.born_b.index_fill_(0, slot, self.frame + 1)
-        pool.shared_b.index_fill_(0, slot, False)
-        self._link_bricks(node, slot_k)
+        words = (self.nodes.brick_tn, self.nodes.request_tn)
+        slots = (pool.owner_b, pool.stamp_b, pool.born_b, pool.shared_b)
+        link_bricks(*words, *slots, node, slot_k, self.frame)
         return nbytes
 
     def _fill_slots(self, slot: Tensor, data: Mapping[str, Tensor]) -> int:

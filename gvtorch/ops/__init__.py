@@ -1,7 +1,16 @@
 """The ops on bare tensors. Importing this package loads the compiled libraries, so that TorchScript
 archives and exported programs that hold `gvtorch::` ops can be loaded."""
 
-from .cache import compact_requests, lacking, link, locate, lru_partition, unlink
+from .cache import (
+    compact_requests,
+    lacking,
+    link,
+    link_bricks,
+    link_tiles,
+    locate,
+    lru_partition,
+    unlink,
+)
 from .registry import available
 from .segments import Samples, Segments, composite, list_samples, sample_bricks, trace_segments
 from .shade import shade_rays
@@ -15,6 +24,8 @@ __all__ = [
     "composite",
     "lacking",
     "link",
+    "link_bricks",
+    "link_tiles",
     "list_samples",
     "locate",
     "lru_partition",

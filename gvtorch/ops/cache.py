@@ -132,6 +132,125 @@ def link(
     _home(backend, pointer_tn).link(pointer_tn, request_tn, node_k, word_k, kind)
 
 
+def link_bricks(
+    brick_tn: Tensor,
+    request_tn: Tensor,
+    owner_b: Tensor,
+    stamp_b: Tensor,
+    born_b: Tensor,
+    shared_b: Tensor,
+    node_k: Tensor,
+    slot_k: Tensor,
+    frame: int,
+    *,
+    backend: Backend = "auto",
+) -> None:
+    """Gives nodes the bricks in slots, which are theirs alone from now on, and takes back that they
+    asked for them.
+
+    Mutates the first six; see `BrickPool` and `NodePool`.
+
+    Args:
+        brick_tn: (t, n) int32 brick words.
+        request_tn: (t, n) int32 request words.
+        owner_b: (b,) int32 the node that owns each slot.
+        stamp_b: (b,) int32 last frame that used it: becomes `frame`.
+        born_b: (b,) int32 the first frame that can show it: becomes `frame` + 1.
+        shared_b: (b,) bool, other nodes may point to it, too.
+        node_k: (k,) int64 node indices, each once; those of no node are left out.
+        slot_k: (k,) int32 slots, each once.
+        frame: Number of the last picture.
+        backend: auto, reference, cpp or cuda.
+
+    Raises:
+        ValueError: A tensor of the wrong shape, dtype or device.
+    """
+    where = "link_bricks"
+    _words(where, "brick_tn", brick_tn, ("t", "n"), brick_tn)
+    _words(where, "request_tn", request_tn, tuple(brick_tn.shape), brick_tn)
+    slots = {"owner_b": owner_b, "stamp_b": stamp_b, "born_b": born_b}
+    for name, words in slots.items():
+        _words(where, name, words, tuple(owner_b.shape[:1]), brick_tn)
+    _words(where, "shared_b", shared_b, tuple(owner_b.shape[:1]), brick_tn, torch.bool)
+    _words(where, "node_k", node_k, ("k",), brick_tn, torch.int64)
+    _words(where, "slot_k", slot_k, tuple(node_k.shape), brick_tn)
+    pools = (brick_tn, request_tn, *slots.values(), shared_b)
+    _home(backend, brick_tn).link_bricks(*pools, node_k, slot_k, frame)
+
+
+def link_tiles(
+    child_tn: Tensor,
+    brick_tn: Tensor,
+    request_tn: Tensor,
+    loc_t4: Tensor,
+    parent_t: Tensor,
+    tree_t: Tensor,
+    stamp_t: Tensor,
+    shared_t: Tensor,
+    child_jw: Tensor,
+    brick_jw: Tensor,
+    node_j: Tensor,
+    loc_j4: Tensor,
+    row_k: Tensor,
+    tile_k: Tensor,
+    tree: int,
+    frame: int,
+    *,
+    backend: Backend = "auto",
+) -> None:
+    """Writes tiles, hangs them below nodes, and takes back that these asked for them.
+
+    Mutates the first eight; see `NodePool`. Words beyond the `w` of the tree become TERMINAL and
+    EMPTY.
+
+    Args:
+        child_tn: (t, n) int32 child words.
+        brick_tn: (t, n) int32 brick words.
+        request_tn: (t, n) int32 request words.
+        loc_t4: (t, 4) int32 places.
+        parent_t: (t,) int32 parents.
+        tree_t: (t,) int32 numbers of trees.
+        stamp_t: (t,) int32 last frame that used a tile: becomes `frame`.
+        shared_t: (t,) bool, other nodes may point to a tile, too.
+        child_jw: (j, w) int32 what the children of j nodes hold, w <= n.
+        brick_jw: (j, w) int32 the same of their bricks.
+        node_j: (j,) int64 the nodes.
+        loc_j4: (j, 4) int64 their places.
+        row_k: (k,) int64 which of the j nodes get tiles, each once.
+        tile_k: (k,) int32 the tiles, each once, none of them a node's own.
+        tree: The tree's number.
+        frame: Number of the last picture.
+        backend: auto, reference, cpp or cuda.
+
+    Raises:
+        ValueError: A tensor of the wrong shape, dtype or device.
+    """
+    where = "link_tiles"
+    _words(where, "child_tn", child_tn, ("t", "n"), child_tn)
+    _words(where, "brick_tn", brick_tn, tuple(child_tn.shape), child_tn)
+    _words(where, "request_tn", request_tn, tuple(child_tn.shape), child_tn)
+    tiles, rows = len(child_tn), len(node_j)
+    _words(where, "loc_t4", loc_t4, (tiles, 4), child_tn)
+    words = {"parent_t": parent_t, "tree_t": tree_t, "stamp_t": stamp_t}
+    for name, tensor in words.items():
+        _words(where, name, tensor, (tiles,), child_tn)
+    _words(where, "shared_t", shared_t, (tiles,), child_tn, torch.bool)
+    _words(where, "child_jw", child_jw, (rows, "w"), child_tn)
+    _words(where, "brick_jw", brick_jw, tuple(child_jw.shape), child_tn)
+    if child_jw.shape[1] > child_tn.shape[1]:
+        width = child_tn.shape[1]
+        raise ValueError(
+            f"{where}: child_jw must hold at most {width} words a row, got {child_jw.shape[1]}"
+        )
+    _words(where, "node_j", node_j, ("j",), child_tn, torch.int64)
+    _words(where, "loc_j4", loc_j4, (rows, 4), child_tn, torch.int64)
+    _words(where, "row_k", row_k, ("k",), child_tn, torch.int64)
+    _words(where, "tile_k", tile_k, tuple(row_k.shape), child_tn)
+    pools = (child_tn, brick_tn, request_tn, loc_t4, *words.values(), shared_t)
+    made = (child_jw, brick_jw, node_j, loc_j4, row_k, tile_k)
+    _home(backend, child_tn).link_tiles(*pools, *made, tree, frame)
+
+
 def locate(
     loc_t4: Tensor, node_k: Tensor, branching: int, per_tile: int, *, backend: Backend = "auto"
 ) -> Tensor:

@@ -8,7 +8,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..config import ABSENT, REQUEST_KINDS, REQUEST_PENDING_SHIFT, REQUEST_PRIORITY
+from ..config import (
+    ABSENT,
+    EMPTY,
+    REQUEST_KINDS,
+    REQUEST_LOAD,
+    REQUEST_PENDING_SHIFT,
+    REQUEST_PRIORITY,
+    REQUEST_SUBDIVIDE,
+    TERMINAL,
+)
 
 
 def compact_requests(request_tn: Tensor, capacity: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -46,6 +55,61 @@ def link(pointer_tn: Tensor, request_tn: Tensor, node_k: Tensor, word_k: Tensor,
     node = node_k[valid].to(torch.int64)
     pointer_tn.view(-1)[node] = word_k[valid]
     request_tn.view(-1)[node] &= ~(kind | kind << REQUEST_PENDING_SHIFT)
+
+
+def link_bricks(
+    brick_tn: Tensor,
+    request_tn: Tensor,
+    owner_b: Tensor,
+    stamp_b: Tensor,
+    born_b: Tensor,
+    shared_b: Tensor,
+    node_k: Tensor,
+    slot_k: Tensor,
+    frame: int,
+) -> None:
+    """Twin of `torch.ops.gvtorch.link_bricks`."""
+    valid = (node_k >= 0) & (node_k < brick_tn.numel())
+    valid &= (slot_k >= 0) & (slot_k < len(owner_b))
+    node_k, slot_k = node_k[valid].to(torch.int32), slot_k[valid]
+    slot = slot_k.to(torch.int64)
+    owner_b[slot] = node_k
+    stamp_b[slot], born_b[slot], shared_b[slot] = frame, frame + 1, False
+    link(brick_tn, request_tn, node_k, slot_k, REQUEST_LOAD)
+
+
+def link_tiles(
+    child_tn: Tensor,
+    brick_tn: Tensor,
+    request_tn: Tensor,
+    loc_t4: Tensor,
+    parent_t: Tensor,
+    tree_t: Tensor,
+    stamp_t: Tensor,
+    shared_t: Tensor,
+    child_jw: Tensor,
+    brick_jw: Tensor,
+    node_j: Tensor,
+    loc_j4: Tensor,
+    row_k: Tensor,
+    tile_k: Tensor,
+    tree: int,
+    frame: int,
+) -> None:
+    """Twin of `torch.ops.gvtorch.link_tiles`."""
+    valid = (row_k >= 0) & (row_k < len(node_j)) & (tile_k >= 0) & (tile_k < len(parent_t))
+    row_k, tile_k = row_k[valid], tile_k[valid]
+    valid = (node_j[row_k] >= 0) & (node_j[row_k] < child_tn.numel())
+    row, tile_k = row_k[valid], tile_k[valid]
+    tile, width = tile_k.to(torch.int64), child_jw.shape[1]
+    child_tn[tile], brick_tn[tile] = TERMINAL, EMPTY
+    child_tn[tile, :width], brick_tn[tile, :width] = child_jw[row], brick_jw[row]
+    request_tn[tile], stamp_t[tile], shared_t[tile] = 0, frame, False
+    loc_t4[tile] = loc_j4[row].to(torch.int32)
+    loc_t4[tile, 3] += 1
+    parent_t[tile] = node_j[row].to(torch.int32)
+    tree_t[tile] = tree
+    link(child_tn, request_tn, node_j[row].to(torch.int32), tile_k, REQUEST_SUBDIVIDE)
 
 
 def locate(loc_t4: Tensor, node_k: Tensor, branching: int, per_tile: int) -> Tensor:

@@ -1,7 +1,7 @@
 """Joins the compiled ops to torch: loads the libraries and gives each op its fake (shapes without
 data).
 
-The schema of an op stands once, in cpp_ext/csrc/entry.h.
+The schema of an op stands once, in cpp_ext/csrc/entry*.h.
 """
 
 from __future__ import annotations
@@ -144,6 +144,8 @@ if not _reasons["cpp"]:
     torch.library.register_fake("gvtorch::lru_partition", _fake_lru_partition)
     torch.library.register_fake("gvtorch::unlink", _fake_in_place)
     torch.library.register_fake("gvtorch::link", _fake_in_place)
+    torch.library.register_fake("gvtorch::link_bricks", _fake_in_place)
+    torch.library.register_fake("gvtorch::link_tiles", _fake_in_place)
     torch.library.register_fake("gvtorch::locate", _fake_locate)
     torch.library.register_fake("gvtorch::lacking", _fake_lacking)
     torch.library.register_fake("gvtorch::count_segments", _fake_count_segments)

@@ -13,7 +13,7 @@ import math
 import threading
 import weakref
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import nullcontext
 from typing import Any
 
@@ -238,7 +238,9 @@ class Staging:
         if count == 0:
             return Shipment([], 0, data)
         row_bytes = {name: _row_bytes(rows) for name, rows in data.items()}
-        per_chunk = (self.chunk - _ALIGN * len(data)) // sum(row_bytes.values())
+        pinned = {name for name, rows in data.items() if self._is_pinned(rows)}
+        room = self.chunk if len(pinned) < len(data) else self.nbytes // 4  # nothing to overlap
+        per_chunk = (room - _ALIGN * len(data)) // sum(row_bytes.values())
         if per_chunk < 1:
             raise ValueError(f"Staging: a brick of {sum(row_bytes.values())} bytes is too large")
         parts: list[Part] = []
@@ -250,11 +252,19 @@ class Staging:
             if span is None:
                 break
             chunk = {name: rows[begin:end] for name, rows in data.items()}
-            parts.append(self._send(span, begin, end, chunk, sizes))
+            parts.append(self._send(span, begin, end, chunk, sizes, pinned))
             begin = end
         return Shipment(parts, begin, {name: rows[begin:] for name, rows in data.items()})
 
-    def _send(self, span: _Span, begin: int, end: int, chunk: Voxels, sizes: Sequence[int]) -> Part:
+    def _send(
+        self,
+        span: _Span,
+        begin: int,
+        end: int,
+        chunk: Voxels,
+        sizes: Sequence[int],
+        pinned: Set[str],
+    ) -> Part:
         assert self._host is not None and self._target is not None
         offset, landed = span.begin, {}
         copies: list[tuple[Tensor, Tensor]] = []  # to, from
@@ -263,7 +273,7 @@ class Staging:
                 at = slice(offset, offset + (end - begin) * _row_bytes(rows))
                 offset += size
                 to = landed[name] = self._target[at].view(rows.dtype).view(rows.shape)
-                if isinstance(rows, Tensor) and rows.is_contiguous() and self._is_pinned(rows):
+                if isinstance(rows, Tensor) and name in pinned:
                     copies.append((to, rows))
                     continue
                 here = self._host[at].view(rows.dtype).view(rows.shape)
@@ -284,8 +294,10 @@ class Staging:
         span.reader = weakref.ref(part)
         return part
 
-    def _is_pinned(self, rows: Tensor) -> bool:
-        return self._stream is not None and rows.is_pinned()
+    def _is_pinned(self, rows: Tensor | Rows) -> bool:
+        if self._device.type != "cuda" or not isinstance(rows, Tensor):
+            return False
+        return rows.is_contiguous() and rows.is_pinned()
 
     def _take(self, nbytes: int) -> _Span | None:
         """The next bytes of the ring, or None where they are not free."""

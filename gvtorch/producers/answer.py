@@ -195,6 +195,8 @@ def _refuse_bad(
         for channel, values in by_channel.items()
         if isinstance(values, Tensor) and values.is_floating_point() and values.numel()
     ]
+    if kind is None and not floats:
+        return [0] * len(Region)
     sums = [torch.isfinite(values.sum(dtype=torch.float32)) for _, values in floats]
     kinds = torch.zeros(len(Region), dtype=torch.int64) if kind is None else count_kinds(kind)
     counts, *finite = _read([kinds, *(flag[None] for flag in sums)])

@@ -148,6 +148,77 @@ struct WritePointer {
   }
 };
 
+// Gives nodes the bricks in slots, which are theirs from now on.
+struct LinkBrick {
+  int32_t* brick_tn;
+  int32_t* request_tn;
+  int32_t* owner_b;
+  int32_t* stamp_b;
+  int32_t* born_b;
+  bool* shared_b;
+  const int64_t* node_k;
+  const int32_t* slot_k;
+  int64_t nodes, slots;
+  int32_t frame;
+
+  GV_HD void operator()(int64_t index) const {
+    const int64_t node = node_k[index];
+    const int32_t slot = slot_k[index];
+    if (node < 0 || node >= nodes || slot < 0 || slot >= slots) return;
+    owner_b[slot] = static_cast<int32_t>(node);
+    stamp_b[slot] = frame;
+    born_b[slot] = frame + 1;
+    shared_b[slot] = false;
+    brick_tn[node] = slot;
+    request_tn[node] &= ~(kLoad | (kLoad << kPendingShift));
+  }
+};
+
+// Writes tiles and hangs them below nodes: an index is a word of a tile. Words beyond those of the tree are TERMINAL
+// and EMPTY. A node's own tile is not among those written.
+struct LinkTile {
+  int32_t* child_tn;
+  int32_t* brick_tn;
+  int32_t* request_tn;
+  int32_t* loc_t4;
+  int32_t* parent_t;
+  int32_t* tree_t;
+  int32_t* stamp_t;
+  bool* shared_t;
+  const int32_t* child_jw;
+  const int32_t* brick_jw;
+  const int64_t* node_j;
+  const int64_t* loc_j4;
+  const int64_t* row_k;
+  const int32_t* tile_k;
+  int64_t tiles, rows;
+  int32_t per_tile, width, tree, frame;
+
+  GV_HD void operator()(int64_t index) const {
+    const int64_t which = index / per_tile;
+    const auto child = static_cast<int32_t>(index - which * per_tile);
+    const int64_t tile = tile_k[which];
+    const int64_t row = row_k[which];
+    if (tile < 0 || tile >= tiles || row < 0 || row >= rows) return;
+    const int64_t node = node_j[row];
+    if (node < 0 || node >= tiles * per_tile) return;
+    const int64_t word = tile * per_tile + child;
+    child_tn[word] = child < width ? child_jw[row * width + child] : kTerminal;
+    brick_tn[word] = child < width ? brick_jw[row * width + child] : kEmpty;
+    request_tn[word] = 0;
+    if (child > 0) return;
+    for (int32_t part = 0; part < 4; ++part) {
+      loc_t4[4 * tile + part] = static_cast<int32_t>(loc_j4[4 * row + part]) + (part == 3 ? 1 : 0);
+    }
+    parent_t[tile] = static_cast<int32_t>(node);
+    tree_t[tile] = tree;
+    stamp_t[tile] = frame;
+    shared_t[tile] = false;
+    child_tn[node] = static_cast<int32_t>(tile);
+    request_tn[node] &= ~(kSubdivide | (kSubdivide << kPendingShift));
+  }
+};
+
 // Where nodes lie: x, y, z and depth of each, from those of its tile; -1 for an index that is no node's.
 struct LocateNodes {
   const int32_t* loc_t4;

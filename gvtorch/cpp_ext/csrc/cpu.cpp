@@ -147,29 +147,19 @@ void trace(const torch::stable::Tensor& like, TraceArgs args, bool wide) {
 
 }  // namespace gvtorch
 
-#include "entry.h"
+#include "entry_cache.h"
 #include "entry_segments.h"
 
 STABLE_TORCH_LIBRARY(gvtorch, library) {
   library.def(gvtorch::kTraceRaysSchema);
   library.def(gvtorch::kShadeRaysSchema);
-  library.def(gvtorch::kCompactRequestsSchema);
-  library.def(gvtorch::kLruPartitionSchema);
-  library.def(gvtorch::kUnlinkSchema);
-  library.def(gvtorch::kLinkSchema);
-  library.def(gvtorch::kLocateSchema);
-  library.def(gvtorch::kLackingSchema);
+  gvtorch::define_cache(library);
   gvtorch::define_segments(library);
 }
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) {
   library.impl("trace_rays", TORCH_BOX(&gvtorch::trace_rays<gvtorch::Cpu>));
   library.impl("shade_rays", TORCH_BOX(&gvtorch::shade_rays<gvtorch::Cpu>));
-  library.impl("compact_requests", TORCH_BOX(&gvtorch::compact_requests<gvtorch::Cpu>));
-  library.impl("lru_partition", TORCH_BOX(&gvtorch::lru_partition<gvtorch::Cpu>));
-  library.impl("unlink", TORCH_BOX(&gvtorch::unlink<gvtorch::Cpu>));
-  library.impl("link", TORCH_BOX(&gvtorch::link<gvtorch::Cpu>));
-  library.impl("locate", TORCH_BOX(&gvtorch::locate<gvtorch::Cpu>));
-  library.impl("lacking", TORCH_BOX(&gvtorch::lacking<gvtorch::Cpu>));
+  GV_IMPLEMENT_CACHE(library, gvtorch::Cpu);
   GV_IMPLEMENT_SEGMENTS(library, gvtorch::Cpu);
 }

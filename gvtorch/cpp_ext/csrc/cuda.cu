@@ -210,17 +210,12 @@ void split(const torch::stable::Tensor& like, int64_t count, const Keep& keep, c
 
 }  // namespace gvtorch
 
-#include "entry.h"
+#include "entry_cache.h"
 #include "entry_segments.h"
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch, CUDA, library) {
   library.impl("trace_rays", TORCH_BOX(&gvtorch::trace_rays<gvtorch::Cuda>));
   library.impl("shade_rays", TORCH_BOX(&gvtorch::shade_rays<gvtorch::Cuda>));
-  library.impl("compact_requests", TORCH_BOX(&gvtorch::compact_requests<gvtorch::Cuda>));
-  library.impl("lru_partition", TORCH_BOX(&gvtorch::lru_partition<gvtorch::Cuda>));
-  library.impl("unlink", TORCH_BOX(&gvtorch::unlink<gvtorch::Cuda>));
-  library.impl("link", TORCH_BOX(&gvtorch::link<gvtorch::Cuda>));
-  library.impl("locate", TORCH_BOX(&gvtorch::locate<gvtorch::Cuda>));
-  library.impl("lacking", TORCH_BOX(&gvtorch::lacking<gvtorch::Cuda>));
+  GV_IMPLEMENT_CACHE(library, gvtorch::Cuda);
   GV_IMPLEMENT_SEGMENTS(library, gvtorch::Cuda);
 }

@@ -1,6 +1,6 @@
 // Where torch meets the kernels: the schema of every op, and the step from tensors to the borrowed views of the
-// kernel headers. Included once by cpu.cpp and once by cuda.cu, each of which brings its own `trace`, `compact` and
-// `split`; and by every user's shader (user_entry.h), which needs none of them.
+// kernel headers. Included once by cpu.cpp and once by cuda.cu, each of which brings its own `trace`; and by every
+// user's shader (user.cpp), which needs none. The cache's ops and those of segments: entry_cache.h, entry_segments.h.
 //
 // Only the LibTorch Stable ABI is used (torch/csrc/stable), so that one binary serves every torch >= 2.11.
 // Messages for users are made in gvtorch/ops/*.py; the checks here only keep memory safe.
@@ -14,7 +14,6 @@
 #include <optional>
 #include <tuple>
 
-#include "cache.h"
 #include "for_each.h"
 #include "shade_rays.h"
 #include "trace.h"
@@ -26,10 +25,6 @@ using torch::stable::Tensor;
 
 template <class Device>
 void trace(const Tensor& like, TraceArgs args, bool wide);
-template <class Device, class List>
-void compact(const Tensor& like, int64_t count, const List& list);
-template <class Device, class Keep, class Put>
-void split(const Tensor& like, int64_t count, const Keep& keep, const Put& put, int64_t* kept);
 
 // (a!) request words, (b!) tile stamps, (c!) brick stamps are written in place.
 constexpr const char* kTraceRaysSchema =
@@ -56,19 +51,6 @@ constexpr const char* kShadeRaysSchema =
     "Tensor? clear_r=None"
     ") -> (Tensor color_r3, Tensor alpha_r1, Tensor depth_r1, Tensor samples_r, Tensor missed_r, "
     "Tensor normal_r3, Tensor features_rc)";
-constexpr const char* kCompactRequestsSchema =
-    "compact_requests(Tensor(a!) request_tn, int capacity) -> (Tensor node_k, Tensor word_k, Tensor count_3)";
-constexpr const char* kLruPartitionSchema =
-    "lru_partition(Tensor order_k, Tensor stamp_s, Tensor frame_1) -> (Tensor order_k, Tensor unused_1)";
-constexpr const char* kUnlinkSchema = "unlink(Tensor(a!) pointer, Tensor slot_k, int slots, int divisor) -> ()";
-constexpr const char* kLinkSchema =
-    "link(Tensor(a!) pointer_tn, Tensor(b!) request_tn, Tensor node_k, Tensor word_k, int kind) -> ()";
-constexpr const char* kLocateSchema =
-    "locate(Tensor loc_t4, Tensor node_k, int branching, int per_tile) -> Tensor loc_k4";
-constexpr const char* kLackingSchema =
-    "lacking(Tensor pointer_tn, Tensor loc_t4, Tensor parent_t, Tensor tree_t, Tensor shared_t, Tensor node_k, "
-    "Tensor loc_k4, int tree, int root, int branching) -> Tensor lacks_k";
-
 inline void require(const Tensor& tensor, const char* name, const Tensor& like, ScalarType dtype) {
   STD_TORCH_CHECK(tensor.is_contiguous(), "gvtorch: ", name, " must be contiguous");
   STD_TORCH_CHECK(tensor.scalar_type() == dtype, "gvtorch: ", name, " has the wrong dtype");
@@ -348,125 +330,6 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> shade_rays(
     Shaders::template with<float>(args, run);
   }
   return {found.color_r3, found.alpha_r1, found.depth_r1, found.samples_r, found.missed_r, normal_r3, features_rc};
-}
-
-template <class Device>
-std::tuple<Tensor, Tensor, Tensor> compact_requests(const Tensor& request_tn, int64_t capacity) {
-  require(request_tn, "request_tn", request_tn, ScalarType::Int);
-  STD_TORCH_CHECK(capacity >= 1 && request_tn.numel() <= INT32_MAX, "gvtorch: capacity or request_tn out of range");
-  Tensor node_k = torch::stable::new_empty(request_tn, {capacity});
-  Tensor word_k = torch::stable::new_empty(request_tn, {capacity});
-  Tensor count_3 = torch::stable::new_empty(request_tn, {3}, ScalarType::Long);
-  auto* count = static_cast<int64_t*>(count_3.mutable_data_ptr());
-  compact<Device>(request_tn, request_tn.numel(),
-                  ListRequests{words_out(request_tn), words_out(node_k), words_out(word_k), count, capacity});
-  return {node_k, word_k, count_3};
-}
-
-template <class Device>
-std::tuple<Tensor, Tensor> lru_partition(const Tensor& order_k, const Tensor& stamp_s, const Tensor& frame_1) {
-  for (const auto& [tensor, name] :
-       {std::tuple<const Tensor&, const char*>{order_k, "order_k"}, {stamp_s, "stamp_s"}, {frame_1, "frame_1"}}) {
-    require(tensor, name, order_k, ScalarType::Int);
-  }
-  require_numel(frame_1, "frame_1", 1);
-  Tensor sorted_k = torch::stable::new_empty(order_k, {order_k.numel()});
-  Tensor unused_1 = torch::stable::new_empty(order_k, {1}, ScalarType::Long);
-  auto* unused = static_cast<int64_t*>(unused_1.mutable_data_ptr());
-  const int64_t size = order_k.numel();
-  const int64_t slots = stamp_s.numel();
-  const PutSlot put{words_in(order_k), words_out(sorted_k)};
-  if constexpr (Device::kReadsAtRandom) {
-    const KeepUnstamped keep{words_in(order_k), words_in(stamp_s), static_cast<uint64_t>(slots), words_in(frame_1)};
-    split<Device>(order_k, size, keep, put, unused);
-  } else {
-    Tensor used_k = torch::stable::new_empty(order_k, {size}, ScalarType::Byte);
-    Tensor used_s = torch::stable::new_empty(order_k, {(slots + 7) / 8}, ScalarType::Byte);
-    auto* flags = static_cast<uint8_t*>(used_k.mutable_data_ptr());
-    auto* bits = static_cast<uint8_t*>(used_s.mutable_data_ptr());
-    for_each<Device>(order_k, (slots + 7) / 8, PackUse{words_in(stamp_s), slots, words_in(frame_1), bits});
-    for_each<Device>(order_k, size, FlagUse{words_in(order_k), bits, static_cast<uint64_t>(slots), flags});
-    split<Device>(order_k, size, KeepUnused{flags}, put, unused);
-  }
-  return {sorted_k, unused_1};
-}
-
-template <class Device>
-void unlink(const Tensor& pointer, const Tensor& slot_k, int64_t slots, int64_t divisor) {
-  require(pointer, "pointer", pointer, ScalarType::Int);
-  require(slot_k, "slot_k", pointer, ScalarType::Int);
-  STD_TORCH_CHECK(slots >= 0 && divisor >= 1 && divisor <= INT32_MAX, "gvtorch: slots or divisor out of range");
-  Tensor leaving_s = torch::stable::new_zeros(pointer, {slots}, ScalarType::Byte);
-  auto* leaving = static_cast<uint8_t*>(leaving_s.mutable_data_ptr());
-  for_each<Device>(pointer, slot_k.numel(), MarkSlot{words_in(slot_k), leaving, slots});
-  for_each<Device>(pointer, pointer.numel(),
-                   ClearPointer{words_out(pointer), leaving, slots, static_cast<int32_t>(divisor)});
-}
-
-template <class Device>
-void link(const Tensor& pointer_tn, const Tensor& request_tn, const Tensor& node_k, const Tensor& word_k,
-          int64_t kind) {
-  for (const auto& [tensor, name] : {std::tuple<const Tensor&, const char*>{pointer_tn, "pointer_tn"},
-                                     {request_tn, "request_tn"},
-                                     {node_k, "node_k"},
-                                     {word_k, "word_k"}}) {
-    require(tensor, name, pointer_tn, ScalarType::Int);
-  }
-  require_numel(request_tn, "request_tn", pointer_tn.numel());
-  require_numel(word_k, "word_k", node_k.numel());
-  STD_TORCH_CHECK(kind == kLoad || kind == kSubdivide, "gvtorch: kind must be LOAD or SUBDIVIDE");
-  for_each<Device>(pointer_tn, node_k.numel(),
-                   WritePointer{words_out(pointer_tn), words_out(request_tn), words_in(node_k), words_in(word_k),
-                                pointer_tn.numel(), static_cast<int32_t>(kind)});
-}
-
-inline LocateNodes places_of(const Tensor& loc_t4, const Tensor& node_k, int64_t branching, int64_t per_tile) {
-  require(loc_t4, "loc_t4", node_k, ScalarType::Int);
-  require(node_k, "node_k", node_k, ScalarType::Long);
-  require_numel(loc_t4, "loc_t4", loc_t4.numel() / 4 * 4);
-  STD_TORCH_CHECK(branching >= 2 && branching <= INT16_MAX, "gvtorch: branching out of range");
-  STD_TORCH_CHECK(per_tile >= 1 && per_tile <= INT32_MAX, "gvtorch: per_tile out of range");
-  return {words_in(loc_t4),
-          static_cast<const int64_t*>(node_k.const_data_ptr()),
-          nullptr,
-          loc_t4.numel() / 4 * per_tile,
-          static_cast<int32_t>(per_tile),
-          static_cast<int32_t>(branching)};
-}
-
-template <class Device>
-Tensor locate(const Tensor& loc_t4, const Tensor& node_k, int64_t branching, int64_t per_tile) {
-  LocateNodes places = places_of(loc_t4, node_k, branching, per_tile);
-  Tensor loc_k4 = torch::stable::new_empty(node_k, {node_k.numel(), 4});
-  places.loc_k4 = static_cast<int64_t*>(loc_k4.mutable_data_ptr());
-  for_each<Device>(node_k, node_k.numel(), places);
-  return loc_k4;
-}
-
-template <class Device>
-Tensor lacking(const Tensor& pointer_tn, const Tensor& loc_t4, const Tensor& parent_t, const Tensor& tree_t,
-               const Tensor& shared_t, const Tensor& node_k, const Tensor& loc_k4, int64_t tree, int64_t root,
-               int64_t branching) {
-  const int64_t tiles = parent_t.numel();
-  const int64_t per_tile = tiles > 0 ? pointer_tn.numel() / tiles : 1;
-  const LocateNodes places = places_of(loc_t4, node_k, branching, per_tile);
-  require(pointer_tn, "pointer_tn", node_k, ScalarType::Int);
-  require(parent_t, "parent_t", node_k, ScalarType::Int);
-  require(tree_t, "tree_t", node_k, ScalarType::Int);
-  require(shared_t, "shared_t", node_k, ScalarType::Bool);
-  require(loc_k4, "loc_k4", node_k, ScalarType::Long);
-  require_numel(pointer_tn, "pointer_tn", tiles * per_tile);
-  require_numel(loc_t4, "loc_t4", 4 * tiles);
-  require_numel(tree_t, "tree_t", tiles);
-  require_numel(shared_t, "shared_t", tiles);
-  require_numel(loc_k4, "loc_k4", 4 * node_k.numel());
-  Tensor lacks_k = torch::stable::new_empty(node_k, {node_k.numel()}, ScalarType::Bool);
-  for_each<Device>(node_k, node_k.numel(),
-                   FindLacking{places, words_in(pointer_tn), words_in(parent_t), words_in(tree_t),
-                               static_cast<const bool*>(shared_t.const_data_ptr()),
-                               static_cast<const int64_t*>(loc_k4.const_data_ptr()),
-                               static_cast<bool*>(lacks_k.mutable_data_ptr()), static_cast<int32_t>(tree), root});
-  return lacks_k;
 }
 
 }  // namespace gvtorch
