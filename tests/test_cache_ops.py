@@ -127,7 +127,7 @@ def test_link_bricks_gives_nodes_slots_of_their_own(backend, data, slots):
 @given(data=st.data(), tiles=st.integers(2, 12), width=st.sampled_from([1, 4, 8]))
 def test_link_tiles_writes_tiles_and_hangs_them_below_nodes(backend, data, tiles, width):
     device, per_tile = DEVICES[backend], 8
-    fresh = data.draw(st.sets(st.integers(1, tiles - 1)))
+    fresh = data.draw(st.sets(st.integers(1, tiles - 1), max_size=per_tile))
     old = [n for n in range(tiles * per_tile) if n // per_tile not in fresh]
     asking = data.draw(st.lists(st.sampled_from(old), unique=True, min_size=len(fresh)))
     rows = data.draw(st.permutations(range(len(asking))))[: len(fresh)]

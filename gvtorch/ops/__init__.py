@@ -11,6 +11,7 @@ from .cache import (
     lru_partition,
     unlink,
 )
+from .cut import cut_bricks
 from .registry import available
 from .segments import Samples, Segments, composite, list_samples, sample_bricks, trace_segments
 from .shade import shade_rays
@@ -22,6 +23,7 @@ __all__ = [
     "available",
     "compact_requests",
     "composite",
+    "cut_bricks",
     "lacking",
     "link",
     "link_bricks",

@@ -65,6 +65,11 @@ def _fake_lacking(*args: Any) -> Tensor:
     return torch.empty_like(node_k, dtype=torch.bool)
 
 
+def _fake_cut_bricks(values_zyxc: Tensor, place_k3: Tensor, brick_size: int, border: int) -> Tensor:
+    side = brick_size + 2 * border
+    return values_zyxc.new_empty((place_k3.shape[0], side, side, side, values_zyxc.shape[3]))
+
+
 def _fake_count_segments(*args: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     rays, child_tn, domain_2 = args[0].shape[0], args[5], args[13]
     return (
@@ -148,6 +153,7 @@ if not _reasons["cpp"]:
     torch.library.register_fake("gvtorch::link_tiles", _fake_in_place)
     torch.library.register_fake("gvtorch::locate", _fake_locate)
     torch.library.register_fake("gvtorch::lacking", _fake_lacking)
+    torch.library.register_fake("gvtorch::cut_bricks", _fake_cut_bricks)
     torch.library.register_fake("gvtorch::count_segments", _fake_count_segments)
     torch.library.register_fake("gvtorch::write_segments", _fake_write_segments)
     torch.library.register_fake("gvtorch::sample_bricks", _fake_sample_bricks)

@@ -1,6 +1,6 @@
 """Node pool, brick pool and the tree over them."""
 
-from .brick_pool import BrickPool, cut_bricks
+from .brick_pool import BrickPool
 from .channel import Channel
 from .n3tree import N3Tree
 from .node_pool import NodePool
@@ -14,5 +14,4 @@ __all__ = [
     "NodePool",
     "Rows",
     "Staging",
-    "cut_bricks",
 ]

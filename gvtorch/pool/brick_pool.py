@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from .. import check
-from ..volume import movable
 from .channel import Channel
 
 
@@ -78,22 +77,3 @@ class BrickPool:
     def nbytes(self) -> int:
         """Memory of all fields."""
         return sum(field.nbytes for field in self.fields.values())
-
-
-def cut_bricks(values_zyxc: Tensor, place_k3: Tensor, brick_size: int, border: int) -> Tensor:
-    """Cuts bricks out of a level, borders from the neighbours, clamped at the level's faces.
-
-    Args:
-        values_zyxc: (z, y, x, c) a whole level.
-        place_k3: (k, 3) int64 brick indices, z y x.
-        brick_size: Voxels along a side, without the border.
-        border: Voxels around.
-
-    Returns:
-        (k, s, s, s, c), s = brick_size + 2 * border.
-    """
-    reach = torch.arange(-border, brick_size + border)
-    corner = place_k3[:, :, None] * brick_size + reach  # (k, 3, s)
-    z, y, x = (corner[:, axis].clamp(0, values_zyxc.shape[axis] - 1) for axis in range(3))
-    index = (z[:, :, None, None], y[:, None, :, None], x[:, None, None, :])
-    return movable(values_zyxc)[index].view(values_zyxc.dtype)

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from .. import check
 from ..config import CONSTANT, EMPTY, TERMINAL
-from ..ops import locate
+from ..ops import cut_bricks, locate
 from ..stage import Progress, no_progress
 from ..volume import Volume, movable
-from .brick_pool import BrickPool, cut_bricks
+from .brick_pool import BrickPool
 from .channel import Channel
 from .node_pool import NodePool
 from .pyramid import Level, round_to, volume_levels

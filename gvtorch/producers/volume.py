@@ -9,9 +9,11 @@ import torch
 from torch import Tensor
 
 from .. import check
-from ..pool import BrickTable, Channel, cut_bricks
+from ..ops import cut_bricks
+from ..pool import BrickTable, Channel
 from ..pool.n3tree import check_channels
 from ..pool.pyramid import Level, round_to, volume_levels
+from ..pool.staging import wide_rows
 from ..volume import Volume, movable
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 
@@ -78,10 +80,7 @@ class VolumeProducer(Producer):
         below = torch.full((count,), self._threshold is not None)
         constants, ranges = {}, {}
         for name, channel in self.channels.items():
-            low, high, mean = (
-                self._at(nodes, [getattr(level, what) for level in self._levels[name]])
-                for what in ("low", "high", "mean")
-            )
+            low, high, mean = self._summary(nodes, self._levels[name])
             same = (low == high).all(-1)
             flat &= same
             if self._threshold is not None:
@@ -107,23 +106,26 @@ class VolumeProducer(Producer):
         for name, channel in self.channels.items():
             bricks = torch.empty((len(nodes), side, side, side, channel.width), dtype=channel.dtype)
             for depth in loc[:, 3].unique().tolist():
-                here = loc[:, 3] == depth
-                values = self._levels[name][depth].values
+                here = (loc[:, 3] == depth).nonzero()[:, 0]
+                level = self._levels[name][depth].values
                 place = loc[here, :3].flip(1)
-                cut = cut_bricks(values, place, layout.brick_size, layout.border)
-                movable(bricks)[here] = movable(cut)
+                cut = cut_bricks(level, place, layout.brick_size, layout.border)
+                rows, found = wide_rows(bricks, cut)
+                rows[here] = found
             data[name] = bricks
         return Bricks(data=data)
 
-    def _at(self, nodes: Nodes, grids: list[Tensor]) -> Tensor:
-        """(k, c) values of the nodes in a grid by depth; beyond the volume the outermost."""
+    def _summary(self, nodes: Nodes, levels: list[Level]) -> list[Tensor]:
+        """(k, c) smallest, largest and mean value of nodes; beyond the volume those at its face."""
         loc = nodes.loc.cpu()
-        values = torch.empty((len(nodes), grids[0].shape[-1]))
+        found = [torch.empty((len(nodes), levels[0].low.shape[-1])) for _ in range(3)]
         for depth in loc[:, 3].unique().tolist():
-            here, grid = loc[:, 3] == depth, grids[depth]
-            z, y, x = (loc[here, 2 - axis].clamp(max=grid.shape[axis] - 1) for axis in range(3))
-            values[here] = grid[z, y, x]
-        return values
+            here, level = (loc[:, 3] == depth).nonzero()[:, 0], levels[depth]
+            zyx = loc[here, :3].flip(1)
+            z, y, x = zyx.minimum(torch.tensor(level.low.shape[:3]) - 1).unbind(1)
+            for values, grid in zip(found, (level.low, level.high, level.mean), strict=True):
+                values[here] = grid[z, y, x]
+        return found
 
 
 def _grid(level: Level, layout: Layout) -> tuple[int, int, int]:

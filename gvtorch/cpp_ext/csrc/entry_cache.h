@@ -1,8 +1,9 @@
-// The cache's ops: from tensors to the functors of cache.h. Included once by cpu.cpp and once by cuda.cu, each of which
-// brings its own `compact` and `split`.
+// The ops of cache and pools: from tensors to the functors of cache.h and cut.h. Included once by cpu.cpp and once by
+// cuda.cu, each of which brings its own `compact` and `split`.
 #pragma once
 
 #include "cache.h"
+#include "cut.h"
 #include "entry.h"
 
 namespace gvtorch {
@@ -31,6 +32,9 @@ constexpr const char* kLinkTilesSchema =
     "link_tiles(Tensor(a!) child_tn, Tensor(b!) brick_tn, Tensor(c!) request_tn, Tensor(d!) loc_t4, "
     "Tensor(e!) parent_t, Tensor(f!) tree_t, Tensor(g!) stamp_t, Tensor(h!) shared_t, Tensor child_jw, "
     "Tensor brick_jw, Tensor node_j, Tensor loc_j4, Tensor row_k, Tensor tile_k, int tree, int frame) -> ()";
+
+constexpr const char* kCutBricksSchema =
+    "cut_bricks(Tensor values_zyxc, Tensor place_k3, int brick_size, int border) -> Tensor bricks_kzyxc";
 
 inline const int64_t* nodes_in(const Tensor& tensor) { return static_cast<const int64_t*>(tensor.const_data_ptr()); }
 
@@ -232,10 +236,56 @@ void link_tiles(const Tensor& child_tn, const Tensor& brick_tn, const Tensor& re
   for_each<Device>(child_tn, row_k.numel() * per_tile, link);
 }
 
+inline int64_t bytes_of(ScalarType dtype) {
+  switch (dtype) {
+    case ScalarType::Byte:
+    case ScalarType::Char:
+    case ScalarType::Bool:
+      return 1;
+    case ScalarType::Short:
+    case ScalarType::UInt16:
+    case ScalarType::Half:
+    case ScalarType::BFloat16:
+      return 2;
+    case ScalarType::Int:
+    case ScalarType::UInt32:
+    case ScalarType::Float:
+      return 4;
+    case ScalarType::Long:
+    case ScalarType::UInt64:
+    case ScalarType::Double:
+      return 8;
+    default:
+      STD_TORCH_CHECK(false, "gvtorch: bricks can't be cut of this dtype");
+  }
+}
+
+template <class Device>
+Tensor cut_bricks(const Tensor& values_zyxc, const Tensor& place_k3, int64_t brick_size, int64_t border) {
+  require(place_k3, "place_k3", values_zyxc, ScalarType::Long);
+  require(values_zyxc, "values_zyxc", values_zyxc, values_zyxc.scalar_type());
+  STD_TORCH_CHECK(values_zyxc.dim() == 4 && values_zyxc.numel() > 0, "gvtorch: values_zyxc must be (z, y, x, c)");
+  STD_TORCH_CHECK(brick_size >= 1 && brick_size <= 1024 && border >= 0 && border <= 1024,
+                  "gvtorch: brick_size or border out of range");
+  const int64_t bricks = place_k3.numel() / 3, side = brick_size + 2 * border, channels = values_zyxc.size(3);
+  require_numel(place_k3, "place_k3", 3 * bricks);
+  Tensor bricks_kzyxc = torch::stable::new_empty(values_zyxc, {bricks, side, side, side, channels});
+  for_each<Device>(values_zyxc, bricks * side,
+                   CutBricks{static_cast<const char*>(values_zyxc.const_data_ptr()),
+                             nodes_in(place_k3),
+                             static_cast<char*>(bricks_kzyxc.mutable_data_ptr()),
+                             {values_zyxc.size(0), values_zyxc.size(1), values_zyxc.size(2)},
+                             channels * bytes_of(values_zyxc.scalar_type()),
+                             bricks * side,
+                             static_cast<int32_t>(brick_size),
+                             static_cast<int32_t>(border)});
+  return bricks_kzyxc;
+}
+
 template <class Library>
 void define_cache(Library& library) {
   for (const char* schema : {kCompactRequestsSchema, kLruPartitionSchema, kUnlinkSchema, kLinkSchema, kLinkBricksSchema,
-                             kLinkTilesSchema, kLocateSchema, kLackingSchema})
+                             kLinkTilesSchema, kLocateSchema, kLackingSchema, kCutBricksSchema})
     library.def(schema);
 }
 
@@ -249,4 +299,5 @@ void define_cache(Library& library) {
   library.impl("link_bricks", TORCH_BOX(&gvtorch::link_bricks<Device>));           \
   library.impl("link_tiles", TORCH_BOX(&gvtorch::link_tiles<Device>));             \
   library.impl("locate", TORCH_BOX(&gvtorch::locate<Device>));                     \
-  library.impl("lacking", TORCH_BOX(&gvtorch::lacking<Device>))
+  library.impl("lacking", TORCH_BOX(&gvtorch::lacking<Device>));                   \
+  library.impl("cut_bricks", TORCH_BOX(&gvtorch::cut_bricks<Device>))
