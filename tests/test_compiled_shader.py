@@ -469,12 +469,12 @@ def test_a_header_that_changes_meanwhile_is_not_kept(tmp_path, monkeypatch):
 def test_folders_of_headers_that_the_environment_names_count(tmp_path):
     header = write(tmp_path, ADD.replace("COLOR", "kColor"))
     header.write_text("#include <color.h>\n" + header.read_text())
+    compiler = quick_compiler(tmp_path)
     for color in ("0.25", "0.75"):
         folder = tmp_path / color
         folder.mkdir()
         (folder / "color.h").write_text(f"constexpr float kColor = {color}f;\n")
-        own = {"CPATH": str(folder), "CXX": quick_compiler(tmp_path)}
-        assert in_processes(1, header, **own) == [color]
+        assert in_processes(1, header, CPATH=str(folder), CXX=compiler) == [color]
 
 
 @pytest.mark.backend("cpp")
