@@ -330,8 +330,13 @@ def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path):
         (ADD.replace("COLOR", "colour"), "Own", r"own.h:7:\d+: error: 'colour' was not declared"),
         ("", "Own", "a shader has GV_HD void add(const gv::Piece<T>&, const gv::Probe<T>&, Sum&)"),
         (ADD, "Mine", "'Mine' does not name a type"),
+        (
+            "  static float nowhere(T);" + ADD.replace("COLOR", "T(nowhere(1))"),
+            "Own",
+            "undefined reference to `Own<double>::nowhere(double)'",
+        ),
     ],
-    ids=["a mistake", "no add", "no such struct"],
+    ids=["a mistake", "no add", "no such struct", "no such function"],
 )
 @pytest.mark.backend("cpp")
 def test_the_compilers_words_are_shown_as_they_are(tmp_path, cache, body, name, message):
@@ -451,6 +456,19 @@ def test_only_its_owner_writes_to_the_folder_of_libraries(tmp_path, monkeypatch)
     else:
         monkeypatch.setattr(os, "geteuid", lambda: folder.stat().st_uid + 1)
     with pytest.raises(RuntimeError, match=r"shaders is another user's; GVTORCH_CACHE"):
+        gv.CompiledShader(header, "Own")
+
+
+@pytest.mark.backend("cpp")
+def test_what_the_loader_refuses_is_told_in_its_words(tmp_path, monkeypatch):
+    """A compiler that writes no library; a folder of which nothing may be run does the same."""
+    header, compiler = write(tmp_path, ADD.replace("COLOR", "0.5")), tmp_path / "c++"
+    compiler.write_text(
+        '#!/bin/sh\nfor word; do case $word in *.so) echo no > "$word"; esac; done\n'
+    )
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+    with pytest.raises(RuntimeError, match=r"^CompiledShader: .*Own_.*\.so: file too short$"):
         gv.CompiledShader(header, "Own")
 
 

@@ -69,8 +69,8 @@ def load(header: str | os.PathLike[str], name: str) -> UserShader:
     Raises:
         ValueError: There is no such file, it is no text, or the name is none.
         CompileError: The compiler refuses it.
-        RuntimeError: There is no compiler, the header changes meanwhile, or the cache's folder
-            can't be written, or is not the user's own.
+        RuntimeError: There is no compiler, the header changes meanwhile, the cache's folder can't
+            be written, or is not the user's own, or what was compiled can't be loaded from there.
     """
     if not isinstance(header, (str, os.PathLike)) or "\0" in str(header):
         raise ValueError(f"CompiledShader: header must be a path, got {header!r}")
@@ -145,7 +145,10 @@ def _loaded(header: Path, name: str, content: str, archs: Sequence[str]) -> Path
     with _lock:
         if key not in _libraries:
             library = compiled(header, name, content, archs)
-            torch.ops.load_library(library)
+            try:
+                torch.ops.load_library(library)
+            except OSError as error:  # its cause has the loader's words
+                raise RuntimeError(f"CompiledShader: {error.__cause__ or error}") from None
             _libraries[key] = library
         return _libraries[key]
 
@@ -185,11 +188,10 @@ def compiled(header: Path, name: str, content: str, archs: Sequence[str]) -> Pat
     with scratch as folder:
         target = Path(folder) / library.name
         include, link = compilers.torch_flags()
-        linker = "-Xlinker=--no-as-needed" if archs else "-Wl,--no-as-needed"
         call = [*command, *flags, f"-DGV_USER_SHADER={name}", f"-DGV_USER_OP={op}"]
         call += [f"-DGV_NAMESPACE=user_{op}", "-I", str(SOURCES), *include]
         call += ["-include", str(header), str(SOURCES / "user.cpp"), "-o", str(target)]
-        call += [linker, *link]
+        call += link
         run = subprocess.run(
             call, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace",
             check=False,
@@ -221,10 +223,11 @@ def _whole(library: Path) -> bool:
 
 def _call(archs: Sequence[str]) -> tuple[list[str], list[str]]:
     """The compiler, and its flags but for those that name a path."""
-    if not archs:
-        return compilers.find_cxx(), [*compilers.CXX_FLAGS, "-pthread"]
-    nvcc = compilers.find_nvcc() or "nvcc"
-    return [nvcc], [*compilers.NVCC_FLAGS, *compilers.machine_codes(archs), "-x", "cu"]
+    if not archs:  # what is nowhere defined is an error here, as it will be when it is loaded
+        linker = "-Wl,--no-as-needed,-z,defs"
+        return compilers.find_cxx(), [*compilers.CXX_FLAGS, "-pthread", linker]
+    nvcc, own = compilers.find_nvcc() or "nvcc", ("-Xlinker=--no-as-needed", "-x", "cu")
+    return [nvcc], [*compilers.NVCC_FLAGS, *compilers.machine_codes(archs), *own]
 
 
 def _folder() -> Path:
