@@ -261,14 +261,16 @@ ADD = """
 
 
 def built(folder: Path) -> list[str]:
-    return sorted(file.name for file in (folder / "shaders").iterdir())
+    return sorted(file.name for file in folder.glob("shaders/*"))
 
 
-def in_processes(count: int, *headers: Path, **environment: str) -> list[str]:
+def in_processes(
+    count: int, *headers: Path, make: str = "gv.CompiledShader(given, 'Own')", **environment: str
+) -> list[str]:
     """Loads `Own` of all headers in processes at the same time; the red that each shows."""
     code = (
-        "import sys, torch, gvtorch as gv\n"
-        "shaders = [gv.CompiledShader(header, 'Own') for header in sys.argv[1:]]\n"
+        "import pickle, sys, torch, gvtorch as gv\n"
+        f"shaders = [{make} for given in sys.argv[1:]]\n"
         "tree = gv.N3Tree.from_volume(gv.Volume(torch.ones(8, 8, 8)), 8)\n"
         "camera = gv.Camera.orbit(width=1, height=1)\n"
         "print(*(float(gv.render(tree, camera, shader).color[0, 0, 0]) for shader in shaders))\n"
@@ -285,20 +287,26 @@ def in_processes(count: int, *headers: Path, **environment: str) -> list[str]:
     return [run.communicate(timeout=300)[0].strip() for run in runs]
 
 
+def quick_compiler(folder: Path, *before: str) -> str:
+    """A compiler that does not optimise, after some lines of shell."""
+    real, file = shutil.which(compilers.find_cxx()[0]), folder / "c++"
+    file.write_text("\n".join(("#!/bin/sh", *before, f'exec {real} "$@" -O0\n')))
+    file.chmod(0o755)
+    return str(file)
+
+
 @pytest.mark.backend("cpp")
 def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path):
     """A compiler that counts its calls: two at once give one library, a third makes none; what
     changes the meaning makes another.
     """
-    count, compiler = tmp_path / "calls", tmp_path / "c++"
-    real = shutil.which(compilers.find_cxx()[0])
-    compiler.write_text(f'#!/bin/sh\necho call >> {count}\nexec {real} "$@" -O0\n')
-    compiler.chmod(0o755)
+    count = tmp_path / "calls"
+    compiler = quick_compiler(tmp_path, f"echo call >> {count}")
     (tmp_path / "color.h").write_text("constexpr float kColor = 0.25f;\n")
     body = '  // #include "none.h"\n' + ADD.replace("COLOR", "kColor")
     header = write(tmp_path, body)
     header.write_text('#include "color.h"\n' + header.read_text())
-    own = {"GVTORCH_CACHE": str(tmp_path / "cache"), "CXX": str(compiler)}
+    own = {"GVTORCH_CACHE": str(tmp_path / "cache"), "CXX": compiler}
     assert in_processes(2, header, **own) == ["0.25", "0.25"]
     calls = count.read_text()
     assert 1 <= calls.count("call") <= 2
@@ -322,8 +330,13 @@ def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path):
         (ADD.replace("COLOR", "colour"), "Own", r"own.h:7:\d+: error: 'colour' was not declared"),
         ("", "Own", "a shader has GV_HD void add(const gv::Piece<T>&, const gv::Probe<T>&, Sum&)"),
         (ADD, "Mine", "'Mine' does not name a type"),
+        (
+            "  static float nowhere(T);" + ADD.replace("COLOR", "T(nowhere(1))"),
+            "Own",
+            "undefined reference to `Own<double>::nowhere(double)'",
+        ),
     ],
-    ids=["a mistake", "no add", "no such struct"],
+    ids=["a mistake", "no add", "no such struct", "no such function"],
 )
 @pytest.mark.backend("cpp")
 def test_the_compilers_words_are_shown_as_they_are(tmp_path, cache, body, name, message):
@@ -359,11 +372,16 @@ def test_without_a_compiler_or_a_folder_there_is_one_clear_line(tmp_path, monkey
 def test_mistakes_have_one_clear_message(tree, tmp_path):
     for make, message in (
         (lambda: gv.CompiledShader(tmp_path / "a.h", "A"), "there is no header"),
+        (lambda: gv.CompiledShader(None, "A"), "header must be a path, got None"),
+        (lambda: gv.CompiledShader("a\0.h", "A"), r"header must be a path, got 'a\x00.h'"),
+        (lambda: gv.CompiledShader(user.SOURCES / "user_shader.h", "A"), "has the name of the hea"),
+        (lambda: gv.CompiledShader(sys.executable, "A"), "is no text"),
+        (lambda: gv.CompiledShader(HEADER, "A" * 129), "of at most 128 letters, got 'AAA"),
         (
             lambda: gv.CompiledShader(HEADER, "mine::Bands; int x"),
             "name must be that of a C++ struct",
         ),
-        (lambda: gv.CompiledShader(HEADER, 3), "name must be that of a C++ struct, got 3"),
+        (lambda: gv.CompiledShader(HEADER, 3), "C++ struct, of at most 128 letters, got 3"),
         (lambda: mine("Bands"), "uniforms must be density, width, fade, got none"),
         (lambda: mine("Bands", uniforms={**BANDS, "x": 1}), "got density, width, fade, x"),
         (
@@ -375,6 +393,16 @@ def test_mistakes_have_one_clear_message(tree, tmp_path):
             "fade must be one number",
         ),
         (lambda: mine("Bands", uniforms=torch.ones(2)), "uniforms must be (3,)"),
+        (lambda: mine("Bands", uniforms=[1, 2, 3]), "must be a dict or a tensor, got [1, 2, 3]"),
+        (lambda: mine("Bands", uniforms=torch.ones(3) * 1j), "must be real, got (3,) complex64"),
+        (
+            lambda: mine("Bands", uniforms={**BANDS, "fade": torch.tensor(1j)}),
+            "uniform fade must be real",
+        ),
+        (
+            lambda: gv.render(tree, CAMERA, mine("Bands", uniforms={**BANDS, "fade": 1e40})),
+            "shader: 1e+40 is beyond what torch.float32 holds",
+        ),
         (lambda: mine("Plain", uniforms={"a": 1}), "uniforms must be a (k,) tensor, got a"),
         (lambda: mine("Plain", transfer="bone"), "transfer must be a TransferFunction, got str"),
         (lambda: mine("Plain", light=3), "light must be a Headlight"),
@@ -390,11 +418,102 @@ def test_mistakes_have_one_clear_message(tree, tmp_path):
         assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
+@pytest.mark.backend("cpp")
+def test_a_damaged_library_is_compiled_again(tmp_path):
+    """Nothing, a part (which the loader dies of), and all but the last byte of it are left."""
+    header = write(tmp_path, ADD.replace("COLOR", "0.5"))
+    own = {"GVTORCH_CACHE": str(tmp_path / "cache"), "CXX": quick_compiler(tmp_path)}
+    assert in_processes(1, header, **own) == ["0.5"]
+    (library,) = (tmp_path / "cache" / "shaders").iterdir()
+    whole = library.read_bytes()
+    for left in (0, len(whole) // 2, -1):
+        library.write_bytes(whole[:left])
+        assert in_processes(1, header, **own) == ["0.5"]
+        assert library.read_bytes()[:4] == b"\x7fELF" and library.stat().st_size == len(whole)
+
+
+@pytest.mark.backend("cpp")
+def test_only_its_owner_writes_to_the_folder_of_libraries(tmp_path, monkeypatch):
+    header, cache = write(tmp_path, ADD.replace("COLOR", "0.5")), tmp_path / "cache"
+    own = {"GVTORCH_CACHE": str(cache), "CXX": quick_compiler(tmp_path)}
+    old = os.umask(0)
+    try:
+        assert in_processes(1, header, **own) == ["0.5"]
+    finally:
+        os.umask(old)
+    folder = cache / "shaders"
+    (library,) = folder.iterdir()
+    assert folder.stat().st_mode & 0o777 == 0o700 and library.stat().st_mode & 0o022 == 0
+    for name, value in own.items():
+        monkeypatch.setenv(name, value)
+    for mode in (0o770, 0o707):
+        folder.chmod(mode)
+        with pytest.raises(RuntimeError, match=r"others may write to .*shaders; GVTORCH_CACHE"):
+            gv.CompiledShader(header, "Own")
+    folder.chmod(0o700)
+    if os.geteuid() == 0:
+        os.chown(folder, 1, -1)
+    else:
+        monkeypatch.setattr(os, "geteuid", lambda: folder.stat().st_uid + 1)
+    with pytest.raises(RuntimeError, match=r"shaders is another user's; GVTORCH_CACHE"):
+        gv.CompiledShader(header, "Own")
+
+
+@pytest.mark.backend("cpp")
+def test_what_the_loader_refuses_is_told_in_its_words(tmp_path, monkeypatch):
+    """A compiler that writes no library; a folder of which nothing may be run does the same."""
+    header, compiler = write(tmp_path, ADD.replace("COLOR", "0.5")), tmp_path / "c++"
+    compiler.write_text(
+        '#!/bin/sh\nfor word; do case $word in *.so) echo no > "$word"; esac; done\n'
+    )
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+    with pytest.raises(RuntimeError, match=r"^CompiledShader: .*Own_.*\.so: file too short$"):
+        gv.CompiledShader(header, "Own")
+
+
+@pytest.mark.backend("cpp")
+def test_a_header_that_changes_meanwhile_is_not_kept(tmp_path, monkeypatch):
+    """Else what it said last would be found under what it said first."""
+    header = write(tmp_path, ADD.replace("COLOR", "0.5"))
+    monkeypatch.setenv("CXX", quick_compiler(tmp_path, f"echo '// more' >> {header}"))
+    monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path / "cache"))
+    with pytest.raises(RuntimeError, match=r"own.h has changed: make the shader anew"):
+        gv.CompiledShader(header, "Own")
+    assert built(tmp_path / "cache") == []
+
+
+@pytest.mark.backend("cpp")
+def test_folders_of_headers_that_the_environment_names_count(tmp_path):
+    header = write(tmp_path, ADD.replace("COLOR", "kColor"))
+    header.write_text("#include <color.h>\n" + header.read_text())
+    compiler = quick_compiler(tmp_path)
+    for color in ("0.25", "0.75"):
+        folder = tmp_path / color
+        folder.mkdir()
+        (folder / "color.h").write_text(f"constexpr float kColor = {color}f;\n")
+        assert in_processes(1, header, CPATH=str(folder), CXX=compiler) == [color]
+
+
+@pytest.mark.backend("cpp")
+def test_it_is_unpickled_in_another_process(tmp_path):
+    shader = gv.CompiledShader(write(tmp_path, ADD.replace("COLOR", "0.5")), "Own")
+    kept, tracer = tmp_path / "shader.pkl", tmp_path / "tracer.pkl"
+    kept.write_bytes(pickle.dumps(shader))
+    assert in_processes(1, kept, make="pickle.load(open(given, 'rb'))") == ["0.5"]
+    tree = gv.N3Tree.from_volume(gv.Volume(torch.ones(8, 8, 8)), 8)
+    unknown = "x" * len(shader.kind)  # a name that no library here has
+    pickled = pickle.dumps(gv.TreeTracer(tree, shader))
+    tracer.write_bytes(pickled.replace(shader.kind.encode(), unknown.encode()))
+    with pytest.raises(RuntimeError, match=r"TreeTracer: op x+ is not loaded: torch.ops.load_lib"):
+        pickle.loads(tracer.read_bytes())
+
+
 @pytest.mark.skipif(compilers.find_nvcc() is None, reason="nvcc is not here")
 @pytest.mark.backend("cpp")
 def test_nvcc_compiles_it(cache):
-    library = user.compiled(HEADER, "mine::Bands", "bands_for_cuda", ("90",))
-    assert library.parent == cache / "shaders" and b"bands_for_cuda" in library.read_bytes()
+    library = user.compiled(HEADER, "mine::Bands", user._content(HEADER, "mine::Bands"), ("90",))
+    assert library.parent == cache / "shaders" and b"mine_Bands_" in library.read_bytes()
 
 
 @pytest.mark.backend("cpp")

@@ -202,6 +202,17 @@ def test_strips_make_the_whole_picture(blobs, tmp_path, model, background):
 
 
 @pytest.mark.backend("cpp")
+@pytest.mark.parametrize("shader", [gv.Lit(HAZE), gv.Projection("mean", HAZE)], ids=["lit", "mean"])
+def test_strips_of_pictures_with_normals_and_with_any_number_of_features(blobs, tmp_path, shader):
+    render = partial(gv.render, gv.N3Tree.from_volume(blobs), shader=shader)
+    camera = gv.Camera.orbit(width=20, height=24)
+    gv.render_tiles(render, camera, tmp_path / "a.tif", memory=20 * 400 * 9)
+    render(camera).save(tmp_path / "b.tif")
+    strips, image = (gv.read_image(tmp_path / f"{name}.tif") for name in "ab")
+    assert torch.equal(strips, image) and image.max() > 0.1
+
+
+@pytest.mark.backend("cpp")
 @pytest.mark.parametrize("alpha", [None, 0.5])
 def test_strips_take_their_part_of_a_layer(blobs, tmp_path, alpha):
     tree, camera = gv.N3Tree.from_volume(blobs), gv.Camera.orbit(30, 20, 0.9, None, 40, 50)

@@ -7,7 +7,7 @@ is kept, in cpp_ext/user.py.
 from __future__ import annotations
 
 import os
-from collections.abc import MutableMapping
+from collections.abc import Mapping, MutableMapping
 from pathlib import Path
 from typing import Any
 
@@ -72,21 +72,30 @@ class CompiledShader(LitShader):
 
         Raises:
             CompileError: The compiler refuses it; holds what the compiler says, as it is.
-            RuntimeError: There is no compiler, or the cache's folder can't be written.
+            RuntimeError: There is no compiler, the header changes meanwhile, or the cache's folder
+                can't be written, or is not the user's own.
             ValueError: There is no such file, or uniforms are not those that the struct names.
         """
         super().__init__(**light)
         if transfer is not None and not isinstance(transfer, TransferFunction):
             kind = type(transfer).__name__
             raise ValueError(f"CompiledShader: transfer must be a TransferFunction, got {kind}")
-        self._compiled = user.load(header, name)
-        self.header, self.name, self.kind = self._compiled.header, name, self._compiled.op
-        self.whole = self._compiled.whole
-        add_user_op(self.kind)
+        self.name = name
+        self._take(user.load(header, name))
         self.transfer, self.channel, self.component = transfer, channel, component
         self.other, self.other_component = other, other_component
         self.uniforms = {} if uniforms is None else uniforms
         self._numbers()
+
+    def _take(self, compiled: user.UserShader) -> None:
+        self._compiled = compiled
+        self.header, self.kind, self.whole = compiled.header, compiled.op, compiled.whole
+        add_user_op(self.kind)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Compiles or finds it again in a process that has not loaded it."""
+        self.__dict__.update(state)
+        self._take(user.reload(self._compiled))
 
     @property
     def libraries(self) -> list[Path]:
@@ -132,7 +141,10 @@ class CompiledShader(LitShader):
         if isinstance(given, Tensor):
             count: int | str = "k" if names is None else len(names)
             check.tensor(self.name, "uniforms", given, (count,), given.dtype, given.device)
+            _check_real(self.name, "uniforms", given)
             return [given]
+        if not isinstance(given, Mapping):
+            raise ValueError(f"{self.name}: uniforms must be a dict or a tensor, got {given!r}")
         if set(given) != set(names or ()):
             known = ", ".join(names) if names else "none" if names is not None else "a (k,) tensor"
             came = ", ".join(map(str, given)) or "none"
@@ -144,6 +156,12 @@ class CompiledShader(LitShader):
                         f"{self.name}: uniform {name} must be one number, "
                         f"got {check.describe(value)}"
                     )
+                _check_real(self.name, f"uniform {name}", value)
             else:
                 check.number(self.name, f"uniform {name}", value)
         return [given[name] for name in names or ()]
+
+
+def _check_real(where: str, what: str, value: Tensor) -> None:
+    if value.is_complex():
+        raise ValueError(f"{where}: {what} must be real, got {check.describe(value)}")

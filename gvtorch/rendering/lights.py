@@ -130,6 +130,9 @@ class Material:
 def pack(parts: Sequence[Any], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Joins numbers, triples and tensors to one (k,) tensor on the device. Numbers go as arguments
     of kernels, tensors of the device stay there: nobody waits, and a CUDA graph reads them anew.
+
+    Raises:
+        ValueError: A number is beyond what the dtype holds.
     """
     out: list[Tensor] = []
     for part in parts:
@@ -138,6 +141,8 @@ def pack(parts: Sequence[Any], dtype: torch.dtype, device: torch.device) -> Tens
             continue
         numbers = part.reshape(-1).tolist() if isinstance(part, Tensor) else part
         for number in numbers if isinstance(numbers, Sequence) else (numbers,):
+            if torch.finfo(dtype).max < abs(number) < math.inf:
+                raise ValueError(f"shader: {number!r} is beyond what {dtype} holds")
             out.append(torch.full((1,), float(number), dtype=dtype, device=device))
     return torch.cat(out)
 

@@ -124,9 +124,19 @@ class TreeTracer(torch.nn.Module):
         return {**self.__dict__, "shade_rays": str(self.shade_rays)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Finds the op again; that of a `CompiledShader` must be loaded."""
+        """Finds the op again.
+
+        Raises:
+            RuntimeError: It is that of a `CompiledShader`, and not loaded in this process.
+        """
         namespace, name = state["shade_rays"].split(".")
-        super().__setstate__({**state, "shade_rays": getattr(getattr(torch.ops, namespace), name)})
+        op = getattr(getattr(torch.ops, namespace), name, None)
+        if op is None:
+            raise RuntimeError(
+                f"TreeTracer: op {name} is not loaded: torch.ops.load_library of its shader's "
+                "libraries first"
+            )
+        super().__setstate__({**state, "shade_rays": op})
 
     def forward(
         self, origin: Tensor, direction: Tensor, cone: Tensor, range: Tensor

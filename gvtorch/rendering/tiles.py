@@ -96,8 +96,10 @@ def strip_rows(limit: int, width: int, height: int) -> int:
 
 
 def _pixels(picture: Picture, bits: int) -> np.ndarray:
-    layers = picture.layers()
-    layers = {name: layer.reshape(-1, *layer.shape[-2:]) for name, layer in layers.items()}
+    rows = picture.color.shape[:-2].numel()
+    layers = {
+        name: layer.reshape(rows, *layer.shape[-2:]) for name, layer in picture.layers().items()
+    }
     return tiff_pixels(layers, picture.transparent, bits)
 
 

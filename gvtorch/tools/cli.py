@@ -207,7 +207,8 @@ def main(args: list[str] | None = None) -> None:
             )
     except SystemExit as end:
         if end.code:
-            words = " ".join(re.sub(r"[^\x20-\x7e]+|[-+|]{3,}", " ", said.getvalue()).split())
+            box = re.sub(r"╭.*╮|[^\x20-\x7e]+|[-+|]{3,}", " ", said.getvalue())  # and its title
+            words = " ".join(box.split())
             print(f"gvtorch: error: {words}", file=sys.stderr)
         raise
     warnings.showwarning = lambda message, *_rest, **_more: print(
