@@ -366,6 +366,32 @@ def test_a_lit_wall_shines_on_the_floor(backend):
     np.testing.assert_allclose(dark, plain, atol=1e-3)  # the wall's own side is in shadow
 
 
+def test_a_headlight_bounces_as_a_lamp_at_the_eye(backend):
+    """Also where a ball stands between the eye and the wall."""
+    x, y, z = places()
+    ball = np.sqrt((x - 16) ** 2 + (y - 18) ** 2 + (z - 32) ** 2) - 4
+    wall = tree_of(np.minimum(np.minimum(x, y) - FLOOR, ball), backend)
+    shader = gv.DistanceField((0.8, 0.8, 0.8), **MATT)
+    eye = np.array([40.0, 30.0, 32.0])
+    rays = down(FLOOR + np.array([2.0, 4.0, 8.0, 14.0]), 30.0, 32.0, DEVICES[backend])
+    way = rays.origin.cpu().numpy() * [1, 0, 1] + [0, FLOOR, 0] - eye
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    origin, way = (torch.tensor(v + 0 * way).to(rays.origin) for v in (eye, way))
+    rays = dataclasses.replace(rays, origin=origin, direction=way)
+    own, lamp = (
+        [
+            light_on(tree, rays, shader, backend, lights=(light,), reach=24.0, indirect=factor)
+            for tree in (corner(1, backend)[0], wall)
+            for factor in (0.0, 1.0)
+        ]
+        for light in (gv.Headlight(), gv.PointLight(tuple(eye)))
+    )
+    np.testing.assert_allclose(own[1], lamp[1], atol=1e-6)
+    bare, blocked = own[1] - own[0], own[3] - own[2]
+    print(np.round((bare[:, 0], blocked[:, 0]), 3))
+    assert bare.min() > 0.08 and (blocked[:2] < 0.8 * bare[:2]).all()
+
+
 def test_a_white_floor_turns_red_beside_a_red_wall(backend):
     x, y, z = places(48)
     alpha = np.clip(0.5 - np.minimum(x, y - 0.0 * z) / 2 + 4, 0, 1)

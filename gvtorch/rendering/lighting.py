@@ -109,6 +109,7 @@ class _Places:
     eye: Tensor  # (r, 3) unit, to where the ray came from
     width: Tensor  # (r,) of the ray's cone there
     seen: Tensor  # (r,) bool, there is a place
+    lamp: Tensor | None  # (r, 3) where a `Headlight` stands; None: at the eye of these rays
     row: int  # pixels of a row, see `Rays`
 
 
@@ -165,7 +166,7 @@ class Lighted:
         sky, (ambient, diffuse, specular) = pack(look, color.dtype, color.device).split(3)
         tally, places = _Tally(hits), self._places(rays, hits, self._lens)
         matt, shine = self._direct(places, tally, self._lighting.shadow_cones)
-        clear, bounced = self._around(places, tally)
+        clear, bounced = self._around(places, rays.origin.to(torch.float64), tally)
         light = ambient * sky * clear.to(color)
         light = light + diffuse * (matt + bounced).to(color)
         color = color * light + hits.alpha * specular * shine.to(color)
@@ -192,6 +193,7 @@ class Lighted:
             eye=-direction,
             width=width,
             seen=seen,
+            lamp=None,
             row=rays.width,
         )
 
@@ -228,7 +230,7 @@ class Lighted:
         eye sees.
         """
         clear = torch.ones_like(distance)
-        if isinstance(light, Headlight) or not self._lighting.shadows:
+        if not self._lighting.shadows or (isinstance(light, Headlight) and places.lamp is None):
             return clear
         size = _size(light, distance)
         growth = 2 * CONE_OF_DISC / math.sqrt(cones) * size
@@ -242,9 +244,9 @@ class Lighted:
             blocked = blocked + hits.alpha[:, 0] / cones
         return 1 - self._lighting.shadows * blocked
 
-    def _around(self, places: _Places, tally: _Tally) -> tuple[Tensor, Tensor]:
+    def _around(self, places: _Places, eye: Tensor, tally: _Tally) -> tuple[Tensor, Tensor]:
         """(r, 1) share of the ambient light that comes through, and (r, 3) the light that matter
-        sends. What lies beyond half of the reach takes half.
+        sends, seen from `eye` (r, 3). What lies beyond half of the reach takes half.
         """
         clear, bounced = torch.ones_like(places.position[:, :1]), torch.zeros_like(places.position)
         lighting, reach = self._lighting, self._lighting.reach
@@ -267,7 +269,7 @@ class Lighted:
             taken = (front.alpha + hits.alpha).to(clear) / 2
             clear = clear - lighting.occlusion * weight * taken
             if self._matter is not None:
-                bounced = bounced + weight * self._sent(first, hits, tally)
+                bounced = bounced + weight * self._sent(first, hits, eye, tally)
         return clear, lighting.indirect * bounced
 
     def _cone(
@@ -292,10 +294,12 @@ class Lighted:
             width=places.row,
         )
 
-    def _sent(self, rays: Rays, hits: Hits, tally: _Tally) -> Tensor:
-        """(r, 3) light that matter sends back along cones that met it."""
+    def _sent(self, rays: Rays, hits: Hits, eye: Tensor, tally: _Tally) -> Tensor:
+        """(r, 3) light that matter sends back along cones that met it; a `Headlight` stays at the
+        eye.
+        """
         places = self._places(rays, hits)
-        places = dataclasses.replace(places, width=_FINER * places.width)
+        places = dataclasses.replace(places, width=_FINER * places.width, lamp=eye)
         matt, _ = self._direct(places, tally, 1)
         (diffuse,) = pack((self._material.diffuse,), torch.float64, matt.device)
         return torch.where(places.seen[:, None], diffuse * matt * hits.color, 0.0)
@@ -303,12 +307,15 @@ class Lighted:
 
 def _towards(light: Light, places: _Places) -> tuple[Tensor, Tensor]:
     """(r, 3) unit directions to a light, and (r,) how far it is."""
-    if isinstance(light, Headlight):
+    if isinstance(light, Headlight) and places.lamp is None:
         return places.eye, torch.zeros_like(places.width)
-    place = pack((light.place,), torch.float64, places.eye.device)
     if isinstance(light, DirectionalLight):
-        beam = normalize(-place, dim=0).expand_as(places.position)
-        return beam, torch.full_like(places.width, torch.inf)
+        beam = normalize(-pack((light.direction,), torch.float64, places.eye.device), dim=0)
+        return beam.expand_as(places.position), torch.full_like(places.width, torch.inf)
+    place = places.lamp
+    if isinstance(light, PointLight):
+        place = pack((light.position,), torch.float64, places.eye.device)
+    assert place is not None
     way = place - places.position
     return normalize(way, dim=1), way.norm(dim=1)
 
@@ -319,8 +326,10 @@ def _is_small(light: Light) -> bool:
     return not isinstance(size, Tensor) and size == 0
 
 
-def _size(light: DirectionalLight | PointLight, distance: Tensor) -> Tensor:
+def _size(light: Light, distance: Tensor) -> Tensor:
     """(r,) radius of a light over how far it is."""
+    if isinstance(light, Headlight):
+        return torch.zeros_like(distance)
     if isinstance(light, PointLight):
         return pack((light.radius,), distance.dtype, distance.device) / distance.clamp(min=1e-30)
     angle = pack((light.angle,), distance.dtype, distance.device)
