@@ -218,6 +218,26 @@ def test_a_light_without_a_size_casts_a_hard_shadow(backend, kind, far):
     assert np.abs(bright - facing).max() < 0.03
 
 
+@pytest.mark.parametrize("width", [0.5, 2.0, 8.0])
+@pytest.mark.parametrize("gap", [1.0, 4.0])
+def test_a_lamp_below_a_ceiling_is_not_in_its_shadow(backend, width, gap):
+    """A cone begins above the place that is seen, but ends at the lamp."""
+    _, y, _ = places()
+    distance, lamp = np.minimum(y - FLOOR, 50 - y), (32.0, 50 - gap, 32.0)
+    x = np.array([32.0, 36.0, 44.0])
+    rays = down(x, FLOOR + 12, 32.0, DEVICES[backend], width)
+    for tree, shader in (
+        (tree_of(distance, backend), gv.DistanceField((1, 1, 1), **MATT)),
+        (
+            tree_of(np.clip(0.5 - distance / 2, 0, 1), backend),
+            gv.Isosurface(0.5, (1, 1, 1), **MATT),
+        ),
+    ):
+        color = light_on(tree, rays, shader, backend, lights=(gv.PointLight(lamp),))[:, 0]
+        facing = (lamp[1] - FLOOR) / np.hypot(lamp[1] - FLOOR, x - lamp[0])
+        np.testing.assert_allclose(color, facing, atol=0.06)
+
+
 def test_shadows_are_as_strong_as_they_are_told(backend):
     tree, shader = over_floor(backend)
     rays = down([32.0, 58.0], FLOOR + 8, 32.0, DEVICES[backend])

@@ -205,13 +205,14 @@ class Lighted:
         matt = shine = torch.zeros_like(places.position)
         for light in self._lights:
             color = pack((light.color,), torch.float64, places.eye.device)
-            beam, distance = _towards(light, places)
+            beam, _ = _towards(light, places)
             facing = torch.where(places.turned, (places.normal * beam).sum(1).clamp(min=0), 1.0)
             half = normalize(beam + places.eye, dim=1)
             highlight = (places.normal * half).sum(1).clamp(0, 1) ** shininess
             highlight = torch.where(places.turned & (facing > 0), highlight, 0.0)
-            to_light = light, beam, distance, 1 if _is_small(light) else cones
-            clear = self._visible(*to_light, places, facing > 0, tally)
+            clear = self._visible(
+                light, 1 if _is_small(light) else cones, places, facing > 0, tally
+            )
             lit = clear[:, None] * color
             matt, shine = matt + facing[:, None] * lit, shine + highlight[:, None] * lit
         return matt, shine
@@ -219,8 +220,6 @@ class Lighted:
     def _visible(
         self,
         light: Light,
-        beam: Tensor,
-        distance: Tensor,
         cones: int,
         places: _Places,
         facing: Tensor,
@@ -229,9 +228,11 @@ class Lighted:
         """(r,) share of a light that is seen from places. The eye's own light is seen wherever the
         eye sees.
         """
-        clear = torch.ones_like(distance)
+        clear = torch.ones_like(places.width)
         if not self._lighting.shadows or (isinstance(light, Headlight) and places.lamp is None):
             return clear
+        places = self._lifted(places, _OFF)
+        beam, distance = _towards(light, places)
         size = _size(light, distance)
         growth = 2 * CONE_OF_DISC / math.sqrt(cones) * size
         right, up = _beside(beam)
@@ -240,7 +241,7 @@ class Lighted:
         blocked = torch.zeros_like(distance)
         for x, y in _disc(cones):
             aim = normalize(beam + size[:, None] * (x * right + y * up), dim=1)
-            hits = tally(self._blocker(self._cone(places, _OFF, aim, growth, start, end)))
+            hits = tally(self._blocker(self._cone(places, aim, growth, start, end)))
             blocked = blocked + hits.alpha[:, 0] / cones
         return 1 - self._lighting.shadows * blocked
 
@@ -259,9 +260,10 @@ class Lighted:
         end = torch.maximum(start, reach * some)
         middle = torch.maximum(start, reach / 2 * some)
         growth = torch.full_like(end, _WIDE)
+        lifted = self._lifted(places, _CLOSE)
         for weight, direction in _hemisphere(places.normal):
             first, second = (
-                self._cone(places, _CLOSE, direction, growth, *span)
+                self._cone(lifted, direction, growth, *span)
                 for span in ((start, middle), (middle, end))
             )
             front = trace(first)
@@ -272,24 +274,21 @@ class Lighted:
                 bounced = bounced + weight * self._sent(first, hits, eye, tally)
         return clear, lighting.indirect * bounced
 
+    def _lifted(self, places: _Places, off: float) -> _Places:
+        """The same `off` voxels above, or widths of what the eye's ray saw."""
+        way = off * places.width.clamp(min=self._voxel)[:, None] * places.normal
+        return dataclasses.replace(places, position=places.position + way)
+
     def _cone(
-        self,
-        places: _Places,
-        off: float,
-        direction: Tensor,
-        growth: Tensor,
-        start: Tensor,
-        end: Tensor,
+        self, places: _Places, direction: Tensor, growth: Tensor, start: Tensor, end: Tensor
     ) -> Rays:
-        """Cones from `off` voxels above places, as wide there as what the eye's ray saw; `growth`
-        is that of the width in the world. One that ends where it starts goes nowhere.
+        """Cones from places, as wide there as what the eye's ray saw; `growth` is that of the width
+        in the world. One that ends where it starts goes nowhere.
         """
-        off_r1 = off * places.width.clamp(min=self._voxel)[:, None]
-        cone = torch.stack((places.width, growth), 1) / self._cone_scale
         return Rays(
-            origin=places.position + off_r1 * places.normal,
+            origin=places.position,
             direction=direction,
-            cone=cone,
+            cone=torch.stack((places.width, growth), 1) / self._cone_scale,
             range=torch.stack((start, end), 1),
             width=places.row,
         )
