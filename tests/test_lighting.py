@@ -201,6 +201,14 @@ def test_umbra_and_penumbra_of_a_ball(backend, name):
         assert seen[0] < 0.01 and seen[-1] > 0.99
 
 
+@pytest.mark.parametrize("length", [1e-30, 1e-13, 1e30])
+def test_a_sun_s_direction_may_have_any_length(backend, length):
+    tree, shader = over_floor(backend)
+    rays = down([32.0, 58.0], FLOOR + 8, 32.0, DEVICES[backend])
+    color = light_on(tree, rays, shader, backend, lights=(gv.DirectionalLight((0, -length, 0)),))
+    np.testing.assert_allclose(color[:, 0], [0, 1], atol=1e-3)
+
+
 @pytest.mark.parametrize("kind", ["distance", "density", "lit"])
 @pytest.mark.parametrize("far", [False, True])
 def test_a_light_without_a_size_casts_a_hard_shadow(backend, kind, far):

@@ -23,6 +23,7 @@ from torch.nn.functional import normalize
 
 from .. import check
 from ..frame import Hits, Rays
+from ..ops.exact import unit
 from .camera import Frame
 from .lens import ThinLens
 from .lights import (
@@ -309,8 +310,9 @@ def _towards(light: Light, places: _Places) -> tuple[Tensor, Tensor]:
     if isinstance(light, Headlight) and places.lamp is None:
         return places.eye, torch.zeros_like(places.width)
     if isinstance(light, DirectionalLight):
-        beam = normalize(-pack((light.direction,), torch.float64, places.eye.device), dim=0)
-        return beam.expand_as(places.position), torch.full_like(places.width, torch.inf)
+        way = -pack((light.direction,), torch.float64, places.eye.device)
+        beam = unit(way.expand_as(places.position))  # of any length but 0
+        return beam, torch.full_like(places.width, torch.inf)
     place = places.lamp
     if isinstance(light, PointLight):
         place = pack((light.position,), torch.float64, places.eye.device)
