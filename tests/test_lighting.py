@@ -98,6 +98,17 @@ def test_without_cones_it_is_the_shader_s_own_light(blobs, backend):
     assert own.alpha.max() == 1
 
 
+def test_a_ray_that_begins_behind_something_has_its_share_of_the_light(backend):
+    rays = parallel(7, 9.0, DEVICES[backend])
+    quarter = torch.full((len(rays.origin),), 0.25).to(rays.origin)
+    shader = gv.DistanceField(light=gv.DirectionalLight((0.3, -0.5, 1)))
+    whole, part = (
+        light_on(ball(backend), some, shader, backend)
+        for some in (rays, dataclasses.replace(rays, clear=quarter))
+    )
+    np.testing.assert_allclose(part, 0.25 * whole, atol=1e-6)
+
+
 def test_translucent_matter_is_lit_where_it_is_seen(blobs, backend):
     """Where colour and gradient do not change along a ray, light by sample and by pixel agree."""
     ramp = np.linspace(0, 1, 24, dtype=np.float32)[:, None, None] * np.ones((1, 20, 20), np.float32)

@@ -170,7 +170,10 @@ class Lighted:
         clear, bounced = self._around(places, rays.origin.to(torch.float64), tally)
         light = ambient * sky * clear.to(color)
         light = light + diffuse * (matt + bounced).to(color)
-        color = color * light + hits.alpha * specular * shine.to(color)
+        taken = hits.alpha  # of the light, by these rays themselves
+        if rays.clear is not None:
+            taken = taken - (1 - rays.clear[:, None]).to(color)
+        color = color * light + taken * specular * shine.to(color)
         color = torch.where(hits.alpha > 0, color, 0.0)  # a closed ray may have no direction
         return dataclasses.replace(hits, color=color, samples=tally.samples, missed=tally.missed)
 
