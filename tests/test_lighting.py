@@ -297,6 +297,22 @@ def test_what_is_clipped_away_casts_no_shadow(backend):
         np.testing.assert_allclose(color, seen, atol=1e-3)
 
 
+def test_a_cap_stands_in_the_light_alone(backend):
+    """A sloping cut through a floor, seen from above, faces the sun, or turns away from it."""
+    tree, shader = over_floor(backend, "density")
+    slope = math.radians(50)
+    normal = (math.sin(slope), math.cos(slope), 0.0)
+    plane = (-normal[0], -normal[1], 0.0, 5 * normal[1] + 32 * normal[0])
+    rays = down([34.0, 36.0], 60.0, 32.0, DEVICES[backend])
+    for sun, expected in ((normal, 1.0), ((0.0, 1.0, 0.0), normal[1]), ((-1.0, 0.1, 0.0), 0.0)):
+        light = gv.DirectionalLight(tuple(-n for n in sun))
+        clip = gv.Clip(planes=[plane], caps=True)
+        given = {"lights": (light,), "plain": {"clip": clip}}
+        np.testing.assert_allclose(
+            light_on(tree, rays, shader, backend, **given), expected, atol=0.02
+        )
+
+
 def test_a_lamp_inside_matter_lights_nothing(backend):
     tree, shader = over_floor(backend)
     rays = down([20.0, 32.0, 50.0], FLOOR + 8, 32.0, DEVICES[backend])
