@@ -142,9 +142,9 @@ def over_floor(backend: str, kind: str = "distance") -> tuple[gv.N3Tree, gv.Shad
     return tree_of(share, backend), gv.Lit(solid, **MATT)
 
 
-def sun_seen(at: np.ndarray, targets: np.ndarray) -> np.ndarray:
+def sun_seen(at: np.ndarray, targets: np.ndarray, centre: np.ndarray = CENTRE) -> np.ndarray:
     """(p,) share of unit directions (p, m, 3) from places (p, 3) that the ball does not block."""
-    away = at - CENTRE
+    away = at - centre
     b = (targets * away[:, None]).sum(-1)
     c = (away**2).sum(-1)[:, None] - RADIUS**2
     return 1 - ((b**2 > c) & (b < 0)).mean(1)
@@ -210,6 +210,30 @@ def test_umbra_and_penumbra_of_a_ball(backend, name):
         print(f"{name}, {cones} cones: {np.round(wrong, 2)} voxels, rms {error:.3f}")
         assert np.abs(wrong).max() < most and error < mean
         assert seen[0] < 0.01 and seen[-1] > 0.99
+
+
+@pytest.mark.parametrize("degrees", [60.0, 45.0, 30.0])
+def test_a_low_sun_casts_its_shadow_where_it_should(backend, degrees):
+    """Cones begin above the place that is seen, but on its way to the sun: to half a voxel, seen
+    from there.
+    """
+    sine, cosine = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
+    x, y, z = places()
+    centre = np.array([40.0 - 16 * cosine / sine, FLOOR + 16, 32.0])  # its shadow's is at x = 40
+    body = np.sqrt((x - centre[0]) ** 2 + (y - centre[1]) ** 2 + (z - centre[2]) ** 2) - RADIUS
+    tree = tree_of(np.minimum(body, y - FLOOR), backend)
+    light = gv.DirectionalLight((cosine, -sine, 0), angle=4.0)
+    u, v = (part * math.tan(math.radians(light.angle) / 2) for part in disc())
+    way = np.stack((-cosine + sine * u, sine + cosine * u, v), -1)
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    at = np.linspace(40, 62, 177)
+    floor = np.stack((at, np.full_like(at, FLOOR), np.full_like(at, 32.0)), -1)
+    expected = sun_seen(floor, way[None].repeat(len(at), 0), centre)
+    rays, shader = down(at, FLOOR + 3, 32.0, DEVICES[backend]), gv.DistanceField((1, 1, 1), **MATT)
+    seen = light_on(tree, rays, shader, backend, lights=(light,))[:, 0] / sine
+    wrong = sine * (crossing(at, seen, 0.5) - crossing(at, expected, 0.5))
+    print(f"{degrees} degrees: {wrong:.2f} voxels")
+    assert abs(wrong) < 0.5
 
 
 @pytest.mark.parametrize("length", [1e-30, 1e-13, 1e30])

@@ -43,6 +43,7 @@ from .pieces import Trace, behind, join
 #: Where secondary rays begin, in voxels: those to lights so far off the surface; those all around
 #: closer, so that they stand in clefts, but begin only after a way.
 _OFF, _CLOSE, _WAY = 1.5, 0.75, 1.5
+_GRAZING = 0.5  # cosine to the normal
 #: Share of a hemisphere's light, cosine counted, from less than 30 degrees off the normal; the
 #: other five cones share the rest.
 _UPRIGHT = 0.25
@@ -235,7 +236,8 @@ class Lighted:
         clear = torch.ones_like(places.width)
         if not self._lighting.shadows or (isinstance(light, Headlight) and places.lamp is None):
             return clear
-        places = self._lifted(places, _OFF)
+        beam, _ = _towards(light, places)
+        places = self._lifted(places, _OFF, beam)
         beam, distance = _towards(light, places)
         size = _size(light, distance)
         growth = 2 * CONE_OF_DISC / math.sqrt(cones) * size
@@ -278,10 +280,16 @@ class Lighted:
                 bounced = bounced + weight * self._sent(first, hits, eye, tally)
         return clear, lighting.indirect * bounced
 
-    def _lifted(self, places: _Places, off: float) -> _Places:
-        """The same `off` voxels above, or widths of what the eye's ray saw."""
-        way = off * places.width.clamp(min=self._voxel)[:, None] * places.normal
-        return dataclasses.replace(places, position=places.position + way)
+    def _lifted(self, places: _Places, off: float, beam: Tensor | None = None) -> _Places:
+        """The same `off` voxels above, or widths of what the eye's ray saw: on the way along
+        `beam` (r, 3), if there is one and it does not graze, so that no shadow moves.
+        """
+        way = places.normal
+        if beam is not None:
+            rise = (way * beam).sum(1, keepdim=True)
+            way = way + (beam - rise * way) / rise.clamp(min=_GRAZING)
+        height = off * places.width.clamp(min=self._voxel)[:, None]
+        return dataclasses.replace(places, position=places.position + height * way)
 
     def _cone(
         self, places: _Places, direction: Tensor, growth: Tensor, start: Tensor, end: Tensor
