@@ -130,7 +130,14 @@ def test_mistakes_have_one_clear_message(blobs):
         (lambda: gv.cost(blobs, CAMERA, SHADER), "cost: tree must be a N3Tree, got Volume"),
         (lambda: gv.cost(tree, CAMERA, 3), "cost: shader must be a TransferFunction, got int"),
         (lambda: gv.cost(tree, CAMERA, SHADER, colour=1), "cost: unknown option 'colour'"),
-        (lambda: gv.cost(tree, CAMERA, SHADER, clip=gv.Clip()), "whole rays, without a clip"),
+        (
+            lambda: gv.cost(tree, CAMERA, SHADER, clip=gv.Clip()),
+            "whole rays, so there must be no clip",
+        ),
+        (
+            lambda: gv.cost(tree, CAMERA, SHADER, lighting=gv.Lighting()),
+            "there must be no lighting",
+        ),
         (lambda: counted.picture("heat"), "image must be samples, nodes, lod, age or fill"),
         (lambda: counted.picture("lod", colormap="mud"), "unknown colormap 'mud'"),
     ):

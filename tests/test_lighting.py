@@ -98,6 +98,17 @@ def test_without_cones_it_is_the_shader_s_own_light(blobs, backend):
     assert own.alpha.max() == 1
 
 
+def test_a_ray_that_begins_behind_something_has_its_share_of_the_light(backend):
+    rays = parallel(7, 9.0, DEVICES[backend])
+    quarter = torch.full((len(rays.origin),), 0.25).to(rays.origin)
+    shader = gv.DistanceField(light=gv.DirectionalLight((0.3, -0.5, 1)))
+    whole, part = (
+        light_on(ball(backend), some, shader, backend)
+        for some in (rays, dataclasses.replace(rays, clear=quarter))
+    )
+    np.testing.assert_allclose(part, 0.25 * whole, atol=1e-6)
+
+
 def test_translucent_matter_is_lit_where_it_is_seen(blobs, backend):
     """Where colour and gradient do not change along a ray, light by sample and by pixel agree."""
     ramp = np.linspace(0, 1, 24, dtype=np.float32)[:, None, None] * np.ones((1, 20, 20), np.float32)
@@ -131,9 +142,9 @@ def over_floor(backend: str, kind: str = "distance") -> tuple[gv.N3Tree, gv.Shad
     return tree_of(share, backend), gv.Lit(solid, **MATT)
 
 
-def sun_seen(at: np.ndarray, targets: np.ndarray) -> np.ndarray:
+def sun_seen(at: np.ndarray, targets: np.ndarray, centre: np.ndarray = CENTRE) -> np.ndarray:
     """(p,) share of unit directions (p, m, 3) from places (p, 3) that the ball does not block."""
-    away = at - CENTRE
+    away = at - centre
     b = (targets * away[:, None]).sum(-1)
     c = (away**2).sum(-1)[:, None] - RADIUS**2
     return 1 - ((b**2 > c) & (b < 0)).mean(1)
@@ -201,6 +212,38 @@ def test_umbra_and_penumbra_of_a_ball(backend, name):
         assert seen[0] < 0.01 and seen[-1] > 0.99
 
 
+@pytest.mark.parametrize("degrees", [60.0, 45.0, 30.0])
+def test_a_low_sun_casts_its_shadow_where_it_should(backend, degrees):
+    """Cones begin above the place that is seen, but on its way to the sun: to half a voxel, seen
+    from there.
+    """
+    sine, cosine = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
+    x, y, z = places()
+    centre = np.array([40.0 - 16 * cosine / sine, FLOOR + 16, 32.0])  # its shadow's is at x = 40
+    body = np.sqrt((x - centre[0]) ** 2 + (y - centre[1]) ** 2 + (z - centre[2]) ** 2) - RADIUS
+    tree = tree_of(np.minimum(body, y - FLOOR), backend)
+    light = gv.DirectionalLight((cosine, -sine, 0), angle=4.0)
+    u, v = (part * math.tan(math.radians(light.angle) / 2) for part in disc())
+    way = np.stack((-cosine + sine * u, sine + cosine * u, v), -1)
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    at = np.linspace(40, 62, 177)
+    floor = np.stack((at, np.full_like(at, FLOOR), np.full_like(at, 32.0)), -1)
+    expected = sun_seen(floor, way[None].repeat(len(at), 0), centre)
+    rays, shader = down(at, FLOOR + 3, 32.0, DEVICES[backend]), gv.DistanceField((1, 1, 1), **MATT)
+    seen = light_on(tree, rays, shader, backend, lights=(light,))[:, 0] / sine
+    wrong = sine * (crossing(at, seen, 0.5) - crossing(at, expected, 0.5))
+    print(f"{degrees} degrees: {wrong:.2f} voxels")
+    assert abs(wrong) < 0.5
+
+
+@pytest.mark.parametrize("length", [1e-30, 1e-13, 1e30])
+def test_a_sun_s_direction_may_have_any_length(backend, length):
+    tree, shader = over_floor(backend)
+    rays = down([32.0, 58.0], FLOOR + 8, 32.0, DEVICES[backend])
+    color = light_on(tree, rays, shader, backend, lights=(gv.DirectionalLight((0, -length, 0)),))
+    np.testing.assert_allclose(color[:, 0], [0, 1], atol=1e-3)
+
+
 @pytest.mark.parametrize("kind", ["distance", "density", "lit"])
 @pytest.mark.parametrize("far", [False, True])
 def test_a_light_without_a_size_casts_a_hard_shadow(backend, kind, far):
@@ -216,6 +259,26 @@ def test_a_light_without_a_size_casts_a_hard_shadow(backend, kind, far):
     assert dark.max() < 0.01 and bright.min() > 0.5
     facing = 1 if far else 112 / np.hypot(112, x[x > 32 + edge + 1.5] - 32)
     assert np.abs(bright - facing).max() < 0.03
+
+
+@pytest.mark.parametrize("width", [0.5, 2.0, 8.0])
+@pytest.mark.parametrize("gap", [1.0, 4.0])
+def test_a_lamp_below_a_ceiling_is_not_in_its_shadow(backend, width, gap):
+    """A cone begins above the place that is seen, but ends at the lamp."""
+    _, y, _ = places()
+    distance, lamp = np.minimum(y - FLOOR, 50 - y), (32.0, 50 - gap, 32.0)
+    x = np.array([32.0, 36.0, 44.0])
+    rays = down(x, FLOOR + 12, 32.0, DEVICES[backend], width)
+    for tree, shader in (
+        (tree_of(distance, backend), gv.DistanceField((1, 1, 1), **MATT)),
+        (
+            tree_of(np.clip(0.5 - distance / 2, 0, 1), backend),
+            gv.Isosurface(0.5, (1, 1, 1), **MATT),
+        ),
+    ):
+        color = light_on(tree, rays, shader, backend, lights=(gv.PointLight(lamp),))[:, 0]
+        facing = (lamp[1] - FLOOR) / np.hypot(lamp[1] - FLOOR, x - lamp[0])
+        np.testing.assert_allclose(color, facing, atol=0.06)
 
 
 def test_shadows_are_as_strong_as_they_are_told(backend):
@@ -256,6 +319,22 @@ def test_what_is_clipped_away_casts_no_shadow(backend):
             lights=(gv.DirectionalLight((0, -1, 0)),),
         )
         np.testing.assert_allclose(color, seen, atol=1e-3)
+
+
+def test_a_cap_stands_in_the_light_alone(backend):
+    """A sloping cut through a floor, seen from above, faces the sun, or turns away from it."""
+    tree, shader = over_floor(backend, "density")
+    slope = math.radians(50)
+    normal = (math.sin(slope), math.cos(slope), 0.0)
+    plane = (-normal[0], -normal[1], 0.0, 5 * normal[1] + 32 * normal[0])
+    rays = down([34.0, 36.0], 60.0, 32.0, DEVICES[backend])
+    for sun, expected in ((normal, 1.0), ((0.0, 1.0, 0.0), normal[1]), ((-1.0, 0.1, 0.0), 0.0)):
+        light = gv.DirectionalLight(tuple(-n for n in sun))
+        clip = gv.Clip(planes=[plane], caps=True)
+        given = {"lights": (light,), "plain": {"clip": clip}}
+        np.testing.assert_allclose(
+            light_on(tree, rays, shader, backend, **given), expected, atol=0.02
+        )
 
 
 def test_a_lamp_inside_matter_lights_nothing(backend):
@@ -364,6 +443,32 @@ def test_a_lit_wall_shines_on_the_floor(backend):
     dark = light_on(tree, rays, shader, backend, indirect=1, **away_from_it)
     plain = light_on(tree, rays, shader, backend, **away_from_it)
     np.testing.assert_allclose(dark, plain, atol=1e-3)  # the wall's own side is in shadow
+
+
+def test_a_headlight_bounces_as_a_lamp_at_the_eye(backend):
+    """Also where a ball stands between the eye and the wall."""
+    x, y, z = places()
+    ball = np.sqrt((x - 16) ** 2 + (y - 18) ** 2 + (z - 32) ** 2) - 4
+    wall = tree_of(np.minimum(np.minimum(x, y) - FLOOR, ball), backend)
+    shader = gv.DistanceField((0.8, 0.8, 0.8), **MATT)
+    eye = np.array([40.0, 30.0, 32.0])
+    rays = down(FLOOR + np.array([2.0, 4.0, 8.0, 14.0]), 30.0, 32.0, DEVICES[backend])
+    way = rays.origin.cpu().numpy() * [1, 0, 1] + [0, FLOOR, 0] - eye
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    origin, way = (torch.tensor(v + 0 * way).to(rays.origin) for v in (eye, way))
+    rays = dataclasses.replace(rays, origin=origin, direction=way)
+    own, lamp = (
+        [
+            light_on(tree, rays, shader, backend, lights=(light,), reach=24.0, indirect=factor)
+            for tree in (corner(1, backend)[0], wall)
+            for factor in (0.0, 1.0)
+        ]
+        for light in (gv.Headlight(), gv.PointLight(tuple(eye)))
+    )
+    np.testing.assert_allclose(own[1], lamp[1], atol=1e-6)
+    bare, blocked = own[1] - own[0], own[3] - own[2]
+    print(np.round((bare[:, 0], blocked[:, 0]), 3))
+    assert bare.min() > 0.08 and (blocked[:2] < 0.8 * bare[:2]).all()
 
 
 def test_a_white_floor_turns_red_beside_a_red_wall(backend):

@@ -127,7 +127,7 @@ def test_each_camera_of_a_batch_has_its_own_light(blobs, compiled):
 def test_rays_that_hit_nothing_go_no_further(blobs, backend):
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[backend])
     camera = gv.Camera.look_at((0, 0, 500), (0, 300, 500), width=12, height=12)
-    fisheye = gv.Camera.orbit(0, 0, 0.8, 180, 12, 12, "fisheye")
+    fisheye = gv.Camera.orbit(0, 0, 0.8, 180, 24, 24, "fisheye")
     for view in (camera, fisheye):
         plain = gv.render(tree, view, SURFACES["isosurface"], backend=backend)
         given = {"lighting": LOOKS["indirect"], "background": (0.1, 0.2, 0.3)}
@@ -144,7 +144,7 @@ def test_rays_that_hit_nothing_go_no_further(blobs, backend):
 def test_lights_are_tensors_that_may_be_edited(blobs, compiled):
     device = DEVICES[compiled]
     tree = gv.N3Tree.from_volume(blobs, 4, device=device)
-    rays = gv.Camera.orbit(20, 30, 1.2, width=16, height=16).placed(tree.box).rays(device)
+    rays = gv.Camera.orbit(20, 30, 1.2, width=32, height=32).placed(tree.box).rays(device)
     position, radius = (torch.tensor(n, device=device) for n in ([10.0, 60.0, 60.0], 2.0))
     tint, ambient = torch.ones(3, device=device), torch.ones(3, device=device)
     lighting = gv.Lighting(lights=(gv.PointLight(position, tint, radius),), ambient=ambient)

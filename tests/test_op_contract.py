@@ -15,6 +15,7 @@ from test_trace_rays import SHADER, arguments, camera_rays, on
 import gvtorch as gv
 from gvtorch import cpp_ext
 from gvtorch.ops import trace_rays
+from gvtorch.rendering.renderer import trace
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # torch deprecates its own TorchScript
 
@@ -129,6 +130,18 @@ def test_module_equals_render(blobs, compiled):
     # The module's rays are rounded to float32 in the world, the renderer's only in the tree.
     assert (color.reshape(16, 16, 3) - picture.color).abs().max() < 5e-3
     assert (alpha.reshape(16, 16, 1) - picture.alpha).abs().mean() < 1e-4
+
+
+@pytest.mark.parametrize("scale", [None, 3.0])
+def test_module_traces_a_camera_s_rays_as_the_renderer_does(blobs, compiled, scale):
+    """At the level of detail that their cones ask for."""
+    tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
+    rays = camera_rays(tree, 16, distance=3.0).to(tree.device)
+    given = {} if scale is None else {"cone_scale": scale}
+    hits = trace(tree, rays, SHADER, gv.RenderOptions(backend=compiled, **given))
+    columns = (rays.origin, rays.direction, rays.cone, rays.range)
+    fields = gv.TreeTracer(tree, SHADER, **given)(*columns)
+    assert_same(fields, (hits.color, hits.alpha, hits.depth, hits.samples))
 
 
 def test_memory_stays_safe_without_the_python_checks(blobs, compiled):

@@ -412,6 +412,18 @@ def test_graphs_on_cuda_replay_every_model(blobs, model):
             "unit length, 4 are not",
         ),
         (
+            lambda: gv.CustomCamera.from_directions(
+                torch.zeros(3), torch.tensor([[[0.0, 0, 2], [0, 0, 0], [0, 0, 1e-20]]])
+            ),
+            "unit length, 1 are not",
+        ),
+        (
+            lambda: gv.CustomCamera.from_directions(
+                torch.tensor([[[0.0], [math.nan]]]), torch.tensor([0.0, 0, 1]).expand(1, 2, 3)
+            ),
+            "rays must not be NaN, 2 are",
+        ),
+        (
             lambda: gv.CustomCamera(
                 dataclasses.replace(askew("pinhole").rays(), clear=torch.ones(140))
             ),

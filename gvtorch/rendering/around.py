@@ -50,7 +50,8 @@ def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -
             if isinstance(sight.shader, Isosurface):
                 slab = SurfaceSlab(sight.shader, lambda shader: sight.seeing(shader, options))
         given = {"step": tracer.arguments["step"], "depth_alpha": options.depth_alpha}
-        return Clipped(trace, options.clip, box, slab=slab, **given)
+        unlit = options.lighting is not None
+        return Clipped(trace, options.clip, box, slab=slab, unlit=unlit, **given)
 
     lens = options.lens and options.lens.placed(box)
     if options.lighting is None:

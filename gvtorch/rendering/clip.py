@@ -42,7 +42,7 @@ class Clip:
     frame: Frame | str = Frame.WORLD  # world units, or the scene's box: centre 0, largest side 1
     caps: bool = False  # a cut through data is drawn as a flat surface
     cap_opacity: float = 1.0  # of that surface
-    cap_light: float = 0.5  # share of its light that comes from the eye; 0: flat colour
+    cap_light: float = 0.5  # share of its light that comes from the eye, where no `Lighting` is
 
     def __post_init__(self) -> None:
         """Checks all numbers.
@@ -108,13 +108,15 @@ class Clipped:
         step: float,
         depth_alpha: float,
         slab: Trace | None = None,
+        unlit: bool = False,
     ) -> None:
         """Takes what traces the pieces, the (2, 3) box of the scene, the shortest interval in world
-        units, which is how deep a cap looks for its colour, where alpha means depth, and what
-        traces so far behind a cut, if that is not `trace`.
+        units, which is how deep a cap looks for its colour, where alpha means depth, what
+        traces so far behind a cut, if that is not `trace`, and whether caps get their light later.
         """
         self._trace, self._clip, self._slab = trace, clip, slab or trace
         self._step, self._hit_clear = step, 1 - depth_alpha
+        self._cap_light = 0.0 if unlit else clip.cap_light
         planes, boxes, self._without = clip.faces(box)
         alone = len(boxes) == 1  # then what is kept is convex
         self._planes = planes + boxes[0] if alone else planes
@@ -181,7 +183,7 @@ class Clipped:
         share = clear - (1 - slab.alpha[:, 0])  # of the light, that the slab takes
         alpha = torch.where(share > _SEEN * clear, self._clip.cap_opacity, 0.0).to(clear)
         facing, normal = self._facing(piece, first)
-        light = 1 - self._clip.cap_light * (1 - facing)
+        light = 1 - self._cap_light * (1 - facing)
         part = clear * alpha / torch.where(alpha > 0, share, 1.0)
         scale = clear * alpha * light.to(clear) / torch.where(alpha > 0, share, 1.0)
         left = clear * (1 - alpha)

@@ -103,17 +103,17 @@ def cost(
         camera: See `render`.
         shader: The transfer function.
         progress: Told how many rays are done.
-        **options: Fields of `RenderOptions`; whole rays are counted, so there is no clip, lens or
-            layer.
+        **options: Fields of `RenderOptions`; whole rays are counted, so there is no clip, lens,
+            layer or lighting.
 
     Raises:
         ValueError: See `render`.
     """
     camera = as_camera("cost", camera)
     chosen = render_options("cost", camera, options)
-    for name in ("clip", "lens", "layer"):
+    for name in ("clip", "lens", "layer", "lighting"):
         if getattr(chosen, name) is not None:
-            raise ValueError(f"cost: it counts whole rays, without a {name}")
+            raise ValueError(f"cost: it counts whole rays, so there must be no {name}")
     check_type("cost", "tree", tree, N3Tree)
     if not isinstance(shader, TransferFunction):
         raise ValueError(f"cost: shader must be a TransferFunction, got {type(shader).__name__}")

@@ -29,7 +29,8 @@ class CustomCamera(Camera):
 
         Raises:
             ValueError: The number of rays is no multiple of a picture's pixels, or a shape is
-                wrong, or (looked at on the CPU only) a direction is not of unit length.
+                wrong, or (looked at on the CPU only) a number is NaN, or a direction is not of unit
+                length.
         """
         columns: list[Tensor] = []
         for name, size in (("origin", 3), ("direction", 3), ("cone", 2), ("range", 2)):
@@ -58,13 +59,16 @@ class CustomCamera(Camera):
             raise ValueError(
                 f"CustomCamera: {count} rays are no pictures of {self.width}x{self.height} pixels"
             )
+        self._rays = torch.cat([column.to(torch.float64) for column in columns], 1)  # (r, 10)
         if rays.direction.device.type == "cpu":
+            lost = self._rays.isnan().any(1)
+            if bool(lost.any()):
+                raise ValueError(f"CustomCamera: rays must not be NaN, {int(lost.sum())} are")
             off = (rays.direction.norm(dim=1) - 1).abs() > 1e-3
             if bool(off.any()):
                 raise ValueError(
                     f"CustomCamera: directions must be of unit length, {int(off.sum())} are not"
                 )
-        self._rays = torch.cat([column.to(torch.float64) for column in columns], 1)  # (r, 10)
         self.frame, self.batched = Frame.WORLD, count > self.width * self.height
 
     @classmethod
@@ -86,14 +90,15 @@ class CustomCamera(Camera):
             range: (..., 2) first and last distance; 0 and infinity if left out.
 
         Raises:
-            ValueError: A shape is wrong.
+            ValueError: A shape is wrong, or (looked at on the CPU only) a number is NaN, or a
+                direction 0.
         """
         if direction.dim() not in (3, 4) or direction.shape[-1] != 3:
             raise ValueError(
                 "CustomCamera: direction must be (h, w, 3) or (n, h, w, 3), "
                 f"got {describe(direction)}"
             )
-        direction = torch.nn.functional.normalize(direction.to(torch.float64), dim=-1, eps=0)
+        direction = torch.nn.functional.normalize(direction.to(torch.float64), dim=-1, eps=1e-300)
         if range is None:
             range = torch.stack((direction.new_zeros(()), direction.new_full((), torch.inf)))
         parts = {"origin": (origin, 3), "cone": (cone, 2), "range": (range, 2)}

@@ -23,6 +23,7 @@ from torch.nn.functional import normalize
 
 from .. import check
 from ..frame import Hits, Rays
+from ..ops.exact import unit
 from .camera import Frame
 from .lens import ThinLens
 from .lights import (
@@ -42,6 +43,7 @@ from .pieces import Trace, behind, join
 #: Where secondary rays begin, in voxels: those to lights so far off the surface; those all around
 #: closer, so that they stand in clefts, but begin only after a way.
 _OFF, _CLOSE, _WAY = 1.5, 0.75, 1.5
+_GRAZING = 0.5  # cosine to the normal
 #: Share of a hemisphere's light, cosine counted, from less than 30 degrees off the normal; the
 #: other five cones share the rest.
 _UPRIGHT = 0.25
@@ -109,6 +111,7 @@ class _Places:
     eye: Tensor  # (r, 3) unit, to where the ray came from
     width: Tensor  # (r,) of the ray's cone there
     seen: Tensor  # (r,) bool, there is a place
+    lamp: Tensor | None  # (r, 3) where a `Headlight` stands; None: at the eye of these rays
     row: int  # pixels of a row, see `Rays`
 
 
@@ -165,10 +168,13 @@ class Lighted:
         sky, (ambient, diffuse, specular) = pack(look, color.dtype, color.device).split(3)
         tally, places = _Tally(hits), self._places(rays, hits, self._lens)
         matt, shine = self._direct(places, tally, self._lighting.shadow_cones)
-        clear, bounced = self._around(places, tally)
+        clear, bounced = self._around(places, rays.origin.to(torch.float64), tally)
         light = ambient * sky * clear.to(color)
         light = light + diffuse * (matt + bounced).to(color)
-        color = color * light + hits.alpha * specular * shine.to(color)
+        taken = hits.alpha  # of the light, by these rays themselves
+        if rays.clear is not None:
+            taken = taken - (1 - rays.clear[:, None]).to(color)
+        color = color * light + taken * specular * shine.to(color)
         color = torch.where(hits.alpha > 0, color, 0.0)  # a closed ray may have no direction
         return dataclasses.replace(hits, color=color, samples=tally.samples, missed=tally.missed)
 
@@ -192,6 +198,7 @@ class Lighted:
             eye=-direction,
             width=width,
             seen=seen,
+            lamp=None,
             row=rays.width,
         )
 
@@ -203,13 +210,14 @@ class Lighted:
         matt = shine = torch.zeros_like(places.position)
         for light in self._lights:
             color = pack((light.color,), torch.float64, places.eye.device)
-            beam, distance = _towards(light, places)
+            beam, _ = _towards(light, places)
             facing = torch.where(places.turned, (places.normal * beam).sum(1).clamp(min=0), 1.0)
             half = normalize(beam + places.eye, dim=1)
             highlight = (places.normal * half).sum(1).clamp(0, 1) ** shininess
             highlight = torch.where(places.turned & (facing > 0), highlight, 0.0)
-            to_light = light, beam, distance, 1 if _is_small(light) else cones
-            clear = self._visible(*to_light, places, facing > 0, tally)
+            clear = self._visible(
+                light, 1 if _is_small(light) else cones, places, facing > 0, tally
+            )
             lit = clear[:, None] * color
             matt, shine = matt + facing[:, None] * lit, shine + highlight[:, None] * lit
         return matt, shine
@@ -217,8 +225,6 @@ class Lighted:
     def _visible(
         self,
         light: Light,
-        beam: Tensor,
-        distance: Tensor,
         cones: int,
         places: _Places,
         facing: Tensor,
@@ -227,9 +233,12 @@ class Lighted:
         """(r,) share of a light that is seen from places. The eye's own light is seen wherever the
         eye sees.
         """
-        clear = torch.ones_like(distance)
-        if isinstance(light, Headlight) or not self._lighting.shadows:
+        clear = torch.ones_like(places.width)
+        if not self._lighting.shadows or (isinstance(light, Headlight) and places.lamp is None):
             return clear
+        beam, _ = _towards(light, places)
+        places = self._lifted(places, _OFF, beam)
+        beam, distance = _towards(light, places)
         size = _size(light, distance)
         growth = 2 * CONE_OF_DISC / math.sqrt(cones) * size
         right, up = _beside(beam)
@@ -238,13 +247,13 @@ class Lighted:
         blocked = torch.zeros_like(distance)
         for x, y in _disc(cones):
             aim = normalize(beam + size[:, None] * (x * right + y * up), dim=1)
-            hits = tally(self._blocker(self._cone(places, _OFF, aim, growth, start, end)))
+            hits = tally(self._blocker(self._cone(places, aim, growth, start, end)))
             blocked = blocked + hits.alpha[:, 0] / cones
         return 1 - self._lighting.shadows * blocked
 
-    def _around(self, places: _Places, tally: _Tally) -> tuple[Tensor, Tensor]:
+    def _around(self, places: _Places, eye: Tensor, tally: _Tally) -> tuple[Tensor, Tensor]:
         """(r, 1) share of the ambient light that comes through, and (r, 3) the light that matter
-        sends. What lies beyond half of the reach takes half.
+        sends, seen from `eye` (r, 3). What lies beyond half of the reach takes half.
         """
         clear, bounced = torch.ones_like(places.position[:, :1]), torch.zeros_like(places.position)
         lighting, reach = self._lighting, self._lighting.reach
@@ -257,9 +266,10 @@ class Lighted:
         end = torch.maximum(start, reach * some)
         middle = torch.maximum(start, reach / 2 * some)
         growth = torch.full_like(end, _WIDE)
+        lifted = self._lifted(places, _CLOSE)
         for weight, direction in _hemisphere(places.normal):
             first, second = (
-                self._cone(places, _CLOSE, direction, growth, *span)
+                self._cone(lifted, direction, growth, *span)
                 for span in ((start, middle), (middle, end))
             )
             front = trace(first)
@@ -267,35 +277,40 @@ class Lighted:
             taken = (front.alpha + hits.alpha).to(clear) / 2
             clear = clear - lighting.occlusion * weight * taken
             if self._matter is not None:
-                bounced = bounced + weight * self._sent(first, hits, tally)
+                bounced = bounced + weight * self._sent(first, hits, eye, tally)
         return clear, lighting.indirect * bounced
 
-    def _cone(
-        self,
-        places: _Places,
-        off: float,
-        direction: Tensor,
-        growth: Tensor,
-        start: Tensor,
-        end: Tensor,
-    ) -> Rays:
-        """Cones from `off` voxels above places, as wide there as what the eye's ray saw; `growth`
-        is that of the width in the world. One that ends where it starts goes nowhere.
+    def _lifted(self, places: _Places, off: float, beam: Tensor | None = None) -> _Places:
+        """The same `off` voxels above, or widths of what the eye's ray saw: on the way along
+        `beam` (r, 3), if there is one and it does not graze, so that no shadow moves.
         """
-        off_r1 = off * places.width.clamp(min=self._voxel)[:, None]
-        cone = torch.stack((places.width, growth), 1) / self._cone_scale
+        way = places.normal
+        if beam is not None:
+            rise = (way * beam).sum(1, keepdim=True)
+            way = way + (beam - rise * way) / rise.clamp(min=_GRAZING)
+        height = off * places.width.clamp(min=self._voxel)[:, None]
+        return dataclasses.replace(places, position=places.position + height * way)
+
+    def _cone(
+        self, places: _Places, direction: Tensor, growth: Tensor, start: Tensor, end: Tensor
+    ) -> Rays:
+        """Cones from places, as wide there as what the eye's ray saw; `growth` is that of the width
+        in the world. One that ends where it starts goes nowhere.
+        """
         return Rays(
-            origin=places.position + off_r1 * places.normal,
+            origin=places.position,
             direction=direction,
-            cone=cone,
+            cone=torch.stack((places.width, growth), 1) / self._cone_scale,
             range=torch.stack((start, end), 1),
             width=places.row,
         )
 
-    def _sent(self, rays: Rays, hits: Hits, tally: _Tally) -> Tensor:
-        """(r, 3) light that matter sends back along cones that met it."""
+    def _sent(self, rays: Rays, hits: Hits, eye: Tensor, tally: _Tally) -> Tensor:
+        """(r, 3) light that matter sends back along cones that met it; a `Headlight` stays at the
+        eye.
+        """
         places = self._places(rays, hits)
-        places = dataclasses.replace(places, width=_FINER * places.width)
+        places = dataclasses.replace(places, width=_FINER * places.width, lamp=eye)
         matt, _ = self._direct(places, tally, 1)
         (diffuse,) = pack((self._material.diffuse,), torch.float64, matt.device)
         return torch.where(places.seen[:, None], diffuse * matt * hits.color, 0.0)
@@ -303,12 +318,16 @@ class Lighted:
 
 def _towards(light: Light, places: _Places) -> tuple[Tensor, Tensor]:
     """(r, 3) unit directions to a light, and (r,) how far it is."""
-    if isinstance(light, Headlight):
+    if isinstance(light, Headlight) and places.lamp is None:
         return places.eye, torch.zeros_like(places.width)
-    place = pack((light.place,), torch.float64, places.eye.device)
     if isinstance(light, DirectionalLight):
-        beam = normalize(-place, dim=0).expand_as(places.position)
+        way = -pack((light.direction,), torch.float64, places.eye.device)
+        beam = unit(way.expand_as(places.position))  # of any length but 0
         return beam, torch.full_like(places.width, torch.inf)
+    place = places.lamp
+    if isinstance(light, PointLight):
+        place = pack((light.position,), torch.float64, places.eye.device)
+    assert place is not None
     way = place - places.position
     return normalize(way, dim=1), way.norm(dim=1)
 
@@ -319,8 +338,10 @@ def _is_small(light: Light) -> bool:
     return not isinstance(size, Tensor) and size == 0
 
 
-def _size(light: DirectionalLight | PointLight, distance: Tensor) -> Tensor:
+def _size(light: Light, distance: Tensor) -> Tensor:
     """(r,) radius of a light over how far it is."""
+    if isinstance(light, Headlight):
+        return torch.zeros_like(distance)
     if isinstance(light, PointLight):
         return pack((light.radius,), distance.dtype, distance.device) / distance.clamp(min=1e-30)
     angle = pack((light.angle,), distance.dtype, distance.device)

@@ -22,7 +22,8 @@ from .shaders import FusedShader, Intervals, Shader
 
 
 class TreeTracer(torch.nn.Module):
-    """Traces world rays through a resident tree. Pools are buffers: `.to(device)` moves them.
+    """Traces world rays through a resident tree, as `render` does. Pools are buffers: `.to(device)`
+    moves them.
 
     Light and material of a lit shader are the buffer `parameter`, laid out as `parameter_54` of
     `ops.shade_rays`; it may be edited.
@@ -45,6 +46,7 @@ class TreeTracer(torch.nn.Module):
         step: float = config.STEP,
         stop_alpha: float = config.STOP_ALPHA,
         depth_alpha: float = config.DEPTH_ALPHA,
+        cone_scale: float = config.CONE_OVERESTIMATE,
     ) -> None:
         """Shares the tree's pools, but for the usage stamps, which are its own.
 
@@ -56,6 +58,7 @@ class TreeTracer(torch.nn.Module):
             step: Shortest interval, in voxels of the finest level.
             stop_alpha: A ray ends at this alpha.
             depth_alpha: Depth is where alpha passes this.
+            cone_scale: Factor on the cones of rays, as in `RenderOptions`.
 
         Raises:
             RuntimeError: The compiled op is missing.
@@ -76,6 +79,7 @@ class TreeTracer(torch.nn.Module):
         check.number(where, "step", step, low=0, open_low=True)
         check.number(where, "stop_alpha", stop_alpha, low=0, high=1, open_low=True)
         check.number(where, "depth_alpha", depth_alpha, low=0, high=1)
+        check.number(where, "cone_scale", cone_scale, low=0, open_low=True)
         most_intervals(float((tree.box[1] - tree.box[0]).norm()), step * min(tree.spacing))
         step = step * min(tree.spacing)
         levels = interval_levels(tree.root_voxel, step)
@@ -110,7 +114,7 @@ class TreeTracer(torch.nn.Module):
         ):
             self.register_buffer(name, tensor)
         self.branching, self.root, self.depth = tree.branching, tree.root, tree.depth
-        self.flatness = float(tree.flatness)
+        self.cone_scale = float(cone_scale * tree.flatness)
         self.border, self.component = bricks.border, component
         self.root_voxel, self.step = float(tree.root_voxel), step
         self.stop_alpha, self.depth_alpha = float(stop_alpha), float(depth_alpha)
@@ -194,7 +198,7 @@ class TreeTracer(torch.nn.Module):
                 self.depth,
                 self.border,
                 self.component,
-                self.flatness,
+                self.cone_scale,
                 self.root_voxel,
                 self.step,
                 self.stop_alpha,
@@ -235,7 +239,7 @@ class TreeTracer(torch.nn.Module):
             self.depth,
             self.border,
             self.component,
-            self.flatness,
+            self.cone_scale,
             self.root_voxel,
             self.step,
             self.stop_alpha,

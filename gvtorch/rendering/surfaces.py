@@ -15,8 +15,8 @@ from .solid import solid_table
 
 
 class Isosurface(LitShader):
-    """The first place where the value passes a level, opaque and lit; to a tenth of a voxel. Where
-    a cap cuts it, it is filled with what is not below the level.
+    """The first place where the value passes a level, opaque and lit. Where a cap cuts it, it
+    is filled with what is not below the level.
     """
 
     kind = kinds.ISOSURFACE
