@@ -35,7 +35,7 @@ INSTRUCTION_SETS = {
     "avx2": ["-mavx2", "-mf16c"],
     "avx512": [
         *("-mavx2", "-mf16c", "-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl"),
-        *("-mprefer-vector-width=512", "-Wno-maybe-uninitialized"),  # GCC's own header warns
+        *("-mprefer-vector-width=512", "-Wno-maybe-uninitialized", "-Wno-uninitialized"),  # GCC's own header warns
     ],
 }
 FOLDER = Path("gvtorch") / "cpp_ext"
