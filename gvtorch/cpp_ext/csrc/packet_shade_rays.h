@@ -138,6 +138,14 @@ struct ShadePacket : PacketWalk<Self> {
     with_probe(lane, [&](const Probe<float>& probe, Sum& sum) { shader.add(one, probe, sum); });
   }
 
+  // Lanes whose nodes all have bricks.
+  GV_HD Mask stored() const { return fine.stored & (~mixed | coarse.stored); }
+  // Twin of Probe::number_at for such lanes.
+  GV_HD Floats number_at(const PacketChannel& channel, Mask which, Floats t) const {
+    const Floats number = channel.read(fine.brick, fine.at(t));
+    if (!any(mixed & which)) return number;
+    return mixed ? number + this->weight(t) * (channel.read(coarse.brick, coarse.at(t)) - number) : number;
+  }
   // Twin of Probe::gradient.
   GV_HD Vec3<Floats> gradient(Mask which, Floats t) {
     Vec3<Floats> slope = differences(fine, this->fine_depth, t);

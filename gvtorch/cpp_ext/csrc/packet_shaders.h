@@ -100,12 +100,30 @@ struct LitPacket : LightPacket<LitPacket, Lit<float>> {
   }
 };
 
-struct StoredColorPacket : ShadePacket<StoredColorPacket, StoredColor<float>> {
-  using ShadePacket::ShadePacket;
+struct StoredColorPacket : LightPacket<StoredColorPacket, StoredColor<float>> {
+  const PacketChannel red, green, blue;
+
+  StoredColorPacket(const ShadeRay<float, Shader>& kernel, const ShadeArgs& args)
+      : LightPacket(kernel, args),
+        red(kernel.channels.value, args.side, 0, args.bricks),
+        green(kernel.channels.value, args.side, 1, args.bricks),
+        blue(kernel.channels.value, args.side, 2, args.bricks) {}
 
   GV_HD void add(Mask seeing, const PacketPiece& piece) {
-    const Mask shown = seeing & (piece.value * shader.light.parameter_54[12] > 0.0f);
-    for_lanes(shown, [&](int lane) { add_alone(lane, piece); });
+    const float* parameters = shader.light.parameter_54;
+    const Floats opacity = clamp(piece.value * parameters[12], Floats{}, Floats{} + 1.0f);
+    const Mask shown = seeing & (opacity > 0.0f);
+    if (!any(shown)) return;
+    const bool lit = parameters[15] > 0;
+    const Mask read = lit && kernel.channels.normal.given() ? Mask{} : shown & stored();
+    for_lanes(shown & ~read, [&](int lane) { add_alone(lane, piece); });
+    if (!any(read)) return;
+    const auto number = [&](const PacketChannel& channel) {
+      const Floats scaled = number_at(channel, read, piece.middle) * parameters[12];
+      return parameters[14] > 0 ? scaled / opacity : scaled;
+    };
+    const PacketRow row{number(red), number(green), number(blue), stretch(opacity, at.length / parameters[13])};
+    composite(read, row, piece, lit);
   }
 };
 
