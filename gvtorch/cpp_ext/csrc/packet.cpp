@@ -7,8 +7,9 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-template <class Packet>
-void trace_packets(Packet&& packet, int64_t begin, int64_t end) {
+template <class Packet, class... Args>
+void trace_packets(int64_t begin, int64_t end, const Args&... args) {
+  Packet packet(args...);
   for (int64_t index = begin; index < end; index += kLanes) packet.trace(index, smaller(index + kLanes, end));
 }
 
@@ -21,9 +22,9 @@ void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end) {
       KeptPath path;
       for (int64_t index = begin; index < end; ++index) kernel.trace(index, path);
     } else if (pool.far(args.bricks)) {
-      trace_packets(TracePacket<Voxel, true>(kernel, pool, args), begin, end);
+      trace_packets<TracePacket<Voxel, true>>(begin, end, kernel, pool, args);
     } else {
-      trace_packets(TracePacket<Voxel, false>(kernel, pool, args), begin, end);
+      trace_packets<TracePacket<Voxel, false>>(begin, end, kernel, pool, args);
     }
   });
 }
@@ -52,7 +53,7 @@ bool shades(const ShadeArgs& args) {
 template <class Packet>
 void shade_packets(const ShadeArgs& args, int64_t begin, int64_t end) {
   const ShadeRay<float, typename Packet::Shader> kernel(args);
-  trace_packets(Packet(kernel, args), begin, end);
+  trace_packets<Packet>(begin, end, kernel, args);
 }
 
 void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end) {

@@ -32,7 +32,7 @@ struct TracePacket : PacketWalk<TracePacket<Voxel, kFar>> {
   }
   GV_HD bool hides(int, int32_t node) const { return kernel.hides(table, node); }
   GV_HD Ints first_of(Ints brick) const { return kFar ? brick : brick * static_cast<int32_t>(pool.stride); }
-  GV_HD Floats read(Ints brick, Vec3<Floats> at) const { return trilinear<Voxel, kFar>(pool, brick, at); }
+  GV_HD Floats read(Ints brick, const Vec3<Floats>& at) const { return trilinear<Voxel, kFar>(pool, brick, at); }
   GV_HD float constant(int32_t node) const {
     const BrickView<Voxel>& view = kernel.bricks;
     return number<float>(view.constant_tnc[static_cast<int64_t>(node) * view.channels + view.component]);

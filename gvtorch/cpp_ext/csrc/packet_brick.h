@@ -67,7 +67,7 @@ GV_HD Floats sample_row(const PacketPool& pool, Ints brick, Ints offset, int32_t
 
 // Twin of `trilinear`. `brick`: as in PacketBrick.
 template <class Voxel, bool kFar>
-GV_HD Floats trilinear(const PacketPool& pool, Ints brick, Vec3<Floats> at) {
+GV_HD Floats trilinear(const PacketPool& pool, Ints brick, const Vec3<Floats>& at) {
   const int32_t step_x = pool.channels * static_cast<int32_t>(sizeof(Voxel));
   const int32_t step_y = step_x * pool.side;
   const int32_t step_z = step_y * pool.side;

@@ -26,7 +26,7 @@ struct PacketChannel {
       reader = pool.far(bricks) ? &read_packet<Voxel, true> : &read_packet<Voxel, false>;
     });
   }
-  GV_HD Floats read(Ints brick, Vec3<Floats> at) const { return reader(pool, brick, at.x, at.y, at.z); }
+  GV_HD Floats read(Ints brick, const Vec3<Floats>& at) const { return reader(pool, brick, at.x, at.y, at.z); }
 };
 
 // What Self has, beside `add` and constants as PacketWalk tells: get(lane, sum) and put(lane, sum), which copy what its
@@ -94,7 +94,7 @@ struct ShadePacket : PacketWalk<Self> {
     return hidden;
   }
   GV_HD Ints first_of(Ints brick) const { return brick; }
-  GV_HD Floats read(Ints brick, Vec3<Floats> at) const { return values.read(brick, at); }
+  GV_HD Floats read(Ints brick, const Vec3<Floats>& at) const { return values.read(brick, at); }
   GV_HD float constant(int32_t node) const {
     const ChannelView& channel = kernel.channels.value;
     return read_number<float>(channel.constant_tnc, channel.type,
@@ -168,10 +168,11 @@ struct ShadePacket : PacketWalk<Self> {
     const Floats scale = pick(walk.levels.scale, depth);
     Vec3<Floats> slope;
     for (int axis = 0; axis < 3; ++axis) {
-      Vec3<Floats> before = at, behind = at;
-      before[axis] = at[axis] + -0.5f;
-      behind[axis] = at[axis] + 0.5f;
-      const Floats rise = values.read(ray.brick, behind) - values.read(ray.brick, before);
+      const auto beside = [&](float by) {
+        return values.read(ray.brick,
+                           {axis == 0 ? at.x + by : at.x, axis == 1 ? at.y + by : at.y, axis == 2 ? at.z + by : at.z});
+      };
+      const Floats rise = beside(0.5f) - beside(-0.5f);
       slope[axis] = ray.stored ? rise * (scale / static_cast<float>(walk.rays.place_33[3 + axis])) : Floats{};
     }
     return slope;

@@ -391,7 +391,7 @@ struct PacketWalk {
     PacketPiece piece;
     piece.middle = at.middle_of(number);
     piece.start = at.start_of(number);
-    if constexpr (Self::kEnds) piece.end = at.start_of(number + 1.0f);
+    piece.end = at.start_of(number + 1.0f);
     number = number - to_floats(which);
     left = left + which;
     if constexpr (Self::kEnds) {
