@@ -158,7 +158,7 @@ struct ShadePacket : PacketWalk<Self> {
     return slope;
   }
 
-  // What a shader needs beside the table: nothing.
+  // Its Sum has nothing more, unless Self tells.
   GV_HD void get(int, Sum&) const {}
   GV_HD void put(int, const Sum&) {}
 

@@ -27,7 +27,7 @@ struct PacketPiece {
 //
 //   kEnds, kSeesEmpty       as in shaders.h
 //   kKeepsPath              which nodes are hidden is the same for all rays
-//   begin_ray(lane, ray)    number is the lane's ray
+//   begin_ray(lane)         the lane has a new ray, numbers[lane]
 //   end_ray(lane)           writes what is known of it
 //   hides(lane, node)       nothing in the node is seen
 //   first_of(brick)         PacketBrick::brick of the brick's number
@@ -36,8 +36,8 @@ struct PacketPiece {
 //   uniform(which)          lanes in a region of one value, of those where two nodes answer and neither has a brick
 //   add(seeing, piece)      adds an interval of those lanes
 //   begin_run(which)        the lanes' next intervals are alike
-//   add_region(lane, start, end)      adds a region of one value
-//   march_node(lane, visit, at)       all intervals of a node that are to come; returns the samples taken
+//   add_region(lane, start, end)   adds a region of one value
+//   march_node(lane, visit, at)    adds all intervals of a node that are to come; returns how many
 template <class Self>
 struct PacketWalk {
   const Walk<float>& walk;
