@@ -35,7 +35,8 @@ INSTRUCTION_SETS = {
     "avx2": ["-mavx2", "-mf16c"],
     "avx512": [
         *("-mavx2", "-mf16c", "-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl"),
-        *("-mprefer-vector-width=512", "-Wno-maybe-uninitialized"),  # GCC's own header warns
+        # GCC's own header warns of what is not initialised.
+        *("-mprefer-vector-width=512", "-Wno-maybe-uninitialized", "-Wno-uninitialized"),
     ],
 }
 FOLDER = Path("gvtorch") / "cpp_ext"

@@ -9,6 +9,7 @@
 
 #include "cache.h"
 #include "for_each.h"
+#include "shade_rays.h"
 #include "trace.h"
 
 namespace gvtorch {
@@ -16,20 +17,28 @@ namespace gvtorch {
 // packet.cpp, compiled once for each instruction set.
 namespace baseline {
 void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end);
-}
+bool shades(const ShadeArgs& args);
+void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end);
+}  // namespace baseline
 #ifdef GV_X86
 namespace avx2 {
 void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end);
-}
+bool shades(const ShadeArgs& args);
+void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end);
+}  // namespace avx2
 namespace avx512 {
 void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end);
-}
+bool shades(const ShadeArgs& args);
+void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end);
+}  // namespace avx512
 #endif
 
 // The widest instructions that this processor has; GVTORCH_CPU=baseline, avx2 or avx512 asks for fewer.
 struct Processor {
   const char* name = "baseline";
   decltype(&baseline::trace_chunk) trace_chunk = &baseline::trace_chunk;
+  decltype(&baseline::shades) shades = &baseline::shades;
+  decltype(&baseline::shade_chunk) shade_chunk = &baseline::shade_chunk;
   Processor() {
 #ifdef GV_X86
     const char* asked = std::getenv("GVTORCH_CPU");
@@ -40,9 +49,13 @@ struct Processor {
         __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl")) {
       name = "avx512";
       trace_chunk = &avx512::trace_chunk;
+      shades = &avx512::shades;
+      shade_chunk = &avx512::shade_chunk;
     } else if ((allows("avx512") || allows("avx2")) && wide) {
       name = "avx2";
       trace_chunk = &avx2::trace_chunk;
+      shades = &avx2::shades;
+      shade_chunk = &avx2::shade_chunk;
     }
 #endif
   }
@@ -127,22 +140,39 @@ void split(const torch::stable::Tensor& like, int64_t count, const Keep& keep, c
   *kept = total;
 }
 
-template <class Device>
-void trace(const torch::stable::Tensor& like, TraceArgs args, bool wide) {
+// body(begin, end) for chunks of the rays; first an empty byte for each node, in which it is kept what is hidden.
+template <class Device, class Body>
+void trace_chunks(const torch::stable::Tensor& like, TraceArgs& args, const Body& body) {
   constexpr int64_t kChunk = 256;
   torch::stable::Tensor hidden_tn =
       torch::stable::new_zeros(like, {args.nodes + 3}, torch::headeronly::ScalarType::Byte);
   args.hidden_tn = static_cast<uint8_t*>(hidden_tn.mutable_data_ptr());
   const int64_t count = RayOrder{args.rays, args.width}.count();
-  if (wide) {
-    with_voxel(args.voxel,
-               [&](auto voxel) { for_each<Device>(like, count, TraceRay<double, decltype(voxel)>(args), kChunk); });
-    return;
-  }
-  const auto chunk = [&](int64_t number) {
-    processor().trace_chunk(args, number * kChunk, std::min(count, (number + 1) * kChunk));
-  };
+  const auto chunk = [&](int64_t number) { body(number * kChunk, std::min(count, (number + 1) * kChunk)); };
   for_each<Device>(like, (count + kChunk - 1) / kChunk, chunk, 1);
+}
+
+template <class Device>
+void trace(const torch::stable::Tensor& like, TraceArgs args, bool wide) {
+  trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) {
+    if (!wide) return processor().trace_chunk(args, begin, end);
+    with_voxel(args.voxel, [&](auto voxel) {
+      const TraceRay<double, decltype(voxel)> kernel(args);
+      for (int64_t index = begin; index < end; ++index) kernel(index);
+    });
+  });
+}
+
+template <class Device>
+void shade(const torch::stable::Tensor& like, ShadeArgs args, bool wide) {
+  const auto run = [&](const auto& kernel) { for_each<Device>(like, kernel.order.count(), kernel); };
+  if (wide) {
+    with_shader<double>(args.shader, args, run);
+  } else if (processor().shades(args)) {
+    trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) { processor().shade_chunk(args, begin, end); });
+  } else {
+    with_shader<float>(args.shader, args, run);
+  }
 }
 
 }  // namespace gvtorch

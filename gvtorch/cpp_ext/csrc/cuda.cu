@@ -6,6 +6,7 @@
 
 #include "cache.h"
 #include "for_each.h"
+#include "shade_rays.h"
 #include "trace.h"
 
 namespace gvtorch {
@@ -31,6 +32,16 @@ void trace(const torch::stable::Tensor& like, TraceArgs args, bool wide) {
       trace_as<Device, float, Voxel>(like, args);
     }
   });
+}
+
+template <class Device>
+void shade(const torch::stable::Tensor& like, ShadeArgs args, bool wide) {
+  const auto run = [&](const auto& kernel) { for_each<Device>(like, kernel.order.count(), kernel); };
+  if (wide) {
+    with_shader<double>(args.shader, args, run);
+  } else {
+    with_shader<float>(args.shader, args, run);
+  }
 }
 
 // The primitives of cache.h in three kernels: blocks count chunks, one block adds the counts up, and blocks place

@@ -25,6 +25,8 @@ using torch::stable::Tensor;
 
 template <class Device>
 void trace(const Tensor& like, TraceArgs args, bool wide);
+template <class Device>
+void shade(const Tensor& like, ShadeArgs args, bool wide);
 
 // (a!) request words, (b!) tile stamps, (c!) brick stamps are written in place.
 constexpr const char* kTraceRaysSchema =
@@ -263,8 +265,8 @@ inline void lay_channel(const std::optional<Tensor>& bricks_bzyxc, const std::op
   numbers = static_cast<int32_t>(channels);
 }
 
-// The shaders of a library: what is asked of their arguments, and `with<T>`, which calls body(ray) for one of them. A
-// user's library has a class like this one (user_entry.h).
+// The shaders of a library: what is asked of their arguments, and `run`, which shades all rays. A user's library has a
+// class like this one (user.cpp).
 struct FusedShaders {
   static bool integrates(int64_t shader) { return static_cast<ShaderKind>(shader) == ShaderKind::kPreIntegrated; }
   static void check(const ShadeArgs& args, int64_t shader) {
@@ -278,9 +280,9 @@ struct FusedShaders {
     STD_TORCH_CHECK(args.parameters == kParameters, "gvtorch: parameter_54 must hold 20 elements, got ",
                     args.parameters);
   }
-  template <class T, class Body>
-  static void with(const ShadeArgs& args, const Body& body) {
-    with_shader<T>(args.shader, args, body);
+  template <class Device>
+  static void run(const Tensor& like, const ShadeArgs& args, bool wide) {
+    shade<Device>(like, args, wide);
   }
 };
 
@@ -323,12 +325,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> shade_rays(
   args.parameter_54 = parameter_54.const_data_ptr();
   args.normal_r3 = normal_r3.mutable_data_ptr();
   args.features_rc = features_rc.mutable_data_ptr();
-  const auto run = [&](const auto& body) { for_each<Device>(origin_r3, body.order.count(), body); };
-  if (real == ScalarType::Double) {
-    Shaders::template with<double>(args, run);
-  } else {
-    Shaders::template with<float>(args, run);
-  }
+  Shaders::template run<Device>(origin_r3, args, real == ScalarType::Double);
   return {found.color_r3, found.alpha_r1, found.depth_r1, found.samples_r, found.missed_r, normal_r3, features_rc};
 }
 

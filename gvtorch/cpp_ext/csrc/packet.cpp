@@ -2,12 +2,14 @@
 // torch or of the standard library's templates may stand here: see hd.h.
 #include "packet.h"
 
+#include "packet_shaders.h"
+
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-template <class Voxel, bool kFar>
-void trace_packets(const TraceRay<float, Voxel>& kernel, int64_t begin, int64_t end) {
-  Packet<Voxel, kFar> packet(kernel);
+template <class Packet, class... Args>
+void trace_packets(int64_t begin, int64_t end, const Args&... args) {
+  Packet packet(args...);
   for (int64_t index = begin; index < end; index += kLanes) packet.trace(index, smaller(index + kLanes, end));
 }
 
@@ -15,15 +17,62 @@ void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end) {
   with_voxel(args.voxel, [&](auto voxel) {
     using Voxel = decltype(voxel);
     const TraceRay<float, Voxel> kernel(args);
-    if (!Packet<Voxel, false>::takes(kernel)) {
+    const PacketPool pool(args.bricks_bzyxc, args.voxel, args.side, args.channels, args.component);
+    if (kernel.tree.digit_bits == 0 || args.bricks < 2 || !pool.fits()) {
       KeptPath path;
       for (int64_t index = begin; index < end; ++index) kernel.trace(index, path);
-    } else if (Packet<Voxel, false>::stride_of(kernel.bricks) * kernel.bricks.bricks > INT32_MAX) {
-      trace_packets<Voxel, true>(kernel, begin, end);
+    } else if (pool.far(args.bricks)) {
+      trace_packets<TracePacket<Voxel, true>>(begin, end, kernel, pool, args);
     } else {
-      trace_packets<Voxel, false>(kernel, begin, end);
+      trace_packets<TracePacket<Voxel, false>>(begin, end, kernel, pool, args);
     }
   });
+}
+
+// Whether packets take a shader's rays.
+bool shades(const ShadeArgs& args) {
+  const PacketPool pool(args.bricks_bzyxc, args.voxel, args.side, args.channels, args.component);
+  if (digit_bits_of(args.branching, args.max_depth) == 0 || args.bricks < 2 || !pool.fits()) return false;
+  const bool point = static_cast<int32_t>(static_cast<const float*>(args.parameter_54)[3]) == Light<float>::kPoint;
+  switch (args.shader) {
+    case ShaderKind::kLit:
+      return args.normal_tnc == nullptr || !point;
+    case ShaderKind::kStoredColor:
+      return args.channels == 4 && (args.normal_tnc == nullptr || !point);
+    case ShaderKind::kPreIntegrated:
+      return int64_t{args.levels} * args.rows * args.rows * PacketTable::kBytes <= INT32_MAX;
+    case ShaderKind::kIsosurface:
+    case ShaderKind::kProjection:
+    case ShaderKind::kFeatures:
+      return true;
+    default:
+      return false;
+  }
+}
+
+template <class Packet>
+void shade_packets(const ShadeArgs& args, int64_t begin, int64_t end) {
+  const ShadeRay<float, typename Packet::Shader> kernel(args);
+  trace_packets<Packet>(begin, end, kernel, args);
+}
+
+void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end) {
+  switch (args.shader) {
+    case ShaderKind::kLit:
+      return shade_packets<LitPacket>(args, begin, end);
+    case ShaderKind::kPreIntegrated:
+      return shade_packets<PreIntegratedPacket>(args, begin, end);
+    case ShaderKind::kStoredColor:
+      return shade_packets<StoredColorPacket>(args, begin, end);
+    case ShaderKind::kIsosurface:
+      return shade_packets<IsosurfacePacket>(args, begin, end);
+    case ShaderKind::kProjection:
+      return shade_packets<ProjectionPacket>(args, begin, end);
+    case ShaderKind::kFeatures:
+      return shade_packets<FeaturesPacket>(args, begin, end);
+    default:
+      return;
+  }
 }
 
 }  // namespace GV_NAMESPACE

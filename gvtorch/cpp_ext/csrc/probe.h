@@ -109,6 +109,20 @@ struct Probe {
     for (int axis = 0; axis < 3; ++axis) cube[axis] = static_cast<T>(rays.place_33[3 + axis]);
   }
 
+  // All its fields, as another has them that walks.
+  GV_HD Probe(const Channels& channels, const Sight<T>& sight, const Spot<T>& fine, const Spot<T>& coarse, bool mixed,
+              T near, T growth, T voxel, T blend, Vec3<T> cube)
+      : channels(channels),
+        sight(sight),
+        fine(fine),
+        coarse(coarse),
+        mixed(mixed),
+        near(near),
+        growth(growth),
+        voxel(voxel),
+        blend(blend),
+        cube(cube) {}
+
   // The shader's own value at distance t.
   GV_HD T value(T t) const { return number_at(channels.value, channels.component, t); }
 

@@ -67,62 +67,34 @@ struct ShadeRay : Walk<T> {
         powers ? surface<BitDigits<T>>(ray, sight, at, wanted, sum) : surface<Digits<T>>(ray, sight, at, wanted, sum);
       }
     }
-    shader.done(sum);
-    const Vec3<T> normal = unit(sum.normal);
-    hits.color_r3[3 * number] = sum.red;
-    hits.color_r3[3 * number + 1] = sum.green;
-    hits.color_r3[3 * number + 2] = sum.blue;
-    hits.alpha_r1[number] = 1 - sum.clear;
-    hits.depth_r1[number] = sum.depth + ray.moved;
-    hits.samples_r[number] = samples;
-    hits.missed_r[number] = sum.missed;
-    normal_r3[3 * number] = normal.x;
-    normal_r3[3 * number + 1] = normal.y;
-    normal_r3[3 * number + 2] = normal.z;
+    finish(number, ray.moved, samples, sum);
   }
 
- private:
-  template <class Number, class Any>
-  GV_HD int32_t visit(const Any& shader, const Ray<T>& ray, const Sight<T>& sight, Intervals<T>& at, int32_t& wanted,
-                      typename Any::Sum& sum) const {
-    constexpr bool shadows = kShadows && std::is_same_v<Any, Shader>;  // none on the way to a light
-    const auto hides = [&](int32_t node) {
-      const int64_t row = int64_t{2} * node * channels.value.width + channels.component;
-      T low = read_number<T>(range_tn2c, channels.value.type, row);
-      T high = read_number<T>(range_tn2c, channels.value.type, row + channels.value.width);
-      for (int32_t other = 1; other < directions; ++other) {
-        low = smaller(low, read_number<T>(range_tn2c, channels.value.type, row + 4 * other));
-        high = larger(high, read_number<T>(range_tn2c, channels.value.type, row + channels.value.width + 4 * other));
-      }
-      return shader.hides(low, high, sum);
-    };
-    const T middle = at.middle();
-    Number digits(tree, ray.at(middle));
-    NoPath path;
-    const Visit<T> visit = this->find(ray, digits, at.cone(middle), hides, stamp_b, path, wanted, sum.missed);
-    const bool empty = !Any::kSeesEmpty && visit.fine.brick == kEmpty && visit.coarse.brick == kEmpty;
-    if (visit.clear || visit.fine.node < 0 || empty) {
-      this->leave(at, visit);
-      return 0;
+  // Nothing between the ends of the node's range changes the sum.
+  template <class Any>
+  GV_HD bool hides(const Any& shader, int32_t node, const typename Any::Sum& sum) const {
+    const int64_t row = int64_t{2} * node * channels.value.width + channels.component;
+    T low = read_number<T>(range_tn2c, channels.value.type, row);
+    T high = read_number<T>(range_tn2c, channels.value.type, row + channels.value.width);
+    for (int32_t other = 1; other < directions; ++other) {
+      low = smaller(low, read_number<T>(range_tn2c, channels.value.type, row + 4 * other));
+      high = larger(high, read_number<T>(range_tn2c, channels.value.type, row + channels.value.width + 4 * other));
     }
-    const Probe<T> probe(channels, sight, this->rays, ray, this->levels, visit, digits);
-    Piece<T> piece;
-    if (!shadows && probe.uniform() && !shades_each_place()) {  // one interval; shadows differ within it
-      piece.start = at.start;
-      this->leave(at, visit);
-      piece.end = smaller(at.start, at.stop);
-      cut(piece);
-      piece.value = piece.front = piece.back = probe.value(piece.middle);
-      shader.add(piece, probe, sum);
-      return 1;
-    }
+    return shader.hides(low, high, sum);
+  }
+
+  // All intervals of a node that are still to come, each given to add(piece). Returns the samples taken.
+  template <bool kEnds, class Any, class Add>
+  GV_HD int32_t march_node(const Probe<T>& probe, const Visit<T>& visit, Intervals<T>& at, const Any& sum,
+                           const Add& add) const {
     const T stop_clear = 1 - options.stop_alpha;
+    Piece<T> piece;
     int32_t samples = 0;
     do {
       const bool last = at.cut();
       const int32_t alike = last ? 1 : at.run(visit.exit, visit.cone_low, visit.cone_high);
       int32_t taken = 0;
-      if (Any::kEnds) piece.back = probe.value(at.start);
+      if (kEnds) piece.back = probe.value(at.start);
       do {
         const T number = at.count + static_cast<T>(taken);
         piece.start = at.start_of(number);
@@ -134,25 +106,96 @@ struct ShadeRay : Walk<T> {
           piece.length = at.length;
           piece.middle = at.middle_of(number);
         }
-        if (Any::kEnds) {
+        if (kEnds) {
           piece.front = piece.back;
           piece.back = probe.value(piece.end);
         } else {
           piece.value = probe.value(piece.middle);
         }
-        if constexpr (shadows) {
-          shader.add(piece, probe, sum, [&](T t, Vec3<T> way, T length, T growth) {
-            return share_of_light<Number>(ray, probe, t, way, length, growth, samples, sum.missed);
-          });
-        } else {
-          shader.add(piece, probe, sum);
-        }
+        add(piece);
         ++taken;
       } while (taken < alike && sum.clear > stop_clear);
       samples += taken;
       at.skip(taken);
       if (last) return samples;
     } while (sum.clear > stop_clear && this->stays(at, visit));
+    return samples;
+  }
+
+  // A region of one value, as one interval.
+  GV_HD static Piece<T> region(const Probe<T>& probe, T start, T end) {
+    Piece<T> piece;
+    piece.start = start;
+    piece.end = end;
+    cut(piece);
+    piece.value = piece.front = piece.back = probe.value(piece.middle);
+    return piece;
+  }
+
+  // The place where depth was set may lie half an interval beside the node that found it.
+  template <class Number>
+  GV_HD void surface(const Ray<T>& ray, const Sight<T>& sight, const Intervals<T>& at, int32_t& wanted,
+                     Sum& sum) const {
+    Number digits(tree, ray.at(sum.depth));
+    NoPath path;
+    const auto hides = [](int32_t) { return false; };
+    const Visit<T> visit = this->find(ray, digits, at.cone(sum.depth), hides, stamp_b, path, wanted, sum.missed);
+    shader.surface(Probe<T>(channels, sight, this->rays, ray, this->levels, visit, digits), sum);
+  }
+
+  // What comes after the last interval.
+  GV_HD void finish(int64_t number, T moved, int32_t samples, Sum& sum) const {
+    shader.done(sum);
+    const Vec3<T> normal = unit(sum.normal);
+    hits.color_r3[3 * number] = sum.red;
+    hits.color_r3[3 * number + 1] = sum.green;
+    hits.color_r3[3 * number + 2] = sum.blue;
+    hits.alpha_r1[number] = 1 - sum.clear;
+    hits.depth_r1[number] = sum.depth + moved;
+    hits.samples_r[number] = samples;
+    hits.missed_r[number] = sum.missed;
+    normal_r3[3 * number] = normal.x;
+    normal_r3[3 * number + 1] = normal.y;
+    normal_r3[3 * number + 2] = normal.z;
+  }
+
+  // Near a light, a stored normal is lit differently wherever it stands.
+  GV_HD bool shades_each_place() const {
+    return channels.normal.given() && static_cast<int32_t>(parameter_54[3]) == Light<T>::kPoint;
+  }
+
+ private:
+  template <class Number, class Any>
+  GV_HD int32_t visit(const Any& shader, const Ray<T>& ray, const Sight<T>& sight, Intervals<T>& at, int32_t& wanted,
+                      typename Any::Sum& sum) const {
+    constexpr bool shadows = kShadows && std::is_same_v<Any, Shader>;  // none on the way to a light
+    const auto hides = [&](int32_t node) { return this->hides(shader, node, sum); };
+    const T middle = at.middle();
+    Number digits(tree, ray.at(middle));
+    NoPath path;
+    const Visit<T> visit = this->find(ray, digits, at.cone(middle), hides, stamp_b, path, wanted, sum.missed);
+    const bool empty = !Any::kSeesEmpty && visit.fine.brick == kEmpty && visit.coarse.brick == kEmpty;
+    if (visit.clear || visit.fine.node < 0 || empty) {
+      this->leave(at, visit);
+      return 0;
+    }
+    const Probe<T> probe(channels, sight, this->rays, ray, this->levels, visit, digits);
+    if (!shadows && probe.uniform() && !shades_each_place()) {  // one interval; shadows differ within it
+      const T entry = at.start;
+      this->leave(at, visit);
+      shader.add(region(probe, entry, smaller(at.start, at.stop)), probe, sum);
+      return 1;
+    }
+    int32_t samples = 0;
+    samples += march_node<Any::kEnds>(probe, visit, at, sum, [&](const Piece<T>& piece) {
+      if constexpr (shadows) {
+        shader.add(piece, probe, sum, [&](T t, Vec3<T> way, T length, T growth) {
+          return share_of_light<Number>(ray, probe, t, way, length, growth, samples, sum.missed);
+        });
+      } else {
+        shader.add(piece, probe, sum);
+      }
+    });
     return samples;
   }
 
@@ -178,21 +221,6 @@ struct ShadeRay : Walk<T> {
     return sum.clear;
   }
 
-  // The place where depth was set may lie half an interval beside the node that found it.
-  template <class Number>
-  GV_HD void surface(const Ray<T>& ray, const Sight<T>& sight, const Intervals<T>& at, int32_t& wanted,
-                     Sum& sum) const {
-    Number digits(tree, ray.at(sum.depth));
-    NoPath path;
-    const auto hides = [](int32_t) { return false; };
-    const Visit<T> visit = this->find(ray, digits, at.cone(sum.depth), hides, stamp_b, path, wanted, sum.missed);
-    shader.surface(Probe<T>(channels, sight, this->rays, ray, this->levels, visit, digits), sum);
-  }
-
-  // Near a light, a stored normal is lit differently wherever it stands.
-  GV_HD bool shades_each_place() const {
-    return channels.normal.given() && static_cast<int32_t>(parameter_54[3]) == Light<T>::kPoint;
-  }
   GV_HD static void cut(Piece<T>& piece) {
     piece.level = -1;
     piece.length = piece.end - piece.start;

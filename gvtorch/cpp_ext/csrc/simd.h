@@ -32,7 +32,7 @@ GV_HD Ints lane_numbers() {
   return lane;
 }
 
-// Comparisons as in hd.h: which of two comes out where one is no number is the same.
+// Comparisons and functions as in hd.h: which of two comes out where one is no number is the same.
 GV_HD Floats smaller(Floats a, Floats b) {
 #if defined(__AVX512F__)
   return (Floats)_mm512_min_ps((__m512)b, (__m512)a);
@@ -62,6 +62,48 @@ GV_HD Floats clamp(Floats value, Floats low, Floats high) { return smaller(high,
 GV_HD Ints floor_int(Floats value) {
   const Ints whole = truncated(value);
   return whole + (to_floats(whole) > value);
+}
+
+GV_HD Floats square_root(Floats value) {
+#if defined(__AVX512F__)
+  return (Floats)_mm512_sqrt_ps((__m512)value);
+#elif defined(__AVX2__)
+  return (Floats)_mm256_sqrt_ps((__m256)value);
+#elif defined(__SSE2__)
+  return (Floats)_mm_sqrt_ps((__m128)value);
+#else
+  for (int i = 0; i < kLanes; ++i) value[i] = sqrt(value[i]);
+  return value;
+#endif
+}
+GV_HD Floats log2_exact(Floats value) {
+  const Ints bits = (Ints)value;
+  const Floats mantissa = (Floats)((bits & 0x007fffff) | 0x3f800000);
+  const Mask large = mantissa > 1.41421356f;
+  const Floats exponent = to_floats((bits >> 23) - 127 - large);
+  const Floats m = large ? mantissa * 0.5f : mantissa;
+  const Floats s = (m - 1.0f) / (m + 1.0f);
+  const Floats z = s * s;
+  Floats series = Floats{} + 0.320598898f;
+  series = series * z + 0.412198583f;
+  series = series * z + 0.577078016f;
+  series = series * z + 0.961796694f;
+  series = series * z + 2.885390082f;
+  return exponent + series * s;
+}
+GV_HD Floats exp2_exact(Floats value) {
+  const Floats x = clamp(value, Floats{} - 126.0f, Floats{} + 126.0f);
+  const Ints whole = floor_int(x + 0.5f);
+  const Floats f = x - to_floats(whole);
+  Floats series = Floats{} + 1.52527338e-5f;
+  series = series * f + 1.54035304e-4f;
+  series = series * f + 1.33335581e-3f;
+  series = series * f + 9.61812911e-3f;
+  series = series * f + 5.55041087e-2f;
+  series = series * f + 2.40226507e-1f;
+  series = series * f + 6.93147181e-1f;
+  series = series * f + 1.0f;
+  return value > -126.0f ? series * (Floats)((whole + 127) << 23) : Floats{};
 }
 
 // A bit for each lane that is set.

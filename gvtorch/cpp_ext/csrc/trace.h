@@ -63,10 +63,6 @@ struct OneByOne {
   }
 };
 
-// Which nodes show nothing: worked out before the rays go on a GPU, where many threads would each do it again; on the
-// CPU, where most nodes are never visited, when the first ray comes.
-constexpr uint8_t kUnknown = 0, kShown = 1, kHidden = 2;
-
 template <class T, class Voxel>
 struct HideNode {
   BrickView<Voxel> bricks;
@@ -129,11 +125,15 @@ struct TraceRay : Walk<T> {
       samples += powers ? visit<BitDigits<T>>(ray, shader, path, at, wanted, sum)
                         : visit<Digits<T>>(ray, shader, path, at, wanted, sum);
     }
+    store(number, sum, ray.moved, samples);
+  }
+
+  GV_HD void store(int64_t number, const Accumulator<T>& sum, T moved, int32_t samples) const {
     hits.color_r3[3 * number] = sum.red;
     hits.color_r3[3 * number + 1] = sum.green;
     hits.color_r3[3 * number + 2] = sum.blue;
     hits.alpha_r1[number] = 1 - sum.clear;
-    hits.depth_r1[number] = sum.depth + ray.moved;
+    hits.depth_r1[number] = sum.depth + moved;
     hits.samples_r[number] = samples;
     hits.missed_r[number] = sum.missed;
   }

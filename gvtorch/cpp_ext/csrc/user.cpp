@@ -61,9 +61,14 @@ struct OneShader {
     STD_TORCH_CHECK(own >= 0 && (uniforms < 0 || own == uniforms),
                     "gvtorch: parameter_54 holds the wrong number of uniforms: ", own);
   }
-  template <class T, class Body>
-  static void with(const ShadeArgs& args, const Body& body) {
-    body(ShadeRay<T, UserShaderOf<T>>(args));
+  template <class Device>
+  static void run(const Tensor& like, const ShadeArgs& args, bool wide) {
+    const auto each = [&](const auto& kernel) { for_each<Device>(like, kernel.order.count(), kernel); };
+    if (wide) {
+      each(ShadeRay<double, UserShaderOf<double>>(args));
+    } else {
+      each(ShadeRay<float, UserShaderOf<float>>(args));
+    }
   }
 };
 
