@@ -68,7 +68,7 @@ class Report:
             table.add_row(f"{name}, ms", f"{spread['median']:.2f}", f"{spread['p95']:.2f}")
         for name in ("samples", "bricks", "tiles", "megabytes"):
             table.add_row(f"{name} / s", f"{content[f'{name}_per_second']:,.0f}", "")
-        table.add_row("misses", f"{content['miss_rate']:.2%}", "")
+        table.add_row("bricks missed, of those wanted", f"{content['miss_rate']:.2%}", "")
         for name, share in content["occupancy"].items():
             table.add_row(f"{name} in use", f"{share:.1%}", "")
         for name, size in content["memory"].items():

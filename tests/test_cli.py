@@ -18,6 +18,11 @@ import gvtorch as gv
 ANEURISM = DATA / "aneurism_256x256x256_uint8.raw.gz"
 
 
+def test_the_version_is_told():
+    done = gvtorch("--version")
+    assert done.returncode == 0 and done.stdout.strip() == f"gvtorch {gv.__version__}"
+
+
 def test_help_does_not_import_torch():
     code = (
         "import sys; from gvtorch.tools.cli import main\n"

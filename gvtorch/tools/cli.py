@@ -192,6 +192,11 @@ def _sparkline(counts: list[int]) -> str:
 
 def main(args: list[str] | None = None) -> None:
     """Runs the command line and ends the process."""
+    if (sys.argv[1:] if args is None else args) == ["--version"]:
+        from .. import __version__
+
+        print(f"gvtorch {__version__}")
+        return
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
