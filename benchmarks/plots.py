@@ -126,13 +126,15 @@ def main(settings: Settings) -> None:
     records = read(settings.records)
     if not records:
         sys.exit(f"plots: no records in {settings.records}; `make bench` makes them")
-    parts = []
+    parts, plots = [], 0
     for name, record in records:
         drawn = draw(settings.records / f"{name}.png", record)
         parts.append(section(settings.records.name, name, record, drawn))
+        plots += drawn
     write_between_markers(settings.page, "\n".join(parts))
-    drawn = sum((settings.records / f"{name}.png").exists() for name, _ in records)
-    print(f"{settings.page}: {len(records)} tables, {drawn} plots")
+    print(f"{settings.page}: {len(records)} tables, {plots} plots")
+    if not plots:
+        print("plots: matplotlib is not installed, so the page shows tables alone")
 
 
 if __name__ == "__main__":
