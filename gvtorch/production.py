@@ -322,7 +322,7 @@ class Production:
 
     def _mark(self, job: Job) -> None:
         wanted = self.cache.wanted(job.plant.tree, job.node, job.loc, job.kind)
-        self.cache.mark_pending(job.node[wanted], job.kind)
+        self.cache.mark_pending(job.node, job.kind, wanted)
 
     def _fail(self, job: Job, message: str, cause: BaseException | None = None) -> None:
         """Counts and names a job's items; they stay marked as pending, so nobody asks again."""

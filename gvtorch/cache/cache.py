@@ -146,10 +146,19 @@ class Cache:
         )
         return {REQUEST_LOAD: coarser, REQUEST_SUBDIVIDE: subdivide}
 
-    def mark_pending(self, node: Tensor, kind: int, pending: bool = True) -> None:
-        """Sets or clears the mark that an answer is on its way: the wish is not listed again."""
+    def mark_pending(self, node: Tensor, kind: int, pending: bool | Tensor = True) -> None:
+        """Marks that answers are on their way: the wishes are not listed again.
+
+        Args:
+            node: (k,) int64 nodes, each once.
+            kind: REQUEST_LOAD or REQUEST_SUBDIVIDE.
+            pending: False clears the marks; a (k,) bool tensor sets those where it is true.
+        """
         words, bit = self.nodes.request_tn.view(-1), kind << REQUEST_PENDING_SHIFT
-        words[node] = words[node] | bit if pending else words[node] & ~bit
+        if isinstance(pending, Tensor):
+            words[node] = words[node] | torch.where(pending, bit, 0).to(torch.int32)
+        else:
+            words[node] = words[node] | bit if pending else words[node] & ~bit
 
     def wanted(self, tree: N3Tree, node: Tensor, loc: Tensor, kind: int) -> Tensor:
         """(k,) bool: the node still stands for the place, and still lacks what was asked for."""

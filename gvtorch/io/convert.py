@@ -145,7 +145,8 @@ def convert(
                 raise
             except BrokenExecutor:
                 raise OSError(
-                    f"{target}: a worker process ended (killed, or out of memory); "
+                    f"{target}: a worker process ended (killed, out of memory, or started by a "
+                    'script that converts outside of `if __name__ == "__main__":`); '
                     f"gvtorch convert {plan.settings['source']} {target} --resume goes on"
                 ) from None
         work.finish(job.layout, plan.settings, _value_range(job))
