@@ -46,19 +46,18 @@ def tensor(
     Raises:
         ValueError: `where: name must be (r, 3) float32 on cpu, got (4, 2) float64 on cpu`.
     """
-    fits = (
-        isinstance(value, Tensor)
-        and value.dim() == len(shape)
-        and all(isinstance(s, str) or s == size for s, size in zip(shape, value.shape, strict=True))
-        and value.dtype == dtype
-        and value.device == device
+    fits = isinstance(value, Tensor) and value.dtype == dtype and value.device == device
+    if fits and value.dim() == len(shape) and all(map(_of_size, shape, value.shape)):
+        return
+    wanted = ", ".join(str(s) for s in shape) + ("," if len(shape) == 1 else "")
+    kind = str(dtype).removeprefix("torch.")
+    raise ValueError(
+        f"{where}: {name} must be ({wanted}) {kind} on {device}, got {describe(value)}"
     )
-    if not fits:
-        wanted = ", ".join(str(s) for s in shape) + ("," if len(shape) == 1 else "")
-        kind = str(dtype).removeprefix("torch.")
-        raise ValueError(
-            f"{where}: {name} must be ({wanted}) {kind} on {device}, got {describe(value)}"
-        )
+
+
+def _of_size(expected: int | str, size: int) -> bool:
+    return expected == size or isinstance(expected, str)
 
 
 def memory(where: str, what: str, nbytes: int, device: torch.device) -> None:

@@ -155,10 +155,11 @@ class Engine:
             self._catch_up(stats)  # 1, 2, 3, 4
             trace = self._tracer(shader, chosen)
             view = camera, self.device, trace, chosen
+            numbers = camera.numbers(self.device)
             if again is None:
-                self._scout(view, stats)
+                self._scout(view, numbers, stats)
             self._count_up()
-            hits = trace_camera(*view, progress, again=again)  # 5, 6
+            hits = trace_camera(*view, progress, again=again, numbers=numbers)  # 5, 6
             self._send(stats, hits, *self._collect(hits.samples))  # 7, 8
         if self.options.monitor:
             self._report.add(stats)
@@ -182,7 +183,7 @@ class Engine:
             with stage("write"):
                 self.production.write(self.production.late(), stats)
 
-    def _scout(self, view: _View, stats: FrameStats) -> None:
+    def _scout(self, view: _View, numbers: Tensor, stats: FrameStats) -> None:
         """Sends rays ahead of the picture: while answers are written at once, some of those that
         missed something are traced again, and what they miss next is served within this frame.
 
@@ -203,12 +204,12 @@ class Engine:
                 else:  # a picture of another size
                     hits.missed.fill_(True)
             where = scouts(hits.missed, camera.width)
-            trace_camera(*view, no_progress, again=(hits, where))
+            trace_camera(*view, no_progress, again=(hits, where), numbers=numbers)
             listed, sent = self._collect(hits.samples[:0])
-            numbers = Numbers(*sent.tolist())  # a frame that misses something waits anyway
-            add(stats.requests, numbers.wishes())
-            self.cache.make_room(numbers.tiles_unused, numbers.bricks_unused)
-            self._serve(listed.read(self.cache.nodes, numbers.wishes()), stats)
+            counts = Numbers(*sent.tolist())  # a frame that misses something waits anyway
+            add(stats.requests, counts.wishes())
+            self.cache.make_room(counts.tiles_unused, counts.bricks_unused)
+            self._serve(listed.read(self.cache.nodes, counts.wishes()), stats)
 
     def _serve(self, wishes: Wishes, stats: FrameStats) -> None:
         """Chooses wishes, asks for them, and writes the answers that are here at once."""
