@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -88,6 +88,7 @@ class Sent:
 
 
 Answer = Regions | Bricks | Sent
+AnyAnswer = TypeVar("AnyAnswer", bound=Answer)
 
 
 def children_of(job: Job, answer: Regions, cache: Cache) -> Children:
@@ -183,7 +184,7 @@ def send_ahead(job: Job, answer: Any, staging: Staging) -> Any:
     return way if isinstance(way, Sent) else answer
 
 
-def shipped(job: Job, answer: Answer, staging: Staging | None) -> Answer:
+def shipped(job: Job, answer: AnyAnswer, staging: Staging | None) -> AnyAnswer | Sent:
     """Puts a checked answer on its way if it is voxels from the host and nothing else."""
     if staging is None or not isinstance(answer, Bricks) or not on_host(answer.data):
         return answer

@@ -24,7 +24,7 @@ from .config import ABSENT, CONSTANT, EMPTY, REQUEST_LOAD
 from .frame import FrameStats
 from .jobs import Answer, Job, Plant, Sent, by_kind, children_of, select, send_ahead, shipped
 from .pool import Staging
-from .pool.staging import Shipment, on_host, upload
+from .pool.staging import Shipment, upload
 from .producers import Bricks, Region, Regions
 
 _KEPT_FAILURES = 1000  # named; all are counted
@@ -360,9 +360,9 @@ class Production:
                 word = upload(word.to(torch.int32), device)
                 values = {name: upload(rows, device) for name, rows in answer.constants.items()}
                 return self.cache.write_uniform(tree, job.node, job.loc, word, values)
-            if self.staging is None or not on_host(answer.data):
+            answer = shipped(job, answer, self.staging)
+            if isinstance(answer, Bricks):
                 return self.cache.write_bricks(tree, job.node, job.loc, answer.data)
-            answer = Sent(self.staging.send(answer.data))
         shipment = answer.shipment
         sent = shipment.sent
         if sent == len(job):
