@@ -74,24 +74,29 @@ def draw(file: Path, record: dict[str, Any]) -> bool:
 
 
 def _bars(pyplot: Any, record: dict[str, Any]) -> Any:
-    """Milliseconds of every row, from smallest to largest repeat; on a logarithmic axis where some
-    are far apart.
+    """Milliseconds of every row, or where rows move bytes gigabytes a second, from smallest to
+    largest repeat; on a logarithmic axis where some are far apart.
     """
     rows = record["rows"][::-1]
     names = list(dict.fromkeys(row["who"] for row in record["rows"]))
     figure, axes = pyplot.subplots(
         figsize=(9, 1.2 + 0.24 * len(rows)), constrained_layout=True, squeeze=True
     )
+    moves = all("bytes_per_second" in row for row in rows)
+    middles = []
     for place, row in enumerate(rows):
-        error = [[row["ms"] - row["ms_low"]], [row["ms_high"] - row["ms"]]]
+        ends = [row[name] for name in ("ms_low", "ms", "ms_high")]
+        if moves:  # not all rows move as many bytes
+            ends = [1e-6 * row["moved_bytes"] / ms for ms in reversed(ends)]
+        low, middle, high = ends
         color = f"C{names.index(row['who']) % 10}"
-        axes.barh(place, row["ms"], color=color, xerr=error, ecolor="0.4")
+        axes.barh(place, middle, color=color, xerr=[[middle - low], [high - middle]], ecolor="0.4")
+        middles.append(middle)
     axes.set_yticks(range(len(rows)), [f"{row['case']}: {row['who']}" for row in rows], fontsize=7)
     axes.margins(y=0.01)
-    times = [row["ms"] for row in rows]
-    if max(times) > 20 * min(times):
+    if max(middles) > 20 * min(middles):
         axes.set_xscale("log")
-    axes.set_xlabel("milliseconds")
+    axes.set_xlabel("GB / s" if moves else "milliseconds")
     axes.grid(axis="x", alpha=0.3)
     return figure
 
