@@ -8,10 +8,13 @@
 
 PYTHON ?= python3
 VENV := .venv
+COMMA := ,
 BIN := $(VENV)/bin
 TORCH := $(shell sed -n 's/.*"\(torch==[0-9.]*\)".*/\1/p' pyproject.toml)
 NATIVE := $(shell nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u | tr -d . | paste -sd ';')
 # A development build compiles CUDA for the cards that are here; without one, for one architecture, to see it compile.
+# What must have run, or the tests have failed; OpenGL in software is the system's (Debian: libegl1, libgl1-mesa-dri).
+REQUIRE := reference,cpp,io$(if $(shell ldconfig -p 2>/dev/null | grep libEGL.so.1),$(COMMA)opengl)
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint .ci/constraints.txt
 export GVTORCH_CUDA_ARCHS ?= $(or $(NATIVE),90)
 
@@ -29,7 +32,7 @@ demo: $(VENV)/ready
 	@echo "The picture: $(CURDIR)/out/demo.png"
 
 test: $(VENV)/ready
-	OMP_NUM_THREADS=1 GVTORCH_REQUIRE=reference,cpp,io $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal $(ARGS)
+	OMP_NUM_THREADS=1 GVTORCH_REQUIRE=$(REQUIRE) $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal $(ARGS)
 
 lint: $(VENV)/ready
 	$(BIN)/ruff check .

@@ -1,6 +1,7 @@
 """Triangles and voxels in one picture: VTK's OpenGL draws rings and a disk that cross a scan.
 
-VTK gets our camera; its colours and its depth buffer come back as a layer.
+VTK gets our camera; its colours and its depth buffer come back as a layer, without leaving the
+device where CUDA and OpenGL are on one.
 """
 
 import math
@@ -17,7 +18,6 @@ import gvtorch as gv
 
 try:
     import vtk
-    from vtk.util.numpy_support import vtk_to_numpy
 except ImportError as error:
     sys.exit(f"mixed_triangles needs VTK: pip install 'gvtorch[triangles]' ({error})")
 if sys.platform == "linux" and not (find_library("EGL") or find_library("OSMesa")):
@@ -42,7 +42,7 @@ def actor(source, place, color) -> vtk.vtkActor:
     return result
 
 
-def rasterise(actors, camera: gv.Camera, near: float, far: float) -> gv.Layer:
+def rasterise(actors, camera: gv.Camera, near: float, far: float, device="cpu") -> gv.Layer:
     """Draws triangles for the pixels of a camera that stands in the world."""
     vtk.vtkObject.GlobalWarningDisplayOff()  # VTK tells which displays it did not find
     renderer, window = vtk.vtkRenderer(), vtk.vtkRenderWindow()
@@ -66,16 +66,14 @@ def rasterise(actors, camera: gv.Camera, near: float, far: float) -> gv.Layer:
     view.UseExplicitProjectionTransformMatrixOn()
     window.Render()
 
-    depth, color = vtk.vtkFloatArray(), vtk.vtkUnsignedCharArray()
-    corners = (0, 0, camera.width - 1, camera.height - 1)
-    window.GetZbufferData(*corners, depth)
-    window.GetPixelData(*corners, 0, color, 0)
-    images = []
-    for array in (depth, color):  # OpenGL's rows go up
-        image = torch.from_numpy(vtk_to_numpy(array).copy())
-        images.append(image.reshape(camera.height, camera.width, -1).flip(0))
-    linear = rgb_to_linear_rgb(images[1].movedim(-1, 0) / 255).movedim(0, -1)
-    return gv.Layer(linear, gv.opengl.ray_distance(images[0], projection))
+    window.MakeCurrent()
+    frame = window.GetRenderFramebuffer()
+    frame.Bind(frame.GetReadMode())
+    with gv.opengl.Exchange(camera.width, camera.height, device) as exchange:
+        color, depth = exchange.read_color()[..., :3], exchange.read_depth()
+        print(exchange)
+    linear = rgb_to_linear_rgb(color.movedim(-1, 0)).movedim(0, -1)
+    return gv.Layer(linear, gv.opengl.ray_distance(depth, projection))
 
 
 @dataclass
@@ -103,7 +101,7 @@ def main(settings: Settings) -> None:
     disk.SetCircumferentialResolution(200)
     actors = [actor(ring, place, (0.2, 0.75, 0.55)) for place in RINGS]
     actors.append(actor(disk, DISK, (0.3, 0.5, 0.9)))
-    layer = rasterise(actors, camera, near=200, far=1000)
+    layer = rasterise(actors, camera, near=200, far=1000, device=device)
 
     volume = gv.read_volume(DATA / "stent_256x128x128_int16.npz")
     tree = gv.N3Tree.from_volume(volume, device=device)
@@ -111,7 +109,7 @@ def main(settings: Settings) -> None:
     picture = gv.render(tree, camera, shader, background=BACKGROUND, layer=layer)
     picture.save(settings.output)
     drawn = layer.depth < math.inf
-    before = drawn & (picture.depth.cpu() < layer.depth)
+    before = drawn & (picture.depth < layer.depth)
     print(f"{settings.output}: {drawn.sum()} pixels of triangles, voxels before {before.sum()}")
 
 

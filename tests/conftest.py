@@ -21,6 +21,7 @@ ROOT = Path(__file__).parent.parent
 DATA = ROOT / "examples" / "data"
 SHARED = ROOT.parent / "shared" / "data"
 DEVICES = {"reference": "cpu", "cpp": "cpu", "cuda": "cuda"}
+_REQUIRED = os.environ.get("GVTORCH_REQUIRE", "")
 _ran: Counter[str] = Counter()
 _absent: set[str] = set()
 _ABSENT = "shared test data is not here: "
@@ -28,7 +29,7 @@ _ABSENT = "shared test data is not here: "
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
-        "markers", "backend(name): runs on this backend; counted in the summary"
+        "markers", "backend(name): runs on this backend, or in OpenGL; counted in the summary"
     )
 
 
@@ -122,26 +123,32 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     counts = ", ".join(
-        f"{name} {_ran[name]}" for name in ("reference", "cpp", "cuda", "no backend")
+        f"{name} {_ran[name]}" for name in ("reference", "cpp", "cuda", "opengl", "no backend")
     )
     terminalreporter.write_line(f"passed by backend: {counts}")
     for name, reason in available().items():
         if reason:
             terminalreporter.write_line(f"backend {name} did not run: {reason}")
+    for name in _missing():
+        terminalreporter.write_line(f"GVTORCH_REQUIRE: {name} did not run, so the tests failed")
     for path in sorted(_absent):
         terminalreporter.write_line(f"did not run for want of shared data: {path}")
 
 
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
-    """With GVTORCH_REQUIRE=cpp,io a run in which no test passed on the C++ backend has failed, and
-    so has one whose tests were skipped because a format's, the video's or the cluster's library is
-    missing.
+    """With GVTORCH_REQUIRE=cpp,opengl,io a run in which no test passed on the C++ backend or in
+    OpenGL has failed, and so has one whose tests were skipped because a format's, the video's, the
+    cluster's or the rasteriser's library is missing.
     """
     if hasattr(session.config, "workerinput"):
         return  # one of several processes
-    libraries = ("nibabel", "nrrd", "tifffile", "imagecodecs", "astropy", "OpenEXR")
-    libraries += ("av", "distributed", "zarr", "yaozarrs", "ome_zarr_models")
-    _ran["io"] = int(all(importlib.util.find_spec(name) for name in libraries))
-    needed = os.environ.get("GVTORCH_REQUIRE", "")
-    if needed and exitstatus == 0 and not all(_ran[name] for name in needed.split(",")):
+    if session.exitstatus == 0 and _missing():
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def _missing() -> list[str]:
+    """What must run, and did not."""
+    libraries = ("nibabel", "nrrd", "tifffile", "imagecodecs", "astropy", "OpenEXR")
+    libraries += ("av", "distributed", "zarr", "yaozarrs", "ome_zarr_models", "vtk", "moderngl")
+    _ran["io"] = int(all(importlib.util.find_spec(name) for name in libraries))
+    return [name for name in filter(None, _REQUIRED.split(",")) if not _ran[name]]

@@ -13,6 +13,7 @@ from test_examples import no_vtk
 from test_layer import SOLID, ball, layer_of, screen, seam_error
 
 import gvtorch as gv
+from gvtorch.ops import available
 from gvtorch.rendering.opengl import ClipDepth, matrices, ray_distance, window_depth
 
 EYES = torch.tensor([[3.0, 2.0, 5.0], [-4.0, 1.0, 2.0]])
@@ -190,6 +191,7 @@ def square(vtk, corners):
     return vtk.actor(plane, (0, 0, 0), (0.1, 0.2, 0.9))
 
 
+@pytest.mark.backend("opengl")
 def test_vtk_draws_our_pixels_at_our_distances(vtk):
     """A tilted square: which pixels it covers, and how far it is, told by its plane."""
     camera = gv.Camera.look_at((30, 20, 80), (3, -2, 1), fov=30, width=200, height=150)
@@ -215,15 +217,19 @@ def test_vtk_draws_our_pixels_at_our_distances(vtk):
     assert (layer.color[drawn][:, 2] > layer.color[drawn][:, 0]).all()
 
 
+@pytest.mark.backend("opengl")
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
 @pytest.mark.parametrize("tilt", [0.0, 25.0])
-def test_the_seam_of_vtks_triangles_and_a_ball_is_exact_to_a_pixel(vtk, tilt):
+def test_the_seam_of_vtks_triangles_and_a_ball_is_exact_to_a_pixel(vtk, tilt, device):
+    if device == "cuda" and (reason := available()["cuda"]):
+        pytest.skip(f"backend cuda: {reason}")
     radius, height, far = 20.0, 12.0, 60
     angle = math.radians(tilt)
     eye = (160 * math.sin(angle), 0.0, 160 * math.cos(angle))
     view = gv.Camera.look_at(eye, (0, 0, height), fov=20, width=160, height=160)
     corners = [(-far, -far, height), (far, -far, height), (-far, far, height)]
-    layer = vtk.rasterise([square(vtk, corners)], view, near=80, far=300)
-    tree = gv.N3Tree.from_volume(ball(radius, 48))
+    layer = vtk.rasterise([square(vtk, corners)], view, near=80, far=300, device=device)
+    tree = gv.N3Tree.from_volume(ball(radius, 48), device=device)
     picture = gv.render(tree, view, SOLID, layer=layer, step=0.1, lod="finest")
     error = seam_error(picture, view, height, radius)
     exact = layer_of(screen(view, torch.tensor([0, 0, height]).double(), (0, 0, 1.0)))

@@ -104,7 +104,7 @@ class Marcher(Peer):
         stride, rows = image.GetImageMemorySize()
         address = int(image.GetImage().split("_")[1], 16)
         memory = (ctypes.c_uint16 * (4 * stride * rows)).from_address(address)
-        used = np.frombuffer(memory, np.uint16).reshape(rows, stride, 4)[:height, :width]
+        used = np.ctypeslib.as_array(memory).reshape(rows, stride, 4)[:height, :width]
         whole = np.zeros((self.height, self.width, 4), np.float32)
         whole[y : y + height, x : x + width] = used / np.float32(_ONE)
         return torch.from_numpy(whole[::-1].copy()).reshape(-1, 4)

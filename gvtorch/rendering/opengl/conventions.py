@@ -18,8 +18,8 @@ from enum import Enum
 import torch
 from torch import Tensor
 
-from .. import check
-from .camera import Camera, Frame
+from ... import check
+from ..camera import Camera, Frame
 
 _AXES = torch.tensor([1, -1, -1, 1], dtype=torch.float64)  # turns y and z
 

@@ -1,0 +1,346 @@
+"""`Exchange`: pictures that pass between OpenGL and torch, on the device where both are on one.
+
+Colours and depths come as tensors from the framebuffer that OpenGL reads, and go into the one that
+it draws. Each moves in the type in which OpenGL has it, for conversions send drivers through the
+host. They do that with most formats of depth in both directions, so depth becomes a colour first
+(or last) by drawing one triangle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+from ... import check
+from . import functions as gl
+from .pixels import Shared, ThroughHost, Way, why_not_shared
+
+_VERTEX = """#version 330 core
+void main() {  // one triangle over all pixels
+  gl_Position = vec4(4 * (gl_VertexID & 1) - 1, 2 * (gl_VertexID & 2) - 1, 0, 1);
+}
+"""
+_FRAGMENT = """#version 330 core
+uniform sampler2D color, depth;
+out vec4 result;
+void main() {
+  ivec2 pixel = ivec2(gl_FragCoord.xy);
+  result = texelFetch(color, pixel, 0);
+  gl_FragDepth = texelFetch(depth, pixel, 0).r;
+}
+"""
+_UNITS = {"color": 0, "depth": 1}
+_READ_TYPES = {gl.UNSIGNED_BYTE: torch.uint8, gl.HALF_FLOAT: torch.float16}
+_TYPES = {torch.uint8: gl.UNSIGNED_BYTE, torch.float16: gl.HALF_FLOAT, torch.float32: gl.FLOAT}
+_STORED = {torch.uint8: gl.RGBA8, torch.float16: gl.RGBA16F, torch.float32: gl.RGBA32F}
+_DEPTHS = {16: gl.DEPTH_COMPONENT16, 24: gl.DEPTH_COMPONENT24, 32: gl.DEPTH_COMPONENT32F}
+#: Filters that don't mix, and a last level 0.
+_ONE_LEVEL = {0x2800: 0x2600, 0x2801: 0x2600, 0x813D: 0}
+_ONE_SAMPLE = "it must be complete, and a framebuffer of several samples a pixel resolved first"
+
+
+class Exchange:
+    """Pictures of one size between an OpenGL context and torch.
+
+    The context is current on this thread in every call, `close` included; its state is left as it
+    was. Rows go down in tensors, as in our pictures. Nothing waits for the device where buffers
+    are shared.
+
+    Attributes:
+        shared: CUDA sees OpenGL's buffers; else pixels go through the host.
+        reason: Why they are not shared, or "".
+    """
+
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        device: torch.device | str = "cuda",
+        *,
+        share: bool | None = None,
+        load: gl.Loader | None = None,
+    ) -> None:
+        """Makes an exchange in the current context, OpenGL 3.3 or newer.
+
+        Args:
+            width: Of the pictures, pixels.
+            height: Likewise.
+            device: Where tensors are given back.
+            share: Whether buffers are shared with CUDA; default: wherever that can be.
+            load: Address of an OpenGL function by its name, from the library that made the
+                context (`glfw.get_proc_address`, for one); default: the system's library.
+
+        Raises:
+            ValueError: A size is not positive.
+            RuntimeError: There is no context, its OpenGL is too old, or `share` is true and CUDA
+                can't see its buffers.
+        """
+        where = "opengl.Exchange"
+        self.width = check.whole(where, "width", width, low=1)
+        self.height = check.whole(where, "height", height, low=1)
+        self.device = torch.device(device)
+        self._gl = gl.Functions(where, load)
+        self.reason = "" if share is False else why_not_shared(self._gl, self.device)
+        if share and self.reason:
+            raise RuntimeError(f"{where}: buffers can't be shared: {self.reason}")
+        self.reason = "share is False" if share is False else self.reason
+        self.shared = not self.reason
+        self._most = torch.full((1,), 255.0, device=self.device)  # divides alike on every device
+        self._ways: dict[str, Way] = {}
+        self._textures: dict[str, tuple[int, int]] = {}  # name and format
+        with self._gl.unchanged(drawing=True):
+            self._frame = self._gl.make("Framebuffers")
+            self._vertices = self._gl.make("VertexArrays")
+            self._program = self._gl.program(_VERTEX, _FRAGMENT)
+            self._gl.UseProgram(self._program)
+            for name, unit in _UNITS.items():
+                place = self._gl.GetUniformLocation(self._program, name.encode())
+                self._gl.Uniform1i(place, unit)
+
+    def __repr__(self) -> str:
+        how = f"shared with {self.device}" if self.shared else f"through the host: {self.reason}"
+        return f"Exchange({self.width}x{self.height}, {how})"
+
+    def read_color(self) -> Tensor:
+        """Reads the framebuffer that is bound for reading, its read buffer.
+
+        Returns:
+            (h, w, 4) float32 as it is stored: 0 to 1 in normalised formats, not decoded in sRGB's.
+
+        Raises:
+            RuntimeError: It has no such colours, several samples a pixel, or another size.
+        """
+        with self._work("read_color"):
+            self._require_size("read_color", self._gl.integer(gl.READ_BUFFER), "colours")
+            dtype = _READ_TYPES.get(self._gl.integer(gl.COLOR_READ_TYPE), torch.float32)
+            return self._pull("read color", gl.RGBA, dtype)
+
+    def read_depth(self) -> Tensor:
+        """Reads the depth of the framebuffer that is bound for reading.
+
+        Returns:
+            (h, w, 1) float32 window depth, 0 to 1; `ray_distance` makes distances of it.
+
+        Raises:
+            RuntimeError: It has no depth, several samples a pixel, or another size.
+        """
+        with self._work("read_depth", drawing=True):
+            self._require_size("read_depth", gl.DEPTH_ATTACHMENT, "depth")
+            size = (self.width, self.height)
+            self._texture("copied depth", self._depth_format())
+            self._gl.CopyTexSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 0, 0, *size)
+            self._gl.check("read_depth", f"the framebuffer has a depth? {_ONE_SAMPLE}")
+            shown = self._texture("shown depth", gl.R32F)
+            self._gl.BindFramebuffer(gl.DRAW_FRAMEBUFFER, self._frame)
+            self._gl.BindFramebuffer(gl.READ_FRAMEBUFFER, self._frame)
+            self._gl.FramebufferTexture2D(
+                gl.DRAW_FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, shown, 0
+            )
+            self._draw("copied depth", None)
+            return self._pull("read depth", gl.RED, torch.float32)
+
+    def upload(self, color: Tensor, depth: Tensor | None = None) -> tuple[int, int]:
+        """Writes pictures into textures, which shaders of one's own may read.
+
+        Args:
+            color: (h, w, 3) or (h, w, 4), uint8, float16 or float32, on any device; kept in RGBA8,
+                RGBA16F or RGBA32F.
+            depth: (h, w, 1) floats, kept in R32F.
+
+        Returns:
+            The names of both textures, whose rows go up; 0 for a depth that was not given. They
+            belong to the exchange, which writes into them the next time.
+
+        Raises:
+            ValueError: A wrong shape or dtype.
+        """
+        with self._work("upload"):
+            return self._upload("upload", color, depth)
+
+    def draw(self, color: Tensor, depth: Tensor | None = None) -> None:
+        """Writes pictures into the framebuffer that is bound for drawing, from its lower left
+        corner on, in place of what it holds; what is drawn later is tested against their depth.
+
+        Args:
+            color: As in `upload`, with the values that the framebuffer shall store.
+            depth: As in `upload`: window depth, 0 to 1, as `window_depth` gives it; without it the
+                framebuffer's depth stays.
+
+        Raises:
+            ValueError: A wrong shape or dtype.
+            RuntimeError: OpenGL can't draw into the framebuffer.
+        """
+        with self._work("draw", drawing=True):
+            self._upload("draw", color, depth)
+            self._draw("color", None if depth is None else "depth")
+
+    def close(self) -> None:
+        """Gives back buffers, textures and the rest; the exchange is of no use afterwards."""
+        self._gl.require_context()
+        for way in self._ways.values():
+            way.close()
+        for name, _ in self._textures.values():
+            self._gl.drop("Textures", name)
+        self._ways, self._textures = {}, {}
+        if self._frame:
+            self._gl.drop("Framebuffers", self._frame)
+            self._gl.drop("VertexArrays", self._vertices)
+            self._gl.DeleteProgram(self._program)
+            self._frame = 0
+
+    def __enter__(self) -> Exchange:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @contextmanager
+    def _work(self, what: str, *, drawing: bool = False) -> Iterator[None]:
+        if not self._frame:
+            raise RuntimeError(f"opengl.Exchange: {what}: the exchange is closed")
+        self._gl.require_context()
+        with self._gl.unchanged(drawing=drawing):
+            yield
+
+    def _way(self, kind: str) -> Way:
+        if kind not in self._ways:
+            way = Shared if self.shared else ThroughHost
+            self._ways[kind] = way(self._gl, self.device)
+        return self._ways[kind]
+
+    def _pull(self, kind: str, channels: int, dtype: torch.dtype) -> Tensor:
+        """Reads the framebuffer that is bound for reading; RGBA or RED."""
+
+        def read(place: int) -> None:
+            size = (self.width, self.height)
+            self._gl.ReadPixels(0, 0, *size, channels, _TYPES[dtype], place)
+            self._gl.check(kind, f"the framebuffer has colours that are no integers? {_ONE_SAMPLE}")
+
+        shape = (self.height, self.width, 4 if channels == gl.RGBA else 1)
+        image = self._way(kind).pull(read, shape, dtype).float()
+        return image / self._most if dtype == torch.uint8 else image
+
+    def _texture(self, kind: str, stored: int) -> int:
+        """Binds the texture of a kind, made anew if its format is another."""
+        name, before = self._textures.get(kind, (0, 0))
+        if name and before != stored:
+            self._gl.drop("Textures", name)
+            name = 0
+        if not name:
+            name = self._gl.make("Textures")
+            self._textures[kind] = name, stored
+            self._gl.BindTexture(gl.TEXTURE_2D, name)
+            layout = (gl.DEPTH_COMPONENT if stored in _DEPTHS.values() else gl.RED, gl.FLOAT)
+            size = (self.width, self.height)
+            self._gl.TexImage2D(gl.TEXTURE_2D, 0, stored, *size, 0, *layout, None)
+            for parameter, value in _ONE_LEVEL.items():
+                self._gl.TexParameteri(gl.TEXTURE_2D, parameter, value)
+            self._gl.check("a texture", f"{self.width}x{self.height} pixels")
+        self._gl.BindTexture(gl.TEXTURE_2D, name)
+        return name
+
+    def _upload(self, what: str, color: Tensor, depth: Tensor | None) -> tuple[int, int]:
+        rows = (self.height, self.width)
+        if not (
+            isinstance(color, Tensor)
+            and color.dtype in _STORED
+            and color.dim() == 3
+            and (*color.shape[:2],) == rows
+            and color.shape[2] in (3, 4)
+        ):
+            raise ValueError(
+                f"opengl.Exchange: {what}: color must be ({rows[0]}, {rows[1]}, 3 or 4) uint8, "
+                f"float16 or float32, got {check.describe(color)}"
+            )
+        if depth is not None and not (
+            isinstance(depth, Tensor) and depth.is_floating_point() and depth.shape == (*rows, 1)
+        ):
+            raise ValueError(
+                f"opengl.Exchange: {what}: depth must be ({rows[0]}, {rows[1]}, 1) floats, "
+                f"got {check.describe(depth)}"
+            )
+        if color.shape[2] == 3:
+            opaque = 255 if color.dtype == torch.uint8 else 1
+            color = torch.cat((color, torch.full_like(color[..., :1], opaque)), -1)
+        first = self._write("color", color.detach(), _STORED[color.dtype], gl.RGBA)
+        if depth is None:
+            return first, 0
+        return first, self._write("depth", depth.detach().float(), gl.R32F, gl.RED)
+
+    def _write(self, kind: str, image: Tensor, stored: int, channels: int) -> int:
+        """Writes an image into the texture of a kind."""
+        name = self._texture(kind, stored)
+
+        def write(place: int) -> None:
+            size = (self.width, self.height)
+            kind_of = _TYPES[image.dtype]
+            self._gl.TexSubImage2D(gl.TEXTURE_2D, 0, 0, 0, *size, channels, kind_of, place)
+
+        self._way(f"write {kind}").push(image, write)
+        self._gl.check("a texture", "its pixels could not be written")
+        return name
+
+    def _draw(self, color: str, depth: str | None) -> None:
+        """Draws textures of these kinds over the framebuffer that is bound for drawing."""
+        for unit, kind in enumerate((color, depth)):
+            self._gl.ActiveTexture(gl.TEXTURE0 + unit)
+            self._gl.BindTexture(gl.TEXTURE_2D, self._textures[kind][0] if kind else 0)
+        (self._gl.Enable if depth else self._gl.Disable)(gl.DEPTH_TEST)
+        self._gl.DepthFunc(gl.ALWAYS)
+        self._gl.DepthMask(1)
+        self._gl.ColorMask(1, 1, 1, 1)
+        self._gl.PolygonMode(gl.FRONT_AND_BACK, gl.FILL)
+        self._gl.Viewport(0, 0, self.width, self.height)
+        self._gl.UseProgram(self._program)
+        self._gl.BindVertexArray(self._vertices)
+        self._gl.DrawArrays(gl.TRIANGLES, 0, 3)
+        self._gl.check("drawing", "is the framebuffer that is bound for drawing complete?")
+
+    def _attached(self, attachment: int, what: int) -> int:
+        """A parameter of what is attached to the framebuffer that is bound for reading."""
+        get = "GetFramebufferAttachmentParameteriv"
+        value = self._gl.parameter(get, gl.READ_FRAMEBUFFER, attachment, what)
+        self._gl.GetError()  # tells that nothing is attached
+        return value
+
+    def _depth_format(self) -> int:
+        """The format of depth that comes next to that of the framebuffer bound for reading."""
+        window = not self._gl.integer(gl.READ_FRAMEBUFFER_BINDING)
+        attachment = gl.DEPTH if window else gl.DEPTH_ATTACHMENT
+        return _DEPTHS.get(self._attached(attachment, gl.ATTACHED_DEPTH_SIZE), gl.DEPTH_COMPONENT24)
+
+    def _require_size(self, what: str, attachment: int, name: str) -> None:
+        """Raises unless something of our size is attached to the framebuffer bound for reading.
+        Of a window's own framebuffer OpenGL tells no size.
+        """
+        if not self._gl.integer(gl.READ_FRAMEBUFFER_BINDING):
+            return
+        kind = self._attached(attachment, gl.ATTACHED_KIND)
+        if not kind:
+            raise RuntimeError(
+                f"opengl.Exchange: {what}: the framebuffer that is bound for reading has no {name}"
+            )
+        object_name = self._attached(attachment, gl.ATTACHED_NAME)
+        if kind == gl.RENDERBUFFER:
+            before = self._gl.integer(gl.RENDERBUFFER_BINDING)
+            self._gl.BindRenderbuffer(gl.RENDERBUFFER, object_name)
+            get, first = "GetRenderbufferParameteriv", (gl.RENDERBUFFER,)
+            numbers = (gl.RENDERBUFFER_WIDTH, gl.RENDERBUFFER_HEIGHT)
+            size = [self._gl.parameter(get, *first, number) for number in numbers]
+            self._gl.BindRenderbuffer(gl.RENDERBUFFER, before)
+        else:
+            self._gl.BindTexture(gl.TEXTURE_2D, object_name)
+            if self._gl.GetError():
+                return  # no plain texture: OpenGL itself tells whether it can be read
+            level = self._attached(attachment, gl.ATTACHED_LEVEL)
+            get = "GetTexLevelParameteriv"
+            numbers = (gl.TEXTURE_WIDTH, gl.TEXTURE_HEIGHT)
+            size = [self._gl.parameter(get, gl.TEXTURE_2D, level, number) for number in numbers]
+        if size != [self.width, self.height]:
+            raise RuntimeError(
+                f"opengl.Exchange: {what}: the framebuffer that is bound for reading has "
+                f"{size[0]}x{size[1]} pixels, the exchange {self.width}x{self.height}"
+            )

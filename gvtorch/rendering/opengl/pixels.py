@@ -1,0 +1,163 @@
+"""How pixels get from OpenGL to torch and back: in a buffer that both see, or through the host.
+
+Source: CUDA runtime API, section "OpenGL interoperability".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Protocol
+
+import torch
+from torch import Tensor
+
+from . import functions as gl
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+#: A call of OpenGL that reads or writes pixels at an address, or at an offset in a bound buffer.
+Transfer = Callable[[int], None]
+
+
+class Way(Protocol):
+    """Moves the pixels of pictures of one kind. Rows go up on OpenGL's side and down on ours."""
+
+    def pull(self, read: Transfer, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+        """Returns what OpenGL reads."""
+
+    def push(self, image: Tensor, write: Transfer) -> None:
+        """Has OpenGL write an image."""
+
+    def close(self) -> None:
+        """Gives back what it holds."""
+
+
+class ThroughHost:
+    """A copy in host memory, for whichever OpenGL and whichever device."""
+
+    def __init__(self, functions: gl.Functions, device: torch.device) -> None:
+        self._gl, self._device = functions, device
+
+    def pull(self, read: Transfer, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+        host = torch.empty(shape, dtype=dtype, pin_memory=self._device.type == "cuda")
+        self._gl.BindBuffer(gl.PIXEL_PACK_BUFFER, 0)
+        read(host.data_ptr())
+        return host.to(self._device).flip(0)
+
+    def push(self, image: Tensor, write: Transfer) -> None:
+        host = image.flip(0).cpu().contiguous()
+        self._gl.BindBuffer(gl.PIXEL_UNPACK_BUFFER, 0)
+        write(host.data_ptr())
+
+    def close(self) -> None:
+        pass
+
+
+class Shared:
+    """A buffer object of OpenGL that CUDA sees too. Nobody waits: each side's work is ordered
+    after the other's where the buffer changes hands.
+    """
+
+    def __init__(self, functions: gl.Functions, device: torch.device) -> None:
+        self._gl, self._device = functions, device
+        self._name, self._nbytes, self._resource = 0, 0, None
+
+    def pull(self, read: Transfer, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+        self._hold(_nbytes(shape, dtype))
+        self._gl.BindBuffer(gl.PIXEL_PACK_BUFFER, self._name)
+        read(0)
+        with self._seen(shape, dtype) as pixels:
+            return pixels.flip(0)
+
+    def push(self, image: Tensor, write: Transfer) -> None:
+        self._hold(image.nbytes)
+        with self._seen(tuple(image.shape), image.dtype) as pixels:
+            pixels.copy_(image.flip(0))
+        self._gl.BindBuffer(gl.PIXEL_UNPACK_BUFFER, self._name)
+        write(0)
+
+    def close(self) -> None:
+        if self._resource is not None:
+            _runtime("cudaGraphicsUnregisterResource", self._resource)
+            self._resource = None
+        if self._name:
+            self._gl.drop("Buffers", self._name)
+            self._name = self._nbytes = 0
+
+    def _hold(self, nbytes: int) -> None:
+        """Has a buffer of so many bytes."""
+        if self._nbytes == nbytes:
+            return
+        self.close()
+        self._name = self._gl.make("Buffers")
+        self._gl.BindBuffer(gl.PIXEL_PACK_BUFFER, self._name)
+        self._gl.BufferData(gl.PIXEL_PACK_BUFFER, nbytes, None, gl.DYNAMIC_COPY)
+        self._gl.check("a buffer of pixels", f"{nbytes} bytes")
+        with torch.cuda.device(self._device):
+            self._resource = _runtime("cudaGraphicsGLRegisterBuffer", self._name, 0)
+        self._nbytes = nbytes
+
+    @contextmanager
+    def _seen(self, shape: tuple[int, ...], dtype: torch.dtype) -> Iterator[Tensor]:
+        """The buffer's memory as a tensor, while CUDA has it."""
+        with torch.cuda.device(self._device):
+            stream = torch.cuda.current_stream(self._device).cuda_stream
+            _runtime("cudaGraphicsMapResources", 1, self._resource, stream)
+            try:
+                place, _ = _runtime("cudaGraphicsResourceGetMappedPointer", self._resource)
+                memory = _Memory(int(place), _nbytes(shape, dtype))
+                yield torch.as_tensor(memory, device=self._device).view(dtype).view(shape)
+            finally:
+                _runtime("cudaGraphicsUnmapResources", 1, self._resource, stream)
+
+
+class _Memory:
+    """Bytes on the device, for `torch.as_tensor`."""
+
+    def __init__(self, place: int, nbytes: int) -> None:
+        self.__cuda_array_interface__ = {
+            "shape": (nbytes,),
+            "typestr": "|u1",
+            "data": (place, False),
+            "version": 3,
+        }
+
+
+def why_not_shared(functions: gl.Functions, device: torch.device) -> str:
+    """Why CUDA on the device can't see the current context's buffers, or nothing."""
+    if device.type != "cuda" or torch.version.cuda is None:
+        return f"{device} is not a CUDA device"
+    try:
+        from cuda.bindings import runtime
+    except ImportError:
+        return "cuda-bindings is not installed"
+    renderer = functions.GetString(gl.RENDERER).decode(errors="replace")
+    with torch.cuda.device(device):
+        torch.cuda.current_stream(device).query()  # makes CUDA's context current
+        every = runtime.cudaGLDeviceList.cudaGLDeviceListAll
+        error, count, devices = runtime.cudaGLGetDevices(16, every)
+    index = torch.cuda.current_device() if device.index is None else device.index
+    if int(error) or index not in [int(each) for each in devices[:count]]:
+        return f"OpenGL draws on {renderer}, not on {device}"
+    return ""
+
+
+def _runtime(function: str, *arguments: Any) -> Any:
+    """Calls CUDA's runtime.
+
+    Raises:
+        RuntimeError: It failed.
+    """
+    from cuda.bindings import runtime
+
+    error, *results = getattr(runtime, function)(*arguments)
+    if int(error):
+        reason = runtime.cudaGetErrorString(error)[1].decode()
+        raise RuntimeError(f"opengl.Exchange: {function}: {reason}")
+    return results[0] if len(results) == 1 else results
+
+
+def _nbytes(shape: tuple[int, ...], dtype: torch.dtype) -> int:
+    return torch.Size(shape).numel() * dtype.itemsize
