@@ -10,7 +10,6 @@ from ctypes.util import find_library
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 import tyro
 from kornia.color import rgb_to_linear_rgb
 

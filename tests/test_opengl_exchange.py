@@ -149,7 +149,7 @@ def test_what_is_drawn_is_what_is_read(context, exchange, dtype, channels):
     assert torch.equal(read.view(HEIGHT, WIDTH, channels).flip(0), image.cpu())
     got = exchange.read_color()
     scale = 255 if dtype == torch.uint8 else 1
-    assert torch.equal(got[..., :channels], image.float() / scale)
+    assert torch.equal(got[..., :channels].cpu(), image.cpu().float() / scale)
     assert channels == 4 or bool((got[..., 3] == 1).all())
     assert torch.equal(exchange.read_depth(), stored)  # no depth was given
     torch.testing.assert_close(stored.cpu(), before, rtol=0, atol=2**-23)

@@ -18,12 +18,12 @@ from ... import check
 from . import functions as gl
 from .pixels import Shared, ThroughHost, Way, why_not_shared
 
-_VERTEX = """#version 330 core
+_VERTEX = """#version 150
 void main() {  // one triangle over all pixels
   gl_Position = vec4(4 * (gl_VertexID & 1) - 1, 2 * (gl_VertexID & 2) - 1, 0, 1);
 }
 """
-_FRAGMENT = """#version 330 core
+_FRAGMENT = """#version 150
 uniform sampler2D color, depth;
 out vec4 result;
 void main() {
@@ -63,7 +63,7 @@ class Exchange:
         share: bool | None = None,
         load: gl.Loader | None = None,
     ) -> None:
-        """Makes an exchange in the current context, OpenGL 3.3 or newer.
+        """Makes an exchange in the current context, OpenGL 3.2 or newer.
 
         Args:
             width: Of the pictures, pixels.

@@ -4,7 +4,7 @@ They come out of the system's library, which hands calls on to whichever context
 of the loader of the library that made the context. Python's bindings of OpenGL are no help here:
 they must be told the window system, or make the context themselves.
 
-Source: OpenGL 3.3 core specification, and its registry for the numbers.
+Source: OpenGL 3.2 core specification, and its registry for the numbers.
 """
 
 from __future__ import annotations
@@ -65,7 +65,6 @@ _FUNCTIONS = {
     "BindBuffer": "-uu",
     "BindFramebuffer": "-uu",
     "BindRenderbuffer": "-uu",
-    "BindSampler": "-uu",
     "BindTexture": "-uu",
     "BindVertexArray": "-u",
     "BufferData": "-unpu",
@@ -120,7 +119,7 @@ Loader = Callable[[str], "int | None"]
 
 
 class Functions:
-    """OpenGL 3.3 of the current context; functions have their names without `gl`."""
+    """OpenGL 3.2 of the current context; functions have their names without `gl`."""
 
     def __init__(self, where: str, load: Loader | None = None) -> None:
         """Finds the functions.
@@ -135,15 +134,21 @@ class Functions:
         self._where = where
         load = load or _system(where)
         for name, kinds in _FUNCTIONS.items():
-            place = load(f"gl{name}")
-            if not place:
-                raise RuntimeError(f"{where}: this OpenGL lacks gl{name}; 3.3 is needed")
-            prototype: Any = ctypes.CFUNCTYPE(*(_TYPES[kind] for kind in kinds))
-            setattr(self, name, prototype(place))
+            self._take(load, name, kinds)
         self.require_context()
         version = self.integer(MAJOR_VERSION), self.integer(MINOR_VERSION)
-        if version < (3, 3):
-            raise RuntimeError(f"{where}: OpenGL 3.3 is needed, got {version[0]}.{version[1]}")
+        if version < (3, 2):
+            raise RuntimeError(f"{where}: OpenGL 3.2 is needed, got {version[0]}.{version[1]}")
+        self._samplers = version >= (3, 3)  # there are sampler objects
+        if self._samplers:
+            self._take(load, "BindSampler", "-uu")
+
+    def _take(self, load: Loader, name: str, kinds: str) -> None:
+        place = load(f"gl{name}")
+        if not place:
+            raise RuntimeError(f"{self._where}: this OpenGL lacks gl{name}; 3.2 is needed")
+        prototype: Any = ctypes.CFUNCTYPE(*(_TYPES[kind] for kind in kinds))
+        setattr(self, name, prototype(place))
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         raise AttributeError(name)  # tells the type of the functions that __init__ sets
@@ -202,7 +207,7 @@ class Functions:
             self.DeleteShader(shader)  # as soon as the program is
         self.LinkProgram(program)
         if not self.parameter("GetProgramiv", program, LINK_STATUS):
-            raise RuntimeError(f"{self._where}: this OpenGL takes no GLSL 3.30")
+            raise RuntimeError(f"{self._where}: this OpenGL takes no GLSL 1.50")
         return program
 
     @contextmanager
@@ -225,10 +230,11 @@ class Functions:
             later.callback(self.ActiveTexture, self.integer(ACTIVE_TEXTURE))
             for unit in (1, 0):
                 self.ActiveTexture(TEXTURE0 + unit)
-                later.callback(self.BindSampler, unit, self.integer(SAMPLER_BINDING))
+                if self._samplers:
+                    later.callback(self.BindSampler, unit, self.integer(SAMPLER_BINDING))
+                    self.BindSampler(unit, 0)
                 later.callback(self.BindTexture, TEXTURE_2D, self.integer(TEXTURE_BINDING))
                 later.callback(self.ActiveTexture, TEXTURE0 + unit)
-                self.BindSampler(unit, 0)
             if drawing:
                 for each in filter(self.IsEnabled, _SWITCHES):
                     later.callback(self.Enable, each)
