@@ -279,7 +279,9 @@ def test_a_layer_drawn_by_opengl_is_the_layer_of_its_distances(context, exchange
     expected = gv.render(tree, placed, shader, layer=apart)
     assert torch.equal(picture.color, expected.color)
     exchange.draw(picture.color, gv.opengl.window_depth(picture.nearest, projection))
-    assert float((exchange.read_color()[..., :3] - picture.color).abs().max()) <= 0.6 / 255  # blending hardware rounds coarsely
+    assert (
+        float((exchange.read_color()[..., :3] - picture.color).abs().max()) <= 0.6 / 255
+    )  # blending hardware rounds coarsely
     back = gv.opengl.ray_distance(exchange.read_depth(), projection)
     near = (picture.nearest < 20).cpu()
     torch.testing.assert_close(
