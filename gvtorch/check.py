@@ -60,6 +60,27 @@ def _of_size(expected: int | str, size: int) -> bool:
     return expected == size or isinstance(expected, str)
 
 
+def device(where: str, value: Any) -> torch.device:
+    """Returns the device of a name, a CUDA device with its index, as tensors name theirs.
+
+    Raises:
+        ValueError: There is none of this name.
+    """
+    try:
+        found = torch.device(value)
+    except (RuntimeError, TypeError):
+        raise ValueError(f"{where}: device must name a device, got {value!r}") from None
+    if found.type != "cuda":
+        return found
+    if not torch.cuda.is_available():
+        raise ValueError(f"{where}: device 'cuda' can't be used here: torch sees no CUDA device")
+    index = torch.cuda.current_device() if found.index is None else found.index
+    count = torch.cuda.device_count()
+    if index >= count:
+        raise ValueError(f"{where}: device {found} can't be used here: torch sees {count} of them")
+    return torch.device("cuda", index)
+
+
 def memory(where: str, what: str, nbytes: int, device: torch.device) -> None:
     """Raises ValueError if something takes more memory than the device has in all."""
     if device.type == "cuda":

@@ -40,7 +40,7 @@ from .rendering.renderer import (
 )
 from .rendering.shaders import Shader
 from .report import Report
-from .scene import EngineOptions, brick_bytes, checked_device, make_plant, make_pools
+from .scene import EngineOptions, brick_bytes, make_plant, make_pools
 from .stage import Progress, collect_timings, mark, milliseconds, no_progress, stage
 from .turns import Turns, scouts
 
@@ -79,7 +79,7 @@ class Engine:
             known = ", ".join(EngineOptions.__dataclass_fields__)
             raise ValueError(f"Engine: unknown option {unknown[0]!r}; known: {known}")
         self.options = EngineOptions(**options)
-        self.device = checked_device(self.options.device)
+        self.device = check.device("Engine", self.options.device)
         producers = dict(scene) if isinstance(scene, Mapping) else {"scene": scene}
         nodes, bricks = make_pools(producers, self.options, self.device)
         self.cache = Cache(nodes, bricks, len(producers))

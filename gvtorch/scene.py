@@ -54,19 +54,6 @@ class EngineOptions:
                 raise ValueError(f"Engine: {name} must be bool, got {getattr(self, name)!r}")
 
 
-def checked_device(device: torch.device | str) -> torch.device:
-    """Returns the device; raises ValueError if there is none of this name."""
-    try:
-        found = torch.device(device)
-    except (RuntimeError, TypeError):
-        raise ValueError(f"Engine: device must name a device, got {device!r}") from None
-    if found.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError("Engine: device 'cuda' can't be used here: torch sees no CUDA device")
-    if found.type == "cuda" and found.index is None:  # as tensors name theirs
-        found = torch.device("cuda", torch.cuda.current_device())
-    return found
-
-
 def _raise_first(errors: Mapping[int, str]) -> None:
     for message in errors.values():
         raise ValueError(message)

@@ -5,6 +5,7 @@ moderngl, which keeps its own record of the context, draws and reads beside us.
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import threading
 
@@ -187,13 +188,17 @@ def test_textures_are_there_for_shaders_of_ones_own(context, exchange):
 
 def state(functions: gl.Functions) -> dict[int, list[int]]:
     """Whatever of a context's state an exchange touches."""
-    several = {gl.VIEWPORT: 4, gl.COLOR_MASK: 4}
-    queries = [*gl._STORE, *gl._BUFFERS.values(), *gl._FRAMES.values(), *several, gl.PROGRAM]
+    several = {gl.VIEWPORT: 4}
+    queries = [*gl._STORE, *gl._BUFFERS.values(), *gl.FRAMES.values(), *several, gl.PROGRAM]
     queries += [gl.VERTEX_ARRAY, gl.DEPTH_MASK, gl.DEPTH_FUNC, gl.POLYGON_MODE, gl.ACTIVE_TEXTURE]
-    queries += [gl.RENDERBUFFER_BINDING]
+    queries += [gl.RENDERBUFFER_BINDING, gl.CLAMP_READ_COLOR]
     found = {query: functions.integers(query, several.get(query, 1)) for query in queries}
     for switch in (*gl._SWITCHES, gl.DEPTH_TEST):
         found[switch] = [functions.IsEnabled(switch)]
+    for index in range(2):
+        mask = (ctypes.c_ubyte * 4)()
+        functions.GetBooleani_v(gl.COLOR_MASK, index, mask)
+        found[-1 - index] = [*mask, *(functions.IsEnabledi(s, index) for s in gl._FIRST_SWITCHES)]
     unit = functions.integer(gl.ACTIVE_TEXTURE)
     for each in (gl.TEXTURE0, gl.TEXTURE0 + 1):
         functions.ActiveTexture(each)
@@ -217,11 +222,14 @@ def test_the_contexts_state_stays(context, exchange):
     odd = {0x0CF2: 5, 0x0CF3: 1, 0x0CF4: 2, 0x0CF5: 8, 0x0D02: 7, 0x0D03: 2, 0x0D04: 1, 0x0D05: 2}
     for number, value in odd.items():
         functions.PixelStorei(number, value)
-    on = [0x0BE2, 0x0B44, 0x0C11, 0x0B90, 0x8C89, 0x864F, gl.DEPTH_TEST]
+    on = [0x0BE2, 0x0B44, 0x0C11, 0x0B90, 0x8C89, 0x864F, 0x80A0, gl.DEPTH_TEST]
     for switch in on:
         functions.Enable(switch)
+    functions.Disablei(0x0BE2, 1)  # blending
     functions.Viewport(1, 2, 3, 4)
-    functions.ColorMask(1, 0, 1, 0)
+    functions.ColorMaski(0, 1, 0, 1, 0)
+    functions.ColorMaski(1, 0, 1, 1, 0)
+    functions.ClampColor(gl.CLAMP_READ_COLOR, 1)
     functions.DepthMask(0)
     functions.DepthFunc(0x0200)  # never
     functions.PolygonMode(gl.FRONT_AND_BACK, 0x1B01)  # lines
@@ -251,7 +259,9 @@ def test_the_contexts_state_stays(context, exchange):
             functions.Disable(switch)
         for target in (gl.PIXEL_PACK_BUFFER, gl.PIXEL_UNPACK_BUFFER):
             functions.BindBuffer(target, 0)
-        functions.ColorMask(1, 1, 1, 1)
+        for index in range(2):
+            functions.ColorMaski(index, 1, 1, 1, 1)
+        functions.ClampColor(gl.CLAMP_READ_COLOR, gl.FIXED_ONLY)
         functions.DepthMask(1)
         functions.DepthFunc(0x0201)
         functions.PolygonMode(gl.FRONT_AND_BACK, gl.FILL)

@@ -8,8 +8,9 @@ host. They do that with most formats of depth in both directions, so depth becom
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import torch
 from torch import Tensor
@@ -32,6 +33,7 @@ void main() {
   gl_FragDepth = texelFetch(depth, pixel, 0).r;
 }
 """
+_NUMBERS = itertools.count()
 _UNITS = {"color": 0, "depth": 1}
 _READ_TYPES = {gl.UNSIGNED_BYTE: torch.uint8, gl.HALF_FLOAT: torch.float16}
 _TYPES = {torch.uint8: gl.UNSIGNED_BYTE, torch.float16: gl.HALF_FLOAT, torch.float32: gl.FLOAT}
@@ -45,11 +47,15 @@ _ONE_SAMPLE = "it must be complete, and a framebuffer of several samples a pixel
 class Exchange:
     """Pictures of one size between an OpenGL context and torch.
 
-    The context is current on this thread in every call, `close` included; its state is left as it
-    was. Rows go down in tensors, as in our pictures. Nothing waits for the device where buffers
-    are shared.
+    The context, or one that shares its objects, is current on this thread in every call, `close`
+    included; its state is left as it was. Rows go down in tensors, as in our pictures. Nothing
+    waits for the device where buffers are shared. An exchange that is never closed leaves its
+    buffers and textures to the context.
 
     Attributes:
+        width: Of the pictures, pixels.
+        height: Likewise.
+        device: Where tensors are given back.
         shared: CUDA sees OpenGL's buffers; else pixels go through the host.
         reason: Why they are not shared, or "".
     """
@@ -74,15 +80,19 @@ class Exchange:
                 context (`glfw.get_proc_address`, for one); default: the system's library.
 
         Raises:
-            ValueError: A size is not positive.
+            ValueError: A size is not positive or more than a texture can have, or there is no such
+                device.
             RuntimeError: There is no context, its OpenGL is too old, or `share` is true and CUDA
                 can't see its buffers.
         """
         where = "opengl.Exchange"
-        self.width = check.whole(where, "width", width, low=1)
-        self.height = check.whole(where, "height", height, low=1)
-        self.device = torch.device(device)
+        if share not in (None, True, False):
+            raise ValueError(f"{where}: share must be bool or None, got {share!r}")
+        self.device = check.device(where, device)
         self._gl = gl.Functions(where, load)
+        most = self._gl.integer(gl.MAX_TEXTURE_SIZE)
+        self.width = check.whole(where, "width", width, low=1, high=most)
+        self.height = check.whole(where, "height", height, low=1, high=most)
         self.reason = "" if share is False else why_not_shared(self._gl, self.device)
         if share and self.reason:
             raise RuntimeError(f"{where}: buffers can't be shared: {self.reason}")
@@ -91,10 +101,10 @@ class Exchange:
         self._most = torch.full((1,), 255.0, device=self.device)  # divides alike on every device
         self._ways: dict[str, Way] = {}
         self._textures: dict[str, tuple[int, int]] = {}  # name and format
+        # No other program has a result of this name: it tells whether we are in our context.
+        self._mark = f"result_{next(_NUMBERS)}"
         with self._gl.unchanged(drawing=True):
-            self._frame = self._gl.make("Framebuffers")
-            self._vertices = self._gl.make("VertexArrays")
-            self._program = self._gl.program(_VERTEX, _FRAGMENT)
+            self._program = self._gl.program(_VERTEX, _FRAGMENT.replace("result", self._mark))
             self._gl.UseProgram(self._program)
             for name, unit in _UNITS.items():
                 place = self._gl.GetUniformLocation(self._program, name.encode())
@@ -111,11 +121,13 @@ class Exchange:
             (h, w, 4) float32 as it is stored: 0 to 1 in normalised formats, not decoded in sRGB's.
 
         Raises:
-            RuntimeError: It has no such colours, several samples a pixel, or another size.
+            RuntimeError: It has no such colours, several samples a pixel, or another size (which
+                OpenGL does not tell of a window).
         """
         with self._work("read_color"):
-            self._require_size("read_color", self._gl.integer(gl.READ_BUFFER), "colours")
+            self._require_size(self._gl.integer(gl.READ_BUFFER), "colours")
             dtype = _READ_TYPES.get(self._gl.integer(gl.COLOR_READ_TYPE), torch.float32)
+            self._gl.forget_errors()  # OpenGL before 4.1 need not know the type
             return self._pull("read color", gl.RGBA, dtype)
 
     def read_depth(self) -> Tensor:
@@ -127,15 +139,16 @@ class Exchange:
         Raises:
             RuntimeError: It has no depth, several samples a pixel, or another size.
         """
-        with self._work("read_depth", drawing=True):
-            self._require_size("read_depth", gl.DEPTH_ATTACHMENT, "depth")
+        temporary = self._gl.temporary
+        with self._work("read_depth", drawing=True), temporary("Framebuffers") as frame:
+            self._require_size(gl.DEPTH_ATTACHMENT, "depth")
             size = (self.width, self.height)
             self._texture("copied depth", self._depth_format())
             self._gl.CopyTexSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 0, 0, *size)
-            self._gl.check("read_depth", f"the framebuffer has a depth? {_ONE_SAMPLE}")
+            self._gl.check(f"the framebuffer has a depth? {_ONE_SAMPLE}")
             shown = self._texture("shown depth", gl.R32F)
-            self._gl.BindFramebuffer(gl.DRAW_FRAMEBUFFER, self._frame)
-            self._gl.BindFramebuffer(gl.READ_FRAMEBUFFER, self._frame)
+            self._gl.BindFramebuffer(gl.DRAW_FRAMEBUFFER, frame)
+            self._gl.BindFramebuffer(gl.READ_FRAMEBUFFER, frame)
             self._gl.FramebufferTexture2D(
                 gl.DRAW_FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, shown, 0
             )
@@ -158,11 +171,12 @@ class Exchange:
             ValueError: A wrong shape or dtype.
         """
         with self._work("upload"):
-            return self._upload("upload", color, depth)
+            return self._upload(color, depth)
 
     def draw(self, color: Tensor, depth: Tensor | None = None) -> None:
-        """Writes pictures into the framebuffer that is bound for drawing, from its lower left
-        corner on, in place of what it holds; what is drawn later is tested against their depth.
+        """Writes pictures into the framebuffer that is bound for drawing, its first draw buffer,
+        from the lower left corner on, in place of what it holds; what is drawn later is tested
+        against their depth.
 
         Args:
             color: As in `upload`, with the values that the framebuffer shall store.
@@ -171,25 +185,36 @@ class Exchange:
 
         Raises:
             ValueError: A wrong shape or dtype.
-            RuntimeError: OpenGL can't draw into the framebuffer.
+            RuntimeError: OpenGL can't draw into the framebuffer, or it has no depth and one was
+                given.
         """
         with self._work("draw", drawing=True):
-            self._upload("draw", color, depth)
+            if depth is not None and not self._attached(
+                gl.DRAW_FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.ATTACHED_KIND
+            ):
+                raise RuntimeError(
+                    f"{self._gl.where}: the framebuffer that is bound for drawing has no depth"
+                )
+            self._upload(color, depth)
             self._draw("color", None if depth is None else "depth")
 
     def close(self) -> None:
-        """Gives back buffers, textures and the rest; the exchange is of no use afterwards."""
-        self._gl.require_context()
-        for way in self._ways.values():
-            way.close()
-        for name, _ in self._textures.values():
-            self._gl.drop("Textures", name)
-        self._ways, self._textures = {}, {}
-        if self._frame:
-            self._gl.drop("Framebuffers", self._frame)
-            self._gl.drop("VertexArrays", self._vertices)
-            self._gl.DeleteProgram(self._program)
-            self._frame = 0
+        """Gives back buffers, textures and the rest; the exchange is of no use afterwards.
+
+        Raises:
+            RuntimeError: Its context is not current; it still has to be closed.
+        """
+        if not self._program:
+            return
+        self._require_context("close")
+        with ExitStack() as later:
+            later.callback(self._gl.forget_errors)
+            for way in self._ways.values():
+                later.callback(way.close)
+            for name, _ in self._textures.values():
+                later.callback(self._gl.drop, "Textures", name)
+            later.callback(self._gl.DeleteProgram, self._program)
+            self._ways, self._textures, self._program = {}, {}, 0
 
     def __enter__(self) -> Exchange:
         return self
@@ -199,11 +224,20 @@ class Exchange:
 
     @contextmanager
     def _work(self, what: str, *, drawing: bool = False) -> Iterator[None]:
-        if not self._frame:
-            raise RuntimeError(f"opengl.Exchange: {what}: the exchange is closed")
-        self._gl.require_context()
+        self._require_context(what)
         with self._gl.unchanged(drawing=drawing):
             yield
+
+    def _require_context(self, what: str) -> None:
+        """Raises unless there is work to do and our context to do it in."""
+        where = self._gl.where = f"opengl.Exchange.{what}"
+        if not self._program:
+            raise RuntimeError(f"{where}: the exchange is closed")
+        self._gl.require_context()
+        ours = self._gl.GetFragDataLocation(self._program, self._mark.encode()) >= 0
+        self._gl.forget_errors()  # there is no such program
+        if not ours:
+            raise RuntimeError(f"{where}: another OpenGL context is current than the exchange's")
 
     def _way(self, kind: str) -> Way:
         if kind not in self._ways:
@@ -217,7 +251,7 @@ class Exchange:
         def read(place: int) -> None:
             size = (self.width, self.height)
             self._gl.ReadPixels(0, 0, *size, channels, _TYPES[dtype], place)
-            self._gl.check(kind, f"the framebuffer has colours that are no integers? {_ONE_SAMPLE}")
+            self._gl.check(f"the framebuffer has colours that are no integers? {_ONE_SAMPLE}")
 
         shape = (self.height, self.width, 4 if channels == gl.RGBA else 1)
         image = self._way(kind).pull(read, shape, dtype).float()
@@ -238,11 +272,11 @@ class Exchange:
             self._gl.TexImage2D(gl.TEXTURE_2D, 0, stored, *size, 0, *layout, None)
             for parameter, value in _ONE_LEVEL.items():
                 self._gl.TexParameteri(gl.TEXTURE_2D, parameter, value)
-            self._gl.check("a texture", f"{self.width}x{self.height} pixels")
+            self._gl.check(f"a texture of {self.width}x{self.height} pixels")
         self._gl.BindTexture(gl.TEXTURE_2D, name)
         return name
 
-    def _upload(self, what: str, color: Tensor, depth: Tensor | None) -> tuple[int, int]:
+    def _upload(self, color: Tensor, depth: Tensor | None) -> tuple[int, int]:
         rows = (self.height, self.width)
         if not (
             isinstance(color, Tensor)
@@ -252,14 +286,14 @@ class Exchange:
             and color.shape[2] in (3, 4)
         ):
             raise ValueError(
-                f"opengl.Exchange: {what}: color must be ({rows[0]}, {rows[1]}, 3 or 4) uint8, "
+                f"{self._gl.where}: color must be ({rows[0]}, {rows[1]}, 3 or 4) uint8, "
                 f"float16 or float32, got {check.describe(color)}"
             )
         if depth is not None and not (
             isinstance(depth, Tensor) and depth.is_floating_point() and depth.shape == (*rows, 1)
         ):
             raise ValueError(
-                f"opengl.Exchange: {what}: depth must be ({rows[0]}, {rows[1]}, 1) floats, "
+                f"{self._gl.where}: depth must be ({rows[0]}, {rows[1]}, 1) floats, "
                 f"got {check.describe(depth)}"
             )
         if color.shape[2] == 3:
@@ -280,7 +314,7 @@ class Exchange:
             self._gl.TexSubImage2D(gl.TEXTURE_2D, 0, 0, 0, *size, channels, kind_of, place)
 
         self._way(f"write {kind}").push(image, write)
-        self._gl.check("a texture", "its pixels could not be written")
+        self._gl.check("a texture's pixels could not be written")
         return name
 
     def _draw(self, color: str, depth: str | None) -> None:
@@ -289,58 +323,45 @@ class Exchange:
             self._gl.ActiveTexture(gl.TEXTURE0 + unit)
             self._gl.BindTexture(gl.TEXTURE_2D, self._textures[kind][0] if kind else 0)
         (self._gl.Enable if depth else self._gl.Disable)(gl.DEPTH_TEST)
-        self._gl.DepthFunc(gl.ALWAYS)
-        self._gl.DepthMask(1)
-        self._gl.ColorMask(1, 1, 1, 1)
-        self._gl.PolygonMode(gl.FRONT_AND_BACK, gl.FILL)
-        self._gl.Viewport(0, 0, self.width, self.height)
+        self._gl.view(self.width, self.height)
         self._gl.UseProgram(self._program)
-        self._gl.BindVertexArray(self._vertices)
-        self._gl.DrawArrays(gl.TRIANGLES, 0, 3)
-        self._gl.check("drawing", "is the framebuffer that is bound for drawing complete?")
+        with self._gl.temporary("VertexArrays") as vertices:
+            self._gl.BindVertexArray(vertices)
+            self._gl.DrawArrays(gl.TRIANGLES, 0, 3)
+        self._gl.check("is the framebuffer that is bound for drawing complete?")
 
-    def _attached(self, attachment: int, what: int) -> int:
-        """A parameter of what is attached to the framebuffer that is bound for reading."""
+    def _attached(self, target: int, attachment: int, what: int) -> int:
+        """A parameter of what is attached to a framebuffer, or 0."""
+        if attachment == gl.DEPTH_ATTACHMENT and not self._gl.integer(gl.FRAMES[target]):
+            attachment = gl.DEPTH  # as a window calls it
         get = "GetFramebufferAttachmentParameteriv"
-        value = self._gl.parameter(get, gl.READ_FRAMEBUFFER, attachment, what)
-        self._gl.GetError()  # tells that nothing is attached
-        return value
+        return self._gl.parameter(get, target, attachment, what)
 
     def _depth_format(self) -> int:
         """The format of depth that comes next to that of the framebuffer bound for reading."""
-        window = not self._gl.integer(gl.READ_FRAMEBUFFER_BINDING)
-        attachment = gl.DEPTH if window else gl.DEPTH_ATTACHMENT
-        return _DEPTHS.get(self._attached(attachment, gl.ATTACHED_DEPTH_SIZE), gl.DEPTH_COMPONENT24)
+        what = (gl.DEPTH_ATTACHMENT, gl.ATTACHED_DEPTH_SIZE)
+        return _DEPTHS.get(self._attached(gl.READ_FRAMEBUFFER, *what), gl.DEPTH_COMPONENT24)
 
-    def _require_size(self, what: str, attachment: int, name: str) -> None:
+    def _require_size(self, attachment: int, name: str) -> None:
         """Raises unless something of our size is attached to the framebuffer bound for reading.
         Of a window's own framebuffer OpenGL tells no size.
         """
         if not self._gl.integer(gl.READ_FRAMEBUFFER_BINDING):
             return
-        kind = self._attached(attachment, gl.ATTACHED_KIND)
+        frame = f"{self._gl.where}: the framebuffer that is bound for reading has"
+        kind, which, level = (
+            self._attached(gl.READ_FRAMEBUFFER, attachment, what)
+            for what in (gl.ATTACHED_KIND, gl.ATTACHED_NAME, gl.ATTACHED_LEVEL)
+        )
         if not kind:
-            raise RuntimeError(
-                f"opengl.Exchange: {what}: the framebuffer that is bound for reading has no {name}"
-            )
-        object_name = self._attached(attachment, gl.ATTACHED_NAME)
+            raise RuntimeError(f"{frame} no {name}")
         if kind == gl.RENDERBUFFER:
-            before = self._gl.integer(gl.RENDERBUFFER_BINDING)
-            self._gl.BindRenderbuffer(gl.RENDERBUFFER, object_name)
-            get, first = "GetRenderbufferParameteriv", (gl.RENDERBUFFER,)
-            numbers = (gl.RENDERBUFFER_WIDTH, gl.RENDERBUFFER_HEIGHT)
-            size = [self._gl.parameter(get, *first, number) for number in numbers]
-            self._gl.BindRenderbuffer(gl.RENDERBUFFER, before)
+            width, height = self._gl.renderbuffer_size(which)
+        elif size := self._gl.texture_size(which, level):
+            width, height = size
         else:
-            self._gl.BindTexture(gl.TEXTURE_2D, object_name)
-            if self._gl.GetError():
-                return  # no plain texture: OpenGL itself tells whether it can be read
-            level = self._attached(attachment, gl.ATTACHED_LEVEL)
-            get = "GetTexLevelParameteriv"
-            numbers = (gl.TEXTURE_WIDTH, gl.TEXTURE_HEIGHT)
-            size = [self._gl.parameter(get, gl.TEXTURE_2D, level, number) for number in numbers]
-        if size != [self.width, self.height]:
+            return  # OpenGL itself tells whether such a texture can be read
+        if (width, height) != (self.width, self.height):
             raise RuntimeError(
-                f"opengl.Exchange: {what}: the framebuffer that is bound for reading has "
-                f"{size[0]}x{size[1]} pixels, the exchange {self.width}x{self.height}"
+                f"{frame} {width}x{height} pixels, the exchange {self.width}x{self.height}"
             )

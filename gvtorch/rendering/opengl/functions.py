@@ -12,7 +12,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from ctypes import c_char_p, c_int, c_ssize_t, c_uint, c_void_p
+from ctypes import c_char_p, c_float, c_int, c_ssize_t, c_ubyte, c_uint, c_void_p
 from functools import partial
 from typing import Any
 
@@ -27,32 +27,51 @@ READ_BUFFER, COLOR_READ_TYPE = 0x0C02, 0x8B9A
 ATTACHED_KIND, ATTACHED_NAME, ATTACHED_LEVEL = 0x8CD0, 0x8CD1, 0x8CD2
 ATTACHED_DEPTH_SIZE = 0x8216
 TEXTURE0, TEXTURE_2D, RENDERBUFFER, RENDERBUFFER_BINDING = 0x84C0, 0x0DE1, 0x8D41, 0x8CA7
-DYNAMIC_COPY, FRONT_AND_BACK, FILL = 0x88EA, 0x0408, 0x1B02
+MAX_TEXTURE_SIZE, MAX_DRAW_BUFFERS = 0x0D33, 0x8824
+DYNAMIC_COPY, FRONT, BACK, FRONT_AND_BACK, FILL = 0x88EA, 0x0404, 0x0405, 0x0408, 0x1B02
 ACTIVE_TEXTURE, TEXTURE_BINDING, SAMPLER_BINDING = 0x84E0, 0x8069, 0x8919
 PROGRAM, VERTEX_ARRAY, VIEWPORT, POLYGON_MODE = 0x8B8D, 0x85B5, 0x0BA2, 0x0B40
 COLOR_MASK, DEPTH_MASK, DEPTH_FUNC = 0x0C23, 0x0B72, 0x0B74
+CLAMP_READ_COLOR, CLAMP_FRAGMENT_COLOR, FIXED_ONLY = 0x891C, 0x891B, 0x891D
 RENDERBUFFER_WIDTH, RENDERBUFFER_HEIGHT = 0x8D42, 0x8D43
 TEXTURE_WIDTH, TEXTURE_HEIGHT = 0x1000, 0x1001
 DEPTH_TEST, ALWAYS, TRIANGLES = 0x0B71, 0x0207, 4
-FRAGMENT_SHADER, VERTEX_SHADER, COMPILE_STATUS, LINK_STATUS = 0x8B30, 0x8B31, 0x8B81, 0x8B82
+FRAGMENT_SHADER, VERTEX_SHADER, LINK_STATUS = 0x8B30, 0x8B31, 0x8B82
 VERSION, RENDERER, MAJOR_VERSION, MINOR_VERSION = 0x1F02, 0x1F01, 0x821B, 0x821C
+PROFILE, CORE_PROFILE = 0x9126, 1
 
-#: Switches that are off while `Exchange` works: blending, culling, dither, scissors, the stencil
-#: test, what discards or masks samples, logic, clamped depth, the encoding of sRGB, clip distances.
-_SWITCHES = (0x0BE2, 0x0B44, 0x0BD0, 0x0C11, 0x0B90, 0x8C89, 0x8E51, 0x809E, 0x0BF2, 0x864F)
-_SWITCHES += (0x8DB9, *range(0x3000, 0x3008))
+#: Switches that are off while `Exchange` works: culling, dither, scissors, the stencil test, what
+#: discards or masks samples, smooth polygons, logic, clamped depth, the encoding of sRGB, clip
+#: distances.
+_SWITCHES = (0x0B44, 0x0BD0, 0x0C11, 0x0B90, 0x8C89, 0x8E51, 0x809E, 0x809F, 0x80A0, 0x0B41)
+_SWITCHES += (0x0BF2, 0x864F, 0x8DB9, *range(0x3000, 0x3008))
+#: Those with an index, of which only the first counts: blending and (from 4.1 on) scissors.
+_FIRST_SWITCHES = (0x0BE2, 0x0C11)
+#: Of compatibility profiles: the alpha test, stipple; whether colours are looked up in a table on
+#: their way, then scale and bias of red, green, blue, alpha and depth.
+_LEGACY_SWITCHES = (0x0BC0, 0x0B42)
+_TRANSFER = {0x0D10: 0.0, 0x0D14: 1.0, 0x0D15: 0.0}
+_TRANSFER |= {number: float(number % 2 == 0) for number in range(0x0D18, 0x0D20)}
 #: How pixels lie in memory: swapped bytes, order of bits, row length, skipped rows and pixels,
 #: alignment; first for what is written (unpack), then for what is read (pack).
 _STORE = {number: 0 for number in (*range(0x0CF0, 0x0CF5), *range(0x0D00, 0x0D05))}
 _STORE |= {0x0CF5: 1, 0x0D05: 1}
 _BUFFERS = {PIXEL_PACK_BUFFER: 0x88ED, PIXEL_UNPACK_BUFFER: 0x88EF}
-_FRAMES = {READ_FRAMEBUFFER: READ_FRAMEBUFFER_BINDING, DRAW_FRAMEBUFFER: DRAW_FRAMEBUFFER_BINDING}
+#: Bindings of framebuffers, with what asks for them.
+FRAMES = {READ_FRAMEBUFFER: READ_FRAMEBUFFER_BINDING, DRAW_FRAMEBUFFER: DRAW_FRAMEBUFFER_BINDING}
 _ERRORS = {0x0500: "INVALID_ENUM", 0x0501: "INVALID_VALUE", 0x0502: "INVALID_OPERATION"}
 _ERRORS |= {0x0505: "OUT_OF_MEMORY", 0x0506: "INVALID_FRAMEBUFFER_OPERATION"}
+_CONTEXT_LOST = 0x0507
+_ERRORS |= {_CONTEXT_LOST: "CONTEXT_LOST"}
+#: Targets of textures of two sizes, with what asks for their binding and what for their size: 2D,
+#: rectangle, array, cube, 3D, array of cubes.
+_TARGETS = [(TEXTURE_2D, 0x8069, TEXTURE_2D), (0x84F5, 0x84F6, 0x84F5), (0x8C1A, 0x8C1D, 0x8C1A)]
+_TARGETS += [(0x8513, 0x8514, 0x8515), (0x806F, 0x806A, 0x806F), (0x9009, 0x900A, 0x9009)]
 
 _TYPES: dict[str, Any] = {
     "i": c_int,
     "u": c_uint,
+    "f": c_float,
     "n": c_ssize_t,
     "p": c_void_p,
     "s": c_char_p,
@@ -68,7 +87,8 @@ _FUNCTIONS = {
     "BindTexture": "-uu",
     "BindVertexArray": "-u",
     "BufferData": "-unpu",
-    "ColorMask": "-iiii",
+    "ClampColor": "-uu",
+    "ColorMaski": "-uiiii",
     "CompileShader": "-u",
     "CopyTexSubImage2D": "-uiiiiiii",
     "CreateProgram": "u",
@@ -82,14 +102,18 @@ _FUNCTIONS = {
     "DepthFunc": "-u",
     "DepthMask": "-i",
     "Disable": "-u",
+    "Disablei": "-uu",
     "DrawArrays": "-uii",
     "Enable": "-u",
+    "Enablei": "-uu",
     "FramebufferTexture2D": "-uuuui",
     "GenBuffers": "-ip",
     "GenFramebuffers": "-ip",
     "GenTextures": "-ip",
     "GenVertexArrays": "-ip",
+    "GetBooleani_v": "-uup",
     "GetError": "u",
+    "GetFragDataLocation": "iup",
     "GetFramebufferAttachmentParameteriv": "-uuup",
     "GetIntegerv": "-up",
     "GetProgramiv": "-uup",
@@ -99,6 +123,7 @@ _FUNCTIONS = {
     "GetTexLevelParameteriv": "-uiup",
     "GetUniformLocation": "ius",
     "IsEnabled": "iu",
+    "IsEnabledi": "iuu",
     "LinkProgram": "-u",
     "PixelStorei": "-ui",
     "PolygonMode": "-uu",
@@ -111,6 +136,9 @@ _FUNCTIONS = {
     "UseProgram": "-u",
     "Viewport": "-iiii",
 }
+_SINCE_3_3 = {"BindSampler": "-uu"}
+_SINCE_4_1 = {"GetFloati_v": "-uup", "ViewportIndexedf": "-uffff"}
+_LEGACY = {"GetFloatv": "-up", "PixelTransferf": "-uf"}
 
 _NO_CONTEXT = "no OpenGL context is current on this thread, none at least that the library knows"
 
@@ -119,7 +147,11 @@ Loader = Callable[[str], "int | None"]
 
 
 class Functions:
-    """OpenGL 3.2 of the current context; functions have their names without `gl`."""
+    """OpenGL 3.2 of the current context; functions have their names without `gl`.
+
+    Attributes:
+        where: Who calls, for messages.
+    """
 
     def __init__(self, where: str, load: Loader | None = None) -> None:
         """Finds the functions.
@@ -129,26 +161,38 @@ class Functions:
             load: Address of a function by its name; default: the system's library.
 
         Raises:
+            ValueError: `load` is no function, or gives something else than addresses.
             RuntimeError: There is no library, no context, or an older OpenGL.
         """
-        self._where = where
-        load = load or _system(where)
-        for name, kinds in _FUNCTIONS.items():
-            self._take(load, name, kinds)
+        self.where = where
+        if load is None:
+            load = _system(where)
+        elif not callable(load):
+            raise ValueError(f"{where}: load must be a function of a name, got {load!r}")
+        self._take(load, _FUNCTIONS)
         self.require_context()
         version = self.integer(MAJOR_VERSION), self.integer(MINOR_VERSION)
-        if version < (3, 2):
-            raise RuntimeError(f"{where}: OpenGL 3.2 is needed, got {version[0]}.{version[1]}")
+        told = self.GetString(VERSION).decode(errors="replace")
+        if version < (3, 2) or told.startswith("OpenGL ES"):
+            raise RuntimeError(f"{where}: OpenGL 3.2 is needed, got {told}")
         self._samplers = version >= (3, 3)  # there are sampler objects
-        if self._samplers:
-            self._take(load, "BindSampler", "-uu")
+        self._viewports = version >= (4, 1)  # and several viewports
+        self._legacy = not self.integer(PROFILE) & CORE_PROFILE
+        self._take(load, _SINCE_3_3 if self._samplers else {})
+        self._take(load, _SINCE_4_1 if self._viewports else {})
+        self._take(load, _LEGACY if self._legacy else {})
 
-    def _take(self, load: Loader, name: str, kinds: str) -> None:
-        place = load(f"gl{name}")
-        if not place:
-            raise RuntimeError(f"{self._where}: this OpenGL lacks gl{name}; 3.2 is needed")
-        prototype: Any = ctypes.CFUNCTYPE(*(_TYPES[kind] for kind in kinds))
-        setattr(self, name, prototype(place))
+    def _take(self, load: Loader, functions: dict[str, str]) -> None:
+        for name, kinds in functions.items():
+            place = load(f"gl{name}")
+            if not place:
+                raise RuntimeError(f"{self.where}: this OpenGL lacks gl{name}; 3.2 is needed")
+            if not isinstance(place, int):
+                raise ValueError(
+                    f"{self.where}: load must give addresses as int, got {place!r} for gl{name}"
+                )
+            prototype: Any = ctypes.CFUNCTYPE(*(_TYPES[kind] for kind in kinds))
+            setattr(self, name, prototype(place))
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         raise AttributeError(name)  # tells the type of the functions that __init__ sets
@@ -156,14 +200,19 @@ class Functions:
     def require_context(self) -> None:
         """Raises RuntimeError unless a context is current; forgets errors of before."""
         if not self.GetString(VERSION):
-            raise RuntimeError(f"{self._where}: {_NO_CONTEXT}")
-        self._forget_errors()
+            raise RuntimeError(f"{self.where}: {_NO_CONTEXT}")
+        self.forget_errors()
 
-    def check(self, what: str, hint: str) -> None:
+    def check(self, hint: str) -> None:
         """Raises RuntimeError if OpenGL tells of an error."""
         if error := self.GetError():
             name = _ERRORS.get(error, hex(error))
-            raise RuntimeError(f"{self._where}: {what}: OpenGL says {name} ({hint})")
+            raise RuntimeError(f"{self.where}: OpenGL says {name} ({hint})")
+
+    def forget_errors(self) -> None:
+        """Has OpenGL tell of no error."""
+        while self.GetError() not in (0, _CONTEXT_LOST):  # the latter stays for ever
+            pass
 
     def integer(self, what: int) -> int:
         """A number of the context's state."""
@@ -179,7 +228,37 @@ class Functions:
         """What a function of the kind of glGetShaderiv tells; 0 if it tells nothing."""
         value = c_int()
         getattr(self, get)(*arguments, ctypes.byref(value))
+        self.forget_errors()
         return value.value
+
+    def texture_size(self, name: int, level: int) -> list[int] | None:
+        """Width and height of a level of a texture; None of a kind that has not both."""
+        get, numbers = "GetTexLevelParameteriv", (TEXTURE_WIDTH, TEXTURE_HEIGHT)
+        for target, binding, asked in _TARGETS:
+            before = self.integer(binding)
+            self.BindTexture(target, name)
+            if not self.GetError():
+                size = [self.parameter(get, asked, level, number) for number in numbers]
+                self.BindTexture(target, before)
+                return size
+        self.forget_errors()
+        return None
+
+    def renderbuffer_size(self, name: int) -> list[int]:
+        """Width and height of a renderbuffer."""
+        get, numbers = "GetRenderbufferParameteriv", (RENDERBUFFER_WIDTH, RENDERBUFFER_HEIGHT)
+        before = self.integer(RENDERBUFFER_BINDING)
+        self.BindRenderbuffer(RENDERBUFFER, name)
+        size = [self.parameter(get, RENDERBUFFER, number) for number in numbers]
+        self.BindRenderbuffer(RENDERBUFFER, before)
+        return size
+
+    def view(self, width: int, height: int) -> None:
+        """Sets the first viewport to so many pixels from the lower left corner on."""
+        if self._viewports:
+            self.ViewportIndexedf(0, 0, 0, width, height)
+        else:
+            self.Viewport(0, 0, width, height)
 
     def make(self, kind: str) -> int:
         """A new name: of Buffers, Textures, Framebuffers or VertexArrays."""
@@ -190,6 +269,15 @@ class Functions:
     def drop(self, kind: str, name: int) -> None:
         """Deletes what `make` made."""
         getattr(self, f"Delete{kind}")(1, ctypes.byref(c_uint(name)))
+
+    @contextmanager
+    def temporary(self, kind: str) -> Iterator[int]:
+        """A name of a kind that contexts don't share: it lives no longer than needed."""
+        name = self.make(kind)
+        try:
+            yield name
+        finally:
+            self.drop(kind, name)
 
     def program(self, vertex: str, fragment: str) -> int:
         """Links two shaders.
@@ -207,25 +295,29 @@ class Functions:
             self.DeleteShader(shader)  # as soon as the program is
         self.LinkProgram(program)
         if not self.parameter("GetProgramiv", program, LINK_STATUS):
-            raise RuntimeError(f"{self._where}: this OpenGL takes no GLSL 1.50")
+            self.DeleteProgram(program)
+            raise RuntimeError(f"{self.where}: this OpenGL takes no GLSL 1.50")
         return program
 
     @contextmanager
     def unchanged(self, *, drawing: bool) -> Iterator[None]:
         """Puts the context's state back afterwards, as far as `Exchange` changes it.
 
-        Until then pixels lie in the host's memory, close together, and with `drawing` nothing is
-        blended, tested or left out.
+        Until then pixels lie in the host's memory, close together, and pass as they are; with
+        `drawing` filled triangles replace colours of the first draw buffer, whatever they cover.
         """
         with ExitStack() as later:
-            later.callback(self._forget_errors)
+            later.callback(self.forget_errors)
             for each, value in _STORE.items():
                 later.callback(self.PixelStorei, each, self.integer(each))
                 self.PixelStorei(each, value)
+            self._clamp(later, CLAMP_READ_COLOR)
+            if self._legacy:
+                self._pass_unchanged(later)
             for target, query in _BUFFERS.items():
                 later.callback(self.BindBuffer, target, self.integer(query))
                 self.BindBuffer(target, 0)
-            for target, query in _FRAMES.items():
+            for target, query in FRAMES.items():
                 later.callback(self.BindFramebuffer, target, self.integer(query))
             later.callback(self.ActiveTexture, self.integer(ACTIVE_TEXTURE))
             for unit in (1, 0):
@@ -236,23 +328,56 @@ class Functions:
                 later.callback(self.BindTexture, TEXTURE_2D, self.integer(TEXTURE_BINDING))
                 later.callback(self.ActiveTexture, TEXTURE0 + unit)
             if drawing:
-                for each in filter(self.IsEnabled, _SWITCHES):
-                    later.callback(self.Enable, each)
-                    self.Disable(each)
-                test = self.Enable if self.IsEnabled(DEPTH_TEST) else self.Disable
-                later.callback(test, DEPTH_TEST)
-                later.callback(self.UseProgram, self.integer(PROGRAM))
-                later.callback(self.BindVertexArray, self.integer(VERTEX_ARRAY))
-                later.callback(self.Viewport, *self.integers(VIEWPORT, 4))
-                later.callback(self.ColorMask, *self.integers(COLOR_MASK, 4))
-                later.callback(self.DepthMask, self.integer(DEPTH_MASK))
-                later.callback(self.DepthFunc, self.integer(DEPTH_FUNC))
-                later.callback(self.PolygonMode, FRONT_AND_BACK, self.integer(POLYGON_MODE))
+                self._draw_plainly(later)
             yield
 
-    def _forget_errors(self) -> None:
-        while self.GetError():
-            pass
+    def _pass_unchanged(self, later: ExitStack) -> None:
+        """Turns off what a compatibility profile does to pixels on their way."""
+        for each, value in _TRANSFER.items():
+            before = c_float()
+            self.GetFloatv(each, ctypes.byref(before))
+            later.callback(self.PixelTransferf, each, before.value)
+            self.PixelTransferf(each, value)
+
+    def _clamp(self, later: ExitStack, colors: int) -> None:
+        """Clamps colours only where they are stored in fixed point."""
+        later.callback(self.ClampColor, colors, self.integer(colors))
+        self.ClampColor(colors, FIXED_ONLY)
+
+    def _draw_plainly(self, later: ExitStack) -> None:
+        """Sets the state of drawing; what has an index only at the first, but for the masks."""
+        for each in _FIRST_SWITCHES:
+            if self.IsEnabledi(each, 0):
+                later.callback(self.Enablei, each, 0)
+                self.Disablei(each, 0)
+        for each in filter(self.IsEnabled, _SWITCHES + _LEGACY_SWITCHES * self._legacy):
+            later.callback(self.Enable, each)
+            self.Disable(each)
+        if self._legacy:
+            self._clamp(later, CLAMP_FRAGMENT_COLOR)
+        test = self.Enable if self.IsEnabled(DEPTH_TEST) else self.Disable
+        later.callback(test, DEPTH_TEST)
+        later.callback(self.UseProgram, self.integer(PROGRAM))
+        later.callback(self.BindVertexArray, self.integer(VERTEX_ARRAY))
+        if self._viewports:
+            box = (c_float * 4)()
+            self.GetFloati_v(VIEWPORT, 0, box)
+            later.callback(self.ViewportIndexedf, 0, *box)
+        else:
+            later.callback(self.Viewport, *self.integers(VIEWPORT, 4))
+        for each in range(self.integer(MAX_DRAW_BUFFERS)):
+            mask = (c_ubyte * 4)()
+            self.GetBooleani_v(COLOR_MASK, each, mask)
+            later.callback(self.ColorMaski, each, *mask)
+            self.ColorMaski(each, *4 * [each == 0])
+        later.callback(self.DepthMask, self.integer(DEPTH_MASK))
+        self.DepthMask(1)
+        later.callback(self.DepthFunc, self.integer(DEPTH_FUNC))
+        self.DepthFunc(ALWAYS)
+        faces = (FRONT, BACK) if self._legacy else (FRONT_AND_BACK,)
+        for face, mode in zip(faces, self.integers(POLYGON_MODE, len(faces)), strict=True):
+            later.callback(self.PolygonMode, face, mode)
+        self.PolygonMode(FRONT_AND_BACK, FILL)
 
 
 def _system(where: str) -> Loader:

@@ -77,14 +77,17 @@ class Shared:
             pixels.copy_(image.flip(0))
         self._gl.BindBuffer(gl.PIXEL_UNPACK_BUFFER, self._name)
         write(0)
+        self._gl.BindBuffer(gl.PIXEL_UNPACK_BUFFER, 0)
 
     def close(self) -> None:
-        if self._resource is not None:
-            _runtime("cudaGraphicsUnregisterResource", self._resource)
-            self._resource = None
-        if self._name:
-            self._gl.drop("Buffers", self._name)
-            self._name = self._nbytes = 0
+        name, resource = self._name, self._resource
+        self._name, self._nbytes, self._resource = 0, 0, None
+        try:
+            if resource is not None:
+                with torch.cuda.device(self._device):
+                    self._cuda("cudaGraphicsUnregisterResource", resource)
+        finally:
+            self._gl.drop("Buffers", name)  # 0 is nothing
 
     def _hold(self, nbytes: int) -> None:
         """Has a buffer of so many bytes."""
@@ -94,9 +97,9 @@ class Shared:
         self._name = self._gl.make("Buffers")
         self._gl.BindBuffer(gl.PIXEL_PACK_BUFFER, self._name)
         self._gl.BufferData(gl.PIXEL_PACK_BUFFER, nbytes, None, gl.DYNAMIC_COPY)
-        self._gl.check("a buffer of pixels", f"{nbytes} bytes")
+        self._gl.check(f"a buffer of {nbytes} bytes for pixels")
         with torch.cuda.device(self._device):
-            self._resource = _runtime("cudaGraphicsGLRegisterBuffer", self._name, 0)
+            self._resource = self._cuda("cudaGraphicsGLRegisterBuffer", self._name, 0)
         self._nbytes = nbytes
 
     @contextmanager
@@ -104,13 +107,27 @@ class Shared:
         """The buffer's memory as a tensor, while CUDA has it."""
         with torch.cuda.device(self._device):
             stream = torch.cuda.current_stream(self._device).cuda_stream
-            _runtime("cudaGraphicsMapResources", 1, self._resource, stream)
+            self._cuda("cudaGraphicsMapResources", 1, self._resource, stream)
             try:
-                place, _ = _runtime("cudaGraphicsResourceGetMappedPointer", self._resource)
+                place, _ = self._cuda("cudaGraphicsResourceGetMappedPointer", self._resource)
                 memory = _Memory(int(place), _nbytes(shape, dtype))
                 yield torch.as_tensor(memory, device=self._device).view(dtype).view(shape)
             finally:
-                _runtime("cudaGraphicsUnmapResources", 1, self._resource, stream)
+                self._cuda("cudaGraphicsUnmapResources", 1, self._resource, stream)
+
+    def _cuda(self, function: str, *arguments: Any) -> Any:
+        """Calls CUDA's runtime.
+
+        Raises:
+            RuntimeError: It failed.
+        """
+        from cuda.bindings import runtime
+
+        error, *results = getattr(runtime, function)(*arguments)
+        if int(error):
+            reason = runtime.cudaGetErrorString(error)[1].decode()
+            raise RuntimeError(f"{self._gl.where}: {function}: {reason}")
+        return results[0] if len(results) == 1 else results
 
 
 class _Memory:
@@ -126,7 +143,7 @@ class _Memory:
 
 
 def why_not_shared(functions: gl.Functions, device: torch.device) -> str:
-    """Why CUDA on the device can't see the current context's buffers, or nothing."""
+    """Why CUDA on the device (with its index) can't see the current context's buffers, or ""."""
     if device.type != "cuda" or torch.version.cuda is None:
         return f"{device} is not a CUDA device"
     try:
@@ -138,25 +155,9 @@ def why_not_shared(functions: gl.Functions, device: torch.device) -> str:
         torch.cuda.current_stream(device).query()  # makes CUDA's context current
         every = runtime.cudaGLDeviceList.cudaGLDeviceListAll
         error, count, devices = runtime.cudaGLGetDevices(16, every)
-    index = torch.cuda.current_device() if device.index is None else device.index
-    if int(error) or index not in [int(each) for each in devices[:count]]:
+    if int(error) or device.index not in [int(each) for each in devices[:count]]:
         return f"OpenGL draws on {renderer}, not on {device}"
     return ""
-
-
-def _runtime(function: str, *arguments: Any) -> Any:
-    """Calls CUDA's runtime.
-
-    Raises:
-        RuntimeError: It failed.
-    """
-    from cuda.bindings import runtime
-
-    error, *results = getattr(runtime, function)(*arguments)
-    if int(error):
-        reason = runtime.cudaGetErrorString(error)[1].decode()
-        raise RuntimeError(f"opengl.Exchange: {function}: {reason}")
-    return results[0] if len(results) == 1 else results
 
 
 def _nbytes(shape: tuple[int, ...], dtype: torch.dtype) -> int:
