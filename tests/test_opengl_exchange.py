@@ -128,6 +128,55 @@ def test_depths_go_there_and_come_back_in_every_format(context, exchange, name):
     assert got[0, 0] == 0 and got[-1, -1] == 1
 
 
+FORMATS = {  # internal formats, with the bits of red, green, blue and alpha
+    "R8": (0x8229, 8, None, None, None),
+    "RGB8": (0x8051, 8, 8, 8, None),
+    "SRGB8_ALPHA8": (0x8C43, 8, 8, 8, 8),
+    "RGB10_A2": (0x8059, 10, 10, 10, 2),
+    "RGBA16": (0x805B, 16, 16, 16, 16),
+    "R11F_G11F_B10F": (0x8C3A, 6, 6, 5, None),
+}
+
+
+@everywhere
+@pytest.mark.parametrize("name", FORMATS)
+def test_colours_keep_the_bits_of_their_format(context, exchange, name):
+    """What is missing is 0, alpha 1."""
+    functions = gl.Functions("test")
+    stored, *bits = FORMATS[name]
+    texture, frame = functions.make("Textures"), functions.make("Framebuffers")
+    functions.BindTexture(gl.TEXTURE_2D, texture)
+    functions.TexImage2D(
+        gl.TEXTURE_2D, 0, stored, WIDTH, HEIGHT, 0, gl.RGBA, gl.UNSIGNED_BYTE, None
+    )
+    for target in (gl.READ_FRAMEBUFFER, gl.DRAW_FRAMEBUFFER):
+        functions.BindFramebuffer(target, frame)
+    functions.FramebufferTexture2D(
+        gl.DRAW_FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0
+    )
+    color = torch.rand(HEIGHT, WIDTH, 4)
+    functions.Enable(0x8DB9)  # were sRGB encoded, it would be off by far more
+    exchange.draw(color)
+    got = exchange.read_color().cpu()
+    functions.Disable(0x8DB9)
+    for channel, kept in enumerate(bits):
+        expected = color[..., channel] if kept else torch.full((HEIGHT, WIDTH), channel // 3.0)
+        step = 1.01 / (2**kept - 1) if kept else 0  # rounded or cut off, as the driver likes
+        torch.testing.assert_close(got[..., channel], expected, rtol=0, atol=step)
+
+
+@everywhere
+def test_only_the_first_of_several_draw_buffers_changes(context, exchange):
+    textures = [context.texture((WIDTH, HEIGHT), 4) for _ in range(3)]
+    several = context.framebuffer(textures)
+    several.use()
+    several.clear(0.2, 0.4, 0.6, 0.8)
+    exchange.draw(torch.ones(HEIGHT, WIDTH, 4))
+    found = [list(texture.read()[-4:]) for texture in textures]
+    assert found == [[255] * 4, [51, 102, 153, 204], [51, 102, 153, 204]]
+    assert bool((exchange.read_color() == 1).all())
+
+
 @everywhere
 def test_depth_is_what_opengl_reads_itself(context, exchange):
     frame, _, _ = scene(context)
@@ -207,6 +256,25 @@ def state(functions: gl.Functions) -> dict[int, list[int]]:
     return found
 
 
+def make_plain(functions: gl.Functions, odd, on) -> None:
+    """Sets a context's state to what it is at first."""
+    for number in odd:
+        functions.PixelStorei(number, 0 if number not in (0x0CF5, 0x0D05) else 4)
+    for switch in on:
+        functions.Disable(switch)
+    for target in (gl.PIXEL_PACK_BUFFER, gl.PIXEL_UNPACK_BUFFER):
+        functions.BindBuffer(target, 0)
+    for index in range(2):
+        functions.ColorMaski(index, 1, 1, 1, 1)
+    functions.ClampColor(gl.CLAMP_READ_COLOR, gl.FIXED_ONLY)
+    functions.DepthMask(1)
+    functions.DepthFunc(0x0201)
+    functions.PolygonMode(gl.FRONT_AND_BACK, gl.FILL)
+    for unit in range(2):
+        functions.BindSampler(unit, 0)
+    functions.ActiveTexture(gl.TEXTURE0)
+
+
 @everywhere
 def test_the_contexts_state_stays(context, exchange):
     """Everything is set to something odd first; what is drawn and read is the same all the same."""
@@ -253,21 +321,7 @@ def test_the_contexts_state_stays(context, exchange):
         functions.BindFramebuffer(gl.DRAW_FRAMEBUFFER, before[gl.DRAW_FRAMEBUFFER_BINDING][0])
         assert state(functions) == before
     finally:
-        for number in odd:
-            functions.PixelStorei(number, 0 if number not in (0x0CF5, 0x0D05) else 4)
-        for switch in on:
-            functions.Disable(switch)
-        for target in (gl.PIXEL_PACK_BUFFER, gl.PIXEL_UNPACK_BUFFER):
-            functions.BindBuffer(target, 0)
-        for index in range(2):
-            functions.ColorMaski(index, 1, 1, 1, 1)
-        functions.ClampColor(gl.CLAMP_READ_COLOR, gl.FIXED_ONLY)
-        functions.DepthMask(1)
-        functions.DepthFunc(0x0201)
-        functions.PolygonMode(gl.FRONT_AND_BACK, gl.FILL)
-        for unit in range(2):
-            functions.BindSampler(unit, 0)
-        functions.ActiveTexture(gl.TEXTURE0)
+        make_plain(functions, odd, on)
     frame.release()
 
 
@@ -327,8 +381,57 @@ def test_what_opengl_cant_read_is_one_clear_line(context, exchange):
     plain.use()
     plain.clear(0.2, 0.4, 1, 1)
     assert exchange.read_color()[3, 4].mul(255).round().tolist() == [51, 102, 255, 255]
+    with pytest.raises(RuntimeError, match=r"Exchange\.draw: .* for drawing has no depth"):
+        plain.use()
+        exchange.draw(color, torch.zeros(HEIGHT, WIDTH, 1))
     frame.use()  # and what went wrong left nothing behind
     assert torch.equal(exchange.read_color().cpu(), color)
+
+
+@everywhere
+@pytest.mark.parametrize("kind", ["array", "3D", "cube"])
+def test_a_layer_is_read_if_it_has_the_size(context, exchange, kind):
+    functions = gl.Functions("test")
+    functions._take(gl._system("test"), {"FramebufferTextureLayer": "-uuuii"})
+    frame = functions.make("Framebuffers")
+    for target in (gl.READ_FRAMEBUFFER, gl.DRAW_FRAMEBUFFER):
+        functions.BindFramebuffer(target, frame)
+    make = {"array": context.texture_array, "3D": context.texture3d}.get(kind)
+    side = 32
+    texture = make((side, side, 3), 4) if make else context.texture_cube((side, side), 4)
+    place = (gl.DRAW_FRAMEBUFFER, gl.COLOR_ATTACHMENT0)
+    if make:
+        functions.FramebufferTextureLayer(*place, texture.glo, 0, 1)
+    else:
+        functions.FramebufferTexture2D(*place, 0x8517, texture.glo, 0)
+    with pytest.raises(RuntimeError, match="has 32x32 pixels, the exchange 37x23"):
+        exchange.read_color()
+    color = torch.rand(side, side, 4, device=exchange.device).round()
+    share = exchange.shared or None
+    with gv.opengl.Exchange(side, side, exchange.device, share=share) as fitting:
+        fitting.draw(color)
+        assert torch.equal(fitting.read_color(), color)
+
+
+@everywhere
+def test_samples_are_all_covered_and_floats_not_clamped(context, exchange):
+    functions = gl.Functions("test")
+    functions._take(gl._system("test"), {"SampleCoverage": "-fi"})
+    plain = context.framebuffer([context.texture((WIDTH, HEIGHT), 4, dtype="f4")])
+    samples = context.framebuffer([context.renderbuffer((WIDTH, HEIGHT), 4, 4, dtype="f4")])
+    color = torch.rand(HEIGHT, WIDTH, 4) * 8 - 4
+    samples.use()
+    functions.Enable(0x80A0)
+    functions.SampleCoverage(0, 0)  # none
+    exchange.draw(color)
+    functions.Disable(0x80A0)
+    functions.SampleCoverage(1, 0)
+    context.copy_framebuffer(plain, samples)
+    plain.use()
+    functions.ClampColor(gl.CLAMP_READ_COLOR, 1)
+    got = exchange.read_color().cpu()
+    functions.ClampColor(gl.CLAMP_READ_COLOR, gl.FIXED_ONLY)
+    assert torch.equal(got, color)
 
 
 @everywhere
@@ -355,8 +458,18 @@ def test_sharing_that_can_not_be_says_why(context):
     with pytest.raises(RuntimeError, match="read_color: the exchange is closed"):
         exchange.read_color()
     exchange.close()  # a second time: nothing left to do
-    with pytest.raises(ValueError, match="width must be"):
-        gv.opengl.Exchange(0, 4, "cpu")
+    for (width, device, options), message in {
+        (0, "cpu", ()): r"width must be an int >= 1 and <= \d+, got 0",
+        (2**40, "cpu", ()): "width must be an int",
+        (4, "gpu", ()): "device must name a device, got 'gpu'",
+        (4, "cuda:99", ()): "device .* can't be used here",
+        (4, "cpu", (("share", "yes"),)): "share must be bool or None, got 'yes'",
+        (4, "cpu", (("load", 3),)): "load must be a function of a name, got 3",
+        (4, "cpu", (("load", str),)): "load must give addresses as int, got 'glActiveTexture'",
+    }.items():
+        with pytest.raises(ValueError, match=f"^opengl.Exchange: {message}") as caught:
+            gv.opengl.Exchange(width, 4, device, **dict(options))
+        assert "\n" not in str(caught.value)
 
 
 def test_without_a_context_it_says_so(context):

@@ -86,7 +86,7 @@ class Exchange:
                 can't see its buffers.
         """
         where = "opengl.Exchange"
-        if share not in (None, True, False):
+        if not (share is None or isinstance(share, bool)):
             raise ValueError(f"{where}: share must be bool or None, got {share!r}")
         self.device = check.device(where, device)
         self._gl = gl.Functions(where, load)
@@ -189,13 +189,13 @@ class Exchange:
                 given.
         """
         with self._work("draw", drawing=True):
+            self._upload(color, depth)
             if depth is not None and not self._attached(
                 gl.DRAW_FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.ATTACHED_KIND
             ):
                 raise RuntimeError(
                     f"{self._gl.where}: the framebuffer that is bound for drawing has no depth"
                 )
-            self._upload(color, depth)
             self._draw("color", None if depth is None else "depth")
 
     def close(self) -> None:

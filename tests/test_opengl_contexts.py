@@ -1,0 +1,211 @@
+"""`Exchange` among several OpenGL contexts, made by EGL itself: foreign ones, ones that share
+objects, ones on other threads, and compatibility profiles with their old state.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import threading
+
+import pytest
+import torch
+
+import gvtorch as gv
+from gvtorch.ops import available
+from gvtorch.rendering.opengl import functions as gl
+
+pytestmark = pytest.mark.backend("opengl")
+WIDTH, HEIGHT = 13, 7
+CORE, COMPATIBILITY = 1, 2
+
+
+@functools.cache
+def _egl():
+    """EGL, and a display on which contexts need no surface."""
+    moderngl = pytest.importorskip("moderngl")
+    try:
+        kept = moderngl.create_standalone_context(backend="egl")
+    except Exception as error:
+        pytest.skip(f"no OpenGL through EGL: {error}")
+    egl = ctypes.CDLL("libEGL.so.1")
+    for name in ("eglGetCurrentDisplay", "eglCreateContext"):
+        getattr(egl, name).restype = ctypes.c_void_p
+    return egl, ctypes.c_void_p(egl.eglGetCurrentDisplay()), kept
+
+
+def make_context(profile: int = CORE, share: ctypes.c_void_p | None = None) -> ctypes.c_void_p:
+    egl, display, _ = _egl()
+    egl.eglBindAPI(0x30A2)
+    wanted = (ctypes.c_int * 5)(0x3040, 8, 0x3033, 1, 0x3038)  # OpenGL, pbuffers
+    config, count = ctypes.c_void_p(), ctypes.c_int()
+    egl.eglChooseConfig(display, wanted, ctypes.byref(config), 1, ctypes.byref(count))
+    wanted = (ctypes.c_int * 7)(0x3098, 3, 0x30FB, 3, 0x30FD, profile, 0x3038)
+    made = ctypes.c_void_p(egl.eglCreateContext(display, config, share, wanted))
+    if not made:
+        pytest.skip(f"EGL makes no context of profile {profile}")
+    return made
+
+
+def use(context: ctypes.c_void_p | None) -> None:
+    egl, display, _ = _egl()
+    egl.eglBindAPI(0x30A2)
+    assert egl.eglMakeCurrent(display, None, None, context)
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.backend("cuda"))])
+def device(request):
+    if request.param == "cuda" and (reason := available()["cuda"]):
+        pytest.skip(f"backend cuda: {reason}")
+    yield request.param
+    use(None)
+
+
+def target(functions: gl.Functions) -> tuple[int, int, int]:
+    """Binds a new framebuffer of colour and depth; gives back the names."""
+    names = [functions.make("Textures") for _ in range(2)]
+    layouts = [(gl.RGBA32F, gl.RGBA), (gl.DEPTH_COMPONENT32F, gl.DEPTH_COMPONENT)]
+    frame = functions.make("Framebuffers")
+    for binding in gl.FRAMES:
+        functions.BindFramebuffer(binding, frame)
+    places = (gl.COLOR_ATTACHMENT0, gl.DEPTH_ATTACHMENT)
+    for name, (stored, layout), place in zip(names, layouts, places, strict=True):
+        functions.BindTexture(gl.TEXTURE_2D, name)
+        size = (WIDTH, HEIGHT)
+        functions.TexImage2D(gl.TEXTURE_2D, 0, stored, *size, 0, layout, gl.FLOAT, None)
+        functions.FramebufferTexture2D(gl.DRAW_FRAMEBUFFER, place, gl.TEXTURE_2D, name, 0)
+    return frame, *names
+
+
+def pictures(device: str, seed: int = 0):
+    generator = torch.Generator().manual_seed(seed)
+    both = [torch.rand(HEIGHT, WIDTH, channels, generator=generator) for channels in (4, 1)]
+    return [picture.to(device) for picture in both]
+
+
+def assert_passes(exchange: gv.opengl.Exchange, seed: int = 0) -> None:
+    color, depth = pictures(exchange.device, seed)
+    exchange.draw(color, depth)
+    assert torch.equal(exchange.read_color(), color)
+    assert torch.equal(exchange.read_depth(), depth)
+
+
+def test_a_foreign_context_is_told_and_stays_as_it_was(device):
+    ours, foreign = make_context(), make_context()
+    use(ours)
+    exchange = gv.opengl.Exchange(WIDTH, HEIGHT, device)
+    target(gl.Functions("test"))
+    assert_passes(exchange)
+    use(foreign)
+    functions = gl.Functions("test")
+    with gv.opengl.Exchange(WIDTH, HEIGHT, device) as other:  # its objects have the same names
+        target(functions)
+        assert_passes(other, seed=1)
+        color, _ = pictures(device)
+        for call in (
+            exchange.read_color,
+            exchange.read_depth,
+            functools.partial(exchange.upload, color),
+            functools.partial(exchange.draw, color),
+            exchange.close,
+        ):
+            with pytest.raises(RuntimeError, match=r"Exchange\.\w+: another OpenGL context is"):
+                call()
+        assert not functions.GetError()
+        assert torch.equal(other.read_color(), pictures(device, 1)[0])
+    use(ours)
+    assert torch.equal(exchange.read_color(), pictures(device)[0])
+    exchange.close()
+    use(None)
+    exchange.close()  # nothing left to do, so no context is needed
+
+
+def test_a_context_that_shares_objects_is_as_good(device):
+    ours = make_context()
+    use(ours)
+    exchange = gv.opengl.Exchange(WIDTH, HEIGHT, device)
+    target(gl.Functions("test"))
+    assert_passes(exchange)
+    use(make_context(share=ours))
+    functions = gl.Functions("test")
+    frames = [target(functions) for _ in range(4)]
+    assert_passes(exchange)
+    for frame, color, _ in frames:  # framebuffers are nobody else's
+        functions.BindFramebuffer(gl.READ_FRAMEBUFFER, frame)
+        where = (gl.READ_FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.ATTACHED_NAME)
+        assert functions.parameter("GetFramebufferAttachmentParameteriv", *where) == color
+    exchange.close()
+
+
+def test_threads_have_exchanges_of_their_own(device):
+    def work(context, seed: int) -> None:
+        try:
+            use(context)
+            target(gl.Functions("test"))
+            with gv.opengl.Exchange(WIDTH, HEIGHT, device) as exchange:
+                for step in range(20):
+                    assert_passes(exchange, seed + step)
+            done.append(seed)
+        finally:
+            use(None)
+
+    done: list[int] = []
+    threads = [threading.Thread(target=work, args=(make_context(), 100 * n)) for n in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(done) == [0, 100]
+
+
+class Legacy:
+    """What only a compatibility profile has."""
+
+    def __init__(self) -> None:
+        library = ctypes.CDLL("libGL.so.1")
+        for name, kind in (("AlphaFunc", ctypes.c_uint), ("PixelTransferf", ctypes.c_uint)):
+            function = getattr(library, f"gl{name}")
+            function.argtypes, function.restype = [kind, ctypes.c_float], None
+            setattr(self, name, function)
+        library.glPolygonStipple.argtypes = [ctypes.c_char_p]
+        self.PolygonStipple = library.glPolygonStipple
+
+    def set_odd(self, functions: gl.Functions) -> None:
+        """Every fragment fails and every pixel becomes another."""
+        for switch in gl._LEGACY_SWITCHES:
+            functions.Enable(switch)
+        self.AlphaFunc(0x0200, 0)  # never
+        self.PolygonStipple(bytes(128))
+        for number, value in gl._TRANSFER.items():
+            if number != 0x0D10:
+                self.PixelTransferf(number, 0.5 * value + 0.25)
+        functions.PolygonMode(gl.FRONT, 0x1B01)  # lines
+        functions.PolygonMode(gl.BACK, 0x1B00)  # points
+
+
+def test_old_state_of_a_compatibility_profile_changes_nothing_and_stays(device):
+    try:
+        legacy = Legacy()
+    except OSError as error:
+        pytest.skip(f"no functions of compatibility profiles: {error}")
+    use(make_context(COMPATIBILITY))
+    functions = gl.Functions("test")
+    assert functions._legacy
+    target(functions)
+
+    def state() -> list[float]:
+        value = ctypes.c_float()
+        found: list[float] = functions.integers(gl.POLYGON_MODE, 2)
+        found += [functions.IsEnabled(switch) for switch in gl._LEGACY_SWITCHES]
+        found += [functions.integer(gl.CLAMP_FRAGMENT_COLOR)]
+        for number in gl._TRANSFER:
+            functions.GetFloatv(number, ctypes.byref(value))
+            found.append(value.value)
+        return found
+
+    with gv.opengl.Exchange(WIDTH, HEIGHT, device) as exchange:
+        legacy.set_odd(functions)
+        before = state()
+        assert before[:4] == [0x1B01, 0x1B00, 1, 1] and 0.75 in before
+        assert_passes(exchange)
+        assert state() == before
