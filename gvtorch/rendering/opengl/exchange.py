@@ -139,8 +139,7 @@ class Exchange:
         Raises:
             RuntimeError: It has no depth, several samples a pixel, or another size.
         """
-        temporary = self._gl.temporary
-        with self._work("read_depth", drawing=True), temporary("Framebuffers") as frame:
+        with self._work("read_depth", drawing=True), self._gl.temporary("Framebuffers") as frame:
             self._require_size(gl.DEPTH_ATTACHMENT, "depth")
             size = (self.width, self.height)
             self._texture("copied depth", self._depth_format())
