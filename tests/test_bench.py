@@ -17,6 +17,7 @@ from gvtorch.bench import peers, scenes, tables
 from gvtorch.bench import record as record_module
 from gvtorch.bench.record import Record, Settings, clock
 from gvtorch.bench.shaders import LOOKS
+from gvtorch.tools.bench import Bench
 
 QUICK = {"quick": True, "repeats": 1}
 CPU = Settings(device=torch.device("cpu"), **QUICK)
@@ -25,6 +26,7 @@ FIGURES = {
     "march": {"samples", "samples_per_second", "rays_per_second", "op_ms", "rms_difference"},
     "first_hit": {"rays_per_second", "max_difference", "mean_difference", "times"},
     "bricks": {"samples_per_second", "tree_bytes", "brick_size", "border"},
+    "opengl": {"host_ms", "same"},
     "frame": {"cache_share", "cache_ms", "stages", "frames", "bricks", "max_difference"},
     "shaders": {"times", "beside", "samples_per_second", "op_ms", "max_difference"},
     "lens": {"aperture", "bricks", "moved_bytes", "brick_bytes", "samples"},
@@ -66,6 +68,25 @@ def test_a_workload_gives_finite_figures_as_json(name, compiled):
         assert row.get("same", True) is True
     assert len({(row["case"], row["who"]) for row in rows}) == len(rows)
     assert len(tables.markdown(content).splitlines()) >= 2 + len(rows)
+
+
+def test_what_cant_run_here_is_left_out_of_all(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "moderngl", None)
+    with pytest.raises(bench.Unavailable, match="opengl needs moderngl"):
+        bench.run("opengl", CPU)
+    asked = []
+
+    def one(self, name):
+        asked.append(name)
+        if name == "opengl":
+            raise bench.Unavailable("no OpenGL")
+
+    monkeypatch.setattr(Bench, "_one", one)
+    Bench(name="all").run()
+    assert asked == [*bench.WORKLOADS]
+    assert capsys.readouterr().err == "opengl is left out: no OpenGL\n"
+    with pytest.raises(bench.Unavailable):
+        Bench(name="opengl").run()
 
 
 def test_twins_and_streamed_shaders_draw_the_same(compiled):

@@ -12,31 +12,42 @@ import pytest
 from conftest import ROOT
 
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-TRIANGLES = ROOT / "examples" / "mixed_triangles.py"
 
 
 @functools.cache
 def no_vtk() -> str:
     """Why VTK can't draw here, or nothing. Without OpenGL it ends its process, so another tries."""
-    if not importlib.util.find_spec("vtk"):
-        return "VTK is not installed"
     code = "import vtk; w = vtk.vtkRenderWindow(); w.SetOffScreenRendering(True); w.Render()"
+    return _why_not("vtk", code)
+
+
+def _no_moderngl() -> str:
+    """Why moderngl can't draw here without a window, or nothing."""
+    code = "import moderngl; moderngl.create_context(standalone=True, backend='egl')"
+    return _why_not("moderngl", code)
+
+
+def _why_not(package: str, code: str) -> str:
+    if not importlib.util.find_spec(package):
+        return f"{package} is not installed"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
-    return "VTK finds no OpenGL" if run.returncode else ""
+    return f"{package} finds no OpenGL" if run.returncode else ""
+
+
+IN_OPENGL = {"mixed_triangles": no_vtk, "opengl_frame": _no_moderngl}
 
 
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize(
     "example",
     [
-        pytest.param(each, id=each.stem, marks=pytest.mark.backend("opengl"))
-        if each == TRIANGLES
-        else pytest.param(each, id=each.stem)
-        for each in EXAMPLES
+        pytest.param(path, id=path.stem, marks=[pytest.mark.backend("opengl")] * opengl)
+        for path in EXAMPLES
+        for opengl in [path.stem in IN_OPENGL]
     ],
 )
 def test_example_writes_a_picture(example, tmp_path):
-    if example == TRIANGLES and (reason := no_vtk()):
+    if example.stem in IN_OPENGL and (reason := IN_OPENGL[example.stem]()):
         pytest.skip(reason)
     out = tmp_path / "picture.png"
     command = [sys.executable, str(example), "--size", "48", "--output", str(out)]
@@ -46,15 +57,22 @@ def test_example_writes_a_picture(example, tmp_path):
     assert 20 <= len(example.read_text().splitlines()) <= 120
 
 
-def test_without_vtk_the_example_tells_what_to_install(tmp_path):
-    (tmp_path / "vtk.py").write_text("raise ImportError('no VTK')")  # shadows what there is
-    command = [sys.executable, str(TRIANGLES)]
+@pytest.mark.parametrize(
+    ("example", "package", "message"),
+    [
+        ("mixed_triangles", "vtk", "needs VTK: pip install 'gvtorch[triangles]'"),
+        ("opengl_frame", "moderngl", "needs moderngl: pip install moderngl"),
+    ],
+)
+def test_an_example_tells_what_to_install(tmp_path, example, package, message):
+    (tmp_path / f"{package}.py").write_text("raise ImportError('none')")  # shadows what there is
+    command = [sys.executable, str(ROOT / "examples" / f"{example}.py")]
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", str(ROOT))])
     run = subprocess.run(
         command, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": path}
     )
     assert run.returncode == 1 and len(run.stderr.splitlines()) == 1
-    assert "needs VTK: pip install 'gvtorch[triangles]'" in run.stderr
+    assert message in run.stderr
 
 
 def test_a_producer_of_ones_own_takes_at_most_40_lines():

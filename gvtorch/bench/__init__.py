@@ -18,6 +18,7 @@ WORKLOADS = {
     "bricks": "marching with brick sizes 4 to 32 and borders 0 to 2, and their memory",
     "shaders": "each shader beside the plain transfer function, resident and in the engine",
     "lens": "the engine through lenses: more blur, coarser levels, fewer bricks",
+    "opengl": "pictures out of OpenGL and into it, in shared buffers and through the host",
     "frame": "the engine: a steady frame and the cache's share of it, a cold start",
     "lru": "1 M slots ordered by use, beside torch.sort",
     "compact": "wishes listed out of 8 M nodes, beside torch.nonzero",
@@ -37,10 +38,14 @@ PEERS = {
 }
 _HOME = {
     **{"march": "march", "first_hit": "march", "bricks": "march", "frame": "frames"},
-    **{"shaders": "shaders", "lens": "lens"},
+    **{"shaders": "shaders", "lens": "lens", "opengl": "exchange"},
     **{"stream": "frames", "lru": "cache", "compact": "cache", "produce": "produce"},
     **{"convert": "storage", "blocks": "storage"},
 }
+
+
+class Unavailable(ValueError):
+    """A workload needs what is not here."""
 
 
 def run(name: str, settings: Settings) -> Record:
@@ -48,6 +53,7 @@ def run(name: str, settings: Settings) -> Record:
 
     Raises:
         ValueError: There is no such workload or peer, or no case has `only` in its name.
+        Unavailable: The workload can't run here.
     """
     for what, wanted, known in (
         ("workload", (name,), WORKLOADS),

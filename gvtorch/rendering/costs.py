@@ -11,11 +11,12 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from ..frame import Rays, RenderStats
+from ..frame import Hits, Rays, RenderStats
 from ..ops.trace import choose_backend
 from ..pool import N3Tree
 from ..stage import Progress, no_progress
 from ..volume import movable
+from .around import around
 from .camera import Camera
 from .custom import as_camera
 from .module_shader import Batch, TransferModule, march
@@ -103,30 +104,35 @@ def cost(
         camera: See `render`.
         shader: The transfer function.
         progress: Told how many rays are done.
-        **options: Fields of `RenderOptions`; whole rays are counted, so there is no clip, lens,
-            layer or lighting.
+        **options: Fields of `RenderOptions`; lighting has no part in it, for transfer functions
+            have no normals.
 
     Raises:
         ValueError: See `render`.
     """
     camera = as_camera("cost", camera)
     chosen = render_options("cost", camera, options)
-    for name in ("clip", "lens", "layer", "lighting"):
-        if getattr(chosen, name) is not None:
-            raise ValueError(f"cost: it counts whole rays, so there must be no {name}")
     check_type("cost", "tree", tree, N3Tree)
     if not isinstance(shader, TransferFunction):
         raise ValueError(f"cost: shader must be a TransferFunction, got {type(shader).__name__}")
     start = time.perf_counter()
     placed = camera.placed(tree.box)
     counter = _Counter(tree, shader, chosen)
+    trace = around(counter, chosen, tree.box)
     numbers, width = placed.numbers(tree.device), placed.width
+    layer = None if chosen.layer is None else chosen.layer.pixels(tree.device)
     rows = len(placed) * placed.height
     block = max(1, _RAYS_A_BLOCK // width)
     parts = []
     for top in range(0, rows, block):
         end = min(top + block, rows)
-        parts.append(counter(placed.pixel_rays(numbers, (top, end))))
+        rays = placed.pixel_rays(numbers, (top, end))
+        counter.nodes = torch.zeros(len(rays.origin), dtype=torch.int32, device=tree.device)
+        if layer is None:
+            hits = trace(rays)
+        else:
+            hits = layer[top * width : end * width].trace(trace, rays, chosen.stop_alpha)
+        parts.append((hits.samples, counter.nodes, *_means(hits)))
         progress("rays", end, rows)
     shape = (len(placed), placed.height, width, 1)
     names = ("samples", "nodes", "lod", "age", "fill")
@@ -148,32 +154,46 @@ def cost(
     return Cost(**images, stats=stats)
 
 
-class _Counter:
-    """Counts along rays of one tree."""
+def _means(hits: Hits) -> tuple[Tensor, ...]:
+    """(r,) lod, age and fill, out of a counter's sums."""
+    assert hits.features is not None
+    seen, lod, bricks, age, fill = hits.features.unbind(1)
+    return tuple(
+        torch.where(weight > 0, total / weight, torch.nan)
+        for total, weight in ((lod, seen), (age, bricks), (fill, bricks))
+    )
+
+
+class _Counter(Tracer):
+    """Counts along rays of one tree: sums as features, and in `nodes` what it visited since that
+    was set to 0.
+    """
 
     def __init__(self, tree: N3Tree, shader: TransferFunction, options: RenderOptions) -> None:
-        tracer = Tracer(tree, shader, options)
-        marks = ("request_tn", "stamp_t", "stamp_b")
-        self.tree = tree
-        self.arguments = {
-            name: value.clone() if name in marks else value
-            for name, value in tracer.arguments.items()
-        }
+        super().__init__(tree, shader, options)
+        for name in ("request_tn", "stamp_t", "stamp_b"):
+            self.arguments[name] = self.arguments[name].clone()
         self.channel = options.channel or tree.channel_names[0]
         self.component = options.component
         self.module = TransferModule(shader, min(tree.spacing)).to(tree.device)
         self.fill_b = torch.full_like(tree.bricks.born_b, -1, dtype=torch.float32)
+        self.nodes: Tensor
 
-    def __call__(self, rays: Rays) -> tuple[Tensor, ...]:
-        """(r,) samples, nodes, lod, age and fill: the columns of `Cost`."""
+    def __call__(self, rays: Rays) -> Hits:
+        """Sums of what each sample adds to alpha: alone, times the depth of its node, if it has a
+        brick, times its age, times its fill.
+        """
         own = (self.tree, self.arguments, self.channel, self.shade, 5)
         sums = march(rays, *own, limit=1, by_node=False)
-        seen, lod, bricks, age, fill = sums.total.unbind(1)
-        means = [
-            torch.where(weight > 0, total / weight, torch.nan)
-            for total, weight in ((lod, seen), (age, bricks), (fill, bricks))
-        ]
-        return (sums.count[:, 0], sums.count[:, 1], *means)
+        self.nodes += sums.count[:, 1]
+        return Hits(
+            color=sums.total.new_zeros((len(sums.total), 3)),
+            alpha=(1 - sums.clear)[:, None],
+            depth=sums.depth[:, None],
+            samples=sums.count[:, 0].contiguous(),
+            missed=sums.missed,
+            features=sums.total,
+        )
 
     def shade(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """One, depth of the node, whether it has a brick, its age, its fill; and alpha."""

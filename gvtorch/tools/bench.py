@@ -39,7 +39,7 @@ class Bench:
 
     def run(self) -> None:
         """Runs and prints."""
-        from ..bench import WORKLOADS
+        from ..bench import WORKLOADS, Unavailable
 
         if self.name is None:
             for name, what in WORKLOADS.items():
@@ -50,7 +50,12 @@ class Bench:
             known = ", ".join((*WORKLOADS, "all"))
             raise ValueError(f"bench: unknown workload {self.name!r}; known: {known}")
         for name in names:
-            self._one(name)
+            try:
+                self._one(name)
+            except Unavailable as why:
+                if self.name != "all":
+                    raise
+                print(f"{name} is left out: {why}", file=sys.stderr)
 
     def _one(self, name: str) -> None:
         import torch
