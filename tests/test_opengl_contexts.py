@@ -158,36 +158,21 @@ def test_threads_have_exchanges_of_their_own(device):
     assert sorted(done) == [0, 100]
 
 
-class Legacy:
-    """What only a compatibility profile has."""
-
-    def __init__(self) -> None:
-        library = ctypes.CDLL("libGL.so.1")
-        for name, kind in (("AlphaFunc", ctypes.c_uint), ("PixelTransferf", ctypes.c_uint)):
-            function = getattr(library, f"gl{name}")
-            function.argtypes, function.restype = [kind, ctypes.c_float], None
-            setattr(self, name, function)
-        library.glPolygonStipple.argtypes = [ctypes.c_char_p]
-        self.PolygonStipple = library.glPolygonStipple
-
-    def set_odd(self, functions: gl.Functions) -> None:
-        """Every fragment fails and every pixel becomes another."""
-        for switch in gl._LEGACY_SWITCHES:
-            functions.Enable(switch)
-        self.AlphaFunc(0x0200, 0)  # never
-        self.PolygonStipple(bytes(128))
-        for number, value in gl._TRANSFER.items():
-            if number != 0x0D10:
-                self.PixelTransferf(number, 0.5 * value + 0.25)
-        functions.PolygonMode(gl.FRONT, 0x1B01)  # lines
-        functions.PolygonMode(gl.BACK, 0x1B00)  # points
+def set_odd(functions: gl.Functions) -> None:
+    """Has every fragment fail and every pixel become another, as only old OpenGL can."""
+    functions._take(gl._system("test"), {"AlphaFunc": "-uf", "PolygonStipple": "-p"})
+    for switch in gl._LEGACY_SWITCHES:
+        functions.Enable(switch)
+    functions.AlphaFunc(0x0200, 0)  # never
+    functions.PolygonStipple(bytes(128))
+    for number, value in gl._TRANSFER.items():
+        if number != 0x0D10:
+            functions.PixelTransferf(number, 0.5 * value + 0.25)
+    functions.PolygonMode(gl.FRONT, 0x1B01)  # lines
+    functions.PolygonMode(gl.BACK, 0x1B00)  # points
 
 
 def test_old_state_of_a_compatibility_profile_changes_nothing_and_stays(device):
-    try:
-        legacy = Legacy()
-    except OSError as error:
-        pytest.skip(f"no functions of compatibility profiles: {error}")
     use(make_context(COMPATIBILITY))
     functions = gl.Functions("test")
     assert functions._legacy
@@ -204,7 +189,7 @@ def test_old_state_of_a_compatibility_profile_changes_nothing_and_stays(device):
         return found
 
     with gv.opengl.Exchange(WIDTH, HEIGHT, device) as exchange:
-        legacy.set_odd(functions)
+        set_odd(functions)
         before = state()
         assert before[:4] == [0x1B01, 0x1B00, 1, 1] and 0.75 in before
         assert_passes(exchange)
