@@ -41,8 +41,7 @@ SHADERS = {
 }
 
 
-@pytest.fixture(scope="module")
-def channels(blobs) -> dict[str, gv.Volume]:
+def channels_of(blobs: gv.Volume) -> dict[str, gv.Volume]:
     """The blobs with a colour and a normal in each voxel, both of 8 bits."""
     value = blobs.data[..., 0]
     z, y, x = torch.meshgrid(*(torch.linspace(0, 1, n) for n in value.shape), indexing="ij")
@@ -61,6 +60,11 @@ def channels(blobs) -> dict[str, gv.Volume]:
         "six": six,
         "normal": gv.Volume((normal * 255).round().to(torch.uint8), *place),
     }
+
+
+@pytest.fixture(scope="module")
+def channels(blobs) -> dict[str, gv.Volume]:
+    return channels_of(blobs)
 
 
 @pytest.fixture(scope="module")
