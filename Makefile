@@ -38,12 +38,12 @@ lint: $(VENV)/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/clang-format --dry-run --Werror $(wildcard gvtorch/cpp_ext/csrc/* tests/cpp/* examples/*.h)
+	$(BIN)/clang-format --dry-run --Werror $(wildcard gvtorch/cpp_ext/csrc/* gvtorch/bench/*.h tests/cpp/* examples/*.h)
 
 format: $(VENV)/ready
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
-	$(BIN)/clang-format -i $(wildcard gvtorch/cpp_ext/csrc/* tests/cpp/* examples/*.h)
+	$(BIN)/clang-format -i $(wildcard gvtorch/cpp_ext/csrc/* gvtorch/bench/*.h tests/cpp/* examples/*.h)
 
 bench: $(VENV)/bench
 	for device in cpu $(if $(NATIVE),cuda); do $(BIN)/gvtorch bench all --device $$device -o docs/performance $(ARGS) || exit; done

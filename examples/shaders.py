@@ -1,5 +1,7 @@
-"""One scan, fused shaders. From left to right, above: plain, lit, isosurface, maximum; below: a
-thin shell by the plain function at step 1, the same pre-integrated, plain at step 0.02; the mean.
+"""One scan, fused shaders. From left to right, first row: plain, lit, isosurface, maximum; second:
+a thin shell by the plain function at step 1, the same pre-integrated, plain at step 0.02; the mean;
+third: stored colours lit by stored normals, a distance field, the minimum within a slab, features:
+the stored normals as colours.
 """
 
 from dataclasses import dataclass, replace
@@ -28,34 +30,54 @@ class Settings:
     device: str = "cpu"
 
 
+def channels(scan: gv.Volume, transfer: gv.TransferFunction) -> dict[str, gv.Volume]:
+    """The scan; its voxels' colours and normals; the distance to a ring in voxels."""
+    value = scan.data[..., 0].float()
+    normal = torch.nn.functional.normalize(-torch.stack(torch.gradient(value)[::-1], -1), dim=-1)
+    z, y, x = torch.meshgrid(*(torch.arange(float(n)) for n in value.shape), indexing="ij")
+    ring = torch.hypot(torch.hypot(x - 63.5, z - 127.5) - 42, y - 63.5) - 14
+    parts = {
+        "rgba": torch.from_numpy(transfer(value.numpy())).half(),
+        "normal": (127 * normal).round().to(torch.int8),
+        "ring": ring[..., None].half(),
+    }
+    return {"value": scan} | {n: gv.Volume(d, scan.spacing, scan.origin) for n, d in parts.items()}
+
+
 def main(settings: Settings) -> None:
     """Renders the grid."""
-    volume = gv.read_volume(DATA / "stent_256x128x128_int16.npz")
-    tree = gv.N3Tree.from_volume(volume, device=settings.device)
+    scan = gv.read_volume(DATA / "stent_256x128x128_int16.npz")
     transfer = gv.TransferFunction.from_json(DATA / "stent.json")
-    white = gv.TransferFunction.preset("gray", 100, 1000)
+    tree = gv.N3Tree.from_volume(channels(scan, transfer), device=settings.device)
+    white, soft = (gv.TransferFunction.preset("gray", *ends) for ends in ((100, 1000), (40, 300)))
     sun = gv.DirectionalLight((0.6, 1.0, -0.7))
     camera = gv.Camera.look_at(EYE, TARGET, UP, fov=28, width=settings.size, height=settings.size)
-    rows = (
-        (
-            (transfer, 0.5),
-            (gv.Lit(transfer, light=sun, ambient=0.3), 0.5),
-            (gv.Isosurface(BONE, (0.9, 0.8, 0.65), light=sun), 0.5),
-            (gv.Projection("maximum", white), 0.5),
-        ),
-        (
-            (SHELL, 1.0),
-            (gv.PreIntegrated(SHELL), 1.0),
-            (SHELL, 0.02),
-            (gv.Projection("mean", gv.TransferFunction.preset("gray", 40, 300)), 0.5),
-        ),
+    ring = gv.DistanceField((0.3, 0.6, 0.9), light=sun)
+    ring.channel = "ring"
+    slab = gv.Clip(planes=[(0.6, 0.8, 0, -86), (-0.6, -0.8, 0, 96)])
+    looks = (
+        (transfer, {}),
+        (gv.Lit(transfer, light=sun, ambient=0.3), {}),
+        (gv.Isosurface(BONE, (0.9, 0.8, 0.65), light=sun), {}),
+        (gv.Projection("maximum", white), {}),
+        (SHELL, {"step": 1.0}),
+        (gv.PreIntegrated(SHELL), {"step": 1.0}),
+        (SHELL, {"step": 0.02}),
+        (gv.Projection("mean", soft), {}),
+        (gv.StoredColor("rgba", normals="normal", light=sun, ambient=0.3), {}),
+        (ring, {}),
+        (gv.Projection("minimum", soft), {"clip": slab}),
+        (gv.Features(transfer, "normal"), {}),
     )
     images = []
-    for row in rows:
-        pictures = [gv.render(tree, camera, s, step=step, lod="finest") for s, step in row]
-        images.append(torch.cat([picture.color for picture in pictures], dim=1))
-    replace(pictures[-1], color=torch.cat(images)).save(settings.output)
-    print(f"{settings.output}: {sum(map(len, rows))} pictures")
+    for shader, options in looks:
+        picture = gv.render(tree, camera, shader, lod="finest", **options)
+        images.append(picture.color)
+    assert picture.features is not None
+    images[-1] = 0.5 * (picture.features / 127 + picture.alpha)  # -127 to 127 as 0 to 1
+    rows = [torch.cat(images[first : first + 4], dim=1) for first in range(0, len(images), 4)]
+    replace(picture, color=torch.cat(rows)).save(settings.output)
+    print(f"{settings.output}: {len(images)} pictures")
 
 
 if __name__ == "__main__":

@@ -66,6 +66,43 @@ def test_a_module_equals_the_fused_one_on_scans(aneurism, stent, compiled):
 
 
 @torch.no_grad()
+@pytest.mark.parametrize("lod", ["auto", "finest"])
+@pytest.mark.parametrize("lit", [False, True])
+def test_stored_colours_and_normals_as_module_equal_the_fused_ones(blobs, compiled, lod, lit):
+    """The formulas of `StoredColor`, with Blinn's and Phong's light, in torch."""
+    generator, device = torch.Generator().manual_seed(4), DEVICES[compiled]
+    place = blobs.spacing, blobs.origin
+    shape = blobs.data.shape[:3]
+    rgba = torch.cat((torch.rand(*shape, 3, generator=generator), 0.4 * blobs.data), -1)
+    normal = torch.rand(*shape, 3, generator=generator) - 0.5
+    volumes = {"rgba": gv.Volume(rgba, *place), "normal": gv.Volume(normal, *place)}
+    tree = gv.N3Tree.from_volume(volumes, 4, device=device)
+    to_sun = torch.nn.functional.normalize(torch.tensor([2.0, -1, 2]), dim=0).to(device)
+    look = {"ambient": 0.2, "diffuse": 0.6, "specular": 0.3, "shininess": 9.0}
+
+    def shade(values, positions, directions, lengths):
+        color, opacity, n = values[:, :3], values[:, 3:4], values[:, 4:]
+        alpha = 1 - (1 - opacity) ** (lengths / min(tree.spacing))
+        if not lit:
+            return color, alpha
+        unit, sun = torch.nn.functional.normalize, to_sun.to(values)
+        n = unit(n, dim=1) * -(n * directions).sum(1, keepdim=True).sign()
+        half = unit(sun - directions, dim=1)
+        facing = (n * sun).sum(1, keepdim=True).clamp(min=0)
+        highlight = (n * half).sum(1, keepdim=True).clamp(min=0) ** look["shininess"]
+        highlight = highlight * (facing > 0)
+        shaded = color * (look["ambient"] + look["diffuse"] * facing) + look["specular"] * highlight
+        return shaded, alpha
+
+    light = {"normals": "normal", "light": gv.DirectionalLight((-2, 1, -2)), **look} if lit else {}
+    camera = gv.Camera.orbit(30, 20, 1.3, width=24, height=24)
+    fused = gv.render(tree, camera, gv.StoredColor("rgba", **light), lod=lod)
+    module = gv.ModuleShader(shade, ["rgba", "normal"])
+    options = {"lod": lod, "component": 3}
+    assert_same_picture(gv.render(tree, camera, module, **options), fused)
+
+
+@torch.no_grad()
 def test_a_module_streams_what_the_fused_shader_streams(blobs, compiled):
     """The same bricks are asked for, and the converged pictures are the same."""
     camera = gv.Camera.orbit(30, 20, 1.3, width=24, height=24)

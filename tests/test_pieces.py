@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 import torch
 from conftest import DEVICES
+from marcher import trilinear
+from test_clip import CLIPS, shown
+from test_shaders import SHADERS, channels_of
 from test_trace_rays import SHADER, assert_equal, camera_rays, forget, run
 
 import gvtorch as gv
@@ -127,3 +130,101 @@ def test_a_wrong_share_is_one_clear_error(blobs, clear):
     rays = dataclasses.replace(camera_rays(tree)[:3], clear=clear)
     with pytest.raises(ValueError, match=r"clear_r must be \(3,\) float64"):
         Tracer(tree, SHADER, gv.RenderOptions())(rays)
+
+
+# --- what a clip leaves, by every shader
+
+
+@pytest.fixture(scope="module")
+def channels(blobs) -> dict[str, gv.Volume]:
+    return channels_of(blobs)
+
+
+@pytest.mark.parametrize("name", SHADERS)
+def test_every_shader_is_cut_by_planes_and_boxes(channels, compiled, name):
+    """A plane ends rays where the plane's own formula does, and several pieces are the twin's."""
+    tree, shader = gv.N3Tree.from_volume(channels, 4), SHADERS[name]
+    rays = camera_rays(tree, 16, distance=1.3)
+    plane = (0.6, 0.0, -0.8, 8.0)
+    normal = torch.tensor(plane[:3], dtype=torch.float64)
+    height, rate = rays.origin @ normal + plane[3], rays.direction @ normal
+    inward = rate > 0
+    first = torch.where(inward, torch.maximum(rays.range[:, 0], -height / rate), rays.range[:, 0])
+    last = torch.where(inward, rays.range[:, 1], torch.minimum(rays.range[:, 1], -height / rate))
+    ends = torch.stack((first, torch.maximum(first, last)), 1)
+    cut, _ = run(tree, compiled, dataclasses.replace(rays, range=ends), shader)
+    clipped, _ = run(tree, compiled, rays, shader, clip=gv.Clip(planes=[plane]))
+    whole, _ = run(tree, compiled, rays, shader)
+    for field in ("color", "alpha", "depth", "features"):
+        torch.testing.assert_close(clipped[field], cut[field], rtol=1e-4, atol=1e-4)
+    assert (whole["color"] - clipped["color"]).abs().max() > 0.05
+    caps = not isinstance(shader, gv.Projection)
+    clip = dataclasses.replace(CLIPS["all"], caps=caps)
+    pieces, _ = assert_equal(tree, compiled, rays, shader, clip=clip)
+    assert (whole["color"] - pieces["color"]).abs().max() > 0.05
+
+
+@pytest.mark.parametrize("which", ["maximum", "minimum", "mean"])
+def test_a_projection_is_that_of_all_that_is_kept(blobs, compiled, which):
+    """Against places along each ray, a hundredth of a voxel apart; caps are refused."""
+    density = 1 - blobs.data if which == "minimum" else blobs.data
+    tree = gv.N3Tree.from_volume(gv.Volume(density, blobs.spacing, blobs.origin), 4)
+    ramp = gv.TransferFunction.from_points([(0, 0)], [(0, 0, 0, 0), (1, 1, 0.5, 0.2)])
+    shader, rays = gv.Projection(which, ramp), camera_rays(tree, 14, distance=1.2)
+    options = {"lod": "finest", "step": 0.1}
+    clear = torch.full((len(rays.origin),), 0.25, dtype=torch.float64)
+    part = dataclasses.replace(rays, clear=clear)
+    data, spacing = density[..., 0].double().numpy(), np.array(blobs.spacing)
+    t = 20 + 0.01 * (np.arange(12000) + 0.5)
+    low, high = tree.box.numpy()
+    pick = {"maximum": np.max, "minimum": np.min, "mean": np.mean}[which]
+    for name in ("cut", "union", "all"):
+        found, _ = run(tree, compiled, rays, shader, clip=CLIPS[name], **options)
+        dimmed, _ = run(tree, compiled, part, shader, clip=CLIPS[name], **options)
+        compared = 0
+        for ray in range(0, len(rays.origin), 5):
+            places = rays.origin[ray].numpy() + t[:, None] * rays.direction[ray].numpy()
+            kept = ((places >= low) & (places <= high)).all(1) & shown(CLIPS[name], places)
+            if not kept.any():
+                assert found["alpha"][ray] == 0 and torch.isinf(found["depth"][ray])
+            if kept.sum() < 100:
+                continue
+            values = trilinear(data, (places[kept] - np.array(blobs.origin)) / spacing)
+            value = pick(values)
+            assert abs(float(found["features"][ray, 0]) - value) < 0.01
+            color = value * np.array([1, 0.5, 0.2])
+            np.testing.assert_allclose(found["color"][ray], color, atol=0.01)
+            np.testing.assert_allclose(dimmed["color"][ray], 0.25 * color, atol=0.01)
+            at = float(found["depth"][ray])
+            if which == "mean":
+                assert abs(at - t[kept][0]) < 0.05
+            else:
+                assert abs(values[np.abs(t[kept] - at).argmin()] - value) < 0.01
+            compared += 1
+        assert compared > 15 and len(found["features"].unique()) > 40
+    with pytest.raises(ValueError, match="Projection sees a ray in one go, so it has no clip with"):
+        run(tree, compiled, rays, shader, clip=dataclasses.replace(CLIPS["cut"], caps=True))
+
+
+@pytest.mark.parametrize("which", ["maximum", "minimum", "mean"])
+def test_a_projection_in_pieces_is_streamed_and_waits_for_nobody(blobs, compiled, which):
+    device, camera = DEVICES[compiled], gv.Camera.orbit(30, 20, 1.2, width=24, height=20)
+    shader, given = gv.Projection(which, SHADER), {"clip": CLIPS["all"]}
+    whole = gv.render(gv.N3Tree.from_volume(blobs, 4, device=device), camera, shader, **given)
+    with gv.Engine(gv.VolumeProducer(blobs), brick_size=4, device=device) as engine:
+        picture = engine.render(camera, shader, **given)
+        engine.frame(camera, shader, **given)
+        if compiled == "cuda":
+            graph = engine.capture(camera, shader, **given)
+            torch.cuda.synchronize()
+            torch.cuda.set_sync_debug_mode("error")
+        try:
+            frame, _ = engine.frame(camera, shader, **given)
+            again = graph.replay(camera)[0] if compiled == "cuda" else frame
+        finally:
+            if compiled == "cuda":
+                torch.cuda.set_sync_debug_mode("default")
+    assert picture.stats.converged and whole.alpha.max() == 1
+    for one in (picture, frame, again):
+        for name in ("color", "alpha", "depth", "features"):
+            assert torch.equal(getattr(one, name), getattr(whole, name)), name

@@ -81,7 +81,6 @@ def test_the_first_frame_is_the_plain_picture_and_all_are_deterministic(blobs, b
 
 
 @pytest.mark.backend("cpp")
-@pytest.mark.backend("cpp")
 @pytest.mark.parametrize(
     "shader", [gv.Lit(HAZE), gv.Isosurface(0.4), gv.Projection("maximum", HAZE)]
 )

@@ -41,8 +41,7 @@ SHADERS = {
 }
 
 
-@pytest.fixture(scope="module")
-def channels(blobs) -> dict[str, gv.Volume]:
+def channels_of(blobs: gv.Volume) -> dict[str, gv.Volume]:
     """The blobs with a colour and a normal in each voxel, both of 8 bits."""
     value = blobs.data[..., 0]
     z, y, x = torch.meshgrid(*(torch.linspace(0, 1, n) for n in value.shape), indexing="ij")
@@ -61,6 +60,11 @@ def channels(blobs) -> dict[str, gv.Volume]:
         "six": six,
         "normal": gv.Volume((normal * 255).round().to(torch.uint8), *place),
     }
+
+
+@pytest.fixture(scope="module")
+def channels(blobs) -> dict[str, gv.Volume]:
+    return channels_of(blobs)
 
 
 @pytest.fixture(scope="module")
@@ -187,6 +191,50 @@ def test_lights_are_tensors_that_may_be_edited(tree):
     assert (moved - before).abs().max() > 0.1
     ambient.fill_(0.5)
     assert (tracer(rays).color - moved).max() > 0.2
+
+
+NUMBERS = {  # before, after
+    "value": (0.5, 0.35),
+    "color": ((0.9, 0.4, 0.2), (0.1, 0.8, 0.3)),
+    "ambient": (0.1, 0.5),
+    "diffuse": (0.7, 0.3),
+    "specular": (0.4, 0.0),
+    "shininess": (20.0, 2.0),
+}
+
+
+@pytest.mark.parametrize("edited", NUMBERS)
+def test_each_parameter_is_a_tensor_that_may_be_edited(tree, compiled, edited):
+    """The next frame is, to the bit, what a new shader with those numbers draws. The colour lies in
+    a frame's table; all else is read as rays are traced.
+    """
+    tree, rays = on(tree, DEVICES[compiled]), camera_rays(tree, 16).to(DEVICES[compiled])
+    numbers = {n: torch.tensor(before, device=tree.device) for n, (before, _) in NUMBERS.items()}
+    shader, options = gv.Isosurface(light=POINT, **numbers), gv.RenderOptions()
+    tracer = Tracer(tree, shader, options)
+    before = tracer(rays).color
+    numbers[edited].copy_(torch.tensor(NUMBERS[edited][1]))
+    after = (Tracer(tree, shader, options) if edited == "color" else tracer)(rays).color
+    plain = {n: pair[n == edited] for n, pair in NUMBERS.items()}
+    new = Tracer(tree, gv.Isosurface(light=POINT, **plain), options)(rays)
+    assert torch.equal(after, new.color) and (after - before).abs().max() > 0.02
+
+
+@pytest.mark.parametrize("which", ["opacity", "color"])
+@pytest.mark.parametrize("kind", [None, gv.Lit, gv.PreIntegrated])
+def test_an_edited_transfer_function_is_the_next_picture_s(tree, compiled, kind, which):
+    """As a new one of those points draws it, without another tree."""
+    points = {"opacity": [(0, 0), (1, 0.4)], "color": [(0, 1, 0, 0), (1, 0.2, 0.6, 1)]}
+    tree, camera = on(tree, DEVICES[compiled]), gv.Camera.orbit(width=16, height=16, distance=1.3)
+    function = gv.TransferFunction.from_points(**points)
+    shader = kind(function) if kind else function
+    before = gv.render(tree, camera, shader).color
+    getattr(function, which)[1, 1:] = 0.05
+    after = gv.render(tree, camera, shader).color
+    points[which][1] = (1, 0.05, 0.05, 0.05) if which == "color" else (1, 0.05)
+    new = gv.TransferFunction.from_points(**points)
+    assert torch.equal(after, gv.render(tree, camera, kind(new) if kind else new).color)
+    assert (after - before).abs().max() > 0.05
 
 
 @pytest.mark.parametrize("name", SHADERS)

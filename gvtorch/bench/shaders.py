@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from ..cpp_ext import compilers
 from ..engine import Engine
 from ..frame import Hits
 from ..pool import N3Tree
 from ..producers import VolumeProducer
 from ..rendering import (
+    CompiledShader,
     DirectionalLight,
     DistanceField,
     Features,
@@ -37,6 +41,7 @@ from .record import Record, Settings, Timing, clock
 from .scenes import Scene, aneurism, fog_dense, worn
 
 _WIDE = 16  # numbers of the widest channel
+_OWN = Path(__file__).with_name("own_shader.h")
 SUN = DirectionalLight((1.0, -2.0, -1.5), angle=4.0)
 
 
@@ -50,6 +55,7 @@ class Look:
     beside: str = "plain"
     twin: bool = False  # both must draw the same picture
     slow: bool = False  # left out of scenes with but one channel
+    compiles: bool = False  # left out where there is no compiler
 
 
 def _projection(which: Literal["maximum", "minimum", "mean"]) -> Callable[[Scene], AnyShader]:
@@ -59,6 +65,10 @@ def _projection(which: Literal["maximum", "minimum", "mean"]) -> Callable[[Scene
 def _module(scene: Scene) -> AnyShader:
     module = TransferModule(scene.shader, min(scene.volume.spacing))
     return ModuleShader(module, hidden_by=scene.shader)
+
+
+def _own(scene: Scene) -> AnyShader:
+    return CompiledShader(_OWN, "Own", transfer=scene.shader)
 
 
 def _cones(name: str, *, occlusion: float = 0.0, indirect: float = 0.0) -> Look:
@@ -95,6 +105,7 @@ LOOKS = (
     Look(name="3 features", shader=lambda s: Features(s.shader, "normal")),
     Look(name=f"{_WIDE} features", shader=lambda s: Features(s.shader, "numbers")),
     Look(name="module", shader=_module, twin=True, slow=True),
+    Look(name="user's header", shader=_own, twin=True, slow=True, compiles=True),
     Look(name="plain, step 1", shader=lambda s: s.shader, options={"step": 1.0}),
     Look(
         name="pre-integrated, step 1",
@@ -129,7 +140,7 @@ def shaders(record: Record) -> None:
     record.note(
         "times: of the look named beside, in the same case. Differences: of the module from the "
         "plain picture, of the engine from the resident tree's. module: TransferModule, hidden by "
-        "its function. op_ms: the compiled op alone"
+        "its function. user's header: the plain function as a CompiledShader. op_ms: the op alone"
     )
 
 
@@ -208,6 +219,9 @@ def _measure(
     medians: dict[str, float] = {}
     pictures: dict[str, Tensor] = {}
     for look in _wanted(record, case):
+        if look.compiles and not _compiles(record.settings.device):
+            record.note(f"{look.name}: left out, there is no compiler for {record.settings.device}")
+            continue
         shader = look.shader(scene)
         needed = set(shader.channels) if isinstance(shader, Shader) else set()
         if not needed <= set(channels) or (look.slow and len(channels) == 1):
@@ -230,6 +244,12 @@ def _measure(
             figures["max_difference"] = difference(pictures[look.name], other)["max_difference"]
         record.add(case, look.name, timing, **figures)
     return pictures
+
+
+def _compiles(device: torch.device) -> bool:
+    """Whether a header can be compiled for a device."""
+    host = shutil.which(compilers.find_cxx()[0])
+    return bool(host and (device.type == "cpu" or compilers.find_nvcc()))
 
 
 def _clock(run: Callable[[], Hits | Picture], settings: Settings) -> tuple[Timing, Hits | Picture]:

@@ -13,7 +13,8 @@ from .lens import ThinLens, ThroughLens
 from .lighting import Lighted
 from .module_shader import ModuleTracer
 from .pieces import Trace
-from .shaders import LitShader, Shader
+from .projected import ProjectedPieces
+from .shaders import LitShader, Projection, Shader
 from .surfaces import Isosurface
 
 if TYPE_CHECKING:
@@ -26,12 +27,15 @@ def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -
     scene's.
 
     Raises:
-        ValueError: The shader sees a ray in one go, and the options cut rays into pieces; or it
-            takes no light, and there is some.
+        ValueError: The shader sees a ray in one go, and the options cut rays into pieces or draw
+            caps; or it takes no light, and there is some.
     """
+    clip = options.clip
+    projects = isinstance(tracer.shader, Projection)  # puts pieces together in its own way
     cuts = {
         "lens": options.lens is not None,
-        "clip with caps or several pieces": options.clip is not None and not options.clip.whole,
+        "clip with caps": clip is not None and clip.caps,
+        "clip of several pieces": clip is not None and not clip.whole and not projects,
         "translucent layer": options.layer is not None and options.layer.alpha is not None,
     }
     if isinstance(tracer.shader, Shader) and tracer.shader.whole and any(cuts.values()):
@@ -46,12 +50,15 @@ def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -
         if options.clip is None:
             return trace
         slab: Trace | None = None
-        if options.clip.caps and not isinstance(sight, ModuleTracer):
-            if isinstance(sight.shader, Isosurface):
+        together: ProjectedPieces | None = None
+        if not isinstance(sight, ModuleTracer):
+            if options.clip.caps and isinstance(sight.shader, Isosurface):
                 slab = SurfaceSlab(sight.shader, lambda shader: sight.seeing(shader, options))
+            if isinstance(sight.shader, Projection):
+                together = ProjectedPieces(sight, sight.shader)
         given = {"step": tracer.arguments["step"], "depth_alpha": options.depth_alpha}
         unlit = options.lighting is not None
-        return Clipped(trace, options.clip, box, slab=slab, unlit=unlit, **given)
+        return Clipped(trace, options.clip, box, slab=slab, unlit=unlit, together=together, **given)
 
     lens = options.lens and options.lens.placed(box)
     if options.lighting is None:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import torch
@@ -109,12 +109,15 @@ class Clipped:
         depth_alpha: float,
         slab: Trace | None = None,
         unlit: bool = False,
+        together: Callable[[Iterable[Rays]], Hits] | None = None,
     ) -> None:
         """Takes what traces the pieces, the (2, 3) box of the scene, the shortest interval in world
         units, which is how deep a cap looks for its colour, where alpha means depth, what
-        traces so far behind a cut, if that is not `trace`, and whether caps get their light later.
+        traces so far behind a cut, if that is not `trace`, whether caps get their light later, and
+        what traces all pieces where one does not simply lie behind the other.
         """
         self._trace, self._clip, self._slab = trace, clip, slab or trace
+        self._together = together or partial(trace_pieces, trace)
         self._step, self._hit_clear = step, 1 - depth_alpha
         self._cap_light = 0.0 if unlit else clip.cap_light
         planes, boxes, self._without = clip.faces(box)
@@ -127,7 +130,7 @@ class Clipped:
         rays = dataclasses.replace(rays, range=rays.range.to(torch.float64))
         pieces = [dataclasses.replace(rays, range=kept) for kept in self.pieces(rays)]
         if not self._clip.caps:
-            return trace_pieces(self._trace, pieces)
+            return self._together(pieces)
         front: Hits | None = None
         for piece in pieces:
             left = piece if front is None else behind(piece, front)
