@@ -34,7 +34,7 @@ from pathlib import Path
 
 import torch
 
-from . import compilers
+from . import compilers, instructions
 
 SOURCES = Path(__file__).parent / "csrc"
 _INCLUDE = re.compile(r'^[ \t]*#[ \t]*include[ \t]*"([^"\n]+)"', re.MULTILINE)
@@ -225,7 +225,8 @@ def _call(archs: Sequence[str]) -> tuple[list[str], list[str]]:
     """The compiler, and its flags but for those that name a path."""
     if not archs:  # what is nowhere defined is an error here, as it will be when it is loaded
         linker = "-Wl,--no-as-needed,-z,defs"
-        return compilers.find_cxx(), [*compilers.CXX_FLAGS, "-pthread", linker]
+        own = compilers.INSTRUCTION_SETS[instructions()]
+        return compilers.find_cxx(), [*compilers.CXX_FLAGS, *own, "-pthread", linker]
     nvcc, own = compilers.find_nvcc() or "nvcc", ("-Xlinker=--no-as-needed", "-x", "cu")
     return [nvcc], [*compilers.NVCC_FLAGS, *compilers.machine_codes(archs), *own]
 

@@ -7,18 +7,12 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-template <class Packet, class... Args>
-void trace_packets(int64_t begin, int64_t end, const Args&... args) {
-  Packet packet(args...);
-  for (int64_t index = begin; index < end; index += kLanes) packet.trace(index, smaller(index + kLanes, end));
-}
-
 void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end) {
   with_voxel(args.voxel, [&](auto voxel) {
     using Voxel = decltype(voxel);
     const TraceRay<float, Voxel> kernel(args);
     const PacketPool pool(args.bricks_bzyxc, args.voxel, args.side, args.channels, args.component);
-    if (kernel.tree.digit_bits == 0 || args.bricks < 2 || !pool.fits()) {
+    if (!packs(args)) {
       KeptPath path;
       for (int64_t index = begin; index < end; ++index) kernel.trace(index, path);
     } else if (pool.far(args.bricks)) {
@@ -31,8 +25,7 @@ void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end) {
 
 // Whether packets take a shader's rays.
 bool shades(const ShadeArgs& args) {
-  const PacketPool pool(args.bricks_bzyxc, args.voxel, args.side, args.channels, args.component);
-  if (digit_bits_of(args.branching, args.max_depth) == 0 || args.bricks < 2 || !pool.fits()) return false;
+  if (!packs(args)) return false;
   const bool point = static_cast<int32_t>(static_cast<const float*>(args.parameter_54)[3]) == Light<float>::kPoint;
   switch (args.shader) {
     case ShaderKind::kLit:
@@ -48,12 +41,6 @@ bool shades(const ShadeArgs& args) {
     default:
       return false;
   }
-}
-
-template <class Packet>
-void shade_packets(const ShadeArgs& args, int64_t begin, int64_t end) {
-  const ShadeRay<float, typename Packet::Shader> kernel(args);
-  trace_packets<Packet>(begin, end, kernel, args);
 }
 
 void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end) {

@@ -1,0 +1,50 @@
+// The packet of a user's shader (user_shader.h): the walk and the values of all lanes at once, then the user's `add`,
+// lane by lane, each with a Sum of its own. Each lane has every bit of its ray's.
+#pragma once
+
+#include <type_traits>
+
+#include "packet_shade_rays.h"
+#include "user_shader.h"
+
+namespace gvtorch {
+inline namespace GV_NAMESPACE {
+
+// Whether `hides` is that of UserShader, which asks the transfer function alone.
+template <class Shader, class = void>
+constexpr bool kHidesByTransfer = false;
+template <class Shader>
+constexpr bool kHidesByTransfer<Shader, std::void_t<decltype(&Shader::hides)>> =
+    std::is_same_v<decltype(&Shader::hides), decltype(&UserShader<float>::hides)>;
+
+template <class Kind>
+struct UserPacket : ShadePacket<UserPacket<Kind>, Kind> {
+  using Base = ShadePacket<UserPacket<Kind>, Kind>;
+  using Sum = typename Kind::Sum;
+  using Base::Base;
+  using Base::sum;
+  static constexpr bool kKeepsPath = kHidesByTransfer<Kind>;  // one of the user's own may ask the ray's Sum
+
+  Sum sum_l[kLanes];
+
+  GV_HD void begin_run(Mask) {}
+  GV_HD void add(Mask seeing, const PacketPiece& piece) {
+    if constexpr (kHidesByTransfer<Kind> && !Kind::kEnds) {
+      seeing = seeing & ~this->table.transparent(piece.value);
+    }
+    for_lanes(seeing, [&](int lane) { this->add_alone(lane, piece); });
+  }
+
+  // The walk looks at what a ray lets through, and tells what it missed.
+  GV_HD Sum& sum_of(int lane) {
+    sum_l[lane].missed = sum.missed[lane] != 0;
+    return sum_l[lane];
+  }
+  GV_HD void put_sum(int lane, const Sum& one) {
+    sum.clear[lane] = one.clear;
+    sum.missed[lane] = one.missed ? -1 : 0;
+  }
+};
+
+}  // namespace GV_NAMESPACE
+}  // namespace gvtorch
