@@ -26,14 +26,12 @@ void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end) {
 // Whether packets take a shader's rays.
 bool shades(const ShadeArgs& args) {
   if (!packs(args)) return false;
-  const bool point = static_cast<int32_t>(static_cast<const float*>(args.parameter_54)[3]) == Light<float>::kPoint;
   switch (args.shader) {
-    case ShaderKind::kLit:
-      return args.normal_tnc == nullptr || !point;
     case ShaderKind::kStoredColor:
-      return args.channels == 4 && (args.normal_tnc == nullptr || !point);
+      return args.channels == 4;
     case ShaderKind::kPreIntegrated:
       return int64_t{args.levels} * args.rows * args.rows * PacketTable::kBytes <= INT32_MAX;
+    case ShaderKind::kLit:
     case ShaderKind::kIsosurface:
     case ShaderKind::kProjection:
     case ShaderKind::kFeatures:

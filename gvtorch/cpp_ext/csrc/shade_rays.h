@@ -10,7 +10,8 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-template <class T, class Shader, bool kShadows = false>
+// kPowers: an N that is a power of two has code of its own.
+template <class T, class Shader, bool kShadows = false, bool kPowers = true>
 struct ShadeRay : Walk<T> {
   using Walk<T>::tree;
   using Walk<T>::options;
@@ -57,7 +58,7 @@ struct ShadeRay : Walk<T> {
     const T stop_clear = 1 - options.stop_alpha;
     int32_t samples = 0;
     int32_t wanted = 0;
-    const bool powers = tree.digit_bits > 0;
+    const bool powers = kPowers && tree.digit_bits > 0;
     while (at.inside() && sum.clear > stop_clear) {
       samples += powers ? visit<BitDigits<T>>(shader, ray, sight, at, wanted, sum)
                         : visit<Digits<T>>(shader, ray, sight, at, wanted, sum);

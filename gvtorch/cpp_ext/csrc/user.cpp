@@ -77,8 +77,11 @@ struct OneShader {
         shade_packets<UserPacket<UserShaderOf<float>>>(args, begin, end);
       });
     }
+    constexpr bool powers = false;  // what is left is mostly of another N
+#else
+    constexpr bool powers = true;
 #endif
-    each(ShadeRay<float, UserShaderOf<float>>(args));
+    each(ShadeRay<float, UserShaderOf<float>, false, powers>(args));
   }
 };
 
