@@ -124,7 +124,7 @@ struct ShadePacket : PacketWalk<Self> {
     return taken;
   }
   // One interval of one lane.
-  __attribute__((noinline)) void add_alone(int lane, const PacketPiece& piece) {
+  __attribute__((noinline)) void add_alone(int lane, const PacketPiece& piece, KnownGradient<float>* known = nullptr) {
     Piece<float> one;
     one.start = piece.start[lane];
     one.end = piece.end[lane];
@@ -137,7 +137,7 @@ struct ShadePacket : PacketWalk<Self> {
     } else {
       one.value = piece.value[lane];
     }
-    with_probe(lane, [&](const Probe<float>& probe, Sum& sum) { shader.add(one, probe, sum); });
+    with_probe(lane, [&](const Probe<float>& probe, Sum& sum) { shader.add(one, probe, sum); }, known);
   }
 
   // Lanes whose nodes all have bricks.
@@ -231,9 +231,10 @@ struct ShadePacket : PacketWalk<Self> {
     self().put_sum(lane, one);
   }
   template <class Body>
-  GV_HD void with_probe(int lane, const Body& body) {
+  GV_HD void with_probe(int lane, const Body& body, KnownGradient<float>* known = nullptr) {
     const Sight<float> sight = sight_of(lane);
-    const Probe<float> probe = probe_of(lane, sight);
+    Probe<float> probe = probe_of(lane, sight);
+    probe.known = known;
     with_sum(lane, [&](Sum& one) { body(probe, one); });
   }
 };

@@ -26,13 +26,24 @@ struct UserPacket : ShadePacket<UserPacket<Kind>, Kind> {
   static constexpr bool kKeepsPath = kHidesByTransfer<Kind>;  // one of the user's own may ask the ray's Sum
 
   Sum sum_l[kLanes];
+  int32_t asked = 0;  // lanes whose shader asked for a gradient at the last interval
 
   GV_HD void begin_run(Mask) {}
   GV_HD void add(Mask seeing, const PacketPiece& piece) {
     if constexpr (kHidesByTransfer<Kind> && !Kind::kEnds) {
       seeing = seeing & ~this->table.transparent(piece.value);
     }
-    for_lanes(seeing, [&](int lane) { this->add_alone(lane, piece); });
+    // All lanes' gradients take about as long as those of two, one by one.
+    const bool ahead = asked >= 2;
+    Vec3<Floats> slope;
+    if (ahead) slope = this->gradient(seeing, piece.middle);
+    asked = 0;
+    for_lanes(seeing, [&](int lane) {
+      KnownGradient<float> known{NAN, {}, false};
+      if (ahead) known = {piece.middle[lane], {slope.x[lane], slope.y[lane], slope.z[lane]}, false};
+      this->add_alone(lane, piece, &known);
+      asked += known.asked ? 1 : 0;
+    });
   }
 
   // The walk looks at what a ray lets through, and tells what it missed.
