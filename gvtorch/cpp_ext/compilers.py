@@ -23,7 +23,7 @@ CXX_FLAGS = (
 # Scalars of a struct packed into vectors make the descent wait for its own stores.
 PACKET_FLAGS = ("-fno-tree-slp-vectorize",)
 AVX2_FLAGS = (*PACKET_FLAGS, "-mavx2", "-mf16c")
-# The kernels of packets are compiled for one of these; cpu.cpp chooses what the processor can.
+# Packets are compiled for each of these, a user's shader for the one that cpu.cpp chooses.
 INSTRUCTION_SETS = {
     "baseline": PACKET_FLAGS,
     "avx2": AVX2_FLAGS,

@@ -2,11 +2,11 @@
 
 What a header holds is told in csrc/user_shader.h, how it becomes an op in csrc/user.cpp. A library
 is known by the digest of all it is made of: the header and what it includes from its folder,
-gvtorch's headers, flags, torch's version, and the compilers (path, size and time of change, and
-the variables that they heed). It is written beside its place and then renamed, so that of two
-processes that compile at once one merely works in vain. Its last bytes are the digest of the
-others: what a crash or a full disk left behind is compiled again, never loaded. A folder that
-others can write to is refused, for a library is code.
+gvtorch's headers, flags (which tell the CPU's instruction set), torch's version, and the compilers
+(path, size and time of change, and the variables that they heed). It is written beside its place
+and then renamed, so that of two processes that compile at once one merely works in vain. Its last
+bytes are the digest of the others: what a crash or a full disk left behind is compiled again, never
+loaded. A folder that others can write to is refused, for a library is code.
 
 Environment:
     GVTORCH_CACHE  where libraries are kept; else gvtorch in XDG_CACHE_HOME or ~/.cache. Nobody

@@ -24,18 +24,19 @@ struct UserPacket : ShadePacket<UserPacket<Kind>, Kind> {
   using Base::Base;
   using Base::sum;
   static constexpr bool kKeepsPath = kHidesByTransfer<Kind>;  // one of the user's own may ask the ray's Sum
+  // Values that are hidden change nothing, unless a Sum of the user's own counts them.
+  static constexpr bool kLeavesOut = kHidesByTransfer<Kind> && std::is_same_v<Sum, ShadeSum<float>> && !Kind::kEnds;
 
+  const PacketTable seen{static_cast<const UserShader<float>&>(this->shader).transfer};
   Sum sum_l[kLanes];
   int32_t asked = 0;  // lanes whose shader asked for a gradient at the last interval
 
   GV_HD void begin_run(Mask) {}
   GV_HD void add(Mask seeing, const PacketPiece& piece) {
-    if constexpr (kHidesByTransfer<Kind> && !Kind::kEnds) {
-      seeing = seeing & ~this->table.transparent(piece.value);
-    }
+    if constexpr (kLeavesOut) seeing = seeing & ~seen.transparent(piece.value);
     // All lanes' gradients take about as long as those of two, one by one.
     const bool ahead = asked >= 2;
-    Vec3<Floats> slope;
+    Vec3<Floats> slope{};
     if (ahead) slope = this->gradient(seeing, piece.middle);
     asked = 0;
     for_lanes(seeing, [&](int lane) {

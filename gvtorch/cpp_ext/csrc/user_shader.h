@@ -16,7 +16,7 @@
 //
 // `add` is all that must be there. All else of a shader (see shaders.h) has a default here, and may be told anew:
 // kEnds, kSeesEmpty, kSurface and `surface`, Sum, hides, done; and kWhole and kFeatures. The struct is copied into the
-// kernel.
+// kernel. Without a Sum and a `hides` of its own, `add` need not be called where the transfer function shows nothing.
 #pragma once
 
 #include "shaders.h"
