@@ -61,7 +61,7 @@ $(VENV)/torch: pyproject.toml .ci/constraints.txt
 	$(PIP) setuptools wheel "$(TORCH)"
 	@touch $@
 
-$(VENV)/ready: $(VENV)/torch $(wildcard gvtorch/cpp_ext/csrc/*) gvtorch/cpp_ext/build.py
+$(VENV)/ready: $(VENV)/torch $(wildcard gvtorch/cpp_ext/csrc/*) gvtorch/cpp_ext/build.py gvtorch/cpp_ext/compilers.py
 	$(PIP) --no-build-isolation -e ".[dev]"
 	@touch $@
 

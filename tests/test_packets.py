@@ -15,7 +15,7 @@ from test_trace_rays import camera_rays, forget, run
 from torch import Tensor
 
 import gvtorch as gv
-from gvtorch.rendering.renderer import trace
+from gvtorch.rendering.renderer import AnyShader, trace
 
 TRANSFER = gv.TransferFunction.from_points(
     [(0.2, 0), (0.5, 0.05), (0.9, 0.6)], [(0.2, 1, 0.3, 0.1), (0.9, 0.2, 0.6, 1)]
@@ -28,6 +28,7 @@ SHADERS = {
     "lit by the sun": gv.Lit(TRANSFER, light=SUN, shininess=7.3),
     "lit by a lamp": gv.Lit(TRANSFER, light=LAMP),
     "lit by stored normals": gv.Lit(TRANSFER, normals="normal", light=SUN),
+    "lit by stored normals and a lamp": gv.Lit(TRANSFER, normals="normal", light=LAMP),
     "pre-integrated": gv.PreIntegrated(TRANSFER),
     "stored colour": gv.StoredColor("rgba"),
     "stored colour, lit": gv.StoredColor("rgba", premultiplied=True, lit=True, light=LAMP),
@@ -45,12 +46,12 @@ _SHADED = """
 import sys, torch
 sys.path.insert(0, {tests!r})
 from test_packets import SHADERS, shaded
-torch.save({{name: shaded(name, "cpp") for name in SHADERS}}, {file!r})
+torch.save({{name: shaded(shader, "cpp") for name, shader in SHADERS.items()}}, {file!r})
 """
 
 
 @cache
-def scene() -> gv.N3Tree:
+def scene(branching: int = 2) -> gv.N3Tree:
     """Rough and smooth matter, between a region of zeros and one of another single value."""
     generator = torch.Generator().manual_seed(4)
     coarse = torch.rand((1, 5, 12, 12, 12), generator=generator)
@@ -67,6 +68,7 @@ def scene() -> gv.N3Tree:
             "normal": gv.Volume((normal * 127).round().to(torch.int8)),
         },
         4,
+        branching=branching,
         threshold=0.0,
     )
 
@@ -78,9 +80,9 @@ def cut(rays: gv.Rays) -> gv.Rays:
     return replace(rays, range=limits, clear=torch.linspace(0.05, 1.0, len(first)).double())
 
 
-def shaded(name: str, backend: str) -> list[Tensor]:
+def shaded(shader: AnyShader, backend: str, branching: int = 2) -> list[Tensor]:
     """All that a shader's traces write."""
-    shader, tree, found = SHADERS[name], scene(), []
+    tree, found = scene(branching), []
     holes = forget(tree, 0.3, 5)
     for which, size, options in (
         (tree, 21, {}),
@@ -98,7 +100,7 @@ def shaded(name: str, backend: str) -> list[Tensor]:
 
 @cache
 def expected(name: str) -> list[Tensor]:
-    return shaded(name, "reference")
+    return shaded(SHADERS[name], "reference")
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ TorchScript archive.
 
 from __future__ import annotations
 
+import ctypes
 import functools
 from pathlib import Path
 
@@ -33,6 +34,17 @@ def load() -> dict[str, str]:
     else:
         reasons["cuda"] = _load("libgvtorch_cuda.so")
     return reasons
+
+
+def instructions() -> str:
+    """Returns the instruction set of this process's kernels on the CPU: the widest that the
+    processor has, or that GVTORCH_CPU allows (baseline, avx2, avx512).
+    """
+    if load()["cpp"]:
+        return "baseline"
+    tell = ctypes.CDLL(str(FOLDER / "libgvtorch_cpu.so")).gvtorch_instructions
+    tell.restype = ctypes.c_char_p
+    return str(tell().decode())
 
 
 def _load(name: str) -> str:

@@ -29,16 +29,6 @@ from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
 
 ARCHS = "75;80;86;89;90;100;120"
-# The CPU's kernels are compiled once for each; the processor chooses when the library is loaded.
-INSTRUCTION_SETS = {
-    "baseline": [],
-    "avx2": ["-mavx2", "-mf16c"],
-    "avx512": [
-        *("-mavx2", "-mf16c", "-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl"),
-        # GCC's own header warns of what is not initialised.
-        *("-mprefer-vector-width=512", "-Wno-maybe-uninitialized", "-Wno-uninitialized"),
-    ],
-}
 FOLDER = Path("gvtorch") / "cpp_ext"
 compilers = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("compilers.py"))))
 
@@ -65,11 +55,9 @@ def commands(output: Path) -> dict[Path, list[list[str]]]:
     cxx = [*compilers.find_cxx(), *compilers.CXX_FLAGS, "-Wall", "-Wextra"]
     x86 = platform.machine().lower() in ("x86_64", "amd64")
     parts = {"cpu": (["-DGV_X86"] if x86 else []) + include}
-    for name, flags in INSTRUCTION_SETS.items():
+    for name, flags in compilers.INSTRUCTION_SETS.items():
         if x86 or name == "baseline":
-            # Scalars of a struct packed into vectors make the descent wait for its own stores.
-            own = [f"-DGV_NAMESPACE={name}", "-fno-tree-slp-vectorize"]
-            parts[f"packet_{name}"] = [*own, *flags]
+            parts[f"packet_{name}"] = [f"-DGV_NAMESPACE={name}", *flags]
     objects = [str(output / f"{name}.o") for name in parts]
     calls = {
         output / "libgvtorch_cpu.so": [

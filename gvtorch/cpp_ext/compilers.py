@@ -20,6 +20,19 @@ CXX_FLAGS = (
     *(*SHARED, "-fPIC", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden"),
     "-Wno-psabi",
 )
+# Scalars of a struct packed into vectors make the descent wait for its own stores.
+PACKET_FLAGS = ("-fno-tree-slp-vectorize",)
+AVX2_FLAGS = (*PACKET_FLAGS, "-mavx2", "-mf16c")
+# Packets are compiled for each of these, a user's shader for the one that cpu.cpp chooses.
+INSTRUCTION_SETS = {
+    "baseline": PACKET_FLAGS,
+    "avx2": AVX2_FLAGS,
+    "avx512": (
+        *(*AVX2_FLAGS, "-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl"),
+        # GCC's own header warns of what is not initialised.
+        *("-mprefer-vector-width=512", "-Wno-maybe-uninitialized", "-Wno-uninitialized"),
+    ),
+}
 NVCC_FLAGS = (
     *(*SHARED, "-DUSE_CUDA", "-fmad=false", "-cudart=static"),
     "-Xcompiler=-fPIC,-fvisibility=hidden",

@@ -2,11 +2,11 @@
 
 What a header holds is told in csrc/user_shader.h, how it becomes an op in csrc/user.cpp. A library
 is known by the digest of all it is made of: the header and what it includes from its folder,
-gvtorch's headers, flags, torch's version, and the compilers (path, size and time of change, and
-the variables that they heed). It is written beside its place and then renamed, so that of two
-processes that compile at once one merely works in vain. Its last bytes are the digest of the
-others: what a crash or a full disk left behind is compiled again, never loaded. A folder that
-others can write to is refused, for a library is code.
+gvtorch's headers, flags (which tell the CPU's instruction set), torch's version, and the compilers
+(path, size and time of change, and the variables that they heed). It is written beside its place
+and then renamed, so that of two processes that compile at once one merely works in vain. Its last
+bytes are the digest of the others: what a crash or a full disk left behind is compiled again, never
+loaded. A folder that others can write to is refused, for a library is code.
 
 Environment:
     GVTORCH_CACHE  where libraries are kept; else gvtorch in XDG_CACHE_HOME or ~/.cache. Nobody
@@ -34,7 +34,7 @@ from pathlib import Path
 
 import torch
 
-from . import compilers
+from . import compilers, instructions
 
 SOURCES = Path(__file__).parent / "csrc"
 _INCLUDE = re.compile(r'^[ \t]*#[ \t]*include[ \t]*"([^"\n]+)"', re.MULTILINE)
@@ -225,7 +225,8 @@ def _call(archs: Sequence[str]) -> tuple[list[str], list[str]]:
     """The compiler, and its flags but for those that name a path."""
     if not archs:  # what is nowhere defined is an error here, as it will be when it is loaded
         linker = "-Wl,--no-as-needed,-z,defs"
-        return compilers.find_cxx(), [*compilers.CXX_FLAGS, "-pthread", linker]
+        own = compilers.INSTRUCTION_SETS[instructions()]
+        return compilers.find_cxx(), [*compilers.CXX_FLAGS, *own, "-pthread", linker]
     nvcc, own = compilers.find_nvcc() or "nvcc", ("-Xlinker=--no-as-needed", "-x", "cu")
     return [nvcc], [*compilers.NVCC_FLAGS, *compilers.machine_codes(archs), *own]
 

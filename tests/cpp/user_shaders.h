@@ -86,6 +86,43 @@ struct FirstEnd : gv::UserShader<T> {
   }
 };
 
+// Where the value rises through one level after the other: all that a struct may tell anew, and hidden by what the ray
+// has found and by what it still lets through.
+template <class T>
+struct Contours : gv::UserShader<T> {
+  using gv::UserShader<T>::UserShader;
+  GV_UNIFORMS(level, gap, least);
+  static constexpr bool kEnds = true, kSeesEmpty = true, kSurface = true, kWhole = true;
+  static constexpr int32_t kFeatures = 2;
+  struct Sum : gv::ShadeSum<T> {
+    int32_t found = 0;
+    T ends[2] = {0, 0};  // of the last interval that was met
+  };
+
+  GV_HD T wanted(const Sum& sum) const { return this->uniform(level) + this->uniform(gap) * static_cast<T>(sum.found); }
+  GV_HD bool hides(T, T high, const Sum& sum) const {
+    return gv::a_little_above(high) < wanted(sum) || sum.clear < this->uniform(least);
+  }
+  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>& probe, Sum& sum) const {
+    sum.ends[0] = piece.start;
+    sum.ends[1] = piece.end;
+    if (piece.back < wanted(sum) || sum.clear < this->uniform(least)) return;
+    ++sum.found;
+    sum.red = sum.red + sum.clear * probe.value(piece.middle);
+    sum.blue = sum.blue + sum.clear * piece.front;
+    sum.clear = sum.clear * static_cast<T>(0.75);
+    if (!(sum.depth < INFINITY)) sum.depth = piece.end;
+  }
+  GV_HD void surface(const gv::Probe<T>& probe, Sum& sum) const {
+    sum.green = probe.value(sum.depth);
+    sum.normal = this->light.normal(probe, sum.depth);
+  }
+  GV_HD void done(Sum& sum) const {
+    sum.feature_c[0] = static_cast<T>(sum.found);
+    sum.feature_c[1] = sum.ends[0] + sum.ends[1];
+  }
+};
+
 // Coloured by its place, darker with the distance from the camera.
 template <class T>
 struct Bands : gv::UserShader<T> {

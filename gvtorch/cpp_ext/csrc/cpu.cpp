@@ -11,6 +11,7 @@
 #include "for_each.h"
 #include "shade_rays.h"
 #include "trace.h"
+#include "trace_chunks.h"
 
 namespace gvtorch {
 
@@ -65,6 +66,9 @@ inline const Processor& processor() {
   static const Processor found;
   return found;
 }
+
+// A user's shader is compiled for the same (cpp_ext/user.py).
+extern "C" __attribute__((visibility("default"))) const char* gvtorch_instructions() { return processor().name; }
 
 // The primitives of cache.h. Threads count chunks, then place them: ranks do not depend on the number of threads.
 struct Chunks {
@@ -138,18 +142,6 @@ void split(const torch::stable::Tensor& like, int64_t count, const Keep& keep, c
     }
   });
   *kept = total;
-}
-
-// body(begin, end) for chunks of the rays; first an empty byte for each node, in which it is kept what is hidden.
-template <class Device, class Body>
-void trace_chunks(const torch::stable::Tensor& like, TraceArgs& args, const Body& body) {
-  constexpr int64_t kChunk = 256;
-  torch::stable::Tensor hidden_tn =
-      torch::stable::new_zeros(like, {args.nodes + 3}, torch::headeronly::ScalarType::Byte);
-  args.hidden_tn = static_cast<uint8_t*>(hidden_tn.mutable_data_ptr());
-  const int64_t count = RayOrder{args.rays, args.width}.count();
-  const auto chunk = [&](int64_t number) { body(number * kChunk, std::min(count, (number + 1) * kChunk)); };
-  for_each<Device>(like, (count + kChunk - 1) / kChunk, chunk, 1);
 }
 
 template <class Device>

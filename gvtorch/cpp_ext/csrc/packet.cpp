@@ -7,18 +7,12 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-template <class Packet, class... Args>
-void trace_packets(int64_t begin, int64_t end, const Args&... args) {
-  Packet packet(args...);
-  for (int64_t index = begin; index < end; index += kLanes) packet.trace(index, smaller(index + kLanes, end));
-}
-
 void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end) {
   with_voxel(args.voxel, [&](auto voxel) {
     using Voxel = decltype(voxel);
     const TraceRay<float, Voxel> kernel(args);
     const PacketPool pool(args.bricks_bzyxc, args.voxel, args.side, args.channels, args.component);
-    if (kernel.tree.digit_bits == 0 || args.bricks < 2 || !pool.fits()) {
+    if (!packs(args)) {
       KeptPath path;
       for (int64_t index = begin; index < end; ++index) kernel.trace(index, path);
     } else if (pool.far(args.bricks)) {
@@ -31,16 +25,13 @@ void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end) {
 
 // Whether packets take a shader's rays.
 bool shades(const ShadeArgs& args) {
-  const PacketPool pool(args.bricks_bzyxc, args.voxel, args.side, args.channels, args.component);
-  if (digit_bits_of(args.branching, args.max_depth) == 0 || args.bricks < 2 || !pool.fits()) return false;
-  const bool point = static_cast<int32_t>(static_cast<const float*>(args.parameter_54)[3]) == Light<float>::kPoint;
+  if (!packs(args)) return false;
   switch (args.shader) {
-    case ShaderKind::kLit:
-      return args.normal_tnc == nullptr || !point;
     case ShaderKind::kStoredColor:
-      return args.channels == 4 && (args.normal_tnc == nullptr || !point);
+      return args.channels == 4;
     case ShaderKind::kPreIntegrated:
       return int64_t{args.levels} * args.rows * args.rows * PacketTable::kBytes <= INT32_MAX;
+    case ShaderKind::kLit:
     case ShaderKind::kIsosurface:
     case ShaderKind::kProjection:
     case ShaderKind::kFeatures:
@@ -48,12 +39,6 @@ bool shades(const ShadeArgs& args) {
     default:
       return false;
   }
-}
-
-template <class Packet>
-void shade_packets(const ShadeArgs& args, int64_t begin, int64_t end) {
-  const ShadeRay<float, typename Packet::Shader> kernel(args);
-  trace_packets<Packet>(begin, end, kernel, args);
 }
 
 void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end) {

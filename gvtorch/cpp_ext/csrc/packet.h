@@ -38,6 +38,7 @@ struct TracePacket : PacketWalk<TracePacket<Voxel, kFar>> {
     return number<float>(view.constant_tnc[static_cast<int64_t>(node) * view.channels + view.component]);
   }
   GV_HD Mask uniform(Mask) const { return fine.constant == coarse.constant; }
+  GV_HD bool shades_each_place() const { return false; }
 
   GV_HD void begin_run(Mask which) { rows = which ? at.level * (table.rows * PacketTable::kBytes) : rows; }
   GV_HD void add(Mask seeing, const PacketPiece& piece) {

@@ -25,6 +25,14 @@ struct PacketTable : Transfer<float> {
     const Ints row = smaller(truncated(place), Ints{} + (rows - 2));
     return {row, place - to_floats(row)};
   }
+  // Twin of Transfer::transparent, for a value alone.
+  GV_HD Mask transparent(Floats value) const {
+    const Floats slack = larger(value, -value) * 9.5367431640625e-7f;
+    const auto place = [&](Floats at) { return clamp((at - low) * scale, Floats{}, Floats{} + last); };
+    const Ints before = truncated(place(value - slack)) - 1;
+    const Ints end = -floor_int(-place(value + slack));
+    return pick(opaque_m, end) == (before < 0 ? Ints{} : pick(opaque_m, larger(before, Ints{})));
+  }
   // A number of the table between two rows; `entry`: the first one's place in bytes.
   GV_HD Floats column(Ints entry, int32_t which, Floats weight) const {
     const float* first = &table_lm[0].red + which;

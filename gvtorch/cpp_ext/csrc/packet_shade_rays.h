@@ -30,7 +30,7 @@ struct PacketChannel {
 };
 
 // What Self has, beside `add` and constants as PacketWalk tells: get(lane, sum) and put(lane, sum), which copy what its
-// shader's Sum has beyond ShadeSum.
+// shader's Sum has beyond ShadeSum; or sum_of(lane) and put_sum(lane, sum), where it keeps its lanes' Sums itself.
 template <class Self, class Kind>
 struct ShadePacket : PacketWalk<Self> {
   using Base = PacketWalk<Self>;
@@ -69,27 +69,29 @@ struct ShadePacket : PacketWalk<Self> {
       from[axis][lane] = sight.origin[axis];
       along[axis][lane] = sight.direction[axis];
     }
-    Sum one;
-    one.clear = sum.clear[lane];
-    put_sum(lane, one);
-    for (int32_t c = 0; c < kernel.features; ++c) kernel.features_rc[numbers[lane] * kernel.features + c] = 0;
+    with_sum(lane, [&](Sum& one) {
+      one = Sum();
+      one.clear = sum.clear[lane];
+      one.hit_clear = hit_clear;
+      one.feature_c = features_of(lane);
+      for (int32_t c = 0; c < kernel.features; ++c) one.feature_c[c] = 0;
+    });
   }
   GV_HD void end_ray(int lane) {
-    Sum one = sum_of(lane);
-    if constexpr (Shader::kSurface) {
-      if (one.depth < INFINITY) {
-        const Ray<float> ray(walk.rays, numbers[lane]);
-        const Intervals<float> at(ray, walk.options.step, this->lengths);
-        int32_t wanted = this->wanted[lane];
-        kernel.template surface<BitDigits<float>>(ray, sight_of(lane), at, wanted, one);
+    with_sum(lane, [&](Sum& one) {
+      if constexpr (Shader::kSurface) {
+        if (one.depth < INFINITY) {
+          const Ray<float> ray(walk.rays, numbers[lane]);
+          const Intervals<float> at(ray, walk.options.step, this->lengths);
+          int32_t wanted = this->wanted[lane];
+          kernel.template surface<BitDigits<float>>(ray, sight_of(lane), at, wanted, one);
+        }
       }
-    }
-    kernel.finish(numbers[lane], moved[lane], this->samples[lane], one);
+      kernel.finish(numbers[lane], moved[lane], this->samples[lane], one);
+    });
   }
   GV_HD bool hides(int lane, int32_t node) {
-    Sum one;
-    self().get(lane, one);
-    const bool hidden = kernel.hides(shader, node, one);
+    const bool hidden = kernel.hides(shader, node, self().sum_of(lane));
     if (Self::kKeepsPath) store_byte(&this->hidden_tn[node], hidden ? kHidden : kShown);
     return hidden;
   }
@@ -122,7 +124,7 @@ struct ShadePacket : PacketWalk<Self> {
     return taken;
   }
   // One interval of one lane.
-  __attribute__((noinline)) void add_alone(int lane, const PacketPiece& piece) {
+  __attribute__((noinline)) void add_alone(int lane, const PacketPiece& piece, KnownGradient<float>* known = nullptr) {
     Piece<float> one;
     one.start = piece.start[lane];
     one.end = piece.end[lane];
@@ -135,7 +137,7 @@ struct ShadePacket : PacketWalk<Self> {
     } else {
       one.value = piece.value[lane];
     }
-    with_probe(lane, [&](const Probe<float>& probe, Sum& sum) { shader.add(one, probe, sum); });
+    with_probe(lane, [&](const Probe<float>& probe, Sum& sum) { shader.add(one, probe, sum); }, known);
   }
 
   // Lanes whose nodes all have bricks.
@@ -158,9 +160,25 @@ struct ShadePacket : PacketWalk<Self> {
     return slope;
   }
 
+  GV_HD bool shades_each_place() const { return kernel.shades_each_place(); }
+
   // Its Sum has nothing more, unless Self tells.
   GV_HD void get(int, Sum&) const {}
   GV_HD void put(int, const Sum&) {}
+  GV_HD Sum sum_of(int lane) const {
+    Sum one;
+    static_cast<Accumulator<float>&>(one) = sum.at(lane);
+    one.normal = {normal.x[lane], normal.y[lane], normal.z[lane]};
+    one.hit_clear = hit_clear;
+    one.feature_c = features_of(lane);
+    static_cast<const Self*>(this)->get(lane, one);
+    return one;
+  }
+  GV_HD void put_sum(int lane, const Sum& one) {
+    sum.put(lane, one);
+    for (int axis = 0; axis < 3; ++axis) normal[axis][lane] = one.normal[axis];
+    self().put(lane, one);
+  }
 
  private:
   GV_HD Vec3<Floats> differences(const PacketBrick& ray, Ints depth, Floats t) const {
@@ -204,30 +222,29 @@ struct ShadePacket : PacketWalk<Self> {
             this->blend_scale[lane],
             {static_cast<float>(cube[0]), static_cast<float>(cube[1]), static_cast<float>(cube[2])}};
   }
-  // body(probe, sum) with a lane's own, of which the sum is kept.
+  GV_HD float* features_of(int lane) const { return kernel.features_rc + numbers[lane] * kernel.features; }
+  // body(sum) with a lane's own, which is kept.
   template <class Body>
-  GV_HD void with_probe(int lane, const Body& body) {
+  GV_HD void with_sum(int lane, const Body& body) {
+    auto&& one = self().sum_of(lane);
+    body(one);
+    self().put_sum(lane, one);
+  }
+  template <class Body>
+  GV_HD void with_probe(int lane, const Body& body, KnownGradient<float>* known = nullptr) {
     const Sight<float> sight = sight_of(lane);
-    const Probe<float> probe = probe_of(lane, sight);
-    Sum one = sum_of(lane);
-    body(probe, one);
-    put_sum(lane, one);
-  }
-  GV_HD Sum sum_of(int lane) const {
-    Sum one;
-    static_cast<Accumulator<float>&>(one) = sum.at(lane);
-    one.normal = {normal.x[lane], normal.y[lane], normal.z[lane]};
-    one.hit_clear = hit_clear;
-    one.feature_c = kernel.features_rc + numbers[lane] * kernel.features;
-    static_cast<const Self*>(this)->get(lane, one);
-    return one;
-  }
-  GV_HD void put_sum(int lane, const Sum& one) {
-    sum.put(lane, one);
-    for (int axis = 0; axis < 3; ++axis) normal[axis][lane] = one.normal[axis];
-    self().put(lane, one);
+    Probe<float> probe = probe_of(lane, sight);
+    probe.known = known;
+    with_sum(lane, [&](Sum& one) { body(probe, one); });
   }
 };
+
+// Traces a share of the rays with a packet of a shader.
+template <class Packet>
+void shade_packets(const ShadeArgs& args, int64_t begin, int64_t end) {
+  const ShadeRay<float, typename Packet::Shader> kernel(args);
+  trace_packets<Packet>(begin, end, kernel, args);
+}
 
 }  // namespace GV_NAMESPACE
 }  // namespace gvtorch

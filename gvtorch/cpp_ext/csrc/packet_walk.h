@@ -36,6 +36,7 @@ struct PacketPiece {
 //   uniform(which)          lanes in a region of one value, of those where two nodes answer and neither has a brick
 //   add(seeing, piece)      adds an interval of those lanes
 //   begin_run(which)        the lanes' next intervals are alike
+//   shades_each_place()     a region of one value is sampled like others
 //   add_region(lane, start, end)   adds a region of one value
 //   march_node(lane, visit, at)    adds all intervals of a node that are to come; returns how many
 template <class Self>
@@ -249,6 +250,7 @@ struct PacketWalk {
       const Mask both = runs & differ;
       if (any(both)) aim(both, coarse_level, coarse_brick, coarse);
       Mask flat = runs & ~fine.stored & (~differ | ~coarse.stored);
+      if (self().shades_each_place()) flat = Mask{};
       if (any(flat & differ)) flat = flat & (~differ | self().uniform(flat & differ));
       if (any(flat)) {
         const Floats entry = at.start;
@@ -445,6 +447,18 @@ struct PacketWalk {
     number[lane] = one.count;
   }
 };
+
+// Whether packets can take the rays: their pools are as the loads above need them.
+inline bool packs(const TraceArgs& args) {
+  const PacketPool pool(args.bricks_bzyxc, args.voxel, args.side, args.channels, args.component);
+  return digit_bits_of(args.branching, args.max_depth) > 0 && args.bricks >= 2 && pool.fits();
+}
+
+template <class Packet, class... Args>
+void trace_packets(int64_t begin, int64_t end, const Args&... args) {
+  Packet packet(args...);
+  for (int64_t index = begin; index < end; index += kLanes) packet.trace(index, smaller(index + kLanes, end));
+}
 
 }  // namespace GV_NAMESPACE
 }  // namespace gvtorch

@@ -83,6 +83,14 @@ struct Channels {
   int32_t component;  // of `value`
 };
 
+// A gradient that the CPU worked out for many rays at once, before a shader asks for it.
+template <class T>
+struct KnownGradient {
+  T at;  // distance; NaN: none is known
+  Vec3<T> gradient;
+  bool asked;
+};
+
 template <class T>
 struct Probe {
   const Channels& channels;
@@ -92,6 +100,9 @@ struct Probe {
   T near, growth;  // cone
   T voxel, blend;  // weight of the coarse node: (cone - voxel) * blend
   Vec3<T> cube;    // world size of the root cube
+#ifndef __CUDACC__
+  KnownGradient<T>* known = nullptr;
+#endif
 
   template <class Number>
   GV_HD Probe(const Channels& channels, const Sight<T>& sight, const RayView& rays, const Ray<T>& ray,
@@ -136,6 +147,12 @@ struct Probe {
   // Gradient of the value at distance t, per world unit: differences over one voxel, half a voxel to each side, which a
   // border of 1 just holds. Neighbours read the same voxels at the face they share, so no seam shows.
   GV_HD Vec3<T> gradient(T t) const {
+#ifndef __CUDACC__
+    if (known != nullptr) {
+      known->asked = true;
+      if (known->at == t) return known->gradient;
+    }
+#endif
     Vec3<T> slope = differences(fine, t);
     if (!mixed) return slope;
     const Vec3<T> other = differences(coarse, t);

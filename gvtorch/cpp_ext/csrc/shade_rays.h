@@ -15,7 +15,8 @@ struct HidesAlike : std::false_type {};
 template <class Shader>
 struct HidesAlike<Shader, std::void_t<decltype(Shader::kHidesAlike)>> : std::bool_constant<Shader::kHidesAlike> {};
 
-template <class T, class Shader, bool kShadows = false>
+// kPowers: an N that is a power of two has code of its own.
+template <class T, class Shader, bool kShadows = false, bool kPowers = true>
 struct ShadeRay : Walk<T> {
   using Walk<T>::tree;
   using Walk<T>::options;
@@ -65,7 +66,7 @@ struct ShadeRay : Walk<T> {
     const T stop_clear = 1 - options.stop_alpha;
     int32_t samples = 0;
     int32_t wanted = 0;
-    const bool powers = tree.digit_bits > 0;
+    const bool powers = kPowers && tree.digit_bits > 0;
     while (at.inside() && sum.clear > stop_clear) {
       samples += powers ? visit<BitDigits<T>>(shader, ray, sight, at, wanted, sum)
                         : visit<Digits<T>>(shader, ray, sight, at, wanted, sum);

@@ -1,6 +1,7 @@
 // The library of a user's shader (user_shader.h): the op `gvtorch_user::GV_USER_OP`, with the schema of `shade_rays`.
 // The compiler gets the user's header by -include, and GV_USER_SHADER, the name of the struct in it. A C++ compiler
-// makes the op and its CPU kernel of this, nvcc the CUDA kernel.
+// makes the op and its CPU kernel of this, nvcc the CUDA kernel. On the CPU rays of float32 go in packets, for the
+// instruction set of the flags; a header that defines GV_RAY_BY_RAY has its rays go one by one, for tests.
 
 #include "user_shader.h"
 
@@ -13,6 +14,12 @@ using UserShaderOf = GV_USER_SHADER<T>;  // the name that CompiledShader was tol
 #include <utility>
 
 #include "entry.h"
+#include "shade_each.h"
+#if !defined(__CUDACC__) && !defined(GV_RAY_BY_RAY)
+#define GV_PACKETS
+#include "packet_user.h"
+#include "trace_chunks.h"
+#endif
 
 namespace gvtorch {
 
@@ -62,13 +69,20 @@ struct OneShader {
                     "gvtorch: parameter_54 holds the wrong number of uniforms: ", own);
   }
   template <class Device>
-  static void run(const Tensor& like, const ShadeArgs& args, bool wide) {
-    const auto each = [&](const auto& kernel) { for_each<Device>(like, kernel.order.count(), kernel); };
-    if (wide) {
-      each(ShadeRay<double, UserShaderOf<double>>(args));
-    } else {
-      each(ShadeRay<float, UserShaderOf<float>>(args));
+  static void run(const Tensor& like, ShadeArgs args, bool wide) {
+    const auto each = [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); };
+    if (wide) return each(ShadeRay<double, UserShaderOf<double>>(args));
+#ifdef GV_PACKETS
+    if (packs(args)) {
+      return trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) {
+        shade_packets<UserPacket<UserShaderOf<float>>>(args, begin, end);
+      });
     }
+    constexpr bool powers = false;  // what is left is mostly of another N
+#else
+    constexpr bool powers = true;
+#endif
+    each(ShadeRay<float, UserShaderOf<float>, false, powers>(args));
   }
 };
 
