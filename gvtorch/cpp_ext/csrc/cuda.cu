@@ -6,7 +6,7 @@
 
 #include "cache.h"
 #include "for_each.h"
-#include "shade_rays.h"
+#include "shade_each.h"
 #include "trace.h"
 
 namespace gvtorch {
@@ -36,7 +36,7 @@ void trace(const torch::stable::Tensor& like, TraceArgs args, bool wide) {
 
 template <class Device>
 void shade(const torch::stable::Tensor& like, ShadeArgs args, bool wide) {
-  const auto run = [&](const auto& kernel) { for_each<Device>(like, kernel.order.count(), kernel); };
+  const auto run = [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); };
   if (wide) {
     with_shader<double>(args.shader, args, run);
   } else {

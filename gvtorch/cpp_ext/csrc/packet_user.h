@@ -10,22 +10,15 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-// Whether `hides` is that of UserShader, which asks the transfer function alone.
-template <class Shader, class = void>
-constexpr bool kHidesByTransfer = false;
-template <class Shader>
-constexpr bool kHidesByTransfer<Shader, std::void_t<decltype(&Shader::hides)>> =
-    std::is_same_v<decltype(&Shader::hides), decltype(&UserShader<float>::hides)>;
-
 template <class Kind>
 struct UserPacket : ShadePacket<UserPacket<Kind>, Kind> {
   using Base = ShadePacket<UserPacket<Kind>, Kind>;
   using Sum = typename Kind::Sum;
   using Base::Base;
   using Base::sum;
-  static constexpr bool kKeepsPath = kHidesByTransfer<Kind>;  // one of the user's own may ask the ray's Sum
+  static constexpr bool kKeepsPath = HidesAlike<Kind>::value;  // one of the user's own may ask the ray's Sum
   // Values that are hidden change nothing, unless a Sum of the user's own counts them.
-  static constexpr bool kLeavesOut = kHidesByTransfer<Kind> && std::is_same_v<Sum, ShadeSum<float>> && !Kind::kEnds;
+  static constexpr bool kLeavesOut = kKeepsPath && std::is_same_v<Sum, ShadeSum<float>> && !Kind::kEnds;
 
   const PacketTable seen{static_cast<const UserShader<float>&>(this->shader).transfer};
   Sum sum_l[kLanes];

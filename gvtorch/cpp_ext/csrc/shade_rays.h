@@ -10,6 +10,11 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
+template <class Shader, class = void>
+struct HidesAlike : std::false_type {};
+template <class Shader>
+struct HidesAlike<Shader, std::void_t<decltype(Shader::kHidesAlike)>> : std::bool_constant<Shader::kHidesAlike> {};
+
 // kPowers: an N that is a power of two has code of its own.
 template <class T, class Shader, bool kShadows = false, bool kPowers = true>
 struct ShadeRay : Walk<T> {
@@ -18,11 +23,13 @@ struct ShadeRay : Walk<T> {
   using Walk<T>::hits;
   using Sum = typename Shader::Sum;
   static constexpr int kBlocksAtOnce = 4;  // on a multiprocessor of CUDA: 128 registers
+  static constexpr bool kHidesAlike = HidesAlike<Shader>::value;
   Shader shader;
   Channels channels;
   const T* parameter_54;
   const void* range_tn2c;
   int32_t* stamp_b;
+  uint8_t* hidden_tn;  // on a GPU, of a shader with kHidesAlike
   int32_t lengths, features, directions;
   T *normal_r3, *features_rc;
 
@@ -38,6 +45,7 @@ struct ShadeRay : Walk<T> {
         parameter_54(static_cast<const T*>(args.parameter_54)),
         range_tn2c(args.range_tn2c),
         stamp_b(args.stamp_b),
+        hidden_tn(args.hidden_tn),
         lengths(args.levels),
         features(args.features),
         directions(std::is_same_v<Shader, StoredColor<T>> ? args.channels / 4 : 1),
@@ -170,7 +178,12 @@ struct ShadeRay : Walk<T> {
   GV_HD int32_t visit(const Any& shader, const Ray<T>& ray, const Sight<T>& sight, Intervals<T>& at, int32_t& wanted,
                       typename Any::Sum& sum) const {
     constexpr bool shadows = kShadows && std::is_same_v<Any, Shader>;  // none on the way to a light
-    const auto hides = [&](int32_t node) { return this->hides(shader, node, sum); };
+    const auto hides = [&](int32_t node) {
+#ifdef __CUDA_ARCH__
+      if constexpr (HidesAlike<Any>::value) return hidden_tn[node] == kHidden;
+#endif
+      return this->hides(shader, node, sum);
+    };
     const T middle = at.middle();
     Number digits(tree, ray.at(middle));
     NoPath path;
@@ -226,6 +239,17 @@ struct ShadeRay : Walk<T> {
     piece.level = -1;
     piece.length = piece.end - piece.start;
     piece.middle = piece.start + piece.length * static_cast<T>(0.5);
+  }
+};
+
+// Works out what a shader with kHidesAlike hides.
+template <class Kernel>
+struct HideShaded {
+  Kernel kernel;
+
+  GV_HD void operator()(int64_t node) const {
+    const bool hidden = kernel.hides(kernel.shader, static_cast<int32_t>(node), typename Kernel::Sum());
+    kernel.hidden_tn[node] = hidden ? kHidden : kShown;
   }
 };
 

@@ -8,6 +8,7 @@
 //   kSeesEmpty                                    EMPTY nodes count, with their mean value
 //   struct Sum : ShadeSum<T>                      what it keeps of a ray; `clear` at 1 - stop_alpha ends the ray
 //   hides(low, high, sum)                         true: no value in [low, high] changes the sum. The node is left out
+//   kHidesAlike                                   it does not look at the sum: nodes are hidden from all rays alike
 //   add(piece, probe, sum)                        adds an interval; `probe` reads any channel at any distance
 //   kSurface, surface(probe, sum)                 where depth was set: `probe` then stands in the node of that place
 //   done(sum)                                     after the last interval
@@ -142,7 +143,7 @@ struct Light {
 // The transfer function, lit.
 template <class T>
 struct Lit {
-  static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false;
+  static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
   using Sum = ShadeSum<T>;
   TransferView<T> transfer;
   Light<T> light;
@@ -177,7 +178,7 @@ struct Lit {
 // the three that it goes along, weighted by the squares of its direction, whose sum is 1.
 template <class T>
 struct StoredColor {
-  static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false;
+  static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
   using Sum = ShadeSum<T>;
   Light<T> light;
 
@@ -237,7 +238,7 @@ struct StoredColor {
 // What a shader takes from the light that goes through: the shader of rays that go to a light.
 template <class T, class Shader>
 struct Veil {
-  static constexpr bool kEnds = false, kSeesEmpty = false;
+  static constexpr bool kEnds = false, kSeesEmpty = false, kHidesAlike = Shader::kHidesAlike;
   struct Sum {
     T clear = 1;  // transmittance
     bool missed = false;
@@ -254,7 +255,7 @@ struct Veil {
 // function is constant: the parts of an interval that lie there are added before and behind.
 template <class T>
 struct PreIntegrated {
-  static constexpr bool kEnds = true, kSeesEmpty = false, kSurface = false;
+  static constexpr bool kEnds = true, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
   using Sum = ShadeSum<T>;
   TransferView<T> transfer;
   T step;
@@ -320,7 +321,7 @@ struct PreIntegrated {
 // interval ended is kept, so that no crossing is lost between two nodes that round differently.
 template <class T>
 struct Isosurface {
-  static constexpr bool kEnds = true, kSeesEmpty = false, kSurface = true;
+  static constexpr bool kEnds = true, kSeesEmpty = false, kSurface = true, kHidesAlike = true;
   struct Sum : ShadeSum<T> {
     T before = 0;
     T before_end = static_cast<T>(-INFINITY);
@@ -386,7 +387,7 @@ struct Isosurface {
 // parameters tells which. A node that can't change a maximum or minimum is left out.
 template <class T>
 struct Projection {
-  static constexpr bool kEnds = false, kSeesEmpty = true, kSurface = false;
+  static constexpr bool kEnds = false, kSeesEmpty = true, kSurface = false, kHidesAlike = false;
   static constexpr int32_t kMaximum = 0, kMinimum = 1, kMean = 2;
   struct Sum : ShadeSum<T> {
     T found = 0;   // extreme so far, or sum of value * length
@@ -434,7 +435,7 @@ struct Projection {
 // All numbers of a second channel, composited with the transfer function's alpha. Sums lie in the output: any number.
 template <class T>
 struct Features {
-  static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false;
+  static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
   using Sum = ShadeSum<T>;
   TransferView<T> transfer;
   T step;

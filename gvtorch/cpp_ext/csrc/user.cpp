@@ -14,6 +14,7 @@ using UserShaderOf = GV_USER_SHADER<T>;  // the name that CompiledShader was tol
 #include <utility>
 
 #include "entry.h"
+#include "shade_each.h"
 #if !defined(__CUDACC__) && !defined(GV_RAY_BY_RAY)
 #define GV_PACKETS
 #include "packet_user.h"
@@ -69,7 +70,7 @@ struct OneShader {
   }
   template <class Device>
   static void run(const Tensor& like, ShadeArgs args, bool wide) {
-    const auto each = [&](const auto& kernel) { for_each<Device>(like, kernel.order.count(), kernel); };
+    const auto each = [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); };
     if (wide) return each(ShadeRay<double, UserShaderOf<double>>(args));
 #ifdef GV_PACKETS
     if (packs(args)) {

@@ -19,7 +19,9 @@
 // kernel. Without a Sum and a `hides` of its own, `add` need not be called where the transfer function shows nothing.
 #pragma once
 
-#include "shaders.h"
+#include <type_traits>
+
+#include "shade_rays.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
@@ -70,6 +72,11 @@ struct UserShader {
   GV_HD bool hides(T low, T high, const ShadeSum<T>&) const { return Transfer<T>(transfer).transparent(low, high); }
   GV_HD void done(ShadeSum<T>&) const {}
 };
+
+// A shader whose `hides` is that of UserShader, which asks the transfer function alone.
+template <template <class> class Kind, class T>
+struct HidesAlike<Kind<T>, std::enable_if_t<std::is_same_v<decltype(&Kind<T>::hides), decltype(&UserShader<T>::hides)>>>
+    : std::true_type {};
 
 }  // namespace GV_NAMESPACE
 }  // namespace gvtorch
