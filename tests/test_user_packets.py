@@ -31,6 +31,8 @@ SHADERS = {
         "mine::LitFeatures",
         {"transfer": TRANSFER, "other": "rgba", "normals": "normal", "light": LAMP},
     ),
+    "own hiding": ("mine::Above", {"transfer": TRANSFER, "uniforms": {"level": 0.1}}),
+    "told": ("mine::PlainAlike", {"transfer": TRANSFER}),
     "own sum": ("mine::Highest", {"transfer": TRANSFER}),
     "ends and surface": (
         "mine::Contours",

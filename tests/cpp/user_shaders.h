@@ -86,6 +86,27 @@ struct FirstEnd : gv::UserShader<T> {
   }
 };
 
+// What is above a level, whatever the transfer function shows; hidden alike from all rays, as it tells.
+template <class T>
+struct Above : gv::UserShader<T> {
+  using gv::UserShader<T>::UserShader;
+  GV_UNIFORMS(level);
+  static constexpr bool kHidesAlike = true;
+
+  GV_HD bool hides(T, T high, const gv::ShadeSum<T>&) const { return gv::a_little_above(high) < this->uniform(level); }
+  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
+    const T over = piece.value - this->uniform(level);
+    if (over > 0) this->composite({piece.value, over, 1, static_cast<T>(0.1)}, piece, sum);
+  }
+};
+
+// The plain transfer function, which tells that its default hides alike.
+template <class T>
+struct PlainAlike : Plain<T> {
+  using Plain<T>::Plain;
+  static constexpr bool kHidesAlike = true;
+};
+
 // Where the value rises through one level after the other: all that a struct may tell anew, and hidden by what the ray
 // has found and by what it still lets through.
 template <class T>

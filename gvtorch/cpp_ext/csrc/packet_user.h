@@ -18,7 +18,7 @@ struct UserPacket : ShadePacket<UserPacket<Kind>, Kind> {
   using Base::sum;
   static constexpr bool kKeepsPath = HidesAlike<Kind>::value;  // one of the user's own may ask the ray's Sum
   // Values that are hidden change nothing, unless a Sum of the user's own counts them.
-  static constexpr bool kLeavesOut = kKeepsPath && std::is_same_v<Sum, ShadeSum<float>> && !Kind::kEnds;
+  static constexpr bool kLeavesOut = kHidesByTransfer<Kind> && std::is_same_v<Sum, ShadeSum<float>> && !Kind::kEnds;
 
   const PacketTable seen{static_cast<const UserShader<float>&>(this->shader).transfer};
   Sum sum_l[kLanes];

@@ -73,10 +73,20 @@ struct UserShader {
   GV_HD void done(ShadeSum<T>&) const {}
 };
 
-// A shader whose `hides` is that of UserShader, which asks the transfer function alone.
+// Whether `hides` is that of UserShader, which asks the transfer function alone.
+template <class Shader, class = void>
+constexpr bool kHidesByTransfer = false;
 template <template <class> class Kind, class T>
-struct HidesAlike<Kind<T>, std::enable_if_t<std::is_same_v<decltype(&Kind<T>::hides), decltype(&UserShader<T>::hides)>>>
-    : std::true_type {};
+constexpr bool kHidesByTransfer<Kind<T>, std::void_t<decltype(&Kind<T>::hides)>> =
+    std::is_same_v<decltype(&Kind<T>::hides), decltype(&UserShader<T>::hides)>;
+
+template <class Shader, class = void>
+constexpr bool kTellsHiding = false;
+template <class Shader>
+constexpr bool kTellsHiding<Shader, std::void_t<decltype(Shader::kHidesAlike)>> = true;
+
+template <template <class> class Kind, class T>
+struct HidesAlike<Kind<T>, std::enable_if_t<kHidesByTransfer<Kind<T>> && !kTellsHiding<Kind<T>>>> : std::true_type {};
 
 }  // namespace GV_NAMESPACE
 }  // namespace gvtorch
