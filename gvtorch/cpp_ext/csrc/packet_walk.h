@@ -448,10 +448,12 @@ struct PacketWalk {
   }
 };
 
-// Whether packets can take the rays: their pools are as the loads above need them.
+// Whether packets can take the rays: their pools are as the loads above need them, which find nodes by 32-bit bytes.
 inline bool packs(const TraceArgs& args) {
+  constexpr int64_t kMostNodes = INT32_MAX / sizeof(int32_t);
   const PacketPool pool(args.bricks_bzyxc, args.voxel, args.side, args.channels, args.component);
-  return digit_bits_of(args.branching, args.max_depth) > 0 && args.bricks >= 2 && pool.fits();
+  return digit_bits_of(args.branching, args.max_depth) > 0 && args.nodes <= kMostNodes && args.bricks >= 2 &&
+         pool.fits();
 }
 
 template <class Packet, class... Args>
