@@ -2,8 +2,6 @@
 // what the shader hides, where that is the same for all rays.
 #pragma once
 
-#include <torch/headeronly/core/ScalarType.h>
-
 #include "for_each.h"
 #include "shade_rays.h"
 
