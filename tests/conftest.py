@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import os
 import subprocess
@@ -49,6 +50,16 @@ def compiled(request: pytest.FixtureRequest) -> str:
     if reason:
         pytest.skip(f"backend {request.param}: {reason}")
     return request.param
+
+
+@functools.cache
+def opengl_context():
+    """moderngl's context without a window, one a process, or a skip."""
+    moderngl = pytest.importorskip("moderngl")
+    try:
+        return moderngl.create_context(standalone=True, backend="egl")
+    except Exception as error:  # it raises no other class
+        pytest.skip(f"no OpenGL through EGL: {error}")
 
 
 def shared(path: str) -> Path:

@@ -10,6 +10,7 @@ import threading
 
 import pytest
 import torch
+from conftest import opengl_context
 
 import gvtorch as gv
 from gvtorch.ops import available
@@ -23,19 +24,15 @@ CORE, COMPATIBILITY = 1, 2
 @functools.cache
 def _egl():
     """EGL, and a display on which contexts need no surface."""
-    moderngl = pytest.importorskip("moderngl")
-    try:
-        kept = moderngl.create_standalone_context(backend="egl")
-    except Exception as error:
-        pytest.skip(f"no OpenGL through EGL: {error}")
+    opengl_context().__enter__()
     egl = ctypes.CDLL("libEGL.so.1")
     for name in ("eglGetCurrentDisplay", "eglCreateContext"):
         getattr(egl, name).restype = ctypes.c_void_p
-    return egl, ctypes.c_void_p(egl.eglGetCurrentDisplay()), kept
+    return egl, ctypes.c_void_p(egl.eglGetCurrentDisplay())
 
 
 def make_context(profile: int = CORE, share: ctypes.c_void_p | None = None) -> ctypes.c_void_p:
-    egl, display, _ = _egl()
+    egl, display = _egl()
     egl.eglBindAPI(0x30A2)
     wanted = (ctypes.c_int * 5)(0x3040, 8, 0x3033, 1, 0x3038)  # OpenGL, pbuffers
     config, count = ctypes.c_void_p(), ctypes.c_int()
@@ -48,7 +45,7 @@ def make_context(profile: int = CORE, share: ctypes.c_void_p | None = None) -> c
 
 
 def use(context: ctypes.c_void_p | None) -> None:
-    egl, display, _ = _egl()
+    egl, display = _egl()
     egl.eglBindAPI(0x30A2)
     assert egl.eglMakeCurrent(display, None, None, context)
 

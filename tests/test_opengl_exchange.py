@@ -6,11 +6,11 @@ moderngl, which keeps its own record of the context, draws and reads beside us.
 from __future__ import annotations
 
 import ctypes
-import functools
 import threading
 
 import pytest
 import torch
+from conftest import opengl_context
 
 import gvtorch as gv
 from gvtorch.ops import available
@@ -27,19 +27,10 @@ DEPTHS = {  # internal formats, with their attachments
 }
 
 
-@functools.cache
-def _context():
-    moderngl = pytest.importorskip("moderngl")
-    try:
-        return moderngl.create_standalone_context(backend="egl")
-    except Exception as error:
-        pytest.skip(f"no OpenGL through EGL: {error}")
-
-
 @pytest.fixture
 def context():
     """A context that is current, with no framebuffer bound and no switch on."""
-    made = _context()
+    made = opengl_context()
     made.__enter__()
     made.screen and made.screen.use()
     return made
