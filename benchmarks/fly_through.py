@@ -23,8 +23,8 @@ from rich.table import Table
 
 import gvtorch as gv
 from gvtorch.bench.scenes import worn_planes
+from gvtorch.cameras.path import CameraPath
 from gvtorch.io import convert
-from gvtorch.rendering.path import CameraPath
 
 
 @dataclass

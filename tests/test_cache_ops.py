@@ -8,8 +8,9 @@ from conftest import DEVICES
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gvtorch import config, ops
-from gvtorch.ops import reference_cache
+from gvtorch import ops
+from gvtorch.base import constants as config
+from gvtorch.ops.reference import cache as reference_cache
 
 LOAD, SUBDIVIDE = config.REQUEST_LOAD, config.REQUEST_SUBDIVIDE
 PENDING = config.REQUEST_PENDING_SHIFT

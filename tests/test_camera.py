@@ -10,7 +10,7 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.depth import unproject_meshgrid
 
 import gvtorch as gv
-from gvtorch.rendering import renderer
+from gvtorch.tracing import renderer
 
 BOX = torch.tensor([[1.0, 2.0, 3.0], [5.0, 4.0, 4.0]], dtype=torch.float64)
 

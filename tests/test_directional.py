@@ -9,10 +9,10 @@ from conftest import DEVICES
 from marcher import trilinear
 
 import gvtorch as gv
+from gvtorch.base.volume import DIRECTIONS
 from gvtorch.io import convert
 from gvtorch.pool.pyramid import pool_directional, volume_levels
-from gvtorch.rendering.renderer import trace
-from gvtorch.volume import DIRECTIONS
+from gvtorch.tracing.renderer import trace
 
 RED, GREEN = (1.0, 0.1, 0.0), (0.0, 0.9, 0.2)
 SIZES = {"brick_size": 4, "border": 1}

@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gvtorch as gv
-from gvtorch import config
-from gvtorch.turns import scouts
+from gvtorch.base import constants as config
+from gvtorch.engine.turns import scouts
 
 VESSELS = gv.TransferFunction.preset("vessels", 0, 255)
 AORTA = gv.TransferFunction.from_points([(140, 0), (400, 0.25), (900, 0.95)])

@@ -11,8 +11,8 @@ import torch
 from conftest import DEVICES
 
 import gvtorch as gv
-from gvtorch.frame import RenderStats
-from gvtorch.rendering.tone import from_srgb, to_srgb, tone_map
+from gvtorch.base.records import RenderStats
+from gvtorch.pictures.tone import from_srgb, to_srgb, tone_map
 
 HAZE = gv.TransferFunction.from_points([(0, 0), (1, 0.05)], [(0, 1, 0.5, 0.2), (1, 0.2, 0.9, 1)])
 VIEW = {"distance": 1.2, "width": 20, "height": 14}

@@ -16,9 +16,9 @@ from test_engine import PARTS, assert_same_picture, camera
 from test_trace_rays import on
 
 import gvtorch as gv
-from gvtorch import config
+from gvtorch.base import constants as config
 from gvtorch.ops import available
-from gvtorch.rendering import renderer
+from gvtorch.tracing import renderer
 
 HAZE = gv.TransferFunction.from_points([(0, 0.03)], [(0, 0.9, 0.5, 0.2)])
 GRAY = gv.TransferFunction.preset("gray", 0, 1)

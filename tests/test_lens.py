@@ -12,9 +12,9 @@ from conftest import DEVICES
 from test_trace_rays import SHADER, assert_equal, camera_rays
 
 import gvtorch as gv
-from gvtorch.config import CONE_OVERESTIMATE
-from gvtorch.rendering.lens import ThroughLens
-from gvtorch.rendering.renderer import trace
+from gvtorch.base.constants import CONE_OVERESTIMATE
+from gvtorch.tracing.renderer import trace
+from gvtorch.tracing.thin_lens import ThroughLens
 
 FOCUS = 2.0  # sides of the box
 

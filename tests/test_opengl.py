@@ -13,8 +13,8 @@ from test_examples import no_vtk
 from test_layer import SOLID, ball, layer_of, screen, seam_error
 
 import gvtorch as gv
+from gvtorch.opengl import ClipDepth, matrices, ray_distance, window_depth
 from gvtorch.ops import available
-from gvtorch.rendering.opengl import ClipDepth, matrices, ray_distance, window_depth
 
 EYES = torch.tensor([[3.0, 2.0, 5.0], [-4.0, 1.0, 2.0]])
 

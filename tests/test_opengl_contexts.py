@@ -13,8 +13,8 @@ import torch
 from conftest import opengl_context
 
 import gvtorch as gv
+from gvtorch.opengl import functions as gl
 from gvtorch.ops import available
-from gvtorch.rendering.opengl import functions as gl
 
 pytestmark = pytest.mark.backend("opengl")
 WIDTH, HEIGHT = 13, 7

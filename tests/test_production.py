@@ -11,8 +11,8 @@ import torch
 from test_producers import GRAY, SIZE, Ball, camera
 
 import gvtorch as gv
-from gvtorch import config
-from gvtorch.production import ProductionError
+from gvtorch.base import constants as config
+from gvtorch.engine.production import ProductionError
 
 
 class Broken(Ball):

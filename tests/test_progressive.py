@@ -14,8 +14,8 @@ from test_production import Held
 
 import gvtorch as gv
 from gvtorch.ops import available
-from gvtorch.rendering.progressive import jitter
-from gvtorch.rendering.tiles import strip_rows
+from gvtorch.pictures.progressive import jitter
+from gvtorch.pictures.strips import strip_rows
 
 HAZE = gv.TransferFunction.preset("gray", 0, 1)
 PARTS = ("color", "alpha", "depth")

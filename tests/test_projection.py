@@ -12,8 +12,8 @@ from conftest import DEVICES
 from kornia.geometry.camera import distort_points_kannala_brandt, project_points_orthographic
 
 import gvtorch as gv
+from gvtorch.cameras.models import distort, last_rising_angle, undistort
 from gvtorch.ops import available
-from gvtorch.rendering.projection import distort, last_rising_angle, undistort
 
 MODELS = ["pinhole", "ortho", "fisheye", "panorama"]
 HAZE = gv.TransferFunction.preset("gray", 0, 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gvtorch import config
+from gvtorch.base import constants as config
 from gvtorch.cache import LRU, Requests, Scheduler
 
 LOAD, SUBDIVIDE = config.REQUEST_LOAD, config.REQUEST_SUBDIVIDE

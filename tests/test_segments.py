@@ -16,7 +16,7 @@ from test_trace_rays import SHADER, arguments, camera_rays, forget, on
 
 import gvtorch as gv
 from gvtorch.ops import composite, list_samples, sample_bricks, trace_rays, trace_segments
-from gvtorch.rendering.renderer import Tracer
+from gvtorch.tracing.renderer import Tracer
 
 DRAWN = ("table_lm4", "stop_alpha", "depth_alpha")
 RAYS = ("origin_r3", "direction_r3", "cone_r2", "range_r2", "place_33")
@@ -446,7 +446,7 @@ def test_samples_that_name_nothing_are_zero(walk):
 
 @pytest.mark.backend("cpp")
 def test_a_list_larger_than_memory_is_one_clear_error(blobs, monkeypatch):
-    from gvtorch import check
+    from gvtorch.base import check
 
     tree = gv.N3Tree.from_volume(blobs, 4)
     monkeypatch.setattr(check.os, "sysconf", lambda name: 64)

@@ -14,7 +14,7 @@ from conftest import DEVICES
 from test_producers import GRAY, camera
 
 import gvtorch as gv
-from gvtorch import config
+from gvtorch.base import constants as config
 from gvtorch.ops import available
 from gvtorch.pool import BrickTable, Rows, Staging
 from gvtorch.pool.staging import wide_rows

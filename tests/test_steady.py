@@ -13,8 +13,8 @@ from test_engine import PARTS, VESSELS, Checked, Late, assert_same_picture, came
 from test_production import Held
 
 import gvtorch as gv
-import gvtorch.engine
-from gvtorch.frame import Counts
+import gvtorch.engine.engine
+from gvtorch.base.records import Counts
 from gvtorch.ops import available
 
 HAZE = gv.TransferFunction.preset("gray", 0, 1)
@@ -33,13 +33,13 @@ def cuda() -> str:
 def traced(monkeypatch):
     """Lists for each pass over a camera's rays whether it was one over scouts."""
     passes: list[bool] = []
-    trace = gvtorch.engine.trace_camera
+    trace = gvtorch.engine.engine.trace_camera
 
     def note(*args, again=None, **options):
         passes.append(again is not None)
         return trace(*args, again=again, **options)
 
-    monkeypatch.setattr(gvtorch.engine, "trace_camera", note)
+    monkeypatch.setattr(gvtorch.engine.engine, "trace_camera", note)
     return passes
 
 

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gvtorch as gv
-from gvtorch import config
-from gvtorch.ops import exact
-from gvtorch.rendering.renderer import Tracer, trace
-from gvtorch.rendering.shader import interval_levels
+from gvtorch.base import constants as config
+from gvtorch.ops.reference import exact
+from gvtorch.shaders.transfer_function import interval_levels
+from gvtorch.tracing.renderer import Tracer, trace
 
 SHADER = gv.TransferFunction.from_points(
     opacity=[(0, 0), (0.2, 0), (0.6, 0.4), (1, 1)],

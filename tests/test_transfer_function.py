@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gvtorch as gv
-from gvtorch.rendering.shader import PRESETS
+from gvtorch.shaders.transfer_function import PRESETS
 
 
 def table_of(function, spacing=1.0, step=1.0, levels=1, dtype=torch.float32):

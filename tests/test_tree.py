@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gvtorch as gv
-from gvtorch import config
+from gvtorch.base import constants as config
 from gvtorch.pool.pyramid import build_levels
 
 SIZES = {"branching": 2, "brick_size": 4, "border": 1}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 import gvtorch as gv
-from gvtorch.turns import Turns
+from gvtorch.engine.turns import Turns
 
 
 def test_scouts_go_first():

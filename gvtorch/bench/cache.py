@@ -6,7 +6,7 @@ import itertools
 
 import torch
 
-from ..config import REQUEST_KINDS, REQUEST_LOAD
+from ..base.constants import REQUEST_KINDS, REQUEST_LOAD
 from ..ops import compact_requests, lru_partition
 from .record import Record, clock
 

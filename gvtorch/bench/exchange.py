@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from ..rendering import opengl as gl
+from .. import opengl as gl
 from . import Unavailable
 from .record import Record, Settings, Timing, spread, synchronize
 

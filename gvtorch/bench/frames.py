@@ -10,11 +10,13 @@ from typing import Any
 
 import torch
 
-from ..engine import Engine
-from ..frame import FrameStats
+from ..base.records import FrameStats
+from ..cameras import Camera
+from ..engine.engine import Engine
 from ..pool import Channel, N3Tree
 from ..producers import Bricks, Nodes, Producer, VolumeProducer
-from ..rendering import Camera, TransferFunction, render
+from ..shaders import TransferFunction
+from ..tracing import render
 from .record import Record, Settings, Timing, clock, spread, synchronize
 from .scenes import Scene, aneurism, fog_dense, worn
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from functools import partial
 
-from ..engine import Engine
+from ..cameras import Camera
+from ..engine.engine import Engine
 from ..producers import VolumeProducer
-from ..rendering import Camera, ThinLens
+from ..tracing import ThinLens
 from .record import Record, clock
 from .scenes import worn
 

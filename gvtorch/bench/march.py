@@ -14,11 +14,13 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from ..frame import Hits, RenderStats
+from ..base.records import Hits, RenderStats
+from ..cameras import Camera
 from ..io.machine import memory_free
+from ..pictures import Picture
 from ..pool import N3Tree
-from ..rendering import Camera, Picture, RenderOptions
-from ..rendering.renderer import trace
+from ..tracing import RenderOptions
+from ..tracing.renderer import trace
 from .peers import Peer, Task, find
 from .record import Record, Settings, Timing, clock, once
 from .scenes import SCENES, Scene, shell_sparse

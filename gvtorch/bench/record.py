@@ -17,7 +17,8 @@ from typing import Any
 
 import torch
 
-from .. import __version__, check
+from .. import __version__
+from ..base import check
 from ..ops.trace import choose_backend
 
 _DISTURBED = 0.05  # share of the cores that others may take unnoticed

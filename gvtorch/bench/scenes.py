@@ -12,9 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..base.volume import Volume
+from ..cameras import Camera
 from ..io import read_volume
-from ..rendering import Camera, TransferFunction
-from ..volume import Volume
+from ..shaders import TransferFunction
 
 SCAN = Path(__file__).parents[2] / "examples" / "data" / "aneurism_256x256x256_uint8.raw.gz"
 

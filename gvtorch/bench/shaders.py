@@ -12,30 +12,27 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from ..base.records import Hits
+from ..base.volume import Volume
 from ..cpp_ext import compilers
-from ..engine import Engine
-from ..frame import Hits
+from ..engine.engine import Engine
+from ..pictures import Picture
 from ..pool import N3Tree
 from ..producers import VolumeProducer
-from ..rendering import (
+from ..shaders import (
     CompiledShader,
     DirectionalLight,
     DistanceField,
     Features,
     Isosurface,
-    Lighting,
     Lit,
-    ModuleShader,
-    Picture,
     PreIntegrated,
     Projection,
-    RenderOptions,
     StoredColor,
-    TransferModule,
 )
-from ..rendering.renderer import AnyShader, trace
-from ..rendering.shaders import Shader
-from ..volume import Volume
+from ..shaders.fused import Shader
+from ..tracing import Lighting, ModuleShader, RenderOptions, TransferModule
+from ..tracing.renderer import AnyShader, trace
 from .march import Size, difference, op_milliseconds, rates, rgba
 from .record import Record, Settings, Timing, clock
 from .scenes import Scene, aneurism, fog_dense, worn

@@ -14,17 +14,17 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ..config import (
+from ..base.constants import (
     ABSENT,
     REQUEST_LOAD,
     REQUEST_PENDING_SHIFT,
     REQUEST_SUBDIVIDE,
     TERMINAL,
 )
+from ..base.volume import movable
 from ..ops import lacking, link, link_bricks, link_tiles, unlink
 from ..pool import BrickPool, N3Tree, NodePool
 from ..pool.staging import Part, Voxels, joined, on_device, wide_rows
-from ..volume import movable
 from .lru import LRU
 from .requests import Listed, Requests, Wishes, collect
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..config import REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
+from ..base.constants import REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
 from ..ops import compact_requests
 from ..pool import NodePool
 

@@ -7,8 +7,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from .. import check
-from ..config import REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
+from ..base import check
+from ..base.constants import REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
 from .requests import Requests, Wishes
 
 _LEARN_FROM = 64  # items: smaller batches tell more about overhead than about throughput

@@ -29,9 +29,9 @@ from typing import Any
 
 import numpy as np
 
-from .. import check
-from ..stage import Progress, no_progress
-from ..volume import Volume
+from ..base import check
+from ..base.stage import Progress, no_progress
+from ..base.volume import Volume
 from . import machine, tasks, workplace
 from .layout import BLOCKS, WORK, Layout, context, kvstore, opened
 from .levels import Deadline

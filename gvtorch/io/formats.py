@@ -19,8 +19,8 @@ from typing import IO, Any
 
 import numpy as np
 
-from .. import check
-from ..volume import Volume, check_extent
+from ..base import check
+from ..base.volume import Volume, check_extent
 
 _RAW_NAME = re.compile(r"_(\d+)x(\d+)x(\d+)_([a-z]+\d+)(?:_?(le|be))?(?=[._]|$)")
 

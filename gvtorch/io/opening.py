@@ -11,18 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from . import ngff
-from .layout import (
-    BLOCKS,
-    BORDER,
-    CELL,
-    DTYPES,
-    MOST_VOXELS,
-    VERSION,
-    WORK,
-    child,
-    context,
-    opened,
-)
+from .layout import BLOCKS, BORDER, CELL, DTYPES, MOST_VOXELS, VERSION, WORK, child, context, opened
 from .levels import Deadline, Stored, StoreError, short
 
 _MOST_CHUNK = 2**31  # bytes of one chunk of a foreign array

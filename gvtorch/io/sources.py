@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ..volume import CHANNEL_DTYPES, Volume
+from ..base.volume import CHANNEL_DTYPES, Volume
 from . import formats
 from .layout import DTYPES, MOST_VOXELS
 from .machine import amount, memory_free

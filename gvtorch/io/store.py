@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from .. import check
+from ..base import check
 from . import ngff
 from .layout import (
     BLOCKS,

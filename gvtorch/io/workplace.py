@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from ..volume import Volume, movable
+from ..base.volume import Volume, movable
 from .layout import BORDER, CELL, GROUPS, VERSION, WORK, Layout
 from .ngff import image_metadata, parse_json
 

@@ -15,9 +15,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .. import check
-from ..config import REQUEST_LOAD, REQUEST_SUBDIVIDE
-from . import reference_cache
+from ..base import check
+from ..base.constants import REQUEST_LOAD, REQUEST_SUBDIVIDE
+from .reference import cache as reference_cache
 from .trace import Backend, choose_backend
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .. import check
-from . import reference_cut
+from ..base import check
+from .reference import cut as reference_cut
 from .trace import Backend, choose_backend
 
 

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .. import check
-from ..volume import CHANNEL_DTYPES
-from . import reference_segments
+from ..base import check
+from ..base.volume import CHANNEL_DTYPES
+from .reference import segments as reference_segments
 from .trace import Backend, choose_backend
 
 _SEGMENT_BYTES = 84  # at most, in float64

@@ -9,9 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .. import check, config
-from . import reference_shaders
-from .reference_shaders import COLORS, FEATURES, PRE_INTEGRATED, PROJECTION, SHADOWED_COLOR
+from ..base import check
+from ..base import constants as config
+from .reference import shaders as reference_shaders
+from .reference.shaders import COLORS, FEATURES, PRE_INTEGRATED, PROJECTION, SHADOWED_COLOR
 from .trace import Backend, check_arguments, choose_backend
 
 _TENSORS = (

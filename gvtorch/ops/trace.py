@@ -9,9 +9,10 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from .. import check, config
-from ..volume import CHANNEL_DTYPES
-from . import reference
+from ..base import check
+from ..base import constants as config
+from ..base.volume import CHANNEL_DTYPES
+from .reference import march as reference
 from .registry import available
 
 Backend = Literal["auto", "reference", "cpp", "cuda"]

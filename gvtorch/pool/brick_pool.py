@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from .. import check
+from ..base import check
 from .channel import Channel
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import torch
 
-from .. import check
-from ..volume import CHANNEL_DTYPES
+from ..base import check
+from ..base.volume import CHANNEL_DTYPES
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from .. import check
-from ..config import CONSTANT, EMPTY, TERMINAL
+from ..base import check
+from ..base.constants import CONSTANT, EMPTY, TERMINAL
+from ..base.stage import Progress, no_progress
+from ..base.volume import Volume, movable
 from ..ops import cut_bricks, locate
-from ..stage import Progress, no_progress
-from ..volume import Volume, movable
 from .brick_pool import BrickPool
 from .channel import Channel
 from .node_pool import NodePool

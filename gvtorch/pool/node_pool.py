@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from .. import check
-from ..config import ABSENT
-from ..volume import movable
+from ..base import check
+from ..base.constants import ABSENT
+from ..base.volume import movable
 from .channel import Channel
 
 

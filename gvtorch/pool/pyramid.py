@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..volume import DIRECTIONS, Volume
+from ..base.volume import DIRECTIONS, Volume
 
 _SLAB = 1 << 22  # voxels pooled at a time: what lies in between stays in a core's cache
 

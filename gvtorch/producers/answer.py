@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .. import check
+from ..base import check
 from ..pool import Channel, Rows
 from ..pool.staging import on_device, on_host, upload
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions

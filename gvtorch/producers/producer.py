@@ -16,7 +16,7 @@ from enum import IntEnum
 import torch
 from torch import Tensor
 
-from .. import check
+from ..base import check
 from ..pool import Channel
 from ..pool.staging import Voxels
 

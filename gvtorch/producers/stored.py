@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from numpy.lib.stride_tricks import as_strided
 
-from .. import check
+from ..base import check
 from ..io.store import Store
 from ..pool import Channel
 from ..pool.pyramid import pool_mean, round_to

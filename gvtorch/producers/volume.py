@@ -8,13 +8,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from .. import check
+from ..base import check
+from ..base.volume import Volume, movable
 from ..ops import cut_bricks
 from ..pool import BrickTable, Channel
 from ..pool.n3tree import check_channels
 from ..pool.pyramid import Level, round_to, volume_levels
 from ..pool.staging import wide_rows
-from ..volume import Volume, movable
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import arg
 
 if TYPE_CHECKING:
-    from ..volume import Volume
+    from ..base.volume import Volume
 
 
 @dataclass(frozen=True, kw_only=True)

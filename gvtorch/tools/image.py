@@ -12,7 +12,8 @@ from tyro.conf import arg
 from .common import numbers
 
 if TYPE_CHECKING:
-    from ..rendering import Camera, Picture
+    from ..cameras import Camera
+    from ..pictures import Picture
 
 KINDS = (".png", ".exr", ".npy", ".npz", ".tif")
 STRIPS = (".npy", ".tif")  # written strip by strip: the picture may be larger than memory
@@ -31,9 +32,9 @@ class Develop:
 
     def wrap(self, render: Callable[[Camera], Picture]) -> Callable[[Camera], Picture]:
         """Returns what renders a camera with all samples, tone-mapped."""
-        from .. import check
-        from ..rendering import Progressive
-        from ..rendering.tone import checked_curve
+        from ..base import check
+        from ..pictures import Progressive
+        from ..pictures.tone import checked_curve
 
         check.whole("render", "--samples", self.samples, low=1)
         checked_curve("render", self.tone, self.exposure)
@@ -57,7 +58,7 @@ def parse_background(text: str) -> Any:
     Raises:
         ValueError: The text is none of these; or see `Environment.read`.
     """
-    from ..rendering import Environment, Gradient
+    from ..pictures import Environment, Gradient
 
     if text == "transparent":
         return None

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from .common import numbers
 
 if TYPE_CHECKING:
-    from ..rendering import Lighting
+    from ..tracing import Lighting
 
 _FACTORS = ("shadows", "occlusion", "indirect", "reach")
 
@@ -18,7 +18,8 @@ def parse_lighting(text: str) -> Lighting:
     Raises:
         ValueError: An item is of no known kind, or its numbers are refused by `Lighting`.
     """
-    from ..rendering import DirectionalLight, Lighting, PointLight
+    from ..shaders import DirectionalLight, PointLight
+    from ..tracing import Lighting
 
     lights: list[Any] = []
     given: dict[str, Any] = {}

@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ..rendering import Picture
+    from ..pictures import Picture
 
 
 class Video:

@@ -23,11 +23,14 @@ from .light import parse_lighting
 if TYPE_CHECKING:
     import torch
 
-    from ..engine import Engine
-    from ..frame import FrameStats, RenderStats
-    from ..rendering import Camera, Clip, Cost, Picture, Shader, ThinLens, TransferFunction
-    from ..rendering.path import CameraPath
-    from ..rendering.projection import CameraModel
+    from ..base.records import FrameStats, RenderStats
+    from ..cameras import Camera
+    from ..cameras.models import CameraModel
+    from ..cameras.path import CameraPath
+    from ..engine.engine import Engine
+    from ..pictures import Picture
+    from ..shaders import Shader, TransferFunction
+    from ..tracing import Clip, Cost, ThinLens
 
 _RANGE_VOXELS = 128**3  # of a foreign image that are read to learn its range
 
@@ -108,7 +111,7 @@ class Look:
 
     def chosen(self, low: float, high: float) -> TransferFunction | Shader:
         """Returns the shader asked for, its transfer function read or spanned over the range."""
-        from ..rendering import Isosurface, Lit, PreIntegrated, Projection, TransferFunction
+        from ..shaders import Isosurface, Lit, PreIntegrated, Projection, TransferFunction
 
         if self.tf.endswith(".json") or Path(self.tf).is_file():
             transfer = TransferFunction.from_json(self.tf)
@@ -151,7 +154,7 @@ class Streaming:
     @contextmanager
     def open(self, path: str, look: Look) -> Iterator[tuple[Engine, TransferFunction | Shader]]:
         """Opens a store: the engine over it, and the transfer function."""
-        from ..engine import Engine
+        from ..engine.engine import Engine
         from ..io import Store
         from ..producers import StoredProducer
 
@@ -202,7 +205,7 @@ class Render:
 
     def run(self) -> None:
         """Reads, renders, writes."""
-        from ..rendering.image import checked_path
+        from ..pictures.files import checked_path
 
         width, height = size(self.look.size)
         _check_suffix("--output", self.output, *KINDS)
@@ -236,7 +239,7 @@ class Render:
         bar: Bar,
     ) -> RenderStats:
         """Renders and writes the files, strip by strip where the kind of file lets it."""
-        from ..rendering import render_tiles
+        from ..pictures import render_tiles
 
         if self.output.suffix in STRIPS and self.show == "picture":
             developed = self.develop.wrap(render)
@@ -253,7 +256,7 @@ class Render:
     ) -> tuple[RenderStats, tuple[int, ...]]:
         """Builds the whole tree of a volume file."""
         from ..pool import N3Tree
-        from ..rendering import cost, render
+        from ..tracing import cost, render
 
         flags = given(self.streaming)
         if flags:
@@ -279,7 +282,7 @@ class Render:
         self, camera: Camera, options: dict[str, Any], bar: Bar
     ) -> tuple[RenderStats, tuple[int, ...]]:
         """Streams a store."""
-        from ..rendering import cost
+        from ..tracing import cost
 
         if self.threshold is not None:
             raise ValueError("--threshold is for volumes; a store's is set by gvtorch convert")
@@ -320,7 +323,7 @@ class Fly:
 
     def run(self) -> None:
         """Renders frame after frame."""
-        from .. import check
+        from ..base import check
         from .video import Video
 
         width, height = size(self.look.size)
@@ -372,7 +375,7 @@ class Fly:
         return self.output / "stats.jsonl"
 
     def _path(self, engine: Engine, start: list[float]) -> CameraPath:
-        from ..rendering.path import CameraPath
+        from ..cameras.path import CameraPath
 
         if self.flight != "orbit":
             return CameraPath.from_json(self.flight)
@@ -398,7 +401,7 @@ def parse_camera(
     Raises:
         ValueError: The text is neither, or a number is out of its range.
     """
-    from ..rendering import Camera
+    from ..cameras import Camera
 
     kind, _, rest = text.partition(":")
     if kind == "orbit":
@@ -417,7 +420,7 @@ def parse_clip(text: str) -> Clip:
     Raises:
         ValueError: An item is of no known kind, or its numbers are refused by `Clip`.
     """
-    from ..rendering import Clip
+    from ..tracing import Clip
 
     found: dict[str, list[Any]] = {"plane": [], "box": [], "cut": []}
     caps = False
@@ -437,7 +440,7 @@ def parse_clip(text: str) -> Clip:
 
 def parse_lens(text: str) -> ThinLens:
     """Makes a lens from `APERTURE,FOCUS`."""
-    from ..rendering import ThinLens
+    from ..tracing import ThinLens
 
     aperture, focus = numbers("--lens", text, 2, float)
     return ThinLens(aperture=aperture, focus=focus, frame="box")
@@ -464,7 +467,7 @@ def value_range(store: Any) -> tuple[float, float]:
 
 def told(stats: RenderStats) -> str:
     """What a picture cost, in a few words."""
-    from ..frame import FrameStats
+    from ..base.records import FrameStats
 
     text = f"{stats.samples / 1e6:.1f} M samples in {stats.milliseconds:.0f} ms ({stats.backend})"
     if not isinstance(stats, FrameStats):

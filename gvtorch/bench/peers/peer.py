@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...frame import Rays
-from ...rendering import Camera, TransferFunction
+from ...base.records import Rays
+from ...cameras import Camera
+from ...shaders import TransferFunction
 from ..scenes import Scene
 
 

@@ -2,7 +2,7 @@
 // lack what they asked for, slots are ordered by use, pointers to slots that change hands are cleared, new pointers are
 // written.
 //
-// Equal to ops/reference_cache.py in every integer. What a device brings (cpu.cpp, cuda.cu):
+// Equal to ops/reference/cache.py in every integer. What a device brings (cpu.cpp, cuda.cu):
 //   for_each(n, body)     body(index)
 //   compact(n, list)      list.flags(index) says whether an index is listed and whether it is touched at all, and
 //                         list.put(index, rank) is called for those that are, ranks rising with the index,

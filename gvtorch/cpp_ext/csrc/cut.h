@@ -1,4 +1,4 @@
-// Bricks cut out of a level, borders from the neighbours, clamped at the level's faces. Equal to ops/reference_cut.py.
+// Bricks cut out of a level, borders from the neighbours, clamped at the level's faces. Equal to ops/reference/cut.py.
 #pragma once
 
 #include <cstring>

@@ -5,7 +5,7 @@
 // (for_each.h). No other header in this folder but entry*.h knows torch.
 //
 // log2 and exp2 in float32 are written with + - * / and bit moves alone, always in the same order, so that the
-// torch twin (ops/reference.py), the CPU and the GPU agree to the last bit. Series: Abramowitz and Stegun,
+// torch twin (ops/reference/march.py), the CPU and the GPU agree to the last bit. Series: Abramowitz and Stegun,
 // "Handbook of Mathematical Functions", 1964, 4.1.27 (logarithm by atanh) and 4.2.1 (exponential).
 #pragma once
 

@@ -23,7 +23,7 @@
 // at most a voxel that bound is never reached, so an end is the same number from both sides; and since all that is read
 // lies in the node's range, leaving a hidden node out changes no bit.
 //
-// Equal to ops/reference_shaders.py. Sources: Blinn, "Models of light reflection for computer synthesized pictures",
+// Equal to ops/reference/shaders.py. Sources: Blinn, "Models of light reflection for computer synthesized pictures",
 // SIGGRAPH 1977; Engel, Kraus, Ertl, "High-quality pre-integrated volume rendering using hardware-accelerated pixel
 // shading", Graphics Hardware 2001; Levoy, "Display of surfaces from volume data", IEEE CG&A 1988.
 #pragma once

@@ -1,7 +1,7 @@
 // TraceRay: one ray from the scene's near side to its far side. Descend, skip or sample, look the value up in the
 // transfer function, composite front to back, and mark what was used and what was missed.
 //
-// Equal to `trace_rays` in ops/reference.py: integers exactly, and every float operation in the same order.
+// Equal to `trace_rays` in ops/reference/march.py: integers exactly, and every float operation in the same order.
 // Method: Crassin, Neyret, Lefebvre, Eisemann, "GigaVoxels: Ray-Guided Streaming for Efficient and Detailed Voxel
 // Rendering", I3D 2009, sections 3 and 4; Crassin, PhD thesis 2011, chapter 6.
 #pragma once

@@ -1,4 +1,4 @@
-// A shader of one's own, in C++: what `CompiledShader` (rendering/compiled_shader.py) compiles into an op. A header of
+// A shader of one's own, in C++: what `CompiledShader` (shaders/compiled.py) compiles into an op. A header of
 // one's own holds it:
 //
 //   #include "user_shader.h"

@@ -1,0 +1,81 @@
+"""The public names of gvtorch, in groups: `import gvtorch as gv` offers all of them."""
+
+# Data, and the tree it becomes.
+from .base.volume import Volume as Volume
+from .io import read_volume as read_volume
+from .pool import (
+    BrickPool as BrickPool,
+    BrickTable as BrickTable,
+    Channel as Channel,
+    N3Tree as N3Tree,
+    NodePool as NodePool,
+)
+
+# What makes the content of a tree.
+from .producers import (
+    Bricks as Bricks,
+    Nodes as Nodes,
+    Producer as Producer,
+    Region as Region,
+    Regions as Regions,
+    StoredProducer as StoredProducer,
+    VolumeProducer as VolumeProducer,
+)
+
+# Cameras and rays.
+from .base.records import Hits as Hits, Rays as Rays
+from .cameras import Camera as Camera, CameraPath as CameraPath, CustomCamera as CustomCamera
+
+# Shaders and lights.
+from .cpp_ext.user import CompileError as CompileError
+from .shaders import (
+    CompiledShader as CompiledShader,
+    DirectionalLight as DirectionalLight,
+    DistanceField as DistanceField,
+    Features as Features,
+    Headlight as Headlight,
+    Isosurface as Isosurface,
+    Lit as Lit,
+    PointLight as PointLight,
+    PreIntegrated as PreIntegrated,
+    Projection as Projection,
+    Shader as Shader,
+    StoredColor as StoredColor,
+    TransferFunction as TransferFunction,
+)
+from .tracing import ModuleShader as ModuleShader, TransferModule as TransferModule
+
+# Rendering a resident tree.
+from .tracing import (
+    Clip as Clip,
+    Cost as Cost,
+    Layer as Layer,
+    Lighting as Lighting,
+    RenderOptions as RenderOptions,
+    ThinLens as ThinLens,
+    TreeTracer as TreeTracer,
+    cost as cost,
+    render as render,
+)
+
+# Streaming a scene larger than memory.
+from .base.records import FrameStats as FrameStats
+from .engine import (
+    Engine as Engine,
+    EngineOptions as EngineOptions,
+    ProductionError as ProductionError,
+)
+
+# Pictures.
+from .pictures import (
+    Backdrop as Backdrop,
+    Environment as Environment,
+    Gradient as Gradient,
+    Picture as Picture,
+    Progressive as Progressive,
+    read_image as read_image,
+    render_tiles as render_tiles,
+)
+from . import opengl as opengl
+
+__version__: str

@@ -1,0 +1,1 @@
+"""What every room stands on: records, checks, constants, the names of stages."""

@@ -1,0 +1,220 @@
+"""`Volume`: a dense grid of values with a place in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from . import check
+from . import constants as config
+
+#: The dtypes that a brick channel can have. Wider ones are narrowed on the way in, see `Volume`.
+CHANNEL_DTYPES = (
+    torch.uint8,
+    torch.int8,
+    torch.int16,
+    torch.uint16,
+    torch.float16,
+    torch.bfloat16,
+    torch.float32,
+)
+
+#: The ways that `Volume.directional` looks along, in the order of its numbers.
+DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
+
+
+def check_extent(where: str, shape: Sequence[int], *, what: str = "extent") -> None:
+    """Raises ValueError unless all sizes are positive and their product is at most 2^31 voxels.
+
+    Readers call it with what a file's header says, before they take any memory for it.
+    """
+    sizes = " x ".join(str(size) for size in shape)
+    if any(size < 1 for size in shape):
+        raise ValueError(f"{where}: {what} must be at least 1 in every direction, got {sizes}")
+    voxels = 1
+    for size in shape:
+        voxels *= int(size)
+    if voxels > config.MAX_VOXELS:
+        raise ValueError(
+            f"{where}: {what} {sizes} is {voxels} voxels, more than the {config.MAX_VOXELS} "
+            "that fit in memory at once"
+        )
+
+
+class Volume:
+    """A dense grid. The centre of voxel (x, y, z) lies at index * spacing + origin in the world.
+
+    The box runs from voxel face to voxel face, -0.5 to n - 0.5 in index units; between the
+    outermost centres and the box's faces the outermost values go on.
+
+    Attributes:
+        data: (z, y, x, c) tensor on the CPU, one of `CHANNEL_DTYPES`.
+        spacing: (x, y, z) world units, distance of neighbouring voxel centres.
+        origin: (x, y, z) world units, centre of voxel 0.
+        name: Where it came from, for messages.
+        filter: How coarse levels are made: the mean, or what is seen along six directions, see
+            `directional`.
+    """
+
+    filter: Literal["mean", "directional"] = "mean"
+
+    def __init__(
+        self,
+        data: Tensor | np.ndarray,
+        spacing: Sequence[float] = (1.0, 1.0, 1.0),
+        origin: Sequence[float] = (0.0, 0.0, 0.0),
+        *,
+        name: str = "volume",
+        nan: float | None = None,
+    ) -> None:
+        """Checks and takes over a grid.
+
+        Args:
+            data: (z, y, x) or (z, y, x, c). Any byte order. bool becomes uint8; 32 and 64 bit
+                integers and float64 become float32.
+            spacing: (x, y, z) world units, positive.
+            origin: (x, y, z) world units.
+            name: Shown in messages.
+            nan: The value that voxels which are not finite get; None refuses them.
+
+        Raises:
+            ValueError: data is empty, of another shape or dtype, has more than 2^31 voxels or
+                holds values that are not finite; spacing is not positive.
+        """
+        where = f"Volume {name!r}" if name != "volume" else "Volume"
+        tensor = _as_tensor(where, data)
+        if tensor.dim() not in (3, 4):
+            raise ValueError(
+                f"{where}: data must be (z, y, x) or (z, y, x, c), got {check.describe(data)}"
+                if isinstance(data, Tensor)
+                else f"{where}: data must be (z, y, x) or (z, y, x, c), got shape {data.shape}"
+            )
+        if tensor.dim() == 3:
+            tensor = tensor[..., None]
+        check_extent(where, tensor.shape[:3], what="data")
+        check_extent(where, tensor.shape, what="data with its channels")
+        self.data = _finite(where, tensor.contiguous(), nan)
+        self.spacing = check.triple(where, "spacing", spacing)
+        if min(self.spacing) <= 0:
+            raise ValueError(f"{where}: spacing must be positive, got {self.spacing}")
+        self.origin = check.triple(where, "origin", origin)
+        self.name = name
+
+    @property
+    def extent(self) -> tuple[int, int, int]:
+        """Voxels in (x, y, z)."""
+        z, y, x, _ = self.data.shape
+        return (x, y, z)
+
+    @property
+    def value_range(self) -> tuple[float, float]:
+        """Smallest and largest value over all channels."""
+        low, high = torch.aminmax(_orderable(self.data))
+        return (float(low), float(high))
+
+    def directional(
+        self, *, premultiplied: bool = False, dtype: torch.dtype = torch.float16
+    ) -> Volume:
+        """Returns a volume of colour and opacity as `StoredColor` reads it with six directions: 24
+        numbers a voxel, for each of `DIRECTIONS` the premultiplied red, green, blue and the opacity
+        that are seen along it. A finest voxel looks the same from all sides; in coarser ones, what
+        lies in front hides what lies behind. So thin walls let no light through, and their two
+        sides keep their colours.
+
+        Opacity is that of the smallest spacing.
+
+        Args:
+            premultiplied: Whether colours are given times opacity.
+            dtype: float16, bfloat16 or float32.
+
+        Raises:
+            ValueError: A voxel holds no 4 numbers, an opacity lies beyond 0 to 1 (integers stand
+                for 0 to 1), or the dtype is another.
+
+        Source: Crassin et al., "Interactive indirect illumination using voxel cone tracing", CGF
+            2011 (anisotropic voxels).
+        """
+        where = "Volume.directional"
+        if dtype not in (torch.float16, torch.bfloat16, torch.float32):
+            raise ValueError(f"{where}: dtype must be float16, bfloat16 or float32, got {dtype}")
+        if self.data.shape[3] != 4:
+            raise ValueError(
+                f"{where}: needs red, green, blue and opacity, "
+                f"got {self.data.shape[3]} numbers a voxel"
+            )
+        rgba = self.data.to(torch.float32)
+        if not self.data.is_floating_point():
+            rgba = rgba / torch.iinfo(self.data.dtype).max
+        color, opacity = rgba[..., :3], rgba[..., 3:]
+        low, high = (float(end) for end in torch.aminmax(opacity))
+        if low < 0 or high > 1:
+            raise ValueError(f"{where}: opacity must lie in 0 to 1, got {low:g} to {high:g}")
+        color = color if premultiplied else color * opacity
+        seen = torch.cat((color, opacity), -1).to(dtype).repeat(1, 1, 1, len(DIRECTIONS))
+        volume = Volume(seen, self.spacing, self.origin, name=self.name)
+        volume.filter = "directional"
+        return volume
+
+    def __repr__(self) -> str:
+        """Shows extent, dtype, channels and spacing."""
+        dtype = str(self.data.dtype).removeprefix("torch.")
+        extent = "x".join(str(size) for size in self.extent)
+        return (
+            f"Volume({self.name!r}, {extent} (x, y, z), {dtype}x{self.data.shape[3]}, "
+            f"spacing={self.spacing})"
+        )
+
+
+def movable(tensor: Tensor) -> Tensor:
+    """Returns a view that can be indexed and written: torch can do neither to uint16, but to
+    int16.
+    """
+    return tensor.view(torch.int16) if tensor.dtype == torch.uint16 else tensor
+
+
+def _orderable(data: Tensor) -> Tensor:
+    """uint16 has no comparisons in torch: int32 has the same order."""
+    return data.to(torch.int32) if data.dtype == torch.uint16 else data
+
+
+def _as_tensor(where: str, data: Tensor | np.ndarray) -> Tensor:
+    if isinstance(data, Tensor):
+        tensor = data.detach().cpu()
+    elif isinstance(data, np.ndarray):
+        if data.dtype.kind not in "biuf":
+            raise ValueError(f"{where}: data must hold numbers, got dtype {data.dtype}")
+        if data.dtype.kind == "f" and data.dtype.itemsize > 8:
+            data = data.astype(np.float64)
+        native = data.astype(data.dtype.newbyteorder("="), copy=False)
+        tensor = torch.from_numpy(np.require(native, requirements=["C", "W"]))
+    else:
+        raise ValueError(f"{where}: data must be a tensor or array, got {type(data).__name__}")
+    if tensor.dtype == torch.bool:
+        return tensor.to(torch.uint8)
+    if tensor.dtype in CHANNEL_DTYPES:
+        return tensor
+    if tensor.is_complex():
+        raise ValueError(f"{where}: data must hold real numbers, got {check.describe(tensor)}")
+    return tensor.to(torch.float32)
+
+
+def _finite(where: str, tensor: Tensor, nan: float | None) -> Tensor:
+    if not tensor.is_floating_point() or tensor.numel() == 0:
+        return tensor
+    if nan is not None:
+        limits = torch.finfo(tensor.dtype)
+        nan = check.number(where, "nan", nan, low=limits.min, high=limits.max)
+    low, high = torch.aminmax(tensor)
+    if torch.isfinite(low) and torch.isfinite(high):
+        return tensor
+    bad = int((~torch.isfinite(tensor)).sum())
+    if nan is None:
+        raise ValueError(
+            f"{where}: data holds {bad} values that are NaN or infinite (of {tensor.numel()}); "
+            "pass nan=VALUE (--nan VALUE) to replace them"
+        )
+    return torch.where(torch.isfinite(tensor), tensor, torch.tensor(nan, dtype=tensor.dtype))

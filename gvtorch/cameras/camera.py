@@ -1,0 +1,473 @@
+"""`Camera`: one or a batch, with a lens of `projection.py`, and the rays through their pixels.
+
+Conventions: camera axes are OpenCV's (x right, y down, z forward); pixel (i, j) covers [i, i + 1)
+x [j, j + 1) of the image plane, its centre is at +0.5 (so do gsplat and nerfstudio; kornia puts
+centres at integers, and `from_kornia` and `to_kornia` shift the principal point by half a pixel).
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from enum import Enum
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from ..base.records import Rays
+from .models import MODELS, CameraModel, default_fov, last_rising_angle, pixel_rays
+
+if TYPE_CHECKING:
+    from kornia.geometry.camera import PinholeCamera
+
+Numbers = float | Sequence[float] | Tensor
+
+
+class Frame(Enum):
+    """What a camera's position is measured in."""
+
+    WORLD = "world"  # world units
+    BOX = "box"  # the scene's box: its centre is 0 and its largest side 1
+
+    @classmethod
+    def of(cls, where: str, value: Frame | str) -> Frame:
+        """Returns the frame of this name; raises ValueError where there is none."""
+        try:
+            return cls(value)
+        except ValueError:
+            raise ValueError(f"{where}: frame must be 'world' or 'box', got {value!r}") from None
+
+
+class Camera:
+    """Cameras that share width, height and lens.
+
+    Attributes:
+        viewmats: (n, 4, 4) float64, world (or box) to camera.
+        Ks: (n, 3, 3) float64 intrinsics in pixels; focal lengths are pixels a unit of slope
+            (pinhole), a radian (fisheye, panorama), or a world unit or side of the box (ortho).
+        width: Pixels.
+        height: Pixels.
+        model: Name of the lens.
+        radial_coeffs: (n, 4) float64 distortion of a fisheye.
+        max_angle: (n,) float64 radians; a fisheye's rays farther from the axis are closed.
+        window: First row and number of rows of the whole picture, of which this camera may take a
+            strip.
+        frame: Whether positions are in the world or relative to the box of what is rendered.
+        batched: False for one camera whose pictures have no batch dimension.
+    """
+
+    def __init__(
+        self,
+        viewmats: Tensor,
+        Ks: Tensor,
+        width: int,
+        height: int,
+        *,
+        model: CameraModel = "pinhole",
+        radial_coeffs: Numbers | None = None,
+        max_angle: float = 180.0,
+        frame: Frame = Frame.WORLD,
+    ) -> None:
+        """Takes matrices (4, 4) and (3, 3), or batches (n, 4, 4) and (n, 3, 3).
+
+        Args:
+            viewmats: World to camera.
+            Ks: Intrinsics.
+            width: Pixels.
+            height: Pixels.
+            model: pinhole, ortho, fisheye (equidistant) or panorama (equirectangular).
+            radial_coeffs: (4,) or (n, 4) of a fisheye, as OpenCV and gsplat have them.
+            max_angle: Of a fisheye, degrees from the axis; pixels beyond show the background.
+            frame: What positions are relative to.
+
+        Raises:
+            ValueError: A wrong shape, a value that is not finite, a focal length that is not
+                positive or a rotation that is none.
+        """
+        self.model = _model("Camera", model)
+        self.width = check.whole("Camera", "width", width, low=1, high=65536)
+        self.height = check.whole("Camera", "height", height, low=1, high=65536)
+        self.window = (0, self.height)
+        view = torch.as_tensor(viewmats, dtype=torch.float64)
+        intrinsics = torch.as_tensor(Ks, dtype=torch.float64)
+        for name, matrix, side in (("viewmats", view, 4), ("Ks", intrinsics, 3)):
+            if matrix.dim() not in (2, 3) or matrix.shape[-2:] != (side, side):
+                raise ValueError(
+                    f"Camera: {name} must be ({side}, {side}) or (n, {side}, {side}), "
+                    f"got {tuple(matrix.shape)}"
+                )
+            if not bool(torch.isfinite(matrix).all()):
+                raise ValueError(f"Camera: {name} must be finite, got NaN or infinity")
+        self.batched = view.dim() == 3 or intrinsics.dim() == 3
+        count = max(m.shape[0] if m.dim() == 3 else 1 for m in (view, intrinsics))
+        try:
+            self.viewmats = view.expand(count, 4, 4).contiguous()
+            self.Ks = intrinsics.expand(count, 3, 3).contiguous()
+        except RuntimeError:
+            raise ValueError(
+                f"Camera: viewmats {tuple(view.shape)} and Ks {tuple(intrinsics.shape)} "
+                "do not match"
+            ) from None
+        if bool((self.Ks[:, (0, 1), (0, 1)] <= 0).any()):
+            raise ValueError("Camera: Ks must have positive focal lengths")
+        rotation = self.viewmats[:, :3, :3]
+        error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().max()
+        if error > 1e-3 or bool((torch.linalg.det(rotation) < 0).any()):
+            raise ValueError("Camera: viewmats must hold rotations (orthonormal, determinant +1)")
+        bottom = torch.tensor([0, 0, 0, 1], dtype=torch.float64)
+        if bool((self.viewmats[:, 3] != bottom).any() or (self.Ks[:, 2] != bottom[1:]).any()):
+            raise ValueError("Camera: last rows must be (0, 0, 0, 1) of viewmats, (0, 0, 1) of Ks")
+        if bool((self.Ks[:, (0, 1), (1, 0)] != 0).any()):
+            raise ValueError("Camera: Ks must have no skew")
+        self.frame = frame
+        angle = math.radians(
+            check.number("Camera", "max_angle", max_angle, low=0, high=180, open_low=True)
+        )
+        self.max_angle = torch.full((count,), angle, dtype=torch.float64)
+        self.radial_coeffs = torch.zeros(count, 4, dtype=torch.float64)
+        if radial_coeffs is not None:
+            self._distort(_numbers("Camera", "radial_coeffs", radial_coeffs))
+        self.distorted = bool((self.radial_coeffs != 0).any())
+
+    def _distort(self, coefficients: Tensor) -> None:
+        if self.model != "fisheye":
+            raise ValueError(f"Camera: radial_coeffs are for a fisheye, got model {self.model!r}")
+        shape, count = tuple(coefficients.shape), len(self)
+        if shape not in ((4,), (1, 4), (count, 4)):
+            raise ValueError(f"Camera: radial_coeffs must be (4,) or ({count}, 4), got {shape}")
+        self.radial_coeffs = coefficients.expand(count, 4).contiguous()
+        rising = [last_rising_angle(row) for row in self.radial_coeffs]
+        self.max_angle = torch.minimum(self.max_angle, torch.tensor(rising, dtype=torch.float64))
+
+    @classmethod
+    def orbit(
+        cls,
+        azimuth: Numbers = 30.0,
+        elevation: Numbers = 20.0,
+        distance: Numbers = 2.4,
+        fov: float | None = None,
+        width: int = 512,
+        height: int = 512,
+        model: CameraModel = "pinhole",
+    ) -> Camera:
+        """Looks at the centre of the scene's box from a sphere around it; up is +y.
+
+        position = centre + distance * L * (sin az cos el, sin el, cos az cos el), L the box's
+        largest side.
+
+        Args:
+            azimuth: Degrees; a number, or (n,) for a batch.
+            elevation: Degrees, likewise.
+            distance: In largest sides of the box, likewise, > 0.
+            fov: Vertical field of view, degrees; see `look_at`.
+            width: Pixels.
+            height: Pixels.
+            model: Name of the lens.
+
+        Raises:
+            ValueError: A number is not finite or out of its range.
+        """
+        turn, lift, far = (
+            _numbers("Camera.orbit", name, value)
+            for name, value in (
+                *(("azimuth", azimuth), ("elevation", elevation)),
+                ("distance", distance),
+            )
+        )
+        if bool((far <= 0).any()):
+            raise ValueError(f"Camera.orbit: distance must be > 0, got {distance!r}")
+        try:
+            turn, lift, far = torch.broadcast_tensors(turn.deg2rad(), lift.deg2rad(), far)
+        except RuntimeError:
+            raise ValueError(
+                "Camera.orbit: azimuth, elevation and distance have different lengths"
+            ) from None
+        if far.dim() > 1:
+            raise ValueError(
+                "Camera.orbit: azimuth, elevation and distance must be numbers or (n,), "
+                f"got {tuple(far.shape)}"
+            )
+        zero = torch.zeros_like(turn)
+        outward = torch.stack(
+            (turn.sin() * lift.cos(), lift.sin(), turn.cos() * lift.cos()), dim=-1
+        )
+        over = torch.where(lift.cos() < -1e-12, -1.0, 1.0)  # beyond a pole up is still +y
+        right = torch.stack((over * turn.cos(), zero, -over * turn.sin()), dim=-1)
+        view = _viewmat(outward * far[..., None], -outward, right)
+        return _aimed("Camera.orbit", view, far, fov, width, height, model, Frame.BOX)
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: Sequence[float] | Tensor,
+        target: Sequence[float] | Tensor,
+        up: Sequence[float] | Tensor = (0.0, 1.0, 0.0),
+        fov: float | None = None,
+        width: int = 512,
+        height: int = 512,
+        model: CameraModel = "pinhole",
+    ) -> Camera:
+        """Stands at `eye` and looks at `target`, in world units.
+
+        Args:
+            eye: (3,) or (n, 3).
+            target: (3,) or (n, 3).
+            up: (3,) or (n, 3); where it is parallel to the view, -z takes its place (or +y, if up
+                is z).
+            fov: Vertical field of view, degrees; left out, 30 of a pinhole and an orthographic
+                camera, which shows what a pinhole would at the target's distance, and 180 of a
+                fisheye, whose circle is as high as the picture, and of a panorama, which is twice
+                as wide as high.
+            width: Pixels.
+            height: Pixels.
+            model: Name of the lens.
+
+        Raises:
+            ValueError: A place is not finite, up is zero, or eye and target are the same.
+        """
+        places = []
+        for name, value in (("eye", eye), ("target", target), ("up", up)):
+            place = _numbers("Camera.look_at", name, value)
+            if place.dim() not in (1, 2) or place.shape[-1] != 3:
+                raise ValueError(
+                    f"Camera.look_at: {name} must be (3,) or (n, 3), got {tuple(place.shape)}"
+                )
+            places.append(place)
+        try:
+            eye_, target_, up_ = torch.broadcast_tensors(*places)
+        except RuntimeError:
+            raise ValueError("Camera.look_at: eye, target and up have different lengths") from None
+        if bool((up_ == 0).all(-1).any()):
+            raise ValueError("Camera.look_at: up must not be zero")
+        forward = target_ - eye_
+        length = forward.norm(dim=-1, keepdim=True)
+        if bool((length == 0).any()):
+            raise ValueError(f"Camera.look_at: eye and target are the same place, {eye!r}")
+        forward = forward / length
+        right = torch.linalg.cross(forward, up_)
+        other = torch.where(
+            forward[..., 2:3].abs() > 0.9,
+            forward.new_tensor([0, 1, 0]),
+            forward.new_tensor([0, 0, -1]),
+        )
+        parallel = right.norm(dim=-1, keepdim=True) < 1e-9 * up_.norm(dim=-1, keepdim=True) + 1e-300
+        right = torch.where(parallel, torch.linalg.cross(forward, other), right)
+        right = right / right.norm(dim=-1, keepdim=True)
+        view = _viewmat(eye_, forward, right)
+        distance = length[..., 0]
+        return _aimed("Camera.look_at", view, distance, fov, width, height, model, Frame.WORLD)
+
+    @classmethod
+    def from_viewmat_K(
+        cls,
+        viewmats: Tensor,
+        Ks: Tensor,
+        width: int,
+        height: int,
+        camera_model: CameraModel = "pinhole",
+        radial_coeffs: Tensor | None = None,
+    ) -> Camera:
+        """Takes gsplat's arguments: (..., 4, 4) world-to-camera (OpenCV), (..., 3, 3), the lens by
+        its word there and (..., 4) coefficients of a fisheye.
+
+        Leading dimensions are laid in a row: the cameras are a batch of their product.
+        """
+        flat = []
+        for name, matrix in (("viewmats", viewmats), ("Ks", Ks)):
+            matrices = _numbers("Camera.from_viewmat_K", name, matrix)
+            many = matrices.dim() > 3
+            flat.append(matrices.reshape(-1, *matrices.shape[-2:]) if many else matrices)
+        if radial_coeffs is not None and radial_coeffs.dim() > 2:
+            radial_coeffs = radial_coeffs.reshape(-1, radial_coeffs.shape[-1])
+        view, K = flat
+        return Camera(view, K, width, height, model=camera_model, radial_coeffs=radial_coeffs)
+
+    @classmethod
+    def from_kornia(cls, camera: PinholeCamera) -> Camera:
+        """Takes kornia's `PinholeCamera` (a batch). Its pixel centres are at integers, ours at
+        +0.5.
+        """
+        sizes = torch.stack((camera.height, camera.width)).long().unique(dim=1)
+        if sizes.shape[1] != 1:
+            raise ValueError("Camera.from_kornia: all cameras must have one height and width")
+        Ks = camera.intrinsics[:, :3, :3].detach().to("cpu", torch.float64).clone()
+        Ks[:, :2, 2] += 0.5
+        view = camera.extrinsics.detach().to("cpu", torch.float64)
+        return Camera(view, Ks, int(sizes[1, 0]), int(sizes[0, 0]))
+
+    def to_kornia(self) -> Any:
+        """Returns the batch as kornia's `PinholeCamera`, float64.
+
+        Raises:
+            ValueError: The camera is no pinhole.
+        """
+        from kornia.geometry.camera import PinholeCamera
+
+        if self.model != "pinhole":
+            raise ValueError(f"Camera.to_kornia: the camera must be a pinhole, is {self.model!r}")
+
+        intrinsics = torch.eye(4, dtype=torch.float64).repeat(len(self), 1, 1)
+        intrinsics[:, :3, :3] = self.Ks
+        intrinsics[:, :2, 2] -= 0.5
+        size = torch.ones(len(self), dtype=torch.float64)
+        return PinholeCamera(intrinsics, self.viewmats, self.height * size, self.width * size)
+
+    def __len__(self) -> int:
+        """Number of cameras."""
+        return self.viewmats.shape[0]
+
+    def __getitem__(self, index: int) -> Camera:
+        """Returns one camera of the batch."""
+        one = range(len(self))[index]
+        parts = {name: getattr(self, name)[one : one + 1] for name in _ROWS}
+        return self._changed(**parts, batched=False)
+
+    def _changed(self, **parts: Any) -> Camera:
+        other = copy.copy(self)
+        vars(other).update(parts)
+        return other
+
+    @property
+    def form(self) -> tuple[Any, ...]:
+        """What cameras must share to be drawn by the same graph."""
+        size = (len(self), self.height, self.width)
+        return (*size, self.batched, self.model, self.distorted, self.window)
+
+    def same(self, other: Camera) -> bool:
+        """Whether another camera has the same rays; nobody waits for a device."""
+        return (self.form, self.frame) == (other.form, other.frame) and all(
+            torch.equal(getattr(self, name), getattr(other, name)) for name in _ROWS
+        )
+
+    def placed(self, box: Tensor) -> Camera:
+        """Returns the camera in world units, given the (2, 3) box of the scene."""
+        if self.frame is Frame.WORLD:
+            return self
+        centre, side = (box[0] + box[1]) / 2, (box[1] - box[0]).max()
+        view, Ks = self.viewmats.clone(), self.Ks
+        rotation = view[:, :3, :3]
+        view[:, :3, 3] = view[:, :3, 3] * side - rotation @ centre
+        if self.model == "ortho":
+            Ks = Ks.clone()
+            Ks[:, (0, 1), (0, 1)] /= side
+        return self._changed(viewmats=view, Ks=Ks, frame=Frame.WORLD)
+
+    def shifted(self, dx: float, dy: float) -> Camera:
+        """Returns the camera whose rays go through (dx, dy) pixels right of and below the centres
+        of the pixels.
+        """
+        Ks = self.Ks.clone()
+        Ks[:, :2, 2] -= torch.tensor([dx, dy], dtype=torch.float64)
+        return self._changed(Ks=Ks)
+
+    def strip(self, first: int, end: int) -> Camera:
+        """Returns the camera of the rows [first, end) of each picture."""
+        window = (self.window[0] + first, self.window[1])
+        return self.shifted(0, first)._changed(height=end - first, window=window)
+
+    def numbers(self, device: torch.device | str = "cpu") -> Tensor:
+        """Returns (n, 25) float64, what `pixel_rays` reads; on CUDA the copy makes nobody wait.
+
+        Raises:
+            ValueError: The camera is relative to a box: call `placed(box)` first.
+        """
+        if self.frame is not Frame.WORLD:
+            raise ValueError("Camera.rays: an orbit camera has no place yet, call placed(tree.box)")
+        rotation, translation = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3]
+        focal, centre = self.Ks[:, (0, 1), (0, 1)], self.Ks[:, :2, 2] - 0.5
+        position = -(translation[:, None] @ rotation)[:, 0]  # -R^T t
+        zero = torch.zeros_like(focal[:, :1])
+        pixel = 1 / focal.min(1, keepdim=True).values
+        cone = (pixel, zero) if self.model == "ortho" else (zero, pixel)
+        range_ = (zero, zero + math.inf)
+        bend = (self.radial_coeffs, self.max_angle[:, None])
+        parts = (rotation.flatten(1), position, focal, centre, *cone, *range_, *bend)
+        return sent(torch.cat(parts, 1), device)
+
+    def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:
+        """Returns the rays of whole rows, counted through the batch, from what `numbers` gave."""
+        return pixel_rays(numbers, self.width, self.height, rows, self.model, self.distorted)
+
+    def rays(self, device: torch.device | str = "cpu", rows: tuple[int, int] | None = None) -> Rays:
+        """Returns the rays through pixel centres, camera by camera, row by row, in float64.
+
+        Args:
+            device: Where they are made.
+            rows: First row and the row after the last, counted through the batch; all if left out.
+
+        Raises:
+            ValueError: The camera is relative to a box: call `placed(box)` first.
+        """
+        everything = (0, len(self) * self.height)
+        return self.pixel_rays(self.numbers(device), rows or everything)
+
+
+_ROWS = ("viewmats", "Ks", "radial_coeffs", "max_angle")  # a row a camera
+
+
+def sent(numbers: Tensor, device: torch.device | str) -> Tensor:
+    """Returns numbers on a device; copies from the host to CUDA make nobody wait."""
+    device = torch.device(device)
+    if device.type == "cuda" and not numbers.is_cuda:
+        return numbers.pin_memory().to(device, non_blocking=True)
+    return numbers.to(device)
+
+
+def _numbers(where: str, name: str, value: Any) -> Tensor:
+    try:
+        tensor = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
+    except (TypeError, ValueError, RuntimeError):
+        raise ValueError(f"{where}: {name} must be numbers, got {value!r}") from None
+    if not bool(torch.isfinite(tensor).all()):
+        raise ValueError(f"{where}: {name} must be finite, got {value!r}")
+    return tensor
+
+
+def _viewmat(eye: Tensor, forward: Tensor, right: Tensor) -> Tensor:
+    """World-to-camera matrix (..., 4, 4) from a place and two orthonormal directions."""
+    down = torch.linalg.cross(forward, right)
+    rotation = torch.stack((right, down, forward), dim=-2)
+    view = torch.eye(4, dtype=torch.float64).repeat(*eye.shape[:-1], 1, 1)
+    view[..., :3, :3] = rotation
+    view[..., :3, 3] = -(rotation @ eye[..., None])[..., 0]
+    return view
+
+
+def _model(where: str, model: Any) -> CameraModel:
+    if model not in MODELS:
+        raise ValueError(f"{where}: model must be one of {', '.join(MODELS)}, got {model!r}")
+    return model
+
+
+def _aimed(
+    where: str,
+    view: Tensor,
+    distance: Tensor,
+    fov: float | None,
+    width: int,
+    height: int,
+    model: CameraModel,
+    frame: Frame,
+) -> Camera:
+    """Cameras with the lens in the middle of the picture; `distance` (...) is the target's."""
+    _model(where, model)
+    round_ = model in ("fisheye", "panorama")
+    high = {"fisheye": 360, "panorama": 180}.get(model, 179)
+    fov = default_fov(model) if fov is None else fov
+    angle = math.radians(check.number(where, "fov", fov, low=0, high=high, open_low=True))
+    check.whole(where, "width", width, low=1, high=65536)
+    check.whole(where, "height", height, low=1, high=65536)
+    across = height / angle if round_ else 0.5 * height / math.tan(0.5 * angle)
+    Ks = torch.tensor(
+        [[across, 0, width / 2], [0, across, height / 2], [0, 0, 1]], dtype=torch.float64
+    )
+    if model == "panorama":
+        Ks[0, 0] = width / (2 * angle)
+    if model == "ortho":
+        Ks = Ks.repeat(*distance.shape, 1, 1)
+        Ks[..., (0, 1), (0, 1)] /= distance[..., None]
+    most = min(180.0, fov / 2) if model == "fisheye" else 180.0
+    return Camera(view, Ks, width, height, model=model, max_angle=most, frame=frame)

@@ -1,0 +1,179 @@
+"""`CustomCamera`: pictures along any rays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..base.check import describe, whole
+from ..base.records import Rays
+from .camera import Camera, Frame, sent
+from .models import neighbour_cones, ray_step
+
+
+class CustomCamera(Camera):
+    """A ray for each pixel, in world units. What is taken with it is a picture like any other."""
+
+    model: Any = "custom"
+    distorted = False
+
+    def __init__(self, rays: Rays, width: int | None = None, height: int | None = None) -> None:
+        """Takes rays row by row, picture by picture.
+
+        Args:
+            rays: n * height * width rays; more than one picture makes a batch.
+            width: Pixels; left out that of the rays, or all of them in one row.
+            height: Pixels; left out all rows.
+
+        Raises:
+            ValueError: The number of rays is no multiple of a picture's pixels, or a shape is
+                wrong, or (looked at on the CPU only) a number is NaN, or a direction is not of unit
+                length.
+        """
+        columns: list[Tensor] = []
+        for name, size in (("origin", 3), ("direction", 3), ("cone", 2), ("range", 2)):
+            column = getattr(rays, name, None)
+            known = columns[0].shape[0] if columns else "r"
+            if (
+                not isinstance(column, Tensor)
+                or column.dim() != 2
+                or not column.is_floating_point()
+                or (column.shape[0] if columns else known, column.shape[1]) != (known, size)
+            ):
+                raise ValueError(
+                    f"CustomCamera: rays.{name} must be ({known}, {size}) float, "
+                    f"got {describe(column)}"
+                )
+            columns.append(column)
+        if rays.clear is not None:
+            raise ValueError("CustomCamera: rays of a picture must have no clear, got some")
+        count = len(rays.origin)
+        width = rays.width or count if width is None else width
+        self.width = whole("CustomCamera", "width", width, low=1)
+        rows = count // self.width
+        self.height = whole("CustomCamera", "height", rows if height is None else height, low=1)
+        self.window = (0, self.height)
+        if count % (self.width * self.height):
+            raise ValueError(
+                f"CustomCamera: {count} rays are no pictures of {self.width}x{self.height} pixels"
+            )
+        self._rays = torch.cat([column.to(torch.float64) for column in columns], 1)  # (r, 10)
+        if rays.direction.device.type == "cpu":
+            lost = self._rays.isnan().any(1)
+            if bool(lost.any()):
+                raise ValueError(f"CustomCamera: rays must not be NaN, {int(lost.sum())} are")
+            off = (rays.direction.norm(dim=1) - 1).abs() > 1e-3
+            if bool(off.any()):
+                raise ValueError(
+                    f"CustomCamera: directions must be of unit length, {int(off.sum())} are not"
+                )
+        self.frame, self.batched = Frame.WORLD, count > self.width * self.height
+
+    @classmethod
+    def from_directions(
+        cls,
+        origin: Tensor,
+        direction: Tensor,
+        *,
+        cone: Tensor | None = None,
+        range: Tensor | None = None,
+    ) -> CustomCamera:
+        """Takes rays in the shape of their picture.
+
+        Args:
+            origin: (h, w, 3) or (n, h, w, 3) world units, or what broadcasts to it.
+            direction: (h, w, 3) or (n, h, w, 3) of any length but 0.
+            cone: (..., 2) width at the origin and growth per unit distance; left out it is taken
+                from the differences between neighbouring rays.
+            range: (..., 2) first and last distance; 0 and infinity if left out.
+
+        Raises:
+            ValueError: A shape is wrong, or (looked at on the CPU only) a number is NaN, or a
+                direction 0.
+        """
+        if direction.dim() not in (3, 4) or direction.shape[-1] != 3:
+            raise ValueError(
+                "CustomCamera: direction must be (h, w, 3) or (n, h, w, 3), "
+                f"got {describe(direction)}"
+            )
+        direction = torch.nn.functional.normalize(direction.to(torch.float64), dim=-1, eps=1e-300)
+        if range is None:
+            range = torch.stack((direction.new_zeros(()), direction.new_full((), torch.inf)))
+        parts = {"origin": (origin, 3), "cone": (cone, 2), "range": (range, 2)}
+        shaped = {"direction": direction}
+        for name, (part, size) in parts.items():
+            if part is None:
+                continue
+            try:
+                shaped[name] = part.to(direction).expand(*direction.shape[:-1], size)
+            except RuntimeError:
+                raise ValueError(
+                    f"CustomCamera: {name} must broadcast to {(*direction.shape[:-1], size)}, "
+                    f"got {describe(part)}"
+                ) from None
+        if cone is None:
+            shaped["cone"] = neighbour_cones(shaped["origin"], direction)
+        flat: dict[str, Any] = {n: part.reshape(-1, part.shape[-1]) for n, part in shaped.items()}
+        height, width = direction.shape[-3:-1]
+        camera = cls(Rays(**flat), width, height)
+        camera.batched = direction.dim() == 4
+        return camera
+
+    def __len__(self) -> int:
+        """Number of pictures."""
+        return len(self._rays) // (self.width * self.height)
+
+    def _pictures(self) -> Tensor:
+        return self._rays.view(-1, self.height, self.width, 10)
+
+    def __getitem__(self, index: int) -> Camera:
+        """Returns one camera of the batch."""
+        return self._changed(_rays=self._pictures()[index].reshape(-1, 10), batched=False)
+
+    def same(self, other: Camera) -> bool:
+        """Whether the other has the same tensor of rays."""
+        return isinstance(other, CustomCamera) and self._rays is other._rays
+
+    def placed(self, box: Tensor) -> Camera:
+        """Returns itself: rays are in world units."""
+        return self
+
+    def shifted(self, dx: float, dy: float) -> Camera:
+        """Returns the camera with its rays moved by a part of the step to their neighbours."""
+        lines = self._pictures()[..., :6]
+        moved = lines + dx * ray_step(lines, -2) + dy * ray_step(lines, -3)
+        origin, direction = moved.split(3, -1)
+        direction = direction / direction.norm(dim=-1, keepdim=True)
+        rays = torch.cat((origin, direction, self._pictures()[..., 6:]), -1)
+        return self._changed(_rays=rays.reshape(-1, 10))
+
+    def strip(self, first: int, end: int) -> Camera:
+        """Returns the camera of the rows [first, end) of each picture."""
+        rays = self._pictures()[:, first:end].reshape(-1, 10)
+        window = (self.window[0] + first, self.window[1])
+        return self._changed(_rays=rays, height=end - first, window=window)
+
+    def numbers(self, device: torch.device | str = "cpu") -> Tensor:
+        """Returns (r, 10) float64: origin, direction, cone and range."""
+        return sent(self._rays, device)
+
+    def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:
+        """Returns the rays of whole rows, from what `numbers` gave."""
+        part = numbers[rows[0] * self.width : rows[1] * self.width]
+        origin, direction, cone, limits = part.split((3, 3, 2, 2), 1)
+        return Rays(origin=origin, direction=direction, cone=cone, range=limits, width=self.width)
+
+
+def as_camera(where: str, camera: Camera | Rays) -> Camera:
+    """Returns a user's camera; rays become one.
+
+    Raises:
+        ValueError: It is neither.
+    """
+    if isinstance(camera, Rays):
+        return CustomCamera(camera)
+    if not isinstance(camera, Camera):
+        raise ValueError(f"{where}: camera must be a Camera, got {type(camera).__name__}")
+    return camera

@@ -1,0 +1,140 @@
+"""`CameraPath`: a camera that moves, from key frames.
+
+Positions, targets and fields of view run along Catmull-Rom curves, which pass through every key and
+have no corners. Source: Catmull and Rom, "A class of local interpolating splines", 1974.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from .camera import Camera
+from .models import CameraModel, default_fov
+
+_KEYS = {"eye", "target", "up", "fov"}
+
+
+class CameraPath:
+    """Cameras by a number that runs from 0 (the first key) to 1 (the last)."""
+
+    def __init__(
+        self,
+        eye: Sequence[Sequence[float]],
+        target: Sequence[Sequence[float]],
+        up: Sequence[Sequence[float]] | None = None,
+        fov: Sequence[float] | None = None,
+    ) -> None:
+        """Takes the keys, one row each.
+
+        Args:
+            eye: (k, 3) world units, k >= 1.
+            target: (k, 3) world units, what is in the middle of the picture.
+            up: (k, 3); +y if left out.
+            fov: (k,) vertical field of view, degrees; 30 if left out.
+
+        Raises:
+            ValueError: The lists differ in length, or a number is not finite.
+        """
+        count = len(eye)
+        if count < 1:
+            raise ValueError("CameraPath: at least one key is needed")
+        up = [(0.0, 1.0, 0.0)] * count if up is None else up
+        fov = [30.0] * count if fov is None else fov
+        rows = []
+        for name, values in (("eye", eye), ("target", target), ("up", up)):
+            if len(values) != count:
+                raise ValueError(
+                    f"CameraPath: {name} must have {count} rows as eye has, got {len(values)}"
+                )
+            rows.append([check.triple("CameraPath", name, value) for value in values])
+        if len(fov) != count:
+            raise ValueError(f"CameraPath: fov must have {count} numbers, got {len(fov)}")
+        angles = [[check.number("CameraPath", "fov", angle, low=0, high=360)] for angle in fov]
+        parts = [torch.tensor(part, dtype=torch.float64) for part in (*rows, angles)]
+        self._keys = torch.cat(parts, 1)  # (k, 10)
+
+    @classmethod
+    def orbit(
+        cls,
+        box: Tensor,
+        model: CameraModel = "pinhole",
+        fov: float | None = None,
+        *,
+        azimuth: float = 30.0,
+        elevation: float = 20.0,
+        distance: float = 2.4,
+    ) -> CameraPath:
+        """Goes once around a box; see `Camera.orbit` for the numbers. The model tells the field of
+        view that is left out.
+        """
+        fov = default_fov(model) if fov is None else fov
+        turn = azimuth + torch.linspace(0, 360, 37)
+        cameras = Camera.orbit(turn, elevation, distance, width=1, height=1).placed(box)
+        rotation, move = cameras.viewmats[:, :3, :3], cameras.viewmats[:, :3, 3:]
+        eye = -(rotation.mT @ move)[..., 0]
+        center = box.mean(0).expand_as(eye)
+        return cls(eye.tolist(), center.tolist(), fov=[fov] * len(eye))
+
+    @classmethod
+    def from_json(cls, path: str | Path) -> CameraPath:
+        """Reads a list of keys: [{"eye": [x, y, z], "target": [x, y, z], "up": ..., "fov": ...}].
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: The file holds something else; the message names the file.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise FileNotFoundError(f"camera path not found: {path}")
+        try:
+            keys = json.loads(path.read_text(encoding="utf-8"))
+        except (UnicodeDecodeError, json.JSONDecodeError) as error:
+            raise ValueError(f"{path}: no JSON: {error}") from None
+        if not isinstance(keys, list) or not all(isinstance(key, Mapping) for key in keys):
+            raise ValueError(f'{path}: must be a list of keys {{"eye": ..., "target": ...}}')
+        for number, key in enumerate(keys):
+            unknown, missing = sorted(set(key) - _KEYS), sorted({"eye", "target"} - set(key))
+            if unknown or missing:
+                what = f"unknown {unknown[0]!r}" if unknown else f"{missing[0]!r} is missing"
+                raise ValueError(f"{path}: key {number}: {what}")
+
+        def column(name: str, default: Any) -> list[Any]:
+            return [key.get(name, default) for key in keys]
+
+        try:
+            return cls(
+                column("eye", None),
+                column("target", None),
+                column("up", (0.0, 1.0, 0.0)),
+                column("fov", 30.0),
+            )
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+
+    def camera(self, at: float, width: int, height: int, model: CameraModel = "pinhole") -> Camera:
+        """Returns the camera at a place of the path.
+
+        Args:
+            at: 0 for the first key, 1 for the last; keys are evenly spaced.
+            width: Pixels.
+            height: Pixels.
+            model: Name of the lens.
+        """
+        at = check.number("CameraPath", "at", at, low=0, high=1)
+        last = len(self._keys) - 1
+        place = at * last
+        first = min(int(place), max(last - 1, 0))
+        t = place - first
+        index = torch.arange(first - 1, first + 3).clamp(0, last)
+        a, b, c, d = self._keys[index]
+        # Cubic through b and c, whose slopes there are those of their neighbours' chords.
+        line = b + 0.5 * t * (c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a)))
+        eye, target, up, fov = line[:3], line[3:6], line[6:9], float(line[9])
+        return Camera.look_at(eye, target, up, fov, width, height, model)

@@ -1,0 +1,112 @@
+"""`Turns`: which rays of a converging picture are traced next.
+
+A ray that missed nothing is done; the others are traced again. At first these are scouts, one of
+4 x 4 pixels: a brick is wider than that on the screen, so they miss almost all that the others
+would, for a sixteenth of the work. Then come all that are not done. Where the pools are full of
+what these rays use and none comes to its end, fewer are traced, so that what the others used makes
+room: half as many each time nothing moves, twice as many after a group is done. Source: the
+original engine suspends rays and takes several passes for quality; Crassin, PhD thesis 2011.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..base.records import FrameStats
+
+_STRIDE = 4  # pixels from scout to scout
+
+
+class Turns:
+    """The state of a picture's rays.
+
+    Attributes:
+        count: Number of rays.
+        done: Rays that need no more passes.
+        now: (count,) bool, to be traced next.
+        over: Nothing is left to trace, or tracing does not help.
+        stuck: The last pass moved nothing.
+        crowded: Rays had to take turns.
+    """
+
+    def __init__(self, count: int, width: int, device: torch.device) -> None:
+        """Starts with all rays, so that each has a colour.
+
+        Args:
+            count: Number of rays.
+            width: Pixels of a row.
+            device: Where the hits lie.
+        """
+        self.count = count
+        self._scouts = _grid(count, width, device)
+        self._open = torch.ones(count, dtype=torch.bool, device=device)
+        self._size = count
+        self.now = self._open.clone()
+        self.over = self.stuck = self.crowded = False
+        self.done = self._given_up = 0
+
+    @property
+    def whole(self) -> bool:
+        """Every ray got all that could be served."""
+        return not self._given_up and self.done == self.count
+
+    def take(self, missed: Tensor, stats: FrameStats, failed: int) -> None:
+        """Learns what a pass did.
+
+        Args:
+            missed: (count,) bool, of the rays that were traced.
+            stats: What the pass cost.
+            failed: Nodes that had failed before it.
+        """
+        # Where nothing could be served, what is missing has failed: these rays are as good as ever.
+        finished = self.now if stats.converged else self.now & ~missed
+        self._open &= ~finished
+        left = self.now & self._open
+        sums = torch.stack([rays.sum() for rays in (finished, left, self._open)])
+        just_done, remaining, unfinished = sums.tolist()  # the one wait
+        moved = sum(stats.produced.values()) + stats.stale > 0 or stats.failed > failed
+        self.stuck = not moved and not just_done
+        self.done = self.count - unfinished
+        if self.stuck and not stats.pending:
+            if not stats.capacity_exceeded:
+                self.over = True
+                return
+            self.crowded = True
+            self._size = remaining // 2
+            if self._size == 0:  # one ray alone does not fit
+                self._given_up += 1
+                self._open &= ~left
+                self.done += remaining
+                self._size, remaining = 1, 0
+        elif not remaining:
+            self._size = min(self.count, 2 * self._size)
+        self._choose(left if remaining else self._open)
+
+    def everyone(self) -> None:
+        """Lets all rays that are not done be traced next: the last pass that there is time for."""
+        self.now = self._open.clone()
+
+    def _choose(self, group: Tensor) -> None:
+        scouts = group & self._scouts
+        first = torch.where(scouts.any(), scouts, group)
+        self.now = first & (first.cumsum(0) <= self._size)
+        self.over = self.done == self.count
+
+
+def scouts(missed: Tensor, width: int) -> Tensor:
+    """Returns which rays are sent ahead of the next picture: all that missed something where these
+    are at most a sixteenth, else one of 4 x 4 pixels.
+
+    Args:
+        missed: (r,) bool, of the rays of the last picture.
+        width: Pixels of a row.
+    """
+    few = missed.sum() * _STRIDE**2 <= len(missed)
+    return missed & (few | _grid(len(missed), width, missed.device))
+
+
+def _grid(count: int, width: int, device: torch.device) -> Tensor:
+    """(count,) bool, one of 4 x 4 pixels."""
+    pixel = torch.arange(count, device=device)
+    return (pixel % width % _STRIDE == 0) & (pixel // width % _STRIDE == 0)

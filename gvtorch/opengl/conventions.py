@@ -1,0 +1,282 @@
+"""OpenGL's cameras and depth: matrices that draw the pixels of a `Camera`, and depth buffers as
+distances along its rays.
+
+Conventions: OpenGL's eye space has x right, y up, z backward. The pixel in row j and column i has
+its centre at (i + 0.5, j + 0.5), in both worlds; our rows go down, OpenGL's go up, so what
+`glReadPixels` gives is flipped first (`image.flip(0)`). Matrices are float64 and act on columns:
+`clip = projection @ modelview @ (x, y, z, 1)`; OpenGL stores columns, so it is handed `matrix.mT`.
+
+Source: OpenGL 4.6 core specification, sections 13.6 (clip space) and 13.8 (window coordinates).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from ..cameras.camera import Camera, Frame
+
+_AXES = torch.tensor([1, -1, -1, 1], dtype=torch.float64)  # turns y and z
+
+
+class ClipDepth(Enum):
+    """The range of clip space's z / w, as `glClipControl` sets it."""
+
+    NEGATIVE_ONE_TO_ONE = "negative_one_to_one"  # OpenGL's own
+    ZERO_TO_ONE = "zero_to_one"  # Direct3D's and Vulkan's; best for reversed depth
+
+
+def matrices(
+    camera: Camera,
+    near: float,
+    far: float = math.inf,
+    *,
+    clip_depth: ClipDepth = ClipDepth.NEGATIVE_ONE_TO_ONE,
+    reversed_z: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Makes the matrices with which OpenGL draws the pixels of a camera.
+
+    Args:
+        camera: In world units (an orbit camera: `camera.placed(tree.box)`).
+        near: Distance of the near plane along the view axis, world units.
+        far: Distance of the far plane, likewise; may be infinite.
+        clip_depth: What `glClipControl` is set to.
+        reversed_z: Window depth is 1 at the near plane and 0 at the far one; needs `glDepthFunc`
+            with GREATER and a buffer cleared to 0. In float32 with ZERO_TO_ONE its relative error
+            is about the same at all distances.
+
+    Returns:
+        projection and modelview, both (4, 4) float64, or (n, 4, 4) for a batch.
+
+    Raises:
+        ValueError: The camera has no place yet, or not 0 < near < far.
+    """
+    where = "opengl.matrices"
+    if camera.frame is not Frame.WORLD:
+        raise ValueError(f"{where}: an orbit camera has no place yet, call placed(tree.box)")
+    check.number(where, "near", near, low=0, open_low=True)
+    if far != math.inf:
+        check.number(where, "far", far, low=near, open_low=True)
+    if not isinstance(clip_depth, ClipDepth):
+        raise ValueError(f"{where}: clip_depth must be a ClipDepth, got {clip_depth!r}")
+    (fx, fy), (cx, cy) = camera.Ks[:, (0, 1), (0, 1)].unbind(1), camera.Ks[:, :2, 2].unbind(1)
+    projection = torch.zeros(len(camera), 4, 4, dtype=torch.float64)
+    projection[:, 0, 0], projection[:, 0, 2] = 2 * fx / camera.width, 1 - 2 * cx / camera.width
+    projection[:, 1, 1], projection[:, 1, 2] = 2 * fy / camera.height, 2 * cy / camera.height - 1
+    share = near / far  # 0 for a far plane at infinity
+    slope, offset = -1 / (1 - share), -near / (1 - share)  # window depth 0 to 1 as z / w
+    if reversed_z:
+        slope, offset = share / (1 - share), -offset
+    if clip_depth is ClipDepth.NEGATIVE_ONE_TO_ONE:
+        slope, offset = 2 * slope + 1, 2 * offset
+    projection[:, 2, 2], projection[:, 2, 3] = slope, offset
+    projection[:, 3, 2] = -1
+    modelview = _AXES[:, None] * camera.viewmats
+    return (projection, modelview) if camera.batched else (projection[0], modelview[0])
+
+
+def camera(projection: Tensor, modelview: Tensor, width: int, height: int) -> Camera:
+    """Makes the camera whose rays go through the pixels that OpenGL draws with these matrices.
+
+    Args:
+        projection: (4, 4) or (n, 4, 4) perspective without skew; its near and far planes do not
+            matter.
+        modelview: (4, 4) or (n, 4, 4) world to eye, without scale.
+        width: Pixels of the viewport.
+        height: Pixels of the viewport.
+
+    Raises:
+        ValueError: The projection is none that a pinhole camera has, or see `Camera`.
+    """
+    where = "opengl.camera"
+    lens = _Lens.read(where, projection)
+    if lens.orthographic:
+        raise ValueError(f"{where}: projection must be perspective, got an orthographic one")
+    check.whole(where, "width", width, low=1)
+    check.whole(where, "height", height, low=1)
+    zero, one = torch.zeros_like(lens.scale[:, 0]), torch.ones_like(lens.scale[:, 0])
+    (sx, sy), (ax, ay) = lens.scale.unbind(1), lens.shift.unbind(1)
+    rows = (
+        (sx * width / 2, zero, (1 - ax) * width / 2),
+        (zero, sy * height / 2, (1 + ay) * height / 2),
+        (zero, zero, one),
+    )
+    intrinsics = torch.stack([torch.stack(row, 1) for row in rows], 1)
+    if not lens.batched:
+        intrinsics = intrinsics[0]
+    view = _AXES[:, None] * torch.as_tensor(modelview).detach().to("cpu", torch.float64)
+    return Camera(view, intrinsics, width, height)
+
+
+def ray_distance(
+    window_depth: Tensor,
+    projection: Tensor,
+    *,
+    clip_depth: ClipDepth = ClipDepth.NEGATIVE_ONE_TO_ONE,
+) -> Tensor:
+    """Turns a depth buffer into distances along the rays: what `Layer` takes.
+
+    On CUDA nobody waits. What is lost is what the buffer rounds: a window depth that is off by e
+    puts a perspective distance d off by about e * d^2 / near. e is 2^-25 far away in float32 and
+    2^-25 everywhere in 24 bits; reversed, float32 keeps a relative error of about 2^-24.
+
+    Args:
+        window_depth: (h, w, 1) or (n, h, w, 1) floats from 0 to 1, the first row at the top.
+        projection: (4, 4), or (n, 4, 4) one for each picture: perspective or orthographic, depth
+            reversed or not.
+        clip_depth: What `glClipControl` was set to.
+
+    Returns:
+        As `window_depth`, float64: world distance along the ray, from the eye (from the plane of
+        the eye, where the projection is orthographic); +inf where the buffer holds the depth of
+        the far plane, to which it is cleared: nothing was drawn there.
+
+    Raises:
+        ValueError: A wrong shape or dtype, or a projection that is none of these.
+    """
+    lens = _Lens.read("opengl.ray_distance", projection)
+    pixels = lens.pixels("opengl.ray_distance", "window_depth", window_depth, clip_depth)
+    depth = window_depth.to(torch.float64)
+    if lens.orthographic:
+        along = (pixels.offset - depth) / pixels.slope
+    else:
+        along = pixels.offset / (depth + pixels.slope)
+    return torch.where(depth == pixels.far, torch.inf, along * pixels.stretch)
+
+
+def window_depth(
+    distance: Tensor,
+    projection: Tensor,
+    *,
+    clip_depth: ClipDepth = ClipDepth.NEGATIVE_ONE_TO_ONE,
+) -> Tensor:
+    """Turns distances along the rays into a depth buffer, against which OpenGL can test; the
+    inverse of `ray_distance`.
+
+    Args:
+        distance: (h, w, 1) or (n, h, w, 1) floats, such as `Picture.depth`.
+        projection: See `ray_distance`.
+        clip_depth: See `ray_distance`.
+
+    Returns:
+        As `distance`, float64 from 0 to 1; what is nearer than the near plane has its depth, and
+        what is beyond the far plane, +inf too, has that of the far one.
+
+    Raises:
+        ValueError: See `ray_distance`.
+    """
+    lens = _Lens.read("opengl.window_depth", projection)
+    pixels = lens.pixels("opengl.window_depth", "distance", distance, clip_depth)
+    along = distance.to(torch.float64) / pixels.stretch
+    if lens.orthographic:
+        depth = pixels.offset - pixels.slope * along
+    else:
+        depth = pixels.offset / along - pixels.slope
+    return depth.clamp(0, 1)
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """What turns the depth of each pixel, on its device; window depth is 0 to 1.
+
+    Perspective: depth = offset / z - slope; orthographic: depth = offset - slope * z, with z along
+    the view axis.
+    """
+
+    slope: Tensor  # (n, 1, 1, 1) or (1, 1, 1)
+    offset: Tensor
+    far: Tensor  # window depth of the far plane
+    stretch: Tensor  # (n, h, w, 1) or (h, w, 1) distance along the ray over that along the axis
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """The numbers of projections, float64 on the CPU."""
+
+    scale: Tensor  # (n, 2) of x and y
+    shift: Tensor  # (n, 2), of a perspective
+    slope: Tensor  # (n,)
+    offset: Tensor  # (n,)
+    orthographic: bool
+    batched: bool
+
+    @classmethod
+    def read(cls, where: str, projection: Tensor) -> _Lens:
+        """Takes (4, 4) or (n, 4, 4)."""
+        matrix = torch.as_tensor(projection).detach().to("cpu", torch.float64)
+        if matrix.dim() not in (2, 3) or matrix.shape[-2:] != (4, 4):
+            raise ValueError(
+                f"{where}: projection must be (4, 4) or (n, 4, 4), got {tuple(matrix.shape)}"
+            )
+        p = matrix.view(-1, 4, 4)
+        last = p[0, 3].tolist()
+        orthographic = last == [0, 0, 0, 1]
+        if not (orthographic or last == [0, 0, -1, 0]) or bool((p[:, 3] != p[:1, 3]).any()):
+            raise ValueError(
+                f"{where}: projection must end in the row (0, 0, -1, 0) (perspective) or "
+                f"(0, 0, 0, 1) (orthographic), got {last}"
+            )
+        other = 2 if orthographic else 3  # a column that such a projection leaves free of x and y
+        zeros = torch.stack((p[:, 0, 1], p[:, 1, 0], p[:, 2, 0], p[:, 2, 1]), 1)
+        zeros = torch.cat((zeros, p[:, :2, other]), 1)
+        moves = p[:, 2, 2 if orthographic else 3]
+        good = torch.isfinite(p).all() & (zeros == 0).all() & (moves != 0).all()
+        if not bool(good & (p[:, 0, 0] > 0).all() & (p[:, 1, 1] > 0).all()):
+            raise ValueError(
+                f"{where}: projection must be finite, without skew or rotation, scale x and y by "
+                f"more than 0 and tell depths apart, got {matrix.tolist()}"
+            )
+        return cls(
+            scale=p[:, (0, 1), (0, 1)],
+            shift=p[:, :2, 2],
+            slope=p[:, 2, 2],
+            offset=p[:, 2, 3],
+            orthographic=orthographic,
+            batched=matrix.dim() == 3,
+        )
+
+    def pixels(self, where: str, name: str, image: Tensor, clip_depth: ClipDepth) -> _Pixels:
+        """Brings the numbers to the pixels of an image."""
+        if not isinstance(clip_depth, ClipDepth):
+            raise ValueError(f"{where}: clip_depth must be a ClipDepth, got {clip_depth!r}")
+        count = len(self.scale)
+        fits = isinstance(image, Tensor) and image.is_floating_point() and image.shape[-1:] == (1,)
+        if (
+            not fits
+            or image.dim() != (4 if self.batched else 3)
+            or (self.batched and count != image.shape[0])
+        ):
+            wanted = f"({count}, h, w, 1)" if self.batched else "(h, w, 1)"
+            raise ValueError(
+                f"{where}: {name} must be {wanted} floats as projection is "
+                f"{'a batch' if self.batched else 'one'}, got {check.describe(image)}"
+            )
+        slope, offset = self.slope, self.offset
+        if clip_depth is ClipDepth.NEGATIVE_ONE_TO_ONE:  # window depth is (z + 1) / 2
+            slope, offset = slope / 2, offset / 2
+            if self.orthographic:
+                offset = offset + 0.5
+            else:
+                slope = slope - 0.5
+        rising = slope < 0 if self.orthographic else offset < 0
+        numbers = torch.cat((self.scale, self.shift, slope[:, None], offset[:, None]), 1)
+        numbers = torch.cat((numbers, rising[:, None].to(numbers)), 1)
+        if image.device.type == "cuda":
+            numbers = numbers.pin_memory().to(image.device, non_blocking=True)
+        else:
+            numbers = numbers.to(image.device)
+        columns = numbers if self.batched else numbers[0]
+        sx, sy, ax, ay, slope, offset, far = columns[..., None, None, None].unbind(-4)
+        *_, height, width, _ = image.shape
+        if self.orthographic:
+            return _Pixels(slope, offset, far, torch.ones_like(slope))
+        x = torch.arange(width, dtype=torch.float64, device=image.device)[:, None]
+        y = torch.arange(height, dtype=torch.float64, device=image.device)[:, None, None]
+        across = ((2 * x + 1) / width - 1 + ax) / sx
+        up = (1 - (2 * y + 1) / height + ay) / sy
+        return _Pixels(slope, offset, far, (1 + across * across + up * up).sqrt())

@@ -1,0 +1,366 @@
+"""`Exchange`: pictures that pass between OpenGL and torch, on the device where both are on one.
+
+Colours and depths come as tensors from the framebuffer that OpenGL reads, and go into the one that
+it draws. Each moves in the type in which OpenGL has it, for conversions send drivers through the
+host. They do that with most formats of depth in both directions, so depth becomes a colour first
+(or last) by drawing one triangle.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from . import functions as gl
+from .pixels import Shared, ThroughHost, Way, why_not_shared
+
+_VERTEX = """#version 150
+void main() {  // one triangle over all pixels
+  gl_Position = vec4(4 * (gl_VertexID & 1) - 1, 2 * (gl_VertexID & 2) - 1, 0, 1);
+}
+"""
+_FRAGMENT = """#version 150
+uniform sampler2D color, depth;
+out vec4 result;
+void main() {
+  ivec2 pixel = ivec2(gl_FragCoord.xy);
+  result = texelFetch(color, pixel, 0);
+  gl_FragDepth = texelFetch(depth, pixel, 0).r;
+}
+"""
+_NUMBERS = itertools.count()
+_UNITS = {"color": 0, "depth": 1}
+_READ_TYPES = {gl.UNSIGNED_BYTE: torch.uint8, gl.HALF_FLOAT: torch.float16}
+_TYPES = {torch.uint8: gl.UNSIGNED_BYTE, torch.float16: gl.HALF_FLOAT, torch.float32: gl.FLOAT}
+_STORED = {torch.uint8: gl.RGBA8, torch.float16: gl.RGBA16F, torch.float32: gl.RGBA32F}
+_DEPTHS = {16: gl.DEPTH_COMPONENT16, 24: gl.DEPTH_COMPONENT24, 32: gl.DEPTH_COMPONENT32F}
+#: Filters that don't mix, and a last level 0.
+_ONE_LEVEL = {0x2800: 0x2600, 0x2801: 0x2600, 0x813D: 0}
+_ONE_SAMPLE = "it must be complete, and a framebuffer of several samples a pixel resolved first"
+
+
+class Exchange:
+    """Pictures of one size between an OpenGL context and torch.
+
+    The context, or one that shares its objects, is current on this thread in every call, `close`
+    included; its state is left as it was. Rows go down in tensors, as in our pictures. Nothing
+    waits for the device where buffers are shared. An exchange that is never closed leaves its
+    buffers and textures to the context.
+
+    Attributes:
+        width: Of the pictures, pixels.
+        height: Likewise.
+        device: Where tensors are given back.
+        shared: CUDA sees OpenGL's buffers; else pixels go through the host.
+        reason: Why they are not shared, or "".
+    """
+
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        device: torch.device | str = "cuda",
+        *,
+        share: bool | None = None,
+        load: gl.Loader | None = None,
+    ) -> None:
+        """Makes an exchange in the current context, OpenGL 3.2 or newer.
+
+        Args:
+            width: Of the pictures, pixels.
+            height: Likewise.
+            device: Where tensors are given back.
+            share: Whether buffers are shared with CUDA; default: wherever that can be.
+            load: Address of an OpenGL function by its name, from the library that made the
+                context (`glfw.get_proc_address`, for one); default: the system's library.
+
+        Raises:
+            ValueError: A size is not positive or more than a texture can have, or there is no such
+                device.
+            RuntimeError: There is no context, its OpenGL is too old, or `share` is true and CUDA
+                can't see its buffers.
+        """
+        where = "opengl.Exchange"
+        if not (share is None or isinstance(share, bool)):
+            raise ValueError(f"{where}: share must be bool or None, got {share!r}")
+        self.device = check.device(where, device)
+        self._gl = gl.Functions(where, load)
+        most = self._gl.integer(gl.MAX_TEXTURE_SIZE)
+        self.width = check.whole(where, "width", width, low=1, high=most)
+        self.height = check.whole(where, "height", height, low=1, high=most)
+        self.reason = "" if share is False else why_not_shared(self._gl, self.device)
+        if share and self.reason:
+            raise RuntimeError(f"{where}: buffers can't be shared: {self.reason}")
+        self.reason = "share is False" if share is False else self.reason
+        self.shared = not self.reason
+        self._most = torch.full((1,), 255.0, device=self.device)  # divides alike on every device
+        self._ways: dict[str, Way] = {}
+        self._textures: dict[str, tuple[int, int]] = {}  # name and format
+        # No other program has a result of this name: it tells whether we are in our context.
+        self._mark = f"result_{next(_NUMBERS)}"
+        with self._gl.unchanged(drawing=True):
+            self._program = self._gl.program(_VERTEX, _FRAGMENT.replace("result", self._mark))
+            self._gl.UseProgram(self._program)
+            for name, unit in _UNITS.items():
+                place = self._gl.GetUniformLocation(self._program, name.encode())
+                self._gl.Uniform1i(place, unit)
+
+    def __repr__(self) -> str:
+        how = f"shared with {self.device}" if self.shared else f"through the host: {self.reason}"
+        return f"Exchange({self.width}x{self.height}, {how})"
+
+    def read_color(self) -> Tensor:
+        """Reads the framebuffer that is bound for reading, its read buffer.
+
+        Returns:
+            (h, w, 4) float32 as it is stored: 0 to 1 in normalised formats, not decoded in sRGB's.
+
+        Raises:
+            RuntimeError: It has no such colours, several samples a pixel, or another size (which
+                OpenGL does not tell of a window).
+        """
+        with self._work("read_color"):
+            self._require_size(self._gl.integer(gl.READ_BUFFER), "colours")
+            dtype = _READ_TYPES.get(self._gl.integer(gl.COLOR_READ_TYPE), torch.float32)
+            self._gl.forget_errors()  # OpenGL before 4.1 need not know the type
+            return self._pull("read color", gl.RGBA, dtype)
+
+    def read_depth(self) -> Tensor:
+        """Reads the depth of the framebuffer that is bound for reading.
+
+        Returns:
+            (h, w, 1) float32 window depth, 0 to 1; `ray_distance` makes distances of it.
+
+        Raises:
+            RuntimeError: It has no depth, several samples a pixel, or another size.
+        """
+        with self._work("read_depth", drawing=True), self._gl.temporary("Framebuffers") as frame:
+            self._require_size(gl.DEPTH_ATTACHMENT, "depth")
+            size = (self.width, self.height)
+            self._texture("copied depth", self._depth_format())
+            self._gl.CopyTexSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 0, 0, *size)
+            self._gl.check(f"the framebuffer has a depth? {_ONE_SAMPLE}")
+            shown = self._texture("shown depth", gl.R32F)
+            self._gl.BindFramebuffer(gl.DRAW_FRAMEBUFFER, frame)
+            self._gl.BindFramebuffer(gl.READ_FRAMEBUFFER, frame)
+            self._gl.FramebufferTexture2D(
+                gl.DRAW_FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, shown, 0
+            )
+            self._draw("copied depth", None)
+            return self._pull("read depth", gl.RED, torch.float32)
+
+    def upload(self, color: Tensor, depth: Tensor | None = None) -> tuple[int, int]:
+        """Writes pictures into textures, which shaders of one's own may read.
+
+        Args:
+            color: (h, w, 3) or (h, w, 4), uint8, float16 or float32, on any device; kept in RGBA8,
+                RGBA16F or RGBA32F.
+            depth: (h, w, 1) floats, kept in R32F.
+
+        Returns:
+            The names of both textures, whose rows go up; 0 for a depth that was not given. They
+            belong to the exchange, which writes into them the next time.
+
+        Raises:
+            ValueError: A wrong shape or dtype.
+        """
+        with self._work("upload"):
+            return self._upload(color, depth)
+
+    def draw(self, color: Tensor, depth: Tensor | None = None) -> None:
+        """Writes pictures into the framebuffer that is bound for drawing, its first draw buffer,
+        from the lower left corner on, in place of what it holds; what is drawn later is tested
+        against their depth.
+
+        Args:
+            color: As in `upload`, with the values that the framebuffer shall store.
+            depth: As in `upload`: window depth, 0 to 1, as `window_depth` gives it; without it the
+                framebuffer's depth stays.
+
+        Raises:
+            ValueError: A wrong shape or dtype.
+            RuntimeError: OpenGL can't draw into the framebuffer, or it has no depth and one was
+                given.
+        """
+        with self._work("draw", drawing=True):
+            self._upload(color, depth)
+            if depth is not None and not self._attached(
+                gl.DRAW_FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.ATTACHED_KIND
+            ):
+                raise RuntimeError(
+                    f"{self._gl.where}: the framebuffer that is bound for drawing has no depth"
+                )
+            self._draw("color", None if depth is None else "depth")
+
+    def close(self) -> None:
+        """Gives back buffers, textures and the rest; the exchange is of no use afterwards.
+
+        Raises:
+            RuntimeError: Its context is not current; it still has to be closed.
+        """
+        if not self._program:
+            return
+        self._require_context("close")
+        with ExitStack() as later:
+            later.callback(self._gl.forget_errors)
+            for way in self._ways.values():
+                later.callback(way.close)
+            for name, _ in self._textures.values():
+                later.callback(self._gl.drop, "Textures", name)
+            later.callback(self._gl.DeleteProgram, self._program)
+            self._ways, self._textures, self._program = {}, {}, 0
+
+    def __enter__(self) -> Exchange:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @contextmanager
+    def _work(self, what: str, *, drawing: bool = False) -> Iterator[None]:
+        self._require_context(what)
+        with self._gl.unchanged(drawing=drawing):
+            yield
+
+    def _require_context(self, what: str) -> None:
+        """Raises unless there is work to do and our context to do it in."""
+        where = self._gl.where = f"opengl.Exchange.{what}"
+        if not self._program:
+            raise RuntimeError(f"{where}: the exchange is closed")
+        self._gl.require_context()
+        ours = self._gl.GetFragDataLocation(self._program, self._mark.encode()) >= 0
+        self._gl.forget_errors()  # there is no such program
+        if not ours:
+            raise RuntimeError(f"{where}: another OpenGL context is current than the exchange's")
+
+    def _way(self, kind: str) -> Way:
+        if kind not in self._ways:
+            way = Shared if self.shared else ThroughHost
+            self._ways[kind] = way(self._gl, self.device)
+        return self._ways[kind]
+
+    def _pull(self, kind: str, channels: int, dtype: torch.dtype) -> Tensor:
+        """Reads the framebuffer that is bound for reading; RGBA or RED."""
+
+        def read(place: int) -> None:
+            size = (self.width, self.height)
+            self._gl.ReadPixels(0, 0, *size, channels, _TYPES[dtype], place)
+            self._gl.check(f"the framebuffer has colours that are no integers? {_ONE_SAMPLE}")
+
+        shape = (self.height, self.width, 4 if channels == gl.RGBA else 1)
+        image = self._way(kind).pull(read, shape, dtype).float()
+        return image / self._most if dtype == torch.uint8 else image
+
+    def _texture(self, kind: str, stored: int) -> int:
+        """Binds the texture of a kind, made anew if its format is another."""
+        name, before = self._textures.get(kind, (0, 0))
+        if name and before != stored:
+            self._gl.drop("Textures", name)
+            name = 0
+        if not name:
+            name = self._gl.make("Textures")
+            self._textures[kind] = name, stored
+            self._gl.BindTexture(gl.TEXTURE_2D, name)
+            layout = (gl.DEPTH_COMPONENT if stored in _DEPTHS.values() else gl.RED, gl.FLOAT)
+            size = (self.width, self.height)
+            self._gl.TexImage2D(gl.TEXTURE_2D, 0, stored, *size, 0, *layout, None)
+            for parameter, value in _ONE_LEVEL.items():
+                self._gl.TexParameteri(gl.TEXTURE_2D, parameter, value)
+            self._gl.check(f"a texture of {self.width}x{self.height} pixels")
+        self._gl.BindTexture(gl.TEXTURE_2D, name)
+        return name
+
+    def _upload(self, color: Tensor, depth: Tensor | None) -> tuple[int, int]:
+        rows = (self.height, self.width)
+        if not (
+            isinstance(color, Tensor)
+            and color.dtype in _STORED
+            and color.dim() == 3
+            and (*color.shape[:2],) == rows
+            and color.shape[2] in (3, 4)
+        ):
+            raise ValueError(
+                f"{self._gl.where}: color must be ({rows[0]}, {rows[1]}, 3 or 4) uint8, "
+                f"float16 or float32, got {check.describe(color)}"
+            )
+        if depth is not None and not (
+            isinstance(depth, Tensor) and depth.is_floating_point() and depth.shape == (*rows, 1)
+        ):
+            raise ValueError(
+                f"{self._gl.where}: depth must be ({rows[0]}, {rows[1]}, 1) floats, "
+                f"got {check.describe(depth)}"
+            )
+        if color.shape[2] == 3:
+            opaque = 255 if color.dtype == torch.uint8 else 1
+            color = torch.cat((color, torch.full_like(color[..., :1], opaque)), -1)
+        first = self._write("color", color.detach(), _STORED[color.dtype], gl.RGBA)
+        if depth is None:
+            return first, 0
+        return first, self._write("depth", depth.detach().float(), gl.R32F, gl.RED)
+
+    def _write(self, kind: str, image: Tensor, stored: int, channels: int) -> int:
+        """Writes an image into the texture of a kind."""
+        name = self._texture(kind, stored)
+
+        def write(place: int) -> None:
+            size = (self.width, self.height)
+            kind_of = _TYPES[image.dtype]
+            self._gl.TexSubImage2D(gl.TEXTURE_2D, 0, 0, 0, *size, channels, kind_of, place)
+
+        self._way(f"write {kind}").push(image, write)
+        self._gl.check("a texture's pixels could not be written")
+        return name
+
+    def _draw(self, color: str, depth: str | None) -> None:
+        """Draws textures of these kinds over the framebuffer that is bound for drawing."""
+        for unit, kind in enumerate((color, depth)):
+            self._gl.ActiveTexture(gl.TEXTURE0 + unit)
+            self._gl.BindTexture(gl.TEXTURE_2D, self._textures[kind][0] if kind else 0)
+        (self._gl.Enable if depth else self._gl.Disable)(gl.DEPTH_TEST)
+        self._gl.view(self.width, self.height)
+        self._gl.UseProgram(self._program)
+        with self._gl.temporary("VertexArrays") as vertices:
+            self._gl.BindVertexArray(vertices)
+            self._gl.DrawArrays(gl.TRIANGLES, 0, 3)
+        self._gl.check("is the framebuffer that is bound for drawing complete?")
+
+    def _attached(self, target: int, attachment: int, what: int) -> int:
+        """A parameter of what is attached to a framebuffer, or 0."""
+        if attachment == gl.DEPTH_ATTACHMENT and not self._gl.integer(gl.FRAMES[target]):
+            attachment = gl.DEPTH  # as a window calls it
+        get = "GetFramebufferAttachmentParameteriv"
+        return self._gl.parameter(get, target, attachment, what)
+
+    def _depth_format(self) -> int:
+        """The format of depth that comes next to that of the framebuffer bound for reading."""
+        what = (gl.DEPTH_ATTACHMENT, gl.ATTACHED_DEPTH_SIZE)
+        return _DEPTHS.get(self._attached(gl.READ_FRAMEBUFFER, *what), gl.DEPTH_COMPONENT24)
+
+    def _require_size(self, attachment: int, name: str) -> None:
+        """Raises unless something of our size is attached to the framebuffer bound for reading.
+        Of a window's own framebuffer OpenGL tells no size.
+        """
+        if not self._gl.integer(gl.READ_FRAMEBUFFER_BINDING):
+            return
+        frame = f"{self._gl.where}: the framebuffer that is bound for reading has"
+        kind, which, level = (
+            self._attached(gl.READ_FRAMEBUFFER, attachment, what)
+            for what in (gl.ATTACHED_KIND, gl.ATTACHED_NAME, gl.ATTACHED_LEVEL)
+        )
+        if not kind:
+            raise RuntimeError(f"{frame} no {name}")
+        if kind == gl.RENDERBUFFER:
+            width, height = self._gl.renderbuffer_size(which)
+        elif size := self._gl.texture_size(which, level):
+            width, height = size
+        else:
+            return  # OpenGL itself tells whether such a texture can be read
+        if (width, height) != (self.width, self.height):
+            raise RuntimeError(
+                f"{frame} {width}x{height} pixels, the exchange {self.width}x{self.height}"
+            )

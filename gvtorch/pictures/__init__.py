@@ -1,0 +1,17 @@
+"""Pictures: what a render gives, what stands behind it, how it is shown, refined and written."""
+
+from .background import Backdrop, Environment, Gradient
+from .files import read_image
+from .picture import Picture
+from .progressive import Progressive
+from .strips import render_tiles
+
+__all__ = [
+    "Backdrop",
+    "Environment",
+    "Gradient",
+    "Picture",
+    "Progressive",
+    "read_image",
+    "render_tiles",
+]

@@ -1,0 +1,188 @@
+"""What stands behind a picture, in linear light: a colour, a gradient, an image of the picture's
+size, or an environment map looked up by the directions of the rays.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from ..cameras.camera import Camera
+from .files import read_image
+
+Color = tuple[float, float, float]
+_ROWS_A_BLOCK = 1 << 20  # pixels whose rays are in memory at once
+
+
+class Background(ABC):
+    """Colours behind a camera's pixels."""
+
+    @abstractmethod
+    def behind(self, camera: Camera, numbers: Tensor, dtype: torch.dtype) -> Tensor:
+        """Returns linear RGB, (r, 3) or what broadcasts to it; nobody waits for the device.
+
+        Args:
+            camera: Placed in the world.
+            numbers: What `camera.numbers` gave, on the device of the picture.
+            dtype: Of the colours.
+        """
+
+    def check(self, where: str, camera: Camera) -> None:
+        """Raises ValueError if this background does not fit a camera's pictures."""
+        del where, camera
+
+
+class Gradient(Background):
+    """A blend from the top row of the picture to the bottom row, even in linear light."""
+
+    def __init__(self, top: Color, bottom: Color) -> None:
+        """Takes two colours, linear RGB, finite and >= 0."""
+        self.ends = [_color("Gradient", n, c) for n, c in (("top", top), ("bottom", bottom))]
+
+    def behind(self, camera: Camera, numbers: Tensor, dtype: torch.dtype) -> Tensor:
+        """Returns (r, 3)."""
+        options: Any = {"dtype": dtype, "device": numbers.device}
+        top_row, rows = camera.window
+        place = (torch.arange(top_row, top_row + camera.height, **options) + 0.5) / rows
+        ends = zip(*self.ends, strict=True)
+        column = torch.stack([top + (bottom - top) * place for top, bottom in ends], -1)
+        shape = (len(camera), camera.height, camera.width, 3)
+        return column[:, None].expand(shape).reshape(-1, 3)
+
+
+class Backdrop(Background):
+    """An image of the size of the picture, pixel behind pixel."""
+
+    def __init__(self, image: Tensor) -> None:
+        """Takes linear RGB, (h, w, 3) or, for a batch of cameras, (n, h, w, 3). From another device
+        it is uploaded once; on the device of the picture it may be edited between frames.
+        """
+        if not _is_image(image) or image.dim() not in (3, 4):
+            raise ValueError(
+                "Backdrop: image must be (h, w, 3) or (n, h, w, 3) floats, "
+                f"got {check.describe(image)}"
+            )
+        if not (image.is_cuda or bool(torch.isfinite(image).all())):
+            raise ValueError("Backdrop: image must be finite, got NaN or infinity")
+        self.image = image
+        self._there: dict[torch.device, Tensor] = {}
+
+    def check(self, where: str, camera: Camera) -> None:
+        """Compares the sizes."""
+        shape, size = tuple(self.image.shape), (camera.window[1], camera.width, 3)
+        if shape[-3:] != size or (len(shape) == 4 and shape[0] not in (1, len(camera))):
+            wanted = (len(camera), *size) if camera.batched else size
+            raise ValueError(f"{where}: background image must be {wanted}, got {shape}")
+
+    def behind(self, camera: Camera, numbers: Tensor, dtype: torch.dtype) -> Tensor:
+        """Returns (r, 3)."""
+        device = numbers.device
+        if self.image.device != device and device not in self._there:
+            self._there[device] = self.image.to(device)
+        top = camera.window[0]
+        image = self._there.get(device, self.image)[..., top : top + camera.height, :, :].to(dtype)
+        shape = (len(camera), camera.height, camera.width, 3)
+        return image.expand(shape).reshape(-1, 3)
+
+
+class Environment(Background):
+    """An equirectangular map around everything, 360 by 180 degrees.
+
+    Its middle lies in the direction -z, its upper edge in +y and its right half towards +x, as a
+    panorama camera that looks along -z would take it. Between texels colours are bilinear.
+    """
+
+    def __init__(self, image: Tensor, *, rotation: Tensor | None = None) -> None:
+        """Takes the map.
+
+        Args:
+            image: (h, w, 3) linear RGB, finite and >= 0; values above 1 are kept.
+            rotation: (3, 3) from world directions to those of the map.
+
+        Raises:
+            ValueError: A shape is wrong, a value is NaN or infinite, or the rotation is none.
+        """
+        if not _is_image(image) or image.dim() != 3:
+            raise ValueError(
+                f"Environment: image must be (h, w, 3) floats, got {check.describe(image)}"
+            )
+        if not bool(torch.isfinite(image).all()):
+            raise ValueError("Environment: image must be finite, got NaN or infinity")
+        self.image = image
+        eye = torch.eye(3, dtype=torch.float64)
+        self.rotation = eye if rotation is None else torch.as_tensor(rotation).to(eye)
+        if self.rotation.shape != (3, 3) or not torch.allclose(
+            self.rotation @ self.rotation.mT, eye, atol=1e-3
+        ):
+            raise ValueError("Environment: rotation must be (3, 3) and orthonormal")
+        self._there: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor]] = {}
+
+    @classmethod
+    def read(cls, path: str | Path) -> Environment:
+        """Reads the map from a file; see `read_image`."""
+        return cls(read_image(path)[..., :3])
+
+    def _on(self, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        """The map (1, 3, h, w + 2), its first and last columns repeated, and the rotation; uploaded
+        once a device.
+        """
+        if (device, dtype) not in self._there:
+            image = self.image.to(device, dtype).movedim(-1, 0)[None]
+            around = torch.cat((image[..., -1:], image, image[..., :1]), -1)
+            self._there[device, dtype] = (around, self.rotation.to(device))
+        return self._there[device, dtype]
+
+    def look_up(self, direction: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Returns the colours (r, 3) in world directions (r, 3) of unit length."""
+        around, rotation = self._on(direction.device, dtype)
+        x, y, z = (direction.to(torch.float64) @ rotation.mT).unbind(-1)
+        width = around.shape[-1] - 2
+        u = torch.atan2(x, -z) / torch.pi  # -1 to 1 over the map
+        v = -2 * torch.asin(y.clamp(-1, 1)) / torch.pi
+        grid = torch.stack((u * (width / (width + 2)), v), -1).to(dtype)
+        found = torch.nn.functional.grid_sample(
+            around, grid[None, None], padding_mode="border", align_corners=False
+        )
+        return found[0, :, 0].mT
+
+    def behind(self, camera: Camera, numbers: Tensor, dtype: torch.dtype) -> Tensor:
+        """Returns (r, 3)."""
+        rows, block = len(camera) * camera.height, max(1, _ROWS_A_BLOCK // camera.width)
+        parts = []
+        for top in range(0, rows, block):
+            rays = camera.pixel_rays(numbers, (top, min(top + block, rows)))
+            parts.append(self.look_up(rays.direction, dtype))
+        return torch.cat(parts)
+
+
+def checked_background(where: str, value: Any) -> Background | Color | None:
+    """Returns a user's background: an object of a class of this file, a colour, or None
+    (transparent).
+    """
+    if value is None or isinstance(value, Background):
+        return value
+    if isinstance(value, Tensor) and value.dim() > 1:
+        return Backdrop(value)
+    color = check.triple(where, "background", value)
+    for part in color:
+        check.number(where, "background", part, low=0, high=1)
+    return color
+
+
+def _is_image(value: Any) -> bool:
+    """Whether it is a tensor (..., 3) of floats, and not empty."""
+    known = isinstance(value, Tensor) and value.is_floating_point() and value.numel() > 0
+    return known and value.shape[-1] == 3
+
+
+def _color(where: str, name: str, value: Sequence[float]) -> Color:
+    red, green, blue = check.triple(where, name, value)
+    for part in (red, green, blue):
+        check.number(where, name, part, low=0)
+    return (red, green, blue)

@@ -1,0 +1,109 @@
+"""`Picture`: what a render gives, and how it is shown and saved."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from ..base.records import RenderStats
+from .files import display_pixels, write_image, write_png
+from .tone import ToneCurve, tone_map
+
+if TYPE_CHECKING:
+    import numpy as np
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """Float pictures of one camera (h, w, c) or of a batch (n, h, w, c)."""
+
+    color: Tensor  # (h, w, 3) linear RGB over the background; premultiplied if transparent
+    alpha: Tensor  # (h, w, 1)
+    depth: Tensor  # (h, w, 1) of the voxels, world units along the ray, +inf where nothing was hit
+    nearest: Tensor  # (h, w, 1) likewise, of voxels and layer: the nearer of both
+    samples: Tensor  # (h, w, 1) int32
+    missed: Tensor | None = None  # (h, w, 1) bool, something that the ray saw was not there
+    transparent: bool = False  # there is no background
+    stats: RenderStats
+    # What only some shaders give, else None:
+    normal: Tensor | None = None  # (h, w, 3) world, towards the eye, of unit length or 0
+    features: Tensor | None = None  # (h, w, c)
+
+    def tone_map(
+        self, curve: ToneCurve = "aces", *, exposure: float = 0.0, white: float = 4.0
+    ) -> Picture:
+        """Returns the picture with its light mapped to what a display shows, still linear.
+
+        Args:
+            curve: none (clipped), reinhard or aces.
+            exposure: Stops.
+            white: Smallest luminance that Reinhard's curve shows as 1.
+
+        Raises:
+            ValueError: See `tone.tone_map`.
+        """
+        if not self.transparent:
+            return replace(self, color=tone_map(self.color, curve, exposure=exposure, white=white))
+        straight = tone_map(self.straight(), curve, exposure=exposure, white=white)
+        return replace(self, color=straight * self.alpha)
+
+    def straight(self) -> Tensor:
+        """Returns the colour (h, w, 3), not premultiplied; 0 where there is nothing."""
+        if not self.transparent:
+            return self.color
+        return torch.where(self.alpha > 0, self.color / self.alpha, 0.0)
+
+    def to_srgb8(self) -> Tensor:
+        """Returns the colour as a display wants it: sRGB-encoded uint8 on the CPU, same shape. A
+        transparent picture is shown over black. NaN is black.
+        """
+        return torch.from_numpy(display_pixels(self.color, None, 8))
+
+    def layers(self) -> dict[str, np.ndarray]:
+        """Returns color, alpha, depth, and normal and features where they are (float32), and
+        samples (int32) as arrays.
+        """
+        names = ("color", "alpha", "depth", "normal", "features")
+        given = {name: getattr(self, name) for name in names}
+        layers = {name: layer.float() for name, layer in given.items() if layer is not None}
+        layers["samples"] = self.samples
+        return {name: layer.detach().cpu().numpy() for name, layer in layers.items()}
+
+    def save(self, path: str | Path, *, bits: int | None = None) -> None:
+        """Writes a file, which appears whole or not at all. A batch is laid side by side, but in
+        NumPy's files.
+
+        - .png: sRGB, 8 or 16 bits; with straight alpha if the picture is transparent.
+        - .tif: the same, or 32 bits: linear float, premultiplied (BigTIFF, Deflate).
+        - .exr: linear, 32 or 16 bits float: R G B A (premultiplied), Z (depth), samples.
+        - .npy: (h, w, 6) float32: color, alpha, depth, samples.
+        - .npz: float32 color, alpha and depth, int32 samples; normal and features where they are.
+
+        Args:
+            path: The file; its ending tells the kind.
+            bits: Of a number; 8 for .png and .tif, 32 for .exr if left out.
+
+        Raises:
+            ValueError: The ending or the number of bits is unknown.
+            FileNotFoundError: The folder does not exist.
+            ImportError: The library for this kind of file is missing.
+        """
+        write_image(Path(path), self.layers(), transparent=self.transparent, bits=bits)
+
+    def _repr_png_(self) -> bytes:
+        """Shows the picture in a notebook."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "picture.png"
+            write_png(path, self.layers(), transparent=self.transparent)
+            return path.read_bytes()
+
+    def __repr__(self) -> str:
+        """Shows the size."""
+        *_, height, width, _ = self.color.shape
+        count = "" if self.color.dim() == 3 else f"{self.color.shape[0]} x "
+        return f"Picture({count}{width}x{height}, {self.stats.milliseconds:.0f} ms)"

@@ -1,0 +1,167 @@
+"""`CompiledShader`: a shader of one's own in C++, a small header, at the speed of the fused ones.
+
+What a header holds is told in cpp_ext/csrc/user_shader.h; how it is compiled and where the result
+is kept, in cpp_ext/user.py.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, MutableMapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from ..cpp_ext import user
+from ..ops.registry import add_user_op
+from ..pool import N3Tree
+from .fused import Intervals, LitShader, one_color, plain_table
+from .lights import Number, pack
+from .transfer_function import Table, TransferFunction
+
+Uniforms = MutableMapping[str, Number] | Tensor
+
+
+class CompiledShader(LitShader):
+    """A struct of a C++ header as a shader: compiled once, and kept by its content.
+
+    It goes wherever a fused shader goes. Uniforms, transfer function, light and material may be
+    edited between frames: nothing is compiled for that.
+
+    Attributes:
+        header: The file, as a full path.
+        name: The struct's name.
+        kind: Name of its op in `torch.ops.gvtorch_user`.
+        uniforms: Its numbers: by the names that the struct gives them, or (k,) in their order.
+        transfer: A transfer function for the struct's own use; None: white and opaque.
+    """
+
+    kind: str
+
+    def __init__(
+        self,
+        header: str | os.PathLike[str],
+        name: str,
+        *,
+        uniforms: Uniforms | None = None,
+        transfer: TransferFunction | None = None,
+        channel: str | None = None,
+        component: int | None = None,
+        other: str | None = None,
+        other_component: int = 0,
+        **light: Any,
+    ) -> None:
+        """Compiles the struct for the CPU, which takes seconds where the cache does not hold it,
+        and loads it. It is compiled for CUDA where it first meets a tree on CUDA.
+
+        Args:
+            header: The header.
+            name: The name of a `template <class T> struct` in it, with its namespaces.
+            uniforms: Its numbers, by name; a float, a tensor of one number each. Or all in a (k,)
+                tensor, which is read where it lies; a struct without names takes any k.
+            transfer: The transfer function that `look_up` and `hides` read.
+            channel: Name of the channel whose value it reads; that of the options if left out.
+            component: Which number of it; that of the options if left out.
+            other: Name of a second channel.
+            other_component: Which number of it the struct is told.
+            **light: `normals`, `light`, `ambient`, `diffuse`, `specular`, `shininess` as in
+                `Isosurface`, for structs that use `light`.
+
+        Raises:
+            CompileError: The compiler refuses it; holds what the compiler says, as it is.
+            RuntimeError: There is no compiler, the header changes meanwhile, or the cache's folder
+                can't be written, or is not the user's own.
+            ValueError: There is no such file, or uniforms are not those that the struct names.
+        """
+        super().__init__(**light)
+        if transfer is not None and not isinstance(transfer, TransferFunction):
+            kind = type(transfer).__name__
+            raise ValueError(f"CompiledShader: transfer must be a TransferFunction, got {kind}")
+        self.name = name
+        self._take(user.load(header, name))
+        self.transfer, self.channel, self.component = transfer, channel, component
+        self.other, self.other_component = other, other_component
+        self.uniforms = {} if uniforms is None else uniforms
+        self._numbers()
+
+    def _take(self, compiled: user.UserShader) -> None:
+        self._compiled = compiled
+        self.header, self.kind, self.whole = compiled.header, compiled.op, compiled.whole
+        add_user_op(self.kind)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Compiles or finds it again in a process that has not loaded it."""
+        self.__dict__.update(state)
+        self._take(user.reload(self._compiled))
+
+    @property
+    def libraries(self) -> list[Path]:
+        """What is loaded for it, CPU and CUDA: `torch.ops.load_library` loads them in a process
+        that only runs an archive or an exported program.
+        """
+        return user.libraries(self.kind)
+
+    def table(self, tree: N3Tree, intervals: Intervals) -> Table:
+        """See `Shader`."""
+        if self.transfer is None:
+            return one_color((1.0, 1.0, 1.0), tree, intervals)
+        return plain_table(self.transfer, tree, intervals)
+
+    def features(self, tree: N3Tree) -> int:
+        """As many as the struct tells."""
+        if self._compiled.features >= 0:
+            return self._compiled.features
+        if self.other is None:
+            raise ValueError(f"{self.name}: its features are those of a second channel: name other")
+        return tree.bricks.channels[self.other].width
+
+    def parameters(self, tree: N3Tree, dtype: torch.dtype) -> Tensor:
+        """Returns (20 + k,): light and material, and the uniforms, as they are now."""
+        fixed = super().parameters(tree, dtype).reshape(-1)
+        numbers = self._numbers()
+        return torch.cat((fixed, pack(numbers, dtype, tree.device))) if numbers else fixed
+
+    def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> dict[str, Any]:
+        """See `Shader`; compiles for CUDA where the tree lies there.
+
+        Raises:
+            CompileError, RuntimeError: See the constructor.
+            ValueError: See `Shader`.
+        """
+        if tree.device.type == "cuda":
+            user.load_cuda(self._compiled)
+        return super().arguments(where, tree, intervals)
+
+    def _numbers(self) -> list[Any]:
+        """The uniforms in the struct's order, checked."""
+        names, given = self._compiled.uniforms, self.uniforms
+        if isinstance(given, Tensor):
+            count: int | str = "k" if names is None else len(names)
+            check.tensor(self.name, "uniforms", given, (count,), given.dtype, given.device)
+            _check_real(self.name, "uniforms", given)
+            return [given]
+        if not isinstance(given, Mapping):
+            raise ValueError(f"{self.name}: uniforms must be a dict or a tensor, got {given!r}")
+        if set(given) != set(names or ()):
+            known = ", ".join(names) if names else "none" if names is not None else "a (k,) tensor"
+            came = ", ".join(map(str, given)) or "none"
+            raise ValueError(f"{self.name}: uniforms must be {known}, got {came}")
+        for name, value in given.items():
+            if isinstance(value, Tensor):
+                if value.numel() != 1:
+                    raise ValueError(
+                        f"{self.name}: uniform {name} must be one number, "
+                        f"got {check.describe(value)}"
+                    )
+                _check_real(self.name, f"uniform {name}", value)
+            else:
+                check.number(self.name, f"uniform {name}", value)
+        return [given[name] for name in names or ()]
+
+
+def _check_real(where: str, what: str, value: Tensor) -> None:
+    if value.is_complex():
+        raise ValueError(f"{where}: {what} must be real, got {check.describe(value)}")

@@ -1,0 +1,24 @@
+"""Tracing: from rays to hits, and from a camera to a picture of a resident tree."""
+
+from .clip import Clip
+from .costs import Cost, cost
+from .layer import Layer
+from .lighting import Lighting
+from .module_shader import ModuleShader, TransferModule
+from .renderer import RenderOptions, render
+from .thin_lens import ThinLens
+from .tree_tracer import TreeTracer
+
+__all__ = [
+    "Clip",
+    "Cost",
+    "Layer",
+    "Lighting",
+    "ModuleShader",
+    "RenderOptions",
+    "ThinLens",
+    "TransferModule",
+    "TreeTracer",
+    "cost",
+    "render",
+]

@@ -1,0 +1,224 @@
+"""`cost`: what each ray of a picture cost, and what it saw, as images (Crassin, PhD thesis 2011,
+chapter 6, shows the cost per ray in this way).
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from ..base.records import Hits, Rays, RenderStats
+from ..base.stage import Progress, no_progress
+from ..base.volume import movable
+from ..cameras.camera import Camera
+from ..cameras.custom import as_camera
+from ..ops.trace import choose_backend
+from ..pictures.picture import Picture
+from ..pool import N3Tree
+from ..shaders.fused import FusedShader
+from ..shaders.transfer_function import TransferFunction
+from .around import around
+from .module_shader import Batch, TransferModule, march
+from .renderer import RenderOptions, Tracer, check_type, render_options
+
+Image = Literal["samples", "nodes", "lod", "age", "fill"]
+
+_RAYS_A_BLOCK = 1 << 16
+_BRICKS_AT_ONCE = 1024
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cost:
+    """Images of one camera (h, w, 1) or of a batch (n, h, w, 1).
+
+    `lod`, `age` and `fill` are means along a ray, weighted by what each sample adds to alpha; NaN
+    where nothing was seen, and for `age` and `fill` where no brick was.
+    """
+
+    samples: Tensor  # int32 places at which the shader was evaluated
+    nodes: Tensor  # int32 nodes visited, those that were left unseen too
+    lod: Tensor  # depth of the nodes whose bricks were sampled, 0 for the root
+    age: Tensor  # frames since the bricks were written
+    fill: Tensor  # share of the bricks' voxels of which the transfer function shows something
+    stats: RenderStats
+
+    def picture(
+        self, name: Image, *, low: float = 0.0, high: float | None = None, colormap: str = "viridis"
+    ) -> Picture:
+        """Shows one of the images in false colours; black where it is NaN.
+
+        Args:
+            name: samples, nodes, lod, age or fill.
+            low: What gets the first colour.
+            high: What gets the last one; the largest value if left out.
+            colormap: A name of `kornia.color.ColorMapType`.
+
+        Raises:
+            ValueError: There is no such image or colour map.
+        """
+        from kornia.color import ColorMap, ColorMapType, rgb_to_linear_rgb
+
+        if name not in ("samples", "nodes", "lod", "age", "fill"):
+            raise ValueError(f"Cost: image must be samples, nodes, lod, age or fill, got {name!r}")
+        if colormap not in ColorMapType.__members__:
+            known = ", ".join(sorted(ColorMapType.__members__))
+            raise ValueError(f"Cost: unknown colormap {colormap!r}; known: {known}")
+        image = getattr(self, name).to("cpu", torch.float32)
+        known = ~image.isnan()
+        if high is None:
+            high = float(image[known].max()) if known.any() else 1.0
+        place = ((image - low) / max(high - low, 1e-6)).clamp(0, 1)
+        colors = rgb_to_linear_rgb(ColorMap(colormap, 256).colors[:, :, None])[:, :, 0].T
+        color = colors[torch.where(known, place * 255, 0).round().long()[..., 0]] * known
+        nothing = torch.full_like(image, torch.inf)
+        return Picture(
+            color=color,
+            alpha=known.float(),
+            depth=nothing,
+            nearest=nothing,
+            samples=self.samples.cpu(),
+            stats=self.stats,
+        )
+
+
+@torch.no_grad()
+def cost(
+    tree: N3Tree,
+    camera: Camera | Rays,
+    shader: FusedShader,
+    *,
+    progress: Progress = no_progress,
+    **options: Any,
+) -> Cost:
+    """Counts what the rays of a picture do. Nothing is written: neither stamps nor requests.
+
+    Of an engine's tree (`engine.plants[NAME].tree`) it shows the last frame. Rays are walked node
+    by node outside the kernel, which takes many times as long as the picture itself.
+
+    Args:
+        tree: The tree.
+        camera: See `render`.
+        shader: The transfer function.
+        progress: Told how many rays are done.
+        **options: Fields of `RenderOptions`; lighting has no part in it, for transfer functions
+            have no normals.
+
+    Raises:
+        ValueError: See `render`.
+    """
+    camera = as_camera("cost", camera)
+    chosen = render_options("cost", camera, options)
+    check_type("cost", "tree", tree, N3Tree)
+    if not isinstance(shader, TransferFunction):
+        raise ValueError(f"cost: shader must be a TransferFunction, got {type(shader).__name__}")
+    start = time.perf_counter()
+    placed = camera.placed(tree.box)
+    counter = _Counter(tree, shader, chosen)
+    trace = around(counter, chosen, tree.box)
+    numbers, width = placed.numbers(tree.device), placed.width
+    layer = None if chosen.layer is None else chosen.layer.pixels(tree.device)
+    rows = len(placed) * placed.height
+    block = max(1, _RAYS_A_BLOCK // width)
+    parts = []
+    for top in range(0, rows, block):
+        end = min(top + block, rows)
+        rays = placed.pixel_rays(numbers, (top, end))
+        counter.nodes = torch.zeros(len(rays.origin), dtype=torch.int32, device=tree.device)
+        if layer is None:
+            hits = trace(rays)
+        else:
+            hits = layer[top * width : end * width].trace(trace, rays, chosen.stop_alpha)
+        parts.append((hits.samples, counter.nodes, *_means(hits)))
+        progress("rays", end, rows)
+    shape = (len(placed), placed.height, width, 1)
+    names = ("samples", "nodes", "lod", "age", "fill")
+    images = {
+        name: torch.cat(columns).reshape(shape)
+        for name, columns in zip(names, zip(*parts, strict=True), strict=True)
+    }
+    if not camera.batched:
+        images = {name: image[0] for name, image in images.items()}
+    stats = RenderStats(
+        milliseconds=1e3 * (time.perf_counter() - start),
+        backend=choose_backend(chosen.backend, tree.device),
+        rays=rows * width,
+        samples=int(images["samples"].sum(dtype=torch.int64)),
+        nodes=tree.nodes.child_tn.numel(),
+        bricks=tree.bricks.capacity,
+        bytes=tree.nbytes,
+    )
+    return Cost(**images, stats=stats)
+
+
+def _means(hits: Hits) -> tuple[Tensor, ...]:
+    """(r,) lod, age and fill, out of a counter's sums."""
+    assert hits.features is not None
+    seen, lod, bricks, age, fill = hits.features.unbind(1)
+    return tuple(
+        torch.where(weight > 0, total / weight, torch.nan)
+        for total, weight in ((lod, seen), (age, bricks), (fill, bricks))
+    )
+
+
+class _Counter(Tracer):
+    """Counts along rays of one tree: sums as features, and in `nodes` what it visited since that
+    was set to 0.
+    """
+
+    def __init__(self, tree: N3Tree, shader: TransferFunction, options: RenderOptions) -> None:
+        super().__init__(tree, shader, options)
+        for name in ("request_tn", "stamp_t", "stamp_b"):
+            self.arguments[name] = self.arguments[name].clone()
+        self.channel = options.channel or tree.channel_names[0]
+        self.component = options.component
+        self.module = TransferModule(shader, min(tree.spacing)).to(tree.device)
+        self.fill_b = torch.full_like(tree.bricks.born_b, -1, dtype=torch.float32)
+        self.nodes: Tensor
+
+    def __call__(self, rays: Rays) -> Hits:
+        """Sums of what each sample adds to alpha: alone, times the depth of its node, if it has a
+        brick, times its age, times its fill.
+        """
+        own = (self.tree, self.arguments, self.channel, self.shade, 5)
+        sums = march(rays, *own, limit=1, by_node=False)
+        self.nodes += sums.count[:, 1]
+        return Hits(
+            color=sums.total.new_zeros((len(sums.total), 3)),
+            alpha=(1 - sums.clear)[:, None],
+            depth=sums.depth[:, None],
+            samples=sums.count[:, 0].contiguous(),
+            missed=sums.missed,
+            features=sums.total,
+        )
+
+    def shade(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """One, depth of the node, whether it has a brick, its age, its fill; and alpha."""
+        values = batch.values(None)[:, self.component, None]
+        _, alpha = self.module(values, values, values, batch.lengths)  # it reads no places
+        slot = batch.segments.brick[batch.segment, 0].to(torch.int64)
+        has, known = slot >= 0, slot.clamp(min=0)
+        if not self.tree.bricks.capacity:
+            age = fill = torch.zeros_like(alpha[:, 0])
+        else:
+            self._fill(slot[has & (alpha[:, 0] > 0)])
+            age, fill = self.tree.frame - self.tree.bricks.born_b[known], self.fill_b[known]
+        depth = batch.segments.depth[batch.segment, 0]
+        columns = (torch.ones_like(depth), depth, has, age * has, fill * has)
+        return torch.stack([c.to(alpha.dtype) for c in columns], 1), alpha[:, 0]
+
+    def _fill(self, slots: Tensor) -> None:
+        """Works out how full bricks are, once for each."""
+        wanted = torch.zeros_like(self.fill_b, dtype=torch.bool)
+        wanted[slots] = True
+        fresh = (wanted & (self.fill_b < 0)).nonzero()[:, 0]
+        border, size = self.tree.bricks.border, self.tree.bricks.brick_size
+        inner = slice(border, border + size)
+        pool = self.tree.bricks.bricks[self.channel]
+        for part in fresh.split(_BRICKS_AT_ONCE):
+            bricks = movable(pool)[part].view(pool.dtype)[:, inner, inner, inner]
+            voxels = bricks[..., self.component].flatten(1).float()
+            self.fill_b[part] = self.module.shows(voxels).float().mean(1)

@@ -1,0 +1,193 @@
+"""`Layer`: the colour and depth of another renderer, mixed with voxels along each ray.
+
+Voxels before the layer go over it. Where it is opaque, rays end at it: nothing behind is sampled or
+asked for. Where it is translucent, a second trace goes on behind it.
+
+Source: Porter, Duff, "Compositing digital images", 1984 (over, premultiplied).
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from ..base.records import Hits, Rays
+from ..cameras.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """What another renderer drew for the same pixels, on any device.
+
+    The tensors are read where they lie, in every frame anew: what is written into them later is
+    what the next picture shows. They are checked once, here; on CUDA that waits for the device, so
+    make a layer once and write into it. A depth that becomes NaN later counts as +inf.
+
+    Attributes:
+        color: (h, w, 3) or, for a batch of cameras, (n, h, w, 3); linear RGB, premultiplied by
+            alpha.
+        depth: (h, w, 1) or (n, h, w, 1) distance along the ray in world units, +inf where there is
+            nothing; `gv.opengl.ray_distance` makes it from a depth buffer.
+        alpha: As depth, 0 (nothing there) to 1; opaque if left out.
+    """
+
+    color: Tensor
+    depth: Tensor
+    alpha: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        """Checks shapes and values.
+
+        Raises:
+            ValueError: A wrong shape or dtype, a colour that is not finite, a depth that is NaN or
+                negative, an alpha out of its range.
+        """
+        parts = {"color": self.color, "depth": self.depth, "alpha": self.alpha}
+        for name, part in parts.items():
+            channels = 3 if name == "color" else 1
+            if part is None and name == "alpha":
+                continue
+            if not (
+                isinstance(part, Tensor)
+                and part.is_floating_point()
+                and part.dim() in (3, 4)
+                and part.shape[-1] == channels
+                and part.numel()
+            ):
+                raise ValueError(
+                    f"Layer: {name} must be (h, w, {channels}) or (n, h, w, {channels}) floats, "
+                    f"got {check.describe(part)}"
+                )
+            if part.shape[:-1] != self.color.shape[:-1]:
+                raise ValueError(
+                    f"Layer: {name} must have the pixels of color, {check.describe(self.color)}, "
+                    f"got {check.describe(part)}"
+                )
+        if not bool(torch.isfinite(self.color).all()):
+            raise ValueError("Layer: color must be finite, got NaN or infinity")
+        if not bool((self.depth >= 0).all()):
+            what = "NaN" if bool(self.depth.isnan().any()) else f"{float(self.depth.min()):g}"
+            raise ValueError(f"Layer: depth must be >= 0, +inf where nothing is, got {what}")
+        if self.alpha is not None and not bool(((self.alpha >= 0) & (self.alpha <= 1)).all()):
+            raise ValueError("Layer: alpha must be finite and >= 0 and <= 1")
+
+    def cut(self, where: str, camera: Camera) -> Layer:
+        """Returns the layer of the camera's pixels: where the camera takes a strip of rows, that
+        strip of the layer, whose tensors are views.
+
+        Raises:
+            ValueError: The layer has not the pixels of the camera's whole pictures.
+        """
+        top, rows = camera.window
+        count = (len(camera),) if camera.batched else ()
+        wanted, got = (*count, rows, camera.width), tuple(self.color.shape[:-1])
+        if got == (*count, camera.height, camera.width):
+            return self
+        if got != wanted:
+            raise ValueError(
+                f"{where}: layer must have the camera's {wanted} pixels (rows, columns), got {got}"
+            )
+        strip = copy.copy(self)  # checked already
+        for name, part in vars(self).items():
+            if part is not None:
+                object.__setattr__(strip, name, part[..., top : top + camera.height, :, :])
+        return strip
+
+    def check_device(self, where: str, device: torch.device) -> None:
+        """Raises ValueError unless all tensors lie on the device."""
+        for part in (self.color, self.depth, self.alpha):
+            if part is not None and part.device != device:
+                raise ValueError(
+                    f"{where}: layer must lie on {device}, where the graph reads it, "
+                    f"got {part.device}"
+                )
+
+    def distance(self, device: torch.device) -> Tensor:
+        """Returns (p, 1) the distance of every pixel's layer, +inf where it shows nothing."""
+        depth = _flat(self.depth, device)
+        shown = depth < torch.inf
+        if self.alpha is not None:
+            shown = shown & (_flat(self.alpha, device) > 0)
+        return torch.where(shown, depth, torch.inf)
+
+    def pixels(self, device: torch.device) -> LayerPixels:
+        """Returns all pixels, row by row through the batch."""
+        alpha = None if self.alpha is None else _flat(self.alpha, device)
+        return LayerPixels(_flat(self.color, device), self.distance(device), alpha)
+
+
+def _flat(image: Tensor, device: torch.device) -> Tensor:
+    """(p, c) of (..., h, w, c): a view, where it lies on the device."""
+    flat = image.reshape(-1, image.shape[-1])
+    return flat.to(device, non_blocking=device.type == "cuda")  # the CPU would not wait for it
+
+
+@dataclass(frozen=True)
+class LayerPixels:
+    """Pixels of a layer, on the device of their rays."""
+
+    color: Tensor  # (r, 3)
+    distance: Tensor  # (r, 1), +inf where nothing is shown
+    alpha: Tensor | None  # (r, 1)
+
+    def __getitem__(self, which: slice | Tensor) -> LayerPixels:
+        """Some of the pixels."""
+        alpha = None if self.alpha is None else self.alpha[which]
+        return LayerPixels(self.color[which], self.distance[which], alpha)
+
+    def trace(self, trace_rays: Callable[[Rays], Hits], rays: Rays, stop_alpha: float) -> Hits:
+        """Traces the rays of these pixels and composites voxels and layer.
+
+        Args:
+            trace_rays: Traces world rays through voxels.
+            rays: One for each pixel.
+            stop_alpha: A ray that has this alpha behind the layer does not go on.
+
+        Returns:
+            Colour and alpha of both; depth of the voxels alone: before the layer, else behind it;
+            their normal, by what each part takes of the light.
+        """
+        near, far = rays.range.split(1, dim=1)
+        stop = self.distance.to(rays.range.dtype)
+        shown = stop < torch.inf
+        before = torch.cat((near, torch.maximum(near, torch.minimum(far, stop))), 1)
+        front = trace_rays(dataclasses.replace(rays, range=before))
+        opacity = shown.to(front.alpha.dtype)
+        if self.alpha is not None:
+            opacity = torch.where(shown, self.alpha, 0).to(front.alpha.dtype)
+        color = torch.where(shown, self.color, 0).to(front.color.dtype)
+        mixed = dataclasses.replace(
+            front,
+            color=front.color + (1 - front.alpha) * color,
+            alpha=front.alpha + (1 - front.alpha) * opacity,
+        )
+        if self.alpha is None:
+            return mixed
+        onward = shown & (mixed.alpha < stop_alpha)
+        start = torch.where(onward, torch.maximum(near, stop), near)
+        end = torch.where(onward, torch.maximum(start, far), start)
+        behind = trace_rays(dataclasses.replace(rays, range=torch.cat((start, end), 1)))
+        normal, features = mixed.normal, mixed.features
+        if normal is not None and behind.normal is not None:
+            share = (1 - mixed.alpha) * behind.alpha  # of the light
+            both = normal * front.alpha + behind.normal * share
+            both = torch.nn.functional.normalize(both, dim=1)
+            normal = torch.where(share > 0, both, normal)
+        if features is not None and behind.features is not None:
+            features = features + (1 - mixed.alpha) * behind.features
+        return dataclasses.replace(
+            mixed,
+            normal=normal,
+            features=features,
+            color=mixed.color + (1 - mixed.alpha) * behind.color,
+            alpha=mixed.alpha + (1 - mixed.alpha) * behind.alpha,
+            depth=torch.minimum(front.depth, behind.depth),
+            samples=front.samples + behind.samples,
+            missed=front.missed | behind.missed,
+        )

@@ -1,0 +1,86 @@
+"""`ThinLens`: depth of field by a double cone.
+
+A ray stands for its pixel's cone and for the circle of confusion, which shrinks towards the focus
+and grows behind it. So it is traced as two pieces, of which the first narrows; where the picture is
+blurred, voxels as wide as the blur are read: fewer samples, and fewer bricks.
+
+Sources: Crassin, Neyret, Lefebvre, Eisemann, "GigaVoxels: Ray-Guided Streaming for Efficient and
+Detailed Voxel Rendering", I3D 2009, section 5; Crassin, PhD thesis 2011, on depth of field;
+Potmesil and Chakravarty, "A lens and aperture camera model for synthetic image generation", 1981,
+for the circle of confusion.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from ..base.records import Hits, Rays
+from ..cameras.camera import Frame
+from .pieces import Trace, trace_pieces
+
+#: Width of the cone over the diameter of the disc. Voxels half as wide as a disc, read trilinearly,
+#: spread as much as it does (variance v^2 / 4, the disc 1 / 16). The pixel's cone comes on top, and
+#: blurred density makes what is opaque grow: pictures agree best with this.
+_CONE_OF_DISC = 0.3
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThinLens:
+    """A lens that sees sharply at one distance.
+
+    What a pixel sees at distance t is a disc of diameter aperture * |t - focus| / focus. Distances
+    are taken along rays: what is sharp is a sphere around the eye, whatever the camera.
+    """
+
+    aperture: float  # diameter of the lens
+    focus: float  # distance at which things are sharp
+    frame: Frame | str = Frame.WORLD  # world units, or largest sides of the scene's box
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        check.number("ThinLens", "aperture", self.aperture, low=0)
+        check.number("ThinLens", "focus", self.focus, low=0, open_low=True)
+        object.__setattr__(self, "frame", Frame.of("ThinLens", self.frame))
+
+    def placed(self, box: Tensor) -> ThinLens:
+        """Returns the lens in world units, given the (2, 3) box of the scene."""
+        if self.frame is Frame.WORLD:
+            return self
+        side = float((box[1] - box[0]).max())
+        return dataclasses.replace(
+            self, aperture=self.aperture * side, focus=self.focus * side, frame=Frame.WORLD
+        )
+
+    def cone(self, t: Tensor) -> Tensor:
+        """Width of the lens's cone at distances, of a lens in world units."""
+        return _CONE_OF_DISC * self.aperture / self.focus * (t - self.focus).abs()
+
+
+class ThroughLens:
+    """Traces rays with the cone of a lens."""
+
+    def __init__(self, trace: Trace, lens: ThinLens, cone_scale: float) -> None:
+        """Takes a lens in world units, and the factor on cones, which the lens's has none of."""
+        self._trace, self._focus = trace, lens.focus
+        self._wide = _CONE_OF_DISC * lens.aperture / cone_scale  # of the cone at the lens
+
+    def __call__(self, rays: Rays) -> Hits:
+        """Traces what lies before the focus, then what lies behind it."""
+        return trace_pieces(self._trace, (self._piece(rays, -1), self._piece(rays, 1)))
+
+    def _piece(self, rays: Rays, side: int) -> Rays:
+        cone, (first, last) = rays.cone.to(torch.float64), rays.range.to(torch.float64).unbind(1)
+        growth = side * self._wide / self._focus
+        near, far = cone[:, 0] - side * self._wide, cone[:, 1] + growth
+        if side < 0:
+            last = last.clamp(max=self._focus)
+        else:
+            first = first.clamp(min=self._focus)
+        return dataclasses.replace(
+            rays, cone=torch.stack((near, far), 1), range=torch.stack((first, last), 1)
+        )
