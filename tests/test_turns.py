@@ -20,7 +20,7 @@ def test_scouts_go_first():
 
 
 def test_rays_take_turns_by_halves(monkeypatch):
-    monkeypatch.setattr("gvtorch.turns._STRIDE", 1)
+    monkeypatch.setattr("gvtorch.engine.turns._STRIDE", 1)
     turns = Turns(16, 16, torch.device("cpu"))
     full = gv.FrameStats(capacity_exceeded=True, produced={"bricks": 0})
     everyone = torch.ones(16, dtype=torch.bool)
