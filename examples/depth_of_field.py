@@ -14,7 +14,7 @@ import tyro
 from kornia.metrics import ssim
 
 import gvtorch as gv
-from gvtorch.tracing.renderer import trace
+from gvtorch.tracing.resident import trace
 
 SCAN = Path(__file__).parent / "data" / "aneurism_256x256x256_uint8.raw.gz"
 OPACITY = [(20, 0), (60, 0.04), (255, 0.25)]

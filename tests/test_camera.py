@@ -10,7 +10,7 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.depth import unproject_meshgrid
 
 import gvtorch as gv
-from gvtorch.tracing import renderer
+from gvtorch.tracing import pixels
 
 BOX = torch.tensor([[1.0, 2.0, 3.0], [5.0, 4.0, 4.0]], dtype=torch.float64)
 
@@ -152,7 +152,7 @@ def test_small_cameras_share_calls(monkeypatch):
     one_call = gv.render(tree, cameras, shader, progress=told)
     assert calls == [320] and one_call.alpha.max() > 0.3
     calls.clear()
-    monkeypatch.setitem(renderer._RAYS_A_BLOCK, "cpu", 1000)  # 62 rows, in the middle of a camera
+    monkeypatch.setitem(pixels._RAYS_A_BLOCK, "cpu", 1000)  # 62 rows, in the middle of a camera
     parts = gv.render(tree, cameras, shader, progress=told)
     assert calls == [62, 124, 186, 248, 310, 320]
     for index in range(20):

@@ -14,7 +14,7 @@ from test_trace_rays import SHADER, assert_equal, camera_rays, forget, run
 
 import gvtorch as gv
 from gvtorch.tracing.clip import Clipped
-from gvtorch.tracing.renderer import trace
+from gvtorch.tracing.resident import trace
 
 UNIT = torch.tensor([[-0.5] * 3, [0.5] * 3], dtype=torch.float64)
 

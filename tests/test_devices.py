@@ -12,7 +12,7 @@ from test_trace_rays import SHADER, camera_rays, on
 
 import gvtorch as gv
 from gvtorch.ops import available
-from gvtorch.tracing.renderer import trace
+from gvtorch.tracing.resident import trace
 
 FIELDS = ("color", "alpha", "depth", "samples")
 

@@ -12,7 +12,7 @@ import gvtorch as gv
 from gvtorch.base.volume import DIRECTIONS
 from gvtorch.io import convert
 from gvtorch.pool.pyramid import pool_directional, volume_levels
-from gvtorch.tracing.renderer import trace
+from gvtorch.tracing.resident import trace
 
 RED, GREEN = (1.0, 0.1, 0.0), (0.0, 0.9, 0.2)
 SIZES = {"brick_size": 4, "border": 1}

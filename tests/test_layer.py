@@ -18,7 +18,8 @@ from test_trace_rays import on
 import gvtorch as gv
 from gvtorch.base import constants as config
 from gvtorch.ops import available
-from gvtorch.tracing import renderer
+from gvtorch.tracing import pixels
+from gvtorch.tracing.resident import trace
 
 HAZE = gv.TransferFunction.from_points([(0, 0.03)], [(0, 0.9, 0.5, 0.2)])
 GRAY = gv.TransferFunction.preset("gray", 0, 1)
@@ -148,7 +149,7 @@ def test_normals_count_by_what_each_part_takes_of_the_light(compiled, blobs):
     near[:, 1] = behind[:, 0] = far
     options = gv.RenderOptions(stop_alpha=1.0)
     front, back = (
-        renderer.trace(tree, dataclasses.replace(rays, range=part), shader, options)
+        trace(tree, dataclasses.replace(rays, range=part), shader, options)
         for part in (near, behind)
     )
     share = (1 - front.alpha) * (1 - 0.4) * back.alpha
@@ -238,9 +239,9 @@ def test_batches_and_blocks_of_rays_change_nothing(monkeypatch, blobs):
     depth = torch.stack([screen(cameras[i], middle(blobs), (0.2, 0, 1)) for i in range(3)])
     for alpha in (None, 0.5 * torch.ones_like(depth)):
         layer = layer_of(depth, alpha)
-        monkeypatch.setitem(renderer._RAYS_A_BLOCK, "cpu", 1 << 16)
+        monkeypatch.setitem(pixels._RAYS_A_BLOCK, "cpu", 1 << 16)
         whole = gv.render(tree, cameras, GRAY, layer=layer)
-        monkeypatch.setitem(renderer._RAYS_A_BLOCK, "cpu", 24 * 7)  # blocks that span cameras
+        monkeypatch.setitem(pixels._RAYS_A_BLOCK, "cpu", 24 * 7)  # blocks that span cameras
         assert_same_picture(gv.render(tree, cameras, GRAY, layer=layer), whole)
         for i in range(3):
             own = layer_of(depth[i], None if alpha is None else alpha[i])

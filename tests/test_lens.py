@@ -13,7 +13,7 @@ from test_trace_rays import SHADER, assert_equal, camera_rays
 
 import gvtorch as gv
 from gvtorch.base.constants import CONE_OVERESTIMATE
-from gvtorch.tracing.renderer import trace
+from gvtorch.tracing.resident import trace
 from gvtorch.tracing.thin_lens import ThroughLens
 
 FOCUS = 2.0  # sides of the box

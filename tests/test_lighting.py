@@ -12,7 +12,7 @@ from conftest import DEVICES
 from test_shading import ball, parallel, phong, sphere
 
 import gvtorch as gv
-from gvtorch.tracing.renderer import trace
+from gvtorch.tracing.resident import trace
 
 MATT = {"ambient": 0.0, "diffuse": 1.0, "specular": 0.0}
 SKY = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0}

@@ -13,7 +13,7 @@ from test_lighting import FLOOR, MATT, places
 
 import gvtorch as gv
 from gvtorch.ops import available
-from gvtorch.tracing.renderer import trace
+from gvtorch.tracing.resident import trace
 
 LOOKS = {
     "shadow": gv.Lighting(lights=(gv.DirectionalLight((1, -2, 0.5), angle=6),)),

@@ -13,7 +13,7 @@ from conftest import DATA, DEVICES
 from test_trace_rays import SHADER
 
 import gvtorch as gv
-from gvtorch.tracing.renderer import tracer_of
+from gvtorch.tracing.tracer import tracer_of
 
 SOFT = gv.TransferFunction.from_points(  # never quite opaque: a power of 0 has no slope
     opacity=[(0, 0), (0.2, 0), (0.6, 0.4), (1, 0.95)],

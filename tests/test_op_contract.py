@@ -15,7 +15,7 @@ from test_trace_rays import SHADER, arguments, camera_rays, on
 import gvtorch as gv
 from gvtorch import cpp_ext
 from gvtorch.ops import trace_rays
-from gvtorch.tracing.renderer import trace
+from gvtorch.tracing.resident import trace
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # torch deprecates its own TorchScript
 

@@ -15,7 +15,8 @@ from test_trace_rays import camera_rays, forget, run
 from torch import Tensor
 
 import gvtorch as gv
-from gvtorch.tracing.renderer import AnyShader, trace
+from gvtorch.tracing.resident import trace
+from gvtorch.tracing.tracer import AnyShader
 
 TRANSFER = gv.TransferFunction.from_points(
     [(0.2, 0), (0.5, 0.05), (0.9, 0.6)], [(0.2, 1, 0.3, 0.1), (0.9, 0.2, 0.6, 1)]

@@ -12,7 +12,7 @@ from conftest import DEVICES, shared
 from kornia.metrics import psnr
 
 import gvtorch as gv
-from gvtorch.tracing.renderer import trace
+from gvtorch.tracing.resident import trace
 
 SIZE = 96
 PLACE = {"azimuth": 30.0, "elevation": 20.0, "distance": 2.4, "fov": 30.0}

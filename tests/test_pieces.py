@@ -15,8 +15,8 @@ from test_shaders import SHADERS, channels_of
 from test_trace_rays import SHADER, assert_equal, camera_rays, forget, run
 
 import gvtorch as gv
-from gvtorch.tracing.pieces import trace_pieces
-from gvtorch.tracing.renderer import Tracer
+from gvtorch.tracing.composite import trace_pieces
+from gvtorch.tracing.tracer import Tracer
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from test_trace_rays import SHADER, arguments, camera_rays, forget, on
 
 import gvtorch as gv
 from gvtorch.ops import composite, list_samples, sample_bricks, trace_rays, trace_segments
-from gvtorch.tracing.renderer import Tracer
+from gvtorch.tracing.tracer import Tracer
 
 DRAWN = ("table_lm4", "stop_alpha", "depth_alpha")
 RAYS = ("origin_r3", "direction_r3", "cone_r2", "range_r2", "place_33")

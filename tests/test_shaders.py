@@ -14,7 +14,7 @@ from test_trace_rays import SHADER, assert_equal, camera_rays, forget, on, run
 
 import gvtorch as gv
 from gvtorch.ops import shade_rays
-from gvtorch.tracing.renderer import Tracer
+from gvtorch.tracing.tracer import Tracer
 
 GOLDEN = ROOT / "tests" / "golden_shaders.npz"
 POINT = gv.PointLight((0.0, 40.0, 60.0), (1.0, 0.9, 0.8))

@@ -8,7 +8,7 @@ import torch
 from conftest import DEVICES
 
 import gvtorch as gv
-from gvtorch.tracing.renderer import Tracer
+from gvtorch.tracing.tracer import Tracer
 
 WHITE = gv.TransferFunction.from_points([(0, 1)], [(0, 1, 1, 1)])
 SPACING = (1.0, 0.8, 1.3)

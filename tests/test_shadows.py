@@ -9,7 +9,8 @@ from conftest import DEVICES
 from marcher import box_of, march, trilinear
 
 import gvtorch as gv
-from gvtorch.tracing.renderer import Tracer, trace
+from gvtorch.tracing.resident import trace
+from gvtorch.tracing.tracer import Tracer
 
 SPACING, ORIGIN = (1.0, 0.8, 1.5), (5.0, -3.0, 2.0)
 SUN = gv.DirectionalLight((0.6, -1.0, 0.3))

@@ -15,7 +15,8 @@ import gvtorch as gv
 from gvtorch.base import constants as config
 from gvtorch.ops.reference import exact
 from gvtorch.shaders.transfer_function import interval_levels
-from gvtorch.tracing.renderer import Tracer, trace
+from gvtorch.tracing.resident import trace
+from gvtorch.tracing.tracer import Tracer
 
 SHADER = gv.TransferFunction.from_points(
     opacity=[(0, 0), (0.2, 0), (0.6, 0.4), (1, 1)],

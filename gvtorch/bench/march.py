@@ -20,7 +20,7 @@ from ..io.machine import memory_free
 from ..pictures import Picture
 from ..pool import N3Tree
 from ..tracing import RenderOptions
-from ..tracing.renderer import trace
+from ..tracing.resident import trace
 from .peers import Peer, Task, find
 from .record import Record, Settings, Timing, clock, once
 from .scenes import SCENES, Scene, shell_sparse

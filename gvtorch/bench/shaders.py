@@ -32,7 +32,8 @@ from ..shaders import (
 )
 from ..shaders.fused import Shader
 from ..tracing import Lighting, ModuleShader, RenderOptions, TransferModule
-from ..tracing.renderer import AnyShader, trace
+from ..tracing.resident import trace
+from ..tracing.tracer import AnyShader
 from .march import Size, difference, op_milliseconds, rates, rgba
 from .record import Record, Settings, Timing, clock
 from .scenes import Scene, aneurism, fog_dense, worn

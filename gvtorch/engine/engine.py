@@ -27,18 +27,11 @@ from ..pictures import Picture
 from ..producers import Producer
 from ..shaders.fused import Shader
 from ..tracing import ModuleShader, RenderOptions
-from ..tracing.pieces import Trace
-from ..tracing.renderer import (
-    AnyShader,
-    around,
-    check_shader,
-    composite_trees,
-    develop,
-    empty_hits,
-    render_options,
-    trace_camera,
-    tracer_of,
-)
+from ..tracing.around import around
+from ..tracing.composite import Trace, composite_trees
+from ..tracing.options import render_options
+from ..tracing.pixels import develop, empty_hits, trace_camera
+from ..tracing.tracer import AnyShader, check_shader, tracer_of
 from .jobs import Plant
 from .production import Failure, Production
 from .readback import Arrivals, Numbers

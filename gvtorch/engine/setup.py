@@ -15,7 +15,7 @@ from ..cache import Cache
 from ..pool import BrickPool, Channel, N3Tree, NodePool
 from ..producers import Nodes, Producer, Region
 from ..producers.answer import checked_bricks, checked_regions, layout_of
-from ..tracing.renderer import check_type
+from ..tracing.options import check_type
 from .jobs import Plant
 from .production import ProductionError
 

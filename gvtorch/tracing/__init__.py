@@ -5,7 +5,8 @@ from .costs import Cost, cost
 from .layer import Layer
 from .lighting import Lighting
 from .module_shader import ModuleShader, TransferModule
-from .renderer import RenderOptions, render
+from .options import RenderOptions
+from .resident import render
 from .thin_lens import ThinLens
 from .tree_tracer import TreeTracer
 

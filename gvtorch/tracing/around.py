@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from torch import Tensor
 
@@ -11,14 +10,13 @@ from ..shaders.fused import LitShader, Projection, Shader
 from ..shaders.surfaces import Isosurface
 from .caps import SurfaceSlab
 from .clip import Clipped
+from .composite import Trace
 from .lighting import Lighted
 from .module_shader import ModuleTracer
-from .pieces import Trace
-from .projected import ProjectedPieces
+from .options import RenderOptions
+from .projection_pieces import ProjectedPieces
 from .thin_lens import ThinLens, ThroughLens
-
-if TYPE_CHECKING:
-    from .renderer import RenderOptions, Tracer
+from .tracer import Tracer
 
 
 def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -> Trace:

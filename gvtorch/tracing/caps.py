@@ -12,7 +12,7 @@ from ..shaders.fused import Projection
 from ..shaders.lights import pack
 from ..shaders.surfaces import Isosurface
 from ..shaders.transfer_function import TransferFunction
-from .pieces import Trace
+from .composite import Trace
 
 _WHITE = TransferFunction.from_points([(0, 1)])  # kept: its table is made once
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.camera import Frame
-from .pieces import Trace, behind, join, trace_pieces
+from .composite import Trace, behind, join, trace_pieces
 
 Numbers = Sequence[Sequence[float]] | Tensor
 Face = tuple[float, ...]  # unit normal and offset (a, b, c, d): inside, a x + b y + c z + d >= 0

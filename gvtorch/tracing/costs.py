@@ -23,7 +23,8 @@ from ..shaders.fused import FusedShader
 from ..shaders.transfer_function import TransferFunction
 from .around import around
 from .module_shader import Batch, TransferModule, march
-from .renderer import RenderOptions, Tracer, check_type, render_options
+from .options import RenderOptions, check_type, render_options
+from .tracer import Tracer
 
 Image = Literal["samples", "nodes", "lod", "age", "fill"]
 

@@ -37,7 +37,7 @@ from ..shaders.lights import (
     check_triple,
     pack,
 )
-from .pieces import Trace, behind, join
+from .composite import Trace, behind, join
 from .thin_lens import ThinLens
 
 #: Where secondary rays begin, in voxels: those to lights so far off the surface; those all around

@@ -21,7 +21,7 @@ from torch import Tensor
 from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.camera import Frame
-from .pieces import Trace, trace_pieces
+from .composite import Trace, trace_pieces
 
 #: Width of the cone over the diameter of the disc. Voxels half as wide as a disc, read trilinearly,
 #: spread as much as it does (variance v^2 / 4, the disc 1 / 16). The pixel's cone comes on top, and

@@ -19,7 +19,7 @@ from ..ops.trace import most_intervals
 from ..pool import N3Tree
 from ..shaders.fused import FusedShader, Intervals, Shader
 from ..shaders.transfer_function import interval_levels
-from .renderer import check_shader
+from .tracer import check_shader
 
 
 class TreeTracer(torch.nn.Module):

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from ..base.records import Hits, Rays
 from ..shaders.fused import Projection
-
-if TYPE_CHECKING:
-    from .renderer import Tracer
+from .tracer import Tracer
 
 
 class ProjectedPieces:

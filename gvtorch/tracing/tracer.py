@@ -1,0 +1,141 @@
+"""`Tracer`: one frame of a tree and a shader, from rays to hits."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..base.records import Hits, Rays
+from ..ops import shade_rays, trace_rays
+from ..ops.trace import choose_backend, most_intervals
+from ..pool import N3Tree
+from ..shaders.fused import FusedShader, Intervals, Shader
+from ..shaders.transfer_function import TransferFunction, interval_levels
+from .module_shader import ModuleShader, ModuleTracer
+from .options import RenderOptions
+
+AnyShader = FusedShader | ModuleShader
+
+
+def tracer_of(
+    tree: N3Tree,
+    shader: AnyShader,
+    options: RenderOptions,
+    **frame: Any,
+) -> Tracer | ModuleTracer:
+    """Returns what traces a frame of a tree with a shader; `frame` as for `Tracer`.
+
+    Raises:
+        ValueError: It is no shader, or see `Tracer`.
+    """
+    if isinstance(shader, ModuleShader):
+        walls = Tracer(tree, shader.walls, options, **frame)
+        channel = options.channel or tree.channel_names[0]
+        return ModuleTracer(tree, shader, walls.arguments, channel)
+    check_shader("render", "shader", shader)
+    return Tracer(tree, shader, options, **frame)
+
+
+class Tracer:
+    """One frame of a tree, `tree.frame`: traces any number of batches of rays."""
+
+    def __init__(
+        self,
+        tree: N3Tree,
+        shader: FusedShader,
+        options: RenderOptions,
+        *,
+        by_level: bool = False,
+        frame_1: Tensor | None = None,
+    ) -> None:
+        """Lays the op's arguments ready; see `trace` and, for `by_level`, `trace_rays`. `frame_1`
+        (1,) int32 is the frame's number on the device, if it lies there already.
+        """
+        choose_backend(options.backend, tree.device)
+        own = shader if isinstance(shader, Shader) else None
+        channel = (own and own.channel) or options.channel or tree.channel_names[0]
+        if channel not in tree.bricks.bricks:
+            known = ", ".join(tree.channel_names)
+            raise ValueError(f"render: unknown channel {channel!r}; the tree has {known}")
+        step = options.step * min(tree.spacing)
+        most_intervals(float((tree.box[1] - tree.box[0]).norm()), step)
+        self.tree = tree
+        if frame_1 is None:
+            frame_1 = torch.full((1,), tree.frame, dtype=torch.int32, device=tree.device)
+        scale = options.cone_scale * tree.flatness if options.lod == "auto" else 0.0
+        levels = interval_levels(tree.root_voxel, step) if scale else 1
+        intervals = Intervals(
+            smallest_spacing=min(tree.spacing), step=step, levels=levels, dtype=options.dtype
+        )
+        if isinstance(shader, TransferFunction):
+            table = vars(shader.table(min(tree.spacing), step, levels, options.dtype, tree.device))
+        elif shader.kind is None:
+            table = vars(shader.table(tree, intervals))
+        else:
+            table = shader.arguments("render", tree, intervals)
+        component = own.component if own and own.component is not None else options.component
+        self.shader = None if own is None or own.kind is None else own
+        self.dtype = options.dtype
+        self.arguments: dict[str, Any] = {
+            "place_33": tree.place,
+            "child_tn": tree.nodes.child_tn,
+            "brick_tn": tree.nodes.brick_tn,
+            "request_tn": tree.nodes.request_tn,
+            "stamp_t": tree.nodes.stamp_t,
+            "bricks_bzyxc": tree.bricks.bricks[channel],
+            "constant_tnc": tree.nodes.constants[channel],
+            "range_tn2c": tree.nodes.ranges[channel],
+            "stamp_b": tree.bricks.stamp_b,
+            **table,
+            "frame_1": frame_1,
+            "branching": tree.branching,
+            "root": tree.root,
+            "max_depth": tree.depth,
+            "border": tree.bricks.border,
+            "component": component,
+            "cone_scale": scale,
+            "root_voxel": tree.root_voxel,
+            "step": step,
+            "stop_alpha": options.stop_alpha,
+            "depth_alpha": options.depth_alpha,
+            "by_level": by_level,
+            "backend": options.backend,
+        }
+
+    def seeing(self, shader: FusedShader, options: RenderOptions) -> Tracer:
+        """Returns what traces the same frame with another shader."""
+        frame = {name: self.arguments[name] for name in ("by_level", "frame_1")}
+        return Tracer(self.tree, shader, options, **frame)
+
+    def __call__(self, rays: Rays) -> Hits:
+        """Traces rays in world units."""
+        columns = (rays.origin, rays.direction, rays.cone, rays.range)
+        origin, direction, cone, limits = (c.to(torch.float64).contiguous() for c in columns)
+        clear = None if rays.clear is None else rays.clear.to(torch.float64).contiguous()
+        given = {"width": rays.width, "clear_r": clear, **self.arguments}
+        if self.shader is None:
+            fields = trace_rays(origin, direction, cone, limits, **given)
+            return Hits(**dict(zip(_FIELDS, fields, strict=False)))
+        found = shade_rays(
+            origin_r3=origin,
+            direction_r3=direction,
+            cone_r2=cone,
+            range_r2=limits,
+            parameter_54=self.shader.parameters(self.tree, self.dtype),
+            **given,
+        )
+        return Hits(**dict(zip(_FIELDS, found, strict=True)))
+
+
+_FIELDS = ("color", "alpha", "depth", "samples", "missed", "normal", "features")
+
+
+def check_shader(where: str, name: str, value: Any) -> None:
+    """Raises ValueError unless a user's argument is a transfer function or another fused shader."""
+    if not isinstance(value, (Shader, TransferFunction)):
+        kind = type(value).__name__
+        raise ValueError(
+            f"{where}: {name} must be a TransferFunction or another shader, got {kind}"
+        )
