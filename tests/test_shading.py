@@ -8,6 +8,7 @@ import torch
 from conftest import DEVICES
 
 import gvtorch as gv
+from gvtorch.ops.shading import IsosurfaceNumbers, LightKind, ShadeParameters
 from gvtorch.tracing.tracer import Tracer
 
 WHITE = gv.TransferFunction.from_points([(0, 1)], [(0, 1, 1, 1)])
@@ -317,3 +318,18 @@ def test_features_are_composited_like_colours(backend, count):
     assert hits["features"].shape == (len(rays.origin), count)
     assert np.abs(hits["features"] - hits["color"][:, :1] * weights).max() < 1e-4
     assert hits["features"].max() > 0.2
+
+
+def test_parameters_read_back_as_they_were_packed():
+    level = torch.tensor(0.25)
+    given = ShadeParameters(
+        (1.0, 2.0, 3.0), LightKind.POINT, (4.0, 5.0, 6.0), 7.0, 8.0, 9.0, 10.0, 11.0,
+        own=IsosurfaceNumbers(level), normal_scale=2.0, normal_offset=-1.0,
+    )  # fmt: skip
+    packed = given.pack(torch.float64, torch.device("cpu"))
+    assert packed.tolist() == [
+        [1, 2, 3, LightKind.POINT], [4, 5, 6, 7], [8, 9, 10, 11], [0.25, 0, 0, 0], [2, -1, 0, 0],
+    ]  # fmt: skip
+    read = ShadeParameters.read(packed)
+    assert read.own_as(IsosurfaceNumbers) == IsosurfaceNumbers(level)
+    assert torch.equal(read.pack(torch.float64, torch.device("cpu")), packed)

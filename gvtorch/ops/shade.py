@@ -12,7 +12,7 @@ from torch import Tensor
 from ..base import check
 from ..base import constants as config
 from .reference import shaders as reference_shaders
-from .reference.shaders import COLORS, FEATURES, PRE_INTEGRATED, PROJECTION, SHADOWED_COLOR
+from .shading import ShaderKind
 from .trace import Backend, check_arguments, choose_backend
 
 _TENSORS = (
@@ -48,17 +48,9 @@ def shade_rays(
     """Traces rays through a tree and shades what they meet with a fused shader, or a user's.
 
     Args:
-        shader: 0 lit transfer function, 1 pre-integrated, 2 stored colour, 3 isosurface, 4
-            projection, 5 features, 6 lit with shadows, 7 stored colour with shadows: as numbered in
-            `reference_shaders`, told in csrc/shaders.h. Or the name of a user's op, see
-            `cpp_ext.user`.
-        parameter_54: (5, 4) in the table's dtype. Row 0: the light's x, y, z (its place, or the way
-            it shines) and its kind (0 headlight, 1 directional, 2 point). 1: its red, green, blue,
-            and ambient. 2: diffuse, specular, shininess, and the width of a cone to the light (its
-            growth; of a point light the width there). 3: the shader's own - stored colour:
-            scale, reference length, premultiplied (0, 1), lit (0, 1); isosurface: the level;
-            projection: 0 maximum, 1 minimum, 2 mean. 4: scale and offset of stored normals, 0, 0.
-            For a user's op (20 + k,): the same and its own k numbers.
+        shader: A `shading.ShaderKind`, or the name of a user's op, see `cpp_ext.user`.
+        parameter_54: (5, 4) in the table's dtype, as `shading.ShadeParameters` packs them. For a
+            user's op (20 + k,): the same and its own k numbers.
         normal_bzyxc: (b, s, s, s, 3) channel of normals; None takes the gradient's.
         normal_tnc: (t, n, 3) its constants.
         other_bzyxc: (b, s, s, s, c) a second channel: the value that colours an isosurface, or
@@ -88,9 +80,10 @@ def shade_rays(
     whole = tuple(shared[name] for name in _NUMBERS)
     reals = (cone_scale, root_voxel, step, stop_alpha, depth_alpha)
     own = isinstance(shader, str)
-    kind = 0 if own else check.whole(where, "shader", shader, low=0, high=SHADOWED_COLOR)
+    number = 0 if own else check.whole(where, "shader", shader, low=0, high=max(ShaderKind))
+    kind = ShaderKind(number)
     rows = tensors["table_lm4"].shape[1] if tensors["table_lm4"].dim() > 1 else 0
-    square = ("l", rows, rows, 4) if shader == PRE_INTEGRATED else ("l", "m", 4)
+    square = ("l", rows, rows, 4) if shader == ShaderKind.PRE_INTEGRATED else ("l", "m", 4)
     check_arguments(where, tensors, (width, *whole, *reals), square, clear_r)
     table, like = tensors["table_lm4"], tensors["bricks_bzyxc"]
     device = table.device
@@ -109,24 +102,24 @@ def shade_rays(
         check.tensor(where, f"{name}_tnc", constants, shape, bricks.dtype, device)
         if not (bricks.is_contiguous() and constants.is_contiguous()):
             raise ValueError(f"{where}: {name}_bzyxc and {name}_tnc must be contiguous")
-    if shader in COLORS and (like.shape[4] not in (4, 24) or shared["component"] != 3):
+    if kind.stores_color and (like.shape[4] not in (4, 24) or shared["component"] != 3):
         raise ValueError(
             f"{where}: stored colour needs a channel of 4 or 24 numbers and component 3"
         )
-    if shader == FEATURES and other_bzyxc is None:
+    if shader == ShaderKind.FEATURES and other_bzyxc is None:
         raise ValueError(f"{where}: features need other_bzyxc")
     others = 0 if other_bzyxc is None else other_bzyxc.shape[4]
     if own:
         check.whole(where, "features", features, low=0)
     else:
-        given = {FEATURES: others, PROJECTION: 1}.get(kind, 0)
+        given = {ShaderKind.FEATURES: others, ShaderKind.PROJECTION: 1}.get(kind, 0)
         check.whole(where, "features", features, low=given, high=given)
     check.whole(where, "other_component", other_component, low=0, high=max(0, others - 1))
 
     args = (
         *tensors.values(),
         *(parameter_54.contiguous(), normal_bzyxc, normal_tnc, other_bzyxc, other_tnc),
-        *(kind, features, other_component, width),
+        *(int(kind), features, other_component, width),
         *whole,
         *(float(real) for real in reals),
         *(by_level, clear_r),

@@ -17,9 +17,9 @@ from torch import Tensor
 from ..base import check
 from ..cpp_ext import user
 from ..ops.registry import add_user_op
+from ..ops.shading import Number, pack
 from ..pool import N3Tree
 from .fused import Intervals, LitShader, one_color, plain_table
-from .lights import Number, pack
 from .transfer_function import Table, TransferFunction
 
 Uniforms = MutableMapping[str, Number] | Tensor

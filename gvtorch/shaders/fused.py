@@ -15,9 +15,17 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..ops.reference import shaders as kinds
+from ..ops.shading import (
+    Number,
+    ProjectionKind,
+    ProjectionNumbers,
+    ShaderKind,
+    StoredColorNumbers,
+    Triple,
+    pack,
+)
 from ..pool import Channel, N3Tree
-from .lights import Headlight, Light, Material, Number, Triple, pack
+from .lights import Headlight, Light, Material
 from .preintegrated import integrated_table
 from .transfer_function import Table, TransferFunction
 
@@ -61,8 +69,8 @@ class Shader(ABC):
         """Returns the colours as the kernel reads them, on the tree's device."""
 
     def own(self, tree: N3Tree) -> tuple[Any, ...]:
-        """Returns the four numbers of row 3 of `parameter_54`, see `shade_rays`."""
-        return (0.0, 0.0, 0.0, 0.0)
+        """Returns the shader's own numbers, a record of `ops.shading`; most have none."""
+        return ()
 
     def material(self) -> Material:
         """Returns light and material; shaders without a light have any."""
@@ -84,8 +92,12 @@ class Shader(ABC):
             scale = 1 / _unit_of(tree.bricks.channels[self.normals].dtype)
             if tree.bricks.channels[self.normals].dtype in (torch.uint8, torch.uint16):
                 scale, offset = 2 * scale, -1.0
-        parts = (*self.material().rows(), *self.own(tree), scale, offset, 0.0, 0.0)
-        return pack(parts, dtype, tree.device).reshape(5, 4)
+        parameters = (
+            self.material()
+            .parameters()
+            ._replace(own=self.own(tree), normal_scale=scale, normal_offset=offset)
+        )
+        return parameters.pack(dtype, tree.device)
 
     def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> dict[str, Any]:
         """Returns the arguments of `shade_rays` that stay the same from call to call.
@@ -196,7 +208,7 @@ class LitShader(Shader):
 class Lit(LitShader):
     """The transfer function, lit by Blinn and Phong on both sides of a surface."""
 
-    kind = kinds.LIT
+    kind = ShaderKind.LIT
 
     def __init__(self, transfer: TransferFunction, *, shadows: bool = False, **light: Any) -> None:
         """Takes a transfer function.
@@ -224,7 +236,7 @@ class PreIntegrated(Shader):
     function need no finer steps.
     """
 
-    kind = kinds.PRE_INTEGRATED
+    kind = ShaderKind.PRE_INTEGRATED
 
     def __init__(self, transfer: TransferFunction) -> None:
         """Takes a transfer function."""
@@ -256,7 +268,7 @@ class StoredColor(LitShader):
     six directions, as `Volume.directional` makes them: a ray sees those that it goes along.
     """
 
-    kind = kinds.STORED_COLOR
+    kind = ShaderKind.STORED_COLOR
     component = 3
 
     def __init__(
@@ -301,11 +313,11 @@ class StoredColor(LitShader):
         scale = 1 / _unit_of(tree.bricks.channels[str(self.channel)].dtype)
         reference = self.reference or min(tree.spacing)
         directional = tree.bricks.channels[str(self.channel)].width != 4
-        return (
-            scale,
-            reference,
-            float(self.premultiplied or directional),
-            self.lit or self.shadows,
+        return StoredColorNumbers(
+            scale=scale,
+            reference=reference,
+            premultiplied=float(self.premultiplied or directional),
+            lit=self.lit or self.shadows,
         )
 
     def unlit(self) -> StoredColor:
@@ -342,7 +354,7 @@ class Projection(Shader):
     where the extreme is or, for the mean, where the ray enters.
     """
 
-    kind = kinds.PROJECTION
+    kind = ShaderKind.PROJECTION
     whole = True
 
     def __init__(
@@ -365,7 +377,7 @@ class Projection(Shader):
 
     def own(self, tree: N3Tree) -> tuple[Any, ...]:
         """See `Shader`."""
-        return (("maximum", "minimum", "mean").index(self.which), 0.0, 0.0, 0.0)
+        return ProjectionNumbers(ProjectionKind[self.which.upper()])
 
     def features(self, tree: N3Tree) -> int:
         """The value."""
@@ -377,7 +389,7 @@ class Features(Shader):
     come out as `Hits.features` (r, c). Any number of them.
     """
 
-    kind = kinds.FEATURES
+    kind = ShaderKind.FEATURES
 
     def __init__(self, transfer: TransferFunction, channel: str) -> None:
         """Takes the transfer function of the density, and the name of the features' channel."""
@@ -394,8 +406,8 @@ class Features(Shader):
 
 FusedShader = TransferFunction | Shader
 _SHADOWED: dict[int | str | None, int] = {
-    kinds.LIT: kinds.SHADOWED_LIT,
-    kinds.STORED_COLOR: kinds.SHADOWED_COLOR,
+    ShaderKind.LIT: ShaderKind.SHADOWED_LIT,
+    ShaderKind.STORED_COLOR: ShaderKind.SHADOWED_COLOR,
 }
 _UNLIT = Material(light=Headlight(), ambient=1.0, diffuse=0.0, specular=0.0, shininess=1.0)
 

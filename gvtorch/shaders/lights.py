@@ -7,7 +7,6 @@ frame is traced, so nothing is built again.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,14 +14,12 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..ops.shading import LightKind, Number, ShadeParameters, Triple
 
 #: Width of a cone over that of the disc of light it stands for. What it meets reaches as far again
 #: as its voxels are wide, and a cone that grazes takes more than its share: shadows agree best with
 #: this.
 CONE_OF_DISC = 0.35
-
-Number = float | Tensor
-Triple = Sequence[float] | Tensor
 
 
 @dataclass
@@ -30,7 +27,7 @@ class Headlight:
     """A light at the eye of each ray."""
 
     color: Triple = (1.0, 1.0, 1.0)  # linear RGB
-    kind = 0
+    kind = LightKind.HEADLIGHT
     width = 0.0
 
     def __post_init__(self) -> None:
@@ -50,7 +47,7 @@ class DirectionalLight:
     direction: Triple  # the way it shines, world; of any length but 0
     color: Triple = (1.0, 1.0, 1.0)  # linear RGB
     angle: Number = 0.0  # how wide it looks, degrees, for soft shadows; the sun: 0.53
-    kind = 1
+    kind = LightKind.DIRECTIONAL
 
     def __post_init__(self) -> None:
         """Checks direction, colour and angle."""
@@ -78,7 +75,7 @@ class PointLight:
     position: Triple  # world
     color: Triple = (1.0, 1.0, 1.0)  # linear RGB
     radius: Number = 0.0  # of the ball that shines, world units, for soft shadows
-    kind = 2
+    kind = LightKind.POINT
 
     def __post_init__(self) -> None:
         """Checks position, colour and radius."""
@@ -118,33 +115,18 @@ class Material:
         for name in ("ambient", "diffuse", "specular", "shininess"):
             check_number("shader", name, getattr(self, name), low=0)
 
-    def rows(self) -> tuple[Any, ...]:
-        """The first three rows of `parameter_54`, see `shade_rays`."""
-        return (
-            *(self.light.place, self.light.kind),
-            *(self.light.color, self.ambient),
-            *(self.diffuse, self.specular, self.shininess, self.light.width),
+    def parameters(self) -> ShadeParameters:
+        """What `shade_rays` is told of light and material."""
+        return ShadeParameters(
+            light=self.light.place,
+            light_kind=self.light.kind,
+            light_color=self.light.color,
+            ambient=self.ambient,
+            diffuse=self.diffuse,
+            specular=self.specular,
+            shininess=self.shininess,
+            light_growth=self.light.width,
         )
-
-
-def pack(parts: Sequence[Any], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Joins numbers, triples and tensors to one (k,) tensor on the device. Numbers go as arguments
-    of kernels, tensors of the device stay there: nobody waits, and a CUDA graph reads them anew.
-
-    Raises:
-        ValueError: A number is beyond what the dtype holds.
-    """
-    out: list[Tensor] = []
-    for part in parts:
-        if isinstance(part, Tensor) and part.device == device:
-            out.append(part.detach().reshape(-1).to(dtype))
-            continue
-        numbers = part.reshape(-1).tolist() if isinstance(part, Tensor) else part
-        for number in numbers if isinstance(numbers, Sequence) else (numbers,):
-            if torch.finfo(dtype).max < abs(number) < math.inf:
-                raise ValueError(f"shader: {number!r} is beyond what {dtype} holds")
-            out.append(torch.full((1,), float(number), dtype=dtype, device=device))
-    return torch.cat(out)
 
 
 def check_light(what: str, value: Any) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .lights import pack
+from ..ops.shading import pack
 from .transfer_function import Table
 
 _ROWS = 1025

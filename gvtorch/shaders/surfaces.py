@@ -6,10 +6,10 @@ from typing import Any
 
 import torch
 
-from ..ops.reference import shaders as kinds
+from ..ops.shading import IsosurfaceNumbers, Number, ShaderKind, Triple, pack
 from ..pool import N3Tree
 from .fused import Intervals, LitShader, Shader, one_color, plain_table
-from .lights import Number, Triple, check_number, check_triple, pack
+from .lights import check_number, check_triple
 from .solid import solid_table
 from .transfer_function import Table, TransferFunction
 
@@ -19,7 +19,7 @@ class Isosurface(LitShader):
     is filled with what is not below the level.
     """
 
-    kind = kinds.ISOSURFACE
+    kind = ShaderKind.ISOSURFACE
     distance = False  # the value is a distance in world units, negative inside
 
     def __init__(
@@ -62,7 +62,7 @@ class Isosurface(LitShader):
 
     def own(self, tree: N3Tree) -> tuple[Any, ...]:
         """See `Shader`."""
-        return (self.value, 0.0, 0.0, 0.0)
+        return IsosurfaceNumbers(self.value)
 
     def matter(self) -> Shader:
         """See `LitShader`.
@@ -108,7 +108,7 @@ class Solid(Shader):
 
     def __init__(self, surface: Isosurface, color: Triple | None) -> None:
         """Takes the surface and its colour; None where its alpha alone counts."""
-        self.kind = None if color is None else kinds.LIT
+        self.kind = None if color is None else ShaderKind.LIT
         self.surface, self.color = surface, (0.0, 0.0, 0.0) if color is None else color
         self.channel, self.component = surface.channel, surface.component
         self.normals = surface.normals

@@ -8,8 +8,8 @@ from collections.abc import Callable
 import torch
 
 from ..base.records import Hits, Rays
+from ..ops.shading import pack
 from ..shaders.fused import Projection
-from ..shaders.lights import pack
 from ..shaders.surfaces import Isosurface
 from ..shaders.transfer_function import TransferFunction
 from .composite import Trace

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..base.records import Hits, Rays
-from ..shaders.lights import pack
+from ..ops.shading import pack
 
 Trace = Callable[[Rays], Hits]
 

@@ -25,6 +25,7 @@ from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.camera import Frame
 from ..ops.reference.exact import unit
+from ..ops.shading import Triple, pack
 from ..shaders.lights import (
     CONE_OF_DISC,
     DirectionalLight,
@@ -32,10 +33,8 @@ from ..shaders.lights import (
     Light,
     Material,
     PointLight,
-    Triple,
     check_light,
     check_triple,
-    pack,
 )
 from .composite import Trace, behind, join
 from .thin_lens import ThinLens

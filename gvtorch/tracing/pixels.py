@@ -11,9 +11,9 @@ from ..base import check
 from ..base.records import Hits, Rays, RenderStats
 from ..base.stage import Progress, stage
 from ..cameras.camera import Camera
+from ..ops.shading import pack
 from ..pictures.background import Background
 from ..pictures.picture import Picture
-from ..shaders.lights import pack
 from .composite import Trace
 from .options import RenderOptions
 

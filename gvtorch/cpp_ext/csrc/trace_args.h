@@ -27,7 +27,7 @@ struct TraceArgs {
   bool by_level;
 };
 
-// The shaders of `shade_rays`, numbered as in ops/reference/shaders.py.
+// The shaders of `shade_rays`, numbered as in ops/shading.py.
 enum class ShaderKind {
   kLit,
   kPreIntegrated,

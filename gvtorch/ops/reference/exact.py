@@ -102,7 +102,7 @@ def unit(v: Tensor) -> Tensor:
     return torch.where(known[:, None], scaled / length[:, None], 0.0)
 
 
-def power(x: Tensor, exponent: Tensor) -> Tensor:
+def power(x: Tensor, exponent: float | Tensor) -> Tensor:
     """x^exponent for x in [0, 1]."""
     known = x > TINY
     return torch.where(known, exp2_exact(log2_exact(torch.where(known, x, 1.0)) * exponent), 0.0)

@@ -9,6 +9,15 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ..shading import (
+    IsosurfaceNumbers,
+    LightKind,
+    ProjectionKind,
+    ProjectionNumbers,
+    ShadeParameters,
+    ShaderKind,
+    StoredColorNumbers,
+)
 from .exact import clamp, divide, dot, larger, power, sqrt_exact, stretch, unit
 from .march import Accumulator, Piece, Probe, Transfer, walk
 from .rays import INF, Beam, Intervals
@@ -16,11 +25,6 @@ from .shadows import Shadows
 from .tree import Bricks, Tree
 
 _BISECTIONS = 4
-(LIT, PRE_INTEGRATED, STORED_COLOR, ISOSURFACE, PROJECTION, FEATURES) = range(6)
-(SHADOWED_LIT, SHADOWED_COLOR) = range(6, 8)
-COLORS = (STORED_COLOR, SHADOWED_COLOR)
-(HEADLIGHT, DIRECTIONAL, POINT) = range(3)
-(MAXIMUM, MINIMUM, MEAN) = range(3)
 
 
 @dataclass
@@ -28,7 +32,7 @@ class Shade:
     """What the shaders share: tables, parameters, channels, and the sums of every ray."""
 
     transfer: Transfer
-    parameter: Tensor  # (20,)
+    parameters: ShadeParameters
     normals: tuple[Bricks, ...]  # three components, or none
     others: tuple[Bricks, ...]  # components of the second channel, or none
     other_component: int
@@ -62,7 +66,7 @@ class Shade:
             equal = equal & (numbers[fine] == numbers[coarse]).all(1)
         equal = equal | (fine == coarse)
         # Near a light, a stored normal is lit differently wherever it stands.
-        return equal & (self.parameter[3].to(torch.int32) != POINT) if self.normals else equal
+        return equal & (self.parameters.light_kind != LightKind.POINT) if self.normals else equal
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
         """The transfer function, lit."""
@@ -119,8 +123,8 @@ class Shade:
     def normal_at(self, probe: Probe, t: Tensor) -> Tensor:
         """(r, 3) normals towards the eye, stored or the gradient's; 0 where there is none."""
         if self.normals:
-            columns = [probe.number(channel, t) for channel in self.normals]
-            normal = torch.stack(columns, 1) * self.parameter[16] + self.parameter[17]
+            p, columns = self.parameters, [probe.number(c, t) for c in self.normals]
+            normal = torch.stack(columns, 1) * p.normal_scale + p.normal_offset
         else:
             normal = self.gradient(probe, t)
         normal = unit(normal)
@@ -128,29 +132,29 @@ class Shade:
 
     def shade(self, base: Tensor, normal: Tensor, t: Tensor, seen: Tensor | None = None) -> Tensor:
         """(r, 3) colours in the light, by Blinn and Phong; shadows fall where `seen` is true."""
-        p, back = self.parameter, -self.along
-        kind = p[3].to(torch.int32)
-        way = p[:3] - (self.eye + (t + self.moved)[:, None] * self.along)
+        p, back = self.parameters, -self.along
+        kind, light = p.light_kind, torch.as_tensor(p.light)
+        way = light - (self.eye + (t + self.moved)[:, None] * self.along)
         to_light, zero = back, torch.zeros_like(t)
-        length, growth = zero + INF, zero + p[11]
-        if kind == DIRECTIONAL:
-            to_light = unit(-p[:3].expand_as(back))
-        if kind == POINT:
+        length, growth = zero + INF, zero + p.light_growth
+        if kind == LightKind.DIRECTIONAL:
+            to_light = unit(-light.expand_as(back))
+        if kind == LightKind.POINT:
             to_light, length = unit(way), sqrt_exact(dot(way, way))
             growth = growth / length
         bare = ~(dot(normal, normal) > 0)
         facing = torch.where(bare, 1.0, larger(zero, dot(normal, to_light)))
         half = unit(to_light - self.along)
-        highlight = power(larger(zero, dot(normal, half)), p[10])
+        highlight = power(larger(zero, dot(normal, half)), p.shininess)
         highlight = torch.where((facing > 0) & ~bare, highlight, zero)
-        if self.shadows is not None and seen is not None and kind != HEADLIGHT:
+        if self.shadows is not None and seen is not None and kind != LightKind.HEADLIGHT:
             dark = seen & (facing > 0)
             share = self.shadows.share(self, t, to_light, length, growth, dark)
             facing, highlight = facing * share, highlight * share
-        diffuse = p[8] * facing
-        specular = p[9] * highlight
-        light, ambient = p[4:7], p[7]
-        return base * (ambient + diffuse[:, None] * light) + specular[:, None] * light
+        diffuse = p.diffuse * facing
+        specular = p.specular * highlight
+        color = torch.as_tensor(p.light_color)
+        return base * (p.ambient + diffuse[:, None] * color) + specular[:, None] * color
 
 
 class Sided(Bricks):
@@ -167,32 +171,37 @@ class Sided(Bricks):
 class StoredColor(Shade):
     """Colour and opacity of each voxel."""
 
+    @property
+    def own(self) -> StoredColorNumbers:
+        """The shader's own numbers."""
+        return self.parameters.own_as(StoredColorNumbers)
+
     def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
         """See `reference.Shader`."""
         return ~(_above(high) > 0)
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
         """See `reference.Shader`."""
-        scale, reference, premultiplied, lit = self.parameter[12:16]
+        own = self.own
         opacity = self.opacity(piece, probe, self.along)
         seen = where & (opacity > 0)
         numbers = [self.seen(probe, i, piece.middle, self.along) for i in range(3)]
-        color = torch.stack(numbers, 1) * scale
-        divisor = torch.where((premultiplied > 0) & seen, opacity, 1.0)
-        alpha = stretch(opacity, piece.length / reference)
+        color = torch.stack(numbers, 1) * own.scale
+        divisor = torch.where((own.premultiplied > 0) & seen, opacity, 1.0)
+        alpha = stretch(opacity, piece.length / own.reference)
         rgba = torch.cat((color / divisor[:, None], alpha[:, None]), 1)
-        if lit > 0:
+        if own.lit > 0:
             self.lit(rgba, piece, probe, seen)
         else:
             self.composite(rgba, piece, seen)
 
     def alpha(self, piece: Piece, probe: Probe, along: Tensor) -> Tensor:
         """See `Shade`."""
-        return stretch(self.opacity(piece, probe, along), piece.length / self.parameter[13])
+        return stretch(self.opacity(piece, probe, along), piece.length / self.own.reference)
 
     def opacity(self, piece: Piece, probe: Probe, along: Tensor) -> Tensor:
         """(r,) per reference length."""
-        return clamp(self.seen(probe, 3, piece.middle, along) * self.parameter[12], 0, 1)
+        return clamp(self.seen(probe, 3, piece.middle, along) * self.own.scale, 0, 1)
 
     def seen(self, probe: Probe, number: int, t: Tensor, along: Tensor) -> Tensor:
         """(r,) one of the four numbers, as it is seen along rays (r, 3): of three directions, where
@@ -265,18 +274,19 @@ class Isosurface(Shade):
 
     def begin(self) -> None:
         """No side is known, and nothing found."""
+        self.level = torch.as_tensor(self.parameters.own_as(IsosurfaceNumbers).level)
         self.found = torch.zeros_like(self.moved, dtype=torch.bool)
         self.before, self.share = torch.zeros_like(self.moved), torch.zeros_like(self.moved)
         self.before_end = torch.full_like(self.moved, -INF)
 
     def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
         """See `reference.Shader`."""
-        level = self.parameter[12]
+        level = self.level
         return ((_above(high) < level) | (_below(low) >= level)) & ~self.found[which]
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
         """See `reference.Shader`."""
-        level = self.parameter[12]
+        level = self.level
         front, back = probe.value(piece.start), probe.value(piece.end)
         below = front < level
         early = where & (self.before_end == piece.start) & ((self.before < level) != below)
@@ -302,7 +312,7 @@ class Isosurface(Shade):
     def surface(self, t: Tensor, probe: Probe) -> None:
         """Shades the places t (r,) that were found; `probe` stands in their nodes."""
         normal = self.normal_at(probe, t)
-        value = self.parameter[12].expand_as(t)
+        value = self.level.expand_as(t)
         if self.others:
             value = probe.number(self.others[self.other_component], t)
         row = self.transfer.look_up(value, torch.zeros_like(t, dtype=torch.int64))
@@ -317,25 +327,26 @@ class Projection(Shade):
     def begin(self) -> None:
         """Nothing found."""
         self.sees_empty = True
+        self.kind = self.parameters.own_as(ProjectionNumbers).kind
         self.found, self.length, self.at = (torch.zeros_like(self.moved) for _ in range(3))
 
     def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
         """See `reference.Shader`."""
-        kind, found = self.parameter[12], self.found[which]
-        useless = ((kind == MAXIMUM) & (_above(high) <= found)) | (
-            (kind == MINIMUM) & (_below(low) >= found)
+        kind, found = self.kind, self.found[which]
+        useless = ((kind == ProjectionKind.MAXIMUM) & (_above(high) <= found)) | (
+            (kind == ProjectionKind.MINIMUM) & (_below(low) >= found)
         )
         return useless & (self.length[which] > 0)
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
         """See `reference.Shader`."""
-        kind, value = self.parameter[12], probe.value(piece.middle)
+        kind, value = self.kind, probe.value(piece.middle)
         first = ~(self.length > 0)
-        if kind == MEAN:
+        if kind == ProjectionKind.MEAN:
             self.at = torch.where(where & first, piece.start, self.at)
             self.found = torch.where(where, self.found + value * piece.length, self.found)
         else:
-            better = value > self.found if kind == MAXIMUM else value < self.found
+            better = value > self.found if kind == ProjectionKind.MAXIMUM else value < self.found
             better = where & (first | better)
             self.found = torch.where(better, value, self.found)
             self.at = torch.where(better, piece.middle, self.at)
@@ -345,7 +356,7 @@ class Projection(Shade):
         """Colours what was found."""
         seen = self.length > 0
         mean = self.found / torch.where(seen, self.length, 1.0)
-        value = mean if self.parameter[12] == MEAN else self.found
+        value = mean if self.kind == ProjectionKind.MEAN else self.found
         row = self.transfer.look_up(value, torch.zeros_like(value, dtype=torch.int64))
         color = self.sum.clear[:, None] * row[:, :3]
         self.sum.color = torch.where(seen[:, None], color, 0.0)
@@ -367,14 +378,14 @@ class Features(Shade):
 
 
 _KINDS: dict[int, type[Shade]] = {
-    LIT: Shade,
-    PRE_INTEGRATED: PreIntegrated,
-    STORED_COLOR: StoredColor,
-    ISOSURFACE: Isosurface,
-    PROJECTION: Projection,
-    FEATURES: Features,
-    SHADOWED_LIT: Shade,
-    SHADOWED_COLOR: StoredColor,
+    ShaderKind.LIT: Shade,
+    ShaderKind.PRE_INTEGRATED: PreIntegrated,
+    ShaderKind.STORED_COLOR: StoredColor,
+    ShaderKind.ISOSURFACE: Isosurface,
+    ShaderKind.PROJECTION: Projection,
+    ShaderKind.FEATURES: Features,
+    ShaderKind.SHADOWED_LIT: Shade,
+    ShaderKind.SHADOWED_COLOR: StoredColor,
 }
 
 
@@ -438,7 +449,7 @@ def shade_rays(
         values = constants.flatten(0, 1)
         return tuple(Bricks(bricks, values, ranges, border, c) for c in range(bricks.shape[4]))
 
-    own = Sided if shader in COLORS else Bricks
+    own = Sided if ShaderKind(shader).stores_color else Bricks
     channel = own(bricks_bzyxc, constant_tnc.flatten(0, 1), ranges, border, component)
     stop_clear = 1 - number(stop_alpha)
     none = torch.zeros_like(beam.first, dtype=torch.int32)
@@ -447,7 +458,7 @@ def shade_rays(
     )
     shade = _KINDS[shader](
         transfer=Transfer(table, domain_2, opaque_m),
-        parameter=parameter_54.reshape(-1),
+        parameters=ShadeParameters.read(parameter_54),
         normals=components(normal_bzyxc, normal_tnc),
         others=components(other_bzyxc, other_tnc),
         other_component=other_component,
@@ -460,7 +471,7 @@ def shade_rays(
         normal=torch.zeros_like(beam.origin),
         features=beam.first.new_zeros((len(beam.first), features)),
         hit_clear=1 - number(depth_alpha),
-        shadows=shadows if shader in (SHADOWED_LIT, SHADOWED_COLOR) else None,
+        shadows=shadows if ShaderKind(shader).shadowed else None,
     )
     if isinstance(shade, (Isosurface, Projection)):
         shade.begin()

@@ -1,0 +1,135 @@
+"""What `shade_rays` is told about a shader: which one, and 20 numbers of light, material and the
+shader's own. Declared once, for the shaders that write them and the torch twin that reads them;
+C++ reads the same numbers in cpp_ext/csrc/shaders.h.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import Any, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+
+Number = float | Tensor
+Triple = Sequence[float] | Tensor
+
+
+class ShaderKind(IntEnum):
+    """The fused shaders; csrc/shaders.h tells what each does."""
+
+    LIT = 0
+    PRE_INTEGRATED = 1
+    STORED_COLOR = 2
+    ISOSURFACE = 3
+    PROJECTION = 4
+    FEATURES = 5
+    SHADOWED_LIT = 6
+    SHADOWED_COLOR = 7
+
+    @property
+    def stores_color(self) -> bool:
+        """Whether it reads colour and opacity from the channel."""
+        return self in (ShaderKind.STORED_COLOR, ShaderKind.SHADOWED_COLOR)
+
+    @property
+    def shadowed(self) -> bool:
+        """Whether cones go from samples to the light."""
+        return self in (ShaderKind.SHADOWED_LIT, ShaderKind.SHADOWED_COLOR)
+
+
+class LightKind(IntEnum):
+    """Where light comes from."""
+
+    HEADLIGHT = 0  # the eye of each ray
+    DIRECTIONAL = 1  # far away
+    POINT = 2  # a place
+
+
+class ProjectionKind(IntEnum):
+    """What a projection shows of the values along a ray."""
+
+    MAXIMUM = 0
+    MINIMUM = 1
+    MEAN = 2
+
+
+class StoredColorNumbers(NamedTuple):
+    """A stored colour's own numbers."""
+
+    scale: Number  # times a stored number: 0 to 1
+    reference: Number  # world length for which opacity is given
+    premultiplied: Number  # above 0: colours are stored times opacity
+    lit: Number  # above 0: it is lit
+
+
+class IsosurfaceNumbers(NamedTuple):
+    """An isosurface's own number."""
+
+    level: Number  # the value at the surface
+
+
+class ProjectionNumbers(NamedTuple):
+    """A projection's own number."""
+
+    kind: Number  # a ProjectionKind
+
+
+_Record = TypeVar("_Record", StoredColorNumbers, IsosurfaceNumbers, ProjectionNumbers)
+#: How many numbers each field of `ShadeParameters` takes, in order; the last two are not used.
+_WIDTHS = (3, 1, 3, 1, 1, 1, 1, 1, 4, 1, 1, 2)
+
+
+class ShadeParameters(NamedTuple):
+    """The 20 numbers of `parameter_54`, in its order."""
+
+    light: Triple  # where a point light stands, or the way a directional one shines, world
+    light_kind: Number  # a LightKind
+    light_color: Triple  # linear RGB
+    ambient: Number  # factor of the base colour
+    diffuse: Number  # factor of base colour, light and cosine
+    specular: Number  # factor of the highlight
+    shininess: Number  # exponent of the highlight
+    light_growth: Number  # of cones to the light, per unit of length; of a point light: width there
+    own: Sequence[Number] | Tensor = ()  # the shader's own, up to four: a record above
+    normal_scale: Number = 1.0  # a stored normal is number * scale + offset
+    normal_offset: Number = 0.0
+
+    def pack(self, dtype: torch.dtype, device: torch.device) -> Tensor:
+        """Returns (5, 4) numbers; raises ValueError as the function `pack` does."""
+        at = self._fields.index("own")
+        own = (*self.own, *(0.0,) * (_WIDTHS[at] - len(self.own)))
+        return pack((*self[:at], *own, *self[at + 1 :], 0.0, 0.0), dtype, device).reshape(5, 4)
+
+    def own_as(self, record: type[_Record]) -> _Record:
+        """Returns the shader's own numbers by name."""
+        return record(*self.own[: len(record._fields)])
+
+    @classmethod
+    def read(cls, parameter_54: Tensor) -> ShadeParameters:
+        """Returns the numbers by name, each () or (k,), as views."""
+        parts = parameter_54.reshape(-1)[: sum(_WIDTHS)].split(_WIDTHS)[: len(cls._fields)]
+        return cls(*(part if len(part) > 1 else part[0] for part in parts))
+
+
+def pack(parts: Sequence[Any], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Joins numbers, triples and tensors to one (k,) tensor on the device. Numbers go as arguments
+    of kernels and tensors of the device stay there: it does not block, and a CUDA graph reads them
+    anew.
+
+    Raises:
+        ValueError: A number is beyond what the dtype holds.
+    """
+    out: list[Tensor] = []
+    for part in parts:
+        if isinstance(part, Tensor) and part.device == device:
+            out.append(part.detach().reshape(-1).to(dtype))
+            continue
+        numbers = part.reshape(-1).tolist() if isinstance(part, Tensor) else part
+        for number in numbers if isinstance(numbers, Sequence) else (numbers,):
+            if torch.finfo(dtype).max < abs(number) < math.inf:
+                raise ValueError(f"shader: {number!r} is beyond what {dtype} holds")
+            out.append(torch.full((1,), float(number), dtype=dtype, device=device))
+    return torch.cat(out)
