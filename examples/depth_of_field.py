@@ -14,7 +14,6 @@ import tyro
 from kornia.metrics import ssim
 
 import gvtorch as gv
-from gvtorch.tracing.resident import trace
 
 SCAN = Path(__file__).parent / "data" / "aneurism_256x256x256_uint8.raw.gz"
 OPACITY = [(20, 0), (60, 0.04), (255, 0.25)]
@@ -52,7 +51,7 @@ def thin_lens(
         turn = number * math.pi * (3 - math.sqrt(5))
         origin = rays.origin + radius * (math.cos(turn) * right + math.sin(turn) * down)
         direction = torch.nn.functional.normalize(sharp - origin)
-        total += trace(tree, replace(rays, origin=origin, direction=direction), shader).color
+        total += gv.trace(tree, replace(rays, origin=origin, direction=direction), shader).color
     return (total / PINHOLES).reshape(camera.height, camera.width, 3).float()
 
 

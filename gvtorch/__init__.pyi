@@ -52,10 +52,12 @@ from .tracing import (
     Layer as Layer,
     Lighting as Lighting,
     RenderOptions as RenderOptions,
+    RenderSettings as RenderSettings,
     ThinLens as ThinLens,
     TreeTracer as TreeTracer,
     cost as cost,
     render as render,
+    trace as trace,
 )
 
 # Streaming a scene larger than memory.

@@ -14,7 +14,6 @@ from test_trace_rays import SHADER, assert_equal, camera_rays, forget, run
 
 import gvtorch as gv
 from gvtorch.tracing.clip import Clipped
-from gvtorch.tracing.resident import trace
 
 UNIT = torch.tensor([[-0.5] * 3, [0.5] * 3], dtype=torch.float64)
 
@@ -135,8 +134,8 @@ def test_a_medium_of_one_value_has_its_closed_form(backend, name, lod):
     tree = gv.N3Tree.from_volume(volume, 8, device=DEVICES[backend])
     shader = gv.TransferFunction.from_points([(0, 0.01)], [(0, 1, 0.5, 0.2)], reference=1.0)
     rays = camera_rays(tree, 20, distance=1.2)
-    options = gv.RenderOptions(clip=CLIPS[name], stop_alpha=1.0, lod=lod, backend=backend)
-    hits = trace(tree, rays.to(tree.device), shader, options)
+    options = {"clip": CLIPS[name], "stop_alpha": 1.0, "lod": lod, "backend": backend}
+    hits = gv.trace(tree, rays.to(tree.device), shader, **options)
     step = 0.01
     t = 20 + step * (np.arange(10000) + 0.5)
     places = rays.origin.numpy()[:, None] + t[:, None] * rays.direction.numpy()[:, None]

@@ -12,7 +12,6 @@ from test_trace_rays import SHADER, camera_rays, on
 
 import gvtorch as gv
 from gvtorch.ops import available
-from gvtorch.tracing.resident import trace
 
 FIELDS = ("color", "alpha", "depth", "samples")
 
@@ -34,7 +33,7 @@ def traced() -> list[torch.Tensor]:
         tree = gv.N3Tree.from_volume(gv.Volume((values * factor).to(dtype)), 8)
         shader = gv.TransferFunction.from_points([(0.3 * factor, 0), (factor, 0.2)])
         for size in (33, 7):  # cones as wide as a voxel, and as several
-            hits = trace(tree, camera_rays(tree, size, distance=1.5), shader)
+            hits = gv.trace(tree, camera_rays(tree, size, distance=1.5), shader)
             found += [getattr(hits, name) for name in FIELDS]
     return found
 
@@ -55,7 +54,7 @@ def test_every_instruction_set_gives_the_same_bits(instructions, tmp_path):
 def test_cuda_brick_pool_of_more_than_4_gib(blobs):
     small = gv.N3Tree.from_volume(blobs, 8, device="cuda")
     rays = camera_rays(small, 64, distance=1.3).to("cuda")
-    expected = trace(small, rays, SHADER)
+    expected = gv.trace(small, rays, SHADER)
     channel = gv.Channel(torch.float32)
     used, size = small.bricks.capacity, 10**3 * 4
     large = gv.BrickPool(5 * 2**30 // size, {"value": channel}, brick_size=8, device="cuda")
@@ -64,7 +63,7 @@ def test_cuda_brick_pool_of_more_than_4_gib(blobs):
     large.bricks["value"][first:] = small.bricks.bricks["value"]
     small.nodes.brick_tn[small.nodes.brick_tn >= 0] += first
     small.bricks = large
-    actual = trace(small, rays, SHADER)
+    actual = gv.trace(small, rays, SHADER)
     assert all(torch.equal(getattr(actual, n), getattr(expected, n)) for n in FIELDS)
     assert (large.stamp_b[first:] == small.frame).any() and expected.alpha.max() > 0.3
 
@@ -74,10 +73,10 @@ def test_cuda_brick_pool_of_more_than_4_gib(blobs):
 def test_cuda_sixteen_million_rays_in_one_call(blobs):
     tree = gv.N3Tree.from_volume(blobs, 8, device="cuda")
     rays = gv.Camera.orbit(width=4096, height=4096, distance=1.3).placed(tree.box).rays("cuda")
-    whole = trace(tree, rays, SHADER)
+    whole = gv.trace(tree, rays, SHADER)
     part = rays.origin.shape[0] // 4
     for begin in range(0, 4 * part, part):
-        some = trace(tree, rays[begin : begin + part], SHADER)
+        some = gv.trace(tree, rays[begin : begin + part], SHADER)
         for name in FIELDS:
             assert torch.equal(getattr(whole, name)[begin : begin + part], getattr(some, name))
 
@@ -87,13 +86,13 @@ def test_cuda_sixteen_million_rays_in_one_call(blobs):
 def test_cuda_streams(blobs):
     tree = on(gv.N3Tree.from_volume(blobs, 8), "cuda")
     rays = camera_rays(tree, 64, distance=1.3).to("cuda")
-    expected = trace(tree, rays, SHADER)
+    expected = gv.trace(tree, rays, SHADER)
     stream = torch.cuda.Stream()
     with torch.cuda.stream(stream):
         torch.cuda._sleep(10**8)
         late = rays.origin + 0  # made on this stream, behind the sleep
         moved = gv.Rays(origin=late, direction=rays.direction, cone=rays.cone, range=rays.range)
-        actual = trace(tree, moved, SHADER)
+        actual = gv.trace(tree, moved, SHADER)
     stream.synchronize()
     assert all(torch.equal(getattr(actual, n), getattr(expected, n)) for n in FIELDS)
 
@@ -104,9 +103,9 @@ def test_cuda_streams(blobs):
 def test_cuda_second_device(blobs):
     tree = gv.N3Tree.from_volume(blobs, 8)
     rays = camera_rays(tree, 64, distance=1.3)
-    expected = trace(tree, rays, SHADER)
+    expected = gv.trace(tree, rays, SHADER)
     with torch.cuda.device(0):
-        actual = trace(on(tree, "cuda:1"), rays.to("cuda:1"), SHADER)
+        actual = gv.trace(on(tree, "cuda:1"), rays.to("cuda:1"), SHADER)
         producer = gv.VolumeProducer(blobs)
         with gv.Engine(producer, device="cuda:1") as engine:
             camera = gv.Camera.orbit(width=32, height=32, distance=1.3)

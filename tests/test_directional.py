@@ -12,7 +12,6 @@ import gvtorch as gv
 from gvtorch.base.volume import DIRECTIONS
 from gvtorch.io import convert
 from gvtorch.pool.pyramid import pool_directional, volume_levels
-from gvtorch.tracing.resident import trace
 
 RED, GREEN = (1.0, 0.1, 0.0), (0.0, 0.9, 0.2)
 SIZES = {"brick_size": 4, "border": 1}
@@ -46,10 +45,8 @@ def shoot(volume: gv.Volume, backend: str, direction, cone: float, branching: in
     """Hits of straight rays of one width, float64."""
     tree = gv.N3Tree.from_volume(volume, **SIZES, branching=branching, device=DEVICES[backend])
     rays = straight(DEVICES[backend], direction, cone, tree.box)
-    chosen = gv.RenderOptions(
-        backend=backend, dtype=torch.float64, cone_scale=1.0, stop_alpha=1.0, **options
-    )
-    hits = trace(tree, rays, gv.StoredColor("value", premultiplied=True), chosen)
+    options |= {"backend": backend, "dtype": torch.float64, "cone_scale": 1.0, "stop_alpha": 1.0}
+    hits = gv.trace(tree, rays, gv.StoredColor("value", premultiplied=True), **options)
     return hits.color.cpu().numpy(), hits.alpha[:, 0].cpu().numpy()
 
 

@@ -19,7 +19,6 @@ import gvtorch as gv
 from gvtorch.base import constants as config
 from gvtorch.ops import available
 from gvtorch.tracing import pixels
-from gvtorch.tracing.resident import trace
 
 HAZE = gv.TransferFunction.from_points([(0, 0.03)], [(0, 0.9, 0.5, 0.2)])
 GRAY = gv.TransferFunction.preset("gray", 0, 1)
@@ -147,9 +146,8 @@ def test_normals_count_by_what_each_part_takes_of_the_light(compiled, blobs):
     rays = view.rays(tree.device)
     near, behind = rays.range.clone(), rays.range.clone()
     near[:, 1] = behind[:, 0] = far
-    options = gv.RenderOptions(stop_alpha=1.0)
     front, back = (
-        trace(tree, dataclasses.replace(rays, range=part), shader, options)
+        gv.trace(tree, dataclasses.replace(rays, range=part), shader, stop_alpha=1.0)
         for part in (near, behind)
     )
     share = (1 - front.alpha) * (1 - 0.4) * back.alpha

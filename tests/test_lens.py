@@ -13,7 +13,6 @@ from test_trace_rays import SHADER, assert_equal, camera_rays
 
 import gvtorch as gv
 from gvtorch.base.constants import CONE_OVERESTIMATE
-from gvtorch.tracing.resident import trace
 from gvtorch.tracing.thin_lens import ThroughLens
 
 FOCUS = 2.0  # sides of the box
@@ -59,7 +58,7 @@ def thin_lens(tree, camera, shader, aperture: float, rays_a_pixel: int) -> torch
             math.cos(turn) * rotation[0] + math.sin(turn) * rotation[1]
         )
         direction = torch.nn.functional.normalize(sharp - origin)
-        total += trace(
+        total += gv.trace(
             tree, dataclasses.replace(rays, origin=origin, direction=direction), shader
         ).color
     return (total / rays_a_pixel).reshape(camera.height, camera.width, 3)

@@ -12,7 +12,6 @@ from conftest import DEVICES
 from test_shading import ball, parallel, phong, sphere
 
 import gvtorch as gv
-from gvtorch.tracing.resident import trace
 
 MATT = {"ambient": 0.0, "diffuse": 1.0, "specular": 0.0}
 SKY = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0}
@@ -43,8 +42,8 @@ def down(x, height: float, z, device: str, width: float = 0.5) -> gv.Rays:
 
 def light_on(tree, rays, shader, backend, *, plain=None, **lighting) -> np.ndarray:
     """(r, 3) colours."""
-    options = gv.RenderOptions(backend=backend, lighting=gv.Lighting(**lighting), **(plain or {}))
-    return trace(tree, rays, shader, options).color.cpu().double().numpy()
+    options = {"backend": backend, "lighting": gv.Lighting(**lighting), **(plain or {})}
+    return gv.trace(tree, rays, shader, **options).color.cpu().double().numpy()
 
 
 # --- the material
@@ -104,7 +103,7 @@ def test_a_ray_that_begins_behind_something_has_its_share_of_the_light(backend):
     shader = gv.DistanceField(light=gv.DirectionalLight((0.3, -0.5, 1)))
     whole, part = (
         light_on(ball(backend), some, shader, backend)
-        for some in (rays, dataclasses.replace(rays, clear=quarter))
+        for some in (rays, dataclasses.replace(rays, transmittance=quarter))
     )
     np.testing.assert_allclose(part, 0.25 * whole, atol=1e-6)
 

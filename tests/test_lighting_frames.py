@@ -13,7 +13,6 @@ from test_lighting import FLOOR, MATT, places
 
 import gvtorch as gv
 from gvtorch.ops import available
-from gvtorch.tracing.resident import trace
 
 LOOKS = {
     "shadow": gv.Lighting(lights=(gv.DirectionalLight((1, -2, 0.5), angle=6),)),
@@ -151,7 +150,7 @@ def test_lights_are_tensors_that_may_be_edited(blobs, compiled):
     shader = SURFACES["isosurface"]
 
     def look():
-        return trace(tree, rays, shader, gv.RenderOptions(lighting=lighting)).color
+        return gv.trace(tree, rays, shader, lighting=lighting).color
 
     first = look()
     for tensor, value in ((position, 100.0), (tint, 0.5), (ambient, 0.3), (radius, 20.0)):

@@ -236,14 +236,14 @@ def test_rays_that_have_ended_mark_and_request_nothing(blobs, compiled):
     tree.frame = 1
     whole = tracer_of(tree, shader, options)(rays)
     tree.frame = 2
-    hits = tracer_of(tree, shader, options)(dataclasses.replace(rays, clear=clear))
+    hits = tracer_of(tree, shader, options)(dataclasses.replace(rays, transmittance=clear))
     ended = clear == 0
     assert not hits.samples[ended].any() and not hits.color[ended].any()
     torch.testing.assert_close(hits.alpha[ended], 1 - clear[ended, None])
     assert torch.equal(hits.samples[~ended], whole.samples[~ended])
     torch.testing.assert_close(hits.color[~ended], 0.5 * whole.color[~ended])
     tree.frame = 3
-    none = dataclasses.replace(rays, clear=torch.zeros_like(clear))
+    none = dataclasses.replace(rays, transmittance=torch.zeros_like(clear))
     tracer_of(tree, shader, options)(none)
     assert not (tree.nodes.stamp_t == 3).any() and (tree.nodes.stamp_t == 2).any()
 

@@ -15,7 +15,6 @@ from test_trace_rays import SHADER, arguments, camera_rays, on
 import gvtorch as gv
 from gvtorch import cpp_ext
 from gvtorch.ops import trace_rays
-from gvtorch.tracing.resident import trace
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # torch deprecates its own TorchScript
 
@@ -138,7 +137,7 @@ def test_module_traces_a_camera_s_rays_as_the_renderer_does(blobs, compiled, sca
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
     rays = camera_rays(tree, 16, distance=3.0).to(tree.device)
     given = {} if scale is None else {"cone_scale": scale}
-    hits = trace(tree, rays, SHADER, gv.RenderOptions(backend=compiled, **given))
+    hits = gv.trace(tree, rays, SHADER, backend=compiled, **given)
     columns = (rays.origin, rays.direction, rays.cone, rays.range)
     fields = gv.TreeTracer(tree, SHADER, **given)(*columns)
     assert_same(fields, (hits.color, hits.alpha, hits.depth, hits.samples))

@@ -15,7 +15,6 @@ from test_trace_rays import camera_rays, forget, run
 from torch import Tensor
 
 import gvtorch as gv
-from gvtorch.tracing.resident import trace
 from gvtorch.tracing.tracer import AnyShader
 
 TRANSFER = gv.TransferFunction.from_points(
@@ -78,7 +77,7 @@ def cut(rays: gv.Rays) -> gv.Rays:
     """Rays that begin within the box, each elsewhere, with a part of their light, and end there."""
     first = torch.linspace(30.0, 45.0, len(rays.origin), dtype=torch.float64)
     limits = torch.stack((first, first + 17.3), 1)
-    return replace(rays, range=limits, clear=torch.linspace(0.05, 1.0, len(first)).double())
+    return replace(rays, range=limits, transmittance=torch.linspace(0.05, 1.0, len(first)).double())
 
 
 def shaded(shader: AnyShader, backend: str, branching: int = 2) -> list[Tensor]:
@@ -135,7 +134,7 @@ def test_bricks_beyond_2_gib_are_read_as_others_are(name, dtype):
     values = torch.rand((24, 24, 24), generator=torch.Generator().manual_seed(2))
     tree = gv.N3Tree.from_volume(gv.Volume((values * factor).to(dtype)), 4)
     rays = camera_rays(tree, 9, distance=1.4)
-    near = trace(tree, rays, SHADERS[name])
+    near = gv.trace(tree, rays, SHADERS[name])
     bricks, voxels = tree.bricks, tree.bricks.bricks["value"]
     used = bricks.capacity
     first = 2**31 // voxels[0].nbytes + 1
@@ -145,7 +144,7 @@ def test_bricks_beyond_2_gib_are_read_as_others_are(name, dtype):
     bricks.bricks["value"] = torch.from_numpy(far)
     bricks.stamp_b = torch.full((first + used,), -1, dtype=torch.int32)
     tree.nodes.brick_tn[tree.nodes.brick_tn >= 0] += first
-    hits = trace(tree, rays, SHADERS[name])
+    hits = gv.trace(tree, rays, SHADERS[name])
     assert near.alpha.max() > 0.3 and (bricks.stamp_b[first:] == tree.frame).any()
     for field, there in vars(near).items():
         assert there is None or torch.equal(getattr(hits, field), there), field

@@ -12,7 +12,6 @@ from conftest import DEVICES, shared
 from kornia.metrics import psnr
 
 import gvtorch as gv
-from gvtorch.tracing.resident import trace
 
 SIZE = 96
 PLACE = {"azimuth": 30.0, "elevation": 20.0, "distance": 2.4, "fov": 30.0}
@@ -117,7 +116,7 @@ def test_no_seam_at_brick_faces(compiled, brick_size):
     rays = {"origin": origin, "direction": direction}
     limits = torch.tensor([[0.0, 1e9]], dtype=torch.float64).repeat(n, 1)
     device = tree.device
-    hits = trace(
+    hits = gv.trace(
         tree,
         gv.Rays(
             **{name: t.to(device) for name, t in rays.items()},
@@ -125,7 +124,9 @@ def test_no_seam_at_brick_faces(compiled, brick_size):
             range=limits.to(device),
         ),
         shader,
-        gv.RenderOptions(lod="finest", dtype=torch.float64, stop_alpha=1.0),
+        lod="finest",
+        dtype=torch.float64,
+        stop_alpha=1.0,
     )
     color, _, _ = marcher.march(
         volume.data[..., 0].double().numpy(),
@@ -251,7 +252,7 @@ def test_levels_blend_without_a_step(compiled):
         range=torch.tensor([[0.0, math.inf]]).repeat(n, 1).to(tree.device),
     )
     haze = gv.TransferFunction.from_points([(0, 0), (1, 0.01)])
-    hits = trace(tree, rays, haze, gv.RenderOptions(cone_scale=1.0))
+    hits = gv.trace(tree, rays, haze, cone_scale=1.0)
     alpha = hits.alpha.cpu()[:, 0].numpy()
     steps = np.abs(np.diff(alpha))
     assert alpha.max() - alpha.min() > 0.01, "wider cones see a blurred ball"
@@ -352,7 +353,7 @@ def test_a_ray_along_the_high_face_sees_the_volume(backend):
         range=torch.tensor([[0.0, math.inf]]).repeat(2, 1).to(tree.device),
     )
     shader = gv.TransferFunction.from_points([(0, 0), (1, 0.2)])
-    alpha = trace(tree, rays, shader, gv.RenderOptions(backend=backend)).alpha
+    alpha = gv.trace(tree, rays, shader, backend=backend).alpha
     assert alpha.min() > 0.5
 
 

@@ -114,11 +114,13 @@ def test_the_share_that_a_ray_begins_with_equals_the_reference(blobs, compiled, 
     generator = torch.Generator().manual_seed(5)
     clear = torch.rand(len(rays.origin), generator=generator, dtype=torch.float64)
     clear[::7], clear[1::7] = 0.0, 1.0
-    result, _ = assert_equal(tree, compiled, dataclasses.replace(rays, clear=clear), dtype=dtype)
+    result, _ = assert_equal(
+        tree, compiled, dataclasses.replace(rays, transmittance=clear), dtype=dtype
+    )
     closed = clear == 0
     assert not result["samples"][closed].any() and (result["alpha"][closed] == 1).all()
     full, _ = run(tree, compiled, rays, dtype=dtype, stop_alpha=1.0)
-    part, _ = run(tree, compiled, dataclasses.replace(rays, clear=clear), stop_alpha=1.0)
+    part, _ = run(tree, compiled, dataclasses.replace(rays, transmittance=clear), stop_alpha=1.0)
     np.testing.assert_allclose(part["color"], full["color"] * clear[:, None], atol=2e-6)
 
 
@@ -127,7 +129,7 @@ def test_the_share_that_a_ray_begins_with_equals_the_reference(blobs, compiled, 
 )
 def test_a_wrong_share_is_one_clear_error(blobs, clear):
     tree = gv.N3Tree.from_volume(blobs, 4)
-    rays = dataclasses.replace(camera_rays(tree)[:3], clear=clear)
+    rays = dataclasses.replace(camera_rays(tree)[:3], transmittance=clear)
     with pytest.raises(ValueError, match=r"clear_r must be \(3,\) float64"):
         Tracer(tree, SHADER, gv.RenderOptions())(rays)
 
@@ -173,7 +175,7 @@ def test_a_projection_is_that_of_all_that_is_kept(blobs, compiled, which):
     shader, rays = gv.Projection(which, ramp), camera_rays(tree, 14, distance=1.2)
     options = {"lod": "finest", "step": 0.1}
     clear = torch.full((len(rays.origin),), 0.25, dtype=torch.float64)
-    part = dataclasses.replace(rays, clear=clear)
+    part = dataclasses.replace(rays, transmittance=clear)
     data, spacing = density[..., 0].double().numpy(), np.array(blobs.spacing)
     t = 20 + 0.01 * (np.arange(12000) + 0.5)
     low, high = tree.box.numpy()

@@ -425,9 +425,9 @@ def test_graphs_on_cuda_replay_every_model(blobs, model):
         ),
         (
             lambda: gv.CustomCamera(
-                dataclasses.replace(askew("pinhole").rays(), clear=torch.ones(140))
+                dataclasses.replace(askew("pinhole").rays(), transmittance=torch.ones(140))
             ),
-            "rays of a picture must have no clear",
+            "rays of a picture must have no transmittance",
         ),
         (
             lambda: gv.CustomCamera.from_directions(torch.ones(2, 3), torch.ones(5, 4, 3)),

@@ -146,7 +146,7 @@ def test_what_ranges_hide_changes_no_bit(channels, name, threshold):
 @pytest.mark.parametrize("name", SHADERS)
 def test_rays_that_have_lost_light_bring_back_the_rest(tree, compiled, name):
     rays = camera_rays(tree, 16, distance=1.6)
-    dimmed = replace(rays, clear=torch.full((len(rays.origin),), 0.25))
+    dimmed = replace(rays, transmittance=torch.full((len(rays.origin),), 0.25))
     for backend in ("reference", compiled):
         options = gv.RenderOptions(stop_alpha=1.0, backend=backend)
         tracer = Tracer(on(tree, DEVICES[compiled]), SHADERS[name], options)

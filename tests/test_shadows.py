@@ -9,7 +9,6 @@ from conftest import DEVICES
 from marcher import box_of, march, trilinear
 
 import gvtorch as gv
-from gvtorch.tracing.resident import trace
 from gvtorch.tracing.tracer import Tracer
 
 SPACING, ORIGIN = (1.0, 0.8, 1.5), (5.0, -3.0, 2.0)
@@ -90,9 +89,8 @@ def test_each_sample_stands_in_the_shadow_of_what_lies_before_its_light(backend,
     value = fog(1)
     tree = tree_of(value, backend, branching)
     rays = rays_through(box_of(value.shape, SPACING, ORIGIN), DEVICES[backend])
-    options = gv.RenderOptions(
-        backend=backend, lod="finest", step=1.0, stop_alpha=1.0, dtype=torch.float64
-    )
+    options = {"backend": backend, "lod": "finest", "dtype": torch.float64}
+    options |= {"step": 1.0, "stop_alpha": 1.0}
     linear = gv.TransferFunction.from_points([(0, 0), (1, 0.2)], [(0, 1, 1, 1)], reference=1.0)
 
     def transfer(v):
@@ -106,7 +104,7 @@ def test_each_sample_stands_in_the_shadow_of_what_lies_before_its_light(backend,
         (gv.Lit(linear, **look), transfer),
         (gv.StoredColor("rgba", reference=1.0, **look), opaque),
     ):
-        hits = trace(tree, rays, shader, options)
+        hits = gv.trace(tree, rays, shader, **options)
         expected = seen(value, rays, light, function, min(SPACING))
         assert expected.max() > 0.05
         for column in hits.color.cpu().numpy().T:
@@ -162,12 +160,12 @@ def test_a_shadow_of_a_wide_light_is_softer_and_coarser(backend):
         cone=flat + torch.tensor([1.0, 0.0]),
         range=flat + torch.tensor([0.0, torch.inf]),
     ).to(DEVICES[backend])
-    options = gv.RenderOptions(backend=backend)
+    options = {"backend": backend}
     edges, samples = [], []
     for angle in (0.0, 20.0, 60.0):
         sun = gv.DirectionalLight((0.0, 0.0, -1.0), angle=angle)
         lit = gv.Lit(transfer, light=sun, shadows=True, **LIGHT_ALONE)
-        hits = trace(tree, rays, lit, options)
+        hits = gv.trace(tree, rays, lit, **options)
         light = (hits.color[:, 0] / hits.alpha[:, 0]).cpu()
         light = light / light[-1]
         assert light[0] < 0.35 and light[-8:].min() > 0.9
@@ -182,9 +180,10 @@ def test_a_headlight_and_no_light_at_all_throw_no_shadow(backend):
     tree = tree_of(fog(2), backend)
     rays = rays_through(tree.box.numpy(), DEVICES[backend])
     transfer = gv.TransferFunction.from_points([(0.2, 0), (1, 0.3)], [(0, 1, 1, 1)])
-    options = gv.RenderOptions(backend=backend, lod="finest")
+    options = {"backend": backend, "lod": "finest"}
     plain, shadowed = (
-        trace(tree, rays, gv.Lit(transfer, shadows=shadows), options) for shadows in (False, True)
+        gv.trace(tree, rays, gv.Lit(transfer, shadows=shadows), **options)
+        for shadows in (False, True)
     )
     assert torch.equal(plain.color, shadowed.color) and plain.color.max() > 0.05
     assert torch.equal(plain.samples, shadowed.samples)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import typing
 
 import pytest
 import torch
@@ -15,7 +16,6 @@ import gvtorch as gv
 from gvtorch.base import constants as config
 from gvtorch.ops.reference import exact
 from gvtorch.shaders.transfer_function import interval_levels
-from gvtorch.tracing.resident import trace
 from gvtorch.tracing.tracer import Tracer
 
 SHADER = gv.TransferFunction.from_points(
@@ -55,7 +55,7 @@ def run(tree, backend, rays, shader=SHADER, **options):
     device = DEVICES[backend]
     copy = on(tree, device)
     moved = rays.to(device)
-    hits = trace(copy, moved, shader, gv.RenderOptions(backend=backend, **options))
+    hits = gv.trace(copy, moved, shader, backend=backend, **options)
     result = {n: t.cpu() for n, t in vars(hits).items() if t is not None}
     marks = {
         "request": copy.nodes.request_tn,
@@ -283,7 +283,7 @@ def test_no_rays(blobs, backend):
     rays = camera_rays(tree)
     none = rays[:0]
     device = DEVICES[backend]
-    hits = trace(on(tree, device), none.to(device), SHADER)
+    hits = gv.trace(on(tree, device), none.to(device), SHADER)
     assert hits.color.shape == (0, 3) and hits.samples.shape == (0,)
 
 
@@ -395,6 +395,24 @@ def test_options_are_checked():
             gv.RenderOptions(**change)
     with pytest.raises(dataclasses.FrozenInstanceError):
         gv.RenderOptions().step = 2  # type: ignore[misc]
+
+
+def test_settings_are_the_options_that_an_editor_completes():
+    assert gv.RenderSettings.__annotations__.keys() == gv.RenderOptions.__annotations__.keys()
+    assert typing.get_type_hints(gv.RenderSettings) == typing.get_type_hints(gv.RenderOptions)
+    assert not gv.RenderSettings.__required_keys__
+
+
+def test_trace_checks_what_it_is_given(blobs):
+    tree = gv.N3Tree.from_volume(blobs, 4)
+    rays = camera_rays(tree, 4)
+    for call, message in (
+        (lambda: gv.trace(tree, rays, SHADER, colour=1), "trace: unknown option 'colour'"),
+        (lambda: gv.trace(blobs, rays, SHADER), "trace: tree must be a N3Tree, got Volume"),
+        (lambda: gv.trace(tree, gv.Camera.orbit(), SHADER), "trace: rays must be a Rays, got Ca"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 @settings(max_examples=30, deadline=None)

@@ -60,6 +60,28 @@ def _of_size(expected: int | str, size: int) -> bool:
     return expected == size or isinstance(expected, str)
 
 
+def instance(where: str, name: str, value: Any, kind: type) -> None:
+    """Raises ValueError unless `value` is of a class."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{where}: {name} must be a {kind.__name__}, got {type(value).__name__}")
+
+
+def images(where: str, name: str, value: Any, channels: int, *, batch: bool = True) -> None:
+    """Raises ValueError unless `value` is a picture (h, w, channels) of floats, not empty, or, if
+    `batch`, several (n, h, w, channels).
+    """
+    if (
+        isinstance(value, Tensor)
+        and value.is_floating_point()
+        and value.dim() in ((3, 4) if batch else (3,))
+        and value.shape[-1] == channels
+        and value.numel()
+    ):
+        return
+    wanted = f"(h, w, {channels})" + (f" or (n, h, w, {channels})" if batch else "")
+    raise ValueError(f"{where}: {name} must be {wanted} floats, got {describe(value)}")
+
+
 def device(where: str, value: Any) -> torch.device:
     """Returns the device of a name, a CUDA device with its index, as tensors name theirs.
 

@@ -19,7 +19,7 @@ class Rays:
     cone: Tensor  # (r, 2) width at the origin, growth of the width per unit distance
     range: Tensor  # (r, 2) first and last distance along the ray; +inf is allowed for the last
     width: int = 0  # pixels of a row, if these are whole rows of a picture: traced in tiles
-    clear: Tensor | None = None  # (r,) transmittance at the first distance; None: 1
+    transmittance: Tensor | None = None  # (r,) at the first distance; None: 1
 
     def __getitem__(self, index: Tensor | slice) -> Rays:
         """Some of the rays, which are no rows any more."""
@@ -29,12 +29,26 @@ class Rays:
         """The rays on a device."""
         return self._each(lambda column: column.to(device), self.width)
 
+    def double(self) -> Rays:
+        """The rays in float64, each column contiguous."""
+        return self._each(lambda column: column.to(torch.float64).contiguous(), self.width)
+
+    def light(self) -> Tensor:
+        """Returns (r, 1) float64 transmittance at the first distance."""
+        if self.transmittance is None:
+            return torch.ones_like(self.origin[:, :1], dtype=torch.float64)
+        return self.transmittance[:, None].to(torch.float64)
+
     def _each(self, change: Callable[[Tensor], Tensor], width: int) -> Rays:
         columns = (self.origin, self.direction, self.cone, self.range)
         origin, direction, cone, limits = (change(column) for column in columns)
-        clear = None if self.clear is None else change(self.clear)
         return Rays(
-            origin=origin, direction=direction, cone=cone, range=limits, width=width, clear=clear
+            origin=origin,
+            direction=direction,
+            cone=cone,
+            range=limits,
+            width=width,
+            transmittance=None if self.transmittance is None else change(self.transmittance),
         )
 
 

@@ -19,7 +19,6 @@ from ..cameras import Camera
 from ..io.machine import memory_free
 from ..pictures import Picture
 from ..pool import N3Tree
-from ..tracing import RenderOptions
 from ..tracing.resident import trace
 from .peers import Peer, Task, find
 from .record import Record, Settings, Timing, clock, once
@@ -145,8 +144,8 @@ def _tracing(
 ) -> Callable[[], Hits]:
     """Returns the call that is timed; rays are made before."""
     rays = camera.rays(device)
-    options = RenderOptions(lod=lod, step=scene.step, stop_alpha=_STOP)  # type: ignore[arg-type]
-    return lambda: trace(tree, rays, scene.shader, options)
+    options: Any = {"lod": lod, "step": scene.step, "stop_alpha": _STOP}
+    return lambda: trace(tree, rays, scene.shader, **options)
 
 
 def rates(hits: Hits | Picture, timing: Timing) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from ..shaders import (
     StoredColor,
 )
 from ..shaders.fused import Shader
-from ..tracing import Lighting, ModuleShader, RenderOptions, TransferModule
+from ..tracing import Lighting, ModuleShader, TransferModule
 from ..tracing.resident import trace
 from ..tracing.tracer import AnyShader
 from .march import Size, difference, op_milliseconds, rates, rgba
@@ -154,7 +154,7 @@ def _resident(
     rays = scene.camera(*size).rays(tree.device)
 
     def frame(shader: AnyShader, **options: Any) -> Hits:
-        return trace(tree, rays, shader, RenderOptions(**options))
+        return trace(tree, rays, shader, **options)
 
     return _measure(record, case, scene, volumes, frame, {})
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
@@ -390,6 +390,19 @@ class Camera:
     def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:
         """Returns the rays of whole rows, counted through the batch, from what `numbers` gave."""
         return pixel_rays(numbers, self.width, self.height, rows, self.model, self.distorted)
+
+    def blocks(self, pixels: int) -> Iterator[tuple[int, int]]:
+        """Yields the rows of all pictures in blocks of about so many pixels, at least a row each:
+        first row and the row after the last, as `pixel_rays` takes them.
+        """
+        rows, block = len(self) * self.height, max(1, pixels // self.width)
+        for first in range(0, rows, block):
+            yield first, min(first + block, rows)
+
+    def image(self, column: Tensor) -> Tensor:
+        """Returns numbers (r,) or (r, c) of all pixels as a picture (h, w, c), or (n, h, w, c)."""
+        image = column.reshape(len(self), self.height, self.width, -1)
+        return image if self.batched else image[0]
 
     def rays(self, device: torch.device | str = "cpu", rows: tuple[int, int] | None = None) -> Rays:
         """Returns the rays through pixel centres, camera by camera, row by row, in float64.

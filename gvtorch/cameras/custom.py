@@ -47,8 +47,8 @@ class CustomCamera(Camera):
                     f"got {describe(column)}"
                 )
             columns.append(column)
-        if rays.clear is not None:
-            raise ValueError("CustomCamera: rays of a picture must have no clear, got some")
+        if rays.transmittance is not None:
+            raise ValueError("CustomCamera: rays of a picture must have no transmittance, got some")
         count = len(rays.origin)
         width = rays.width or count if width is None else width
         self.width = whole("CustomCamera", "width", width, low=1)

@@ -10,8 +10,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from functools import cached_property
-from typing import Any, Literal
+from functools import cached_property, partial
+from typing import Any, Literal, Unpack
 
 import torch
 from torch import Tensor
@@ -28,8 +28,8 @@ from ..producers import Producer
 from ..shaders.fused import Shader
 from ..tracing import ModuleShader, RenderOptions
 from ..tracing.around import around
-from ..tracing.composite import Trace, composite_trees
-from ..tracing.options import render_options
+from ..tracing.composite import Trace, trace_trees
+from ..tracing.options import RenderSettings, render_options
 from ..tracing.pixels import develop, empty_hits, trace_camera
 from ..tracing.tracer import AnyShader, check_shader, tracer_of
 from .jobs import Plant
@@ -108,7 +108,7 @@ class Engine:
         shader: Shaders,
         *,
         progress: Progress = no_progress,
-        **options: Any,
+        **options: Unpack[RenderSettings],
     ) -> tuple[Picture, FrameStats]:
         """Produces what the last picture missed, then renders one from what is there.
 
@@ -132,7 +132,7 @@ class Engine:
             ProductionError: A node can't be produced, and the engine is strict.
         """
         camera = as_camera("frame", camera).placed(self.box)
-        chosen = render_options("frame", camera, options)
+        chosen = render_options("frame", options, camera)
         hits, stats = self._pass(camera, shader, chosen, progress)
         return develop(hits, camera, chosen, stats), stats
 
@@ -267,7 +267,7 @@ class Engine:
         productions: int = 4,
         max_frames: int = 1000,
         progress: Progress = no_progress,
-        **options: Any,
+        **options: Unpack[RenderSettings],
     ) -> Picture:
         """Renders a picture over one or more frames.
 
@@ -296,7 +296,7 @@ class Engine:
         """
         most = _most_frames(mode, productions, max_frames)
         camera = as_camera("render", camera).placed(self.box)
-        chosen = render_options("render", camera, options)
+        chosen = render_options("render", options, camera)
         if mode == "interactive":
             return self.frame(camera, shader, **options)[0]
         count = len(camera) * camera.height * camera.width
@@ -333,7 +333,9 @@ class Engine:
         stats = stats.of_picture(total)
         return develop(hits, camera, chosen, stats)
 
-    def capture(self, camera: Camera | Rays, shader: Shaders, **options: Any) -> FrameGraph:
+    def capture(
+        self, camera: Camera | Rays, shader: Shaders, **options: Unpack[RenderSettings]
+    ) -> FrameGraph:
         """Records a frame as a CUDA graph, for cameras of this number and size.
 
         Renders a frame first, as `frame` does.
@@ -357,7 +359,7 @@ class Engine:
         if self.device.type != "cuda":
             raise ValueError(f"Engine.capture: the engine must be on CUDA, it is on {self.device}")
         camera = as_camera("capture", camera)
-        chosen = render_options("capture", camera, options)
+        chosen = render_options("capture", options, camera)
         if chosen.layer is not None:
             chosen.layer.check_device("capture", self.device)
         self.frame(camera, shader, **vars(chosen))  # loads what is loaded at first use
@@ -464,9 +466,7 @@ class Engine:
             frame = {"by_level": by_level, "frame_1": self._frame_1}
             tracer = tracer_of(plant.tree, one, chosen, **frame)
             trees.append((plant.tree.box, around(tracer, chosen, box)))
-        if len(trees) == 1:
-            return trees[0][1]
-        return lambda rays: composite_trees(trees, rays)
+        return partial(trace_trees, trees)
 
 
 class FrameGraph:

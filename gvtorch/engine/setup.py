@@ -15,7 +15,6 @@ from ..cache import Cache
 from ..pool import BrickPool, Channel, N3Tree, NodePool
 from ..producers import Nodes, Producer, Region
 from ..producers.answer import checked_bricks, checked_regions, layout_of
-from ..tracing.options import check_type
 from .jobs import Plant
 from .production import ProductionError
 
@@ -67,7 +66,7 @@ def make_pools(
     if not producers:
         raise ValueError("Engine: scene must have at least one producer")
     for name, producer in producers.items():
-        check_type("Engine", f"tree {name!r}", producer, Producer)
+        check.instance("Engine", f"tree {name!r}", producer, Producer)
         if "channels" not in vars(producer):
             kind = type(producer).__name__
             raise ValueError(f"Engine: {kind}.__init__ must call super().__init__(extent, ...)")

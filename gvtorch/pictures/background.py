@@ -17,7 +17,7 @@ from ..cameras.camera import Camera
 from .files import read_image
 
 Color = tuple[float, float, float]
-_ROWS_A_BLOCK = 1 << 20  # pixels whose rays are in memory at once
+_PIXELS_A_BLOCK = 1 << 20  # whose rays are in memory at once
 
 
 class Background(ABC):
@@ -63,11 +63,7 @@ class Backdrop(Background):
         """Takes linear RGB, (h, w, 3) or, for a batch of cameras, (n, h, w, 3). From another device
         it is uploaded once; on the device of the picture it may be edited between frames.
         """
-        if not _is_image(image) or image.dim() not in (3, 4):
-            raise ValueError(
-                "Backdrop: image must be (h, w, 3) or (n, h, w, 3) floats, "
-                f"got {check.describe(image)}"
-            )
+        check.images("Backdrop", "image", image, 3)
         if not (image.is_cuda or bool(torch.isfinite(image).all())):
             raise ValueError("Backdrop: image must be finite, got NaN or infinity")
         self.image = image
@@ -108,10 +104,7 @@ class Environment(Background):
         Raises:
             ValueError: A shape is wrong, a value is NaN or infinite, or the rotation is none.
         """
-        if not _is_image(image) or image.dim() != 3:
-            raise ValueError(
-                f"Environment: image must be (h, w, 3) floats, got {check.describe(image)}"
-            )
+        check.images("Environment", "image", image, 3, batch=False)
         if not bool(torch.isfinite(image).all()):
             raise ValueError("Environment: image must be finite, got NaN or infinity")
         self.image = image
@@ -153,12 +146,9 @@ class Environment(Background):
 
     def behind(self, camera: Camera, numbers: Tensor, dtype: torch.dtype) -> Tensor:
         """Returns (r, 3)."""
-        rows, block = len(camera) * camera.height, max(1, _ROWS_A_BLOCK // camera.width)
-        parts = []
-        for top in range(0, rows, block):
-            rays = camera.pixel_rays(numbers, (top, min(top + block, rows)))
-            parts.append(self.look_up(rays.direction, dtype))
-        return torch.cat(parts)
+        blocks = camera.blocks(_PIXELS_A_BLOCK)
+        rays = (camera.pixel_rays(numbers, rows) for rows in blocks)
+        return torch.cat([self.look_up(some.direction, dtype) for some in rays])
 
 
 def checked_background(where: str, value: Any) -> Background | Color | None:
@@ -173,12 +163,6 @@ def checked_background(where: str, value: Any) -> Background | Color | None:
     for part in color:
         check.number(where, "background", part, low=0, high=1)
     return color
-
-
-def _is_image(value: Any) -> bool:
-    """Whether it is a tensor (..., 3) of floats, and not empty."""
-    known = isinstance(value, Tensor) and value.is_floating_point() and value.numel() > 0
-    return known and value.shape[-1] == 3
 
 
 def _color(where: str, name: str, value: Sequence[float]) -> Color:

@@ -5,8 +5,8 @@ from .costs import Cost, cost
 from .layer import Layer
 from .lighting import Lighting
 from .module_shader import ModuleShader, TransferModule
-from .options import RenderOptions
-from .resident import render
+from .options import RenderOptions, RenderSettings
+from .resident import render, trace
 from .thin_lens import ThinLens
 from .tree_tracer import TreeTracer
 
@@ -17,9 +17,11 @@ __all__ = [
     "Lighting",
     "ModuleShader",
     "RenderOptions",
+    "RenderSettings",
     "ThinLens",
     "TransferModule",
     "TreeTracer",
     "cost",
     "render",
+    "trace",
 ]

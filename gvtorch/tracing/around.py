@@ -1,4 +1,4 @@
-"""`around`: what the options put around a tree's tracer, from the inside out."""
+"""From a tree's tracer to what the options make of it: depth of field, clip, lighting."""
 
 from __future__ import annotations
 
@@ -20,47 +20,22 @@ from .tracer import Tracer
 
 
 def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -> Trace:
-    """Returns a tree's tracer with what the options put around it: the lens, then the clip, then
-    the light, whose cones go through the clip, but not through the lens; `box` (2, 3) is the
-    scene's.
+    """Wraps a tree's tracer in what the options ask for. Each ray goes through lighting, then the
+    clip, then the lens, then the tree; cones to the lights go through clip and tree alone.
+
+    Args:
+        tracer: Traces rays of one frame through one tree.
+        options: How the picture is made.
+        box: (2, 3) world corners of the scene, all trees together.
 
     Raises:
-        ValueError: The shader sees a ray in one go, and the options cut rays into pieces or draw
-            caps; or it takes no light, and there is some.
+        ValueError: The shader must see a ray in one go, and the options cut rays into pieces or
+            draw caps; or it has no normals, and there is lighting.
     """
-    clip = options.clip
-    projects = isinstance(tracer.shader, Projection)  # puts pieces together in its own way
-    cuts = {
-        "lens": options.lens is not None,
-        "clip with caps": clip is not None and clip.caps,
-        "clip of several pieces": clip is not None and not clip.whole and not projects,
-        "translucent layer": options.layer is not None and options.layer.alpha is not None,
-    }
-    if isinstance(tracer.shader, Shader) and tracer.shader.whole and any(cuts.values()):
-        name = next(name for name, cut in cuts.items() if cut)
-        kind = type(tracer.shader).__name__
-        raise ValueError(f"render: {kind} sees a ray in one go, so it has no {name}")
-
-    def through(sight: Tracer | ModuleTracer, lens: ThinLens | None = None) -> Trace:
-        trace: Trace = sight
-        if lens is not None:
-            trace = ThroughLens(trace, lens, options.cone_scale)
-        if options.clip is None:
-            return trace
-        slab: Trace | None = None
-        together: ProjectedPieces | None = None
-        if not isinstance(sight, ModuleTracer):
-            if options.clip.caps and isinstance(sight.shader, Isosurface):
-                slab = SurfaceSlab(sight.shader, lambda shader: sight.seeing(shader, options))
-            if isinstance(sight.shader, Projection):
-                together = ProjectedPieces(sight, sight.shader)
-        given = {"step": tracer.arguments["step"], "depth_alpha": options.depth_alpha}
-        unlit = options.lighting is not None
-        return Clipped(trace, options.clip, box, slab=slab, unlit=unlit, together=together, **given)
-
+    _check_whole(tracer, options)
     lens = options.lens and options.lens.placed(box)
     if options.lighting is None:
-        return through(tracer, lens)
+        return _clipped(tracer, options, box, lens)
     shader = tracer.shader
     if isinstance(tracer, ModuleTracer) or not isinstance(shader, LitShader):
         kind = "TransferFunction" if shader is None else type(shader).__name__
@@ -72,14 +47,63 @@ def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -
     matter = None
     if options.lighting.indirect:
         early = replace(cones, depth_alpha=0.25 * options.stop_alpha)
-        matter = through(tracer.seeing(shader.matter(), early))
+        matter = _clipped(tracer.seeing(shader.matter(), early), options, box)
     return Lighted(
-        through(tracer.seeing(shader.unlit(), options), lens),
-        blocker=through(tracer.seeing(shader.blocker(), cones)),
+        _clipped(tracer.seeing(shader.unlit(), options), options, box, lens),
+        blocker=_clipped(tracer.seeing(shader.blocker(), cones), options, box),
         matter=matter,
         lighting=options.lighting.placed(box),
         material=shader.material(),
         voxel=max(tracer.tree.spacing),
         cone_scale=options.cone_scale,
         lens=lens,
+    )
+
+
+def _check_whole(tracer: Tracer | ModuleTracer, options: RenderOptions) -> None:
+    """Raises ValueError if the shader must see a ray in one go, and the options do not let it."""
+    shader, clip, layer = tracer.shader, options.clip, options.layer
+    if not (isinstance(shader, Shader) and shader.whole):
+        return
+    joins = isinstance(shader, Projection)  # can put the pieces of a clip together itself
+    cuts = {
+        "lens": options.lens is not None,
+        "clip with caps": clip is not None and clip.caps,
+        "clip of several pieces": clip is not None and not clip.whole and not joins,
+        "translucent layer": layer is not None and layer.alpha is not None,
+    }
+    for name, cut in cuts.items():
+        if cut:
+            kind = type(shader).__name__
+            raise ValueError(f"render: {kind} sees a ray in one go, so it has no {name}")
+
+
+def _clipped(
+    tracer: Tracer | ModuleTracer,
+    options: RenderOptions,
+    box: Tensor,
+    lens: ThinLens | None = None,
+) -> Trace:
+    """A tracer with the lens (in world units) and the options' clip."""
+    trace: Trace = tracer
+    if lens is not None:
+        trace = ThroughLens(trace, lens, options.cone_scale)
+    if options.clip is None:
+        return trace
+    slab: Trace | None = None
+    together: ProjectedPieces | None = None
+    if isinstance(tracer, Tracer):
+        if options.clip.caps and isinstance(tracer.shader, Isosurface):
+            slab = SurfaceSlab(tracer.shader, lambda shader: tracer.seeing(shader, options))
+        if isinstance(tracer.shader, Projection):
+            together = ProjectedPieces(tracer, tracer.shader)
+    return Clipped(
+        trace,
+        options.clip,
+        box,
+        step=tracer.arguments["step"],
+        depth_alpha=options.depth_alpha,
+        slab=slab,
+        unlit=options.lighting is not None,
+        together=together,
     )

@@ -1,4 +1,4 @@
-"""What a cut through the inside of an isosurface shows."""
+"""Caps of isosurfaces: what a cut through their inside shows."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from ..shaders.surfaces import Isosurface
 from ..shaders.transfer_function import TransferFunction
 from .composite import Trace
 
-_WHITE = TransferFunction.from_points([(0, 1)])  # kept: its table is made once
+_WHITE = TransferFunction.from_points([(0, 1)])  # one object, so that its table is made once
 
 
 class SurfaceSlab:
-    """Traces slabs behind cuts: opaque where the first value lies inside of a surface, in the
-    surface's own colour, unlit. An isosurface alone shows nothing where a ray begins inside.
+    """Traces the intervals behind cuts: opaque where the first value lies inside the surface, in
+    the surface's own colour, unlit. The isosurface shader itself shows nothing where a ray begins
+    inside.
     """
 
     def __init__(self, shader: Isosurface, trace_with: Callable[[Projection], Trace]) -> None:
-        """Takes the surface, and what gives the tracer of the same frame with another shader."""
+        """Takes the surface, and a function that gives the frame's tracer with another shader."""
         self._shader = shader
         value = Projection("maximum", _WHITE)
         value.channel, value.component = shader.channel, shader.component
@@ -46,11 +47,10 @@ class SurfaceSlab:
         level = pack((self._shader.value,), color.dtype, color.device)
         inside = (hits.features >= level) != self._shader.distance
         inside = inside & (hits.depth < torch.inf)
-        clear = torch.ones_like(hits.alpha) if rays.clear is None else rays.clear[:, None]
         return dataclasses.replace(
             hits,
             color=torch.where(inside, color, 0),
-            alpha=torch.where(inside, hits.alpha, 1 - clear.to(hits.alpha)),
+            alpha=torch.where(inside, hits.alpha, 1 - rays.light().to(hits.alpha)),
             depth=torch.where(inside, hits.depth, torch.inf),
             features=None,
         )

@@ -1,8 +1,8 @@
 """`Clip`: the region of interest, from planes and boxes.
 
-It acts on rays, so it is the same for every shader, and what is clipped is neither sampled nor
-asked for. A ray is cut in float64 into the pieces of it that are kept, which are traced one after
-the other. How many there can be follows from the number of boxes: those a ray has not are empty.
+It cuts rays, so it works with every shader, and clipped space is neither sampled nor requested. A
+ray is cut in float64 into the pieces that are kept, which are traced one after the other. All rays
+have as many pieces as the number of boxes allows for; those that a ray does not need are empty.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from torch import Tensor
 from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.camera import Frame
-from .composite import Trace, behind, join, trace_pieces
+from .composite import Trace, behind, over, trace_pieces
+from .spans import Face, convex_span, dot, height_over
 
 Numbers = Sequence[Sequence[float]] | Tensor
-Face = tuple[float, ...]  # unit normal and offset (a, b, c, d): inside, a x + b y + c z + d >= 0
-_SEEN = 1e-4  # a cut through what has less alpha than this shows nothing
+_SEEN = 1e-4  # a cap is drawn where one interval behind the cut has more alpha than this
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Clip:
-    """What is kept of a scene: what lies inside all planes, inside some box if there are any, and
+    """The region that is kept: inside all planes, inside at least one box if there are any, and
     inside no box of `without`.
 
-    A box is its corners ((x, y, z), (x, y, z)), low and high, or a (4, 4) matrix that takes the
-    unit cube [0, 1]^3 to it.
+    A box is either its low and high corner, ((x, y, z), (x, y, z)), or a (4, 4) matrix that maps
+    the unit cube [0, 1]^3 to it.
     """
 
     planes: Numbers = ()  # (p, 4): (a, b, c, d) keeps where a x + b y + c z + d >= 0
-    boxes: Sequence[Numbers] = ()  # kept
-    without: Sequence[Numbers] = ()  # cut away
+    boxes: Sequence[Numbers] = ()  # to keep
+    without: Sequence[Numbers] = ()  # to remove
     frame: Frame | str = Frame.WORLD  # world units, or the scene's box: centre 0, largest side 1
-    caps: bool = False  # a cut through data is drawn as a flat surface
+    caps: bool = False  # draws a flat surface where a cut goes through matter
     cap_opacity: float = 1.0  # of that surface
-    cap_light: float = 0.5  # share of its light that comes from the eye, where no `Lighting` is
+    cap_light: float = 0.5  # share of its light that comes from the eye; without `Lighting` only
 
     def __post_init__(self) -> None:
         """Checks all numbers.
@@ -58,12 +58,12 @@ class Clip:
 
     @property
     def whole(self) -> bool:
-        """Whether one piece is left of a ray, without a cap."""
+        """Whether at most one piece of each ray is kept, and no cap is drawn."""
         return len(self.boxes) <= 1 and not len(self.without) and not self.caps
 
     @cached_property
     def _own(self) -> Faces:
-        """In the units of `frame`."""
+        """The faces in the units of `frame`."""
         for name in ("planes", "boxes", "without"):
             if not isinstance(getattr(self, name), (Sequence, Tensor)):
                 kind = type(getattr(self, name)).__name__
@@ -82,14 +82,14 @@ class Clip:
         centre, side = ((box[0] + box[1]) / 2).tolist(), float((box[1] - box[0]).max())
 
         def place(faces: list[Face]) -> list[Face]:
-            return [(*n, d * side - _dot(n, centre)) for *n, d in faces]
+            return [(*n, d * side - dot(n, centre)) for *n, d in faces]
 
         planes, boxes, without = self._own
         return Faces(place(planes), [*map(place, boxes)], [*map(place, without)])
 
 
 class Faces(NamedTuple):
-    """The faces of a clip: convex sets, whose faces look inwards."""
+    """The convex sets of a clip, by their faces, whose normals point inwards."""
 
     planes: list[Face]
     boxes: list[list[Face]]
@@ -97,7 +97,7 @@ class Faces(NamedTuple):
 
 
 class Clipped:
-    """Traces what is kept of rays."""
+    """Traces the kept pieces of rays, and the caps in front of them."""
 
     def __init__(
         self,
@@ -111,22 +111,31 @@ class Clipped:
         unlit: bool = False,
         together: Callable[[Iterable[Rays]], Hits] | None = None,
     ) -> None:
-        """Takes what traces the pieces, the (2, 3) box of the scene, the shortest interval in world
-        units, which is how deep a cap looks for its colour, where alpha means depth, what
-        traces so far behind a cut, if that is not `trace`, whether caps get their light later, and
-        what traces all pieces where one does not simply lie behind the other.
+        """Prepares a clip for one frame.
+
+        Args:
+            trace: Traces a piece.
+            clip: What is kept.
+            box: (2, 3) world corners of the scene.
+            step: World length of the shortest interval; a cap takes its colour from one such
+                interval behind the cut.
+            depth_alpha: Depth is where alpha passes this.
+            slab: Traces the intervals that give caps their colour; `trace` if left out.
+            unlit: Caps are not lit here, because `Lighting` lights them later.
+            together: Traces all pieces of each ray; if left out, each piece is composited over
+                those behind it.
         """
         self._trace, self._clip, self._slab = trace, clip, slab or trace
         self._together = together or partial(trace_pieces, trace)
-        self._step, self._hit_clear = step, 1 - depth_alpha
+        self._step, self._hit_transmittance = step, 1 - depth_alpha
         self._cap_light = 0.0 if unlit else clip.cap_light
         planes, boxes, self._without = clip.faces(box)
-        alone = len(boxes) == 1  # then what is kept is convex
-        self._planes = planes + boxes[0] if alone else planes
-        self._boxes = [] if alone else boxes
+        convex = len(boxes) == 1  # then the faces of the box act as planes
+        self._planes = planes + boxes[0] if convex else planes
+        self._boxes = [] if convex else boxes
 
     def __call__(self, rays: Rays) -> Hits:
-        """Traces the pieces of rays in world units, and the caps before them."""
+        """Traces rays in world units."""
         rays = dataclasses.replace(rays, range=rays.range.to(torch.float64))
         pieces = [dataclasses.replace(rays, range=kept) for kept in self.pieces(rays)]
         if not self._clip.caps:
@@ -135,28 +144,28 @@ class Clipped:
         for piece in pieces:
             left = piece if front is None else behind(piece, front)
             cap = self._cap(left, rays.range[:, 0])
-            front = cap if front is None else join(front, cap)
-            front = join(front, self._trace(behind(piece, front)))
+            front = cap if front is None else over(front, cap, dimmed=True)
+            front = over(front, self._trace(behind(piece, front)), dimmed=True)
         assert front is not None
         return front
 
     def pieces(self, rays: Rays) -> list[Tensor]:
-        """Returns (r, 2) first and last distances that are kept, nearest first, as many as a ray
-        can have; an empty one ends where it begins.
+        """Returns the kept (r, 2) ranges of rays, nearest first, as many as a ray can have; a range
+        that a ray does not need ends where it begins.
         """
-        first, last = _inside(self._planes, rays, *rays.range.unbind(1))
+        first, last = convex_span(self._planes, rays, *rays.range.unbind(1))
         last = torch.maximum(first, last)
         if not (self._boxes or self._without):
             return [torch.stack((first, last), 1)]
         everything = torch.full_like(first, -torch.inf), torch.full_like(first, torch.inf)
         boxes, without = (
-            [_inside(faces, rays, *everything) for faces in faces_of]
+            [convex_span(faces, rays, *everything) for faces in faces_of]
             for faces_of in (self._boxes, self._without)
         )
         all_ends = [end.clamp(first, last) for span in boxes + without for end in span]
         ends = torch.stack([first, last, *all_ends], 1).sort(1).values
         low, high = ends[:, :-1], ends[:, 1:]
-        middle = (low + high) / 2  # where something ends nothing changes between two ends
+        middle = (low + high) / 2  # stands for all places between two neighbouring ends
         kept = torch.full_like(middle, not boxes, dtype=torch.bool)
         for a, b in boxes:
             kept = kept | ((a[:, None] <= middle) & (middle <= b[:, None]))
@@ -175,74 +184,50 @@ class Clipped:
         return pieces
 
     def _cap(self, piece: Rays, begin: Tensor) -> Hits:
-        """What a cut shows where it is the beginning of a piece: one interval behind it tells the
-        colour, features if there are, and whether there is anything.
+        """The caps of pieces that begin at a cut, not at `begin` (r,). One interval behind the cut
+        gives the colour, the features, and whether there is matter at all.
         """
         first, last = piece.range.unbind(1)
         end = torch.where(first > begin, torch.minimum(first + self._step, last), first)
         slab = self._slab(dataclasses.replace(piece, range=torch.stack((first, end), 1)))
-        clear = torch.ones_like(first) if piece.clear is None else piece.clear
-        clear = clear.to(slab.color.dtype)
-        share = clear - (1 - slab.alpha[:, 0])  # of the light, that the slab takes
-        alpha = torch.where(share > _SEEN * clear, self._clip.cap_opacity, 0.0).to(clear)
+        before = piece.light()[:, 0].to(slab.color)  # transmittance before the cap
+        taken = before - (1 - slab.alpha[:, 0])  # by the slab, of the light
+        alpha = torch.where(taken > _SEEN * before, self._clip.cap_opacity, 0.0).to(before)
         facing, normal = self._facing(piece, first)
         light = 1 - self._cap_light * (1 - facing)
-        part = clear * alpha / torch.where(alpha > 0, share, 1.0)
-        scale = clear * alpha * light.to(clear) / torch.where(alpha > 0, share, 1.0)
-        left = clear * (1 - alpha)
-        hit = (left < self._hit_clear) & (clear >= self._hit_clear)
+        taken = torch.where(alpha > 0, taken, 1.0)
+        part = before * alpha / taken
+        scale = before * alpha * light.to(before) / taken
+        after = before * (1 - alpha)
+        hit = (after < self._hit_transmittance) & (before >= self._hit_transmittance)
         return Hits(
             color=slab.color * scale[:, None],
-            alpha=(1 - left)[:, None],
-            depth=torch.where(hit, first.to(clear), torch.inf)[:, None],
+            alpha=(1 - after)[:, None],
+            depth=torch.where(hit, first.to(before), torch.inf)[:, None],
             samples=slab.samples,
             missed=slab.missed,
-            normal=None if slab.normal is None else normal.to(clear) * (alpha > 0)[:, None],
+            normal=None if slab.normal is None else normal.to(before) * (alpha > 0)[:, None],
             features=None if slab.features is None else slab.features * part[:, None],
         )
 
     def _facing(self, rays: Rays, t: Tensor) -> tuple[Tensor, Tensor]:
-        """(r,) cosine between the ray and the normal of the face at distance t, and (r, 3) that
-        normal, towards the eye: the nearest face of those through which rays come in.
+        """(r,) cosine between each ray and the normal of the face that it crosses at distances t
+        (r,), and (r, 3) that normal, towards the eye. Of the faces through which the ray enters
+        the kept region, it is the nearest to that place.
         """
         nearest, cosine = torch.full_like(t, torch.inf), torch.ones_like(t)
         normal = [torch.zeros_like(t)] * 3
-        kept = [face for faces in ([self._planes], self._boxes) for some in faces for face in some]
+        kept = [face for faces in (self._planes, *self._boxes) for face in faces]
         cut = [face for faces in self._without for face in faces]
         for side, faces in ((1, kept), (-1, cut)):
             for face in faces:
-                height, rate = _height(face, rays)
+                height, rate = height_over(face, rays)
                 away = torch.where(side * rate > 0, (height + t * rate).abs(), torch.inf)
                 cosine = torch.where(away < nearest, rate.abs(), cosine)
                 sides = zip(face, normal, strict=False)
                 normal = [torch.where(away < nearest, -side * n, known) for n, known in sides]
                 nearest = torch.minimum(away, nearest)
         return cosine, torch.stack(normal, 1)
-
-
-def _height(face: Face, rays: Rays) -> tuple[Tensor, Tensor]:
-    """(r,) how far each ray's origin lies inside of a face, and by how much that grows with t."""
-    *normal, offset = face
-    height = _dot(normal, rays.origin.to(torch.float64).unbind(1)) + offset
-    return height, _dot(normal, rays.direction.to(torch.float64).unbind(1))
-
-
-def _dot(normal: Sequence[float], vector: Sequence[Any]) -> Any:
-    x, y, z = vector
-    return normal[0] * x + normal[1] * y + normal[2] * z
-
-
-def _inside(faces: list[Face], rays: Rays, first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays enter and leave a convex set, (r,) each, cut out of [first, last]; they leave
-    before they enter where they pass by.
-    """
-    for face in faces:
-        height, rate = _height(face, rays)
-        t = -height / rate
-        first = torch.where(rate > 0, torch.maximum(first, t), first)
-        last = torch.where(rate < 0, torch.minimum(last, t), last)
-        last = torch.where((rate == 0) & (height < 0), -torch.inf, last)
-    return first, last
 
 
 def _face(name: str, numbers: Any) -> Face:

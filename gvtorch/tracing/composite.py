@@ -1,4 +1,4 @@
-"""Hits put over hits: of the pieces of a ray, and of several trees.
+"""Hits put over hits: of the pieces of a ray, of what another renderer drew, of several trees.
 
 Source: Porter, Duff, "Compositing digital images", 1984 (over, premultiplied).
 """
@@ -7,105 +7,107 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
+from functools import reduce
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from ..base.records import Hits, Rays
 from ..ops.shading import pack
+from .spans import box_span
 
-Trace = Callable[[Rays], Hits]
+Trace = Callable[[Rays], Hits]  # through one tree or several, with whatever the options put around
+
+
+def over(front: Hits, back: Hits, *, dimmed: bool = False) -> Hits:
+    """Composites hits of the same rays; a normal is the mean of both, by the light each part takes.
+
+    Args:
+        front: Nearer.
+        back: Farther: of rays `behind(rays, front)` if `dimmed`, else of rays of full light.
+        dimmed: Whether `back` already has only the light that `front` lets through; its alpha then
+            includes that of `front`.
+    """
+    color, alpha, features = back.color, back.alpha, back.features
+    taken = None if back.normal is None else back.normal * (alpha - front.alpha)
+    if not dimmed:
+        transmittance = 1 - front.alpha
+        color, alpha = transmittance * color, front.alpha + transmittance * alpha
+        features = None if features is None else transmittance * features
+        taken = None if back.normal is None else transmittance * (back.normal * back.alpha)
+    normal = front.normal if back.normal is None else back.normal
+    if front.normal is not None and taken is not None:
+        normal = normalize(front.normal * front.alpha + taken, dim=1)
+    if front.features is not None:
+        features = front.features if features is None else front.features + features
+    return Hits(
+        color=front.color + color,
+        alpha=alpha,
+        depth=torch.minimum(front.depth, back.depth),
+        samples=front.samples + back.samples,
+        missed=front.missed | back.missed,
+        normal=normal,
+        features=features,
+    )
+
+
+def behind(rays: Rays, front: Hits) -> Rays:
+    """The rays with the light that `front` lets through."""
+    return dataclasses.replace(rays, transmittance=1 - front.alpha[:, 0].to(torch.float64))
 
 
 def trace_pieces(trace: Trace, pieces: Iterable[Rays]) -> Hits:
-    """Traces pieces of the same rays, nearest first. What a piece lets through reaches the next, so
-    a ray that has ended takes no samples any more, and depth is found in whichever piece it lies.
+    """Traces pieces of the same rays, nearest first, as if each ray were traced in one go: one that
+    has ended takes no more samples, and its depth is found in whichever piece it lies.
     """
     front: Hits | None = None
     for piece in pieces:
         if front is None:
             front = trace(piece)
         else:
-            front = join(front, trace(behind(piece, front)))
+            front = over(front, trace(behind(piece, front)), dimmed=True)
     assert front is not None
     return front
 
 
-def behind(rays: Rays, front: Hits) -> Rays:
-    """The rays, with what `front` lets through of them."""
-    return dataclasses.replace(rays, clear=1 - front.alpha[:, 0].to(torch.float64))
-
-
-def join(front: Hits, back: Hits) -> Hits:
-    """Hits of rays that were traced `behind` others: colours and features add up, alpha is the
-    later one, and a normal counts by what its piece took of the light.
-    """
-    normal = _sum(front.normal, back.normal, front.alpha, back.alpha - front.alpha)
-    return Hits(
-        color=front.color + back.color,
-        alpha=back.alpha,
-        depth=torch.minimum(front.depth, back.depth),
-        samples=front.samples + back.samples,
-        missed=front.missed | back.missed,
-        normal=None if normal is None else torch.nn.functional.normalize(normal, dim=1),
-        features=_sum(front.features, back.features, 1, 1),
-    )
-
-
-def _sum(
-    front: Tensor | None, back: Tensor | None, front_weight: Tensor | int, back_weight: Tensor | int
-) -> Tensor | None:
-    """The weighted sum of those that are given."""
-    if front is None or back is None:
-        return back if front is None else front
-    return front * front_weight + back * back_weight
-
-
-def composite_trees(trees: Sequence[tuple[Tensor, Trace]], rays: Rays) -> Hits:
-    """Traces rays through several trees, each a (2, 3) box and what traces it, and puts them one
-    over the other, nearest box first.
+def trace_trees(trees: Sequence[tuple[Tensor, Trace]], rays: Rays) -> Hits:
+    """Traces rays through several trees, each a (2, 3) world box and what traces it, and composites
+    the trees, the one whose box a ray enters first in front.
 
     Right wherever boxes do not overlap along a ray; where they do, the nearer box as a whole comes
     first.
     """
+    if len(trees) == 1:
+        return trees[0][1](rays)
     near = torch.stack([_entry(box, rays) for box, _ in trees])  # (m, r)
     order = near.argsort(dim=0, stable=True)
     hits = [trace(rays) for _, trace in trees]
-    fields = {
-        name: torch.stack([vars(one)[name] for one in hits])
-        for name in ("color", "alpha", "depth", "samples", "missed")
-    }
-    which = order[:, :, None]
-    over = {name: fields[name] for name in ("color", "alpha")}
-    for name in ("normal", "features"):
-        given = [vars(one)[name] for one in hits if vars(one)[name] is not None]
-        if given and len({field.shape[1] for field in given}) > 1:
-            raise ValueError("render: trees must give as many features each")
-        if given:
-            none = torch.zeros_like(given[0])
-            found = [vars(one)[name] for one in hits]
-            over[name] = torch.stack([none if field is None else field for field in found])
-    if "normal" in over:
-        over["normal"] = over["normal"] * over["alpha"]
-    over = {name: field.gather(0, which.expand_as(field)) for name, field in over.items()}
-    depths = fields["depth"].gather(0, which)
-    total = {name: field[0] for name, field in over.items()}
-    for behind in range(1, len(trees)):
-        clear = 1 - total["alpha"]
-        total = {name: total[name] + clear * field[behind] for name, field in over.items()}
-    if "normal" in total:
-        total["normal"] = torch.nn.functional.normalize(total["normal"], dim=1)
-    return Hits(
-        **total,
-        depth=depths.amin(0),
-        samples=fields["samples"].sum(0, dtype=torch.int32),
-        missed=fields["missed"].any(0),
-    )
+    fields = {name: _stacked([vars(one)[name] for one in hits]) for name in vars(hits[0])}
+    ray = torch.arange(order.shape[1], device=order.device)
+
+    def ranked(tree: Tensor) -> Hits:
+        """The hits of one tree (r,) for each ray."""
+        picked: Any = {name: None if f is None else f[tree, ray] for name, f in fields.items()}
+        return Hits(**picked)
+
+    return reduce(over, map(ranked, order))
+
+
+def _stacked(fields: list[Tensor | None]) -> Tensor | None:
+    """(m, r, ...) the same field of m trees; zeros stand for a tree that has none."""
+    given = [field for field in fields if field is not None]
+    if not given:
+        return None
+    if len({field.shape[1:] for field in given}) > 1:
+        raise ValueError("render: trees must give as many features each")
+    nothing = torch.zeros_like(given[0])
+    return torch.stack([nothing if field is None else field for field in fields])
 
 
 def _entry(box: Tensor, rays: Rays) -> Tensor:
-    """(r,) distance at which rays enter a world box, +inf where they pass it by."""
+    """(r,) distance at which rays enter a (2, 3) box, +inf where they pass it by."""
     low, high = pack((box,), rays.origin.dtype, rays.origin.device).view(2, 3)
-    a, b = (low - rays.origin) / rays.direction, (high - rays.origin) / rays.direction
-    first, last = torch.fmin(a, b).amax(1), torch.fmax(a, b).amin(1)
+    first, last = box_span(low, high, rays.origin, rays.direction)
     return torch.where(first <= last, first.clamp(min=0), torch.inf)

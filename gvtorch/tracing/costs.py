@@ -6,27 +6,30 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal, Unpack, get_args
 
 import torch
 from torch import Tensor
 
+from ..base import check
 from ..base.records import Hits, Rays, RenderStats
 from ..base.stage import Progress, no_progress
 from ..base.volume import movable
 from ..cameras.camera import Camera
 from ..cameras.custom import as_camera
-from ..ops.trace import choose_backend
 from ..pictures.picture import Picture
 from ..pool import N3Tree
 from ..shaders.fused import FusedShader
 from ..shaders.transfer_function import TransferFunction
 from .around import around
 from .module_shader import Batch, TransferModule, march
-from .options import RenderOptions, check_type, render_options
+from .options import RenderOptions, RenderSettings, render_options
+from .pixels import trace_blocks
+from .resident import tree_stats
 from .tracer import Tracer
 
 Image = Literal["samples", "nodes", "lod", "age", "fill"]
+IMAGES = get_args(Image)
 
 _RAYS_A_BLOCK = 1 << 16
 _BRICKS_AT_ONCE = 1024
@@ -63,7 +66,7 @@ class Cost:
         """
         from kornia.color import ColorMap, ColorMapType, rgb_to_linear_rgb
 
-        if name not in ("samples", "nodes", "lod", "age", "fill"):
+        if name not in IMAGES:
             raise ValueError(f"Cost: image must be samples, nodes, lod, age or fill, got {name!r}")
         if colormap not in ColorMapType.__members__:
             known = ", ".join(sorted(ColorMapType.__members__))
@@ -93,7 +96,7 @@ def cost(
     shader: FusedShader,
     *,
     progress: Progress = no_progress,
-    **options: Any,
+    **options: Unpack[RenderSettings],
 ) -> Cost:
     """Counts what the rays of a picture do. Nothing is written: neither stamps nor requests.
 
@@ -112,46 +115,22 @@ def cost(
         ValueError: See `render`.
     """
     camera = as_camera("cost", camera)
-    chosen = render_options("cost", camera, options)
-    check_type("cost", "tree", tree, N3Tree)
+    chosen = render_options("cost", options, camera)
+    check.instance("cost", "tree", tree, N3Tree)
     if not isinstance(shader, TransferFunction):
         raise ValueError(f"cost: shader must be a TransferFunction, got {type(shader).__name__}")
     start = time.perf_counter()
     placed = camera.placed(tree.box)
     counter = _Counter(tree, shader, chosen)
-    trace = around(counter, chosen, tree.box)
-    numbers, width = placed.numbers(tree.device), placed.width
-    layer = None if chosen.layer is None else chosen.layer.pixels(tree.device)
-    rows = len(placed) * placed.height
-    block = max(1, _RAYS_A_BLOCK // width)
-    parts = []
-    for top in range(0, rows, block):
-        end = min(top + block, rows)
-        rays = placed.pixel_rays(numbers, (top, end))
-        counter.nodes = torch.zeros(len(rays.origin), dtype=torch.int32, device=tree.device)
-        if layer is None:
-            hits = trace(rays)
-        else:
-            hits = layer[top * width : end * width].trace(trace, rays, chosen.stop_alpha)
-        parts.append((hits.samples, counter.nodes, *_means(hits)))
-        progress("rays", end, rows)
-    shape = (len(placed), placed.height, width, 1)
-    names = ("samples", "nodes", "lod", "age", "fill")
-    images = {
-        name: torch.cat(columns).reshape(shape)
-        for name, columns in zip(names, zip(*parts, strict=True), strict=True)
-    }
-    if not camera.batched:
-        images = {name: image[0] for name, image in images.items()}
-    stats = RenderStats(
-        milliseconds=1e3 * (time.perf_counter() - start),
-        backend=choose_backend(chosen.backend, tree.device),
-        rays=rows * width,
-        samples=int(images["samples"].sum(dtype=torch.int64)),
-        nodes=tree.nodes.child_tn.numel(),
-        bricks=tree.bricks.capacity,
-        bytes=tree.nbytes,
-    )
+    given = placed, placed.numbers(tree.device), around(counter, chosen, tree.box), chosen, progress
+    columns = [
+        (hits.samples, counter.take_nodes(), *_means(hits))
+        for _, hits in trace_blocks(*given, pixels=_RAYS_A_BLOCK)
+    ]
+    joined = [torch.cat(parts) for parts in zip(*columns, strict=True)]
+    stats = tree_stats(tree, chosen, joined[0])
+    stats.milliseconds = 1e3 * (time.perf_counter() - start)
+    images = {name: camera.image(column) for name, column in zip(IMAGES, joined, strict=True)}
     return Cost(**images, stats=stats)
 
 
@@ -166,9 +145,7 @@ def _means(hits: Hits) -> tuple[Tensor, ...]:
 
 
 class _Counter(Tracer):
-    """Counts along rays of one tree: sums as features, and in `nodes` what it visited since that
-    was set to 0.
-    """
+    """Counts along rays of one tree: sums as features, and the nodes that it visits."""
 
     def __init__(self, tree: N3Tree, shader: TransferFunction, options: RenderOptions) -> None:
         super().__init__(tree, shader, options)
@@ -178,7 +155,13 @@ class _Counter(Tracer):
         self.component = options.component
         self.module = TransferModule(shader, min(tree.spacing)).to(tree.device)
         self.fill_b = torch.full_like(tree.bricks.born_b, -1, dtype=torch.float32)
-        self.nodes: Tensor
+        self._nodes: Tensor | None = None
+
+    def take_nodes(self) -> Tensor:
+        """Returns (r,) int32 nodes that rays visited since the last call."""
+        assert self._nodes is not None
+        nodes, self._nodes = self._nodes, None
+        return nodes
 
     def __call__(self, rays: Rays) -> Hits:
         """Sums of what each sample adds to alpha: alone, times the depth of its node, if it has a
@@ -186,7 +169,8 @@ class _Counter(Tracer):
         """
         own = (self.tree, self.arguments, self.channel, self.shade, 5)
         sums = march(rays, *own, limit=1, by_node=False)
-        self.nodes += sums.count[:, 1]
+        nodes = sums.count[:, 1]
+        self._nodes = nodes if self._nodes is None else self._nodes + nodes
         return Hits(
             color=sums.total.new_zeros((len(sums.total), 3)),
             alpha=(1 - sums.clear)[:, None],

@@ -1,24 +1,23 @@
-"""`Layer`: the colour and depth of another renderer, mixed with voxels along each ray.
+"""`Layer`: the colour and depth of another renderer, composited with voxels along each ray.
 
-Voxels before the layer go over it. Where it is opaque, rays end at it: nothing behind is sampled or
-asked for. Where it is translucent, a second trace goes on behind it.
-
-Source: Porter, Duff, "Compositing digital images", 1984 (over, premultiplied).
+Voxels in front of the layer are composited over it. Where it is opaque, rays end at it: nothing
+behind is sampled or requested. Where it is translucent, a second trace goes on behind it.
 """
 
 from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.camera import Camera
+from .composite import Trace, over
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,22 +47,10 @@ class Layer:
             ValueError: A wrong shape or dtype, a colour that is not finite, a depth that is NaN or
                 negative, an alpha out of its range.
         """
-        parts = {"color": self.color, "depth": self.depth, "alpha": self.alpha}
-        for name, part in parts.items():
-            channels = 3 if name == "color" else 1
+        for name, part in vars(self).items():
             if part is None and name == "alpha":
                 continue
-            if not (
-                isinstance(part, Tensor)
-                and part.is_floating_point()
-                and part.dim() in (3, 4)
-                and part.shape[-1] == channels
-                and part.numel()
-            ):
-                raise ValueError(
-                    f"Layer: {name} must be (h, w, {channels}) or (n, h, w, {channels}) floats, "
-                    f"got {check.describe(part)}"
-                )
+            check.images("Layer", name, part, 3 if name == "color" else 1)
             if part.shape[:-1] != self.color.shape[:-1]:
                 raise ValueError(
                     f"Layer: {name} must have the pixels of color, {check.describe(self.color)}, "
@@ -77,12 +64,21 @@ class Layer:
         if self.alpha is not None and not bool(((self.alpha >= 0) & (self.alpha <= 1)).all()):
             raise ValueError("Layer: alpha must be finite and >= 0 and <= 1")
 
+    def __repr__(self) -> str:
+        """Tells shape and device."""
+        kind = "opaque" if self.alpha is None else "translucent"
+        return f"Layer({kind}, color={check.describe(self.color)})"
+
+    def _parts(self) -> list[tuple[str, Tensor]]:
+        """The tensors that there are, by name."""
+        return [(name, part) for name, part in vars(self).items() if part is not None]
+
     def cut(self, where: str, camera: Camera) -> Layer:
-        """Returns the layer of the camera's pixels: where the camera takes a strip of rows, that
-        strip of the layer, whose tensors are views.
+        """Returns the part of the layer that a camera sees: where the camera is a strip of rows,
+        views of these rows.
 
         Raises:
-            ValueError: The layer has not the pixels of the camera's whole pictures.
+            ValueError: The layer's size is not that of the camera's whole pictures.
         """
         top, rows = camera.window
         count = (len(camera),) if camera.batched else ()
@@ -94,22 +90,21 @@ class Layer:
                 f"{where}: layer must have the camera's {wanted} pixels (rows, columns), got {got}"
             )
         strip = copy.copy(self)  # checked already
-        for name, part in vars(self).items():
-            if part is not None:
-                object.__setattr__(strip, name, part[..., top : top + camera.height, :, :])
+        for name, part in self._parts():
+            object.__setattr__(strip, name, part[..., top : top + camera.height, :, :])
         return strip
 
     def check_device(self, where: str, device: torch.device) -> None:
         """Raises ValueError unless all tensors lie on the device."""
-        for part in (self.color, self.depth, self.alpha):
-            if part is not None and part.device != device:
+        for _, part in self._parts():
+            if part.device != device:
                 raise ValueError(
                     f"{where}: layer must lie on {device}, where the graph reads it, "
                     f"got {part.device}"
                 )
 
     def distance(self, device: torch.device) -> Tensor:
-        """Returns (p, 1) the distance of every pixel's layer, +inf where it shows nothing."""
+        """Returns (p, 1) the distance of the layer at every pixel, +inf where it shows nothing."""
         depth = _flat(self.depth, device)
         shown = depth < torch.inf
         if self.alpha is not None:
@@ -117,7 +112,7 @@ class Layer:
         return torch.where(shown, depth, torch.inf)
 
     def pixels(self, device: torch.device) -> LayerPixels:
-        """Returns all pixels, row by row through the batch."""
+        """Returns all pixels on a device, row by row through the batch."""
         alpha = None if self.alpha is None else _flat(self.alpha, device)
         return LayerPixels(_flat(self.color, device), self.distance(device), alpha)
 
@@ -141,7 +136,7 @@ class LayerPixels:
         alpha = None if self.alpha is None else self.alpha[which]
         return LayerPixels(self.color[which], self.distance[which], alpha)
 
-    def trace(self, trace_rays: Callable[[Rays], Hits], rays: Rays, stop_alpha: float) -> Hits:
+    def trace(self, trace_rays: Trace, rays: Rays, stop_alpha: float) -> Hits:
         """Traces the rays of these pixels and composites voxels and layer.
 
         Args:
@@ -150,44 +145,35 @@ class LayerPixels:
             stop_alpha: A ray that has this alpha behind the layer does not go on.
 
         Returns:
-            Colour and alpha of both; depth of the voxels alone: before the layer, else behind it;
-            their normal, by what each part takes of the light.
+            Color and alpha of both. Depth, normal and features are those of the voxels alone, the
+            normal by the light that the voxels in front of the layer and behind it take.
         """
         near, far = rays.range.split(1, dim=1)
         stop = self.distance.to(rays.range.dtype)
-        shown = stop < torch.inf
-        before = torch.cat((near, torch.maximum(near, torch.minimum(far, stop))), 1)
-        front = trace_rays(dataclasses.replace(rays, range=before))
-        opacity = shown.to(front.alpha.dtype)
-        if self.alpha is not None:
-            opacity = torch.where(shown, self.alpha, 0).to(front.alpha.dtype)
-        color = torch.where(shown, self.color, 0).to(front.color.dtype)
-        mixed = dataclasses.replace(
-            front,
-            color=front.color + (1 - front.alpha) * color,
-            alpha=front.alpha + (1 - front.alpha) * opacity,
-        )
+        first = torch.cat((near, torch.maximum(near, torch.minimum(far, stop))), 1)
+        front = trace_rays(dataclasses.replace(rays, range=first))
+        mixed = over(front, self._hits(front))
         if self.alpha is None:
             return mixed
-        onward = shown & (mixed.alpha < stop_alpha)
+        onward = (stop < torch.inf) & (mixed.alpha < stop_alpha)
         start = torch.where(onward, torch.maximum(near, stop), near)
         end = torch.where(onward, torch.maximum(start, far), start)
-        behind = trace_rays(dataclasses.replace(rays, range=torch.cat((start, end), 1)))
-        normal, features = mixed.normal, mixed.features
-        if normal is not None and behind.normal is not None:
-            share = (1 - mixed.alpha) * behind.alpha  # of the light
-            both = normal * front.alpha + behind.normal * share
-            both = torch.nn.functional.normalize(both, dim=1)
-            normal = torch.where(share > 0, both, normal)
-        if features is not None and behind.features is not None:
-            features = features + (1 - mixed.alpha) * behind.features
-        return dataclasses.replace(
-            mixed,
-            normal=normal,
-            features=features,
-            color=mixed.color + (1 - mixed.alpha) * behind.color,
-            alpha=mixed.alpha + (1 - mixed.alpha) * behind.alpha,
-            depth=torch.minimum(front.depth, behind.depth),
-            samples=front.samples + behind.samples,
-            missed=front.missed | behind.missed,
+        back = trace_rays(dataclasses.replace(rays, range=torch.cat((start, end), 1)))
+        total = over(mixed, back)
+        if front.normal is None or back.normal is None:
+            return total
+        taken = (1 - mixed.alpha) * back.alpha  # of the light; the layer has no part in the normal
+        normal = normalize(front.normal * front.alpha + back.normal * taken, dim=1)
+        return dataclasses.replace(total, normal=torch.where(taken > 0, normal, front.normal))
+
+    def _hits(self, like: Hits) -> Hits:
+        """The layer as hits in the dtype of others, without a depth of its own."""
+        shown = self.distance < torch.inf
+        alpha = shown if self.alpha is None else torch.where(shown, self.alpha, 0)
+        return Hits(
+            color=torch.where(shown, self.color, 0).to(like.color),
+            alpha=alpha.to(like.alpha),
+            depth=torch.full_like(like.depth, torch.inf),
+            samples=torch.zeros_like(like.samples),
+            missed=torch.zeros_like(like.missed),
         )

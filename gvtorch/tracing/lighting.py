@@ -36,7 +36,7 @@ from ..shaders.lights import (
     check_light,
     check_triple,
 )
-from .composite import Trace, behind, join
+from .composite import Trace, behind, over
 from .thin_lens import ThinLens
 
 #: Where secondary rays begin, in voxels: those to lights so far off the surface; those all around
@@ -170,9 +170,7 @@ class Lighted:
         clear, bounced = self._around(places, rays.origin.to(torch.float64), tally)
         light = ambient * sky * clear.to(color)
         light = light + diffuse * (matt + bounced).to(color)
-        taken = hits.alpha  # of the light, by these rays themselves
-        if rays.clear is not None:
-            taken = taken - (1 - rays.clear[:, None]).to(color)
+        taken = hits.alpha - (1 - rays.light()).to(color)  # of the light, by these rays themselves
         color = color * light + taken * specular * shine.to(color)
         color = torch.where(hits.alpha > 0, color, 0.0)  # a closed ray may have no direction
         return dataclasses.replace(hits, color=color, samples=tally.samples, missed=tally.missed)
@@ -272,7 +270,7 @@ class Lighted:
                 for span in ((start, middle), (middle, end))
             )
             front = trace(first)
-            hits = tally(join(front, trace(behind(second, front))))
+            hits = tally(over(front, trace(behind(second, front)), dimmed=True))
             taken = (front.alpha + hits.alpha).to(clear) / 2
             clear = clear - lighting.occlusion * weight * taken
             if self._matter is not None:

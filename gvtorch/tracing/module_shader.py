@@ -20,6 +20,7 @@ from ..base.records import Hits, Rays
 from ..ops import Samples, Segments, composite, list_samples, sample_bricks, trace_segments
 from ..pool import N3Tree
 from ..shaders.transfer_function import TransferFunction
+from .spans import box_span
 
 _LIMIT = 64  # samples of a ray in one part
 _SAMPLES = {"cpu": 1 << 20, "cuda": 1 << 24}  # shaded at once
@@ -219,8 +220,7 @@ class Batch:
         """(r,) float64 distances from the camera to where rays enter the tree's box."""
         corner, size, high = self.arguments["place_33"]
         origin, direction = self.columns[:2]
-        a, b = (corner - origin) / direction, (corner + size * high - origin) / direction
-        near = torch.where(direction != 0, torch.fmin(a, b), -torch.inf).amax(1)
+        near, _ = box_span(corner, corner + size * high, origin, direction)
         return torch.where((near > 0) & (near < torch.inf), near, 0.0)
 
     @cached_property
@@ -272,18 +272,19 @@ def march(
     walk = {name: arguments[name] for name in _WALK}
     walk |= {"levels": arguments["table_lm4"].shape[0], "limit": limit, "by_node": by_node}
     real, count = arguments["domain_2"].dtype, len(rays.origin)
-    columns = _wide(rays)
+    rays = rays.double()
+    columns: Columns = (rays.origin, rays.direction, rays.cone, rays.range)
     stop_alpha, hit_clear = arguments["stop_alpha"], 1 - arguments["depth_alpha"]
     like = arguments["domain_2"]
     sums = Marched(
         total=like.new_zeros((count, features)),
-        clear=like.new_ones(count) if rays.clear is None else rays.clear.to(like.dtype),
+        clear=rays.light()[:, 0].to(like.dtype),
         depth=like.new_full((count,), torch.inf),
         count=like.new_zeros((count, 2), dtype=torch.int32),
         missed=like.new_zeros(count, dtype=torch.bool),
     )
     which, state, width = torch.arange(count, device=like.device), None, rays.width
-    if rays.clear is not None:  # some may have ended before
+    if rays.transmittance is not None:  # some may have ended before
         which, width = (sums.clear > 1 - stop_alpha).nonzero()[:, 0], 0
         columns = _some(columns, which)
     while len(which):
@@ -314,14 +315,6 @@ def march(
         columns = _some(columns, on)
         which, state, width = which[on], segments.state[on], 0
     return sums
-
-
-def _wide(rays: Rays) -> Columns:
-    origin, direction, cone, limits = (
-        column.to(torch.float64).contiguous()
-        for column in (rays.origin, rays.direction, rays.cone, rays.range)
-    )
-    return origin, direction, cone, limits
 
 
 def _some(columns: Columns, which: Tensor) -> Columns:

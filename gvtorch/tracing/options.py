@@ -1,9 +1,12 @@
-"""`RenderOptions`: how a picture is made, checked once."""
+"""`RenderOptions`: how a picture is made, checked once. `RenderSettings` tells editors and type
+checkers the same options as keyword arguments.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict
 
 import torch
 from torch import Tensor
@@ -32,7 +35,7 @@ class RenderOptions:
     cone_scale: float = config.CONE_OVERESTIMATE  # widens the pixel cone
     channel: str | None = None  # name of the channel the shader reads; None: the first
     component: int = 0  # which number of the channel
-    layer: Layer | None = None  # what another renderer drew: voxels go before and behind it
+    layer: Layer | None = None  # what another renderer drew, composited with the voxels
     clip: Clip | None = None  # the region of interest; None: everything
     lens: ThinLens | None = None  # depth of field; None: all is sharp
     lighting: Lighting | None = None  # shadows and light from all around; None: the shader's own
@@ -40,12 +43,16 @@ class RenderOptions:
     dtype: torch.dtype = torch.float32  # float64 for trees deeper than about 2^16 voxels
 
     def __post_init__(self) -> None:
-        """Checks every option."""
+        """Checks every option.
+
+        Raises:
+            ValueError: One is of the wrong type or out of its range.
+        """
         where = "render"
         check.number(where, "step", self.step, low=0, open_low=True)
         if self.lod not in ("auto", "finest"):
             raise ValueError(f"{where}: lod must be 'auto' or 'finest', got {self.lod!r}")
-        checked_background(where, self.background)
+        object.__setattr__(self, "background", checked_background(where, self.background))
         check.number(where, "stop_alpha", self.stop_alpha, low=0, high=1, open_low=True)
         check.number(where, "depth_alpha", self.depth_alpha, low=0, high=1)
         if self.depth_alpha >= self.stop_alpha:
@@ -55,37 +62,53 @@ class RenderOptions:
             )
         check.number(where, "cone_scale", self.cone_scale, low=0, open_low=True)
         check.whole(where, "component", self.component, low=0)
-        for name, value, kind in (
-            ("clip", self.clip, Clip),
-            ("layer", self.layer, Layer),
-            ("lens", self.lens, ThinLens),
-            ("lighting", self.lighting, Lighting),
-        ):
-            if value is not None:
-                check_type(where, name, value, kind)
+        for name, kind in _OBJECTS.items():
+            if getattr(self, name) is not None:
+                check.instance(where, name, getattr(self, name), kind)
         if self.lens is not None and self.lod == "finest":
             raise ValueError(f"{where}: a lens blurs by level of detail: lod must be 'auto'")
         if self.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"{where}: dtype must be float32 or float64, got {self.dtype}")
 
 
-def render_options(where: str, camera: Camera, options: dict[str, Any]) -> RenderOptions:
-    """Checks a user's options, for a camera."""
-    unknown = sorted(set(options) - set(RenderOptions.__dataclass_fields__))
+_OBJECTS = {"clip": Clip, "layer": Layer, "lens": ThinLens, "lighting": Lighting}
+
+
+class RenderSettings(TypedDict, total=False):
+    """The fields of `RenderOptions`, all of which may be left out."""
+
+    step: float
+    lod: Literal["auto", "finest"]
+    background: tuple[float, float, float] | Background | Tensor | None
+    stop_alpha: float
+    depth_alpha: float
+    cone_scale: float
+    channel: str | None
+    component: int
+    layer: Layer | None
+    clip: Clip | None
+    lens: ThinLens | None
+    lighting: Lighting | None
+    backend: Backend
+    dtype: torch.dtype
+
+
+def render_options(
+    where: str, settings: Mapping[str, Any], camera: Camera | None = None
+) -> RenderOptions:
+    """Returns a user's options, for a camera if there is one.
+
+    Raises:
+        ValueError: One is unknown, of the wrong type or out of its range, or does not fit the
+            camera's pictures.
+    """
+    known = RenderOptions.__dataclass_fields__
+    unknown = sorted(set(settings) - set(known))
     if unknown:
-        raise ValueError(
-            f"{where}: unknown option {unknown[0]!r}; "
-            f"known: {', '.join(RenderOptions.__dataclass_fields__)}"
-        )
-    chosen = RenderOptions(**options)
-    background = checked_background(where, chosen.background)
-    if isinstance(background, Background):
-        background.check(where, camera)
-    layer = chosen.layer and chosen.layer.cut(where, camera)
-    return replace(chosen, background=background, layer=layer)
-
-
-def check_type(where: str, name: str, value: Any, kind: type) -> None:
-    """Raises ValueError unless a user's argument is of a class."""
-    if not isinstance(value, kind):
-        raise ValueError(f"{where}: {name} must be a {kind.__name__}, got {type(value).__name__}")
+        raise ValueError(f"{where}: unknown option {unknown[0]!r}; known: {', '.join(known)}")
+    options = RenderOptions(**settings)
+    if camera is None:
+        return options
+    if isinstance(options.background, Background):
+        options.background.check(where, camera)
+    return replace(options, layer=options.layer and options.layer.cut(where, camera))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -17,74 +18,106 @@ from ..pictures.picture import Picture
 from .composite import Trace
 from .options import RenderOptions
 
+Pixels = slice | Tensor  # some of the pixels of all pictures of a camera, row by row
 _RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that progress shows
+
+
+def trace_blocks(
+    camera: Camera,
+    numbers: Tensor,
+    trace: Trace,
+    options: RenderOptions,
+    progress: Progress,
+    *,
+    pixels: int,
+    where: Tensor | None = None,
+) -> Iterator[tuple[Pixels, Hits]]:
+    """Traces a camera's rays block after block of whole rows, since rays take more memory than the
+    picture they make.
+
+    Args:
+        camera: Placed in the world.
+        numbers: What `camera.numbers` gave, on the device that traces.
+        trace: Traces world rays.
+        options: Of which the layer counts: voxels are composited with it.
+        progress: Told how many rows are done.
+        pixels: Of a block.
+        where: (p,) bool, which pixels are traced; all if left out.
+
+    Yields:
+        The pixels of a block that were traced, and their hits.
+    """
+    rows, width = len(camera) * camera.height, camera.width
+    layer = None if options.layer is None else options.layer.pixels(numbers.device)
+    for first, end in camera.blocks(pixels):
+        some: Pixels = slice(first * width, end * width)
+        with stage("rays"):
+            if where is None:
+                rays = camera.pixel_rays(numbers, (first, end))
+            else:
+                which = where[some].nonzero()[:, 0]
+                rays = _some_rays(numbers, camera, first, which)
+                some = which + first * width
+        if len(rays.origin):
+            with stage("trace"):
+                if layer is None:
+                    hits = trace(rays)
+                else:
+                    hits = layer[some].trace(trace, rays, options.stop_alpha)
+            yield some, hits
+        progress("rays", end, rows)
 
 
 def trace_camera(
     camera: Camera,
     device: torch.device,
-    trace_rays: Trace,
+    trace: Trace,
     options: RenderOptions,
     progress: Progress,
     *,
     again: tuple[Hits, Tensor] | None = None,
     numbers: Tensor | None = None,
 ) -> Hits:
-    """Traces all rays of a camera, or of a batch, block after block of whole rows: rays take more
-    memory than the picture they make.
+    """Traces all rays of a camera, or of a batch.
 
     Args:
         camera: Placed in the world.
         device: Where the rays are traced.
-        trace_rays: Traces world rays.
-        options: The dtype of the hits, and the layer that they are mixed with.
+        trace: Traces world rays.
+        options: The dtype of the hits, and the layer that voxels are composited with.
         progress: Told how many rows are done.
-        again: Hits of an earlier pass, which are overwritten, and which (pixels,) bool of them
-            are traced once more.
+        again: Hits of an earlier pass, which are overwritten, and which (p,) bool of them are
+            traced once more.
         numbers: What `camera.numbers` gave, where it lies on the device already.
 
     Raises:
         ValueError: The picture is larger than the device's memory.
     """
-    rows, width = len(camera) * camera.height, camera.width
-    block = max(1, _RAYS_A_BLOCK[device.type] // width)
-    size = rows * width * (8 * options.dtype.itemsize + 5)  # the colour twice
-    check.memory("render", f"a picture of {rows * width} pixels", size, device)
+    count, block = len(camera) * camera.height * camera.width, _RAYS_A_BLOCK[device.type]
+    size = count * (8 * options.dtype.itemsize + 5)  # the colour twice
+    check.memory("render", f"a picture of {count} pixels", size, device)
     numbers = camera.numbers(device) if numbers is None else numbers
-    layer = None if options.layer is None else options.layer.pixels(device)
     hits, where = again or (None, None)
-    if hits is None and rows > block:
-        hits = empty_hits(
-            device, options.dtype, rows * width
-        )  # too large a one fails before the first ray
-    for top in range(0, rows, block):
-        end = min(top + block, rows)
-        pixels: slice | Tensor = slice(top * width, end * width)
-        with stage("rays"):
-            if where is None:
-                rays = camera.pixel_rays(numbers, (top, end))
-            else:
-                which = where[pixels].nonzero()[:, 0]
-                rays = _some_rays(numbers, camera, top, which)
-                pixels = which + top * width
-        if len(rays.origin):
-            with stage("trace"):
-                if layer is None:
-                    part = trace_rays(rays)
-                else:
-                    part = layer[pixels].trace(trace_rays, rays, options.stop_alpha)
-            if hits is None:
-                hits = part  # the only block
-            else:
-                for name, field in vars(part).items():
-                    if field is None:
-                        continue
-                    if vars(hits)[name] is None:
-                        vars(hits)[name] = field.new_empty((rows * width, *field.shape[1:]))
-                    vars(hits)[name][pixels] = field
-        progress("rays", end, rows)
+    if hits is None and len(list(camera.blocks(block))) > 1:
+        hits = empty_hits(device, options.dtype, count)  # too large: fails before the first ray
+    given = camera, numbers, trace, options, progress
+    for pixels, part in trace_blocks(*given, pixels=block, where=where):
+        if hits is None:
+            hits = part  # the only block
+        else:
+            _write(hits, pixels, part, count)
     assert hits is not None
     return hits
+
+
+def _write(hits: Hits, pixels: Pixels, part: Hits, count: int) -> None:
+    """Puts the hits of some pixels among those of all."""
+    for name, field in vars(part).items():
+        if field is None:
+            continue
+        if vars(hits)[name] is None:
+            vars(hits)[name] = field.new_empty((count, *field.shape[1:]))
+        vars(hits)[name][pixels] = field
 
 
 def _some_rays(numbers: Tensor, camera: Camera, top: int, which: Tensor) -> Rays:
@@ -132,19 +165,6 @@ def develop(
     if options.layer is not None:
         layer = options.layer.distance(hits.depth.device).to(hits.depth.dtype)
         nearest = torch.minimum(hits.depth, layer)
-    shape = (len(camera), camera.height, camera.width)
-    images = {
-        "color": color.reshape(*shape, 3),
-        "alpha": hits.alpha.reshape(*shape, 1),
-        "depth": hits.depth.reshape(*shape, 1),
-        "nearest": nearest.reshape(*shape, 1),
-        "samples": hits.samples.reshape(*shape, 1),
-        "missed": hits.missed.reshape(*shape, 1),
-    }
-    for name in ("normal", "features"):
-        field = getattr(hits, name)
-        if field is not None:
-            images[name] = field.reshape(*shape, field.shape[1])
-    if not camera.batched:
-        images = {name: image[0] for name, image in images.items()}
+    columns = {**vars(hits), "color": color, "nearest": nearest}
+    images = {name: camera.image(c) for name, c in columns.items() if c is not None}
     return Picture(**images, transparent=background is None, stats=stats)

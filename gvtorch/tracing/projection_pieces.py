@@ -1,4 +1,4 @@
-"""`ProjectedPieces`: the maximum, minimum or mean along rays of which several pieces are kept."""
+"""`ProjectedPieces`: a `Projection` (maximum, minimum or mean) of rays cut into several pieces."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ from torch import Tensor
 
 from ..base.records import Hits, Rays
 from ..shaders.fused import Projection
+from .spans import box_span
 from .tracer import Tracer
 
 
 class ProjectedPieces:
-    """Traces the pieces of rays one by one; the picture is that of what all of them hold."""
+    """Projects each piece, then combines the pieces' values into that of the whole ray."""
 
     def __init__(self, tracer: Tracer, shader: Projection) -> None:
-        """Takes what traces with the projection."""
+        """Takes the frame's tracer, and the projection that it draws."""
         self._tracer, self._which = tracer, shader.which
 
     def __call__(self, pieces: Iterable[Rays]) -> Hits:
-        """Returns the extreme of pieces in world units, where it is nearest, or the mean of their
-        means, weighted by their lengths in the box.
+        """Returns the largest or smallest value of all pieces, at its nearest place, or the mean of
+        their means, weighted by their lengths inside the tree's box.
         """
         rays = list(pieces)
         hits = [self._tracer(piece) for piece in rays]
@@ -39,11 +40,10 @@ class ProjectedPieces:
         depth = torch.where(known, depths, torch.inf).amin(0)
         seen = depth < torch.inf
         value = torch.where(seen, value, 0)
-        clear = torch.ones_like(depth) if rays[0].clear is None else rays[0].clear[:, None]
-        clear = clear.to(depth)
+        light = rays[0].light().to(depth)
         return Hits(
-            color=torch.where(seen, clear * self._color(value), 0),
-            alpha=torch.where(seen, 1, 1 - clear),
+            color=torch.where(seen, light * self._color(value), 0),
+            alpha=torch.where(seen, 1, 1 - light),
             depth=depth,
             samples=torch.stack([one.samples for one in hits]).sum(0, dtype=torch.int32),
             missed=torch.stack([one.missed for one in hits]).any(0),
@@ -52,7 +52,7 @@ class ProjectedPieces:
         )
 
     def _color(self, value: Tensor) -> Tensor:
-        """(r, 3) the transfer function's colours of values (r, 1)."""
+        """(r, 3) the transfer function's colours of values (r, 1), interpolated in its table."""
         table = self._tracer.arguments["table_lm4"][0, :, :3]  # (m, 3), at even distances
         low, high = self._tracer.arguments["domain_2"].unbind(0)
         last = len(table) - 1
@@ -62,9 +62,8 @@ class ProjectedPieces:
         return a + (place - row) * (b - a)
 
     def _length(self, rays: Rays) -> Tensor:
-        """(r,) world length of what lies in the tree's box."""
+        """(r,) world length of each ray inside the tree's box."""
         low, size, high = self._tracer.tree.place
-        a, b = ((end - rays.origin) / rays.direction for end in (low, low + size * high))
+        enter, leave = box_span(low, low + size * high, rays.origin, rays.direction)
         first, last = rays.range.unbind(1)
-        enter, leave = torch.fmin(a, b).amax(1), torch.fmax(a, b).amin(1)
         return (torch.minimum(last, leave) - torch.maximum(first, enter)).clamp(min=0)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
-from typing import Any
+from typing import Unpack
 
 import torch
 
+from ..base import check
 from ..base.records import Hits, Rays, RenderStats
 from ..base.stage import Progress, collect_timings, no_progress, stage
 from ..cameras.camera import Camera
@@ -15,7 +16,7 @@ from ..ops.trace import choose_backend
 from ..pictures.picture import Picture
 from ..pool import N3Tree
 from .around import around
-from .options import RenderOptions, check_type, render_options
+from .options import RenderOptions, RenderSettings, render_options
 from .pixels import develop, trace_camera
 from .tracer import AnyShader, tracer_of
 
@@ -26,7 +27,7 @@ def render(
     shader: AnyShader,
     *,
     progress: Progress = no_progress,
-    **options: Any,
+    **options: Unpack[RenderSettings],
 ) -> Picture:
     """Renders a resident tree.
 
@@ -34,9 +35,9 @@ def render(
         tree: What to render, on the device that renders it; its stamps and request words are
             written.
         camera: One camera or a batch; an orbit camera stands around the tree's box. Or rays in
-            world units, which make a picture as wide as they tell, or of one row.
+            world units, which make a picture as wide as `Rays.width`, or of one row.
         shader: The transfer function, in data units, or another shader.
-        progress: Told how many rays are done.
+        progress: Told how many rows are done.
         **options: Fields of `RenderOptions`.
 
     Returns:
@@ -46,8 +47,8 @@ def render(
         ValueError: An option is unknown or out of its range, or the backend can't be used.
     """
     camera = as_camera("render", camera)
-    chosen = render_options("render", camera, options)
-    check_type("render", "tree", tree, N3Tree)
+    chosen = render_options("render", options, camera)
+    check.instance("render", "tree", tree, N3Tree)
     start = time.perf_counter()
     with collect_timings(tree.device) as timings:
         with stage("prepare"):
@@ -56,39 +57,46 @@ def render(
         placed = camera.placed(tree.box)
         hits = trace_camera(placed, tree.device, trace, chosen, progress)
         with stage("picture"):
-            stats = RenderStats(
-                backend=choose_backend(chosen.backend, tree.device),
-                rays=hits.alpha.shape[0],
-                samples=int(hits.samples.sum(dtype=torch.int64)),
-                nodes=tree.nodes.child_tn.numel(),
-                bricks=tree.bricks.capacity,
-                bytes=tree.nbytes,
-                tiles_used=int((tree.nodes.stamp_t == tree.frame).sum()),
-                bricks_used=int((tree.bricks.stamp_b == tree.frame).sum()),
-            )
+            stats = tree_stats(tree, chosen, hits.samples)
+            stats.tiles_used = int((tree.nodes.stamp_t == tree.frame).sum())
+            stats.bricks_used = int((tree.bricks.stamp_b == tree.frame).sum())
             picture = develop(hits, placed, chosen, stats)
     stats.stages = timings.as_dict()
     stats.milliseconds = 1e3 * (time.perf_counter() - start)
     return picture
 
 
-def trace(
-    tree: N3Tree, rays: Rays, shader: AnyShader, options: RenderOptions | None = None
-) -> Hits:
-    """Traces any world rays through a tree as one frame.
+def trace(tree: N3Tree, rays: Rays, shader: AnyShader, **options: Unpack[RenderSettings]) -> Hits:
+    """Traces any world rays through a resident tree, as one frame.
 
     Args:
         tree: The tree; its stamps and request words are written.
         rays: Rays in world units, on the tree's device.
         shader: The transfer function, or another shader.
-        options: Lod, step and the like; `background` is not used.
+        **options: Fields of `RenderOptions`; background and layer belong to pictures and have no
+            part in it.
 
     Returns:
-        Colour, alpha, depth and samples of each ray, in `options.dtype`.
+        Colour, alpha, depth and samples of each ray, in the options' dtype.
 
     Raises:
-        ValueError: The channel is unknown, the step too short, or the backend can't be used.
+        ValueError: An option is unknown or out of its range, the channel is unknown, or the backend
+            can't be used.
     """
+    chosen = render_options("trace", options)
+    check.instance("trace", "tree", tree, N3Tree)
+    check.instance("trace", "rays", rays, Rays)
     tree.frame += 1
-    chosen = options or RenderOptions()
     return around(tracer_of(tree, shader, chosen), chosen, tree.box)(rays)
+
+
+def tree_stats(tree: N3Tree, options: RenderOptions, samples: torch.Tensor) -> RenderStats:
+    """Returns the statistics of a picture, given the samples (r,) of its rays."""
+    return RenderStats(
+        backend=choose_backend(options.backend, tree.device),
+        rays=samples.numel(),
+        samples=int(samples.sum(dtype=torch.int64)),
+        nodes=tree.nodes.child_tn.numel(),
+        bricks=tree.bricks.capacity,
+        bytes=tree.nbytes,
+    )

@@ -111,10 +111,9 @@ class Tracer:
 
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays in world units."""
-        columns = (rays.origin, rays.direction, rays.cone, rays.range)
-        origin, direction, cone, limits = (c.to(torch.float64).contiguous() for c in columns)
-        clear = None if rays.clear is None else rays.clear.to(torch.float64).contiguous()
-        given = {"width": rays.width, "clear_r": clear, **self.arguments}
+        rays = rays.double()
+        origin, direction, cone, limits = rays.origin, rays.direction, rays.cone, rays.range
+        given = {"width": rays.width, "clear_r": rays.transmittance, **self.arguments}
         if self.shader is None:
             fields = trace_rays(origin, direction, cone, limits, **given)
             return Hits(**dict(zip(_FIELDS, fields, strict=False)))
