@@ -20,7 +20,7 @@ from conftest import DEVICES, ROOT
 from test_module_shader import assert_same_picture
 from test_op_contract import world_rays
 from test_shaders import POINT, op_arguments
-from test_trace_rays import SHADER, camera_rays, forget, on, run
+from test_trace_rays import SHADER, camera_rays, forget, in_order, on, run
 
 import gvtorch as gv
 from gvtorch.cpp_ext import compilers, user
@@ -226,18 +226,22 @@ def test_script_compile_export_and_pickle(tree, compiled, name):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", ["Bands", "LitFeatures"])
+@in_order
 def test_opcheck_and_memory_safety(tree, compiled, name, dtype):
     tree = on(tree, DEVICES[compiled])
     own = {"uniforms": BANDS} if name == "Bands" else {"transfer": SHADER, "other": "rgba"}
     shader = mine(name, **own)
-    given = op_arguments(tree, shader, dtype)
-    given |= {"width": 0, "table": given.pop("table_lm4"), "clear_r": None, "shader": 0}
+    rays, traced, shading, parameters = op_arguments(tree, shader, dtype)
     op = getattr(torch.ops.gvtorch_user, shader.kind).default
-    torch.library.opcheck(op, tuple(given[a.name] for a in op._schema.arguments))
-    short = given["parameter_54"][: 19 if name == "LitFeatures" else -1]
-    for change in ({"features": 3}, {"shader": 1}, {"parameter_54": short.contiguous()}):
+    torch.library.opcheck(op, (*rays, *traced, *shading, parameters))
+    short = parameters[: 19 if name == "LitFeatures" else -1].contiguous()
+    for wrong, numbers in (
+        (shading._replace(features=3), parameters),
+        (shading._replace(shader=1), parameters),
+        (shading, short),
+    ):
         with pytest.raises(RuntimeError, match="gvtorch"):
-            op(*({**given, **change}[a.name] for a in op._schema.arguments))
+            op(*rays, *traced, *wrong, numbers)
 
 
 # --- the compiler and the cache

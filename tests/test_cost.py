@@ -8,7 +8,7 @@ from conftest import DEVICES
 from test_trace_rays import SHADER, arguments, on
 
 import gvtorch as gv
-from gvtorch.ops import trace_segments
+from gvtorch.ops import RayArguments, trace_segments
 
 CAMERA = gv.Camera.orbit(30, 20, 1.3, width=24, height=24)
 
@@ -76,13 +76,10 @@ def test_nodes_are_counted_up_to_where_a_ray_ends(blobs, compiled):
     wall = gv.TransferFunction.from_points([(0, 1), (1, 1)])
     found = gv.cost(tree, CAMERA, haze, lod="finest").nodes
     rays = CAMERA.placed(tree.box).rays().to(tree.device)
-    given = {**arguments(on(tree, DEVICES[compiled]), len(rays.origin)), "width": 0}
-    drop = ("table_lm4", "stop_alpha", "depth_alpha", "cone_scale")
-    columns = {"origin_r3": rays.origin, "direction_r3": rays.direction, "range_r2": rays.range}
-    given |= {name: column.double().contiguous() for name, column in columns.items()}
-    given["opaque_m"] = torch.tensor([1, 2], dtype=torch.int32, device=tree.device)
-    walk = {name: value for name, value in given.items() if name not in drop}
-    segments = trace_segments(**walk, levels=1, cone_scale=0.0)
+    _, given = arguments(on(tree, DEVICES[compiled]), 1, SHADER)
+    hides_none = torch.arange(1, len(given.opaque_m) + 1, dtype=torch.int32, device=tree.device)
+    given = given._replace(opaque_m=hides_none, table_lm4=given.table_lm4[:1], cone_scale=0.0)
+    segments = trace_segments(RayArguments.of(rays), given)
     assert torch.equal(found.reshape(-1), segments.counts[:, 2]) and found.max() > 8
     first = gv.cost(tree, CAMERA, wall, lod="finest").nodes
     assert (first <= found).all() and first.max() == 1

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from conftest import DEVICES, ROOT
-from test_trace_rays import SHADER, arguments, camera_rays, on
+from test_trace_rays import SHADER, arguments, camera_rays, in_order, on
 
 import gvtorch as gv
 from gvtorch import cpp_ext
@@ -34,7 +34,7 @@ def world_rays(tree_box, count: int, device) -> tuple[torch.Tensor, ...]:
 
 @pytest.fixture
 def rays(tracer, blobs):
-    return world_rays(gv.N3Tree.from_volume(blobs).box, 33, tracer.child.device)
+    return world_rays(gv.N3Tree.from_volume(blobs).box, 33, tracer.child_tn.device)
 
 
 def assert_same(actual, expected) -> None:
@@ -45,19 +45,22 @@ def assert_same(actual, expected) -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@in_order
 def test_opcheck(blobs, compiled, dtype):
     tree = on(gv.N3Tree.from_volume(blobs, 4), DEVICES[compiled])
-    values = arguments(tree, 5, dtype=dtype).values()
-    torch.library.opcheck(torch.ops.gvtorch.trace_rays.default, tuple(values))
+    rays, given = arguments(tree, 5, dtype=dtype)
+    torch.library.opcheck(torch.ops.gvtorch.trace_rays.default, (*rays, *given))
 
 
+@in_order
 def test_fake_gives_shapes_without_data(blobs, compiled):
     from torch._subclasses.fake_tensor import FakeTensorMode
 
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
-    values = arguments(tree, 5)
+    rays, given = arguments(tree, 5)
     with FakeTensorMode() as mode:
-        fake = [mode.from_tensor(v) if isinstance(v, torch.Tensor) else v for v in values.values()]
+        values = (*rays, *given)
+        fake = [mode.from_tensor(v) if isinstance(v, torch.Tensor) else v for v in values]
         color, alpha, depth, samples, missed = torch.ops.gvtorch.trace_rays(*fake)
     assert color.shape == (5, 3) and alpha.shape == depth.shape == (5, 1)
     assert samples.shape == missed.shape == (5,)
@@ -93,15 +96,15 @@ def test_compiles_with_the_default_backend(blobs):
 
 def test_the_checked_function_compiles(blobs, compiled):
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
-    fixed = arguments(tree, 7)
-    origin, direction = fixed.pop("origin_r3"), fixed.pop("direction_r3")
+    rays, given = arguments(tree, 7)
 
-    def shoot(origin: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
-        color, alpha, *_ = trace_rays(origin * 1.0, direction, backend=compiled, **fixed)
+    def shoot(origin: torch.Tensor) -> torch.Tensor:
+        moved = rays._replace(origin_r3=origin * 1.0)
+        color, alpha, *_ = trace_rays(moved, given, backend=compiled)
         return color + alpha
 
     fast = torch.compile(shoot, fullgraph=True, backend="aot_eager")
-    assert torch.equal(fast(origin, direction), shoot(origin, direction))
+    assert torch.equal(fast(rays.origin_r3), shoot(rays.origin_r3))
 
 
 def test_exports_with_a_dynamic_ray_count(tracer, rays):
@@ -143,14 +146,16 @@ def test_module_traces_a_camera_s_rays_as_the_renderer_does(blobs, compiled, sca
     assert_same(fields, (hits.color, hits.alpha, hits.depth, hits.samples))
 
 
+@in_order
 def test_memory_stays_safe_without_the_python_checks(blobs, compiled):
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
-    good = arguments(tree, 5)
+    rays, given = arguments(tree, 5)
+    good = {**rays._asdict(), **given._asdict()}
     for name, value in (
-        ("direction_r3", good["direction_r3"][:3].contiguous()),
-        ("table_lm4", good["table_lm4"][:, :1].contiguous()),
-        ("stamp_t", good["stamp_t"][:1]),
-        ("constant_tnc", good["constant_tnc"][:1]),
+        ("direction_r3", rays.direction_r3[:3].contiguous()),
+        ("table_lm4", given.table_lm4[:, :1].contiguous()),
+        ("stamp_t", given.stamp_t[:1]),
+        ("constant_tnc", given.constant_tnc[:1]),
         ("root", 10**6),
         ("component", 3),
         ("border", 9),

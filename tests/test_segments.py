@@ -12,54 +12,40 @@ from conftest import DEVICES
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_composite import packed
-from test_trace_rays import SHADER, arguments, camera_rays, forget, on
+from test_trace_rays import SHADER, arguments, camera_rays, changed, forget, in_order, on
+from torch import Tensor
 
 import gvtorch as gv
-from gvtorch.ops import composite, list_samples, sample_bricks, trace_rays, trace_segments
+from gvtorch.ops import (
+    RayArguments,
+    TraceArguments,
+    composite,
+    list_samples,
+    sample_bricks,
+    trace_rays,
+    trace_segments,
+)
 from gvtorch.tracing.tracer import Tracer
 
-DRAWN = ("table_lm4", "stop_alpha", "depth_alpha")
-RAYS = ("origin_r3", "direction_r3", "cone_r2", "range_r2", "place_33")
 MARKS = ("request_tn", "stamp_t", "stamp_b")
 
 
-def tracing(tree, backend, rays, shader=SHADER, *, stop_alpha=0.99, **options) -> dict:
+def tracing(
+    tree, backend, rays, shader=SHADER, *, stop_alpha=0.99, hides=True, **options
+) -> tuple[RayArguments, TraceArguments]:
     """Arguments of `trace_rays` for rays through a clean copy of a tree."""
     copy = on(tree, DEVICES[backend])
     copy.frame += 1
     chosen = gv.RenderOptions(backend=backend, stop_alpha=stop_alpha, **options)
-    columns = (rays.origin, rays.direction, rays.cone, rays.range)
-    moved = [column.to(copy.device, torch.float64).contiguous() for column in columns]
-    return {
-        **dict(zip(RAYS, moved, strict=False)),
-        **Tracer(copy, shader, chosen).arguments,
-        "width": rays.width,
-    }
+    traced = Tracer(copy, shader, chosen).arguments
+    if not hides:
+        rows = len(traced.opaque_m)
+        none = torch.arange(1, rows + 1, dtype=torch.int32, device=copy.device)
+        traced = traced._replace(opaque_m=none)
+    return RayArguments.of(rays.to(copy.device)), traced
 
 
-def walking(traced: dict, *, hides: bool = True, **changes) -> dict:
-    """Arguments of `trace_segments` out of those of `trace_rays`."""
-    opaque = traced["opaque_m"]
-    none = torch.tensor([1, 2], dtype=torch.int32, device=opaque.device)
-    kept = {name: value for name, value in traced.items() if name not in DRAWN}
-    levels = traced["table_lm4"].shape[0]
-    return {**kept, "opaque_m": opaque if hides else none, "levels": levels, **changes}
-
-
-SHAPE = ("branching", "max_depth", "border", "cone_scale", "root_voxel", "step")
 LISTED = ("ray_index", "node", "brick", "depth", "interval", "distance")
-
-
-def sampling(traced: dict, segments, samples) -> dict:
-    """Arguments of `sample_bricks`."""
-    names = ("ray_s", "node_s2", "brick_s2", "depth_s3", "interval_s3", "distance_s3")
-    listed = {name: getattr(segments, own) for name, own in zip(names, LISTED, strict=True)}
-    return {
-        **{name: traced[name] for name in (*RAYS, "bricks_bzyxc", "constant_tnc")},
-        **listed,
-        **{"segment_k": samples.segment, "number_k": samples.number},
-        **{name: traced[name] for name in (*SHAPE, "backend")},
-    }
 
 
 def tensors(segments) -> dict[str, torch.Tensor]:
@@ -70,10 +56,12 @@ def assert_same_walk(tree, compiled, rays, *, hides=True, limit=0, by_node=False
     """Segments, marks and samples of the twin and of a kernel."""
     found = []
     for backend in ("reference", compiled):
-        traced = tracing(tree, backend, rays, **options)
-        segments = trace_segments(**walking(traced, hides=hides, limit=limit, by_node=by_node))
-        values = sample_bricks(**sampling(traced, segments, list_samples(segments)))
-        marks = {name: traced[name].cpu() for name in MARKS}
+        given, traced = tracing(tree, backend, rays, hides=hides, **options)
+        part = {"limit": limit, "by_node": by_node, "backend": backend}
+        segments = trace_segments(given, traced, **part)
+        samples = list_samples(segments)
+        values = sample_bricks(given, traced, segments, samples, backend=backend)
+        marks = {name: getattr(traced, name).cpu() for name in MARKS}
         found.append({**tensors(segments), **marks, "values": values.cpu()})
     expected, actual = found
     for name in expected:
@@ -130,28 +118,26 @@ def test_segments_are_what_trace_rays_samples(blobs, backend, lod, distance):
     """Same number of samples, same marks, same requests, in a tree of which a part is missing."""
     tree = forget(gv.N3Tree.from_volume(blobs, 4), 0.3, 7)
     rays = camera_rays(tree, distance=distance)
-    drawn = tracing(tree, backend, rays, stop_alpha=1.0, lod=lod)
+    given, drawn = tracing(tree, backend, rays, stop_alpha=1.0, lod=lod)
     haze = gv.TransferFunction.from_points([(0, 0), (0.2, 0), (1, 0.1)])  # nothing is opaque
-    drawn |= vars(
-        haze.table(min(tree.spacing), drawn["step"], len(drawn["table_lm4"]), torch.float32,
-                   drawn["child_tn"].device)
-    )  # fmt: skip
-    walked = {**drawn, **{name: drawn[name].clone() for name in MARKS}}
-    *_, samples, missed = trace_rays(**drawn)
-    segments = trace_segments(**walking(walked))
+    lengths = (min(tree.spacing), drawn.step, len(drawn.table_lm4))
+    drawn = drawn._replace(**vars(haze.table(*lengths, torch.float32, drawn.child_tn.device)))
+    walked = drawn._replace(**{name: getattr(drawn, name).clone() for name in MARKS})
+    *_, samples, missed = trace_rays(given, drawn, backend=backend)
+    segments = trace_segments(given, walked, backend=backend)
     assert torch.equal(segments.counts[:, 1], samples) and samples.max() > 10
     assert torch.equal(segments.missed, missed) and missed.any()
     for name in MARKS:
-        assert torch.equal(walked[name], drawn[name]), name
+        assert torch.equal(getattr(walked, name), getattr(drawn, name)), name
 
 
 def table_colors(values_k, level_k, table) -> torch.Tensor:
     """(k, 4) rows of a transfer function's table, by its own formula."""
-    low, high = table["domain_2"]
-    last = table["table_lm4"].shape[1] - 1
+    low, high = table.domain_2
+    last = table.table_lm4.shape[1] - 1
     place = ((values_k - low) / (high - low) * last).clamp(0, last)
     row = place.long().clamp(max=last - 1)
-    rows = table["table_lm4"][level_k.long()]
+    rows = table.table_lm4[level_k.long()]
     a = rows.gather(1, row[:, None, None].expand(-1, 1, 4))[:, 0]
     b = rows.gather(1, row[:, None, None].expand(-1, 1, 4) + 1)[:, 0]
     return a + (place - row)[:, None] * (b - a)
@@ -163,23 +149,23 @@ def test_sampled_and_composited_segments_are_the_picture(blobs, backend, lod, li
     """The whole open road beside the fused one, whole and by parts."""
     tree = gv.N3Tree.from_volume(blobs, 8)
     rays = camera_rays(tree, distance=1.3)
-    traced = tracing(tree, backend, rays, lod=lod)
-    color, alpha, _, samples, _ = trace_rays(**traced)
+    given, traced = tracing(tree, backend, rays, lod=lod)
+    color, alpha, _, samples, _ = trace_rays(given, traced, backend=backend)
     count = len(samples)
     total, clear = torch.zeros_like(color), torch.ones_like(alpha[:, 0])
     taken, state, rounds = torch.zeros_like(samples), None, 0
     while True:
-        segments = trace_segments(**walking(traced, limit=limit, state_r3=state))
+        segments = trace_segments(given, traced, state, limit=limit, backend=backend)
         state, listed = segments.state, list_samples(segments)
         if not len(listed.segment):
             break
         rounds += 1
-        values = sample_bricks(**sampling(traced, segments, listed))[:, 0]
+        values = sample_bricks(given, traced, segments, listed, backend=backend)[:, 0]
         which = listed.segment.long()
         level = segments.interval[which, 2]
         piece = level < 0
         rgba = table_colors(values, level.clamp(min=0), traced)
-        length = (segments.t1 - segments.t0)[which] / traced["step"]
+        length = (segments.t1 - segments.t0)[which] / traced.step
         alpha_k = torch.where(piece, 1 - (1 - rgba[:, 3]) ** length, rgba[:, 3])
         part, clear, before = composite(
             *(alpha_k, rgba[:, :3].contiguous(), listed.offset, clear),
@@ -199,11 +185,11 @@ def test_sampled_and_composited_segments_are_the_picture(blobs, backend, lod, li
 def test_parts_of_a_walk_are_the_walk(blobs, backend):
     tree = gv.N3Tree.from_volume(blobs, 4)
     rays = camera_rays(tree, distance=1.3)
-    traced = tracing(tree, backend, rays)
-    whole = trace_segments(**walking(traced))
+    given, traced = tracing(tree, backend, rays)
+    whole = trace_segments(given, traced, backend=backend)
     parts, state = [], None
     while not parts or len(parts[-1].ray_index):
-        parts.append(trace_segments(**walking(traced, limit=1, state_r3=state)))
+        parts.append(trace_segments(given, traced, state, limit=1, backend=backend))
         state = parts[-1].state
     assert len(parts) > 5
     joined = [torch.cat([getattr(part, name) for part in parts]) for name in LISTED]
@@ -218,16 +204,16 @@ def test_distances_cover_the_box(blobs, backend):
     noise = gv.Volume(torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(1)))
     tree = gv.N3Tree.from_volume(noise, 8)
     rays = camera_rays(tree, 8, distance=3, azimuth=0, elevation=0)
-    traced = tracing(tree, backend, rays, lod="finest")
-    segments = trace_segments(**walking(traced, hides=False))
+    given, traced = tracing(tree, backend, rays, lod="finest", hides=False)
+    segments = trace_segments(given, traced, backend=backend)
     assert (segments.t1 > segments.t0).all() and (segments.depth == 0).all()
     ray = segments.ray_index.long()
     covered = torch.zeros(64).to(segments.t0).index_add_(0, ray, segments.t1 - segments.t0)
-    near = (3 * 8 - 4) / -traced["direction_r3"][:, 2]
-    inner = traced["direction_r3"][:, :2].abs() * (3 * 8 + 4) / -traced["direction_r3"][:, 2:] < 4
+    near = (3 * 8 - 4) / -given.direction_r3[:, 2]
+    inner = given.direction_r3[:, :2].abs() * (3 * 8 + 4) / -given.direction_r3[:, 2:] < 4
     inner = inner.all(1)
     assert inner.sum() >= 4
-    expected = 8 / -traced["direction_r3"][:, 2]
+    expected = 8 / -given.direction_r3[:, 2]
     assert (covered - expected)[inner].abs().max() < 1e-4
     first = (
         torch.full((64,), math.inf).to(near).scatter_reduce_(0, ray, segments.t0.double(), "amin")
@@ -245,12 +231,12 @@ def test_gradient_by_bricks_and_constants(blobs, compiled):
     rays = camera_rays(tree, 16, distance=1.5)
     grads = []
     for backend in ("reference", compiled):
-        traced = tracing(tree, backend, rays, dtype=torch.float64)
-        segments = trace_segments(**walking(traced, hides=False))
-        args = sampling(traced, segments, list_samples(segments))
-        leaves = [args[name].clone().requires_grad_() for name in ("bricks_bzyxc", "constant_tnc")]
-        args |= {"bricks_bzyxc": leaves[0], "constant_tnc": leaves[1]}
-        values = sample_bricks(**args)
+        given, traced = tracing(tree, backend, rays, dtype=torch.float64, hides=False)
+        segments = trace_segments(given, traced, backend=backend)
+        pool = (traced.bricks_bzyxc, traced.constant_tnc)
+        leaves = [tensor.clone().requires_grad_() for tensor in pool]
+        traced = traced._replace(bricks_bzyxc=leaves[0], constant_tnc=leaves[1])
+        values = sample_bricks(given, traced, segments, list_samples(segments), backend=backend)
         weight = torch.linspace(-1, 1, len(values), dtype=torch.float64).to(values)[:, None]
         (values * weight).sum().backward()
         grads.append([leaf.grad.cpu() for leaf in leaves])
@@ -264,15 +250,15 @@ def test_gradient_by_bricks_against_differences(blobs, backend):
     """gradcheck on a pool of float32: sampling is linear, so a wide step is exact."""
     tree = gv.N3Tree.from_volume(gv.Volume(blobs.data[12:20, 8:16, 10:18].contiguous()), 2)
     rays = camera_rays(tree, 3, distance=1.5)
-    traced = tracing(tree, backend, rays, dtype=torch.float64)
-    segments = trace_segments(**walking(traced, hides=False))
-    args = sampling(traced, segments, list_samples(segments))
-    pool = args["bricks_bzyxc"]
+    given, traced = tracing(tree, backend, rays, dtype=torch.float64, hides=False)
+    segments = trace_segments(given, traced, backend=backend)
+    samples, pool = list_samples(segments), traced.bricks_bzyxc
     used = segments.brick[:, 0].long()
     rows = used[used >= 0].unique()[:3]
 
     def read(part: torch.Tensor) -> torch.Tensor:
-        return sample_bricks(**{**args, "bricks_bzyxc": pool.index_copy(0, rows, part)}).float()
+        own = traced._replace(bricks_bzyxc=pool.index_copy(0, rows, part))
+        return sample_bricks(given, own, segments, samples, backend=backend).float()
 
     part = pool[rows].clone().requires_grad_()
     assert torch.autograd.gradcheck(read, (part,), eps=0.5, atol=1e-4, rtol=1e-4, nondet_tol=1e-5)
@@ -285,37 +271,31 @@ def test_gradient_by_bricks_against_differences(blobs, backend):
 @pytest.fixture
 def walk(blobs, compiled):
     tree = gv.N3Tree.from_volume(blobs, 4)
-    traced = tracing(tree, compiled, camera_rays(tree, 6, distance=1.3))
-    segments = trace_segments(**walking(traced))
-    return traced, segments, list_samples(segments)
+    given, traced = tracing(tree, compiled, camera_rays(tree, 6, distance=1.3))
+    segments = trace_segments(given, traced)
+    return given, traced, segments, list_samples(segments)
 
 
-def positional(traced) -> list:
-    """Arguments of `torch.ops.gvtorch.count_segments` in order."""
-    order = (
-        *(*RAYS, "child_tn", "brick_tn", "request_tn", "stamp_t", "bricks_bzyxc", "constant_tnc"),
-        *("range_tn2c", "stamp_b", "domain_2", "opaque_m", "frame_1", "state_r3", "width"),
-        *("branching", "root", "max_depth", "border", "component", "levels", "limit"),
-        *("cone_scale", "root_voxel", "step", "by_level", "by_node"),
-    )
-    given = {**walking(traced), "state_r3": None, "limit": 0, "by_node": False}
-    return [given[name] for name in order]
+def sampling(given, traced, segments, samples) -> list:
+    """Arguments of `torch.ops.gvtorch.sample_bricks` in order."""
+    return [*given, *traced.channel, *segments[:6], samples.segment, samples.number]
 
 
+@in_order
 def test_opcheck(walk):
-    traced, segments, samples = walk
+    given, traced, segments, samples = walk
     ops = torch.ops.gvtorch
-    args = positional(traced)
-    torch.library.opcheck(ops.count_segments.default, tuple(args))
+    args = (*given, *traced, None, 0, False)
+    torch.library.opcheck(ops.count_segments.default, args)
     first = (segments.counts[:, 0].cumsum(0) - segments.counts[:, 0]).long()
     torch.library.opcheck(ops.write_segments.default, (*args, first, len(segments.ray_index)))
-    reads = [v for n, v in sampling(traced, segments, samples).items() if n != "backend"]
-    reads[5] = reads[5].clone().requires_grad_()
-    reads[6] = reads[6].clone().requires_grad_()
+    own = {name: getattr(traced, name).clone() for name in ("bricks_bzyxc", "constant_tnc")}
+    leaves = traced._replace(**{name: leaf.requires_grad_() for name, leaf in own.items()})
+    reads = sampling(given, leaves, segments, samples)
     torch.library.opcheck(ops.sample_bricks.default, tuple(reads))
     grad = torch.ones(len(samples.segment), 1, device=reads[0].device)
-    reads = [v.detach() if isinstance(v, torch.Tensor) else v for v in reads]
     checks = ("test_schema", "test_faketensor")
+    reads = sampling(given, traced, segments, samples)
     torch.library.opcheck(ops.sample_bricks_backward.default, (grad, *reads), test_utils=checks)
     alpha, feature, offset, clear = packed(device=reads[0].device)
     leaves = (alpha.requires_grad_(), feature.requires_grad_(), offset, clear.requires_grad_())
@@ -325,30 +305,27 @@ def test_opcheck(walk):
 class Emission(torch.nn.Module):
     """Samples and composites segments: what scripts, compiles and exports."""
 
-    def __init__(self, numbers: list) -> None:
-        super().__init__()
-        self.shape = (int(numbers[0]), int(numbers[1]), int(numbers[2]))
-        self.sizes = (float(numbers[3]), float(numbers[4]), float(numbers[5]))
-
     def forward(
-        self, reads: list[torch.Tensor], offset: torch.Tensor, clear: torch.Tensor
-    ) -> torch.Tensor:
-        values = torch.ops.gvtorch.sample_bricks(
-            reads[0], reads[1], reads[2], reads[3], reads[4], reads[5], reads[6], reads[7],
-            reads[8], reads[9], reads[10], reads[11], reads[12], reads[13], reads[14],
-            self.shape[0], self.shape[1], self.shape[2],
-            self.sizes[0], self.sizes[1], self.sizes[2],
-        )  # fmt: skip
+        self,
+        rays: RayArguments,
+        channel: tuple[Tensor, int, int, int, float, float, float, Tensor, Tensor],
+        listed: tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor],
+        offset: Tensor,
+        clear: Tensor,
+    ) -> Tensor:
+        values = torch.ops.gvtorch.sample_bricks(*rays, *channel, *listed)
         alpha = values[:, 0] * 0.5
         return torch.ops.gvtorch.composite(alpha, values, offset, clear, 0.01)[0]
 
 
 @pytest.mark.filterwarnings("ignore")
+@in_order
 def test_scripts_compiles_and_exports(walk):
-    traced, segments, samples = walk
-    reads = [v for n, v in sampling(traced, segments, samples).items() if n != "backend"]
-    clear = torch.ones(len(segments.counts), device=reads[0].device)
-    module, inputs = Emission(reads[15:]), (reads[:15], samples.offset, clear)
+    given, traced, segments, samples = walk
+    listed = (*segments[:6], samples.segment, samples.number)
+    clear = torch.ones(len(segments.counts), device=traced.child_tn.device)
+    module = Emission()
+    inputs = (given, traced.channel, listed, samples.offset, clear)
     expected = module(*inputs)
     assert expected.max() > 0.3
     assert torch.equal(torch.jit.script(module)(*inputs), expected)
@@ -358,20 +335,21 @@ def test_scripts_compiles_and_exports(walk):
 
 
 @pytest.mark.filterwarnings("ignore")
+@in_order
 def test_the_walk_compiles_and_exports(walk):
-    traced, expected, _ = walk
+    given, traced, expected, _ = walk
 
     class Walk(torch.nn.Module):
         def forward(self, origin: torch.Tensor) -> tuple[torch.Tensor, ...]:
-            count, _, _ = torch.ops.gvtorch.count_segments(origin, *positional(traced)[1:])
+            args = (origin, *given[1:], *traced, None, 0, False)
+            count, _, _ = torch.ops.gvtorch.count_segments(*args)
             ends = count[:, 0].cumsum(0, dtype=torch.int64)
             total = ends[-1].item()
             torch._check_is_size(total)
-            args = (origin, *positional(traced)[1:], ends - count[:, 0], total)
-            return torch.ops.gvtorch.write_segments(*args)
+            return torch.ops.gvtorch.write_segments(*args, ends - count[:, 0], total)
 
-    program = torch.export.export(Walk(), (traced["origin_r3"],))
-    for name, found in zip(expected._fields, program.module()(traced["origin_r3"]), strict=False):
+    program = torch.export.export(Walk(), (given.origin_r3,))
+    for name, found in zip(expected._fields, program.module()(given.origin_r3), strict=False):
         assert torch.equal(found, getattr(expected, name)), name
 
 
@@ -380,12 +358,9 @@ def test_the_walk_compiles_and_exports(walk):
     ("change", "message"),
     [
         ({"origin_r3": torch.zeros(4, 2).double()}, "origin_r3 must be (4, 3) float64 on cpu"),
-        ({"domain_2": torch.zeros(2).int()}, "domain_2 must be (2,) float32 or float64"),
-        ({"opaque_m": torch.zeros(3)}, "opaque_m must be (m,) int32"),
-        ({"opaque_m": torch.zeros(1).int()}, "opaque_m's length must be an int >= 2"),
+        ({"domain_2": torch.zeros(2).int()}, "domain_2 must be (2,) float32"),
         ({"state_r3": torch.zeros(4, 2)}, "state_r3 must be (4, 3) float32"),
         ({"limit": -1}, "limit must be an int >= 0"),
-        ({"levels": 0}, "levels must be an int >= 1"),
         ({"width": 3}, "4 rays are no whole rows of 3 pixels"),
         ({"step": math.nan}, "step must be finite"),
         ({"component": 1}, "component must be an int >= 0 and <= 0"),
@@ -395,25 +370,26 @@ def test_the_walk_compiles_and_exports(walk):
 def test_bad_arguments_of_trace_segments(blobs, change, message):
     tree = gv.N3Tree.from_volume(blobs, 8)
     with pytest.raises(ValueError) as caught:
-        trace_segments(**{**walking(arguments(tree, 4)), **change})
+        own = {name: change[name] for name in ("state_r3", "limit", "backend") if name in change}
+        trace_segments(*changed(arguments(tree, 4), change), **own)
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.backend("cpp")
 def test_bad_arguments_of_sampling_and_compositing(blobs):
     tree = gv.N3Tree.from_volume(blobs, 8)
-    traced = {**arguments(tree, 4), "backend": "cpp"}
-    segments = trace_segments(**walking(traced))
-    good = sampling(traced, segments, list_samples(segments))
+    given, traced = arguments(tree, 4)
+    segments = trace_segments(given, traced)
+    good = (given, traced, segments, list_samples(segments))
     for change, message in (
-        ({"segment_k": torch.zeros(3)}, "segment_k must be (3,) int32"),
-        ({"distance_s3": good["distance_s3"].half()}, "distance_s3 must be (s, 3) float32 or"),
-        ({"constant_tnc": torch.zeros(1, 8, 2)}, "constant_tnc must be (t, n, 1)"),
-        ({"bricks_bzyxc": good["bricks_bzyxc"].double()}, "which no channel can have"),
+        ({"segment": torch.zeros(3)}, "segment must be (3,) int32"),
+        ({"distance": segments.distance.half()}, "distance must be (s, 3) float32 or"),
+        ({"constant_tnc": torch.zeros(1, 8, 2)}, "constant_tnc must be (1, 8, 1)"),
+        ({"bricks_bzyxc": traced.bricks_bzyxc.double()}, "which no channel can have"),
         ({"max_depth": 99}, "max_depth must be an int >= 0"),
     ):
         with pytest.raises(ValueError) as caught:
-            sample_bricks(**{**good, **change})
+            sample_bricks(*changed(good, change))
         assert message in str(caught.value) and "\n" not in str(caught.value)
     alpha, feature, offset, clear = packed()
     for args, message in (
@@ -429,18 +405,17 @@ def test_bad_arguments_of_sampling_and_compositing(blobs):
 
 def test_samples_that_name_nothing_are_zero(walk):
     """Memory stays safe whatever the words are."""
-    traced, segments, samples = walk
-    good = sampling(traced, segments, samples)
+    *_, segments, samples = walk
     some = samples.segment.clone()
     some[0], some[1] = -1, 10**6
     for change in (
-        {"segment_k": some},
-        {"ray_s": torch.full_like(good["ray_s"], 10**6)},
-        {"node_s2": torch.full_like(good["node_s2"], 10**8)},
-        {"brick_s2": torch.full_like(good["brick_s2"], 10**6)},
-        {"depth_s3": torch.full_like(good["depth_s3"], 60)},
+        {"segment": some},
+        {"ray_index": torch.full_like(segments.ray_index, 10**6)},
+        {"node": torch.full_like(segments.node, 10**8)},
+        {"brick": torch.full_like(segments.brick, 10**6)},
+        {"depth": torch.full_like(segments.depth, 60)},
     ):
-        values = sample_bricks(**{**good, **change})
+        values = sample_bricks(*changed(walk, change))
         assert (values[:2] == 0).all()
 
 
@@ -451,4 +426,4 @@ def test_a_list_larger_than_memory_is_one_clear_error(blobs, monkeypatch):
     tree = gv.N3Tree.from_volume(blobs, 4)
     monkeypatch.setattr(check.os, "sysconf", lambda name: 64)
     with pytest.raises(ValueError, match=r"trace_segments: a list of \d+ segments takes .* GiB"):
-        trace_segments(**walking(arguments(tree, 100)))
+        trace_segments(*arguments(tree, 100))

@@ -10,10 +10,10 @@ import pytest
 import torch
 from conftest import DEVICES, ROOT
 from test_op_contract import world_rays
-from test_trace_rays import SHADER, assert_equal, camera_rays, forget, on, run
+from test_trace_rays import SHADER, assert_equal, camera_rays, changed, forget, in_order, on, run
 
 import gvtorch as gv
-from gvtorch.ops import shade_rays
+from gvtorch.ops import RayArguments, shade_rays
 from gvtorch.tracing.tracer import Tracer
 
 GOLDEN = ROOT / "tests" / "golden_shaders.npz"
@@ -297,25 +297,22 @@ def test_script_compile_and_export(tree, compiled, name):
     assert all(torch.equal(a, b) for a, b in zip(program(*rays), plain, strict=True))
 
 
-def op_arguments(tree, shader, dtype) -> dict:
+def op_arguments(tree, shader, dtype) -> list:
     """The checked function's arguments for the rays of a camera."""
     rays = camera_rays(tree, 3).to(tree.device)
     tracer = Tracer(tree, shader, gv.RenderOptions(dtype=dtype))
-    columns = ("origin_r3", "direction_r3", "cone_r2", "range_r2")
-    values = (rays.origin, rays.direction, rays.cone, rays.range)
-    parameters = tracer.shader.parameters(tree, dtype)
-    columns = dict(zip(columns, (v.double().contiguous() for v in values), strict=True))
-    return {**columns, **tracer.arguments, "parameter_54": parameters}
+    records = [RayArguments.of(rays)._replace(width=0), tracer.arguments, tracer.shading]
+    return [*records, shader.parameters(tree, dtype)]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", SHADERS)
+@in_order
 def test_opcheck(tree, compiled, name, dtype):
     tree = on(tree, DEVICES[compiled])
-    given = op_arguments(tree, SHADERS[name], dtype)
-    given |= {"width": 0, "table": given.pop("table_lm4"), "clear_r": None}
+    rays, traced, shading, parameters = op_arguments(tree, SHADERS[name], dtype)
     op = torch.ops.gvtorch.shade_rays.default
-    torch.library.opcheck(op, tuple(given[a.name] for a in op._schema.arguments))
+    torch.library.opcheck(op, (*rays, *traced, *shading, parameters))
 
 
 @pytest.mark.parametrize(
@@ -365,17 +362,17 @@ def test_a_missing_channel_is_one_clear_error(tree, shader, message):
 
 
 def test_the_op_checks_its_arguments(tree):
-    good = op_arguments(tree, SHADERS["features"], torch.float32)
-    shade_rays(**good)
+    *good, parameters = op_arguments(tree, SHADERS["features"], torch.float32)
+    shade_rays(*good, parameters)
+    with pytest.raises(ValueError, match=r"parameter_54 must be \(5, 4\)"):
+        shade_rays(*good, torch.zeros(5))
     for change, message in (
         ({"shader": 9}, "shader must be an int >= 0 and <= 7"),
         ({"features": 3}, "features must be an int >= 4"),
-        ({"parameter_54": torch.zeros(5)}, r"parameter_54 must be \(5, 4\)"),
         ({"other_tnc": None}, "belong together"),
         ({"other_bzyxc": None, "other_tnc": None}, "features need other_bzyxc"),
-        ({"frame": 1}, "argument 'frame' is missing or unknown"),
         ({"shader": 1}, "table_lm4 must be"),
         ({"shader": 2}, "stored colour needs a channel of 4 or 24 numbers"),
     ):
         with pytest.raises(ValueError, match=message):
-            shade_rays(**{**good, **change})
+            shade_rays(*changed(good, change), parameters)

@@ -14,13 +14,19 @@ from hypothesis import strategies as st
 
 import gvtorch as gv
 from gvtorch.base import constants as config
+from gvtorch.ops import RayArguments, TraceArguments
 from gvtorch.ops.reference import exact
-from gvtorch.shaders.transfer_function import interval_levels
 from gvtorch.tracing.tracer import Tracer
 
 SHADER = gv.TransferFunction.from_points(
     opacity=[(0, 0), (0.2, 0), (0.6, 0.4), (1, 1)],
     color=[(0, 1, 0, 0), (0.5, 0.2, 0.8, 0.1), (1, 1, 1, 1)],
+)
+
+
+_ORDER = tuple(argument.name for argument in torch.ops.gvtorch.trace_rays.default._schema.arguments)
+in_order = pytest.mark.skipif(
+    _ORDER != RayArguments._fields + TraceArguments._fields, reason="the library is an older one"
 )
 
 
@@ -335,58 +341,47 @@ def test_logarithm_and_power_are_accurate():
         ({"step": 0.0}, "step must be finite and > 0"),
         ({"step": math.nan}, "step must be finite"),
         ({"stop_alpha": 1.5}, "stop_alpha must be finite and >= 0 and <= 1"),
-        ({"backend": "opengl"}, "backend must be auto, reference, cpp or cuda"),
     ],
 )
 def test_bad_arguments_have_one_clear_message(blobs, change, message):
     tree = gv.N3Tree.from_volume(blobs, 8)
     with pytest.raises(ValueError) as caught:
-        gv.ops.trace_rays(**{**arguments(tree, 4), **change})
+        gv.ops.trace_rays(*changed(arguments(tree, 4), change))
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_an_unknown_backend_is_one_clear_error(blobs):
+    given = arguments(gv.N3Tree.from_volume(blobs, 8), 4)
+    with pytest.raises(ValueError, match="backend must be auto, reference, cpp or cuda"):
+        gv.ops.trace_rays(*given, backend="opengl")  # type: ignore[arg-type]
+
+
+def changed(records: tuple, change: dict) -> list:
+    """Records with some fields replaced."""
+    return [
+        record._replace(**{name: value for name, value in change.items() if name in record._fields})
+        for record in records
+    ]
 
 
 def arguments(
     tree: gv.N3Tree, rays: int, shader: gv.TransferFunction = SHADER, dtype=torch.float32
-) -> dict:
-    """Keyword arguments of the op for parallel rays through the middle of a tree."""
+) -> tuple[RayArguments, TraceArguments]:
+    """Arguments of the op for parallel rays through the middle of a tree."""
     device = tree.device
-    step = 0.5 * min(tree.spacing)
-    levels = interval_levels(tree.root_voxel, step)
-    table = shader.table(min(tree.spacing), step, levels, dtype, device)
-    channel = tree.channel_names[0]
     real = {"dtype": torch.float64, "device": device}
     size = tree.box[1] - tree.box[0]
     part = 0.25 + torch.linspace(0, 0.1, rays, dtype=torch.float64)[:, None]
     direction = torch.tensor([0.3, 0.2, 1.0]) / torch.tensor([0.3, 0.2, 1.0]).norm()
-    return {
-        "origin_r3": (tree.box[0] + part * size).to(device),
-        "direction_r3": direction.to(**real).repeat(rays, 1),
-        "cone_r2": torch.tensor([[0.5, 0.02]], **real).repeat(rays, 1),
-        "range_r2": torch.tensor([[0.0, 1e9]], **real).repeat(rays, 1),
-        "place_33": tree.place,
-        "child_tn": tree.nodes.child_tn,
-        "brick_tn": tree.nodes.brick_tn,
-        "request_tn": tree.nodes.request_tn,
-        "stamp_t": tree.nodes.stamp_t,
-        "bricks_bzyxc": tree.bricks.bricks[channel],
-        "constant_tnc": tree.nodes.constants[channel],
-        "range_tn2c": tree.nodes.ranges[channel],
-        "stamp_b": tree.bricks.stamp_b,
-        **vars(table),
-        "frame_1": torch.tensor([3], dtype=torch.int32, device=device),
-        "width": 0,
-        "branching": tree.branching,
-        "root": tree.root,
-        "max_depth": tree.depth,
-        "border": tree.bricks.border,
-        "component": 0,
-        "cone_scale": 1.0,
-        "root_voxel": tree.root_voxel,
-        "step": step,
-        "stop_alpha": 0.99,
-        "depth_alpha": 0.1,
-        "by_level": False,
-    }
+    given = RayArguments(
+        origin_r3=(tree.box[0] + part * size).to(device),
+        direction_r3=direction.to(**real).repeat(rays, 1),
+        cone_r2=torch.tensor([[0.5, 0.02]], **real).repeat(rays, 1),
+        range_r2=torch.tensor([[0.0, 1e9]], **real).repeat(rays, 1),
+    )
+    frame_1 = torch.tensor([3], dtype=torch.int32, device=device)
+    traced = Tracer(tree, shader, gv.RenderOptions(dtype=dtype, cone_scale=1.0), frame_1=frame_1)
+    return given, traced.arguments
 
 
 def test_options_are_checked():

@@ -9,7 +9,7 @@ import operator
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -54,6 +54,52 @@ def tensor(
     raise ValueError(
         f"{where}: {name} must be ({wanted}) {kind} on {device}, got {describe(value)}"
     )
+
+
+Field = tuple[
+    str, Tensor, str, torch.dtype
+]  # name, tensor, shape (a letter or digit a size), dtype
+
+
+def tensors(
+    where: str,
+    device: torch.device,
+    fields: Iterable[Field],
+    sizes: Mapping[str, int] | None = None,
+) -> dict[str, int]:
+    """Raises unless all tensors are contiguous and of the shapes, dtypes and device.
+
+    Args:
+        where: The function that the user called.
+        device: The device expected.
+        fields: What came and what was expected: ("origin_r3", origin_r3, "r3", torch.float64) for
+            (r, 3). A letter stands for the same size in all of them.
+        sizes: Of letters that are known before.
+
+    Returns:
+        What letters stand for.
+
+    Raises:
+        ValueError: See `tensor`; or `where: name must be contiguous`.
+    """
+    known = dict(sizes or {})
+    for name, value, shape, dtype in fields:
+        if isinstance(value, Tensor) and value.dim() == len(shape):
+            for letter, size in zip(shape, value.shape, strict=True):
+                if not letter.isdigit():
+                    known.setdefault(letter, size)
+        expected = [int(part) if part.isdigit() else known.get(part, part) for part in shape]
+        tensor(where, name, value, expected, dtype, device)
+        if not value.is_contiguous():
+            raise ValueError(f"{where}: {name} must be contiguous")
+    return known
+
+
+def shape_of(name: str) -> str:
+    """Returns the shape that a name ends with, as in "r3" of origin_r3; bricks are cubes: "bsssc"
+    of bricks_bzyxc.
+    """
+    return name.rpartition("_")[2].replace("bzyx", "bsss")
 
 
 def _of_size(expected: int | str, size: int) -> bool:

@@ -1,6 +1,7 @@
 """The ops on bare tensors. Importing this package loads the compiled libraries, so that TorchScript
 archives and exported programs that hold `gvtorch::` ops can be loaded."""
 
+from .arguments import RayArguments, Samples, Segments, ShadeArguments, TraceArguments
 from .cache import (
     compact_requests,
     lacking,
@@ -13,13 +14,15 @@ from .cache import (
 )
 from .cut import cut_bricks
 from .registry import available
-from .segments import Samples, Segments, composite, list_samples, sample_bricks, trace_segments
-from .shade import shade_rays
-from .trace import trace_rays
+from .segments import composite, list_samples, sample_bricks, trace_segments
+from .trace import shade_rays, trace_rays
 
 __all__ = [
+    "RayArguments",
     "Samples",
     "Segments",
+    "ShadeArguments",
+    "TraceArguments",
     "available",
     "compact_requests",
     "composite",

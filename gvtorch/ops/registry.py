@@ -1,12 +1,14 @@
 """Joins the compiled ops to torch: loads the libraries and gives each op its fake (shapes without
 data).
 
-The schema of an op stands once, in cpp_ext/csrc/entry*.h.
+The schema of an op stands once, in cpp_ext/csrc (arguments.h and the entry headers); fakes take
+what they need by the schema's names.
 """
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -21,105 +23,158 @@ def available() -> dict[str, str]:
     return {"reference": "", **_reasons}
 
 
-def _fake_trace_rays(*args: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    rays, table_lm4 = args[0].shape[0], args[13]
+def _names(op: Any) -> tuple[str, ...]:
+    """The names of an op's arguments, as its schema has them."""
+    return tuple(argument.name for argument in op.default._schema.arguments)
+
+
+def _register_fake(op: Any, fake: Callable[..., Any]) -> None:
+    """Gives an op its fake, which is called with all arguments by name."""
+    names = NAMES[str(op)] = _names(op)
+
+    def by_name(*given: Any, **named: Any) -> Any:
+        named |= dict(zip(names, given, strict=False))
+        if "table" in named:
+            named["table_lm4"] = named.pop("table")
+        return fake(**named)
+
+    torch.library.register_fake(op.default.name(), by_name)
+
+
+def _trace_rays(*, origin_r3: Tensor, table_lm4: Tensor, **_: Any) -> tuple[Tensor, ...]:
+    rays = origin_r3.shape[0]
     return (
-        table_lm4.new_empty((rays, 3)),
-        table_lm4.new_empty((rays, 1)),
-        table_lm4.new_empty((rays, 1)),
+        *(table_lm4.new_empty((rays, width)) for width in (3, 1, 1)),
         table_lm4.new_empty((rays,), dtype=torch.int32),
         table_lm4.new_empty((rays,), dtype=torch.bool),
     )
 
 
-def _fake_shade_rays(*args: Any) -> tuple[Tensor, ...]:
-    rays, table, features = args[0].shape[0], args[13], args[23]
+def _shade_rays(*, table_lm4: Tensor, features: int, **given: Any) -> tuple[Tensor, ...]:
+    hits = _trace_rays(table_lm4=table_lm4, **given)
+    rays = hits[0].shape[0]
+    return (*hits, *(table_lm4.new_empty((rays, width)) for width in (3, features)))
+
+
+def _count_segments(*, origin_r3: Tensor, domain_2: Tensor, **_: Any) -> tuple[Tensor, ...]:
+    rays = origin_r3.shape[0]
     return (
-        *_fake_trace_rays(*args),
-        table.new_empty((rays, 3)),
-        table.new_empty((rays, features)),
+        domain_2.new_empty((rays, 3), dtype=torch.int32),
+        domain_2.new_empty((rays, 3)),
+        domain_2.new_empty((rays,), dtype=torch.bool),
     )
+
+
+def _write_segments(*, domain_2: Tensor, total: int, **_: Any) -> tuple[Tensor, ...]:
+    widths = ((), (2,), (2,), (3,), (3,))
+    words = (domain_2.new_empty((total, *width), dtype=torch.int32) for width in widths)
+    return (*words, *(domain_2.new_empty((total, *width)) for width in ((3,), (), ())))
+
+
+def _sample_bricks(
+    *, bricks_bzyxc: Tensor, distance_s3: Tensor, segment_k: Tensor, **_: Any
+) -> Tensor:
+    return distance_s3.new_empty((segment_k.shape[0], bricks_bzyxc.shape[4]))
+
+
+def _sample_bricks_backward(
+    *, grad_kc: Tensor, bricks_bzyxc: Tensor, constant_tnc: Tensor, **_: Any
+) -> tuple[Tensor, Tensor]:
+    return grad_kc.new_empty(bricks_bzyxc.shape), grad_kc.new_empty(constant_tnc.shape)
+
+
+def _composite(
+    *, alpha_k: Tensor, feature_kc: Tensor, clear_r: Tensor, **_: Any
+) -> tuple[Tensor, Tensor, Tensor]:
+    total = alpha_k.new_empty((clear_r.shape[0], feature_kc.shape[1]))
+    return total, torch.empty_like(clear_r), torch.empty_like(alpha_k)
+
+
+def _composite_backward(
+    *, grad_left_r: Tensor, alpha_k: Tensor, feature_kc: Tensor, **_: Any
+) -> tuple[Tensor, Tensor, Tensor]:
+    return torch.empty_like(alpha_k), torch.empty_like(feature_kc), torch.empty_like(grad_left_r)
+
+
+def _compact_requests(*, request_tn: Tensor, capacity: int) -> tuple[Tensor, Tensor, Tensor]:
+    words = request_tn.new_empty((capacity,))
+    return words, torch.empty_like(words), request_tn.new_empty((3,), dtype=torch.int64)
+
+
+def _lru_partition(*, order_k: Tensor, **_: Any) -> tuple[Tensor, Tensor]:
+    return torch.empty_like(order_k), order_k.new_empty((1,), dtype=torch.int64)
+
+
+def _locate(*, node_k: Tensor, **_: Any) -> Tensor:
+    return node_k.new_empty((node_k.shape[0], 4))
+
+
+def _lacking(*, node_k: Tensor, **_: Any) -> Tensor:
+    return torch.empty_like(node_k, dtype=torch.bool)
+
+
+def _cut_bricks(*, values_zyxc: Tensor, place_k3: Tensor, brick_size: int, border: int) -> Tensor:
+    side = brick_size + 2 * border
+    return values_zyxc.new_empty((place_k3.shape[0], side, side, side, values_zyxc.shape[3]))
+
+
+def _in_place(**_: Any) -> None:
+    return None
+
+
+_FAKES: dict[str, Callable[..., Any]] = {
+    "trace_rays": _trace_rays,
+    "shade_rays": _shade_rays,
+    "count_segments": _count_segments,
+    "write_segments": _write_segments,
+    "sample_bricks": _sample_bricks,
+    "sample_bricks_backward": _sample_bricks_backward,
+    "composite": _composite,
+    "composite_backward": _composite_backward,
+    "compact_requests": _compact_requests,
+    "lru_partition": _lru_partition,
+    "unlink": _in_place,
+    "link": _in_place,
+    "link_bricks": _in_place,
+    "link_tiles": _in_place,
+    "locate": _locate,
+    "lacking": _lacking,
+    "cut_bricks": _cut_bricks,
+}
+
+
+def call(op: Any, *records: Any, **extras: Any) -> Any:
+    """Calls an op with the fields of records, by name."""
+    named = {name: value for record in records for name, value in record._asdict().items()}
+    if "table_lm4" in named:
+        named |= {"table": named["table_lm4"], "levels": named["table_lm4"].shape[0]}
+    named |= extras
+    return op(**{name: named[name] for name in NAMES[str(op)]})
+
+
+NAMES: dict[str, tuple[str, ...]] = {}
 
 
 @functools.cache
 def add_user_op(name: str) -> None:
     """Gives the op of a user's shader, which is loaded, its fake; once."""
-    torch.library.register_fake(f"gvtorch_user::{name}", _fake_shade_rays)
-
-
-def _fake_compact_requests(request_tn: Tensor, capacity: int) -> tuple[Tensor, Tensor, Tensor]:
-    words = request_tn.new_empty((capacity,))
-    return words, torch.empty_like(words), request_tn.new_empty((3,), dtype=torch.int64)
-
-
-def _fake_lru_partition(order_k: Tensor, stamp_s: Tensor, frame_1: Tensor) -> tuple[Tensor, Tensor]:
-    return torch.empty_like(order_k), order_k.new_empty((1,), dtype=torch.int64)
-
-
-def _fake_locate(loc_t4: Tensor, node_k: Tensor, branching: int, per_tile: int) -> Tensor:
-    return node_k.new_empty((node_k.shape[0], 4))
-
-
-def _fake_lacking(*args: Any) -> Tensor:
-    node_k = args[5]
-    return torch.empty_like(node_k, dtype=torch.bool)
-
-
-def _fake_cut_bricks(values_zyxc: Tensor, place_k3: Tensor, brick_size: int, border: int) -> Tensor:
-    side = brick_size + 2 * border
-    return values_zyxc.new_empty((place_k3.shape[0], side, side, side, values_zyxc.shape[3]))
-
-
-def _fake_count_segments(*args: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    rays, child_tn, domain_2 = args[0].shape[0], args[5], args[13]
-    return (
-        child_tn.new_empty((rays, 3)),
-        domain_2.new_empty((rays, 3)),
-        child_tn.new_empty((rays,), dtype=torch.bool),
-    )
-
-
-def _fake_write_segments(*args: Any) -> tuple[Tensor, ...]:
-    child_tn, domain_2, total = args[5], args[13], args[-1]
-    words = [child_tn.new_empty((total, *width)) for width in ((), (2,), (2,), (3,), (3,))]
-    return (*words, *(domain_2.new_empty((total, *width)) for width in ((), (), (3,))))
-
-
-def _fake_sample_bricks(*args: Any) -> Tensor:
-    bricks_bzyxc, distance_s3, segment_k = args[5], args[12], args[13]
-    return distance_s3.new_empty((segment_k.shape[0], bricks_bzyxc.shape[4]))
-
-
-def _fake_sample_bricks_backward(grad_kc: Tensor, *args: Any) -> tuple[Tensor, Tensor]:
-    return grad_kc.new_empty(args[5].shape), grad_kc.new_empty(args[6].shape)
-
-
-def _fake_composite(
-    alpha_k: Tensor, feature_kc: Tensor, offset_r: Tensor, clear_r: Tensor, stop_clear: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    rays = clear_r.shape[0]
-    total = alpha_k.new_empty((rays, feature_kc.shape[1]))
-    return total, alpha_k.new_empty((rays,)), torch.empty_like(alpha_k)
-
-
-def _fake_composite_backward(
-    grad_sum_rc: Tensor, grad_left_r: Tensor, alpha_k: Tensor, feature_kc: Tensor, *_args: Any
-) -> tuple[Tensor, Tensor, Tensor]:
-    return torch.empty_like(alpha_k), torch.empty_like(feature_kc), torch.empty_like(grad_left_r)
+    _register_fake(getattr(torch.ops.gvtorch_user, name), _shade_rays)
 
 
 def _save_samples(ctx: Any, inputs: tuple, output: Tensor) -> None:
-    ctx.save_for_backward(*inputs[:15])
-    ctx.numbers = inputs[15:]
+    ctx.save_for_backward(*(one if isinstance(one, Tensor) else None for one in inputs))
+    ctx.numbers = [None if isinstance(one, Tensor) else one for one in inputs]
 
 
 def _sample_gradient(ctx: Any, grad_kc: Tensor) -> tuple[Tensor | None, ...]:
     """The gradient by bricks and constants; in their own dtype."""
-    saved = ctx.saved_tensors
-    backward = torch.ops.gvtorch.sample_bricks_backward
-    bricks, constants = backward(grad_kc.contiguous(), *saved, *ctx.numbers)
-    dtype = saved[5].dtype
-    return (*(None,) * 5, bricks.to(dtype), constants.to(dtype), *(None,) * 14)
+    pairs = zip(ctx.saved_tensors, ctx.numbers, strict=True)
+    inputs = [number if tensor is None else tensor for tensor, number in pairs]
+    bricks, constants = torch.ops.gvtorch.sample_bricks_backward(grad_kc.contiguous(), *inputs)
+    names = _names(torch.ops.gvtorch.sample_bricks)
+    dtype = inputs[names.index("bricks_bzyxc")].dtype
+    grads = {"bricks_bzyxc": bricks.to(dtype), "constant_tnc": constants.to(dtype)}
+    return tuple(grads.get(name) for name in names)
 
 
 def _save_composite(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
@@ -137,29 +192,10 @@ def _composite_gradient(
     return alpha, feature, None, clear, None
 
 
-def _fake_in_place(*_args: object) -> None:
-    return None
-
-
 _reasons = cpp_ext.load()
 if not _reasons["cpp"]:
-    torch.library.register_fake("gvtorch::trace_rays", _fake_trace_rays)
-    torch.library.register_fake("gvtorch::shade_rays", _fake_shade_rays)
-    torch.library.register_fake("gvtorch::compact_requests", _fake_compact_requests)
-    torch.library.register_fake("gvtorch::lru_partition", _fake_lru_partition)
-    torch.library.register_fake("gvtorch::unlink", _fake_in_place)
-    torch.library.register_fake("gvtorch::link", _fake_in_place)
-    torch.library.register_fake("gvtorch::link_bricks", _fake_in_place)
-    torch.library.register_fake("gvtorch::link_tiles", _fake_in_place)
-    torch.library.register_fake("gvtorch::locate", _fake_locate)
-    torch.library.register_fake("gvtorch::lacking", _fake_lacking)
-    torch.library.register_fake("gvtorch::cut_bricks", _fake_cut_bricks)
-    torch.library.register_fake("gvtorch::count_segments", _fake_count_segments)
-    torch.library.register_fake("gvtorch::write_segments", _fake_write_segments)
-    torch.library.register_fake("gvtorch::sample_bricks", _fake_sample_bricks)
-    torch.library.register_fake("gvtorch::sample_bricks_backward", _fake_sample_bricks_backward)
-    torch.library.register_fake("gvtorch::composite", _fake_composite)
-    torch.library.register_fake("gvtorch::composite_backward", _fake_composite_backward)
+    for _name, _fake in _FAKES.items():
+        _register_fake(getattr(torch.ops.gvtorch, _name), _fake)
     torch.library.register_autograd(
         "gvtorch::sample_bricks", _sample_gradient, setup_context=_save_samples
     )

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ..base import check
 from ..cpp_ext import user
+from ..ops import ShadeArguments
 from ..ops.registry import add_user_op
 from ..ops.shading import Number, pack
 from ..pool import N3Tree
@@ -124,7 +125,7 @@ class CompiledShader(LitShader):
         numbers = self._numbers()
         return torch.cat((fixed, pack(numbers, dtype, tree.device))) if numbers else fixed
 
-    def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> dict[str, Any]:
+    def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> ShadeArguments:
         """See `Shader`; compiles for CUDA where the tree lies there.
 
         Raises:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..ops import ShadeArguments
 from ..ops.shading import (
     Number,
     ProjectionKind,
@@ -99,8 +100,8 @@ class Shader(ABC):
         )
         return parameters.pack(dtype, tree.device)
 
-    def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> dict[str, Any]:
-        """Returns the arguments of `shade_rays` that stay the same from call to call.
+    def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> ShadeArguments:
+        """Returns what `shade_rays` reads of the shader beside its table.
 
         Raises:
             ValueError: A channel that it names is not there, or of the wrong width.
@@ -120,16 +121,20 @@ class Shader(ABC):
                 where, "component of the colour", self.other_component, low=0, high=width - 1
             )
         bricks, constants = tree.bricks.bricks, tree.nodes.constants
-        return {
-            **vars(self.table(tree, intervals)),
-            "shader": self.kind,
-            "normal_bzyxc": None if self.normals is None else bricks[self.normals],
-            "normal_tnc": None if self.normals is None else constants[self.normals],
-            "other_bzyxc": None if self.other is None else bricks[self.other],
-            "other_tnc": None if self.other is None else constants[self.other],
-            "features": self.features(tree),
-            "other_component": self.other_component,
-        }
+        return ShadeArguments(
+            shader=int(self.kind) if isinstance(self.kind, int) else 0,
+            features=self.features(tree),
+            normal_bzyxc=None if self.normals is None else bricks[self.normals],
+            normal_tnc=None if self.normals is None else constants[self.normals],
+            other_bzyxc=None if self.other is None else bricks[self.other],
+            other_tnc=None if self.other is None else constants[self.other],
+            other_component=self.other_component,
+        )
+
+    @property
+    def op(self) -> str | None:
+        """Name of its own op; None: that of the fused shaders."""
+        return self.kind if isinstance(self.kind, str) else None
 
 
 class LitShader(Shader):
@@ -187,13 +192,13 @@ class LitShader(Shader):
         bare.ambient, bare.diffuse, bare.specular, bare.shadows = 1.0, 0.0, 0.0, False
         return bare
 
-    def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> dict[str, Any]:
+    def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> ShadeArguments:
         """See `Shader`."""
         given = super().arguments(where, tree, intervals)
         if self.shadows:
             if self.kind not in _SHADOWED:
                 raise ValueError(f"{where}: shadows per sample are for Lit and StoredColor")
-            given["shader"] = _SHADOWED[self.kind]
+            return given._replace(shader=int(_SHADOWED[self.kind]))
         return given
 
     def matter(self) -> Shader:
@@ -332,7 +337,7 @@ class StoredColor(LitShader):
         bare.lit = bare.shadows = False
         return bare
 
-    def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> dict[str, Any]:
+    def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> ShadeArguments:
         """See `Shader`."""
         known = tree.bricks.channels.get(str(self.channel), Channel(width=4))
         if known.width not in (4, 24):

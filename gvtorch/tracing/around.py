@@ -101,7 +101,7 @@ def _clipped(
         trace,
         options.clip,
         box,
-        step=tracer.arguments["step"],
+        step=tracer.arguments.step,
         depth_alpha=options.depth_alpha,
         slab=slab,
         unlit=options.lighting is not None,

@@ -149,8 +149,9 @@ class _Counter(Tracer):
 
     def __init__(self, tree: N3Tree, shader: TransferFunction, options: RenderOptions) -> None:
         super().__init__(tree, shader, options)
-        for name in ("request_tn", "stamp_t", "stamp_b"):
-            self.arguments[name] = self.arguments[name].clone()
+        marks = ("request_tn", "stamp_t", "stamp_b")
+        copies = {name: getattr(self.arguments, name).clone() for name in marks}
+        self.arguments = self.arguments._replace(**copies)
         self.channel = options.channel or tree.channel_names[0]
         self.component = options.component
         self.module = TransferModule(shader, min(tree.spacing)).to(tree.device)
@@ -167,7 +168,7 @@ class _Counter(Tracer):
         """Sums of what each sample adds to alpha: alone, times the depth of its node, if it has a
         brick, times its age, times its fill.
         """
-        own = (self.tree, self.arguments, self.channel, self.shade, 5)
+        own = (self.tree, self.arguments, self.channel, self.backend, self.shade, 5)
         sums = march(rays, *own, limit=1, by_node=False)
         nodes = sums.count[:, 1]
         self._nodes = nodes if self._nodes is None else self._nodes + nodes

@@ -10,27 +10,29 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..base import check
 from ..base.records import Hits, Rays
-from ..ops import Samples, Segments, composite, list_samples, sample_bricks, trace_segments
+from ..ops import (
+    RayArguments,
+    Samples,
+    Segments,
+    TraceArguments,
+    composite,
+    list_samples,
+    sample_bricks,
+    trace_segments,
+)
+from ..ops.trace import Backend
 from ..pool import N3Tree
 from ..shaders.transfer_function import TransferFunction
 from .spans import box_span
 
 _LIMIT = 64  # samples of a ray in one part
 _SAMPLES = {"cpu": 1 << 20, "cuda": 1 << 24}  # shaded at once
-_WALK = (
-    *("place_33", "child_tn", "brick_tn", "request_tn", "stamp_t", "bricks_bzyxc"),
-    *("constant_tnc", "range_tn2c", "stamp_b", "domain_2", "opaque_m", "frame_1", "branching"),
-    *("root", "max_depth", "border", "component", "cone_scale", "root_voxel", "step", "by_level"),
-    "backend",
-)
-_SHAPE = ("branching", "max_depth", "border", "cone_scale", "root_voxel", "step", "backend")
 
 
 class ModuleShader:
@@ -153,17 +155,15 @@ class TransferModule(torch.nn.Module):
         return rgb, alpha_a + (place - row) * (alpha_b - alpha_a)
 
 
-Columns = tuple[Tensor, Tensor, Tensor, Tensor]  # rays in float64: origin, direction, cone, range
-
-
 @dataclass(frozen=True)
 class Batch:
     """Samples of rays that were walked, and what can be read there."""
 
-    columns: Columns
+    rays: RayArguments
     tree: N3Tree
-    arguments: dict[str, Any]  # of `trace_segments`
+    arguments: TraceArguments
     channel: str
+    backend: Backend
     segments: Segments
     listed: Samples
 
@@ -174,14 +174,12 @@ class Batch:
             if name not in self.tree.bricks.bricks:
                 known = ", ".join(self.tree.channel_names)
                 raise ValueError(f"ModuleShader: unknown channel {name!r}; the tree has {known}")
-            s = self.segments
-            reads = (
-                *(*self.columns, self.arguments["place_33"]),
-                *(self.tree.bricks.bricks[name], self.tree.nodes.constants[name]),
-                *(s.ray_index, s.node, s.brick, s.depth, s.interval, s.distance),
-                *(self.listed.segment, self.listed.number),
+            arguments = self.arguments._replace(
+                bricks_bzyxc=self.tree.bricks.bricks[name],
+                constant_tnc=self.tree.nodes.constants[name],
             )
-            value = sample_bricks(*reads, **{one: self.arguments[one] for one in _SHAPE})
+            reads = (arguments, self.segments, self.listed)
+            value = sample_bricks(self.rays, *reads, backend=self.backend)
             found.append(value)
         return found[0] if len(found) == 1 else torch.cat(found, 1)
 
@@ -198,14 +196,14 @@ class Batch:
     @cached_property
     def directions(self) -> Tensor:
         """(k, 3) unit length."""
-        return self.columns[1][self.ray].to(self.segments.t0.dtype)
+        return self.rays.direction_r3[self.ray].to(self.segments.t0.dtype)
 
     @cached_property
     def lengths(self) -> Tensor:
         """(k, 1) world length of each interval."""
         base, end, _ = self.segments.distance[self.segment].unbind(1)
         level = self.segments.interval[self.segment, 2]
-        whole = self.arguments["step"] * 2.0 ** level.clamp(min=0).to(base.dtype)
+        whole = self.arguments.step * 2.0 ** level.clamp(min=0).to(base.dtype)
         return torch.where(level < 0, end - base, whole)[:, None]
 
     @cached_property
@@ -218,16 +216,15 @@ class Batch:
     @cached_property
     def moved(self) -> Tensor:
         """(r,) float64 distances from the camera to where rays enter the tree's box."""
-        corner, size, high = self.arguments["place_33"]
-        origin, direction = self.columns[:2]
-        near, _ = box_span(corner, corner + size * high, origin, direction)
+        corner, size, high = self.arguments.place_33
+        near, _ = box_span(corner, corner + size * high, *self.rays[:2])
         return torch.where((near > 0) & (near < torch.inf), near, 0.0)
 
     @cached_property
     def positions(self) -> Tensor:
         """(k, 3) world places of the samples, the middles of their intervals."""
         t = self.moved[self.ray] + self.starts + 0.5 * self.lengths[:, 0]
-        origin, direction = (column[self.ray] for column in self.columns[:2])
+        origin, direction = (column[self.ray] for column in self.rays[:2])
         return (origin + t[:, None] * direction).to(self.starts.dtype)
 
 
@@ -248,8 +245,9 @@ Shade = Callable[[Batch], tuple[Tensor, Tensor]]  # features (k, c) and alpha (k
 def march(
     rays: Rays,
     tree: N3Tree,
-    arguments: dict[str, Any],
+    arguments: TraceArguments,
     channel: str,
+    backend: Backend,
     shade: Shade,
     features: int,
     *,
@@ -264,18 +262,15 @@ def march(
         tree: The tree.
         arguments: Of a `Tracer`.
         channel: The one that the options name.
+        backend: auto, reference, cpp or cuda.
         shade: Gives features and alpha of samples.
         features: How many there are.
         limit: Samples of a ray in one part.
         by_node: See `trace_segments`.
     """
-    walk = {name: arguments[name] for name in _WALK}
-    walk |= {"levels": arguments["table_lm4"].shape[0], "limit": limit, "by_node": by_node}
-    real, count = arguments["domain_2"].dtype, len(rays.origin)
-    rays = rays.double()
-    columns: Columns = (rays.origin, rays.direction, rays.cone, rays.range)
-    stop_alpha, hit_clear = arguments["stop_alpha"], 1 - arguments["depth_alpha"]
-    like = arguments["domain_2"]
+    like, count = arguments.domain_2, len(rays.origin)
+    stop_alpha, hit_clear = arguments.stop_alpha, 1 - arguments.depth_alpha
+    going_on = RayArguments.of(rays)._replace(clear_r=None)  # a walk has no transmittance
     sums = Marched(
         total=like.new_zeros((count, features)),
         clear=rays.light()[:, 0].to(like.dtype),
@@ -283,15 +278,17 @@ def march(
         count=like.new_zeros((count, 2), dtype=torch.int32),
         missed=like.new_zeros(count, dtype=torch.bool),
     )
-    which, state, width = torch.arange(count, device=like.device), None, rays.width
+    which, state = torch.arange(count, device=like.device), None
     if rays.transmittance is not None:  # some may have ended before
-        which, width = (sums.clear > 1 - stop_alpha).nonzero()[:, 0], 0
-        columns = _some(columns, which)
+        which = (sums.clear > 1 - stop_alpha).nonzero()[:, 0]
+        going_on = going_on.some(which)
     while len(which):
-        segments = trace_segments(*columns, **walk, state_r3=state, width=width)
+        segments = trace_segments(
+            going_on, arguments, state, limit=limit, by_node=by_node, backend=backend
+        )
         sums.missed[which] |= segments.missed
         sums.count[which, 1] += segments.counts[:, 2]
-        batch = Batch(columns, tree, walk, channel, segments, list_samples(segments))
+        batch = Batch(going_on, tree, arguments, channel, backend, segments, list_samples(segments))
         if not len(batch.segment):
             break  # all have ended
         feature, alpha = shade(batch)
@@ -299,37 +296,37 @@ def march(
         total, left, before = composite(
             *(alpha.contiguous(), feature.contiguous(), batch.listed.offset, clear.contiguous()),
             stop_alpha=stop_alpha,
-            backend=arguments["backend"],
+            backend=backend,
         )
         sums.total = sums.total.index_add(0, which, total)
         sums.clear = sums.clear.index_put((which,), left)
         with torch.no_grad():
             sums.count[:, 0].index_add_(0, which[batch.ray], (before > 0).to(torch.int32))
             hit = ((before >= hit_clear) & (before * (1 - alpha) < hit_clear)).nonzero()[:, 0]
-            part = torch.log(hit_clear / before[hit]) / torch.log1p(-alpha[hit])
-            part = torch.where(alpha[hit] < 1, part.clamp(0, 1), 0.0)
-            place = batch.starts[hit] + part * batch.lengths[hit, 0] + batch.moved[batch.ray[hit]]
-            sums.depth[which[batch.ray[hit]]] = place.to(real)
+            share = torch.log(hit_clear / before[hit]) / torch.log1p(-alpha[hit])
+            share = torch.where(alpha[hit] < 1, share.clamp(0, 1), 0.0)
+            place = batch.starts[hit] + share * batch.lengths[hit, 0] + batch.moved[batch.ray[hit]]
+            sums.depth[which[batch.ray[hit]]] = place.to(like.dtype)
             going = (segments.counts[:, 1] >= limit) & (left > 1 - stop_alpha)
             on = going.nonzero()[:, 0]
-        columns = _some(columns, on)
-        which, state, width = which[on], segments.state[on], 0
+        going_on, which, state = going_on.some(on), which[on], segments.state[on]
     return sums
-
-
-def _some(columns: Columns, which: Tensor) -> Columns:
-    origin, direction, cone, limits = columns
-    return origin[which], direction[which], cone[which], limits[which]
 
 
 class ModuleTracer:
     """One frame of a tree through a `ModuleShader`: traces any number of batches of rays."""
 
     def __init__(
-        self, tree: N3Tree, shader: ModuleShader, arguments: dict[str, Any], channel: str
+        self,
+        tree: N3Tree,
+        shader: ModuleShader,
+        arguments: TraceArguments,
+        channel: str,
+        backend: Backend,
     ) -> None:
         """Takes over the arguments of a `Tracer` that draws `shader.walls`."""
         self.tree, self.shader, self.arguments, self.channel = tree, shader, arguments, channel
+        self.backend = backend
 
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays in world units, a block at a time."""
@@ -343,7 +340,7 @@ class ModuleTracer:
         return Hits(**{n: torch.cat(all_) for n, all_ in joined.items() if all_[0] is not None})
 
     def _block(self, rays: Rays) -> Hits:
-        own = (self.tree, self.arguments, self.channel, self.shader.shade, 3)
+        own = (self.tree, self.arguments, self.channel, self.backend, self.shader.shade, 3)
         sums = march(rays, *own)
         return Hits(
             color=sums.total,

@@ -53,8 +53,8 @@ class ProjectedPieces:
 
     def _color(self, value: Tensor) -> Tensor:
         """(r, 3) the transfer function's colours of values (r, 1), interpolated in its table."""
-        table = self._tracer.arguments["table_lm4"][0, :, :3]  # (m, 3), at even distances
-        low, high = self._tracer.arguments["domain_2"].unbind(0)
+        table = self._tracer.arguments.table_lm4[0, :, :3]  # (m, 3), at even distances
+        low, high = self._tracer.arguments.domain_2.unbind(0)
         last = len(table) - 1
         place = ((value - low) / (high - low) * last).clamp(0, last)
         row = place.to(torch.int64).clamp(max=last - 1)

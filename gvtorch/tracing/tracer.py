@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from ..base.records import Hits, Rays
-from ..ops import shade_rays, trace_rays
+from ..ops import RayArguments, ShadeArguments, TraceArguments, shade_rays, trace_rays
 from ..ops.trace import choose_backend, most_intervals
 from ..pool import N3Tree
-from ..shaders.fused import FusedShader, Intervals, Shader
+from ..shaders.fused import FusedShader, Intervals, Shader, plain_table
 from ..shaders.transfer_function import TransferFunction, interval_levels
 from .module_shader import ModuleShader, ModuleTracer
 from .options import RenderOptions
@@ -33,7 +33,7 @@ def tracer_of(
     if isinstance(shader, ModuleShader):
         walls = Tracer(tree, shader.walls, options, **frame)
         channel = options.channel or tree.channel_names[0]
-        return ModuleTracer(tree, shader, walls.arguments, channel)
+        return ModuleTracer(tree, shader, walls.arguments, channel, options.backend)
     check_shader("render", "shader", shader)
     return Tracer(tree, shader, options, **frame)
 
@@ -69,62 +69,55 @@ class Tracer:
         intervals = Intervals(
             smallest_spacing=min(tree.spacing), step=step, levels=levels, dtype=options.dtype
         )
-        if isinstance(shader, TransferFunction):
-            table = vars(shader.table(min(tree.spacing), step, levels, options.dtype, tree.device))
-        elif shader.kind is None:
-            table = vars(shader.table(tree, intervals))
-        else:
-            table = shader.arguments("render", tree, intervals)
-        component = own.component if own and own.component is not None else options.component
         self.shader = None if own is None or own.kind is None else own
-        self.dtype = options.dtype
-        self.arguments: dict[str, Any] = {
-            "place_33": tree.place,
-            "child_tn": tree.nodes.child_tn,
-            "brick_tn": tree.nodes.brick_tn,
-            "request_tn": tree.nodes.request_tn,
-            "stamp_t": tree.nodes.stamp_t,
-            "bricks_bzyxc": tree.bricks.bricks[channel],
-            "constant_tnc": tree.nodes.constants[channel],
-            "range_tn2c": tree.nodes.ranges[channel],
-            "stamp_b": tree.bricks.stamp_b,
-            **table,
-            "frame_1": frame_1,
-            "branching": tree.branching,
-            "root": tree.root,
-            "max_depth": tree.depth,
-            "border": tree.bricks.border,
-            "component": component,
-            "cone_scale": scale,
-            "root_voxel": tree.root_voxel,
-            "step": step,
-            "stop_alpha": options.stop_alpha,
-            "depth_alpha": options.depth_alpha,
-            "by_level": by_level,
-            "backend": options.backend,
-        }
+        self.shading: ShadeArguments | None = None
+        if own is not None and own.kind is not None:
+            self.shading = own.arguments("render", tree, intervals)
+        if isinstance(shader, TransferFunction):
+            table = plain_table(shader, tree, intervals)
+        else:
+            table = shader.table(tree, intervals)
+        component = own.component if own and own.component is not None else options.component
+        self.dtype, self.backend = options.dtype, options.backend
+        self.arguments = TraceArguments(
+            place_33=tree.place,
+            branching=tree.branching,
+            max_depth=tree.depth,
+            border=tree.bricks.border,
+            root_voxel=tree.root_voxel,
+            cone_scale=scale,
+            step=step,
+            bricks_bzyxc=tree.bricks.bricks[channel],
+            constant_tnc=tree.nodes.constants[channel],
+            range_tn2c=tree.nodes.ranges[channel],
+            component=component,
+            child_tn=tree.nodes.child_tn,
+            brick_tn=tree.nodes.brick_tn,
+            request_tn=tree.nodes.request_tn,
+            stamp_t=tree.nodes.stamp_t,
+            stamp_b=tree.bricks.stamp_b,
+            frame_1=frame_1,
+            root=tree.root,
+            **vars(table),
+            stop_alpha=options.stop_alpha,
+            depth_alpha=options.depth_alpha,
+            by_level=by_level,
+        )
 
     def seeing(self, shader: FusedShader, options: RenderOptions) -> Tracer:
         """Returns what traces the same frame with another shader."""
-        frame = {name: self.arguments[name] for name in ("by_level", "frame_1")}
-        return Tracer(self.tree, shader, options, **frame)
+        frame: dict[str, Any] = {"by_level": self.arguments.by_level}
+        return Tracer(self.tree, shader, options, frame_1=self.arguments.frame_1, **frame)
 
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays in world units."""
-        rays = rays.double()
-        origin, direction, cone, limits = rays.origin, rays.direction, rays.cone, rays.range
-        given = {"width": rays.width, "clear_r": rays.transmittance, **self.arguments}
-        if self.shader is None:
-            fields = trace_rays(origin, direction, cone, limits, **given)
+        given = RayArguments.of(rays)
+        if self.shader is None or self.shading is None:
+            fields = trace_rays(given, self.arguments, backend=self.backend)
             return Hits(**dict(zip(_FIELDS, fields, strict=False)))
-        found = shade_rays(
-            origin_r3=origin,
-            direction_r3=direction,
-            cone_r2=cone,
-            range_r2=limits,
-            parameter_54=self.shader.parameters(self.tree, self.dtype),
-            **given,
-        )
+        parameters = self.shader.parameters(self.tree, self.dtype)
+        own = (self.arguments, self.shading, parameters)
+        found = shade_rays(given, *own, op=self.shader.op, backend=self.backend)
         return Hits(**dict(zip(_FIELDS, found, strict=True)))
 
 

@@ -13,11 +13,10 @@ from torch import Tensor
 
 from ..base import check
 from ..base import constants as config
-from ..ops import available
-from ..ops.shade import op_of
-from ..ops.trace import most_intervals
+from ..ops import ShadeArguments, TraceArguments, available
+from ..ops.trace import most_intervals, op_of
 from ..pool import N3Tree
-from ..shaders.fused import FusedShader, Intervals, Shader
+from ..shaders.fused import FusedShader, Intervals, Shader, plain_table
 from ..shaders.transfer_function import interval_levels
 from .tracer import check_shader
 
@@ -26,16 +25,15 @@ class TreeTracer(torch.nn.Module):
     """Traces world rays through a resident tree, as `render` does. Pools are buffers: `.to(device)`
     moves them.
 
-    Light and material of a lit shader are the buffer `parameter`, laid out as `parameter_54` of
-    `ops.shade_rays`; it may be edited.
+    Buffers and numbers have the names of the ops' arguments. Light and material of a lit shader are
+    the buffer `parameter_54`, see `ops.shade_rays`; it may be edited.
     """
 
     if TYPE_CHECKING:  # TorchScript would read these as attributes of its own
-        place: Tensor
-        normals: Tensor
-        normal_constant: Tensor
-        others: Tensor
-        other_constant: Tensor
+        normal_bzyxc: Tensor
+        normal_tnc: Tensor
+        other_bzyxc: Tensor
+        other_tnc: Tensor
 
     def __init__(
         self,
@@ -86,43 +84,47 @@ class TreeTracer(torch.nn.Module):
         levels = interval_levels(tree.root_voxel, step)
         spacing, real = min(tree.spacing), torch.float32
         lengths = Intervals(smallest_spacing=spacing, step=step, levels=levels, dtype=real)
+        shading, op = ShadeArguments(), None
+        nothing = parameter = torch.zeros(0, device=tree.device)
+        self.plain = own is None or own.kind is None  # the transfer function's own kernel
+        if own is not None and not self.plain:
+            shading, op = own.arguments(where, tree, lengths), own.op
+            parameter = own.parameters(tree, real)
         if isinstance(shader, Shader):
-            laid = shader.arguments(where, tree, lengths)
-            laid["parameter"] = shader.parameters(tree, real)
+            table = shader.table(tree, lengths)
         else:
-            laid = vars(shader.table(spacing, step, levels, real, tree.device))
-        nothing = torch.zeros(0, device=tree.device)
+            table = plain_table(shader, tree, lengths)
+        self.shade_rays = op_of(op)
         nodes, bricks = tree.nodes, tree.bricks
-        for name, tensor in (
-            ("place", tree.place),
-            ("child", nodes.child_tn),
-            ("brick", nodes.brick_tn),
-            ("request", nodes.request_tn),
-            ("stamp_tile", nodes.stamp_t.clone()),  # frames of its own, not the tree's
-            ("bricks", bricks.bricks[channel]),
-            ("constant", nodes.constants[channel]),
-            ("value_range", nodes.ranges[channel]),
-            ("stamp_brick", bricks.stamp_b.clone()),
-            ("table", laid["table_lm4"]),
-            ("domain", laid["domain_2"]),
-            ("opaque", laid["opaque_m"]),
-            ("parameter", laid.get("parameter", nothing)),
-            ("normals", _given(laid, "normal_bzyxc", nothing)),
-            ("normal_constant", _given(laid, "normal_tnc", nothing)),
-            ("others", _given(laid, "other_bzyxc", nothing)),
-            ("other_constant", _given(laid, "other_tnc", nothing)),
-            ("frame", torch.zeros(1, dtype=torch.int32, device=tree.device)),
-        ):
-            self.register_buffer(name, tensor)
-        self.branching, self.root, self.depth = tree.branching, tree.root, tree.depth
-        self.cone_scale = float(cone_scale * tree.flatness)
-        self.border, self.component = bricks.border, component
-        self.root_voxel, self.step = float(tree.root_voxel), step
-        self.stop_alpha, self.depth_alpha = float(stop_alpha), float(depth_alpha)
-        kind = laid.get("shader", -1)  # -1: the plain transfer function
-        self.shader, self.shade_rays = 0 if isinstance(kind, str) else int(kind), op_of(kind)
-        self.features = int(laid.get("features", 0))
-        self.other_component = int(laid.get("other_component", 0))
+        arguments = TraceArguments(
+            place_33=tree.place,
+            branching=tree.branching,
+            max_depth=tree.depth,
+            border=bricks.border,
+            root_voxel=float(tree.root_voxel),
+            cone_scale=float(cone_scale * tree.flatness),
+            step=step,
+            bricks_bzyxc=bricks.bricks[channel],
+            constant_tnc=nodes.constants[channel],
+            range_tn2c=nodes.ranges[channel],
+            component=component,
+            child_tn=nodes.child_tn,
+            brick_tn=nodes.brick_tn,
+            request_tn=nodes.request_tn,
+            stamp_t=nodes.stamp_t.clone(),  # frames of its own, not the tree's
+            stamp_b=bricks.stamp_b.clone(),
+            frame_1=torch.zeros(1, dtype=torch.int32, device=tree.device),
+            root=tree.root,
+            **vars(table),
+            stop_alpha=float(stop_alpha),
+            depth_alpha=float(depth_alpha),
+        )
+        for name, value in {**arguments._asdict(), **shading._asdict()}.items():
+            if isinstance(value, (int, float)):
+                setattr(self, name, value)
+            else:
+                self.register_buffer(name, nothing if value is None else value)
+        self.register_buffer("parameter_54", parameter)
 
     def __getstate__(self) -> dict[str, Any]:
         """Names its op, which can't be pickled."""
@@ -174,29 +176,29 @@ class TreeTracer(torch.nn.Module):
             cone.to(torch.float64).contiguous(),
             range.to(torch.float64).contiguous(),
         )
-        if self.shader < 0:
+        if self.plain:
             color, alpha, depth, samples, _ = torch.ops.gvtorch.trace_rays(
                 rays[0],
                 rays[1],
                 rays[2],
                 rays[3],
-                self.place,
-                self.child,
-                self.brick,
-                self.request,
-                self.stamp_tile,
-                self.bricks,
-                self.constant,
-                self.value_range,
-                self.stamp_brick,
-                self.table,
-                self.domain,
-                self.opaque,
-                self.frame,
+                self.place_33,
+                self.child_tn,
+                self.brick_tn,
+                self.request_tn,
+                self.stamp_t,
+                self.bricks_bzyxc,
+                self.constant_tnc,
+                self.range_tn2c,
+                self.stamp_b,
+                self.table_lm4,
+                self.domain_2,
+                self.opaque_m,
+                self.frame_1,
                 0,
                 self.branching,
                 self.root,
-                self.depth,
+                self.max_depth,
                 self.border,
                 self.component,
                 self.cone_scale,
@@ -207,37 +209,37 @@ class TreeTracer(torch.nn.Module):
                 False,
             )
             return color, alpha, depth, samples, color.new_zeros((0, 3)), color.new_zeros((0, 0))
-        with_normals, with_others = len(self.normal_constant) > 0, len(self.other_constant) > 0
+        with_normals, with_others = len(self.normal_tnc) > 0, len(self.other_tnc) > 0
         color, alpha, depth, samples, _, normal, features = self.shade_rays(
             rays[0],
             rays[1],
             rays[2],
             rays[3],
-            self.place,
-            self.child,
-            self.brick,
-            self.request,
-            self.stamp_tile,
-            self.bricks,
-            self.constant,
-            self.value_range,
-            self.stamp_brick,
-            self.table,
-            self.domain,
-            self.opaque,
-            self.frame,
-            self.parameter,
-            self.normals if with_normals else None,
-            self.normal_constant if with_normals else None,
-            self.others if with_others else None,
-            self.other_constant if with_others else None,
+            self.place_33,
+            self.child_tn,
+            self.brick_tn,
+            self.request_tn,
+            self.stamp_t,
+            self.bricks_bzyxc,
+            self.constant_tnc,
+            self.range_tn2c,
+            self.stamp_b,
+            self.table_lm4,
+            self.domain_2,
+            self.opaque_m,
+            self.frame_1,
+            self.parameter_54,
+            self.normal_bzyxc if with_normals else None,
+            self.normal_tnc if with_normals else None,
+            self.other_bzyxc if with_others else None,
+            self.other_tnc if with_others else None,
             self.shader,
             self.features,
             self.other_component,
             0,
             self.branching,
             self.root,
-            self.depth,
+            self.max_depth,
             self.border,
             self.component,
             self.cone_scale,
@@ -248,8 +250,3 @@ class TreeTracer(torch.nn.Module):
             False,
         )
         return color, alpha, depth, samples, normal, features
-
-
-def _given(laid: dict[str, Any], name: str, nothing: Tensor) -> Tensor:
-    found = laid.get(name)
-    return nothing if found is None else found

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from ...base.constants import EMPTY
+from ..arguments import RayArguments, TraceArguments
 from .exact import TINY, clamp, divide, larger, log2_exact, smaller, stretch
 from .rays import INF, Beam, Intervals
 from .tree import Bricks, Place, Tree, descend, wanted_depth
@@ -110,58 +111,25 @@ class Transfer:
 
 
 def trace_rays(
-    origin_r3: Tensor,
-    direction_r3: Tensor,
-    cone_r2: Tensor,
-    range_r2: Tensor,
-    place_33: Tensor,
-    child_tn: Tensor,
-    brick_tn: Tensor,
-    request_tn: Tensor,
-    stamp_t: Tensor,
-    bricks_bzyxc: Tensor,
-    constant_tnc: Tensor,
-    range_tn2c: Tensor,
-    stamp_b: Tensor,
-    table_lm4: Tensor,
-    domain_2: Tensor,
-    opaque_m: Tensor,
-    frame_1: Tensor,
-    width: int,
-    branching: int,
-    root: int,
-    max_depth: int,
-    border: int,
-    component: int,
-    cone_scale: float,
-    root_voxel: float,
-    step: float,
-    stop_alpha: float,
-    depth_alpha: float,
-    by_level: bool,
-    clear_r: Tensor | None = None,
+    rays: RayArguments, arguments: TraceArguments
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Twin of `torch.ops.gvtorch.trace_rays`; arguments as in `gvtorch.ops.trace_rays`.
+    """Twin of `torch.ops.gvtorch.trace_rays`; see `gvtorch.ops.trace_rays`.
 
     Writes request_tn, stamp_t and stamp_b in place. `width` orders the rays, which changes nothing.
     """
-    real = table_lm4.dtype
-    beam = Beam.enter(*(origin_r3, direction_r3, cone_r2, range_r2, place_33), cone_scale, real)
+    a, real = arguments, arguments.table_lm4.dtype
+    beam = Beam.enter(*rays[:4], a.place_33, a.cone_scale, real)
 
     def number(value: float) -> Tensor:
-        return torch.tensor(value, dtype=real).to(table_lm4)
+        return torch.tensor(value, dtype=real).to(a.table_lm4)
 
-    hit_clear = 1 - number(depth_alpha)
-    at = Intervals.begin(beam, step, table_lm4.shape[0])
-    tree = Tree(
-        *(child_tn.view(-1), brick_tn.view(-1), request_tn.view(-1), stamp_t, stamp_b, frame_1[0]),
-        *(number(root_voxel), branching, child_tn.shape[1], root, max_depth, by_level),
-    )
-    values = constant_tnc.flatten(0, 1), range_tn2c.flatten(0, 1)
-    bricks = Bricks(bricks_bzyxc, *values, border, component)
-    sum_ = Accumulator.begin(beam, clear_r)
-    shader = Plain(Transfer(table_lm4, domain_2, opaque_m), sum_, hit_clear)
-    samples, visit = walk(beam, at, tree, bricks, shader, number(step), 1 - number(stop_alpha))
+    hit_clear = 1 - number(a.depth_alpha)
+    at = Intervals.begin(beam, a.step, a.table_lm4.shape[0])
+    tree = Tree.of(a, number(a.root_voxel))
+    bricks = Bricks.of(a)
+    sum_ = Accumulator.begin(beam, rays.clear_r)
+    shader = Plain(Transfer(a.table_lm4, a.domain_2, a.opaque_m), sum_, hit_clear)
+    samples, visit = walk(beam, at, tree, bricks, shader, number(a.step), 1 - number(a.stop_alpha))
     depth = sum_.depth + beam.moved
     return sum_.color, (1 - sum_.clear)[:, None], depth[:, None], samples, visit.missed
 

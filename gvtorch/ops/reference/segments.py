@@ -7,6 +7,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..arguments import RayArguments, Samples, Segments, TraceArguments
 from .exact import clamp, divide, smaller
 from .march import Accumulator, Plain, Transfer, Visit
 from .rays import Beam, Intervals
@@ -16,57 +17,28 @@ _PIECE = -1  # level of an interval of any length
 
 
 def walk_segments(
-    origin_r3: Tensor,
-    direction_r3: Tensor,
-    cone_r2: Tensor,
-    range_r2: Tensor,
-    place_33: Tensor,
-    child_tn: Tensor,
-    brick_tn: Tensor,
-    request_tn: Tensor,
-    stamp_t: Tensor,
-    bricks_bzyxc: Tensor,
-    constant_tnc: Tensor,
-    range_tn2c: Tensor,
-    stamp_b: Tensor,
-    domain_2: Tensor,
-    opaque_m: Tensor,
-    frame_1: Tensor,
+    rays: RayArguments,
+    arguments: TraceArguments,
     state_r3: Tensor | None,
-    width: int,
-    branching: int,
-    root: int,
-    max_depth: int,
-    border: int,
-    component: int,
-    levels: int,
     limit: int,
-    cone_scale: float,
-    root_voxel: float,
-    step: float,
-    by_level: bool,
     by_node: bool,
-) -> tuple[tuple[Tensor, Tensor, Tensor], tuple[Tensor, ...]]:
-    """Twin of `torch.ops.gvtorch.count_segments` and `write_segments` in one: what the two return.
+) -> Segments:
+    """Twin of `torch.ops.gvtorch.count_segments` and `write_segments` in one; see
+    `gvtorch.ops.trace_segments`.
 
     Writes request_tn, stamp_t and stamp_b in place.
     """
-    real = domain_2.dtype
-    beam = Beam.enter(*(origin_r3, direction_r3, cone_r2, range_r2, place_33), cone_scale, real)
-    at = Intervals.begin(beam, step, levels)
+    a, real, levels = arguments, arguments.table_lm4.dtype, arguments.table_lm4.shape[0]
+    beam = Beam.enter(*rays[:4], a.place_33, a.cone_scale, real)
+    at = Intervals.begin(beam, a.step, levels)
     if state_r3 is not None:
         at.base, at.count = state_r3[:, 0].clone(), state_r3[:, 1].clone()
         at.level = clamp(state_r3[:, 2], 0, levels - 1).to(torch.int64)
         at.start = at.base + at.count * at.length
-    tree = Tree(
-        *(child_tn.view(-1), brick_tn.view(-1), request_tn.view(-1), stamp_t, stamp_b, frame_1[0]),
-        torch.tensor(root_voxel, dtype=real).to(domain_2),
-        *(branching, child_tn.shape[1], root, max_depth, by_level),
-    )
-    values = constant_tnc.flatten(0, 1), range_tn2c.flatten(0, 1)
-    bricks = Bricks(bricks_bzyxc, *values, border, component)
-    transfer = Transfer(domain_2.new_zeros((1, len(opaque_m), 4)), domain_2, opaque_m)
-    shader = Plain(transfer, Accumulator.begin(beam), domain_2[0])  # asked what it hides alone
+    tree = Tree.of(a, torch.tensor(a.root_voxel, dtype=real).to(a.domain_2))
+    bricks = Bricks.of(a)
+    transfer = Transfer(a.table_lm4, a.domain_2, a.opaque_m)
+    shader = Plain(transfer, Accumulator.begin(beam), a.domain_2[0])  # asked what it hides alone
     visit = Visit.none(beam, tree)
     seen = torch.zeros_like(beam.first)
     samples, visits = torch.zeros_like(at.level), torch.zeros_like(at.level)
@@ -109,7 +81,7 @@ def walk_segments(
     counts = torch.bincount(segments[0].to(torch.int64), minlength=len(samples))
     count_r3 = torch.stack((counts, samples, visits), 1).to(torch.int32)
     state = torch.stack((at.base, at.count, at.level.to(real)), 1)
-    return (count_r3, state, visit.missed), segments
+    return Segments._make((*segments, count_r3, state, visit.missed))
 
 
 def _joined(parts: list[tuple[Tensor, ...]], beam: Beam, tree: Tree) -> tuple[Tensor, ...]:
@@ -139,9 +111,9 @@ def _joined(parts: list[tuple[Tensor, ...]], beam: Beam, tree: Tree) -> tuple[Te
         tree.brick_n[pairs],
         torch.stack((*depths, wanted_depth(cone, tree)[0]), 1).to(torch.int32),
         torch.stack(intervals, 1).to(torch.int32),
+        torch.stack((base[first], end[last], seen[first]), 1),
         start[first] + moved,
         end[last] + moved,
-        torch.stack((base[first], end[last], seen[first]), 1),
     )
 
 
@@ -155,50 +127,34 @@ def _depth(size: Tensor, tree: Tree) -> Tensor:
 
 
 def sample_bricks(
-    origin_r3: Tensor,
-    direction_r3: Tensor,
-    cone_r2: Tensor,
-    range_r2: Tensor,
-    place_33: Tensor,
-    bricks_bzyxc: Tensor,
-    constant_tnc: Tensor,
-    ray_s: Tensor,
-    node_s2: Tensor,
-    brick_s2: Tensor,
-    depth_s3: Tensor,
-    interval_s3: Tensor,
-    distance_s3: Tensor,
-    segment_k: Tensor,
-    number_k: Tensor,
-    branching: int,
-    max_depth: int,
-    border: int,
-    cone_scale: float,
-    root_voxel: float,
-    step: float,
+    rays: RayArguments, arguments: TraceArguments, segments: Segments, samples: Samples
 ) -> Tensor:
     """Twin of `torch.ops.gvtorch.sample_bricks`: (k, c). Bricks may be float64 here."""
-    real, segment = distance_s3.dtype, segment_k.to(torch.int64)
-    beam = Beam.enter(*(origin_r3, direction_r3, cone_r2, range_r2, place_33), cone_scale, real)
-    ray = ray_s.to(torch.int64)[segment]
-    base, end, seen = distance_s3[segment].unbind(1)
-    first, _, level = interval_s3[segment].unbind(1)
-    length = torch.tensor(step, dtype=real).to(base) * 2.0 ** level.clamp(min=0).to(real)
-    middle = base + ((first + number_k).to(real) + 0.5) * length
+    a, real, segment = arguments, segments.distance.dtype, samples.segment.to(torch.int64)
+    beam = Beam.enter(*rays[:4], a.place_33, a.cone_scale, real)
+    ray = segments.ray_index.to(torch.int64)[segment]
+    base, end, seen = segments.distance[segment].unbind(1)
+    first, _, level = segments.interval[segment].unbind(1)
+    length = torch.tensor(a.step, dtype=real).to(base) * 2.0 ** level.clamp(min=0).to(real)
+    middle = base + ((first + samples.number).to(real) + 0.5) * length
     t = torch.where(level == _PIECE, base + (end - base) * 0.5, middle)
 
-    node, word = node_s2.to(torch.int64)[segment], brick_s2[segment]
+    node, word = segments.node.to(torch.int64)[segment], segments.brick[segment]
     values = []
-    for component in range(bricks_bzyxc.shape[4]):
+    for component in range(a.bricks_bzyxc.shape[4]):
         sides = []
         for which in range(2):
-            corner, size = _box(beam.at(ray, seen), depth_s3[segment, which], branching, max_depth)
-            constant = constant_tnc.flatten(0, 1)[node[:, which]]
-            bricks = Bricks(bricks_bzyxc, constant, constant, border, component)
+            corner, size = _box(
+                beam.at(ray, seen), segments.depth[segment, which], a.branching, a.max_depth
+            )
+            constant = a.constant_tnc.flatten(0, 1)[node[:, which]]
+            bricks = Bricks(a.bricks_bzyxc, constant, constant, a.border, component)
             own = torch.arange(len(segment), device=segment.device)
             place = (corner, size, beam.origin[ray], beam.direction[ray], t)
             sides.append(bricks.sample(word[:, which], own, *place))
-        voxel, above = _voxels(depth_s3[segment, 2], root_voxel, branching, max_depth, base)
+        voxel, above = _voxels(
+            segments.depth[segment, 2], a.root_voxel, a.branching, a.max_depth, base
+        )
         cone = beam.cone_near[ray] + beam.cone_growth[ray] * t
         weight = clamp((cone - voxel) * divide(1.0, above - voxel, voxel), 0, 1)
         mixed = sides[0] + weight * (sides[1] - sides[0])

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ..arguments import RayArguments, ShadeArguments, TraceArguments
 from ..shading import (
     IsosurfaceNumbers,
     LightKind,
@@ -390,92 +391,51 @@ _KINDS: dict[int, type[Shade]] = {
 
 
 def shade_rays(
-    origin_r3: Tensor,
-    direction_r3: Tensor,
-    cone_r2: Tensor,
-    range_r2: Tensor,
-    place_33: Tensor,
-    child_tn: Tensor,
-    brick_tn: Tensor,
-    request_tn: Tensor,
-    stamp_t: Tensor,
-    bricks_bzyxc: Tensor,
-    constant_tnc: Tensor,
-    range_tn2c: Tensor,
-    stamp_b: Tensor,
-    table: Tensor,
-    domain_2: Tensor,
-    opaque_m: Tensor,
-    frame_1: Tensor,
-    parameter_54: Tensor,
-    normal_bzyxc: Tensor | None,
-    normal_tnc: Tensor | None,
-    other_bzyxc: Tensor | None,
-    other_tnc: Tensor | None,
-    shader: int,
-    features: int,
-    other_component: int,
-    width: int,
-    branching: int,
-    root: int,
-    max_depth: int,
-    border: int,
-    component: int,
-    cone_scale: float,
-    root_voxel: float,
-    step: float,
-    stop_alpha: float,
-    depth_alpha: float,
-    by_level: bool,
-    clear_r: Tensor | None = None,
+    rays: RayArguments, arguments: TraceArguments, shading: ShadeArguments, parameter_54: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Twin of `torch.ops.gvtorch.shade_rays`; arguments as in `gvtorch.ops.shade_rays`."""
+    """Twin of `torch.ops.gvtorch.shade_rays`; see `gvtorch.ops.shade_rays`."""
+    a, table, shader = arguments, arguments.table_lm4, shading.shader
     real = table.dtype
-    beam = Beam.enter(*(origin_r3, direction_r3, cone_r2, range_r2, place_33), cone_scale, real)
+    beam = Beam.enter(*rays[:4], a.place_33, a.cone_scale, real)
 
     def number(value: float) -> Tensor:
         return torch.tensor(value, dtype=real).to(table)
 
-    at = Intervals.begin(beam, step, table.shape[0])
-    tree = Tree(
-        *(child_tn.view(-1), brick_tn.view(-1), request_tn.view(-1), stamp_t, stamp_b, frame_1[0]),
-        *(number(root_voxel), branching, child_tn.shape[1], root, max_depth, by_level),
-    )
-    ranges = range_tn2c.flatten(0, 1)
+    at = Intervals.begin(beam, a.step, table.shape[0])
+    tree = Tree.of(a, number(a.root_voxel))
+    channel = (Sided if ShaderKind(shader).stores_color else Bricks).of(a)
 
     def components(bricks: Tensor | None, constants: Tensor | None) -> tuple[Bricks, ...]:
         if bricks is None or constants is None:
             return ()
-        values = constants.flatten(0, 1)
-        return tuple(Bricks(bricks, values, ranges, border, c) for c in range(bricks.shape[4]))
+        own = replace(channel, bricks_bzyxc=bricks, constant_nc=constants.flatten(0, 1))
+        return tuple(replace(own, component=c) for c in range(bricks.shape[4]))
 
-    own = Sided if ShaderKind(shader).stores_color else Bricks
-    channel = own(bricks_bzyxc, constant_tnc.flatten(0, 1), ranges, border, component)
-    stop_clear = 1 - number(stop_alpha)
+    stop_clear = 1 - number(a.stop_alpha)
     none = torch.zeros_like(beam.first, dtype=torch.int32)
     shadows = Shadows(
-        *(beam, tree, step, table.shape[0], stop_clear, number(cone_scale), none, none > 0)
+        *(beam, tree, a.step, table.shape[0], stop_clear, number(a.cone_scale), none, none > 0)
     )
     shade = _KINDS[shader](
-        transfer=Transfer(table, domain_2, opaque_m),
+        transfer=Transfer(table, a.domain_2, a.opaque_m),
         parameters=ShadeParameters.read(parameter_54),
-        normals=components(normal_bzyxc, normal_tnc),
-        others=components(other_bzyxc, other_tnc),
-        other_component=other_component,
+        normals=components(shading.normal_bzyxc, shading.normal_tnc),
+        others=components(shading.other_bzyxc, shading.other_tnc),
+        other_component=shading.other_component,
         channel=channel,
-        eye=origin_r3.to(real),
-        along=direction_r3.to(real),
+        eye=rays.origin_r3.to(real),
+        along=rays.direction_r3.to(real),
         moved=beam.moved,
-        cube=place_33[1].to(real),
-        sum=Accumulator.begin(beam, clear_r),
+        cube=a.place_33[1].to(real),
+        sum=Accumulator.begin(beam, rays.clear_r),
         normal=torch.zeros_like(beam.origin),
-        features=beam.first.new_zeros((len(beam.first), features)),
-        hit_clear=1 - number(depth_alpha),
+        features=beam.first.new_zeros((len(beam.first), shading.features)),
+        hit_clear=1 - number(a.depth_alpha),
         shadows=shadows if ShaderKind(shader).shadowed else None,
     )
     if isinstance(shade, (Isosurface, Projection)):
         shade.begin()
-    samples, visit = walk(beam, at, tree, channel, shade, number(step), stop_clear)
+    samples, visit = walk(beam, at, tree, channel, shade, number(a.step), stop_clear)
     if isinstance(shade, Isosurface):
         shade.found = shade.sum.depth < INF
         t = torch.where(shade.found, shade.sum.depth, 0.0)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ...base.constants import ABSENT, REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
+from ..arguments import TraceArguments
 from .exact import clamp, divide, smaller
 from .rays import INF
 
@@ -49,6 +50,13 @@ class Tree:
     root: int
     max_depth: int
     by_level: bool
+
+    @classmethod
+    def of(cls, a: TraceArguments, root_voxel: Tensor) -> Tree:
+        """The tree of an op's arguments."""
+        words = (a.child_tn.view(-1), a.brick_tn.view(-1), a.request_tn.view(-1))
+        numbers = (a.branching, a.child_tn.shape[1], a.root, a.max_depth)
+        return cls(*words, a.stamp_t, a.stamp_b, a.frame_1[0], root_voxel, *numbers, a.by_level)
 
     def voxel_at(self, depth: Tensor) -> Tensor:
         """World size of a voxel at each depth."""
@@ -165,6 +173,12 @@ class Bricks:
     range_n2c: Tensor
     border: int
     component: int
+
+    @classmethod
+    def of(cls, a: TraceArguments) -> Bricks:
+        """The channel of an op's arguments."""
+        values = a.constant_tnc.flatten(0, 1), a.range_tn2c.flatten(0, 1)
+        return cls(a.bricks_bzyxc, *values, a.border, a.component)
 
     def ends(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
         """(r,) smallest and largest value in reach of the nodes' bricks, and of the nodes below."""
