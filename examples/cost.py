@@ -35,7 +35,7 @@ def main(settings: Settings) -> None:
             azimuth = 30 + DEGREES * frame
             camera = gv.Camera.orbit(azimuth, 20, 0.75, 60, settings.size, settings.size)
             picture, _ = engine.frame(camera, shader)
-        tree = engine.plants["scene"].tree
+        tree = engine.trees["scene"].tree
         cost = gv.cost(tree, camera, shader)
     for name in IMAGES:
         image = getattr(cost, name).float()

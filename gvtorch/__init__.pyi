@@ -61,10 +61,10 @@ from .tracing import (
 )
 
 # Streaming a scene larger than memory.
-from .base.records import FrameStats as FrameStats
 from .engine import (
     Engine as Engine,
     EngineOptions as EngineOptions,
+    FrameStats as FrameStats,
     ProductionError as ProductionError,
 )
 

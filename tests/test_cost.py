@@ -116,7 +116,7 @@ def test_age_counts_frames_since_a_brick_was_written(blobs, compiled):
         gv.VolumeProducer(blobs), brick_size=4, node_pool="1 MB", brick_pool="4 MB",
         device=DEVICES[compiled],
     ) as engine:  # fmt: skip
-        tree = next(iter(engine.plants.values())).tree
+        tree = next(iter(engine.trees.values())).tree
         engine.frame(CAMERA, SHADER)
         born = tree.bricks.born_b[tree.bricks.owner_b >= 0]
         assert (born <= 1).all(), "before the first frame only the root was written"

@@ -7,6 +7,7 @@ import random
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ from hypothesis import strategies as st
 
 import gvtorch as gv
 from gvtorch.base import constants as config
-from gvtorch.engine.turns import scouts
+from gvtorch.engine import EngineSettings
+from gvtorch.engine.ray_subsets import scouts
 
 VESSELS = gv.TransferFunction.preset("vessels", 0, 255)
 AORTA = gv.TransferFunction.from_points([(140, 0), (400, 0.25), (900, 0.95)])
@@ -173,7 +175,7 @@ class Checked(gv.Engine):
 
     def frame(self, *args, **options):
         nodes, bricks = self.cache.nodes, self.cache.bricks
-        roots = len(self.plants)
+        roots = len(self.trees)
         locked = nodes.brick_tn[:roots, 0].clone()
         before = [bricks.owner_b.clone(), nodes.parent_t.clone()]
         used_b = (bricks.stamp_b == self.frames) & (before[0] >= 0)
@@ -185,7 +187,7 @@ class Checked(gv.Engine):
         assert torch.equal(nodes.brick_tn[:roots, 0], locked), "a root was touched"
         assert stats.tiles_used == int((nodes.stamp_t == self.frames).sum())
         assert stats.bricks_used == int((bricks.stamp_b == self.frames).sum())
-        assert not (nodes.request_tn & config.REQUEST_KINDS).any(), "wishes are cleared"
+        assert not (nodes.request_tn & config.REQUEST_KINDS).any(), "requests are cleared"
         return picture, stats
 
 
@@ -269,7 +271,7 @@ class Watched(Checked):
         self.round = 0
         return super().frame(*args, **options)
 
-    def _serve(self, wishes, stats):
+    def serve(self, requests, stats):
         nodes, bricks = self.cache.nodes, self.cache.bricks
         before = [bricks.owner_b.clone(), nodes.parent_t.clone()]
         kept = [
@@ -279,7 +281,7 @@ class Watched(Checked):
             )
         ]
         evicted = sum(stats.evicted.values())
-        super()._serve(wishes, stats)
+        super().serve(requests, stats)
         for now, old, keep in zip((bricks.owner_b, nodes.parent_t), before, kept, strict=True):
             assert torch.equal(now[keep], old[keep])
         if self.round:
@@ -571,3 +573,23 @@ def test_a_batch_of_cameras_converges_as_one_picture(aneurism):
         picture = engine.render(views, VESSELS)
         assert picture.stats.converged and picture.color.shape == (3, 30, 40, 3)
         assert_same_picture(picture, whole)
+
+
+def test_keywords_of_an_engine_are_its_options():
+    assert get_type_hints(EngineSettings) == get_type_hints(gv.EngineOptions)
+
+
+@pytest.mark.backend("cpp")
+def test_engine_objects_show_themselves_in_a_line(blobs):
+    haze = gv.TransferFunction.preset("gray", 0, 1)
+    with gv.Engine(gv.VolumeProducer(blobs), brick_size=4) as engine:
+        _, stats = engine.frame(camera(), haze)
+        assert "not read back" in repr(stats)
+        assert "misses some" in repr(stats.settle())
+        stats = engine.render(camera(), haze).stats
+        assert "converged" in repr(stats)
+        rays = camera().placed(engine.box).rays()
+        shown = [engine, engine.cache, *engine.cache.lru.values(), engine.scheduler, stats, rays]
+        shown += [engine.production, engine.readbacks, *engine.trees.values(), engine.report()]
+        for one in shown:
+            assert len(repr(one)) < 100 and "\n" not in repr(one) and " at 0x" not in repr(one)

@@ -87,7 +87,7 @@ def test_what_is_seen_only_in_a_shadow_is_streamed_at_its_coarser_level(compiled
         with gv.Engine(producer, brick_size=8, device=DEVICES[compiled]) as engine:
             found[name] = engine.render(camera, shader, lighting=lighting)
             assert found[name].stats.converged
-            tree = engine.plants["scene"].tree
+            tree = engine.trees["scene"].tree
             depths[name] = brick_depths(tree, np.array([40, 96, 40]), 14)
     assert found["none"].color.min() > 0.9 and found["shadow"].color.min() < 0.01
     print("depths of the ball's bricks:", depths, "of", tree.depth)

@@ -112,7 +112,7 @@ def test_a_module_streams_what_the_fused_shader_streams(blobs, compiled):
             gv.VolumeProducer(blobs), brick_size=4, node_pool="1 MB", brick_pool="4 MB",
             device=DEVICES[compiled],
         ) as engine:  # fmt: skip
-            spacing = next(iter(engine.plants.values())).tree.spacing
+            spacing = next(iter(engine.trees.values())).tree.spacing
             shader = twin(SOFT, spacing, engine.device, hidden_by=SOFT)
             picture = engine.render(camera, SOFT if name == "fused" else shader)
             engine.validate()

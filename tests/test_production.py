@@ -12,7 +12,7 @@ from test_producers import GRAY, SIZE, Ball, camera
 
 import gvtorch as gv
 from gvtorch.base import constants as config
-from gvtorch.engine.production import ProductionError
+from gvtorch.engine import ProductionError
 
 
 class Broken(Ball):
@@ -266,7 +266,7 @@ def test_a_later_job_may_answer_before_an_earlier_one(blobs):
         producer.hold = False
         producer.go()
         assert engine.render(views[-1], GRAY).stats.converged
-        assert engine.production.failed == 0
+        assert len(engine.production.failures) == 0
 
 
 @pytest.mark.backend("cpp")

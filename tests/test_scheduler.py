@@ -1,4 +1,4 @@
-"""The order of use, and which wishes are served."""
+"""The order of use, and which requests are served."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_lru_takes_from_the_front_and_refuses_more_than_is_unused():
         lru.take(2)
 
 
-def wishes(depth, priority) -> dict[int, Requests]:
+def requests(depth, priority) -> dict[int, Requests]:
     none = torch.zeros(0, dtype=torch.int64)
     loads = Requests(
         node=torch.arange(len(depth)),
@@ -33,7 +33,7 @@ def wishes(depth, priority) -> dict[int, Requests]:
 
 
 def test_the_scheduler_serves_by_level_then_by_size_and_trims():
-    asked = wishes([3, 1, 2, 1], [5, 7, 1, 9])
+    asked = requests([3, 1, 2, 1], [5, 7, 1, 9])
     room = {LOAD: 10, SUBDIVIDE: 10}
     for order, expected in (("coarse", [3, 1, 2, 0]), ("fine", [0, 2, 3, 1])):
         served, deferred, exceeded = Scheduler(order=order).choose(asked, room)
@@ -47,7 +47,7 @@ def test_the_scheduler_serves_by_level_then_by_size_and_trims():
 
 def test_the_time_budget_learns_what_fits():
     scheduler = Scheduler(milliseconds=4.0)
-    asked = wishes([0] * 1000, [1] * 1000)
+    asked = requests([0] * 1000, [1] * 1000)
     room = {LOAD: 5000, SUBDIVIDE: 5000}
     first, deferred, _ = scheduler.choose(asked, room)
     assert 0 < len(first[LOAD]) < 1000 and deferred == 1000 - len(first[LOAD])

@@ -223,27 +223,27 @@ def linked(engine) -> torch.Tensor:
 
 def finest(engine) -> torch.Tensor:
     """Nodes of the finest level that lack their bricks."""
-    nodes, depth = engine.cache.nodes, engine.plants["scene"].layout.depth
+    nodes, depth = engine.cache.nodes, engine.trees["scene"].layout.depth
     lacks = (nodes.brick_tn == config.ABSENT).flatten() & linked(engine)
     lacks &= (nodes.loc_t4[:, 3] == depth).repeat_interleave(nodes.nodes_per_tile)
     return lacks.nonzero()[:, 0]
 
 
 def serve(engine, node, kind) -> gv.FrameStats:
-    """What a frame does for wishes, without its rays."""
+    """What a frame does for requests, without its rays."""
     stats = gv.FrameStats()
     engine.production.write(engine.production.late(), stats)
-    engine.production.write(engine.production.ask([*engine.plants.values()], {kind: node}), stats)
+    engine.production.write(engine.production.ask([*engine.trees.values()], {kind: node}), stats)
     return stats
 
 
 def assert_slots_hold_what_the_producer_made(engine, nodes) -> None:
-    plant, cache = engine.plants["scene"], engine.cache
+    source, cache = engine.trees["scene"], engine.cache
     slot = cache.nodes.brick_tn.view(-1)[nodes].long()
     assert bool((slot > 0).all()) and len(slot.unique()) == len(slot)
     assert torch.equal(cache.bricks.owner_b[slot].long(), nodes)
     for some in torch.arange(len(nodes)).split(5000):
-        made = plant.producer.make(plant.tree.loc(nodes[some.to(nodes.device)]))
+        made = source.producer.make(source.tree.loc(nodes[some.to(nodes.device)]))
         at = slot[some.to(slot.device)]
         for name, pool in cache.bricks.bricks.items():
             held = wide_rows(pool)[0][at]
@@ -274,7 +274,7 @@ def test_slots_hold_what_the_producer_made(device, where):
             if not todo and not engine.production.pending[config.REQUEST_LOAD]:
                 break
             engine.production.wait(limit=0.01)
-        assert moved == len(nodes) * 5000 and engine.production.failed == 0
+        assert moved == len(nodes) * 5000 and len(engine.production.failures) == 0
         engine.validate()
         assert_slots_hold_what_the_producer_made(engine, nodes)
 
@@ -319,7 +319,7 @@ def test_what_finds_no_room_is_held_until_a_later_frame(device, where):
     with grown(Numbered(), device, load_budget=1000) as engine:
         if device.type == "cpu":
             engine.production.staging = Staging(5_000_000, 5000, device)
-        producer, nodes = engine.plants["scene"].producer, finest(engine)[:20_000]
+        producer, nodes = engine.trees["scene"].producer, finest(engine)[:20_000]
         producer.where = where
         serve(engine, nodes[:1], config.REQUEST_LOAD)
         serve(engine, nodes[1:], config.REQUEST_LOAD)

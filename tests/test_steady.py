@@ -13,8 +13,8 @@ from test_engine import PARTS, VESSELS, Checked, Late, assert_same_picture, came
 from test_production import Held
 
 import gvtorch as gv
-import gvtorch.engine.engine
-from gvtorch.base.records import Counts
+import gvtorch.engine.view
+from gvtorch.engine.readback import Readback
 from gvtorch.ops import available
 
 HAZE = gv.TransferFunction.preset("gray", 0, 1)
@@ -33,28 +33,29 @@ def cuda() -> str:
 def traced(monkeypatch):
     """Lists for each pass over a camera's rays whether it was one over scouts."""
     passes: list[bool] = []
-    trace = gvtorch.engine.engine.trace_camera
+    trace = gvtorch.engine.view.trace_camera
 
     def note(*args, again=None, **options):
         passes.append(again is not None)
         return trace(*args, again=again, **options)
 
-    monkeypatch.setattr(gvtorch.engine.engine, "trace_camera", note)
+    monkeypatch.setattr(gvtorch.engine.view, "trace_camera", note)
     return passes
 
 
 @pytest.fixture
 def slow(monkeypatch):
     """Counts that have not come when they are looked at; lists which of them were waited for."""
-    waited: list[Counts] = []
-    read = Counts.read
+    waited: list[Readback] = []
+    wait = Readback.wait
 
-    def wait(self):
-        waited.append(self)
-        return read(self)
+    def note(self):
+        if self not in waited:
+            waited.append(self)
+        return wait(self)
 
-    monkeypatch.setattr(Counts, "here", property(lambda self: False))
-    monkeypatch.setattr(Counts, "read", wait)
+    monkeypatch.setattr(Readback, "arrived", property(lambda self: False))
+    monkeypatch.setattr(Readback, "wait", note)
     return waited
 
 
@@ -177,7 +178,7 @@ def test_scouts_go_only_where_something_was_written(traced, blobs):
 def test_pools_stay_in_order_where_counts_come_at_random(blobs, monkeypatch, producer):
     """A thousand frames each, from pools of a few slots; `Checked` asserts after every frame."""
     pick = random.Random(11)
-    monkeypatch.setattr(Counts, "here", property(lambda self: pick.random() < 0.4))
+    monkeypatch.setattr(Readback, "arrived", property(lambda self: pick.random() < 0.4))
     tree = gv.N3Tree.from_volume(blobs, 4)
     evicted = 0
     for trial in range(4):

@@ -10,9 +10,8 @@ from typing import Any
 
 import torch
 
-from ..base.records import FrameStats
 from ..cameras import Camera
-from ..engine.engine import Engine
+from ..engine import Engine, FrameStats
 from ..pool import Channel, N3Tree
 from ..producers import Bricks, Nodes, Producer, VolumeProducer
 from ..shaders import TransferFunction
@@ -86,7 +85,7 @@ def _captured(
     samples = torch.zeros(1, dtype=torch.int32, device=settings.device)
     cache = torch.cuda.CUDAGraph()
     with torch.cuda.graph(cache):
-        kept = engine._collect(samples)
+        kept = engine.collect_requests_and_use(samples)
     cost = clock(cache.replay, settings, calls=calls).median
     del kept  # a graph's memory stays in use until then
     share = {"cache_ms": cost, "cache_share": cost / timing.median}

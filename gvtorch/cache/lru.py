@@ -9,11 +9,11 @@ from ..ops import lru_partition
 
 
 class LRU:
-    """The order in which slots are given away: those that were not used for longest first.
+    """The order in which slots are given away: least recently used first.
 
     Attributes:
-        order: (k,) int32 slots, locked ones not among them. Its memory stays the same.
-        unused: How many at the front may be taken.
+        order: (k,) int32 slots without the locked ones, changed in place: CUDA graphs read it.
+        unused: How many at the front the last picture did not use; these may be taken.
     """
 
     def __init__(self, capacity: int, locked: int, device: torch.device) -> None:
@@ -22,17 +22,21 @@ class LRU:
         self.unused = len(self.order)
 
     def sort(self, stamp: Tensor, frame: Tensor) -> Tensor:
-        """Brings what this frame did not use to the front, in order; see `ops.lru_partition`.
+        """Moves the slots that were not used in a frame to the front, each part in its old order.
+
+        Args:
+            stamp: (capacity,) int32 frame in which a slot was last used.
+            frame: (1,) int32 the frame.
 
         Returns:
-            (1,) int64 what `unused` is to be set to, once the host knows it.
+            (1,) int64 number of unused slots; `unused` is set once the host knows it.
         """
         order, unused = lru_partition(self.order, stamp, frame)
         self.order.copy_(order)
         return unused
 
     def take(self, count: int) -> Tensor:
-        """Returns (count,) int32 slots from the front, which then stand last.
+        """Returns (count,) int32 slots from the front, and moves them to the back.
 
         Raises:
             ValueError: Fewer slots are unused.
@@ -43,3 +47,6 @@ class LRU:
         self.order.copy_(self.order.roll(-count))
         self.unused -= count
         return taken
+
+    def __repr__(self) -> str:
+        return f"LRU({len(self.order)} slots, {self.unused} may be taken)"

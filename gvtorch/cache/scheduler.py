@@ -1,24 +1,34 @@
-"""`Scheduler`: which wishes are served in a frame, by priority and within the budgets."""
+"""`Scheduler`: which requests are served in a frame, by priority and within the budgets."""
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..base import check
 from ..base.constants import REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
-from .requests import Requests, Wishes
+from .requests import Requests, RequestsByKind
 
 _LEARN_FROM = 64  # items: smaller batches tell more about overhead than about throughput
 _LEARN_RATE = 0.3  # weight of the newest frame
 
 
+class Choice(NamedTuple):
+    """Which requests are served."""
+
+    nodes: dict[int, Tensor]  # for each kind (k,) int64, most wanted first
+    deferred: int  # requests that the budgets put off
+    exceeded: bool  # whether slots were too few
+
+
 class Scheduler:
-    """Orders wishes and trims them to budgets.
+    """Orders requests and trims them to budgets.
 
     Attributes:
+        most: For each kind, most items a frame.
         rate: For each kind, items a millisecond, learned from what production took; None at first.
         spent: For each kind, items that were asked for in this frame, which are off its budget.
     """
@@ -61,31 +71,27 @@ class Scheduler:
         """Starts a frame: its budgets are whole."""
         self.spent = dict.fromkeys(self.most, 0)
 
-    def choose(self, wishes: Wishes, room: dict[int, int]) -> tuple[dict[int, Tensor], int, bool]:
-        """Returns the wishes to serve, most wanted first.
+    def choose(self, requests: RequestsByKind, room: Mapping[int, int]) -> Choice:
+        """Returns the requests to serve.
 
         Args:
-            wishes: All wishes of the frame.
-            room: For each kind, how many slots are free to take.
-
-        Returns:
-            For each kind the (k,) int64 nodes; how many wishes the budgets put off; whether slots
-            were too few.
+            requests: All requests of the frame.
+            room: For each kind, how many slots may be taken.
         """
-        chosen: dict[int, Tensor] = {}
+        nodes: dict[int, Tensor] = {}
         deferred, exceeded = 0, False
         for kind, most in self.most.items():
-            requests = wishes[kind]
+            asked = requests[kind]
             self._budget[kind] = min(most, self._in_time(kind))
             budget = max(0, self._budget[kind] - self.spent[kind])
-            deferred += max(0, min(len(requests), room[kind]) - budget)
-            exceeded |= len(requests) > room[kind]
-            chosen[kind] = requests.node[self.rank(requests)[: min(budget, room[kind])]]
-        return chosen, deferred, exceeded
+            deferred += max(0, min(len(asked), room[kind]) - budget)
+            exceeded |= len(asked) > room[kind]
+            nodes[kind] = asked.node[self.rank(asked)[: min(budget, room[kind])]]
+        return Choice(nodes, deferred, exceeded)
 
     def rank(self, requests: Requests) -> Tensor:
-        """Returns the order in which wishes are served: by level, then by size on the screen, then
-        by node, so that it does not depend on chance.
+        """(k,) int64 rows in the order in which they are served: by level, then by size on the
+        screen, then by node, so that it does not depend on chance.
         """
         level = requests.depth if self.order == "coarse" else -requests.depth
         small = REQUEST_PRIORITY - requests.priority.to(torch.int64)
@@ -101,8 +107,13 @@ class Scheduler:
         self.rate[kind] = seen if known is None else known + _LEARN_RATE * (seen - known)
 
     def _in_time(self, kind: int) -> int:
+        """How many items half of the time is enough for."""
         if self.milliseconds is None:
             return self.most[kind]
         rate = self.rate[kind]
-        half = 0.5 * self.milliseconds
-        return _LEARN_FROM if rate is None else max(1, int(rate * half))
+        return _LEARN_FROM if rate is None else max(1, int(rate * 0.5 * self.milliseconds))
+
+    def __repr__(self) -> str:
+        loads, tiles = self.most[REQUEST_LOAD], self.most[REQUEST_SUBDIVIDE]
+        time = "" if self.milliseconds is None else f", {self.milliseconds:g} ms"
+        return f"Scheduler({self.order} first, at most {loads} bricks, {tiles} tiles{time} a frame)"

@@ -1,7 +1,16 @@
 """The engine: frames that stream what the rays ask for."""
 
-from .engine import Engine
-from .production import ProductionError
-from .setup import EngineOptions
+from .engine import Engine, FrameGraph
+from .failures import Failure, ProductionError
+from .options import EngineOptions, EngineSettings
+from .stats import FrameStats
 
-__all__ = ["Engine", "EngineOptions", "ProductionError"]
+__all__ = [
+    "Engine",
+    "EngineOptions",
+    "EngineSettings",
+    "Failure",
+    "FrameGraph",
+    "FrameStats",
+    "ProductionError",
+]

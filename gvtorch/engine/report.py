@@ -6,7 +6,7 @@ import statistics
 from collections import deque
 from typing import Any
 
-from ..base.records import FrameStats
+from .stats import FrameStats
 
 _KEPT = 1000  # frames
 
@@ -74,6 +74,9 @@ class Report:
         for name, size in content["memory"].items():
             table.add_row(f"{name}, MB", f"{size / 1e6:.1f}", "")
         return table
+
+    def __repr__(self) -> str:
+        return f"Report({len(self._frames)} frames)"
 
     def __str__(self) -> str:
         """Shows the table as plain text."""

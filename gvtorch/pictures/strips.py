@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..base import check
-from ..base.records import FrameStats, Rays, RenderStats
+from ..base.records import Rays, RenderStats
 from ..base.stage import Progress, no_progress
 from ..cameras.camera import Camera
 from ..cameras.custom import as_camera
@@ -64,14 +63,15 @@ def render_tiles(
     limit = check.nbytes("render_tiles", "memory", memory)
     height, width = camera.height, camera.width
     rows = strip_rows(limit, width, height)
-    stats: list[RenderStats] = []
+    stats: RenderStats | None = None
 
     def pictures() -> Iterator[Picture]:
+        nonlocal stats
         for top in range(0, height, rows):
             end = min(top + rows, height)
             made = render(camera.strip(top, end))
             picture: Picture = made[0] if isinstance(made, tuple) else made
-            _add_up(stats, picture.stats)
+            stats = picture.stats if stats is None else picture.stats.after(stats)
             yield picture
             progress("rows", end, height)
 
@@ -86,7 +86,8 @@ def render_tiles(
             kind = {8: np.uint8, 16: np.uint16, 32: np.float32}[bits]
             shape = (height, width, 4 if first.transparent else 3)
             write_tiff(part, shape, np.dtype(kind), pixels, rows)
-    return stats[0]
+    assert stats is not None
+    return stats
 
 
 def strip_rows(limit: int, width: int, height: int) -> int:
@@ -109,15 +110,3 @@ def _write_npy(path: Path, pictures: Iterator[Picture], shape: tuple[int, ...]) 
         np.lib.format.write_array_header_1_0(file, header)
         for picture in pictures:
             file.write(stacked(picture.layers()).astype("<f4").tobytes())
-
-
-def _add_up(total: list[RenderStats], stats: RenderStats) -> None:
-    """Keeps the newest statistics, with the sums of all before."""
-    stats = dataclasses.replace(stats)
-    for before in total:
-        for name in ("milliseconds", "rays", "samples"):
-            setattr(stats, name, getattr(stats, name) + getattr(before, name))
-        if isinstance(stats, FrameStats) and isinstance(before, FrameStats):
-            stats.converged &= before.converged
-            stats.capacity_exceeded |= before.capacity_exceeded
-    total[:] = [stats]

@@ -23,11 +23,11 @@ from .light import parse_lighting
 if TYPE_CHECKING:
     import torch
 
-    from ..base.records import FrameStats, RenderStats
+    from ..base.records import RenderStats
     from ..cameras import Camera
     from ..cameras.models import CameraModel
     from ..cameras.path import CameraPath
-    from ..engine.engine import Engine
+    from ..engine import Engine, FrameStats
     from ..pictures import Picture
     from ..shaders import Shader, TransferFunction
     from ..tracing import Clip, Cost, ThinLens
@@ -289,15 +289,15 @@ class Render:
         refuse_for_store(self.source)
         streaming = self.streaming
         with streaming.open(self.path, self.look) as (engine, shader):
-            (plant,) = engine.plants.values()
+            (source,) = engine.trees.values()
             mode, most = streaming.mode or "converge", streaming.max_frames
             stats = self._take(
                 partial(engine.render, shader=shader, mode=mode, max_frames=most, **options),
-                partial(cost, plant.tree, shader=shader, **options),
+                partial(cost, source.tree, shader=shader, **options),
                 *(camera, bar),
             )
             _tell_failures(engine)
-            return stats, plant.tree.extent
+            return stats, source.tree.extent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -467,7 +467,7 @@ def value_range(store: Any) -> tuple[float, float]:
 
 def told(stats: RenderStats) -> str:
     """What a picture cost, in a few words."""
-    from ..base.records import FrameStats
+    from ..engine import FrameStats
 
     text = f"{stats.samples / 1e6:.1f} M samples in {stats.milliseconds:.0f} ms ({stats.backend})"
     if not isinstance(stats, FrameStats):
@@ -492,7 +492,7 @@ def _tell_failures(engine: Engine) -> None:
     for failure in engine.failures[:3]:
         print(f"gvtorch: {failure}", file=sys.stderr)
     if len(engine.failures) > 3:
-        print(f"gvtorch: {engine.production.failed} nodes failed in all", file=sys.stderr)
+        print(f"gvtorch: {len(engine.production.failures)} nodes failed in all", file=sys.stderr)
 
 
 def _check_suffix(flag: str, path: Path, *kinds: str) -> None:

@@ -100,7 +100,7 @@ def cost(
 ) -> Cost:
     """Counts what the rays of a picture do. Nothing is written: neither stamps nor requests.
 
-    Of an engine's tree (`engine.plants[NAME].tree`) it shows the last frame. Rays are walked node
+    Of an engine's tree (`engine.trees[NAME].tree`) it shows the last frame. Rays are walked node
     by node outside the kernel, which takes many times as long as the picture itself.
 
     Args:

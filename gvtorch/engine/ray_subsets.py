@@ -1,11 +1,11 @@
-"""`Turns`: which rays of a converging picture are traced next.
+"""`RaySubsets`: which rays of a converging picture are traced next.
 
 A ray that missed nothing is done; the others are traced again. At first these are scouts, one of
 4 x 4 pixels: a brick is wider than that on the screen, so they miss almost all that the others
 would, for a sixteenth of the work. Then come all that are not done. Where the pools are full of
-what these rays use and none comes to its end, fewer are traced, so that what the others used makes
-room: half as many each time nothing moves, twice as many after a group is done. Source: the
-original engine suspends rays and takes several passes for quality; Crassin, PhD thesis 2011.
+what these rays use and none of them gets done, fewer are traced, which frees what the others used:
+half as many each time nothing moves, twice as many after a subset is done. Source: the original
+engine suspends rays and takes several passes for quality; Crassin, PhD thesis 2011.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..base.records import FrameStats
+from .stats import FrameStats
 
 _STRIDE = 4  # pixels from scout to scout
 
 
-class Turns:
+class RaySubsets:
     """The state of a picture's rays.
 
     Attributes:
         count: Number of rays.
         done: Rays that need no more passes.
-        now: (count,) bool, to be traced next.
+        next: (count,) bool, to be traced next.
         over: Nothing is left to trace, or tracing does not help.
         stuck: The last pass moved nothing.
-        crowded: Rays had to take turns.
+        crowded: The pools were too small for all rays at once.
     """
 
     def __init__(self, count: int, width: int, device: torch.device) -> None:
@@ -42,7 +42,7 @@ class Turns:
         self._scouts = _grid(count, width, device)
         self._open = torch.ones(count, dtype=torch.bool, device=device)
         self._size = count
-        self.now = self._open.clone()
+        self.next = self._open.clone()
         self.over = self.stuck = self.crowded = False
         self.done = self._given_up = 0
 
@@ -51,8 +51,8 @@ class Turns:
         """Every ray got all that could be served."""
         return not self._given_up and self.done == self.count
 
-    def take(self, missed: Tensor, stats: FrameStats, failed: int) -> None:
-        """Learns what a pass did.
+    def update(self, missed: Tensor, stats: FrameStats, failed: int) -> None:
+        """Chooses the next subset from what a pass did; waits for the device.
 
         Args:
             missed: (count,) bool, of the rays that were traced.
@@ -60,11 +60,11 @@ class Turns:
             failed: Nodes that had failed before it.
         """
         # Where nothing could be served, what is missing has failed: these rays are as good as ever.
-        finished = self.now if stats.converged else self.now & ~missed
+        finished = self.next if stats.converged else self.next & ~missed
         self._open &= ~finished
-        left = self.now & self._open
+        left = self.next & self._open
         sums = torch.stack([rays.sum() for rays in (finished, left, self._open)])
-        just_done, remaining, unfinished = sums.tolist()  # the one wait
+        just_done, remaining, unfinished = sums.tolist()
         moved = sum(stats.produced.values()) + stats.stale > 0 or stats.failed > failed
         self.stuck = not moved and not just_done
         self.done = self.count - unfinished
@@ -83,15 +83,18 @@ class Turns:
             self._size = min(self.count, 2 * self._size)
         self._choose(left if remaining else self._open)
 
-    def everyone(self) -> None:
-        """Lets all rays that are not done be traced next: the last pass that there is time for."""
-        self.now = self._open.clone()
+    def trace_all(self) -> None:
+        """Lets all rays that are not done be traced next: it is the last pass."""
+        self.next = self._open.clone()
 
     def _choose(self, group: Tensor) -> None:
         scouts = group & self._scouts
         first = torch.where(scouts.any(), scouts, group)
-        self.now = first & (first.cumsum(0) <= self._size)
+        self.next = first & (first.cumsum(0) <= self._size)
         self.over = self.done == self.count
+
+    def __repr__(self) -> str:
+        return f"RaySubsets({self.done} of {self.count} rays done)"
 
 
 def scouts(missed: Tensor, width: int) -> Tensor:
