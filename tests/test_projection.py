@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import typing
 
 import numpy as np
 import pytest
@@ -12,10 +13,15 @@ from conftest import DEVICES
 from kornia.geometry.camera import distort_points_kannala_brandt, project_points_orthographic
 
 import gvtorch as gv
-from gvtorch.cameras.models import distort, last_rising_angle, undistort
+from gvtorch.cameras.models import (
+    MODELS,
+    CameraModel,
+    distort,
+    last_rising_angle,
+    undistort,
+)
 from gvtorch.ops import available
 
-MODELS = ["pinhole", "ortho", "fisheye", "panorama"]
 HAZE = gv.TransferFunction.preset("gray", 0, 1)
 BEND = [0.08, -0.03, 0.004, -0.0005]
 WIDTH, HEIGHT = 14, 10
@@ -46,8 +52,12 @@ def local_ray(model: str, x: float, y: float) -> tuple[list[float], list[float]]
     return [0, 0, 0], [math.sin(x) * math.cos(y), math.sin(y), math.cos(x) * math.cos(y)]
 
 
+def test_editors_know_every_model():
+    assert typing.get_args(CameraModel) == tuple(MODELS)
+
+
 @pytest.mark.parametrize("model", MODELS)
-def test_rays_follow_the_formula_of_the_lens(model):
+def test_rays_follow_the_formula_of_their_model(model):
     camera = askew(model)
     rays, K = camera.rays(), camera.Ks[0]
     rotation, move = camera.viewmats[0, :3, :3].numpy(), camera.viewmats[0, :3, 3].numpy()

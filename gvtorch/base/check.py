@@ -4,6 +4,7 @@ came.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import operator
 import os
@@ -23,6 +24,20 @@ def describe(tensor: Any) -> str:
     shape = ", ".join(str(size) for size in tensor.shape)
     dtype = str(tensor.dtype).removeprefix("torch.")
     return f"({shape}{',' if tensor.dim() == 1 else ''}) {dtype} on {tensor.device}"
+
+
+def brief(record: Any) -> str:
+    """Returns one line on a dataclass: `Name(field=value, ...)` of the fields that differ from
+    their defaults, of tensors only shape and dtype.
+    """
+    parts = []
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        if isinstance(value, Tensor):
+            parts.append(f"{field.name}={describe(value).partition(' on ')[0]}")
+        elif value != field.default:
+            parts.append(f"{field.name}={value!r}")
+    return f"{type(record).__name__}({', '.join(parts)})"
 
 
 def tensor(

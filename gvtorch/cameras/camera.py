@@ -1,4 +1,4 @@
-"""`Camera`: one or a batch, with a lens of `projection.py`, and the rays through their pixels.
+"""`Camera`: one or a batch, of one of the `models`, and the rays through their pixels.
 
 Conventions: camera axes are OpenCV's (x right, y down, z forward); pixel (i, j) covers [i, i + 1)
 x [j, j + 1) of the image plane, its centre is at +0.5 (so do gsplat and nerfstudio; kornia puts
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.records import Rays
-from .models import MODELS, CameraModel, default_fov, last_rising_angle, pixel_rays
+from .models import CameraModel, last_rising_angle, model_of, pixel_rays
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
@@ -42,7 +42,7 @@ class Frame(Enum):
 
 
 class Camera:
-    """Cameras that share width, height and lens.
+    """Cameras that share width, height and camera model.
 
     Attributes:
         viewmats: (n, 4, 4) float64, world (or box) to camera.
@@ -50,7 +50,7 @@ class Camera:
             (pinhole), a radian (fisheye, panorama), or a world unit or side of the box (ortho).
         width: Pixels.
         height: Pixels.
-        model: Name of the lens.
+        model: Name of the camera model.
         radial_coeffs: (n, 4) float64 distortion of a fisheye.
         max_angle: (n,) float64 radians; a fisheye's rays farther from the axis are closed.
         window: First row and number of rows of the whole picture, of which this camera may take a
@@ -87,7 +87,8 @@ class Camera:
             ValueError: A wrong shape, a value that is not finite, a focal length that is not
                 positive or a rotation that is none.
         """
-        self.model = _model("Camera", model)
+        model_of("Camera", model)
+        self.model = model
         self.width = check.whole("Camera", "width", width, low=1, high=65536)
         self.height = check.whole("Camera", "height", height, low=1, high=65536)
         self.window = (0, self.height)
@@ -133,7 +134,7 @@ class Camera:
         self.distorted = bool((self.radial_coeffs != 0).any())
 
     def _distort(self, coefficients: Tensor) -> None:
-        if self.model != "fisheye":
+        if not model_of("Camera", self.model).bends:
             raise ValueError(f"Camera: radial_coeffs are for a fisheye, got model {self.model!r}")
         shape, count = tuple(coefficients.shape), len(self)
         if shape not in ((4,), (1, 4), (count, 4)):
@@ -165,7 +166,7 @@ class Camera:
             fov: Vertical field of view, degrees; see `look_at`.
             width: Pixels.
             height: Pixels.
-            model: Name of the lens.
+            model: Name of the camera model.
 
         Raises:
             ValueError: A number is not finite or out of its range.
@@ -223,7 +224,7 @@ class Camera:
                 as wide as high.
             width: Pixels.
             height: Pixels.
-            model: Name of the lens.
+            model: Name of the camera model.
 
         Raises:
             ValueError: A place is not finite, up is zero, or eye and target are the same.
@@ -270,8 +271,8 @@ class Camera:
         camera_model: CameraModel = "pinhole",
         radial_coeffs: Tensor | None = None,
     ) -> Camera:
-        """Takes gsplat's arguments: (..., 4, 4) world-to-camera (OpenCV), (..., 3, 3), the lens by
-        its word there and (..., 4) coefficients of a fisheye.
+        """Takes gsplat's arguments: (..., 4, 4) world-to-camera (OpenCV), (..., 3, 3),
+        the camera model by its name there, and (..., 4) coefficients of a fisheye.
 
         Leading dimensions are laid in a row: the cameras are a batch of their product.
         """
@@ -319,6 +320,14 @@ class Camera:
         """Number of cameras."""
         return self.viewmats.shape[0]
 
+    def __repr__(self) -> str:
+        """Tells number, size and model."""
+        count = f"{len(self)} x " if self.batched else ""
+        return (
+            f"{type(self).__name__}({count}{self.width}x{self.height}, {self.model}, "
+            f"in {self.frame.value} units)"
+        )
+
     def __getitem__(self, index: int) -> Camera:
         """Returns one camera of the batch."""
         one = range(len(self))[index]
@@ -337,7 +346,7 @@ class Camera:
         return (*size, self.batched, self.model, self.distorted, self.window)
 
     def same(self, other: Camera) -> bool:
-        """Whether another camera has the same rays; nobody waits for a device."""
+        """Whether another camera has the same rays; does not wait for a device."""
         return (self.form, self.frame) == (other.form, other.frame) and all(
             torch.equal(getattr(self, name), getattr(other, name)) for name in _ROWS
         )
@@ -350,7 +359,7 @@ class Camera:
         view, Ks = self.viewmats.clone(), self.Ks
         rotation = view[:, :3, :3]
         view[:, :3, 3] = view[:, :3, 3] * side - rotation @ centre
-        if self.model == "ortho":
+        if model_of("Camera", self.model).parallel:
             Ks = Ks.clone()
             Ks[:, (0, 1), (0, 1)] /= side
         return self._changed(viewmats=view, Ks=Ks, frame=Frame.WORLD)
@@ -369,7 +378,7 @@ class Camera:
         return self.shifted(0, first)._changed(height=end - first, window=window)
 
     def numbers(self, device: torch.device | str = "cpu") -> Tensor:
-        """Returns (n, 25) float64, what `pixel_rays` reads; on CUDA the copy makes nobody wait.
+        """Returns (n, 25) float64, what `pixel_rays` reads; does not wait for the device.
 
         Raises:
             ValueError: The camera is relative to a box: call `placed(box)` first.
@@ -381,7 +390,8 @@ class Camera:
         position = -(translation[:, None] @ rotation)[:, 0]  # -R^T t
         zero = torch.zeros_like(focal[:, :1])
         pixel = 1 / focal.min(1, keepdim=True).values
-        cone = (pixel, zero) if self.model == "ortho" else (zero, pixel)
+        parallel = model_of("Camera", self.model).parallel
+        cone = (pixel, zero) if parallel else (zero, pixel)
         range_ = (zero, zero + math.inf)
         bend = (self.radial_coeffs, self.max_angle[:, None])
         parts = (rotation.flatten(1), position, focal, centre, *cone, *range_, *bend)
@@ -422,7 +432,7 @@ _ROWS = ("viewmats", "Ks", "radial_coeffs", "max_angle")  # a row a camera
 
 
 def sent(numbers: Tensor, device: torch.device | str) -> Tensor:
-    """Returns numbers on a device; copies from the host to CUDA make nobody wait."""
+    """Returns numbers on a device; does not wait for it."""
     device = torch.device(device)
     if device.type == "cuda" and not numbers.is_cuda:
         return numbers.pin_memory().to(device, non_blocking=True)
@@ -449,12 +459,6 @@ def _viewmat(eye: Tensor, forward: Tensor, right: Tensor) -> Tensor:
     return view
 
 
-def _model(where: str, model: Any) -> CameraModel:
-    if model not in MODELS:
-        raise ValueError(f"{where}: model must be one of {', '.join(MODELS)}, got {model!r}")
-    return model
-
-
 def _aimed(
     where: str,
     view: Tensor,
@@ -465,22 +469,16 @@ def _aimed(
     model: CameraModel,
     frame: Frame,
 ) -> Camera:
-    """Cameras with the lens in the middle of the picture; `distance` (...) is the target's."""
-    _model(where, model)
-    round_ = model in ("fisheye", "panorama")
-    high = {"fisheye": 360, "panorama": 180}.get(model, 179)
-    fov = default_fov(model) if fov is None else fov
-    angle = math.radians(check.number(where, "fov", fov, low=0, high=high, open_low=True))
+    """Cameras that look through the middle of the picture; `distance` (...) is the target's."""
+    kind = model_of(where, model)
+    fov = kind.fov if fov is None else fov
+    check.number(where, "fov", fov, low=0, high=kind.widest, open_low=True)
     check.whole(where, "width", width, low=1, high=65536)
     check.whole(where, "height", height, low=1, high=65536)
-    across = height / angle if round_ else 0.5 * height / math.tan(0.5 * angle)
-    Ks = torch.tensor(
-        [[across, 0, width / 2], [0, across, height / 2], [0, 0, 1]], dtype=torch.float64
-    )
-    if model == "panorama":
-        Ks[0, 0] = width / (2 * angle)
-    if model == "ortho":
+    fx, fy = kind.focal(math.radians(fov), width, height)
+    Ks = torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], dtype=torch.float64)
+    if kind.parallel:
         Ks = Ks.repeat(*distance.shape, 1, 1)
         Ks[..., (0, 1), (0, 1)] /= distance[..., None]
-    most = min(180.0, fov / 2) if model == "fisheye" else 180.0
+    most = min(180.0, fov / 2) if kind.bends else 180.0
     return Camera(view, Ks, width, height, model=model, max_angle=most, frame=frame)

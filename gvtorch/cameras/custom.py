@@ -10,7 +10,6 @@ from torch import Tensor
 from ..base.check import describe, whole
 from ..base.records import Rays
 from .camera import Camera, Frame, sent
-from .models import neighbour_cones, ray_step
 
 
 class CustomCamera(Camera):
@@ -114,7 +113,7 @@ class CustomCamera(Camera):
                     f"got {describe(part)}"
                 ) from None
         if cone is None:
-            shaped["cone"] = neighbour_cones(shaped["origin"], direction)
+            shaped["cone"] = _neighbour_cones(shaped["origin"], direction)
         flat: dict[str, Any] = {n: part.reshape(-1, part.shape[-1]) for n, part in shaped.items()}
         height, width = direction.shape[-3:-1]
         camera = cls(Rays(**flat), width, height)
@@ -143,7 +142,7 @@ class CustomCamera(Camera):
     def shifted(self, dx: float, dy: float) -> Camera:
         """Returns the camera with its rays moved by a part of the step to their neighbours."""
         lines = self._pictures()[..., :6]
-        moved = lines + dx * ray_step(lines, -2) + dy * ray_step(lines, -3)
+        moved = lines + dx * _ray_step(lines, -2) + dy * _ray_step(lines, -3)
         origin, direction = moved.split(3, -1)
         direction = direction / direction.norm(dim=-1, keepdim=True)
         rays = torch.cat((origin, direction, self._pictures()[..., 6:]), -1)
@@ -177,3 +176,27 @@ def as_camera(where: str, camera: Camera | Rays) -> Camera:
     if not isinstance(camera, Camera):
         raise ValueError(f"{where}: camera must be a Camera, got {type(camera).__name__}")
     return camera
+
+
+def _neighbour_cones(origin: Tensor, direction: Tensor) -> Tensor:
+    """Returns cones (..., h, w, 2) from the differences between neighbouring rays: width at the
+    origin and growth per unit distance, the larger of both axes of the picture.
+
+    Args:
+        origin: (..., h, w, 3).
+        direction: (..., h, w, 3), unit length.
+
+    Source: Igehy, "Tracing ray differentials", SIGGRAPH 1999.
+    """
+    widths = []
+    for field in (origin, direction):
+        steps = [_ray_step(field, axis).norm(dim=-1) for axis in (-3, -2)]
+        widths.append(torch.maximum(*steps))
+    return torch.stack(widths, -1)
+
+
+def _ray_step(field: Tensor, axis: int) -> Tensor:
+    """Change of (..., h, w, c) from pixel to pixel: central differences, 0 along a lone row."""
+    if field.shape[axis] == 1:
+        return torch.zeros_like(field)
+    return torch.gradient(field, dim=axis)[0]

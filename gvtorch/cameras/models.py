@@ -1,21 +1,15 @@
-"""Projections: from pixels to rays, on the device, for every camera model.
+"""Camera models: from pixels to rays, on the device.
 
-A lens turns a place of the image plane, x = (u - cx) / fx and y = (v - cy) / fy, into a ray:
-
-- pinhole: the direction is (x, y, 1).
-- ortho: the origin moves by (x, y), all directions are (0, 0, 1); fx is in pixels a world unit.
-- fisheye: equidistant, the angle to the axis is the distance from the middle; with four
-  coefficients it is the angle t whose t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) is that distance.
-  Source: Kannala and Brandt, "A generic camera model and calibration method for conventional,
-  wide-angle, and fish-eye lenses", PAMI 2006, eq. 6; OpenCV's fisheye model.
-- panorama: equirectangular, x is the longitude and y the latitude (down), in radians.
-
-Axes are OpenCV's: x right, y down, z forward.
+A model turns a place of the image plane, x = (u - cx) / fx and y = (v - cy) / fy, into a ray. Each
+is a class here, of which one instance stands in `MODELS`; all else asks that instance. Axes are
+OpenCV's: x right, y down, z forward.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -24,13 +18,189 @@ from torch import Tensor
 from ..base.records import Rays
 
 CameraModel = Literal["pinhole", "ortho", "fisheye", "panorama"]
-MODELS = ("pinhole", "ortho", "fisheye", "panorama")
 _NEWTON = 20  # steps; each halves the bracket where Newton's leaves it
+_ROUNDING = 1 + 1e-12  # of the edges of fisheye and panorama
 
 
-def default_fov(model: CameraModel) -> float:
-    """Returns the vertical field of view, degrees, of a camera for which none was told."""
-    return 180.0 if model in ("fisheye", "panorama") else 30.0
+@dataclass(frozen=True)
+class Plane:
+    """Rows of pixels on the image planes of cameras: y rows of w pixels, r = y * w in all."""
+
+    x: Tensor  # (k, w) float64; k is 1 where all rows are one camera's, else y
+    y: Tensor  # (y,)
+    numbers: Tensor  # (k, 25), see `pixel_rays`
+    distorted: bool  # the coefficients of a fisheye are used
+
+    @property
+    def rotation(self) -> Tensor:
+        """(k, 3, 3) world to camera."""
+        return self.numbers[:, :9].unflatten(1, (3, 3))
+
+    @property
+    def position(self) -> Tensor:
+        """(k, 3) world."""
+        return self.numbers[:, 9:12]
+
+    def spread(self, values: Tensor) -> Tensor:
+        """(r, c) of (k, c): one camera's is not copied."""
+        rows, width = len(self.y), self.x.shape[1]
+        if len(values) == 1:
+            return values.expand(rows * width, -1)
+        return values[:, None].expand(-1, width, -1).reshape(rows * width, -1)
+
+    def turned(self, local: Tensor) -> Tensor:
+        """(y, w, 3) world directions of those in camera axes."""
+        parts = (local[..., i, None] * self.rotation[:, None, i] for i in range(3))
+        return sum(parts, torch.zeros_like(local))
+
+    def rays(
+        self,
+        direction: Tensor,
+        *,
+        origin: Tensor | None = None,
+        widening: Tensor | None = None,
+        inside: Tensor | None = None,
+    ) -> Rays:
+        """Returns the rays of all pixels.
+
+        Args:
+            direction: (y, w, 3) or (r, 3) world, unit length.
+            origin: (y, w, 3) world; the camera's position if left out.
+            widening: (y, w) factor on the cones.
+            inside: (y, w) bool, the pixel has a ray; others get an empty range. All if left out.
+        """
+        cone, limits = (self.spread(part) for part in self.numbers[:, 16:20].split(2, 1))
+        if widening is not None:
+            cone = cone * widening.reshape(-1, 1)
+        if inside is not None:
+            limits = torch.where(inside.reshape(-1, 1), limits, 0.0)
+        return Rays(
+            origin=self.spread(self.position) if origin is None else origin.reshape(-1, 3),
+            direction=direction.reshape(-1, 3),
+            cone=cone,
+            range=limits,
+            width=self.x.shape[1],
+        )
+
+
+class Model(ABC):
+    """A camera model.
+
+    Attributes:
+        fov: Vertical field of view in degrees where none is given.
+        widest: Largest one.
+        parallel: Rays are parallel; focal lengths are pixels per world unit, and cones do not grow.
+        bends: It takes radial coefficients and a largest angle to the axis.
+    """
+
+    fov = 30.0
+    widest = 179.0
+    parallel = False
+    bends = False
+
+    def focal(self, fov: float, width: int, height: int) -> tuple[float, float]:
+        """Returns fx and fy for a vertical field of view in radians; of a parallel model for a
+        target at distance 1.
+        """
+        length = 0.5 * height / math.tan(0.5 * fov)
+        return length, length
+
+    @abstractmethod
+    def rays(self, plane: Plane) -> Rays:
+        """Returns the rays through places of the image plane."""
+
+
+class Pinhole(Model):
+    """The direction is (x, y, 1)."""
+
+    def rays(self, plane: Plane) -> Rays:
+        x, y, rotation = plane.x, plane.y, plane.rotation
+        length = (x * x + (y * y + 1)[:, None]).sqrt_()  # (y, w)
+        across = x[..., None] * rotation[:, None, 0]
+        down = y[:, None] * rotation[:, 1] + rotation[:, 2]
+        return plane.rays((across + down[:, None]).div_(length[..., None]))
+
+
+class Ortho(Model):
+    """The origin moves by (x, y); all directions are (0, 0, 1)."""
+
+    parallel = True
+
+    def rays(self, plane: Plane) -> Rays:
+        rotation = plane.rotation
+        across = plane.x[..., None] * rotation[:, None, 0]
+        down = plane.y[:, None] * rotation[:, 1] + plane.position
+        return plane.rays(plane.spread(rotation[:, 2]), origin=across + down[:, None])
+
+
+class Fisheye(Model):
+    """Equidistant: the angle to the axis is the distance from the middle. With four coefficients it
+    is the angle t whose t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) is that distance.
+
+    Source: Kannala and Brandt, "A generic camera model and calibration method for conventional,
+    wide-angle, and fish-eye lenses", PAMI 2006, eq. 6; OpenCV's fisheye model.
+    """
+
+    fov, widest, bends = 180.0, 360.0, True
+
+    def focal(self, fov: float, width: int, height: int) -> tuple[float, float]:
+        """A unit of the image plane is a radian."""
+        return height / fov, height / fov
+
+    def rays(self, plane: Plane) -> Rays:
+        x, y = plane.x, plane.y[:, None]
+        k, limit = plane.numbers[:, 20:24], plane.numbers[:, 24:]
+        radius = (x * x + (y * y)).sqrt()  # (y, w)
+        angle = undistort(radius, k, limit) if plane.distorted else radius
+        scale = torch.where(radius > 0, angle.sin() / radius, 1.0)
+        across = torch.stack((x.expand_as(radius), y.expand_as(radius)), -1)
+        local = torch.cat((scale[..., None] * across, angle.cos()[..., None]), -1)
+        edge, widening = limit, None
+        if plane.distorted:
+            edge = distort(limit, k)
+            # Along the radius a pixel spans 1 / slope, across it sin(angle) / radius.
+            widening = torch.maximum(1 / slope(angle, k), scale)
+        inside = radius <= edge * _ROUNDING
+        return plane.rays(plane.turned(local), widening=widening, inside=inside)
+
+
+class Panorama(Model):
+    """Equirectangular: x is the longitude and y the latitude (down), in radians."""
+
+    fov, widest = 180.0, 180.0
+
+    def focal(self, fov: float, width: int, height: int) -> tuple[float, float]:
+        """A unit of the image plane is a radian; a picture shows twice the angle across."""
+        return width / (2 * fov), height / fov
+
+    def rays(self, plane: Plane) -> Rays:
+        latitude = plane.y[:, None].expand(-1, plane.x.shape[-1])
+        longitude = plane.x.expand_as(latitude)
+        ring = latitude.cos()
+        parts = (longitude.sin() * ring, latitude.sin(), longitude.cos() * ring)
+        below = latitude.abs() <= _ROUNDING * math.pi / 2
+        inside = below & (longitude.abs() <= _ROUNDING * math.pi)
+        # A pixel spans 1 / fy radians down, and along its circle of latitude cos / fx.
+        fx, fy = plane.numbers[:, 12:14].unbind(1)
+        span = torch.maximum(plane.y.cos() / fx, 1 / fy) * torch.minimum(fx, fy)
+        widening = span[:, None].expand_as(latitude)
+        return plane.rays(plane.turned(torch.stack(parts, -1)), widening=widening, inside=inside)
+
+
+#: Every camera model by its name.
+MODELS: dict[str, Model] = {
+    "pinhole": Pinhole(),
+    "ortho": Ortho(),
+    "fisheye": Fisheye(),
+    "panorama": Panorama(),
+}
+
+
+def model_of(where: str, name: str) -> Model:
+    """Returns the camera model of a name; raises ValueError where there is none."""
+    if name not in MODELS:
+        raise ValueError(f"{where}: model must be one of {', '.join(MODELS)}, got {name!r}")
+    return MODELS[name]
 
 
 def pixel_rays(
@@ -41,7 +211,7 @@ def pixel_rays(
     model: str = "pinhole",
     distorted: bool = False,
 ) -> Rays:
-    """Returns the rays through the pixel centres of whole rows; nobody waits for the device.
+    """Returns the rays through the pixel centres of whole rows; does not wait for the device.
 
     Args:
         numbers: (n, 25) float64, a row a camera: world-to-camera rotation (9), position (3), focal
@@ -57,66 +227,10 @@ def pixel_rays(
     row = torch.arange(first, end, device=numbers.device)  # (y,)
     if len(numbers) > 1:
         numbers, row = numbers[row // height], row % height  # one for each row
-    rotation, position = numbers[:, :9].unflatten(1, (3, 3)), numbers[:, 9:12]  # (k, 3, 3), (k, 3)
     (fx, fy), (cx, cy) = numbers[:, 12:14].unbind(1), numbers[:, 14:16].unbind(1)
     column = torch.arange(width, dtype=torch.float64, device=numbers.device)
-    x, y = (column - cx[:, None]) / fx[:, None], (row - cy) / fy  # (k, w), (y,)
-
-    def spread(values: Tensor) -> Tensor:
-        """(r, c) of (k, c): one camera's is not copied."""
-        if len(values) == 1:
-            return values.expand(len(row) * width, -1)
-        return values[:, None].expand(-1, width, -1).reshape(len(row) * width, -1)
-
-    origin, cone, limits = (spread(part) for part in (position, *numbers[:, 16:20].split(2, 1)))
-    if model == "pinhole":
-        length = (x * x + (y * y + 1)[:, None]).sqrt_()  # (y, w)
-        across = x[..., None] * rotation[:, None, 0]
-        down = y[:, None] * rotation[:, 1] + rotation[:, 2]
-        direction = (across + down[:, None]).div_(length[..., None]).reshape(-1, 3)
-    elif model == "ortho":
-        across, down = x[..., None] * rotation[:, None, 0], y[:, None] * rotation[:, 1] + position
-        origin, direction = (across + down[:, None]).reshape(-1, 3), spread(rotation[:, 2])
-    else:
-        if model == "fisheye":
-            local, inside, stretch = _fisheye(x, y, numbers[:, 20:24], numbers[:, 24:], distorted)
-            cone = cone * stretch if distorted else cone
-        else:
-            local, inside = _panorama(x, y)
-            # A pixel spans 1 / fy radians down, and along its circle of latitude cos / fx.
-            span = torch.maximum(y.cos() / fx, 1 / fy) * torch.minimum(fx, fy)
-            cone = cone * span[:, None].expand(-1, width).reshape(-1, 1)
-        turned = (local[..., i, None] * rotation[:, None, i] for i in range(3))
-        direction = sum(turned, torch.zeros_like(local)).reshape(-1, 3)
-        limits = torch.where(inside.reshape(-1, 1), limits, 0.0)  # an empty range closes a ray
-    return Rays(origin=origin, direction=direction, cone=cone, range=limits, width=width)
-
-
-def _panorama(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit directions (y, w, 3), and (y, w) whether a pixel lies on the sphere."""
-    latitude = y[:, None].expand(-1, x.shape[-1])
-    longitude = x.expand_as(latitude)
-    ring = latitude.cos()
-    local = torch.stack((longitude.sin() * ring, latitude.sin(), longitude.cos() * ring), -1)
-    rounding = 1 + 1e-12
-    inside = (latitude.abs() <= rounding * math.pi / 2) & (longitude.abs() <= rounding * math.pi)
-    return local, inside
-
-
-def _fisheye(
-    x: Tensor, y: Tensor, k: Tensor, limit: Tensor, distorted: bool
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Unit directions (y, w, 3), (y, w) whether a pixel lies in the circle, and (r, 1) by how much
-    wider its cone is than that of an equidistant lens.
-    """
-    radius = (x * x + (y * y)[:, None]).sqrt()  # (y, w)
-    angle = undistort(radius, k, limit) if distorted else radius
-    scale = torch.where(radius > 0, angle.sin() / radius, 1.0)
-    plane = scale[..., None] * torch.stack((x.expand_as(radius), y[:, None].expand_as(radius)), -1)
-    inside = radius <= (distort(limit, k) if distorted else limit) * (1 + 1e-12)
-    # Along the radius a pixel spans 1 / slope, across it sin(angle) / radius.
-    stretch = torch.maximum(1 / slope(angle, k), scale) if distorted else torch.ones_like(scale)
-    return torch.cat((plane, angle.cos()[..., None]), -1), inside, stretch.reshape(-1, 1)
+    x, y = (column - cx[:, None]) / fx[:, None], (row - cy) / fy
+    return MODELS[model].rays(Plane(x, y, numbers, distorted))
 
 
 def distort(angle: Tensor, k: Tensor) -> Tensor:
@@ -156,27 +270,3 @@ def last_rising_angle(k: Tensor) -> float:
     roots = np.roots([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0])
     real = roots.real[(abs(roots.imag) < 1e-9) & (roots.real > 0)]
     return min([math.pi, *np.sqrt(real).tolist()])
-
-
-def neighbour_cones(origin: Tensor, direction: Tensor) -> Tensor:
-    """Returns cones (..., h, w, 2) from the differences between neighbouring rays: width at the
-    origin and growth per unit distance, the larger of both axes of the picture.
-
-    Args:
-        origin: (..., h, w, 3).
-        direction: (..., h, w, 3), unit length.
-
-    Source: Igehy, "Tracing ray differentials", SIGGRAPH 1999.
-    """
-    widths = []
-    for field in (origin, direction):
-        steps = [ray_step(field, axis).norm(dim=-1) for axis in (-3, -2)]
-        widths.append(torch.maximum(*steps))
-    return torch.stack(widths, -1)
-
-
-def ray_step(field: Tensor, axis: int) -> Tensor:
-    """Change of (..., h, w, c) from pixel to pixel: central differences, 0 along a lone row."""
-    if field.shape[axis] == 1:
-        return torch.zeros_like(field)
-    return torch.gradient(field, dim=axis)[0]

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..base import check
 from .camera import Camera
-from .models import CameraModel, default_fov
+from .models import CameraModel, model_of
 
 _KEYS = {"eye", "target", "up", "fov"}
 
@@ -74,7 +74,7 @@ class CameraPath:
         """Goes once around a box; see `Camera.orbit` for the numbers. The model tells the field of
         view that is left out.
         """
-        fov = default_fov(model) if fov is None else fov
+        fov = model_of("CameraPath.orbit", model).fov if fov is None else fov
         turn = azimuth + torch.linspace(0, 360, 37)
         cameras = Camera.orbit(turn, elevation, distance, width=1, height=1).placed(box)
         rotation, move = cameras.viewmats[:, :3, :3], cameras.viewmats[:, :3, 3:]
@@ -118,6 +118,10 @@ class CameraPath:
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
 
+    def __repr__(self) -> str:
+        """Tells the number of keys."""
+        return f"CameraPath({len(self._keys)} keys)"
+
     def camera(self, at: float, width: int, height: int, model: CameraModel = "pinhole") -> Camera:
         """Returns the camera at a place of the path.
 
@@ -125,7 +129,7 @@ class CameraPath:
             at: 0 for the first key, 1 for the last; keys are evenly spaced.
             width: Pixels.
             height: Pixels.
-            model: Name of the lens.
+            model: Name of the camera model.
         """
         at = check.number("CameraPath", "at", at, low=0, high=1)
         last = len(self._keys) - 1

@@ -45,6 +45,11 @@ class Gradient(Background):
         """Takes two colours, linear RGB, finite and >= 0."""
         self.ends = [_color("Gradient", n, c) for n, c in (("top", top), ("bottom", bottom))]
 
+    def __repr__(self) -> str:
+        """Tells both colours."""
+        top, bottom = self.ends
+        return f"Gradient(top={top}, bottom={bottom})"
+
     def behind(self, camera: Camera, numbers: Tensor, dtype: torch.dtype) -> Tensor:
         """Returns (r, 3)."""
         options: Any = {"dtype": dtype, "device": numbers.device}
@@ -68,6 +73,10 @@ class Backdrop(Background):
             raise ValueError("Backdrop: image must be finite, got NaN or infinity")
         self.image = image
         self._there: dict[torch.device, Tensor] = {}
+
+    def __repr__(self) -> str:
+        """Tells the shape."""
+        return f"Backdrop({check.describe(self.image)})"
 
     def check(self, where: str, camera: Camera) -> None:
         """Compares the sizes."""
@@ -120,6 +129,10 @@ class Environment(Background):
     def read(cls, path: str | Path) -> Environment:
         """Reads the map from a file; see `read_image`."""
         return cls(read_image(path)[..., :3])
+
+    def __repr__(self) -> str:
+        """Tells the shape."""
+        return f"Environment({check.describe(self.image)})"
 
     def _on(self, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """The map (1, 3, h, w + 2), its first and last columns repeated, and the rotation; uploaded

@@ -56,6 +56,10 @@ class Progressive:
         self._render = render
         self.reset()
 
+    def __repr__(self) -> str:
+        """Tells camera and frames."""
+        return f"Progressive({self._camera}, {self.count} frames)"
+
     def reset(self) -> None:
         """Begins anew; to be called where the scene or its shader changed."""
         self.count = 0

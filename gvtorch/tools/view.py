@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from ..pictures import Picture
     from ..shaders import Shader, TransferFunction
     from ..tracing import Clip, Cost, ThinLens
+else:
+    CameraModel = str  # checked by the camera, since its module would load torch
 
 _RANGE_VOXELS = 128**3  # of a foreign image that are read to learn its range
 
@@ -39,8 +41,8 @@ _RANGE_VOXELS = 128**3  # of a foreign image that are read to learn its range
 class Look:
     """How it is shown."""
 
-    camera_model: Literal["pinhole", "ortho", "fisheye", "panorama"] = "pinhole"
-    """lens: ortho is parallel, fisheye equidistant, panorama equirectangular"""
+    camera_model: Annotated[CameraModel, arg(metavar="MODEL")] = "pinhole"
+    """pinhole, ortho (parallel), fisheye (equidistant) or panorama (equirectangular)"""
     fov: Annotated[float | None, arg(metavar="DEG")] = None
     """vertical field of view; 30, or 180 of a fisheye or panorama, if left out"""
     size: Annotated[str, arg(metavar="WxH")] = "512x512"

@@ -56,6 +56,12 @@ class Clip:
         check.number("Clip", "cap_light", self.cap_light, low=0, high=1)
         _ = self._own
 
+    def __repr__(self) -> str:
+        """Tells how many planes and boxes there are."""
+        counts = [f"{name}={len(getattr(self, name))}" for name in ("planes", "boxes", "without")]
+        frame = Frame(self.frame).value
+        return f"Clip({', '.join(counts)}, caps={self.caps}, in {frame} units)"
+
     @property
     def whole(self) -> bool:
         """Whether at most one piece of each ray is kept, and no cap is drawn."""

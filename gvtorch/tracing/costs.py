@@ -50,6 +50,11 @@ class Cost:
     fill: Tensor  # share of the bricks' voxels of which the transfer function shows something
     stats: RenderStats
 
+    def __repr__(self) -> str:
+        """Tells the size."""
+        *_, height, width, _ = self.samples.shape
+        return f"Cost({width}x{height}, {self.stats.samples} samples)"
+
     def picture(
         self, name: Image, *, low: float = 0.0, high: float | None = None, colormap: str = "viridis"
     ) -> Picture:

@@ -91,6 +91,10 @@ class Lighting:
         object.__setattr__(self, "frame", Frame.of(where, self.frame))
         check_triple(where, "ambient", self.ambient, low=0.0)
 
+    def __repr__(self) -> str:
+        """Tells what differs from the defaults."""
+        return check.brief(self)
+
     def placed(self, box: Tensor) -> Lighting:
         """Returns it in world units, given the (2, 3) box of the scene."""
         if self.reach is not None and self.frame is Frame.WORLD:

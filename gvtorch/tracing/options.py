@@ -70,6 +70,10 @@ class RenderOptions:
         if self.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"{where}: dtype must be float32 or float64, got {self.dtype}")
 
+    def __repr__(self) -> str:
+        """Tells what differs from the defaults."""
+        return check.brief(self)
+
 
 _OBJECTS = {"clip": Clip, "layer": Layer, "lens": ThinLens, "lighting": Lighting}
 

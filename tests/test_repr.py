@@ -1,0 +1,43 @@
+"""Every public object tells of itself in one short line, by shapes, not by contents."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import gvtorch as gv
+
+GRAY = gv.TransferFunction.preset("gray", 0, 1)
+ORBIT = gv.Camera.orbit(width=8, height=6)
+IMAGE = torch.rand(6, 8, 3)
+
+
+@pytest.fixture
+def tree():
+    return gv.N3Tree.from_volume(gv.Volume(torch.rand(8, 8, 8)), 4)
+
+
+def test_objects_tell_of_themselves_in_one_line(tree):
+    rays = ORBIT.placed(tree.box).rays()
+    for thing, begin in (
+        (ORBIT, "Camera(8x6, pinhole, in box units)"),
+        (gv.Camera.orbit([0, 90], model="ortho"), "Camera(2 x 512x512, ortho, in box units)"),
+        (gv.CustomCamera(rays), "CustomCamera(8x6, custom, in world units)"),
+        (gv.CameraPath([(0, 0, 0)] * 2, [(1, 1, 1)] * 2), "CameraPath(2 keys)"),
+        (rays[:5], "Rays((5, 3) float64 on cpu)"),
+        (gv.trace(tree, rays, GRAY), "Hits((48, 3) float32 on cpu)"),
+        (gv.render(tree, ORBIT, GRAY), "Picture(8x6, "),
+        (gv.cost(tree, ORBIT, GRAY), "Cost(8x6, "),
+        (gv.Clip(boxes=[((0, 0, 0), (1, 1, 1))]), "Clip(planes=0, boxes=1, without=0, caps=F"),
+        (gv.Layer(IMAGE, IMAGE[..., :1]), "Layer(opaque, color=(6, 8, 3) float32 on cpu)"),
+        (gv.Lighting(occlusion=1), "Lighting(occlusion=1)"),
+        (gv.ThinLens(aperture=0.1, focus=2), "ThinLens(aperture=0.1, focus=2)"),
+        (gv.RenderOptions(background=IMAGE), "RenderOptions(background=Backdrop((6, 8, 3) fl"),
+        (gv.Gradient((0, 0, 0), (1, 1, 1)), "Gradient(top=(0.0, 0.0, 0.0), bottom="),
+        (gv.Environment(IMAGE), "Environment((6, 8, 3) float32 on cpu)"),
+        (gv.Progressive(print), "Progressive(None, 0 frames)"),
+        (tree, "N3Tree(8x8x8"),
+    ):
+        text = repr(thing)
+        assert text.startswith(begin), text
+        assert len(text) < 200 and "\n" not in text, text
