@@ -24,7 +24,6 @@ from rich.table import Table
 import gvtorch as gv
 from gvtorch.bench.scenes import worn_planes
 from gvtorch.cameras.path import CameraPath
-from gvtorch.io import convert
 
 
 @dataclass
@@ -94,7 +93,7 @@ def main(settings: Settings) -> None:
         if not store.exists():
             console.print(f"making {store}")
             write_volume(raw, settings.side)
-            convert(raw, store, shape=(settings.side,) * 3, dtype="uint8")
+            gv.convert(raw, store, shape=(settings.side,) * 3, dtype="uint8")
             raw.unlink()
         table = Table(title=f"{settings.frames} frames of {settings.size}^2, {settings.loading}")
         for column in ("brick pool", "miss rate", "unserved", "bricks used a frame"):

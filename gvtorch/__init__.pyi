@@ -2,7 +2,9 @@
 
 # Data, and the tree it becomes.
 from .base.volume import Volume as Volume
-from .io import read_volume as read_volume
+from .io.conversion import convert as convert, estimate as estimate
+from .io.reading import read_volume as read_volume
+from .io.store import Store as Store
 from .pool import (
     BrickPool as BrickPool,
     BrickTable as BrickTable,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import bz2
 import errno
 import gzip
-import importlib
 import json
 import os
 import signal
@@ -19,12 +19,14 @@ import pytest
 from test_store import assert_holds, noise, write_foreign
 
 import gvtorch as gv
-from gvtorch.io import Store, convert, estimate, sources, tasks
-from gvtorch.io.layout import WORK
+from gvtorch.io import conversion, shard
+from gvtorch.io.conversion import convert, estimate
+from gvtorch.io.formats import FORMATS, find_format
+from gvtorch.io.reading import open_source
+from gvtorch.io.store import Store
+from gvtorch.io.store_layout import WORK
 from gvtorch.tools.cli import main
 
-#: `gvtorch.io.convert` names the function.
-convert_module = importlib.import_module("gvtorch.io.convert")
 SHAPE = (9, 20, 300)  # z y x: two shards along x
 
 
@@ -44,7 +46,7 @@ def raw(tmp_path, data) -> Path:
 
 
 def source_files(folder: Path) -> dict[str, Path]:
-    """One small volume in every format that is read in parts, and in some that are not."""
+    """One small volume in every format, in every way that is read differently."""
     import nibabel
     import nrrd
     import tifffile
@@ -58,6 +60,9 @@ def source_files(folder: Path) -> dict[str, Path]:
     nibabel.save(nibabel.Nifti1Image(grid.T.copy(), turned), folder / "a.nii")
     nibabel.save(nibabel.Nifti1Image(grid.swapaxes(1, 2).T.copy(), swapped), folder / "swap.nii")
     nibabel.save(nibabel.Nifti1Image(grid.T.copy(), turned), folder / "a.nii.gz")
+    scaled = nibabel.Nifti1Image(grid.T.copy(), turned)
+    scaled.header.set_slope_inter(0.5, 3)
+    nibabel.save(scaled, folder / "scaled.nii")
     header = {"space directions": turned[:3, :3], "space origin": [1, 2, 3], "space": "LPS"}
     for name, more in (("raw", {}), ("gzip", {}), ("raw", {"detached_header": True})):
         file = folder / (f"{name}.nhdr" if more else f"{name}.nrrd")
@@ -72,14 +77,24 @@ def source_files(folder: Path) -> dict[str, Path]:
     tifffile.imwrite(folder / "plain.tif", grid, photometric="minisblack", byteorder=">")
     tifffile.imwrite(folder / "packed.tif", grid, photometric="minisblack", compression="zlib")
     tifffile.imwrite(folder / "rgb.tif", rgb, photometric="rgb", compression="zlib")
+    planes = np.stack((grid, grid + 1), 1)
+    tifffile.imwrite(
+        folder / "planes.tif", planes, imagej=True, metadata={"axes": "ZCYX"}, compression="zlib"
+    )
     (folder / "slices").mkdir(exist_ok=True)
     for index, image in enumerate(grid):
         tifffile.imwrite(folder / "slices" / f"s{index}.tif", image)
     fits.writeto(folder / "a.fits", grid[None], overwrite=True)
     fits.writeto(folder / "u.fits", grid.astype(np.uint16), overwrite=True)
+    fits.writeto(folder / "a.fits.gz", grid.astype(np.uint16), overwrite=True)
+    packed = fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(grid)])
+    packed.writeto(folder / "packed.fits", overwrite=True)
     np.save(folder / "c.npy", rgb)
     np.save(folder / "fortran.npy", np.asfortranarray(grid.astype(">f8")))
     np.savez(folder / "a.npz", grid)
+    (folder / "c.npy.gz").write_bytes(gzip.compress((folder / "c.npy").read_bytes()))
+    (folder / "f.npy.bz2").write_bytes(bz2.compress((folder / "fortran.npy").read_bytes()))
+    write_foreign(folder / "a.zarr", [np.moveaxis(rgb, 3, 0)], "czyx", [[1, 3.0, 2, 1]], version=2)
     (folder / "a_12x9x7_int16be.raw").write_bytes(grid.astype(">i2").tobytes())
     (folder / "b_12x9x7_int16.raw.gz").write_bytes(gzip.compress(grid.tobytes()))
     names = sorted(p for p in folder.iterdir() if not p.name.endswith(".raw.part"))
@@ -87,23 +102,23 @@ def source_files(folder: Path) -> dict[str, Path]:
 
 
 def test_every_format_converts_to_what_read_volume_reads(tmp_path):
-    whole = {"a.nii.gz", "gzip.nrrd", "a.npz", "b_12x9x7_int16.raw.gz"}
+    whole = {"a.nii.gz", "gzip.nrrd", "a.npz", "b_12x9x7_int16.raw.gz", "planes.tif"}
+    whole |= {"a.fits.gz", "c.npy.gz", "f.npy.bz2"}
     files = source_files(tmp_path / "files")
     detached = files.pop("raw.raw", None)
-    assert detached is not None and len(files) == 18
+    assert detached is not None and len(files) == 25
+    assert {find_format(str(file)).name for file in files.values()} == {f.name for f in FORMATS}
     for name, file in files.items():
         volume = gv.read_volume(file)
-        source = sources.open_source(file)
-        assert (source is None) == (name in whole), name
+        source = open_source(file)
+        assert source.whole == (name in whole), name
         store = convert(file, tmp_path / f"{name}.zarr")
-        assert store.spacing == pytest.approx(volume.spacing), name
-        assert store.origin == pytest.approx(volume.origin), name
+        assert (store.spacing, store.origin) == (volume.spacing, volume.origin), name
         data = volume.data.numpy()
         assert store.width == data.shape[3]
         assert np.array_equal(store.read_region(0, (0, 0, 0), data.shape[:3]), data), name
-        if source is not None:
-            box = source.read_box((2, 3, 4), (5, 4, 11))
-            assert np.array_equal(box, data[2:5, 3:4, 4:11]), name
+        box = source.read_region((2, 3, 4), (5, 4, 11))
+        assert np.array_equal(box, data[2:5, 3:4, 4:11]), name
 
 
 def test_an_ome_zarr_image_becomes_a_store(tmp_path):
@@ -168,16 +183,15 @@ def test_arguments_are_checked_before_the_work(tmp_path, raw):
 def test_what_does_not_fit_is_told_with_numbers(tmp_path, raw, monkeypatch):
     target = tmp_path / "a.zarr"
     (tmp_path / "b_300x20x9_uint8.raw.gz").write_bytes(gzip.compress(raw.read_bytes()))
-    monkeypatch.setattr(sources, "memory_free", lambda: 1000)
-    with pytest.raises(ValueError, match=r"takes 0\.1 MB, and 0\.0 MB of memory are free: unpack"):
-        convert(tmp_path / "b_300x20x9_uint8.raw.gz", target)
     with monkeypatch.context() as patch:
-        patch.setattr(convert_module.machine, "memory_free", lambda: 1000)
+        patch.setattr(conversion.resources, "memory_free", lambda: 1000)
+        with pytest.raises(ValueError, match=r"takes 0\.1 MB, and 0\.0 MB of memory are free"):
+            convert(tmp_path / "b_300x20x9_uint8.raw.gz", target)
         with pytest.raises(OSError, match=r"takes up to .* MB of memory, 0\.0 MB are free"):
             convert(raw, target)
     with monkeypatch.context() as patch:
         usage = type("usage", (), {"free": 1000})
-        patch.setattr(convert_module.shutil, "disk_usage", lambda _: usage)
+        patch.setattr(conversion.shutil, "disk_usage", lambda _: usage)
         with pytest.raises(OSError, match=r"the store takes about .* MB, 0\.0 MB are free"):
             convert(raw, target)
     assert not target.exists()
@@ -193,7 +207,7 @@ class Crash(Exception):
 def crash_after(monkeypatch, count: int, error: Exception) -> list[tuple[int, ...]]:
     """Lets so many tasks run, then fails; returns the list of those that ran."""
     ran: list[tuple[int, ...]] = []
-    original = tasks.write_shard
+    original = shard.write_shard
 
     def write(job, level, place):
         if len(ran) == count:
@@ -203,7 +217,7 @@ def crash_after(monkeypatch, count: int, error: Exception) -> list[tuple[int, ..
             ran.append((level, *place))
         return result
 
-    monkeypatch.setattr(tasks, "write_shard", write)
+    monkeypatch.setattr(shard, "write_shard", write)
     return ran
 
 
@@ -247,10 +261,10 @@ def test_a_full_disk_is_told_and_goes_on(tmp_path, raw, data, monkeypatch):
         def result(self):
             raise ValueError("RESOURCE_EXHAUSTED: Error writing: [OS error 28: No space left on")
 
-    original = tasks._write
+    original = shard._write
     with monkeypatch.context() as patch:
         patch.setattr(
-            tasks,
+            shard,
             "_write",
             lambda job, spec, *rest: (
                 Full()
@@ -268,14 +282,15 @@ def test_a_full_disk_is_told_and_goes_on(tmp_path, raw, data, monkeypatch):
 
 KILLED = """
 import sys, time
-from gvtorch.io import convert, tasks
-original = tasks.write_shard
+from gvtorch.io import shard
+from gvtorch.io.conversion import convert
+original = shard.write_shard
 def slow(job, level, place):
     result = original(job, level, place)
     if job.root["driver"] == "file":
         time.sleep(0.2)
     return result
-tasks.write_shard = slow
+shard.write_shard = slow
 convert(sys.argv[1], sys.argv[2], workers=1)
 """
 
@@ -307,7 +322,7 @@ def test_kill_9_and_resume(tmp_path, raw, data, monkeypatch):
 
 
 def test_processes_write_the_same(tmp_path, data, raw, monkeypatch):
-    monkeypatch.setattr(convert_module, "_FEW", 1)
+    monkeypatch.setattr(conversion, "_FEW", 1)
     seen: list[tuple[int, int]] = []
     store = convert(
         raw,

@@ -10,7 +10,7 @@ from marcher import trilinear
 
 import gvtorch as gv
 from gvtorch.base.volume import DIRECTIONS
-from gvtorch.io import convert
+from gvtorch.io.conversion import convert
 from gvtorch.pool.pyramid import pool_directional, volume_levels
 
 RED, GREEN = (1.0, 0.1, 0.0), (0.0, 0.9, 0.2)

@@ -16,7 +16,7 @@ from test_store import Handler, served  # noqa: F401
 import gvtorch as gv
 from gvtorch.bench.storage import Memory
 from gvtorch.engine import ProductionError
-from gvtorch.io.convert import convert
+from gvtorch.io.conversion import convert
 from gvtorch.io.store import Store
 from gvtorch.producers.stored import HostCache
 

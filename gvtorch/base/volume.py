@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -27,21 +28,21 @@ CHANNEL_DTYPES = (
 DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
 
 
-def check_extent(where: str, shape: Sequence[int], *, what: str = "extent") -> None:
-    """Raises ValueError unless all sizes are positive and their product is at most 2^31 voxels.
+def check_extent(
+    where: str, shape: Sequence[int], *, what: str = "extent", most: int = config.MAX_VOXELS
+) -> None:
+    """Raises ValueError unless all sizes are positive and their product is at most `most`.
 
     Readers call it with what a file's header says, before they take any memory for it.
     """
     sizes = " x ".join(str(size) for size in shape)
     if any(size < 1 for size in shape):
         raise ValueError(f"{where}: {what} must be at least 1 in every direction, got {sizes}")
-    voxels = 1
-    for size in shape:
-        voxels *= int(size)
-    if voxels > config.MAX_VOXELS:
+    voxels = math.prod(int(size) for size in shape)
+    if voxels > most:
+        place = "in memory at once" if most == config.MAX_VOXELS else "into a store"
         raise ValueError(
-            f"{where}: {what} {sizes} is {voxels} voxels, more than the {config.MAX_VOXELS} "
-            "that fit in memory at once"
+            f"{where}: {what} {sizes} is {voxels} voxels, more than the {most} that fit {place}"
         )
 
 
@@ -158,6 +159,30 @@ class Volume:
         volume = Volume(seen, self.spacing, self.origin, name=self.name)
         volume.filter = "directional"
         return volume
+
+    def describe(self, bins: int = 32) -> dict[str, Any]:
+        """Returns extent, dtype, place, range and histogram as plain values.
+
+        Args:
+            bins: Of the histogram, over the range of all channels.
+        """
+        check.whole("Volume.describe", "bins", bins, low=1)
+        low, high = self.value_range
+        values = (self.data.float() if self.data.dtype == torch.bfloat16 else self.data).numpy()
+        limits = (low, high) if high > low else (low, low + 1)
+        counts, _ = np.histogram(values, bins=bins, range=limits)
+        return {
+            "name": self.name,
+            "extent": list(self.extent),
+            "channels": int(self.data.shape[3]),
+            "dtype": str(self.data.dtype).removeprefix("torch."),
+            "spacing": list(self.spacing),
+            "origin": list(self.origin),
+            "range": [low, high],
+            "mean": float(values.mean(dtype=np.float64)),
+            "histogram": [int(count) for count in counts],
+            "bytes": self.data.nbytes,
+        }
 
     def __repr__(self) -> str:
         """Shows extent, dtype, channels and spacing."""

@@ -16,7 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from ..base.records import Hits, RenderStats
 from ..cameras import Camera
-from ..io.machine import memory_free
+from ..io.resources import memory_free
 from ..pictures import Picture
 from ..pool import N3Tree
 from ..tracing.resident import trace

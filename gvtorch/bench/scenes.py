@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..base.volume import Volume
 from ..cameras import Camera
-from ..io import read_volume
+from ..io.reading import read_volume
 from ..shaders import TransferFunction
 
 SCAN = Path(__file__).parents[2] / "examples" / "data" / "aneurism_256x256x256_uint8.raw.gz"

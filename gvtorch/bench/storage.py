@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from ..io import Store
-from ..io.convert import convert as convert_volume
+from ..io.conversion import convert as convert_volume
+from ..io.store import Store
 from . import PEERS
 from .record import Record, clock, spread
 

@@ -1,7 +1,8 @@
-"""Reading volumes from files, and the store on disk."""
+"""Reading volumes from files, and the store on disk.
 
-from .convert import Estimate, convert, estimate
-from .formats import read_volume
-from .store import Store
+    reading.py      `read_volume`, `open_source`, over one file a format in formats/
+    conversion.py   `convert`, `estimate`: any volume to a store
+    store.py        `Store`: a volume on disk, read block by block
 
-__all__ = ["Estimate", "Store", "convert", "estimate", "read_volume"]
+Nothing is imported here: the command line names the formats without waiting for torch.
+"""

@@ -1,4 +1,4 @@
-"""OME-Zarr metadata: `read_image` (NGFF 0.1 to 0.5) and `image_metadata` (0.5).
+"""OME-Zarr metadata: `parse_image` (NGFF 0.1 to 0.5) and `image_metadata` (0.5).
 
 What a file says is checked here before anything is done with it. Arrays are not opened.
 Source: OME-NGFF specification, versions 0.4 and 0.5 (multiscales).
@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 _MOST_LEVELS = 64
@@ -18,7 +19,7 @@ _DEFAULT_AXES = "tczyx"  # of versions 0.1 and 0.2
 
 
 @dataclass(frozen=True)
-class Scale:
+class ImageArray:
     """One array of a multiscale image."""
 
     path: str
@@ -27,15 +28,23 @@ class Scale:
 
 
 @dataclass(frozen=True)
-class Image:
+class MultiscaleImage:
     """A multiscale image: its axes in stored order, one letter each, and its arrays, finest
     first.
     """
 
     axes: str
-    scales: tuple[Scale, ...]
+    scales: tuple[ImageArray, ...]
     name: str
     unit: str | None
+
+
+def is_zarr(path: str | Path) -> bool:
+    """Tells a Zarr group, or what is named like one (a URL, `NAME.zarr`), from any other file."""
+    text = str(path)
+    if "://" in text or text.rstrip("/").endswith(".zarr"):
+        return True
+    return any((Path(text) / name).is_file() for name in ("zarr.json", ".zattrs", ".zgroup"))
 
 
 def parse_json(where: str, content: bytes) -> dict[str, Any]:
@@ -55,7 +64,9 @@ def parse_json(where: str, content: bytes) -> dict[str, Any]:
     return found
 
 
-def read_image(where: str, attributes: dict[str, Any], image: str | None) -> Image | None:
+def parse_image(
+    where: str, attributes: dict[str, Any], image: str | None
+) -> MultiscaleImage | None:
     """Reads the multiscale image out of a group's attributes.
 
     Args:
@@ -82,7 +93,7 @@ def read_image(where: str, attributes: dict[str, Any], image: str | None) -> Ima
     return None
 
 
-def _image(where: str, item: dict[str, Any]) -> Image:
+def _image(where: str, item: dict[str, Any]) -> MultiscaleImage:
     axes, unit = _axes(where, item.get("axes"))
     datasets = item.get("datasets")
     if not isinstance(datasets, list) or not 1 <= len(datasets) <= _MOST_LEVELS:
@@ -96,9 +107,9 @@ def _image(where: str, item: dict[str, Any]) -> Image:
         scale, move = _transform(where, dataset.get("coordinateTransformations"), axes)
         z, y, x = (a * b for a, b in zip(scale, outer[0], strict=True))
         mz, my, mx = (m * s + o for m, s, o in zip(move, *outer, strict=True))
-        scales.append(Scale(path.strip("/"), (z, y, x), (mz, my, mx)))
+        scales.append(ImageArray(path.strip("/"), (z, y, x), (mz, my, mx)))
     name = item.get("name")
-    return Image(axes, tuple(scales), name if isinstance(name, str) else "image", unit)
+    return MultiscaleImage(axes, tuple(scales), name if isinstance(name, str) else "image", unit)
 
 
 def _axes(where: str, axes: Any) -> tuple[str, str | None]:

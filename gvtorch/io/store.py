@@ -20,12 +20,14 @@ import torch
 
 from ..base import check
 from . import ngff
-from .layout import (
+from .level_reader import Deadline, LevelReader, StoreError
+from .multiscale import find_image, open_arrays
+from .store_layout import (
     BLOCKS,
     BORDER,
     CELL,
     DTYPES,
-    Layout,
+    StoreLayout,
     child,
     context,
     kvstore,
@@ -33,8 +35,6 @@ from .layout import (
     level_shape,
     opened,
 )
-from .levels import Deadline, Levels, StoreError
-from .opening import find_image, open_arrays
 
 _OPEN_TIMEOUT = 20.0  # seconds
 _BATCH = 256  # blocks read at once; more only makes memory travel
@@ -69,9 +69,9 @@ class Store:
     def __init__(
         self,
         location: str,
-        levels: Levels,
+        levels: LevelReader,
         count: int,
-        image: ngff.Image,
+        image: ngff.MultiscaleImage,
         own: dict[str, Any] | None,
         channels: slice | list[int],
     ) -> None:
@@ -97,7 +97,7 @@ class Store:
             ranges = [(float(low), float(high)) for low, high in own["value_range"]]
             picked = [ranges[c] for c in channels] if isinstance(channels, list) else ranges
             self.value_range = picked
-            self._layout = Layout(
+            self._layout = StoreLayout(
                 extent=self.extent, dtype=own["dtype"], width=own["channels"], block=self.block
             )
 
@@ -135,7 +135,7 @@ class Store:
             raise ValueError(f"{where}: dtype {name} is unknown; known: {known}")
         extent = tuple(stored[0].size(axis) for axis in "xyz")
         count = level_count(extent)
-        levels = Levels(stored, count, kind)
+        levels = LevelReader(stored, count, kind)
         if own and (list(extent) != own["extent"] or kind.name != own["dtype"]):
             raise ValueError(f"{where}: damaged: metadata and level 0 differ in extent or dtype")
         self = cls(where, levels, count, found, own, chosen)

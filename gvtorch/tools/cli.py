@@ -21,8 +21,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg
 
+from ..io.ngff import is_zarr
 from .bench import Bench
-from .common import Bar, Source, is_store, refuse_for_store
+from .common import VOLUMES, Bar, ReadOptions, refuse_for_store
 from .view import Fly, Render
 
 if TYPE_CHECKING:
@@ -37,23 +38,21 @@ class Info:
     """a volume or a store; without it backends, devices and versions"""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """print JSON"""
-    source: tyro.conf.OmitArgPrefixes[Source] = Source()
+    source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     def run(self) -> None:
         """Prints the answer."""
         if self.path is None:
             content = installation()
-        elif is_store(self.path):
-            from ..io import Store
+        elif is_zarr(self.path):
+            from ..io.store import Store
 
             refuse_for_store(self.source)
             content = Store.open(self.path).describe()
         else:
-            from ..io.formats import describe
-
             with Bar() as bar:
                 bar("reading", 0, 0)
-                content = describe(self.source.read(Path(self.path)))
+                content = self.source.read(self.path).describe()
         if self.json:
             print(json.dumps(content))
         else:
@@ -64,8 +63,7 @@ class Info:
 class Convert:
     """Convert a volume of any size to a store: OME-Zarr with bordered blocks."""
 
-    path: Positional[Annotated[str, arg(metavar="PATH")]]
-    """the volume: RAW, NPY, NPZ, NIfTI, NRRD, TIFF, FITS or OME-Zarr (folder or URL)"""
+    path: Positional[Annotated[str, arg(metavar="PATH", help=f"the volume: {VOLUMES}")]]
     store: Positional[Annotated[Path, arg(metavar="STORE.zarr")]]
     """the folder to make"""
     block: Literal[32, 64] = 32
@@ -80,12 +78,12 @@ class Convert:
     """go on with a half-written store"""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
     """tell disk, memory and time, and write nothing"""
-    source: tyro.conf.OmitArgPrefixes[Source] = Source()
+    source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     def run(self) -> None:
         """Converts, or tells what it would take."""
-        from ..io.convert import convert, estimate
-        from ..io.machine import amount
+        from ..io.conversion import convert, estimate
+        from ..io.resources import amount
 
         if self.scheduler is not None and self.workers is not None:
             raise ValueError("--scheduler brings its own workers: leave --workers out")
@@ -127,12 +125,13 @@ class Convert:
 
 
 def installation() -> dict[str, Any]:
-    """Returns versions, what each backend can do here, and the devices."""
+    """Returns versions, what each backend can do here, the devices, and the file formats."""
     import platform
 
     import torch
 
     from .. import __version__
+    from ..io.formats import FORMATS
     from ..ops import available
 
     cards = range(torch.cuda.device_count()) if torch.cuda.is_available() else ()
@@ -145,12 +144,13 @@ def installation() -> dict[str, Any]:
             f"cpu ({torch.get_num_threads()} threads)",
             *(f"cuda:{i} ({torch.cuda.get_device_name(i)})" for i in cards),
         ],
+        "formats": {found.name: found.status for found in FORMATS},
     }
 
 
 def _readable(content: dict[str, Any]) -> dict[str, Any]:
     """Underscores to blanks, and bytes for people."""
-    from ..io.machine import amount
+    from ..io.resources import amount
 
     out = {}
     for name, value in content.items():

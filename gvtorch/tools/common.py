@@ -9,12 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import arg
 
+from ..io.formats import format_names
+
 if TYPE_CHECKING:
     from ..base.volume import Volume
 
+#: What a volume may be, for help texts.
+VOLUMES = f"{format_names()}; an OME-Zarr image is a folder or a URL"
+
 
 @dataclass(frozen=True, kw_only=True)
-class Source:
+class ReadOptions:
     """How to read the volume where the file does not tell."""
 
     shape: Annotated[str | None, arg(metavar="X,Y,Z")] = None
@@ -28,9 +33,9 @@ class Source:
     nan: Annotated[float | None, arg(metavar="VALUE")] = None
     """value for voxels that are NaN or infinite"""
 
-    def read(self, path: Path) -> Volume:
+    def read(self, path: str | Path) -> Volume:
         """Reads the volume at `path`."""
-        from ..io import read_volume
+        from ..io.reading import read_volume
 
         return read_volume(path, **self.options())
 
@@ -91,20 +96,13 @@ class Bar:
         self._progress.update(self._tasks[what], completed=done, total=total or None)
 
 
-def is_store(path: str) -> bool:
-    """Tells a store or an OME-Zarr image, a folder or a URL, from a volume file."""
-    marks = ("zarr.json", ".zattrs", ".zgroup")
-    known = any((Path(path) / mark).exists() for mark in marks)
-    return "://" in path or path.rstrip("/").endswith(".zarr") or known
-
-
 def given(options: Any) -> list[str]:
     """Flags of a group of options that differ from what they are if left out."""
     plain = vars(type(options)())
     return [f"--{n.replace('_', '-')}" for n, v in vars(options).items() if v != plain[n]]
 
 
-def refuse_for_store(source: Source) -> None:
+def refuse_for_store(source: ReadOptions) -> None:
     """Raises ValueError where flags tell how to read a volume file, but a store was named."""
     flags = given(source)
     if flags:

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg
 
-from .common import Bar, Source, given, is_store, numbers, refuse_for_store, size
+from ..io.ngff import is_zarr
+from .common import VOLUMES, Bar, ReadOptions, given, numbers, refuse_for_store, size
 from .image import KINDS, STRIPS, Develop, parse_background
 from .light import parse_lighting
 
@@ -157,7 +158,7 @@ class Streaming:
     def open(self, path: str, look: Look) -> Iterator[tuple[Engine, TransferFunction | Shader]]:
         """Opens a store: the engine over it, and the transfer function."""
         from ..engine.engine import Engine
-        from ..io import Store
+        from ..io.store import Store
         from ..producers import StoredProducer
 
         store = Store.open(path, image=self.image, time=self.time)
@@ -180,8 +181,7 @@ class Streaming:
 class Render:
     """Render a volume or a store to a picture."""
 
-    path: Positional[Annotated[str, arg(metavar="PATH")]]
-    """a volume (RAW, NPY, NPZ, NIfTI, NRRD, TIFF or FITS), or a store (folder or URL)"""
+    path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {VOLUMES}")]]
     output: Annotated[Path, arg(aliases=["-o"], metavar="OUT.png")]
     """the picture: .png, .exr, .tif, .npy or .npz; .tif and .npy may be larger than memory"""
     bits: Annotated[int | None, arg(metavar="N")] = None
@@ -202,7 +202,7 @@ class Render:
     """volumes: regions with no value above it are never drawn"""
     look: tyro.conf.OmitArgPrefixes[Look] = Look()
     streaming: tyro.conf.OmitArgPrefixes[Streaming] = Streaming()
-    source: tyro.conf.OmitArgPrefixes[Source] = Source()
+    source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
     develop: tyro.conf.OmitArgPrefixes[Develop] = Develop()
 
     def run(self) -> None:
@@ -224,7 +224,7 @@ class Render:
         options = self.look.options()
         with Bar() as bar:
             bar("reading", 0, 0)
-            if is_store(self.path):
+            if is_zarr(self.path):
                 stats, extent = self._stream(camera, options, bar)
             else:
                 stats, extent = self._resident(camera, options, bar)

@@ -11,15 +11,26 @@ from pathlib import Path
 from typing import Any
 
 from . import ngff
-from .layout import BLOCKS, BORDER, CELL, DTYPES, MOST_VOXELS, VERSION, WORK, child, context, opened
-from .levels import Deadline, Stored, StoreError, short
+from .level_reader import Deadline, StoredArray, StoreError, short
+from .store_layout import (
+    BLOCKS,
+    BORDER,
+    CELL,
+    DTYPES,
+    MOST_VOXELS,
+    VERSION,
+    WORK,
+    child,
+    context,
+    opened,
+)
 
 _MOST_CHUNK = 2**31  # bytes of one chunk of a foreign array
 
 
 def find_image(
     where: str, root: Any, image: str | None, deadline: Deadline
-) -> tuple[Any, ngff.Image, dict[str, Any] | None]:
+) -> tuple[Any, ngff.MultiscaleImage, dict[str, Any] | None]:
     """Finds a multiscale image.
 
     Returns:
@@ -35,13 +46,13 @@ def find_image(
     own = attributes.get("gvtorch")
     if own is not None:
         _check_own(where, own)
-    found = ngff.read_image(where, _ome(attributes), image)
+    found = ngff.parse_image(where, _ome(attributes), image)
     if found is None and own is None:
         inner = image if image is not None else "0"  # where converters of microscopy files put it
         if ".." not in inner and not inner.startswith("/"):
             root = child(root, inner)
             deeper = _attributes(f"{where}/{inner}", root, deadline)
-            found = ngff.read_image(where, _ome(deeper), None) if deeper else None
+            found = ngff.parse_image(where, _ome(deeper), None) if deeper else None
     if found is None:
         asked = "no multiscale image" if image is None else f"no image {image!r}"
         raise ValueError(f"{where}: has {asked} (NGFF multiscales)")
@@ -131,17 +142,17 @@ def _check_own(where: str, own: Any) -> None:
 def open_arrays(
     where: str,
     root: Any,
-    image: ngff.Image,
+    image: ngff.MultiscaleImage,
     moment: int,
     channels: Sequence[int] | None,
     deadline: Deadline,
-) -> tuple[list[Stored], slice | list[int]]:
+) -> tuple[list[StoredArray], slice | list[int]]:
     """Opens the image's arrays that fit the tree, the finest first."""
     at = child(root, image.scales[0].path)
     is_v3 = _read_json(f"{where}/{image.scales[0].path}", at, "zarr.json", deadline) is not None
     driver = "zarr3" if is_v3 else "zarr"
     futures = [opened(root, {"driver": driver, "path": scale.path}) for scale in image.scales]
-    stored: list[Stored] = []
+    stored: list[StoredArray] = []
     chosen: slice | list[int] = slice(None)
     for scale, future in zip(image.scales, futures, strict=True):
         name = f"{where}/{scale.path}"
@@ -159,10 +170,10 @@ def open_arrays(
         # Singleton axes of an index array would move: oindex leaves every axis where it is.
         array = array.oindex[place]
         first = stored[0] if stored else None
-        candidate = Stored(array, axes, (1, 1, 1), name)
+        candidate = StoredArray(array, axes, (1, 1, 1), name)
         factors = _factors(first, candidate, image.scales[0], scale)
         if factors is not None:
-            stored.append(Stored(array, axes, factors, name))
+            stored.append(StoredArray(array, axes, factors, name))
     return stored, chosen
 
 
@@ -197,7 +208,7 @@ def _choose(
 
 
 def _factors(
-    first: Stored | None, other: Stored, fine: ngff.Scale, coarse: ngff.Scale
+    first: StoredArray | None, other: StoredArray, fine: ngff.ImageArray, coarse: ngff.ImageArray
 ) -> tuple[int, int, int] | None:
     """Whole factors (z, y, x) between the finest array and another; None where there are none."""
     if first is None:

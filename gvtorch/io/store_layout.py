@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from .machine import cores
+from .resources import cores
 
 VERSION = 1
 CELL = 8  # voxels along a side of a cell
@@ -62,7 +62,7 @@ def kvstore(location: str | Path) -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Layout:
+class StoreLayout:
     """Sizes of a store; picklable."""
 
     extent: tuple[int, int, int]  # x y z
@@ -93,6 +93,10 @@ class Layout:
         """(z, y, x) number of cubes of `side` voxels that cover a level."""
         z, y, x = (-(-n // side) for n in self.shape(level))
         return (z, y, x)
+
+    def shards(self, level: int) -> tuple[int, int, int]:
+        """(z, y, x) number of shards of a level: one a task of the converter."""
+        return self.grid(level, self.shard)
 
     def plain(self, level: int, *, path: str | None = None) -> dict[str, Any]:
         """Spec of the pyramid's array of a level."""
@@ -151,7 +155,7 @@ def opened(root: Any, spec: dict[str, Any], mode: str = "read") -> Any:
 
     Args:
         root: What `kvstore` returned.
-        spec: What a method of `Layout` returned.
+        spec: What a method of `StoreLayout` returned.
         mode: "read"; "write" to it; "create" it if it is not there.
     """
     import tensorstore as ts

@@ -1,8 +1,8 @@
 """`convert`: any volume -> a store, out of core, on all cores, resumable; `estimate`: its price.
 
-One task writes one cube of one level (tasks.py); levels follow one another. A journal beside the
-data names the tasks that are done. The store's own metadata is written last, so a store that is not
-whole is never opened. What lies where is in layout.py, how files are read in sources.py.
+One task writes one cube of one level (shard.py); levels follow one another. A journal beside the
+data names the tasks that are done (unfinished.py). The store's own metadata is written last, so a
+store that is not whole is never opened. What lies where is in store_layout.py.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import multiprocessing
+import os
 import shutil
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -32,11 +34,12 @@ import numpy as np
 from ..base import check
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume
-from . import machine, tasks, workplace
-from .layout import BLOCKS, WORK, Layout, context, kvstore, opened
-from .levels import Deadline
-from .sources import Array, Source, open_source
+from . import resources, shard, unfinished
+from .level_reader import Deadline
+from .reading import open_source, placed, read_whole
+from .source import MemorySource, VolumeSource
 from .store import Store
+from .store_layout import BLOCKS, DTYPES, WORK, StoreLayout, context, kvstore, opened
 
 _FEW = 4  # tasks of level 0 up to which processes are not worth their start
 _AHEAD = 64  # tasks handed to an executor that does not tell how many workers it has
@@ -46,6 +49,7 @@ _BELOW = 4  # a voxel of a coarser level costs so many of the finest
 _DISK = 2.0  # writing to disk takes so much longer than to memory
 _SAMPLES = 3  # cubes that are converted for an estimate
 _SAMPLE_TIME = 2.0  # seconds after which no more are
+_OPEN_TIMEOUT = 60.0  # seconds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,10 +77,26 @@ class Estimate:
 
 @dataclass(frozen=True, kw_only=True)
 class _Plan:
-    source: Source | Array
-    job: tasks.Job
+    task: shard.Conversion
     settings: dict[str, Any]  # what must be the same to go on with a half-written store
     workers: int
+
+    @property
+    def layout(self) -> StoreLayout:
+        return self.task.layout
+
+    @property
+    def source(self) -> VolumeSource:
+        return self.task.source
+
+    @property
+    def uses_processes(self) -> bool:
+        return math.prod(self.layout.shards(0)) > _FEW
+
+    @property
+    def value_bytes(self) -> int:
+        """Of a voxel with all its channels."""
+        return self.layout.width * np.dtype(self.layout.dtype).itemsize
 
 
 def convert(
@@ -129,18 +149,17 @@ def convert(
             from there.
     """
     target = Path(store)
-    begun = workplace.state(target, resume=resume)
-    options = {"shape": shape, "dtype": dtype, "key": key, "nan": nan}
-    source_ = _source(source, target, options, spacing, origin)
-    plan = _plan(source, source_, target, block, threshold, nan, workers)
+    begun = unfinished.is_begun(target, resume=resume)
+    opened_source = _source(source, shape, dtype, spacing, origin, key)
+    plan = _plan(source, opened_source, target, block, threshold, nan, workers)
     if not begun:
         _check_room(target, _estimate(plan, target))
-    with workplace.locked(target, plan.settings, resume=begun) as work:
+    with unfinished.claimed(target, plan.settings, resume=begun) as work:
         with _executor(executor, plan) as pool:
-            job = _staged(plan, target, pool)
+            task = _staged(plan, target, pool)
             try:
-                _levels(job, work, pool, plan.workers, progress)
-            except workplace.NotFiniteError:
+                _write_levels(dataclasses.replace(plan, task=task), work, pool, progress)
+            except unfinished.NotFiniteError:
                 work.discard()
                 raise
             except BrokenExecutor:
@@ -149,7 +168,7 @@ def convert(
                     'script that converts outside of `if __name__ == "__main__":`); '
                     f"gvtorch convert {plan.settings['source']} {target} --resume goes on"
                 ) from None
-        work.finish(job.layout, plan.settings, _value_range(job))
+        work.finish(plan.layout, plan.settings, _value_range(plan.task))
     return Store.open(target)
 
 
@@ -170,9 +189,8 @@ def estimate(
     Args, Raises: as `convert`.
     """
     target = Path(store)
-    options = {"shape": shape, "dtype": dtype, "key": key, "nan": nan}
-    source_ = _source(source, target, options, None, None)
-    plan = _plan(source, source_, target, block, threshold, nan, workers)
+    opened_source = _source(source, shape, dtype, None, None, key)
+    plan = _plan(source, opened_source, target, block, threshold, nan, workers)
     return _estimate(plan, target)
 
 
@@ -181,36 +199,40 @@ def estimate(
 
 def _source(
     source: str | Path | Volume,
-    target: Path,
-    options: dict[str, Any],
+    shape: Sequence[int] | None,
+    dtype: str | None,
     spacing: Sequence[float] | None,
     origin: Sequence[float] | None,
-) -> Source | Array:
+    key: str | None,
+) -> VolumeSource:
+    """Opens the source; one that can only be read whole is read, once."""
     if isinstance(source, Volume):
         if source.filter != "mean":
             raise ValueError(
                 "convert: a store's levels are means: a volume seen from six directions "
                 "is rendered with N3Tree.from_volume or VolumeProducer"
             )
-        found: Source | Array = Array.of(source)
-    else:
-        wants = options["key"] is not None  # an .npz, or a mistake that `read_volume` tells of
-        raw = {"shape": options["shape"], "dtype": options["dtype"]}
-        opened_ = None if wants else open_source(source, **raw)
-        found = opened_ or Array.read(Path(source), options)
-    if spacing is not None:
-        size = check.triple("convert", "spacing", spacing)
-        if min(size) <= 0:
-            raise ValueError(f"convert: spacing must be positive, got {size}")
-        found = dataclasses.replace(found, spacing=size)
-    if origin is not None:
-        found = dataclasses.replace(found, origin=check.triple("convert", "origin", origin))
-    return found
+        if str(source.data.dtype).removeprefix("torch.") not in DTYPES:
+            raise ValueError(f"{source.name}: {source.data.dtype} has no place in a store")
+        told = {"path": source.name, "spacing": source.spacing, "origin": source.origin}
+        return placed("convert", MemorySource.of(source.data.numpy(), **told), spacing, origin)
+    found = open_source(source, shape=shape, dtype=dtype, spacing=spacing, origin=origin, key=key)
+    if not found.whole:
+        return found
+    free = resources.memory_free()
+    if found.peak_bytes > free:
+        raise ValueError(
+            f"{source}: can only be read as a whole, which takes "
+            f"{resources.amount(found.peak_bytes)}, and {resources.amount(free)} of memory are "
+            "free: unpack it first"
+        )
+    told = {name: getattr(found, name) for name in ("path", "spacing", "origin", "unit")}
+    return MemorySource.of(read_whole(found), **told)
 
 
 def _plan(
     given: str | Path | Volume,
-    source: Source | Array,
+    source: VolumeSource,
     target: Path,
     block: int,
     threshold: float | None,
@@ -224,16 +246,17 @@ def _plan(
     if nan is not None:
         most = float(np.finfo(source.dtype).max) if np.dtype(source.dtype).kind == "f" else math.inf
         nan = check.number("convert", "nan", nan, low=-most, high=most)
-    layout = Layout(extent=source.extent, dtype=source.dtype, width=source.width, block=block)
+    layout = StoreLayout(extent=source.extent, dtype=source.dtype, width=source.width, block=block)
     if workers is None:
-        workers = machine.cores()
-    workers = min(check.whole("convert", "workers", workers, low=1), math.prod(_grid(layout, 0)))
-    job = tasks.Job(
+        workers = resources.cores()
+    tasks = math.prod(layout.shards(0))
+    workers = min(check.whole("convert", "workers", workers, low=1), tasks)
+    task = shard.Conversion(
         root=kvstore(target), layout=layout, source=source, threshold=threshold, nan=nan
     )
     settings = {
         "source": source.path,
-        "fingerprint": workplace.fingerprint(given),
+        "fingerprint": unfinished.fingerprint(given),
         "extent": list(source.extent),
         "dtype": source.dtype,
         "channels": source.width,
@@ -243,29 +266,26 @@ def _plan(
         "block": block,
         "threshold": threshold,
         "nan": nan,
-        "tasks": sum(math.prod(_grid(layout, level)) for level in range(layout.levels)),
+        "tasks": sum(math.prod(layout.shards(level)) for level in range(layout.levels)),
     }
-    return _Plan(source=source, job=job, settings=settings, workers=workers)
+    return _Plan(task=task, settings=settings, workers=workers)
 
 
-def _grid(layout: Layout, level: int) -> tuple[int, int, int]:
-    return layout.grid(level, layout.shard)
-
-
-def _places(layout: Layout, level: int) -> Iterator[tuple[int, ...]]:
-    return itertools.product(*map(range, _grid(layout, level)))
+def _places(layout: StoreLayout, level: int) -> Iterator[shard.Zyx]:
+    return itertools.product(*map(range, layout.shards(level)))  # type: ignore[return-value]
 
 
 def _estimate(plan: _Plan, target: Path) -> Estimate:
-    layout = plan.job.layout
+    layout = plan.layout
     voxels = math.prod(layout.extent)
     below = sum(math.prod(layout.shape(level)) for level in range(1, layout.levels))
-    plain, beside, seen, seconds = _sample(plan.job)
+    plain, beside, seen, seconds = _sample(plan.task)
     share = (voxels + below) / seen
-    copies = _COPIES * (layout.shard + 2) ** 3 * layout.width * np.dtype(layout.dtype).itemsize
+    copies = _COPIES * (layout.shard + 2) ** 3 * plan.value_bytes
     cube = min(1.0, voxels / layout.shard**3)
-    processes = _uses_processes(layout)
-    each = (_PROCESS if processes else 0) + int(copies * cube)
+    each = (_PROCESS if plan.uses_processes else 0) + int(copies * cube)
+    staged = plan.source.resident if plan.uses_processes else 0
+    start = 3.0 * plan.uses_processes
     return Estimate(
         extent=layout.extent,
         dtype=layout.dtype,
@@ -274,34 +294,30 @@ def _estimate(plan: _Plan, target: Path) -> Estimate:
         tasks=plan.settings["tasks"],
         source_bytes=plan.source.nbytes,
         disk_bytes=int((plain + beside) * share),
-        temporary_bytes=int(2 * plain * below / seen) + _staged_bytes(plan),
+        temporary_bytes=int(2 * plain * below / seen) + staged,
         memory_bytes=_PROCESS + plan.workers * each + plan.source.resident,
-        seconds=_DISK * seconds * (voxels + _BELOW * below) / seen / plan.workers + 3.0 * processes,
+        seconds=_DISK * seconds * (voxels + _BELOW * below) / seen / plan.workers + start,
         workers=plan.workers,
-        disk_free=shutil.disk_usage(machine.existing(target)).free,
-        memory_free=machine.memory_free() + plan.source.resident,
+        disk_free=shutil.disk_usage(resources.existing(target)).free,
+        memory_free=resources.memory_free() + plan.source.resident,
     )
 
 
-def _staged_bytes(plan: _Plan) -> int:
-    return plan.source.resident if _uses_processes(plan.job.layout) else 0
-
-
-def _sample(job: tasks.Job) -> tuple[int, int, int, float]:
+def _sample(task: shard.Conversion) -> tuple[int, int, int, float]:
     """Converts a few cubes in memory: bytes of the pyramid, bytes beside it, voxels, seconds."""
     import tensorstore as ts
 
-    layout = job.layout
+    layout = task.layout
     places = list(_places(layout, 0))
     picked = [places[(2 * i + 1) * len(places) // (2 * _SAMPLES)] for i in range(_SAMPLES)]
-    root = {"driver": "memory", "path": f"gvtorch-estimate-{id(job)}/"}
+    root = {"driver": "memory", "path": f"gvtorch-estimate-{id(task)}/"}
     store = ts.KvStore.open(root, context=context()).result()
-    trial = dataclasses.replace(job, root=root, nan=0.0 if job.nan is None else job.nan)
+    trial = dataclasses.replace(task, root=root, nan=0.0 if task.nan is None else task.nan)
     for spec in (layout.plain(0), layout.blocks(0), layout.cells(0)):
         opened(root, spec, "create").result()
     start, seen = time.perf_counter(), 0
     for place in dict.fromkeys(picked):
-        seen += tasks.write_shard(trial, 0, place).voxels  # type: ignore[arg-type]
+        seen += shard.write_shard(trial, 0, place).voxels
         if time.perf_counter() - start > _SAMPLE_TIME:
             break
     seconds = time.perf_counter() - start
@@ -316,22 +332,18 @@ def _check_room(target: Path, needs: Estimate) -> None:
     disk = needs.disk_bytes + needs.temporary_bytes
     if disk > needs.disk_free:
         raise OSError(
-            f"{target}: the store takes about {machine.amount(disk)}, "
-            f"{machine.amount(needs.disk_free)} are free on the disk"
+            f"{target}: the store takes about {resources.amount(disk)}, "
+            f"{resources.amount(needs.disk_free)} are free on the disk"
         )
     if needs.memory_bytes > needs.memory_free:
         raise OSError(
             f"{target}: converting with {needs.workers} workers takes up to "
-            f"{machine.amount(needs.memory_bytes)} of memory, "
-            f"{machine.amount(needs.memory_free)} are free; fewer --workers take less"
+            f"{resources.amount(needs.memory_bytes)} of memory, "
+            f"{resources.amount(needs.memory_free)} are free; fewer --workers take less"
         )
 
 
 # --- the work
-
-
-def _uses_processes(layout: Layout) -> bool:
-    return math.prod(_grid(layout, 0)) > _FEW
 
 
 @contextmanager
@@ -339,16 +351,10 @@ def _executor(given: Executor | None, plan: _Plan) -> Iterator[Executor]:
     if given is not None:
         yield given
         return
-    if _uses_processes(plan.job.layout) and plan.workers > 1:
-        import multiprocessing
-        import os
-
-        own: Executor = ProcessPoolExecutor(
-            plan.workers,
-            multiprocessing.get_context("spawn"),
-            machine.begin_worker,
-            (os.getpid(),),
-        )
+    own: Executor
+    if plan.uses_processes and plan.workers > 1:
+        spawn = multiprocessing.get_context("spawn")
+        own = ProcessPoolExecutor(plan.workers, spawn, resources.begin_worker, (os.getpid(),))
     else:
         own = ThreadPoolExecutor(plan.workers)
     try:
@@ -357,68 +363,65 @@ def _executor(given: Executor | None, plan: _Plan) -> Iterator[Executor]:
         own.shutdown(wait=True, cancel_futures=True)
 
 
-def _staged(plan: _Plan, target: Path, pool: Executor) -> tasks.Job:
+def _staged(plan: _Plan, target: Path, pool: Executor) -> shard.Conversion:
     """Writes a volume that lies in memory to a file, where other processes shall read it."""
-    if isinstance(plan.source, Source) or isinstance(pool, ThreadPoolExecutor):
-        return plan.job
+    if not isinstance(plan.source, MemorySource) or isinstance(pool, ThreadPoolExecutor):
+        return plan.task
     file = target / WORK / "source.npy"
     np.save(file, plan.source.data)
-    staged = open_source(file)
-    assert staged is not None
-    return dataclasses.replace(plan.job, source=staged)
+    return dataclasses.replace(plan.task, source=open_source(file))
 
 
-def _levels(
-    job: tasks.Job, work: workplace.Work, pool: Executor, workers: int, progress: Progress
+def _write_levels(
+    plan: _Plan, work: unfinished.UnfinishedStore, pool: Executor, progress: Progress
 ) -> None:
-    layout = job.layout
-    value = layout.width * np.dtype(layout.dtype).itemsize
-    total = value * sum(math.prod(layout.shape(level)) for level in range(layout.levels))
-    done = sum(voxels for voxels in work.done.values()) * value
+    layout = plan.layout
+    total = plan.value_bytes * sum(math.prod(layout.shape(level)) for level in range(layout.levels))
+    done = sum(work.done.values()) * plan.value_bytes
     progress("converting", done, total)
-    ahead = (
-        2 * workers + 2 if isinstance(pool, (ProcessPoolExecutor, ThreadPoolExecutor)) else _AHEAD
-    )
+    counted = isinstance(pool, (ProcessPoolExecutor, ThreadPoolExecutor))
+    ahead = 2 * plan.workers + 2 if counted else _AHEAD
     for level in range(layout.levels):
         places = [place for place in _places(layout, level) if (level, *place) not in work.done]
         if not places:
             continue
-        _create(job, level)
+        _create_arrays(plan.task, level)
         bad = 0
-        for result in _run(pool, job, level, places, ahead):
+        for result in _run(pool, plan.task, level, places, ahead):
             bad += result.bad
             if not result.bad:
                 work.note((level, *result.place), result.voxels)
-                done += result.voxels * value
+                done += result.voxels * plan.value_bytes
                 progress("converting", done, total)
         if bad:
-            raise workplace.NotFiniteError(
-                f"{job.source.path}: {bad} values are NaN or infinite (of "
+            raise unfinished.NotFiniteError(
+                f"{plan.settings['source']}: {bad} values are NaN or infinite (of "
                 f"{math.prod(layout.extent) * layout.width}); pass nan=VALUE (--nan VALUE) to "
                 "replace them"
             )
         work.forget_bounds(level - 1)
 
 
-def _create(job: tasks.Job, level: int) -> None:
-    layout = job.layout
+def _create_arrays(task: shard.Conversion, level: int) -> None:
+    layout = task.layout
     specs = [layout.plain(level), layout.blocks(level), layout.cells(level)]
     if 0 < level < layout.levels - 1:
         specs += [layout.bound(which, level) for which in ("low", "high")]
     for spec in specs:
-        Deadline(60.0).wait(opened(job.root, spec, "create"), f"{job.root['path']}{spec['path']}")
+        where = f"{task.root['path']}{spec['path']}"
+        Deadline(_OPEN_TIMEOUT).wait(opened(task.root, spec, "create"), where)
 
 
 def _run(
-    pool: Executor, job: tasks.Job, level: int, places: Iterable[Any], ahead: int
-) -> Iterator[tasks.Done]:
+    pool: Executor, task: shard.Conversion, level: int, places: Iterable[Any], ahead: int
+) -> Iterator[shard.ShardResult]:
     """Runs the tasks of a level, a bounded number at a time, and yields what they tell."""
     waiting = iter(places)
-    running: set[Future[tasks.Done]] = set()
+    running: set[Future[shard.ShardResult]] = set()
     try:
         while True:
-            for place in itertools.islice(waiting, ahead - len(running)):
-                running.add(pool.submit(tasks.write_shard, job, level, place))
+            for at in itertools.islice(waiting, ahead - len(running)):
+                running.add(pool.submit(shard.write_shard, task, level, at))
             if not running:
                 return
             finished, running = wait(running, return_when=FIRST_COMPLETED)
@@ -429,8 +432,9 @@ def _run(
             future.cancel()
 
 
-def _value_range(job: tasks.Job) -> list[list[float]]:
+def _value_range(task: shard.Conversion) -> list[list[float]]:
     """Smallest and largest value of each channel: those of the one cell of the last level."""
-    array = Deadline(60.0).wait(opened(job.root, job.layout.cells(job.layout.levels - 1)), "cells")
-    cell = Deadline(60.0).wait(array.read(), "cells")[0, 0, 0]
+    deadline = Deadline(_OPEN_TIMEOUT)
+    spec = task.layout.cells(task.layout.levels - 1)
+    cell = deadline.wait(deadline.wait(opened(task.root, spec), "cells").read(), "cells")[0, 0, 0]
     return [[low.item(), high.item()] for low, high in cell[:2].T]

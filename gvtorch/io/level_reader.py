@@ -1,4 +1,4 @@
-"""`Levels`: the tree levels of a multiscale image, read from whatever arrays it stores.
+"""`LevelReader`: the tree levels of a multiscale image, read from whatever arrays it stores.
 
 A tree level is 2^L coarser along every axis. Where no array is, the level is averaged: from the
 coarsest array whose factors divide 2^L, or tile by tile from the tree level below, whichever
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ..pool.pyramid import pool_mean
-from .layout import level_shape
+from .store_layout import level_shape
 
 _TILE = 64  # voxels along a side of a tile that is made on demand
 _KEPT = 128 << 20  # bytes of such tiles
@@ -63,7 +63,7 @@ def short(error: BaseException) -> str:
 
 
 @dataclass(frozen=True)
-class Stored:
+class StoredArray:
     """One array of a multiscale image, the time point chosen."""
 
     array: Any  # tensorstore.TensorStore
@@ -99,10 +99,10 @@ class Stored:
         return data
 
 
-class Levels:
+class LevelReader:
     """Tree levels over stored arrays. Safe to use from several threads."""
 
-    def __init__(self, stored: Sequence[Stored], count: int, dtype: np.dtype) -> None:
+    def __init__(self, stored: Sequence[StoredArray], count: int, dtype: np.dtype) -> None:
         """Plans how each level is read.
 
         Args:
@@ -113,7 +113,7 @@ class Levels:
         first = stored[0]
         self.extent = (first.size("x"), first.size("y"), first.size("z"))
         self.dtype, self.width = dtype, first.size("c")
-        self._plans: list[tuple[Stored, tuple[int, ...]] | None] = []
+        self._plans: list[tuple[StoredArray, tuple[int, ...]] | None] = []
         cost = 1.0
         for level in range(count):
             base, rest = _coarsest(stored, 2**level)
@@ -184,7 +184,7 @@ class Levels:
         return tile
 
 
-def _coarsest(stored: Sequence[Stored], factor: int) -> tuple[Stored, tuple[int, ...]]:
+def _coarsest(stored: Sequence[StoredArray], factor: int) -> tuple[StoredArray, tuple[int, ...]]:
     """The coarsest array whose factors divide `factor`, and what is left to average."""
     fits = [s for s in stored if all(factor % f == 0 for f in s.factors)]
     best = max(fits, key=lambda s: math.prod(s.factors))

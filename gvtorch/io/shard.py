@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from ..pool.pyramid import extend, pool_max, pool_mean, pool_min, round_array, window
-from .layout import BORDER, CELL, Layout, opened
-from .levels import Deadline, Stored, StoreError, short
-from .sources import Array, Source
+from .level_reader import Deadline, StoredArray, StoreError, short
+from .source import VolumeSource
 from .store import needed_cells
+from .store_layout import BORDER, CELL, StoreLayout, opened
 
 _TIMEOUT = 3600.0  # seconds for one read of local data
 _SLAB = 32  # planes of a level made at a time: two chunks of the level below
@@ -27,18 +27,18 @@ _POOLS = (pool_mean, pool_min, pool_max)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job:
+class Conversion:
     """What all tasks of a conversion share."""
 
     root: dict[str, Any]  # kvstore of the store
-    layout: Layout
-    source: Source | Array
+    layout: StoreLayout
+    source: VolumeSource
     threshold: float | None
     nan: float | None
 
 
 @dataclass(frozen=True)
-class Done:
+class ShardResult:
     """What a task tells."""
 
     level: int
@@ -47,18 +47,18 @@ class Done:
     bad: int  # values that are not finite; the shard is not written then
 
 
-def write_shard(job: Job, level: int, place: Zyx) -> Done:
+def write_shard(conversion: Conversion, level: int, place: Zyx) -> ShardResult:
     """Writes the shards of one cube of a level.
 
     Args:
-        job: The conversion.
+        conversion: The conversion.
         level: 0 is the finest.
         place: (z, y, x) of the cube, in shards.
 
     Raises:
         OSError: The source can't be read, or the store can't be written (ENOSPC: the disk is full).
     """
-    layout = job.layout
+    layout = conversion.layout
     shape = layout.shape(level)
     low = [at * layout.shard for at in place]
     stop = [min(a + layout.shard, n) for a, n in zip(low, shape, strict=True)]
@@ -67,49 +67,53 @@ def write_shard(job: Job, level: int, place: Zyx) -> Done:
     box = [a - BORDER for a in low], [a + n + BORDER for a, n in zip(low, padded, strict=True)]
     inner = tuple(slice(BORDER, BORDER + n) for n in size)
     if level == 0:
-        values, bad = _from_source(job, *box, inner)
+        values, bad = _from_source(conversion, *box, inner)
         if bad:
-            return Done(level, place, 0, bad)
+            return ShardResult(level, place, 0, bad)
         least = most = values
     else:
-        values, least, most = _from_below(job, level, *box)
-    writes = [_write(job, layout.plain(level), low, _plain(values[inner]))]
+        values, least, most = _from_below(conversion, level, *box)
+    writes = [_write(conversion, layout.plain(level), low, _plain(values[inner]))]
     if 0 < level < layout.levels - 1:
         for which, bound in (("low", least), ("high", most)):
-            writes.append(_write(job, layout.bound(which, level), low, _plain(bound[inner])))
+            writes.append(_write(conversion, layout.bound(which, level), low, _plain(bound[inner])))
     cells = _cells(values, least, most, [-(-n // CELL) for n in size])
-    writes.append(_write(job, layout.cells(level), [a // CELL for a in low], cells))
-    blocks = _blocks(layout, values, needed_cells(cells, job.threshold))
+    writes.append(_write(conversion, layout.cells(level), [a // CELL for a in low], cells))
+    blocks = _blocks(layout, values, needed_cells(cells, conversion.threshold))
     if blocks is not None:
-        writes.append(_write(job, layout.blocks(level), [a // layout.block for a in low], blocks))
+        writes.append(
+            _write(conversion, layout.blocks(level), [a // layout.block for a in low], blocks)
+        )
     for write in writes:
-        _finish(write, job.root.get("path", "store"))
-    return Done(level, place, int(np.prod(size)), 0)
+        _finish(write, conversion.root.get("path", "store"))
+    return ShardResult(level, place, int(np.prod(size)), 0)
 
 
 def _from_source(
-    job: Job, low: list[int], high: list[int], inner: tuple[slice, ...]
+    conversion: Conversion, low: list[int], high: list[int], inner: tuple[slice, ...]
 ) -> tuple[np.ndarray, int]:
-    shape = job.layout.shape(0)
+    shape = conversion.layout.shape(0)
     start = [max(a, 0) for a in low]
     stop = [min(b, n) for b, n in zip(high, shape, strict=True)]
-    values = job.source.read_box(start, stop)
+    values = conversion.source.read_region(start, stop)
     bad = 0
     if values.dtype.kind == "f":
         wrong = ~np.isfinite(values)
         if wrong.any():
-            if job.nan is not None:
-                values = np.where(wrong, values.dtype.type(job.nan), values)
+            if conversion.nan is not None:
+                values = np.where(wrong, values.dtype.type(conversion.nan), values)
             else:
                 bad = int(_pad(wrong, low, high, start, stop)[inner].sum())
     return _pad(values, low, high, start, stop), bad
 
 
-def _from_below(job: Job, level: int, low: list[int], high: list[int]) -> list[np.ndarray]:
+def _from_below(
+    conversion: Conversion, level: int, low: list[int], high: list[int]
+) -> list[np.ndarray]:
     """Makes a box of a level, voxels around it included, from the level below: means, smallest and
     largest finest values.
     """
-    layout = job.layout
+    layout = conversion.layout
     shape, below = layout.shape(level), layout.shape(level - 1)
     specs = [layout.plain(level - 1)]
     if level > 1:  # below that, the values are their own smallest and largest
@@ -117,8 +121,8 @@ def _from_below(job: Job, level: int, low: list[int], high: list[int]) -> list[n
     deadline = Deadline(_TIMEOUT)
     arrays = []
     for spec in specs:
-        array = deadline.wait(opened(job.root, spec), spec["path"])
-        arrays.append(Stored(array, "czyx"[-array.rank :], (1, 1, 1), spec["path"]))
+        array = deadline.wait(opened(conversion.root, spec), spec["path"])
+        arrays.append(StoredArray(array, "czyx"[-array.rank :], (1, 1, 1), spec["path"]))
     start = [max(a, 0) for a in low]
     stop = [min(b, n) for b, n in zip(high, shape, strict=True)]
     size = (*[b - a for a, b in zip(start, stop, strict=True)], layout.width)
@@ -157,7 +161,7 @@ def _cells(values: np.ndarray, least: np.ndarray, most: np.ndarray, count: list[
     return np.stack((low, high, round_array(mean, values.dtype)), axis=3)
 
 
-def _blocks(layout: Layout, values: np.ndarray, needed: np.ndarray) -> np.ndarray | None:
+def _blocks(layout: StoreLayout, values: np.ndarray, needed: np.ndarray) -> np.ndarray | None:
     """(gz, gy, gx, s, s, s, c) blocks of a cube; zero, which is not written, where no cell needs
     them.
     """
@@ -181,9 +185,9 @@ def _blocks(layout: Layout, values: np.ndarray, needed: np.ndarray) -> np.ndarra
     return blocks
 
 
-def _write(job: Job, spec: dict[str, Any], low: list[int], data: np.ndarray) -> Any:
+def _write(conversion: Conversion, spec: dict[str, Any], low: list[int], data: np.ndarray) -> Any:
     """Begins to write a box into an array of the store."""
-    array = Deadline(_TIMEOUT).wait(opened(job.root, spec, "write"), spec["path"])
+    array = Deadline(_TIMEOUT).wait(opened(conversion.root, spec, "write"), spec["path"])
     sizes = data.shape
     if len(sizes) == 4:  # (c, z, y, x)
         low = [0, *low]

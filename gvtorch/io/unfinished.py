@@ -1,6 +1,5 @@
-"""A store while it is made: state, lock, manifest, journal, and the step that makes it a store.
-
-The work itself is in convert.py.
+"""`UnfinishedStore`: a store while it is made: its lock, manifest and journal, and the last step,
+which makes it a store. The work itself is in conversion.py.
 """
 
 from __future__ import annotations
@@ -16,16 +15,16 @@ from pathlib import Path
 from typing import IO, Any
 
 from ..base.volume import Volume, movable
-from .layout import BORDER, CELL, GROUPS, VERSION, WORK, Layout
 from .ngff import image_metadata, parse_json
+from .store_layout import BORDER, CELL, GROUPS, VERSION, WORK, StoreLayout
 
 
 class NotFiniteError(ValueError):
     """The source holds NaN or infinite values."""
 
 
-class Work:
-    """The hidden folder of a store that is being made."""
+class UnfinishedStore:
+    """A store that is being made, by this process alone: tasks that are done, and its metadata."""
 
     def __init__(self, target: Path, done: dict[tuple[int, ...], int], journal: IO[str]) -> None:
         """Takes the folder over; `done` maps (level, z, y, x) of finished tasks to their voxels."""
@@ -48,7 +47,7 @@ class Work:
         shutil.rmtree(self.target, ignore_errors=True)
 
     def finish(
-        self, layout: Layout, settings: dict[str, Any], value_range: list[list[float]]
+        self, layout: StoreLayout, settings: dict[str, Any], value_range: list[list[float]]
     ) -> None:
         """Writes the metadata, the root's last of all, and removes the hidden folder."""
         for group in GROUPS:
@@ -80,7 +79,7 @@ class Work:
         shutil.rmtree(self.target / WORK, ignore_errors=True)
 
 
-def state(target: Path, *, resume: bool) -> bool:
+def is_begun(target: Path, *, resume: bool) -> bool:
     """Returns whether there is a half-written store to go on with.
 
     Raises:
@@ -107,7 +106,7 @@ def state(target: Path, *, resume: bool) -> bool:
 
 
 @contextmanager
-def locked(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator[Work]:
+def claimed(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator[UnfinishedStore]:
     """Makes or takes over the hidden folder, for this process alone.
 
     Raises:
@@ -133,7 +132,7 @@ def locked(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator[
             journal.flush()
             os.fsync(journal.fileno())
             _write_json(folder / "manifest.json", settings)
-            yield Work(target, done, journal)
+            yield UnfinishedStore(target, done, journal)
 
 
 def _compare(target: Path, settings: dict[str, Any]) -> None:

@@ -1,0 +1,66 @@
+"""FITS, through astropy: the first image of three dimensions.
+
+Spacing is 1: FITS axes have units of their own (degrees, m/s), a box in space has one.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..source import ArraySource, Index, VolumeSource
+from .format import file_format
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitsSource(VolumeSource):
+    """An image that is scaled or packed: plane by plane, or all at once."""
+
+    def read_stored(self, index: Index) -> np.ndarray:
+        """Reads a part."""
+        from astropy.io import fits
+
+        with fits.open(self.path, memmap=False) as units:
+            cube = _cube(self.path, units)
+            if self.whole or self.covers(index):
+                return np.asarray(cube.data)[index]
+            first = (0,) * (len(index) - 3)
+            planes = range(*index[-3].indices(self.shape[-3]))
+            found = np.stack([np.asarray(cube.section[(*first, z)])[index[-2:]] for z in planes])
+        return found.reshape((1,) * len(first) + found.shape)
+
+
+@file_format("FITS", ".fits", ".fits.gz", ".fit", library="astropy")
+def open_fits(path: str) -> VolumeSource:
+    """Opens a cube; its first voxel tells the dtype after scaling."""
+    from astropy.io import fits
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*truncated.*")
+        with fits.open(path, memmap=False) as units:
+            cube = _cube(path, units)
+            shape = tuple(int(n) for n in cube.shape)
+            scaled = any(key in cube.header for key in ("BSCALE", "BZERO", "BLANK"))
+            packed = path.lower().endswith(".gz")
+            first = np.asarray(cube.section[(slice(0, 1),) * len(shape)]).dtype
+            offset = int(cube.fileinfo()["datLoc"])
+            plain = not (scaled or packed or isinstance(cube, fits.CompImageHDU))
+    told: dict[str, Any] = {"path": path, "shape": shape, "axes": "-" * (len(shape) - 3) + "zyx"}
+    if plain:
+        stored = first.newbyteorder(">").str
+        return ArraySource(file=path, stored=stored, offset=offset, **told)
+    return FitsSource(stored=first.str, whole=packed, **told)
+
+
+def _cube(path: str, units: Any) -> Any:
+    """The first image of three dimensions among the units of a file."""
+    cube = next((unit for unit in units if unit.is_image and len(unit.shape) >= 3), None)
+    if cube is None:
+        raise ValueError(f"{path}: holds no image of three dimensions")
+    if math.prod(cube.shape[:-3]) != 1:
+        raise ValueError(f"{path}: expected a cube, got {cube.shape}")
+    return cube

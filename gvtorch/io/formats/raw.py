@@ -1,0 +1,56 @@
+"""RAW: numbers alone, x fastest; the file's name or the user tells extent and dtype."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..source import ArraySource
+from .format import file_format
+
+_NAME = re.compile(r"_(\d+)x(\d+)x(\d+)_([a-z]+\d+)(?:_?(le|be))?(?=[._]|$)")
+_HINT = "name it *_XxYxZ_dtype.raw or pass"
+
+
+@file_format("RAW", ".raw", ".raw.gz", options=("shape", "dtype"))
+def open_raw(
+    path: str, shape: Sequence[int] | None = None, dtype: str | np.dtype | None = None
+) -> ArraySource:
+    """Opens a RAW file.
+
+    Args:
+        path: The file; its name may hold `_XxYxZ_dtype`, as in `scan_512x512x300_int16.raw`.
+        shape: (x, y, z) voxels; the name's if left out.
+        dtype: A NumPy dtype; the name's, little endian unless it says "be", if left out.
+    """
+    named = _NAME.search(Path(path).name.lower())
+    if shape is None:
+        if named is None:
+            raise ValueError(f"{path}: a RAW file needs its extent: {_HINT} shape and dtype")
+        shape = [int(named[axis]) for axis in (1, 2, 3)]
+    if len(shape) != 3:
+        raise ValueError(f"{path}: shape must be three numbers X,Y,Z, got {tuple(shape)}")
+    if dtype is None and named is None:
+        raise ValueError(f"{path}: a RAW file needs its dtype: {_HINT} dtype")
+    told = named[4] if dtype is None and named else dtype
+    try:
+        kind = np.dtype(told)
+    except TypeError:
+        raise ValueError(f"{path}: dtype must be a NumPy dtype, got {told!r}") from None
+    if kind.kind not in "iuf":
+        raise ValueError(f"{path}: dtype must be an integer or a float, got {told!r}")
+    if dtype is None and named:
+        kind = kind.newbyteorder(">" if named[5] == "be" else "<")
+    return ArraySource(
+        path=path,
+        file=path,
+        shape=tuple(int(size) for size in shape),
+        axes="xyz",
+        fortran=True,
+        stored=kind.str,
+        exact=True,
+        whole=path.lower().endswith(".gz"),
+    )

@@ -1,0 +1,136 @@
+"""`read_volume`: a file into memory; `open_source`: a file of any size, to be read in regions.
+
+Both read every format by its one entry in formats/. Every header is read first and refused if its
+extent does not fit, before memory is taken.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..base import check
+from ..base.constants import MAX_VOXELS
+from ..base.volume import Volume, check_extent
+from .formats import FORMATS, Format, find_format
+from .level_reader import StoreError
+from .ngff import is_zarr
+from .source import VolumeSource, told_as
+from .store_layout import DTYPES, MOST_VOXELS
+
+_MOST_CHANNELS = 2**10
+
+
+def read_volume(
+    path: str | Path,
+    *,
+    shape: Sequence[int] | None = None,
+    dtype: str | np.dtype | None = None,
+    spacing: Sequence[float] | None = None,
+    origin: Sequence[float] | None = None,
+    key: str | None = None,
+    nan: float | None = None,
+) -> Volume:
+    """Reads a volume.
+
+    Formats: RAW (`.raw`, `.raw.gz`; x fastest), `.npy`, `.npy.gz`, `.npy.bz2`, `.npz`, NIfTI
+    (`.nii`, `.nii.gz`), NRRD (`.nrrd`, `.nhdr`), TIFF (`.tif`, `.tiff`, or a folder of them), FITS
+    (`.fits`, `.fits.gz`), OME-Zarr (a folder or a URL). NumPy arrays are (z, y, x) or
+    (z, y, x, c). NIfTI and NRRD with axes along the world's are turned to x, y, z; oblique ones
+    keep their voxel axes, with a warning.
+
+    Args:
+        path: The file, or a folder of TIFF slices.
+        shape: RAW only: (x, y, z) voxels; the name's `_XxYxZ_dtype` if left out.
+        dtype: RAW only: a NumPy dtype, as in "int16" or ">i2"; the name's if left out.
+        spacing: (x, y, z) world units; overrides the file's. 1 where neither tells.
+        origin: (x, y, z) world place of the first voxel's centre; overrides the file's. 0 where
+            neither tells.
+        key: `.npz` only: which array; needed where there are several.
+        nan: Value for voxels that are NaN or infinite; they are refused if left out.
+
+    Returns:
+        The volume, dtype kept (64 and 32 bit integers and float64 become float32).
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The format is unknown, the file is damaged or too short, or an argument does
+            not fit.
+        ImportError: A library is missing; the message tells which pip command brings it.
+    """
+    source = open_source(
+        path, shape=shape, dtype=dtype, spacing=spacing, origin=origin, key=key, most=MAX_VOXELS
+    )
+    data, name = read_whole(source), Path(path).name
+    return Volume(data, source.spacing, source.origin, name=name, nan=nan)
+
+
+def open_source(
+    path: str | Path,
+    *,
+    shape: Sequence[int] | None = None,
+    dtype: str | np.dtype | None = None,
+    spacing: Sequence[float] | None = None,
+    origin: Sequence[float] | None = None,
+    key: str | None = None,
+    most: int = MOST_VOXELS * _MOST_CHANNELS,
+) -> VolumeSource:
+    """Reads a volume's header: what there is, where it lies, what reading will take.
+
+    Args, Raises: as `read_volume`, and
+        most: Values (voxels times channels); a larger volume is refused.
+    """
+    text = str(path)
+    if not is_zarr(text) and not Path(text).exists():
+        raise FileNotFoundError(f"volume not found: {path}")
+    found = find_format(text)
+    options = {"shape": shape, "dtype": dtype, "key": key}
+    given = {name: value for name, value in options.items() if value is not None}
+    _check_options(text, found, given)
+    found.need_library(text)
+    with told_as(ValueError, text, f"can't be read as {found.name}", StoreError, TimeoutError):
+        source = found.open(text, **given)
+        check_extent(text, source.shape, most=most)
+        check_extent(text, source.extent, most=MOST_VOXELS)
+        if source.dtype not in DTYPES:
+            raise ValueError(f"{path}: values must be real numbers, got dtype {source.dtype}")
+        source.check_file()
+    return placed(text, source, spacing, origin)
+
+
+def placed(
+    where: str,
+    source: VolumeSource,
+    spacing: Sequence[float] | None,
+    origin: Sequence[float] | None,
+) -> VolumeSource:
+    """Returns the source at a place of the user's; None leaves what the file tells."""
+    if spacing is not None:
+        source = dataclasses.replace(source, spacing=check.triple(where, "spacing", spacing))
+    if origin is not None:
+        source = dataclasses.replace(source, origin=check.triple(where, "origin", origin))
+    if min(source.spacing) <= 0:
+        raise ValueError(f"{where}: spacing must be positive, got {source.spacing}")
+    return source
+
+
+def read_whole(source: VolumeSource) -> np.ndarray:
+    """Reads all of a source, (z, y, x, c).
+
+    Raises:
+        ValueError: The file is damaged.
+    """
+    text = f"can't be read as {find_format(source.path).name}"
+    with told_as(ValueError, source.path, text, StoreError, TimeoutError):
+        return source.read_whole()
+
+
+def _check_options(path: str, found: Format, given: Iterable[str]) -> None:
+    for name in given:
+        if name not in found.options:
+            owner = next(other for other in FORMATS if name in other.options)
+            those = " and ".join(owner.options) + (" are" if len(owner.options) > 1 else " is")
+            raise ValueError(f"{path}: {those} for {owner.name} files, this is {found.name}")
