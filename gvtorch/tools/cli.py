@@ -23,7 +23,7 @@ from tyro.conf import Positional, arg
 
 from ..io.ngff import is_zarr
 from .bench import Bench
-from .common import VOLUMES, Bar, ReadOptions, refuse_for_store
+from .common import Bar, ReadOptions, refuse_for_store, volume_formats
 from .view import Fly, Render
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class Info:
 class Convert:
     """Convert a volume of any size to a store: OME-Zarr with bordered blocks."""
 
-    path: Positional[Annotated[str, arg(metavar="PATH", help=f"the volume: {VOLUMES}")]]
+    path: Positional[Annotated[str, arg(metavar="PATH", help=f"the volume: {volume_formats()}")]]
     store: Positional[Annotated[Path, arg(metavar="STORE.zarr")]]
     """the folder to make"""
     block: Literal[32, 64] = 32

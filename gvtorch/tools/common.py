@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import arg
 
-from ..io.formats import format_names
-
 if TYPE_CHECKING:
     from ..base.volume import Volume
 
-#: What a volume may be, for help texts.
-VOLUMES = f"{format_names()}; an OME-Zarr image is a folder or a URL"
+
+def volume_formats() -> str:
+    """What a volume may be, for help texts."""
+    from ..io.formats import format_names
+
+    return f"{format_names()}; an OME-Zarr image is a folder or a URL"
 
 
 @dataclass(frozen=True, kw_only=True)

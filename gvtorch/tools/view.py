@@ -17,7 +17,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from ..io.ngff import is_zarr
-from .common import VOLUMES, Bar, ReadOptions, given, numbers, refuse_for_store, size
+from .common import Bar, ReadOptions, given, numbers, refuse_for_store, size, volume_formats
 from .image import KINDS, STRIPS, Develop, parse_background
 from .light import parse_lighting
 
@@ -181,7 +181,7 @@ class Streaming:
 class Render:
     """Render a volume or a store to a picture."""
 
-    path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {VOLUMES}")]]
+    path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {volume_formats()}")]]
     output: Annotated[Path, arg(aliases=["-o"], metavar="OUT.png")]
     """the picture: .png, .exr, .tif, .npy or .npz; .tif and .npy may be larger than memory"""
     bits: Annotated[int | None, arg(metavar="N")] = None
