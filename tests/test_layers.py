@@ -6,6 +6,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 from conftest import ROOT
@@ -35,20 +36,35 @@ def floor(name: str) -> int:
     return next(number for number, rooms in enumerate(FLOORS) if name in rooms)
 
 
-def imported_rooms(path: Path) -> set[str]:
-    rooms = set()
+def imported(path: Path) -> set[tuple[str, ...]]:
+    """Dotted names that a file imports, also inside functions and for type checkers."""
+    names: set[tuple[str, ...]] = set()
     here = path.relative_to(PACKAGE.parent).with_suffix("").parts[:-1]
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom):
             base = here[: len(here) - node.level + 1] if node.level else ()
             parts = (*base, *(node.module or "").split(".")) if node.module else base
-            targets = [(*parts, alias.name) for alias in node.names]
+            names |= {(*parts, alias.name) for alias in node.names}
         elif isinstance(node, ast.Import):
-            targets = [tuple(alias.name.split(".")) for alias in node.names]
-        else:
-            continue
-        rooms |= {target[1] for target in targets if len(target) > 1 and target[0] == "gvtorch"}
-    return rooms
+            names |= {tuple(alias.name.split(".")) for alias in node.names}
+    return names
+
+
+def imported_rooms(path: Path) -> set[str]:
+    return {name[1] for name in imported(path) if len(name) > 1 and name[0] == "gvtorch"}
+
+
+def imported_files(path: Path) -> set[Path]:
+    """Files of the package that a file imports: a module, or where a name comes from."""
+    files = set()
+    for name in imported(path):
+        for parts in (name, name[:-1]):
+            place = PACKAGE.parent.joinpath(*parts)
+            found = [f for f in (place.with_suffix(".py"), place / "__init__.py") if f.is_file()]
+            if parts[:1] == ("gvtorch",) and found:
+                files.add(found[0])
+                break
+    return files - {PACKAGE / "__init__.py"}
 
 
 def modules() -> list[Path]:
@@ -66,6 +82,12 @@ def test_imports_only_go_down():
         own = room(path)
         for other in imported_rooms(path) - {own, "__version__"}:
             assert floor(other) < floor(own), f"{path.relative_to(ROOT)} imports {other}"
+
+
+def test_no_import_circle():
+    graph = {path: imported_files(path) for path in modules()}
+    assert sum(map(len, graph.values())) > 300
+    list(TopologicalSorter(graph).static_order())  # raises CycleError, which holds the circle
 
 
 def test_ops_know_no_objects():

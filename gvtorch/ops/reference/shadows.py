@@ -1,37 +1,33 @@
-"""Shadows in the torch twin of `shade_rays`: from samples, cones go to the light."""
+"""Part of the torch twin: shadows. From samples, cones go to the light."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from .march import Accumulator, Piece, Probe, walk
-from .rays import Beam, Intervals
-from .tree import Bricks, Tree
-
-if TYPE_CHECKING:
-    from .shaders import Shade
+from .march import Plain, Probe, Visitor, Walk
+from .rays import Intervals
+from .transfer import Piece
 
 
 @dataclass
 class Shadows:
     """What cones from samples to the light go through, and what they cost."""
 
-    beam: Beam  # the eye's
-    tree: Tree
-    step: float
-    levels: int  # lengths of intervals
-    stop_clear: Tensor
-    cone_scale: Tensor
-    samples: Tensor  # (r,) int32
-    missed: Tensor  # (r,) bool
+    walk: Walk  # the eye's
+    cube: Tensor  # (3,) world size of the root cube
+    cone_scale: float
+
+    def __post_init__(self) -> None:
+        """No cone went yet."""
+        self.samples = torch.zeros_like(self.walk.samples)
+        self.missed = torch.zeros_like(self.walk.missed)
 
     def share(
         self,
-        shade: Shade,
+        matter: Plain,
         t: Tensor,
         way: Tensor,
         length: Tensor,
@@ -43,47 +39,49 @@ class Shadows:
         does not stand in its own shadow.
         """
         which = where.nonzero()[:, 0]
-        t, way = t[which], way[which]
-        eye = self.beam
-        beam = Beam(
-            origin=eye.origin[which] + t[:, None] * eye.direction[which],
-            direction=way / shade.cube,
-            high=eye.high,
-            cone_near=eye.cone_near[which] + eye.cone_growth[which] * t,
+        t, way, eye = t[which], way[which], self.walk.at.beam[which]
+        beam = replace(
+            eye,
+            origin=eye.origin + t[:, None] * eye.direction,
+            direction=way / self.cube,
+            cone_near=eye.cone(t),
             cone_growth=growth[which] * self.cone_scale,
             first=torch.zeros_like(t),
             last=length[which],
             moved=torch.zeros_like(t),
-        )
-        beam.clip()
-        at = Intervals.begin(beam, self.step, self.levels)
+        ).clipped()
+        length_l = self.walk.at.length_l
+        at = Intervals.begin(beam, length_l[0], len(length_l))
         at.next(torch.ones_like(where[which]))
-        veil = Veil(shade, way, Accumulator.begin(beam))
-        step = torch.tensor(self.step, dtype=t.dtype).to(t)
-        samples, visit = walk(beam, at, self.tree, shade.channel, veil, step, self.stop_clear)
-        self.samples[which] += samples
-        self.missed[which] |= visit.missed
-        return torch.ones_like(length).index_put((which,), veil.sum.clear)
+        veil = Veil(matter.transfer, matter.channel, matter, way, torch.ones_like(t))
+        walk = Walk(at, self.walk.tree, matter.channel)
+        walk.go(veil)
+        self.samples[which] += walk.samples
+        self.missed[which] |= walk.missed
+        return torch.ones_like(length).index_put((which,), veil.clear)
 
 
 @dataclass
-class Veil:
-    """What a shader takes from the light that goes through: the shader of rays to a light."""
+class Veil(Visitor):
+    """What matter takes from the light that goes through."""
 
-    shade: Shade
+    matter: Plain
     along: Tensor  # (r, 3) world
-    sum: Accumulator
-    sees_empty: bool = False
+    clear: Tensor  # (r,) transmittance
 
     def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        """See `reference.Shader`."""
-        return self.shade.hides(which, low, high)
+        """See `Visitor`."""
+        return self.matter.hides(which, low, high)
 
-    def same(self, bricks: Bricks, fine: Tensor, coarse: Tensor) -> Tensor:
-        """See `reference.Shader`."""
-        return self.shade.equal(fine, coarse)
+    def same(self, fine: Tensor, coarse: Tensor) -> Tensor:
+        """See `Visitor`."""
+        return self.matter.same(fine, coarse)
+
+    def goes_on(self, leaves: Tensor) -> Tensor:
+        """See `Visitor`."""
+        return self.clear > self.matter.stop_clear
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
-        """See `reference.Shader`."""
-        clear = self.sum.clear * (1 - self.shade.alpha(piece, probe, self.along))
-        self.sum.clear = torch.where(where, clear, self.sum.clear)
+        """See `Visitor`."""
+        clear = self.clear * (1 - self.matter.alpha(piece, probe, self.along))
+        self.clear = torch.where(where, clear, self.clear)

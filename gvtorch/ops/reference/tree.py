@@ -1,11 +1,12 @@
-"""Part of the reference: descents to a node, marks, and samples of bricks, as csrc/tree.h, walk.h
+"""Part of the torch twin: descents to a node, marks, and samples of bricks, as csrc/tree.h, walk.h
 and brick.h.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -13,25 +14,78 @@ from torch import Tensor
 from ...base.constants import ABSENT, REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
 from ..arguments import TraceArguments
 from .exact import clamp, divide, smaller
-from .rays import INF
+from .rays import INF, Beam, Rows
 
 
 @dataclass
-class Place:
-    """Where a descent ended, and the two nodes whose bricks answer (-1: nobody)."""
+class Levels:
+    """The sizes of nodes and voxels at each depth, from the root's by repeated division."""
 
-    corner: Tensor  # (r, 3) of the box in which the answer stays the same
+    branching: int
+    size_d: Tensor  # (d,) side of a node, tree units
+    voxel_d: Tensor  # (d,) side of a voxel, world units
+
+    @classmethod
+    def of(cls, a: TraceArguments, real: torch.dtype) -> Levels:
+        """Levels from 0 to the deepest."""
+        device = a.place_33.device
+        size = [torch.ones((), dtype=real, device=device)]
+        voxel = [torch.tensor(a.root_voxel, dtype=real, device=device)]
+        for _ in range(a.max_depth):
+            size.append(divide(size[-1], a.branching, size[-1]))
+            voxel.append(divide(voxel[-1], a.branching, voxel[-1]))
+        return cls(a.branching, torch.stack(size), torch.stack(voxel))
+
+    def wanted(self, cone: Tensor) -> Tensor:
+        """(r,) first depths whose voxels are not wider than the cone: the level of detail."""
+        return (self.voxel_d[:-1] > cone[:, None]).sum(1)
+
+    def voxels(self, depth: Tensor) -> tuple[Tensor, Tensor]:
+        """(r,) voxel at each depth, and the one above (+inf above the root)."""
+        above = torch.where(depth > 0, self.voxel_d[(depth - 1).clamp(min=0)], INF)
+        return self.voxel_d[depth], above
+
+    def digits(self, position_r3: Tensor) -> Iterator[Tensor]:
+        """Yields (r, 3) digits x, y, z of places, from depth 1 on: which child, along each axis."""
+        local = position_r3
+        for _ in range(len(self.size_d) - 1):
+            scaled = local * self.branching
+            digit = clamp(torch.floor(scaled), 0, self.branching - 1)
+            local = scaled - digit
+            yield digit
+
+    def corner(self, position_r3: Tensor, depth: Tensor) -> Tensor:
+        """(r, 3) low corners of the nodes at a depth in which places lie."""
+        corner = torch.zeros_like(position_r3)
+        for level, digit in enumerate(self.digits(position_r3), 1):
+            inside = (depth >= level)[:, None]
+            corner = torch.where(inside, corner + digit * self.size_d[level], corner)
+        return corner
+
+
+@dataclass
+class Holder(Rows):
+    """A node and its brick, where one answers."""
+
+    node: Tensor  # (r,) int64; -1: no node answers
+    brick: Tensor  # (r,) int64 slot, or the node's brick word below 0
+    depth: Tensor  # (r,) int64
+    corner: Tensor  # (r, 3) tree units
     size: Tensor  # (r,)
-    depth: Tensor  # (r,)
+
+
+@dataclass
+class Descent(Rows):
+    """Where a descent ended, and the two nodes whose bricks answer (-1: none)."""
+
     node: Tensor  # (r,) last node reached
+    depth: Tensor  # (r,) its depth
     parent: Tensor  # (r,)
     hidden: Tensor  # (r,) bool: nothing in the node or below it is seen
-    fine_node: Tensor  # (r,)
-    fine_corner: Tensor  # (r, 3)
-    fine_size: Tensor  # (r,)
-    coarse_node: Tensor  # (r,)
-    coarse_corner: Tensor  # (r, 3)
-    coarse_size: Tensor  # (r,)
+    fine: Tensor  # (r,) the deepest node with a brick or a constant
+    fine_depth: Tensor  # (r,)
+    coarse: Tensor  # (r,) the deepest above the wanted depth
+    coarse_depth: Tensor  # (r,)
 
 
 @dataclass
@@ -44,43 +98,77 @@ class Tree:
     stamp_t: Tensor
     stamp_b: Tensor
     frame: Tensor  # ()
-    root_voxel: Tensor  # () world size of a depth-0 voxel
-    branching: int
+    levels: Levels
     nodes_per_tile: int
     root: int
-    max_depth: int
     by_level: bool
 
     @classmethod
-    def of(cls, a: TraceArguments, root_voxel: Tensor) -> Tree:
+    def of(cls, a: TraceArguments) -> Tree:
         """The tree of an op's arguments."""
-        words = (a.child_tn.view(-1), a.brick_tn.view(-1), a.request_tn.view(-1))
-        numbers = (a.branching, a.child_tn.shape[1], a.root, a.max_depth)
-        return cls(*words, a.stamp_t, a.stamp_b, a.frame_1[0], root_voxel, *numbers, a.by_level)
+        return cls(
+            child_n=a.child_tn.view(-1),
+            brick_n=a.brick_tn.view(-1),
+            request_n=a.request_tn.view(-1),
+            stamp_t=a.stamp_t,
+            stamp_b=a.stamp_b,
+            frame=a.frame_1[0],
+            levels=Levels.of(a, a.table_lm4.dtype),
+            nodes_per_tile=a.child_tn.shape[1],
+            root=a.root,
+            by_level=a.by_level,
+        )
 
-    def voxel_at(self, depth: Tensor) -> Tensor:
-        """World size of a voxel at each depth."""
-        voxel = self.root_voxel.expand(depth.shape)
-        for level in range(self.max_depth):
-            voxel = torch.where(depth > level, divide(voxel, self.branching, voxel), voxel)
-        return voxel
+    def descend(
+        self, position_r3: Tensor, wanted_r: Tensor, hides: Callable[[Tensor], Tensor]
+    ) -> Descent:
+        """Descends from the root to the wanted depth, or as far as tiles exist and something is
+        seen; stamps the tiles.
+        """
+        n = self.levels.branching
+        node, depth = torch.full_like(wanted_r, self.root), torch.zeros_like(wanted_r)
+        none = torch.full_like(node, -1)
+        at = Descent(node, depth, none, hides(node), none, depth, none, depth)
+        going = torch.ones_like(node, dtype=torch.bool)
+        digits = self.levels.digits(position_r3)
+        while True:
+            self.stamp_t[torch.unique(at.node[going] // self.nodes_per_tile)] = self.frame
+            answers = going & (self.brick_n[at.node] != ABSENT)
+            at.fine = torch.where(answers, at.node, at.fine)
+            at.fine_depth = torch.where(answers, at.depth, at.fine_depth)
+            above = answers & (at.depth < wanted_r)
+            at.coarse = torch.where(above, at.node, at.coarse)
+            at.coarse_depth = torch.where(above, at.depth, at.coarse_depth)
+
+            tile = self.child_n[at.node].to(torch.int64)
+            going = going & (at.depth < wanted_r) & (tile >= 0) & ~at.hidden
+            if not going.any():
+                return at
+            x, y, z = next(digits).to(torch.int64).unbind(1)
+            child = tile * self.nodes_per_tile + (z * n + y) * n + x
+            at.parent = torch.where(going, at.node, at.parent)
+            at.node = torch.where(going, child, at.node)
+            at.depth = torch.where(going, at.depth + 1, at.depth)
+            at.hidden = torch.where(going, hides(at.node), at.hidden)
+
+    def holder(self, node: Tensor, depth: Tensor, position_r3: Tensor) -> Holder:
+        """The nodes (r,), or -1, that were found at a depth around places."""
+        brick = torch.where(node >= 0, self.brick_n[node.clamp(min=0)].to(torch.int64), ABSENT)
+        corner = self.levels.corner(position_r3, depth)
+        return Holder(node, brick, depth, corner, self.levels.size_d[depth])
 
     def mark(
-        self, found: Place, wanted: Tensor, blends: Tensor, cone: Tensor, seen: Tensor
+        self, found: Descent, wanted: Tensor, blends: Tensor, cone: Tensor, seen: Tensor
     ) -> Tensor:
-        """Stamps the bricks that answer where something is seen; requests what is not there, and
-        returns (r,) bool whether it did.
+        """Requests what is not there where something is seen, and returns (r,) bool whether it did.
 
         Straight to the wanted level, or level by level: then a brick is there before its node is
         subdivided.
         """
-        for node in (found.fine_node, found.coarse_node):
-            slot = torch.where(seen & (node >= 0), self.brick_n[node.clamp(min=0)], -1)
-            self.stamp_b[torch.unique(slot[slot >= 0]).to(torch.int64)] = self.frame
         absent = self.brick_n[found.node] == ABSENT
         deeper = (found.depth < wanted) & (self.child_n[found.node] == ABSENT)
         short = seen & deeper & ~(self.by_level & absent)
-        missing = seen & absent & (self.by_level | ~deeper | (found.fine_node < 0))
+        missing = seen & absent & (self.by_level | ~deeper | (found.fine < 0))
         parent = found.parent.clamp(min=0)
         above = seen & blends & (found.depth == wanted) & (self.brick_n[parent] == ABSENT)
         self.request(found.node[short], found.depth[short], cone[short], REQUEST_SUBDIVIDE)
@@ -88,80 +176,24 @@ class Tree:
         self.request(parent[above], found.depth[above] - 1, cone[above], REQUEST_LOAD)
         return short | missing | above
 
+    def stamp(self, brick: Tensor) -> None:
+        """Stamps brick slots as used in this frame; words below 0 name none."""
+        self.stamp_b[torch.unique(brick[brick >= 0])] = self.frame
+
     def request(self, node: Tensor, depth: Tensor, cone: Tensor, kind: int) -> None:
-        """Joins wishes into the request words: kinds by OR, priorities by maximum.
+        """Joins requests into the request words: kinds by OR, priorities by maximum.
 
         The priority is the width of one voxel of the node on the screen in sixteenths of a pixel.
         """
-        priority = torch.where(cone > 0, self.voxel_at(depth) / cone * 16, REQUEST_PRIORITY)
+        voxel = self.levels.voxel_d[depth]
+        priority = torch.where(cone > 0, voxel / cone * 16, REQUEST_PRIORITY)
         priority = torch.where(priority < REQUEST_PRIORITY, priority, REQUEST_PRIORITY)
-        wished, inverse = torch.unique(node, return_inverse=True)
-        most = torch.zeros_like(wished, dtype=torch.int32)
+        asked, inverse = torch.unique(node, return_inverse=True)
+        most = torch.zeros_like(asked, dtype=torch.int32)
         most.scatter_reduce_(0, inverse, priority.to(torch.int32), "amax")
-        word = self.request_n[wished]
+        word = self.request_n[asked]
         kinds = (word & ~REQUEST_PRIORITY) | kind
-        self.request_n[wished] = kinds | torch.maximum(word & REQUEST_PRIORITY, most)
-
-
-def descend(
-    position_r3: Tensor, wanted_r: Tensor, tree: Tree, hides: Callable[[Tensor], Tensor]
-) -> Place:
-    """Descends from the root to the wanted depth, or as far as tiles exist and something is seen;
-    stamps the tiles.
-    """
-    n = tree.branching
-    local, corner = position_r3, torch.zeros_like(position_r3)
-    size = torch.ones_like(position_r3[:, 0])
-    node = torch.full_like(wanted_r, tree.root)
-    nobody = torch.full_like(node, -1)
-    place = Place(
-        *(corner, size, torch.zeros_like(node), node, nobody, hides(node)),
-        *(nobody, corner, size, nobody, corner, size),
-    )
-    going = torch.ones_like(node, dtype=torch.bool)
-    for _ in range(tree.max_depth + 1):
-        tree.stamp_t[torch.unique(place.node[going] // tree.nodes_per_tile)] = tree.frame
-        answers = going & (tree.brick_n[place.node] != ABSENT)
-        place.fine_node = torch.where(answers, place.node, place.fine_node)
-        place.fine_corner = torch.where(answers[:, None], place.corner, place.fine_corner)
-        place.fine_size = torch.where(answers, place.size, place.fine_size)
-        above = answers & (place.depth < wanted_r)
-        place.coarse_node = torch.where(above, place.node, place.coarse_node)
-        place.coarse_corner = torch.where(above[:, None], place.corner, place.coarse_corner)
-        place.coarse_size = torch.where(above, place.size, place.coarse_size)
-
-        tile = tree.child_n[place.node].to(torch.int64)
-        going = going & (place.depth < wanted_r) & (tile >= 0) & ~place.hidden
-        if not going.any():
-            break
-        size = divide(place.size, n, place.size)
-        scaled = local * n
-        digit = clamp(torch.floor(scaled), 0, n - 1)
-        x, y, z = digit.to(torch.int64).unbind(1)
-        child = (z * n + y) * n + x
-        moved = place.corner + digit * size[:, None]
-        local = torch.where(going[:, None], scaled - digit, local)
-        place.corner = torch.where(going[:, None], moved, place.corner)
-        place.size = torch.where(going, size, place.size)
-        place.parent = torch.where(going, place.node, place.parent)
-        place.node = torch.where(going, tile * tree.nodes_per_tile + child, place.node)
-        place.depth = torch.where(going, place.depth + 1, place.depth)
-        place.hidden = torch.where(going, hides(place.node), place.hidden)
-    return place
-
-
-def wanted_depth(cone: Tensor, tree: Tree) -> tuple[Tensor, Tensor, Tensor]:
-    """Level of detail: the first depth whose voxel fits the cone, its voxel, and the voxel
-    above."""
-    voxel = tree.root_voxel.expand(cone.shape)
-    above = torch.full_like(cone, INF)
-    wanted = torch.zeros_like(cone, dtype=torch.int64)
-    for _ in range(tree.max_depth):
-        deeper = voxel > cone
-        above = torch.where(deeper, voxel, above)
-        wanted = torch.where(deeper, wanted + 1, wanted)
-        voxel = torch.where(deeper, divide(voxel, tree.branching, voxel), voxel)
-    return wanted, voxel, above
+        self.request_n[asked] = kinds | torch.maximum(word & REQUEST_PRIORITY, most)
 
 
 @dataclass
@@ -175,47 +207,53 @@ class Bricks:
     component: int
 
     @classmethod
-    def of(cls, a: TraceArguments) -> Bricks:
+    def of(cls, a: TraceArguments) -> Self:
         """The channel of an op's arguments."""
-        values = a.constant_tnc.flatten(0, 1), a.range_tn2c.flatten(0, 1)
-        return cls(a.bricks_bzyxc, *values, a.border, a.component)
+        constant_nc, range_n2c = a.constant_tnc.flatten(0, 1), a.range_tn2c.flatten(0, 1)
+        return cls(a.bricks_bzyxc, constant_nc, range_n2c, a.border, a.component)
+
+    def components(self, bricks: Tensor | None, constants: Tensor | None) -> tuple[Self, ...]:
+        """Every number of another channel of the same nodes; none where there is no channel."""
+        if bricks is None or constants is None:
+            return ()
+        other = replace(self, bricks_bzyxc=bricks, constant_nc=constants.flatten(0, 1))
+        return tuple(replace(other, component=c) for c in range(bricks.shape[4]))
 
     def ends(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
         """(r,) smallest and largest value in reach of the nodes' bricks, and of the nodes below."""
         low, high = self.range_n2c[node, :, self.component].to(real).unbind(1)
         return low, high
 
+    def same(self, a: Tensor, b: Tensor) -> Tensor:
+        """(r,) bool: two nodes have the same constant."""
+        constant = self.constant_nc[:, self.component]
+        return constant[a] == constant[b]
+
     def sample(
         self,
-        brick_n: Tensor,
-        node: Tensor,
-        corner: Tensor,
-        size: Tensor,
-        origin_r3: Tensor,
-        direction_r3: Tensor,
+        holder: Holder,
+        beam: Beam,
         t: Tensor,
-        shift: tuple[float, float, float] = (0, 0, 0),
+        shift: Sequence[float] = (0, 0, 0),
     ) -> Tensor:
-        """Trilinear value of each ray's node at distance t, `shift` voxels beside the ray; its
-        constant where it has no brick.
+        """(r,) trilinear values at distances t (r,), `shift` voxels beside the ray; the node's
+        constant where it has no brick, 0 where there is no node.
         """
-        real, known = origin_r3.dtype, node.clamp(min=0)
-        constant = torch.where(node >= 0, self.constant_nc[known, self.component].to(real), 0.0)
-        slot = torch.where(node >= 0, brick_n[known].to(torch.int64), -1)
+        real, side = t.dtype, self.bricks_bzyxc.shape[1]
+        constant = self.constant_nc[holder.node.clamp(min=0), self.component].to(real)
+        constant = torch.where(holder.node >= 0, constant, 0.0)
         if self.bricks_bzyxc.shape[0] == 0:
             return constant
-        side = self.bricks_bzyxc.shape[1]
-        scale = divide(side - 2 * self.border, size, size)
-        offset = (origin_r3 - corner) * scale[:, None] + (self.border - 0.5)
-        place = offset + t[:, None] * (direction_r3 * scale[:, None])
-        place = torch.stack(
-            [p + d if d else p for p, d in zip(place.unbind(1), shift, strict=True)], 1
-        )
+        scale = divide(side - 2 * self.border, holder.size, holder.size)[:, None]
+        offset = (beam.origin - holder.corner) * scale + (self.border - 0.5)
+        place = offset + t[:, None] * (beam.direction * scale)
+        columns = zip(place.unbind(1), shift, strict=True)
+        place = torch.stack([p + d if d else p for p, d in columns], 1)
         place = clamp(place, 0, side - 1)
         cell = smaller(torch.floor(place), torch.full_like(place, side - 2))
         wx, wy, wz = (place - cell).unbind(1)
         x, y, z = cell.to(torch.int64).unbind(1)
-        brick = slot.clamp(min=0)
+        brick = holder.brick.clamp(min=0)
 
         def voxel(dx: int, dy: int, dz: int) -> Tensor:
             found = self.bricks_bzyxc[brick, z + dz, y + dy, x + dx, self.component]
@@ -230,4 +268,4 @@ class Bricks:
             return low + wy * (high - low)
 
         near, far = plane(0), plane(1)
-        return torch.where(slot >= 0, near + wz * (far - near), constant)
+        return torch.where(holder.brick >= 0, near + wz * (far - near), constant)
