@@ -10,15 +10,18 @@ import ast
 import importlib
 from pathlib import Path
 
+from .base.declared import declared_names
+
 __version__ = "0.1.0"
 
 #: Public name -> the module that defines it; an empty text for a room.
-_HOME = {
-    alias.name: node.module or ""
-    for node in ast.parse(Path(__file__).with_name("__init__.pyi").read_text("utf-8")).body
-    if isinstance(node, ast.ImportFrom)
-    for alias in node.names
-}
+_HOME: dict[str, str] = {}
+for _node in ast.parse(Path(__file__).with_name("__init__.pyi").read_text("utf-8")).body:
+    if isinstance(_node, ast.ImportFrom):
+        _module, _names = _node.module or "", [alias.name for alias in _node.names]
+        if _names == ["*"]:
+            _names = declared_names(_module, "__all__")
+        _HOME |= dict.fromkeys(_names, _module)
 __all__ = sorted(_HOME)  # noqa: PLE0605
 
 

@@ -33,19 +33,14 @@ from .cpp_ext.user import CompileError as CompileError
 from .shaders import (
     CompiledShader as CompiledShader,
     DirectionalLight as DirectionalLight,
-    DistanceField as DistanceField,
-    Features as Features,
     Headlight as Headlight,
-    Isosurface as Isosurface,
-    Lit as Lit,
+    ModuleShader as ModuleShader,
     PointLight as PointLight,
-    PreIntegrated as PreIntegrated,
-    Projection as Projection,
     Shader as Shader,
-    StoredColor as StoredColor,
     TransferFunction as TransferFunction,
+    TransferModule as TransferModule,
 )
-from .tracing import ModuleShader as ModuleShader, TransferModule as TransferModule
+from .shaders.built_in import *  # its __all__: Lit, Isosurface, Projection and others
 
 # Rendering a resident tree.
 from .tracing import (

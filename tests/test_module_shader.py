@@ -13,7 +13,7 @@ from conftest import DATA, DEVICES
 from test_trace_rays import SHADER
 
 import gvtorch as gv
-from gvtorch.tracing.tracer import tracer_of
+from gvtorch.tracing.tracer import Tracer
 
 SOFT = gv.TransferFunction.from_points(  # never quite opaque: a power of 0 has no slope
     opacity=[(0, 0), (0.2, 0), (0.6, 0.4), (1, 0.95)],
@@ -234,9 +234,9 @@ def test_rays_that_have_ended_mark_and_request_nothing(blobs, compiled):
     clear = torch.where(torch.arange(len(rays.origin)) % 2 == 0, 0.0, 0.5).to(device)
     shader, options = twin(SOFT, blobs.spacing, device), gv.RenderOptions(stop_alpha=1.0)
     tree.frame = 1
-    whole = tracer_of(tree, shader, options)(rays)
+    whole = Tracer(tree, shader, options)(rays)
     tree.frame = 2
-    hits = tracer_of(tree, shader, options)(dataclasses.replace(rays, transmittance=clear))
+    hits = Tracer(tree, shader, options)(dataclasses.replace(rays, transmittance=clear))
     ended = clear == 0
     assert not hits.samples[ended].any() and not hits.color[ended].any()
     torch.testing.assert_close(hits.alpha[ended], 1 - clear[ended, None])
@@ -244,7 +244,7 @@ def test_rays_that_have_ended_mark_and_request_nothing(blobs, compiled):
     torch.testing.assert_close(hits.color[~ended], 0.5 * whole.color[~ended])
     tree.frame = 3
     none = dataclasses.replace(rays, transmittance=torch.zeros_like(clear))
-    tracer_of(tree, shader, options)(none)
+    Tracer(tree, shader, options)(none)
     assert not (tree.nodes.stamp_t == 3).any() and (tree.nodes.stamp_t == 2).any()
 
 

@@ -15,7 +15,6 @@ from test_trace_rays import camera_rays, forget, run
 from torch import Tensor
 
 import gvtorch as gv
-from gvtorch.tracing.tracer import AnyShader
 
 TRANSFER = gv.TransferFunction.from_points(
     [(0.2, 0), (0.5, 0.05), (0.9, 0.6)], [(0.2, 1, 0.3, 0.1), (0.9, 0.2, 0.6, 1)]
@@ -80,7 +79,7 @@ def cut(rays: gv.Rays) -> gv.Rays:
     return replace(rays, range=limits, transmittance=torch.linspace(0.05, 1.0, len(first)).double())
 
 
-def shaded(shader: AnyShader, backend: str, branching: int = 2) -> list[Tensor]:
+def shaded(shader: gv.Shader, backend: str, branching: int = 2) -> list[Tensor]:
     """All that a shader's traces write."""
     tree, found = scene(branching), []
     holes = forget(tree, 0.3, 5)

@@ -25,6 +25,7 @@ from gvtorch.ops import (
     trace_rays,
     trace_segments,
 )
+from gvtorch.shaders.tables import Sampling
 from gvtorch.tracing.tracer import Tracer
 
 MARKS = ("request_tn", "stamp_t", "stamp_b")
@@ -120,8 +121,14 @@ def test_segments_are_what_trace_rays_samples(blobs, backend, lod, distance):
     rays = camera_rays(tree, distance=distance)
     given, drawn = tracing(tree, backend, rays, stop_alpha=1.0, lod=lod)
     haze = gv.TransferFunction.from_points([(0, 0), (0.2, 0), (1, 0.1)])  # nothing is opaque
-    lengths = (min(tree.spacing), drawn.step, len(drawn.table_lm4))
-    drawn = drawn._replace(**vars(haze.table(*lengths, torch.float32, drawn.child_tn.device)))
+    sampling = Sampling(
+        smallest_spacing=min(tree.spacing),
+        step=drawn.step,
+        levels=len(drawn.table_lm4),
+        dtype=torch.float32,
+        device=drawn.child_tn.device,
+    )
+    drawn = drawn._replace(**vars(haze.table(sampling)))
     walked = drawn._replace(**{name: getattr(drawn, name).clone() for name in MARKS})
     *_, samples, missed = trace_rays(given, drawn, backend=backend)
     segments = trace_segments(given, walked, backend=backend)

@@ -302,7 +302,7 @@ def op_arguments(tree, shader, dtype) -> list:
     rays = camera_rays(tree, 3).to(tree.device)
     tracer = Tracer(tree, shader, gv.RenderOptions(dtype=dtype))
     records = [RayArguments.of(rays)._replace(width=0), tracer.arguments, tracer.shading]
-    return [*records, shader.parameters(tree, dtype)]
+    return [*records, shader.parameter_tensor(tree, dtype)]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

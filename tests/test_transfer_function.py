@@ -11,11 +11,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gvtorch as gv
+from gvtorch.shaders.tables import Sampling
 from gvtorch.shaders.transfer_function import PRESETS
 
 
 def table_of(function, spacing=1.0, step=1.0, levels=1, dtype=torch.float32):
-    return function.table(spacing, step, levels, dtype, "cpu")
+    return function.table(
+        Sampling(
+            smallest_spacing=spacing,
+            step=step,
+            levels=levels,
+            dtype=dtype,
+            device=torch.device("cpu"),
+        )
+    )
 
 
 def look_up(function: gv.TransferFunction, value: np.ndarray) -> np.ndarray:

@@ -26,14 +26,15 @@ from ..shaders import (
     Features,
     Isosurface,
     Lit,
+    ModuleShader,
     PreIntegrated,
     Projection,
+    Shader,
     StoredColor,
+    TransferModule,
 )
-from ..shaders.fused import Shader
-from ..tracing import Lighting, ModuleShader, TransferModule
+from ..tracing import Lighting
 from ..tracing.resident import trace
-from ..tracing.tracer import AnyShader
 from .march import Size, difference, op_milliseconds, rates, rgba
 from .record import Record, Settings, Timing, clock
 from .scenes import Scene, aneurism, fog_dense, worn
@@ -48,7 +49,7 @@ class Look:
     """A shader with its options, and the look that its time is a ratio of."""
 
     name: str
-    shader: Callable[[Scene], AnyShader]
+    shader: Callable[[Scene], Shader]
     options: Mapping[str, Any] = field(default_factory=dict)  # of `RenderOptions`
     beside: str = "plain"
     twin: bool = False  # both must draw the same picture
@@ -56,16 +57,16 @@ class Look:
     compiles: bool = False  # left out where there is no compiler
 
 
-def _projection(which: Literal["maximum", "minimum", "mean"]) -> Callable[[Scene], AnyShader]:
+def _projection(which: Literal["maximum", "minimum", "mean"]) -> Callable[[Scene], Shader]:
     return lambda scene: Projection(which, scene.shader)
 
 
-def _module(scene: Scene) -> AnyShader:
+def _module(scene: Scene) -> Shader:
     module = TransferModule(scene.shader, min(scene.volume.spacing))
     return ModuleShader(module, hidden_by=scene.shader)
 
 
-def _own(scene: Scene) -> AnyShader:
+def _own(scene: Scene) -> Shader:
     return CompiledShader(_OWN, "Own", transfer=scene.shader)
 
 
@@ -153,7 +154,7 @@ def _resident(
     tree = N3Tree.from_volume(volumes, device=record.settings.device)
     rays = scene.camera(*size).rays(tree.device)
 
-    def frame(shader: AnyShader, **options: Any) -> Hits:
+    def frame(shader: Shader, **options: Any) -> Hits:
         return trace(tree, rays, shader, **options)
 
     return _measure(record, case, scene, volumes, frame, {})
@@ -180,10 +181,10 @@ def _streamed(
         monitor=False,
     ) as engine:
 
-        def frame(shader: AnyShader, **options: Any) -> Picture:
+        def frame(shader: Shader, **options: Any) -> Picture:
             return engine.frame(camera, shader, background=None, **options)[0]
 
-        def converge(shader: AnyShader, **options: Any) -> None:
+        def converge(shader: Shader, **options: Any) -> None:
             engine.render(camera, shader, background=None, **options)
             if not engine.frame(camera, shader, background=None, **options)[1].converged:
                 record.note(f"{case}: it was not steady")
@@ -221,12 +222,10 @@ def _measure(
             record.note(f"{look.name}: left out, there is no compiler for {record.settings.device}")
             continue
         shader = look.shader(scene)
-        needed = set(shader.channels) if isinstance(shader, Shader) else set()
-        if not needed <= set(channels) or (look.slow and len(channels) == 1):
+        if not set(shader.channels) <= set(channels) or (look.slow and len(channels) == 1):
             continue
-        module = shader.module if isinstance(shader, ModuleShader) else None
-        if isinstance(module, torch.nn.Module):
-            module.to(record.settings.device)
+        if isinstance(shader, ModuleShader):
+            shader.to(record.settings.device)
         record.settings.tell(f"{case}: {look.name}")
         options = {"step": scene.step, **look.options}
         if prepare is not None:
@@ -236,7 +235,7 @@ def _measure(
         medians[look.name], pictures[look.name] = timing.median, rgba(shown)
         figures = {"beside": look.beside, "times": timing.median / medians[look.beside]}
         figures |= rates(shown, timing)
-        figures["op_ms"] = None if module else op_milliseconds(run, record.settings)
+        figures["op_ms"] = None if shader.uses_torch else op_milliseconds(run, record.settings)
         other = others.get(look.name, pictures[look.beside] if look.twin else None)
         if other is not None:
             figures["max_difference"] = difference(pictures[look.name], other)["max_difference"]

@@ -25,7 +25,8 @@ from ..cameras.custom import as_camera
 from ..ops.trace import choose_backend
 from ..pictures import Picture
 from ..producers import Producer
-from ..tracing import ModuleShader, RenderOptions
+from ..shaders.shader import Shader
+from ..tracing import RenderOptions
 from ..tracing.options import RenderSettings, render_options
 from ..tracing.pixels import empty_hits
 from .failures import Failure
@@ -395,7 +396,7 @@ class Engine:
             ProductionError: See `frame`.
         """
         shaders = shader.values() if isinstance(shader, Mapping) else (shader,)
-        if any(isinstance(one, ModuleShader) for one in shaders):
+        if any(isinstance(one, Shader) and one.uses_torch for one in shaders):
             raise ValueError(
                 "Engine.capture: a ModuleShader can't be recorded: the host waits in it"
             )

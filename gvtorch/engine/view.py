@@ -13,16 +13,16 @@ from ..base.records import Hits, RenderStats
 from ..base.stage import Progress, no_progress
 from ..cameras import Camera
 from ..pictures import Picture
-from ..shaders.fused import Shader
-from ..tracing import ModuleShader, RenderOptions
+from ..shaders.shader import Shader, check_shader
+from ..tracing import RenderOptions
 from ..tracing.around import around
 from ..tracing.composite import Trace, trace_trees
 from ..tracing.pixels import develop, trace_camera
-from ..tracing.tracer import AnyShader, check_shader, tracer_of
+from ..tracing.tracer import Tracer
 from .request_batch import ProducedTree
 
 #: A shader for all trees, or one for each by name.
-Shaders = AnyShader | Mapping[str, AnyShader]
+Shaders = Shader | Mapping[str, Shader]
 #: Hits of an earlier pass, which are overwritten, and which (r,) bool of their rays to trace again.
 Again = tuple[Hits, Tensor]
 
@@ -79,13 +79,12 @@ def trace_scene(
     for name, source in trees.items():
         tree, channels = source.tree, source.producer.channels
         shader: Any = shaders.get(name) if isinstance(shaders, Mapping) else shaders
-        if not isinstance(shader, ModuleShader):
-            check_shader("frame", f"shader of tree {name!r}", shader)
+        check_shader("frame", f"shader of tree {name!r}", shader)
         channel = options.channel or next(iter(channels))
-        for needed in (channel, *(shader.channels if isinstance(shader, Shader) else ())):
+        for needed in (channel, *shader.channels):
             if needed not in channels:
                 known = ", ".join(channels)
                 raise ValueError(f"frame: tree {name!r} has no channel {needed!r}; it has {known}")
         chosen = replace(options, channel=channel)
-        traces.append((tree.box, around(tracer_of(tree, shader, chosen, **frame), chosen, box)))
+        traces.append((tree.box, around(Tracer(tree, shader, chosen, **frame), chosen, box)))
     return partial(trace_trees, traces)

@@ -1,23 +1,21 @@
 """Shaders: what turns the values along a ray into colour."""
 
+from .built_in import *  # noqa: F403
+from .built_in import __all__ as _built_in
 from .compiled import CompiledShader
-from .fused import Features, Lit, PreIntegrated, Projection, Shader, StoredColor
 from .lights import DirectionalLight, Headlight, PointLight
-from .surfaces import DistanceField, Isosurface
+from .module import ModuleShader, TransferModule
+from .shader import Shader
 from .transfer_function import TransferFunction
 
-__all__ = [
+__all__ = [  # noqa: PLE0604
     "CompiledShader",
     "DirectionalLight",
-    "DistanceField",
-    "Features",
     "Headlight",
-    "Isosurface",
-    "Lit",
+    "ModuleShader",
     "PointLight",
-    "PreIntegrated",
-    "Projection",
     "Shader",
-    "StoredColor",
     "TransferFunction",
+    "TransferModule",
+    *_built_in,
 ]

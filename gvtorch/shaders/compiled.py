@@ -20,8 +20,9 @@ from ..ops import ShadeArguments
 from ..ops.registry import add_user_op
 from ..ops.shading import Number, pack
 from ..pool import N3Tree
-from .fused import Intervals, LitShader, one_color, plain_table
-from .transfer_function import Table, TransferFunction
+from .lit import LitShader
+from .tables import ColorTable, Sampling, one_color
+from .transfer_function import TransferFunction, check_transfer
 
 Uniforms = MutableMapping[str, Number] | Tensor
 
@@ -78,9 +79,8 @@ class CompiledShader(LitShader):
             ValueError: There is no such file, or uniforms are not those that the struct names.
         """
         super().__init__(**light)
-        if transfer is not None and not isinstance(transfer, TransferFunction):
-            kind = type(transfer).__name__
-            raise ValueError(f"CompiledShader: transfer must be a TransferFunction, got {kind}")
+        if transfer is not None:
+            check_transfer("CompiledShader", "transfer", transfer)
         self.name = name
         self._take(user.load(header, name))
         self.transfer, self.channel, self.component = transfer, channel, component
@@ -90,7 +90,7 @@ class CompiledShader(LitShader):
 
     def _take(self, compiled: user.UserShader) -> None:
         self._compiled = compiled
-        self.header, self.kind, self.whole = compiled.header, compiled.op, compiled.whole
+        self.header, self.kind, self.whole_ray = compiled.header, compiled.op, compiled.whole
         add_user_op(self.kind)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -105,13 +105,13 @@ class CompiledShader(LitShader):
         """
         return user.libraries(self.kind)
 
-    def table(self, tree: N3Tree, intervals: Intervals) -> Table:
+    def table(self, sampling: Sampling) -> ColorTable:
         """See `Shader`."""
         if self.transfer is None:
-            return one_color((1.0, 1.0, 1.0), tree, intervals)
-        return plain_table(self.transfer, tree, intervals)
+            return one_color((1.0, 1.0, 1.0), sampling)
+        return self.transfer.table(sampling)
 
-    def features(self, tree: N3Tree) -> int:
+    def feature_count(self, tree: N3Tree) -> int:
         """As many as the struct tells."""
         if self._compiled.features >= 0:
             return self._compiled.features
@@ -119,13 +119,13 @@ class CompiledShader(LitShader):
             raise ValueError(f"{self.name}: its features are those of a second channel: name other")
         return tree.bricks.channels[self.other].width
 
-    def parameters(self, tree: N3Tree, dtype: torch.dtype) -> Tensor:
+    def parameter_tensor(self, tree: N3Tree, dtype: torch.dtype) -> Tensor:
         """Returns (20 + k,): light and material, and the uniforms, as they are now."""
-        fixed = super().parameters(tree, dtype).reshape(-1)
+        fixed = super().parameter_tensor(tree, dtype).reshape(-1)
         numbers = self._numbers()
         return torch.cat((fixed, pack(numbers, dtype, tree.device))) if numbers else fixed
 
-    def arguments(self, where: str, tree: N3Tree, intervals: Intervals) -> ShadeArguments:
+    def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
         """See `Shader`; compiles for CUDA where the tree lies there.
 
         Raises:
@@ -134,7 +134,7 @@ class CompiledShader(LitShader):
         """
         if tree.device.type == "cuda":
             user.load_cuda(self._compiled)
-        return super().arguments(where, tree, intervals)
+        return super().shading(where, tree)
 
     def _numbers(self) -> list[Any]:
         """The uniforms in the struct's order, checked."""

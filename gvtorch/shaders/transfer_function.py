@@ -9,16 +9,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ..base import check
+from .shader import Shader
+from .tables import ColorTable, Sampling, TableCache, common_cells
 
 Points = Sequence[Sequence[float]]
 
@@ -44,24 +42,19 @@ PRESETS: dict[str, tuple[Points, Points]] = {
     ),
 }
 
-# Cells of a table: at least; at least, where corners fall beside rows; how many of them two corners
-# are then apart; most where corners fall on rows and there could be fewer; most at all.
-_FEWEST_CELLS, _FEWEST_SAMPLED, _CELLS_APART, _MANY_CELLS, _MOST_CELLS = (
-    2**10,
-    2**12,
-    16,
-    2**16,
-    2**20,
-)
-_MOST_BYTES = 64 * 2**20  # of a table in float32
-_KEPT_TABLES = 4
+# Cells of a table.
+_FEWEST_CELLS = 2**10
+_FEWEST_SAMPLED = 2**12  # where corners fall beside rows
+_CELLS_APART = 16  # two corners that fall beside rows, at least
+_MANY_CELLS = 2**16  # at most, where corners fall on rows and there could be fewer
+_MOST_CELLS = 2**20
 
 
-class TransferFunction:
+class TransferFunction(Shader):
     """Two piecewise linear functions of a value in data units; constant beyond their end points.
 
-    Attributes may be edited: the next picture is made with them (a `TreeTracer` or a captured
-    frame keeps those it was made with).
+    The plain shader, and a part of most others. Attributes may be edited: the next picture is made
+    with them (a `TreeTracer` or a captured frame keeps those it was made with).
 
     Attributes:
         opacity: (k, 2) float64 points (value, alpha per reference length).
@@ -78,7 +71,7 @@ class TransferFunction:
                 "TransferFunction", "reference", reference, low=0, open_low=True
             )
         self.reference = reference
-        self._tables: dict[tuple[Any, ...], Table] = {}
+        self._tables = TableCache()
 
     @classmethod
     def from_points(
@@ -151,122 +144,72 @@ class TransferFunction:
         channels = [np.interp(value, self.color[:, 0], self.color[:, i]) for i in (1, 2, 3)]
         return np.stack([*channels, np.interp(value, *self.opacity.T)], axis=-1)
 
-    def table(
-        self,
-        smallest_spacing: float,
-        step: float,
-        levels: int,
-        dtype: torch.dtype,
-        device: torch.device | str,
-    ) -> Table:
-        """Returns the function as the kernel reads it: rows at even distances over a domain.
+    def corners(self) -> tuple[float, float, np.ndarray]:
+        """Returns the first and last value of a table, and (k,) where the corner points lie between
+        them, 0 to 1.
+        """
+        values = np.unique(np.concatenate((self.opacity[:, 0], self.color[:, 0])))
+        low, high = float(values[0]), float(values[-1])
+        if high == low:
+            high = low + max(1.0, abs(low))
+        return low, high, (values - low) / (high - low)
+
+    def key(self, sampling: Sampling) -> tuple[Any, ...]:
+        """Returns what a table is made of, as a key of `TableCache`."""
+        return self.opacity.tobytes(), self.color.tobytes(), self.reference, sampling
+
+    def length(self, sampling: Sampling) -> float:
+        """Returns the length of the shortest interval in reference lengths."""
+        return sampling.step / (self.reference or sampling.smallest_spacing)
+
+    def table(self, sampling: Sampling) -> ColorTable:
+        """Returns the function as the kernel reads it: rows at even distances over a domain. The
+        last tables are kept: asking again costs nothing.
 
         Rows are laid so that every corner point falls on one, where that takes no more than 2^16
         cells; else so densely that corners are at least 16 cells apart. There are at least 1,024
         cells. Between rows, colour and alpha are linear.
 
-        Args:
-            smallest_spacing: World units; opacity's reference length where none was given.
-            step: World length of the shortest interval.
-            levels: How many lengths of intervals, each twice the one before; fewer where tables
-                would take more than 64 MB.
-            dtype: Of table and domain.
-            device: Where they lie. The last tables are kept: asking again costs nothing.
-
         Raises:
             ValueError: Two points are too close to each other.
         """
-        number = self.reference or smallest_spacing
-        key = (
-            self.opacity.tobytes(),
-            self.color.tobytes(),
-            number,
-            step,
-            levels,
-            dtype,
-            str(device),
-        )
-        if key not in self._tables:
-            table = self._make_table(step / number, levels, dtype, torch.device(device))
-            if len(self._tables) == _KEPT_TABLES:
-                self._tables.pop(next(iter(self._tables)))
-            self._tables[key] = table
-        return self._tables[key]
+        return self._tables.get(self.key(sampling), lambda: self._make_table(sampling))
 
-    def _make_table(
-        self, length: float, levels: int, dtype: torch.dtype, device: torch.device
-    ) -> Table:
-        """`length`: of the shortest interval, in reference lengths."""
-        corners = np.unique(np.concatenate((self.opacity[:, 0], self.color[:, 0])))
-        low, high = float(corners[0]), float(corners[-1])
-        if high == low:
-            high = low + max(1.0, abs(low))
-        cells = _grid((corners - low) / (high - low))
+    def _make_table(self, sampling: Sampling) -> ColorTable:
+        low, high, places = self.corners()
+        cells = _cells(places)
         if cells is None:
-            gap = np.diff(corners)
-            at = int(gap.argmin())
+            at = int(np.diff(places).argmin())
+            first, second = (low + place * (high - low) for place in places[at : at + 2])
             raise ValueError(
-                f"TransferFunction: values {corners[at]:g} and {corners[at + 1]:g} are too close "
+                f"TransferFunction: values {first:g} and {second:g} are too close "
                 f"for a table of {_MOST_CELLS + 1} rows from {low:g} to {high:g}"
             )
         rows = self(low + (high - low) * np.arange(cells + 1) / cells)
-        levels = max(1, min(levels, _MOST_BYTES // (16 * len(rows))))
-        lengths = length * 2.0 ** np.arange(levels)
+        levels = sampling.fitting(len(rows))
+        lengths = self.length(sampling) * 2.0 ** np.arange(levels)
         with np.errstate(divide="ignore"):
             alpha = -np.expm1(lengths[:, None] * np.log1p(-rows[:, 3]))
-        table = np.concatenate(
-            (np.broadcast_to(rows[:, :3], (levels, *rows[:, :3].shape)), alpha[..., None]), 2
-        )
-        return Table(
-            table_lm4=torch.tensor(table, dtype=dtype, device=device),
-            domain_2=torch.tensor([low, high], dtype=dtype, device=device),
-            opaque_m=torch.tensor(np.cumsum(rows[:, 3] > 0), dtype=torch.int32, device=device),
-        )
+        colors = np.broadcast_to(rows[:, :3], (levels, *rows[:, :3].shape))
+        table = np.concatenate((colors, alpha[..., None]), 2)
+        return ColorTable.of(table, (low, high), rows[:, 3] > 0, sampling)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Table:
-    """A transfer function as the kernel reads it."""
+def check_transfer(where: str, name: str, value: Any) -> TransferFunction:
+    """Returns a user's argument, which must be a transfer function.
 
-    table_lm4: Tensor  # (l, m, 4) linear RGB, alpha of an interval of step * 2^l
-    domain_2: Tensor  # (2,) value of the first row, of the last row
-    opaque_m: Tensor  # (m,) int32, how many rows up to this one have an opacity
-
-
-def interval_levels(root_voxel: float, step: float) -> int:
-    """Returns how many lengths of intervals a tree needs: up to that of a voxel of its root."""
-    return max(1, math.ceil(math.log2(root_voxel / step)) + 1)
-
-
-def corner_cells(
-    transfer: TransferFunction, fewest: int, most: int
-) -> tuple[float, float, int, float]:
-    """Returns the first and last value of a coarse table, its cells, and the smallest distance of
-    two corner points as a part of it. Corners fall on rows where `most` cells allow it.
+    Raises:
+        ValueError: It is none.
     """
-    corners = np.unique(np.concatenate((transfer.opacity[:, 0], transfer.color[:, 0])))
-    low, high = float(corners[0]), float(corners[-1])
-    if high == low:
-        high = low + max(1.0, abs(low))
-    places = (corners - low) / (high - low)
-    gap = float(np.diff(places, append=2.0).min())
-    exact = 1
-    for place in places:
-        exact = math.lcm(exact, Fraction(float(place)).limit_denominator(most).denominator)
-        if exact > most:
-            return low, high, most, gap
-    return low, high, exact * math.ceil(fewest / exact), gap
+    if not isinstance(value, TransferFunction):
+        kind = type(value).__name__
+        raise ValueError(f"{where}: {name} must be a TransferFunction, got {kind}")
+    return value
 
 
-def _grid(places: np.ndarray) -> int | None:
+def _cells(places: np.ndarray) -> int | None:
     """A number of cells of [0, 1] fine enough for corners at these places; None: there is none."""
-    exact = 1
-    for place in places:
-        fraction = Fraction(float(place)).limit_denominator(_MOST_CELLS)
-        exact = math.lcm(exact, fraction.denominator)
-        if abs(float(fraction) - place) > 1e-9 or exact > _MOST_CELLS:
-            exact = 0
-            break
+    exact = common_cells(places, _MOST_CELLS, tolerance=1e-9)
     gap = float(np.diff(places, append=2.0).min())
     dense = max(_FEWEST_SAMPLED, 2 ** math.ceil(math.log2(_CELLS_APART / gap)))
     if exact and (exact <= _MANY_CELLS or dense > _MOST_CELLS):

@@ -4,7 +4,6 @@ from .clip import Clip
 from .costs import Cost, cost
 from .layer import Layer
 from .lighting import Lighting
-from .module_shader import ModuleShader, TransferModule
 from .options import RenderOptions, RenderSettings
 from .resident import render, trace
 from .thin_lens import ThinLens
@@ -15,11 +14,9 @@ __all__ = [
     "Cost",
     "Layer",
     "Lighting",
-    "ModuleShader",
     "RenderOptions",
     "RenderSettings",
     "ThinLens",
-    "TransferModule",
     "TreeTracer",
     "cost",
     "render",

@@ -6,20 +6,17 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from ..shaders.fused import LitShader, Projection, Shader
-from ..shaders.surfaces import Isosurface
 from .caps import SurfaceSlab
 from .clip import Clipped
 from .composite import Trace
 from .lighting import Lighted
-from .module_shader import ModuleTracer
 from .options import RenderOptions
 from .projection_pieces import ProjectedPieces
 from .thin_lens import ThinLens, ThroughLens
 from .tracer import Tracer
 
 
-def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -> Trace:
+def around(tracer: Tracer, options: RenderOptions, box: Tensor) -> Trace:
     """Wraps a tree's tracer in what the options ask for. Each ray goes through lighting, then the
     clip, then the lens, then the tree; cones to the lights go through clip and tree alone.
 
@@ -37,19 +34,14 @@ def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -
     if options.lighting is None:
         return _clipped(tracer, options, box, lens)
     shader = tracer.shader
-    if isinstance(tracer, ModuleTracer) or not isinstance(shader, LitShader):
-        kind = "TransferFunction" if shader is None else type(shader).__name__
-        raise ValueError(
-            "render: lighting needs normals: the shader must be Lit, StoredColor, Isosurface or "
-            f"DistanceField, got {kind}"
-        )
+    unlit = shader.unlit()
     cones = replace(options, lod="auto")
     matter = None
     if options.lighting.indirect:
         early = replace(cones, depth_alpha=0.25 * options.stop_alpha)
         matter = _clipped(tracer.seeing(shader.matter(), early), options, box)
     return Lighted(
-        _clipped(tracer.seeing(shader.unlit(), options), options, box, lens),
+        _clipped(tracer.seeing(unlit, options), options, box, lens),
         blocker=_clipped(tracer.seeing(shader.blocker(), cones), options, box),
         matter=matter,
         lighting=options.lighting.placed(box),
@@ -60,16 +52,15 @@ def around(tracer: Tracer | ModuleTracer, options: RenderOptions, box: Tensor) -
     )
 
 
-def _check_whole(tracer: Tracer | ModuleTracer, options: RenderOptions) -> None:
+def _check_whole(tracer: Tracer, options: RenderOptions) -> None:
     """Raises ValueError if the shader must see a ray in one go, and the options do not let it."""
     shader, clip, layer = tracer.shader, options.clip, options.layer
-    if not (isinstance(shader, Shader) and shader.whole):
+    if not shader.whole_ray:
         return
-    joins = isinstance(shader, Projection)  # can put the pieces of a clip together itself
     cuts = {
         "lens": options.lens is not None,
         "clip with caps": clip is not None and clip.caps,
-        "clip of several pieces": clip is not None and not clip.whole and not joins,
+        "clip of several pieces": clip is not None and not clip.whole and not shader.projection,
         "translucent layer": layer is not None and layer.alpha is not None,
     }
     for name, cut in cuts.items():
@@ -79,7 +70,7 @@ def _check_whole(tracer: Tracer | ModuleTracer, options: RenderOptions) -> None:
 
 
 def _clipped(
-    tracer: Tracer | ModuleTracer,
+    tracer: Tracer,
     options: RenderOptions,
     box: Tensor,
     lens: ThinLens | None = None,
@@ -92,11 +83,11 @@ def _clipped(
         return trace
     slab: Trace | None = None
     together: ProjectedPieces | None = None
-    if isinstance(tracer, Tracer):
-        if options.clip.caps and isinstance(tracer.shader, Isosurface):
-            slab = SurfaceSlab(tracer.shader, lambda shader: tracer.seeing(shader, options))
-        if isinstance(tracer.shader, Projection):
-            together = ProjectedPieces(tracer, tracer.shader)
+    surface = tracer.shader.cut_surface() if options.clip.caps else None
+    if surface is not None:
+        slab = SurfaceSlab(surface, lambda shader: tracer.seeing(shader, options))
+    if tracer.shader.projection is not None:
+        together = ProjectedPieces(tracer, tracer.shader.projection)
     return Clipped(
         trace,
         options.clip,

@@ -9,12 +9,8 @@ import torch
 
 from ..base.records import Hits, Rays
 from ..ops.shading import pack
-from ..shaders.fused import Projection
-from ..shaders.surfaces import Isosurface
-from ..shaders.transfer_function import TransferFunction
+from ..shaders.shader import CutSurface, Shader
 from .composite import Trace
-
-_WHITE = TransferFunction.from_points([(0, 1)])  # one object, so that its table is made once
 
 
 class SurfaceSlab:
@@ -23,29 +19,20 @@ class SurfaceSlab:
     inside.
     """
 
-    def __init__(self, shader: Isosurface, trace_with: Callable[[Projection], Trace]) -> None:
+    def __init__(self, surface: CutSurface, trace_with: Callable[[Shader], Trace]) -> None:
         """Takes the surface, and a function that gives the frame's tracer with another shader."""
-        self._shader = shader
-        value = Projection("maximum", _WHITE)
-        value.channel, value.component = shader.channel, shader.component
-        self._value = trace_with(value)
-        self._color: Trace | None = None
-        if isinstance(shader.color, TransferFunction):
-            color = Projection("maximum", shader.color)
-            color.channel, color.component = shader.other, shader.other_component
-            self._color = trace_with(color)
+        self._surface = surface
+        self._value = trace_with(surface.value)
+        self._colors = None if surface.colors is None else trace_with(surface.colors)
 
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays in world units, each no longer than one interval."""
         hits = self._value(rays)
-        color = hits.color
-        if self._color is not None:
-            color = self._color(rays).color
-        elif not isinstance(self._shader.color, TransferFunction):
-            color = color * pack((self._shader.color,), color.dtype, color.device)
         assert hits.features is not None
-        level = pack((self._shader.value,), color.dtype, color.device)
-        inside = (hits.features >= level) != self._shader.distance
+        colors = hits.color if self._colors is None else self._colors(rays).color
+        color = colors * pack((self._surface.color,), colors.dtype, colors.device)
+        level = pack((self._surface.level,), color.dtype, color.device)
+        inside = (hits.features >= level) != self._surface.below
         inside = inside & (hits.depth < torch.inf)
         return dataclasses.replace(
             hits,

@@ -19,10 +19,11 @@ from ..cameras.camera import Camera
 from ..cameras.custom import as_camera
 from ..pictures.picture import Picture
 from ..pool import N3Tree
-from ..shaders.fused import FusedShader
-from ..shaders.transfer_function import TransferFunction
+from ..shaders.module import TransferModule
+from ..shaders.shader import Shader
+from ..shaders.transfer_function import TransferFunction, check_transfer
 from .around import around
-from .module_shader import Batch, TransferModule, march
+from .module_march import Batch, march
 from .options import RenderOptions, RenderSettings, render_options
 from .pixels import trace_blocks
 from .resident import tree_stats
@@ -98,7 +99,7 @@ class Cost:
 def cost(
     tree: N3Tree,
     camera: Camera | Rays,
-    shader: FusedShader,
+    shader: Shader,
     *,
     progress: Progress = no_progress,
     **options: Unpack[RenderSettings],
@@ -122,11 +123,10 @@ def cost(
     camera = as_camera("cost", camera)
     chosen = render_options("cost", options, camera)
     check.instance("cost", "tree", tree, N3Tree)
-    if not isinstance(shader, TransferFunction):
-        raise ValueError(f"cost: shader must be a TransferFunction, got {type(shader).__name__}")
+    transfer = check_transfer("cost", "shader", shader)
     start = time.perf_counter()
     placed = camera.placed(tree.box)
-    counter = _Counter(tree, shader, chosen)
+    counter = _Counter(tree, transfer, chosen)
     given = placed, placed.numbers(tree.device), around(counter, chosen, tree.box), chosen, progress
     columns = [
         (hits.samples, counter.take_nodes(), *_means(hits))
@@ -157,8 +157,7 @@ class _Counter(Tracer):
         marks = ("request_tn", "stamp_t", "stamp_b")
         copies = {name: getattr(self.arguments, name).clone() for name in marks}
         self.arguments = self.arguments._replace(**copies)
-        self.channel = options.channel or tree.channel_names[0]
-        self.component = options.component
+        self.component = self.arguments.component
         self.module = TransferModule(shader, min(tree.spacing)).to(tree.device)
         self.fill_b = torch.full_like(tree.bricks.born_b, -1, dtype=torch.float32)
         self._nodes: Tensor | None = None
@@ -188,7 +187,7 @@ class _Counter(Tracer):
 
     def shade(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """One, depth of the node, whether it has a brick, its age, its fill; and alpha."""
-        values = batch.values(None)[:, self.component, None]
+        values = batch.values()[:, self.component, None]
         _, alpha = self.module(values, values, values, batch.lengths)  # it reads no places
         slot = batch.segments.brick[batch.segment, 0].to(torch.int64)
         has, known = slot >= 0, slot.clamp(min=0)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from ..base.records import Hits, Rays
-from ..shaders.fused import Projection
 from .spans import box_span
 from .tracer import Tracer
 
@@ -16,9 +16,9 @@ from .tracer import Tracer
 class ProjectedPieces:
     """Projects each piece, then combines the pieces' values into that of the whole ray."""
 
-    def __init__(self, tracer: Tracer, shader: Projection) -> None:
-        """Takes the frame's tracer, and the projection that it draws."""
-        self._tracer, self._which = tracer, shader.which
+    def __init__(self, tracer: Tracer, which: Literal["maximum", "minimum", "mean"]) -> None:
+        """Takes the frame's tracer, and which projection it draws."""
+        self._tracer, self._which = tracer, which
 
     def __call__(self, pieces: Iterable[Rays]) -> Hits:
         """Returns the largest or smallest value of all pieces, at its nearest place, or the mean of

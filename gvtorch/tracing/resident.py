@@ -15,16 +15,17 @@ from ..cameras.custom import as_camera
 from ..ops.trace import choose_backend
 from ..pictures.picture import Picture
 from ..pool import N3Tree
+from ..shaders.shader import Shader
 from .around import around
 from .options import RenderOptions, RenderSettings, render_options
 from .pixels import develop, trace_camera
-from .tracer import AnyShader, tracer_of
+from .tracer import Tracer
 
 
 def render(
     tree: N3Tree,
     camera: Camera | Rays,
-    shader: AnyShader,
+    shader: Shader,
     *,
     progress: Progress = no_progress,
     **options: Unpack[RenderSettings],
@@ -53,7 +54,7 @@ def render(
     with collect_timings(tree.device) as timings:
         with stage("prepare"):
             tree.frame += 1
-            trace = around(tracer_of(tree, shader, chosen), chosen, tree.box)
+            trace = around(Tracer(tree, shader, chosen), chosen, tree.box)
         placed = camera.placed(tree.box)
         hits = trace_camera(placed, tree.device, trace, chosen, progress)
         with stage("picture"):
@@ -66,7 +67,7 @@ def render(
     return picture
 
 
-def trace(tree: N3Tree, rays: Rays, shader: AnyShader, **options: Unpack[RenderSettings]) -> Hits:
+def trace(tree: N3Tree, rays: Rays, shader: Shader, **options: Unpack[RenderSettings]) -> Hits:
     """Traces any world rays through a resident tree, as one frame.
 
     Args:
@@ -87,7 +88,7 @@ def trace(tree: N3Tree, rays: Rays, shader: AnyShader, **options: Unpack[RenderS
     check.instance("trace", "tree", tree, N3Tree)
     check.instance("trace", "rays", rays, Rays)
     tree.frame += 1
-    return around(tracer_of(tree, shader, chosen), chosen, tree.box)(rays)
+    return around(Tracer(tree, shader, chosen), chosen, tree.box)(rays)
 
 
 def tree_stats(tree: N3Tree, options: RenderOptions, samples: torch.Tensor) -> RenderStats:

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from ..base import check
 from ..base import constants as config
-from ..ops import ShadeArguments, TraceArguments, available
-from ..ops.trace import most_intervals, op_of
+from ..ops import ShadeArguments, available
+from ..ops.trace import op_of
 from ..pool import N3Tree
-from ..shaders.fused import FusedShader, Intervals, Shader, plain_table
-from ..shaders.transfer_function import interval_levels
-from .tracer import check_shader
+from ..shaders.shader import Shader, check_shader
+from .options import RenderOptions
+from .tracer import Tracer
 
 
 class TreeTracer(torch.nn.Module):
@@ -38,7 +38,7 @@ class TreeTracer(torch.nn.Module):
     def __init__(
         self,
         tree: N3Tree,
-        shader: FusedShader,
+        shader: Shader,
         *,
         channel: str | None = None,
         component: int = 0,
@@ -67,64 +67,37 @@ class TreeTracer(torch.nn.Module):
         if available()["cpp"]:
             raise RuntimeError(f"TreeTracer needs the compiled op: {available()['cpp']}")
         check_shader("TreeTracer", "shader", shader)
-        own = shader if isinstance(shader, Shader) else None
-        channel = (own and own.channel) or channel or tree.channel_names[0]
-        component = own.component if own and own.component is not None else component
-        if channel not in tree.bricks.bricks:
-            known = ", ".join(tree.channel_names)
-            raise ValueError(f"TreeTracer: unknown channel {channel!r}; the tree has {known}")
-        where, width = "TreeTracer", tree.bricks.channels[channel].width
-        check.whole(where, "component", component, low=0, high=width - 1)
-        check.number(where, "step", step, low=0, open_low=True)
-        check.number(where, "stop_alpha", stop_alpha, low=0, high=1, open_low=True)
-        check.number(where, "depth_alpha", depth_alpha, low=0, high=1)
-        check.number(where, "cone_scale", cone_scale, low=0, open_low=True)
-        most_intervals(float((tree.box[1] - tree.box[0]).norm()), step * min(tree.spacing))
-        step = step * min(tree.spacing)
-        levels = interval_levels(tree.root_voxel, step)
-        spacing, real = min(tree.spacing), torch.float32
-        lengths = Intervals(smallest_spacing=spacing, step=step, levels=levels, dtype=real)
-        shading, op = ShadeArguments(), None
-        nothing = parameter = torch.zeros(0, device=tree.device)
-        self.plain = own is None or own.kind is None  # the transfer function's own kernel
-        if own is not None and not self.plain:
-            shading, op = own.arguments(where, tree, lengths), own.op
-            parameter = own.parameters(tree, real)
-        if isinstance(shader, Shader):
-            table = shader.table(tree, lengths)
-        else:
-            table = plain_table(shader, tree, lengths)
-        self.shade_rays = op_of(op)
-        nodes, bricks = tree.nodes, tree.bricks
-        arguments = TraceArguments(
-            place_33=tree.place,
-            branching=tree.branching,
-            max_depth=tree.depth,
-            border=bricks.border,
-            root_voxel=float(tree.root_voxel),
-            cone_scale=float(cone_scale * tree.flatness),
+        if shader.uses_torch:
+            kind = type(shader).__name__
+            raise ValueError(f"TreeTracer: shader must be one of the kernels', got {kind}")
+        options = RenderOptions(
             step=step,
-            bricks_bzyxc=bricks.bricks[channel],
-            constant_tnc=nodes.constants[channel],
-            range_tn2c=nodes.ranges[channel],
+            stop_alpha=stop_alpha,
+            depth_alpha=depth_alpha,
+            cone_scale=cone_scale,
+            channel=channel,
             component=component,
-            child_tn=nodes.child_tn,
-            brick_tn=nodes.brick_tn,
-            request_tn=nodes.request_tn,
-            stamp_t=nodes.stamp_t.clone(),  # frames of its own, not the tree's
-            stamp_b=bricks.stamp_b.clone(),
-            frame_1=torch.zeros(1, dtype=torch.int32, device=tree.device),
-            root=tree.root,
-            **vars(table),
-            stop_alpha=float(stop_alpha),
-            depth_alpha=float(depth_alpha),
         )
+        tracer = Tracer(tree, shader, options)
+        arguments, shading = tracer.arguments, tracer.shading or ShadeArguments()
+        width = arguments.bricks_bzyxc.shape[4]
+        check.whole("TreeTracer", "component", arguments.component, low=0, high=width - 1)
+        arguments = arguments._replace(
+            stamp_t=arguments.stamp_t.clone(),  # frames of its own, not the tree's
+            stamp_b=arguments.stamp_b.clone(),
+            frame_1=torch.zeros_like(arguments.frame_1),
+        )
+        nothing = parameters = torch.zeros(0, device=tree.device)
+        self.plain = tracer.shading is None  # the kernel of `trace_rays` draws it
+        if not self.plain:
+            parameters = shader.parameter_tensor(tree, options.dtype)
+        self.shade_rays = op_of(shader.op)
         for name, value in {**arguments._asdict(), **shading._asdict()}.items():
             if isinstance(value, (int, float)):
                 setattr(self, name, value)
             else:
                 self.register_buffer(name, nothing if value is None else value)
-        self.register_buffer("parameter_54", parameter)
+        self.register_buffer("parameter_54", parameters)
 
     def __getstate__(self) -> dict[str, Any]:
         """Names its op, which can't be pickled."""

@@ -10,38 +10,26 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import torch
 from numpy.lib.stride_tricks import sliding_window_view
 
-from .transfer_function import Table, TransferFunction, corner_cells
+from .tables import ColorTable, Sampling, common_cells
+from .transfer_function import TransferFunction
 
-_CELLS = 128, 256  # of a table's side: fewest, most
+_FEWEST_CELLS, _MOST_CELLS = 128, 256  # of a table's side
 _FEWEST_PARTS, _MOST_PARTS = 8, 4096  # a cell is integrated in
-_MOST_BYTES = 64 * 2**20  # of a table in float32
 
 
-def integrated_table(
-    transfer: TransferFunction,
-    length: float,
-    levels: int,
-    dtype: torch.dtype,
-    device: torch.device,
-) -> Table:
-    """Integrates a transfer function over pairs of values, in float64.
-
-    Args:
-        transfer: The function. A cell of the table is the mean of the function over it, so a peak
-            thinner than a cell keeps its opacity.
-        length: Of the shortest interval, in reference lengths.
-        levels: How many lengths of intervals, each twice the one before; fewer where tables would
-            take more than 64 MB.
-        dtype: Of table and domain.
-        device: Where they lie.
+def integrated_table(transfer: TransferFunction, sampling: Sampling) -> ColorTable:
+    """Integrates a transfer function over pairs of values, in float64. A cell of the table is the
+    mean of the function over it, so a peak thinner than a cell keeps its opacity.
 
     Returns:
         (l, m, m, 4): premultiplied colour and alpha by the value in front and behind.
     """
-    low, high, cells, gap = corner_cells(transfer, *_CELLS)
+    low, high, places = transfer.corners()
+    exact = common_cells(places, _MOST_CELLS)
+    cells = exact * math.ceil(_FEWEST_CELLS / exact) if exact else _MOST_CELLS
+    gap = float(np.diff(places, append=2.0).min())
     parts = min(_MOST_PARTS, max(_FEWEST_PARTS, math.ceil(4 / (gap * cells))))
     middles = (np.arange(cells * parts) + 0.5) / (cells * parts)
     inside = transfer(low + (high - low) * middles).reshape(cells, parts, 4)
@@ -50,18 +38,12 @@ def integrated_table(
     weight = density / np.maximum(density.sum(1, keepdims=True), 1e-300)
     color = (weight[..., None] * inside[..., :3]).sum(1)
     rows = transfer(low + (high - low) * np.arange(cells + 1) / cells)
-    levels = max(1, min(levels, _MOST_BYTES // (16 * len(rows) ** 2)))
-    table = np.stack(
-        [_pairs(rows, thickness, color, length * 2.0**level) for level in range(levels)]
-    )
+    lengths = transfer.length(sampling) * 2.0 ** np.arange(sampling.fitting(len(rows) ** 2))
+    table = np.stack([_pairs(rows, thickness, color, length) for length in lengths])
     seen = rows[:, 3] > 0
     seen[1:] |= thickness > 0
     seen[:-1] |= thickness > 0
-    return Table(
-        table_lm4=torch.tensor(table, dtype=dtype, device=device),
-        domain_2=torch.tensor([low, high], dtype=dtype, device=device),
-        opaque_m=torch.tensor(np.cumsum(seen), dtype=torch.int32, device=device),
-    )
+    return ColorTable.of(table, (low, high), seen, sampling)
 
 
 def _pairs(rows: np.ndarray, thickness: np.ndarray, color: np.ndarray, length: float) -> np.ndarray:

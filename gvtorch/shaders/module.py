@@ -1,0 +1,151 @@
+"""`ModuleShader`: any `nn.Module` as a shader, for whatever torch can compute and differentiate.
+
+Slower than a shader in the kernel, by an order of magnitude and more. tracing/module_march.py tells
+how rays are walked for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from .shader import Shader
+from .tables import ColorTable, Sampling
+from .transfer_function import TransferFunction, check_transfer
+
+#: Samples of a ray that are shaded at once; so the fewest of `ModuleShader.samples`.
+PART_SAMPLES = 64
+_HIDES_NOTHING = TransferFunction.from_points([(0, 1)])
+
+
+class ModuleShader(Shader, torch.nn.Module):
+    """A module as a shader: `module(values, positions, directions, lengths)` returns colour and
+    opacity of samples. Itself an `nn.Module` that holds the other: `parameters()`, `state_dict()`
+    and `.to(device)` are those of the module.
+
+    The module gets, for k samples, `values` (k, c) of all channels side by side in data units,
+    `positions` (k, 3) and `directions` (k, 3) in world units, and `lengths` (k, 1) of the intervals
+    that the samples stand for, in world units. It returns linear RGB (k, 3), not premultiplied,
+    and the alpha (k, 1) of those lengths, in [0, 1]. Its parameters lie on the tree's device.
+
+    Pictures have gradients by the parameters, and by bricks that are floats and require them.
+    Then all samples stay in memory until the backward pass; without gradients (`torch.no_grad`)
+    memory is bounded by `samples`.
+
+    Attributes:
+        module: The module.
+        channels: Names of the channels it reads; none: that of `RenderOptions.channel`.
+        hidden_by: A transfer function: what it shows nothing of is neither sampled nor requested.
+        samples: About how many samples are shaded at once; None: 2^20 on the CPU and 2^24 on CUDA,
+            where each batch waits for the device.
+    """
+
+    uses_torch = True
+    channels: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        module: Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
+        channels: Sequence[str] | None = None,
+        *,
+        hidden_by: TransferFunction | None = None,
+        samples: int | None = None,
+    ) -> None:
+        """See the class.
+
+        Raises:
+            ValueError: The module can't be called, or a number is out of its range.
+        """
+        super().__init__()
+        if not callable(module):
+            raise ValueError(f"ModuleShader: module must be callable, got {type(module).__name__}")
+        if isinstance(channels, str) or (channels is not None and not len(channels)):
+            raise ValueError(f"ModuleShader: channels must be names, got {channels!r}")
+        if hidden_by is not None:
+            check_transfer("ModuleShader", "hidden_by", hidden_by)
+        if samples is not None:
+            check.whole("ModuleShader", "samples", samples, low=PART_SAMPLES)
+        self.module, self.hidden_by, self.samples = module, hidden_by, samples
+        self.channels = tuple(channels or ())
+
+    def table(self, sampling: Sampling) -> ColorTable:
+        """See `Shader`: that of `hidden_by`, of which only what it hides counts."""
+        return (self.hidden_by or _HIDES_NOTHING).table(sampling)
+
+    def forward(
+        self, values: Tensor, positions: Tensor, directions: Tensor, lengths: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Returns colour (k, 3) and alpha (k, 1) of samples, checked.
+
+        Raises:
+            ValueError: The module gives something of another shape or dtype, a colour that is not
+                finite, or no alpha.
+        """
+        made = self.module(values, positions, directions, lengths)
+        if not (isinstance(made, Sequence) and len(made) == 2):
+            got = f"{len(made)} parts" if isinstance(made, Sequence) else type(made).__name__
+            raise ValueError(f"ModuleShader: the module must give colour and alpha, got {got}")
+        color, alpha = made
+        count, real, device = len(values), values.dtype, values.device
+        check.tensor("ModuleShader", "the module's colour", color, (count, 3), real, device)
+        check.tensor("ModuleShader", "the module's alpha", alpha, (count, 1), real, device)
+        if not bool(((alpha >= 0) & (alpha <= 1)).all()):
+            raise ValueError("ModuleShader: the module's alpha must lie in [0, 1]")
+        if not bool(torch.isfinite(color).all()):
+            raise ValueError("ModuleShader: the module's colour must be finite")
+        return color, alpha
+
+
+class TransferModule(torch.nn.Module):
+    """A transfer function as a module, whose rows are parameters: the twin of the kernel's.
+
+    Attributes:
+        rows: (m, 4) linear RGB and opacity per reference length, at even distances of values.
+    """
+
+    def __init__(self, shader: TransferFunction, spacing: float) -> None:
+        """Copies a transfer function.
+
+        Args:
+            shader: The function.
+            spacing: Smallest spacing of the volume, world units: opacity's reference length where
+                the function has none of its own.
+        """
+        super().__init__()
+        self.reference = float(shader.reference or spacing)
+        sampling = Sampling(
+            smallest_spacing=spacing,
+            step=self.reference,
+            levels=1,
+            dtype=torch.float32,
+            device=torch.device("cpu"),
+        )
+        table = shader.table(sampling)
+        self.low, high = table.domain_2.tolist()
+        self.scale = (len(table.opaque_m) - 1) / (high - self.low)
+        self.rows = torch.nn.Parameter(table.table_lm4[0].clone())
+
+    def shows(self, values: Tensor) -> Tensor:
+        """Bool of the same shape: a value has an opacity."""
+        place = ((values - self.low) * self.scale).clamp(0, len(self.rows) - 1)
+        opaque = self.rows[:, 3] > 0
+        return opaque[place.floor().long()] | opaque[place.ceil().long()]
+
+    def forward(
+        self, values: Tensor, positions: Tensor, directions: Tensor, lengths: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Colour (k, 3) and alpha (k, 1) of the first value."""
+        last = len(self.rows) - 1
+        place = ((values[:, :1] - self.low) * self.scale).clamp(0, last)
+        row = place.long().clamp(max=last - 1)
+        rows = self.rows.to(values.dtype)
+        a, b = rows[row[:, 0]], rows[row[:, 0] + 1]
+        rgb = a[:, :3] + (place - row) * (b[:, :3] - a[:, :3])
+        alpha_a, alpha_b = (
+            -torch.expm1(lengths / self.reference * torch.log1p(-side[:, 3:].clamp(0, 1 - 2**-23)))
+            for side in (a, b)
+        )
+        return rgb, alpha_a + (place - row) * (alpha_b - alpha_a)

@@ -1,0 +1,190 @@
+"""`Shader`: what every shader tells the tracer, and the effects around it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from ..ops import ShadeArguments
+from ..ops.shading import Number, ShaderKind, Triple
+from ..pool import N3Tree
+from .lights import Headlight, Material
+from .tables import ColorTable, Sampling
+
+_UNLIT = Material(light=Headlight(), ambient=1.0, diffuse=0.0, specular=0.0, shininess=1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CutSurface:
+    """What a cut through the inside of a surface shows: its own colour, unlit, wherever the value
+    lies inside.
+    """
+
+    level: Number  # the value at the surface
+    below: bool  # inside is where the value is below the level, else where it is not
+    value: Shader  # gives the value in front as a feature, in white
+    color: Triple  # linear RGB, times what `colors` shows
+    colors: Shader | None  # shows the colour of another channel's value; None: that is white
+
+
+class Shader(ABC):
+    """What turns the values along a ray into colour. Attributes may be edited: the next picture is
+    made with them, and nothing is compiled.
+
+    Attributes:
+        kind: Which shader of the op `shade_rays` it is, or the name of a user's op; None: the op
+            `trace_rays` draws its table.
+        channel: Name of the channel whose value it reads; None: that of the options.
+        component: Which number of it; None: that of the options.
+        normals: Name of a channel of 3 numbers that holds normals; None: the gradient's.
+        other: Name of a second channel that it reads, or None.
+        other_component: Which number of it colours a surface.
+        whole_ray: It must see a ray in one go: what cuts rays into pieces refuses it.
+        uses_torch: Its colours are made in torch, outside of the kernel. The host waits for the
+            device meanwhile, so it is not recorded as a CUDA graph.
+    """
+
+    kind: ShaderKind | str | None = None
+    channel: str | None = None
+    component: int | None = None
+    normals: str | None = None
+    other: str | None = None
+    other_component: int = 0
+    whole_ray: bool = False
+    uses_torch: bool = False
+
+    @abstractmethod
+    def table(self, sampling: Sampling) -> ColorTable:
+        """Returns the colours as the kernel reads them."""
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the channels that it names itself."""
+        return tuple(n for n in (self.channel, self.normals, self.other) if n is not None)
+
+    # What `shade_rays` is told.
+
+    def own_numbers(self, tree: N3Tree) -> Sequence[Number]:
+        """Returns the shader's own numbers, a record of `ops.shading`; most have none."""
+        return ()
+
+    def material(self) -> Material:
+        """Returns light and material; shaders without a light have any."""
+        return _UNLIT
+
+    def feature_count(self, tree: N3Tree) -> int:
+        """Returns how many numbers `Hits.features` has."""
+        return 0
+
+    def parameter_tensor(self, tree: N3Tree, dtype: torch.dtype) -> Tensor:
+        """Returns `parameter_54` of `shade_rays`, with lights and materials as they are now."""
+        scale, offset = 1.0, 0.0
+        if self.normals is not None:
+            kind = tree.bricks.channels[self.normals].dtype
+            scale = 1 / number_of_one(kind)
+            if kind in (torch.uint8, torch.uint16):
+                scale, offset = 2 * scale, -1.0
+        parameters = (
+            self.material()
+            .parameters()
+            ._replace(own=self.own_numbers(tree), normal_scale=scale, normal_offset=offset)
+        )
+        return parameters.pack(dtype, tree.device)
+
+    def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
+        """Returns what `shade_rays` reads of the shader beside its table; None: `trace_rays` draws
+        the table, which is all.
+
+        Raises:
+            ValueError: A channel that it names is not there, or of the wrong width.
+        """
+        channels = tree.bricks.channels
+        for name in self.channels:
+            if name not in channels:
+                known = ", ".join(tree.channel_names)
+                raise ValueError(f"{where}: unknown channel {name!r}; the tree has {known}")
+        if self.kind is None:
+            return None
+        if self.normals is not None and channels[self.normals].width != 3:
+            raise ValueError(
+                f"{where}: normals need 3 numbers a voxel, "
+                f"{self.normals!r} has {channels[self.normals].width}"
+            )
+        if self.other is not None:
+            last = channels[self.other].width - 1
+            check.whole(where, "component of the colour", self.other_component, low=0, high=last)
+        bricks, constants = tree.bricks.bricks, tree.nodes.constants
+        return ShadeArguments(
+            shader=0 if isinstance(self.kind, str) else int(self.kind),
+            features=self.feature_count(tree),
+            normal_bzyxc=None if self.normals is None else bricks[self.normals],
+            normal_tnc=None if self.normals is None else constants[self.normals],
+            other_bzyxc=None if self.other is None else bricks[self.other],
+            other_tnc=None if self.other is None else constants[self.other],
+            other_component=self.other_component,
+        )
+
+    @property
+    def op(self) -> str | None:
+        """Name of its own op; None: that of the fused shaders."""
+        return self.kind if isinstance(self.kind, str) else None
+
+    # What the effects around it are told.
+
+    @property
+    def projection(self) -> Literal["maximum", "minimum", "mean"] | None:
+        """Which value along a ray it shows, so that pieces of the ray are put together accordingly;
+        None: they are composited.
+        """
+        return None
+
+    def cut_surface(self) -> CutSurface | None:
+        """Returns what a cut through its inside shows; None: it is a volume, and shows itself."""
+        return None
+
+    def unlit(self) -> Shader:
+        """Returns the shader without its light, for light by cones: base colours, and normals.
+
+        Raises:
+            ValueError: It has no light.
+        """
+        raise ValueError(
+            "render: lighting needs normals: the shader must be Lit, StoredColor, Isosurface or "
+            f"DistanceField, got {type(self).__name__}"
+        )
+
+    def matter(self) -> Shader:
+        """Returns what a wide cone meets: base colours, alpha, and normals.
+
+        Raises:
+            ValueError: It has no light, or no colour of its own.
+        """
+        return self.unlit()
+
+    def blocker(self) -> Shader:
+        """Returns what stands in the way of light: only its alpha counts.
+
+        Raises:
+            ValueError: It has no light.
+        """
+        return self.matter()
+
+
+def check_shader(where: str, name: str, value: Any) -> None:
+    """Raises ValueError unless a user's argument is a shader."""
+    if not isinstance(value, Shader):
+        kind = type(value).__name__
+        raise ValueError(
+            f"{where}: {name} must be a TransferFunction or another shader, got {kind}"
+        )
+
+
+def number_of_one(dtype: torch.dtype) -> float:
+    """Returns the stored number that stands for 1."""
+    return 1.0 if dtype.is_floating_point else float(torch.iinfo(dtype).max)
