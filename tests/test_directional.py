@@ -11,7 +11,8 @@ from marcher import trilinear
 import gvtorch as gv
 from gvtorch.base.volume import DIRECTIONS
 from gvtorch.io.conversion import convert
-from gvtorch.pool.pyramid import pool_directional, volume_levels
+from gvtorch.pool.downsample import pool_directional
+from gvtorch.pool.pyramid import volume_levels
 
 RED, GREEN = (1.0, 0.1, 0.0), (0.0, 0.9, 0.2)
 SIZES = {"brick_size": 4, "border": 1}

@@ -6,10 +6,12 @@ import pytest
 import torch
 
 import gvtorch as gv
+from gvtorch.producers import Layout
 
 GRAY = gv.TransferFunction.preset("gray", 0, 1)
 ORBIT = gv.Camera.orbit(width=8, height=6)
 IMAGE = torch.rand(6, 8, 3)
+VOXELS = torch.zeros(3, 10, 10, 10, 1, dtype=torch.uint8)
 
 
 @pytest.fixture
@@ -37,6 +39,39 @@ def test_objects_tell_of_themselves_in_one_line(tree):
         (gv.Environment(IMAGE), "Environment((6, 8, 3) float32 on cpu)"),
         (gv.Progressive(print), "Progressive(None, 0 frames)"),
         (tree, "N3Tree(8x8x8"),
+    ):
+        text = repr(thing)
+        assert text.startswith(begin), text
+        assert len(text) < 200 and "\n" not in text, text
+
+
+def test_data_and_producers_tell_of_themselves_in_one_line(tmp_path):
+    volume = gv.Volume(torch.arange(1000, dtype=torch.uint8).view(10, 10, 10) % 250)
+    gv.convert(volume, tmp_path / "a.zarr")
+    channels = {"a": gv.Channel(torch.int16), "b": gv.Channel(torch.uint8, 4)}
+    layout = Layout.of(gv.Producer(100), 8, 1, torch.device("cpu"))
+    kind = torch.zeros(5, dtype=torch.int64)
+    for thing, begin in (
+        (channels["b"], "Channel(dtype=torch.uint8, width=4)"),
+        (
+            gv.NodePool(20, channels),
+            "NodePool(20 tiles of 8 nodes, a int16x1, b uint8x4, 0.0 MB",
+        ),
+        (
+            gv.BrickPool(30, channels),
+            "BrickPool(30 bricks of 8^3+1, a int16x1, b uint8x4, 0.2 ",
+        ),
+        (gv.N3Tree.from_volume(volume), "N3Tree(10x10x10 (x, y, z), N=2, depth=1, 2 tiles, 9 bri"),
+        (gv.BrickTable(VOXELS), "BrickTable((3, 10, 10, 10, 1) uint8 on cpu, 0.0 MB)"),
+        (gv.Nodes(kind[:, None], layout), "Nodes(5 on cpu, bricks of 8^3+1, tree depth 4)"),
+        (gv.Regions(kind=kind, ranges={"a": kind}), "Regions(kind=(5,) int64, ranges={a: (5,) int"),
+        (
+            gv.Bricks(data={"a": VOXELS}, errors={2: "lost"}),
+            "Bricks(data={a: (3, 10, 10, 10, 1) uint8})",
+        ),
+        (gv.Producer((4, 5, 6)), "Producer(4x5x6 (x, y, z), N=2, value float32x1)"),
+        (gv.VolumeProducer(volume), "VolumeProducer(10x10x10 (x, y, z), N=2, value uint8x1)"),
+        (gv.StoredProducer(tmp_path / "a.zarr"), "StoredProducer(10x10x10 (x, y, z), N=2, value"),
     ):
         text = repr(thing)
         assert text.startswith(begin), text

@@ -16,15 +16,15 @@ from test_producers import GRAY, camera
 import gvtorch as gv
 from gvtorch.base import constants as config
 from gvtorch.ops import available
-from gvtorch.pool import BrickTable, Rows, Staging
-from gvtorch.pool.staging import wide_rows
+from gvtorch.pool import BrickTable, Staging, TableRows
+from gvtorch.pool.brick_table import wide_rows
 
 
 def landed(shipment, channel="value") -> torch.Tensor:
     """All bricks of a shipment; its bytes are given back."""
     pieces = []
-    for part in shipment.parts:
-        with part as data:
+    for chunk in shipment.chunks:
+        with chunk as data:
             pieces.append(data[channel].clone().cpu())
     return torch.cat(pieces)
 
@@ -55,19 +55,19 @@ def test_what_is_sent_arrives_while_the_ring_wraps_many_times(device):
         wide = voxels(count, torch.uint16, 3, seed=step)
         real = voxels(count, torch.float32, 1, seed=step + 1)
         shipment = ring.send({"value": table[row], "wide": wide, "real": real})
-        assert shipment.sent == count or shipment.parts
-        assert [part.begin for part in shipment.parts][:1] == [0][: len(shipment.parts)]
-        many = len(shipment.parts)
-        for part in shipment.parts:
-            with part as data:
-                here = slice(part.begin, part.end)
+        assert shipment.sent == count or shipment.chunks
+        assert [chunk.begin for chunk in shipment.chunks][:1] == [0][: len(shipment.chunks)]
+        many = len(shipment.chunks)
+        for chunk in shipment.chunks:
+            with chunk as data:
+                here = slice(chunk.begin, chunk.end)
                 assert torch.equal(data["value"].cpu(), table.bricks[row[here]])
                 assert torch.equal(data["wide"].cpu().int(), wide[here].int())
                 assert torch.equal(data["real"].cpu(), real[here])
         if device.type == "cuda":
             torch.cuda.synchronize()
         sent += shipment.sent * 11000
-        assert many == 0 or shipment.parts[-1].end == shipment.sent
+        assert many == 0 or shipment.chunks[-1].end == shipment.sent
     assert sent > 10 * ring.nbytes
 
 
@@ -75,8 +75,8 @@ def test_a_payload_larger_than_a_chunk_is_cut(device):
     bricks = voxels(6000)
     ring = Staging(6000 * 1000, 1000, device)
     shipment = ring.send({"value": bricks})
-    assert len(shipment.parts) > 2 and shipment.sent == 6000 and len(shipment.rest["value"]) == 0
-    assert all(1000 * (part.end - part.begin) <= ring.chunk for part in shipment.parts)
+    assert len(shipment.chunks) > 2 and shipment.sent == 6000 and len(shipment.rest["value"]) == 0
+    assert all(1000 * (chunk.end - chunk.begin) <= ring.chunk for chunk in shipment.chunks)
     assert torch.equal(landed(shipment), bricks)
 
 
@@ -86,7 +86,7 @@ def test_a_full_ring_takes_fewer_bricks_and_waits_for_none(device):
     first = ring.send({"value": bricks})
     assert 0 < first.sent < 20000 and len(first.rest["value"]) == 20000 - first.sent
     full = ring.send({"value": bricks})
-    assert full.sent == 0 and full.parts == [] and len(full.rest["value"]) == 20000
+    assert full.sent == 0 and full.chunks == [] and len(full.rest["value"]) == 20000
     assert torch.equal(landed(first), bricks[: first.sent]), "what is under way is left alone"
     if device.type == "cuda":
         torch.cuda.synchronize()
@@ -158,7 +158,7 @@ def test_bad_tables_are_named():
     with pytest.raises(ValueError, match="BrickTable: rows must be 0 to 4"):
         table[torch.tensor([0, 5])]
     some = table[torch.tensor([4, 1, 1])]
-    assert isinstance(some, Rows) and some.shape == (3, 10, 10, 10, 1)
+    assert isinstance(some, TableRows) and some.shape == (3, 10, 10, 10, 1)
     assert torch.equal(some[torch.tensor([0, 2])].gather(), table.bricks[[4, 1]])
 
 

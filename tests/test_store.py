@@ -23,7 +23,8 @@ import gvtorch as gv
 from gvtorch.io.conversion import convert
 from gvtorch.io.level_reader import StoreError
 from gvtorch.io.store import Store
-from gvtorch.pool.pyramid import build_levels, pool_mean, round_to
+from gvtorch.pool.downsample import pool_mean
+from gvtorch.pool.pyramid import round_to, volume_levels
 
 DTYPES = ["uint8", "int8", "uint16", "int16", "float16", "float32"]
 
@@ -51,7 +52,7 @@ def block_of(level: np.ndarray, at: np.ndarray, block: int) -> np.ndarray:
 def assert_holds(store: Store, data: np.ndarray) -> None:
     """The store has the bits of the pyramid that is built in memory."""
     sizes = {"branching": 2, "brick_size": store.cell, "border": store.border}
-    levels = list(build_levels(torch.from_numpy(data), store.levels, **sizes))
+    levels = list(volume_levels(gv.Volume(data), store.levels, **sizes))
     for number, level in enumerate(levels):
         values = level.values.numpy()
         assert store.level_extent(number) == values.shape[2::-1]
@@ -63,7 +64,7 @@ def assert_holds(store: Store, data: np.ndarray) -> None:
             assert np.array_equal(block, block_of(values, at, store.block))
         if store.has_blocks:
             cells = store.read_cells(number, (0, 0, 0), store.cell_grid(number))
-            for index, expected in enumerate((level.low, level.high, level.mean)):
+            for index, expected in enumerate((level.nodes.low, level.nodes.high, level.nodes.mean)):
                 rounded = round_to(expected, store.dtype).numpy()
                 assert np.array_equal(cells[..., index, :], rounded)
     assert max(store.level_extent(store.levels - 1)) <= 8

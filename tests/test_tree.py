@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import gvtorch as gv
 from gvtorch.base import constants as config
-from gvtorch.pool.pyramid import build_levels
+from gvtorch.pool.pyramid import volume_levels
 
 SIZES = {"branching": 2, "brick_size": 4, "border": 1}
 
@@ -41,7 +41,7 @@ def test_levels_are_means_of_the_voxels_below(extent, branching):
     volume = random_volume(extent)
     sizes = {**SIZES, "branching": branching}
     expected = volume.data[..., 0].double().numpy()
-    for number, level in enumerate(build_levels(volume.data, 3, **sizes)):
+    for number, level in enumerate(volume_levels(volume, 3, **sizes)):
         if number:
             expected = coarse_by_hand(expected, branching)
         np.testing.assert_allclose(level.values[..., 0].numpy(), expected, rtol=1e-5)
@@ -49,7 +49,7 @@ def test_levels_are_means_of_the_voxels_below(extent, branching):
 
 def test_integer_levels_are_rounded_once():
     volume = random_volume((8, 8, 8), torch.uint8)
-    levels = list(build_levels(volume.data, 4, **SIZES))
+    levels = list(volume_levels(volume, 4, **SIZES))
     mean = volume.data.double().mean()
     assert levels[3].values.dtype == torch.uint8 and abs(int(levels[3].values) - mean) <= 0.5
 
@@ -80,7 +80,7 @@ def test_every_brick_holds_its_region_of_its_level(extent, branching, brick_size
     tree = gv.N3Tree.from_volume(volume, brick_size, border, branching=branching)
     tree.validate()
     sizes = {"branching": branching, "brick_size": brick_size, "border": border}
-    levels = [level.values for level in build_levels(volume.data, tree.depth + 1, **sizes)][::-1]
+    levels = [level.values for level in volume_levels(volume, tree.depth + 1, **sizes)][::-1]
     found = 0
     for depth, level in enumerate(levels):
         grid = [-(-size // brick_size) for size in level.shape[2::-1]]
@@ -153,11 +153,6 @@ def test_channels_keep_dtype_and_width(blobs):
     assert tree.bricks.bricks["color"].dtype == torch.uint8
     fields = (tree.nodes.fields, tree.bricks.fields)
     assert tree.nbytes == sum(tensor.nbytes for part in fields for tensor in part.values())
-
-
-def test_pools_hold_maps_as_well_as_volumes():
-    pool = gv.NodePool(10, branching=3, dimensions=2)
-    assert pool.child_tn.shape == (10, 9) and (pool.child_tn == config.ABSENT).all()
 
 
 @pytest.mark.parametrize(

@@ -33,11 +33,17 @@ def brief(record: Any) -> str:
     parts = []
     for field in dataclasses.fields(record):
         value = getattr(record, field.name)
-        if isinstance(value, Tensor):
-            parts.append(f"{field.name}={describe(value).partition(' on ')[0]}")
-        elif value != field.default:
-            parts.append(f"{field.name}={value!r}")
+        if field.repr and (isinstance(value, Tensor) or value not in (field.default, {})):
+            parts.append(f"{field.name}={_shown(value)}")
     return f"{type(record).__name__}({', '.join(parts)})"
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key}: {_shown(one)}" for key, one in value.items()) + "}"
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
+    return repr(value)
 
 
 def tensor(

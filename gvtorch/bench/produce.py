@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from ..pool import Channel
-from ..producers import Bricks, Nodes, Producer
-from ..producers.answer import layout_of
+from ..producers import Bricks, Layout, Nodes, Producer
 from .record import Record, clock, synchronize
 
 _SIDE = 4096  # finest voxels along a side of the scene
@@ -42,11 +41,10 @@ def produce(record: Record) -> None:
     if not record.wants(case):
         return
     producer = Ripples().to(settings.device)
-    depth = (_SIDE // 8).bit_length() - 1
-    layout = layout_of(producer, depth, 8, 1, settings.device)
+    layout = Layout.of(producer, 8, 1, settings.device)
     generator = torch.Generator().manual_seed(3)
     loc = torch.randint(0, _SIDE // 8, (count, 4), generator=generator)
-    loc[:, 3] = depth
+    loc[:, 3] = layout.depth
     loc = loc.to(settings.device)
 
     def eager() -> Tensor:

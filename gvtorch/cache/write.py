@@ -18,7 +18,8 @@ from ..base.constants import ABSENT, REQUEST_LOAD, REQUEST_SUBDIVIDE, TERMINAL
 from ..base.volume import movable
 from ..ops import lacking, link, link_bricks, link_tiles, unlink
 from ..pool import N3Tree
-from ..pool.staging import Part, Voxels, joined, on_device, wide_rows
+from ..pool.brick_table import Voxels, on_device, wide_rows
+from ..pool.staging import Chunk, joined
 from .cache import Cache
 
 
@@ -134,7 +135,7 @@ def _alias(cache: Cache, node: Tensor, target: Tensor) -> None:
     cache.bricks.shared_b[slots[slots >= 0].to(torch.int64)] = True
 
 
-def write_bricks(cache: Cache, targets: Targets, data: Voxels | Sequence[Part]) -> Written:
+def write_bricks(cache: Cache, targets: Targets, data: Voxels | Sequence[Chunk]) -> Written:
     """Gives nodes their bricks: takes slots, unlinks, writes and links them.
 
     Args:
@@ -164,7 +165,7 @@ def write_bricks(cache: Cache, targets: Targets, data: Voxels | Sequence[Part]) 
     return done
 
 
-def put_bricks(cache: Cache, slot_k: Tensor, node: Tensor, data: Voxels | Sequence[Part]) -> int:
+def put_bricks(cache: Cache, slot_k: Tensor, node: Tensor, data: Voxels | Sequence[Chunk]) -> int:
     """Writes voxels into slots, which lose what they held, and links nodes to them.
 
     Args:
@@ -183,9 +184,9 @@ def put_bricks(cache: Cache, slot_k: Tensor, node: Tensor, data: Voxels | Sequen
         there = {name: on_device(rows, slot.device) for name, rows in data.items()}
         nbytes += _fill_slots(cache, slot, there)
     else:
-        for part in data:
-            with part as landed:
-                nbytes += _fill_slots(cache, slot[part.begin : part.end], landed)
+        for chunk in data:
+            with chunk as arrived:
+                nbytes += _fill_slots(cache, slot[chunk.begin : chunk.end], arrived)
     slots = (pool.owner_b, pool.stamp_b, pool.born_b, pool.shared_b)
     link_bricks(nodes.brick_tn, nodes.request_tn, *slots, node, slot_k, cache.frame)
     return nbytes

@@ -343,7 +343,7 @@ class Production:
             self._mark(rest)
             self._held.append(Answered(rest, Bricks(data=shipment.rest)))
         if len(sent):
-            self._add_up(sent, write_bricks(self.cache, sent.targets, shipment.parts), stats)
+            self._add_up(sent, write_bricks(self.cache, sent.targets, shipment.chunks), stats)
 
     def _write_aliases(self, batch: RequestBatch, alias: Tensor) -> list[Answered]:
         """Shares the bricks of alias targets (k, 4); where such a brick is not here, it is made for

@@ -15,8 +15,9 @@ from torch import Tensor
 from ..base.constants import ABSENT, CONSTANT, EMPTY, REQUEST_LOAD, TERMINAL
 from ..base.volume import movable
 from ..cache import KINDS, Cache, Children, Targets
-from ..pool import N3Tree, Rows, Staging
-from ..pool.staging import Shipment, on_host, upload
+from ..pool import N3Tree, Staging, TableRows
+from ..pool.brick_table import on_host
+from ..pool.staging import Shipment, upload
 from ..producers import Bricks, Layout, Nodes, Producer, Region, Regions
 from ..producers.answer import checked_bricks, checked_regions, count_kinds
 
@@ -187,7 +188,7 @@ def send_ahead(batch: RequestBatch, answer: Any, staging: Staging) -> Any:
     """
     data = answer.data if isinstance(answer, Bricks) else answer
     if not isinstance(data, Mapping) or not all(
-        isinstance(rows, Rows) or (isinstance(rows, Tensor) and rows.device.type == "cpu")
+        isinstance(rows, TableRows) or (isinstance(rows, Tensor) and rows.device.type == "cpu")
         for rows in data.values()
     ):
         return answer
@@ -215,7 +216,7 @@ def select(answer: Any, row: Tensor) -> Any:
     """The items of an answer that `row` (m,) names, errors left out."""
 
     def rows(value: Any) -> Any:
-        if isinstance(value, Rows):
+        if isinstance(value, TableRows):
             return value[row]
         if isinstance(value, Tensor):
             return movable(value)[row.to(value.device)].view(value.dtype)

@@ -12,8 +12,8 @@ from ..base.constants import ABSENT, CONSTANT, EMPTY, TERMINAL
 from ..base.volume import movable
 from ..cache import Cache, put_bricks
 from ..pool import BrickPool, Channel, N3Tree, NodePool
-from ..producers import Nodes, Producer, Region
-from ..producers.answer import checked_bricks, checked_regions, layout_of
+from ..producers import Layout, Nodes, Producer, Region
+from ..producers.answer import checked_bricks, checked_regions
 from .failures import ProductionError
 from .options import EngineOptions
 from .request_batch import ProducedTree
@@ -81,10 +81,7 @@ def make_tree(
     """
     nodes = cache.nodes
     device = nodes.child_tn.device
-    depth = 0
-    while options.brick_size * producer.branching**depth < max(producer.extent):
-        depth += 1
-    layout = layout_of(producer, depth, options.brick_size, options.border, device)
+    layout = Layout.of(producer, options.brick_size, options.border, device)
     if producer.layout is not None:
         raise ValueError(
             f"Engine: the producer of tree {name!r} serves another engine: "
@@ -94,7 +91,7 @@ def make_tree(
     producer.prepare(layout)
     tree = N3Tree(
         *(nodes, cache.bricks),
-        depth=depth,
+        depth=layout.depth,
         extent=producer.extent,
         spacing=producer.spacing,
         origin=producer.origin,

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ..pool.pyramid import pool_mean
+from ..pool.downsample import pool_mean
 from .store_layout import level_shape
 
 _TILE = 64  # voxels along a side of a tile that is made on demand

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..pool.pyramid import extend, pool_max, pool_mean, pool_min, round_array, window
+from ..pool.downsample import extend, pool_max, pool_mean, pool_min, round_array, window
 from .level_reader import Deadline, StoredArray, StoreError, short
 from .source import VolumeSource
 from .store import needed_cells

@@ -1,10 +1,11 @@
-"""Node pool, brick pool and the tree over them."""
+"""Node pool, brick pool, the tree over them, and the way of bricks to the device."""
 
 from .brick_pool import BrickPool
+from .brick_table import BrickTable, TableRows
 from .channel import Channel
 from .n3tree import N3Tree
 from .node_pool import NodePool
-from .staging import BrickTable, Rows, Staging
+from .staging import Staging
 
 __all__ = [
     "BrickPool",
@@ -12,6 +13,6 @@ __all__ = [
     "Channel",
     "N3Tree",
     "NodePool",
-    "Rows",
     "Staging",
+    "TableRows",
 ]

@@ -8,19 +8,22 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from .channel import Channel
+from .channel import Channel, phrase
 
 
 class BrickPool:
-    """Room for `capacity` bricks of brick_size ** 3 voxels with `border` voxels around.
+    """Slots for `capacity` bricks of brick_size ** 3 voxels, with `border` voxels around each.
 
     Attributes:
-        bricks: For each channel (b, z, y, x, c), sides of brick_size + 2 * border.
-        stamp_b: (b,) last frame in which a ray sampled the brick, or after which it was written;
-            -1 for never.
-        born_b: (b,) first frame that could draw the brick, 0 for those that were there before.
-        owner_b: (b,) node index that the brick belongs to, -1 for free.
-        shared_b: (b,) bool, other nodes may point to the brick as well (instancing).
+        brick_size: Voxels along a side of a brick, without the border.
+        border: Voxels around a brick, copied from its neighbours.
+        channels: What each voxel holds, by name.
+        bricks: For each channel (b, z, y, x, c) voxels, sides of brick_size + 2 * border.
+        stamp_b: (b,) int32 usage stamp: the last frame in which a ray sampled the brick, or after
+            which it was written; -1 for never.
+        born_b: (b,) int32 first frame that could draw the brick, 0 if it was there from the start.
+        owner_b: (b,) int32 index of the node that the brick was made for, -1 for a free slot.
+        shared_b: (b,) bool, whether other nodes may point to the brick as well (aliases).
     """
 
     def __init__(
@@ -32,14 +35,14 @@ class BrickPool:
         border: int = 1,
         device: torch.device | str = "cpu",
     ) -> None:
-        """Takes the memory.
+        """Allocates the pool: every slot is free.
 
         Args:
             capacity: Number of bricks, 0 or more.
             channels: What each voxel holds, by name.
             brick_size: Voxels along a side, without the border, >= 2.
-            border: Voxels around, 0 or more; neighbours agree at their faces from 1 on.
-            device: Where the tensors lie.
+            border: Voxels around, 0 to 16; from 1 on, trilinear samples meet without a seam.
+            device: Device of the tensors.
 
         Raises:
             ValueError: A number is out of its range, or there is no channel.
@@ -70,10 +73,17 @@ class BrickPool:
 
     @property
     def capacity(self) -> int:
-        """Number of bricks."""
+        """Number of slots."""
         return self.stamp_b.shape[0]
 
     @property
     def nbytes(self) -> int:
-        """Memory of all fields."""
+        """Bytes of all fields."""
         return sum(field.nbytes for field in self.fields.values())
+
+    def __repr__(self) -> str:
+        """Shows slots, sizes, channels and memory."""
+        return (
+            f"BrickPool({self.capacity} bricks of {self.brick_size}^3+{self.border}, "
+            f"{phrase(self.channels)}, {self.nbytes / 1e6:.1f} MB on {self.stamp_b.device})"
+        )

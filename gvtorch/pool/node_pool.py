@@ -10,29 +10,32 @@ from torch import Tensor
 from ..base import check
 from ..base.constants import ABSENT
 from ..base.volume import movable
-from .channel import Channel
+from .channel import Channel, phrase
 
 
 class NodePool:
-    """Room for `capacity` node tiles of n = branching ** dimensions sibling nodes.
+    """Slots for `capacity` node tiles of n = branching ** 3 sibling nodes each.
 
-    Node index = tile * n + child. A fresh tile's nodes have neither children nor brick. Trees of
-    several N may share a pool, which is then as wide as the widest: n = largest N ** dimensions.
+    Node index = tile * n + child, child = (z * branching + y) * branching + x. A fresh tile's nodes
+    have neither children nor brick. Trees of several N may share a pool, whose tiles are then as
+    wide as the widest: n = largest N ** 3.
 
     Attributes:
-        child_tn: (t, n) tile index of the node's children, or ABSENT, TERMINAL.
-        brick_tn: (t, n) brick slot, or ABSENT, EMPTY, CONSTANT.
-        request_tn: (t, n) what rays wished for since the words were last cleared.
-        loc_t4: (t, 4) x, y, z of the tile's parent node at its depth, and the depth of the tile's
-            own nodes; node x at that depth = loc x * N + child x.
-        parent_t: (t,) node index whose children this tile holds, -1 for a root tile.
-        tree_t: (t,) number of the tree that owns the tile.
-        stamp_t: (t,) last frame in which a ray passed through, or after which it was
-            written, -1 for never.
-        shared_t: (t,) bool, other nodes may point to the tile as well (instancing, recursion).
+        branching: N of the widest tree.
+        channels: What each voxel holds, by name.
+        child_tn: (t, n) int32 tile of the node's children, or ABSENT (not loaded), TERMINAL (none).
+        brick_tn: (t, n) int32 slot of the node's brick, or ABSENT, EMPTY, CONSTANT.
+        request_tn: (t, n) int32 what rays have requested since the words were last cleared.
+        loc_t4: (t, 4) int32 x, y, z of the tile's parent node at its own depth, and the depth of
+            the tile's nodes; node x at that depth = loc x * N + child x.
+        parent_t: (t,) int32 index of the node whose children this tile holds, -1 for a root tile.
+        tree_t: (t,) int32 number of the tree that owns the tile.
+        stamp_t: (t,) int32 usage stamp: the last frame in which a ray passed through, or after
+            which the tile was written; -1 for never.
+        shared_t: (t,) bool, whether other nodes may point to the tile as well (aliases).
         constants: For each channel (t, n, c): the value of CONSTANT nodes, the mean of EMPTY ones.
         ranges: For each channel (t, n, 2, c): smallest and largest value in reach of the node's
-            brick, of all levels; what may be anything spans all that the dtype can hold.
+            brick, at all levels; all that the dtype can hold where nobody has told.
     """
 
     def __init__(
@@ -41,30 +44,27 @@ class NodePool:
         channels: Mapping[str, Channel] | None = None,
         *,
         branching: int = 2,
-        dimensions: int = 3,
         device: torch.device | str = "cpu",
     ) -> None:
-        """Takes the memory.
+        """Allocates the pool: every tile is free.
 
         Args:
             capacity: Number of tiles.
             channels: What each voxel holds, by name; a node keeps a constant and a range of each.
             branching: N >= 2, of the widest tree.
-            dimensions: 3 for volumes, 2 for maps.
-            device: Where the tensors lie.
+            device: Device of the tensors.
 
         Raises:
             ValueError: A number is out of its range, or nodes could not be counted in int32.
         """
         check.whole("NodePool", "capacity", capacity, low=1)
         check.whole("NodePool", "branching", branching, low=2, high=16)
-        check.whole("NodePool", "dimensions", dimensions, low=2, high=3)
-        n = branching**dimensions
+        n = branching**3
         if capacity * n >= 2**31:
             raise ValueError(
                 f"NodePool: {capacity} tiles of {n} nodes are more than int32 can name"
             )
-        self.branching, self.dimensions = branching, dimensions
+        self.branching, self.channels = branching, dict(channels or {})
         self.child_tn = torch.full((capacity, n), ABSENT, dtype=torch.int32, device=device)
         self.brick_tn = torch.full((capacity, n), ABSENT, dtype=torch.int32, device=device)
         self.request_tn = torch.zeros((capacity, n), dtype=torch.int32, device=device)
@@ -75,7 +75,7 @@ class NodePool:
         self.shared_t = torch.zeros((capacity,), dtype=torch.bool, device=device)
         self.constants: dict[str, Tensor] = {}
         self.ranges: dict[str, Tensor] = {}
-        for name, channel in (channels or {}).items():
+        for name, channel in self.channels.items():
             shape = (capacity, n, channel.width)
             self.constants[name] = torch.zeros(shape, dtype=channel.dtype, device=device)
             limits = torch.tensor(channel.limits, dtype=torch.float64).to(channel.dtype)
@@ -96,10 +96,18 @@ class NodePool:
 
     @property
     def nodes_per_tile(self) -> int:
-        """n = N ** dimensions."""
+        """n = N ** 3."""
         return self.child_tn.shape[1]
 
     @property
     def nbytes(self) -> int:
-        """Memory of all fields."""
+        """Bytes of all fields."""
         return sum(field.nbytes for field in self.fields.values())
+
+    def __repr__(self) -> str:
+        """Shows tiles, nodes a tile, channels and memory."""
+        return (
+            f"NodePool({self.capacity} tiles of {self.nodes_per_tile} nodes, "
+            f"{phrase(self.channels) or 'no channels'}, {self.nbytes / 1e6:.1f} MB "
+            f"on {self.child_tn.device})"
+        )

@@ -1,4 +1,4 @@
-"""Checks what a producer answered, item by item: a bad one becomes an error, the others stay."""
+"""Checks of what a producer answered, item by item: a bad one becomes an error, the others stay."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..pool import Channel, Rows
-from ..pool.staging import on_device, on_host, upload
+from ..pool import Channel, TableRows
+from ..pool.brick_table import on_device, on_host
+from ..pool.pyramid import NodeSummary
+from ..pool.staging import upload
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 
 
 def checked_regions(answer: Any, nodes: Nodes, producer: Producer) -> Regions:
-    """Returns `Regions` on the layout's device.
+    """Returns a producer's answer to `classify(nodes)` as `Regions` on the layout's device.
 
     Raises:
         ValueError: The answer is of the wrong type, shape or dtype.
@@ -24,7 +26,8 @@ def checked_regions(answer: Any, nodes: Nodes, producer: Producer) -> Regions:
     if isinstance(answer, Tensor):
         answer = Regions(kind=answer)
     if not isinstance(answer, Regions):
-        raise ValueError(f"{where}: must return Regions or a tensor, got {_name(answer)}")
+        came = type(answer).__name__
+        raise ValueError(f"{where}: must return Regions or a tensor, got {came}")
     count, device = len(nodes), nodes.layout.device
     errors = _known_errors(where, answer.errors, count)
     kind = _kind(where, answer.kind, count)
@@ -36,21 +39,20 @@ def checked_regions(answer: Any, nodes: Nodes, producer: Producer) -> Regions:
     counts = _refuse_bad(kind, [*fields.values()], errors)
     _need_constants(where, counts, fields["constants"], producer)
     alias = _alias(where, answer.alias, kind, counts, nodes.layout, errors)
-    there = {
-        name: {channel: upload(values, device) for channel, values in by_channel.items()}
-        for name, by_channel in fields.items()
-    }
     return Regions(
         kind=upload(kind, device),
         alias=None if alias is None else upload(alias, device),
         errors=errors,
-        **there,
+        **{
+            name: {channel: upload(values, device) for channel, values in by_channel.items()}
+            for name, by_channel in fields.items()
+        },
     )
 
 
 def checked_bricks(answer: Any, nodes: Nodes, producer: Producer) -> Bricks:
-    """Returns `Bricks` in which items that hold NaN are errors. Voxels stay where they are, all on
-    the host or none; no kind told means that all are DATA.
+    """Returns a producer's answer to `fill(nodes)` as `Bricks`. Voxels stay where they are, unless
+    some channels lie on the host and others on the device: then all go to the device.
 
     Raises:
         ValueError: The answer is of the wrong type, shape or dtype.
@@ -59,15 +61,15 @@ def checked_bricks(answer: Any, nodes: Nodes, producer: Producer) -> Bricks:
     if isinstance(answer, Mapping):
         answer = Bricks(data=answer)
     if not isinstance(answer, Bricks):
-        raise ValueError(f"{where}: must return Bricks or a dict of tensors, got {_name(answer)}")
+        came = type(answer).__name__
+        raise ValueError(f"{where}: must return Bricks or a dict of tensors, got {came}")
     layout, count = nodes.layout, len(nodes)
     errors = _known_errors(where, answer.errors, count)
     kind = None if answer.kind is None else _kind(where, answer.kind, count)
-    side = layout.brick_size + 2 * layout.border
     missing = sorted(set(producer.channels) - set(answer.data))
     if missing:
         raise ValueError(f"{where}: channel {missing[0]!r} is missing")
-    shape = (count, side, side, side)
+    shape = (count, *(layout.side,) * 3)
     data = _by_channel(where, "data", answer.data, shape, producer)
     if any(on_host({name: rows}) != on_host(data) for name, rows in data.items()):
         data = {name: on_device(rows, layout.device) for name, rows in data.items()}
@@ -84,24 +86,20 @@ def count_kinds(kind: Tensor) -> Tensor:
     return (kind == codes[:, None]).sum(1)
 
 
-def layout_of(
-    producer: Producer, depth: int, brick_size: int, border: int, device: torch.device
-) -> Layout:
-    """Returns how a producer's world is cut."""
-    return Layout(
-        depth=depth,
-        branching=producer.branching,
-        brick_size=brick_size,
-        border=border,
-        extent=producer.extent,
-        spacing=producer.spacing,
-        origin=producer.origin,
-        device=device,
+def regions_of(
+    summaries: Mapping[str, NodeSummary], channels: Mapping[str, Channel], threshold: float | None
+) -> Regions:
+    """Returns what a summary of all channels tells of k nodes: CONSTANT where every channel is
+    uniform, EMPTY where none has a value above the threshold, else DATA.
+    """
+    constant = torch.stack([one.is_constant for one in summaries.values()]).all(0)
+    empty = torch.stack([one.is_empty(threshold) for one in summaries.values()]).all(0)
+    kind = torch.where(constant, Region.CONSTANT, Region.DATA)
+    return Regions(
+        kind=torch.where(empty, Region.EMPTY, kind),
+        constants={name: one.constants(channels[name].dtype) for name, one in summaries.items()},
+        ranges={name: one.ranges(channels[name].dtype) for name, one in summaries.items()},
     )
-
-
-def _name(answer: Any) -> str:
-    return type(answer).__name__
 
 
 def _known_errors(where: str, errors: Mapping[int, str], count: int) -> dict[int, str]:
@@ -123,6 +121,7 @@ def _by_channel(
     shape: tuple[int, ...],
     producer: Producer,
 ) -> dict[str, Any]:
+    """Returns the values of each channel as (*shape, width); a width of 1 may be left out."""
     result = {}
     for channel, value in values.items():
         if channel not in producer.channels:
@@ -132,7 +131,9 @@ def _by_channel(
         wanted = (*shape, what.width)
         plain = isinstance(value, Tensor) and what.width == 1 and value.shape == shape
         tensor = value[..., None] if plain else value
-        known_type = isinstance(tensor, Tensor) or (isinstance(tensor, Rows) and name == "data")
+        known_type = isinstance(tensor, Tensor) or (
+            isinstance(tensor, TableRows) and name == "data"
+        )
         fits = known_type and tensor.shape == wanted and tensor.dtype == what.dtype
         if not fits:
             sizes = ", ".join(str(size) for size in wanted)
@@ -161,6 +162,7 @@ def _alias(
     layout: Layout,
     errors: dict[int, str],
 ) -> Tensor | None:
+    """Returns (k, 4) alias targets, None if no item is ALIAS; wrong places become errors."""
     if not counts[Region.ALIAS]:
         return None
     if not isinstance(alias, Tensor) or alias.shape != (len(kind), 4):
@@ -180,14 +182,15 @@ def _alias(
 
 def _refuse_bad(
     kind: Tensor | None,
-    fields: Sequence[Mapping[str, Tensor | Rows]],
+    fields: Sequence[Mapping[str, Tensor | TableRows]],
     errors: dict[int, str],
 ) -> list[int]:
-    """Names items of no kind, and those that hold NaN or infinite values. Tables have been checked.
+    """Adds items of an unknown kind, and those that hold NaN or infinite values, to the errors.
+    Rows of a table are not looked at: `BrickTable` has checked them.
 
     Returns:
-        How many items are of each kind, none where no kind was told. What lies on a device is read
-        from it at once.
+        How many items are of each kind, zeros where `kind` is None. The host waits for the device
+        once, if anything lies there.
     """
     floats = [
         (channel, values)
@@ -213,7 +216,7 @@ def _refuse_bad(
 
 
 def _read(values: Sequence[Tensor]) -> list[list[int]]:
-    """Small tensors of integers as lists: one transfer for each device."""
+    """Returns small tensors of integers as lists, with one transfer for each device."""
     result: dict[int, list[int]] = {}
     for device in {value.device for value in values}:
         here = [index for index, value in enumerate(values) if value.device == device]

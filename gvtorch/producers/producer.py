@@ -1,8 +1,9 @@
-"""`Producer`: what makes the content of a tree. It answers two questions, both on a batch: what is
-in these nodes (`classify`), and what are the voxels of these bricks (`fill`).
+"""`Producer`: makes the content of a tree, and the records that it is asked and answers with.
 
-It never sees pools, slots or the order of use: nodes are named by place. Source: Crassin et al.,
-"GigaVoxels", I3D 2009, section 5; Crassin, PhD thesis 2011, chapter 7 (a producer may decline).
+It answers two questions, both for a batch of nodes: what do these nodes hold (`classify`), and what
+are the voxels of their bricks (`fill`). It knows nodes by place only, never pools and slots.
+Source: Crassin et al., "GigaVoxels", I3D 2009, section 5; Crassin, PhD thesis 2011, chapter 7 (a
+    producer may decline).
 """
 
 from __future__ import annotations
@@ -18,31 +19,52 @@ from torch import Tensor
 
 from ..base import check
 from ..pool import Channel
-from ..pool.staging import Voxels
+from ..pool.brick_table import Voxels
+from ..pool.channel import phrase
+from ..pool.pyramid import tree_depth
 
 
 class Region(IntEnum):
     """What a node holds."""
 
-    EMPTY = 0  # nothing is ever drawn here, nor below
-    CONSTANT = 1  # one value all over, also below
+    EMPTY = 0  # nothing to draw, neither here nor in its children
+    CONSTANT = 1  # one value everywhere, also in its children
     DATA = 2  # voxels; its children may hold more detail
-    DATA_MAX_DEPTH = 3  # voxels; its children would hold nothing new
-    ALIAS = 4  # the same as another node, with all that is below it
+    DATA_MAX_DEPTH = 3  # voxels; its children hold no more detail and are never asked for
+    ALIAS = 4  # the same as another node of the tree, the alias target, with all below it
 
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """How the engine cuts a producer's world into bricks."""
+    """How an engine cuts a producer's world into nodes and bricks."""
 
-    depth: int  # of the finest level
-    branching: int
-    brick_size: int
-    border: int
+    depth: int  # of the finest level; the root's is 0
+    branching: int  # N: a node has N^3 children
+    brick_size: int  # voxels along a side of a brick, without the border
+    border: int  # voxels around a brick
     extent: tuple[int, int, int]  # finest voxels along x, y, z
     spacing: tuple[float, float, float]  # world size of a finest voxel
     origin: tuple[float, float, float]  # world place of the centre of voxel 0
-    device: torch.device
+    device: torch.device  # of the pools
+
+    @classmethod
+    def of(cls, producer: Producer, brick_size: int, border: int, device: torch.device) -> Layout:
+        """Returns the layout of a producer's world in bricks of a size."""
+        return cls(
+            depth=tree_depth(producer.extent, brick_size, producer.branching),
+            branching=producer.branching,
+            brick_size=brick_size,
+            border=border,
+            extent=producer.extent,
+            spacing=producer.spacing,
+            origin=producer.origin,
+            device=device,
+        )
+
+    @property
+    def side(self) -> int:
+        """s = brick_size + 2 * border, voxels along a side of a brick with its border."""
+        return self.brick_size + 2 * self.border
 
     @functools.cached_property
     def spacing_3(self) -> Tensor:
@@ -66,8 +88,8 @@ class Layout:
 
     @functools.cached_property
     def grid(self) -> Tensor:
-        """(s * s * s * 3,) int64: where each component of each voxel's place stands among the
-        3 * s places along the axes.
+        """(s * s * s * 3,) int64: for each x, y, z of each voxel of a brick, its index among the
+        3 * s coordinates along the axes.
         """
         at = torch.arange(len(self.reach), device=self.device)
         z, y, x = torch.meshgrid(at, at, at, indexing="ij")
@@ -75,25 +97,25 @@ class Layout:
 
 
 class Nodes:
-    """A batch of nodes of one tree, by place.
+    """A batch of k nodes of one tree, by place: what a producer is asked about.
 
     Attributes:
         loc: (k, 4) int64 x, y, z, depth: node x of its level covers voxels x * brick_size to
             (x + 1) * brick_size of that level.
-        layout: Brick size, border, spacing and the like.
+        layout: How the tree's world is cut: brick size, border, spacing and the like.
     """
 
     def __init__(self, loc: Tensor, layout: Layout) -> None:
         """Holds the places."""
         self.loc, self.layout = loc, layout
-        self._known: dict[str, Tensor] = {}  # made when first asked for; torch.compile follows it
+        self._known: dict[str, Tensor] = {}  # a cache of properties that torch.compile can trace
 
     def __len__(self) -> int:
         """Number of nodes."""
         return self.loc.shape[0]
 
     def __getitem__(self, index: slice | Tensor) -> Nodes:
-        """Some of the nodes."""
+        """Returns some of the nodes."""
         return Nodes(self.loc[index], self.layout)
 
     @property
@@ -131,76 +153,88 @@ class Nodes:
         """(k,) float64 world distance from the centre to the farthest voxel centre of the brick,
         border included.
         """
-        side = self.layout.brick_size + 2 * self.layout.border - 1
-        return (self.voxel_size * (0.5 * side)).norm(dim=1)
+        return (self.voxel_size * (0.5 * (self.layout.side - 1))).norm(dim=1)
 
     @property
     def axes(self) -> tuple[Tensor, Tensor, Tensor]:
-        """float32 world places of the voxel centres along x (k, 1, 1, s), y (k, 1, s, 1) and
-        z (k, s, 1, 1), border included. What is made of them broadcasts to (k, z, y, x), and they
-        take a hundredth of the memory traffic of `positions`: a compiled function of them writes
-        each brick once and reads next to nothing.
+        """float32 world coordinates of the voxel centres along x (k, 1, 1, s), y (k, 1, s, 1) and
+        z (k, s, 1, 1), border included. A function of them broadcasts to (k, z, y, x) and reads a
+        hundredth of the memory that `positions` take.
         """
         x, y, z = self._places.unbind(1)
         return x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]
 
     @property
     def positions(self) -> Tensor:
-        """(k, z, y, x, 3) float32 world places of the voxel centres, x y z, border included."""
+        """(k, z, y, x, 3) float32 world positions of the voxel centres, border included."""
         if "positions" not in self._known:
-            side = len(self.layout.reach)
+            side = self.layout.side
             places = self._places.flatten(1).index_select(1, self.layout.grid.to(self.loc.device))
             self._known["positions"] = places.view(-1, side, side, side, 3)
         return self._known["positions"]
 
     @property
     def _places(self) -> Tensor:
-        """(k, 3, s) float32 world places of the voxel centres along each axis."""
+        """(k, 3, s) float32 world coordinates of the voxel centres along each axis."""
         if "places" not in self._known:
             reach = self.layout.reach.to(self.loc.device)
             voxel = self.loc[:, :3, None] * self.layout.brick_size + reach
             finest = (voxel + 0.5) * self.scale[:, None, None] - 0.5
-            places = self._world(finest.mT).mT.to(torch.float32).contiguous()
-            self._known["places"] = places
+            self._known["places"] = self._world(finest.mT).mT.to(torch.float32).contiguous()
         return self._known["places"]
 
     def _world(self, finest: Tensor) -> Tensor:
-        spacing, origin = (
-            v.to(finest.device) for v in (self.layout.spacing_3, self.layout.origin_3)
+        """Brings places (..., 3) from finest voxels to the world."""
+        layout = self.layout
+        return finest * layout.spacing_3.to(finest.device) + layout.origin_3.to(finest.device)
+
+    def __repr__(self) -> str:
+        """Shows how many nodes there are, and the tree's bricks and depth."""
+        layout = self.layout
+        return (
+            f"Nodes({len(self)} on {self.loc.device}, "
+            f"bricks of {layout.brick_size}^3+{layout.border}, tree depth {layout.depth})"
         )
-        return finest * spacing + origin
 
 
 @dataclass(frozen=True, kw_only=True)
 class Regions:
-    """Answer of `classify`: what each of k nodes holds."""
+    """Answer of `classify`: what each of k nodes holds. Constants and ranges go by channel."""
 
     kind: Tensor  # (k,) of `Region`
-    constants: Mapping[str, Tensor] = field(default_factory=dict)  # (k, c): of CONSTANT and EMPTY
+    constants: Mapping[str, Tensor] = field(default_factory=dict)  # (k, c), see `Region.CONSTANT`
     ranges: Mapping[str, Tensor] = field(default_factory=dict)  # (k, 2, c) smallest, largest value
-    alias: Tensor | None = None  # (k, 4) loc of the node that an ALIAS is the same as
-    errors: Mapping[int, str] = field(default_factory=dict)  # which can't be told, and why
+    alias: Tensor | None = None  # (k, 4) int64 places of alias targets; other rows are not read
+    errors: Mapping[int, str] = field(default_factory=dict, repr=False)  # by item, why it failed
+
+    def __repr__(self) -> str:
+        """Shows shapes and dtypes."""
+        return check.brief(self)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bricks:
     """Answer of `fill`: the voxels of k bricks, or why a brick has none.
 
-    Bricks may lie on the engine's device or in host memory, whatever the device: those are sent
-    through pinned memory while the engine renders. Bricks that lie ready are best named by the rows
-    of a `BrickTable`; those that lie in pinned memory themselves are copied from there a little
-    later, so a producer must leave them as they are.
+    Voxels may lie on the engine's device or in host memory; from there they are sent through pinned
+    memory while the engine renders. Bricks that lie ready are best named by the rows of a
+    `BrickTable`. Tensors in pinned memory are copied from where they are a little later, so they
+    must not be changed any more.
     """
 
-    data: Voxels  # (k, z, y, x, c) for each channel, border included
-    kind: Tensor | None = None  # (k,) of `Region`; all DATA if left out
-    constants: Mapping[str, Tensor] = field(default_factory=dict)  # (k, c)
-    alias: Tensor | None = None  # (k, 4) loc
-    errors: Mapping[int, str] = field(default_factory=dict)
+    data: Voxels  # for each channel (k, z, y, x, c), border included
+    kind: Tensor | None = None  # (k,) of `Region`; None: all DATA
+    constants: Mapping[str, Tensor] = field(default_factory=dict)  # as in `Regions`
+    alias: Tensor | None = None  # as in `Regions`
+    errors: Mapping[int, str] = field(default_factory=dict, repr=False)  # as in `Regions`
+
+    def __repr__(self) -> str:
+        """Shows shapes and dtypes."""
+        return check.brief(self)
 
 
 class Producer(torch.nn.Module):
-    """Base of producers: subclass it and write `fill`, and `classify` where that saves work.
+    """Base of producers. A subclass writes `fill`, and `classify` where that saves work.
 
     Attributes:
         extent: (x, y, z) voxels of the finest level.
@@ -209,8 +243,9 @@ class Producer(torch.nn.Module):
         branching: N of its tree.
         channels: What a voxel holds, by name.
         value_range: For each channel its smallest and largest value, where they are known.
-        patience: Seconds until an answer that does not come is given up; None: the engine's.
-        layout: How the engine that it serves cuts its world; None while it serves none.
+        patience: Seconds after which an answer that has not come counts as failed; None: the
+            engine's.
+        layout: Set by the engine that uses this producer; None while none does.
     """
 
     patience: float | None = None
@@ -269,23 +304,34 @@ class Producer(torch.nn.Module):
         self.value_range = dict(value_range or {})
 
     def prepare(self, layout: Layout) -> None:
-        """Learns how the engine cuts the world; called once, before the first question."""
+        """Is called once by the engine, before anything else, with how it cuts the world."""
 
     def classify(self, nodes: Nodes) -> Regions | Tensor | Future:
-        """Tells what nodes hold: `Regions`, or a (k,) tensor of `Region`, now or as a future.
+        """Tells what k nodes hold; all DATA unless overridden.
 
-        A wrong DATA costs memory; a wrong EMPTY or CONSTANT costs the picture: what lies in reach
-        of the node's brick, border included, and of all nodes below counts. All DATA unless
-        overridden.
+        DATA is always right and costs memory. EMPTY and CONSTANT must be true of all that lies in
+        reach of the node's brick, border included, and of the bricks of all nodes below it.
+
+        Returns:
+            `Regions`, or their (k,) kinds alone, now or as a future.
         """
         return torch.full((len(nodes),), Region.DATA, device=nodes.loc.device)
 
     def fill(self, nodes: Nodes) -> Bricks | Mapping[str, Tensor] | Future:
-        """Makes bricks: `Bricks`, or {channel: (k, z, y, x, c)}, now or as a future.
+        """Makes the voxels of k bricks, borders included.
 
-        Coarse levels must be pre-filtered: a voxel stands for the mean over the space it covers.
+        Coarse levels must be pre-filtered: a voxel is the mean over the space that it covers.
+
+        Returns:
+            `Bricks`, or their voxels {channel: (k, z, y, x, c)} alone, now or as a future.
         """
         raise NotImplementedError(f"{type(self).__name__}: fill is not written")
 
     def close(self) -> None:
-        """Lets go of files and threads."""
+        """Closes files and ends threads; does nothing unless overridden."""
+
+    def __repr__(self) -> str:
+        """Shows extent, branching and channels."""
+        extent = "x".join(str(n) for n in self.extent)
+        channels = phrase(self.channels)
+        return f"{type(self).__name__}({extent} (x, y, z), N={self.branching}, {channels})"

@@ -22,7 +22,8 @@ from numpy.lib.stride_tricks import as_strided
 from ..base import check
 from ..io.store import Store
 from ..pool import Channel
-from ..pool.pyramid import pool_mean, round_to
+from ..pool.downsample import pool_mean
+from ..pool.pyramid import round_to
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 
 _TILE = 32  # cells along a side of what is read at once

@@ -1,0 +1,257 @@
+"""Reductions of voxels in NumPy, of which coarse levels and summaries of nodes are made.
+
+`pool_mean` is the filter of a level: a coarse voxel is the mean of the N^3 voxels below it (a box
+filter), the average over just the space that it covers. So a cone as wide as a voxel reads its own
+footprint, and sums over a region, and how much light a thin medium absorbs, stay the same from
+level to level. Wider kernels blur more and need more border; a maximum keeps thin shells opaque but
+lets them grow. `pool_directional` is the filter of volumes with six directions, see
+`Volume.directional`.
+
+All functions take (z, y, x, c) arrays. Each gives the same bits on any part of an array whose
+corner is a multiple of the factor as on the whole, so volumes are also converted part by part.
+Source: Crassin et al., "GigaVoxels", I3D 2009, section 3 (mip-mapped bricks); Williams, "Pyramidal
+    parametrics", 1983; Crassin et al., "Interactive indirect illumination using voxel cone
+    tracing", CGF 2011 (anisotropic voxels).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ..base.volume import DIRECTIONS
+
+Reduce = Callable[[np.ndarray], np.ndarray]
+
+_SLAB = 1 << 22  # voxels reduced at a time, so that intermediate arrays stay in a core's cache
+
+
+def round_array(values: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """Converts means to a dtype: to nearest for integers, ties to even."""
+    return values.astype(dtype) if dtype.kind == "f" else np.rint(values).astype(dtype)
+
+
+def pool_mean(values: np.ndarray, factor: int | Sequence[int]) -> np.ndarray:
+    """Averages blocks of voxels.
+
+    Sums are exact for integers and float64 for float32, always in the same order.
+
+    Args:
+        values: (z, y, x, c) integers of at most 16 bits, float16 or float32.
+        factor: Voxels along a block's side, one number or (z, y, x). A last block that is not full
+            repeats its last voxel.
+
+    Returns:
+        (ceil(z / factor), ..., c) of the same dtype, rounded to nearest, ties to even.
+    """
+    factors = _factors(factor)
+    voxels = int(np.prod(factors))
+    return _pool(values, factors, lambda part: _narrow(_sum(part, factors), voxels, values.dtype))
+
+
+def pool_min(values: np.ndarray, factor: int | Sequence[int]) -> np.ndarray:
+    """Returns the minimum of each block; arguments as for `pool_mean`."""
+    return _pool_extreme(values, factor, np.minimum)
+
+
+def pool_max(values: np.ndarray, factor: int | Sequence[int]) -> np.ndarray:
+    """Returns the maximum of each block; arguments as for `pool_mean`."""
+    return _pool_extreme(values, factor, np.maximum)
+
+
+def pool_directional(
+    values: np.ndarray, factor: int, sides_zyx: tuple[float, float, float]
+) -> np.ndarray:
+    """Reduces blocks of factor^3 voxels of premultiplied colour and opacity, as seen along each of
+    six directions.
+
+    For a direction, each of the block's factor^2 columns along it is composited front to back; the
+    mean of the columns is stored. Opacity is stored per reference length at every level: that of a
+    homogeneous voxel which lets as much light through. So a homogeneous medium stays as it is, and
+    so does opacity 1. Sums are float64.
+
+    Args:
+        values: (z, y, x, 24) as `Volume.directional` lays them out.
+        factor: Voxels along a block's side. A last block that is not full repeats its last voxel.
+        sides_zyx: Sides of a voxel of `values`, in reference lengths.
+
+    Returns:
+        (ceil(z / factor), ..., 24) of the same dtype.
+    """
+    factors = _factors(factor)
+
+    def reduce(part: np.ndarray) -> np.ndarray:
+        seen = []
+        for number in range(len(DIRECTIONS)):
+            axis = 2 - number // 2
+            rgba = part[..., 4 * number : 4 * number + 4].astype(np.float64)
+            columns = list(range(factor))[:: 1 if number % 2 == 0 else -1]
+            rgba = _of_length(rgba, sides_zyx[axis])
+            total = _every(rgba, axis, factor, columns[0])
+            for k in columns[1:]:
+                total = total + (1 - total[..., 3:]) * _every(rgba, axis, factor, k)
+            across = [1 if a == axis else factor for a in range(3)]
+            mean = _sum(total, _factors(across)) / factor**2
+            seen.append(_of_length(mean, 1 / (factor * sides_zyx[axis])))
+        return np.concatenate(seen, -1)
+
+    return _pool(values, factors, reduce)
+
+
+def _of_length(rgba: np.ndarray, lengths: float) -> np.ndarray:
+    """Returns premultiplied colour and alpha of a homogeneous medium over other lengths."""
+    alpha = rgba[..., 3:]
+    with np.errstate(divide="ignore"):  # log 0: opaque
+        changed = -np.expm1(np.log1p(-alpha) * lengths)
+    scale = np.divide(changed, alpha, out=np.zeros_like(alpha), where=alpha > 0)
+    return np.concatenate((rgba[..., :3] * scale, changed), -1)
+
+
+def window(values: np.ndarray, how: str, *, size: int, step: int) -> np.ndarray:
+    """Reduces overlapping windows of size^3 voxels, `step` apart, the first at the array's corner.
+
+    Args:
+        values: (z, y, x, c), borders included.
+        how: "min", "max" or "mean".
+        size: Voxels along a window's side.
+        step: Voxels from one window to the next.
+
+    Returns:
+        (gz, gy, gx, c), g = (n - size) // step + 1; of the same dtype for min and max, float32 for
+        mean.
+    """
+    counts = [(n - size) // step + 1 for n in values.shape[:3]]
+    for axis in range(3):
+        values = _window_axis(values, axis, how, counts[axis], size, step)
+    return (values / size**3).astype(np.float32) if how == "mean" else values
+
+
+def extend(values: np.ndarray, axis: int, before: int, after: int) -> np.ndarray:
+    """Repeats the outermost voxels along an axis, `before` and `after` times."""
+    if before == after == 0:
+        return values
+    index = np.arange(-before, values.shape[axis] + after).clip(0, values.shape[axis] - 1)
+    return values.take(index, axis)
+
+
+def by_node(values: np.ndarray, how: str, brick_size: int, border: int) -> np.ndarray:
+    """Reduces the voxels of each node's brick and `border` voxels around, repeated at the faces.
+
+    Args:
+        values: (z, y, x, c) a whole level.
+        how: "min", "max" or "mean".
+        brick_size: Voxels along a side of a brick, without the border.
+        border: Voxels around that count as well.
+
+    Returns:
+        (gz, gy, gx, c) float32, g = ceil(n / brick_size).
+    """
+    size = brick_size + 2 * border
+    for axis in range(3):  # one after the other: only the first extends an array of full size
+        count = -(-values.shape[axis] // brick_size)
+        extra = count * brick_size - values.shape[axis]
+        values = extend(values, axis, border, extra + border)
+        values = _window_axis(values, axis, how, count, size, brick_size)
+    return (values / size**3 if how == "mean" else values).astype(np.float32)
+
+
+def _window_axis(
+    values: np.ndarray, axis: int, how: str, count: int, size: int, step: int
+) -> np.ndarray:
+    """Reduces `count` windows along one axis; "mean" gives sums, to be divided at the end."""
+
+    def offset(k: int) -> np.ndarray:
+        place = [slice(None)] * values.ndim
+        place[axis] = slice(k, k + step * (count - 1) + 1, step)
+        return values[tuple(place)]
+
+    if how == "mean":
+        total = offset(0).astype(_wide(values.dtype, size))
+        for k in range(1, size):
+            total += offset(k)
+        return total
+    combine = np.minimum if how == "min" else np.maximum
+    found = offset(0).copy()
+    for k in range(1, size):
+        combine(found, offset(k), out=found)
+    return found
+
+
+def _factors(factor: int | Sequence[int]) -> tuple[int, int, int]:
+    z, y, x = (factor,) * 3 if isinstance(factor, int) else factor
+    return (int(z), int(y), int(x))
+
+
+def _pool(values: np.ndarray, factors: tuple[int, int, int], reduce: Reduce) -> np.ndarray:
+    """Runs `reduce`, which takes whole blocks to one voxel each, over slabs of an array."""
+    shape = [-(-n // f) for n, f in zip(values.shape[:3], factors, strict=True)]
+    out = np.empty((*shape, values.shape[3]), values.dtype)
+    rows = max(1, _SLAB // max(1, int(np.prod(values.shape[1:])) * factors[0]))
+    for start in range(0, shape[0], rows):
+        part = values[start * factors[0] : (start + rows) * factors[0]]
+        for axis in range(3):
+            part = extend(part, axis, 0, -part.shape[axis] % factors[axis])
+        out[start : start + rows] = reduce(part)
+    return out
+
+
+def _pool_extreme(values: np.ndarray, factor: int | Sequence[int], combine: np.ufunc) -> np.ndarray:
+    factors = _factors(factor)
+
+    def reduce(part: np.ndarray) -> np.ndarray:
+        for axis, f in enumerate(factors):
+            found = _every(part, axis, f, 0)
+            for k in range(1, f):
+                found = combine(found, _every(part, axis, f, k))
+            part = found
+        return part
+
+    return _pool(values, factors, reduce)
+
+
+def _sum(part: np.ndarray, factors: tuple[int, int, int]) -> np.ndarray:
+    """Adds up whole blocks, axis after axis, in a dtype that holds the sums."""
+    wide = _wide(part.dtype, int(np.prod(factors)))
+    for axis, f in enumerate(factors):
+        total = _every(part, axis, f, 0)
+        for k in range(1, f):
+            total = np.add(total, _every(part, axis, f, k), dtype=wide)
+        part = total
+    return part.astype(wide, copy=False)
+
+
+def _every(values: np.ndarray, axis: int, step: int, first: int) -> np.ndarray:
+    """Returns every `step`-th slice along an axis."""
+    place = [slice(None)] * axis + [slice(first, None, step)]
+    return values[tuple(place)]
+
+
+def _wide(dtype: np.dtype, terms: int) -> np.dtype:
+    """Returns a dtype that holds the sum of so many terms."""
+    if dtype.kind == "f":
+        return np.dtype(np.float32 if dtype.itemsize == 2 else np.float64)
+    if dtype.itemsize > 4:
+        return np.dtype(np.int64)
+    info = np.iinfo(dtype)
+    most = max(-int(info.min), int(info.max)) * terms
+    return next(np.dtype(f"int{bits}") for bits in (16, 32, 64) if most < 2 ** (bits - 1))
+
+
+def _narrow(total: np.ndarray, voxels: int, dtype: np.dtype) -> np.ndarray:
+    """Divides sums by the number of voxels; integers are rounded to nearest, ties to even."""
+    if dtype.kind == "f":
+        return (total / total.dtype.type(voxels)).astype(dtype)
+    if voxels & (voxels - 1) == 0:  # a shift: floor, plus one above a half or at an odd half
+        if voxels == 1:
+            return total.astype(dtype)
+        shift = voxels.bit_length() - 1
+        odd = total >> shift
+        odd &= 1
+        odd += total
+        odd += voxels // 2 - 1
+        odd >>= shift
+        return odd.astype(dtype)
+    whole, rest = np.divmod(total, voxels)
+    up = (2 * rest > voxels) | ((2 * rest == voxels) & (whole & 1 == 1))
+    return (whole + up).astype(dtype)
