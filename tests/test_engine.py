@@ -590,6 +590,6 @@ def test_engine_objects_show_themselves_in_a_line(blobs):
         assert "converged" in repr(stats)
         rays = camera().placed(engine.box).rays()
         shown = [engine, engine.cache, *engine.cache.lru.values(), engine.scheduler, stats, rays]
-        shown += [engine.production, engine.readbacks, *engine.trees.values(), engine.report()]
+        shown += [engine.production, *engine.trees.values(), engine.report()]
         for one in shown:
             assert len(repr(one)) < 100 and "\n" not in repr(one) and " at 0x" not in repr(one)

@@ -95,7 +95,7 @@ def test_a_strict_engine_raises_what_failed(how):
             engine.render(camera(elevation=35, azimuth=45), GRAY, lod="finest")
         assert REASONS[how] in str(caught.value) and "depth 3, node" in str(caught.value)
         engine.validate()
-        engine.production.strict = False
+        engine.production.failures.strict = False
         picture = engine.render(camera(elevation=35, azimuth=45), GRAY, lod="finest")
         assert picture.stats.converged and picture.alpha.max() > 0.3, "and it goes on"
 

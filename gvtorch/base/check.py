@@ -11,6 +11,7 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 import torch
@@ -131,6 +132,14 @@ def instance(where: str, name: str, value: Any, kind: type) -> None:
     """Raises ValueError unless `value` is of a class."""
     if not isinstance(value, kind):
         raise ValueError(f"{where}: {name} must be a {kind.__name__}, got {type(value).__name__}")
+
+
+def known(where: str, options: Mapping[str, Any], kind: type) -> None:
+    """Raises ValueError unless all options are fields of a dataclass."""
+    names = [field.name for field in fields(kind)]
+    unknown = sorted(set(options) - set(names))
+    if unknown:
+        raise ValueError(f"{where}: unknown option {unknown[0]!r}; known: {', '.join(names)}")
 
 
 def images(where: str, name: str, value: Any, channels: int, *, batch: bool = True) -> None:

@@ -2,34 +2,7 @@
 
 from .cache import Cache
 from .lru import LRU
-from .requests import KINDS, RequestList, Requests, RequestsByKind, coarser_requests
+from .requests import KINDS, RequestList, Requests, RequestsByKind
 from .scheduler import Scheduler
-from .write import (
-    Children,
-    Targets,
-    Written,
-    put_bricks,
-    share_bricks,
-    write_bricks,
-    write_tiles,
-    write_uniform,
-)
 
-__all__ = [
-    "KINDS",
-    "LRU",
-    "Cache",
-    "Children",
-    "RequestList",
-    "Requests",
-    "RequestsByKind",
-    "Scheduler",
-    "Targets",
-    "Written",
-    "coarser_requests",
-    "put_bricks",
-    "share_bricks",
-    "write_bricks",
-    "write_tiles",
-    "write_uniform",
-]
+__all__ = ["KINDS", "LRU", "Cache", "RequestList", "Requests", "RequestsByKind", "Scheduler"]

@@ -38,9 +38,6 @@ class Requests:
         """Number of requests."""
         return self.node.shape[0]
 
-    def __repr__(self) -> str:
-        return f"Requests({len(self)} nodes)"
-
 
 #: `Requests` for each of REQUEST_LOAD and REQUEST_SUBDIVIDE.
 RequestsByKind = Mapping[int, Requests]
@@ -81,9 +78,6 @@ class RequestList:
             priority = self.word[row] & REQUEST_PRIORITY
             requests[kind] = Requests(node=node, depth=depth, priority=priority)
         return requests
-
-    def __repr__(self) -> str:
-        return f"RequestList(of at most {len(self.node)} nodes)"
 
 
 def coarser_requests(

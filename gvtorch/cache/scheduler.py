@@ -8,7 +8,6 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from ..base import check
 from ..base.constants import REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
 from .requests import Requests, RequestsByKind
 
@@ -49,20 +48,9 @@ class Scheduler:
             loads: Most bricks a frame.
             subdivisions: Most node tiles a frame.
             milliseconds: Most time a frame for production, shared by both kinds; None: no limit.
-
-        Raises:
-            ValueError: A number is out of its range.
         """
-        if order not in ("coarse", "fine"):
-            raise ValueError(f"Engine: order must be 'coarse' or 'fine', got {order!r}")
-        self.order = order
-        self.most = {
-            REQUEST_LOAD: check.whole("Engine", "load_budget", loads, low=1),
-            REQUEST_SUBDIVIDE: check.whole("Engine", "subdivide_budget", subdivisions, low=1),
-        }
-        if milliseconds is not None:
-            check.number("Engine", "time_budget", milliseconds, low=0, open_low=True)
-        self.milliseconds = milliseconds
+        self.order, self.milliseconds = order, milliseconds
+        self.most = {REQUEST_LOAD: loads, REQUEST_SUBDIVIDE: subdivisions}
         self.rate: dict[int, float | None] = dict.fromkeys(self.most)
         self.spent = dict.fromkeys(self.most, 0)
         self._budget = dict(self.most)

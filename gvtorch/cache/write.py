@@ -47,11 +47,8 @@ class Targets:
         """
         pool, tree = cache.nodes, self.tree
         words = pool.brick_tn if kind == REQUEST_LOAD else pool.child_tn
-        tiles = pool.loc_t4, pool.parent_t, pool.tree_t, pool.shared_t
-        return lacking(words, *tiles, self.node, self.loc, tree.number, tree.root, tree.branching)
-
-    def __repr__(self) -> str:
-        return f"Targets({len(self)} nodes of tree {self.tree.number})"
+        places = pool.loc_t4, pool.parent_t, pool.tree_t, pool.shared_t
+        return lacking(words, *places, self.node, self.loc, tree.number, tree.root, tree.branching)
 
 
 @dataclass
@@ -78,11 +75,8 @@ class Children:
     is_alias: Tensor  # (k, n) bool
     alias: Tensor | None  # (k, n, 4) loc of alias targets
 
-    def __repr__(self) -> str:
-        return f"Children(of {len(self.child)} tiles)"
 
-
-def write_tiles(cache: Cache, targets: Targets, children: Children) -> Written:
+def tiles(cache: Cache, targets: Targets, children: Children) -> Written:
     """Gives nodes their children: takes tiles, unlinks, writes and links them."""
     lru, pool, per_tile = cache.lru[REQUEST_SUBDIVIDE], cache.nodes, cache.nodes.nodes_per_tile
     tree, node = targets.tree, targets.node
@@ -112,9 +106,9 @@ def write_tiles(cache: Cache, targets: Targets, children: Children) -> Written:
         for name, tensor in values.items():
             movable(held[name])[tile, :width] = movable(tensor)[rows]
     words = (pool.child_tn, pool.brick_tn, pool.request_tn)
-    tiles = (pool.loc_t4, pool.parent_t, pool.tree_t, pool.stamp_t, pool.shared_t)
+    places = (pool.loc_t4, pool.parent_t, pool.tree_t, pool.stamp_t, pool.shared_t)
     made = (children.child.contiguous(), children.brick.contiguous(), node, targets.loc)
-    link_tiles(*words, *tiles, *made, rows, tile_k, tree.number, cache.frame)
+    link_tiles(*words, *places, *made, rows, tile_k, tree.number, cache.frame)
     if children.alias is not None:
         row, child = children.is_alias[rows].nonzero().unbind(1)
         target = tree.find(children.alias[rows][row, child])
@@ -130,12 +124,12 @@ def _alias(cache: Cache, node: Tensor, target: Tensor) -> None:
     child[node], brick[node] = child[target], brick[target]
     for words in (*pool.constants.values(), *pool.ranges.values()):
         _copy_rows(words, node, target)
-    tiles, slots = child[node], brick[node]
-    pool.shared_t[tiles[tiles >= 0].to(torch.int64)] = True
-    cache.bricks.shared_b[slots[slots >= 0].to(torch.int64)] = True
+    for shared, pointer in ((pool.shared_t, child), (cache.bricks.shared_b, brick)):
+        slot = pointer[node]
+        shared[slot[slot >= 0].to(torch.int64)] = True
 
 
-def write_bricks(cache: Cache, targets: Targets, data: Voxels | Sequence[Chunk]) -> Written:
+def bricks(cache: Cache, targets: Targets, data: Voxels | Sequence[Chunk]) -> Written:
     """Gives nodes their bricks: takes slots, unlinks, writes and links them.
 
     Args:
@@ -195,16 +189,16 @@ def put_bricks(cache: Cache, slot_k: Tensor, node: Tensor, data: Voxels | Sequen
 def _fill_slots(cache: Cache, slot: Tensor, data: Mapping[str, Tensor]) -> int:
     """Writes voxels that are on the device; returns how many bytes they are."""
     channels = cache.bricks.bricks
-    for name, bricks in channels.items():
+    for name, held in channels.items():
         if name in data:
-            to, rows = wide_rows(bricks, data[name])
+            to, rows = wide_rows(held, data[name])
             to.index_copy_(0, slot, rows)
         else:
-            wide_rows(bricks)[0].index_fill_(0, slot, 0)  # a tree without this channel
+            wide_rows(held)[0].index_fill_(0, slot, 0)  # a tree without this channel
     return sum(rows.nbytes for name, rows in data.items() if name in channels)
 
 
-def write_uniform(
+def uniform(
     cache: Cache, targets: Targets, word: Tensor, constants: Mapping[str, Tensor]
 ) -> Written:
     """Marks nodes as EMPTY or CONSTANT: they need no bricks.

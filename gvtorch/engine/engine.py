@@ -19,7 +19,8 @@ from torch import Tensor
 from ..base import check
 from ..base.records import Hits, Rays, add
 from ..base.stage import Progress, collect_timings, mark, milliseconds, no_progress, stage
-from ..cache import Cache, RequestsByKind, Scheduler, coarser_requests
+from ..cache import Cache, RequestsByKind, Scheduler
+from ..cache.requests import coarser_requests
 from ..cameras import Camera
 from ..cameras.custom import as_camera
 from ..ops.trace import choose_backend
@@ -71,10 +72,7 @@ class Engine:
                 roots, or producers do not agree on a channel.
             ProductionError: A root can't be produced.
         """
-        unknown = sorted(set(options) - set(EngineOptions.__dataclass_fields__))
-        if unknown:
-            known = ", ".join(EngineOptions.__dataclass_fields__)
-            raise ValueError(f"Engine: unknown option {unknown[0]!r}; known: {known}")
+        check.known("Engine", options, EngineOptions)
         self.options = EngineOptions(**options)
         self.device = check.device("Engine", self.options.device)
         producers = dict(scene) if isinstance(scene, Mapping) else {"scene": scene}
@@ -173,7 +171,7 @@ class Engine:
             raise
         if self.options.monitor:
             self._report.add(stats)
-        self.production.raise_if_strict()
+        self.production.failures.raise_if_strict()
 
     def serve_last_frame(self, stats: FrameStats, wait: bool = False) -> None:
         """Serves the requests of the last frame and writes answers that came late.
@@ -521,7 +519,7 @@ class FrameGraph:
         return replace(self._picture, stats=stats), stats
 
     def __repr__(self) -> str:
-        return f"FrameGraph({self._view!r})"
+        return f"FrameGraph({self._view.camera!r})"
 
 
 def _most_frames(mode: str, productions: int, max_frames: int) -> int:

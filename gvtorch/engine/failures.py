@@ -38,11 +38,13 @@ class Failures:
     """All nodes that failed, by place: a node's tile may be given away and come back.
 
     Attributes:
+        strict: `raise_if_strict` raises.
         newest: The last 1000, by name.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, strict: bool) -> None:
         """Starts with none."""
+        self.strict = strict
         self.newest: deque[Failure] = deque(maxlen=_KEPT)
         self._places: set[tuple[str, int, tuple[int, ...]]] = set()  # tree, kind, loc
         self._first: tuple[Failure, BaseException | None] | None = None
@@ -69,10 +71,12 @@ class Failures:
         failed = [(name, kind, tuple(loc)) in self._places for loc in places]
         return torch.tensor(failed, device=batch.targets.node.device) if any(failed) else None
 
-    def raise_first(self, strict: bool) -> None:
-        """Raises `ProductionError` for the first failure since the last call, if `strict`."""
+    def raise_if_strict(self) -> None:
+        """Raises `ProductionError` for the first failure since the last call, if strict: at the end
+        of a frame, when the pools are in order.
+        """
         first, self._first = self._first, None
-        if strict and first is not None:
+        if self.strict and first is not None:
             failure, cause = first
             raise ProductionError(str(failure)) from cause
 
@@ -80,6 +84,3 @@ class Failures:
         """Forgets them all."""
         self.newest.clear()
         self._places.clear()
-
-    def __repr__(self) -> str:
-        return f"Failures({len(self)} nodes)"

@@ -30,12 +30,16 @@ class EngineOptions:
     monitor: bool = True  # time the stages and remember the last frames, for `report`
 
     def __post_init__(self) -> None:
-        """Checks what the pools and the scheduler do not check themselves."""
+        """Checks what the pools do not check themselves."""
         if self.loading not in ("straight", "levels"):
             raise ValueError(
                 f"Engine: loading must be 'straight' or 'levels', got {self.loading!r}"
             )
+        if self.order not in ("coarse", "fine"):
+            raise ValueError(f"Engine: order must be 'coarse' or 'fine', got {self.order!r}")
         check.number("Engine", "patience", self.patience, low=0, open_low=True)
+        if self.time_budget is not None:
+            check.number("Engine", "time_budget", self.time_budget, low=0, open_low=True)
         for name in ("load_budget", "subdivide_budget"):
             check.whole("Engine", name, getattr(self, name), low=1)
         check.whole("Engine", "scout_rounds", self.scout_rounds, low=0)

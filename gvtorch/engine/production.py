@@ -20,17 +20,8 @@ import torch
 from torch import Tensor
 
 from ..base.constants import ABSENT, CONSTANT, EMPTY, REQUEST_LOAD
-from ..cache import (
-    KINDS,
-    Cache,
-    Scheduler,
-    Targets,
-    Written,
-    share_bricks,
-    write_bricks,
-    write_tiles,
-    write_uniform,
-)
+from ..cache import KINDS, Cache, Scheduler, write
+from ..cache.write import Targets, Written
 from ..pool import Staging
 from ..pool.staging import upload
 from ..producers import Bricks, Region, Regions
@@ -88,15 +79,14 @@ class Production:
 
     Attributes:
         failures: What failed.
-        strict: A failure raises `ProductionError` at the end of its frame.
         staging: The way of bricks from the host to a CUDA device; None where they are there.
     """
 
     def __init__(self, cache: Cache, scheduler: Scheduler, patience: float, strict: bool) -> None:
         """Waits for nothing yet."""
         self.cache, self.scheduler = cache, scheduler
-        self.patience, self.strict = patience, strict
-        self.failures = Failures()
+        self.patience = patience
+        self.failures = Failures(strict)
         self._raised = self._skipped = 0
         self._waiting: list[_Waiting] = []
         self._held: list[Answered] = []  # the staging ring had no room
@@ -162,7 +152,7 @@ class Production:
             batch, answer = queue.popleft()
             if isinstance(answer, Regions):
                 children = children_of(batch, answer, self.cache)
-                self._add_up(batch, write_tiles(self.cache, batch.targets, children), stats)
+                self._add_up(batch, write.tiles(self.cache, batch.targets, children), stats)
             elif isinstance(answer, Sent):
                 self._write_sent(batch, answer, stats)
             else:
@@ -180,12 +170,6 @@ class Production:
             longest = min(limit, max(0.0, left) + 1e-3)
             wait_for(futures, timeout=longest, return_when=FIRST_COMPLETED)
             wait_for(futures, timeout=more)
-
-    def raise_if_strict(self) -> None:
-        """Raises `ProductionError` for the first failure since the last call, if strict: at the end
-        of a frame, when the pools are in order.
-        """
-        self.failures.raise_first(self.strict)
 
     def forget_failures(self) -> None:
         """Lets what failed be asked for again."""
@@ -322,14 +306,14 @@ class Production:
             word = torch.where(answer.kind == Region.CONSTANT, CONSTANT, EMPTY).to(torch.int32)
             constants = {name: upload(rows, device) for name, rows in answer.constants.items()}
             word = upload(word, device)
-            written = write_uniform(self.cache, batch.targets, word, constants)
+            written = write.uniform(self.cache, batch.targets, word, constants)
             self._add_up(batch, written, stats)
             return []
         answer = shipped(batch, answer, self.staging)
         if isinstance(answer, Sent):
             self._write_sent(batch, answer, stats)
         else:
-            written = write_bricks(self.cache, batch.targets, answer.data)
+            written = write.bricks(self.cache, batch.targets, answer.data)
             self._add_up(batch, written, stats)
         return []
 
@@ -343,7 +327,7 @@ class Production:
             self._mark(rest)
             self._held.append(Answered(rest, Bricks(data=shipment.rest)))
         if len(sent):
-            self._add_up(sent, write_bricks(self.cache, sent.targets, shipment.chunks), stats)
+            self._add_up(sent, write.bricks(self.cache, sent.targets, shipment.chunks), stats)
 
     def _write_aliases(self, batch: RequestBatch, alias: Tensor) -> list[Answered]:
         """Shares the bricks of alias targets (k, 4); where such a brick is not here, it is made for
@@ -353,7 +337,7 @@ class Production:
         other = tree.find(alias)
         words = self.cache.nodes.brick_tn.view(-1)
         there = (other >= 0) & (words[other.clamp(min=0)] != ABSENT)
-        share_bricks(self.cache, targets[there], other[there])
+        write.share_bricks(self.cache, targets[there], other[there])
         if bool(there.all()):
             return []
         alone = batch[~there]

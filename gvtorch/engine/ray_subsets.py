@@ -26,7 +26,6 @@ class RaySubsets:
         done: Rays that need no more passes.
         next: (count,) bool, to be traced next.
         over: Nothing is left to trace, or tracing does not help.
-        stuck: The last pass moved nothing.
         crowded: The pools were too small for all rays at once.
     """
 
@@ -43,8 +42,8 @@ class RaySubsets:
         self._open = torch.ones(count, dtype=torch.bool, device=device)
         self._size = count
         self.next = self._open.clone()
-        self.over = self.stuck = self.crowded = False
-        self.done = self._given_up = 0
+        self.over = self.crowded = self._given_up = False
+        self.done = 0
 
     @property
     def whole(self) -> bool:
@@ -66,16 +65,15 @@ class RaySubsets:
         sums = torch.stack([rays.sum() for rays in (finished, left, self._open)])
         just_done, remaining, unfinished = sums.tolist()
         moved = sum(stats.produced.values()) + stats.stale > 0 or stats.failed > failed
-        self.stuck = not moved and not just_done
         self.done = self.count - unfinished
-        if self.stuck and not stats.pending:
+        if not (moved or just_done or stats.pending):
             if not stats.capacity_exceeded:
                 self.over = True
                 return
             self.crowded = True
             self._size = remaining // 2
             if self._size == 0:  # one ray alone does not fit
-                self._given_up += 1
+                self._given_up = True
                 self._open &= ~left
                 self.done += remaining
                 self._size, remaining = 1, 0
@@ -92,9 +90,6 @@ class RaySubsets:
         first = torch.where(scouts.any(), scouts, group)
         self.next = first & (first.cumsum(0) <= self._size)
         self.over = self.done == self.count
-
-    def __repr__(self) -> str:
-        return f"RaySubsets({self.done} of {self.count} rays done)"
 
 
 def scouts(missed: Tensor, width: int) -> Tensor:

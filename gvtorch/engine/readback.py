@@ -100,9 +100,6 @@ class Readback:
         stats.tiles_used, stats.bricks_used = counts.tiles_used, counts.bricks_used
         stats.samples, stats.converged = counts.samples, self.converged()
 
-    def __repr__(self) -> str:
-        return f"Readback(frame {self.stats.frame}, {'here' if self.arrived else 'on its way'})"
-
 
 class Readbacks:
     """The frames whose counts are on their way, oldest first."""
@@ -158,6 +155,3 @@ class Readbacks:
         self._steady = readback.converged()
         readback.stats.settle()
         return readback
-
-    def __repr__(self) -> str:
-        return f"Readbacks({len(self)} frames on their way)"

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from ..base.constants import ABSENT, CONSTANT, EMPTY, REQUEST_LOAD, TERMINAL
 from ..base.volume import movable
-from ..cache import KINDS, Cache, Children, Targets
+from ..cache import KINDS, Cache
+from ..cache.write import Children, Targets
 from ..pool import N3Tree, Staging, TableRows
 from ..pool.brick_table import on_host
 from ..pool.staging import Shipment, upload

@@ -10,7 +10,8 @@ import torch
 from ..base import check
 from ..base.constants import ABSENT, CONSTANT, EMPTY, TERMINAL
 from ..base.volume import movable
-from ..cache import Cache, put_bricks
+from ..cache import Cache
+from ..cache.write import put_bricks
 from ..pool import BrickPool, Channel, N3Tree, NodePool
 from ..producers import Layout, Nodes, Producer, Region
 from ..producers.answer import checked_bricks, checked_regions

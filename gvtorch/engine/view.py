@@ -52,9 +52,6 @@ class View:
         """Puts the hits over the background."""
         return develop(hits, self.camera, self.options, stats, self.numbers)
 
-    def __repr__(self) -> str:
-        return f"View({self.camera!r})"
-
 
 def trace_scene(
     trees: Mapping[str, ProducedTree],

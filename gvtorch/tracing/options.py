@@ -106,10 +106,7 @@ def render_options(
         ValueError: One is unknown, of the wrong type or out of its range, or does not fit the
             camera's pictures.
     """
-    known = RenderOptions.__dataclass_fields__
-    unknown = sorted(set(settings) - set(known))
-    if unknown:
-        raise ValueError(f"{where}: unknown option {unknown[0]!r}; known: {', '.join(known)}")
+    check.known(where, settings, RenderOptions)
     options = RenderOptions(**settings)
     if camera is None:
         return options
