@@ -1,7 +1,7 @@
 """Names for the steps of a frame: `with stage("trace"):` feeds timer and profiler.
 
-Times are differences of marks. On CUDA a mark is an event in the stream, so that taking the time
-makes nobody wait; only who reads it does.
+Times are differences of marks. On CUDA a mark is an event in the stream: taking one does not make
+the host wait, reading the time between two does.
 """
 
 from __future__ import annotations
@@ -13,14 +13,13 @@ from contextvars import ContextVar
 
 import torch
 
-#: Told (what, done, total) by work that can be long; the command line draws its progress bar from
-#: it.
+#: Told (what, done, total) by work that can take long, as a progress bar needs it.
 Progress = Callable[[str, int, int], None]
 Mark = float | torch.cuda.Event
 
 
 def no_progress(what: str, done: int, total: int) -> None:
-    """Listens to nothing."""
+    """Shows nothing."""
 
 
 def mark(device: torch.device) -> Mark:
@@ -49,7 +48,7 @@ class Timings:
         self._spans: list[tuple[str, Mark, Mark]] = []
 
     def add(self, name: str, start: Mark, end: Mark) -> None:
-        """Takes note of a stage."""
+        """Adds a stage."""
         self._spans.append((name, start, end))
 
     def as_dict(self) -> dict[str, float]:
@@ -65,8 +64,8 @@ _timings: ContextVar[Timings | None] = ContextVar("gvtorch_timings", default=Non
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Names a step: adds its time to the open `collect_timings()` and shows it to torch's
-    profiler. It does nothing where neither listens.
+    """Names the step that the block does, for the open `collect_timings()` and torch's profiler;
+    costs nothing where neither is on.
     """
     timings = _timings.get()
     if timings is None and not torch.autograd._profiler_enabled():
@@ -85,7 +84,7 @@ def stage(name: str) -> Iterator[None]:
 
 @contextmanager
 def collect_timings(device: torch.device) -> Iterator[Timings]:
-    """Yields what gathers the times of stages while the block runs."""
+    """Yields the times of the stages that the block runs."""
     timings = Timings(device)
     token = _timings.set(timings)
     try:

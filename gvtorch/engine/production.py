@@ -369,6 +369,6 @@ class Production:
         self.cache.mark_pending(batch.targets.node, batch.kind, lacking)
 
     def _fail(self, batch: RequestBatch, message: str, cause: Exception | None = None) -> None:
-        """Counts and names a batch's nodes; they stay marked as pending: nobody asks again."""
+        """Counts and names a batch's nodes; they stay marked as pending: no ray asks again."""
         self._mark(batch)
         self.failures.add(batch, message, cause)

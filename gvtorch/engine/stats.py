@@ -40,11 +40,11 @@ def waits(make: Callable[[], T]) -> T:
 class FrameStats(RenderStats):
     """What a frame of the engine cost, and what it asked for.
 
-    Times, and what rays used and missed, are known when the device has finished the frame: who
-    reads one of these first waits for that frame, nobody else does; `settle` waits for all of them.
-    Produced is what this call wrote: for requests of the frame before, for those of the scouts that
-    went ahead of the picture, and answers that came late. Requests and deferred count the requests
-    of scouts too; use, misses and samples are those of the picture alone.
+    Times, and what rays used and missed, are known when the device has finished the frame: reading
+    one of these fields waits for that frame; `settle` waits for all of them. What this frame
+    produced are answers to requests of the frame before and of its own scouts, and answers that
+    came late. Requests and deferred count those of scouts too; use, misses and samples are those of
+    the picture alone.
     """
 
     milliseconds: float = waits(float)  # on the device
@@ -91,14 +91,16 @@ class FrameStats(RenderStats):
         """Returns the statistics of a picture up to this frame: its own, with the sums of what the
         frames `before` took, and the most tiles and bricks that one frame used.
         """
-        joined = replace(self)
-        for name in ("milliseconds", "bytes_uploaded"):
-            setattr(joined, name, getattr(before, name) + getattr(self, name))
-        for name in ("tiles_used", "bricks_used"):
-            setattr(joined, name, max(getattr(before, name), getattr(self, name)))
-        for name in ("stages", "produced", "evicted"):
-            setattr(joined, name, add(dict(getattr(before, name)), getattr(self, name)))
-        return joined
+        return replace(
+            self,
+            milliseconds=before.milliseconds + self.milliseconds,
+            bytes_uploaded=before.bytes_uploaded + self.bytes_uploaded,
+            tiles_used=max(before.tiles_used, self.tiles_used),
+            bricks_used=max(before.bricks_used, self.bricks_used),
+            stages=add(dict(before.stages), self.stages),
+            produced=add(dict(before.produced), self.produced),
+            evicted=add(dict(before.evicted), self.evicted),
+        )
 
     def after(self, before: RenderStats) -> RenderStats:
         """See `RenderStats.after`; the whole has converged if both parts have."""
