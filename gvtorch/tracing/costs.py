@@ -45,10 +45,10 @@ class Cost:
     """
 
     samples: Tensor  # int32 places at which the shader was evaluated
-    nodes: Tensor  # int32 nodes visited, those that were left unseen too
+    nodes: Tensor  # int32 nodes visited, including those that were skipped
     lod: Tensor  # depth of the nodes whose bricks were sampled, 0 for the root
     age: Tensor  # frames since the bricks were written
-    fill: Tensor  # share of the bricks' voxels of which the transfer function shows something
+    fill: Tensor  # share of the bricks' voxels that the transfer function makes visible
     stats: RenderStats
 
     def __repr__(self) -> str:
@@ -63,8 +63,8 @@ class Cost:
 
         Args:
             name: samples, nodes, lod, age or fill.
-            low: What gets the first colour.
-            high: What gets the last one; the largest value if left out.
+            low: Value of the colour map's first colour.
+            high: Value of its last one; the largest in the image if left out.
             colormap: A name of `kornia.color.ColorMapType`.
 
         Raises:
@@ -104,7 +104,7 @@ def cost(
     progress: Progress = no_progress,
     **options: Unpack[RenderSettings],
 ) -> Cost:
-    """Counts what the rays of a picture do. Nothing is written: neither stamps nor requests.
+    """Counts what the rays of a picture do; writes neither stamps nor requests.
 
     Of an engine's tree (`engine.trees[NAME].tree`) it shows the last frame. Rays are walked node
     by node outside the kernel, which takes many times as long as the picture itself.
@@ -114,8 +114,7 @@ def cost(
         camera: See `render`.
         shader: The transfer function.
         progress: Told how many rays are done.
-        **options: Fields of `RenderOptions`; lighting has no part in it, for transfer functions
-            have no normals.
+        **options: Fields of `RenderOptions`; no lighting, since transfer functions have no normals.
 
     Raises:
         ValueError: See `render`.
@@ -169,8 +168,8 @@ class _Counter(Tracer):
         return nodes
 
     def __call__(self, rays: Rays) -> Hits:
-        """Sums of what each sample adds to alpha: alone, times the depth of its node, if it has a
-        brick, times its age, times its fill.
+        """Returns as features, for each ray, sums over its samples weighted by what they add to
+        alpha: of 1, the node's depth, whether it has a brick, the brick's age and its fill.
         """
         own = (self.tree, self.arguments, self.channel, self.backend, self.shade, 5)
         sums = march(rays, *own, limit=1, by_node=False)
@@ -186,7 +185,9 @@ class _Counter(Tracer):
         )
 
     def shade(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """One, depth of the node, whether it has a brick, its age, its fill; and alpha."""
+        """(k, 5) of samples: 1, the node's depth, whether it has a brick, the brick's age and fill;
+        and (k,) alpha.
+        """
         values = batch.values()[:, self.component, None]
         _, alpha = self.module(values, values, values, batch.lengths)  # it reads no places
         slot = batch.segments.brick[batch.segment, 0].to(torch.int64)
@@ -201,7 +202,7 @@ class _Counter(Tracer):
         return torch.stack([c.to(alpha.dtype) for c in columns], 1), alpha[:, 0]
 
     def _fill(self, slots: Tensor) -> None:
-        """Works out how full bricks are, once for each."""
+        """Computes how full bricks are, each brick once."""
         wanted = torch.zeros_like(self.fill_b, dtype=torch.bool)
         wanted[slots] = True
         fresh = (wanted & (self.fill_b < 0)).nonzero()[:, 0]

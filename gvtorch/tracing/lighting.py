@@ -1,9 +1,9 @@
 """`Lighting`: shadows, ambient occlusion and one bounce of indirect light, by cones.
 
-A pixel is traced with the colours that its shader gives without light. From the place it sees,
-cones go to the lights and to all sides, through the same tree, at the level that their width asks
-for; what they miss is streamed as what is seen is. A light as wide as it looks from there gives a
-soft shadow.
+A pixel is traced with its shader's unlit colours. From the surface point it sees, cones are traced
+to the lights and over the hemisphere, through the same tree, at the level of detail of their width;
+nodes they miss are requested like any others. The cone to a light is as wide as the light looks
+from there, which gives soft shadows.
 
 Sources: Crassin, Neyret, Sainz, Green, Eisemann, "Interactive indirect illumination using voxel
 cone tracing", Computer Graphics Forum 2011; Crassin, PhD thesis 2011, on voxel cone tracing; Blinn,
@@ -39,35 +39,35 @@ from ..shaders.lights import (
 from .composite import Trace, behind, over
 from .thin_lens import ThinLens
 
-#: Where secondary rays begin, in voxels: those to lights so far off the surface; those all around
-#: closer, so that they stand in clefts, but begin only after a way.
+#: Where cones begin, in voxels. Cones to lights are lifted `_OFF` above the surface. Hemisphere
+#: cones are lifted less, `_CLOSE`, to sample crevices, and start marching after `_WAY` voxels.
 _OFF, _CLOSE, _WAY = 1.5, 0.75, 1.5
-_GRAZING = 0.5  # cosine to the normal
-#: Share of a hemisphere's light, cosine counted, from less than 30 degrees off the normal; the
-#: other five cones share the rest.
+_GRAZING = 0.5  # smallest cosine to the normal along which a light's cone is lifted
+#: The upright cone of a hemisphere stands for directions up to 30 degrees off the normal: its share
+#: of the cosine-weighted light. Five tilted cones share the rest.
 _UPRIGHT = 0.25
-_TILT = math.radians(50)  # of those: the mean, cosine counted
-_FINER = 0.5  # of the cone's width, is that of the cones that go on from where it ends
-_WIDE = 2 * math.tan(math.radians(17))  # growth of all six; wider ones meet their own surface
+_TILT = math.radians(50)  # cosine-weighted mean angle of the directions they stand for
+_WIDE = 2 * math.tan(math.radians(17))  # growth of all six; wider cones hit their own surface
+_FINER = 0.5  # width of the shadow cones of bounced light, relative to the cone that met matter
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lighting:
-    """What light a scene stands in. It takes a shader with normals: `Lit`, `StoredColor`,
-    `Isosurface` or `DistanceField`, of which it uses the material.
+    """The light of a scene, for a shader with normals: `Lit`, `StoredColor`, `Isosurface` or
+    `DistanceField`, whose material it uses.
 
-    Light of a pixel = base * (ambient * sky * (1 - occlusion) + diffuse * (direct + indirect))
-    + specular * direct.
+    Colour of a pixel = base * (material.ambient * ambient * (1 - occlusion)
+    + material.diffuse * (direct + indirect)) + material.specular * highlight.
     """
 
     lights: Sequence[Light] | None = None  # None: the shader's own
-    shadows: float = 1.0  # how much of the light they take away, 0 to 1; 0: no cone is traced
-    shadow_cones: int = 1  # to each light that has a size; more: exacter penumbras
-    occlusion: float = 0.0  # how much of the ambient light near matter takes away, 0 to 1
+    shadows: float = 1.0  # how dark full shadow is, 0 to 1; 0: no cone is traced
+    shadow_cones: int = 1  # to each light that has a size; more give more exact penumbras
+    occlusion: float = 0.0  # share of the ambient light that matter nearby can block, 0 to 1
     indirect: float = 0.0  # factor of the light that comes from lit matter nearby
     reach: float | None = None  # of occlusion and indirect light; None: a quarter of the box
     frame: Frame | str = Frame.WORLD  # of reach: world units, or largest sides of the scene's box
-    ambient: Triple = (1.0, 1.0, 1.0)  # light from all around, linear RGB
+    ambient: Triple = (1.0, 1.0, 1.0)  # light from all directions, linear RGB
 
     def __post_init__(self) -> None:
         """Checks every number.
@@ -96,7 +96,7 @@ class Lighting:
         return check.brief(self)
 
     def placed(self, box: Tensor) -> Lighting:
-        """Returns it in world units, given the (2, 3) box of the scene."""
+        """Returns the lighting with its reach in world units, given the scene's (2, 3) box."""
         if self.reach is not None and self.frame is Frame.WORLD:
             return self
         side = float((box[1] - box[0]).max())
@@ -105,33 +105,33 @@ class Lighting:
 
 
 @dataclass(frozen=True)
-class _Places:
-    """What rays see: one place each, float64 in the world."""
+class _Points:
+    """The points where rays met matter, one a ray, float64 in world units."""
 
     position: Tensor  # (r, 3)
     normal: Tensor  # (r, 3) unit, towards the eye
-    turned: Tensor  # (r,) bool, the normal is the shader's; else there is none, and it is the eye's
-    eye: Tensor  # (r, 3) unit, to where the ray came from
+    has_normal: Tensor  # (r,) bool, the shader gave the normal; else it is the direction to the eye
+    eye: Tensor  # (r, 3) unit, back along the ray
     width: Tensor  # (r,) of the ray's cone there
-    seen: Tensor  # (r,) bool, there is a place
-    lamp: Tensor | None  # (r, 3) where a `Headlight` stands; None: at the eye of these rays
-    row: int  # pixels of a row, see `Rays`
+    seen: Tensor  # (r,) bool, the ray met matter
+    headlight: Tensor | None  # (r, 3) its position; None: where these rays came from
+    row: int  # pixels of a row, see `Rays.width`
 
 
 class _Tally:
-    """What all rays of a pixel cost."""
+    """Samples and misses of all rays of a pixel."""
 
     def __init__(self, hits: Hits) -> None:
         self.samples, self.missed = hits.samples, hits.missed
 
     def __call__(self, hits: Hits) -> Hits:
-        """Adds some."""
+        """Adds those of some hits, which it returns."""
         self.samples, self.missed = self.samples + hits.samples, self.missed | hits.missed
         return hits
 
 
 class Lighted:
-    """Traces rays, and from where they end to the light."""
+    """Traces rays, then cones from the points that they met, and lights these points."""
 
     def __init__(
         self,
@@ -145,18 +145,18 @@ class Lighted:
         cone_scale: float,
         lens: ThinLens | None = None,
     ) -> None:
-        """Takes what traces the eye's rays without light.
+        """Prepares the lighting of one frame.
 
         Args:
-            trace: Traces the eye's rays: base colours, and normals.
-            blocker: Traces cones whose alpha alone counts.
-            matter: Traces cones that bring light back: base colours, and normals; None where there
-                is no indirect light.
+            trace: Traces the eye's rays: unlit colours and normals.
+            blocker: Traces cones of which only alpha is used.
+            matter: Traces cones to matter that reflects light: unlit colours and normals; None
+                where there is no indirect light.
             lighting: In world units.
-            material: How matter takes light.
+            material: How matter reflects light.
             voxel: World size of the finest voxel's largest side.
-            cone_scale: Factor that the tracers put on cones.
-            lens: In world units.
+            cone_scale: Factor by which the tracers widen cones.
+            lens: Depth of field of the eye's rays, in world units.
         """
         self._trace, self._blocker, self._matter = trace, blocker, matter
         self._lighting, self._material = lighting, material
@@ -169,18 +169,18 @@ class Lighted:
         color, m = hits.color, self._material
         look = (self._lighting.ambient, m.ambient, m.diffuse, m.specular)
         sky, (ambient, diffuse, specular) = pack(look, color.dtype, color.device).split(3)
-        tally, places = _Tally(hits), self._places(rays, hits, self._lens)
-        matt, shine = self._direct(places, tally, self._lighting.shadow_cones)
-        clear, bounced = self._around(places, rays.origin.to(torch.float64), tally)
-        light = ambient * sky * clear.to(color)
-        light = light + diffuse * (matt + bounced).to(color)
+        tally, points = _Tally(hits), self._points(rays, hits, self._lens)
+        direct, highlight = self._direct(points, tally, self._lighting.shadow_cones)
+        unblocked, bounced = self._hemisphere(points, rays.origin.to(torch.float64), tally)
+        light = ambient * sky * unblocked.to(color)
+        light = light + diffuse * (direct + bounced).to(color)
         taken = hits.alpha - (1 - rays.light()).to(color)  # of the light, by these rays themselves
-        color = color * light + taken * specular * shine.to(color)
+        color = color * light + taken * specular * highlight.to(color)
         color = torch.where(hits.alpha > 0, color, 0.0)  # a closed ray may have no direction
         return dataclasses.replace(hits, color=color, samples=tally.samples, missed=tally.missed)
 
-    def _places(self, rays: Rays, hits: Hits, lens: ThinLens | None = None) -> _Places:
-        """Where rays ended; `lens` is what they went through."""
+    def _points(self, rays: Rays, hits: Hits, lens: ThinLens | None = None) -> _Points:
+        """The points that rays met; `lens` is the depth of field that they were traced with."""
         depth = hits.depth[:, 0].to(torch.float64)
         seen = depth < torch.inf
         t = torch.where(seen, depth, 0.0)
@@ -191,156 +191,152 @@ class Lighted:
         if lens is not None:
             width = width + lens.cone(t)
         normal = torch.zeros_like(direction) if hits.normal is None else hits.normal.to(direction)
-        turned = (normal != 0).any(1)
-        return _Places(
+        has_normal = (normal != 0).any(1)
+        return _Points(
             position=origin + t[:, None] * direction,
-            normal=torch.where(turned[:, None], normalize(normal, dim=1), -direction),
-            turned=turned & seen,
+            normal=torch.where(has_normal[:, None], normalize(normal, dim=1), -direction),
+            has_normal=has_normal & seen,
             eye=-direction,
             width=width,
             seen=seen,
-            lamp=None,
+            headlight=None,
             row=rays.width,
         )
 
-    def _direct(self, places: _Places, tally: _Tally, cones: int) -> tuple[Tensor, Tensor]:
-        """(r, 3) light by its cosine, and by the highlight's. A place without a normal faces the
-        light and has no highlight.
+    def _direct(self, points: _Points, tally: _Tally, cones: int) -> tuple[Tensor, Tensor]:
+        """(r, 3) diffuse light and (r, 3) highlight of all lights, with their shadows. A point
+        without a normal faces every light and has no highlight.
         """
-        (shininess,) = pack((self._material.shininess,), torch.float64, places.eye.device)
-        matt = shine = torch.zeros_like(places.position)
+        (shininess,) = pack((self._material.shininess,), torch.float64, points.eye.device)
+        diffuse = shine = torch.zeros_like(points.position)
         for light in self._lights:
-            color = pack((light.color,), torch.float64, places.eye.device)
-            beam, _ = _towards(light, places)
-            facing = torch.where(places.turned, (places.normal * beam).sum(1).clamp(min=0), 1.0)
-            half = normalize(beam + places.eye, dim=1)
-            highlight = (places.normal * half).sum(1).clamp(0, 1) ** shininess
-            highlight = torch.where(places.turned & (facing > 0), highlight, 0.0)
-            clear = self._visible(
-                light, 1 if _is_small(light) else cones, places, facing > 0, tally
-            )
-            lit = clear[:, None] * color
-            matt, shine = matt + facing[:, None] * lit, shine + highlight[:, None] * lit
-        return matt, shine
+            color = pack((light.color,), torch.float64, points.eye.device)
+            beam, _ = _towards(light, points)
+            facing = (points.normal * beam).sum(1).clamp(min=0)
+            facing = torch.where(points.has_normal, facing, 1.0)
+            half = normalize(beam + points.eye, dim=1)
+            highlight = (points.normal * half).sum(1).clamp(0, 1) ** shininess
+            highlight = torch.where(points.has_normal & (facing > 0), highlight, 0.0)
+            count = 1 if _is_small(light) else cones
+            lit = self._visible(light, count, points, facing > 0, tally)[:, None] * color
+            diffuse, shine = diffuse + facing[:, None] * lit, shine + highlight[:, None] * lit
+        return diffuse, shine
 
     def _visible(
-        self,
-        light: Light,
-        cones: int,
-        places: _Places,
-        facing: Tensor,
-        tally: _Tally,
+        self, light: Light, cones: int, points: _Points, facing: Tensor, tally: _Tally
     ) -> Tensor:
-        """(r,) share of a light that is seen from places. The eye's own light is seen wherever the
-        eye sees.
-        """
-        clear = torch.ones_like(places.width)
-        if not self._lighting.shadows or (isinstance(light, Headlight) and places.lamp is None):
-            return clear
-        beam, _ = _towards(light, places)
-        places = self._lifted(places, _OFF, beam)
-        beam, distance = _towards(light, places)
+        """(r,) share of a light that reaches points; a `Headlight` reaches all the eye sees."""
+        if not self._lighting.shadows or (
+            isinstance(light, Headlight) and points.headlight is None
+        ):
+            return torch.ones_like(points.width)
+        beam, _ = _towards(light, points)
+        points = self._lifted(points, _OFF, beam)
+        beam, distance = _towards(light, points)
         size = _size(light, distance)
         growth = 2 * CONE_OF_DISC / math.sqrt(cones) * size
         right, up = _beside(beam)
         start = torch.zeros_like(distance)
-        end = torch.where(facing & places.seen, distance, start)
+        end = torch.where(facing & points.seen, distance, start)
         blocked = torch.zeros_like(distance)
         for x, y in _disc(cones):
             aim = normalize(beam + size[:, None] * (x * right + y * up), dim=1)
-            hits = tally(self._blocker(self._cone(places, aim, growth, start, end)))
+            hits = tally(self._blocker(self._cone(points, aim, growth, start, end)))
             blocked = blocked + hits.alpha[:, 0] / cones
         return 1 - self._lighting.shadows * blocked
 
-    def _around(self, places: _Places, eye: Tensor, tally: _Tally) -> tuple[Tensor, Tensor]:
-        """(r, 1) share of the ambient light that comes through, and (r, 3) the light that matter
-        sends, seen from `eye` (r, 3). What lies beyond half of the reach takes half.
+    def _hemisphere(self, points: _Points, eye: Tensor, tally: _Tally) -> tuple[Tensor, Tensor]:
+        """(r, 1) share of the ambient light that is not occluded, and (r, 3) light that matter
+        around the points reflects; `eye` (r, 3) is where a `Headlight` stands. Matter farther away
+        than half of the reach blocks half as much.
         """
-        clear, bounced = torch.ones_like(places.position[:, :1]), torch.zeros_like(places.position)
+        unblocked, bounced = (
+            torch.ones_like(points.position[:, :1]),
+            torch.zeros_like(points.position),
+        )
         lighting, reach = self._lighting, self._lighting.reach
         if not (lighting.occlusion or lighting.indirect):
-            return clear, bounced
+            return unblocked, bounced
         assert reach is not None
         trace = self._blocker if self._matter is None else self._matter
-        some = places.seen.to(torch.float64)
-        start = _WAY * some * places.width.clamp(min=self._voxel)
+        some = points.seen.to(torch.float64)
+        start = _WAY * some * points.width.clamp(min=self._voxel)
         end = torch.maximum(start, reach * some)
         middle = torch.maximum(start, reach / 2 * some)
         growth = torch.full_like(end, _WIDE)
-        lifted = self._lifted(places, _CLOSE)
-        for weight, direction in _hemisphere(places.normal):
+        lifted = self._lifted(points, _CLOSE)
+        for weight, direction in _cones_over(points.normal):
             first, second = (
                 self._cone(lifted, direction, growth, *span)
                 for span in ((start, middle), (middle, end))
             )
             front = trace(first)
             hits = tally(over(front, trace(behind(second, front)), dimmed=True))
-            taken = (front.alpha + hits.alpha).to(clear) / 2
-            clear = clear - lighting.occlusion * weight * taken
+            taken = (front.alpha + hits.alpha).to(unblocked) / 2
+            unblocked = unblocked - lighting.occlusion * weight * taken
             if self._matter is not None:
-                bounced = bounced + weight * self._sent(first, hits, eye, tally)
-        return clear, lighting.indirect * bounced
+                bounced = bounced + weight * self._reflected(first, hits, eye, tally)
+        return unblocked, lighting.indirect * bounced
 
-    def _lifted(self, places: _Places, off: float, beam: Tensor | None = None) -> _Places:
-        """The same `off` voxels above, or widths of what the eye's ray saw: on the way along
-        `beam` (r, 3), if there is one and it does not graze, so that no shadow moves.
+    def _lifted(self, points: _Points, off: float, beam: Tensor | None = None) -> _Points:
+        """The points moved `off` voxels above the surface, or, where the eye's ray is wider than a
+        voxel, `off` of its widths. Along `beam` (r, 3) if given and not grazing, so that the
+        shadow stays where it is; else along the normal.
         """
-        way = places.normal
+        way = points.normal
         if beam is not None:
             rise = (way * beam).sum(1, keepdim=True)
             way = way + (beam - rise * way) / rise.clamp(min=_GRAZING)
-        height = off * places.width.clamp(min=self._voxel)[:, None]
-        return dataclasses.replace(places, position=places.position + height * way)
+        height = off * points.width.clamp(min=self._voxel)[:, None]
+        return dataclasses.replace(points, position=points.position + height * way)
 
     def _cone(
-        self, places: _Places, direction: Tensor, growth: Tensor, start: Tensor, end: Tensor
+        self, points: _Points, direction: Tensor, growth: Tensor, start: Tensor, end: Tensor
     ) -> Rays:
-        """Cones from places, as wide there as what the eye's ray saw; `growth` is that of the width
-        in the world. One that ends where it starts goes nowhere.
+        """Cones from points, as wide there as the eye's ray; `growth` (r,) is that of the width per
+        unit distance. A cone that ends where it starts is not traced.
         """
         return Rays(
-            origin=places.position,
+            origin=points.position,
             direction=direction,
-            cone=torch.stack((places.width, growth), 1) / self._cone_scale,
+            cone=torch.stack((points.width, growth), 1) / self._cone_scale,
             range=torch.stack((start, end), 1),
-            width=places.row,
+            width=points.row,
         )
 
-    def _sent(self, rays: Rays, hits: Hits, eye: Tensor, tally: _Tally) -> Tensor:
-        """(r, 3) light that matter sends back along cones that met it; a `Headlight` stays at the
-        eye.
-        """
-        places = self._places(rays, hits)
-        places = dataclasses.replace(places, width=_FINER * places.width, lamp=eye)
-        matt, _ = self._direct(places, tally, 1)
-        (diffuse,) = pack((self._material.diffuse,), torch.float64, matt.device)
-        return torch.where(places.seen[:, None], diffuse * matt * hits.color, 0.0)
+    def _reflected(self, rays: Rays, hits: Hits, eye: Tensor, tally: _Tally) -> Tensor:
+        """(r, 3) light that the matter met by cones reflects; a `Headlight` stays at the eye."""
+        points = self._points(rays, hits)
+        points = dataclasses.replace(points, width=_FINER * points.width, headlight=eye)
+        direct, _ = self._direct(points, tally, 1)
+        (diffuse,) = pack((self._material.diffuse,), torch.float64, direct.device)
+        return torch.where(points.seen[:, None], diffuse * direct * hits.color, 0.0)
 
 
-def _towards(light: Light, places: _Places) -> tuple[Tensor, Tensor]:
-    """(r, 3) unit directions to a light, and (r,) how far it is."""
-    if isinstance(light, Headlight) and places.lamp is None:
-        return places.eye, torch.zeros_like(places.width)
+def _towards(light: Light, points: _Points) -> tuple[Tensor, Tensor]:
+    """(r, 3) unit directions to a light, and (r,) its distances."""
+    if isinstance(light, Headlight) and points.headlight is None:
+        return points.eye, torch.zeros_like(points.width)
     if isinstance(light, DirectionalLight):
-        way = -pack((light.direction,), torch.float64, places.eye.device)
-        beam = unit(way.expand_as(places.position))  # of any length but 0
-        return beam, torch.full_like(places.width, torch.inf)
-    place = places.lamp
+        way = -pack((light.direction,), torch.float64, points.eye.device)
+        beam = unit(way.expand_as(points.position))  # of any length but 0
+        return beam, torch.full_like(points.width, torch.inf)
+    position = points.headlight
     if isinstance(light, PointLight):
-        place = pack((light.position,), torch.float64, places.eye.device)
-    assert place is not None
-    way = place - places.position
+        position = pack((light.position,), torch.float64, points.eye.device)
+    assert position is not None
+    way = position - points.position
     return normalize(way, dim=1), way.norm(dim=1)
 
 
 def _is_small(light: Light) -> bool:
-    """Whether it is known to have no size."""
+    """Whether a light is known to have no size, without reading tensors."""
     size = getattr(light, "angle", getattr(light, "radius", 0.0))
     return not isinstance(size, Tensor) and size == 0
 
 
 def _size(light: Light, distance: Tensor) -> Tensor:
-    """(r,) radius of a light over how far it is."""
+    """(r,) radius of a light over its distance."""
     if isinstance(light, Headlight):
         return torch.zeros_like(distance)
     if isinstance(light, PointLight):
@@ -350,7 +346,7 @@ def _size(light: Light, distance: Tensor) -> Tensor:
 
 
 def _disc(count: int) -> Iterator[tuple[float, float]]:
-    """Places spread evenly over the unit disc; one is its centre (Vogel, 1979)."""
+    """Points (x, y) spread evenly over the unit disc; a single one is its centre (Vogel, 1979)."""
     for number in range(count):
         radius = math.sqrt((number + 0.5) / count) if count > 1 else 0.0
         turn = number * math.pi * (3 - math.sqrt(5))
@@ -358,8 +354,8 @@ def _disc(count: int) -> Iterator[tuple[float, float]]:
 
 
 def _beside(axis: Tensor) -> tuple[Tensor, Tensor]:
-    """Two (r, 3) unit vectors across unit vectors and each other (Duff et al., "Building an
-    orthonormal basis, revisited", 2017).
+    """Two (r, 3) unit vectors orthogonal to (r, 3) unit vectors and to each other (Duff et al.,
+    "Building an orthonormal basis, revisited", 2017).
     """
     x, y, z = axis.unbind(1)
     sign = torch.where(z < 0, -1.0, 1.0).to(z)
@@ -369,8 +365,8 @@ def _beside(axis: Tensor) -> tuple[Tensor, Tensor]:
     return right, torch.stack((b, sign + y * y * a, -y), 1)
 
 
-def _hemisphere(normal: Tensor) -> Iterator[tuple[float, Tensor]]:
-    """Six cones over a hemisphere: weights that add up to 1, and (r, 3) directions."""
+def _cones_over(normal: Tensor) -> Iterator[tuple[float, Tensor]]:
+    """Six cones that cover a hemisphere: weights that add up to 1, and (r, 3) directions."""
     yield _UPRIGHT, normal
     right, up = _beside(normal)
     for number in range(5):
