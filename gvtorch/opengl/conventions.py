@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..cameras.camera import Camera, Frame
+from ..cameras.camera import Camera, Frame, sent
 
 _AXES = torch.tensor([1, -1, -1, 1], dtype=torch.float64)  # turns y and z
 
@@ -94,20 +94,20 @@ def camera(projection: Tensor, modelview: Tensor, width: int, height: int) -> Ca
         ValueError: The projection is none that a pinhole camera has, or see `Camera`.
     """
     where = "opengl.camera"
-    lens = _Lens.read(where, projection)
-    if lens.orthographic:
+    matrix = _Matrix.read(where, projection)
+    if matrix.orthographic:
         raise ValueError(f"{where}: projection must be perspective, got an orthographic one")
     check.whole(where, "width", width, low=1)
     check.whole(where, "height", height, low=1)
-    zero, one = torch.zeros_like(lens.scale[:, 0]), torch.ones_like(lens.scale[:, 0])
-    (sx, sy), (ax, ay) = lens.scale.unbind(1), lens.shift.unbind(1)
+    zero, one = torch.zeros_like(matrix.scale[:, 0]), torch.ones_like(matrix.scale[:, 0])
+    (sx, sy), (ax, ay) = matrix.scale.unbind(1), matrix.shift.unbind(1)
     rows = (
         (sx * width / 2, zero, (1 - ax) * width / 2),
         (zero, sy * height / 2, (1 + ay) * height / 2),
         (zero, zero, one),
     )
     intrinsics = torch.stack([torch.stack(row, 1) for row in rows], 1)
-    if not lens.batched:
+    if not matrix.batched:
         intrinsics = intrinsics[0]
     view = _AXES[:, None] * torch.as_tensor(modelview).detach().to("cpu", torch.float64)
     return Camera(view, intrinsics, width, height)
@@ -121,8 +121,8 @@ def ray_distance(
 ) -> Tensor:
     """Turns a depth buffer into distances along the rays: what `Layer` takes.
 
-    On CUDA nobody waits. What is lost is what the buffer rounds: a window depth that is off by e
-    puts a perspective distance d off by about e * d^2 / near. e is 2^-25 far away in float32 and
+    Does not wait for the device. The error is that of the buffer's rounding: a window depth off by
+    e puts a perspective distance d off by about e * d^2 / near. e is 2^-25 far away in float32 and
     2^-25 everywhere in 24 bits; reversed, float32 keeps a relative error of about 2^-24.
 
     Args:
@@ -139,10 +139,10 @@ def ray_distance(
     Raises:
         ValueError: A wrong shape or dtype, or a projection that is none of these.
     """
-    lens = _Lens.read("opengl.ray_distance", projection)
-    pixels = lens.pixels("opengl.ray_distance", "window_depth", window_depth, clip_depth)
+    matrix = _Matrix.read("opengl.ray_distance", projection)
+    pixels = matrix.pixels("opengl.ray_distance", "window_depth", window_depth, clip_depth)
     depth = window_depth.to(torch.float64)
-    if lens.orthographic:
+    if matrix.orthographic:
         along = (pixels.offset - depth) / pixels.slope
     else:
         along = pixels.offset / (depth + pixels.slope)
@@ -170,10 +170,10 @@ def window_depth(
     Raises:
         ValueError: See `ray_distance`.
     """
-    lens = _Lens.read("opengl.window_depth", projection)
-    pixels = lens.pixels("opengl.window_depth", "distance", distance, clip_depth)
+    matrix = _Matrix.read("opengl.window_depth", projection)
+    pixels = matrix.pixels("opengl.window_depth", "distance", distance, clip_depth)
     along = distance.to(torch.float64) / pixels.stretch
-    if lens.orthographic:
+    if matrix.orthographic:
         depth = pixels.offset - pixels.slope * along
     else:
         depth = pixels.offset / along - pixels.slope
@@ -182,21 +182,21 @@ def window_depth(
 
 @dataclass(frozen=True)
 class _Pixels:
-    """What turns the depth of each pixel, on its device; window depth is 0 to 1.
+    """What converts the depth of each pixel of an image, on the image's device.
 
-    Perspective: depth = offset / z - slope; orthographic: depth = offset - slope * z, with z along
-    the view axis.
+    Window depth (0 to 1) from z along the view axis: offset / z - slope in a perspective, offset -
+    slope * z in an orthographic projection.
     """
 
     slope: Tensor  # (n, 1, 1, 1) or (1, 1, 1)
     offset: Tensor
     far: Tensor  # window depth of the far plane
-    stretch: Tensor  # (n, h, w, 1) or (h, w, 1) distance along the ray over that along the axis
+    stretch: Tensor  # (n, h, w, 1) or (h, w, 1) distance along the ray over z
 
 
 @dataclass(frozen=True)
-class _Lens:
-    """The numbers of projections, float64 on the CPU."""
+class _Matrix:
+    """The numbers of n projection matrices, float64 on the CPU."""
 
     scale: Tensor  # (n, 2) of x and y
     shift: Tensor  # (n, 2), of a perspective
@@ -206,7 +206,7 @@ class _Lens:
     batched: bool
 
     @classmethod
-    def read(cls, where: str, projection: Tensor) -> _Lens:
+    def read(cls, where: str, projection: Tensor) -> _Matrix:
         """Takes (4, 4) or (n, 4, 4)."""
         matrix = torch.as_tensor(projection).detach().to("cpu", torch.float64)
         if matrix.dim() not in (2, 3) or matrix.shape[-2:] != (4, 4):
@@ -221,7 +221,7 @@ class _Lens:
                 f"{where}: projection must end in the row (0, 0, -1, 0) (perspective) or "
                 f"(0, 0, 0, 1) (orthographic), got {last}"
             )
-        other = 2 if orthographic else 3  # a column that such a projection leaves free of x and y
+        other = 2 if orthographic else 3  # the column in which such a projection has no x and y
         zeros = torch.stack((p[:, 0, 1], p[:, 1, 0], p[:, 2, 0], p[:, 2, 1]), 1)
         zeros = torch.cat((zeros, p[:, :2, other]), 1)
         moves = p[:, 2, 2 if orthographic else 3]
@@ -241,7 +241,7 @@ class _Lens:
         )
 
     def pixels(self, where: str, name: str, image: Tensor, clip_depth: ClipDepth) -> _Pixels:
-        """Brings the numbers to the pixels of an image."""
+        """Returns these numbers for the pixels of an image."""
         if not isinstance(clip_depth, ClipDepth):
             raise ValueError(f"{where}: clip_depth must be a ClipDepth, got {clip_depth!r}")
         count = len(self.scale)
@@ -266,10 +266,7 @@ class _Lens:
         rising = slope < 0 if self.orthographic else offset < 0
         numbers = torch.cat((self.scale, self.shift, slope[:, None], offset[:, None]), 1)
         numbers = torch.cat((numbers, rising[:, None].to(numbers)), 1)
-        if image.device.type == "cuda":
-            numbers = numbers.pin_memory().to(image.device, non_blocking=True)
-        else:
-            numbers = numbers.to(image.device)
+        numbers = sent(numbers, image.device)
         columns = numbers if self.batched else numbers[0]
         sx, sy, ax, ay, slope, offset, far = columns[..., None, None, None].unbind(-4)
         *_, height, width, _ = image.shape

@@ -25,7 +25,7 @@ class Background(ABC):
 
     @abstractmethod
     def behind(self, camera: Camera, numbers: Tensor, dtype: torch.dtype) -> Tensor:
-        """Returns linear RGB, (r, 3) or what broadcasts to it; nobody waits for the device.
+        """Returns linear RGB (r, 3), or (1, 3) for all pixels; does not wait for the device.
 
         Args:
             camera: Placed in the world.
@@ -39,7 +39,7 @@ class Background(ABC):
 
 
 class Gradient(Background):
-    """A blend from the top row of the picture to the bottom row, even in linear light."""
+    """A blend from the top row of the picture to the bottom row, linear in linear light."""
 
     def __init__(self, top: Color, bottom: Color) -> None:
         """Takes two colours, linear RGB, finite and >= 0."""
@@ -62,7 +62,7 @@ class Gradient(Background):
 
 
 class Backdrop(Background):
-    """An image of the size of the picture, pixel behind pixel."""
+    """An image of the size of the picture."""
 
     def __init__(self, image: Tensor) -> None:
         """Takes linear RGB, (h, w, 3) or, for a batch of cameras, (n, h, w, 3). From another device
@@ -97,10 +97,10 @@ class Backdrop(Background):
 
 
 class Environment(Background):
-    """An equirectangular map around everything, 360 by 180 degrees.
+    """An equirectangular map of all directions, 360 by 180 degrees, interpolated bilinearly.
 
-    Its middle lies in the direction -z, its upper edge in +y and its right half towards +x, as a
-    panorama camera that looks along -z would take it. Between texels colours are bilinear.
+    Its middle is the direction -z, its upper edge +y, its right half faces +x: what a panorama
+    camera that looks along -z would see.
     """
 
     def __init__(self, image: Tensor, *, rotation: Tensor | None = None) -> None:
@@ -135,8 +135,8 @@ class Environment(Background):
         return f"Environment({check.describe(self.image)})"
 
     def _on(self, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        """The map (1, 3, h, w + 2), its first and last columns repeated, and the rotation; uploaded
-        once a device.
+        """The map (1, 3, h, w + 2) with a column repeated on either side, and the rotation;
+        uploaded once per device.
         """
         if (device, dtype) not in self._there:
             image = self.image.to(device, dtype).movedim(-1, 0)[None]

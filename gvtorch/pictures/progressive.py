@@ -1,9 +1,9 @@
 """`Progressive`: pictures of a camera at rest that get better from frame to frame.
 
-The first frame looks through the centres of the pixels, each other one through a place beside them:
-places of Roberts' R2 sequence and, every other frame, the same place on the other side. So a pixel
-is filled evenly whenever one stops, and what changes linearly across it cancels out (antithetic
-sampling). The mean of the frames converges to the picture through square pixels.
+The first frame samples the centres of the pixels, each later one another place in every pixel: a
+point of Roberts' R2 sequence and, in the next frame, its mirror image through the centre. So
+samples cover a pixel evenly after any number of frames, and what varies linearly across it cancels
+out (antithetic sampling). The mean of the frames converges to the picture under a box filter.
 
 Source: Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018.
 """
@@ -24,7 +24,7 @@ from ..cameras.camera import Camera
 from ..cameras.custom import as_camera
 from .picture import Picture
 
-_OF_CENTRES = ("depth", "nearest", "normal", "features")  # what has no mean
+_OF_CENTRES = ("depth", "nearest", "normal", "features")  # the first frame's are kept
 _PLASTIC = 1.32471795724474602596  # the real root of x^3 = x + 1
 
 
@@ -36,20 +36,19 @@ def jitter(index: int) -> tuple[float, float]:
 
 
 class Progressive:
-    """The running mean of jittered frames.
+    """The running mean of jittered frames; does not wait for the device.
 
-    Of a pixel whose ray missed something that is still being streamed, the newest frame is shown;
-    its mean begins with the first frame in which nothing was missing, and frames that miss
-    something again are left out. Nobody waits for the device.
+    A pixel's mean begins with its first frame without a miss, and leaves out later frames with one.
+    Until then the pixel shows the newest frame.
 
     Attributes:
         count: Frames since the camera moved.
     """
 
     def __init__(self, render: Callable[[Camera], Any]) -> None:
-        """Takes what renders one frame, such as `partial(gv.render, tree, shader=shader)`,
-        `partial(engine.frame, shader=shader)` or the `replay` of a graph: from a camera to a
-        `Picture`, or to one and its statistics.
+        """Takes a function from a camera to a `Picture`, or to one and its statistics, such as
+        `partial(gv.render, tree, shader=shader)`, `partial(engine.frame, shader=shader)` or the
+        `replay` of a graph.
         """
         if not callable(render):
             raise ValueError(f"Progressive: render must be callable, got {type(render).__name__}")
@@ -61,7 +60,7 @@ class Progressive:
         return f"Progressive({self._camera}, {self.count} frames)"
 
     def reset(self) -> None:
-        """Begins anew; to be called where the scene or its shader changed."""
+        """Starts a new mean; to be called when the scene or its shader changed."""
         self.count = 0
         self._given: Camera | Rays | None = None
         self._camera: Camera | None = None
@@ -93,7 +92,7 @@ class Progressive:
             self._still = {name: image.clone() for name, image in still.items()}
         else:
             seen = self._frames > 0
-            # A pixel that was never whole takes the newest frame, a whole one takes whole frames.
+            # A pixel without a whole frame yet shows the newest one; others add whole frames only.
             self._sum = torch.where(seen, torch.where(whole, self._sum + light, self._sum), light)
             for name, image in still.items():
                 self._still[name] = torch.where(seen, self._still[name], image)

@@ -250,10 +250,8 @@ class Lighted:
         around the points reflects; `eye` (r, 3) is where a `Headlight` stands. Matter farther away
         than half of the reach blocks half as much.
         """
-        unblocked, bounced = (
-            torch.ones_like(points.position[:, :1]),
-            torch.zeros_like(points.position),
-        )
+        unblocked = torch.ones_like(points.position[:, :1])
+        bounced = torch.zeros_like(points.position)
         lighting, reach = self._lighting, self._lighting.reach
         if not (lighting.occlusion or lighting.indirect):
             return unblocked, bounced

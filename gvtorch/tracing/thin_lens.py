@@ -1,8 +1,8 @@
 """`ThinLens`: depth of field by a double cone.
 
-A ray stands for its pixel's cone and for the circle of confusion, which shrinks towards the focus
-and grows behind it. So it is traced as two pieces, of which the first narrows; where the picture is
-blurred, voxels as wide as the blur are read: fewer samples, and fewer bricks.
+A ray stands for its pixel's cone widened by the circle of confusion, which shrinks towards the
+focus and grows behind it. So it is traced as two pieces: a narrowing cone, then a widening one.
+Where the picture is blurred, voxels as wide as the blur are read: fewer samples and fewer bricks.
 
 Sources: Crassin, Neyret, Lefebvre, Eisemann, "GigaVoxels: Ray-Guided Streaming for Efficient and
 Detailed Voxel Rendering", I3D 2009, section 5; Crassin, PhD thesis 2011, on depth of field;
@@ -23,18 +23,18 @@ from ..base.records import Hits, Rays
 from ..cameras.camera import Frame
 from .composite import Trace, trace_pieces
 
-#: Width of the cone over the diameter of the disc. Voxels half as wide as a disc, read trilinearly,
-#: spread as much as it does (variance v^2 / 4, the disc 1 / 16). The pixel's cone comes on top, and
-#: blurred density makes what is opaque grow: pictures agree best with this.
+#: Width of the cone over the diameter of the circle of confusion. Voxels half as wide as the
+#: circle, read trilinearly, blur as much as it does (variance v^2 / 4; the circle's is 1 / 16).
+#: Fitted, and below 1 / 2: the pixel's cone is added, and blurred density makes opaque things grow.
 _CONE_OF_DISC = 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
 class ThinLens:
-    """A lens that sees sharply at one distance.
+    """A lens in front of the camera that is sharp at one distance only.
 
-    What a pixel sees at distance t is a disc of diameter aperture * |t - focus| / focus. Distances
-    are taken along rays: what is sharp is a sphere around the eye, whatever the camera.
+    At distance t a pixel sees a disc of diameter aperture * |t - focus| / focus. Distances are
+    along rays, so that a sphere around the eye is sharp, with every camera model.
     """
 
     aperture: float  # diameter of the lens
@@ -61,23 +61,26 @@ class ThinLens:
         )
 
     def cone(self, t: Tensor) -> Tensor:
-        """Width of the lens's cone at distances, of a lens in world units."""
+        """Returns the width of the lens's cone at distances t, for a lens in world units."""
         return _CONE_OF_DISC * self.aperture / self.focus * (t - self.focus).abs()
 
 
 class ThroughLens:
-    """Traces rays with the cone of a lens."""
+    """Traces rays whose cones are widened by a lens."""
 
     def __init__(self, trace: Trace, lens: ThinLens, cone_scale: float) -> None:
-        """Takes a lens in world units, and the factor on cones, which the lens's has none of."""
+        """Takes a lens in world units, and the factor that the tracer puts on cones, which shall
+        not widen the lens's.
+        """
         self._trace, self._focus = trace, lens.focus
-        self._wide = _CONE_OF_DISC * lens.aperture / cone_scale  # of the cone at the lens
+        self._wide = _CONE_OF_DISC * lens.aperture / cone_scale  # width of its cone at the eye
 
     def __call__(self, rays: Rays) -> Hits:
-        """Traces what lies before the focus, then what lies behind it."""
+        """Traces rays up to the focus, then from there on."""
         return trace_pieces(self._trace, (self._piece(rays, -1), self._piece(rays, 1)))
 
     def _piece(self, rays: Rays, side: int) -> Rays:
+        """The rays before the focus (`side` -1) or behind it (1)."""
         cone, (first, last) = rays.cone.to(torch.float64), rays.range.to(torch.float64).unbind(1)
         growth = side * self._wide / self._focus
         near, far = cone[:, 0] - side * self._wide, cone[:, 1] + growth
