@@ -18,7 +18,7 @@ from gvtorch.bench.storage import Memory
 from gvtorch.engine import ProductionError
 from gvtorch.io.conversion import convert
 from gvtorch.io.store import Store
-from gvtorch.producers.stored import HostCache
+from gvtorch.producers.host_cache import HostCache
 
 GRAY = gv.TransferFunction.preset("gray", 0, 255)
 PARTS = ("color", "alpha", "depth", "samples")
