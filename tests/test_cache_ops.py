@@ -28,7 +28,7 @@ def int32(values, device="cpu") -> torch.Tensor:
 
 @fixed
 @given(request_words=st.lists(words, min_size=8, max_size=400), capacity=st.integers(1, 500))
-def test_compact_requests_lists_open_wishes_and_keeps_pending_ones(
+def test_compact_requests_lists_open_requests_and_keeps_pending_ones(
     backend, request_words, capacity
 ):
     count = len(request_words) // 8 * 8
@@ -40,8 +40,8 @@ def test_compact_requests_lists_open_wishes_and_keeps_pending_ones(
         if kinds:
             expected.append((index, kinds | before & config.REQUEST_PRIORITY))
     kept = expected[:capacity]
-    wished = sum(1 for before in request_words[:count] if before & (LOAD | SUBDIVIDE))
-    assert counts.tolist() == [len(kept), len(expected), wished]
+    requested = sum(1 for before in request_words[:count] if before & (LOAD | SUBDIVIDE))
+    assert counts.tolist() == [len(kept), len(expected), requested]
     assert list(zip(node.tolist(), word.tolist(), strict=True))[: len(kept)] == kept
     assert set(node.tolist()[len(kept) :]) <= {-1}
     left = [before & (LOAD | SUBDIVIDE) << PENDING for before in request_words[:count]]

@@ -175,7 +175,7 @@ def test_an_answer_for_a_node_that_is_gone_is_dropped():
     slow.shutdown()
 
 
-def test_pending_wishes_are_not_listed_twice(backend):
+def test_pending_requests_are_not_listed_twice(backend):
     asked = []
 
     class Never(Ball):

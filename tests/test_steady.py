@@ -1,4 +1,4 @@
-"""Frames that nobody waits for: late counts and statistics, no host sync, CUDA graphs."""
+"""Frames that do not wait for the device: late counts and statistics, CUDA graphs."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_frames_go_on_where_counts_do_not_come(slow, blobs):
             slow.clear()
             for view in views:
                 engine.frame(view, HAZE)
-            assert not slow and not producer.asked, "nobody waits"
+            assert not slow and not producer.asked, "the host does not wait"
             engine.frame(right, HAZE)
             assert len(slow) == 4, "the fifth frame looks at the four before"
             asked.append(set(producer.asked))
@@ -151,7 +151,7 @@ def test_a_stalled_producer_stalls_no_frame(slow, blobs):
 
 @pytest.mark.backend("cpp")
 def test_scouts_go_only_where_something_was_written(traced, blobs):
-    """Neither in a steady frame nor while a store is stalled: nobody waits for answers."""
+    """Neither in a steady frame nor while a store is stalled: answers are not waited for."""
     producer = Held(blobs)
     with gv.Engine(producer, brick_size=4) as engine:
         for _ in range(10):

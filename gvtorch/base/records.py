@@ -42,16 +42,9 @@ class Rays:
         return self.transmittance[:, None].to(torch.float64)
 
     def _each(self, change: Callable[[Tensor], Tensor], width: int) -> Rays:
-        columns = (self.origin, self.direction, self.cone, self.range)
-        origin, direction, cone, limits = (change(column) for column in columns)
-        return Rays(
-            origin=origin,
-            direction=direction,
-            cone=cone,
-            range=limits,
-            width=width,
-            transmittance=None if self.transmittance is None else change(self.transmittance),
-        )
+        columns = {name: value for name, value in vars(self).items() if name != "width"}
+        changed = {n: None if value is None else change(value) for n, value in columns.items()}
+        return Rays(**changed, width=width)  # type: ignore[arg-type]
 
     def __repr__(self) -> str:
         rows = f", rows of {self.width}" if self.width else ""

@@ -1,9 +1,9 @@
 """The cache's ops, checked and sent to a backend: requests listed, nodes located, slots ordered by
 use, pointers cleared and written.
 
-Words and slots are int32, nodes that the host names int64. Lists of wishes have a fixed capacity
-and a count that stays on the device, so that a frame needs no host synchronisation; places that are
-not taken hold -1.
+Words and slots are int32, nodes that the host names int64. Lists have a fixed capacity and a
+count that stays on the device, so that a frame needs no host synchronisation; places that are not
+taken hold -1.
 
 Source: Crassin et al., "GigaVoxels", I3D 2009, section 5.
 """
@@ -24,7 +24,8 @@ from .trace import Backend, choose_backend
 def compact_requests(
     request_tn: Tensor, capacity: int, *, backend: Backend = "auto"
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Lists what rays asked for and clears the wishes; pending kinds are left alone.
+    """Lists requests and clears their words, the pending bits excepted; kinds that are pending are
+    not listed.
 
     Mutates `request_tn`.
 
@@ -35,7 +36,7 @@ def compact_requests(
 
     Returns:
         node_k (capacity,) node indices, rising, -1 behind them; word_k (capacity,) kinds and
-        priority; count_3 (3,) int64: nodes listed, nodes that could be listed, nodes with a wish,
+        priority; count_3 (3,) int64: nodes listed, nodes that could be listed, requested nodes,
         pending or not.
 
     Raises:
@@ -107,7 +108,7 @@ def link(
     *,
     backend: Backend = "auto",
 ) -> None:
-    """Writes pointers of nodes and takes back what they asked for.
+    """Writes pointers of nodes and clears the requests that they answer.
 
     Mutates `pointer_tn` and `request_tn`.
 

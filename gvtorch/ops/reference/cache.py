@@ -23,7 +23,7 @@ from ...base.constants import (
 def compact_requests(request_tn: Tensor, capacity: int) -> tuple[Tensor, Tensor, Tensor]:
     """Twin of `torch.ops.gvtorch.compact_requests`."""
     words = request_tn.view(-1)
-    wished = int((words & REQUEST_KINDS).count_nonzero())
+    requested = int((words & REQUEST_KINDS).count_nonzero())
     open_kinds = words & REQUEST_KINDS & ~(words >> REQUEST_PENDING_SHIFT)
     node = open_kinds.nonzero()[:, 0]
     kept = node[:capacity]
@@ -32,7 +32,7 @@ def compact_requests(request_tn: Tensor, capacity: int) -> tuple[Tensor, Tensor,
     node_k[: len(kept)] = kept.to(torch.int32)
     word_k[: len(kept)] = open_kinds[kept] | (words[kept] & REQUEST_PRIORITY)
     words &= REQUEST_KINDS << REQUEST_PENDING_SHIFT
-    return node_k, word_k, torch.tensor([len(kept), len(node), wished], device=words.device)
+    return node_k, word_k, torch.tensor([len(kept), len(node), requested], device=words.device)
 
 
 def lru_partition(order_k: Tensor, stamp_s: Tensor, frame_1: Tensor) -> tuple[Tensor, Tensor]:
