@@ -284,7 +284,8 @@ def _estimate(plan: _Plan, target: Path) -> Estimate:
     copies = _COPIES * (layout.shard + 2) ** 3 * plan.value_bytes
     cube = min(1.0, voxels / layout.shard**3)
     each = (_PROCESS if plan.uses_processes else 0) + int(copies * cube)
-    staged = plan.source.resident if plan.uses_processes else 0
+    held = plan.source.nbytes if isinstance(plan.source, MemorySource) else 0
+    staged = held if plan.uses_processes else 0
     start = 3.0 * plan.uses_processes
     return Estimate(
         extent=layout.extent,
@@ -295,11 +296,11 @@ def _estimate(plan: _Plan, target: Path) -> Estimate:
         source_bytes=plan.source.nbytes,
         disk_bytes=int((plain + beside) * share),
         temporary_bytes=int(2 * plain * below / seen) + staged,
-        memory_bytes=_PROCESS + plan.workers * each + plan.source.resident,
+        memory_bytes=_PROCESS + plan.workers * each + held,
         seconds=_DISK * seconds * (voxels + _BELOW * below) / seen / plan.workers + start,
         workers=plan.workers,
         disk_free=shutil.disk_usage(resources.existing(target)).free,
-        memory_free=resources.memory_free() + plan.source.resident,
+        memory_free=resources.memory_free() + held,
     )
 
 

@@ -68,9 +68,7 @@ class StoredArray:
 
     array: Any  # tensorstore.TensorStore
     axes: str  # letters among c, z, y, x in stored order
-    factors: tuple[
-        int, int, int
-    ]  # z y x, voxels of the finest array along a side of one of its own
+    factors: tuple[int, int, int]  # z y x, finest voxels along a side of one of its own
     where: str
 
     def size(self, axis: str) -> int:
@@ -79,24 +77,30 @@ class StoredArray:
 
     def read(self, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         """Reads (z, y, x, c); voxels beyond the array repeat its outermost ones."""
-        inside = {}
-        for axis, a, b in zip("zyx", low, high, strict=True):
-            end = self.size(axis)
-            start = min(max(a, 0), end - 1)
-            inside[axis] = slice(start, max(min(b, end), start + 1))
+        start, stop = clamp_box(low, high, [self.size(axis) for axis in "zyx"])
+        inside = dict(zip("zyx", map(slice, start, stop), strict=True))
         place = tuple(inside.get(axis, slice(None)) for axis in self.axes)
         data = deadline.wait(self.array[place].read(order="C"), self.where)
-        for axis in "czyx":
-            if axis not in self.axes:
-                data = data[None]
-        order = "".join(axis for axis in reversed("czyx") if axis not in self.axes) + self.axes
-        data = data.transpose([order.index(axis) for axis in "zyxc"])
-        for axis, a, b in zip("zyx", low, high, strict=True):
-            taken = inside[axis]
-            if (taken.start, taken.stop) != (a, b):
-                index = np.arange(a, b).clip(taken.start, taken.stop - 1) - taken.start
-                data = data.take(index, "zyx".index(axis))
-        return data
+        missing = "".join(axis for axis in "zyxc" if axis not in self.axes)
+        letters = missing + self.axes
+        data = data[(None,) * len(missing)].transpose([letters.index(axis) for axis in "zyxc"])
+        return repeat_edges(data, start, low, high)
+
+
+def clamp_box(low: Zyx, high: Zyx, shape: Zyx) -> tuple[list[int], list[int]]:
+    """The part of a box that lies in a grid, or what is next to it: at least one voxel a side."""
+    start = [min(max(a, 0), n - 1) for a, n in zip(low, shape, strict=True)]
+    stop = [max(min(b, n), a + 1) for a, b, n in zip(start, high, shape, strict=True)]
+    return start, stop
+
+
+def repeat_edges(data: np.ndarray, start: Zyx, low: Zyx, high: Zyx) -> np.ndarray:
+    """Extends (z, y, x, c) voxels, which begin at `start`, to a box; the outermost repeat."""
+    for axis, (at, a, b) in enumerate(zip(start, low, high, strict=True)):
+        size = data.shape[axis]
+        if (at, at + size) != (a, b):
+            data = data.take(np.arange(a - at, b - at).clip(0, size - 1), axis)
+    return data
 
 
 class LevelReader:
@@ -129,15 +133,9 @@ class LevelReader:
 
     def read(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         """Reads (z, y, x, c) voxels `low` to `high` of a level; beyond it the outermost repeat."""
-        shape = level_shape(self.extent, level)
-        start = [min(max(a, 0), n - 1) for a, n in zip(low, shape, strict=True)]
-        stop = [max(min(b, n), a + 1) for a, b, n in zip(start, high, shape, strict=True)]
+        start, stop = clamp_box(low, high, level_shape(self.extent, level))
         data = self._inside(level, start, stop, deadline)
-        for axis in range(3):
-            if (start[axis], stop[axis]) != (low[axis], high[axis]):
-                index = np.arange(low[axis], high[axis]).clip(start[axis], stop[axis] - 1)
-                data = data.take(index - start[axis], axis)
-        return np.ascontiguousarray(data)
+        return np.ascontiguousarray(repeat_edges(data, start, low, high))
 
     def _inside(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         plan = self._plans[level]

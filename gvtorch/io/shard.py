@@ -1,8 +1,8 @@
-"""`write_shard`: what one task of the converter does; a plain function of picklable arguments.
+"""`write_shard`: one task of the converter, a plain function of picklable arguments.
 
-A task makes one cube of a level: its shard of the pyramid, of the blocks and of the cells. It reads
-the source (level 0) or the level below as stored, with the voxels around the cube, so it needs no
-other task of its own level. Run twice, it writes the same again.
+A task writes one cube of a level: its shard of the pyramid, of the blocks and of the cells. It
+reads the source (level 0) or the level below as stored, with the voxels around the cube, so it
+depends on no other task of its own level, and may be run again after a crash.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _POOLS = (pool_mean, pool_min, pool_max)
 
 @dataclass(frozen=True, kw_only=True)
 class Conversion:
-    """What all tasks of a conversion share."""
+    """What all tasks of a conversion share: where they read, where they write, and how."""
 
     root: dict[str, Any]  # kvstore of the store
     layout: StoreLayout
@@ -39,7 +39,7 @@ class Conversion:
 
 @dataclass(frozen=True)
 class ShardResult:
-    """What a task tells."""
+    """What a task reports back."""
 
     level: int
     place: Zyx

@@ -22,7 +22,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from .store_layout import DTYPES
+from .store_layout import value_dtype
 
 Index = tuple[slice, ...]
 
@@ -68,10 +68,7 @@ class VolumeSource(ABC):
     @property
     def dtype(self) -> str:
         """What values are read as: wide numbers become float32, as in `Volume`."""
-        kind = np.dtype(self.stored)
-        if kind.kind == "b":
-            return "uint8"
-        return "float32" if kind.kind in "iuf" and kind.name not in DTYPES else kind.name
+        return value_dtype(np.dtype(self.stored))
 
     @property
     def nbytes(self) -> int:
@@ -82,11 +79,6 @@ class VolumeSource(ABC):
     def peak_bytes(self) -> int:
         """Bytes of memory that reading all at once takes: as it is stored, and as it is read."""
         return math.prod(self.shape) * np.dtype(self.stored).itemsize + self.nbytes
-
-    @property
-    def resident(self) -> int:
-        """Bytes of memory that it holds between reads."""
-        return 0
 
     def size(self, axis: str) -> int:
         """Voxels along an axis, 1 where it has none."""
@@ -202,11 +194,6 @@ class MemorySource(VolumeSource):
     def of(cls, data: np.ndarray, **told: Any) -> MemorySource:
         """Takes (z, y, x, c) values; `told` are path, spacing, origin and unit."""
         return cls(data=data, shape=data.shape, axes="zyxc", stored=data.dtype.str, **told)
-
-    @property
-    def resident(self) -> int:
-        """Bytes of memory that it holds."""
-        return self.data.nbytes
 
     def read_stored(self, index: Index) -> np.ndarray:
         """Returns a view."""

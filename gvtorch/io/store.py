@@ -20,7 +20,7 @@ import torch
 
 from ..base import check
 from . import ngff
-from .level_reader import Deadline, LevelReader, StoreError
+from .level_reader import Deadline, LevelReader, StoreError, clamp_box
 from .multiscale import find_image, open_arrays
 from .store_layout import (
     BLOCKS,
@@ -34,6 +34,7 @@ from .store_layout import (
     level_count,
     level_shape,
     opened,
+    value_dtype,
 )
 
 _OPEN_TIMEOUT = 20.0  # seconds
@@ -41,8 +42,6 @@ _BATCH = 256  # blocks read at once; more only makes memory travel
 _AHEAD = 2  # batches on their way
 _GROUP = 4  # blocks along a side of a group that may be read as one region
 _READERS = 4  # threads that read such groups
-_NARROWED = {"bool": "uint8", "uint32": "float32", "int32": "float32", "uint64": "float32"}
-_NARROWED |= {"int64": "float32", "float64": "float32"}
 
 
 class Store:
@@ -128,15 +127,13 @@ class Store:
         deadline = Deadline(_OPEN_TIMEOUT)
         root, found, own = find_image(where, root, image, deadline)
         stored, chosen = open_arrays(where, root, found, time, channels, deadline)
-        name = stored[0].array.dtype.name
-        kind = np.dtype(_NARROWED.get(name, name)) if name in {*_NARROWED, *DTYPES} else None
-        if kind is None:
-            known = ", ".join(DTYPES)
-            raise ValueError(f"{where}: dtype {name} is unknown; known: {known}")
+        dtype = value_dtype(stored[0].array.dtype.numpy_dtype)
+        if dtype not in DTYPES:
+            raise ValueError(f"{where}: dtype {dtype} is unknown; known: {', '.join(DTYPES)}")
         extent = tuple(stored[0].size(axis) for axis in "xyz")
         count = level_count(extent)
-        levels = LevelReader(stored, count, kind)
-        if own and (list(extent) != own["extent"] or kind.name != own["dtype"]):
+        levels = LevelReader(stored, count, np.dtype(dtype))
+        if own and (list(extent) != own["extent"] or dtype != own["dtype"]):
             raise ValueError(f"{where}: damaged: metadata and level 0 differ in extent or dtype")
         self = cls(where, levels, count, found, own, chosen)
         if own:
@@ -222,9 +219,7 @@ class Store:
         deadline = Deadline(timeout)
         data = self._levels.read(self._checked(level), low, high, deadline)
         if self.has_blocks:
-            shape = level_shape(self.extent, level)
-            start = [min(max(a, 0), n - 1) for a, n in zip(low, shape, strict=True)]
-            stop = [max(min(b, n), a + 1) for a, b, n in zip(start, high, shape, strict=True)]
+            start, stop = clamp_box(low, high, level_shape(self.extent, level))
             box = data[tuple(slice(max(0, a - b), None) for a, b in zip(start, low, strict=True))]
             self._check_shards(self._layout.plain(level), box, start, stop, 1, deadline)
         return data

@@ -38,6 +38,13 @@ _CELL_CHUNK = 16  # cells
 _KEEP = "store_data_equal_to_fill_value"  # zeros are written too: what is missing then shows
 
 
+def value_dtype(stored: np.dtype) -> str:
+    """Name of the dtype that values are read as: bool becomes uint8, wide numbers float32."""
+    if stored.kind == "b":
+        return "uint8"
+    return "float32" if stored.kind in "iuf" and stored.name not in DTYPES else stored.name
+
+
 @functools.cache
 def context() -> Any:
     """tensorstore's resources: no cache (the pools and their host cache are it), few threads."""

@@ -184,7 +184,7 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 def fingerprint(source: str | Path | Volume) -> list[Any]:
-    """What tells whether a source is still the same: sizes and times of change, or a checksum."""
+    """Sizes and times of change of a source, or a checksum: equal as long as it is unchanged."""
     if isinstance(source, Volume):
         data = movable(source.data)
         return [list(data.shape), str(source.data.dtype), zlib.crc32(data.numpy().tobytes())]

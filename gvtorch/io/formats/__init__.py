@@ -6,7 +6,7 @@ torch is not imported here, so that the command line can name the formats at onc
 import importlib
 import pkgutil
 
-from .format import FORMATS, Format, file_format
+from .format import FORMATS, Format
 
 for _module in sorted(module.name for module in pkgutil.iter_modules(__path__)):
     importlib.import_module(f".{_module}", __name__)
@@ -19,7 +19,7 @@ def find_format(path: str) -> Format:
         ValueError: It is none of the known ones.
     """
     for candidate in FORMATS:
-        if candidate.fits(path):
+        if candidate.matches(path):
             return candidate
     endings = ", ".join(ending for candidate in FORMATS for ending in candidate.endings)
     raise ValueError(
@@ -33,4 +33,4 @@ def format_names() -> str:
     return f"{', '.join(names)} or {last}"
 
 
-__all__ = ["FORMATS", "Format", "file_format", "find_format", "format_names"]
+__all__ = ["FORMATS", "Format", "find_format", "format_names"]

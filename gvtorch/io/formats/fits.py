@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..source import ArraySource, Index, VolumeSource
-from .format import file_format
+from .format import Format
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +34,7 @@ class FitsSource(VolumeSource):
         return found.reshape((1,) * len(first) + found.shape)
 
 
-@file_format("FITS", ".fits", ".fits.gz", ".fit", library="astropy")
+@Format("FITS", ".fits", ".fits.gz", ".fit", library="astropy")
 def open_fits(path: str) -> VolumeSource:
     """Opens a cube; its first voxel tells the dtype after scaling."""
     from astropy.io import fits

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..placement import place_axes
 from ..source import Index, VolumeSource
-from .format import file_format
+from .format import Format
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +21,7 @@ class NiftiSource(VolumeSource):
         return np.asanyarray(_load(self.path).dataobj[index])
 
 
-@file_format("NIfTI", ".nii", ".nii.gz", library="nibabel")
+@Format("NIfTI", ".nii", ".nii.gz", library="nibabel")
 def open_nifti(path: str) -> NiftiSource:
     """Opens an image; its first voxel tells the dtype after scaling."""
     image = _load(path)

@@ -7,10 +7,10 @@ import zipfile
 import numpy as np
 
 from ..source import ArraySource, open_unpacked
-from .format import file_format
+from .format import Format
 
 
-@file_format("NPY", ".npy", ".npy.gz", ".npy.bz2")
+@Format("NPY", ".npy", ".npy.gz", ".npy.bz2")
 def open_npy(path: str, member: str = "") -> ArraySource:
     """Opens an array file, or a member of an archive of them."""
     with open_unpacked(path, member) as stream:
@@ -40,7 +40,7 @@ def open_npy(path: str, member: str = "") -> ArraySource:
     )
 
 
-@file_format("NPZ", ".npz", options=("key",))
+@Format("NPZ", ".npz", options=("key",))
 def open_npz(path: str, key: str | None = None) -> ArraySource:
     """Opens the array `key` of an archive; without it, the only one."""
     with zipfile.ZipFile(path) as archive:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..placement import place_axes
 from ..source import ArraySource, Index, VolumeSource
-from .format import file_format
+from .format import Format
 
 _TYPES = {
     **dict.fromkeys(("signed char", "int8"), "i1"),
@@ -40,7 +40,7 @@ class NrrdSource(VolumeSource):
         return nrrd.read(self.path, index_order="F")[0][index]
 
 
-@file_format("NRRD", ".nrrd", ".nhdr", library="nrrd", package="pynrrd")
+@Format("NRRD", ".nrrd", ".nhdr", library="nrrd", package="pynrrd")
 def open_nrrd(path: str) -> VolumeSource:
     """Opens a file."""
     import nrrd

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..ngff import is_zarr
 from ..source import Index, VolumeSource
-from .format import file_format
+from .format import Format
 
 _TIMEOUT = 600.0  # seconds for one read
 
@@ -32,7 +32,7 @@ def _store(source: OmeZarrSource) -> Any:
     return Store.open(source.path)
 
 
-@file_format("OME-Zarr", ".zarr", matches=is_zarr)
+@Format("OME-Zarr", ".zarr", matches=is_zarr)
 def open_ome_zarr(path: str) -> OmeZarrSource:
     """Opens the first image, its first time point and all channels."""
     from ..store import Store

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from ..source import ArraySource
-from .format import file_format
+from .format import Format
 
 _NAME = re.compile(r"_(\d+)x(\d+)x(\d+)_([a-z]+\d+)(?:_?(le|be))?(?=[._]|$)")
 _HINT = "name it *_XxYxZ_dtype.raw or pass"
 
 
-@file_format("RAW", ".raw", ".raw.gz", options=("shape", "dtype"))
+@Format("RAW", ".raw", ".raw.gz", options=("shape", "dtype"))
 def open_raw(
     path: str, shape: Sequence[int] | None = None, dtype: str | np.dtype | None = None
 ) -> ArraySource:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..ngff import is_zarr
 from ..source import ArraySource, Index, VolumeSource
-from .format import file_format
+from .format import Format
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +71,7 @@ def _series(source: TiffSource) -> Any:
     return tifffile.TiffFile(source.path).series[0]
 
 
-@file_format("TIFF", ".tif", ".tiff", library="tifffile")
+@Format("TIFF", ".tif", ".tiff", library="tifffile")
 def open_tiff(path: str) -> VolumeSource:
     """Opens a stack: the first series of a file."""
     import tifffile
@@ -96,7 +96,7 @@ def _is_folder(path: str) -> bool:
     return Path(path).is_dir() and not is_zarr(path)
 
 
-@file_format("a folder of TIFF slices", matches=_is_folder, library="tifffile")
+@Format("a folder of TIFF slices", matches=_is_folder, library="tifffile")
 def open_folder(path: str) -> SlicesSource:
     """Opens a folder of slices, in natural order of their names."""
     import tifffile
