@@ -24,7 +24,8 @@ from tyro.conf import Positional, arg
 from ..io.ngff import is_zarr
 from .bench import Bench
 from .common import Bar, ReadOptions, refuse_for_store, volume_formats
-from .view import Fly, Render
+from .fly import Fly
+from .render import Render
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor

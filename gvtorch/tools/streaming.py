@@ -1,0 +1,114 @@
+"""`Streaming`: the flags of an engine over a store; what is told about its pictures."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from tyro.conf import arg
+
+from .look import Look
+
+if TYPE_CHECKING:
+    from ..base.records import RenderStats
+    from ..engine import Engine, FrameStats
+    from ..shaders import Shader, TransferFunction
+
+_RANGE_VOXELS = 128**3  # of a foreign image that are read to learn its range
+
+
+@dataclass(frozen=True, kw_only=True)
+class Streaming:
+    """Stores: what is kept, and how it is loaded."""
+
+    node_pool: Annotated[str, arg(metavar="BYTES")] = "8 MB"
+    """memory of node tiles"""
+    brick_pool: Annotated[str, arg(metavar="BYTES")] = "256 MB"
+    """memory of bricks, on the device that renders"""
+    host_cache: Annotated[str, arg(metavar="BYTES")] = "512 MB"
+    """memory of decoded blocks"""
+    mode: Literal["interactive", "balanced", "converge"] | None = None
+    """one frame, a few, or until nothing is missing"""
+    max_frames: Annotated[int, arg(metavar="N")] = 1000
+    """most frames of a picture that converges"""
+    loading: Literal["straight", "levels"] = "straight"
+    """to the wanted level at once, or level by level"""
+    time: Annotated[int, arg(metavar="N")] = 0
+    """time point"""
+    image: Annotated[str | None, arg(metavar="NAME")] = None
+    """which image, where a store has several"""
+    strict: tyro.conf.FlagCreatePairsOff[bool] = False
+    """a block that can't be read ends the work"""
+
+    @contextmanager
+    def open(self, path: str, look: Look) -> Iterator[tuple[Engine, TransferFunction | Shader]]:
+        """Opens a store: the engine over it, and the transfer function."""
+        from ..engine.engine import Engine
+        from ..io.store import Store
+        from ..producers import StoredProducer
+
+        store = Store.open(path, image=self.image, time=self.time)
+        producer = StoredProducer(store, host_cache=self.host_cache)
+        shader = look.chosen(*value_range(store))
+        with Engine(
+            producer,
+            node_pool=self.node_pool,
+            brick_pool=self.brick_pool,
+            brick_size=look.brick_size,
+            border=look.border,
+            loading=self.loading,
+            strict=self.strict,
+            device=look.device(),
+        ) as engine:
+            yield engine, shader
+
+
+def value_range(store: Any) -> tuple[float, float]:
+    """Smallest and largest value of a store. Other people's images do not tell: of them the finest
+    level of at most 128^3 voxels is read, which blurs the extremes a little.
+    """
+    if store.value_range is not None:
+        return (
+            min(low for low, _ in store.value_range),
+            max(high for _, high in store.value_range),
+        )
+    level = 0
+    while level + 1 < store.levels:
+        x, y, z = store.level_extent(level)
+        if x * y * z <= _RANGE_VOXELS:
+            break
+        level += 1
+    data = store.read_region(level, (0, 0, 0), store.level_extent(level)[::-1])
+    return (float(data.min()), float(data.max()))
+
+
+def told(stats: RenderStats) -> str:
+    """What a picture cost, in a few words."""
+    from ..engine import FrameStats
+
+    text = f"{stats.samples / 1e6:.1f} M samples in {stats.milliseconds:.0f} ms ({stats.backend})"
+    if not isinstance(stats, FrameStats):
+        return text
+    bricks = f"{stats.bricks_used} bricks of {stats.bricks}"
+    return f"{text}, {stats.frames} frames, {bricks}{_shortfall(stats)}"
+
+
+def _shortfall(stats: FrameStats) -> str:
+    if stats.capacity_exceeded and not stats.converged:
+        return "; the pools are too small for this picture, parts of it are coarser"
+    if stats.capacity_exceeded:
+        return " (the pools are too small for all at once: rays took turns)"
+    if stats.failed:
+        return f"; {stats.failed} nodes failed, parts of it are coarser"
+    return "" if stats.converged else "; not converged"
+
+
+def tell_failures(engine: Engine) -> None:
+    for failure in engine.failures[:3]:
+        print(f"gvtorch: {failure}", file=sys.stderr)
+    if len(engine.failures) > 3:
+        print(f"gvtorch: {len(engine.production.failures)} nodes failed in all", file=sys.stderr)
