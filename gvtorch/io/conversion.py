@@ -52,7 +52,7 @@ _SAMPLE_TIME = 2.0  # seconds after which no more are
 _OPEN_TIMEOUT = 60.0  # seconds
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Estimate:
     """What a conversion takes."""
 
@@ -69,6 +69,15 @@ class Estimate:
     workers: int
     disk_free: int
     memory_free: int
+
+    def __repr__(self) -> str:
+        """Shows extent, disk, memory and time."""
+        extent = "x".join(str(n) for n in self.extent)
+        disk, memory = resources.amount(self.disk_bytes), resources.amount(self.memory_bytes)
+        return (
+            f"Estimate({extent} (x, y, z), {self.dtype}x{self.channels}: {disk} on disk, "
+            f"{memory} of memory, {self.seconds:.1f} s with {self.workers} workers)"
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """The fields as plain values."""

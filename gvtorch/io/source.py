@@ -188,7 +188,7 @@ class MemorySource(VolumeSource):
         data: (z, y, x, c).
     """
 
-    data: np.ndarray
+    data: np.ndarray = dataclasses.field(repr=False)
 
     @classmethod
     def of(cls, data: np.ndarray, **told: Any) -> MemorySource:
