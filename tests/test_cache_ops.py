@@ -328,7 +328,7 @@ def test_nothing_to_do(backend):
                 0,
                 0,
             ),
-            "child_jw must be (8, w) int32",
+            "tile_k must be (k,) int32",
         ),
         (lambda w: ops.locate(w, w[0].long(), 2, 8), "loc_t4 must be (t, 4) int32"),
         (lambda w: ops.locate(w[:, :4].clone(), w[0], 2, 8), "node_k must be (k,) int64"),

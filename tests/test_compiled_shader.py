@@ -20,7 +20,7 @@ from conftest import DEVICES, ROOT
 from test_module_shader import assert_same_picture
 from test_op_contract import world_rays
 from test_shaders import POINT, op_arguments
-from test_trace_rays import SHADER, camera_rays, forget, in_order, on, run
+from test_trace_rays import SHADER, camera_rays, forget, on, run
 
 import gvtorch as gv
 from gvtorch.cpp_ext import compilers, user
@@ -226,7 +226,6 @@ def test_script_compile_export_and_pickle(tree, compiled, name):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", ["Bands", "LitFeatures"])
-@in_order
 def test_opcheck_and_memory_safety(tree, compiled, name, dtype):
     tree = on(tree, DEVICES[compiled])
     own = {"uniforms": BANDS} if name == "Bands" else {"transfer": SHADER, "other": "rgba"}

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from conftest import DEVICES, ROOT
-from test_trace_rays import SHADER, arguments, camera_rays, in_order, on
+from test_trace_rays import SHADER, arguments, camera_rays, on
 
 import gvtorch as gv
 from gvtorch import cpp_ext
@@ -45,14 +45,12 @@ def assert_same(actual, expected) -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@in_order
 def test_opcheck(blobs, compiled, dtype):
     tree = on(gv.N3Tree.from_volume(blobs, 4), DEVICES[compiled])
     rays, given = arguments(tree, 5, dtype=dtype)
     torch.library.opcheck(torch.ops.gvtorch.trace_rays.default, (*rays, *given))
 
 
-@in_order
 def test_fake_gives_shapes_without_data(blobs, compiled):
     from torch._subclasses.fake_tensor import FakeTensorMode
 
@@ -146,7 +144,6 @@ def test_module_traces_a_camera_s_rays_as_the_renderer_does(blobs, compiled, sca
     assert_same(fields, (hits.color, hits.alpha, hits.depth, hits.samples))
 
 
-@in_order
 def test_memory_stays_safe_without_the_python_checks(blobs, compiled):
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
     rays, given = arguments(tree, 5)

@@ -12,7 +12,7 @@ from conftest import DEVICES
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_composite import packed
-from test_trace_rays import SHADER, arguments, camera_rays, changed, forget, in_order, on
+from test_trace_rays import SHADER, arguments, camera_rays, changed, forget, on
 from torch import Tensor
 
 import gvtorch as gv
@@ -288,7 +288,6 @@ def sampling(given, traced, segments, samples) -> list:
     return [*given, *traced.channel, *segments[:6], samples.segment, samples.number]
 
 
-@in_order
 def test_opcheck(walk):
     given, traced, segments, samples = walk
     ops = torch.ops.gvtorch
@@ -326,7 +325,6 @@ class Emission(torch.nn.Module):
 
 
 @pytest.mark.filterwarnings("ignore")
-@in_order
 def test_scripts_compiles_and_exports(walk):
     given, traced, segments, samples = walk
     listed = (*segments[:6], samples.segment, samples.number)
@@ -342,7 +340,6 @@ def test_scripts_compiles_and_exports(walk):
 
 
 @pytest.mark.filterwarnings("ignore")
-@in_order
 def test_the_walk_compiles_and_exports(walk):
     given, traced, expected, _ = walk
 
@@ -364,7 +361,7 @@ def test_the_walk_compiles_and_exports(walk):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"origin_r3": torch.zeros(4, 2).double()}, "origin_r3 must be (4, 3) float64 on cpu"),
+        ({"origin_r3": torch.zeros(4, 2).double()}, "origin_r3 must be (r, 3) float64 on cpu"),
         ({"domain_2": torch.zeros(2).int()}, "domain_2 must be (2,) float32"),
         ({"state_r3": torch.zeros(4, 2)}, "state_r3 must be (4, 3) float32"),
         ({"limit": -1}, "limit must be an int >= 0"),
@@ -389,9 +386,9 @@ def test_bad_arguments_of_sampling_and_compositing(blobs):
     segments = trace_segments(given, traced)
     good = (given, traced, segments, list_samples(segments))
     for change, message in (
-        ({"segment": torch.zeros(3)}, "segment must be (3,) int32"),
+        ({"segment": torch.zeros(3)}, "segment must be (k,) int32"),
         ({"distance": segments.distance.half()}, "distance must be (s, 3) float32 or"),
-        ({"constant_tnc": torch.zeros(1, 8, 2)}, "constant_tnc must be (1, 8, 1)"),
+        ({"constant_tnc": torch.zeros(1, 8, 2)}, "constant_tnc must be (t, n, 1)"),
         ({"bricks_bzyxc": traced.bricks_bzyxc.double()}, "which no channel can have"),
         ({"max_depth": 99}, "max_depth must be an int >= 0"),
     ):

@@ -10,7 +10,7 @@ import pytest
 import torch
 from conftest import DEVICES, ROOT
 from test_op_contract import world_rays
-from test_trace_rays import SHADER, assert_equal, camera_rays, changed, forget, in_order, on, run
+from test_trace_rays import SHADER, assert_equal, camera_rays, changed, forget, on, run
 
 import gvtorch as gv
 from gvtorch.ops import RayArguments, shade_rays
@@ -307,7 +307,6 @@ def op_arguments(tree, shader, dtype) -> list:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", SHADERS)
-@in_order
 def test_opcheck(tree, compiled, name, dtype):
     tree = on(tree, DEVICES[compiled])
     rays, traced, shading, parameters = op_arguments(tree, SHADERS[name], dtype)

@@ -106,12 +106,13 @@ def tensors(
     """
     known = dict(sizes or {})
     for name, value, shape, dtype in fields:
-        if isinstance(value, Tensor) and value.dim() == len(shape):
-            for letter, size in zip(shape, value.shape, strict=True):
-                if not letter.isdigit():
-                    known.setdefault(letter, size)
         expected = [int(part) if part.isdigit() else known.get(part, part) for part in shape]
         tensor(where, name, value, expected, dtype, device)
+        for letter, size in zip(shape, value.shape, strict=True):
+            if not letter.isdigit() and known.setdefault(letter, size) != size:  # twice in a shape
+                raise ValueError(
+                    f"{where}: {name} must be ({', '.join(shape)}), got {describe(value)}"
+                )
         if not value.is_contiguous():
             raise ValueError(f"{where}: {name} must be contiguous")
     return known

@@ -43,7 +43,7 @@ def compact_requests(
         ValueError: request_tn is no contiguous (t, n) int32, or capacity < 1.
     """
     where = "compact_requests"
-    _words(where, "request_tn", request_tn, ("t", "n"), request_tn)
+    _check(where, request_tn, words={"request_tn": request_tn})
     check.whole(where, "capacity", capacity, low=1, high=2**31 - 1)
     return _home(backend, request_tn).compact_requests(request_tn, capacity)
 
@@ -67,10 +67,8 @@ def lru_partition(
     Raises:
         ValueError: A tensor of the wrong shape, dtype or device.
     """
-    where = "lru_partition"
-    _words(where, "order_k", order_k, ("k",), order_k)
-    _words(where, "stamp_s", stamp_s, ("s",), order_k)
-    _words(where, "frame_1", frame_1, (1,), order_k)
+    words = {"order_k": order_k, "stamp_s": stamp_s, "frame_1": frame_1}
+    _check("lru_partition", order_k, words=words)
     return _home(backend, order_k).lru_partition(order_k, stamp_s, frame_1)
 
 
@@ -92,8 +90,9 @@ def unlink(
         ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.
     """
     where = "unlink"
-    _words(where, "pointer", pointer, tuple("abcd"[: pointer.dim()]), pointer)
-    _words(where, "slot_k", slot_k, ("k",), pointer)
+    _check(where, pointer, words={"slot_k": slot_k})
+    fields = [("pointer", pointer, "abcd"[: pointer.dim()], torch.int32)]
+    check.tensors(where, pointer.device, fields)
     check.whole(where, "slots", slots, low=0, high=2**31 - 1)
     check.whole(where, "divisor", divisor, low=1, high=2**31 - 1)
     _home(backend, pointer).unlink(pointer, slot_k, slots, divisor)
@@ -124,10 +123,8 @@ def link(
         ValueError: A tensor of the wrong shape, dtype or device, or an unknown kind.
     """
     where = "link"
-    _words(where, "pointer_tn", pointer_tn, ("t", "n"), pointer_tn)
-    _words(where, "request_tn", request_tn, tuple(pointer_tn.shape), pointer_tn)
-    _words(where, "node_k", node_k, ("k",), pointer_tn)
-    _words(where, "word_k", word_k, tuple(node_k.shape), pointer_tn)
+    words = {"pointer_tn": pointer_tn, "request_tn": request_tn, "node_k": node_k, "word_k": word_k}
+    _check(where, pointer_tn, words=words)
     if kind not in (REQUEST_LOAD, REQUEST_SUBDIVIDE):
         raise ValueError(f"{where}: kind must be REQUEST_LOAD or REQUEST_SUBDIVIDE, got {kind!r}")
     _home(backend, pointer_tn).link(pointer_tn, request_tn, node_k, word_k, kind)
@@ -166,17 +163,15 @@ def link_bricks(
     Raises:
         ValueError: A tensor of the wrong shape, dtype or device.
     """
-    where = "link_bricks"
-    _words(where, "brick_tn", brick_tn, ("t", "n"), brick_tn)
-    _words(where, "request_tn", request_tn, tuple(brick_tn.shape), brick_tn)
-    slots = {"owner_b": owner_b, "stamp_b": stamp_b, "born_b": born_b}
-    for name, words in slots.items():
-        _words(where, name, words, tuple(owner_b.shape[:1]), brick_tn)
-    _words(where, "shared_b", shared_b, tuple(owner_b.shape[:1]), brick_tn, torch.bool)
-    _words(where, "node_k", node_k, ("k",), brick_tn, torch.int64)
-    _words(where, "slot_k", slot_k, tuple(node_k.shape), brick_tn)
-    pools = (brick_tn, request_tn, *slots.values(), shared_b)
-    _home(backend, brick_tn).link_bricks(*pools, node_k, slot_k, frame)
+    words = {"brick_tn": brick_tn, "request_tn": request_tn}
+    words |= {"owner_b": owner_b, "stamp_b": stamp_b, "born_b": born_b}
+    _check(
+        *("link_bricks", brick_tn),
+        words={**words, "slot_k": slot_k},
+        nodes={"node_k": node_k},
+        flags={"shared_b": shared_b},
+    )
+    _home(backend, brick_tn).link_bricks(*words.values(), shared_b, node_k, slot_k, frame)
 
 
 def link_tiles(
@@ -227,29 +222,21 @@ def link_tiles(
         ValueError: A tensor of the wrong shape, dtype or device.
     """
     where = "link_tiles"
-    _words(where, "child_tn", child_tn, ("t", "n"), child_tn)
-    _words(where, "brick_tn", brick_tn, tuple(child_tn.shape), child_tn)
-    _words(where, "request_tn", request_tn, tuple(child_tn.shape), child_tn)
-    tiles, rows = len(child_tn), len(node_j)
-    _words(where, "loc_t4", loc_t4, (tiles, 4), child_tn)
-    words = {"parent_t": parent_t, "tree_t": tree_t, "stamp_t": stamp_t}
-    for name, tensor in words.items():
-        _words(where, name, tensor, (tiles,), child_tn)
-    _words(where, "shared_t", shared_t, (tiles,), child_tn, torch.bool)
-    _words(where, "child_jw", child_jw, (rows, "w"), child_tn)
-    _words(where, "brick_jw", brick_jw, tuple(child_jw.shape), child_tn)
+    pools = {"child_tn": child_tn, "brick_tn": brick_tn, "request_tn": request_tn}
+    pools |= {"loc_t4": loc_t4, "parent_t": parent_t, "tree_t": tree_t, "stamp_t": stamp_t}
+    _check(
+        *(where, child_tn),
+        words={**pools, "child_jw": child_jw, "brick_jw": brick_jw, "tile_k": tile_k},
+        nodes={"node_j": node_j, "loc_j4": loc_j4, "row_k": row_k},
+        flags={"shared_t": shared_t},
+    )
     if child_jw.shape[1] > child_tn.shape[1]:
         width = child_tn.shape[1]
         raise ValueError(
             f"{where}: child_jw must hold at most {width} words a row, got {child_jw.shape[1]}"
         )
-    _words(where, "node_j", node_j, ("j",), child_tn, torch.int64)
-    _words(where, "loc_j4", loc_j4, (rows, 4), child_tn, torch.int64)
-    _words(where, "row_k", row_k, ("k",), child_tn, torch.int64)
-    _words(where, "tile_k", tile_k, tuple(row_k.shape), child_tn)
-    pools = (child_tn, brick_tn, request_tn, loc_t4, *words.values(), shared_t)
     made = (child_jw, brick_jw, node_j, loc_j4, row_k, tile_k)
-    _home(backend, child_tn).link_tiles(*pools, *made, tree, frame)
+    _home(backend, child_tn).link_tiles(*pools.values(), shared_t, *made, tree, frame)
 
 
 def locate(
@@ -271,8 +258,7 @@ def locate(
         ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.
     """
     where = "locate"
-    _words(where, "loc_t4", loc_t4, ("t", 4), node_k)
-    _words(where, "node_k", node_k, ("k",), node_k, torch.int64)
+    _check(where, node_k, words={"loc_t4": loc_t4}, nodes={"node_k": node_k})
     check.whole(where, "branching", branching, low=2, high=2**15 - 1)
     check.whole(where, "per_tile", per_tile, low=1, high=2**31 - 1)
     return _home(backend, node_k).locate(loc_t4, node_k, branching, per_tile)
@@ -314,30 +300,28 @@ def lacking(
         ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.
     """
     where = "lacking"
-    _words(where, "pointer_tn", pointer_tn, ("t", "n"), node_k)
-    tiles = len(pointer_tn)
-    _words(where, "loc_t4", loc_t4, (tiles, 4), node_k)
-    _words(where, "parent_t", parent_t, (tiles,), node_k)
-    _words(where, "tree_t", tree_t, (tiles,), node_k)
-    _words(where, "shared_t", shared_t, (tiles,), node_k, torch.bool)
-    _words(where, "node_k", node_k, ("k",), node_k, torch.int64)
-    _words(where, "loc_k4", loc_k4, (len(node_k), 4), node_k, torch.int64)
+    pools = {"pointer_tn": pointer_tn, "loc_t4": loc_t4, "parent_t": parent_t, "tree_t": tree_t}
+    nodes = {"node_k": node_k, "loc_k4": loc_k4}
+    _check(where, node_k, words=pools, nodes=nodes, flags={"shared_t": shared_t})
     check.whole(where, "branching", branching, low=2, high=2**15 - 1)
-    pools = (pointer_tn, loc_t4, parent_t, tree_t, shared_t)
-    return _home(backend, node_k).lacking(*pools, node_k, loc_k4, tree, root, branching)
+    pool = (*pools.values(), shared_t)
+    return _home(backend, node_k).lacking(*pool, node_k, loc_k4, tree, root, branching)
 
 
-def _words(
+def _check(
     where: str,
-    name: str,
-    value: Tensor,
-    shape: tuple,
     like: Tensor,
-    dtype: torch.dtype = torch.int32,
+    *,
+    words: dict[str, Tensor],
+    nodes: dict[str, Tensor] | None = None,
+    flags: dict[str, Tensor] | None = None,
 ) -> None:
-    check.tensor(where, name, value, shape, dtype, like.device)
-    if not value.is_contiguous():
-        raise ValueError(f"{where}: {name} must be contiguous")
+    """Checks words (int32), nodes (int64) and flags (bool) on the device of `like`; names end with
+    their shapes.
+    """
+    groups = ((words, torch.int32), (nodes or {}, torch.int64), (flags or {}, torch.bool))
+    fields = [(n, t, check.shape_of(n), dtype) for group, dtype in groups for n, t in group.items()]
+    check.tensors(where, like.device, fields)
 
 
 def _home(backend: Backend, tensor: Tensor) -> Any:  # the module of twins, or the compiled ops

@@ -30,13 +30,10 @@ def _names(op: Any) -> tuple[str, ...]:
 
 def _register_fake(op: Any, fake: Callable[..., Any]) -> None:
     """Gives an op its fake, which is called with all arguments by name."""
-    names = NAMES[str(op)] = _names(op)
+    names = _names(op)
 
     def by_name(*given: Any, **named: Any) -> Any:
-        named |= dict(zip(names, given, strict=False))
-        if "table" in named:
-            named["table_lm4"] = named.pop("table")
-        return fake(**named)
+        return fake(**dict(zip(names, given, strict=False)), **named)
 
     torch.library.register_fake(op.default.name(), by_name)
 
@@ -122,7 +119,7 @@ def _in_place(**_: Any) -> None:
     return None
 
 
-_FAKES: dict[str, Callable[..., Any]] = {
+FAKES: dict[str, Callable[..., Any]] = {
     "trace_rays": _trace_rays,
     "shade_rays": _shade_rays,
     "count_segments": _count_segments,
@@ -141,18 +138,6 @@ _FAKES: dict[str, Callable[..., Any]] = {
     "lacking": _lacking,
     "cut_bricks": _cut_bricks,
 }
-
-
-def call(op: Any, *records: Any, **extras: Any) -> Any:
-    """Calls an op with the fields of records, by name."""
-    named = {name: value for record in records for name, value in record._asdict().items()}
-    if "table_lm4" in named:
-        named |= {"table": named["table_lm4"], "levels": named["table_lm4"].shape[0]}
-    named |= extras
-    return op(**{name: named[name] for name in NAMES[str(op)]})
-
-
-NAMES: dict[str, tuple[str, ...]] = {}
 
 
 @functools.cache
@@ -194,7 +179,7 @@ def _composite_gradient(
 
 _reasons = cpp_ext.load()
 if not _reasons["cpp"]:
-    for _name, _fake in _FAKES.items():
+    for _name, _fake in FAKES.items():
         _register_fake(getattr(torch.ops.gvtorch, _name), _fake)
     torch.library.register_autograd(
         "gvtorch::sample_bricks", _sample_gradient, setup_context=_save_samples

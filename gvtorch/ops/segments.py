@@ -12,7 +12,6 @@ from ..base import check
 from .arguments import RayArguments, Samples, Segments, TraceArguments
 from .checks import check_channel, check_rays, check_real, check_trace, check_voxels
 from .reference import segments as reference
-from .registry import call
 from .trace import Backend, choose_backend
 
 _SEGMENT_BYTES = 84  # at most, in float64
@@ -54,18 +53,16 @@ def trace_segments(
         state = ("state_r3", state_r3, "r3", arguments.table_lm4.dtype)
         check.tensors(where, device, [state], sizes)
     check.whole(where, "limit", limit, low=0, high=2**31 - 1)
-    part = {"state_r3": state_r3, "limit": limit, "by_node": by_node}
+    given = (*rays, *arguments, state_r3, limit, by_node)
     with torch.no_grad():
         if choose_backend(backend, device) == "reference":
             return reference.walk_segments(rays, arguments, state_r3, limit, by_node)
         op = torch.ops.gvtorch
-        count, state, missed = call(op.count_segments, rays, arguments, **part)
+        count, state, missed = op.count_segments(*given)
         ends = count[:, 0].cumsum(0, dtype=torch.int64)
         total = int(ends[-1]) if sizes["r"] else 0
         check.memory(where, f"a list of {total} segments", total * _SEGMENT_BYTES, device)
-        part |= {"first_r": ends - count[:, 0], "total": total}
-        *found, t0, t1, distance = call(op.write_segments, rays, arguments, **part)
-        found = (*found, distance, t0, t1)
+        found = op.write_segments(*given, ends - count[:, 0], total)
         return Segments._make((*found, count, state, missed))
 
 
@@ -130,9 +127,8 @@ def sample_bricks(
     check.tensors(where, device, fields)
     if chosen == "reference":
         return reference.sample_bricks(rays, arguments, segments, samples)
-    names = ("ray_s", "node_s2", "brick_s2", "depth_s3", "interval_s3", "distance_s3")
-    places = dict(zip((*names, "segment_k", "number_k"), (*listed, *samples[:2]), strict=True))
-    return call(torch.ops.gvtorch.sample_bricks, rays, arguments, **places)
+    places = (*listed, samples.segment, samples.number)
+    return torch.ops.gvtorch.sample_bricks(*rays, *arguments.channel, *places)
 
 
 def composite(

@@ -12,7 +12,7 @@ from ..base import constants as config
 from .arguments import RayArguments, ShadeArguments, TraceArguments
 from .checks import check_shade, check_trace
 from .reference import march, shaders
-from .registry import available, call
+from .registry import available
 
 Backend = Literal["auto", "reference", "cpp", "cuda"]
 
@@ -62,7 +62,7 @@ def trace_rays(
     check_trace("trace_rays", rays, arguments)
     if choose_backend(backend, rays.origin_r3.device) == "reference":
         return march.trace_rays(rays, arguments)
-    return call(torch.ops.gvtorch.trace_rays, rays, arguments)
+    return torch.ops.gvtorch.trace_rays(*rays, *arguments)
 
 
 def shade_rays(
@@ -96,7 +96,7 @@ def shade_rays(
     """
     check_shade("shade_rays", rays, arguments, shading, parameter_54, own=op is not None)
     if choose_backend(backend, rays.origin_r3.device) != "reference":
-        return call(op_of(op), rays, arguments, shading, parameter_54=parameter_54)
+        return op_of(op)(*rays, *arguments, *shading, parameter_54)
     if op is not None:
         raise ValueError("shade_rays: a shader in C++ has no reference: write a ModuleShader")
     return shaders.shade_rays(rays, arguments, shading, parameter_54)

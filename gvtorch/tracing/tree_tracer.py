@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base import constants as config
-from ..ops import ShadeArguments, available
+from ..ops import RayArguments, ShadeArguments, TraceArguments, available
 from ..ops.trace import op_of
 from ..pool import N3Tree
 from ..shaders.shader import Shader, check_shader
@@ -29,11 +29,9 @@ class TreeTracer(torch.nn.Module):
     the buffer `parameter_54`, see `ops.shade_rays`; it may be edited.
     """
 
-    if TYPE_CHECKING:  # TorchScript would read these as attributes of its own
-        normal_bzyxc: Tensor
-        normal_tnc: Tensor
-        other_bzyxc: Tensor
-        other_tnc: Tensor
+    if TYPE_CHECKING:  # the arguments, which are registered by name
+
+        def __getattr__(self, name: str) -> Any: ...
 
     def __init__(
         self,
@@ -143,83 +141,61 @@ class TreeTracer(torch.nn.Module):
         """As `forward`, and returns also normal (r, 3) and features (r, c), (0, 3) and (0, 0) where
         the shader gives none.
         """
-        rays = (
+        rays = RayArguments(
             origin.to(torch.float64).contiguous(),
             direction.to(torch.float64).contiguous(),
             cone.to(torch.float64).contiguous(),
             range.to(torch.float64).contiguous(),
-        )
-        if self.plain:
-            color, alpha, depth, samples, _ = torch.ops.gvtorch.trace_rays(
-                rays[0],
-                rays[1],
-                rays[2],
-                rays[3],
-                self.place_33,
-                self.child_tn,
-                self.brick_tn,
-                self.request_tn,
-                self.stamp_t,
-                self.bricks_bzyxc,
-                self.constant_tnc,
-                self.range_tn2c,
-                self.stamp_b,
-                self.table_lm4,
-                self.domain_2,
-                self.opaque_m,
-                self.frame_1,
-                0,
-                self.branching,
-                self.root,
-                self.max_depth,
-                self.border,
-                self.component,
-                self.cone_scale,
-                self.root_voxel,
-                self.step,
-                self.stop_alpha,
-                self.depth_alpha,
-                False,
-            )
-            return color, alpha, depth, samples, color.new_zeros((0, 3)), color.new_zeros((0, 0))
-        with_normals, with_others = len(self.normal_tnc) > 0, len(self.other_tnc) > 0
-        color, alpha, depth, samples, _, normal, features = self.shade_rays(
-            rays[0],
-            rays[1],
-            rays[2],
-            rays[3],
-            self.place_33,
-            self.child_tn,
-            self.brick_tn,
-            self.request_tn,
-            self.stamp_t,
-            self.bricks_bzyxc,
-            self.constant_tnc,
-            self.range_tn2c,
-            self.stamp_b,
-            self.table_lm4,
-            self.domain_2,
-            self.opaque_m,
-            self.frame_1,
-            self.parameter_54,
-            self.normal_bzyxc if with_normals else None,
-            self.normal_tnc if with_normals else None,
-            self.other_bzyxc if with_others else None,
-            self.other_tnc if with_others else None,
-            self.shader,
-            self.features,
-            self.other_component,
             0,
-            self.branching,
-            self.root,
-            self.max_depth,
-            self.border,
-            self.component,
-            self.cone_scale,
-            self.root_voxel,
-            self.step,
-            self.stop_alpha,
-            self.depth_alpha,
-            False,
+            None,
+        )
+        arguments = self.arguments()
+        if self.plain:
+            color, alpha, depth, samples, _ = torch.ops.gvtorch.trace_rays(*rays, *arguments)
+            return color, alpha, depth, samples, color.new_zeros((0, 3)), color.new_zeros((0, 0))
+        color, alpha, depth, samples, _, normal, features = self.shade_rays(
+            *rays, *arguments, *self.shading(), self.parameter_54
         )
         return color, alpha, depth, samples, normal, features
+
+    def arguments(self) -> TraceArguments:
+        """What rays go through."""
+        return TraceArguments(
+            place_33=self.place_33,
+            branching=self.branching,
+            max_depth=self.max_depth,
+            border=self.border,
+            root_voxel=self.root_voxel,
+            cone_scale=self.cone_scale,
+            step=self.step,
+            bricks_bzyxc=self.bricks_bzyxc,
+            constant_tnc=self.constant_tnc,
+            range_tn2c=self.range_tn2c,
+            component=self.component,
+            child_tn=self.child_tn,
+            brick_tn=self.brick_tn,
+            request_tn=self.request_tn,
+            stamp_t=self.stamp_t,
+            stamp_b=self.stamp_b,
+            frame_1=self.frame_1,
+            root=self.root,
+            table_lm4=self.table_lm4,
+            domain_2=self.domain_2,
+            opaque_m=self.opaque_m,
+            stop_alpha=self.stop_alpha,
+            depth_alpha=self.depth_alpha,
+            by_level=self.by_level,
+        )
+
+    def shading(self) -> ShadeArguments:
+        """Which shader, and its channels."""
+        with_normals, with_others = len(self.normal_tnc) > 0, len(self.other_tnc) > 0
+        return ShadeArguments(
+            shader=self.shader,
+            features=self.features,
+            normal_bzyxc=self.normal_bzyxc if with_normals else None,
+            normal_tnc=self.normal_tnc if with_normals else None,
+            other_bzyxc=self.other_bzyxc if with_others else None,
+            other_tnc=self.other_tnc if with_others else None,
+            other_component=self.other_component,
+        )

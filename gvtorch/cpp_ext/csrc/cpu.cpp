@@ -1,4 +1,4 @@
-// The CPU library: defines the ops (schemas in entry.h) and runs every functor on torch's threads.
+// The CPU library: defines the ops (entry.h) and runs every functor on torch's threads.
 
 #include <algorithm>
 #include <atomic>
@@ -173,15 +173,13 @@ void shade(const torch::stable::Tensor& like, ShadeArgs args, bool wide) {
 #include "entry_segments.h"
 
 STABLE_TORCH_LIBRARY(gvtorch, library) {
-  library.def(gvtorch::kTraceRaysSchema);
-  library.def(gvtorch::kShadeRaysSchema);
-  gvtorch::define_cache(library);
-  gvtorch::define_segments(library);
+  gvtorch::define(library, gvtorch::RayOps{});
+  gvtorch::define(library, gvtorch::SegmentOps{});
+  gvtorch::define(library, gvtorch::CacheOps{});
 }
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) {
-  library.impl("trace_rays", TORCH_BOX(&gvtorch::trace_rays<gvtorch::Cpu>));
-  library.impl("shade_rays", TORCH_BOX(&gvtorch::shade_rays<gvtorch::Cpu>));
-  GV_IMPLEMENT_CACHE(library, gvtorch::Cpu);
-  GV_IMPLEMENT_SEGMENTS(library, gvtorch::Cpu);
+  gvtorch::implement<gvtorch::Cpu>(library, gvtorch::RayOps{});
+  gvtorch::implement<gvtorch::Cpu>(library, gvtorch::SegmentOps{});
+  gvtorch::implement<gvtorch::Cpu>(library, gvtorch::CacheOps{});
 }

@@ -225,8 +225,7 @@ void split(const torch::stable::Tensor& like, int64_t count, const Keep& keep, c
 #include "entry_segments.h"
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch, CUDA, library) {
-  library.impl("trace_rays", TORCH_BOX(&gvtorch::trace_rays<gvtorch::Cuda>));
-  library.impl("shade_rays", TORCH_BOX(&gvtorch::shade_rays<gvtorch::Cuda>));
-  GV_IMPLEMENT_CACHE(library, gvtorch::Cuda);
-  GV_IMPLEMENT_SEGMENTS(library, gvtorch::Cuda);
+  gvtorch::implement<gvtorch::Cuda>(library, gvtorch::RayOps{});
+  gvtorch::implement<gvtorch::Cuda>(library, gvtorch::SegmentOps{});
+  gvtorch::implement<gvtorch::Cuda>(library, gvtorch::CacheOps{});
 }

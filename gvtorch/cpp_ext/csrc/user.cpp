@@ -8,8 +8,6 @@
 template <class T>
 using UserShaderOf = GV_USER_SHADER<T>;  // the name that CompiledShader was told: a template <class T> struct
 
-#include <cstring>
-#include <string>
 #include <type_traits>
 #include <utility>
 
@@ -92,17 +90,17 @@ struct OneShader {
 #define GV_TEXT(name) GV_TEXT_OF(name)
 
 #ifdef __CUDACC__
-constexpr auto kShadeRays = &gvtorch::shade_rays<gvtorch::Cuda, gvtorch::OneShader>;
-
-STABLE_TORCH_LIBRARY_IMPL(gvtorch_user, CUDA, library) { library.impl(GV_TEXT(GV_USER_OP), TORCH_BOX(kShadeRays)); }
+STABLE_TORCH_LIBRARY_IMPL(gvtorch_user, CUDA, library) {
+  gvtorch::implement_as<gvtorch::Cuda, gvtorch::ShadeRaysOp, gvtorch::OneShader>(library, GV_TEXT(GV_USER_OP));
+}
 #else
-constexpr auto kShadeRays = &gvtorch::shade_rays<gvtorch::Cpu, gvtorch::OneShader>;
-
 STABLE_TORCH_LIBRARY_FRAGMENT(gvtorch_user, library) {
-  library.def((GV_TEXT(GV_USER_OP) + std::string(std::strchr(gvtorch::kShadeRaysSchema, '('))).c_str());
+  library.def(gvtorch::ShadeRaysOp::schema(GV_TEXT(GV_USER_OP)).c_str());
 }
 
-STABLE_TORCH_LIBRARY_IMPL(gvtorch_user, CPU, library) { library.impl(GV_TEXT(GV_USER_OP), TORCH_BOX(kShadeRays)); }
+STABLE_TORCH_LIBRARY_IMPL(gvtorch_user, CPU, library) {
+  gvtorch::implement_as<gvtorch::Cpu, gvtorch::ShadeRaysOp, gvtorch::OneShader>(library, GV_TEXT(GV_USER_OP));
+}
 
 // What Python asks of the struct.
 #define GV_TELLS extern "C" __attribute__((visibility("default")))
