@@ -166,7 +166,7 @@ def composite(
         *(("alpha_k", alpha_k, "k", real), ("feature_kc", feature_kc, "kc", real)),
         *(("offset_r", offset_r, "o", torch.int64), ("clear_r", clear, "r", real)),
     )
-    check.tensors(where, device, fields, {"r": rays})
+    check.tensors(where, device, fields, {"r": rays, "o": rays + 1})
     stop_clear = 1 - check.number(where, "stop_alpha", stop_alpha, low=0, high=1, open_low=True)
     args = (alpha_k, feature_kc, offset_r, clear, stop_clear)
     if choose_backend(backend, device) == "reference":
