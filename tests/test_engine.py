@@ -271,7 +271,7 @@ class Watched(Checked):
         self.round = 0
         return super().frame(*args, **options)
 
-    def serve(self, requests, stats):
+    def serve(self, listed, counts, stats):
         nodes, bricks = self.cache.nodes, self.cache.bricks
         before = [bricks.owner_b.clone(), nodes.parent_t.clone()]
         kept = [
@@ -281,7 +281,7 @@ class Watched(Checked):
             )
         ]
         evicted = sum(stats.evicted.values())
-        super().serve(requests, stats)
+        super().serve(listed, counts, stats)
         for now, old, keep in zip((bricks.owner_b, nodes.parent_t), before, kept, strict=True):
             assert torch.equal(now[keep], old[keep])
         if self.round:

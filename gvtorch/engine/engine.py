@@ -19,7 +19,7 @@ from torch import Tensor
 from ..base import check
 from ..base.records import Hits, Rays, add
 from ..base.stage import Progress, collect_timings, mark, milliseconds, no_progress, stage
-from ..cache import Cache, RequestsByKind, Scheduler
+from ..cache import Cache, RequestList, Scheduler
 from ..cache.requests import coarser_requests
 from ..cameras import Camera
 from ..cameras.custom import as_camera
@@ -34,7 +34,7 @@ from .failures import Failure
 from .options import EngineOptions, EngineSettings
 from .production import Production
 from .ray_subsets import RaySubsets, scouts
-from .readback import Collected, Readbacks
+from .readback import Collected, Counts, Readbacks
 from .report import Report
 from .request_batch import ProducedTree
 from .setup import brick_bytes, make_pools, make_tree
@@ -183,19 +183,21 @@ class Engine:
         last = self.readbacks.catch_up(wait or self.production.due)
         if self.readbacks:
             return
-        if last is not None:
-            counts = last.wait()
-            self.cache.make_room(counts.tiles_unused, counts.bricks_unused)
+        if last is not None:  # nothing was written since it was traced: its nodes are still there
             self.scheduler.begin()
-            if counts.listed:
-                # Nothing was written since it was traced: its nodes are those that rays saw.
-                self.serve(last.requests(self.cache.nodes), stats)
+            self.serve(last.requests, last.wait(), stats)
         with stage("write"):
             self.production.write(self.production.late(), stats)
 
-    def serve(self, requests: RequestsByKind, stats: FrameStats) -> None:
-        """Chooses requests, asks the producers, and writes the answers that are here at once."""
+    def serve(self, listed: RequestList, counts: Counts, stats: FrameStats) -> None:
+        """Lets slots be taken again, chooses requests, asks the producers, and writes the answers
+        that are here at once.
+        """
+        self.cache.make_room(counts.tiles_unused, counts.bricks_unused)
+        if not counts.listed:
+            return
         with stage("schedule"):
+            requests = listed.by_kind(self.cache.nodes, counts.by_kind())
             pending = self.production.pending
             room = {kind: max(0, n - pending[kind]) for kind, n in self.cache.room().items()}
             nodes, deferred, exceeded = self.scheduler.choose(requests, room)
@@ -231,8 +233,7 @@ class Engine:
             collected = self.collect_requests_and_use(hits.samples[:0])
             counts = collected.read()  # a frame that misses something waits anyway
             add(stats.requests, counts.by_kind())
-            self.cache.make_room(counts.tiles_unused, counts.bricks_unused)
-            self.serve(collected.requests.by_kind(self.cache.nodes, counts.by_kind()), stats)
+            self.serve(collected.requests, counts, stats)
 
     def trace(
         self, view: View, progress: Progress = no_progress, again: Again | None = None

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from ..base.records import add
-from ..cache import KINDS, RequestList, Requests
-from ..pool import NodePool
+from ..cache import KINDS, RequestList
 from .stats import FrameStats
 
 _AHEAD = 3  # most frames that the host may be ahead of the device
@@ -55,11 +54,12 @@ class Readback:
 
     Attributes:
         stats: Of the frame; completed when the counts are here.
+        requests: Of the frame, on the device.
     """
 
     def __init__(self, stats: FrameStats, collected: Collected) -> None:
         """Starts the copy."""
-        self.stats, self._requests = stats, collected.requests
+        self.stats, self.requests = stats, collected.requests
         self._pending = stats.pending > 0  # answers were on their way while it was traced
         self._numbers, self._event = collected.numbers, None
         self._counts: Counts | None = None
@@ -87,10 +87,6 @@ class Readback:
     def converged(self) -> bool:
         """Whether nothing that could be served was missing; waits until the counts are here."""
         return not (self.wait().found or self._pending)
-
-    def requests(self, nodes: NodePool) -> dict[int, Requests]:
-        """Returns the frame's requests; waits until their counts are here."""
-        return self._requests.by_kind(nodes, self.wait().by_kind())
 
     def _complete(self) -> None:
         """Sets what `FrameStats` waits for."""

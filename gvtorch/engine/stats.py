@@ -47,7 +47,7 @@ class FrameStats(RenderStats):
     the picture alone.
     """
 
-    milliseconds: float = waits(float)  # on the device
+    milliseconds: float = waits(float)  # of the frame; on CUDA, of the device
     stages: dict[str, float] = waits(dict)  # noqa: RUF009 - milliseconds by stage
     samples: int = waits(int)  # places at which the shader was evaluated
     tiles_used: int = waits(int)  # node tiles that rays passed through
