@@ -516,7 +516,7 @@ def test_it_is_unpickled_in_another_process(tmp_path):
 @pytest.mark.skipif(compilers.find_nvcc() is None, reason="nvcc is not here")
 @pytest.mark.backend("cpp")
 def test_nvcc_compiles_it(cache):
-    library = user.compiled(HEADER, "mine::Bands", user._content(HEADER, "mine::Bands"), ("90",))
+    library = user.compiled(user.ShaderSource.read(HEADER, "mine::Bands"), ("90",))
     assert library.parent == cache / "shaders" and b"mine_Bands_" in library.read_bytes()
 
 

@@ -1,16 +1,18 @@
-"""Compiles a user's shader, a C++ header, into a library of one op; keeps the library by content.
+"""Compiles a user's shader, a C++ header, into a library of one op, and caches the library.
 
-What a header holds is told in csrc/user_shader.h, how it becomes an op in csrc/user.cpp. A library
-is known by the digest of all it is made of: the header and what it includes from its folder,
-gvtorch's headers, flags (which tell the CPU's instruction set), torch's version, and the compilers
-(path, size and time of change, and the variables that they heed). It is written beside its place
-and then renamed, so that of two processes that compile at once one merely works in vain. Its last
-bytes are the digest of the others: what a crash or a full disk left behind is compiled again, never
-loaded. A folder that others can write to is refused, for a library is code.
+csrc/user_shader.h says what a header holds, csrc/user.cpp how it becomes an op. A library is found
+by a digest of all that it is made of: the header and what it includes from its folder, gvtorch's
+headers, the flags (and with them the CPU's instruction set), torch's version, and the compilers
+(path, size, time of change, and the environment variables that they read).
+
+What keeps the cache safe: a library is written beside its place and then renamed, so two processes
+may compile the same one at once; its last 32 bytes are the digest of the others, so one that a
+crash or a full disk cut short is compiled again; and a folder that others can write to is refused,
+for a library is code.
 
 Environment:
-    GVTORCH_CACHE  where libraries are kept; else gvtorch in XDG_CACHE_HOME or ~/.cache. Nobody
-                   cleans it up, and anybody may.
+    GVTORCH_CACHE  folder of the libraries; else gvtorch in XDG_CACHE_HOME or in ~/.cache. gvtorch
+                   never deletes them; anybody may.
     CXX, NVCC, CUDA_HOME  see compilers.py
 """
 
@@ -39,38 +41,70 @@ from . import compilers, instructions
 SOURCES = Path(__file__).parent / "csrc"
 _INCLUDE = re.compile(r'^[ \t]*#[ \t]*include[ \t]*"([^"\n]+)"', re.MULTILINE)
 _NAME = re.compile(r"(?=.{1,128}$)[A-Za-z_]\w*(::[A-Za-z_]\w*)*", re.ASCII)
-_HEEDED = ("CPATH", "CPLUS_INCLUDE_PATH", "NVCC_PREPEND_FLAGS", "NVCC_APPEND_FLAGS")
+_READ_BY_COMPILERS = ("CPATH", "CPLUS_INCLUDE_PATH", "NVCC_PREPEND_FLAGS", "NVCC_APPEND_FLAGS")
 _lock = threading.Lock()
 
 
 class CompileError(RuntimeError):
-    """A compiler refused a user's shader: one line with file and command, then all that it said."""
+    """A compiler refused a user's shader: a line with file and command, then its output."""
+
+
+@dataclass(frozen=True)
+class ShaderSource:
+    """A struct of a header, with the digest of all the code that it is compiled from."""
+
+    header: Path
+    name: str  # of the struct, with its namespaces
+    digest: str
+
+    @classmethod
+    def read(cls, header: Path, name: str) -> ShaderSource:
+        """Reads the header, all that it includes from its folder, and gvtorch's own headers."""
+        known: dict[Path, bytes] = {}
+        waiting = [header]
+        while waiting:
+            file = waiting.pop()
+            known[file] = text = file.read_bytes()
+            for named in _INCLUDE.findall(text.decode(errors="replace")):
+                beside = (file.parent / named).resolve()
+                if beside.is_file() and beside not in known:
+                    waiting.append(beside)
+        digest = hashlib.sha256(name.encode() + _own_sources())
+        for file in sorted(known):
+            digest.update(os.fsencode(os.path.relpath(file, header.parent)) + b"\0")
+            digest.update(hashlib.sha256(known[file]).digest())
+        return cls(header, name, digest.hexdigest())
+
+    @property
+    def op(self) -> str:
+        """Name of the op, in the namespace gvtorch_user."""
+        return f"{self.name.replace('::', '_')}_{self.digest[:16]}"
 
 
 @dataclass(frozen=True)
 class UserShader:
-    """A compiled shader, as its struct tells of itself."""
+    """A compiled shader, and what its struct says of itself."""
 
     header: Path
     name: str
     op: str  # in the namespace gvtorch_user
-    features: int  # how many it gives; -1: as many as the second channel holds
+    features: int  # numbers it gives for each ray; -1: as many as the second channel holds
     whole: bool  # a ray must not be traced in pieces
     uniforms: tuple[str, ...] | None  # their names; None: any number, without names
 
 
 def load(header: str | os.PathLike[str], name: str) -> UserShader:
-    """Compiles a struct of a header for the CPU, if that is not done yet, and loads its op.
+    """Loads the op of a header's struct for the CPU; compiles it unless the cache has it.
 
     Args:
-        header: The file.
+        header: Path of the C++ header.
         name: The struct's name, with its namespaces.
 
     Raises:
-        ValueError: There is no such file, it is no text, or the name is none.
+        ValueError: There is no such file, it is no text, or the name is no C++ name.
         CompileError: The compiler refuses it.
         RuntimeError: There is no compiler, the header changes meanwhile, the cache's folder can't
-            be written, or is not the user's own, or what was compiled can't be loaded from there.
+            be written or is not the user's own, or the library can't be loaded.
     """
     if not isinstance(header, (str, os.PathLike)) or "\0" in str(header):
         raise ValueError(f"CompiledShader: header must be a path, got {header!r}")
@@ -86,41 +120,39 @@ def load(header: str | os.PathLike[str], name: str) -> UserShader:
             "CompiledShader: name must be that of a C++ struct, of at most 128 letters, "
             f"got {name!r}"
         )
-    content = _content(path, name)
-    op = _op(name, content)
-    told = ctypes.CDLL(str(_loaded(path, name, content, ())))
-    told.gvtorch_uniforms.restype = ctypes.c_char_p
-    names = told.gvtorch_uniforms().decode()
+    source = ShaderSource.read(path, name)
+    library = ctypes.CDLL(str(_loaded(source, ())))
+    library.gvtorch_uniforms.restype = ctypes.c_char_p
+    names = library.gvtorch_uniforms().decode()
     return UserShader(
         header=path,
         name=name,
-        op=op,
-        features=told.gvtorch_features(),
-        whole=bool(told.gvtorch_whole()),
-        uniforms=tuple(re.findall(r"\w+", names)) if told.gvtorch_named() else None,
+        op=source.op,
+        features=library.gvtorch_features(),
+        whole=bool(library.gvtorch_whole()),
+        uniforms=tuple(re.findall(r"\w+", names)) if library.gvtorch_named() else None,
     )
 
 
 def load_cuda(shader: UserShader) -> None:
-    """Compiles and loads the CUDA kernel, for the devices that are here.
+    """Loads a shader's CUDA kernel; compiles it for this machine's devices unless the cache has it.
 
     Raises:
-        RuntimeError: The header has changed since `load`; else as there.
+        RuntimeError: The header has changed since `load`, or see there.
     """
-    header, name, op = shader.header, shader.name, shader.op
-    if (op, "cuda") in _libraries:
+    if (shader.op, "cuda") in _libraries:
         return
-    content = _content(header, name) if header.is_file() else ""
-    if op != _op(name, content):
-        raise _changed(header)
+    source = ShaderSource.read(shader.header, shader.name) if shader.header.is_file() else None
+    if source is None or source.op != shader.op:
+        raise _changed(shader.header)
     devices = range(torch.cuda.device_count())
     found = {"".join(map(str, torch.cuda.get_device_capability(device))) for device in devices}
-    _loaded(header, name, content, sorted(found))
+    _loaded(source, sorted(found))
 
 
 def reload(shader: UserShader) -> UserShader:
-    """Returns a shader that came from another process with its op loaded: the same one, or what its
-    header makes here.
+    """Returns a shader that another process compiled (an unpickled one, say) as it is if its op is
+    loaded here, else made anew from its header.
 
     Raises:
         ValueError, CompileError, RuntimeError: See `load`.
@@ -128,23 +160,20 @@ def reload(shader: UserShader) -> UserShader:
     return shader if (shader.op, "cpu") in _libraries else load(shader.header, shader.name)
 
 
-_libraries: dict[tuple[str, str], Path] = {}  # what is loaded, by op and device type
+_libraries: dict[tuple[str, str], Path] = {}  # the loaded ones, by op and device type
 
 
 def libraries(op: str) -> list[Path]:
-    """Returns the libraries of an op that are loaded, the CPU's first."""
+    """Returns the paths of an op's loaded libraries, the CPU's first."""
     return [_libraries[op, kind] for kind in ("cpu", "cuda") if (op, kind) in _libraries]
 
 
-def _op(name: str, content: str) -> str:
-    return f"{name.replace('::', '_')}_{content[:16]}"
-
-
-def _loaded(header: Path, name: str, content: str, archs: Sequence[str]) -> Path:
-    key = (_op(name, content), "cuda" if archs else "cpu")
+def _loaded(source: ShaderSource, archs: Sequence[str]) -> Path:
+    """Returns the path of a library after loading it, once."""
+    key = (source.op, "cuda" if archs else "cpu")
     with _lock:
         if key not in _libraries:
-            library = compiled(header, name, content, archs)
+            library = compiled(source, archs)
             try:
                 torch.ops.load_library(library)
             except OSError as error:  # its cause has the loader's words
@@ -153,28 +182,26 @@ def _loaded(header: Path, name: str, content: str, archs: Sequence[str]) -> Path
         return _libraries[key]
 
 
-def compiled(header: Path, name: str, content: str, archs: Sequence[str]) -> Path:
-    """Returns a library from the cache, where it is put if it is not there.
+def compiled(source: ShaderSource, archs: Sequence[str]) -> Path:
+    """Returns the path of a library in the cache, after compiling it if it is not there.
 
     Args:
-        header: See `load`.
-        name: See `load`.
-        content: The digest by which the header is known, which makes the op's name.
-        archs: CUDA compute capabilities, as in ("90",); none: the CPU.
+        source: The struct and its code.
+        archs: CUDA compute capabilities, as in ("90",); none for the CPU.
 
     Raises:
         CompileError: The compiler refuses it.
         RuntimeError: See `load`.
     """
-    for_whom = "CUDA" if archs else "the CPU"
-    command, flags = _call(archs)
-    tools = [command, compilers.find_cxx()] if archs else [command]  # nvcc calls it
-    parts = [content, *flags, torch.__version__, platform.machine(), *map(_identity, tools)]
-    parts += [os.environ.get(variable, "") for variable in _HEEDED]
+    header, name, op = source.header, source.name, source.op
+    kind, for_whom = ("cuda", "CUDA") if archs else ("cpu", "the CPU")
+    command, flags = _compiler(archs)
+    tools = [command, compilers.find_cxx()] if archs else [command]  # nvcc calls the C++ compiler
+    parts = [source.digest, *flags, torch.__version__, platform.machine()]
+    parts += [*map(_identity, tools), *(os.environ.get(one, "") for one in _READ_BY_COMPILERS)]
     digest = hashlib.sha256("\0".join(parts).encode(errors="surrogateescape")).hexdigest()
-    kind, op = "cuda" if archs else "cpu", _op(name, content)
     library = _folder() / f"{op}_{kind}_{digest[:16]}.so"
-    if _whole(library):
+    if _is_intact(library):
         return library
     if shutil.which(command[0]) is None:
         raise RuntimeError(
@@ -201,7 +228,7 @@ def compiled(header: Path, name: str, content: str, archs: Sequence[str]) -> Pat
                 f"{header}: {name} did not compile for {for_whom} with: {shlex.join(call)}\n"
                 f"{run.stdout}"
             )
-        if not header.is_file() or _content(header, name) != content:
+        if not header.is_file() or ShaderSource.read(header, name) != source:
             raise _changed(header)
         with target.open("ab") as file:
             file.write(hashlib.sha256(target.read_bytes()).digest())
@@ -210,8 +237,8 @@ def compiled(header: Path, name: str, content: str, archs: Sequence[str]) -> Pat
     return library
 
 
-def _whole(library: Path) -> bool:
-    """Tells whether a library is there, and is what was written."""
+def _is_intact(library: Path) -> bool:
+    """Returns whether a library is in the cache and ends with the digest of its other bytes."""
     try:
         kept = library.read_bytes()
     except FileNotFoundError:
@@ -221,9 +248,9 @@ def _whole(library: Path) -> bool:
     return kept[-32:] == hashlib.sha256(kept[:-32]).digest()
 
 
-def _call(archs: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The compiler, and its flags but for those that name a path."""
-    if not archs:  # what is nowhere defined is an error here, as it will be when it is loaded
+def _compiler(archs: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Returns the compiler's call and its flags, without those that name a path."""
+    if not archs:  # "defs": an undefined symbol is an error now, not when the library is loaded
         linker = "-Wl,--no-as-needed,-z,defs"
         own = compilers.INSTRUCTION_SETS[instructions()]
         return compilers.find_cxx(), [*compilers.CXX_FLAGS, *own, "-pthread", linker]
@@ -232,7 +259,11 @@ def _call(archs: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def _folder() -> Path:
-    """Returns where libraries are kept, as a full path; makes it, for its owner alone."""
+    """Returns the absolute path of the cache's folder; makes it, for its owner alone.
+
+    Raises:
+        RuntimeError: It can't be made, is another user's, or others may write to it.
+    """
     try:
         named = os.environ.get("GVTORCH_CACHE")
         base = named or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "gvtorch"
@@ -258,35 +289,16 @@ def _refused(reason: object) -> RuntimeError:
     )
 
 
-def _content(header: Path, name: str) -> str:
-    """Digest of a struct, of its header with all that it includes from its folder, and of
-    gvtorch's own headers.
-    """
-    known: dict[Path, bytes] = {}
-    waiting = [header]
-    while waiting:
-        file = waiting.pop()
-        known[file] = text = file.read_bytes()
-        for named in _INCLUDE.findall(text.decode(errors="replace")):
-            beside = (file.parent / named).resolve()
-            if beside.is_file() and beside not in known:
-                waiting.append(beside)
-    digest = hashlib.sha256(name.encode() + _own_sources())
-    for file in sorted(known):
-        digest.update(os.fsencode(os.path.relpath(file, header.parent)) + b"\0")
-        digest.update(hashlib.sha256(known[file]).digest())
-    return digest.hexdigest()
-
-
 @functools.cache
 def _own_sources() -> bytes:
+    """Returns the digests of gvtorch's own sources, one after the other."""
     digests = [hashlib.sha256(file.read_bytes()).digest() for file in sorted(SOURCES.iterdir())]
     return b"".join(digests)
 
 
 def _identity(command: Sequence[str]) -> str:
-    """Tells a compiler from another without calling it: the command, and the path, size and time of
-    change of each program in it, as of `ccache` and `g++`.
+    """Returns a text by which a compiler is known without calling it: its command, and path, size
+    and time of change of each program in it (both `ccache` and `g++`, say).
     """
     parts = [shlex.join(command)]
     for word in command:
