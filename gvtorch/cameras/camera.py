@@ -88,20 +88,12 @@ class Camera:
                 positive or a rotation that is none.
         """
         model_of("Camera", model)
-        self.model = model
+        self.model, self.frame = model, frame
         self.width = check.whole("Camera", "width", width, low=1, high=65536)
         self.height = check.whole("Camera", "height", height, low=1, high=65536)
         self.window = (0, self.height)
-        view = torch.as_tensor(viewmats, dtype=torch.float64)
-        intrinsics = torch.as_tensor(Ks, dtype=torch.float64)
-        for name, matrix, side in (("viewmats", view, 4), ("Ks", intrinsics, 3)):
-            if matrix.dim() not in (2, 3) or matrix.shape[-2:] != (side, side):
-                raise ValueError(
-                    f"Camera: {name} must be ({side}, {side}) or (n, {side}, {side}), "
-                    f"got {tuple(matrix.shape)}"
-                )
-            if not bool(torch.isfinite(matrix).all()):
-                raise ValueError(f"Camera: {name} must be finite, got NaN or infinity")
+        (view,) = _batch("Camera", (4, 4), viewmats=viewmats)
+        (intrinsics,) = _batch("Camera", (3, 3), Ks=Ks)
         self.batched = view.dim() == 3 or intrinsics.dim() == 3
         count = max(m.shape[0] if m.dim() == 3 else 1 for m in (view, intrinsics))
         try:
@@ -112,22 +104,9 @@ class Camera:
                 f"Camera: viewmats {tuple(view.shape)} and Ks {tuple(intrinsics.shape)} "
                 "do not match"
             ) from None
-        if bool((self.Ks[:, (0, 1), (0, 1)] <= 0).any()):
-            raise ValueError("Camera: Ks must have positive focal lengths")
-        rotation = self.viewmats[:, :3, :3]
-        error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().max()
-        if error > 1e-3 or bool((torch.linalg.det(rotation) < 0).any()):
-            raise ValueError("Camera: viewmats must hold rotations (orthonormal, determinant +1)")
-        bottom = torch.tensor([0, 0, 0, 1], dtype=torch.float64)
-        if bool((self.viewmats[:, 3] != bottom).any() or (self.Ks[:, 2] != bottom[1:]).any()):
-            raise ValueError("Camera: last rows must be (0, 0, 0, 1) of viewmats, (0, 0, 1) of Ks")
-        if bool((self.Ks[:, (0, 1), (1, 0)] != 0).any()):
-            raise ValueError("Camera: Ks must have no skew")
-        self.frame = frame
-        angle = math.radians(
-            check.number("Camera", "max_angle", max_angle, low=0, high=180, open_low=True)
-        )
-        self.max_angle = torch.full((count,), angle, dtype=torch.float64)
+        _check_matrices(self.viewmats, self.Ks)
+        angle = check.number("Camera", "max_angle", max_angle, low=0, high=180, open_low=True)
+        self.max_angle = torch.full((count,), math.radians(angle), dtype=torch.float64)
         self.radial_coeffs = torch.zeros(count, 4, dtype=torch.float64)
         if radial_coeffs is not None:
             self._distort(_numbers("Camera", "radial_coeffs", radial_coeffs))
@@ -171,34 +150,18 @@ class Camera:
         Raises:
             ValueError: A number is not finite or out of its range.
         """
-        turn, lift, far = (
-            _numbers("Camera.orbit", name, value)
-            for name, value in (
-                *(("azimuth", azimuth), ("elevation", elevation)),
-                ("distance", distance),
-            )
-        )
+        where = "Camera.orbit"
+        numbers = {"azimuth": azimuth, "elevation": elevation, "distance": distance}
+        turn, lift, far = _batch(where, (), **numbers)
         if bool((far <= 0).any()):
-            raise ValueError(f"Camera.orbit: distance must be > 0, got {distance!r}")
-        try:
-            turn, lift, far = torch.broadcast_tensors(turn.deg2rad(), lift.deg2rad(), far)
-        except RuntimeError:
-            raise ValueError(
-                "Camera.orbit: azimuth, elevation and distance have different lengths"
-            ) from None
-        if far.dim() > 1:
-            raise ValueError(
-                "Camera.orbit: azimuth, elevation and distance must be numbers or (n,), "
-                f"got {tuple(far.shape)}"
-            )
+            raise ValueError(f"{where}: distance must be > 0, got {distance!r}")
+        turn, lift = turn.deg2rad(), lift.deg2rad()
         zero = torch.zeros_like(turn)
-        outward = torch.stack(
-            (turn.sin() * lift.cos(), lift.sin(), turn.cos() * lift.cos()), dim=-1
-        )
-        over = torch.where(lift.cos() < -1e-12, -1.0, 1.0)  # beyond a pole up is still +y
-        right = torch.stack((over * turn.cos(), zero, -over * turn.sin()), dim=-1)
+        outward = torch.stack((turn.sin() * lift.cos(), lift.sin(), turn.cos() * lift.cos()), -1)
+        sign = torch.where(lift.cos() < -1e-12, -1.0, 1.0)  # beyond a pole up is still +y
+        right = torch.stack((sign * turn.cos(), zero, -sign * turn.sin()), -1)
         view = _viewmat(outward * far[..., None], -outward, right)
-        return _aimed("Camera.orbit", view, far, fov, width, height, model, Frame.BOX)
+        return _aimed(where, view, far, fov, width, height, model, Frame.BOX)
 
     @classmethod
     def look_at(
@@ -229,37 +192,23 @@ class Camera:
         Raises:
             ValueError: A place is not finite, up is zero, or eye and target are the same.
         """
-        places = []
-        for name, value in (("eye", eye), ("target", target), ("up", up)):
-            place = _numbers("Camera.look_at", name, value)
-            if place.dim() not in (1, 2) or place.shape[-1] != 3:
-                raise ValueError(
-                    f"Camera.look_at: {name} must be (3,) or (n, 3), got {tuple(place.shape)}"
-                )
-            places.append(place)
-        try:
-            eye_, target_, up_ = torch.broadcast_tensors(*places)
-        except RuntimeError:
-            raise ValueError("Camera.look_at: eye, target and up have different lengths") from None
+        where = "Camera.look_at"
+        eye_, target_, up_ = _batch(where, (3,), eye=eye, target=target, up=up)
         if bool((up_ == 0).all(-1).any()):
-            raise ValueError("Camera.look_at: up must not be zero")
+            raise ValueError(f"{where}: up must not be zero")
         forward = target_ - eye_
         length = forward.norm(dim=-1, keepdim=True)
         if bool((length == 0).any()):
-            raise ValueError(f"Camera.look_at: eye and target are the same place, {eye!r}")
+            raise ValueError(f"{where}: eye and target are the same place, {eye!r}")
         forward = forward / length
         right = torch.linalg.cross(forward, up_)
-        other = torch.where(
-            forward[..., 2:3].abs() > 0.9,
-            forward.new_tensor([0, 1, 0]),
-            forward.new_tensor([0, 0, -1]),
-        )
+        along_z = forward[..., 2:3].abs() > 0.9
+        other = torch.where(along_z, *forward.new_tensor([[0, 1, 0], [0, 0, -1]]))
         parallel = right.norm(dim=-1, keepdim=True) < 1e-9 * up_.norm(dim=-1, keepdim=True) + 1e-300
         right = torch.where(parallel, torch.linalg.cross(forward, other), right)
         right = right / right.norm(dim=-1, keepdim=True)
         view = _viewmat(eye_, forward, right)
-        distance = length[..., 0]
-        return _aimed("Camera.look_at", view, distance, fov, width, height, model, Frame.WORLD)
+        return _aimed(where, view, length[..., 0], fov, width, height, model, Frame.WORLD)
 
     @classmethod
     def from_viewmat_K(
@@ -271,20 +220,18 @@ class Camera:
         camera_model: CameraModel = "pinhole",
         radial_coeffs: Tensor | None = None,
     ) -> Camera:
-        """Takes gsplat's arguments: (..., 4, 4) world-to-camera (OpenCV), (..., 3, 3),
-        the camera model by its name there, and (..., 4) coefficients of a fisheye.
-
-        Leading dimensions are laid in a row: the cameras are a batch of their product.
+        """Takes gsplat's arguments: (..., 4, 4) world-to-camera (OpenCV), (..., 3, 3) intrinsics,
+        the camera model by its name there, and (..., 4) coefficients of a fisheye. Leading
+        dimensions are flattened to one batch.
         """
-        flat = []
-        for name, matrix in (("viewmats", viewmats), ("Ks", Ks)):
-            matrices = _numbers("Camera.from_viewmat_K", name, matrix)
-            many = matrices.dim() > 3
-            flat.append(matrices.reshape(-1, *matrices.shape[-2:]) if many else matrices)
-        if radial_coeffs is not None and radial_coeffs.dim() > 2:
-            radial_coeffs = radial_coeffs.reshape(-1, radial_coeffs.shape[-1])
-        view, K = flat
-        return Camera(view, K, width, height, model=camera_model, radial_coeffs=radial_coeffs)
+
+        def flat(values: Tensor, dims: int) -> Tensor:
+            return values.flatten(0, -dims - 1) if values.dim() > dims + 1 else values
+
+        if radial_coeffs is not None:
+            radial_coeffs = flat(radial_coeffs, 1)
+        matrices = flat(viewmats, 2), flat(Ks, 2)
+        return Camera(*matrices, width, height, model=camera_model, radial_coeffs=radial_coeffs)
 
     @classmethod
     def from_kornia(cls, camera: PinholeCamera) -> Camera:
@@ -440,13 +387,51 @@ def sent(numbers: Tensor, device: torch.device | str) -> Tensor:
 
 
 def _numbers(where: str, name: str, value: Any) -> Tensor:
+    """Finite numbers as a float64 tensor on the CPU."""
     try:
         tensor = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
     except (TypeError, ValueError, RuntimeError):
         raise ValueError(f"{where}: {name} must be numbers, got {value!r}") from None
     if not bool(torch.isfinite(tensor).all()):
-        raise ValueError(f"{where}: {name} must be finite, got {value!r}")
+        got = "NaN or infinity" if isinstance(value, Tensor) else repr(value)
+        raise ValueError(f"{where}: {name} must be finite, got {got}")
     return tensor
+
+
+def _batch(where: str, shape: tuple[int, ...], **values: Any) -> list[Tensor]:
+    """Numbers of one camera, each of this shape, or of n cameras (n, *shape), broadcast against
+    each other.
+    """
+    found = []
+    for name, value in values.items():
+        numbers = _numbers(where, name, value)
+        batch = numbers.dim() - len(shape)
+        if batch not in (0, 1) or numbers.shape[batch:] != shape:
+            many = "(" + ", ".join(["n", *map(str, shape)]) + ("," if not shape else "") + ")"
+            raise ValueError(
+                f"{where}: {name} must be {shape or 'a number'} or {many}, "
+                f"got {tuple(numbers.shape)}"
+            )
+        found.append(numbers)
+    try:
+        return list(torch.broadcast_tensors(*found))
+    except RuntimeError:
+        raise ValueError(f"{where}: {', '.join(values)} have different lengths") from None
+
+
+def _check_matrices(viewmats: Tensor, Ks: Tensor) -> None:
+    """Raises ValueError unless these are poses (n, 4, 4) and intrinsics (n, 3, 3)."""
+    if bool((Ks[:, (0, 1), (0, 1)] <= 0).any()):
+        raise ValueError("Camera: Ks must have positive focal lengths")
+    rotation = viewmats[:, :3, :3]
+    error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().max()
+    if error > 1e-3 or bool((torch.linalg.det(rotation) < 0).any()):
+        raise ValueError("Camera: viewmats must hold rotations (orthonormal, determinant +1)")
+    bottom = torch.tensor([0, 0, 0, 1], dtype=torch.float64)
+    if bool((viewmats[:, 3] != bottom).any() or (Ks[:, 2] != bottom[1:]).any()):
+        raise ValueError("Camera: last rows must be (0, 0, 0, 1) of viewmats, (0, 0, 1) of Ks")
+    if bool((Ks[:, (0, 1), (1, 0)] != 0).any()):
+        raise ValueError("Camera: Ks must have no skew")
 
 
 def _viewmat(eye: Tensor, forward: Tensor, right: Tensor) -> Tensor:
