@@ -53,8 +53,8 @@ class Camera:
         model: Name of the camera model.
         radial_coeffs: (n, 4) float64 distortion of a fisheye.
         max_angle: (n,) float64 radians; a fisheye's rays farther from the axis are closed.
-        window: First row and number of rows of the whole picture, of which this camera may take a
-            strip.
+        window: First row of this camera, which may take a strip only, and number of rows of the
+            whole picture.
         frame: Whether positions are in the world or relative to the box of what is rendered.
         batched: False for one camera whose pictures have no batch dimension.
     """
@@ -85,7 +85,7 @@ class Camera:
 
         Raises:
             ValueError: A wrong shape, a value that is not finite, a focal length that is not
-                positive or a rotation that is none.
+                positive or a matrix that is no rotation.
         """
         model_of("Camera", model)
         self.model, self.frame = model, frame

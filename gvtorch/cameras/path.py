@@ -71,8 +71,8 @@ class CameraPath:
         elevation: float = 20.0,
         distance: float = 2.4,
     ) -> CameraPath:
-        """Goes once around a box; see `Camera.orbit` for the numbers. The model tells the field of
-        view that is left out.
+        """Goes once around a box (2, 3); see `Camera.orbit` for the numbers. If left out, the field
+        of view is the model's own.
         """
         fov = model_of("CameraPath.orbit", model).fov if fov is None else fov
         turn = azimuth + torch.linspace(0, 360, 37)

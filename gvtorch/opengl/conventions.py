@@ -91,7 +91,7 @@ def camera(projection: Tensor, modelview: Tensor, width: int, height: int) -> Ca
         height: Pixels of the viewport.
 
     Raises:
-        ValueError: The projection is none that a pinhole camera has, or see `Camera`.
+        ValueError: The matrix is not that of a pinhole camera, or see `Camera`.
     """
     where = "opengl.camera"
     matrix = _Matrix.read(where, projection)
@@ -137,7 +137,7 @@ def ray_distance(
         the far plane, to which it is cleared: nothing was drawn there.
 
     Raises:
-        ValueError: A wrong shape or dtype, or a projection that is none of these.
+        ValueError: A wrong shape or dtype, or another kind of projection.
     """
     matrix = _Matrix.read("opengl.ray_distance", projection)
     pixels = matrix.pixels("opengl.ray_distance", "window_depth", window_depth, clip_depth)

@@ -1,9 +1,9 @@
 """`Exchange`: pictures that pass between OpenGL and torch, on the device where both are on one.
 
-Colours and depths come as tensors from the framebuffer that OpenGL reads, and go into the one that
-it draws. Each moves in the type in which OpenGL has it, for conversions send drivers through the
-host. They do that with most formats of depth in both directions, so depth becomes a colour first
-(or last) by drawing one triangle.
+Colours and depths are read as tensors from the framebuffer bound for reading, and written into the
+one bound for drawing. Each moves in the type in which OpenGL stores it, because drivers convert
+types on the host. They do so for most formats of depth, in both directions, so depth is turned into
+a colour (or back) by drawing one triangle.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..base import check
 from . import functions as gl
-from .pixels import Shared, ThroughHost, Way, why_not_shared
+from .transfer import Shared, ThroughHost, Way, why_not_shared
 
 _VERTEX = """#version 150
 void main() {  // one triangle over all pixels
@@ -47,16 +47,16 @@ _ONE_SAMPLE = "it must be complete, and a framebuffer of several samples a pixel
 class Exchange:
     """Pictures of one size between an OpenGL context and torch.
 
-    The context, or one that shares its objects, is current on this thread in every call, `close`
-    included; its state is left as it was. Rows go down in tensors, as in our pictures. Nothing
-    waits for the device where buffers are shared. An exchange that is never closed leaves its
-    buffers and textures to the context.
+    The context, or one that shares its objects, must be current on this thread in every call,
+    `close` included; its state is left unchanged. Tensors have their first row at the top, as
+    pictures do. Where buffers are shared, no call waits for the device. An exchange that is never
+    closed leaves its buffers and textures to the context.
 
     Attributes:
         width: Of the pictures, pixels.
         height: Likewise.
-        device: Where tensors are given back.
-        shared: CUDA sees OpenGL's buffers; else pixels go through the host.
+        device: Of the tensors that are read.
+        shared: Whether CUDA maps OpenGL's buffers; else pixels are copied through the host.
         reason: Why they are not shared, or "".
     """
 
@@ -74,8 +74,8 @@ class Exchange:
         Args:
             width: Of the pictures, pixels.
             height: Likewise.
-            device: Where tensors are given back.
-            share: Whether buffers are shared with CUDA; default: wherever that can be.
+            device: Of the tensors that are read.
+            share: Whether buffers are shared with CUDA; default: wherever that is possible.
             load: Address of an OpenGL function by its name, from the library that made the
                 context (`glfw.get_proc_address`, for one); default: the system's library.
 
@@ -83,7 +83,7 @@ class Exchange:
             ValueError: A size is not positive or more than a texture can have, or there is no such
                 device.
             RuntimeError: There is no context, its OpenGL is too old, or `share` is true and CUDA
-                can't see its buffers.
+                can't map its buffers.
         """
         where = "opengl.Exchange"
         if not (share is None or isinstance(share, bool)):
@@ -101,7 +101,7 @@ class Exchange:
         self._most = torch.full((1,), 255.0, device=self.device)  # divides alike on every device
         self._ways: dict[str, Way] = {}
         self._textures: dict[str, tuple[int, int]] = {}  # name and format
-        # No other program has a result of this name: it tells whether we are in our context.
+        # No other program has an output of this name, by which our context is recognised.
         self._mark = f"result_{next(_NUMBERS)}"
         with self._gl.unchanged(drawing=True):
             self._program = self._gl.program(_VERTEX, _FRAGMENT.replace("result", self._mark))
@@ -155,7 +155,7 @@ class Exchange:
             return self._pull("read depth", gl.RED, torch.float32)
 
     def upload(self, color: Tensor, depth: Tensor | None = None) -> tuple[int, int]:
-        """Writes pictures into textures, which shaders of one's own may read.
+        """Writes pictures into textures, for shaders of the caller.
 
         Args:
             color: (h, w, 3) or (h, w, 4), uint8, float16 or float32, on any device; kept in RGBA8,
@@ -163,8 +163,8 @@ class Exchange:
             depth: (h, w, 1) floats, kept in R32F.
 
         Returns:
-            The names of both textures, whose rows go up; 0 for a depth that was not given. They
-            belong to the exchange, which writes into them the next time.
+            The names of both textures, whose first row is the lowest; 0 for a depth that was not
+            given. They belong to the exchange, which overwrites them in the next call.
 
         Raises:
             ValueError: A wrong shape or dtype.
@@ -173,14 +173,13 @@ class Exchange:
             return self._upload(color, depth)
 
     def draw(self, color: Tensor, depth: Tensor | None = None) -> None:
-        """Writes pictures into the framebuffer that is bound for drawing, its first draw buffer,
-        from the lower left corner on, in place of what it holds; what is drawn later is tested
-        against their depth.
+        """Overwrites the first draw buffer of the framebuffer bound for drawing with pictures, from
+        the lower left corner on; what is drawn later is tested against their depth.
 
         Args:
-            color: As in `upload`, with the values that the framebuffer shall store.
-            depth: As in `upload`: window depth, 0 to 1, as `window_depth` gives it; without it the
-                framebuffer's depth stays.
+            color: As in `upload`, the values to be stored.
+            depth: As in `upload`: window depth, 0 to 1, as `window_depth` gives it; if left out,
+                the framebuffer's depth stays.
 
         Raises:
             ValueError: A wrong shape or dtype.
@@ -198,7 +197,7 @@ class Exchange:
             self._draw("color", None if depth is None else "depth")
 
     def close(self) -> None:
-        """Gives back buffers, textures and the rest; the exchange is of no use afterwards.
+        """Frees buffers, textures and program; the exchange can't be used afterwards.
 
         Raises:
             RuntimeError: Its context is not current; it still has to be closed.
@@ -228,7 +227,7 @@ class Exchange:
             yield
 
     def _require_context(self, what: str) -> None:
-        """Raises unless there is work to do and our context to do it in."""
+        """Raises unless the exchange is open and its context current."""
         where = self._gl.where = f"opengl.Exchange.{what}"
         if not self._program:
             raise RuntimeError(f"{where}: the exchange is closed")
@@ -257,7 +256,7 @@ class Exchange:
         return image / self._most if dtype == torch.uint8 else image
 
     def _texture(self, kind: str, stored: int) -> int:
-        """Binds the texture of a kind, made anew if its format is another."""
+        """Binds the texture of a kind, which is made again if its format has changed."""
         name, before = self._textures.get(kind, (0, 0))
         if name and before != stored:
             self._gl.drop("Textures", name)
@@ -342,8 +341,8 @@ class Exchange:
         return _DEPTHS.get(self._attached(gl.READ_FRAMEBUFFER, *what), gl.DEPTH_COMPONENT24)
 
     def _require_size(self, attachment: int, name: str) -> None:
-        """Raises unless something of our size is attached to the framebuffer bound for reading.
-        Of a window's own framebuffer OpenGL tells no size.
+        """Raises unless something of the exchange's size is attached to the framebuffer bound for
+        reading. The size of a window's own framebuffer is not known to OpenGL.
         """
         if not self._gl.integer(gl.READ_FRAMEBUFFER_BINDING):
             return
@@ -359,7 +358,7 @@ class Exchange:
         elif size := self._gl.texture_size(which, level):
             width, height = size
         else:
-            return  # OpenGL itself tells whether such a texture can be read
+            return  # OpenGL reports by itself whether such a texture can be read
         if (width, height) != (self.width, self.height):
             raise RuntimeError(
                 f"{frame} {width}x{height} pixels, the exchange {self.width}x{self.height}"

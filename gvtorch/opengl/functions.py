@@ -1,8 +1,8 @@
-"""OpenGL's functions and numbers, as far as `Exchange` needs them, in the context that is current.
+"""OpenGL's functions and constants that `Exchange` needs, for the current context.
 
-They come out of the system's library, which hands calls on to whichever context is current, or out
-of the loader of the library that made the context. Python's bindings of OpenGL are no help here:
-they must be told the window system, or make the context themselves.
+Functions are loaded from the system's library, which dispatches to the current context, or by the
+loader of the library that made the context. Python's bindings of OpenGL do not help: they must be
+told the window system, or make the context themselves.
 
 Source: OpenGL 3.2 core specification, and its registry for the numbers.
 """
@@ -179,19 +179,19 @@ class Functions:
         raise AttributeError(name)  # tells the type of the functions that __init__ sets
 
     def require_context(self) -> None:
-        """Raises RuntimeError unless a context is current; forgets errors of before."""
+        """Raises RuntimeError unless a context is current; clears earlier errors."""
         if not self.GetString(VERSION):
             raise RuntimeError(f"{self.where}: {_NO_CONTEXT}")
         self.forget_errors()
 
     def check(self, hint: str) -> None:
-        """Raises RuntimeError if OpenGL tells of an error."""
+        """Raises RuntimeError if OpenGL reports an error."""
         if error := self.GetError():
             name = _ERRORS.get(error, hex(error))
             raise RuntimeError(f"{self.where}: OpenGL says {name} ({hint})")
 
     def forget_errors(self) -> None:
-        """Has OpenGL tell of no error."""
+        """Clears OpenGL's errors."""
         while self.GetError() not in (0, _CONTEXT_LOST):  # the latter stays for ever
             pass
 
@@ -206,7 +206,7 @@ class Functions:
         return list(values)[:count]
 
     def parameter(self, get: str, *arguments: int) -> int:
-        """What a function of the kind of glGetShaderiv tells; 0 if it tells nothing."""
+        """The number that a function such as glGetShaderiv writes; 0 if it writes none."""
         value = c_int()
         getattr(self, get)(*arguments, ctypes.byref(value))
         self.forget_errors()
@@ -264,7 +264,7 @@ class Functions:
         """Links two shaders.
 
         Raises:
-            RuntimeError: OpenGL takes them not.
+            RuntimeError: They do not compile or link.
         """
         program = self.CreateProgram()
         for kind, text in ((VERTEX_SHADER, vertex), (FRAGMENT_SHADER, fragment)):

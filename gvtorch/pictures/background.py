@@ -111,7 +111,7 @@ class Environment(Background):
             rotation: (3, 3) from world directions to those of the map.
 
         Raises:
-            ValueError: A shape is wrong, a value is NaN or infinite, or the rotation is none.
+            ValueError: A shape is wrong, a value is NaN or infinite, or the matrix is no rotation.
         """
         check.images("Environment", "image", image, 3, batch=False)
         if not bool(torch.isfinite(image).all()):

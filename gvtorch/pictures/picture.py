@@ -59,8 +59,8 @@ class Picture:
         return torch.where(self.alpha > 0, self.color / self.alpha, 0.0)
 
     def to_srgb8(self) -> Tensor:
-        """Returns the colour as a display wants it: sRGB-encoded uint8 on the CPU, same shape. A
-        transparent picture is shown over black. NaN is black.
+        """Returns the colour for a display: sRGB-encoded uint8 on the CPU, of the same shape. A
+        transparent picture is shown over black, NaN as black.
         """
         return torch.from_numpy(display_pixels(self.color, None, 8))
 
@@ -75,8 +75,8 @@ class Picture:
         return {name: layer.detach().cpu().numpy() for name, layer in layers.items()}
 
     def save(self, path: str | Path, *, bits: int | None = None) -> None:
-        """Writes a file, which appears whole or not at all. A batch is laid side by side, but in
-        NumPy's files.
+        """Writes a file, whole or not at all. The pictures of a batch are laid side by side, except
+        in NumPy files.
 
         - .png: sRGB, 8 or 16 bits; with straight alpha if the picture is transparent.
         - .tif: the same, or 32 bits: linear float, premultiplied (BigTIFF, Deflate).
@@ -85,8 +85,8 @@ class Picture:
         - .npz: float32 color, alpha and depth, int32 samples; normal and features where they are.
 
         Args:
-            path: The file; its ending tells the kind.
-            bits: Of a number; 8 for .png and .tif, 32 for .exr if left out.
+            path: The file; its ending chooses the format.
+            bits: Of each number; 8 for .png and .tif, 32 for .exr if left out.
 
         Raises:
             ValueError: The ending or the number of bits is unknown.

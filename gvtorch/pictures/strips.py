@@ -40,7 +40,7 @@ def render_tiles(
             shader=shader)` or `partial(engine.render, shader=shader)`; what it does to the picture,
             such as `tone_map`, must treat pixels one by one.
         camera: One camera; an orbit camera must be placed by what renders.
-        path: The file; it appears when it is whole.
+        path: The file; it appears when it is complete.
         bits: Of a number; 8 for .tif if left out.
         memory: Most bytes that a strip takes, but for scene and libraries; a strip has at least
             one row.

@@ -84,26 +84,26 @@ def trace_trees(trees: Sequence[tuple[Tensor, Trace]], rays: Rays) -> Hits:
     near = torch.stack([_entry(box, rays) for box, _ in trees])  # (m, r)
     order = near.argsort(dim=0, stable=True)
     hits = [trace(rays) for _, trace in trees]
-    fields = {name: _stacked([vars(one)[name] for one in hits]) for name in vars(hits[0])}
-    ray = torch.arange(order.shape[1], device=order.device)
-
-    def ranked(tree: Tensor) -> Hits:
-        """The hits of one tree (r,) for each ray."""
-        picked: Any = {name: None if f is None else f[tree, ray] for name, f in fields.items()}
-        return Hits(**picked)
-
-    return reduce(over, map(ranked, order))
+    fields = {name: _ranked([vars(one)[name] for one in hits], order) for name in vars(hits[0])}
+    ranks = zip(*fields.values(), strict=True)  # the nearest tree's hits of each ray come first
+    columns: list[Any] = [dict(zip(fields, rank, strict=True)) for rank in ranks]
+    return reduce(over, [Hits(**column) for column in columns])
 
 
-def _stacked(fields: list[Tensor | None]) -> Tensor | None:
-    """(m, r, ...) the same field of m trees; zeros stand for a tree that has none."""
+def _ranked(fields: list[Tensor | None], order: Tensor) -> Sequence[Tensor | None]:
+    """The same field (r, ...) of m trees, in the order (m, r) of the trees along each ray; zeros
+    stand for a tree that does not give it.
+    """
     given = [field for field in fields if field is not None]
     if not given:
-        return None
+        return fields
     if len({field.shape[1:] for field in given}) > 1:
         raise ValueError("render: trees must give as many features each")
     nothing = torch.zeros_like(given[0])
-    return torch.stack([nothing if field is None else field for field in fields])
+    stacked = torch.stack([nothing if field is None else field for field in fields])
+    if stacked.dim() == 3:
+        order = order[:, :, None].expand_as(stacked)
+    return stacked.gather(0, order).unbind(0)
 
 
 def _entry(box: Tensor, rays: Rays) -> Tensor:

@@ -73,7 +73,7 @@ class Lighting:
         """Checks every number.
 
         Raises:
-            ValueError: One is out of its range, or a light is none.
+            ValueError: One is out of its range, or what should be a light is not.
         """
         where = "Lighting"
         if self.lights is not None:

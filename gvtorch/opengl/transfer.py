@@ -22,7 +22,7 @@ Transfer = Callable[[int], None]
 
 
 class Way(Protocol):
-    """Moves the pixels of pictures of one kind. Rows go up on OpenGL's side and down on ours."""
+    """Moves the pixels of pictures of one kind, and flips their rows: OpenGL's go up."""
 
     def pull(self, read: Transfer, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         """Returns what OpenGL reads."""
@@ -31,11 +31,11 @@ class Way(Protocol):
         """Has OpenGL write an image."""
 
     def close(self) -> None:
-        """Gives back what it holds."""
+        """Frees what it holds."""
 
 
 class ThroughHost:
-    """A copy in host memory, for whichever OpenGL and whichever device."""
+    """Copies through host memory, between any OpenGL and any device."""
 
     def __init__(self, functions: gl.Functions, device: torch.device) -> None:
         self._gl, self._device = functions, device
@@ -56,8 +56,8 @@ class ThroughHost:
 
 
 class Shared:
-    """A buffer object of OpenGL that CUDA sees too. Nobody waits: each side's work is ordered
-    after the other's where the buffer changes hands.
+    """A buffer object of OpenGL that CUDA maps. The host does not wait: mapping and unmapping order
+    the work of each side after the other's.
     """
 
     def __init__(self, functions: gl.Functions, device: torch.device) -> None:
@@ -90,7 +90,7 @@ class Shared:
             self._gl.drop("Buffers", name)  # 0 is nothing
 
     def _hold(self, nbytes: int) -> None:
-        """Has a buffer of so many bytes."""
+        """Makes sure that the buffer has so many bytes."""
         if self._nbytes == nbytes:
             return
         self.close()
@@ -104,7 +104,7 @@ class Shared:
 
     @contextmanager
     def _seen(self, shape: tuple[int, ...], dtype: torch.dtype) -> Iterator[Tensor]:
-        """The buffer's memory as a tensor, while CUDA has it."""
+        """The buffer's memory as a tensor, while it is mapped to CUDA."""
         with torch.cuda.device(self._device):
             stream = torch.cuda.current_stream(self._device).cuda_stream
             self._cuda("cudaGraphicsMapResources", 1, self._resource, stream)
