@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,11 +28,11 @@ from ..shaders import (
     Lit,
     ModuleShader,
     PreIntegrated,
-    Projection,
     Shader,
     StoredColor,
     TransferModule,
 )
+from ..shaders.built_in import BY_NAME
 from ..tracing import Lighting
 from ..tracing.resident import trace
 from .march import Size, difference, op_milliseconds, rates, rgba
@@ -57,8 +57,8 @@ class Look:
     compiles: bool = False  # left out where there is no compiler
 
 
-def _projection(which: Literal["maximum", "minimum", "mean"]) -> Callable[[Scene], Shader]:
-    return lambda scene: Projection(which, scene.shader)
+def _named(name: str, scene: Scene) -> Shader:
+    return BY_NAME[name](scene.shader, scene.surface)
 
 
 def _module(scene: Scene) -> Shader:
@@ -83,8 +83,10 @@ def _cones(name: str, *, occlusion: float = 0.0, indirect: float = 0.0) -> Look:
 #: What is measured, each behind the look that it stands beside. Left out where a scene has not the
 #: channels that a shader names.
 LOOKS = (
-    Look(name="plain", shader=lambda s: s.shader),
-    Look(name="lit", shader=lambda s: Lit(s.shader)),
+    *(Look(name=name, shader=partial(_named, name)) for name in BY_NAME),
+    _cones("shadow"),
+    _cones("shadow, occlusion", occlusion=1.0),
+    _cones("shadow, occlusion, bounce", occlusion=1.0, indirect=1.0),
     Look(name="lit by stored normals", shader=lambda s: Lit(s.shader, normals="normal")),
     Look(name="stored colour", shader=lambda _: StoredColor("rgba")),
     Look(name="stored colour, lit", shader=lambda _: StoredColor("rgba", lit=True)),
@@ -93,14 +95,7 @@ LOOKS = (
         shader=lambda s: Lit(s.shader, light=SUN, shadows=True),
         slow=True,
     ),
-    Look(name="isosurface", shader=lambda s: Isosurface(s.surface)),
-    _cones("shadow"),
-    _cones("shadow, occlusion", occlusion=1.0),
-    _cones("shadow, occlusion, bounce", occlusion=1.0, indirect=1.0),
     Look(name="distance field", shader=lambda s: DistanceField(offset=s.surface)),
-    Look(name="maximum", shader=_projection("maximum")),
-    Look(name="minimum", shader=_projection("minimum")),
-    Look(name="mean", shader=_projection("mean")),
     Look(name="3 features", shader=lambda s: Features(s.shader, "normal")),
     Look(name=f"{_WIDE} features", shader=lambda s: Features(s.shader, "numbers")),
     Look(name="module", shader=_module, twin=True, slow=True),

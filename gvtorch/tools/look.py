@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
+from ..base.declared import declared_names
 from .common import numbers
 from .image import parse_background
 from .light import parse_lighting
@@ -17,10 +18,13 @@ if TYPE_CHECKING:
 
     from ..cameras import Camera
     from ..cameras.models import CameraModel
-    from ..shaders import Shader, TransferFunction
+    from ..shaders import Shader
     from ..tracing import Clip, ThinLens
+
+    ShaderName = str
 else:
     CameraModel = str  # checked by the camera, since its module would load torch
+    ShaderName = Literal[tuple(declared_names("shaders.built_in", "BY_NAME"))]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,9 +40,7 @@ class Look:
     tf: Annotated[str, arg(metavar="FILE|PRESET")] = "gray"
     """transfer function: a JSON file, or a preset over the data's range: gray, hot, vessels, bone,
     tissue"""
-    shader: Literal["plain", "lit", "preintegrated", "isosurface", "maximum", "minimum", "mean"] = (
-        "plain"
-    )
+    shader: ShaderName = "plain"
     """what is made of the values"""
     value: Annotated[float | None, arg(metavar="VALUE")] = None
     """of the isosurface"""
@@ -97,9 +99,10 @@ class Look:
         choose_backend(self.backend, device)
         return device
 
-    def chosen(self, low: float, high: float) -> TransferFunction | Shader:
+    def chosen(self, low: float, high: float) -> Shader:
         """Returns the shader asked for, its transfer function read or spanned over the range."""
-        from ..shaders import Isosurface, Lit, PreIntegrated, Projection, TransferFunction
+        from ..shaders import TransferFunction
+        from ..shaders.built_in import BY_NAME
 
         if self.tf.endswith(".json") or Path(self.tf).is_file():
             transfer = TransferFunction.from_json(self.tf)
@@ -107,13 +110,7 @@ class Look:
             transfer = TransferFunction.preset(self.tf, low, high)
         if (self.value is None) == (self.shader == "isosurface"):
             raise ValueError("--value and --shader isosurface belong together")
-        if self.shader == "isosurface":
-            return Isosurface(float(self.value or 0))
-        if self.shader in ("maximum", "minimum", "mean"):
-            return Projection(self.shader, transfer)
-        if self.shader == "plain":
-            return transfer
-        return Lit(transfer) if self.shader == "lit" else PreIntegrated(transfer)
+        return BY_NAME[self.shader](transfer, self.value or 0.0)
 
 
 def parse_camera(

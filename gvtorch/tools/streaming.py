@@ -16,7 +16,7 @@ from .look import Look
 if TYPE_CHECKING:
     from ..base.records import RenderStats
     from ..engine import Engine, FrameStats
-    from ..shaders import Shader, TransferFunction
+    from ..shaders import Shader
 
 _RANGE_VOXELS = 128**3  # of a foreign image that are read to learn its range
 
@@ -45,7 +45,7 @@ class Streaming:
     """a block that can't be read ends the work"""
 
     @contextmanager
-    def open(self, path: str, look: Look) -> Iterator[tuple[Engine, TransferFunction | Shader]]:
+    def open(self, path: str, look: Look) -> Iterator[tuple[Engine, Shader]]:
         """Opens a store: the engine over it, and the transfer function."""
         from ..engine.engine import Engine
         from ..io.store import Store
