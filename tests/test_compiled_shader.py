@@ -231,7 +231,7 @@ def test_opcheck_and_memory_safety(tree, compiled, name, dtype):
     own = {"uniforms": BANDS} if name == "Bands" else {"transfer": SHADER, "other": "rgba"}
     shader = mine(name, **own)
     rays, traced, shading, parameters = op_arguments(tree, shader, dtype)
-    op = getattr(torch.ops.gvtorch_user, shader.kind).default
+    op = getattr(torch.ops.gvtorch_user, shader.op).default
     torch.library.opcheck(op, (*rays, *traced, *shading, parameters))
     short = parameters[: 19 if name == "LitFeatures" else -1].contiguous()
     for wrong, numbers in (
@@ -506,9 +506,9 @@ def test_it_is_unpickled_in_another_process(tmp_path):
     kept.write_bytes(pickle.dumps(shader))
     assert in_processes(1, kept, make="pickle.load(open(given, 'rb'))") == ["0.5"]
     tree = gv.N3Tree.from_volume(gv.Volume(torch.ones(8, 8, 8)), 8)
-    unknown = "x" * len(shader.kind)  # a name that no library here has
+    unknown = "x" * len(shader.op)  # a name that no library here has
     pickled = pickle.dumps(gv.TreeTracer(tree, shader))
-    tracer.write_bytes(pickled.replace(shader.kind.encode(), unknown.encode()))
+    tracer.write_bytes(pickled.replace(shader.op.encode(), unknown.encode()))
     with pytest.raises(RuntimeError, match=r"TreeTracer: op x+ is not loaded: torch.ops.load_lib"):
         pickle.loads(tracer.read_bytes())
 

@@ -316,3 +316,27 @@ def test_a_frame_with_a_module_is_not_captured(blobs):
     with gv.Engine(gv.VolumeProducer(blobs), node_pool="1 MB", brick_pool="4 MB") as engine:
         with pytest.raises(ValueError, match="a ModuleShader can't be recorded"):
             engine.capture(gv.Camera.orbit(width=8, height=8), twin(SOFT, blobs.spacing))
+
+
+def test_a_module_shader_is_a_module(blobs, compiled):
+    """Optimisers, `state_dict` and `.to` reach the module that it holds; functions go as well."""
+    tree = gv.N3Tree.from_volume(blobs, 8, device=DEVICES[compiled])
+    shader = twin(SOFT, tree.spacing).to(tree.device)
+    (rows,) = shader.parameters()
+    assert rows is shader.module.rows and [*shader.state_dict()] == ["module.rows"]
+    assert shader.channels == () and not [*gv.ModuleShader(lambda *four: four).parameters()]
+    camera = gv.Camera.orbit(30, 20, 1.3, width=8, height=8)
+    optimizer = torch.optim.SGD(shader.parameters(), lr=1.0)
+    before = gv.render(tree, camera, shader).color
+    before.sum().backward()
+    optimizer.step()
+    assert (gv.render(tree, camera, shader).color - before).abs().max() > 1e-3
+    copy = twin(SOFT, tree.spacing, tree.device)
+    copy.load_state_dict(shader.state_dict())
+    assert torch.equal(gv.render(tree, camera, copy).color, gv.render(tree, camera, shader).color)
+
+
+@pytest.mark.backend("cpp")
+def test_a_tree_tracer_takes_no_module(blobs):
+    with pytest.raises(ValueError, match="shader must be one of the kernels', got ModuleShader"):
+        gv.TreeTracer(gv.N3Tree.from_volume(blobs, 8), gv.ModuleShader(torch.nn.Identity()))

@@ -39,6 +39,11 @@ def test_objects_tell_of_themselves_in_one_line(tree):
         (gv.Environment(IMAGE), "Environment((6, 8, 3) float32 on cpu)"),
         (gv.Progressive(print), "Progressive(None, 0 frames)"),
         (tree, "N3Tree(8x8x8"),
+        (GRAY, "TransferFunction(3 opacities, 2 colours, from 0 to 1)"),
+        (gv.Lit(GRAY, normals="n"), "Lit(normals='n', transfer=TransferFunction("),
+        (gv.Isosurface(torch.tensor(2.0)), "Isosurface(value=() float32, color=(0.8"),
+        (gv.Projection("mean", GRAY), "Projection(transfer=TransferFunction("),
+        (gv.ModuleShader(torch.nn.Identity()), "ModuleShader(Identity, channels=())"),
     ):
         text = repr(thing)
         assert text.startswith(begin), text

@@ -13,7 +13,11 @@ from test_op_contract import world_rays
 from test_trace_rays import SHADER, assert_equal, camera_rays, changed, forget, on, run
 
 import gvtorch as gv
+from gvtorch import cpp_ext
 from gvtorch.ops import RayArguments, shade_rays
+from gvtorch.ops.reference.shaders import TWINS
+from gvtorch.ops.shading import SHADER_KINDS, shader_number
+from gvtorch.shaders import built_in
 from gvtorch.tracing.tracer import Tracer
 
 GOLDEN = ROOT / "tests" / "golden_shaders.npz"
@@ -375,3 +379,39 @@ def test_the_op_checks_its_arguments(tree):
     ):
         with pytest.raises(ValueError, match=message):
             shade_rays(*changed(good, change), parameters)
+
+
+# --- one base, one registry
+
+
+def test_every_shader_is_a_shader():
+    for shader in (SHADER, *SHADERS.values(), gv.ModuleShader(torch.nn.Identity())):
+        assert isinstance(shader, gv.Shader), shader
+
+
+def test_a_kind_has_a_struct_a_twin_and_a_class():
+    """One name in csrc/shaders.h, in its twin and among the built-in classes."""
+    assert [*TWINS] == [*SHADER_KINDS]
+    structs = (cpp_ext.SOURCES / "shaders.h").read_text()
+    classes = [getattr(gv, name) for name in built_in.__all__]
+    for kind in SHADER_KINDS:
+        assert f"struct {kind} " in structs or kind.startswith("Shadowed"), kind
+        assert any(kind in (one.kind, getattr(one, "shadowed_kind", "")) for one in classes), kind
+    with pytest.raises(ValueError, match=r"shader: kind must be Lit, .*, got 'Lamp'"):
+        shader_number("Lamp")
+
+
+@pytest.mark.parametrize("name", built_in.BY_NAME)
+def test_every_named_shader_draws(tree, name):
+    """What the command line offers needs but a transfer function and a level."""
+    shader = built_in.BY_NAME[name](SHADER, 0.5)
+    picture = gv.render(tree, gv.Camera.orbit(width=16, height=16, distance=1.4), shader)
+    assert picture.alpha.max() > 0.3 and picture.color.max() > 0.1
+
+
+def test_what_effects_ask_of_a_shader_without_a_light():
+    for shader in (SHADER, gv.Features(SHADER, "rgba"), gv.ModuleShader(torch.nn.Identity())):
+        for ask in (shader.unlit, shader.matter, shader.blocker):
+            with pytest.raises(ValueError, match=f"lighting needs .*, got {type(shader).__name__}"):
+                ask()
+        assert shader.cut_surface() is None and shader.projection is None

@@ -35,13 +35,14 @@ def brief(record: Any) -> str:
     for field in dataclasses.fields(record):
         value = getattr(record, field.name)
         if field.repr and (isinstance(value, Tensor) or value not in (field.default, {})):
-            parts.append(f"{field.name}={_shown(value)}")
+            parts.append(f"{field.name}={shown(value)}")
     return f"{type(record).__name__}({', '.join(parts)})"
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
+    """Returns a value as text, of a tensor or array only shape and dtype."""
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key}: {_shown(one)}" for key, one in value.items()) + "}"
+        return "{" + ", ".join(f"{key}: {shown(one)}" for key, one in value.items()) + "}"
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
     return repr(value)

@@ -14,6 +14,7 @@ from pathlib import Path
 import torch
 
 FOLDER = Path(__file__).parent / "lib"
+SOURCES = Path(__file__).parent / "csrc"
 
 
 @functools.cache

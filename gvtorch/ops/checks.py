@@ -11,7 +11,7 @@ from torch import Tensor
 from ..base import check
 from ..base.volume import CHANNEL_DTYPES
 from .arguments import RayArguments, ShadeArguments, TraceArguments
-from .shading import ShaderKind
+from .shading import SHADER_KINDS
 
 
 def _tensors(record: Any, names: str, dtype: torch.dtype) -> Iterable[check.Field]:
@@ -118,10 +118,9 @@ def check_shade(
     own: bool,
 ) -> None:
     """Raises ValueError unless all that a shader reads is right; `own`: it is a user's."""
-    high = 0 if own else max(ShaderKind)
-    kind = ShaderKind(check.whole(where, "shader", shading.shader, low=0, high=high))
-    integrates = kind == ShaderKind.PRE_INTEGRATED and not own
-    sizes = check_trace(where, rays, arguments, "lmm4" if integrates else "lm4")
+    known = ("",) if own else SHADER_KINDS
+    kind = known[check.whole(where, "shader", shading.shader, low=0, high=len(known) - 1)]
+    sizes = check_trace(where, rays, arguments, "lmm4" if kind == "PreIntegrated" else "lm4")
     table, device, shape = arguments.table_lm4, rays.origin_r3.device, "k" if own else "54"
     parameters = ("parameter_54", parameter_54, shape, table.dtype)
     check.tensors(where, device, [parameters])
@@ -138,16 +137,17 @@ def check_shade(
                 (f"{name}_tnc", constants, f"tn{width}", bricks.dtype),
             )
             others = check.tensors(where, device, fields, sizes).get("d", 0)
-    if not own and kind.stores_color and (sizes["c"] not in (4, 24) or arguments.component != 3):
+    colored = sizes["c"] in (4, 24) and arguments.component == 3
+    if kind in ("StoredColor", "ShadowedColor") and not colored:
         raise ValueError(
             f"{where}: stored colour needs a channel of 4 or 24 numbers and component 3"
         )
-    if not own and kind == ShaderKind.FEATURES and not others:
+    if kind == "Features" and not others:
         raise ValueError(f"{where}: features need other_bzyxc")
     if own:
         check.whole(where, "features", shading.features, low=0)
     else:
-        given = {ShaderKind.FEATURES: others, ShaderKind.PROJECTION: 1}.get(kind, 0)
+        given = {"Features": others, "Projection": 1}.get(kind, 0)
         check.whole(where, "features", shading.features, low=given, high=given)
     high = max(0, others - 1)
     check.whole(where, "other_component", shading.other_component, low=0, high=high)

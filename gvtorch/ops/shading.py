@@ -6,6 +6,7 @@ C++ reads the same numbers in cpp_ext/csrc/shaders.h.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple, TypeVar
@@ -13,31 +14,35 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
+from .. import cpp_ext
+
 Number = float | Tensor
 Triple = Sequence[float] | Tensor
 
 
-class ShaderKind(IntEnum):
-    """The fused shaders; csrc/shaders.h tells what each does."""
+def _declared_kinds() -> tuple[str, ...]:
+    """The names in `enum class ShaderKind` of csrc, without their k."""
+    for header in sorted(cpp_ext.SOURCES.glob("*.h")):
+        found = re.search(r"enum class ShaderKind \{([\w\s,]*)\}", header.read_text("utf-8"))
+        if found is not None:
+            return tuple(re.findall(r"\bk(\w+)", found[1]))
+    raise RuntimeError(f"gvtorch: {cpp_ext.SOURCES} declares no ShaderKind")
 
-    LIT = 0
-    PRE_INTEGRATED = 1
-    STORED_COLOR = 2
-    ISOSURFACE = 3
-    PROJECTION = 4
-    FEATURES = 5
-    SHADOWED_LIT = 6
-    SHADOWED_COLOR = 7
 
-    @property
-    def stores_color(self) -> bool:
-        """Whether it reads colour and opacity from the channel."""
-        return self in (ShaderKind.STORED_COLOR, ShaderKind.SHADOWED_COLOR)
+#: The fused shaders, by the names of their structs in csrc/shaders.h, in the order in which C++
+#: numbers them.
+SHADER_KINDS = _declared_kinds()
 
-    @property
-    def shadowed(self) -> bool:
-        """Whether cones go from samples to the light."""
-        return self in (ShaderKind.SHADOWED_LIT, ShaderKind.SHADOWED_COLOR)
+
+def shader_number(kind: str) -> int:
+    """Returns the number of a fused shader.
+
+    Raises:
+        ValueError: There is none of this name.
+    """
+    if kind not in SHADER_KINDS:
+        raise ValueError(f"shader: kind must be {', '.join(SHADER_KINDS)}, got {kind!r}")
+    return SHADER_KINDS.index(kind)
 
 
 class LightKind(IntEnum):

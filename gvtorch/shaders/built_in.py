@@ -17,7 +17,6 @@ from ..ops.shading import (
     Number,
     ProjectionKind,
     ProjectionNumbers,
-    ShaderKind,
     StoredColorNumbers,
     Triple,
 )
@@ -46,8 +45,8 @@ _WHITE = TransferFunction.from_points([(0, 1)])
 class Lit(LitShader):
     """The transfer function, lit by Blinn and Phong on both sides of a surface."""
 
-    kind = ShaderKind.LIT
-    shadowed_kind = ShaderKind.SHADOWED_LIT
+    kind = "Lit"
+    shadowed_kind = "ShadowedLit"
 
     def __init__(self, transfer: TransferFunction, *, shadows: bool = False, **light: Any) -> None:
         """Takes a transfer function.
@@ -75,7 +74,7 @@ class PreIntegrated(Shader):
     function need no finer steps.
     """
 
-    kind = ShaderKind.PRE_INTEGRATED
+    kind = "PreIntegrated"
 
     def __init__(self, transfer: TransferFunction) -> None:
         """Takes a transfer function."""
@@ -95,8 +94,8 @@ class StoredColor(LitShader):
     six directions, as `Volume.directional` makes them: a ray sees those that it goes along.
     """
 
-    kind = ShaderKind.STORED_COLOR
-    shadowed_kind = ShaderKind.SHADOWED_COLOR
+    kind = "StoredColor"
+    shadowed_kind = "ShadowedColor"
     component = 3
 
     def __init__(
@@ -181,7 +180,7 @@ class Isosurface(LitShader):
     is filled with what is not below the level.
     """
 
-    kind = ShaderKind.ISOSURFACE
+    kind = "Isosurface"
     distance = False  # the value is a distance in world units, negative inside
 
     def __init__(
@@ -277,7 +276,7 @@ class Projection(Shader):
     where the extreme is or, for the mean, where the ray enters.
     """
 
-    kind = ShaderKind.PROJECTION
+    kind = "Projection"
     whole_ray = True
 
     def __init__(
@@ -317,7 +316,7 @@ class Features(Shader):
     come out as `Hits.features` (r, c). Any number of them.
     """
 
-    kind = ShaderKind.FEATURES
+    kind = "Features"
 
     def __init__(self, transfer: TransferFunction, channel: str) -> None:
         """Takes the transfer function of the density, and the name of the features' channel."""

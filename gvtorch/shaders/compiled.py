@@ -36,12 +36,12 @@ class CompiledShader(LitShader):
     Attributes:
         header: The file, as a full path.
         name: The struct's name.
-        kind: Name of its op in `torch.ops.gvtorch_user`.
+        op: Name of its op in `torch.ops.gvtorch_user`.
         uniforms: Its numbers: by the names that the struct gives them, or (k,) in their order.
         transfer: A transfer function for the struct's own use; None: white and opaque.
     """
 
-    kind: str
+    op: str
 
     def __init__(
         self,
@@ -90,8 +90,9 @@ class CompiledShader(LitShader):
 
     def _take(self, compiled: user.UserShader) -> None:
         self._compiled = compiled
-        self.header, self.kind, self.whole_ray = compiled.header, compiled.op, compiled.whole
-        add_user_op(self.kind)
+        self.header, self.kind = compiled.header, compiled.name
+        self.op, self.whole_ray = compiled.op, compiled.whole
+        add_user_op(self.op)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Compiles or finds it again in a process that has not loaded it."""
@@ -103,7 +104,7 @@ class CompiledShader(LitShader):
         """What is loaded for it, CPU and CUDA: `torch.ops.load_library` loads them in a process
         that only runs an archive or an exported program.
         """
-        return user.libraries(self.kind)
+        return user.libraries(self.op)
 
     def table(self, sampling: Sampling) -> ColorTable:
         """See `Shader`."""

@@ -6,7 +6,7 @@ from copy import copy
 from typing import Self
 
 from ..ops import ShadeArguments
-from ..ops.shading import Number, ShaderKind
+from ..ops.shading import Number, shader_number
 from ..pool import N3Tree
 from .lights import Headlight, Light, Material
 from .shader import Shader
@@ -22,7 +22,7 @@ class LitShader(Shader):
     """
 
     shadows = False
-    shadowed_kind: ShaderKind | None = None
+    shadowed_kind: str | None = None
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class LitShader(Shader):
             return given
         if self.shadowed_kind is None:
             raise ValueError(f"{where}: shadows per sample are for Lit and StoredColor")
-        return given._replace(shader=int(self.shadowed_kind))
+        return given._replace(shader=shader_number(self.shadowed_kind))
 
     def unlit(self) -> Self:
         """See `Shader`."""

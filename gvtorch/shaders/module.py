@@ -71,6 +71,11 @@ class ModuleShader(Shader, torch.nn.Module):
         self.module, self.hidden_by, self.samples = module, hidden_by, samples
         self.channels = tuple(channels or ())
 
+    def __repr__(self) -> str:
+        """Names the module and its channels."""
+        name = getattr(self.module, "__name__", type(self.module).__name__)
+        return f"ModuleShader({name}, channels={self.channels})"
+
     def table(self, sampling: Sampling) -> ColorTable:
         """See `Shader`: that of `hidden_by`, of which only what it hides counts."""
         return (self.hidden_by or _HIDES_NOTHING).table(sampling)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..base import check
 from ..ops import ShadeArguments
-from ..ops.shading import Number, ShaderKind, Triple
+from ..ops.shading import Number, Triple, shader_number
 from ..pool import N3Tree
 from .lights import Headlight, Material
 from .tables import ColorTable, Sampling
@@ -38,8 +38,9 @@ class Shader(ABC):
     made with them, and nothing is compiled.
 
     Attributes:
-        kind: Which shader of the op `shade_rays` it is, or the name of a user's op; None: the op
-            `trace_rays` draws its table.
+        kind: Name of its C++ struct, which the op `shade_rays` runs; None: its table
+            is all, and the op `trace_rays` draws it.
+        op: Name of a user's op, which runs in place of `shade_rays`.
         channel: Name of the channel whose value it reads; None: that of the options.
         component: Which number of it; None: that of the options.
         normals: Name of a channel of 3 numbers that holds normals; None: the gradient's.
@@ -50,7 +51,8 @@ class Shader(ABC):
             device meanwhile, so it is not recorded as a CUDA graph.
     """
 
-    kind: ShaderKind | str | None = None
+    kind: str | None = None
+    op: str | None = None
     channel: str | None = None
     component: int | None = None
     normals: str | None = None
@@ -58,6 +60,13 @@ class Shader(ABC):
     other_component: int = 0
     whole_ray: bool = False
     uses_torch: bool = False
+
+    def __repr__(self) -> str:
+        """Tells its channels, and what it is made of."""
+        names = ("channel", "normals", "transfer", "value", "which", "color", "other", "light")
+        given = {name: getattr(self, name, None) for name in names}
+        parts = [f"{name}={check.shown(one)}" for name, one in given.items() if one is not None]
+        return f"{type(self).__name__}({', '.join(parts)})"
 
     @abstractmethod
     def table(self, sampling: Sampling) -> ColorTable:
@@ -121,7 +130,7 @@ class Shader(ABC):
             check.whole(where, "component of the colour", self.other_component, low=0, high=last)
         bricks, constants = tree.bricks.bricks, tree.nodes.constants
         return ShadeArguments(
-            shader=0 if isinstance(self.kind, str) else int(self.kind),
+            shader=0 if self.op else shader_number(self.kind),
             features=self.feature_count(tree),
             normal_bzyxc=None if self.normals is None else bricks[self.normals],
             normal_tnc=None if self.normals is None else constants[self.normals],
@@ -129,11 +138,6 @@ class Shader(ABC):
             other_tnc=None if self.other is None else constants[self.other],
             other_component=self.other_component,
         )
-
-    @property
-    def op(self) -> str | None:
-        """Name of its own op; None: that of the fused shaders."""
-        return self.kind if isinstance(self.kind, str) else None
 
     # What the effects around it are told.
 

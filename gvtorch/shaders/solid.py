@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..ops.shading import Number, ShaderKind, Triple, pack
+from ..ops.shading import Number, Triple, pack
 from .shader import Shader
 from .tables import ColorTable, Sampling
 
@@ -30,7 +30,7 @@ class Solid(Shader):
         """Takes what the surface reads, its level and its colour; None where its alpha alone
         counts.
         """
-        self.kind = None if color is None else ShaderKind.LIT
+        self.kind = None if color is None else "Lit"
         self.channel, self.component = surface.channel, surface.component
         self.normals = surface.normals
         self.level, self.distance = level, distance

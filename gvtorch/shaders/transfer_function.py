@@ -139,6 +139,12 @@ class TransferFunction(Shader):
         content = {"opacity": self.opacity.tolist(), "color": self.color.tolist()}
         return json.dumps({**content, "reference": self.reference} if self.reference else content)
 
+    def __repr__(self) -> str:
+        """Tells its corner points by number, and its values from first to last."""
+        low, high, _ = self.corners()
+        points = f"{len(self.opacity)} opacities, {len(self.color)} colours"
+        return f"TransferFunction({points}, from {low:g} to {high:g})"
+
     def __call__(self, value: np.ndarray) -> np.ndarray:
         """Returns (..., 4) linear RGB and opacity per reference length, exactly, in float64."""
         channels = [np.interp(value, self.color[:, 0], self.color[:, i]) for i in (1, 2, 3)]

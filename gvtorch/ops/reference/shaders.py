@@ -11,12 +11,12 @@ from torch import Tensor
 
 from ..arguments import RayArguments, ShadeArguments, TraceArguments
 from ..shading import (
+    SHADER_KINDS,
     IsosurfaceNumbers,
     LightKind,
     ProjectionKind,
     ProjectionNumbers,
     ShadeParameters,
-    ShaderKind,
     StoredColorNumbers,
 )
 from .exact import clamp, larger, stretch, unit
@@ -297,15 +297,16 @@ class Features(Shade):
         self.sum.add(rgba, piece, where)
 
 
-_KINDS: dict[int, type[Shade]] = {
-    ShaderKind.LIT: Shade,
-    ShaderKind.PRE_INTEGRATED: PreIntegrated,
-    ShaderKind.STORED_COLOR: StoredColor,
-    ShaderKind.ISOSURFACE: Isosurface,
-    ShaderKind.PROJECTION: Projection,
-    ShaderKind.FEATURES: Features,
-    ShaderKind.SHADOWED_LIT: Shade,
-    ShaderKind.SHADOWED_COLOR: StoredColor,
+#: Twins by the names of C++'s structs.
+TWINS: dict[str, type[Shade]] = {
+    "Lit": Shade,
+    "PreIntegrated": PreIntegrated,
+    "StoredColor": StoredColor,
+    "Isosurface": Isosurface,
+    "Projection": Projection,
+    "Features": Features,
+    "ShadowedLit": Shade,
+    "ShadowedColor": StoredColor,
 }
 
 
@@ -313,8 +314,9 @@ def shade_rays(
     rays: RayArguments, arguments: TraceArguments, shading: ShadeArguments, parameter_54: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Twin of `torch.ops.gvtorch.shade_rays`; see `gvtorch.ops.shade_rays`."""
-    kind = ShaderKind(shading.shader)
-    walk = Walk.enter(rays, arguments, Sided if kind.stores_color else Bricks)
+    kind = SHADER_KINDS[shading.shader]
+    twin = TWINS[kind]
+    walk = Walk.enter(rays, arguments, Sided if twin is StoredColor else Bricks)
     beam, channel = walk.at.beam, walk.channel
     columns = (rays.origin_r3, rays.direction_r3, beam.moved, arguments.place_33[1])
     light = Light(
@@ -325,9 +327,9 @@ def shade_rays(
     shadows = Shadows(walk, light.cube, arguments.cone_scale)
     others = channel.components(shading.other_bzyxc, shading.other_tnc)
     features = beam.first.new_zeros((len(beam.first), shading.features))
-    shade = _KINDS[kind].begin(
+    shade = twin.begin(
         *(rays, arguments, walk, light, others, shading.other_component, features),
-        shadows if kind.shadowed else None,
+        shadows if kind.startswith("Shadowed") else None,
     )
     walk.go(shade)
     shade.done(walk)
