@@ -1,6 +1,6 @@
-"""One scene through four lenses, side by side: pinhole, orthographic, fisheye and panorama.
+"""One scene through four camera models: pinhole, orthographic, fisheye and panorama.
 
-The first two look at the stent from outside, the other two stand among its wires.
+The first two look at the stent from outside, the other two from between its wires.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ INSIDE, AHEAD, UP = (63.0, 62.0, 96.0), (63.0, 50.0, 150.0), (0.0, 0.0, 1.0)
 
 @dataclass
 class Settings:
-    """Renders the bundled stent through four lenses."""
+    """Renders the bundled stent with four camera models."""
 
     output: Path = Path("cameras.png")
     size: int = 250
@@ -27,7 +27,7 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    """Renders each lens at the same height, and joins the pictures."""
+    """Renders all at the same height, side by side."""
     tree = gv.N3Tree.from_volume(
         gv.read_volume(DATA / "stent_256x128x128_int16.npz"), device=settings.device
     )

@@ -1,5 +1,5 @@
-"""A region of interest: a scan cut in half. Surfaces are hollow, unless caps fill the
-cut; coloured by the scan itself, they show what a slice does.
+"""A region of interest: a scan cut in half. An isosurface is hollow; caps close it, and coloured
+by the scan they look like a slice of it.
 """
 
 from dataclasses import dataclass, replace

@@ -1,5 +1,5 @@
-"""A cloud of noise in the sun: lit without shadows, and with a cone from each sample to the sun, so
-that it shades itself.
+"""A cloud of noise in the sun: lit without shadows, and with a shadow cone from each sample to the
+sun.
 """
 
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ class Settings:
 
 
 def cloud() -> torch.Tensor:
-    """(z, y, x) density: round puffs, eaten by noise of five octaves."""
+    """(z, y, x) density: round puffs, roughened by noise of five octaves."""
     random = torch.Generator().manual_seed(4)
     noise = torch.zeros((1, 1, *EXTENT))
     for octave in range(5):
@@ -47,7 +47,7 @@ def cloud() -> torch.Tensor:
 def main(settings: Settings) -> None:
     """Renders both pictures."""
     density = cloud()
-    # Normals of no length: a droplet sends light to all sides, whichever way it comes.
+    # Normals of length 0: droplets scatter light to all sides.
     none = torch.zeros((*density.shape, 3), dtype=torch.int8)
     channels = {"density": gv.Volume(density), "none": gv.Volume(none)}
     tree = gv.N3Tree.from_volume(channels, device=settings.device)

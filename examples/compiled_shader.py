@@ -1,5 +1,5 @@
-"""A shader of one's own in C++, examples/ink.h: vessels by a transfer function, by pen and ink, and
-with other numbers. It is compiled when it is first used; numbers may change with every frame.
+"""Your own shader in C++, examples/ink.h: vessels by a transfer function, in pen and ink, and with
+other uniforms. It is compiled once; uniforms may change with every frame.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    """Compiles, renders, changes numbers, renders."""
+    """Compiles, renders, changes uniforms, renders again."""
     volume = gv.read_volume(HERE / "data" / "aneurism_256x256x256_uint8.raw.gz")
     tree = gv.N3Tree.from_volume(volume, device=settings.device)
     camera = gv.Camera.orbit(40, 15, 1.45, fov=30, width=settings.size, height=settings.size)

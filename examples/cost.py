@@ -1,5 +1,5 @@
-"""What a picture costs: samples and nodes of each ray, and the level, age and fill of the bricks it
-saw, while a camera turns around a scan that is streamed."""
+"""What a picture costs, as images: samples and nodes of each ray, and level, age and fill of the
+bricks it saw, after a camera has turned around a streamed scan."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -17,8 +17,7 @@ IMAGES = ("samples", "nodes", "lod", "age", "fill")
 
 @dataclass
 class Settings:
-    """Renders the bundled aneurism and its cost pictures: the picture and samples per ray, nodes
-    visited and level of detail, age and fill of the bricks."""
+    """Renders the bundled aneurism: the picture, samples and nodes; level, age and fill."""
 
     output: Path = Path("cost.png")
     size: int = 200
@@ -26,7 +25,7 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    """Turns the camera, then counts what the last frame did."""
+    """Turns the camera, then draws the cost of the last frame."""
     volume = gv.read_volume(SCAN)
     shader = gv.TransferFunction.preset("vessels", *volume.value_range)
     options = {"brick_pool": "32 MB", "load_budget": 400, "device": settings.device}

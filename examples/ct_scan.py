@@ -1,4 +1,4 @@
-"""A CT scan from disk to picture: read, build the tree, look at it."""
+"""A CT scan from file to picture: read it, build the tree, render."""
 
 from dataclasses import dataclass
 from pathlib import Path

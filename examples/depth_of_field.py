@@ -1,8 +1,9 @@
-"""Depth of field: a lens of three apertures, beside 256 pinholes all over the widest.
+"""Depth of field: a lens of three apertures, and the mean of 256 pinhole pictures from all over
+the widest.
 
-Voxels hold the colour and opacity that the transfer function gives them: what a wide cone reads is
-then the mean of what is seen. The mean of densities would be another thing. The pinholes take
-minutes on a CPU.
+Voxels hold the colour and opacity that the transfer function gives them, so that a wide cone
+reads the mean of what is seen, not the colour of a mean density. The pinholes take minutes on a
+CPU.
 """
 
 import math
@@ -32,7 +33,7 @@ class Settings:
 
 
 def seen(volume: gv.Volume, function: gv.TransferFunction) -> gv.Volume:
-    """Colour, premultiplied, and opacity of every voxel."""
+    """Premultiplied colour and opacity of every voxel."""
     rgba = torch.from_numpy(function(volume.data[..., 0].numpy()))
     rgba[..., :3] *= rgba[..., 3:]
     return gv.Volume(rgba.half(), spacing=volume.spacing, origin=volume.origin)
@@ -41,7 +42,7 @@ def seen(volume: gv.Volume, function: gv.TransferFunction) -> gv.Volume:
 def thin_lens(
     tree: gv.N3Tree, camera: gv.Camera, shader: gv.StoredColor, aperture: float
 ) -> torch.Tensor:
-    """Mean colour of rays from all over the lens through the point in focus."""
+    """(h, w, 3) mean colour of rays from all over the lens through each pixel's point in focus."""
     placed = camera.placed(tree.box)
     rays, side = placed.rays(tree.device), float((tree.box[1] - tree.box[0]).max())
     right, down = placed.viewmats[0, :2, :3].to(tree.device)
@@ -56,7 +57,7 @@ def thin_lens(
 
 
 def main(settings: Settings) -> None:
-    """Renders four pictures, side by side, and tells how alike lens and pinholes are."""
+    """Renders four pictures, side by side, and prints the SSIM of lens and pinholes."""
     volume = seen(gv.read_volume(SCAN), gv.TransferFunction.from_points(OPACITY, COLOR))
     tree = gv.N3Tree.from_volume(volume, device=settings.device)
     shader = gv.StoredColor("value", premultiplied=True)

@@ -1,6 +1,6 @@
-"""A sphere that nobody stored: a producer of one's own, and its picture.
+"""A sphere that is computed, not stored: your own producer, and its picture.
 
-65,536 voxels along a side would be 1,100 TB; the picture needs a few MB of them.
+65,536^3 voxels would take 1,100 TB; the picture needs a few MB of them.
 """
 
 import torch

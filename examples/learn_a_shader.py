@@ -1,5 +1,5 @@
-"""A transfer function out of pictures: a module shader starts gray, and gradients through the
-renderer give it the colours and the opacities that made the pictures."""
+"""Learns a transfer function from pictures: a module shader starts as a gray haze, and gradients
+through the renderer find the colours and opacities that made the pictures."""
 
 import dataclasses
 import math
@@ -17,7 +17,7 @@ TRAINING = {"step": 1.0}
 
 
 class Learned(torch.nn.Module):
-    """Rows of colour and log extinction at even distances of values, and straight lines between."""
+    """Colour and log extinction at evenly spaced values, linear in between."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -33,7 +33,7 @@ class Learned(torch.nn.Module):
 
 
 def shown(color: torch.Tensor) -> torch.Tensor:
-    """About what a display makes of linear light: dark differences count."""
+    """Roughly display-encoded light, so that differences in the dark count."""
     return (color + 1e-4).sqrt()
 
 

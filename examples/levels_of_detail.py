@@ -1,5 +1,5 @@
-"""Level of detail: the same scan ever farther away, with the samples and bricks that each picture
-took."""
+"""Level of detail: the same scan from ever farther away, with the samples and bricks of each
+picture."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +22,7 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    """Renders a batch of cameras, then each alone for its figures."""
+    """Renders each camera alone for its figures, then all as a batch."""
     tree = gv.N3Tree.from_volume(gv.read_volume(SCAN), device=settings.device)
     shader = gv.TransferFunction.preset("vessels", *tree.value_range["value"])
     cameras = gv.Camera.orbit(30, 20, DISTANCES, 30, settings.size, settings.size)

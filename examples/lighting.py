@@ -1,5 +1,6 @@
-"""Light by cones. Above: a scan in its shader's own light, with soft shadows, and with ambient
-occlusion. Below: a room with a lamp: direct light, occluded ambient light, one bounce of light.
+"""Lighting by secondary cones. Above: a scan in its shader's own light, with soft shadows, and
+with ambient occlusion. Below: a room with a lamp: direct light, occluded ambient light, one
+bounce of light.
 """
 
 import math
@@ -18,7 +19,7 @@ VESSELS = gv.Isosurface(
     50, (0.85, 0.35, 0.25), light=SUN, ambient=0.5, diffuse=0.75, specular=0.2, shininess=30
 )
 SKY, EVENING = (0.75, 0.9, 1.15), (0.5, 0.56, 0.64)
-SIDE, WALL, SOFT = 96, 5.0, 3.0  # of the room, voxels: its walls, and how far surfaces fade
+SIDE, WALL, SOFT = 96, 5.0, 3.0  # voxels: of the room, its walls, and the fade of surfaces
 WHITE, RED, GREEN, BRASS = (0.8, 0.8, 0.8), (0.8, 0.1, 0.06), (0.12, 0.55, 0.1), (0.85, 0.7, 0.45)
 LAMP = gv.PointLight((46.0, 82.0, 66.0), (1.0, 0.95, 0.85), radius=7.0)
 PAINT = gv.StoredColor(
@@ -37,7 +38,7 @@ class Settings:
 
 
 def room() -> gv.Volume:
-    """Colours, premultiplied, and opacity: walls, a block and a ball."""
+    """Premultiplied colour and opacity of walls, a block and a ball."""
     place = torch.arange(SIDE, dtype=torch.float32)
     z, y, x = torch.meshgrid(place, place, place, indexing="ij")
     u, v = (math.cos(a) * (x - 32) + math.sin(a) * (z - 34) for a in (0.35, 0.35 + math.pi / 2))
@@ -49,7 +50,7 @@ def room() -> gv.Volume:
         *((x - WALL, RED), (far - x, GREEN), (block, WHITE), (ball, BRASS)),
     )
     color, alpha = torch.zeros(SIDE, SIDE, SIDE, 3), torch.zeros_like(x)
-    for distance, paint in bodies:  # one over the other
+    for distance, paint in bodies:  # composited front to back
         share = (0.5 - distance / SOFT).clamp(0, 1) * (1 - alpha)
         color, alpha = color + share[..., None] * torch.tensor(paint), alpha + share
     return gv.Volume(torch.cat((color, alpha[..., None]), -1))

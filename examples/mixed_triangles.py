@@ -1,7 +1,7 @@
 """Triangles and voxels in one picture: VTK's OpenGL draws rings and a disk that cross a scan.
 
-VTK gets our camera; its colours and its depth buffer come back as a layer, without leaving the
-device where CUDA and OpenGL are on one.
+VTK takes our camera; its colours and depth buffer come back as a layer. They stay on the GPU if
+CUDA and OpenGL use the same one.
 """
 
 import math
@@ -30,7 +30,7 @@ DISK = (64, 64, 58)
 
 
 def actor(source, place, color) -> vtk.vtkActor:
-    """Triangles of a source at a place."""
+    """The triangles of a source, moved to a place."""
     mapper, result = vtk.vtkPolyDataMapper(), vtk.vtkActor()
     mapper.SetInputConnection(source.GetOutputPort())
     mapper.ScalarVisibilityOff()
@@ -42,8 +42,8 @@ def actor(source, place, color) -> vtk.vtkActor:
 
 
 def rasterise(actors, camera: gv.Camera, near: float, far: float, device="cpu") -> gv.Layer:
-    """Draws triangles for the pixels of a camera that stands in the world."""
-    vtk.vtkObject.GlobalWarningDisplayOff()  # VTK tells which displays it did not find
+    """Draws triangles for the pixels of a camera in world units."""
+    vtk.vtkObject.GlobalWarningDisplayOff()  # else it warns of each display it did not find
     renderer, window = vtk.vtkRenderer(), vtk.vtkRenderWindow()
     window.SetOffScreenRendering(True)
     window.SetMultiSamples(0)  # a pixel has one depth
@@ -85,7 +85,7 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    """Draws the triangles, then the voxels before and around them."""
+    """Draws the triangles, then the voxels in front of and around them."""
     size, device = settings.size, settings.device
     camera = gv.Camera.look_at(EYE, TARGET, UP, fov=30, width=size, height=size)
     torus = vtk.vtkParametricTorus()

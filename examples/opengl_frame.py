@@ -1,7 +1,7 @@
-"""A frame of OpenGL and voxels: OpenGL draws a ball, voxels join it, and OpenGL goes on with the
-edges of their box, hidden where a voxel or the ball stands before them.
+"""A frame drawn by OpenGL and gvtorch: OpenGL draws a ball, voxels join it, and OpenGL adds the
+edges of the box, which voxels and ball hide.
 
-On an NVIDIA GPU (`--device cuda`) nothing of it passes through the host.
+On an NVIDIA GPU (`--device cuda`) no picture passes through the host.
 """
 
 import dataclasses
@@ -41,7 +41,7 @@ void main() { result = vec4(tint, 1); }
 
 
 def ball(sides: int = 96) -> Tensor:
-    """(k, 6) place and colour of the corners of triangles."""
+    """(k, 6) place and colour of triangle corners."""
     v, u = torch.linspace(0, math.pi, sides + 1), torch.linspace(0, 2 * math.pi, 2 * sides + 1)
     v, u = torch.meshgrid(v, u, indexing="ij")
     normals = torch.stack((v.sin() * u.cos(), v.sin() * u.sin(), v.cos()), -1)
@@ -54,7 +54,7 @@ def ball(sides: int = 96) -> Tensor:
 
 
 def edges(box: Tensor) -> Tensor:
-    """(24, 6) place and colour of the ends of the edges of a (2, 3) box."""
+    """(24, 6) place and colour of the ends of the 12 edges of a (2, 3) box."""
     corners = torch.tensor(list(itertools.product((0, 1), repeat=3)))
     pairs = [(i, j) for i, j in itertools.combinations(range(8), 2) if (i ^ j) in (1, 2, 4)]
     ends = corners[torch.tensor(pairs).flatten()]
@@ -99,7 +99,7 @@ def main(settings: Settings) -> None:
         stored, depth = exchange.read_color()[..., :3], exchange.read_depth()
         drawn = rgb_to_linear_rgb(stored.movedim(-1, 0)).movedim(0, -1)
         layer = gv.Layer(drawn, gv.opengl.ray_distance(depth, projection))
-        background = gv.Backdrop(drawn)  # where nothing was drawn it is OpenGL's, too
+        background = gv.Backdrop(drawn)  # OpenGL's, also where it drew nothing
         picture = gv.render(tree, camera, shader, layer=layer, background=background)
         mixed = linear_rgb_to_rgb(picture.color.movedim(-1, 0)).movedim(0, -1)
         exchange.draw(mixed, gv.opengl.window_depth(picture.nearest, projection))

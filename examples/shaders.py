@@ -1,7 +1,7 @@
-"""One scan, fused shaders. From left to right, first row: plain, lit, isosurface, maximum; second:
-a thin shell by the plain function at step 1, the same pre-integrated, plain at step 0.02; the mean;
-third: stored colours lit by stored normals, a distance field, the minimum within a slab, features:
-the stored normals as colours.
+"""One scan, built-in shaders. First row: plain, lit, isosurface, maximum. Second: a thin
+shell by the plain function at step 1, pre-integrated at step 1, plain at step 0.02; the mean.
+Third: stored colours lit by stored normals, a distance field, the minimum within a slab, features
+(the stored normals as colours).
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ import gvtorch as gv
 DATA = Path(__file__).parent / "data"
 EYE, TARGET, UP = (-230.0, -330.0, 170.0), (63.5, 63.5, 127.5), (0.0, 0.0, 1.0)
 BONE = 290.0  # aorta, bones and the stent
-SHELL = gv.TransferFunction.from_points(  # a skin thinner than a step's change of value
+SHELL = gv.TransferFunction.from_points(  # thinner than the change of the value in one step
     opacity=[(240, 0), (244, 0.98), (252, 0.98), (256, 0)],
     color=[(240, 0.9, 0.3, 0.15), (256, 1.0, 0.8, 0.5)],
 )
@@ -74,7 +74,7 @@ def main(settings: Settings) -> None:
         picture = gv.render(tree, camera, shader, lod="finest", **options)
         images.append(picture.color)
     assert picture.features is not None
-    images[-1] = 0.5 * (picture.features / 127 + picture.alpha)  # -127 to 127 as 0 to 1
+    images[-1] = 0.5 * (picture.features / 127 + picture.alpha)  # -127 to 127 become 0 to 1
     rows = [torch.cat(images[first : first + 4], dim=1) for first in range(0, len(images), 4)]
     replace(picture, color=torch.cat(rows)).save(settings.output)
     print(f"{settings.output}: {len(images)} pictures")

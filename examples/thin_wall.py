@@ -1,5 +1,5 @@
-"""A wall two voxels thick, red on this side and green on the other, seen by cones 1, 8, 16 and 32
-times as wide as a pixel's. Above, coarse levels are means; below, seen from six directions.
+"""A wall two voxels thick, red in front and green behind, seen by cones 1, 8, 16 and 32 times as
+wide as a pixel's. Above, coarse voxels are means; below, they hold six directions.
 """
 
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ class Settings:
 
 
 def wall() -> gv.Volume:
-    """Two sheets, one behind the other, with a window: colour times opacity, and opacity."""
+    """Premultiplied colour and opacity of two sheets, one behind the other, with a window."""
     rgba = torch.zeros((SIDE, SIDE, SIDE, 4))  # z, y, x
     middle, low, high = SIDE // 2 + 2, SIDE // 8, SIDE - SIDE // 8
     for depth, color in ((middle, RED), (middle - 1, GREEN)):

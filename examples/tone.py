@@ -1,5 +1,6 @@
-"""From scene light to the display: a picture before a bright sky, 16 rays a pixel, shown clipped,
-with Reinhard's curve and with a filmic one; and transparent, as a PNG with alpha."""
+"""From scene light to the display: a picture before a bright sky, clipped, with Reinhard's curve
+and with a filmic one; and a transparent PNG. All with 16 rays a pixel.
+"""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -36,7 +37,7 @@ def sky(height: int = 512) -> torch.Tensor:
 
 
 def main(settings: Settings) -> None:
-    """Renders once and develops three times."""
+    """Renders once and tone-maps three times; then renders without a background."""
     tree = gv.N3Tree.from_volume(gv.read_volume(SCAN), device=settings.device)
     shader = gv.TransferFunction.preset("vessels", *tree.value_range["value"])
     camera = gv.Camera.orbit(10, 3, 2.0, 40, settings.size, settings.size)
