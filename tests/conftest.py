@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 import os
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,14 +15,12 @@ import torch
 import gvtorch as gv
 from gvtorch.ops import available
 
-ROOT = Path(__file__).parent.parent
-DATA = ROOT / "examples" / "data"
-SHARED = ROOT.parent / "shared" / "data"
-DEVICES = {"reference": "cpu", "cpp": "cpu", "cuda": "cuda"}
+pytest.register_assert_rewrite("helpers")
+from helpers import ABSENT, DATA, DEVICES  # noqa: E402
+
 _REQUIRED = os.environ.get("GVTORCH_REQUIRE", "")
 _ran: Counter[str] = Counter()
 _absent: set[str] = set()
-_ABSENT = "shared test data is not here: "
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -52,24 +47,6 @@ def compiled(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-@functools.cache
-def opengl_context():
-    """moderngl's context without a window, one a process, or a skip."""
-    moderngl = pytest.importorskip("moderngl")
-    try:
-        return moderngl.create_context(standalone=True, backend="egl")
-    except Exception as error:  # it raises no other class
-        pytest.skip(f"no OpenGL through EGL: {error}")
-
-
-def shared(path: str) -> Path:
-    """A file of the shared test data, or a skip that the summary tells of."""
-    file = SHARED / path
-    if not file.exists():
-        pytest.skip(_ABSENT + path)
-    return file
-
-
 @pytest.fixture(scope="session", autouse=True)
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Where compiled shaders are kept: each is compiled once for all tests, and none stays."""
@@ -78,12 +55,6 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
         patch.setenv("GVTORCH_CACHE", str(folder))
         yield folder
-
-
-def gvtorch(*args: object, cwd=None) -> subprocess.CompletedProcess[str]:
-    """Runs the command line in a process of its own."""
-    command = [sys.executable, "-m", "gvtorch", *map(str, args)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False)
 
 
 @pytest.fixture(scope="session")
@@ -116,6 +87,28 @@ def blobs() -> gv.Volume:
     return gv.Volume(torch.from_numpy(value), spacing=(1.0, 0.8, 1.5), origin=(5.0, -3.0, 2.0))
 
 
+@pytest.fixture(scope="session")
+def channels(blobs) -> dict[str, gv.Volume]:
+    """The blobs with a colour and a normal in each voxel, both of 8 bits."""
+    value = blobs.data[..., 0]
+    z, y, x = torch.meshgrid(*(torch.linspace(0, 1, n) for n in value.shape), indexing="ij")
+    rgba = torch.stack((x, y, z, value), -1)
+    normal = torch.stack(torch.gradient(value)[::-1], -1)
+    normal = torch.nn.functional.normalize(normal, dim=-1) * 0.5 + 0.5
+    place = blobs.spacing, blobs.origin
+    six = gv.Volume(rgba, *place).directional()
+    six.data = six.data * torch.linspace(0.6, 1.0, 24).to(six.data)  # no two of them are equal
+    return {
+        "value": blobs,
+        "rgba": gv.Volume((rgba * 255).round().to(torch.uint8), *place),
+        "premultiplied": gv.Volume(
+            torch.cat((rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]), -1), *place
+        ),
+        "six": six,
+        "normal": gv.Volume((normal * 255).round().to(torch.uint8), *place),
+    }
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Notes the backends of a test, which its report takes along, from whatever process."""
     values = getattr(item, "callspec", None)
@@ -126,8 +119,8 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
     noted = [value for name, value in report.user_properties if name == "backend"]
-    if report.skipped and isinstance(report.longrepr, tuple) and _ABSENT in report.longrepr[2]:
-        _absent.add(report.longrepr[2].partition(_ABSENT)[2])
+    if report.skipped and isinstance(report.longrepr, tuple) and ABSENT in report.longrepr[2]:
+        _absent.add(report.longrepr[2].partition(ABSENT)[2])
     if report.when == "call" and report.passed:
         _ran.update(noted)
 

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 import torch
-from conftest import DEVICES, ROOT
+from helpers import DEVICES, ROOT
 
 import gvtorch as gv
 from gvtorch import bench

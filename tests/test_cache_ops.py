@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from conftest import DEVICES
+from helpers import DEVICES
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 

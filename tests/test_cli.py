@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import DATA, ROOT, gvtorch
+from helpers import DATA, ROOT, gvtorch
 
 import gvtorch as gv
 

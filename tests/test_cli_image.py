@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from conftest import gvtorch
+from helpers import gvtorch
 
 import gvtorch as gv
 

@@ -9,8 +9,11 @@ import math
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES
-from test_trace_rays import SHADER, assert_equal, camera_rays, forget, run
+from helpers import DEVICES
+from helpers.clips import CLIPS, inside, shown, turned
+from helpers.rays import camera_rays, rays_along
+from helpers.traces import SHADER, assert_equal, run
+from helpers.trees import forget
 
 import gvtorch as gv
 from gvtorch.tracing.clip import Clipped
@@ -18,38 +21,12 @@ from gvtorch.tracing.clip import Clipped
 UNIT = torch.tensor([[-0.5] * 3, [0.5] * 3], dtype=torch.float64)
 
 
-def turned(degrees: float, size: float, centre: tuple[float, float, float]) -> torch.Tensor:
-    """The matrix of a cube that is turned about z and then about x."""
-    a = math.radians(degrees)
-    about_z = torch.tensor(
-        [[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1]]
-    )
-    about_x = torch.tensor(
-        [[1, 0, 0], [0, math.cos(a), -math.sin(a)], [0, math.sin(a), math.cos(a)]]
-    )
-    axes = size * (about_x @ about_z).double()
-    matrix = torch.eye(4, dtype=torch.float64)
-    matrix[:3, :3] = axes
-    matrix[:3, 3] = torch.tensor(centre, dtype=torch.float64) - axes.sum(1) / 2
-    return matrix
-
-
-def inside(box, places: np.ndarray) -> np.ndarray:
-    """Whether (k, 3) places lie in a box: straight from its definition."""
-    if len(box) == 2:
-        low, high = np.array(box)
-        return ((places >= low) & (places <= high)).all(1)
-    own = (places - box[:3, 3].numpy()) @ np.linalg.inv(box[:3, :3].numpy()).T
-    return ((own >= 0) & (own <= 1)).all(1)
-
-
 def rays_through(count: int, seed: int) -> gv.Rays:
     generator = torch.Generator().manual_seed(seed)
     origin, to = torch.rand(2, count, 3, generator=generator, dtype=torch.float64) * 4 - 2
-    direction = torch.nn.functional.normalize(to * 0.3 - origin)
+    direction = to * 0.3 - origin
     direction[0] = torch.tensor([0.0, 0.0, 1.0])
-    limits = torch.tensor([0.0, torch.inf], dtype=torch.float64).repeat(count, 1)
-    return gv.Rays(origin=origin, direction=direction, cone=limits * 0, range=limits)
+    return rays_along(origin, direction)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -102,20 +79,6 @@ def test_boxes_that_touch_are_one_piece():
     assert torch.equal(second[:, 0], second[:, 1])
 
 
-CLIPS = {
-    "plane": gv.Clip(planes=[(-1, 0, 0, 30.0)]),
-    "box": gv.Clip(boxes=[((9.0, 1.0, 8.0), (33.0, 14.0, 50.0))]),
-    "turned": gv.Clip(boxes=[turned(35, 24.0, (27, 8, 29))]),
-    "cut": gv.Clip(without=[((17.0, 2.0, 3.0), (30.0, 16.0, 60.0))]),
-    "union": gv.Clip(boxes=[((0, -9, 0), (18, 30, 60)), ((30, -9, 0), (60, 30, 60))]),
-    "all": gv.Clip(
-        planes=[(0, 1, 0, -1.0)],
-        boxes=[((0, -9, 0), (26, 30, 60)), turned(20, 22.0, (40, 8, 30))],
-        without=[((9, 0, 0), (14, 11, 60)), ((35, 4, 20), (44, 10, 40))],
-    ),
-}
-
-
 @pytest.mark.parametrize("caps", [False, True])
 @pytest.mark.parametrize("name", CLIPS)
 def test_compiled_equals_reference_clipped(blobs, compiled, name, caps):
@@ -156,18 +119,6 @@ def test_a_medium_of_one_value_has_its_closed_form(backend, name, lod):
     both = sure & np.isfinite(depth)
     np.testing.assert_allclose(actual[both], depth[both], atol=0.1)
     assert both.sum() > 20
-
-
-def shown(clip: gv.Clip, places: np.ndarray) -> np.ndarray:
-    """Whether (k, 3) places are kept."""
-    seen = np.ones(len(places), dtype=bool)
-    for *normal, offset in clip.planes:
-        seen &= places @ np.array(normal) + offset >= 0
-    if len(clip.boxes):
-        seen &= np.any([inside(box, places) for box in clip.boxes], axis=0)
-    for box in clip.without:
-        seen &= ~inside(box, places)
-    return seen
 
 
 @pytest.mark.parametrize("name", CLIPS)

@@ -16,16 +16,17 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import DEVICES, ROOT
-from test_module_shader import assert_same_picture
-from test_op_contract import world_rays
-from test_shaders import POINT, op_arguments
-from test_trace_rays import SHADER, camera_rays, forget, on, run
+from helpers import DEVICES
+from helpers.compiled import HEADER, quick_compiler
+from helpers.pictures import assert_close_picture
+from helpers.rays import camera_rays, world_rays
+from helpers.shaders import POINT
+from helpers.traces import SHADER, op_arguments, run
+from helpers.trees import forget, on
 
 import gvtorch as gv
 from gvtorch.cpp_ext import compilers, user
 
-HEADER = ROOT / "tests" / "cpp" / "user_shaders.h"
 BANDS = {"density": 0.4, "width": 3.0, "fade": 0.005}
 CAMERA = gv.Camera.orbit(30, 20, 1.3, width=24, height=24)
 
@@ -139,7 +140,7 @@ def test_a_shader_of_ones_own_equals_its_module_twin(blobs, compiled, lod, dtype
     eye = CAMERA.placed(tree.box).rays().origin[0].to(tree.device)
     options = {"lod": lod, "dtype": dtype}
     picture = gv.render(tree, CAMERA, mine("Bands", uniforms=BANDS), **options)
-    assert_same_picture(gv.render(tree, CAMERA, bands_as_module(eye, **BANDS), **options), picture)
+    assert_close_picture(gv.render(tree, CAMERA, bands_as_module(eye, **BANDS), **options), picture)
 
 
 def test_an_engine_streams_what_it_sees(channels):
@@ -288,14 +289,6 @@ def in_processes(
         for _ in range(count)
     ]
     return [run.communicate(timeout=300)[0].strip() for run in runs]
-
-
-def quick_compiler(folder: Path, *before: str) -> str:
-    """A compiler that does not optimise, after some lines of shell."""
-    real, file = shutil.which(compilers.find_cxx()[0]), folder / "c++"
-    file.write_text("\n".join(("#!/bin/sh", *before, f'exec {real} "$@" -O0\n')))
-    file.chmod(0o755)
-    return str(file)
 
 
 @pytest.mark.backend("cpp")

@@ -4,20 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from conftest import DEVICES
+from helpers import DEVICES
+from helpers.traces import packed
 
 from gvtorch.ops import composite
-
-
-def packed(seed=0, rays=7, dtype=torch.float64, device="cpu"):
-    generator = torch.Generator().manual_seed(seed)
-    counts = torch.randint(0, 6, (rays,), generator=generator)
-    counts[2] = 0
-    offset = torch.cat((counts.new_zeros(1), counts.cumsum(0)))
-    alpha = torch.rand(int(offset[-1]), generator=generator, dtype=dtype)
-    feature = torch.randn(int(offset[-1]), 4, generator=generator, dtype=dtype)
-    clear = 0.5 + 0.5 * torch.rand(rays, generator=generator, dtype=dtype)
-    return [t.to(device) for t in (alpha, feature, offset, clear)]
 
 
 @pytest.mark.parametrize("stop_alpha", [0.6, 1.0])

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_store import assert_holds, noise, write_foreign
+from helpers.stores import assert_holds, noise, write_foreign
 
 import gvtorch as gv
 from gvtorch.io import conversion, shard

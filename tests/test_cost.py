@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from conftest import DEVICES
-from test_trace_rays import SHADER, arguments, on
+from helpers import DEVICES
+from helpers.traces import SHADER, arguments
+from helpers.trees import on
 
 import gvtorch as gv
 from gvtorch.ops import RayArguments, trace_segments

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES
+from helpers import DEVICES
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 

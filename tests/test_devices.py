@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-
 import pytest
 import torch
-from test_trace_rays import SHADER, camera_rays, on
+from helpers.packets import INSTRUCTIONS, result, start
+from helpers.rays import camera_rays
+from helpers.traces import SHADER
+from helpers.trees import on
 
 import gvtorch as gv
 from gvtorch.ops import available
@@ -16,13 +15,6 @@ from gvtorch.ops import available
 FIELDS = ("color", "alpha", "depth", "samples")
 
 needs_cuda = pytest.mark.skipif(bool(available()["cuda"]), reason=available()["cuda"] or "-")
-
-_TRACE = """
-import sys, torch
-sys.path.insert(0, {tests!r})
-from test_devices import traced
-torch.save(traced(), {file!r})
-"""
 
 
 def traced() -> list[torch.Tensor]:
@@ -39,13 +31,10 @@ def traced() -> list[torch.Tensor]:
 
 
 @pytest.mark.backend("cpp")
-@pytest.mark.parametrize("instructions", ["baseline", "avx2", "avx512"])
+@pytest.mark.parametrize("instructions", INSTRUCTIONS)
 def test_every_instruction_set_gives_the_same_bits(instructions, tmp_path):
-    file = str(tmp_path / "hits.pt")
-    program = _TRACE.format(tests=os.path.dirname(__file__), file=file)
-    environment = {**os.environ, "GVTORCH_CPU": instructions}
-    subprocess.run([sys.executable, "-c", program], env=environment, check=True)
-    for one, other in zip(torch.load(file, weights_only=True), traced(), strict=True):
+    found = result(start(traced, tmp_path, instructions))
+    for one, other in zip(found, traced(), strict=True):
         assert torch.equal(one, other)
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES
-from marcher import trilinear
+from helpers import DEVICES
+from helpers.marcher import trilinear
+from helpers.rays import rays_along
 
 import gvtorch as gv
 from gvtorch.base.volume import DIRECTIONS
@@ -32,14 +33,7 @@ def straight(device: str, direction, cone: float, box: torch.Tensor, grid: int =
     side = (box[1] - box[0]).max()
     shift = torch.cartesian_prod(*(torch.linspace(-0.2, 0.2, grid).double() for _ in "xyz")) * side
     origin = box.mean(0) + shift - 2 * side * along
-    flat = torch.zeros((len(origin), 2), dtype=torch.float64)
-    rays = gv.Rays(
-        origin=origin,
-        direction=along.expand_as(origin).contiguous(),
-        cone=flat + torch.tensor([cone, 0.0]),
-        range=flat + torch.tensor([0.0, torch.inf]),
-    )
-    return rays.to(device)
+    return rays_along(origin, along, cone, device)
 
 
 def shoot(volume: gv.Volume, backend: str, direction, cone: float, branching: int = 2, **options):

@@ -4,63 +4,23 @@ from __future__ import annotations
 
 import gc
 import random
-import time
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import get_type_hints
 
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES, shared
+from helpers import DEVICES, shared
+from helpers.pictures import PARTS, VESSELS, assert_same_picture, camera
+from helpers.producers import Checked, Late
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gvtorch as gv
-from gvtorch.base import constants as config
 from gvtorch.engine import EngineSettings
 from gvtorch.engine.ray_subsets import scouts
 
-VESSELS = gv.TransferFunction.preset("vessels", 0, 255)
 AORTA = gv.TransferFunction.from_points([(140, 0), (400, 0.25), (900, 0.95)])
-PARTS = ("color", "alpha", "depth", "samples")
-
-
-def camera(size=48, **place) -> gv.Camera:
-    return gv.Camera.orbit(**{"azimuth": 30, "elevation": 20, **place}, width=size, height=size)
-
-
-def assert_same_picture(actual: gv.Picture, expected: gv.Picture) -> None:
-    for name in PARTS:
-        assert torch.equal(getattr(actual, name), getattr(expected, name)), name
-    assert expected.alpha.max() > 0.3, "the test must see something"
-
-
-class Late(gv.VolumeProducer):
-    """Answers from threads, after random delays, so in any order."""
-
-    def __init__(self, volume: gv.Volume, seed: int = 0, most: float = 0.004) -> None:
-        super().__init__(volume)
-        self.random, self.most = random.Random(seed), most
-        self.threads = ThreadPoolExecutor(6)
-
-    def later(self, answer, nodes: gv.Nodes) -> Future:
-        delay = self.random.uniform(0, self.most)
-
-        def work():
-            time.sleep(delay)
-            return answer(nodes)
-
-        return self.threads.submit(work)
-
-    def classify(self, nodes):
-        return self.later(super().classify, nodes)
-
-    def fill(self, nodes):
-        return self.later(super().fill, nodes)
-
-    def close(self):
-        self.threads.shutdown()
 
 
 def working_set(picture: gv.Picture) -> int:
@@ -166,29 +126,6 @@ def test_a_pool_that_holds_almost_nothing_ends_too(aneurism):
             engine.validate()
             assert picture.stats.capacity_exceeded and picture.stats.frames <= 150
             assert not picture.stats.converged and torch.isfinite(picture.color).all()
-
-
-class Checked(gv.Engine):
-    """Looks after every frame at what the frame may have done: what the picture before used is
-    still there.
-    """
-
-    def frame(self, *args, **options):
-        nodes, bricks = self.cache.nodes, self.cache.bricks
-        roots = len(self.trees)
-        locked = nodes.brick_tn[:roots, 0].clone()
-        before = [bricks.owner_b.clone(), nodes.parent_t.clone()]
-        used_b = (bricks.stamp_b == self.frames) & (before[0] >= 0)
-        used_t = (nodes.stamp_t == self.frames) & (before[1] >= 0)
-        picture, stats = super().frame(*args, **options)
-        self.validate()
-        assert torch.equal(bricks.owner_b[used_b], before[0][used_b]), "a brick in use was taken"
-        assert torch.equal(nodes.parent_t[used_t], before[1][used_t]), "a tile in use was taken"
-        assert torch.equal(nodes.brick_tn[:roots, 0], locked), "a root was touched"
-        assert stats.tiles_used == int((nodes.stamp_t == self.frames).sum())
-        assert stats.bricks_used == int((bricks.stamp_b == self.frames).sum())
-        assert not (nodes.request_tn & config.REQUEST_KINDS).any(), "requests are cleared"
-        return picture, stats
 
 
 @settings(max_examples=25, deadline=None)

@@ -2,39 +2,15 @@
 
 from __future__ import annotations
 
-import functools
-import importlib.util
 import os
 import subprocess
 import sys
 
 import pytest
-from conftest import ROOT
+from helpers import ROOT
+from helpers.opengl import IN_OPENGL
 
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-
-
-@functools.cache
-def no_vtk() -> str:
-    """Why VTK can't draw here, or nothing. Without OpenGL it ends its process, so another tries."""
-    code = "import vtk; w = vtk.vtkRenderWindow(); w.SetOffScreenRendering(True); w.Render()"
-    return _why_not("vtk", code)
-
-
-def _no_moderngl() -> str:
-    """Why moderngl can't draw here without a window, or nothing."""
-    code = "import moderngl; moderngl.create_context(standalone=True, backend='egl')"
-    return _why_not("moderngl", code)
-
-
-def _why_not(package: str, code: str) -> str:
-    if not importlib.util.find_spec(package):
-        return f"{package} is not installed"
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
-    return f"{package} finds no OpenGL" if run.returncode else ""
-
-
-IN_OPENGL = {"mixed_triangles": no_vtk, "opengl_frame": _no_moderngl}
 
 
 @pytest.mark.backend("cpp")

@@ -38,7 +38,7 @@ from typing import Any
 
 import pytest
 import torch
-from golden_scenes import (
+from helpers.golden_scenes import (
     CAMERAS,
     LIGHTS,
     LOOKS,

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES
+from helpers import DEVICES
 
 import gvtorch as gv
 from gvtorch.base.records import RenderStats

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from conftest import shared
+from helpers import shared
 
 import gvtorch as gv
 

@@ -7,13 +7,13 @@ from __future__ import annotations
 import dataclasses
 import math
 
-import marcher
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES
-from test_engine import PARTS, assert_same_picture, camera
-from test_trace_rays import on
+from helpers import DEVICES, marcher
+from helpers.layers import BLUE, SOLID, ball, layer_of, screen, seam_error
+from helpers.pictures import GRAY, PARTS, assert_same_picture, camera
+from helpers.trees import on
 
 import gvtorch as gv
 from gvtorch.base import constants as config
@@ -21,23 +21,6 @@ from gvtorch.ops import available
 from gvtorch.tracing import pixels
 
 HAZE = gv.TransferFunction.from_points([(0, 0.03)], [(0, 0.9, 0.5, 0.2)])
-GRAY = gv.TransferFunction.preset("gray", 0, 1)
-BLUE = (0.1, 0.2, 0.8)
-
-
-def screen(view: gv.Camera, place: torch.Tensor, normal: tuple[float, float, float]):
-    """(h, w, 1) distance at which the rays of a camera meet the plane through `place`, +inf where
-    they do not.
-    """
-    rays, normal = view.rays(), torch.tensor(normal, dtype=torch.float64)
-    along = ((place - rays.origin) @ normal) / (rays.direction @ normal)
-    return torch.where(along > 0, along, math.inf).reshape(view.height, view.width, 1)
-
-
-def layer_of(depth: torch.Tensor, alpha: torch.Tensor | None = None, color=BLUE) -> gv.Layer:
-    """One straight colour at a depth."""
-    plain = depth.new_tensor(color).expand(*depth.shape[:-1], 3)
-    return gv.Layer(plain if alpha is None else plain * alpha, depth, alpha)
 
 
 def middle(volume: gv.Volume) -> torch.Tensor:
@@ -317,43 +300,6 @@ def test_on_cuda_nobody_waits_and_a_graph_reads_the_layer(blobs, alpha):
         assert_same_picture(engine.frame(view, GRAY, layer=host)[0], expected)
         with pytest.raises(ValueError, match=r"capture: layer must lie on cuda:0, .* got cpu"):
             engine.capture(view, GRAY, layer=host)
-
-
-def ball(radius: float, size: int) -> gv.Volume:
-    """Signed distance to a sphere around the world's origin, positive inside; voxels are 1 wide."""
-    place = torch.arange(size) - (size - 1) / 2
-    z, y, x = torch.meshgrid(place, place, place, indexing="ij")
-    origin = (-(size - 1) / 2,) * 3
-    return gv.Volume(radius - (x * x + y * y + z * z).sqrt(), origin=origin)
-
-
-SOLID = gv.TransferFunction.from_points([(-1e-3, 0), (1e-3, 1)], [(0, 1, 0, 0)], reference=0.01)
-
-
-def seam_error(picture: gv.Picture, view: gv.Camera, height: float, radius: float) -> float:
-    """How many pixels the seam of a ball and the plane z = height is off: the farthest from the
-    seam's circle of all pixels that show the wrong one. A ray meets the plane inside the ball where
-    its ball was entered before.
-    """
-    rays = view.rays()
-    along = (height - rays.origin[:, 2]) / rays.direction[:, 2]
-    place = rays.origin + along[:, None] * rays.direction
-    ring = math.sqrt(radius**2 - height**2)
-    from_axis = place[:, :2].norm(dim=1)
-    red, blue = picture.color.cpu().double().reshape(-1, 3)[:, (0, 2)].unbind(1)
-    wrong = (red > blue) != (from_axis < ring)
-    # The nearest point of the circle, in pixels.
-    edge = place.clone()
-    edge[:, :2] *= (ring / from_axis)[:, None]
-    matrix = view.Ks[0] @ view.viewmats[0, :3]
-    pixels = []
-    for point in (place, edge):
-        flat = torch.cat((point, torch.ones_like(point[:, :1])), 1) @ matrix.T
-        pixels.append(flat[:, :2] / flat[:, 2:])
-    inside = int((from_axis < ring).sum())
-    assert inside > 500 and inside < 0.8 * len(place), "the test must see something"
-    off = (pixels[0] - pixels[1]).norm(dim=1)[wrong]
-    return float(off.max()) if len(off) else 0.0
 
 
 @pytest.mark.parametrize("tilt", [0.0, 25.0])

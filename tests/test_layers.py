@@ -9,7 +9,7 @@ import sys
 from graphlib import TopologicalSorter
 from pathlib import Path
 
-from conftest import ROOT
+from helpers import ROOT
 
 PACKAGE = ROOT / "gvtorch"
 FLOORS = [
@@ -110,3 +110,9 @@ def test_import_loads_torch_and_nothing_heavier():
     loaded = set(run.stdout.split())
     assert "torch" in loaded
     assert not loaded & {"kornia", "nibabel", "astropy", "tifffile", "nrrd", "tyro", "rich", "PIL"}
+
+
+def test_test_files_import_helpers_and_no_test_file():
+    for path in (ROOT / "tests").rglob("*.py"):
+        for name in imported(path):
+            assert name[0] != "conftest" and not name[0].startswith("test_"), path

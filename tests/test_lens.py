@@ -8,8 +8,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES
-from test_trace_rays import SHADER, assert_equal, camera_rays
+from helpers import DEVICES
+from helpers.rays import camera_rays
+from helpers.traces import SHADER, assert_equal
 
 import gvtorch as gv
 from gvtorch.base.constants import CONE_OVERESTIMATE

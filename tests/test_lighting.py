@@ -8,20 +8,19 @@ import math
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES
-from test_shading import ball, parallel, phong, sphere
+from helpers import DEVICES
+from helpers.rays import rays_along
+from helpers.shading import MATT, ball, grid, parallel, phong, sphere
 
 import gvtorch as gv
 
-MATT = {"ambient": 0.0, "diffuse": 1.0, "specular": 0.0}
 SKY = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0}
 FLOOR, SIZE = 8.0, 64
 
 
-def places(size: int = SIZE) -> tuple[np.ndarray, ...]:
+def places() -> np.ndarray:
     """x, y, z of the voxels of a cube."""
-    z, y, x = np.mgrid[0:size, 0:size, 0:size].astype(np.float32)
-    return x, y, z
+    return np.moveaxis(grid((SIZE,) * 3), -1, 0)
 
 
 def tree_of(distance: np.ndarray, backend: str) -> gv.N3Tree:
@@ -32,12 +31,7 @@ def down(x, height: float, z, device: str, width: float = 0.5) -> gv.Rays:
     """Rays down from a height at places (x, z)."""
     x, z = np.broadcast_arrays(np.asarray(x, float), z)
     origin = torch.tensor(np.stack((x, np.full_like(x, height), z), -1))
-    direction = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64).expand_as(origin).contiguous()
-    flat = torch.zeros((len(origin), 2), dtype=torch.float64)
-    cone, far = (torch.tensor(row, dtype=torch.float64) for row in ([width, 0.0], [0.0, math.inf]))
-    return gv.Rays(origin=origin, direction=direction, cone=flat + cone, range=flat + far).to(
-        device
-    )
+    return rays_along(origin, [0.0, -1.0, 0.0], width, device)
 
 
 def light_on(tree, rays, shader, backend, *, plain=None, **lighting) -> np.ndarray:

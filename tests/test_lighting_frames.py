@@ -8,12 +8,13 @@ import math
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES
-from test_lighting import FLOOR, MATT, places
+from helpers import DEVICES
+from helpers.shading import MATT, grid
 
 import gvtorch as gv
 from gvtorch.ops import available
 
+FLOOR = 8.0
 LOOKS = {
     "shadow": gv.Lighting(lights=(gv.DirectionalLight((1, -2, 0.5), angle=6),)),
     "occlusion": gv.Lighting(occlusion=1, reach=0.3, frame="box"),
@@ -72,7 +73,7 @@ def test_a_streamed_picture_is_the_resident_one(blobs, compiled, surface, look):
 
 def test_what_is_seen_only_in_a_shadow_is_streamed_at_its_coarser_level(compiled):
     """A ball outside the picture, whose shadow falls into it."""
-    x, y, z = places(128)
+    x, y, z = np.moveaxis(grid((128,) * 3), -1, 0)
     body = np.sqrt((x - 40) ** 2 + (y - 96) ** 2 + (z - 40) ** 2) - 12
     value = np.clip(0.5 - np.minimum(body, y - FLOOR) / 2, 0, 1).astype(np.float32)
     camera = gv.Camera.look_at((48, 40, 48), (40, 8, 40), (1, 0, 0), fov=40, width=40, height=40)

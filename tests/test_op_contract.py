@@ -9,8 +9,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import DEVICES, ROOT
-from test_trace_rays import SHADER, arguments, camera_rays, on
+from helpers import DEVICES, ROOT
+from helpers.rays import camera_rays, world_rays
+from helpers.traces import SHADER, arguments
+from helpers.trees import on
 
 import gvtorch as gv
 from gvtorch import cpp_ext
@@ -23,13 +25,6 @@ pytestmark = pytest.mark.filterwarnings("ignore")  # torch deprecates its own To
 def tracer(blobs, compiled):
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
     return gv.TreeTracer(tree, SHADER)
-
-
-def world_rays(tree_box, count: int, device) -> tuple[torch.Tensor, ...]:
-    camera = gv.Camera.orbit(width=count // 3, height=3, distance=1.2).placed(tree_box)
-    rays = camera.rays()
-    columns = (rays.origin, rays.direction, rays.cone, rays.range)
-    return tuple(t.float().to(device) for t in columns)
 
 
 @pytest.fixture

@@ -8,9 +8,9 @@ import sys
 
 import pytest
 import torch
-from conftest import ROOT
-from test_examples import no_vtk
-from test_layer import SOLID, ball, layer_of, screen, seam_error
+from helpers import ROOT
+from helpers.layers import SOLID, ball, layer_of, screen, seam_error
+from helpers.opengl import no_vtk
 
 import gvtorch as gv
 from gvtorch.opengl import ClipDepth, matrices, ray_distance, window_depth

@@ -10,7 +10,7 @@ import threading
 
 import pytest
 import torch
-from conftest import opengl_context
+from helpers.opengl import opengl_context
 
 import gvtorch as gv
 from gvtorch.opengl import functions as gl

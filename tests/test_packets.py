@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 import torch
-from test_trace_rays import camera_rays, forget, run
+from helpers.packets import INSTRUCTIONS, LAMP, TRANSFER, result, shaded, start
+from helpers.rays import camera_rays
 from torch import Tensor
 
 import gvtorch as gv
 
-TRANSFER = gv.TransferFunction.from_points(
-    [(0.2, 0), (0.5, 0.05), (0.9, 0.6)], [(0.2, 1, 0.3, 0.1), (0.9, 0.2, 0.6, 1)]
-)
 SUN = gv.DirectionalLight((1.0, -1.0, 0.0), (1.0, 0.9, 0.8))
-LAMP = gv.PointLight((10.0, 50.0, 30.0))
 SHADERS = {
     "plain": TRANSFER,
     "lit": gv.Lit(TRANSFER),
@@ -39,62 +32,10 @@ SHADERS = {
     "mean": gv.Projection("mean", TRANSFER),
     "features": gv.Features(TRANSFER, "rgba"),
 }
-INSTRUCTIONS = ["baseline", "avx2", "avx512"]
-
-_SHADED = """
-import sys, torch
-sys.path.insert(0, {tests!r})
-from test_packets import SHADERS, shaded
-torch.save({{name: shaded(shader, "cpp") for name, shader in SHADERS.items()}}, {file!r})
-"""
 
 
-@cache
-def scene(branching: int = 2) -> gv.N3Tree:
-    """Rough and smooth matter, between a region of zeros and one of another single value."""
-    generator = torch.Generator().manual_seed(4)
-    coarse = torch.rand((1, 5, 12, 12, 12), generator=generator)
-    numbers = torch.nn.functional.interpolate(coarse, size=(37, 37, 37), mode="trilinear")[0]
-    value = numbers[4] + 0.1 * torch.rand((37, 37, 37), generator=generator)
-    value[:14, :, :], value[:, 24:, :20] = 0.0, 0.35
-    rgba = numbers[:4].movedim(0, -1).clone()
-    rgba[..., 3] *= 0.3 * (value > 0.2)
-    normal = torch.nn.functional.normalize(numbers[:3].movedim(0, -1) - 0.5, dim=-1)
-    return gv.N3Tree.from_volume(
-        {
-            "value": gv.Volume(value),
-            "rgba": gv.Volume((rgba * 255).round().to(torch.uint8)),
-            "normal": gv.Volume((normal * 127).round().to(torch.int8)),
-        },
-        4,
-        branching=branching,
-        threshold=0.0,
-    )
-
-
-def cut(rays: gv.Rays) -> gv.Rays:
-    """Rays that begin within the box, each elsewhere, with a part of their light, and end there."""
-    first = torch.linspace(30.0, 45.0, len(rays.origin), dtype=torch.float64)
-    limits = torch.stack((first, first + 17.3), 1)
-    return replace(rays, range=limits, transmittance=torch.linspace(0.05, 1.0, len(first)).double())
-
-
-def shaded(shader: gv.Shader, backend: str, branching: int = 2) -> list[Tensor]:
-    """All that a shader's traces write."""
-    tree, found = scene(branching), []
-    holes = forget(tree, 0.3, 5)
-    for which, size, options in (
-        (tree, 21, {}),
-        (tree, 5, {}),  # cones as wide as several voxels: levels blend
-        (tree, 11, {"lod": "finest", "step": 1.3}),
-        (tree, 11, {"stop_alpha": 0.6, "depth_alpha": 0.5}),
-        (holes, 14, {}),
-    ):
-        rays = camera_rays(which, size, distance=1.5)
-        for some in (rays, cut(rays)):
-            hits, marks = run(which, backend, some, shader, **options)
-            found += [*hits.values(), *marks.values()]
-    return found
+def all_shaded() -> dict[str, list[Tensor]]:
+    return {name: shaded(shader, "cpp") for name, shader in SHADERS.items()}
 
 
 @cache
@@ -105,14 +46,8 @@ def expected(name: str) -> list[Tensor]:
 @pytest.fixture(scope="module")
 def of_instructions(tmp_path_factory) -> dict[str, dict[str, list[Tensor]]]:
     """What each instruction set gives, by its name and the shader's."""
-    found = {}
-    for instructions in INSTRUCTIONS:
-        file = str(tmp_path_factory.mktemp("packets") / "hits.pt")
-        program = _SHADED.format(tests=os.path.dirname(__file__), file=file)
-        environment = {**os.environ, "GVTORCH_CPU": instructions}
-        subprocess.run([sys.executable, "-c", program], env=environment, check=True)
-        found[instructions] = torch.load(file, weights_only=True)
-    return found
+    folder = tmp_path_factory.mktemp("packets")
+    return {name: result(start(all_shaded, folder, name)) for name in INSTRUCTIONS}
 
 
 @pytest.mark.backend("cpp")

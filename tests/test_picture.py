@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 
-import marcher
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES, shared
+from helpers import DEVICES, marcher, shared
 from kornia.metrics import psnr
 
 import gvtorch as gv

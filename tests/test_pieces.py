@@ -8,11 +8,13 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES
-from marcher import trilinear
-from test_clip import CLIPS, shown
-from test_shaders import SHADERS, channels_of
-from test_trace_rays import SHADER, assert_equal, camera_rays, forget, run
+from helpers import DEVICES
+from helpers.clips import CLIPS, shown
+from helpers.marcher import trilinear
+from helpers.rays import camera_rays
+from helpers.shaders import SHADERS
+from helpers.traces import SHADER, assert_equal, run
+from helpers.trees import forget
 
 import gvtorch as gv
 from gvtorch.tracing.composite import trace_pieces
@@ -135,11 +137,6 @@ def test_a_wrong_share_is_one_clear_error(blobs, clear):
 
 
 # --- what a clip leaves, by every shader
-
-
-@pytest.fixture(scope="module")
-def channels(blobs) -> dict[str, gv.Volume]:
-    return channels_of(blobs)
 
 
 @pytest.mark.parametrize("name", SHADERS)

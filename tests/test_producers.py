@@ -6,28 +6,11 @@ from concurrent.futures import Future
 
 import pytest
 import torch
+from helpers.pictures import GRAY, camera
+from helpers.producers import SIZE, Ball
 
 import gvtorch as gv
 from gvtorch.producers import Layout
-
-GRAY = gv.TransferFunction.preset("gray", 0, 1)
-SIZE = {"brick_size": 4, "brick_pool": "4 MB", "node_pool": "200 kB"}
-
-
-def camera(size=24, **place) -> gv.Camera:
-    return gv.Camera.orbit(**{"distance": 1.3, **place}, width=size, height=size)
-
-
-class Ball(gv.Producer):
-    """Density 1 in the middle, falling to 0 at distance 1."""
-
-    def __init__(self, extent=32, **options):
-        super().__init__(extent, box=((-1, -1, -1), (1, 1, 1)), **options)
-        self.filled: list[torch.Tensor] = []
-
-    def fill(self, nodes):
-        self.filled.append(nodes.loc.clone())
-        return {"value": (1 - nodes.positions.norm(dim=-1)).clamp(min=0)}
 
 
 def layout(**changes) -> Layout:
@@ -71,7 +54,7 @@ def test_nodes_know_their_place():
 def test_a_producer_is_asked_only_for_what_is_seen_and_once():
     ball = Ball(256)
     with gv.Engine(ball, **SIZE) as engine:
-        picture = engine.render(camera(distance=0.3), GRAY)
+        picture = engine.render(camera(24, distance=0.3), GRAY)
         assert picture.stats.converged and picture.alpha.max() > 0.5
     asked = torch.cat(ball.filled)
     assert len(asked.unique(dim=0)) == len(asked)
@@ -91,7 +74,7 @@ def test_a_brick_may_turn_out_constant_or_empty():
                 data={"value": data}, kind=kind, constants={"value": data[:, 0, 0, 0, None]}
             )
 
-    view = camera()
+    view = camera(24, distance=1.3)
     with gv.Engine(Ball(), **SIZE) as plain, gv.Engine(Told(), **SIZE) as told:
         a, b = (e.render(view, GRAY, lod="finest") for e in (plain, told))
         told.validate()
@@ -256,7 +239,7 @@ def test_aliases_fail_as_other_answers_do(how, message):
     twins = Twins()
     twins.how = how
     with gv.Engine(twins, **SIZE) as engine:
-        picture = engine.render(camera(), GRAY, lod="finest")
+        picture = engine.render(camera(24, distance=1.3), GRAY, lod="finest")
         engine.validate()
         assert picture.stats.converged and picture.stats.failed > 0
         assert torch.isfinite(picture.color).all()
@@ -275,7 +258,7 @@ def test_a_root_may_be_constant_by_fill():
 
     for extent in (8, 64):
         with gv.Engine(Flat(extent)) as engine:
-            assert engine.render(camera(8), GRAY).alpha.max() > 0.9
+            assert engine.render(camera(8, distance=1.3), GRAY).alpha.max() > 0.9
 
 
 def test_a_producer_serves_one_engine_at_a_time(blobs):
@@ -284,6 +267,6 @@ def test_a_producer_serves_one_engine_at_a_time(blobs):
         with pytest.raises(ValueError, match="serves another engine"):
             gv.Engine(producer, brick_size=8)
     with gv.Engine(producer, brick_size=8) as engine:
-        assert engine.frame(camera(8), GRAY)[0].alpha.max() > 0
+        assert engine.frame(camera(8, distance=1.3), GRAY)[0].alpha.max() > 0
     with pytest.raises(ValueError, match="Engine: it is closed"):
-        engine.render(camera(8), GRAY)
+        engine.render(camera(8, distance=1.3), GRAY)

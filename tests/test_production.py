@@ -8,11 +8,14 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import pytest
 import torch
-from test_producers import GRAY, SIZE, Ball, camera
+from helpers.pictures import GRAY, camera
+from helpers.producers import SIZE, Ball, Held
 
 import gvtorch as gv
 from gvtorch.base import constants as config
 from gvtorch.engine import ProductionError
+
+CORNER = camera(24, azimuth=45, elevation=35, distance=1.3)
 
 
 class Broken(Ball):
@@ -64,7 +67,7 @@ REASONS = {
 @pytest.mark.parametrize("how", REASONS)
 def test_what_fails_is_named_and_takes_nobody_with_it(how):
     """The picture stays complete, coarser where bricks failed; each failure is named once."""
-    view = camera(elevation=35, azimuth=45)
+    view = CORNER
     with gv.Engine(Ball(), **SIZE) as whole, gv.Engine(Broken(how), patience=0.2, **SIZE) as engine:
         expected = whole.render(view, GRAY, lod="finest")
         start = time.monotonic()
@@ -92,17 +95,17 @@ def test_what_fails_is_named_and_takes_nobody_with_it(how):
 def test_a_strict_engine_raises_what_failed(how):
     with gv.Engine(Broken(how), patience=0.2, strict=True, **SIZE) as engine:
         with pytest.raises(ProductionError) as caught:
-            engine.render(camera(elevation=35, azimuth=45), GRAY, lod="finest")
+            engine.render(CORNER, GRAY, lod="finest")
         assert REASONS[how] in str(caught.value) and "depth 3, node" in str(caught.value)
         engine.validate()
         engine.production.failures.strict = False
-        picture = engine.render(camera(elevation=35, azimuth=45), GRAY, lod="finest")
+        picture = engine.render(CORNER, GRAY, lod="finest")
         assert picture.stats.converged and picture.alpha.max() > 0.3, "and it goes on"
 
 
 @pytest.mark.backend("cpp")
 def test_failures_can_be_forgotten_and_are_then_asked_for_again():
-    view, broken = camera(elevation=35, azimuth=45), Broken("raises")
+    view, broken = CORNER, Broken("raises")
     with gv.Engine(Ball(), **SIZE) as whole, gv.Engine(broken, **SIZE) as engine:
         assert engine.render(view, GRAY, lod="finest").stats.failed > 0
         broken.how = "nothing"
@@ -137,7 +140,7 @@ def test_wrong_regions_are_named(answer, message):
             return answer(nodes) if (nodes.depth > 0).any() else super().classify(nodes)
 
     with gv.Engine(Wrong(), **SIZE) as engine:
-        picture = engine.render(camera(), GRAY)
+        picture = engine.render(camera(24, distance=1.3), GRAY)
         assert picture.stats.failed >= 1 and message in engine.failures[0].message
         assert engine.failures[0].kind == "subdivide" and picture.alpha.max() > 0.1
 
@@ -169,7 +172,7 @@ def test_an_answer_for_a_node_that_is_gone_is_dropped():
         for azimuth in range(0, 360, 20):
             engine.frame(camera(8, azimuth=azimuth, distance=0.4), GRAY)
             engine.validate()
-        picture = engine.render(camera(distance=9.0), GRAY)
+        picture = engine.render(camera(24, distance=9.0), GRAY)
         engine.validate()
         assert picture.stats.failed == 0
     slow.shutdown()
@@ -188,39 +191,13 @@ def test_pending_requests_are_not_listed_twice(backend):
     device = "cuda" if backend == "cuda" else "cpu"
     with gv.Engine(Never(), device=device, **SIZE) as engine:
         for _ in range(6):
-            _, stats = engine.frame(camera(8), GRAY, backend=backend)
+            _, stats = engine.frame(camera(8, distance=1.3), GRAY, backend=backend)
         everything = torch.cat(asked)
         assert len(everything.unique(dim=0)) == len(everything) == stats.pending
         assert stats.misses >= stats.pending > 0 and not stats.converged
         request = engine.cache.nodes.request_tn
         bits = config.REQUEST_LOAD << config.REQUEST_PENDING_SHIFT
         assert int((request & bits).count_nonzero()) == stats.pending
-
-
-class Held(gv.VolumeProducer):
-    """Keeps its answers back until `go`, which gives them in an order of its own."""
-
-    def __init__(self, volume, seed=0):
-        super().__init__(volume)
-        self.held, self.hold, self.random = [], True, random.Random(seed)
-
-    def later(self, answer, nodes):
-        if not self.hold or (nodes.depth == 0).any():
-            return answer(nodes)
-        self.held.append((future := Future(), answer, nodes))
-        return future
-
-    def go(self):
-        self.random.shuffle(self.held)
-        for future, answer, nodes in self.held:
-            future.set_result(answer(nodes))
-        self.held.clear()
-
-    def classify(self, nodes):
-        return self.later(super().classify, nodes)
-
-    def fill(self, nodes):
-        return self.later(super().fill, nodes)
 
 
 @pytest.mark.backend("cpp")
@@ -294,7 +271,7 @@ def test_a_producer_that_always_raises_is_not_asked_for_ever():
             raise RuntimeError("out of order")
 
     with gv.Engine(Never(256), **{**SIZE, "node_pool": "4 MB"}) as engine:
-        picture = engine.render(camera(64), GRAY, lod="finest")
+        picture = engine.render(camera(64, distance=1.3), GRAY, lod="finest")
         assert picture.stats.failed > 2000 and len(calls) < 0.6 * picture.stats.failed
         assert picture.stats.converged and picture.alpha.max() > 0.1
 
@@ -336,7 +313,7 @@ def test_a_frame_that_is_broken_off_loses_nothing(later):
             data = super().fill(nodes)
             return Unready(lambda: data) if later and not (nodes.depth == 0).any() else data
 
-    view, options = camera(distance=1.0), {**SIZE, "loading": "levels"}
+    view, options = camera(24, distance=1.0), {**SIZE, "loading": "levels"}
     with gv.Engine(Ball(64), **options) as plain, gv.Engine(Stopped(64), **options) as engine:
         for _ in range(3):
             with pytest.raises(KeyboardInterrupt):

@@ -9,22 +9,22 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES
-from test_production import Held
+from helpers import DEVICES
+from helpers.pictures import GRAY
+from helpers.producers import Held
 
 import gvtorch as gv
 from gvtorch.ops import available
 from gvtorch.pictures.progressive import jitter
 from gvtorch.pictures.strips import strip_rows
 
-HAZE = gv.TransferFunction.preset("gray", 0, 1)
 PARTS = ("color", "alpha", "depth")
 
 
 def supersampled(tree, size: int, across: int, backend: str) -> torch.Tensor:
     """Colour and alpha through `across`^2 rays a pixel on a grid, whose cones are the pixels'."""
     camera = gv.Camera.orbit(distance=1.6, width=size * across, height=size * across)
-    fine = gv.render(tree, camera, HAZE, backend=backend, cone_scale=across * 4 / 3)
+    fine = gv.render(tree, camera, GRAY, backend=backend, cone_scale=across * 4 / 3)
     both = torch.cat((fine.color, fine.alpha), -1).double().cpu()
     return both.reshape(size, across, size, across, 4).mean((1, 3))
 
@@ -48,7 +48,7 @@ def test_the_mean_converges_to_the_supersampled_picture(blobs, compiled):
     tree = gv.N3Tree.from_volume(blobs, device=DEVICES[compiled])
     truth = supersampled(tree, 24, 32, compiled)
     camera = gv.Camera.orbit(distance=1.6, width=24, height=24)
-    progressive = gv.Progressive(partial(gv.render, tree, shader=HAZE, backend=compiled))
+    progressive = gv.Progressive(partial(gv.render, tree, shader=GRAY, backend=compiled))
     errors = {}
     for count in (1, 5, 17, 65, 257):
         picture = progressive.refine(camera, count)
@@ -64,7 +64,7 @@ def test_the_mean_converges_to_the_supersampled_picture(blobs, compiled):
 def test_the_first_frame_is_the_plain_picture_and_all_are_deterministic(blobs, backend):
     tree = gv.N3Tree.from_volume(blobs, device=DEVICES[backend])
     camera = gv.Camera.orbit(width=16, height=12)
-    render = partial(gv.render, tree, shader=HAZE, backend=backend, background=(0.1, 0.2, 0.3))
+    render = partial(gv.render, tree, shader=GRAY, backend=backend, background=(0.1, 0.2, 0.3))
     plain = render(camera)
     runs = []
     for _ in range(2):
@@ -82,7 +82,7 @@ def test_the_first_frame_is_the_plain_picture_and_all_are_deterministic(blobs, b
 
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize(
-    "shader", [gv.Lit(HAZE), gv.Isosurface(0.4), gv.Projection("maximum", HAZE)]
+    "shader", [gv.Lit(GRAY), gv.Isosurface(0.4), gv.Projection("maximum", GRAY)]
 )
 def test_what_has_no_mean_is_that_of_the_centres(blobs, shader):
     tree, camera = gv.N3Tree.from_volume(blobs, 8), gv.Camera.orbit(width=20, height=14)
@@ -101,7 +101,7 @@ def test_a_camera_that_moves_begins_anew(blobs, model):
     views = [gv.Camera.orbit(a, 20, 0.8, None, 12, 8, kind).placed(tree.box) for a in (0, 9)]
     if model == "custom":
         views = [gv.CustomCamera(view.rays()) for view in views]
-    render = partial(gv.render, tree, shader=HAZE)
+    render = partial(gv.render, tree, shader=GRAY)
     progressive = gv.Progressive(render)
     progressive.refine(views[0], 3)
     moved = progressive.frame(views[1])
@@ -122,15 +122,15 @@ def test_frames_that_miss_something_do_not_stay_in_the_mean(blobs):
     """A stalled store, then one that answers: the mean is that of complete frames alone."""
     tree = gv.N3Tree.from_volume(blobs, 4)
     camera = gv.Camera.orbit(distance=1.0, width=24, height=20)
-    whole = [gv.render(tree, camera.shifted(*jitter(k)), HAZE) for k in range(24)]
+    whole = [gv.render(tree, camera.shifted(*jitter(k)), GRAY) for k in range(24)]
     producer = Held(blobs)
     with gv.Engine(producer, brick_size=4) as engine:
-        progressive = gv.Progressive(partial(engine.frame, shader=HAZE))
+        progressive = gv.Progressive(partial(engine.frame, shader=GRAY))
         for _ in range(4):
             coarse = progressive.frame(camera)
         assert coarse.missed.any() and not coarse.missed.all()
         stuck = coarse.missed[..., 0]
-        newest = engine.frame(camera.shifted(*jitter(3)), HAZE)[0]
+        newest = engine.frame(camera.shifted(*jitter(3)), GRAY)[0]
         assert torch.equal(coarse.color[stuck], newest.color[stuck]), "the newest, no mean"
         assert (coarse.color - whole[3].color).abs().max() > 0.02, "the test must see a difference"
         producer.hold = False
@@ -149,10 +149,10 @@ def test_refining_on_cuda_waits_for_nobody(blobs):
         pytest.skip(f"backend cuda: {available()['cuda']}")
     camera = gv.Camera.orbit(distance=1.2, width=32, height=24)
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4, device="cuda") as engine:
-        progressive = gv.Progressive(partial(engine.render, shader=HAZE))
+        progressive = gv.Progressive(partial(engine.render, shader=GRAY))
         whole = progressive.refine(camera, 12)
-        graph = engine.capture(camera, HAZE)
-        for render in (partial(engine.frame, shader=HAZE), graph.replay):
+        graph = engine.capture(camera, GRAY)
+        for render in (partial(engine.frame, shader=GRAY), graph.replay):
             progressive = gv.Progressive(render)
             progressive.refine(camera, 2)
             torch.cuda.synchronize()
@@ -177,7 +177,7 @@ def test_strips_make_the_whole_picture(blobs, tmp_path, model, background):
     }[background]
     tree = gv.N3Tree.from_volume(blobs)
     camera = gv.Camera.orbit(30, 20, 0.9, None, 40, 50, model)
-    render = partial(gv.render, tree, shader=HAZE, background=behind)
+    render = partial(gv.render, tree, shader=GRAY, background=behind)
     whole, told = render(camera), []
     limit = 40 * 400 * 9
     assert strip_rows(limit, 40, 50) == 8
@@ -201,7 +201,7 @@ def test_strips_make_the_whole_picture(blobs, tmp_path, model, background):
 
 
 @pytest.mark.backend("cpp")
-@pytest.mark.parametrize("shader", [gv.Lit(HAZE), gv.Projection("mean", HAZE)], ids=["lit", "mean"])
+@pytest.mark.parametrize("shader", [gv.Lit(GRAY), gv.Projection("mean", GRAY)], ids=["lit", "mean"])
 def test_strips_of_pictures_with_normals_and_with_any_number_of_features(blobs, tmp_path, shader):
     render = partial(gv.render, gv.N3Tree.from_volume(blobs), shader=shader)
     camera = gv.Camera.orbit(width=20, height=24)
@@ -218,7 +218,7 @@ def test_strips_take_their_part_of_a_layer(blobs, tmp_path, alpha):
     depth = torch.rand(50, 40, 1) * 40
     opacity = None if alpha is None else torch.full_like(depth, alpha)
     layer = gv.Layer(torch.rand(50, 40, 3), depth, opacity)
-    render = partial(gv.render, tree, shader=HAZE, layer=layer)
+    render = partial(gv.render, tree, shader=GRAY, layer=layer)
     gv.render_tiles(render, camera, tmp_path / "a.npy", memory=40 * 400 * 9)
     array = np.load(tmp_path / "a.npy")
     np.testing.assert_allclose(array[..., :3], render(camera).color, rtol=1e-5, atol=1e-6)
@@ -227,9 +227,9 @@ def test_strips_take_their_part_of_a_layer(blobs, tmp_path, alpha):
 @pytest.mark.backend("cpp")
 def test_an_engine_streams_strip_by_strip(blobs, tmp_path):
     camera = gv.Camera.orbit(distance=1.2, width=40, height=50)
-    whole = gv.render(gv.N3Tree.from_volume(blobs, 4), camera, HAZE)
+    whole = gv.render(gv.N3Tree.from_volume(blobs, 4), camera, GRAY)
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4) as engine:
-        render = partial(engine.render, shader=HAZE)
+        render = partial(engine.render, shader=GRAY)
         stats = gv.render_tiles(render, camera, tmp_path / "a.npy", memory=40 * 400 * 12)
     assert stats.converged and stats.rays == 2000
     np.testing.assert_allclose(np.load(tmp_path / "a.npy")[..., :3], whole.color, atol=1e-6)
@@ -271,7 +271,7 @@ def test_what_breaks_off_leaves_no_file(blobs, tmp_path):
         calls.append(camera)
         if len(calls) == 3:
             raise KeyboardInterrupt
-        return gv.render(tree, camera, HAZE)
+        return gv.render(tree, camera, GRAY)
 
     camera = gv.Camera.orbit(width=16, height=16)
     with pytest.raises(KeyboardInterrupt):

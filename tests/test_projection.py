@@ -9,7 +9,8 @@ import typing
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES
+from helpers import DEVICES
+from helpers.pictures import GRAY
 from kornia.geometry.camera import distort_points_kannala_brandt, project_points_orthographic
 
 import gvtorch as gv
@@ -22,7 +23,6 @@ from gvtorch.cameras.models import (
 )
 from gvtorch.ops import available
 
-HAZE = gv.TransferFunction.preset("gray", 0, 1)
 BEND = [0.08, -0.03, 0.004, -0.0005]
 WIDTH, HEIGHT = 14, 10
 
@@ -183,7 +183,7 @@ def test_a_closed_ray_shows_the_background_and_takes_no_sample(blobs, backend):
     tree = gv.N3Tree.from_volume(blobs, device=DEVICES[backend])
     camera = gv.Camera.orbit(distance=0.2, fov=200, width=16, height=12, model="fisheye")
     sky = (0.2, 0.4, 0.6)
-    picture = gv.render(tree, camera, HAZE, backend=backend, background=sky)
+    picture = gv.render(tree, camera, GRAY, backend=backend, background=sky)
     outside = (camera.placed(tree.box).rays().range[:, 1] == 0).reshape(12, 16)
     assert outside.sum() > 40 and (~outside).sum() > 80
     seen = picture.color.cpu()[outside]
@@ -195,10 +195,10 @@ def test_a_closed_ray_shows_the_background_and_takes_no_sample(blobs, backend):
 def test_a_batch_is_its_cameras_one_by_one(blobs, compiled, model):
     tree = gv.N3Tree.from_volume(blobs, device=DEVICES[compiled])
     batch = gv.Camera.orbit([0, 90, 180], 10, [0.4, 1, 2.0], None, 12, 8, model)
-    pictures = gv.render(tree, batch, HAZE, backend=compiled)
+    pictures = gv.render(tree, batch, GRAY, backend=compiled)
     assert pictures.alpha.max() > 0
     for index in range(3):
-        one = gv.render(tree, batch[index], HAZE, backend=compiled)
+        one = gv.render(tree, batch[index], GRAY, backend=compiled)
         assert torch.equal(one.color, pictures.color[index])
 
 
@@ -280,12 +280,12 @@ def test_a_panorama_from_the_middle_of_a_shell_has_one_depth(compiled):
 def test_rays_make_the_picture_of_their_camera(blobs, backend, form):
     tree = gv.N3Tree.from_volume(blobs, device=DEVICES[backend])
     camera = gv.Camera.orbit(width=16, height=12)
-    whole = gv.render(tree, camera, HAZE, backend=backend)
+    whole = gv.render(tree, camera, GRAY, backend=backend)
     rays = camera.placed(tree.box).rays(tree.device)
     given = rays if form == "rays" else gv.CustomCamera(rays, 16, 12)
     for picture in (
-        gv.render(tree, given, HAZE, backend=backend),
-        gv.render(tree, gv.CustomCamera(rays[:]), HAZE, backend=backend),
+        gv.render(tree, given, GRAY, backend=backend),
+        gv.render(tree, gv.CustomCamera(rays[:]), GRAY, backend=backend),
     ):
         assert torch.equal(picture.color.flatten(0, -2), whole.color.flatten(0, -2))
         assert torch.equal(picture.depth.flatten(), whole.depth.flatten())
@@ -296,13 +296,13 @@ def test_rays_make_the_picture_of_their_camera(blobs, backend, form):
 def test_an_engine_streams_what_any_rays_ask_for(blobs):
     camera = gv.Camera.orbit([0.0, 70.0], distance=1.2, width=16, height=12)
     tree = gv.N3Tree.from_volume(blobs, 4)
-    whole = gv.render(tree, camera, HAZE)
+    whole = gv.render(tree, camera, GRAY)
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4) as engine:
         custom = gv.CustomCamera(camera.placed(engine.box).rays(), 16, 12)
         assert len(custom) == 2 and custom.batched
-        picture = engine.render(custom, HAZE)
+        picture = engine.render(custom, GRAY)
         assert picture.stats.converged and torch.equal(picture.color, whole.color)
-        one, stats = engine.frame(custom[1].placed(engine.box), HAZE)
+        one, stats = engine.frame(custom[1].placed(engine.box), GRAY)
         assert torch.equal(one.color, whole.color[1]) and stats.rays == 192
 
 
@@ -365,14 +365,14 @@ def test_graphs_on_cuda_replay_every_model(blobs, model):
         if model == "custom":
             views = [gv.CustomCamera(v.rays("cuda")) for v in views]
         for view in [*views, *views]:
-            assert engine.render(view, HAZE, background=sky).stats.converged
-        expected = [engine.frame(view, HAZE, background=sky)[0] for view in views]
-        graph = engine.capture(views[0], HAZE, background=sky)
+            assert engine.render(view, GRAY, background=sky).stats.converged
+        expected = [engine.frame(view, GRAY, background=sky)[0] for view in views]
+        graph = engine.capture(views[0], GRAY, background=sky)
         torch.cuda.synchronize()
         torch.cuda.set_sync_debug_mode("error")
         try:
             for view in views:
-                engine.frame(view, HAZE, background=sky)
+                engine.frame(view, GRAY, background=sky)
             seen = [graph.replay(view)[0].color.clone() for view in [*views, *views]]
         finally:
             torch.cuda.set_sync_debug_mode("default")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.pictures import GRAY
 
 import gvtorch as gv
 from gvtorch.producers import Layout
 
-GRAY = gv.TransferFunction.preset("gray", 0, 1)
 ORBIT = gv.Camera.orbit(width=8, height=6)
 IMAGE = torch.rand(6, 8, 3)
 VOXELS = torch.zeros(3, 10, 10, 10, 1, dtype=torch.uint8)

@@ -8,11 +8,12 @@ import math
 
 import pytest
 import torch
-from conftest import DEVICES
+from helpers import DEVICES
+from helpers.rays import camera_rays
+from helpers.traces import SHADER, arguments, changed, packed
+from helpers.trees import forget, on
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_composite import packed
-from test_trace_rays import SHADER, arguments, camera_rays, changed, forget, on
 from torch import Tensor
 
 import gvtorch as gv

@@ -8,67 +8,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES, ROOT
-from test_op_contract import world_rays
-from test_trace_rays import SHADER, assert_equal, camera_rays, changed, forget, on, run
+from helpers import DEVICES, ROOT
+from helpers.rays import camera_rays, world_rays
+from helpers.shaders import POINT, SHADERS
+from helpers.traces import SHADER, assert_equal, changed, op_arguments, run
+from helpers.trees import forget, on
 
 import gvtorch as gv
 from gvtorch import cpp_ext
-from gvtorch.ops import RayArguments, shade_rays
+from gvtorch.ops import shade_rays
 from gvtorch.ops.reference.shaders import TWINS
 from gvtorch.ops.shading import SHADER_KINDS, shader_number
 from gvtorch.shaders import built_in
 from gvtorch.tracing.tracer import Tracer
 
 GOLDEN = ROOT / "tests" / "golden_shaders.npz"
-POINT = gv.PointLight((0.0, 40.0, 60.0), (1.0, 0.9, 0.8))
-SHADERS = {
-    "lit": gv.Lit(SHADER),
-    "lit by stored normals": gv.Lit(SHADER, normals="normal", light=POINT),
-    "pre-integrated": gv.PreIntegrated(SHADER),
-    "stored colour": gv.StoredColor("rgba"),
-    "stored colour lit": gv.StoredColor(
-        "premultiplied", premultiplied=True, light=gv.DirectionalLight((1, -1, -1)), lit=True
-    ),
-    "lit with shadows": gv.Lit(SHADER, shadows=True, light=replace(POINT, radius=20.0)),
-    "colour with shadows": gv.StoredColor(
-        "six", shadows=True, light=gv.DirectionalLight((1, -1, -1), angle=9.0)
-    ),
-    "six directions": gv.StoredColor("six", light=POINT, lit=True),
-    "isosurface": gv.Isosurface(0.5, (0.9, 0.4, 0.2), light=POINT),
-    "coloured isosurface": gv.Isosurface(0.4, SHADER, color_channel="rgba", color_component=1),
-    "distance field": gv.DistanceField(offset=0.3),
-    "maximum": gv.Projection("maximum", SHADER),
-    "minimum": gv.Projection("minimum", SHADER),
-    "mean": gv.Projection("mean", SHADER),
-    "features": gv.Features(SHADER, "rgba"),
-}
-
-
-def channels_of(blobs: gv.Volume) -> dict[str, gv.Volume]:
-    """The blobs with a colour and a normal in each voxel, both of 8 bits."""
-    value = blobs.data[..., 0]
-    z, y, x = torch.meshgrid(*(torch.linspace(0, 1, n) for n in value.shape), indexing="ij")
-    rgba = torch.stack((x, y, z, value), -1)
-    normal = torch.stack(torch.gradient(value)[::-1], -1)
-    normal = torch.nn.functional.normalize(normal, dim=-1) * 0.5 + 0.5
-    place = blobs.spacing, blobs.origin
-    six = gv.Volume(rgba, *place).directional()
-    six.data = six.data * torch.linspace(0.6, 1.0, 24).to(six.data)  # no two of them are equal
-    return {
-        "value": blobs,
-        "rgba": gv.Volume((rgba * 255).round().to(torch.uint8), *place),
-        "premultiplied": gv.Volume(
-            torch.cat((rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]), -1), *place
-        ),
-        "six": six,
-        "normal": gv.Volume((normal * 255).round().to(torch.uint8), *place),
-    }
-
-
-@pytest.fixture(scope="module")
-def channels(blobs) -> dict[str, gv.Volume]:
-    return channels_of(blobs)
 
 
 @pytest.fixture(scope="module")
@@ -299,14 +253,6 @@ def test_script_compile_and_export(tree, compiled, name):
     assert_all_same(fast(*rays), expected)
     program = torch.export.export(tracer, rays).module()
     assert all(torch.equal(a, b) for a, b in zip(program(*rays), plain, strict=True))
-
-
-def op_arguments(tree, shader, dtype) -> list:
-    """The checked function's arguments for the rays of a camera."""
-    rays = camera_rays(tree, 3).to(tree.device)
-    tracer = Tracer(tree, shader, gv.RenderOptions(dtype=dtype))
-    records = [RayArguments.of(rays)._replace(width=0), tracer.arguments, tracer.shading]
-    return [*records, shader.parameter_tensor(tree, dtype)]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -5,69 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES
+from helpers import DEVICES
+from helpers.shading import CENTRE, RADIUS, SPACING, ball, grid, parallel, phong, sphere
 
 import gvtorch as gv
 from gvtorch.ops.shading import IsosurfaceNumbers, LightKind, ShadeParameters
 from gvtorch.tracing.tracer import Tracer
 
 WHITE = gv.TransferFunction.from_points([(0, 1)], [(0, 1, 1, 1)])
-SPACING = (1.0, 0.8, 1.3)
-RADIUS, CENTRE = 11.0, np.array([16.0, 15.0, 17.0])
-
-
-def grid(extent, spacing=(1.0, 1.0, 1.0)) -> np.ndarray:
-    """(z, y, x, 3) world places of voxel centres."""
-    nx, ny, nz = extent
-    z, y, x = np.mgrid[0:nz, 0:ny, 0:nx].astype(np.float64)
-    return np.stack((x, y, z), -1) * np.array(spacing)
-
-
-def ball(backend: str, spacing=SPACING, brick_size: int = 4, **more: gv.Volume) -> gv.N3Tree:
-    """The signed distance to a sphere, float32, cut into many bricks."""
-    place = grid((33, 39, 27), spacing)
-    distance = np.linalg.norm(place - CENTRE, axis=-1) - RADIUS
-    volume = gv.Volume(distance.astype(np.float32), spacing)
-    channels = {"value": volume, **more}
-    return gv.N3Tree.from_volume(channels, brick_size, device=DEVICES[backend])
-
-
-def parallel(count: int, reach: float, device: str, direction=(0.3, -0.2, 1.0)) -> gv.Rays:
-    """Parallel rays through a disc around the sphere's centre."""
-    along = torch.tensor(direction, dtype=torch.float64)
-    along = along / along.norm()
-    right = torch.linalg.cross(along, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
-    right = right / right.norm()
-    up = torch.linalg.cross(right, along)
-    a, b = torch.meshgrid(
-        *(torch.linspace(-reach, reach, count).double() for _ in "ab"), indexing="ij"
-    )
-    keep = a**2 + b**2 < reach**2
-    places = torch.from_numpy(CENTRE) + a[keep][:, None] * right + b[keep][:, None] * up
-    origin = places - 60 * along
-    flat = torch.zeros((len(origin), 2), dtype=torch.float64)
-    rays = gv.Rays(
-        origin=origin,
-        direction=along.expand_as(origin).contiguous(),
-        cone=flat,
-        range=flat + torch.tensor([0.0, torch.inf], dtype=torch.float64),
-    )
-    return rays.to(device)
 
 
 def shoot(tree, rays, shader, backend, **options) -> dict[str, np.ndarray]:
     chosen = gv.RenderOptions(backend=backend, lod="finest", **options)
     hits = vars(Tracer(tree, shader, chosen)(rays))
     return {n: field.cpu().double().numpy() for n, field in hits.items() if field is not None}
-
-
-def sphere(rays: gv.Rays, radius: float = RADIUS) -> tuple[np.ndarray, np.ndarray]:
-    """Distance to the sphere's near side, and the outward normals there."""
-    origin, along = rays.origin.cpu().numpy(), rays.direction.cpu().numpy()
-    b = ((origin - CENTRE) * along).sum(1)
-    c = ((origin - CENTRE) ** 2).sum(1) - radius**2
-    t = -b - np.sqrt(b**2 - c)
-    return t, (origin + t[:, None] * along - CENTRE) / radius
 
 
 @pytest.mark.parametrize("step", [0.5, 1.0, 2.0])
@@ -120,15 +71,6 @@ def test_normals_show_no_seam_at_brick_faces(backend):
     for field in ("color", "normal"):
         assert np.abs(many[field] - one[field]).max() < 1e-4
     assert many["alpha"].min() > 0.3
-
-
-def phong(normal, to_light, eye, base, light, ambient, diffuse, specular, shininess):
-    """Blinn and Phong in NumPy."""
-    half = to_light + eye
-    half = half / np.linalg.norm(half, axis=1, keepdims=True)
-    facing = np.maximum(0, (normal * to_light).sum(1))[:, None]
-    highlight = np.maximum(0, (normal * half).sum(1))[:, None] ** shininess * (facing > 0)
-    return base * (ambient + diffuse * facing * light) + specular * highlight * light
 
 
 @pytest.mark.parametrize("kind", ["head", "directional", "point"])

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES
-from marcher import box_of, march, trilinear
+from helpers import DEVICES
+from helpers.marcher import box_of, march, trilinear
+from helpers.rays import rays_along
+from helpers.shading import MATT
 
 import gvtorch as gv
 from gvtorch.tracing.tracer import Tracer
@@ -15,7 +17,6 @@ SPACING, ORIGIN = (1.0, 0.8, 1.5), (5.0, -3.0, 2.0)
 SUN = gv.DirectionalLight((0.6, -1.0, 0.3))
 LAMP = gv.PointLight((19.0, 30.0, 12.0))
 INSIDE = gv.PointLight((15.0, 6.0, 14.0))
-LIGHT_ALONE = {"ambient": 0.0, "diffuse": 1.0, "specular": 0.0}
 
 
 def fog(seed: int, side: int = 16) -> np.ndarray:
@@ -41,13 +42,8 @@ def rays_through(box: np.ndarray, device: str, count: int = 12) -> gv.Rays:
     target = box[0] + random.uniform(0.2, 0.8, (count, 3)) * (box[1] - box[0])
     along = random.normal(size=(count, 3))
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    flat = torch.zeros((count, 2), dtype=torch.float64)
-    return gv.Rays(
-        origin=torch.from_numpy(target - 60 * along),
-        direction=torch.from_numpy(along),
-        cone=flat,
-        range=flat + torch.tensor([0.0, torch.inf]),
-    ).to(device)
+    places = torch.from_numpy(target - 60 * along)
+    return rays_along(places, torch.from_numpy(along), device=device)
 
 
 def to_light(light, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -99,7 +95,7 @@ def test_each_sample_stands_in_the_shadow_of_what_lies_before_its_light(backend,
     def opaque(v):
         return np.stack((*[np.ones_like(v)] * 3, v), -1)
 
-    look = {"normals": "none", "light": light, "shadows": True, **LIGHT_ALONE}
+    look = {"normals": "none", "light": light, "shadows": True, **MATT}
     for shader, function in (
         (gv.Lit(linear, **look), transfer),
         (gv.StoredColor("rgba", reference=1.0, **look), opaque),
@@ -132,7 +128,7 @@ def test_light_decays_with_depth_in_a_homogeneous_medium(backend, dtype):
     transfer.reference = 1.0
     for slope in (0.0, 1.0):
         sun = gv.DirectionalLight(tuple((-up + slope * torch.tensor([0.0, 0.0, 0.5])).tolist()))
-        shader = gv.Lit(transfer, light=sun, shadows=True, **LIGHT_ALONE)
+        shader = gv.Lit(transfer, light=sun, shadows=True, **MATT)
         step = 0.25
         options = gv.RenderOptions(
             backend=backend, dtype=dtype, lod="finest", step=step / min(SPACING), stop_alpha=1.0
@@ -164,7 +160,7 @@ def test_a_shadow_of_a_wide_light_is_softer_and_coarser(backend):
     edges, samples = [], []
     for angle in (0.0, 20.0, 60.0):
         sun = gv.DirectionalLight((0.0, 0.0, -1.0), angle=angle)
-        lit = gv.Lit(transfer, light=sun, shadows=True, **LIGHT_ALONE)
+        lit = gv.Lit(transfer, light=sun, shadows=True, **MATT)
         hits = gv.trace(tree, rays, lit, **options)
         light = (hits.color[:, 0] / hits.alpha[:, 0]).cpu()
         light = light / light[-1]

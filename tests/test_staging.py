@@ -10,8 +10,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES
-from test_producers import GRAY, camera
+from helpers import DEVICES
+from helpers.pictures import GRAY, camera
 
 import gvtorch as gv
 from gvtorch.base import constants as config
@@ -341,7 +341,7 @@ def test_a_producer_that_never_answers_stalls_no_frame(device):
     producer.patience = 60
     with gv.Engine(producer, device=device, brick_pool="50 MB") as engine:
         for _ in range(12):
-            _, stats = engine.frame(camera(), GRAY)
+            _, stats = engine.frame(camera(24), GRAY)
         assert stats.pending > 0 and stats.produced["bricks"] == 0
         engine.validate()
 
@@ -361,9 +361,10 @@ def test_bricks_cut_ahead_give_the_picture_of_the_volume(blobs, backend, hold, d
     shader = gv.TransferFunction.preset("gray", *volume.value_range)
     for sizes in ({"brick_size": 4}, {"brick_size": 6, "border": 2}):
         tree = gv.N3Tree.from_volume(volume, *sizes.values(), device=DEVICES[backend])
-        expected = gv.render(tree, camera(), shader)
+        view = camera(24, distance=1.3)
+        expected = gv.render(tree, view, shader)
         producer = gv.VolumeProducer(volume, hold=hold)
         with gv.Engine(producer, device=DEVICES[backend], **sizes) as engine:
-            picture = engine.render(camera(), shader)
+            picture = engine.render(view, shader)
             engine.validate()
         assert torch.equal(picture.color, expected.color) and expected.alpha.max() > 0.3

@@ -9,15 +9,13 @@ import random
 import numpy as np
 import pytest
 import torch
-from test_engine import PARTS, VESSELS, Checked, Late, assert_same_picture, camera
-from test_production import Held
+from helpers.pictures import GRAY, PARTS, VESSELS, assert_same_picture, camera
+from helpers.producers import Checked, Held, Late
 
 import gvtorch as gv
 import gvtorch.engine.view
 from gvtorch.engine.readback import Readback
 from gvtorch.ops import available
-
-HAZE = gv.TransferFunction.preset("gray", 0, 1)
 
 
 @pytest.fixture
@@ -80,15 +78,15 @@ def test_a_frame_serves_what_the_one_before_missed(blobs):
     producer = Noted(blobs)
     with gv.Engine(producer, brick_size=4) as engine:
         producer.asked.clear()
-        _, stats = engine.frame(camera(), HAZE)
+        _, stats = engine.frame(camera(), GRAY)
         assert not any(stats.produced.values()) and not producer.asked
         assert stats.misses > 0 and not stats.converged
-        _, stats = engine.frame(camera(), HAZE)
+        _, stats = engine.frame(camera(), GRAY)
         assert sum(stats.produced.values()) > 0 and producer.asked
         while not stats.converged:
-            _, stats = engine.frame(camera(), HAZE)
+            _, stats = engine.frame(camera(), GRAY)
         producer.asked.clear()
-        _, stats = engine.frame(camera(), HAZE)
+        _, stats = engine.frame(camera(), GRAY)
         assert not producer.asked, "nothing was missed, nothing is asked for"
 
 
@@ -102,13 +100,13 @@ def test_frames_go_on_where_counts_do_not_come(slow, blobs):
     for views in ((left, left, left, right), (right,) * 4, (left,) * 4):
         producer = Noted(blobs)
         with gv.Engine(producer, brick_size=4, monitor=False) as engine:
-            engine.render(camera(distance=9.0), HAZE)
+            engine.render(camera(distance=9.0), GRAY)
             producer.asked.clear()
             slow.clear()
             for view in views:
-                engine.frame(view, HAZE)
+                engine.frame(view, GRAY)
             assert not slow and not producer.asked, "the host does not wait"
-            engine.frame(right, HAZE)
+            engine.frame(right, GRAY)
             assert len(slow) == 4, "the fifth frame looks at the four before"
             asked.append(set(producer.asked))
     assert asked[0] == asked[1] != asked[2] and asked[2]
@@ -134,19 +132,19 @@ def test_a_stalled_producer_stalls_no_frame(slow, blobs):
     producer = Held(blobs)
     with gv.Engine(producer, brick_size=4) as engine:
         for _ in range(20):
-            _, stats = engine.frame(camera(8), HAZE)
+            _, stats = engine.frame(camera(8), GRAY)
         assert stats.pending > 0 and producer.held
         slow.clear()
         for number in range(10):
-            _, stats = engine.frame(camera(8), HAZE)
+            _, stats = engine.frame(camera(8), GRAY)
             assert len(slow) == number + 1, "one a frame, of a frame that is long done"
         assert not any(stats.produced.values())
         producer.go()
-        _, stats = engine.frame(camera(8), HAZE)
+        _, stats = engine.frame(camera(8), GRAY)
         assert sum(stats.produced.values()) > 0
         producer.hold = False
         producer.go()  # what was asked for meanwhile
-        assert engine.render(camera(8), HAZE).stats.converged
+        assert engine.render(camera(8), GRAY).stats.converged
 
 
 @pytest.mark.backend("cpp")
@@ -155,21 +153,21 @@ def test_scouts_go_only_where_something_was_written(traced, blobs):
     producer = Held(blobs)
     with gv.Engine(producer, brick_size=4) as engine:
         for _ in range(10):
-            _, stats = engine.frame(camera(), HAZE)
+            _, stats = engine.frame(camera(), GRAY)
         assert stats.pending > 0 and traced == [False] * 10
         traced.clear()
         producer.go()
-        _, stats = engine.frame(camera(), HAZE)
+        _, stats = engine.frame(camera(), GRAY)
         assert stats.pending > 0 and traced == [True, False], "what they ask for does not come"
         producer.hold = False
         producer.go()
         traced.clear()
-        engine.frame(camera(), HAZE)
+        engine.frame(camera(), GRAY)
         assert traced == [True, True, False]
         while not stats.converged:
-            _, stats = engine.frame(camera(), HAZE)
+            _, stats = engine.frame(camera(), GRAY)
         traced.clear()
-        engine.frame(camera(), HAZE)
+        engine.frame(camera(), GRAY)
         assert traced == [False]
 
 
@@ -191,12 +189,12 @@ def test_pools_stay_in_order_where_counts_come_at_random(blobs, monkeypatch, pro
                 azimuth += pick.gauss(0, 20)
                 distance = min(3.0, max(0.2, distance * np.exp(pick.gauss(0, 0.2))))
                 view = camera(4, azimuth=azimuth % 360 - 180, distance=distance)
-                _, stats = engine.frame(view, HAZE)
+                _, stats = engine.frame(view, GRAY)
                 evicted += stats.evicted["bricks"]
-            picture = engine.render(view, HAZE, max_frames=200)
+            picture = engine.render(view, GRAY, max_frames=200)
             engine.validate()
             if picture.stats.converged:
-                expected = gv.render(tree, view, HAZE)
+                expected = gv.render(tree, view, GRAY)
                 assert all(torch.equal(getattr(picture, n), getattr(expected, n)) for n in PARTS)
     assert evicted > 100
 
@@ -204,14 +202,14 @@ def test_pools_stay_in_order_where_counts_come_at_random(blobs, monkeypatch, pro
 @pytest.mark.backend("cpp")
 def test_statistics_come_when_they_are_read(slow, blobs):
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4) as engine:
-        _, stats = engine.frame(camera(), HAZE)
+        _, stats = engine.frame(camera(), GRAY)
         assert stats.frame == 1 and stats.rays == 48 * 48 and stats.pending == 0 and not slow
         assert stats.samples > 0 and len(slow) == 1
         assert stats.as_dict()["misses"] == stats.misses > 0
         assert stats.milliseconds >= sum(stats.stages.values()) > 0
         assert len(slow) == 1, "once is enough"
         for again in (copy.copy, copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))):
-            _, stats = engine.frame(camera(), HAZE)
+            _, stats = engine.frame(camera(), GRAY)
             assert again(stats) == stats and stats.tiles_used > 0
 
 
@@ -233,14 +231,14 @@ def test_a_steady_frame_on_cuda_waits_for_nobody(cuda, blobs, monitor, trees):
     with gv.Engine(scene, brick_size=4, device=cuda, monitor=monitor) as engine:
         expected = []
         for view in [*views, *views]:
-            expected.append(engine.render(view, HAZE, background=background))
+            expected.append(engine.render(view, GRAY, background=background))
             assert expected[-1].stats.converged
         for view in views:  # what is loaded or uploaded once, is
-            engine.frame(view, HAZE, background=background)
+            engine.frame(view, GRAY, background=background)
         torch.cuda.synchronize()
         torch.cuda.set_sync_debug_mode("error")
         try:
-            frames = [engine.frame(view, HAZE, background=background) for view in views * 3]
+            frames = [engine.frame(view, GRAY, background=background) for view in views * 3]
         finally:
             torch.cuda.set_sync_debug_mode("default")
         for (picture, stats), whole in zip(frames, (expected[3:]) * 3, strict=True):
@@ -258,9 +256,9 @@ def test_a_replayed_graph_on_cuda_is_the_frame(cuda, blobs, trees):
     with gv.Engine(scene, brick_size=4, device=cuda) as engine:
         for _ in range(2):
             for view in views:
-                assert engine.render(view, HAZE).stats.converged
-        expected = [engine.frame(view, HAZE) for view in views]
-        graph = engine.capture(views[0], HAZE)
+                assert engine.render(view, GRAY).stats.converged
+        expected = [engine.frame(view, GRAY) for view in views]
+        graph = engine.capture(views[0], GRAY)
         torch.cuda.synchronize()
         assert engine.steady
         torch.cuda.set_sync_debug_mode("error")
@@ -310,14 +308,14 @@ def test_a_graph_on_cuda_tells_when_it_is_not_steady(cuda, aneurism):
 def test_steady_tells_what_is_known(slow, blobs):
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4) as engine:
         assert not engine.steady
-        assert engine.render(camera(), HAZE).stats.converged and engine.steady
-        _, stats = engine.frame(camera(distance=0.1), HAZE)
+        assert engine.render(camera(), GRAY).stats.converged and engine.steady
+        _, stats = engine.frame(camera(distance=0.1), GRAY)
         assert engine.steady and not stats.converged, "its counts have not come"
-        engine.render(camera(distance=0.1), HAZE, "balanced", productions=1)
+        engine.render(camera(distance=0.1), GRAY, "balanced", productions=1)
         assert not engine.steady
 
 
 def test_a_graph_needs_cuda(blobs):
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4) as engine:
         with pytest.raises(ValueError, match=r"Engine\.capture: the engine must be on CUDA, it is"):
-            engine.capture(camera(), HAZE)
+            engine.capture(camera(), GRAY)

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import DEVICES, shared
-from test_store import Handler, served  # noqa: F401
+from helpers import DEVICES, shared
+from helpers.pictures import PARTS, assert_same_picture, camera
+from helpers.stores import Handler, serving
 
 import gvtorch as gv
 from gvtorch.bench.storage import Memory
@@ -21,17 +22,7 @@ from gvtorch.io.store import Store
 from gvtorch.producers.host_cache import HostCache
 
 GRAY = gv.TransferFunction.preset("gray", 0, 255)
-PARTS = ("color", "alpha", "depth", "samples")
-
-
-def camera(size=48, **place) -> gv.Camera:
-    return gv.Camera.orbit(**{"distance": 1.4, **place}, width=size, height=size)
-
-
-def assert_same_picture(actual: gv.Picture, expected: gv.Picture) -> None:
-    for name in PARTS:
-        assert torch.equal(getattr(actual, name), getattr(expected, name)), name
-    assert expected.alpha.max() > 0.3, "the test must see something"
+VIEW = camera(distance=1.4)
 
 
 @pytest.fixture(scope="session")
@@ -54,6 +45,13 @@ def whole(tmp_path_factory, cloud) -> Path:
 
 
 @pytest.fixture
+def served(whole):
+    """URL of the folder that holds the store."""
+    with serving(whole.parent) as url:
+        yield url
+
+
+@pytest.fixture
 def store(tmp_path, whole) -> Path:
     """A copy that may be damaged."""
     return Path(shutil.copytree(whole, tmp_path / "cloud.zarr"))
@@ -68,7 +66,7 @@ def test_a_small_pool_over_a_store_gives_the_picture_of_the_volume(
         volume = gv.read_volume(shared("volumes/tooth_103x94x161_uint8.raw.gz"))
     else:
         volume = request.getfixturevalue(scan)
-    device, view = DEVICES[compiled], camera()
+    device, view = DEVICES[compiled], VIEW
     shader = gv.TransferFunction.preset("gray", *volume.value_range)
     resident = gv.render(gv.N3Tree.from_volume(volume, device=device), view, shader)
     convert(volume, tmp_path / "a.zarr", block=32 if loading == "straight" else 64)
@@ -85,7 +83,7 @@ def test_a_small_pool_over_a_store_gives_the_picture_of_the_volume(
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize(("brick_size", "border"), [(4, 1), (8, 0), (8, 2), (12, 1), (16, 1)])
 def test_any_brick_size_and_border_can_be_streamed(whole, cloud, brick_size, border):
-    view, options = camera(32), {"brick_size": brick_size, "border": border}
+    view, options = camera(32, distance=1.4), {"brick_size": brick_size, "border": border}
     with gv.Engine(gv.StoredProducer(whole), **options) as engine:
         picture = engine.render(view, GRAY)
         assert picture.stats.converged and picture.stats.failed == 0
@@ -100,15 +98,15 @@ def test_a_threshold_is_kept_by_the_store(tmp_path, cloud):
     convert(cloud, tmp_path / "a.zarr", threshold=60)
     tree = gv.N3Tree.from_volume(cloud, threshold=60)
     with gv.Engine(gv.StoredProducer(tmp_path / "a.zarr")) as engine:
-        picture = engine.render(camera(), GRAY)
-    assert_same_picture(picture, gv.render(tree, camera(), GRAY))
+        picture = engine.render(VIEW, GRAY)
+    assert_same_picture(picture, gv.render(tree, VIEW, GRAY))
 
 
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("loading", ["straight", "levels"])
 def test_the_order_in_which_reads_come_back_does_not_matter(whole, cloud, monkeypatch, loading):
     """Every read is late by chance, in four threads."""
-    resident = gv.render(gv.N3Tree.from_volume(cloud), camera(), GRAY)
+    resident = gv.render(gv.N3Tree.from_volume(cloud), VIEW, GRAY)
     pick = random.Random(11)
     for name in ("read_blocks", "read_cells"):
         read = getattr(Store, name)
@@ -122,7 +120,7 @@ def test_the_order_in_which_reads_come_back_does_not_matter(whole, cloud, monkey
     for _ in range(3):
         producer = gv.StoredProducer(whole, host_cache="100 kB")
         with gv.Engine(producer, brick_pool=bricks * 1000, loading=loading) as engine:
-            picture = engine.render(camera(), GRAY)
+            picture = engine.render(VIEW, GRAY)
             engine.validate()
             assert picture.stats.converged
             assert_same_picture(picture, resident)
@@ -139,10 +137,10 @@ def test_channels_of_a_store_are_components(tmp_path, cloud, channels):
     picked = gv.Volume(three[..., channels] if channels else three, cloud.spacing, cloud.origin)
     tree = gv.N3Tree.from_volume(picked)
     for component in range(picked.data.shape[3]):
-        expected = gv.render(tree, camera(24), GRAY, component=component)
+        expected = gv.render(tree, camera(24, distance=1.4), GRAY, component=component)
         producer = gv.StoredProducer(tmp_path / "a.zarr", channels=channels)
         with gv.Engine(producer) as engine:
-            picture = engine.render(camera(24), GRAY, component=component)
+            picture = engine.render(camera(24, distance=1.4), GRAY, component=component)
         for name in PARTS:
             assert torch.equal(getattr(picture, name), getattr(expected, name)), name
         assert expected.alpha.max() > 0.05
@@ -162,7 +160,7 @@ def test_what_a_transfer_function_does_not_show_is_not_read(whole, monkeypatch):
         seen.clear()
         with gv.Engine(gv.StoredProducer(whole)) as engine:
             shader = gv.TransferFunction.from_points(opacity)
-            stats = engine.render(camera(), shader, lod="finest").stats
+            stats = engine.render(VIEW, shader, lod="finest").stats
         loads.append((stats.produced["bricks"], sum(seen)))
     assert loads[0] > loads[1] > loads[2], loads
     assert loads[2][0] < 0.2 * loads[0][0]
@@ -179,7 +177,9 @@ def test_a_block_is_read_once_while_the_host_cache_holds_it(whole, monkeypatch):
     monkeypatch.setattr(Store, "read_blocks", count)
     with gv.Engine(gv.StoredProducer(whole), brick_pool="400 kB") as engine:
         for azimuth in (0, 90, 180, 270):
-            engine.render(camera(24, azimuth=azimuth), GRAY, max_frames=40, lod="finest")
+            engine.render(
+                camera(24, azimuth=azimuth, distance=1.4), GRAY, max_frames=40, lod="finest"
+            )
         assert engine.frames > 8
     assert len(seen) == len(set(seen)) > 20
 
@@ -230,12 +230,12 @@ def gone(store: Path) -> str:
 @pytest.mark.parametrize("fault", [missing, corrupt, gone])
 @pytest.mark.parametrize("loading", ["straight", "levels"])
 def test_a_damaged_store_gives_a_complete_coarser_picture(store, cloud, fault, loading):
-    expected = gv.render(gv.N3Tree.from_volume(cloud), camera(), GRAY, lod="finest")
+    expected = gv.render(gv.N3Tree.from_volume(cloud), VIEW, GRAY, lod="finest")
     with gv.Engine(gv.StoredProducer(store, timeout=5), loading=loading, patience=9) as engine:
         for _ in range(2):
-            engine.frame(camera(), GRAY, lod="finest")  # the damage comes while it runs
+            engine.frame(VIEW, GRAY, lod="finest")  # the damage comes while it runs
         reason = fault(store)
-        picture = engine.render(camera(), GRAY, lod="finest")
+        picture = engine.render(VIEW, GRAY, lod="finest")
         engine.validate()
         stats = picture.stats
         assert stats.converged and stats.failed == len(engine.failures) > 0
@@ -252,7 +252,7 @@ def test_strict_raises_the_first_fault(store):
     with gv.Engine(gv.StoredProducer(store), strict=True) as engine:
         reason = missing(store)
         with pytest.raises(ProductionError, match=reason) as caught:
-            engine.render(camera(), GRAY, lod="finest")
+            engine.render(VIEW, GRAY, lod="finest")
         assert "tree 'scene', depth 4, node (" in str(caught.value)
 
 
@@ -260,7 +260,7 @@ def test_strict_raises_the_first_fault(store):
 def test_a_store_that_errors_now_and_then_recovers(whole, monkeypatch):
     """Every third read fails once; what failed is asked for again when told so."""
     with gv.Engine(gv.StoredProducer(whole)) as engine:
-        expected = engine.render(camera(), GRAY)
+        expected = engine.render(VIEW, GRAY)
     read, calls = Store.read_blocks, []
 
     def flaky(self, level, zyx, **options):
@@ -271,26 +271,26 @@ def test_a_store_that_errors_now_and_then_recovers(whole, monkeypatch):
 
     monkeypatch.setattr(Store, "read_blocks", flaky)
     with gv.Engine(gv.StoredProducer(whole)) as engine:
-        picture = engine.render(camera(), GRAY)
+        picture = engine.render(VIEW, GRAY)
         assert picture.stats.failed > 0
         assert any("the network is down" in one.message for one in engine.failures)
         for _ in range(50):
             if not engine.failures:
                 break
             engine.forget_failures()
-            picture = engine.render(camera(), GRAY)
+            picture = engine.render(VIEW, GRAY)
         assert_same_picture(picture, expected)
 
 
 @pytest.mark.backend("cpp")
-def test_a_store_that_stalls_does_not_hang(served, whole):  # noqa: F811
+def test_a_store_that_stalls_does_not_hang(served, whole):
     """A server that takes its time from one moment on."""
     with gv.Engine(gv.StoredProducer(f"{served}/{whole.name}", timeout=0.3), patience=5) as engine:
         for _ in range(2):
-            engine.frame(camera(16), GRAY)
+            engine.frame(camera(16, distance=1.4), GRAY)
         Handler.delay = 2.0
         start = time.monotonic()
-        picture = engine.render(camera(16), GRAY)
+        picture = engine.render(camera(16, distance=1.4), GRAY)
         assert time.monotonic() - start < 20
         assert picture.stats.failed > 0 and picture.alpha.max() > 0.05
         assert "no answer within 0.3 s" in engine.failures[0].message
@@ -315,11 +315,11 @@ def test_a_foreign_image_is_streamed_as_well(tmp_path, cloud):
             "datasets": [{"path": "0", "coordinateTransformations": transform}],
         }
     ]
-    resident = gv.render(gv.N3Tree.from_volume(cloud), camera(), GRAY)
+    resident = gv.render(gv.N3Tree.from_volume(cloud), VIEW, GRAY)
     pictures = []
     for pool in ("9 MB", 1000 * int(1.3 * resident.stats.bricks_used + 300)):
         with gv.Engine(gv.StoredProducer(tmp_path / "plain.zarr"), brick_pool=pool) as engine:
-            picture = engine.render(camera(), GRAY)
+            picture = engine.render(VIEW, GRAY)
             engine.validate()
             assert picture.stats.converged and picture.stats.failed == 0
             pictures.append(picture)

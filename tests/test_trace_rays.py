@@ -8,78 +8,17 @@ import typing
 
 import pytest
 import torch
-from conftest import DEVICES
+from helpers import DEVICES
+from helpers.rays import camera_rays
+from helpers.traces import SHADER, arguments, assert_equal, changed, run
+from helpers.trees import forget, on
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gvtorch as gv
 from gvtorch.base import constants as config
-from gvtorch.ops import RayArguments, TraceArguments
 from gvtorch.ops.reference import exact
 from gvtorch.tracing.tracer import Tracer
-
-SHADER = gv.TransferFunction.from_points(
-    opacity=[(0, 0), (0.2, 0), (0.6, 0.4), (1, 1)],
-    color=[(0, 1, 0, 0), (0.5, 0.2, 0.8, 0.1), (1, 1, 1, 1)],
-)
-
-
-def on(tree: gv.N3Tree, device: str) -> gv.N3Tree:
-    """A copy of the tree whose marks are clean, on a device."""
-    nodes = gv.NodePool(
-        tree.nodes.capacity, tree.bricks.channels, branching=tree.branching, device=device
-    )
-    bricks = gv.BrickPool(
-        tree.bricks.capacity,
-        tree.bricks.channels,
-        brick_size=tree.bricks.brick_size,
-        border=tree.bricks.border,
-        device=device,
-    )
-    half = 0.5 * torch.tensor(tree.spacing, dtype=torch.float64)
-    origin = tuple((tree.box[0] + half).tolist())
-    copy = gv.N3Tree(
-        *(nodes, bricks), depth=tree.depth, extent=tree.extent, spacing=tree.spacing, origin=origin
-    )
-    for old, new in ((tree.nodes.fields, nodes.fields), (tree.bricks.fields, bricks.fields)):
-        for name, field in new.items():
-            field.copy_(old[name])
-    nodes.request_tn.zero_()
-    nodes.stamp_t.fill_(-1)
-    bricks.stamp_b.fill_(-1)
-    return copy
-
-
-def run(tree, backend, rays, shader=SHADER, **options):
-    """Everything `trace_rays` writes, on the CPU."""
-    device = DEVICES[backend]
-    copy = on(tree, device)
-    moved = rays.to(device)
-    hits = gv.trace(copy, moved, shader, backend=backend, **options)
-    result = {n: t.cpu() for n, t in vars(hits).items() if t is not None}
-    marks = {
-        "request": copy.nodes.request_tn,
-        "tile": copy.nodes.stamp_t,
-        "brick": copy.bricks.stamp_b,
-    }
-    return result, {n: t.cpu() for n, t in marks.items()}
-
-
-def camera_rays(tree, size=24, **place):
-    return gv.Camera.orbit(width=size, height=size, **place).placed(tree.box).rays()
-
-
-def assert_equal(tree, backend, rays, shader=SHADER, **options):
-    expected, expected_marks = run(tree, "reference", rays, shader, **options)
-    actual, marks = run(tree, backend, rays, shader, **options)
-    assert torch.equal(actual["samples"], expected["samples"])
-    assert torch.equal(actual["missed"], expected["missed"])
-    for name, mark in marks.items():
-        assert torch.equal(mark, expected_marks[name]), name
-    tolerance = 1e-5 if expected["color"].dtype == torch.float32 else 1e-12
-    for name in ("color", "alpha", "depth"):
-        torch.testing.assert_close(actual[name], expected[name], rtol=tolerance, atol=tolerance)
-    return expected, expected_marks
 
 
 @pytest.mark.parametrize("lod", ["finest", "auto"])
@@ -128,19 +67,6 @@ def test_second_channel_and_second_component(blobs, compiled):
     result, _ = assert_equal(tree, compiled, rays, channel="two", component=1)
     single, _ = run(gv.N3Tree.from_volume(blobs), compiled, rays)
     assert torch.equal(result["alpha"], single["alpha"])
-
-
-def forget(tree: gv.N3Tree, share: float, seed: int) -> gv.N3Tree:
-    """A copy in which a share of the bricks and of the tiles is not there yet."""
-    copy = on(tree, "cpu")
-    generator = torch.Generator().manual_seed(seed)
-    for words, absent in (
-        (copy.nodes.brick_tn, config.ABSENT),
-        (copy.nodes.child_tn, config.ABSENT),
-    ):
-        gone = (torch.rand(words.shape, generator=generator) < share) & (words >= 0)
-        words[gone] = absent
-    return copy
 
 
 @settings(max_examples=25, deadline=None)
@@ -348,34 +274,6 @@ def test_an_unknown_backend_is_one_clear_error(blobs):
     given = arguments(gv.N3Tree.from_volume(blobs, 8), 4)
     with pytest.raises(ValueError, match="backend must be auto, reference, cpp or cuda"):
         gv.ops.trace_rays(*given, backend="opengl")  # type: ignore[arg-type]
-
-
-def changed(records: tuple, change: dict) -> list:
-    """Records with some fields replaced."""
-    return [
-        record._replace(**{name: value for name, value in change.items() if name in record._fields})
-        for record in records
-    ]
-
-
-def arguments(
-    tree: gv.N3Tree, rays: int, shader: gv.TransferFunction = SHADER, dtype=torch.float32
-) -> tuple[RayArguments, TraceArguments]:
-    """Arguments of the op for parallel rays through the middle of a tree."""
-    device = tree.device
-    real = {"dtype": torch.float64, "device": device}
-    size = tree.box[1] - tree.box[0]
-    part = 0.25 + torch.linspace(0, 0.1, rays, dtype=torch.float64)[:, None]
-    direction = torch.tensor([0.3, 0.2, 1.0]) / torch.tensor([0.3, 0.2, 1.0]).norm()
-    given = RayArguments(
-        origin_r3=(tree.box[0] + part * size).to(device),
-        direction_r3=direction.to(**real).repeat(rays, 1),
-        cone_r2=torch.tensor([[0.5, 0.02]], **real).repeat(rays, 1),
-        range_r2=torch.tensor([[0.0, 1e9]], **real).repeat(rays, 1),
-    )
-    frame_1 = torch.tensor([3], dtype=torch.int32, device=device)
-    traced = Tracer(tree, shader, gv.RenderOptions(dtype=dtype, cone_scale=1.0), frame_1=frame_1)
-    return given, traced.arguments
 
 
 def test_options_are_checked():

@@ -5,7 +5,6 @@ instruction sets.
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from functools import cache
@@ -13,14 +12,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import ROOT
-from test_compiled_shader import HEADER
-from test_packets import INSTRUCTIONS, LAMP, TRANSFER, cut, scene, shaded
-from test_trace_rays import camera_rays, run
+from helpers import ROOT
+from helpers.compiled import HEADER, quick_compiler
+from helpers.packets import INSTRUCTIONS, LAMP, TRANSFER, cut, result, scene, shaded, start
+from helpers.rays import camera_rays
+from helpers.traces import run
 from torch import Tensor
 
 import gvtorch as gv
-from gvtorch.cpp_ext import compilers, instructions
+from gvtorch.cpp_ext import instructions
 
 INK = dict(steep=0.05, sharpness=2.0, wash=0.1, near=20.0, far=80.0, paper=0.9)
 SHADERS = {
@@ -40,12 +40,6 @@ SHADERS = {
     ),
     "ink": ("Ink", {"transfer": TRANSFER, "uniforms": INK}),
 }
-_SHADED = """
-import sys, torch
-sys.path.insert(0, {tests!r})
-from test_user_packets import SHADERS, given
-torch.save({{name: given(name) for name in SHADERS}}, {file!r})
-"""
 
 
 def shader(name: str, folder: Path | None = None) -> gv.CompiledShader:
@@ -72,12 +66,8 @@ def given(name: str, folder: Path | None = None) -> list[Tensor]:
     return [*found, *hits.values(), *marks.values()]
 
 
-def quick(folder: Path, level: int) -> str:
-    """A compiler that optimises less."""
-    real, file = shutil.which(compilers.find_cxx()[0]), folder / f"c++{level}"
-    file.write_text(f'#!/bin/sh\nexec {real} "$@" -O{level}\n')
-    file.chmod(0o755)
-    return str(file)
+def all_given() -> dict[str, list[Tensor]]:
+    return {name: given(name) for name in SHADERS}
 
 
 @pytest.fixture(scope="module")
@@ -85,18 +75,11 @@ def of_instructions(tmp_path_factory) -> dict[str, dict[str, list[Tensor]]]:
     """What each instruction set gives, by its name and the shader's; this process's own, as users
     have it.
     """
-    folder, runs, found = tmp_path_factory.mktemp("packets"), {}, {}
+    folder, runs = tmp_path_factory.mktemp("packets"), {}
     for name in INSTRUCTIONS:
-        file = str(folder / f"{name}.pt")
-        program = _SHADED.format(tests=os.path.dirname(__file__), file=file)
-        environment = {**os.environ, "GVTORCH_CPU": name}
-        if name != instructions():
-            environment["CXX"] = quick(folder, 1)
-        runs[file] = name, subprocess.Popen([sys.executable, "-c", program], env=environment)
-    for file, (name, process) in runs.items():
-        assert process.wait(timeout=600) == 0
-        found[name] = torch.load(file, weights_only=True)
-    return found
+        quick = {} if name == instructions() else {"CXX": quick_compiler(folder, level=1)}
+        runs[name] = start(all_given, folder, name, **quick)
+    return {name: result(run) for name, run in runs.items()}
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +89,7 @@ def one_by_one(tmp_path_factory):
     @cache
     def expected(name: str) -> list[Tensor]:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setenv("CXX", quick(folder, 0))
+            patch.setenv("CXX", quick_compiler(folder))
             return given(name, folder)
 
     return expected
@@ -129,7 +112,7 @@ def test_packets_go_in_float32_and_rays_in_float64(tmp_path, monkeypatch):
     """
     own = shader("ends and surface")
     assert b"UserPacket" in own.libraries[0].read_bytes()
-    monkeypatch.setenv("CXX", quick(tmp_path, 0))
+    monkeypatch.setenv("CXX", quick_compiler(tmp_path))
     alone = shader("ends and surface", tmp_path)
     assert b"UserPacket" not in alone.libraries[0].read_bytes()
     tree = scene()
@@ -143,7 +126,7 @@ def test_packets_go_in_float32_and_rays_in_float64(tmp_path, monkeypatch):
 def test_a_folder_serves_several_instruction_sets(tmp_path, monkeypatch):
     """Each has a library of its own, of one op."""
     monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path))
-    monkeypatch.setenv("CXX", quick(tmp_path, 0))
+    monkeypatch.setenv("CXX", quick_compiler(tmp_path))
     program = f"import gvtorch as gv; gv.CompiledShader({str(HEADER)!r}, 'mine::Plain')"
     for name in ("baseline", instructions(), "baseline"):
         environment = {**os.environ, "GVTORCH_CPU": name}

@@ -1,0 +1,63 @@
+"""Planes that a formula draws, and balls that they cut: colour and depth of another renderer."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+import gvtorch as gv
+
+BLUE = (0.1, 0.2, 0.8)
+
+
+def screen(view: gv.Camera, place: torch.Tensor, normal: tuple[float, float, float]):
+    """(h, w, 1) distance at which the rays of a camera meet the plane through `place`, +inf where
+    they do not.
+    """
+    rays, normal = view.rays(), torch.tensor(normal, dtype=torch.float64)
+    along = ((place - rays.origin) @ normal) / (rays.direction @ normal)
+    return torch.where(along > 0, along, math.inf).reshape(view.height, view.width, 1)
+
+
+def layer_of(depth: torch.Tensor, alpha: torch.Tensor | None = None, color=BLUE) -> gv.Layer:
+    """One straight colour at a depth."""
+    plain = depth.new_tensor(color).expand(*depth.shape[:-1], 3)
+    return gv.Layer(plain if alpha is None else plain * alpha, depth, alpha)
+
+
+def ball(radius: float, size: int) -> gv.Volume:
+    """Signed distance to a sphere around the world's origin, positive inside; voxels are 1 wide."""
+    place = torch.arange(size) - (size - 1) / 2
+    z, y, x = torch.meshgrid(place, place, place, indexing="ij")
+    origin = (-(size - 1) / 2,) * 3
+    return gv.Volume(radius - (x * x + y * y + z * z).sqrt(), origin=origin)
+
+
+SOLID = gv.TransferFunction.from_points([(-1e-3, 0), (1e-3, 1)], [(0, 1, 0, 0)], reference=0.01)
+
+
+def seam_error(picture: gv.Picture, view: gv.Camera, height: float, radius: float) -> float:
+    """How many pixels the seam of a ball and the plane z = height is off: the farthest from the
+    seam's circle of all pixels that show the wrong one. A ray meets the plane inside the ball where
+    its ball was entered before.
+    """
+    rays = view.rays()
+    along = (height - rays.origin[:, 2]) / rays.direction[:, 2]
+    place = rays.origin + along[:, None] * rays.direction
+    ring = math.sqrt(radius**2 - height**2)
+    from_axis = place[:, :2].norm(dim=1)
+    red, blue = picture.color.cpu().double().reshape(-1, 3)[:, (0, 2)].unbind(1)
+    wrong = (red > blue) != (from_axis < ring)
+    # The nearest point of the circle, in pixels.
+    edge = place.clone()
+    edge[:, :2] *= (ring / from_axis)[:, None]
+    matrix = view.Ks[0] @ view.viewmats[0, :3]
+    pixels = []
+    for point in (place, edge):
+        flat = torch.cat((point, torch.ones_like(point[:, :1])), 1) @ matrix.T
+        pixels.append(flat[:, :2] / flat[:, 2:])
+    inside = int((from_axis < ring).sum())
+    assert inside > 500 and inside < 0.8 * len(place), "the test must see something"
+    off = (pixels[0] - pixels[1]).norm(dim=1)[wrong]
+    return float(off.max()) if len(off) else 0.0

@@ -1,0 +1,35 @@
+"""Pictures: where tests stand, what they see, and how two pictures are held side by side."""
+
+from __future__ import annotations
+
+import torch
+
+import gvtorch as gv
+
+GRAY = gv.TransferFunction.preset("gray", 0, 1)
+
+
+PARTS = ("color", "alpha", "depth", "samples")
+
+
+def camera(size=48, **place) -> gv.Camera:
+    return gv.Camera.orbit(**{"azimuth": 30, "elevation": 20, **place}, width=size, height=size)
+
+
+def assert_same_picture(actual: gv.Picture, expected: gv.Picture) -> None:
+    for name in PARTS:
+        assert torch.equal(getattr(actual, name), getattr(expected, name)), name
+    assert expected.alpha.max() > 0.3, "the test must see something"
+
+
+def assert_close_picture(actual: gv.Picture, expected: gv.Picture, *, tolerance=1e-4) -> None:
+    """Two pictures that are equal but for rounding."""
+    assert expected.alpha.max() > 0.5, "the test must see something"
+    assert (actual.color - expected.color).abs().max() < tolerance
+    assert (actual.alpha - expected.alpha).abs().max() < tolerance
+    assert torch.equal(torch.isinf(actual.depth), torch.isinf(expected.depth))
+    hit = torch.isfinite(expected.depth)
+    assert (actual.depth - expected.depth)[hit].abs().max() < 1e-2
+
+
+VESSELS = gv.TransferFunction.preset("vessels", 0, 255)

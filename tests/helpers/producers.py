@@ -1,0 +1,102 @@
+"""Producers that are early, late or broken, and an engine that looks after itself."""
+
+from __future__ import annotations
+
+import random
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import torch
+
+import gvtorch as gv
+from gvtorch.base import constants as config
+
+SIZE = {"brick_size": 4, "brick_pool": "4 MB", "node_pool": "200 kB"}
+
+
+class Ball(gv.Producer):
+    """Density 1 in the middle, falling to 0 at distance 1."""
+
+    def __init__(self, extent=32, **options):
+        super().__init__(extent, box=((-1, -1, -1), (1, 1, 1)), **options)
+        self.filled: list[torch.Tensor] = []
+
+    def fill(self, nodes):
+        self.filled.append(nodes.loc.clone())
+        return {"value": (1 - nodes.positions.norm(dim=-1)).clamp(min=0)}
+
+
+class Held(gv.VolumeProducer):
+    """Keeps its answers back until `go`, which gives them in an order of its own."""
+
+    def __init__(self, volume, seed=0):
+        super().__init__(volume)
+        self.held, self.hold, self.random = [], True, random.Random(seed)
+
+    def later(self, answer, nodes):
+        if not self.hold or (nodes.depth == 0).any():
+            return answer(nodes)
+        self.held.append((future := Future(), answer, nodes))
+        return future
+
+    def go(self):
+        self.random.shuffle(self.held)
+        for future, answer, nodes in self.held:
+            future.set_result(answer(nodes))
+        self.held.clear()
+
+    def classify(self, nodes):
+        return self.later(super().classify, nodes)
+
+    def fill(self, nodes):
+        return self.later(super().fill, nodes)
+
+
+class Late(gv.VolumeProducer):
+    """Answers from threads, after random delays, so in any order."""
+
+    def __init__(self, volume: gv.Volume, seed: int = 0, most: float = 0.004) -> None:
+        super().__init__(volume)
+        self.random, self.most = random.Random(seed), most
+        self.threads = ThreadPoolExecutor(6)
+
+    def later(self, answer, nodes: gv.Nodes) -> Future:
+        delay = self.random.uniform(0, self.most)
+
+        def work():
+            time.sleep(delay)
+            return answer(nodes)
+
+        return self.threads.submit(work)
+
+    def classify(self, nodes):
+        return self.later(super().classify, nodes)
+
+    def fill(self, nodes):
+        return self.later(super().fill, nodes)
+
+    def close(self):
+        self.threads.shutdown()
+
+
+class Checked(gv.Engine):
+    """Looks after every frame at what the frame may have done: what the picture before used is
+    still there.
+    """
+
+    def frame(self, *args, **options):
+        nodes, bricks = self.cache.nodes, self.cache.bricks
+        roots = len(self.trees)
+        locked = nodes.brick_tn[:roots, 0].clone()
+        before = [bricks.owner_b.clone(), nodes.parent_t.clone()]
+        used_b = (bricks.stamp_b == self.frames) & (before[0] >= 0)
+        used_t = (nodes.stamp_t == self.frames) & (before[1] >= 0)
+        picture, stats = super().frame(*args, **options)
+        self.validate()
+        assert torch.equal(bricks.owner_b[used_b], before[0][used_b]), "a brick in use was taken"
+        assert torch.equal(nodes.parent_t[used_t], before[1][used_t]), "a tile in use was taken"
+        assert torch.equal(nodes.brick_tn[:roots, 0], locked), "a root was touched"
+        assert stats.tiles_used == int((nodes.stamp_t == self.frames).sum())
+        assert stats.bricks_used == int((bricks.stamp_b == self.frames).sum())
+        assert not (nodes.request_tn & config.REQUEST_KINDS).any(), "requests are cleared"
+        return picture, stats

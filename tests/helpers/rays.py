@@ -1,0 +1,36 @@
+"""Rays of cameras, and of directions that tests choose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+import gvtorch as gv
+
+
+def rays_along(
+    origin: Tensor, direction: Tensor | Sequence[float], cone: float = 0.0, device: str = "cpu"
+) -> gv.Rays:
+    """Rays from places (r, 3) without an end, in one direction or one for each, of one width."""
+    flat = torch.zeros((len(origin), 2), dtype=torch.float64)
+    unit = torch.nn.functional.normalize(torch.as_tensor(direction).double(), dim=-1)
+    rays = gv.Rays(
+        origin=origin,
+        direction=unit.expand_as(origin).contiguous(),
+        cone=flat + torch.tensor([cone, 0.0]),
+        range=flat + torch.tensor([0.0, torch.inf]),
+    )
+    return rays.to(device)
+
+
+def camera_rays(tree, size=24, **place):
+    return gv.Camera.orbit(width=size, height=size, **place).placed(tree.box).rays()
+
+
+def world_rays(tree_box, count: int, device) -> tuple[torch.Tensor, ...]:
+    camera = gv.Camera.orbit(width=count // 3, height=3, distance=1.2).placed(tree_box)
+    rays = camera.rays()
+    columns = (rays.origin, rays.direction, rays.cone, rays.range)
+    return tuple(t.float().to(device) for t in columns)

@@ -1,0 +1,33 @@
+"""The fused shaders, with a channel for each in the fixture `channels`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gvtorch as gv
+from helpers.traces import SHADER
+
+POINT = gv.PointLight((0.0, 40.0, 60.0), (1.0, 0.9, 0.8))
+
+
+SHADERS = {
+    "lit": gv.Lit(SHADER),
+    "lit by stored normals": gv.Lit(SHADER, normals="normal", light=POINT),
+    "pre-integrated": gv.PreIntegrated(SHADER),
+    "stored colour": gv.StoredColor("rgba"),
+    "stored colour lit": gv.StoredColor(
+        "premultiplied", premultiplied=True, light=gv.DirectionalLight((1, -1, -1)), lit=True
+    ),
+    "lit with shadows": gv.Lit(SHADER, shadows=True, light=replace(POINT, radius=20.0)),
+    "colour with shadows": gv.StoredColor(
+        "six", shadows=True, light=gv.DirectionalLight((1, -1, -1), angle=9.0)
+    ),
+    "six directions": gv.StoredColor("six", light=POINT, lit=True),
+    "isosurface": gv.Isosurface(0.5, (0.9, 0.4, 0.2), light=POINT),
+    "coloured isosurface": gv.Isosurface(0.4, SHADER, color_channel="rgba", color_component=1),
+    "distance field": gv.DistanceField(offset=0.3),
+    "maximum": gv.Projection("maximum", SHADER),
+    "minimum": gv.Projection("minimum", SHADER),
+    "mean": gv.Projection("mean", SHADER),
+    "features": gv.Features(SHADER, "rgba"),
+}

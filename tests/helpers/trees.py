@@ -1,0 +1,47 @@
+"""Trees as tests need them: fresh copies, trees with holes, volumes of several channels."""
+
+from __future__ import annotations
+
+import torch
+
+import gvtorch as gv
+from gvtorch.base import constants as config
+
+
+def on(tree: gv.N3Tree, device: str) -> gv.N3Tree:
+    """A copy of the tree whose marks are clean, on a device."""
+    nodes = gv.NodePool(
+        tree.nodes.capacity, tree.bricks.channels, branching=tree.branching, device=device
+    )
+    bricks = gv.BrickPool(
+        tree.bricks.capacity,
+        tree.bricks.channels,
+        brick_size=tree.bricks.brick_size,
+        border=tree.bricks.border,
+        device=device,
+    )
+    half = 0.5 * torch.tensor(tree.spacing, dtype=torch.float64)
+    origin = tuple((tree.box[0] + half).tolist())
+    copy = gv.N3Tree(
+        *(nodes, bricks), depth=tree.depth, extent=tree.extent, spacing=tree.spacing, origin=origin
+    )
+    for old, new in ((tree.nodes.fields, nodes.fields), (tree.bricks.fields, bricks.fields)):
+        for name, field in new.items():
+            field.copy_(old[name])
+    nodes.request_tn.zero_()
+    nodes.stamp_t.fill_(-1)
+    bricks.stamp_b.fill_(-1)
+    return copy
+
+
+def forget(tree: gv.N3Tree, share: float, seed: int) -> gv.N3Tree:
+    """A copy in which a share of the bricks and of the tiles is not there yet."""
+    copy = on(tree, "cpu")
+    generator = torch.Generator().manual_seed(seed)
+    for words, absent in (
+        (copy.nodes.brick_tn, config.ABSENT),
+        (copy.nodes.child_tn, config.ABSENT),
+    ):
+        gone = (torch.rand(words.shape, generator=generator) < share) & (words >= 0)
+        words[gone] = absent
+    return copy
