@@ -9,7 +9,7 @@ import sys
 
 import pytest
 import torch
-from helpers import DEVICES, ROOT
+from helpers import DEVICES, ROOT, gvtorch
 
 import gvtorch as gv
 from gvtorch import bench
@@ -37,11 +37,6 @@ FIGURES = {
     "convert": {"source_bytes_per_second", "memory_bytes", "disk_bytes"},
     "blocks": {"blocks_per_second"},
 }
-
-
-def gvtorch(*args: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "gvtorch", "bench", *map(str, args)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def figures(value) -> list[float]:
@@ -192,7 +187,9 @@ def test_a_busy_machine_is_noted(monkeypatch):
 
 
 def test_the_command_lists_and_names_mistakes():
-    listed = gvtorch()
+    listed = gvtorch(
+        "bench",
+    )
     assert listed.returncode == 0
     assert [line.split()[0] for line in listed.stdout.splitlines()] == [*bench.WORKLOADS]
     for args, words in (
@@ -202,14 +199,14 @@ def test_the_command_lists_and_names_mistakes():
         (["lru", "--quick", "--only", "nothing"], "no case of lru has 'nothing' in its name"),
         (["lru", "--repeats", "0"], "repeats must be an int >= 1"),
     ):
-        run = gvtorch(*args)
+        run = gvtorch("bench", *args)
         assert run.returncode == 2 and words in run.stderr, run.stderr
         assert len(run.stderr.strip().splitlines()) == 1 and not run.stdout
 
 
 @pytest.mark.backend("cpp")
 def test_the_command_prints_json_and_plots_write_the_page(tmp_path):
-    run = gvtorch("lru", "--quick", "--repeats", 1, "--json", "-o", tmp_path)
+    run = gvtorch("bench", "lru", "--quick", "--repeats", 1, "--json", "-o", tmp_path)
     assert run.returncode == 0, run.stderr
     content = json.loads(run.stdout)
     (file,) = tmp_path.glob("lru.*.quick.json")

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: in a process of its own."""
+"""The command line as a user meets it."""
 
 from __future__ import annotations
 
@@ -21,6 +21,14 @@ ANEURISM = DATA / "aneurism_256x256x256_uint8.raw.gz"
 def test_the_version_is_told():
     done = gvtorch("--version")
     assert done.returncode == 0 and done.stdout.strip() == f"gvtorch {gv.__version__}"
+
+
+def test_a_process_of_its_own(small, tmp_path):
+    """All other tests run commands within their process."""
+    for path, status, said in ((small, 0, 0), (tmp_path / "none.nrrd", 2, 1)):
+        command = [sys.executable, "-m", "gvtorch", "info", str(path)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == status and len(done.stderr.splitlines()) == said, done.stderr
 
 
 def test_help_does_not_import_torch():

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import subprocess
-import sys
+import warnings
 from pathlib import Path
 
 import pytest
+
+from gvtorch.tools.cli import main
 
 ROOT = Path(__file__).parents[2]
 TESTS = ROOT / "tests"
@@ -26,7 +30,25 @@ def shared(path: str) -> Path:
     return file
 
 
-def gvtorch(*args: object, cwd=None) -> subprocess.CompletedProcess[str]:
-    """Runs the command line in a process of its own."""
-    command = [sys.executable, "-m", "gvtorch", *map(str, args)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False)
+def gvtorch(*args: object, cwd: str | Path = ".") -> subprocess.CompletedProcess[str]:
+    """Runs the command line within this process, with the warnings that a process of its own has:
+    that would import torch for each call.
+    """
+    out, error = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8") for _ in range(2))
+    status = 0
+    with (
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(error),
+        contextlib.chdir(cwd),
+        warnings.catch_warnings(),
+    ):
+        warnings.resetwarnings()
+        for unseen in (DeprecationWarning, PendingDeprecationWarning, ResourceWarning):
+            warnings.simplefilter("ignore", unseen)
+        try:
+            main([str(arg) for arg in args])
+        except SystemExit as end:
+            status = int(end.code or 0)
+    for stream in (out, error):
+        stream.seek(0)
+    return subprocess.CompletedProcess(args, status, out.read(), error.read())
