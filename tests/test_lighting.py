@@ -18,9 +18,9 @@ SKY = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0}
 FLOOR, SIZE = 8.0, 64
 
 
-def places() -> np.ndarray:
+def places(size: int = SIZE) -> np.ndarray:
     """x, y, z of the voxels of a cube."""
-    return np.moveaxis(grid((SIZE,) * 3), -1, 0)
+    return np.moveaxis(grid((size,) * 3), -1, 0)
 
 
 def tree_of(distance: np.ndarray, backend: str) -> gv.N3Tree:
