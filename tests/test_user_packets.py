@@ -77,7 +77,7 @@ def of_instructions(tmp_path_factory) -> dict[str, dict[str, list[Tensor]]]:
     """
     folder, runs = tmp_path_factory.mktemp("packets"), {}
     for name in INSTRUCTIONS:
-        quick = {} if name == instructions() else {"CXX": quick_compiler(folder, level=1)}
+        quick = {} if name == instructions() else {"CXX": quick_compiler(folder)}
         runs[name] = start(all_given, folder, name, **quick)
     return {name: result(run) for name, run in runs.items()}
 

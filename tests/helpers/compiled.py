@@ -11,9 +11,9 @@ from helpers import TESTS
 HEADER = TESTS / "cpp" / "user_shaders.h"
 
 
-def quick_compiler(folder: Path, *before: str, level: int = 0) -> str:
-    """A compiler that optimises less, after some lines of shell."""
-    real, file = shutil.which(compilers.find_cxx()[0]), folder / f"c++{level}"
-    file.write_text("\n".join(("#!/bin/sh", *before, f'exec {real} "$@" -O{level}\n')))
+def quick_compiler(folder: Path, *before: str) -> str:
+    """A compiler that does not optimise, after some lines of shell."""
+    real, file = shutil.which(compilers.find_cxx()[0]), folder / "c++"
+    file.write_text("\n".join(("#!/bin/sh", *before, f'exec {real} "$@" -O0\n')))
     file.chmod(0o755)
     return str(file)
