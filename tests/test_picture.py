@@ -1,4 +1,4 @@
-"""Pictures against a dense marcher written apart (marcher.py), and against closed forms."""
+"""Pictures against a dense marcher written apart (helpers/marcher.py), and against closed forms."""
 
 from __future__ import annotations
 
