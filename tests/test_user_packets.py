@@ -111,10 +111,10 @@ def test_packets_go_in_float32_and_rays_in_float64(tmp_path, monkeypatch):
     float64 is the same in both.
     """
     own = shader("ends and surface")
-    assert b"UserPacket" in own.libraries[0].read_bytes()
+    assert b"PacketWalk" in own.libraries[0].read_bytes()
     monkeypatch.setenv("CXX", quick_compiler(tmp_path))
     alone = shader("ends and surface", tmp_path)
-    assert b"UserPacket" not in alone.libraries[0].read_bytes()
+    assert b"PacketWalk" not in alone.libraries[0].read_bytes()
     tree = scene()
     rays = cut(camera_rays(tree, 11, distance=1.5))
     one, other = (run(tree, "cpp", rays, each, dtype=torch.float64)[0] for each in (own, alone))

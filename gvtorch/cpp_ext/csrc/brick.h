@@ -35,6 +35,12 @@ GV_HD void with_voxel(VoxelType type, const Body& body) {
   }
 }
 
+inline int64_t brick_bytes(VoxelType type, int32_t side, int32_t channels) {
+  int64_t bytes = int64_t{side} * side * side * channels;
+  with_voxel(type, [&](auto voxel) { bytes *= sizeof(voxel); });
+  return bytes;
+}
+
 template <class Voxel>
 struct BrickView {
   const Voxel* bricks_bzyxc;
@@ -52,7 +58,6 @@ struct BrickView {
 template <class T, class Voxel>
 struct BrickRay {
   const Voxel* voxels = nullptr;  // the brick's first voxel; null: `constant` everywhere
-  bool last = false;              // nothing may be read behind the brick
   T constant = 0;
   Vec3<T> offset{0, 0, 0};
   Vec3<T> slope{0, 0, 0};
@@ -69,7 +74,6 @@ GV_HD BrickRay<T, Voxel> aim(const BrickView<Voxel>& view, const Levels<T>& leve
   }
   const int64_t volume = static_cast<int64_t>(view.side) * view.side * view.side;
   ray.voxels = view.bricks_bzyxc + (holder.brick * volume * view.channels + view.component);
-  ray.last = holder.brick + 1 == view.bricks;
   const T scale = levels.scale[holder.depth];
   const Vec3<T> corner = digits.corner(holder.depth, levels);
   const T first = static_cast<T>(view.border) - static_cast<T>(0.5);
@@ -80,36 +84,64 @@ GV_HD BrickRay<T, Voxel> aim(const BrickView<Voxel>& view, const Levels<T>& leve
   return ray;
 }
 
-// Value at a place of a brick, in voxels from the centre of its first one; a place beyond the last is clamped.
-// kSide > 0: a brick of one channel and that side, so that eight addresses are one address and seven constants.
+// The lower of the two voxels beside a place, along one axis; the upper one exists. A packet multiplies floats faster.
+template <class T>
+GV_HD int32_t voxel_below(T place, int32_t side) {
+  return smaller(static_cast<int32_t>(place), side - 2);
+}
+#ifndef __CUDACC__
+GV_HD Floats voxel_below(Floats place, int32_t side) {
+  return smaller(to_floats(truncated(place)), splat<Floats>(static_cast<float>(side - 2)));
+}
+#endif
+
+// The eight voxels around a place of a brick, in voxels from the centre of its first one; a place beyond the last is
+// clamped.
+template <class T>
+struct Eight {
+  decltype(voxel_below(T{}, 0)) cell[3];
+  T weight[3];
+
+  GV_HD Eight(const Vec3<T>& at, int32_t side) {
+    using Real = RealOf<T>;
+    for (int axis = 0; axis < 3; ++axis) {
+      const T place = clamp(at[axis], static_cast<Real>(0), static_cast<Real>(side - 1));
+      cell[axis] = voxel_below(place, side);
+      weight[axis] = place - static_cast<T>(cell[axis]);
+    }
+  }
+  // Their values, blended; pair(y, z) gives those of two neighbours along x.
+  template <class Pair>
+  GV_HD T blend(const Pair& pair) const {
+    T plane[2];
+    for (int z = 0; z < 2; ++z) {
+      T row[2];
+      for (int y = 0; y < 2; ++y) {
+        T left, right;
+        pair(y, z, left, right);
+        row[y] = left + weight[0] * (right - left);
+      }
+      plane[z] = row[0] + weight[1] * (row[1] - row[0]);
+    }
+    return plane[0] + weight[2] * (plane[1] - plane[0]);
+  }
+};
+
+// Value at a place of a brick. kSide > 0: a brick of one channel and that side, so that eight addresses are one address
+// and seven constants.
 template <int32_t kSide = 0, class T, class Voxel>
 GV_HD T trilinear(const Voxel* voxels, int32_t any_side, int32_t channels, Vec3<T> at) {
   const int32_t side = kSide > 0 ? kSide : any_side;
-  int32_t index[3];
-  T weight[3];
-  const T last = static_cast<T>(side - 1);
-  for (int axis = 0; axis < 3; ++axis) {
-    const T place = clamp(at[axis], static_cast<T>(0), last);
-    const int32_t cell = smaller(static_cast<int32_t>(place), side - 2);
-    index[axis] = cell;
-    weight[axis] = place - static_cast<T>(cell);
-  }
   const int32_t step_x = kSide > 0 ? 1 : channels;
   const int32_t step_y = step_x * side;
   const int32_t step_z = step_y * side;
-  const Voxel* corner = voxels + (index[2] * step_z + index[1] * step_y + index[0] * step_x);
-  T plane[2];
-  for (int z = 0; z < 2; ++z) {
-    T row[2];
-    for (int y = 0; y < 2; ++y) {
-      const Voxel* pair = corner + (z * step_z + y * step_y);
-      const T left = number<T>(pair[0]);
-      const T right = number<T>(pair[step_x]);
-      row[y] = left + weight[0] * (right - left);
-    }
-    plane[z] = row[0] + weight[1] * (row[1] - row[0]);
-  }
-  return plane[0] + weight[2] * (plane[1] - plane[0]);
+  const Eight<T> eight(at, side);
+  const Voxel* corner = voxels + (eight.cell[2] * step_z + eight.cell[1] * step_y + eight.cell[0] * step_x);
+  return eight.blend([&](int y, int z, T& left, T& right) {
+    const Voxel* first = corner + (z * step_z + y * step_y);
+    left = number<T>(first[0]);
+    right = number<T>(first[step_x]);
+  });
 }
 
 template <int32_t kSide = 0, class T, class Voxel>

@@ -18,18 +18,15 @@ namespace gvtorch {
 // packet.cpp, compiled once for each instruction set.
 namespace baseline {
 void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end);
-bool shades(const ShadeArgs& args);
 void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end);
 }  // namespace baseline
 #ifdef GV_X86
 namespace avx2 {
 void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end);
-bool shades(const ShadeArgs& args);
 void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end);
 }  // namespace avx2
 namespace avx512 {
 void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end);
-bool shades(const ShadeArgs& args);
 void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end);
 }  // namespace avx512
 #endif
@@ -38,7 +35,6 @@ void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end);
 struct Processor {
   const char* name = "baseline";
   decltype(&baseline::trace_chunk) trace_chunk = &baseline::trace_chunk;
-  decltype(&baseline::shades) shades = &baseline::shades;
   decltype(&baseline::shade_chunk) shade_chunk = &baseline::shade_chunk;
   Processor() {
 #ifdef GV_X86
@@ -50,12 +46,10 @@ struct Processor {
         __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl")) {
       name = "avx512";
       trace_chunk = &avx512::trace_chunk;
-      shades = &avx512::shades;
       shade_chunk = &avx512::shade_chunk;
     } else if ((allows("avx512") || allows("avx2")) && wide) {
       name = "avx2";
       trace_chunk = &avx2::trace_chunk;
-      shades = &avx2::shades;
       shade_chunk = &avx2::shade_chunk;
     }
 #endif
@@ -147,10 +141,13 @@ void split(const torch::stable::Tensor& like, int64_t count, const Keep& keep, c
 template <class Device>
 void trace(const torch::stable::Tensor& like, TraceArgs args, bool wide) {
   trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) {
-    if (!wide) return processor().trace_chunk(args, begin, end);
+    if (!wide && packs(args)) return processor().trace_chunk(args, begin, end);
     with_voxel(args.voxel, [&](auto voxel) {
-      const TraceRay<double, decltype(voxel)> kernel(args);
-      for (int64_t index = begin; index < end; ++index) kernel(index);
+      using Voxel = decltype(voxel);
+      const auto each = [&](const auto& kernel) {
+        for (int64_t index = begin; index < end; ++index) kernel(index);
+      };
+      wide ? each(TraceRay<double, Voxel>(args)) : each(TraceRay<float, Voxel>(args));
     });
   });
 }
@@ -160,7 +157,7 @@ void shade(const torch::stable::Tensor& like, ShadeArgs args, bool wide) {
   const auto run = [&](const auto& kernel) { for_each<Device>(like, kernel.order.count(), kernel); };
   if (wide) {
     with_shader<double>(args.shader, args, run);
-  } else if (processor().shades(args)) {
+  } else if (shades(args)) {
     trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) { processor().shade_chunk(args, begin, end); });
   } else {
     with_shader<float>(args.shader, args, run);

@@ -3,7 +3,7 @@
 
 #include <cstring>
 
-#include "hd.h"
+#include "arithmetic.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {

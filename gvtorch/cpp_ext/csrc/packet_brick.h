@@ -1,39 +1,34 @@
-// Bricks as packets read them, each lane in a brick of its own: the twin of brick.h.
+// Bricks as packets read them, each lane in a brick of its own. Coordinates, weights and blending are those of brick.h;
+// only the loads differ.
 #pragma once
 
-#include "brick.h"
-#include "simd.h"
+#include "probe.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-// Twin of BrickRay. A lane with a constant has no slope and reads the pool's first voxels in vain.
+// As BrickRay. A lane with a constant has no slope and reads the pool's first voxels in vain.
 struct PacketBrick {
-  Floats offset[3], slope[3];
+  Vec3<Floats> offset, slope;
   Floats constant;
   Mask stored;
-  Ints brick;  // its first byte in the pool, or its number where that takes 64 bits
+  Ints brick;  // as `first_of` of what reads it has it
 
   GV_HD Vec3<Floats> at(Floats t) const {
-    return {offset[0] + t * slope[0], offset[1] + t * slope[1], offset[2] + t * slope[2]};
+    return {offset.x + t * slope.x, offset.y + t * slope.y, offset.z + t * slope.z};
   }
 };
 
-// One component of a channel of the brick pool.
+// A channel of the brick pool.
 struct PacketPool {
-  const void* first;  // of the first voxel
+  const void* first;  // of the first voxel: the number to read
   int64_t stride;     // bytes of a brick
   int32_t side, channels;
 
   PacketPool(const void* bricks, VoxelType type, int32_t side, int32_t channels, int32_t component)
-      : side(side), channels(channels) {
-    with_voxel(type, [&](auto voxel) {
-      first = static_cast<const decltype(voxel)*>(bricks) + component;
-      stride = int64_t{sizeof(voxel)} * side * side * side * channels;
-    });
+      : stride(brick_bytes(type, side, channels)), side(side), channels(channels) {
+    with_voxel(type, [&](auto voxel) { first = static_cast<const decltype(voxel)*>(bricks) + component; });
   }
-  // Loads of 4 bytes may reach behind a voxel, but never behind the pool; places in a brick are counted in a float.
-  bool fits() const { return stride >= 4 && stride < 1 << 24; }
   // Offsets in the pool need 64 bits.
   bool far(int64_t bricks) const { return stride * bricks > INT32_MAX; }
 };
@@ -50,44 +45,76 @@ GV_HD Ints load_words(const PacketPool& pool, Ints brick, Ints offset) {
   return word;
 }
 
-// Two neighbours along x, blended. One load serves both where they lie in 4 bytes.
-template <class Voxel, bool kFar>
-GV_HD Floats sample_row(const PacketPool& pool, Ints brick, Ints offset, int32_t step_x, Floats weight) {
-  constexpr int32_t kBytes = sizeof(Voxel);
-  const Ints word = load_words<kFar>(pool, brick, offset);
-  Ints next;
-  if (kBytes <= 2 && step_x == kBytes) {
-    next = (word >> (8 * kBytes % 32)) & ((1 << (8 * kBytes % 32)) - 1);
-  } else {
-    next = load_words<kFar>(pool, brick, offset + step_x);
-  }
-  const Floats from = Unpack<Voxel>::low(word);
-  return from + weight * (Unpack<Voxel>::low(next) - from);
-}
-
-// Twin of `trilinear`. `brick`: as in PacketBrick.
+// Values at places of bricks, each told by its first byte in the pool; kFar: by its number, for offsets of 64 bits.
 template <class Voxel, bool kFar>
 GV_HD Floats trilinear(const PacketPool& pool, Ints brick, const Vec3<Floats>& at) {
-  const int32_t step_x = pool.channels * static_cast<int32_t>(sizeof(Voxel));
+  constexpr int32_t kBytes = sizeof(Voxel);
+  const int32_t step_x = pool.channels * kBytes;
   const int32_t step_y = step_x * pool.side;
   const int32_t step_z = step_y * pool.side;
-  const Floats last = Floats{} + static_cast<float>(pool.side - 1);
-  Floats cell[3], weight[3];
-  for (int axis = 0; axis < 3; ++axis) {
-    const Floats place = clamp(at[axis], Floats{}, last);
-    cell[axis] = smaller(to_floats(truncated(place)), last - 1.0f);
-    weight[axis] = place - cell[axis];
-  }
-  const Ints corner = truncated(cell[2] * static_cast<float>(step_z) + cell[1] * static_cast<float>(step_y) +
-                                cell[0] * static_cast<float>(step_x));
-  Floats plane[2];
-  for (int z = 0; z < 2; ++z) {
-    const Floats near = sample_row<Voxel, kFar>(pool, brick, corner + z * step_z, step_x, weight[0]);
-    const Floats behind = sample_row<Voxel, kFar>(pool, brick, corner + (z * step_z + step_y), step_x, weight[0]);
-    plane[z] = near + weight[1] * (behind - near);
-  }
-  return plane[0] + weight[2] * (plane[1] - plane[0]);
+  const Eight<Floats> eight(at, pool.side);
+  const Ints corner =
+      truncated(eight.cell[2] * static_cast<float>(step_z) + eight.cell[1] * static_cast<float>(step_y) +
+                eight.cell[0] * static_cast<float>(step_x));
+  return eight.blend([&](int y, int z, Floats& left, Floats& right) {
+    const Ints first = corner + (z * step_z + y * step_y);
+    const Ints word = load_words<kFar>(pool, brick, first);
+    left = Unpack<Voxel>::low(word);
+    if (kBytes <= 2 && step_x == kBytes) {  // one load serves both
+      right = Unpack<Voxel>::low((word >> (8 * kBytes % 32)) & ((1 << (8 * kBytes % 32)) - 1));
+    } else {
+      right = Unpack<Voxel>::low(load_words<kFar>(pool, brick, first + step_x));
+    }
+  });
 }
+
+template <class Voxel, bool kFar>
+GV_CALL Floats read_packet(PacketPool pool, int64_t shift, Ints brick, Floats x, Floats y, Floats z) {
+  pool.first = static_cast<const char*>(pool.first) + shift;
+  return trilinear<Voxel, kFar>(pool, kFar ? brick : brick * static_cast<int32_t>(pool.stride), {x, y, z});
+}
+
+// A channel whose dtype is known at run time. Bricks are told by their numbers.
+struct PacketChannel : ChannelView {
+  PacketPool pool;
+  int64_t bytes;  // of a number
+  decltype(&read_packet<float, false>) reader;
+
+  PacketChannel(const ChannelView& channel, int32_t side, int64_t bricks)
+      : ChannelView(channel), pool(bricks_bzyxc, type, side, width, 0) {
+    with_voxel(type, [&](auto voxel) {
+      using Voxel = decltype(voxel);
+      bytes = sizeof(Voxel);
+      reader = pool.far(bricks) ? &read_packet<Voxel, true> : &read_packet<Voxel, false>;
+    });
+  }
+  GV_HD Floats read(int32_t component, Ints brick, const Vec3<Floats>& at) const {
+    return reader(pool, component * bytes, brick, at.x, at.y, at.z);
+  }
+  GV_HD float constant(int32_t component, int32_t node) const {
+    return read_number<float>(constant_tnc, type, static_cast<int64_t>(node) * width + component);
+  }
+};
+
+// The values that a packet walks on: of a dtype known to the compiler, or only at run time.
+template <class Voxel, bool kFar>
+struct TypedValues {
+  const PacketPool pool;
+
+  TypedValues(const ChannelView& channel, int32_t side, int32_t component, int64_t)
+      : pool(channel.bricks_bzyxc, channel.type, side, channel.width, component) {}
+  GV_HD Ints first_of(Ints brick) const { return kFar ? brick : brick * static_cast<int32_t>(pool.stride); }
+  GV_HD Floats read(Ints brick, const Vec3<Floats>& at) const { return trilinear<Voxel, kFar>(pool, brick, at); }
+};
+struct AnyValues {
+  const PacketChannel channel;
+  const int32_t component;
+
+  AnyValues(const ChannelView& channel, int32_t side, int32_t component, int64_t bricks)
+      : channel(channel, side, bricks), component(component) {}
+  GV_HD Ints first_of(Ints brick) const { return brick; }
+  GV_HD Floats read(Ints brick, const Vec3<Floats>& at) const { return channel.read(component, brick, at); }
+};
 
 }  // namespace GV_NAMESPACE
 }  // namespace gvtorch

@@ -1,160 +1,217 @@
-// kLanes rays at once from node to node, each in a node and an interval of its own: the twin of walk.h for float32 and
-// an N that is a power of two. What is made of the values is told by `Self`, the packet of a shader (packet.h,
-// packet_shaders.h), which derives from PacketWalk<Self>. Each lane does what its ray does alone, so every bit is the
-// same.
+// kLanes rays at once through the tree with any shader of shaders.h, each lane in a node and an interval of its own,
+// for float32 and an N that is a power of two. Each lane does what its ray does alone, so every bit is the same.
 //
-// Lanes whose run of intervals has ended wait; the others march on together, until too few are left. What is rare (a
-// region of one value, the cut interval at the far side, the pool's last brick, a wish) is done lane by lane by the
+// A second walk beside that of walk.h, for two reasons. Lanes keep the path of their last descent and go on from where
+// the next one parts from it; a GPU's threads would have to keep it in local memory, which takes twice as long as to
+// begin again. And lanes whose run of intervals has ended wait, while the others march on together, until too few are
+// left. What is rare (the cut interval at the far side, the pool's last brick, a request) is done lane by lane by the
 // functions of a single ray.
 #pragma once
 
 #include "packet_brick.h"
-#include "packet_intervals.h"
-#include "packet_shade.h"
-#include "walk.h"
+#include "shade_rays.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-// An interval of every lane.
-struct PacketPiece {
-  Floats start, end, middle;
-  Floats value;        // in the middle
-  Floats front, back;  // at both ends, where the shader is of kEnds
+// A lane's own part of a struct of all lanes, and back.
+template <class One, class All>
+GV_HD One take_lane(const All& all, int lane) {
+  One one;
+  All::each(all, one, [&](const auto& own, auto& out) { out = lane_of(own, lane); });
+  return one;
+}
+template <class All, class One>
+GV_HD void put_lane(All& all, int lane, const One& one) {
+  All::each(all, one, [&](auto& own, const auto& in) { set_lane(own, lane, in); });
+}
+// The same of Sums. What keeps a Sum for each lane has functions of its own, see user_shader.h.
+template <class Sum, class Sums>
+GV_HD Sum sum_of(const Sums& sums, int lane) {
+  return take_lane<Sum>(sums, lane);
+}
+template <class Sums, class Sum>
+GV_HD void put_sum(Sums& sums, int lane, const Sum& one) {
+  put_lane(sums, lane, one);
+}
+
+struct PacketChannels {
+  const PacketChannel value, normal, other;
 };
 
-// What Self has:
-//
-//   kEnds, kSeesEmpty       as in shaders.h
-//   kKeepsPath              which nodes are hidden is the same for all rays
-//   begin_ray(lane)         the lane has a new ray, numbers[lane]
-//   end_ray(lane)           writes what is known of it
-//   hides(lane, node)       nothing in the node is seen
-//   first_of(brick)         PacketBrick::brick of the brick's number
-//   read(brick, at)         the value at a place of a brick
-//   constant(node)          the value of a node without a brick
-//   uniform(which)          lanes in a region of one value, of those where two nodes answer and neither has a brick
-//   add(seeing, piece)      adds an interval of those lanes
-//   begin_run(which)        the lanes' next intervals are alike
-//   shades_each_place()     a region of one value is sampled like others
-//   add_region(lane, start, end)   adds a region of one value
-//   march_node(lane, visit, at)    adds all intervals of a node that are to come; returns how many
-template <class Self>
+// Is the probe (see probe.h) of the lanes that march. Values: TypedValues or AnyValues.
+template <class Shader, class Values>
 struct PacketWalk {
+  using Number = Floats;
+  using Kernel = ShadeRay<float, Shader>;
+  using Sum = typename Shader::Sum;
+  static constexpr bool kEnds = Shader::kEnds;
+  static constexpr bool kKeepsPath = Kernel::kHidesAlike;  // else the nodes that are hidden differ from ray to ray
+
+  const Kernel& kernel;
   const Walk<float>& walk;
+  const Shader& shader;
+  const Values values;
+  const PacketChannels channels;
   uint8_t* const hidden_tn;
-  int32_t* const stamp_b;
   const int64_t bricks;
-  const int32_t lengths, border;
-  const float stop_clear, hit_clear;
+  const float stop_clear;
   const int32_t frame;
 
   // Rays.
   int64_t numbers[kLanes];
-  Floats origin[3], direction[3], inverse[3], moved;
-  PacketIntervals at;
+  Ray<Floats> ray;
+  Sight<Floats> sight;
+  Intervals<Floats> at;
   Mask alive;
   Ints wanted;
-  PacketSum sum;
+  typename Shader::template SumOf<Floats> sum;
   Ints samples;
 
   // The last descent: a node of each level, below 0 (bit 31) where it is hidden.
-  Ints cell[3];
-  Ints path_depth;
+  Vec3<Ints> cell{};
+  Ints path_depth = Ints{} - 1;
   Ints path_node[kMostLevels], path_brick[kMostLevels], path_tile[kMostLevels];
 
   // The run of intervals that a lane is in.
+  Mask marching;  // lanes that are asked for values
   Ints left;
-  Floats number, exit, cone_low, cone_high;
+  Floats number;
+  Extent<Floats> extent;
   Floats voxel, blend_scale;
   Floats back;  // value where the last interval ended
   Mask mixed;
   PacketBrick fine, coarse;
   Ints fine_depth, coarse_depth;
 
-  PacketWalk(const Walk<float>& walk, const TraceArgs& args)
-      : walk(walk),
+  PacketWalk(const Kernel& kernel, const ShadeArgs& args)
+      : kernel(kernel),
+        walk(kernel),
+        shader(kernel.shader),
+        values(kernel.channels.value, args.side, args.component, args.bricks),
+        channels{{kernel.channels.value, args.side, args.bricks},
+                 {kernel.channels.normal, args.side, args.bricks},
+                 {kernel.channels.other, args.side, args.bricks}},
         hidden_tn(args.hidden_tn),
-        stamp_b(args.stamp_b),
         bricks(args.bricks),
-        lengths(args.levels),
-        border(args.border),
-        stop_clear(1 - walk.options.stop_alpha),
-        hit_clear(1 - walk.options.depth_alpha),
-        frame(*walk.frame_1) {
-    path_depth = Ints{} - 1;
-    for (int axis = 0; axis < 3; ++axis) cell[axis] = Ints{};
-  }
+        stop_clear(kernel.stop_clear),
+        frame(*kernel.frame_1) {}
 
   // Traces the rays at places begin to end of the order, at most kLanes.
   GV_HD void trace(int64_t begin, int64_t end) {
     load(begin, end);
     while (any(alive)) {
-      const Mask waiting = alive & (left == 0);
+      const Mask waiting = alive && left == 0;
       if (any(waiting)) go_on(waiting);
-      Mask marching = alive & (left > 0);
+      Mask marching = alive && left > 0;
       const int32_t enough = count(alive) / 2 + 1;
       while (count(marching) >= enough) marching = march(marching);
     }
     for (int lane = 0; lane < kLanes; ++lane) {
-      const int64_t ray = numbers[lane];
-      if (ray < 0) continue;
-      self().end_ray(lane);
+      if (numbers[lane] >= 0) end_ray(lane);
     }
   }
 
- protected:
-  GV_HD Self& self() { return static_cast<Self&>(*this); }
+  // As those of Probe, for all lanes that march.
+  GV_HD Floats value(Floats t) const {
+    const Floats value = value_in(fine, t);
+    if (!any(mixed && marching)) return value;
+    return mixed ? value + weight(t) * (value_in(coarse, t) - value) : value;
+  }
+  GV_HD Floats number_at(const PacketChannel& channel, int32_t component, Floats t) const {
+    const Floats number = number_in(channel, component, fine, fine_depth, t);
+    if (!any(mixed && marching)) return number;
+    const Floats other = number_in(channel, component, coarse, coarse_depth, t);
+    return mixed ? number + weight(t) * (other - number) : number;
+  }
+  GV_HD Vec3<Floats> gradient(Floats t) const {
+    Vec3<Floats> slope = differences(fine, fine_depth, t);
+    if (!any(mixed && marching)) return slope;
+    const Vec3<Floats> other = differences(coarse, coarse_depth, t);
+    const Floats part = weight(t);
+    for (int axis = 0; axis < 3; ++axis) {
+      slope[axis] = mixed ? slope[axis] + part * (other[axis] - slope[axis]) : slope[axis];
+    }
+    return slope;
+  }
+
+  GV_HD void narrow(Mask which) { marching = which; }
+  // body(lane, probe) with each lane's own.
+  template <class Body>
+  GV_HD void each(Mask which, const Body& body, KnownGradient<float>* known = nullptr) const {
+    const double* cube = walk.rays.place_33 + 3;
+    for_lanes(which, [&](int lane) {
+      const Sight<float> own_sight = take_lane<Sight<float>>(sight, lane);
+      const Spot<float> one = spot_of(lane, fine, fine_depth);
+      const bool two = mixed[lane] != 0;
+      Probe<float> probe(kernel.channels, own_sight, one, two ? spot_of(lane, coarse, coarse_depth) : one, two,
+                         at.near[lane], at.growth[lane], voxel[lane], blend_scale[lane],
+                         {static_cast<float>(cube[0]), static_cast<float>(cube[1]), static_cast<float>(cube[2])});
+      probe.known = known;
+      body(lane, probe);
+    });
+  }
+
+ private:
+  using Visitor = typename Kernel::template Visitor<Shader, BitDigits<float>>;
 
   GV_HD void load(int64_t begin, int64_t end) {
     alive = Mask{};
     left = wanted = samples = mixed = fine_depth = coarse_depth = Ints{};
-    number = exit = cone_low = cone_high = voxel = blend_scale = back = moved = Floats{};
-    sum = PacketSum{};
-    sum.clear = Floats{} + 1.0f;
-    sum.depth = Floats{} + INFINITY;
+    number = voxel = blend_scale = back = Floats{};
+    extent = Extent<Floats>{};
+    sum = {};
     fine = coarse = PacketBrick{};
-    at = PacketIntervals{};
+    ray = Ray<Floats>{};
+    at = Intervals<Floats>{};
     at.step = walk.options.step;
-    at.top = lengths - 1;
-    at.length = Floats{} + at.step;
+    at.top = kernel.lengths - 1;
+    at.length = splat<Floats>(at.step);
     at.shortness = 1.0f / at.length;
-    for (int axis = 0; axis < 3; ++axis) origin[axis] = direction[axis] = inverse[axis] = Floats{};
+    for (int axis = 0; axis < 3; ++axis) ray.high[axis] = static_cast<float>(walk.rays.place_33[6 + axis]);
     for (int lane = 0; lane < kLanes; ++lane) {
       numbers[lane] = begin + lane < end ? walk.order(begin + lane) : -1;
       if (numbers[lane] < 0) continue;
-      const Ray<float> ray(walk.rays, numbers[lane]);
-      for (int axis = 0; axis < 3; ++axis) {
-        origin[axis][lane] = ray.origin[axis];
-        direction[axis][lane] = ray.direction[axis];
-        inverse[axis][lane] = ray.inverse[axis];
-      }
-      at.near[lane] = ray.cone_near;
-      at.growth[lane] = ray.cone_growth;
-      at.start[lane] = at.base[lane] = ray.first;
-      at.stop[lane] = ray.last;
-      moved[lane] = ray.moved;
-      sum.clear[lane] = static_cast<float>(walk.rays.clear(numbers[lane]));
+      const Ray<float> one(walk.rays, numbers[lane]);
+      put_lane(ray, lane, one);
+      put_lane(sight, lane, Sight<float>(walk.rays, numbers[lane], one.moved));
+      at.near[lane] = one.cone_near;
+      at.growth[lane] = one.cone_growth;
+      at.start[lane] = at.base[lane] = one.first;
+      at.stop[lane] = one.last;
+      float* feature_c = kernel.features_rc + numbers[lane] * kernel.features;
+      for (int32_t c = 0; c < kernel.features; ++c) feature_c[c] = 0;
+      sum.begin(lane, static_cast<float>(walk.rays.clear(numbers[lane])), kernel.hit_clear, feature_c);
       alive[lane] = -1;
-      self().begin_ray(lane);
     }
     at.choose_level(alive);
-    alive = alive & at.inside() & (sum.clear > stop_clear);
+    alive = alive && at.inside() && sum.clear > stop_clear;
+  }
+
+  GV_HD void end_ray(int lane) {
+    auto&& one = sum_of<Sum>(sum, lane);
+    if constexpr (Shader::kSurface) {
+      if (one.depth < INFINITY) {
+        const Ray<float> own(walk.rays, numbers[lane]);
+        kernel.template surface<BitDigits<float>>(own, take_lane<Sight<float>>(sight, lane), one);
+      }
+    }
+    kernel.finish(numbers[lane], ray.moved[lane], samples[lane], one);
   }
 
   // Lanes without a run: begins the next one in the same node, or visits the next node.
   GV_HD void go_on(Mask waiting) {
-    const Mask ran = waiting & (number > at.count);
+    const Mask ran = waiting && number > at.count;
     at.go(ran, number);
-    alive = alive & ~(waiting & ~(at.inside() & (sum.clear > stop_clear)));
-    const Mask again = ran & alive & at.stays(exit, cone_low, cone_high);
-    Mask next = waiting & alive & ~again;
+    alive = alive && !(waiting && !(at.inside() && sum.clear > stop_clear));
+    const Mask again = ran && alive && at.stays(extent);
+    const Mask next = waiting && alive && !again;
     if (any(again)) begin_run(again);
     if (any(next)) visit(next);
-    alive = alive & ~(waiting & (left == 0) & ~(at.inside() & (sum.clear > stop_clear)));
+    alive = alive && !(waiting && left == 0 && !(at.inside() && sum.clear > stop_clear));
   }
 
-  // Twin of Walk::find, and of what a kernel does with the visit.
+  // As Walk::find, and what Walk::follow does with the visit.
   GV_HD void visit(Mask which) {
     const TreeView& tree = walk.tree;
     const Levels<float>& levels = walk.levels;
@@ -176,24 +233,16 @@ struct PacketWalk {
     const Floats own = pick(levels.voxel, wanted);
     const Mask reached = own <= cone;
     const Mask blend = reached & (wanted > 0);
-    cone_low = which ? (reached ? own : Floats{} - INFINITY) : cone_low;
-    cone_high = which ? (reached ? above : own) : cone_high;
+    extent.cone_low = which ? (reached ? own : Floats{} - INFINITY) : extent.cone_low;
+    extent.cone_high = which ? (reached ? above : own) : extent.cone_high;
     voxel = which ? own : voxel;
     blend_scale = which ? 1.0f / (above - own) : blend_scale;
 
     Ints reach, node, brick, tile;
     descend(which, middle, reach, node, brick, tile);
     const Mask hides = node < 0;
-    const Ints shift = tree.digit_bits * (tree.max_depth - reach);
-    const Floats size = pick(levels.size, reach);
-    Floats face = Floats{} + INFINITY;
-    for (int axis = 0; axis < 3; ++axis) {
-      const Floats low = to_floats(cell[axis] >> shift) * size;
-      const Floats side = direction[axis] > 0.0f ? low + size : low;
-      const Floats leave = (side - origin[axis]) * inverse[axis];
-      face = direction[axis] == 0.0f ? face : smaller(face, leave);
-    }
-    exit = which ? face : exit;
+    const Floats face = ray.leave(corner(reach), pick(levels.size, reach));
+    extent.exit = which ? face : extent.exit;
 
     // The nodes whose bricks answer.
     Ints fine_level = reach, fine_brick = brick;
@@ -217,7 +266,7 @@ struct PacketWalk {
       coarse_brick = found ? coarse_brick : fine_brick;
     }
     const Mask clears = hides & ((reach < wanted) | ~blend);
-    const Mask empty = Self::kSeesEmpty ? Mask{} : (fine_brick == kEmpty) & (coarse_brick == kEmpty);
+    const Mask empty = Shader::kSeesEmpty ? Mask{} : (fine_brick == kEmpty) & (coarse_brick == kEmpty);
     const Mask nothing = which & (clears | (fine_brick == kAbsent) | empty);
 
     const Mask seen = which & ~clears;
@@ -237,8 +286,8 @@ struct PacketWalk {
         walk.mark_missing(place, wanted[lane], blend[lane] != 0, cone[lane]);
       });
     }
-    stamp(stamp_b, seen & (fine_brick >= 0), fine_brick);
-    stamp(stamp_b, seen & (coarse_brick >= 0), coarse_brick);
+    stamp(walk.stamp_b, seen & (fine_brick >= 0), fine_brick);
+    stamp(walk.stamp_b, seen & (coarse_brick >= 0), coarse_brick);
 
     Mask runs = which & ~nothing;
     if (any(runs)) {
@@ -249,32 +298,25 @@ struct PacketWalk {
       aim(runs, fine_level, fine_brick, fine);
       const Mask both = runs & differ;
       if (any(both)) aim(both, coarse_level, coarse_brick, coarse);
-      Mask flat = runs & ~fine.stored & (~differ | ~coarse.stored);
-      if (self().shades_each_place()) flat = Mask{};
-      if (any(flat & differ)) flat = flat & (~differ | self().uniform(flat & differ));
-      if (any(flat)) {
-        const Floats entry = at.start;
-        leave(flat);
-        for_lanes(flat,
-                  [&](int lane) { self().add_region(lane, entry[lane], smaller(at.start[lane], at.stop[lane])); });
-        samples = samples - flat;
-        runs = runs & ~flat;
-      }
+      Mask flat = runs && !fine.stored && (!differ || !coarse.stored);
+      if (kernel.shades_each_place()) flat = Mask{};
+      each(flat && differ, [&](int lane, const Probe<float>& probe) { set_lane(flat, lane, probe.uniform()); });
+      runs = runs && !flat;
       if (any(runs)) begin_run(runs);
+      if (any(flat)) add_region(flat);
     }
     leave(nothing);
   }
 
-  // Twin of `descend` in tree.h, level by level for all lanes: those whose known part of the path ends deeper wait.
+  // As `descend` in tree.h, level by level for all lanes: those whose known part of the path ends deeper wait.
   GV_HD void descend(Mask which, Floats middle, Ints& reach, Ints& node, Ints& brick, Ints& tile) {
     const TreeView& tree = walk.tree;
     const int32_t top = tree.digit_bits * tree.max_depth;
     const float cells = static_cast<float>(1 << top);
     Ints parted{};
+    const Vec3<Floats> place = ray.at(middle);
     for (int axis = 0; axis < 3; ++axis) {
-      const float high = static_cast<float>(walk.rays.place_33[6 + axis]) * 0.9999999f;
-      const Floats place = clamp(origin[axis] + middle * direction[axis], Floats{}, Floats{} + high);
-      const Ints here = which ? truncated(place * cells) : cell[axis];
+      const Ints here = which ? truncated(place[axis] * cells) : cell[axis];
       parted = parted | (cell[axis] ^ here);
       cell[axis] = here;
     }
@@ -282,7 +324,7 @@ struct PacketWalk {
     const Ints high = ((Ints)to_floats(parted) >> 23) - 126;
     const Ints equal = truncated(to_floats(top - high) / static_cast<float>(tree.digit_bits));
     Ints known = parted == 0 ? path_depth : smaller(path_depth, equal);
-    known = Self::kKeepsPath ? smaller(known, wanted) : Ints{} - 1;
+    known = kKeepsPath ? smaller(known, wanted) : Ints{} - 1;
     const Ints from = larger(known, Ints{});
     node = own_lane(path_node, from);
     brick = own_lane(path_brick, from);
@@ -296,7 +338,7 @@ struct PacketWalk {
       Ints next = Ints{} + tree.root, home = Ints{} + tree.root_tile;
       if (level > 0) {
         const int32_t shift = top - level * tree.digit_bits, mask = (1 << tree.digit_bits) - 1;
-        const Ints x = (cell[0] >> shift) & mask, y = (cell[1] >> shift) & mask, z = (cell[2] >> shift) & mask;
+        const Ints x = (cell.x >> shift) & mask, y = (cell.y >> shift) & mask, z = (cell.z >> shift) & mask;
         home = here ? tile : Ints{};
         next = home * tree.nodes_per_tile + ((z << (2 * tree.digit_bits)) | (y << tree.digit_bits) | x);
       }
@@ -319,12 +361,16 @@ struct PacketWalk {
 
   GV_HD Mask hidden(Mask here, Ints node) {
     Mask hides{}, unknown = here;
-    if constexpr (Self::kKeepsPath) {
+    if constexpr (kKeepsPath) {
       const Ints known = gather(hidden_tn, node) & 0xff;
-      hides = here & (known == kHidden);
-      unknown = here & (known == kUnknown);
+      hides = here && known == kHidden;
+      unknown = here && known == kUnknown;
     }
-    for_lanes(unknown, [&](int lane) { hides[lane] = self().hides(lane, node[lane]) ? -1 : 0; });
+    for_lanes(unknown, [&](int lane) {
+      const bool found = kernel.hides(shader, node[lane], sum_of<Sum>(sum, lane));
+      if (kKeepsPath) store_byte(&hidden_tn[node[lane]], found ? kHidden : kShown);
+      set_lane(hides, lane, found);
+    });
     return hides;
   }
 
@@ -339,126 +385,148 @@ struct PacketWalk {
     return pick(reinterpret_cast<const int32_t*>(path), level * kLanes + lane_numbers());
   }
 
-  // Goes to the first interval behind the node.
+  // Low corners of the nodes of these depths that the lanes are in.
+  GV_HD Vec3<Floats> corner(Ints depth) const {
+    const Ints shift = walk.tree.digit_bits * (walk.tree.max_depth - depth);
+    const Floats size = pick(walk.levels.size, depth);
+    return {to_floats(cell.x >> shift) * size, to_floats(cell.y >> shift) * size, to_floats(cell.z >> shift) * size};
+  }
+
   GV_HD void leave(Mask which) {
-    for (Mask inside = which; any(inside); inside = inside & at.stays(exit, cone_low, cone_high)) {
-      const Ints whole = at.run(inside, exit, cone_low, cone_high);
-      const Ints intervals = at.cut() ? Ints{} + 1 : whole;
-      at.go(inside, at.count + to_floats(intervals));
-    }
+    at.leave(which, extent);
     number = which ? at.count : number;
   }
 
-  GV_HD void aim(Mask which, Ints holder_depth, Ints brick, PacketBrick& ray) {
+  GV_HD void aim(Mask which, Ints holder_depth, Ints brick, PacketBrick& to) {
     const Mask stored = brick >= 0;
     const Floats scale = pick(walk.levels.scale, holder_depth);
-    const Floats size = pick(walk.levels.size, holder_depth);
-    const Ints shift = walk.tree.digit_bits * (walk.tree.max_depth - holder_depth);
-    const float first = static_cast<float>(border) - 0.5f;
+    const Vec3<Floats> low = corner(holder_depth);
+    const float first = static_cast<float>(kernel.channels.border) - 0.5f;
     for (int axis = 0; axis < 3; ++axis) {
-      const Floats corner = to_floats(cell[axis] >> shift) * size;
-      const Floats offset = (origin[axis] - corner) * scale + first;
-      const Floats slope = direction[axis] * scale;
-      ray.offset[axis] = which ? (stored ? offset : Floats{}) : ray.offset[axis];
-      ray.slope[axis] = which ? (stored ? slope : Floats{}) : ray.slope[axis];
+      const Floats offset = (ray.origin[axis] - low[axis]) * scale + first;
+      const Floats slope = ray.direction[axis] * scale;
+      to.offset[axis] = which ? (stored ? offset : Floats{}) : to.offset[axis];
+      to.slope[axis] = which ? (stored ? slope : Floats{}) : to.slope[axis];
     }
-    ray.stored = which ? stored : ray.stored;
-    ray.brick = which ? (stored ? self().first_of(brick) : Ints{}) : ray.brick;
-    for_lanes(which & ~stored, [&](int lane) { ray.constant[lane] = self().constant(node_of(lane, holder_depth)); });
+    to.stored = which ? stored : to.stored;
+    to.brick = which ? (stored ? values.first_of(brick) : Ints{}) : to.brick;
+    for_lanes(which & ~stored, [&](int lane) { to.constant[lane] = constant_of(lane, holder_depth); });
+  }
+  GV_HD float constant_of(int lane, Ints depth) const {
+    return channels.value.constant(kernel.channels.component, node_of(lane, depth));
   }
   GV_HD int32_t node_of(int lane, Ints depth) const { return path_node[depth[lane]][lane] & INT32_MAX; }
 
   // Begins the run of intervals that are alike; lanes that need care are done with the node at once.
   GV_HD void begin_run(Mask which) {
-    const Ints last = self().first_of(Ints{} + static_cast<int32_t>(bricks - 1));
-    const Mask end = (fine.stored & (fine.brick == last)) | (mixed & coarse.stored & (coarse.brick == last));
-    const Mask careful = which & (at.cut() | end);
+    const Ints last = values.first_of(Ints{} + static_cast<int32_t>(bricks - 1));
+    const Mask end = (fine.stored && fine.brick == last) || (mixed && coarse.stored && coarse.brick == last);
+    const Mask careful = which && (at.cut() || end);
     if (any(careful)) {
-      for_lanes(careful, [&](int lane) { march_alone(lane); });
+      march_alone(careful);
       fine.brick = careful ? Ints{} : fine.brick;  // what other lanes read in vain must lie in the pool
       coarse.brick = careful ? Ints{} : coarse.brick;
-      which = which & ~careful;
+      which = which && !careful;
     }
-    left = which ? at.run(which, exit, cone_low, cone_high) : left;
+    left = which ? at.run(which, extent) : left;
     number = which ? at.count : number;
-    if constexpr (Self::kEnds) {
-      if (any(which)) back = which ? value(which, at.start) : back;
+    if constexpr (kEnds) {
+      marching = which;
+      if (any(which)) back = which ? value(at.start) : back;
     }
-    self().begin_run(which);
+  }
+
+  // A region of one value, as one interval.
+  GV_HD void add_region(Mask which) {
+    Piece<Floats> piece;
+    piece.odd = true;
+    piece.start = at.start;
+    leave(which);
+    piece.end = smaller(at.start, at.stop);
+    piece.length = piece.end - piece.start;
+    piece.middle = piece.start + piece.length * 0.5f;
+    piece.value = piece.front = piece.back = fine.constant;
+    samples = samples - which;
+    marching = which;
+    shader.add(which, piece, *this, sum);
   }
 
   // One interval of all lanes that march; returns those whose run goes on. Nothing that leads to the next sample waits
   // for this one's colour: a lane that has seen enough marches on in vain to the end of its run.
   GV_HD Mask march(Mask which) {
-    PacketPiece piece;
+    marching = which;
+    Piece<Floats> piece;
     piece.middle = at.middle_of(number);
     piece.start = at.start_of(number);
     piece.end = at.start_of(number + 1.0f);
+    piece.length = at.length;
+    piece.level = at.level;
     number = number - to_floats(which);
     left = left + which;
-    if constexpr (Self::kEnds) {
+    if constexpr (kEnds) {
       piece.front = back;
-      piece.back = back = value(which, piece.end);
+      piece.back = back = value(piece.end);
     } else {
-      piece.value = value(which, piece.middle);
+      piece.value = value(piece.middle);
     }
-    const Mask seeing = which & (sum.clear > stop_clear);
+    const Mask seeing = which && sum.clear > stop_clear;
     samples = samples - seeing;
-    self().add(seeing, piece);
-    return which & (left > 0);
+    shader.add(seeing, piece, *this, sum);
+    return which && left > 0;
   }
 
-  GV_HD Floats value(Mask which, Floats t) {
-    const Floats value = value_of(fine, t);
-    if (!any(mixed & which)) return value;
-    return mixed ? value + weight(t) * (value_of(coarse, t) - value) : value;
+  __attribute__((noinline)) void march_alone(Mask which) {
+    each(which, [&](int lane, const Probe<float>& probe) {
+      auto one = take_lane<Intervals<float>>(at, lane);
+      const Extent<float> own{extent.exit[lane], extent.cone_low[lane], extent.cone_high[lane]};
+      auto&& own_sum = sum_of<Sum>(sum, lane);
+      Visitor visitor{kernel, shader, nullptr, nullptr, own_sum};
+      kernel.march(own, one, visitor, probe);
+      put_sum(sum, lane, own_sum);
+      put_lane(at, lane, one);
+      samples[lane] += visitor.samples;
+      number[lane] = one.count;
+    });
   }
-  GV_HD Floats value_of(const PacketBrick& ray, Floats t) {
-    const Floats value = self().read(ray.brick, ray.at(t));
-    return ray.stored ? value : ray.constant;
+
+  GV_HD Floats value_in(const PacketBrick& brick, Floats t) const {
+    const Floats value = values.read(brick.brick, brick.at(t));
+    return brick.stored ? value : brick.constant;
+  }
+  GV_HD Floats number_in(const PacketChannel& channel, int32_t component, const PacketBrick& brick, Ints depth,
+                         Floats t) const {
+    Floats number = channel.read(component, brick.brick, brick.at(t));
+    for_lanes(marching && !brick.stored,
+              [&](int lane) { number[lane] = channel.constant(component, node_of(lane, depth)); });
+    return number;
+  }
+  GV_HD Vec3<Floats> differences(const PacketBrick& brick, Ints depth, Floats t) const {
+    const Vec3<Floats> place = brick.at(t);
+    const Floats scale = pick(walk.levels.scale, depth);
+    Vec3<Floats> slope;
+    for (int axis = 0; axis < 3; ++axis) {
+      Vec3<Floats> below = place, above = place;
+      below[axis] = place[axis] - 0.5f;
+      above[axis] = place[axis] + 0.5f;
+      const Floats rise = values.read(brick.brick, above) - values.read(brick.brick, below);
+      const Floats per_unit = scale / static_cast<float>(walk.rays.place_33[3 + axis]);
+      slope[axis] = brick.stored ? rise * per_unit : Floats{};
+    }
+    return slope;
   }
   // Of the coarse node.
-  GV_HD Floats weight(Floats t) const { return clamp((at.cone(t) - voxel) * blend_scale, Floats{}, Floats{} + 1.0f); }
-
-  __attribute__((noinline)) void march_alone(int lane) {
-    Intervals<float> one;
-    one.near = at.near[lane];
-    one.growth = at.growth[lane];
-    one.step = at.step;
-    one.stop = at.stop[lane];
-    one.top = at.top;
-    one.level = at.level[lane];
-    one.base = at.base[lane];
-    one.length = at.length[lane];
-    one.shortness = at.shortness[lane];
-    one.count = at.count[lane];
-    one.start = at.start[lane];
-    Visit<float> visit;
-    visit.exit = exit[lane];
-    visit.cone_low = cone_low[lane];
-    visit.cone_high = cone_high[lane];
-    samples[lane] += self().march_node(lane, visit, one);
-    at.level[lane] = one.level;
-    at.base[lane] = one.base;
-    at.length[lane] = one.length;
-    at.shortness[lane] = one.shortness;
-    at.count[lane] = one.count;
-    at.start[lane] = one.start;
-    number[lane] = one.count;
+  GV_HD Floats weight(Floats t) const { return clamp((at.cone(t) - voxel) * blend_scale, 0.0f, 1.0f); }
+  GV_HD Spot<float> spot_of(int lane, const PacketBrick& brick, Ints depth) const {
+    return {node_of(lane, depth), brick.stored[lane] ? path_brick[depth[lane]][lane] : kAbsent,
+            walk.levels.scale[depth[lane]], lane_of(brick.offset, lane), lane_of(brick.slope, lane)};
   }
 };
 
-// Whether packets can take the rays: their pools are as the loads above need them, which find nodes by 32-bit bytes.
-inline bool packs(const TraceArgs& args) {
-  constexpr int64_t kMostNodes = INT32_MAX / sizeof(int32_t);
-  const PacketPool pool(args.bricks_bzyxc, args.voxel, args.side, args.channels, args.component);
-  return digit_bits_of(args.branching, args.max_depth) > 0 && args.nodes <= kMostNodes && args.bricks >= 2 &&
-         pool.fits();
-}
-
-template <class Packet, class... Args>
-void trace_packets(int64_t begin, int64_t end, const Args&... args) {
-  Packet packet(args...);
+// Traces a share of the rays.
+template <class Shader, class Values>
+void trace_packets(const ShadeArgs& args, int64_t begin, int64_t end) {
+  const ShadeRay<float, Shader> kernel(args);
+  PacketWalk<Shader, Values> packet(kernel, args);
   for (int64_t index = begin; index < end; index += kLanes) packet.trace(index, smaller(index + kLanes, end));
 }
 

@@ -42,10 +42,13 @@ GV_HD T dot(Vec3<T> a, Vec3<T> b) {
 template <class T>
 GV_HD Vec3<T> unit(Vec3<T> v) {
   const T most = larger(larger(larger(v.x, -v.x), larger(v.y, -v.y)), larger(v.z, -v.z));
-  if (!(most > 0 && most < static_cast<T>(INFINITY))) return {0, 0, 0};
-  const Vec3<T> scaled{v.x / most, v.y / most, v.z / most};
-  const T length = sqrt(dot(scaled, scaled));
-  return {scaled.x / length, scaled.y / length, scaled.z / length};
+  const MaskOf<T> some = most > 0 && most < static_cast<RealOf<T>>(INFINITY);
+  Vec3<T> scaled{};
+  if (!any(some)) return scaled;
+  scaled = {v.x / most, v.y / most, v.z / most};
+  const T length = square_root(dot(scaled, scaled));
+  for (int axis = 0; axis < 3; ++axis) scaled[axis] = select(some, scaled[axis] / length, T{});
+  return scaled;
 }
 
 // One node seen along one ray: place in its brick, in voxels = offset + t * slope.
@@ -64,6 +67,7 @@ struct Sight {
   Vec3<T> origin, direction;
   T moved;  // distance from the camera to where t counts from
 
+  Sight() = default;
   GV_HD Sight(Vec3<T> origin, Vec3<T> direction) : origin(origin), direction(direction), moved(0) {}
   GV_HD Sight(const RayView& rays, int64_t index, T moved) : moved(moved) {
     for (int axis = 0; axis < 3; ++axis) {
@@ -74,6 +78,14 @@ struct Sight {
   GV_HD Vec3<T> at(T t) const {
     const T far = t + moved;
     return {origin.x + far * direction.x, origin.y + far * direction.y, origin.z + far * direction.z};
+  }
+
+  // body(number, other's) for each number that a lane has of its own.
+  template <class Own, class Other, class Body>
+  GV_HD static void each(Own& own, Other& other, const Body& body) {
+    body(own.origin, other.origin);
+    body(own.direction, other.direction);
+    body(own.moved, other.moved);
   }
 };
 
@@ -93,6 +105,7 @@ struct KnownGradient {
 
 template <class T>
 struct Probe {
+  using Number = T;
   const Channels& channels;
   const Sight<T>& sight;
   Spot<T> fine, coarse;
@@ -104,9 +117,9 @@ struct Probe {
   KnownGradient<T>* known = nullptr;
 #endif
 
-  template <class Number>
+  template <class Digits>
   GV_HD Probe(const Channels& channels, const Sight<T>& sight, const RayView& rays, const Ray<T>& ray,
-              const Levels<T>& levels, const Visit<T>& visit, const Number& digits)
+              const Levels<T>& levels, const Visit<T>& visit, const Digits& digits)
       : channels(channels),
         sight(sight),
         fine(spot(levels, visit.fine, digits, ray)),
@@ -133,6 +146,13 @@ struct Probe {
         voxel(voxel),
         blend(blend),
         cube(cube) {}
+
+  // What a packet's probe has beside: see shaders.h.
+  GV_HD void narrow(bool) const {}
+  template <class Body>
+  GV_HD void each(bool which, const Body& body) const {
+    if (which) body(0, *this);
+  }
 
   // The shader's own value at distance t.
   GV_HD T value(T t) const { return number_at(channels.value, channels.component, t); }
@@ -168,8 +188,8 @@ struct Probe {
   }
 
  private:
-  template <class Number>
-  GV_HD Spot<T> spot(const Levels<T>& levels, const Holder& holder, const Number& digits, const Ray<T>& ray) const {
+  template <class Digits>
+  GV_HD Spot<T> spot(const Levels<T>& levels, const Holder& holder, const Digits& digits, const Ray<T>& ray) const {
     Spot<T> spot{holder.node, holder.brick, levels.scale[holder.depth], {0, 0, 0}, {0, 0, 0}};
     const Vec3<T> corner = digits.corner(holder.depth, levels);
     const T first = static_cast<T>(channels.border) - static_cast<T>(0.5);

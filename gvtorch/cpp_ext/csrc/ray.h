@@ -6,7 +6,7 @@
 // that begins behind skipped space gets each of its samples, the first included.
 #pragma once
 
-#include "hd.h"
+#include "arithmetic.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
@@ -24,16 +24,18 @@ struct RayView {
 };
 
 // One ray in tree units (a distance along it stays a world length), begun where it enters the scene: float32 then
-// counts from there, however far the camera is.
+// counts from there, however far the camera is. Or the rays of a packet.
 template <class T>
 struct Ray {
+  using Real = RealOf<T>;
   Vec3<T> origin, direction;
   Vec3<T> inverse;  // of the direction
-  Vec3<T> high;     // corner of the scene; its low corner is 0
+  Vec3<Real> high;  // corner of the scene; its low corner is 0
   T cone_near, cone_growth;
   T first, last;
   T moved;  // distance from the camera to the origin
 
+  Ray() = default;
   GV_HD Ray(const RayView& rays, int64_t index) {
     Vec3<double> from, along;
     double near = -INFINITY;
@@ -93,96 +95,159 @@ struct Ray {
 
   // Where the ray is at distance t, inside the root cube: a place on the scene's high face belongs to the scene.
   GV_HD Vec3<T> at(T t) const {
-    const T inner = static_cast<T>(0.9999999);
+    const Real inner = static_cast<Real>(0.9999999);
     Vec3<T> place;
     for (int axis = 0; axis < 3; ++axis) {
-      place[axis] = clamp(origin[axis] + t * direction[axis], static_cast<T>(0), high[axis] * inner);
+      place[axis] = clamp(origin[axis] + t * direction[axis], static_cast<Real>(0), high[axis] * inner);
     }
     return place;
   }
 
   // Distance at which the ray leaves a box.
   GV_HD T leave(Vec3<T> corner, T size) const {
-    T exit = static_cast<T>(INFINITY);
+    T exit = splat<T>(static_cast<Real>(INFINITY));
     for (int axis = 0; axis < 3; ++axis) {
-      if (direction[axis] == 0) continue;
-      const T face = direction[axis] > 0 ? corner[axis] + size : corner[axis];
-      exit = smaller(exit, (face - origin[axis]) * inverse[axis]);
+      const T face = select(direction[axis] > 0, corner[axis] + size, corner[axis]);
+      const T distance = (face - origin[axis]) * inverse[axis];
+      exit = select(direction[axis] == 0, exit, smaller(exit, distance));
     }
     return exit;
   }
+
+  // body(number, other's) for each number that a lane has of its own.
+  template <class Own, class Other, class Body>
+  GV_HD static void each(Own& own, Other& other, const Body& body) {
+    body(own.origin, other.origin);
+    body(own.direction, other.direction);
+    body(own.inverse, other.inverse);
+    body(own.moved, other.moved);
+  }
+};
+
+// Where an answer of the tree holds: up to `exit`, and while the cone is in [cone_low, cone_high).
+template <class T>
+struct Extent {
+  T exit, cone_low, cone_high;
+
+  GV_HD MaskOf<T> holds(T t, T cone) const { return t < exit && cone >= cone_low && cone < cone_high; }
 };
 
 constexpr int32_t kMostIntervals = 1 << 23;  // counted in a float32
 
-// Where a ray stands in its fixed sequence of intervals. Starts are products, not sums of roundings.
+// Where a ray stands in its fixed sequence of intervals. Starts are products, not sums of roundings. `which`: the lanes
+// that a change or a question is for.
 template <class T>
 struct Intervals {
-  T near, growth, step, stop;
+  using Real = RealOf<T>;
+  using Mask = MaskOf<T>;
+  T near, growth, stop;
+  Real step;
   int32_t top;  // longest level
-  int32_t level = 0;
+  IntOf<T> level{};
   T base, length, shortness;  // start = base + count * length; shortness: 1 / length
-  T count = 0;
+  T count{};
   T start;
 
   GV_HD Intervals(const Ray<T>& ray, T step, int32_t levels)
       : near(ray.cone_near),
         growth(ray.cone_growth),
-        step(step),
         stop(ray.last),
+        step(step),
         top(levels - 1),
         base(ray.first),
         length(step),
         shortness(1 / step),
         start(ray.first) {
-    choose_level();
+    choose_level(true);
   }
   Intervals() = default;
   GV_HD T cone(T t) const { return near + growth * t; }
   GV_HD T start_of(T number) const { return base + number * length; }
-  GV_HD T middle_of(T number) const { return base + (number + static_cast<T>(0.5)) * length; }
-  GV_HD bool inside() const { return start < stop && count < kMostIntervals; }
+  GV_HD T middle_of(T number) const { return base + (number + static_cast<Real>(0.5)) * length; }
+  GV_HD Mask inside() const { return start < stop && count < static_cast<Real>(kMostIntervals); }
   // The last interval, which ends at the far side.
-  GV_HD bool cut() const { return !(start_of(count + 1) <= stop); }
-  GV_HD T middle() const { return cut() ? start + (stop - start) * static_cast<T>(0.5) : middle_of(count); }
+  GV_HD Mask cut() const { return !(start_of(count + static_cast<Real>(1)) <= stop); }
+  GV_HD T middle() const { return select(cut(), start + (stop - start) * static_cast<Real>(0.5), middle_of(count)); }
 
-  GV_HD bool fits(T width) const {
+  GV_HD Mask fits(T width) const {
     return (level == 0 || !(width < length)) && (level == top || !(width >= length + length));
   }
-  GV_HD void choose_level() {
+  GV_HD void choose_level(Mask which) {
     const T width = cone(start);
-    if (fits(width)) return;
-    base = start;
-    count = 0;
-    level = 0;
-    length = step;
-    while (!fits(width) && level < top) {
-      length = length + length;
-      level = level + 1;
+    const Mask wrong = which && !fits(width);
+    if (!any(wrong)) return;
+    base = select(wrong, start, base);
+    count = select(wrong, T{}, count);
+    level = select(wrong, IntOf<T>{}, level);
+    length = select(wrong, splat<T>(step), length);
+    for (;;) {
+      const Mask longer = wrong && !fits(width) && level < top;
+      if (!any(longer)) break;
+      length = select(longer, length + length, length);
+      level = select(longer, level + 1, level);
     }
-    shortness = 1 / length;
+    shortness = select(wrong, 1 / length, shortness);
   }
-  GV_HD void skip(int32_t intervals) {
-    count = count + static_cast<T>(intervals);
-    start = start_of(count);
-    choose_level();
+  // Goes to the interval `number` of those of this length.
+  GV_HD void go(Mask which, T number) {
+    count = select(which, number, count);
+    start = select(which, start_of(count), start);
+    choose_level(which);
   }
-  // How many intervals from this one on are alike: whole, of one length, their middles before `exit`, the cone there in
-  // [low, high). At least 1. All bounds are monotone along the ray, also where the cone narrows, so the last one tells
-  // for all.
-  GV_HD int32_t run(T exit, T low, T high) const {
-    T limit = smaller(exit, stop);
-    if (growth > 0) limit = smaller(limit, (smaller(high, level == top ? high : length + length) - near) / growth);
-    if (growth < 0) limit = smaller(limit, (larger(low, level == 0 ? low : length) - near) / growth);
-    const T most = static_cast<T>(kMostIntervals);
-    int32_t alike = floor_int(clamp((limit - start) * shortness + 1, static_cast<T>(1), most - count));
-    while (alike > 1 && !same(count + static_cast<T>(alike - 1), exit, low, high)) --alike;
-    return alike;
+  // How many intervals from this one on are alike: whole, of one length, in one extent. At least 1. All bounds are
+  // monotone along the ray, also where the cone narrows, so the last one tells for all.
+  GV_HD IntOf<T> run(Mask which, const Extent<T>& extent) const {
+    T limit = smaller(extent.exit, stop);
+    if (any(growth > 0)) {
+      const T longest = smaller(extent.cone_high, select(level == top, extent.cone_high, length + length));
+      limit = select(growth > 0, smaller(limit, (longest - near) / growth), limit);
+    }
+    if (any(growth < 0)) {
+      const T shortest = larger(extent.cone_low, select(level == 0, extent.cone_low, length));
+      limit = select(growth < 0, smaller(limit, (shortest - near) / growth), limit);
+    }
+    const T one = splat<T>(static_cast<Real>(1)), most = static_cast<Real>(kMostIntervals) - count;
+    IntOf<T> alike = floor_int(clamp((limit - start) * shortness + one, one, most));
+    for (;;) {
+      const Mask over = which && alike > 1 && !same(count + to_real<T>(alike - 1), extent);
+      if (!any(over)) return alike;
+      alike = select(over, alike - 1, alike);
+    }
   }
-  GV_HD bool same(T number, T exit, T low, T high) const {
-    const T width = cone(middle_of(number));
-    return middle_of(number) < exit && start_of(number + 1) <= stop && width >= low && width < high &&
+  GV_HD Mask same(T number, const Extent<T>& extent) const {
+    const T middle = middle_of(number);
+    return extent.holds(middle, cone(middle)) && start_of(number + static_cast<Real>(1)) <= stop &&
            fits(cone(start_of(number)));
+  }
+  // This interval lies in the extent.
+  GV_HD Mask stays(const Extent<T>& extent) const {
+    const T here = middle();
+    return inside() && extent.holds(here, cone(here));
+  }
+  // Goes to the first interval behind the extent.
+  GV_HD void leave(Mask which, const Extent<T>& extent) {
+    for (Mask inside = which; any(inside); inside = inside && stays(extent)) {
+      const Mask whole = inside && !cut();
+      IntOf<T> alike = splat<IntOf<T>>(1);
+      if (any(whole)) alike = select(whole, run(whole, extent), alike);
+      go(inside, count + to_real<T>(alike));
+    }
+  }
+
+  // body(number, other's) for each number.
+  template <class Own, class Other, class Body>
+  GV_HD static void each(Own& own, Other& other, const Body& body) {
+    body(own.near, other.near);
+    body(own.growth, other.growth);
+    body(own.stop, other.stop);
+    body(own.step, other.step);
+    body(own.top, other.top);
+    body(own.level, other.level);
+    body(own.base, other.base);
+    body(own.length, other.length);
+    body(own.shortness, other.shortness);
+    body(own.count, other.count);
+    body(own.start, other.start);
   }
 };
 

@@ -49,11 +49,6 @@ struct SegmentView {
   }
 };
 
-struct Walked {
-  int32_t segments = 0, samples = 0, visits = 0;
-  bool missed = false;
-};
-
 // Walks a ray, and calls emit(segment) for what it samples.
 template <class T, class Voxel>
 struct WalkRay {
@@ -63,7 +58,7 @@ struct WalkRay {
   bool by_node;       // a region is of one value only where one node answers
 
   GV_HD Intervals<T> begin(const Ray<T>& ray, int64_t number) const {
-    Intervals<T> at(ray, trace.options.step, trace.transfer.levels);
+    Intervals<T> at(ray, trace.options.step, trace.lengths);
     if (state_r3 == nullptr) return at;
     at.base = state_r3[3 * number];
     at.count = state_r3[3 * number + 1];
@@ -75,89 +70,83 @@ struct WalkRay {
     return at;
   }
 
+  // See Walk::follow.
   template <class Emit>
-  GV_HD Walked walk(const Ray<T>& ray, Intervals<T>& at, Emit& emit) const {
-    const Transfer<T> shader(trace.transfer);
-    Walked walked;
-    int32_t wanted = 0;
-    const bool powers = trace.tree.digit_bits > 0;
-    while (at.inside() && (limit == 0 || walked.samples < limit)) {
-      if (powers) {
-        visit<BitDigits<T>>(ray, shader, at, wanted, walked, emit);
-      } else {
-        visit<Digits<T>>(ray, shader, at, wanted, walked, emit);
-      }
-    }
-    return walked;
-  }
+  struct Visitor {
+    static constexpr bool kSeesEmpty = false;
+    const WalkRay& walk;
+    const Transfer<T> shader;
+    Emit& emit;
+    int32_t segments = 0, samples = 0, visits = 0;
+    bool lacks = false;
 
-  // One node, as TraceRay::visit takes it.
-  template <class Number, class Emit>
-  GV_HD void visit(const Ray<T>& ray, const Transfer<T>& shader, Intervals<T>& at, int32_t& wanted, Walked& walked,
-                   Emit& emit) const {
-    const auto hides = [&](int32_t node) { return trace.hides(shader, node); };
-    const T middle = at.middle();
-    Number digits(trace.tree, ray.at(middle));
-    NoPath path;
-    const Visit<T> found =
-        trace.find(ray, digits, at.cone(middle), hides, trace.bricks.stamp_b, path, wanted, walked.missed);
-    ++walked.visits;
-    Segment<T> segment;
-    segment.wanted = wanted;
-    segment.seen = middle;
-    segment.fine = found.fine;
-    segment.coarse = found.coarse;
-    const Holder &fine = segment.fine, &coarse = segment.coarse;
-    if (found.clear || fine.node < 0 || (fine.brick == kEmpty && coarse.brick == kEmpty)) {
-      trace.leave(at, found);
-      return;
+    GV_HD bool& missed() { return lacks; }
+    GV_HD bool sees() const { return true; }
+    GV_HD bool more() {
+      if (walk.limit != 0 && samples >= walk.limit) return false;
+      ++visits;
+      return true;
     }
-    const auto put = [&] {
-      emit(segment);
-      ++walked.segments;
-      walked.samples += segment.count;
-      segment.count = 0;
-    };
-    const auto piece = [&](T start, T end) {
+    GV_HD bool hides(int32_t node) const { return walk.trace.hides(shader, node); }
+    template <class Digits>
+    GV_HD Segment<T> enter(const Ray<T>&, const Visit<T>& visit, const Digits&) const {
+      Segment<T> segment;
+      segment.fine = visit.fine;
+      segment.coarse = visit.coarse;
+      segment.wanted = visit.wanted;
+      segment.seen = visit.seen;
+      return segment;
+    }
+    GV_HD bool uniform(const Segment<T>& segment) const {
+      const Holder &fine = segment.fine, &coarse = segment.coarse;
+      if (fine.brick >= 0 || coarse.brick >= 0) return false;
+      return walk.by_node ? fine.node == coarse.node : walk.constant(fine) == walk.constant(coarse);
+    }
+    GV_HD void region(Segment<T>& segment, T start, T end) {
       segment.base = segment.start = start;
       segment.end = end;
       segment.first = 0;
       segment.count = 1;
       segment.level = kPiece;
-      put();
-    };
-    if (uniform(fine, coarse)) {
-      const T entry = at.start;
-      trace.leave(at, found);
-      piece(entry, smaller(at.start, at.stop));
-      return;
+      finish(segment);
     }
-    do {
-      if (at.cut()) {
-        if (segment.count > 0) put();
-        piece(at.start, at.stop);
-        at.skip(1);
-        return;
+    GV_HD int32_t take(Segment<T>& segment, const Intervals<T>& at, int32_t alike, bool last) {
+      if (last || at.base != segment.base || at.level != segment.level) finish(segment);
+      if (last) {
+        region(segment, at.start, at.stop);
+        return 1;
       }
-      if (segment.count > 0 && (at.base != segment.base || at.level != segment.level)) put();
       if (segment.count == 0) {
         segment.base = at.base;
         segment.start = at.start;
         segment.first = static_cast<int32_t>(at.count);
         segment.level = at.level;
       }
-      const int32_t alike = at.run(found.exit, found.cone_low, found.cone_high);
       segment.count += alike;
       segment.end = at.start_of(at.count + static_cast<T>(alike));
-      at.skip(alike);
-    } while (trace.stays(at, found));
-    put();
+      return alike;
+    }
+    // The segment is complete; another may begin.
+    GV_HD void finish(Segment<T>& segment) {
+      if (segment.count == 0) return;
+      emit(segment);
+      ++segments;
+      samples += segment.count;
+      segment.count = 0;
+    }
+  };
+
+  template <class Emit>
+  GV_HD Visitor<Emit> walk(const Ray<T>& ray, Intervals<T>& at, Emit& emit) const {
+    Visitor<Emit> visitor{*this, Transfer<T>(trace.transfer), emit};
+    if (trace.tree.digit_bits > 0) {
+      trace.template follow<BitDigits<T>>(ray, at, visitor);
+    } else {
+      trace.template follow<Digits<T>>(ray, at, visitor);
+    }
+    return visitor;
   }
 
-  GV_HD bool uniform(const Holder& fine, const Holder& coarse) const {
-    if (fine.brick >= 0 || coarse.brick >= 0) return false;
-    return by_node ? fine.node == coarse.node : constant(fine) == constant(coarse);
-  }
   GV_HD T constant(const Holder& holder) const {
     const auto& bricks = trace.bricks;
     return number<T>(bricks.constant_tnc[static_cast<int64_t>(holder.node) * bricks.channels + bricks.component]);
@@ -177,14 +166,14 @@ struct CountSegments {
     const Ray<T> ray(walk.trace.rays, ray_number);
     Intervals<T> at = walk.begin(ray, ray_number);
     const auto ignore = [](const Segment<T>&) {};
-    const Walked walked = walk.walk(ray, at, ignore);
+    const auto walked = walk.walk(ray, at, ignore);
     count_r3[3 * ray_number] = walked.segments;
     count_r3[3 * ray_number + 1] = walked.samples;
     count_r3[3 * ray_number + 2] = walked.visits;
     state_r3[3 * ray_number] = at.base;
     state_r3[3 * ray_number + 1] = at.count;
     state_r3[3 * ray_number + 2] = static_cast<T>(at.level);
-    missed_r[ray_number] = walked.missed;
+    missed_r[ray_number] = walked.lacks;
   }
 };
 
@@ -244,7 +233,7 @@ struct AimSample {
     const bool powers = tree.digit_bits > 0;
     return powers ? aim_at<BitDigits<T>>(k) : aim_at<Digits<T>>(k);
   }
-  template <class Number>
+  template <class Digits>
   GV_HD Aimed aim_at(int64_t k) const {
     Aimed aimed;
     const int64_t segment = segment_k[k];
@@ -262,7 +251,7 @@ struct AimSample {
     if (ray_number < 0 || ray_number >= ray_count || wanted < 0 || wanted > tree.max_depth) return aimed;
     aimed.known = true;
     const Ray<T> ray(rays, ray_number);
-    Number digits(tree, ray.at(segments.distance_s3[3 * segment + 2]));
+    Digits digits(tree, ray.at(segments.distance_s3[3 * segment + 2]));
     aimed.fine = aimed.coarse = aim(bricks, levels, aimed.fine_holder, digits, ray.origin, ray.direction);
     aimed.t = place(segment, number_k[k]);
     aimed.weight = 0;
@@ -338,20 +327,16 @@ struct SpreadGradient {
         add_to(constant + channel, share * grad_c[channel]);
       return;
     }
-    int64_t corner[3];
-    T weight[3];
-    for (int axis = 0; axis < 3; ++axis) {
-      const T place = clamp(ray.offset[axis] + t * ray.slope[axis], static_cast<T>(0), static_cast<T>(bricks.side - 1));
-      const int32_t cell = smaller(static_cast<int32_t>(place), bricks.side - 2);
-      corner[axis] = cell;
-      weight[axis] = place - static_cast<T>(cell);
-    }
+    const Vec3<T> at{ray.offset.x + t * ray.slope.x, ray.offset.y + t * ray.slope.y, ray.offset.z + t * ray.slope.z};
+    const Eight<T> eight(at, bricks.side);
+    const auto& weight = eight.weight;
     const int64_t first = static_cast<int64_t>(holder.brick) * bricks.side * bricks.side * bricks.side;
     for (int which = 0; which < 8; ++which) {
       const int dx = which & 1, dy = which >> 1 & 1, dz = which >> 2;
       const T part = share * (dx ? weight[0] : 1 - weight[0]) * (dy ? weight[1] : 1 - weight[1]) *
                      (dz ? weight[2] : 1 - weight[2]);
-      const int64_t voxel = first + ((corner[2] + dz) * bricks.side + corner[1] + dy) * bricks.side + corner[0] + dx;
+      const int64_t z = eight.cell[2] + dz, y = eight.cell[1] + dy, x = eight.cell[0] + dx;
+      const int64_t voxel = first + (z * bricks.side + y) * bricks.side + x;
       for (int32_t channel = 0; channel < bricks.channels; ++channel) {
         add_to(grad_bzyxc + voxel * bricks.channels + channel, part * grad_c[channel]);
       }

@@ -1,7 +1,7 @@
-// The transfer function as a table, and front-to-back compositing.
+// The transfer function as a table, and front-to-back compositing. T is as in arithmetic.h.
 #pragma once
 
-#include "hd.h"
+#include "arithmetic.h"
 #include "trace_args.h"
 
 namespace gvtorch {
@@ -9,105 +9,193 @@ inline namespace GV_NAMESPACE {
 
 // Red, green, blue, and the alpha of an interval; aligned, so that a row is one load (two of float64).
 template <class T>
-struct alignas(16) Row {
+struct alignas(16) alignas(T) Row {
   T red, green, blue, alpha;
+
+  GV_HD T operator[](int which) const { return which == 0 ? red : (which == 1 ? green : (which == 2 ? blue : alpha)); }
+};
+constexpr int kAlpha = 3;
+
+// A packet of which nothing is seen is done with an interval; to a single ray the question costs more than it spares.
+template <class T>
+GV_HD bool unseen(MaskOf<T> which, T alpha) {
+  if constexpr (kPacket<T>) return !any(which && alpha > 0);
+  return false;
+}
+
+// A row made of its numbers, column(0) to column(kAlpha); without colours where a packet sees nothing.
+template <class T, class Column>
+GV_HD Row<T> make_row(MaskOf<T> which, const Column& column) {
+  Row<T> row{};
+  row.alpha = column(kAlpha);
+  if (unseen(which, row.alpha)) return row;
+  row.red = column(0);
+  row.green = column(1);
+  row.blue = column(2);
+  return row;
+}
+
+// Where a value stands in the table: between two rows.
+template <class T>
+struct Cell {
+  IntOf<T> row;
+  T weight;
 };
 
+#ifndef __CUDACC__
+// A row of the table for each lane, of which a number is read when it is asked for.
+struct PacketRow {
+  const float* table;
+  Ints offset;  // bytes
+
+  GV_HD Floats operator[](int which) const { return (Floats)gather(table + which, offset); }
+};
+#endif
+
+// Values a little apart: interpolation may round beyond the ends of a range.
+template <class T>
+GV_HD T a_little_below(T value) {
+  return value - larger(value, -value) * static_cast<RealOf<T>>(9.5367431640625e-7);  // 2^-20
+}
+template <class T>
+GV_HD T a_little_above(T value) {
+  return value + larger(value, -value) * static_cast<RealOf<T>>(9.5367431640625e-7);
+}
+
+// The table as a kernel carries it: what lies on a GPU is not read before a ray is traced.
 template <class T>
 struct TransferView {
   const Row<T>* table_lm;   // for each length of interval, step * 2^l
   const T* domain_2;        // value of the first row, value of the last row
   const int32_t* opaque_m;  // rows with an opacity up to this one, itself included
   int32_t rows;
-  int32_t levels;
 
   explicit TransferView(const TraceArgs& args)
       : table_lm(static_cast<const Row<T>*>(args.table_lm4)),
         domain_2(static_cast<const T*>(args.domain_2)),
         opaque_m(args.opaque_m),
-        rows(args.rows),
-        levels(args.levels) {}
+        rows(args.rows) {}
 };
 
-// Where a value stands in the table: between two rows.
-template <class T>
-struct Cell {
-  int32_t row;
-  T weight;
-};
-
-// The transfer function with its numbers read once a ray.
+// The transfer function with its numbers read once: by each ray on a GPU, by the kernel itself on the CPU.
 template <class T>
 struct Transfer {
   const Row<T>* table_lm;
   const int32_t* opaque_m;
-  T low, scale, last;
+  T low, high, scale, last;
   int32_t rows;
 
   GV_HD explicit Transfer(const TransferView<T>& view)
       : table_lm(view.table_lm),
         opaque_m(view.opaque_m),
         low(view.domain_2[0]),
+        high(view.domain_2[1]),
         last(static_cast<T>(view.rows - 1)),
         rows(view.rows) {
-    scale = last / (view.domain_2[1] - low);
+    scale = last / (high - low);
+  }
+#ifndef __CUDACC__
+  explicit Transfer(const TraceArgs& args) : Transfer(TransferView<T>(args)) {}
+#endif
+
+  template <class V>
+  GV_HD V place_of(V value) const {
+    return clamp((value - low) * scale, static_cast<T>(0), last);
+  }
+  template <class V>
+  GV_HD Cell<V> find(V value) const {
+    const V place = place_of(value);
+    const IntOf<V> row = smaller(truncated(place), splat<IntOf<V>>(rows - 2));
+    return {row, place - to_real<V>(row)};
   }
 
-  GV_HD Cell<T> find(T value) const {
-    const T place = clamp((value - low) * scale, static_cast<T>(0), last);
-    const int32_t row = smaller(static_cast<int32_t>(place), rows - 2);
-    return {row, place - static_cast<T>(row)};
-  }
+  // The row `index`, or the one that lies so many behind it.
+  GV_HD const Row<T>& row_at(int64_t index, int32_t behind) const { return table_lm[index + behind]; }
+#ifndef __CUDACC__
+  GV_HD PacketRow row_at(Ints index, int32_t behind) const { return {&table_lm[behind].red, index << 4}; }
+#endif
 
-  GV_HD Row<T> look_up(Cell<T> cell, int32_t level) const {
-    const Row<T>* rows_m = table_lm + static_cast<int64_t>(level) * rows;
-    const Row<T> a = rows_m[cell.row];
-    const Row<T> b = rows_m[cell.row + 1];
-    return {a.red + cell.weight * (b.red - a.red), a.green + cell.weight * (b.green - a.green),
-            a.blue + cell.weight * (b.blue - a.blue), a.alpha + cell.weight * (b.alpha - a.alpha)};
+  // Colour and alpha of a value, for a level of intervals. Lanes that are not asked for may get anything.
+  template <class V>
+  GV_HD Row<V> look_up(V value, IntOf<V> level, MaskOf<V> which = all_lanes<V>()) const {
+    const Cell<V> cell = find(value);
+    const auto index = static_cast<typename LanesOf<V>::Index>(level) * rows + cell.row;
+    const auto a = row_at(index, 0), b = row_at(index, 1);
+    return make_row<V>(which, [&](int column) { return a[column] + cell.weight * (b[column] - a[column]); });
   }
 
   // No value between the two is seen. They are taken a little apart: interpolation may round beyond its ends.
-  GV_HD bool transparent(T smallest, T largest) const {
-    const T slack = static_cast<T>(9.5367431640625e-7);  // 2^-20
-    const T below = smallest - larger(smallest, -smallest) * slack;
-    const T above = largest + larger(largest, -largest) * slack;
-    const int32_t first = floor_int(clamp((below - low) * scale, static_cast<T>(0), last));
-    const int32_t end = -floor_int(-clamp((above - low) * scale, static_cast<T>(0), last));
-    return opaque_m[end] == (first > 0 ? opaque_m[first - 1] : 0);
+  template <class V>
+  GV_HD MaskOf<V> transparent(V smallest, V largest) const {
+    const IntOf<V> before = floor_int(place_of(a_little_below(smallest))) - 1;
+    const IntOf<V> end = -floor_int(-place_of(a_little_above(largest)));
+    return pick(opaque_m, end) == select(before < 0, IntOf<V>{}, pick(opaque_m, larger(before, IntOf<V>{})));
   }
 };
+
+// What a shader has as a member, and makes a Transfer of.
+#ifdef __CUDACC__
+template <class T>
+using TransferTable = TransferView<T>;
+#else
+template <class T>
+using TransferTable = Transfer<T>;
+#endif
 
 // Alpha of a length, from the alpha of an interval of level 0.
 template <class T>
 GV_HD T stretch(T alpha, T lengths) {
-  const T kept = 1 - alpha;
-  if (!(kept > static_cast<T>(1.1754944e-38f))) return 1;
-  return 1 - exp2_exact(log2_exact(kept) * lengths);
+  using Real = RealOf<T>;
+  const T kept = 1 - alpha, whole = splat<T>(static_cast<Real>(1));
+  const auto left = kept > static_cast<Real>(1.1754944e-38f);
+  if (!any(left)) return whole;
+  return select(left, 1 - exp2_exact(log2_exact(kept) * lengths), whole);
 }
 
 template <class T>
 struct Accumulator {
-  T red = 0, green = 0, blue = 0;
-  T clear = 1;  // transmittance
-  T depth = static_cast<T>(INFINITY);
-  bool missed = false;  // something that was seen was not there
+  using Real = RealOf<T>;
+  using Mask = MaskOf<T>;
+  T red{}, green{}, blue{};
+  T clear = splat<T>(static_cast<Real>(1));  // transmittance
+  T depth = splat<T>(static_cast<Real>(INFINITY));
+  Mask missed{};  // something that was seen was not there
 
-  // Adds an interval. Depth is where, inside it, the transmittance fell to hit_clear, as if it were of one value.
-  GV_HD void add(const Row<T>& row, T start, T length, T hit_clear) {
-    const T share = clear * row.alpha;
-    const T left = clear * (1 - row.alpha);
-    red = red + share * row.red;
-    green = green + share * row.green;
-    blue = blue + share * row.blue;
-    if (left < hit_clear && clear >= hit_clear) depth = start + reach(row.alpha, hit_clear) * length;
-    clear = left;
+  // Adds an interval.
+  GV_HD void add(const Row<T>& row, T start, T length, Real hit_clear, Mask which = all_lanes<T>()) {
+    add_light(row, clear * row.alpha, which);
+    absorb(row.alpha, start, length, hit_clear, which);
+  }
+  GV_HD void add_light(const Row<T>& row, T share, Mask which) {
+    red = select(which, red + share * row.red, red);
+    green = select(which, green + share * row.green, green);
+    blue = select(which, blue + share * row.blue, blue);
+  }
+  // Depth is where, inside the interval, the transmittance fell to hit_clear, as if it were of one value.
+  GV_HD void absorb(T alpha, T start, T length, Real hit_clear, Mask which) {
+    const T left = clear * (1 - alpha);
+    for_lanes(which && left < hit_clear && clear >= hit_clear, [&](int lane) {
+      const Real part = reach(lane_of(clear, lane), lane_of(alpha, lane), hit_clear);
+      set_lane(depth, lane, lane_of(start, lane) + part * lane_of(length, lane));
+    });
+    clear = select(which, left, clear);
   }
   // Part of an interval after which the transmittance is hit_clear.
-  GV_HD T reach(T alpha, T hit_clear) const {
-    const T kept = 1 - alpha;
-    if (!(kept > static_cast<T>(1.1754944e-38f))) return 0;
-    return clamp(log2_exact(hit_clear / clear) / log2_exact(kept), static_cast<T>(0), static_cast<T>(1));
+  GV_HD static Real reach(Real clear, Real alpha, Real hit_clear) {
+    const Real kept = 1 - alpha;
+    if (!(kept > static_cast<Real>(1.1754944e-38f))) return 0;
+    return clamp(log2_exact(hit_clear / clear) / log2_exact(kept), static_cast<Real>(0), static_cast<Real>(1));
+  }
+
+  // body(number, other's) for each number that a lane has of its own.
+  template <class Own, class Other, class Body>
+  GV_HD static void each(Own& own, Other& other, const Body& body) {
+    body(own.red, other.red);
+    body(own.green, other.green);
+    body(own.blue, other.blue);
+    body(own.clear, other.clear);
+    body(own.depth, other.depth);
+    body(own.missed, other.missed);
   }
 };
 

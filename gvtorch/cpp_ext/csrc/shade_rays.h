@@ -20,15 +20,13 @@ template <class T, class Shader, bool kShadows = false, bool kPowers = true>
 struct ShadeRay : Walk<T> {
   using Walk<T>::tree;
   using Walk<T>::options;
-  using Walk<T>::hits;
   using Sum = typename Shader::Sum;
   static constexpr int kBlocksAtOnce = 4;  // on a multiprocessor of CUDA: 128 registers
   static constexpr bool kHidesAlike = HidesAlike<Shader>::value;
   Shader shader;
   Channels channels;
-  const T* parameter_54;
+  Light<T> light;
   const void* range_tn2c;
-  int32_t* stamp_b;
   uint8_t* hidden_tn;  // on a GPU, of a shader with kHidesAlike
   int32_t lengths, features, directions;
   T *normal_r3, *features_rc;
@@ -42,9 +40,8 @@ struct ShadeRay : Walk<T> {
                  args.side,
                  args.border,
                  args.component},
-        parameter_54(static_cast<const T*>(args.parameter_54)),
+        light{static_cast<const Parameters<T>*>(args.parameter_54)},
         range_tn2c(args.range_tn2c),
-        stamp_b(args.stamp_b),
         hidden_tn(args.hidden_tn),
         lengths(args.levels),
         features(args.features),
@@ -55,28 +52,11 @@ struct ShadeRay : Walk<T> {
   GV_HD void operator()(int64_t index) const {
     const int64_t number = this->order(index);
     if (number < 0) return;
-    const Ray<T> ray(this->rays, number);
-    const Sight<T> sight(this->rays, number, ray.moved);
-    Intervals<T> at(ray, options.step, lengths);
-    Sum sum;
-    sum.clear = static_cast<T>(this->rays.clear(number));
-    sum.hit_clear = 1 - options.depth_alpha;
-    sum.feature_c = features_rc + number * features;
-    for (int32_t c = 0; c < features; ++c) sum.feature_c[c] = 0;
-    const T stop_clear = 1 - options.stop_alpha;
-    int32_t samples = 0;
-    int32_t wanted = 0;
-    const bool powers = kPowers && tree.digit_bits > 0;
-    while (at.inside() && sum.clear > stop_clear) {
-      samples += powers ? visit<BitDigits<T>>(shader, ray, sight, at, wanted, sum)
-                        : visit<Digits<T>>(shader, ray, sight, at, wanted, sum);
+    if (kPowers && tree.digit_bits > 0) {
+      shade<BitDigits<T>>(number);
+    } else {
+      shade<Digits<T>>(number);
     }
-    if constexpr (Shader::kSurface) {
-      if (sum.depth < static_cast<T>(INFINITY)) {
-        powers ? surface<BitDigits<T>>(ray, sight, at, wanted, sum) : surface<Digits<T>>(ray, sight, at, wanted, sum);
-      }
-    }
-    finish(number, ray.moved, samples, sum);
   }
 
   // Nothing between the ends of the node's range changes the sum.
@@ -92,16 +72,69 @@ struct ShadeRay : Walk<T> {
     return shader.hides(low, high, sum);
   }
 
-  // All intervals of a node that are still to come, each given to add(piece). Returns the samples taken.
-  template <bool kEnds, class Any, class Add>
-  GV_HD int32_t march_node(const Probe<T>& probe, const Visit<T>& visit, Intervals<T>& at, const Any& sum,
-                           const Add& add) const {
-    const T stop_clear = 1 - options.stop_alpha;
-    Piece<T> piece;
+  // The place where depth was set may lie half an interval beside the node that found it.
+  template <class Digits>
+  GV_HD void surface(const Ray<T>& ray, const Sight<T>& sight, Sum& sum) const {
+    Digits digits(tree, ray.at(sum.depth));
+    int32_t wanted = 0;
+    const auto hides = [](int32_t) { return false; };
+    const T cone = ray.cone_near + ray.cone_growth * sum.depth;
+    const Visit<T> visit = this->find(ray, digits, cone, hides, wanted, sum.missed);
+    shader.surface(Probe<T>(channels, sight, this->rays, ray, this->levels, visit, digits), sum);
+  }
+
+  // What comes after the last interval.
+  GV_HD void finish(int64_t number, T moved, int32_t samples, Sum& sum) const {
+    shader.done(sum);
+    this->store(number, sum, moved, samples);
+    if (normal_r3 == nullptr) return;
+    const Vec3<T> normal = unit(sum.normal);
+    for (int axis = 0; axis < 3; ++axis) normal_r3[3 * number + axis] = normal[axis];
+  }
+
+  // Near a light, a stored normal is lit differently wherever it stands.
+  GV_HD bool shades_each_place() const { return channels.normal.given() && light.kind() == LightKind::kPoint; }
+
+  // See Walk::follow. Any: the shader, or its Veil on the way to a light. Digits: for shadows.
+  template <class Any, class Digits>
+  struct Visitor {
+    static constexpr bool kSeesEmpty = Any::kSeesEmpty, kEnds = Any::kEnds;
+    static constexpr bool kShadowed = kShadows && std::is_same_v<Any, Shader>;  // none on the way to a light
+    const ShadeRay& kernel;
+    const Any& shader;
+    const Ray<T>* ray;
+    const Sight<T>* sight;
+    typename Any::Sum& sum;
     int32_t samples = 0;
-    do {
-      const bool last = at.cut();
-      const int32_t alike = last ? 1 : at.run(visit.exit, visit.cone_low, visit.cone_high);
+
+    GV_HD bool& missed() { return sum.missed; }
+    GV_HD bool sees() const { return sum.clear > kernel.stop_clear; }
+    GV_HD bool more() const { return sees(); }
+    template <class Node>
+    GV_HD void finish(const Node&) const {}
+    GV_HD bool hides(int32_t node) const {
+#ifdef __CUDA_ARCH__
+      if constexpr (HidesAlike<Any>::value) return kernel.hidden_tn[node] == kHidden;
+#endif
+      return kernel.hides(shader, node, sum);
+    }
+    GV_HD Probe<T> enter(const Ray<T>& ray, const Visit<T>& visit, const Digits& digits) const {
+      return Probe<T>(kernel.channels, *sight, kernel.rays, ray, kernel.levels, visit, digits);
+    }
+    GV_HD bool uniform(const Probe<T>& probe) const {  // shadows differ within it
+      return !kShadowed && probe.uniform() && !kernel.shades_each_place();
+    }
+    GV_HD void region(const Probe<T>& probe, T start, T end) {
+      Piece<T> piece;
+      piece.start = start;
+      piece.end = end;
+      cut(piece);
+      piece.value = piece.front = piece.back = probe.value(piece.middle);
+      shader.add(true, piece, probe, sum);
+      ++samples;
+    }
+    GV_HD int32_t take(const Probe<T>& probe, const Intervals<T>& at, int32_t alike, bool last) {
+      Piece<T> piece;
       int32_t taken = 0;
       if (kEnds) piece.back = probe.value(at.start);
       do {
@@ -121,101 +154,50 @@ struct ShadeRay : Walk<T> {
         } else {
           piece.value = probe.value(piece.middle);
         }
-        add(piece);
+        add(piece, probe);
         ++taken;
-      } while (taken < alike && sum.clear > stop_clear);
+      } while (taken < alike && sees());
       samples += taken;
-      at.skip(taken);
-      if (last) return samples;
-    } while (sum.clear > stop_clear && this->stays(at, visit));
-    return samples;
-  }
-
-  // A region of one value, as one interval.
-  GV_HD static Piece<T> region(const Probe<T>& probe, T start, T end) {
-    Piece<T> piece;
-    piece.start = start;
-    piece.end = end;
-    cut(piece);
-    piece.value = piece.front = piece.back = probe.value(piece.middle);
-    return piece;
-  }
-
-  // The place where depth was set may lie half an interval beside the node that found it.
-  template <class Number>
-  GV_HD void surface(const Ray<T>& ray, const Sight<T>& sight, const Intervals<T>& at, int32_t& wanted,
-                     Sum& sum) const {
-    Number digits(tree, ray.at(sum.depth));
-    NoPath path;
-    const auto hides = [](int32_t) { return false; };
-    const Visit<T> visit = this->find(ray, digits, at.cone(sum.depth), hides, stamp_b, path, wanted, sum.missed);
-    shader.surface(Probe<T>(channels, sight, this->rays, ray, this->levels, visit, digits), sum);
-  }
-
-  // What comes after the last interval.
-  GV_HD void finish(int64_t number, T moved, int32_t samples, Sum& sum) const {
-    shader.done(sum);
-    const Vec3<T> normal = unit(sum.normal);
-    hits.color_r3[3 * number] = sum.red;
-    hits.color_r3[3 * number + 1] = sum.green;
-    hits.color_r3[3 * number + 2] = sum.blue;
-    hits.alpha_r1[number] = 1 - sum.clear;
-    hits.depth_r1[number] = sum.depth + moved;
-    hits.samples_r[number] = samples;
-    hits.missed_r[number] = sum.missed;
-    normal_r3[3 * number] = normal.x;
-    normal_r3[3 * number + 1] = normal.y;
-    normal_r3[3 * number + 2] = normal.z;
-  }
-
-  // Near a light, a stored normal is lit differently wherever it stands.
-  GV_HD bool shades_each_place() const {
-    return channels.normal.given() && static_cast<int32_t>(parameter_54[3]) == Light<T>::kPoint;
-  }
-
- private:
-  template <class Number, class Any>
-  GV_HD int32_t visit(const Any& shader, const Ray<T>& ray, const Sight<T>& sight, Intervals<T>& at, int32_t& wanted,
-                      typename Any::Sum& sum) const {
-    constexpr bool shadows = kShadows && std::is_same_v<Any, Shader>;  // none on the way to a light
-    const auto hides = [&](int32_t node) {
-#ifdef __CUDA_ARCH__
-      if constexpr (HidesAlike<Any>::value) return hidden_tn[node] == kHidden;
-#endif
-      return this->hides(shader, node, sum);
-    };
-    const T middle = at.middle();
-    Number digits(tree, ray.at(middle));
-    NoPath path;
-    const Visit<T> visit = this->find(ray, digits, at.cone(middle), hides, stamp_b, path, wanted, sum.missed);
-    const bool empty = !Any::kSeesEmpty && visit.fine.brick == kEmpty && visit.coarse.brick == kEmpty;
-    if (visit.clear || visit.fine.node < 0 || empty) {
-      this->leave(at, visit);
-      return 0;
+      return taken;
     }
-    const Probe<T> probe(channels, sight, this->rays, ray, this->levels, visit, digits);
-    if (!shadows && probe.uniform() && !shades_each_place()) {  // one interval; shadows differ within it
-      const T entry = at.start;
-      this->leave(at, visit);
-      shader.add(region(probe, entry, smaller(at.start, at.stop)), probe, sum);
-      return 1;
+
+   private:
+    GV_HD static void cut(Piece<T>& piece) {
+      piece.odd = true;
+      piece.length = piece.end - piece.start;
+      piece.middle = piece.start + piece.length * static_cast<T>(0.5);
     }
-    int32_t samples = 0;
-    samples += march_node<Any::kEnds>(probe, visit, at, sum, [&](const Piece<T>& piece) {
-      if constexpr (shadows) {
-        shader.add(piece, probe, sum, [&](T t, Vec3<T> way, T length, T growth) {
-          return share_of_light<Number>(ray, probe, t, way, length, growth, samples, sum.missed);
+    GV_HD void add(const Piece<T>& piece, const Probe<T>& probe) {
+      if constexpr (kShadowed) {
+        shader.add(true, piece, probe, sum, [&](T t, Vec3<T> way, T length, T growth) {
+          return kernel.template share_of_light<Digits>(*ray, probe, t, way, length, growth, samples, sum.missed);
         });
       } else {
-        shader.add(piece, probe, sum);
+        shader.add(true, piece, probe, sum);
       }
-    });
-    return samples;
+    }
+  };
+
+ private:
+  template <class Digits>
+  GV_HD void shade(int64_t number) const {
+    const Ray<T> ray(this->rays, number);
+    const Sight<T> sight(this->rays, number, ray.moved);
+    Intervals<T> at(ray, options.step, lengths);
+    Sum sum;
+    sum.begin(0, static_cast<T>(this->rays.clear(number)), this->hit_clear, features_rc + number * features);
+    for (int32_t c = 0; c < features; ++c) sum.feature_c[c] = 0;
+    Visitor<Shader, Digits> visitor{*this, shader, &ray, &sight, sum};
+    this->template follow<Digits>(ray, at, visitor);
+    if constexpr (Shader::kSurface) {
+      if (sum.depth < static_cast<T>(INFINITY)) surface<Digits>(ray, sight, sum);
+    }
+    finish(number, ray.moved, visitor.samples, sum);
   }
 
   // How much light comes from `length` away to the place at distance t. The cone is as wide there as the ray's; its
   // first interval is left out, so that a place does not stand in its own shadow.
-  template <class Number>
+  template <class Digits>
   GV_HD T share_of_light(const Ray<T>& ray, const Probe<T>& probe, T t, Vec3<T> way, T length, T growth,
                          int32_t& samples, bool& missed) const {
     const Vec3<T> place{ray.origin.x + t * ray.direction.x, ray.origin.y + t * ray.direction.y,
@@ -224,21 +206,14 @@ struct ShadeRay : Walk<T> {
                       growth * static_cast<T>(this->rays.cone_scale), length);
     const Sight<T> sight(probe.sight.at(t), way);
     Intervals<T> at(beam, options.step, lengths);
-    at.skip(1);
+    at.go(true, at.count + 1);
     const Veil<T, Shader> veil{shader};
     typename Veil<T, Shader>::Sum sum;
-    int32_t wanted = 0;
-    while (at.inside() && sum.clear > 1 - options.stop_alpha) {
-      samples += visit<Number>(veil, beam, sight, at, wanted, sum);
-    }
+    Visitor<Veil<T, Shader>, Digits> visitor{*this, veil, &beam, &sight, sum};
+    this->template follow<Digits>(beam, at, visitor);
+    samples += visitor.samples;
     missed = missed || sum.missed;
     return sum.clear;
-  }
-
-  GV_HD static void cut(Piece<T>& piece) {
-    piece.level = -1;
-    piece.length = piece.end - piece.start;
-    piece.middle = piece.start + piece.length * static_cast<T>(0.5);
   }
 };
 

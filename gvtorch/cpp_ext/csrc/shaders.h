@@ -1,22 +1,27 @@
-// The fused shaders: what a ray makes of the values it meets. `ShadeRay` (shade_rays.h) walks the tree and calls them;
-// the plain transfer function has a kernel of its own (trace.h).
+// The fused shaders: what a ray makes of the values it meets. `ShadeRay` (shade_rays.h) and `PacketWalk`
+// (packet_walk.h) walk the tree and call them.
 //
 // A shader is a small struct, copied into the kernel:
 //
 //   explicit Shader(const ShadeArgs&)             on the host: borrows tables and parameters
 //   kEnds                                         its values are those at an interval's two ends, else in the middle
 //   kSeesEmpty                                    EMPTY nodes count, with their mean value
-//   struct Sum : ShadeSum<T>                      what it keeps of a ray; `clear` at 1 - stop_alpha ends the ray
+//   SumOf<V> : ShadeSum<V>, Sum = SumOf<T>        what it keeps of a ray; `clear` at 1 - stop_alpha ends the ray
 //   hides(low, high, sum)                         true: no value in [low, high] changes the sum. The node is left out
 //   kHidesAlike                                   it does not look at the sum: nodes are hidden from all rays alike
-//   add(piece, probe, sum)                        adds an interval; `probe` reads any channel at any distance
+//   add(which, piece, probe, sum)                 adds an interval; `probe` reads any channel at any distance
 //   kSurface, surface(probe, sum)                 where depth was set: `probe` then stands in the node of that place
 //   done(sum)                                     after the last interval
 //
 // One that shadows fall on has, beside,
 //
 //   alpha(piece, probe)                           of an interval: what it takes from the light behind it
-//   add(piece, probe, sum, shadow)                `shadow(t, way, length, growth)`: share of the light that comes there
+//   add(which, piece, probe, sum, shadow)         `shadow(t, way, length, growth)`: share of the light that comes there
+//
+// T is float or double. `add` is written once for a ray and for a packet (V is T or Floats, see arithmetic.h), whose
+// lanes in `which` add an interval each: piece, probe and sum are those of V. `probe.narrow(which)` tells that fewer
+// lanes are asked for from here on, `probe.each(which, body)` gives each lane's own probe. All else is called for one
+// ray.
 //
 // An interval lies in the node in which its middle lies. Its ends may stand up to half an interval outside; they are
 // read in this node all the same, where a brick's outermost voxel centres bound them. With a border of 1 and steps of
@@ -37,200 +42,245 @@ inline namespace GV_NAMESPACE {
 template <class T>
 struct Piece {
   T start, end, length, middle;  // distances, world units
-  int32_t level;                 // a whole interval of step * 2^level; -1: any length
+  IntOf<T> level{};              // step * 2^level is as long, unless `odd`
   T value;                       // in the middle
   T front, back;                 // at both ends, where the shader is of kEnds
+  bool odd = false;              // of any length, and of level 0
 };
 
 template <class T>
 struct ShadeSum : Accumulator<T> {
-  Vec3<T> normal{0, 0, 0};  // towards the eye, weighted by share
-  T hit_clear;              // transmittance at which depth is taken
-  T* feature_c;
+  using Base = Accumulator<T>;
+  using typename Base::Mask;
+  using typename Base::Real;
+  Vec3<T> normal{};                        // towards the eye, weighted by share
+  Real hit_clear;                          // transmittance at which depth is taken
+  typename LanesOf<T>::Pointer feature_c;  // of each lane
 
-  GV_HD void add_normal(Vec3<T> n, T share) {
-    for (int axis = 0; axis < 3; ++axis) normal[axis] = normal[axis] + share * n[axis];
+  GV_HD void add_normal(Vec3<T> n, T share, Mask which = all_lanes<T>()) {
+    for (int axis = 0; axis < 3; ++axis) normal[axis] = select(which, normal[axis] + share * n[axis], normal[axis]);
+  }
+
+  // A lane has a new ray.
+  GV_HD void begin(int lane, Real clear, Real hit_clear, Real* feature_c) {
+    set_lane(this->clear, lane, clear);
+    this->hit_clear = hit_clear;
+    set_lane(this->feature_c, lane, feature_c);
+  }
+  template <class Own, class Other, class Body>
+  GV_HD static void each(Own& own, Other& other, const Body& body) {
+    Base::each(own, other, body);
+    body(own.normal, other.normal);
+    body(own.hit_clear, other.hit_clear);
+    body(own.feature_c, other.feature_c);
   }
 };
 
-// Values a little apart: interpolation may round beyond the ends of a range.
-template <class T>
-GV_HD T a_little_below(T value) {
-  return value - larger(value, -value) * static_cast<T>(9.5367431640625e-7);  // 2^-20
-}
-template <class T>
-GV_HD T a_little_above(T value) {
-  return value + larger(value, -value) * static_cast<T>(9.5367431640625e-7);
-}
-
-// The function with the alpha of an interval of any length.
-template <class T>
-GV_HD Row<T> look_up(const Transfer<T>& transfer, T value, const Piece<T>& piece, T step) {
-  Row<T> row = transfer.look_up(transfer.find(value), piece.level < 0 ? 0 : piece.level);
-  if (piece.level < 0) row.alpha = stretch(row.alpha, piece.length / step);
+// The function's colour of a value, and its alpha over an interval of any length.
+template <class T, class V>
+GV_HD Row<V> look_up(const Transfer<T>& transfer, V value, const Piece<V>& piece, T step,
+                     MaskOf<V> which = all_lanes<V>()) {
+  Row<V> row = transfer.look_up(value, piece.level, which);
+  if (piece.odd) row.alpha = stretch(row.alpha, piece.length / step);
   return row;
 }
 
 // x^power for x in [0, 1].
 template <class T>
-GV_HD T power_of(T x, T power) {
-  return x > static_cast<T>(1.1754944e-38f) ? exp2_exact(log2_exact(x) * power) : static_cast<T>(0);
+GV_HD T power_of(T x, RealOf<T> power) {
+  const MaskOf<T> positive = x > static_cast<RealOf<T>>(1.1754944e-38f);
+  if (!any(positive)) return T{};
+  return select(positive, exp2_exact(log2_exact(x) * power), T{});
 }
 
-// Blinn-Phong, on both sides of a surface. Rows of parameter_54: light x y z and its kind; its red green blue, ambient;
-// diffuse, specular, shininess, and the width of a cone to the light: its growth (directional), or the width at
-// the light (point); then those that shaders name, and in the last the stored normal's scale and offset.
-constexpr int32_t kParameters = 20;
+// Blinn-Phong, on both sides of a surface.
 template <class T>
 struct Light {
-  static constexpr int32_t kHeadlight = 0, kDirectional = 1, kPoint = 2;
-  const T* parameter_54;
+  const Parameters<T>* parameters;
 
-  // The normal at distance t, towards the eye: stored, or the gradient's.
-  GV_HD Vec3<T> normal(const Probe<T>& probe, T t) const {
-    Vec3<T> n;
+  GV_HD LightKind kind() const { return static_cast<LightKind>(static_cast<int32_t>(parameters->light_kind)); }
+
+  // The normal at distance t, towards the eye: stored, or the gradient's. Of a ray or of each of a packet.
+  template <class Eye, class V = typename Eye::Number>
+  GV_HD Vec3<V> normal(const Eye& probe, typename Eye::Number t) const {
+    Vec3<V> n;
     if (probe.channels.normal.given()) {
       for (int axis = 0; axis < 3; ++axis) {
-        n[axis] = probe.number_at(probe.channels.normal, axis, t) * parameter_54[16] + parameter_54[17];
+        n[axis] =
+            probe.number_at(probe.channels.normal, axis, t) * parameters->normal_scale + parameters->normal_offset;
       }
     } else {
       n = probe.gradient(t);
     }
     n = unit(n);
-    if (dot(n, probe.sight.direction) > 0) n = {-n.x, -n.y, -n.z};
+    const MaskOf<V> away = dot(n, probe.sight.direction) > 0;
+    for (int axis = 0; axis < 3; ++axis) n[axis] = select(away, -n[axis], n[axis]);
     return n;
   }
   // Colour of a place in the light. Where there is no normal, it is lit as if it faced the light, without a highlight.
-  template <class... Shadow>
-  GV_HD Row<T> shade(Row<T> base, Vec3<T> n, const Probe<T>& probe, T t, const Shadow&... shadow) const {
-    const Vec3<T> d = probe.sight.direction;
-    const Vec3<T> given{parameter_54[0], parameter_54[1], parameter_54[2]};
-    const int32_t kind = static_cast<int32_t>(parameter_54[3]);
-    Vec3<T> to_light{-d.x, -d.y, -d.z};
-    T length = static_cast<T>(INFINITY), growth = parameter_54[11];
-    if (kind == kDirectional) to_light = unit(Vec3<T>{-given.x, -given.y, -given.z});
-    if (kind == kPoint) {
-      const Vec3<T> place = probe.sight.at(t);
-      const Vec3<T> way{given.x - place.x, given.y - place.y, given.z - place.z};
+  template <class Eye, class V = typename Eye::Number, class... Shadow>
+  GV_HD Row<V> shade(Row<typename Eye::Number> base, Vec3<typename Eye::Number> n, const Eye& probe,
+                     typename Eye::Number t, const Shadow&... shadow) const {
+    const Parameters<T>& own = *parameters;
+    const Vec3<V> d = probe.sight.direction;
+    Vec3<V> to_light{-d.x, -d.y, -d.z};
+    V length = splat<V>(static_cast<T>(INFINITY)), growth = splat<V>(own.light_width);
+    if (kind() == LightKind::kDirectional) {
+      for (int axis = 0; axis < 3; ++axis) to_light[axis] = splat<V>(-own.light_place[axis]);
+      to_light = unit(to_light);
+    }
+    if (kind() == LightKind::kPoint) {
+      const Vec3<V> place = probe.sight.at(t);
+      Vec3<V> way;
+      for (int axis = 0; axis < 3; ++axis) way[axis] = own.light_place[axis] - place[axis];
       to_light = unit(way);
-      length = sqrt(dot(way, way));
+      length = square_root(dot(way, way));
       growth = growth / length;
     }
-    T facing = 1, highlight = 0;
-    if (dot(n, n) > 0) {
-      facing = larger(static_cast<T>(0), dot(n, to_light));
-      const Vec3<T> half = unit(Vec3<T>{to_light.x - d.x, to_light.y - d.y, to_light.z - d.z});
-      if (facing > 0) highlight = power_of(larger(static_cast<T>(0), dot(n, half)), parameter_54[10]);
+    V facing = splat<V>(static_cast<T>(1)), highlight{};
+    const MaskOf<V> turned = dot(n, n) > 0;
+    if (any(turned)) {
+      facing = select(turned, larger(V{}, dot(n, to_light)), facing);
+      const Vec3<V> half = unit(Vec3<V>{to_light.x - d.x, to_light.y - d.y, to_light.z - d.z});
+      const MaskOf<V> faces = turned && facing > 0;
+      if (any(faces)) highlight = select(faces, power_of(larger(V{}, dot(n, half)), own.shininess), highlight);
     }
     if constexpr (sizeof...(shadow) > 0) {
-      if (facing > 0 && kind != kHeadlight) {
+      if (facing > 0 && kind() != LightKind::kHeadlight) {
         const T share = (shadow(t, to_light, length, growth), ...);
         facing = facing * share;
         highlight = highlight * share;
       }
     }
-    const T diffuse = parameter_54[8] * facing;
-    const T specular = parameter_54[9] * highlight;
-    const T ambient = parameter_54[7];
-    Row<T> lit = base;
-    lit.red = base.red * (ambient + diffuse * parameter_54[4]) + specular * parameter_54[4];
-    lit.green = base.green * (ambient + diffuse * parameter_54[5]) + specular * parameter_54[5];
-    lit.blue = base.blue * (ambient + diffuse * parameter_54[6]) + specular * parameter_54[6];
-    return lit;
+    const V diffuse = own.diffuse * facing;
+    const V specular = own.specular * highlight;
+    const auto lit = [&](V color, int which) {
+      const T light = own.light_color[which];
+      return color * (own.ambient + diffuse * light) + specular * light;
+    };
+    return {lit(base.red, 0), lit(base.green, 1), lit(base.blue, 2), base.alpha};
   }
 };
 
-// The transfer function, lit.
+// The plain transfer function.
 template <class T>
-struct Lit {
+struct Plain {
   static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
-  using Sum = ShadeSum<T>;
-  TransferView<T> transfer;
-  Light<T> light;
+  template <class V>
+  using SumOf = ShadeSum<V>;
+  using Sum = SumOf<T>;
+  TransferTable<T> transfer;
   T step;
 
-  explicit Lit(const ShadeArgs& args)
-      : transfer(args), light{static_cast<const T*>(args.parameter_54)}, step(static_cast<T>(args.step)) {}
+  explicit Plain(const TraceArgs& args) : transfer(args), step(static_cast<T>(args.step)) {}
 
   template <class Any>
   GV_HD bool hides(T low, T high, const Any&) const {
     return Transfer<T>(transfer).transparent(low, high);
   }
-  GV_HD T alpha(const Piece<T>& piece, const Probe<T>&) const {
-    return look_up(Transfer<T>(transfer), piece.value, piece, step).alpha;
-  }
-  template <class... Shadow>
-  GV_HD void add(const Piece<T>& piece, const Probe<T>& probe, Sum& sum, const Shadow&... shadow) const {
-    Row<T> row = look_up(Transfer<T>(transfer), piece.value, piece, step);
-    if (row.alpha > 0) {
-      const Vec3<T> n = light.normal(probe, piece.middle);
-      row = light.shade(row, n, probe, piece.middle, shadow...);
-      sum.add_normal(n, sum.clear * row.alpha);
-    }
-    sum.add(row, piece.start, piece.length, sum.hit_clear);
+  template <class V, class Eye>
+  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye&, SumOf<V>& sum) const {
+    const Row<V> row = look_up(Transfer<T>(transfer), piece.value, piece, step, which);
+    if (!unseen(which, row.alpha)) sum.add(row, piece.start, piece.length, sum.hit_clear, which);
   }
   GV_HD void done(Sum&) const {}
 };
 
-// Colour and opacity of each voxel; the value is the opacity. Row 3 of the parameters: scale of the numbers, reference
-// length, whether colours are premultiplied, whether they are lit. A channel may hold four numbers for each of six
+// The transfer function, lit.
+template <class T>
+struct Lit : Plain<T> {
+  template <class V>
+  using SumOf = ShadeSum<V>;
+  using Plain<T>::transfer;
+  using Plain<T>::step;
+  Light<T> light;
+
+  explicit Lit(const ShadeArgs& args) : Plain<T>(args), light{static_cast<const Parameters<T>*>(args.parameter_54)} {}
+
+  GV_HD T alpha(const Piece<T>& piece, const Probe<T>&) const {
+    return look_up(Transfer<T>(transfer), piece.value, piece, step).alpha;
+  }
+  template <class V, class Eye, class... Shadow>
+  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum, const Shadow&... shadow) const {
+    Row<V> row = look_up(Transfer<T>(transfer), piece.value, piece, step, which);
+    const MaskOf<V> shown = which && row.alpha > 0;
+    if (!any(shown)) return;
+    probe.narrow(shown);
+    const Vec3<V> n = light.normal(probe, piece.middle);
+    row = light.shade(row, n, probe, piece.middle, shadow...);
+    sum.add_normal(n, sum.clear * row.alpha, shown);
+    sum.add(row, piece.start, piece.length, sum.hit_clear, shown);
+  }
+};
+
+// Colour and opacity of each voxel; the value is the opacity. A channel may hold four numbers for each of six
 // directions (Crassin et al., "Interactive indirect illumination using voxel cone tracing", CGF 2011): a ray reads
-// the three that it goes along, weighted by the squares of its direction, whose sum is 1.
+// the three that it goes along, weighted by the squares of its direction, whose sum is 1. No packet reads those.
 template <class T>
 struct StoredColor {
   static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
-  using Sum = ShadeSum<T>;
+  template <class V>
+  using SumOf = ShadeSum<V>;
+  using Sum = SumOf<T>;
   Light<T> light;
 
-  explicit StoredColor(const ShadeArgs& args) : light{static_cast<const T*>(args.parameter_54)} {}
+  explicit StoredColor(const ShadeArgs& args) : light{static_cast<const Parameters<T>*>(args.parameter_54)} {}
 
   template <class Any>
   GV_HD bool hides(T, T high, const Any&) const {
     return !(a_little_above(high) > 0);
   }
-  GV_HD T opacity_of(const Piece<T>& piece, const Probe<T>& probe) const {
-    const T value = probe.channels.value.width == 4 ? piece.value : seen(probe, 3, piece.middle);
-    return clamp(value * light.parameter_54[12], static_cast<T>(0), static_cast<T>(1));
+  GV_HD const StoredColorNumbers<T>& own() const { return light.parameters->stored_color; }
+  template <class V, class Eye>
+  GV_HD V opacity_of(const Piece<V>& piece, const Eye& probe) const {
+    const V value = probe.channels.value.width == 4 ? piece.value : seen(probe, 3, piece.middle);
+    return clamp(value * own().scale, static_cast<T>(0), static_cast<T>(1));
   }
   GV_HD T alpha(const Piece<T>& piece, const Probe<T>& probe) const {
-    return stretch(opacity_of(piece, probe), piece.length / light.parameter_54[13]);
+    return stretch(opacity_of(piece, probe), piece.length / own().reference_length);
   }
-  template <class... Shadow>
-  GV_HD void add(const Piece<T>& piece, const Probe<T>& probe, Sum& sum, const Shadow&... shadow) const {
-    const T scale = light.parameter_54[12];
-    const T opacity = opacity_of(piece, probe);
-    if (!(opacity > 0)) return;
-    T color[3];
+  template <class V, class Eye, class... Shadow>
+  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum, const Shadow&... shadow) const {
+    const V opacity = opacity_of(piece, probe);
+    const MaskOf<V> shown = which && opacity > 0;
+    if (!any(shown)) return;
+    probe.narrow(shown);
+    V color[3];
 #ifdef __CUDA_ARCH__
 #pragma unroll 1
 #endif
     for (int i = 0; i < 3; ++i) {
-      color[i] = seen(probe, i, piece.middle) * scale;
-      if (light.parameter_54[14] > 0) color[i] = color[i] / opacity;
+      color[i] = seen(probe, i, piece.middle) * own().scale;
+      if (own().premultiplied > 0) color[i] = color[i] / opacity;
     }
-    Row<T> row{color[0], color[1], color[2], stretch(opacity, piece.length / light.parameter_54[13])};
-    if (light.parameter_54[15] > 0) {
-      const Vec3<T> n = light.normal(probe, piece.middle);
+    Row<V> row{color[0], color[1], color[2], stretch(opacity, piece.length / own().reference_length)};
+    if (own().lit > 0) {
+      const Vec3<V> n = light.normal(probe, piece.middle);
       row = light.shade(row, n, probe, piece.middle, shadow...);
-      sum.add_normal(n, sum.clear * row.alpha);
+      sum.add_normal(n, sum.clear * row.alpha, shown);
     }
-    sum.add(row, piece.start, piece.length, sum.hit_clear);
+    sum.add(row, piece.start, piece.length, sum.hit_clear, shown);
   }
   // One of the four numbers, as it is seen along the ray: to the bit that of one direction, where all six are equal.
-  GV_HD static T seen(const Probe<T>& probe, int32_t number, T t) {
-    const ChannelView& channel = probe.channels.value;
-    const Vec3<T> d = probe.sight.direction;
-    const bool directional = channel.width > 4;
-    const T z = probe.number_at(channel, directional ? number + 16 + (d.z < 0 ? 4 : 0) : number, t);
-    T value = z;
+  template <class Eye, class V>
+  GV_HD static V seen(const Eye& probe, int32_t number, V t) {
+    const auto& channel = probe.channels.value;
+    if constexpr (kPacket<V>) {
+      return probe.number_at(channel, number, t);
+    } else {
+      const Vec3<T> d = probe.sight.direction;
+      const bool directional = channel.width > 4;
+      const T z = probe.number_at(channel, directional ? number + 16 + (d.z < 0 ? 4 : 0) : number, t);
+      T value = z;
 #ifdef __CUDA_ARCH__
 #pragma unroll 1
 #endif
-    for (int axis = 0; directional && axis < 2; ++axis) {
-      const T other = probe.number_at(channel, number + 8 * axis + (d[axis] < 0 ? 4 : 0), t);
-      value = value + d[axis] * d[axis] * (other - z);
+      for (int axis = 0; directional && axis < 2; ++axis) {
+        const T other = probe.number_at(channel, number + 8 * axis + (d[axis] < 0 ? 4 : 0), t);
+        value = value + d[axis] * d[axis] * (other - z);
+      }
+      return value;
     }
-    return value;
   }
   GV_HD void done(Sum&) const {}
 };
@@ -246,7 +296,7 @@ struct Veil {
   const Shader& shader;
 
   GV_HD bool hides(T low, T high, const Sum& sum) const { return shader.hides(low, high, sum); }
-  GV_HD void add(const Piece<T>& piece, const Probe<T>& probe, Sum& sum) const {
+  GV_HD void add(bool, const Piece<T>& piece, const Probe<T>& probe, Sum& sum) const {
     sum.clear = sum.clear * (1 - shader.alpha(piece, probe));
   }
 };
@@ -256,173 +306,211 @@ struct Veil {
 template <class T>
 struct PreIntegrated {
   static constexpr bool kEnds = true, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
-  using Sum = ShadeSum<T>;
-  TransferView<T> transfer;
+  template <class V>
+  using SumOf = ShadeSum<V>;
+  using Sum = SumOf<T>;
+  TransferTable<T> transfer;
   T step;
 
   explicit PreIntegrated(const ShadeArgs& args) : transfer(args), step(static_cast<T>(args.step)) {}
 
   GV_HD bool hides(T low, T high, const Sum&) const { return Transfer<T>(transfer).transparent(low, high); }
-  GV_HD void add(const Piece<T>& piece, const Probe<T>&, Sum& sum) const {
-    const T lengths = piece.level < 0 ? piece.length / step : static_cast<T>(1);
-    const int64_t level = piece.level < 0 ? 0 : piece.level;
+  template <class V, class Eye>
+  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye&, SumOf<V>& sum) const {
     const Transfer<T> places(transfer);
-    const T low = transfer.domain_2[0];
-    const T high = transfer.domain_2[1];
-    const T front = clamp(piece.front, low, high);
-    const T back = clamp(piece.back, low, high);
-    Row<T> row = pair(places, front, back, level);
-    if (front == back || (front == piece.front && back == piece.back)) {
+    V lengths = splat<V>(static_cast<T>(1));
+    if (piece.odd) lengths = piece.length / step;
+    const auto pair = [&](V from, V to) { return between(places, from, to, piece.level, which); };
+    const V front = clamp(piece.front, places.low, places.high);
+    const V back = clamp(piece.back, places.low, places.high);
+    const MaskOf<V> beyond = which && !(front == back || (front == piece.front && back == piece.back));
+    Row<V> row = pair(front, back);
+    if (!any(beyond)) {
       row = part(row, lengths);
     } else {
-      const T share = lengths / size_of(piece.back - piece.front);
-      row = part(row, share * size_of(back - front));
-      row = over(part(pair(places, front, front, level), share * size_of(front - piece.front)), row);
-      row = over(row, part(pair(places, back, back, level), share * size_of(piece.back - back)));
+      const V share = lengths / size_of(piece.back - piece.front);
+      const Row<V> before = part(pair(front, front), share * size_of(front - piece.front));
+      const Row<V> behind = part(pair(back, back), share * size_of(piece.back - back));
+      const Row<V> parts = over(over(before, part(row, share * size_of(back - front))), behind);
+      row = choose(beyond, parts, part(row, lengths));
     }
-    const T red = sum.red + sum.clear * row.red;
-    const T green = sum.green + sum.clear * row.green;
-    const T blue = sum.blue + sum.clear * row.blue;
-    sum.add({0, 0, 0, row.alpha}, piece.start, piece.length, sum.hit_clear);
-    sum.red = red;
-    sum.green = green;
-    sum.blue = blue;
+    if (unseen(which, row.alpha)) return;
+    sum.add_light(row, sum.clear, which);
+    sum.absorb(row.alpha, piece.start, piece.length, sum.hit_clear, which);
   }
   // What an interval of a length of the table shows, from one value to another.
-  GV_HD Row<T> pair(const Transfer<T>& places, T in_front, T behind, int64_t level) const {
-    const Cell<T> front = places.find(in_front);
-    const Cell<T> back = places.find(behind);
-    const int64_t rows = transfer.rows;
-    const Row<T>* corner = transfer.table_lm + ((level * rows + front.row) * rows + back.row);
-    return mix(mix(corner[0], corner[1], back.weight), mix(corner[rows], corner[rows + 1], back.weight), front.weight);
+  template <class V>
+  GV_HD Row<V> between(const Transfer<T>& places, V from, V to, IntOf<V> level, MaskOf<V> which) const {
+    const Cell<V> front = places.find(from), back = places.find(to);
+    const int32_t rows = places.rows;
+    const auto index = (static_cast<typename LanesOf<V>::Index>(level) * rows + front.row) * rows + back.row;
+    const auto a = places.row_at(index, 0), b = places.row_at(index, 1);
+    const auto c = places.row_at(index, rows), d = places.row_at(index, rows + 1);
+    return make_row<V>(which, [&](int column) {
+      const V near = a[column] + back.weight * (b[column] - a[column]);
+      const V far = c[column] + back.weight * (d[column] - c[column]);
+      return near + front.weight * (far - near);
+    });
   }
   // The same values over another length.
-  GV_HD static Row<T> part(Row<T> row, T lengths) {
-    if (!(row.alpha > 0) || lengths == 1) return row;
-    if (!(lengths > 0)) return {0, 0, 0, 0};
-    const T alpha = stretch(row.alpha, lengths);
-    const T scale = alpha / row.alpha;
-    return {row.red * scale, row.green * scale, row.blue * scale, alpha};
+  template <class V>
+  GV_HD static Row<V> part(const Row<V>& row, V lengths) {
+    const MaskOf<V> changes = row.alpha > 0 && !(lengths == 1);
+    if (!any(changes)) return row;
+    const V alpha = select(lengths > 0, stretch(row.alpha, lengths), V{});
+    const V scale = alpha / row.alpha;
+    return choose(changes, {row.red * scale, row.green * scale, row.blue * scale, alpha}, row);
   }
-  GV_HD static Row<T> over(Row<T> a, Row<T> b) {
-    const T kept = 1 - a.alpha;
+  template <class V>
+  GV_HD static Row<V> choose(MaskOf<V> which, const Row<V>& a, const Row<V>& b) {
+    return {select(which, a.red, b.red), select(which, a.green, b.green), select(which, a.blue, b.blue),
+            select(which, a.alpha, b.alpha)};
+  }
+  template <class V>
+  GV_HD static Row<V> over(const Row<V>& a, const Row<V>& b) {
+    const V kept = 1 - a.alpha;
     return {a.red + kept * b.red, a.green + kept * b.green, a.blue + kept * b.blue, a.alpha + kept * b.alpha};
   }
-  GV_HD static T size_of(T value) { return larger(value, -value); }
-  GV_HD static Row<T> mix(const Row<T>& a, const Row<T>& b, T weight) {
-    return {a.red + weight * (b.red - a.red), a.green + weight * (b.green - a.green),
-            a.blue + weight * (b.blue - a.blue), a.alpha + weight * (b.alpha - a.alpha)};
+  template <class V>
+  GV_HD static V size_of(V value) {
+    return larger(value, -value);
   }
   GV_HD void done(Sum&) const {}
 };
 
-// The first place where the value passes row 3, number 0 of the parameters, in either direction. Four bisections and a
-// secant: an interval of a voxel is cut to a sixteenth before its rest is taken for linear. The side on which the last
-// interval ended is kept, so that no crossing is lost between two nodes that round differently.
+// The first place where the value passes a number, in either direction. Four bisections and a secant: an interval of a
+// voxel is cut to a sixteenth before its rest is taken for linear. The side on which the last interval ended is kept,
+// so that no crossing is lost between two nodes that round differently.
 template <class T>
 struct Isosurface {
   static constexpr bool kEnds = true, kSeesEmpty = false, kSurface = true, kHidesAlike = true;
-  struct Sum : ShadeSum<T> {
-    T before = 0;
-    T before_end = static_cast<T>(-INFINITY);
-    T share = 0;  // of the light, that came to the surface
+  template <class V>
+  struct SumOf : ShadeSum<V> {
+    V before{};
+    V before_end = splat<V>(static_cast<T>(-INFINITY));
+    V share{};  // of the light, that came to the surface
+
+    template <class Own, class Other, class Body>
+    GV_HD static void each(Own& own, Other& other, const Body& body) {
+      ShadeSum<V>::each(own, other, body);
+      body(own.before, other.before);
+      body(own.before_end, other.before_end);
+      body(own.share, other.share);
+    }
   };
-  TransferView<T> transfer;
+  using Sum = SumOf<T>;
+  TransferTable<T> transfer;
   Light<T> light;
   int32_t color_component;
 
   explicit Isosurface(const ShadeArgs& args)
-      : transfer(args), light{static_cast<const T*>(args.parameter_54)}, color_component(args.other_component) {}
+      : transfer(args),
+        light{static_cast<const Parameters<T>*>(args.parameter_54)},
+        color_component(args.other_component) {}
 
+  GV_HD T iso() const { return light.parameters->iso_value; }
   GV_HD bool hides(T low, T high, const Sum&) const {
     return a_little_above(high) < iso() || a_little_below(low) >= iso();
   }
-  GV_HD void add(const Piece<T>& piece, const Probe<T>& probe, Sum& sum) const {
+  template <class V, class Eye>
+  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
+    using Mask = MaskOf<V>;
     const T level = iso();
-    const bool below = piece.front < level;
-    if (sum.before_end == piece.start && (sum.before < level) != below) return hit(piece.start, sum);
-    if (below != (piece.back < level)) {
-      T near = piece.start, far = piece.end, near_value = piece.front, far_value = piece.back;
+    const Mask below = piece.front < level;
+    const Mask parted = which && sum.before_end == piece.start && (sum.before < level) != below;
+    const Mask crosses = which && !parted && below != (piece.back < level);
+    V place = piece.start;
+    if (any(crosses)) {
+      probe.narrow(crosses);
+      V near = piece.start, far = piece.end, near_value = piece.front, far_value = piece.back;
 #ifdef __CUDA_ARCH__
 #pragma unroll 1
 #endif
       for (int step = 0; step < 4; ++step) {
-        const T middle = near + (far - near) * static_cast<T>(0.5);
-        const T value = probe.value(middle);
-        const bool same = (value < level) == below;
-        near = same ? middle : near;
-        near_value = same ? value : near_value;
-        far = same ? far : middle;
-        far_value = same ? far_value : value;
+        const V middle = near + (far - near) * static_cast<T>(0.5);
+        const V value = probe.value(middle);
+        const Mask same = (value < level) == below;
+        near = select(same, middle, near);
+        near_value = select(same, value, near_value);
+        far = select(same, far, middle);
+        far_value = select(same, far_value, value);
       }
-      const T part = clamp((level - near_value) / (far_value - near_value), static_cast<T>(0), static_cast<T>(1));
-      return hit(near + part * (far - near), sum);
+      const V part = clamp((level - near_value) / (far_value - near_value), static_cast<T>(0), static_cast<T>(1));
+      place = select(crosses, near + part * (far - near), place);
     }
-    sum.before = piece.back;
-    sum.before_end = piece.end;
+    const Mask hit = parted || crosses, passed = which && !hit;
+    sum.share = select(hit, sum.clear, sum.share);
+    sum.clear = select(hit, V{}, sum.clear);
+    sum.depth = select(hit, place, sum.depth);
+    sum.before = select(passed, piece.back, sum.before);
+    sum.before_end = select(passed, piece.end, sum.before_end);
   }
   GV_HD void surface(const Probe<T>& probe, Sum& sum) const {
     const T t = sum.depth;
     const Vec3<T> n = light.normal(probe, t);
     const T value = probe.channels.other.given() ? probe.number_at(probe.channels.other, color_component, t) : iso();
-    const Transfer<T> colors(transfer);
-    const Row<T> row = light.shade(colors.look_up(colors.find(value), 0), n, probe, t);
+    const Row<T> row = light.shade(Transfer<T>(transfer).look_up(value, 0), n, probe, t);
     sum.red = sum.share * row.red;
     sum.green = sum.share * row.green;
     sum.blue = sum.share * row.blue;
     sum.normal = n;
   }
   GV_HD void done(Sum&) const {}
-
- private:
-  GV_HD T iso() const { return light.parameter_54[12]; }
-  GV_HD static void hit(T t, Sum& sum) {
-    sum.share = sum.clear;
-    sum.clear = 0;
-    sum.depth = t;
-  }
 };
 
-// Maximum, minimum or mean of the value along the ray, coloured by the transfer function. Row 3, number 0 of the
-// parameters tells which. A node that can't change a maximum or minimum is left out.
+// Maximum, minimum or mean of the value along the ray, coloured by the transfer function. A node that can't change a
+// maximum or minimum is left out.
 template <class T>
 struct Projection {
   static constexpr bool kEnds = false, kSeesEmpty = true, kSurface = false, kHidesAlike = false;
-  static constexpr int32_t kMaximum = 0, kMinimum = 1, kMean = 2;
-  struct Sum : ShadeSum<T> {
-    T found = 0;   // extreme so far, or sum of value * length
-    T length = 0;  // sum of lengths
-    T at = 0;      // where the extreme is; where the first interval starts
+  template <class V>
+  struct SumOf : ShadeSum<V> {
+    V found{};   // extreme so far, or sum of value * length
+    V length{};  // sum of lengths
+    V at{};      // where the extreme is; where the first interval starts
+
+    template <class Own, class Other, class Body>
+    GV_HD static void each(Own& own, Other& other, const Body& body) {
+      ShadeSum<V>::each(own, other, body);
+      body(own.found, other.found);
+      body(own.length, other.length);
+      body(own.at, other.at);
+    }
   };
-  TransferView<T> transfer;
-  const T* parameter_54;
+  using Sum = SumOf<T>;
+  TransferTable<T> transfer;
+  const Parameters<T>* parameters;
 
-  explicit Projection(const ShadeArgs& args) : transfer(args), parameter_54(static_cast<const T*>(args.parameter_54)) {}
+  explicit Projection(const ShadeArgs& args)
+      : transfer(args), parameters(static_cast<const Parameters<T>*>(args.parameter_54)) {}
 
-  GV_HD int32_t kind() const { return static_cast<int32_t>(parameter_54[12]); }
+  GV_HD ProjectionKind kind() const {
+    return static_cast<ProjectionKind>(static_cast<int32_t>(parameters->projection));
+  }
   GV_HD bool hides(T low, T high, const Sum& sum) const {
     if (!(sum.length > 0)) return false;
-    const int32_t which = kind();
-    return which == kMaximum ? a_little_above(high) <= sum.found
-                             : which == kMinimum && a_little_below(low) >= sum.found;
+    return kind() == ProjectionKind::kMaximum ? a_little_above(high) <= sum.found
+                                              : kind() == ProjectionKind::kMinimum && a_little_below(low) >= sum.found;
   }
-  GV_HD void add(const Piece<T>& piece, const Probe<T>&, Sum& sum) const {
-    const int32_t which = kind();
-    const bool first = !(sum.length > 0);
-    if (which == kMean) {
-      if (first) sum.at = piece.start;
-      sum.found = sum.found + piece.value * piece.length;
-    } else if (first || (which == kMaximum ? piece.value > sum.found : piece.value < sum.found)) {
-      sum.found = piece.value;
-      sum.at = piece.middle;
+  template <class V, class Eye>
+  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye&, SumOf<V>& sum) const {
+    const MaskOf<V> first = which && !(sum.length > 0);
+    if (kind() == ProjectionKind::kMean) {
+      sum.at = select(first, piece.start, sum.at);
+      sum.found = select(which, sum.found + piece.value * piece.length, sum.found);
+    } else {
+      const bool highest = kind() == ProjectionKind::kMaximum;
+      const MaskOf<V> beyond = highest ? piece.value > sum.found : piece.value < sum.found;
+      const MaskOf<V> better = first || (which && beyond);
+      sum.found = select(better, piece.value, sum.found);
+      sum.at = select(better, piece.middle, sum.at);
     }
-    sum.length = sum.length + piece.length;
+    sum.length = select(which, sum.length + piece.length, sum.length);
   }
   GV_HD void done(Sum& sum) const {
     if (!(sum.length > 0)) return;
-    const T value = kind() == kMean ? sum.found / sum.length : sum.found;
-    const Transfer<T> colors(transfer);
-    const Row<T> row = colors.look_up(colors.find(value), 0);
+    const T value = kind() == ProjectionKind::kMean ? sum.found / sum.length : sum.found;
+    const Row<T> row = Transfer<T>(transfer).look_up(value, 0);
     sum.red = sum.clear * row.red;
     sum.green = sum.clear * row.green;
     sum.blue = sum.clear * row.blue;
@@ -434,25 +522,25 @@ struct Projection {
 
 // All numbers of a second channel, composited with the transfer function's alpha. Sums lie in the output: any number.
 template <class T>
-struct Features {
-  static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
-  using Sum = ShadeSum<T>;
-  TransferView<T> transfer;
-  T step;
+struct Features : Plain<T> {
+  template <class V>
+  using SumOf = ShadeSum<V>;
+  using Plain<T>::Plain;
 
-  explicit Features(const ShadeArgs& args) : transfer(args), step(static_cast<T>(args.step)) {}
-
-  GV_HD bool hides(T low, T high, const Sum&) const { return Transfer<T>(transfer).transparent(low, high); }
-  GV_HD void add(const Piece<T>& piece, const Probe<T>& probe, Sum& sum) const {
-    const Row<T> row = look_up(Transfer<T>(transfer), piece.value, piece, step);
-    const T share = sum.clear * row.alpha;
-    const ChannelView& features = probe.channels.other;
-    for (int32_t c = 0; share > 0 && c < features.width; ++c) {
-      sum.feature_c[c] = sum.feature_c[c] + share * probe.number_at(features, c, piece.middle);
-    }
-    sum.add(row, piece.start, piece.length, sum.hit_clear);
+  template <class V, class Eye>
+  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
+    const Row<V> row = look_up(Transfer<T>(this->transfer), piece.value, piece, this->step, which);
+    const V share = sum.clear * row.alpha;
+    probe.each(which && share > 0, [&](int lane, const Probe<T>& own) {
+      const ChannelView& features = own.channels.other;
+      T* feature_c = lane_of(sum.feature_c, lane);
+      for (int32_t c = 0; c < features.width; ++c) {
+        const T number = own.number_at(features, c, lane_of(piece.middle, lane));
+        feature_c[c] = feature_c[c] + lane_of(share, lane) * number;
+      }
+    });
+    sum.add(row, piece.start, piece.length, sum.hit_clear, which);
   }
-  GV_HD void done(Sum&) const {}
 };
 
 }  // namespace GV_NAMESPACE

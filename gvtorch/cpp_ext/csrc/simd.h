@@ -1,6 +1,6 @@
 // Vectors of kLanes numbers, one for each ray of a packet: the compiler's (GCC and Clang "vector extensions"), as wide
-// as the instruction set that this file is compiled for. Only what these lack is written for each set: loads from many
-// addresses, and which lanes of a mask are set.
+// as the instruction set that this file is compiled for. Only what these lack is written for each set: the exact
+// minimum and maximum, square roots, loads from many addresses, and which lanes of a mask are set.
 #pragma once
 
 #if defined(__SSE2__)
@@ -32,7 +32,7 @@ GV_HD Ints lane_numbers() {
   return lane;
 }
 
-// Comparisons and functions as in hd.h: which of two comes out where one is no number is the same.
+// As in arithmetic.h: which of two comes out where one is no number is the same.
 GV_HD Floats smaller(Floats a, Floats b) {
 #if defined(__AVX512F__)
   return (Floats)_mm512_min_ps((__m512)b, (__m512)a);
@@ -59,11 +59,6 @@ GV_HD Ints smaller(Ints a, Ints b) { return b < a ? b : a; }
 GV_HD Ints larger(Ints a, Ints b) { return b > a ? b : a; }
 // value > low ? value : low, then raised < high ? raised : high.
 GV_HD Floats clamp(Floats value, Floats low, Floats high) { return smaller(high, larger(low, value)); }
-GV_HD Ints floor_int(Floats value) {
-  const Ints whole = truncated(value);
-  return whole + (to_floats(whole) > value);
-}
-
 GV_HD Floats square_root(Floats value) {
 #if defined(__AVX512F__)
   return (Floats)_mm512_sqrt_ps((__m512)value);
@@ -75,35 +70,6 @@ GV_HD Floats square_root(Floats value) {
   for (int i = 0; i < kLanes; ++i) value[i] = sqrt(value[i]);
   return value;
 #endif
-}
-GV_HD Floats log2_exact(Floats value) {
-  const Ints bits = (Ints)value;
-  const Floats mantissa = (Floats)((bits & 0x007fffff) | 0x3f800000);
-  const Mask large = mantissa > 1.41421356f;
-  const Floats exponent = to_floats((bits >> 23) - 127 - large);
-  const Floats m = large ? mantissa * 0.5f : mantissa;
-  const Floats s = (m - 1.0f) / (m + 1.0f);
-  const Floats z = s * s;
-  Floats series = Floats{} + 0.320598898f;
-  series = series * z + 0.412198583f;
-  series = series * z + 0.577078016f;
-  series = series * z + 0.961796694f;
-  series = series * z + 2.885390082f;
-  return exponent + series * s;
-}
-GV_HD Floats exp2_exact(Floats value) {
-  const Floats x = clamp(value, Floats{} - 126.0f, Floats{} + 126.0f);
-  const Ints whole = floor_int(x + 0.5f);
-  const Floats f = x - to_floats(whole);
-  Floats series = Floats{} + 1.52527338e-5f;
-  series = series * f + 1.54035304e-4f;
-  series = series * f + 1.33335581e-3f;
-  series = series * f + 9.61812911e-3f;
-  series = series * f + 5.55041087e-2f;
-  series = series * f + 2.40226507e-1f;
-  series = series * f + 6.93147181e-1f;
-  series = series * f + 1.0f;
-  return value > -126.0f ? series * (Floats)((whole + 127) << 23) : Floats{};
 }
 
 // A bit for each lane that is set.

@@ -1,5 +1,6 @@
 // The arguments of `trace_rays` and `shade_rays` as plain pointers and numbers: what entry.h hands to the kernels,
-// however they were compiled. No function stands here, so this header means the same in every file.
+// however they were compiled; and the kinds of things that Python names by numbers. No function that is not constexpr
+// stands here, so this header means the same in every file.
 #pragma once
 
 #include "arguments.h"
@@ -25,7 +26,33 @@ constexpr int64_t kShaderKinds = 8;
 constexpr bool is_stored_color(ShaderKind kind) {
   return kind == ShaderKind::kStoredColor || kind == ShaderKind::kShadowedColor;
 }
+enum class LightKind { kHeadlight, kDirectional, kPoint };
+enum class ProjectionKind { kMaximum, kMinimum, kMean };
 constexpr int32_t kDirections = 6;  // +x -x +y -y +z -z: a stored colour may have four numbers for each
+
+template <class T>
+struct StoredColorNumbers {
+  T scale;               // of the numbers stored
+  T reference_length;    // of which they tell the opacity
+  T premultiplied, lit;  // 1 or 0
+};
+
+// The numbers of a fused shader, `parameter_54`, by name; a user's own stand behind them.
+template <class T>
+struct Parameters {
+  T light_place[3];  // of a point light; of a directional one: the way it shines
+  T light_kind;      // a LightKind
+  T light_color[3], ambient;
+  T diffuse, specular, shininess;
+  T light_width;  // of a cone to the light: its growth (directional), or the width at the light (point)
+  union {         // of each shader its own
+    StoredColorNumbers<T> stored_color;
+    T iso_value;
+    T projection;  // a ProjectionKind
+  };
+  T normal_scale, normal_offset, unused[2];  // a stored normal is number * scale + offset
+};
+constexpr int32_t kParameters = sizeof(Parameters<float>) / sizeof(float);
 
 // Of what is optional, null: there is no such channel.
 struct ShadeArgs : TraceArgs {

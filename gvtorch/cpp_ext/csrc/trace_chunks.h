@@ -1,10 +1,35 @@
-// How the CPU shares out rays that are traced in packets.
+// Which rays the CPU traces in packets, and how it shares them out.
 #pragma once
 
 #include "for_each.h"
 #include "walk.h"
 
 namespace gvtorch {
+
+// Packets find nodes by 32-bit bytes, count the places in a brick in floats, and load 4 bytes at once, which may reach
+// behind a voxel, but never behind the pool: its last brick is read by single rays.
+inline bool packs(const TraceArgs& args) {
+  constexpr int64_t kMostNodes = INT32_MAX / sizeof(int32_t);
+  return digit_bits_of(args.branching, args.max_depth) > 0 && args.nodes <= kMostNodes && args.bricks >= 2 &&
+         brick_bytes(args.voxel, args.side, args.channels) < 1 << 24;
+}
+
+// Whether packets take a fused shader's rays.
+inline bool shades(const ShadeArgs& args) {
+  const auto fits = [&](VoxelType type, int32_t channels) { return brick_bytes(type, args.side, channels) < 1 << 24; };
+  if (!packs(args) || !fits(args.normal_voxel, 3) || !fits(args.other_voxel, args.other_channels)) return false;
+  switch (args.shader) {
+    case ShaderKind::kStoredColor:
+      return args.channels == 4;
+    case ShaderKind::kPreIntegrated:
+      return int64_t{args.levels} * args.rows * args.rows * int64_t{sizeof(Row<float>)} <= INT32_MAX;
+    case ShaderKind::kShadowedLit:
+    case ShaderKind::kShadowedColor:
+      return false;
+    default:
+      return true;
+  }
+}
 
 // body(begin, end) for chunks of the rays; first an empty byte for each node, in which it is kept what is hidden.
 template <class Device, class Body>

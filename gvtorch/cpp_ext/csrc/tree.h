@@ -7,14 +7,13 @@
 //
 //   child_tn    >= 0 tile of its children | kAbsent: not made yet | kTerminal: nothing finer exists
 //   brick_tn    >= 0 brick slot | kAbsent: not loaded yet | kEmpty | kConstant: one value, see constant_tnc
-//   request_tn  what rays wish for it, see post_request in hd.h
+//   request_tn  what rays ask for, see post_request in hd.h
 //
 // Tree units: the root is the cube [0,1]^3. A descent that restarts from the root needs no stack (Horn et al.,
-// "Interactive k-d tree GPU raytracing", I3D 2007, kd-restart; Crassin, PhD thesis 2011, 6.1); one that keeps its last
-// path starts where the two places part.
+// "Interactive k-d tree GPU raytracing", I3D 2007, kd-restart; Crassin, PhD thesis 2011, 6.1).
 #pragma once
 
-#include "hd.h"
+#include "arithmetic.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
@@ -83,7 +82,6 @@ struct Place {
 // The digits of a place in base N, from the root down. Any N: each digit from what the one above left over.
 template <class T>
 struct Digits {
-  static constexpr bool kRandomAccess = false;
   Vec3<T> position, local;
   int32_t branching;
 
@@ -116,7 +114,6 @@ struct Digits {
 // N a power of two: all digits are the bits of one number, and every corner is exact.
 template <class T>
 struct BitDigits {
-  static constexpr bool kRandomAccess = true;
   Vec3<int32_t> cell;
   int32_t bits, top;
 
@@ -139,87 +136,29 @@ struct BitDigits {
   }
 };
 
-// No memory of the last descent.
-struct NoPath {
-  static constexpr bool kKept = false;
-};
-
-// The nodes of the last descent, for a thread that traces ray after ray through a tree that does not change.
-struct KeptPath {
-  static constexpr bool kKept = true;
-  struct alignas(16) Step {
-    int32_t node, brick, tile, hidden;
-  };
-  Step steps[kMostLevels];
-  Vec3<int32_t> cell{0, 0, 0};
-  int32_t depth = -1;
-
-  // The deepest level whose node is known for these digits; -1: none.
-  template <class T>
-  GV_HD int32_t shared(const BitDigits<T>& digits) const {
-    const int32_t parted = (cell.x ^ digits.cell.x) | (cell.y ^ digits.cell.y) | (cell.z ^ digits.cell.z);
-    if (parted == 0) return depth;
-    const int32_t high = bit_width(parted);
-    const int32_t equal = digits.top - high;
-    return smaller(depth, digits.bits == 1 ? equal : equal / digits.bits);
-  }
-};
-
 // Descends to `wanted` depth, or as far as tiles exist and something is seen; stamps every tile on the way.
 // The coarse holder is looked for where two levels blend.
-template <class Number, class Hides, class Path>
-GV_HD Place descend(const TreeView& tree, Number& digits, int32_t wanted, bool blend, int32_t frame, const Hides& hides,
-                    Path& path) {
+template <class Number, class Hides>
+GV_HD Place descend(const TreeView& tree, Number& digits, int32_t wanted, bool blend, int32_t frame,
+                    const Hides& hides) {
   Place place;
   place.node = tree.root;
-  int32_t known = -1;
-  if constexpr (Path::kKept && Number::kRandomAccess) {
-    known = smaller(path.shared(digits), wanted);
-    path.cell = digits.cell;
-    if (known >= 0) {
-      const KeptPath::Step& step = path.steps[known];
-      place.depth = known;
-      place.node = step.node;
-      place.brick = step.brick;
-      place.tile = step.tile;
-      place.hidden = step.hidden != 0;
-    }
-  }
   int32_t own_tile = tree.root_tile;  // of the node
   for (;;) {
-    if (place.depth > known) {
-      store_stamp(&tree.stamp_t[own_tile], frame);
-      place.brick = tree.brick_tn[place.node];
-      place.tile = tree.child_tn[place.node];
-      place.hidden = hides(place.node);
-      if constexpr (Path::kKept && Number::kRandomAccess) {
-        path.steps[place.depth] = {place.node, place.brick, place.tile, place.hidden ? 1 : 0};
-      }
+    store_stamp(&tree.stamp_t[own_tile], frame);
+    place.brick = tree.brick_tn[place.node];
+    place.tile = tree.child_tn[place.node];
+    place.hidden = hides(place.node);
+    if (place.brick != kAbsent) {
+      if (blend && place.depth < wanted) place.coarse = {place.node, place.brick, place.depth};
+      place.fine = {place.node, place.brick, place.depth};
     }
-    if constexpr (!(Path::kKept && Number::kRandomAccess)) {
-      if (place.brick != kAbsent) {
-        if (blend && place.depth < wanted) place.coarse = {place.node, place.brick, place.depth};
-        place.fine = {place.node, place.brick, place.depth};
-      }
-    }
-    if (place.depth == wanted || place.tile < 0 || place.hidden) break;
+    if (place.depth == wanted || place.tile < 0 || place.hidden) return place;
     place.depth = place.depth + 1;
     place.parent = place.node;
     own_tile = place.tile;
     place.node = own_tile * tree.nodes_per_tile + digits.child(place.depth);
   }
-  if constexpr (Path::kKept && Number::kRandomAccess) {
-    path.depth = place.depth;
-    if (place.depth > 0) place.parent = path.steps[place.depth - 1].node;
-    int32_t level = place.depth;
-    while (level > 0 && path.steps[level].brick == kAbsent) --level;
-    if (path.steps[level].brick != kAbsent) place.fine = {path.steps[level].node, path.steps[level].brick, level};
-    while (blend && level > 0 && (level >= wanted || path.steps[level].brick == kAbsent)) --level;
-    if (blend && level < wanted && path.steps[level].brick != kAbsent) {
-      place.coarse = {path.steps[level].node, path.steps[level].brick, level};
-    }
-  }
-  return place;
 }
 
 }  // namespace GV_NAMESPACE

@@ -15,7 +15,7 @@ using UserShaderOf = GV_USER_SHADER<T>;  // the name that CompiledShader was tol
 #include "shade_each.h"
 #if !defined(__CUDACC__) && !defined(GV_RAY_BY_RAY)
 #define GV_PACKETS
-#include "packet_user.h"
+#include "packet_walk.h"
 #include "trace_chunks.h"
 #endif
 
@@ -69,18 +69,18 @@ struct OneShader {
   template <class Device>
   static void run(const Tensor& like, ShadeArgs args, bool wide) {
     const auto each = [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); };
-    if (wide) return each(ShadeRay<double, UserShaderOf<double>>(args));
+    if (wide) return each(ShadeRay<double, CalledShader<UserShaderOf, double>>(args));
 #ifdef GV_PACKETS
     if (packs(args)) {
       return trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) {
-        shade_packets<UserPacket<UserShaderOf<float>>>(args, begin, end);
+        trace_packets<CalledShader<UserShaderOf, float>, AnyValues>(args, begin, end);
       });
     }
     constexpr bool powers = false;  // what is left is mostly of another N
 #else
     constexpr bool powers = true;
 #endif
-    each(ShadeRay<float, UserShaderOf<float>, false, powers>(args));
+    each(ShadeRay<float, CalledShader<UserShaderOf, float>, false, powers>(args));
   }
 };
 

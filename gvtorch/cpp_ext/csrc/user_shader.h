@@ -41,7 +41,7 @@ struct UserShader {
   static constexpr const char* kUniformNames = "";
   using Sum = ShadeSum<T>;
 
-  TransferView<T> transfer;  // white and opaque where none was given
+  TransferTable<T> transfer;  // white and opaque where none was given
   Light<T> light;
   const T* uniform_k;
   int32_t uniforms;         // how many
@@ -50,8 +50,8 @@ struct UserShader {
 
   explicit UserShader(const ShadeArgs& args)
       : transfer(args),
-        light{static_cast<const T*>(args.parameter_54)},
-        uniform_k(light.parameter_54 + kParameters),
+        light{static_cast<const Parameters<T>*>(args.parameter_54)},
+        uniform_k(static_cast<const T*>(args.parameter_54) + kParameters),
         uniforms(args.parameters - kParameters),
         other_component(args.other_component),
         step(static_cast<T>(args.step)) {}
@@ -87,6 +87,92 @@ constexpr bool kTellsHiding<Shader, std::void_t<decltype(Shader::kHidesAlike)>> 
 
 template <template <class> class Kind, class T>
 struct HidesAlike<Kind<T>, std::enable_if_t<kHidesByTransfer<Kind<T>> && !kTellsHiding<Kind<T>>>> : std::true_type {};
+
+#ifndef __CUDACC__
+// The Sums of a packet's rays, each a user's own. The walk looks at what a ray lets through, and tells what it missed.
+template <class Sum>
+struct UserSums {
+  Sum of_lane[kLanes];
+  Floats clear{};
+  Mask missed{};
+  int32_t asked = 0;  // lanes whose shader asked for a gradient at the last interval
+
+  GV_HD void begin(int lane, float clear_then, float hit_clear, float* feature_c) {
+    of_lane[lane].begin(0, clear_then, hit_clear, feature_c);
+    clear[lane] = clear_then;
+  }
+};
+template <class Sum>
+GV_HD Sum& sum_of(UserSums<Sum>& sums, int lane) {
+  sums.of_lane[lane].missed = sums.missed[lane] != 0;
+  return sums.of_lane[lane];
+}
+template <class Sum>
+GV_HD void put_sum(UserSums<Sum>& sums, int lane, const Sum& one) {
+  sums.clear[lane] = one.clear;
+  set_lane(sums.missed, lane, one.missed);
+}
+#endif
+
+// A user's shader as the walks call it. In a packet the walk and the values are those of all lanes at once; the user's
+// `add` is called for one lane after the other.
+template <template <class> class Kind, class T>
+struct CalledShader : Kind<T> {
+  using Base = Kind<T>;
+  using Base::Base;
+  using Sum = typename Base::Sum;
+  static constexpr bool kHidesAlike = HidesAlike<Base>::value;
+
+  GV_HD void add(bool, const Piece<T>& piece, const Probe<T>& probe, Sum& sum) const { Base::add(piece, probe, sum); }
+
+#ifndef __CUDACC__
+  template <class V>
+  using SumOf = UserSums<Sum>;
+  // Values that are hidden change nothing, unless a Sum of the user's own counts them.
+  static constexpr bool kLeavesOut = kHidesByTransfer<Base> && std::is_same_v<Sum, ShadeSum<T>> && !Base::kEnds;
+
+  template <class Packet>
+  GV_HD void add(Mask which, const Piece<Floats>& pieces, Packet& packet, UserSums<Sum>& sums) const {
+    if constexpr (kLeavesOut) which = which && !this->transfer.transparent(pieces.value, pieces.value);
+    // All lanes' gradients take about as long as those of two, one by one.
+    const bool ahead = sums.asked >= 2;
+    Vec3<Floats> slope{};
+    if (ahead) slope = packet.gradient(pieces.middle);
+    sums.asked = 0;
+    KnownGradient<float> known{NAN, {}, false};
+    packet.each(
+        which,
+        [&](int lane, const Probe<T>& probe) {
+          if (ahead) known = {pieces.middle[lane], lane_of(slope, lane), false};
+          known.asked = false;
+          add_lane(lane, pieces, probe, sums);
+          sums.asked += known.asked ? 1 : 0;
+        },
+        &known);
+  }
+
+ private:
+  __attribute__((noinline)) void add_lane(int lane, const Piece<Floats>& pieces, const Probe<T>& probe,
+                                          UserSums<Sum>& sums) const {
+    Piece<float> piece;
+    piece.start = pieces.start[lane];
+    piece.end = pieces.end[lane];
+    piece.middle = pieces.middle[lane];
+    piece.length = pieces.length[lane];
+    piece.level = pieces.level[lane];
+    piece.odd = pieces.odd;
+    if constexpr (Base::kEnds) {
+      piece.front = pieces.front[lane];
+      piece.back = pieces.back[lane];
+    } else {
+      piece.value = pieces.value[lane];
+    }
+    Sum& sum = sum_of(sums, lane);
+    Base::add(piece, probe, sum);
+    put_sum(sums, lane, sum);
+  }
+#endif
+};
 
 }  // namespace GV_NAMESPACE
 }  // namespace gvtorch

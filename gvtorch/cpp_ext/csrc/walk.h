@@ -1,9 +1,11 @@
-// From node to node along a ray: which node a visit stands in, what is marked there, and where the visit ends. The
-// kernels on top of it, trace.h and shade_rays.h, take the samples.
+// From node to node along a ray: which node a visit stands in, what is marked there, where the visit ends, and which
+// intervals are taken in it. What is made of them a visitor tells: that of trace.h, shade_rays.h or segments.h. Packets
+// have a walk of their own (packet_walk.h).
 #pragma once
 
 #include "brick.h"
 #include "ray.h"
+#include "shade.h"
 #include "trace_args.h"
 
 namespace gvtorch {
@@ -48,14 +50,15 @@ struct RayOrder {
   }
 };
 
-// A visit: the two nodes that answer, and where the answer ends. It ends with the node's box, or where the cone leaves
-// [cone_low, cone_high) and other levels are wanted.
+// A visit: the two nodes that answer, and where they do. That ends with the node's box, or where other levels are
+// wanted.
 template <class T>
-struct Visit {
+struct Visit : Extent<T> {
   Holder fine, coarse;  // of the wanted level and of the one above it: the same where they do not blend
-  T exit, cone_low, cone_high;
-  T voxel, above;  // world size of a voxel of either level
-  bool clear;      // hidden: neither marked nor sampled
+  T voxel, above;       // world size of a voxel of either level
+  T seen;               // distance at which the node was looked up
+  int32_t wanted;       // the level
+  bool hidden;          // neither marked nor sampled
 };
 
 template <class T>
@@ -67,6 +70,8 @@ struct Walk {
   TraceOptions<T> options;
   HitView<T> hits;
   const int32_t* frame_1;
+  int32_t* stamp_b;
+  T stop_clear, hit_clear;  // transmittance at which a ray ends, and at which its depth is taken
 
   explicit Walk(const TraceArgs& args)
       : rays{args.origin_r3, args.direction_r3, args.cone_r2, args.range_r2,
@@ -82,18 +87,73 @@ struct Walk {
                 args.by_level},
         hits{static_cast<T*>(args.color_r3), static_cast<T*>(args.alpha_r1), static_cast<T*>(args.depth_r1),
              args.samples_r, args.missed_r},
-        frame_1(args.frame_1) {}
+        frame_1(args.frame_1),
+        stamp_b(args.stamp_b),
+        stop_clear(1 - options.stop_alpha),
+        hit_clear(1 - options.depth_alpha) {}
+
+  // Goes along a ray of a tree with digits of that kind, to its end or until the visitor has enough. A visitor has:
+  //
+  //   kSeesEmpty                       EMPTY nodes count
+  //   missed()                         a bool&: something that is seen was not there
+  //   more()                           the ray goes on to another node
+  //   hides(node)                      nothing in the node is seen
+  //   enter(ray, visit, digits)        what the visitor has to know of a visit, `node` below
+  //   uniform(node)                    the visit may be taken as one interval
+  //   region(node, start, end)         takes it so
+  //   take(node, at, alike, last)      takes up to so many whole intervals, or the ray's last one, which is cut at
+  //                                    the far side; returns how many
+  //   sees()                           the ray goes on in this node
+  //   finish(node)                     all intervals of the visit have been taken
+  template <class Digits, class Visitor>
+  GV_HD void follow(const Ray<T>& ray, Intervals<T>& at, Visitor& visitor) const {
+    int32_t wanted = 0;
+    while (at.inside() && visitor.more()) {
+      const T middle = at.middle();
+      Digits digits(tree, ray.at(middle));
+      const auto hides = [&](int32_t node) { return visitor.hides(node); };
+      Visit<T> visit = find(ray, digits, at.cone(middle), hides, wanted, visitor.missed());
+      visit.seen = middle;
+      const bool empty = !Visitor::kSeesEmpty && visit.fine.brick == kEmpty && visit.coarse.brick == kEmpty;
+      if (visit.hidden || visit.fine.node < 0 || empty) {
+        at.leave(true, visit);
+        continue;
+      }
+      auto node = visitor.enter(ray, visit, digits);
+      if (visitor.uniform(node)) {
+        const T entry = at.start;
+        at.leave(true, visit);
+        visitor.region(node, entry, smaller(at.start, at.stop));
+      } else {
+        march(visit, at, visitor, node);
+        visitor.finish(node);
+      }
+    }
+  }
+
+  // All intervals of a visit that are still to come.
+  template <class Visitor, class Node>
+  GV_HD void march(const Extent<T>& extent, Intervals<T>& at, Visitor& visitor, Node& node) const {
+    do {
+      const bool last = at.cut();
+      const int32_t alike = last ? 1 : at.run(true, extent);
+      const int32_t taken = visitor.take(node, at, alike, last);
+      at.go(true, at.count + static_cast<T>(taken));
+      if (last) return;
+    } while (visitor.sees() && at.stays(extent));
+  }
 
   // Finds the node in which an interval's middle lies; marks what is used and what is missing. `wanted` is the depth
   // that the visit before wanted.
-  template <class Number, class Hides, class Path>
-  GV_HD Visit<T> find(const Ray<T>& ray, Number& digits, T cone, const Hides& hides, int32_t* stamp_b, Path& path,
-                      int32_t& wanted, bool& missed) const {
+  template <class Digits, class Hides>
+  GV_HD Visit<T> find(const Ray<T>& ray, Digits& digits, T cone, const Hides& hides, int32_t& wanted,
+                      bool& missed) const {
     // Level of detail: the first depth whose voxel fits into the cone.
     const T infinity = static_cast<T>(INFINITY);
     while (wanted < tree.max_depth && levels.voxel[wanted] > cone) ++wanted;
     while (wanted > 0 && !(levels.voxel[wanted - 1] > cone)) --wanted;
     Visit<T> visit;
+    visit.wanted = wanted;
     visit.voxel = levels.voxel[wanted];
     visit.above = wanted > 0 ? levels.voxel[wanted - 1] : infinity;
     const bool reached = visit.voxel <= cone;
@@ -101,29 +161,17 @@ struct Walk {
     visit.cone_low = reached ? visit.voxel : -infinity;
     visit.cone_high = reached ? visit.above : visit.voxel;
 
-    const Place place = descend(tree, digits, wanted, blend, *frame_1, hides, path);
+    const Place place = descend(tree, digits, wanted, blend, *frame_1, hides);
     visit.exit = ray.leave(digits.corner(place.depth, levels), levels.size[place.depth]);
-    visit.clear = place.hidden && (place.depth < wanted || !blend);
-    if (!visit.clear && mark_missing(place, wanted, blend, cone)) missed = true;
+    visit.hidden = place.hidden && (place.depth < wanted || !blend);
+    if (!visit.hidden && mark_missing(place, wanted, blend, cone)) missed = true;
 
     // The two levels that blend; below the finest level, or where both are the same node, only one is read.
     visit.fine = place.fine;
     visit.coarse = place.coarse.node >= 0 ? place.coarse : visit.fine;
-    if (!visit.clear && visit.fine.brick >= 0) store_stamp(&stamp_b[visit.fine.brick], *frame_1);
-    if (!visit.clear && visit.coarse.brick >= 0) store_stamp(&stamp_b[visit.coarse.brick], *frame_1);
+    if (!visit.hidden && visit.fine.brick >= 0) store_stamp(&stamp_b[visit.fine.brick], *frame_1);
+    if (!visit.hidden && visit.coarse.brick >= 0) store_stamp(&stamp_b[visit.coarse.brick], *frame_1);
     return visit;
-  }
-
-  GV_HD static bool stays(const Intervals<T>& at, const Visit<T>& visit) {
-    const T middle = at.middle();
-    const T cone = at.cone(middle);
-    return at.inside() && middle < visit.exit && cone >= visit.cone_low && cone < visit.cone_high;
-  }
-
-  // Goes to the first interval behind the node.
-  GV_HD static void leave(Intervals<T>& at, const Visit<T>& visit) {
-    do at.skip(at.cut() ? 1 : at.run(visit.exit, visit.cone_low, visit.cone_high));
-    while (stays(at, visit));
   }
 
   // Asks for what is not there, and tells whether it did. Straight to the wanted level, or level by level: then a
@@ -145,6 +193,17 @@ struct Walk {
     const T most = static_cast<T>(kPriorityMask);
     const T priority = cone > 0 ? smaller(levels.voxel[depth] / cone * 16, most) : most;
     post_request(&tree.request_tn[node], kind | static_cast<int32_t>(priority));
+  }
+
+  // What a ray gives. `moved`: from the camera to where depth counts from.
+  GV_HD void store(int64_t number, const Accumulator<T>& sum, T moved, int32_t samples) const {
+    hits.color_r3[3 * number] = sum.red;
+    hits.color_r3[3 * number + 1] = sum.green;
+    hits.color_r3[3 * number + 2] = sum.blue;
+    hits.alpha_r1[number] = 1 - sum.clear;
+    hits.depth_r1[number] = sum.depth + moved;
+    hits.samples_r[number] = samples;
+    hits.missed_r[number] = sum.missed;
   }
 };
 

@@ -1,0 +1,208 @@
+// Arithmetic on T, which is float, double, or on the CPU `Floats` (simd.h): a number of each ray of a packet. What is
+// written on T is one source for one ray and for a packet:
+//
+//   RealOf<T>, IntOf<T>, MaskOf<T>    the type of one number; of a whole number and of a comparison's result, per lane
+//   select(mask, a, b)                a where the mask is set, else b
+//   any(mask)                         some lane is set
+//   for_lanes(mask, body)             body(lane) for each lane that is set; `lane_of` and `set_lane` take it apart
+//
+// Masks are joined by && || and !. A single ray is one lane: its mask is a bool, for which && and || stop early.
+//
+// log2 and exp2 in float32 are written with + - * / and bit moves alone, always in the same order, so that the torch
+// twin (ops/reference/exact.py), the CPU and the GPU agree to the last bit. Series: Abramowitz and Stegun, "Handbook of
+// Mathematical Functions", 1964, 4.1.27 (logarithm by atanh) and 4.2.1 (exponential).
+#pragma once
+
+#include "hd.h"
+#ifndef __CUDACC__
+#include "simd.h"
+#endif
+
+namespace gvtorch {
+inline namespace GV_NAMESPACE {
+
+template <class T>
+struct LanesOf {
+  using Real = T;
+  using Int = int32_t;
+  using Index = int64_t;  // into a table
+  using Mask = bool;
+  using Pointer = T*;
+  static constexpr bool kPacket = false;
+  static GV_HD bool all() { return true; }
+};
+
+template <class T>
+GV_HD T select(bool which, T a, T b) {
+  return which ? a : b;
+}
+GV_HD bool any(bool which) { return which; }
+template <class Body>
+GV_HD void for_lanes(bool which, const Body& body) {
+  if (which) body(0);
+}
+template <class T>
+GV_HD T lane_of(T value, int) {
+  return value;
+}
+template <class T>
+GV_HD void set_lane(T& value, int, T own) {
+  value = own;
+}
+template <class T>
+GV_HD T pick(const T* table, int32_t index) {
+  return table[index];
+}
+
+// The same number in every lane.
+template <class T, class Number>
+GV_HD T splat(Number value) {
+  return static_cast<T>(value);
+}
+// A whole number as a T.
+template <class T>
+GV_HD T to_real(int32_t value) {
+  return static_cast<T>(value);
+}
+template <class T>
+GV_HD int32_t truncated(T value) {
+  return static_cast<int32_t>(value);
+}
+template <class T>
+GV_HD T square_root(T value) {
+  return sqrt(value);
+}
+
+// Which of two comes out where one is no number is the same for rays and packets. Clamped, a NaN ends at the lower
+// bound: an index made from the result is always valid.
+template <class T>
+GV_HD T smaller(T a, T b) {
+  return b < a ? b : a;
+}
+template <class T>
+GV_HD T larger(T a, T b) {
+  return b > a ? b : a;
+}
+template <class T>
+GV_HD T clamp(T value, T low, T high) {
+#ifdef __CUDA_ARCH__
+  if constexpr (static_cast<T>(0.5) != 0) return fmin(fmax(value, low), high);
+#endif
+  const T raised = value > low ? value : low;
+  return raised < high ? raised : high;
+}
+
+#ifndef __CUDACC__
+struct LanePointers {
+  float* lane[kLanes];
+};
+
+template <>
+struct LanesOf<Floats> {
+  using Real = float;
+  using Int = Ints;
+  using Index = Ints;
+  using Mask = Ints;
+  using Pointer = LanePointers;
+  static constexpr bool kPacket = true;
+  static GV_HD Ints all() { return Ints{} == 0; }
+};
+
+GV_HD Floats select(Mask which, Floats a, Floats b) { return which ? a : b; }
+GV_HD Ints select(Mask which, Ints a, Ints b) { return which ? a : b; }
+GV_HD float lane_of(Floats value, int lane) { return value[lane]; }
+GV_HD int32_t lane_of(Ints value, int lane) { return value[lane]; }
+GV_HD float* lane_of(const LanePointers& pointers, int lane) { return pointers.lane[lane]; }
+GV_HD void set_lane(Floats& value, int lane, float own) { value[lane] = own; }
+GV_HD void set_lane(Ints& value, int lane, int32_t own) { value[lane] = own; }
+GV_HD void set_lane(Ints& mask, int lane, bool own) { mask[lane] = own ? -1 : 0; }
+GV_HD void set_lane(LanePointers& pointers, int lane, float* own) { pointers.lane[lane] = own; }
+template <class T>
+GV_HD Vec3<float> lane_of(const Vec3<T>& value, int lane) {
+  return {lane_of(value.x, lane), lane_of(value.y, lane), lane_of(value.z, lane)};
+}
+template <class T>
+GV_HD void set_lane(Vec3<T>& value, int lane, const Vec3<float>& own) {
+  for (int axis = 0; axis < 3; ++axis) set_lane(value[axis], lane, own[axis]);
+}
+
+template <>
+GV_HD Floats splat<Floats, float>(float value) {
+  return value - Floats{};
+}
+template <>
+GV_HD Ints splat<Ints, int32_t>(int32_t value) {
+  return value - Ints{};
+}
+template <class T>
+GV_HD T to_real(Ints value) {
+  return to_floats(value);
+}
+GV_HD Floats clamp(Floats value, float low, float high) {
+  return clamp(value, splat<Floats>(low), splat<Floats>(high));
+}
+#endif
+
+template <class T>
+using RealOf = typename LanesOf<T>::Real;
+template <class T>
+using IntOf = typename LanesOf<T>::Int;
+template <class T>
+using MaskOf = typename LanesOf<T>::Mask;
+template <class T>
+GV_HD MaskOf<T> all_lanes() {
+  return LanesOf<T>::all();
+}
+template <class T>
+constexpr bool kPacket = LanesOf<T>::kPacket;
+
+// floor of a value that fits an int32. Without SSE4.1 (the baseline of x86-64) std::floor is a call.
+template <class T>
+GV_HD IntOf<T> floor_int(T value) {
+  const IntOf<T> whole = truncated(value);
+  return select(to_real<T>(whole) > value, whole - 1, whole);
+}
+
+// Base-2 logarithm of a positive, normal float.
+template <class T>
+GV_HD T log2_exact(T value) {
+  const auto bits = bit_cast<IntOf<T>>(value);
+  const T fraction = bit_cast<T>((bits & 0x007fffff) | 0x3f800000);
+  const auto large = fraction > 1.41421356f;
+  const T mantissa = select(large, fraction * 0.5f, fraction);
+  const IntOf<T> power = (bits >> 23) - 127;
+  const T exponent = to_real<T>(select(large, power + 1, power));
+  const T s = (mantissa - 1.0f) / (mantissa + 1.0f);
+  const T z = s * s;
+  T series = splat<T>(0.320598898f);
+  series = series * z + 0.412198583f;
+  series = series * z + 0.577078016f;
+  series = series * z + 0.961796694f;
+  series = series * z + 2.885390082f;
+  return exponent + series * s;
+}
+
+// 2 to the power of `value`; 0 below -126, the largest power below 127 above it.
+template <class T>
+GV_HD T exp2_exact(T value) {
+  const auto normal = value > -126.0f;
+  if (!any(normal)) return T{};
+  const T x = smaller(value, splat<T>(126.0f));
+  const auto whole = floor_int(x + 0.5f);
+  const T f = x - to_real<T>(whole);
+  T series = splat<T>(1.52527338e-5f);
+  series = series * f + 1.54035304e-4f;
+  series = series * f + 1.33335581e-3f;
+  series = series * f + 9.61812911e-3f;
+  series = series * f + 5.55041087e-2f;
+  series = series * f + 2.40226507e-1f;
+  series = series * f + 6.93147181e-1f;
+  series = series * f + 1.0f;
+  return select(normal, series * bit_cast<T>((whole + 127) << 23), T{});
+}
+
+GV_HD double log2_exact(double value) { return ::log2(value); }
+GV_HD double exp2_exact(double value) { return ::exp2(value); }
+
+}  // namespace GV_NAMESPACE
+}  // namespace gvtorch
