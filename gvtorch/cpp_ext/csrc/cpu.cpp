@@ -9,8 +9,7 @@
 
 #include "cache.h"
 #include "for_each.h"
-#include "shade_rays.h"
-#include "trace.h"
+#include "shade_each.h"
 #include "trace_chunks.h"
 
 namespace gvtorch {
@@ -140,21 +139,19 @@ void split(const torch::stable::Tensor& like, int64_t count, const Keep& keep, c
 
 template <class Device>
 void trace(const torch::stable::Tensor& like, TraceArgs args, bool wide) {
-  trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) {
-    if (!wide && packs(args)) return processor().trace_chunk(args, begin, end);
-    with_voxel(args.voxel, [&](auto voxel) {
-      using Voxel = decltype(voxel);
-      const auto each = [&](const auto& kernel) {
-        for (int64_t index = begin; index < end; ++index) kernel(index);
-      };
-      wide ? each(TraceRay<double, Voxel>(args)) : each(TraceRay<float, Voxel>(args));
-    });
-  });
+  const PlainArgs plain(args);
+  if (wide) {
+    shade_each<Device>(like, args.nodes, ShadeRay<double, Plain<double>>(plain));
+  } else if (packs(args)) {
+    trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) { processor().trace_chunk(args, begin, end); });
+  } else {
+    shade_each<Device>(like, args.nodes, ShadeRay<float, Plain<float>>(plain));
+  }
 }
 
 template <class Device>
 void shade(const torch::stable::Tensor& like, ShadeArgs args, bool wide) {
-  const auto run = [&](const auto& kernel) { for_each<Device>(like, kernel.order.count(), kernel); };
+  const auto run = [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); };
   if (wide) {
     with_shader<double>(args.shader, args, run);
   } else if (shades(args)) {

@@ -11,27 +11,20 @@
 
 namespace gvtorch {
 
-template <class Device, class T, class Voxel>
+template <class Device, class T>
 void trace_as(const torch::stable::Tensor& like, TraceArgs args) {
-  using torch::headeronly::ScalarType;
-  torch::stable::Tensor hidden_tn = torch::stable::new_empty(like, {args.nodes}, ScalarType::Byte);
-  auto* hidden = static_cast<uint8_t*>(hidden_tn.mutable_data_ptr());
-  args.hidden_tn = hidden;
-  const TraceRay<T, Voxel> body(args);
-  for_each<Device>(like, args.nodes, HideNode<T, Voxel>{body.bricks, body.transfer, hidden});
-  for_each<Device>(like, body.order.count(), body);
+  ShadeRay<T, Plain<T>> hider{PlainArgs(args)};
+  const torch::stable::Tensor hidden_tn = hide_nodes<Device>(like, args.nodes, hider);
+  args.hidden_tn = hider.hidden_tn;
+  with_voxel(args.voxel, [&](auto voxel) {
+    const TraceRay<T, decltype(voxel)> kernel(args);
+    for_each<Device>(like, kernel.order.count(), kernel);
+  });
 }
 
 template <class Device>
 void trace(const torch::stable::Tensor& like, TraceArgs args, bool wide) {
-  with_voxel(args.voxel, [&](auto voxel) {
-    using Voxel = decltype(voxel);
-    if (wide) {
-      trace_as<Device, double, Voxel>(like, args);
-    } else {
-      trace_as<Device, float, Voxel>(like, args);
-    }
-  });
+  wide ? trace_as<Device, double>(like, args) : trace_as<Device, float>(like, args);
 }
 
 template <class Device>

@@ -5,6 +5,7 @@
 
 #include "entry.h"
 #include "segments.h"
+#include "shade_each.h"
 
 namespace gvtorch {
 
@@ -47,16 +48,13 @@ template <class Device, class Op, class Make>
 void walk_rays(const Op& a, const Make& make) {
   TraceArgs args{};
   lay_ready(args, a);
-  Tensor hidden_tn = torch::stable::new_zeros(a.origin_r3, {args.nodes}, ScalarType::Byte);
-  lay(args.hidden_tn, hidden_tn);
   with_real(a.table_lm4, [&](auto real) {
     using T = decltype(real);
     const T* state = a.state_r3.has_value() ? read<T>(*a.state_r3) : nullptr;
-    with_voxel(args.voxel, [&](auto voxel) {
-      const TraceRay<T, decltype(voxel)> trace(args);
-      const WalkRay<T, decltype(voxel)> walk{trace, state, static_cast<int32_t>(a.limit), a.by_node};
-      for_each<Device>(a.origin_r3, trace.order.count(), make(walk, real));
-    });
+    ShadeRay<T, Plain<T>> kernel{PlainArgs(args)};
+    const Tensor hidden_tn = hide_nodes<Device>(a.origin_r3, args.nodes, kernel);
+    const WalkRay<T> walk{kernel, state, static_cast<int32_t>(a.limit), a.by_node};
+    for_each<Device>(a.origin_r3, kernel.order.count(), make(walk, real));
   });
 }
 

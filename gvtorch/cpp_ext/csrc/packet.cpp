@@ -6,8 +6,7 @@ namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
 void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end) {
-  ShadeArgs plain{};
-  static_cast<TraceArgs&>(plain) = args;
+  const PlainArgs plain(args);
   const bool far = brick_bytes(args.voxel, args.side, args.channels) * args.bricks > INT32_MAX;
   with_voxel(args.voxel, [&](auto voxel) {
     using Voxel = decltype(voxel);

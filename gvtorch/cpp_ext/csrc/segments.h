@@ -7,7 +7,8 @@
 // to count and to write. A ray may be walked by parts: `limit` samples, at least one visit, and on from `state_r3`.
 #pragma once
 
-#include "trace.h"
+#include "brick.h"
+#include "shade_rays.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
@@ -50,15 +51,15 @@ struct SegmentView {
 };
 
 // Walks a ray, and calls emit(segment) for what it samples.
-template <class T, class Voxel>
+template <class T>
 struct WalkRay {
-  TraceRay<T, Voxel> trace;
+  ShadeRay<T, Plain<T>> kernel;
   const T* state_r3;  // base, count and level that each ray goes on with; null: rays begin
   int32_t limit;      // a ray pauses behind the visit in which it has taken so many samples; 0: it goes to its end
   bool by_node;       // a region is of one value only where one node answers
 
   GV_HD Intervals<T> begin(const Ray<T>& ray, int64_t number) const {
-    Intervals<T> at(ray, trace.options.step, trace.lengths);
+    Intervals<T> at(ray, kernel.options.step, kernel.lengths);
     if (state_r3 == nullptr) return at;
     at.base = state_r3[3 * number];
     at.count = state_r3[3 * number + 1];
@@ -75,7 +76,6 @@ struct WalkRay {
   struct Visitor {
     static constexpr bool kSeesEmpty = false;
     const WalkRay& walk;
-    const Transfer<T> shader;
     Emit& emit;
     int32_t segments = 0, samples = 0, visits = 0;
     bool lacks = false;
@@ -87,7 +87,7 @@ struct WalkRay {
       ++visits;
       return true;
     }
-    GV_HD bool hides(int32_t node) const { return walk.trace.hides(shader, node); }
+    GV_HD bool hides(int32_t node) const { return walk.kernel.hides(node); }
     template <class Digits>
     GV_HD Segment<T> enter(const Ray<T>&, const Visit<T>& visit, const Digits&) const {
       Segment<T> segment;
@@ -138,18 +138,19 @@ struct WalkRay {
 
   template <class Emit>
   GV_HD Visitor<Emit> walk(const Ray<T>& ray, Intervals<T>& at, Emit& emit) const {
-    Visitor<Emit> visitor{*this, Transfer<T>(trace.transfer), emit};
-    if (trace.tree.digit_bits > 0) {
-      trace.template follow<BitDigits<T>>(ray, at, visitor);
+    Visitor<Emit> visitor{*this, emit};
+    if (kernel.tree.digit_bits > 0) {
+      kernel.template follow<BitDigits<T>>(ray, at, visitor);
     } else {
-      trace.template follow<Digits<T>>(ray, at, visitor);
+      kernel.template follow<Digits<T>>(ray, at, visitor);
     }
     return visitor;
   }
 
   GV_HD T constant(const Holder& holder) const {
-    const auto& bricks = trace.bricks;
-    return number<T>(bricks.constant_tnc[static_cast<int64_t>(holder.node) * bricks.channels + bricks.component]);
+    const ChannelView& channel = kernel.channels.value;
+    return read_number<T>(channel.constant_tnc, channel.type,
+                          static_cast<int64_t>(holder.node) * channel.width + kernel.channels.component);
   }
 };
 
@@ -161,9 +162,9 @@ struct CountSegments {
   bool* missed_r;
 
   GV_HD void operator()(int64_t index) const {
-    const int64_t ray_number = walk.trace.order(index);
+    const int64_t ray_number = walk.kernel.order(index);
     if (ray_number < 0) return;
-    const Ray<T> ray(walk.trace.rays, ray_number);
+    const Ray<T> ray(walk.kernel.rays, ray_number);
     Intervals<T> at = walk.begin(ray, ray_number);
     const auto ignore = [](const Segment<T>&) {};
     const auto walked = walk.walk(ray, at, ignore);
@@ -185,9 +186,9 @@ struct WriteSegments {
   SegmentView<T> out;
 
   GV_HD void operator()(int64_t index) const {
-    const int64_t ray_number = walk.trace.order(index);
+    const int64_t ray_number = walk.kernel.order(index);
     if (ray_number < 0) return;
-    const Ray<T> ray(walk.trace.rays, ray_number);
+    const Ray<T> ray(walk.kernel.rays, ray_number);
     Intervals<T> at = walk.begin(ray, ray_number);
     int64_t place = first_r[ray_number];
     const auto write = [&](const Segment<T>& segment) {

@@ -1,5 +1,4 @@
-// A shader's rays one by one, on any device: `shade_each<Device>(like, nodes, kernel)`. On a GPU it is worked out first
-// what the shader hides, where that is the same for all rays.
+// Rays one by one, with any shader and on any device.
 #pragma once
 
 #include "for_each.h"
@@ -7,18 +6,28 @@
 
 namespace gvtorch {
 
+// Gives a ShadeRay a byte for each node, in which it is kept what is hidden from all rays: see kUnknown in walk.h. They
+// live as long as what is returned.
 template <class Device, class Kernel>
-void shade_each(const torch::stable::Tensor& like, int64_t nodes, Kernel kernel) {
-#ifdef __CUDACC__
+torch::stable::Tensor hide_nodes(const torch::stable::Tensor& like, int64_t nodes, Kernel& kernel) {
   torch::stable::Tensor hidden_tn;
   if constexpr (Kernel::kHidesAlike) {
-    hidden_tn = torch::stable::new_empty(like, {nodes}, torch::headeronly::ScalarType::Byte);
+    constexpr auto kByte = torch::headeronly::ScalarType::Byte;
+#ifdef __CUDACC__
+    hidden_tn = torch::stable::new_empty(like, {nodes}, kByte);
     kernel.hidden_tn = static_cast<uint8_t*>(hidden_tn.mutable_data_ptr());
     for_each<Device>(like, nodes, HideShaded<Kernel>{kernel});
-  }
 #else
-  (void)nodes;
+    hidden_tn = torch::stable::new_zeros(like, {nodes}, kByte);
+    kernel.hidden_tn = static_cast<uint8_t*>(hidden_tn.mutable_data_ptr());
 #endif
+  }
+  return hidden_tn;
+}
+
+template <class Device, class Kernel>
+void shade_each(const torch::stable::Tensor& like, int64_t nodes, Kernel kernel) {
+  const torch::stable::Tensor hidden_tn = hide_nodes<Device>(like, nodes, kernel);
   for_each<Device>(like, kernel.order.count(), kernel);
 }
 

@@ -27,7 +27,7 @@ struct ShadeRay : Walk<T> {
   Channels channels;
   Light<T> light;
   const void* range_tn2c;
-  uint8_t* hidden_tn;  // on a GPU, of a shader with kHidesAlike
+  uint8_t* hidden_tn;  // of a shader with kHidesAlike, see shade_each.h
   int32_t lengths, features, directions;
   T *normal_r3, *features_rc;
 
@@ -72,6 +72,20 @@ struct ShadeRay : Walk<T> {
     return shader.hides(low, high, sum);
   }
 
+  // The same for all rays: looked at once.
+  GV_HD bool hides(int32_t node) const {
+#ifdef __CUDA_ARCH__
+    return hidden_tn[node] == kHidden;
+#else
+    uint8_t known = load_byte(&hidden_tn[node]);
+    if (known == kUnknown) {
+      known = hides(shader, node, Sum()) ? kHidden : kShown;
+      store_byte(&hidden_tn[node], known);
+    }
+    return known == kHidden;
+#endif
+  }
+
   // The place where depth was set may lie half an interval beside the node that found it.
   template <class Digits>
   GV_HD void surface(const Ray<T>& ray, const Sight<T>& sight, Sum& sum) const {
@@ -113,9 +127,7 @@ struct ShadeRay : Walk<T> {
     template <class Node>
     GV_HD void finish(const Node&) const {}
     GV_HD bool hides(int32_t node) const {
-#ifdef __CUDA_ARCH__
-      if constexpr (HidesAlike<Any>::value) return kernel.hidden_tn[node] == kHidden;
-#endif
+      if constexpr (HidesAlike<Any>::value) return kernel.hides(node);
       return kernel.hides(shader, node, sum);
     }
     GV_HD Probe<T> enter(const Ray<T>& ray, const Visit<T>& visit, const Digits& digits) const {

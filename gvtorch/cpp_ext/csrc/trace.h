@@ -22,22 +22,6 @@ struct Run {
 };
 
 template <class T, class Voxel>
-struct HideNode {
-  BrickView<Voxel> bricks;
-  TransferTable<T> transfer;
-  uint8_t* hidden_tn;
-
-  GV_HD void operator()(int64_t node) const {
-    hidden_tn[node] = hidden(bricks, Transfer<T>(transfer), static_cast<int32_t>(node)) ? kHidden : kShown;
-  }
-  // Everything in reach of the node's brick, and so of every node below it, is transparent.
-  GV_HD static bool hidden(const BrickView<Voxel>& bricks, const Transfer<T>& transfer, int32_t node) {
-    const int64_t row = int64_t{2} * node * bricks.channels + bricks.component;
-    return transfer.transparent(number<T>(bricks.range_tn2c[row]), number<T>(bricks.range_tn2c[row + bricks.channels]));
-  }
-};
-
-template <class T, class Voxel>
 struct TraceRay : Walk<T> {
   using Walk<T>::tree;
   using Walk<T>::levels;
@@ -45,7 +29,7 @@ struct TraceRay : Walk<T> {
   BrickView<Voxel> bricks;
   TransferTable<T> transfer;
   int32_t lengths;
-  uint8_t* hidden_tn;
+  const uint8_t* hidden_tn;
 
   explicit TraceRay(const TraceArgs& args)
       : Walk<T>(args),
@@ -77,16 +61,6 @@ struct TraceRay : Walk<T> {
     this->store(number, visitor.sum, ray.moved, visitor.samples);
   }
 
-  // Whether a node shows nothing, looked at once.
-  GV_HD bool hides(const Transfer<T>& shader, int32_t node) const {
-    uint8_t known = load_byte(&hidden_tn[node]);
-    if (known == kUnknown) {
-      known = HideNode<T, Voxel>::hidden(bricks, shader, node) ? kHidden : kShown;
-      store_byte(&hidden_tn[node], known);
-    }
-    return known == kHidden;
-  }
-
   // See Walk::follow.
   struct Visitor {
     static constexpr bool kSeesEmpty = false;
@@ -100,7 +74,7 @@ struct TraceRay : Walk<T> {
     GV_HD bool more() const { return sees(); }
     template <class Node>
     GV_HD void finish(const Node&) const {}
-    GV_HD bool hides(int32_t node) const { return kernel.hides(shader, node); }
+    GV_HD bool hides(int32_t node) const { return kernel.hidden_tn[node] == kHidden; }
 
     template <class Digits>
     GV_HD Run<T, Voxel> enter(const Ray<T>& ray, const Visit<T>& visit, const Digits& digits) const {

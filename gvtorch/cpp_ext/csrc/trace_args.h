@@ -15,7 +15,7 @@ struct TraceArgs {
   void *color_r3, *alpha_r1, *depth_r1;
   int32_t* samples_r;
   bool* missed_r;
-  uint8_t* hidden_tn;  // scratch, see HideNode
+  uint8_t* hidden_tn;  // scratch, see hide_nodes
 
   int64_t rays, bricks, nodes;
   VoxelType voxel;
@@ -62,6 +62,11 @@ struct ShadeArgs : TraceArgs {
   int32_t other_channels;
   int32_t parameters;  // how many numbers there are: 20, and behind them a user's own
   void *normal_r3, *features_rc;
+};
+
+// Those of the plain transfer function, which is a shader as well.
+struct PlainArgs : ShadeArgs {
+  explicit PlainArgs(const TraceArgs& args) : ShadeArgs{} { static_cast<TraceArgs&>(*this) = args; }
 };
 
 }  // namespace gvtorch

@@ -28,8 +28,8 @@ struct HitView {
   bool* missed_r;
 };
 
-// Which nodes show nothing: worked out before the rays go on a GPU, where many threads would each do it again; on the
-// CPU, where most nodes are never visited, when the first ray comes.
+// Which nodes show nothing: looked at once, on a GPU before the rays are traced, where many threads would each do it
+// again; on the CPU, where most nodes are never visited, when the first ray comes.
 constexpr uint8_t kUnknown = 0, kShown = 1, kHidden = 2;
 
 // Rays of a picture are taken in tiles of 8 x 4 pixels, which share bricks; others in order.
