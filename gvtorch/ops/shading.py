@@ -5,9 +5,10 @@ C++ reads the same numbers in cpp_ext/csrc/shaders.h.
 
 from __future__ import annotations
 
+import inspect
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple, TypeVar
 
@@ -21,16 +22,15 @@ Triple = Sequence[float] | Tensor
 
 
 def _declared_kinds() -> tuple[str, ...]:
-    """The names in `enum class ShaderKind` of csrc, without their k."""
-    for header in sorted(cpp_ext.SOURCES.glob("*.h")):
-        found = re.search(r"enum class ShaderKind \{([\w\s,]*)\}", header.read_text("utf-8"))
+    """The kinds in the list `GV_SHADERS` of csrc/shaders.h."""
+    for header in sorted(cpp_ext.SOURCES.rglob("shaders.h")):
+        found = re.search(r"#define GV_SHADERS\(X\)((?:.*\\\n)*.*)", header.read_text("utf-8"))
         if found is not None:
-            return tuple(re.findall(r"\bk(\w+)", found[1]))
-    raise RuntimeError(f"gvtorch: {cpp_ext.SOURCES} declares no ShaderKind")
+            return tuple(re.findall(r"X\((\w+), \w+, \w+\)", found[1]))
+    raise RuntimeError(f"gvtorch: {cpp_ext.SOURCES} lists no shaders")
 
 
-#: The fused shaders, by the names of their structs in csrc/shaders.h, in the order in which C++
-#: numbers them.
+#: The kinds of the fused shaders, in the order in which C++ numbers them.
 SHADER_KINDS = _declared_kinds()
 
 
@@ -82,7 +82,13 @@ class ProjectionNumbers(NamedTuple):
     kind: Number  # a ProjectionKind
 
 
-_Record = TypeVar("_Record", StoredColorNumbers, IsosurfaceNumbers, ProjectionNumbers)
+class GradientMagnitudeNumbers(NamedTuple):
+    """The own number of a shader by gradient magnitude."""
+
+    full: Number  # the gradient's length at which opacity is whole, value per world unit
+
+
+_Record = TypeVar("_Record")
 #: How many numbers each field of `ShadeParameters` takes, in order; the last two are not used.
 _WIDTHS = (3, 1, 3, 1, 1, 1, 1, 1, 4, 1, 1, 2)
 
@@ -108,9 +114,10 @@ class ShadeParameters(NamedTuple):
         own = (*self.own, *(0.0,) * (_WIDTHS[at] - len(self.own)))
         return pack((*self[:at], *own, *self[at + 1 :], 0.0, 0.0), dtype, device).reshape(5, 4)
 
-    def own_as(self, record: type[_Record]) -> _Record:
-        """Returns the shader's own numbers by name."""
-        return record(*self.own[: len(record._fields)])
+    def own_as(self, record: Callable[..., _Record]) -> _Record:
+        """Returns the shader's own numbers by name, as one of the records above."""
+        count = len(inspect.signature(record).parameters)
+        return record(*self.own[:count])
 
     @classmethod
     def read(cls, parameter_54: Tensor) -> ShadeParameters:

@@ -25,18 +25,6 @@ namespace gvtorch {
 
 enum class VoxelType { kUInt8, kInt8, kInt16, kUInt16, kHalf, kBFloat16, kFloat };
 
-// The shaders of `shade_rays`, numbered as in ops/shading.py.
-enum class ShaderKind {
-  kLit,
-  kPreIntegrated,
-  kStoredColor,
-  kIsosurface,
-  kProjection,
-  kFeatures,
-  kShadowedLit,
-  kShadowedColor
-};
-
 constexpr int64_t kAny = -1;
 
 namespace kinds {
@@ -78,9 +66,6 @@ struct Int {
 };
 struct Count {  // an int that torch.compile need not know, of any size
   using View = int64_t;
-};
-struct Shader {
-  using View = ShaderKind;
 };
 struct Float {
   using View = double;
@@ -132,7 +117,7 @@ struct Bool {
 
 // What a shader reads beside.
 #define GV_SHADE(X)                  \
-  X(Shader, shader, kAny)            \
+  X(Int, shader, kAny)               \
   X(Int, features, kAny)             \
   X(MaybeVoxels, normal_bzyxc, kAny) \
   X(MaybeVoxels, normal_tnc, kAny)   \

@@ -153,11 +153,11 @@ template <class Device>
 void shade(const torch::stable::Tensor& like, ShadeArgs args, bool wide) {
   const auto run = [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); };
   if (wide) {
-    with_shader<double>(args.shader, args, run);
+    with_rays<double>(args, run);
   } else if (shades(args)) {
     trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) { processor().shade_chunk(args, begin, end); });
   } else {
-    with_shader<float>(args.shader, args, run);
+    with_rays<float>(args, run);
   }
 }
 

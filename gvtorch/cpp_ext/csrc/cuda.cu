@@ -31,9 +31,9 @@ template <class Device>
 void shade(const torch::stable::Tensor& like, ShadeArgs args, bool wide) {
   const auto run = [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); };
   if (wide) {
-    with_shader<double>(args.shader, args, run);
+    with_rays<double>(args, run);
   } else {
-    with_shader<float>(args.shader, args, run);
+    with_rays<float>(args, run);
   }
 }
 

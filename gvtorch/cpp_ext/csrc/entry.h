@@ -318,15 +318,21 @@ inline int32_t check_second(const std::optional<Tensor>& bricks_bzyxc, const std
 // The shaders of a library: what is asked of their arguments, and `run`, which shades all rays. A user's library has a
 // class like this one (user.cpp).
 struct FusedShaders {
-  static bool integrates(int64_t shader) { return static_cast<ShaderKind>(shader) == ShaderKind::kPreIntegrated; }
+  static bool integrates(int64_t shader) {
+    STD_TORCH_CHECK(shader < static_cast<int64_t>(ShaderKind::kCount), "gvtorch: shader is unknown");
+    return with_shader<float>(static_cast<int32_t>(shader),
+                              [](auto type) { return decltype(type)::Shader::kIntegrates; });
+  }
   static void check(const ShadeArgs& args, int64_t shader) {
-    STD_TORCH_CHECK(shader >= 0 && shader < kShaderKinds, "gvtorch: shader is unknown");
-    const auto kind = static_cast<ShaderKind>(shader);
-    STD_TORCH_CHECK(kind != ShaderKind::kFeatures || args.other_channels > 0, "gvtorch: other_bzyxc is missing");
-    const bool colored = (args.channels == 4 || args.channels == 4 * kDirections) && args.component == 3;
-    STD_TORCH_CHECK(!is_stored_color(kind) || colored, "gvtorch: bricks_bzyxc must hold red, green, blue and opacity");
-    const int32_t given = kind == ShaderKind::kFeatures ? args.other_channels : kind == ShaderKind::kProjection ? 1 : 0;
-    STD_TORCH_CHECK(args.features == given, "gvtorch: features is not what the shader gives");
+    with_shader<float>(static_cast<int32_t>(shader), [&](auto type) {
+      using Shader = typename decltype(type)::Shader;
+      const bool by_other = Shader::kFeatures == Shader::kAsOther;
+      STD_TORCH_CHECK(!by_other || args.other_channels > 0, "gvtorch: other_bzyxc is missing");
+      const bool colored = (args.channels == 4 || args.channels == 4 * kDirections) && args.component == 3;
+      STD_TORCH_CHECK(!Shader::kColored || colored, "gvtorch: bricks_bzyxc must hold red, green, blue and opacity");
+      STD_TORCH_CHECK(args.features == (by_other ? args.other_channels : Shader::kFeatures),
+                      "gvtorch: features is not what the shader gives");
+    });
     STD_TORCH_CHECK(args.parameters == kParameters, "gvtorch: parameter_54 must hold 20 elements, got ",
                     args.parameters);
   }

@@ -16,22 +16,10 @@ void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end) {
 }
 
 void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end) {
-  switch (args.shader) {
-    case ShaderKind::kLit:
-      return trace_packets<Lit<float>, AnyValues>(args, begin, end);
-    case ShaderKind::kPreIntegrated:
-      return trace_packets<PreIntegrated<float>, AnyValues>(args, begin, end);
-    case ShaderKind::kStoredColor:
-      return trace_packets<StoredColor<float>, AnyValues>(args, begin, end);
-    case ShaderKind::kIsosurface:
-      return trace_packets<Isosurface<float>, AnyValues>(args, begin, end);
-    case ShaderKind::kProjection:
-      return trace_packets<Projection<float>, AnyValues>(args, begin, end);
-    case ShaderKind::kFeatures:
-      return trace_packets<Features<float>, AnyValues>(args, begin, end);
-    default:
-      return;
-  }
+  with_shader<float>(args.shader, [&](auto type) {
+    using Type = decltype(type);
+    if constexpr (!Type::kShadows) trace_packets<typename Type::Shader, AnyValues>(args, begin, end);
+  });
 }
 
 }  // namespace GV_NAMESPACE

@@ -240,27 +240,13 @@ struct HideShaded {
   }
 };
 
-// Calls body(Shader) with the shader of a kind.
+// Calls body(ShadeRay) with the rays of a fused shader.
 template <class T, class Body>
-void with_shader(ShaderKind kind, const ShadeArgs& args, const Body& body) {
-  switch (kind) {
-    case ShaderKind::kLit:
-      return body(ShadeRay<T, Lit<T>>(args));
-    case ShaderKind::kPreIntegrated:
-      return body(ShadeRay<T, PreIntegrated<T>>(args));
-    case ShaderKind::kStoredColor:
-      return body(ShadeRay<T, StoredColor<T>>(args));
-    case ShaderKind::kIsosurface:
-      return body(ShadeRay<T, Isosurface<T>>(args));
-    case ShaderKind::kProjection:
-      return body(ShadeRay<T, Projection<T>>(args));
-    case ShaderKind::kFeatures:
-      return body(ShadeRay<T, Features<T>>(args));
-    case ShaderKind::kShadowedLit:
-      return body(ShadeRay<T, Lit<T>, true>(args));
-    case ShaderKind::kShadowedColor:
-      return body(ShadeRay<T, StoredColor<T>, true>(args));
-  }
+void with_rays(const ShadeArgs& args, const Body& body) {
+  with_shader<T>(args.shader, [&](auto type) {
+    using Type = decltype(type);
+    body(ShadeRay<T, typename Type::Shader, Type::kShadows>(args));
+  });
 }
 
 }  // namespace GV_NAMESPACE

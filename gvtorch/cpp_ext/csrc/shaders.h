@@ -93,6 +93,13 @@ GV_HD T power_of(T x, RealOf<T> power) {
   return select(positive, exp2_exact(log2_exact(x) * power), T{});
 }
 
+// A shader's own numbers by name: a struct of at most four.
+template <class Own, class T>
+GV_HD const Own& own_numbers(const Parameters<T>* parameters) {
+  static_assert(sizeof(Own) <= sizeof(parameters->own));
+  return *reinterpret_cast<const Own*>(parameters->own);
+}
+
 // Blinn-Phong, on both sides of a surface.
 template <class T>
 struct Light {
@@ -162,10 +169,19 @@ struct Light {
   }
 };
 
+// What a shader says of itself, where it does not say otherwise; see the head of this file.
+struct ShaderFacts {
+  static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
+  static constexpr bool kIntegrates = false;  // its table is (l, m, m, 4)
+  static constexpr bool kColored = false;     // its channel holds red, green, blue and opacity, once or by direction
+  static constexpr int32_t kFeatures = 0;     // numbers of sum.feature_c
+  static constexpr int32_t kAsOther = -1;     // for kFeatures: as many as the second channel holds
+  static bool packs(const ShadeArgs&) { return true; }  // packets may take its rays
+};
+
 // The plain transfer function.
 template <class T>
-struct Plain {
-  static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
+struct Plain : ShaderFacts {
   template <class V>
   using SumOf = ShadeSum<V>;
   using Sum = SumOf<T>;
@@ -217,8 +233,9 @@ struct Lit : Plain<T> {
 // directions (Crassin et al., "Interactive indirect illumination using voxel cone tracing", CGF 2011): a ray reads
 // the three that it goes along, weighted by the squares of its direction, whose sum is 1. No packet reads those.
 template <class T>
-struct StoredColor {
-  static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
+struct StoredColor : ShaderFacts {
+  static constexpr bool kColored = true;
+  static bool packs(const ShadeArgs& args) { return args.channels == 4; }
   template <class V>
   using SumOf = ShadeSum<V>;
   using Sum = SumOf<T>;
@@ -230,7 +247,12 @@ struct StoredColor {
   GV_HD bool hides(T, T high, const Any&) const {
     return !(a_little_above(high) > 0);
   }
-  GV_HD const StoredColorNumbers<T>& own() const { return light.parameters->stored_color; }
+  struct Own {
+    T scale;               // of the numbers stored
+    T reference_length;    // of which they tell the opacity
+    T premultiplied, lit;  // 1 or 0
+  };
+  GV_HD const Own& own() const { return own_numbers<Own>(light.parameters); }
   template <class V, class Eye>
   GV_HD V opacity_of(const Piece<V>& piece, const Eye& probe) const {
     const V value = probe.channels.value.width == 4 ? piece.value : seen(probe, 3, piece.middle);
@@ -304,8 +326,11 @@ struct Veil {
 // A table over the values at both ends of an interval, (l, m, m): premultiplied colour and alpha. Beyond its domain the
 // function is constant: the parts of an interval that lie there are added before and behind.
 template <class T>
-struct PreIntegrated {
-  static constexpr bool kEnds = true, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
+struct PreIntegrated : ShaderFacts {
+  static constexpr bool kEnds = true, kIntegrates = true;
+  static bool packs(const ShadeArgs& args) {  // which count the bytes of the table in 32 bits
+    return int64_t{args.levels} * args.rows * args.rows * int64_t{sizeof(Row<float>)} <= INT32_MAX;
+  }
   template <class V>
   using SumOf = ShadeSum<V>;
   using Sum = SumOf<T>;
@@ -382,8 +407,8 @@ struct PreIntegrated {
 // voxel is cut to a sixteenth before its rest is taken for linear. The side on which the last interval ended is kept,
 // so that no crossing is lost between two nodes that round differently.
 template <class T>
-struct Isosurface {
-  static constexpr bool kEnds = true, kSeesEmpty = false, kSurface = true, kHidesAlike = true;
+struct Isosurface : ShaderFacts {
+  static constexpr bool kEnds = true, kSurface = true;
   template <class V>
   struct SumOf : ShadeSum<V> {
     V before{};
@@ -408,7 +433,10 @@ struct Isosurface {
         light{static_cast<const Parameters<T>*>(args.parameter_54)},
         color_component(args.other_component) {}
 
-  GV_HD T iso() const { return light.parameters->iso_value; }
+  struct Own {
+    T level;
+  };
+  GV_HD T iso() const { return own_numbers<Own>(light.parameters).level; }
   GV_HD bool hides(T low, T high, const Sum&) const {
     return a_little_above(high) < iso() || a_little_below(low) >= iso();
   }
@@ -461,8 +489,9 @@ struct Isosurface {
 // Maximum, minimum or mean of the value along the ray, coloured by the transfer function. A node that can't change a
 // maximum or minimum is left out.
 template <class T>
-struct Projection {
-  static constexpr bool kEnds = false, kSeesEmpty = true, kSurface = false, kHidesAlike = false;
+struct Projection : ShaderFacts {
+  static constexpr bool kSeesEmpty = true, kHidesAlike = false;
+  static constexpr int32_t kFeatures = 1;  // the value
   template <class V>
   struct SumOf : ShadeSum<V> {
     V found{};   // extreme so far, or sum of value * length
@@ -484,8 +513,11 @@ struct Projection {
   explicit Projection(const ShadeArgs& args)
       : transfer(args), parameters(static_cast<const Parameters<T>*>(args.parameter_54)) {}
 
+  struct Own {
+    T kind;  // a ProjectionKind
+  };
   GV_HD ProjectionKind kind() const {
-    return static_cast<ProjectionKind>(static_cast<int32_t>(parameters->projection));
+    return static_cast<ProjectionKind>(static_cast<int32_t>(own_numbers<Own>(parameters).kind));
   }
   GV_HD bool hides(T low, T high, const Sum& sum) const {
     if (!(sum.length > 0)) return false;
@@ -523,6 +555,7 @@ struct Projection {
 // All numbers of a second channel, composited with the transfer function's alpha. Sums lie in the output: any number.
 template <class T>
 struct Features : Plain<T> {
+  static constexpr int32_t kFeatures = Plain<T>::kAsOther;
   template <class V>
   using SumOf = ShadeSum<V>;
   using Plain<T>::Plain;
@@ -542,6 +575,42 @@ struct Features : Plain<T> {
     sum.add(row, piece.start, piece.length, sum.hit_clear, which);
   }
 };
+
+// The fused shaders: X(kind, struct, whether a cone goes from each sample to the light), in the order of their numbers.
+// ops/shading.py reads the kinds here.
+#define GV_SHADERS(X)                    \
+  X(Lit, Lit, false)                     \
+  X(PreIntegrated, PreIntegrated, false) \
+  X(StoredColor, StoredColor, false)     \
+  X(Isosurface, Isosurface, false)       \
+  X(Projection, Projection, false)       \
+  X(Features, Features, false)           \
+  X(ShadowedLit, Lit, true)              \
+  X(ShadowedColor, StoredColor, true)
+
+#define GV_KIND(kind, Shader, shadows) k##kind,
+enum class ShaderKind : int32_t { GV_SHADERS(GV_KIND) kCount };
+#undef GV_KIND
+
+template <class Kind, bool kWithShadows>
+struct ShaderType {
+  using Shader = Kind;
+  static constexpr bool kShadows = kWithShadows;
+};
+
+// Returns body(ShaderType) with the shader of a kind.
+template <class T, class Body>
+auto with_shader(int32_t kind, const Body& body) {
+#define GV_CASE(kind, Shader, shadows) \
+  case ShaderKind::k##kind:            \
+    return body(ShaderType<Shader<T>, shadows>{});
+  switch (static_cast<ShaderKind>(kind)) {
+    GV_SHADERS(GV_CASE)
+    default:
+      return body(ShaderType<Plain<T>, false>{});
+  }
+#undef GV_CASE
+}
 
 }  // namespace GV_NAMESPACE
 }  // namespace gvtorch

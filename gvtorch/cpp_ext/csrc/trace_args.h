@@ -22,20 +22,9 @@ struct TraceArgs {
   int32_t nodes_per_tile, side, channels, rows, levels;
 };
 
-constexpr int64_t kShaderKinds = 8;
-constexpr bool is_stored_color(ShaderKind kind) {
-  return kind == ShaderKind::kStoredColor || kind == ShaderKind::kShadowedColor;
-}
 enum class LightKind { kHeadlight, kDirectional, kPoint };
 enum class ProjectionKind { kMaximum, kMinimum, kMean };
 constexpr int32_t kDirections = 6;  // +x -x +y -y +z -z: a stored colour may have four numbers for each
-
-template <class T>
-struct StoredColorNumbers {
-  T scale;               // of the numbers stored
-  T reference_length;    // of which they tell the opacity
-  T premultiplied, lit;  // 1 or 0
-};
 
 // The numbers of a fused shader, `parameter_54`, by name; a user's own stand behind them.
 template <class T>
@@ -45,11 +34,7 @@ struct Parameters {
   T light_color[3], ambient;
   T diffuse, specular, shininess;
   T light_width;  // of a cone to the light: its growth (directional), or the width at the light (point)
-  union {         // of each shader its own
-    StoredColorNumbers<T> stored_color;
-    T iso_value;
-    T projection;  // a ProjectionKind
-  };
+  T own[4];       // the shader's own: its Own, see shaders.h
   T normal_scale, normal_offset, unused[2];  // a stored normal is number * scale + offset
 };
 constexpr int32_t kParameters = sizeof(Parameters<float>) / sizeof(float);

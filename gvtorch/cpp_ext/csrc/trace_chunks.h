@@ -2,6 +2,7 @@
 #pragma once
 
 #include "for_each.h"
+#include "shaders.h"
 #include "walk.h"
 
 namespace gvtorch {
@@ -18,17 +19,10 @@ inline bool packs(const TraceArgs& args) {
 inline bool shades(const ShadeArgs& args) {
   const auto fits = [&](VoxelType type, int32_t channels) { return brick_bytes(type, args.side, channels) < 1 << 24; };
   if (!packs(args) || !fits(args.normal_voxel, 3) || !fits(args.other_voxel, args.other_channels)) return false;
-  switch (args.shader) {
-    case ShaderKind::kStoredColor:
-      return args.channels == 4;
-    case ShaderKind::kPreIntegrated:
-      return int64_t{args.levels} * args.rows * args.rows * int64_t{sizeof(Row<float>)} <= INT32_MAX;
-    case ShaderKind::kShadowedLit:
-    case ShaderKind::kShadowedColor:
-      return false;
-    default:
-      return true;
-  }
+  return with_shader<float>(args.shader, [&](auto type) {
+    using Type = decltype(type);
+    return !Type::kShadows && Type::Shader::packs(args);
+  });
 }
 
 // body(begin, end) for chunks of the rays; first an empty byte for each node, in which it is kept what is hidden.
