@@ -275,3 +275,21 @@ def test_parameters_read_back_as_they_were_packed():
     read = ShadeParameters.read(packed)
     assert read.own_as(IsosurfaceNumbers) == IsosurfaceNumbers(level)
     assert torch.equal(read.pack(torch.float64, torch.device("cpu")), packed)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25, 0.5, 3.0])
+def test_gradient_magnitude_scales_the_optical_depth_of_a_ramp(backend, share):
+    ramp = np.broadcast_to(0.01 * np.arange(32, dtype=np.float32), (8, 8, 32))
+    data = ramp.copy() if share else np.full((8, 8, 32), 0.5, np.float32)
+    tree = gv.N3Tree.from_volume(gv.Volume(data), 4, device=DEVICES[backend])
+    transfer = gv.TransferFunction.from_points([(-1, 0.3), (1, 0.3)], reference=10)
+    shader = gv.GradientMagnitude(transfer, 0.01 / share if share else None)
+    rays = gv.Rays(
+        origin=torch.tensor([[10.0, 3.7, -5.0]], dtype=torch.float64),
+        direction=torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64),
+        cone=torch.zeros(1, 2, dtype=torch.float64),
+        range=torch.tensor([[0.0, torch.inf]], dtype=torch.float64),
+    )
+    hits = shoot(tree, rays.to(DEVICES[backend]), shader, backend, stop_alpha=1.0)
+    expected = 1 - (1 - 0.3) ** (8 / 10 * min(share, 1.0))
+    assert abs(float(hits["alpha"][0, 0]) - expected) < 2e-5

@@ -30,4 +30,5 @@ SHADERS = {
     "minimum": gv.Projection("minimum", SHADER),
     "mean": gv.Projection("mean", SHADER),
     "features": gv.Features(SHADER, "rgba"),
+    "gradient magnitude": gv.GradientMagnitude(SHADER, 0.1),
 }

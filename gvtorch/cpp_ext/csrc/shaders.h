@@ -576,6 +576,34 @@ struct Features : Plain<T> {
   }
 };
 
+// The transfer function, the denser the faster the value changes (after Levoy 1988, "region boundary surfaces"): the
+// optical depth of an interval times the gradient's length over `full`, 1 at most.
+template <class T>
+struct GradientMagnitude : Plain<T> {
+  template <class V>
+  using SumOf = ShadeSum<V>;
+  struct Own {
+    T full;  // a unit of the value per world unit
+  };
+  const Parameters<T>* parameters;
+
+  explicit GradientMagnitude(const ShadeArgs& args)
+      : Plain<T>(args), parameters(static_cast<const Parameters<T>*>(args.parameter_54)) {}
+
+  template <class V, class Eye>
+  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
+    Row<V> row = look_up(Transfer<T>(this->transfer), piece.value, piece, this->step, which);
+    const MaskOf<V> shown = which && row.alpha > 0;
+    if (!any(shown)) return;
+    probe.narrow(shown);
+    const Vec3<V> slope = probe.gradient(piece.middle);
+    const V part =
+        clamp(square_root(dot(slope, slope)) / own_numbers<Own>(parameters).full, static_cast<T>(0), static_cast<T>(1));
+    row.alpha = select(part > 0, stretch(row.alpha, part), V{});
+    sum.add(row, piece.start, piece.length, sum.hit_clear, shown);
+  }
+};
+
 // The fused shaders: X(kind, struct, whether a cone goes from each sample to the light), in the order of their numbers.
 // ops/shading.py reads the kinds here.
 #define GV_SHADERS(X)                    \
@@ -586,7 +614,8 @@ struct Features : Plain<T> {
   X(Projection, Projection, false)       \
   X(Features, Features, false)           \
   X(ShadowedLit, Lit, true)              \
-  X(ShadowedColor, StoredColor, true)
+  X(ShadowedColor, StoredColor, true)    \
+  X(GradientMagnitude, GradientMagnitude, false)
 
 #define GV_KIND(kind, Shader, shadows) k##kind,
 enum class ShaderKind : int32_t { GV_SHADERS(GV_KIND) kCount };

@@ -12,6 +12,7 @@ from torch import Tensor
 from ..arguments import RayArguments, ShadeArguments, TraceArguments
 from ..shading import (
     SHADER_KINDS,
+    GradientMagnitudeNumbers,
     IsosurfaceNumbers,
     LightKind,
     ProjectionKind,
@@ -19,7 +20,7 @@ from ..shading import (
     ShadeParameters,
     StoredColorNumbers,
 )
-from .exact import clamp, larger, stretch, unit
+from .exact import clamp, dot, larger, sqrt_exact, stretch, unit
 from .lights import Light
 from .march import Plain, Probe, Walk
 from .rays import INF
@@ -298,6 +299,19 @@ class Features(Shade):
 
 
 #: Twins by the names of C++'s structs.
+class GradientMagnitude(Shade):
+    """The transfer function, the denser the faster the value changes."""
+
+    def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
+        """See `Visitor`."""
+        own = self.light.parameters.own_as(GradientMagnitudeNumbers)
+        rgba = self.rgba(piece, probe)
+        slope = probe.gradient(piece.middle, self.light.cube)
+        part = clamp(sqrt_exact(dot(slope, slope)) / own.full, 0, 1)
+        alpha = torch.where(part > 0, stretch(rgba[:, 3], part), 0.0)
+        self.sum.add(torch.cat((rgba[:, :3], alpha[:, None]), 1), piece, where)
+
+
 TWINS: dict[str, type[Shade]] = {
     "Lit": Shade,
     "PreIntegrated": PreIntegrated,
@@ -307,6 +321,7 @@ TWINS: dict[str, type[Shade]] = {
     "Features": Features,
     "ShadowedLit": Shade,
     "ShadowedColor": StoredColor,
+    "GradientMagnitude": GradientMagnitude,
 }
 
 
