@@ -153,7 +153,7 @@ struct PacketWalk {
   }
 
  private:
-  using Visitor = typename Kernel::template Visitor<Shader, BitDigits<float>>;
+  using Visitor = typename Kernel::template Visitor<Shader>;
 
   GV_HD void load(int64_t begin, int64_t end) {
     alive = Mask{};

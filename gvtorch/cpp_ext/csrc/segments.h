@@ -74,7 +74,7 @@ struct WalkRay {
   // See Walk::follow.
   template <class Emit>
   struct Visitor {
-    static constexpr bool kSeesEmpty = false;
+    static constexpr bool kPowers = true, kSeesEmpty = false;
     const WalkRay& walk;
     Emit& emit;
     int32_t segments = 0, samples = 0, visits = 0;
@@ -139,11 +139,7 @@ struct WalkRay {
   template <class Emit>
   GV_HD Visitor<Emit> walk(const Ray<T>& ray, Intervals<T>& at, Emit& emit) const {
     Visitor<Emit> visitor{*this, emit};
-    if (kernel.tree.digit_bits > 0) {
-      kernel.template follow<BitDigits<T>>(ray, at, visitor);
-    } else {
-      kernel.template follow<Digits<T>>(ray, at, visitor);
-    }
+    kernel.follow(ray, at, visitor);
     return visitor;
   }
 

@@ -15,8 +15,8 @@ struct HidesAlike : std::false_type {};
 template <class Shader>
 struct HidesAlike<Shader, std::void_t<decltype(Shader::kHidesAlike)>> : std::bool_constant<Shader::kHidesAlike> {};
 
-// kPowers: an N that is a power of two has code of its own.
-template <class T, class Shader, bool kShadows = false, bool kPowers = true>
+// kOwnPowers: an N that is a power of two has code of its own.
+template <class T, class Shader, bool kShadows = false, bool kOwnPowers = true>
 struct ShadeRay : Walk<T> {
   using Walk<T>::tree;
   using Walk<T>::options;
@@ -52,11 +52,20 @@ struct ShadeRay : Walk<T> {
   GV_HD void operator()(int64_t index) const {
     const int64_t number = this->order(index);
     if (number < 0) return;
-    if (kPowers && tree.digit_bits > 0) {
-      shade<BitDigits<T>>(number);
-    } else {
-      shade<Digits<T>>(number);
+    const Ray<T> ray(this->rays, number);
+    const Sight<T> sight(this->rays, number, ray.moved);
+    Intervals<T> at(ray, options.step, lengths);
+    Sum sum;
+    sum.begin(0, static_cast<T>(this->rays.clear(number)), this->hit_clear, features_rc + number * features);
+    for (int32_t c = 0; c < features; ++c) sum.feature_c[c] = 0;
+    Visitor<Shader> visitor{*this, shader, &ray, &sight, sum};
+    this->follow(ray, at, visitor);
+    if constexpr (Shader::kSurface) {
+      if (sum.depth < static_cast<T>(INFINITY)) {
+        kOwnPowers&& tree.digit_bits > 0 ? surface<BitDigits<T>>(ray, sight, sum) : surface<Digits<T>>(ray, sight, sum);
+      }
     }
+    finish(number, ray.moved, visitor.samples, sum);
   }
 
   // Nothing between the ends of the node's range changes the sum.
@@ -109,10 +118,10 @@ struct ShadeRay : Walk<T> {
   // Near a light, a stored normal is lit differently wherever it stands.
   GV_HD bool shades_each_place() const { return channels.normal.given() && light.kind() == LightKind::kPoint; }
 
-  // See Walk::follow. Any: the shader, or its Veil on the way to a light. Digits: for shadows.
-  template <class Any, class Digits>
+  // See Walk::follow. Any: the shader, or its Veil on the way to a light.
+  template <class Any>
   struct Visitor {
-    static constexpr bool kSeesEmpty = Any::kSeesEmpty, kEnds = Any::kEnds;
+    static constexpr bool kPowers = kOwnPowers, kSeesEmpty = Any::kSeesEmpty, kEnds = Any::kEnds;
     static constexpr bool kShadowed = kShadows && std::is_same_v<Any, Shader>;  // none on the way to a light
     const ShadeRay& kernel;
     const Any& shader;
@@ -130,6 +139,7 @@ struct ShadeRay : Walk<T> {
       if constexpr (HidesAlike<Any>::value) return kernel.hides(node);
       return kernel.hides(shader, node, sum);
     }
+    template <class Digits>
     GV_HD Probe<T> enter(const Ray<T>& ray, const Visit<T>& visit, const Digits& digits) const {
       return Probe<T>(kernel.channels, *sight, kernel.rays, ray, kernel.levels, visit, digits);
     }
@@ -182,7 +192,7 @@ struct ShadeRay : Walk<T> {
     GV_HD void add(const Piece<T>& piece, const Probe<T>& probe) {
       if constexpr (kShadowed) {
         shader.add(true, piece, probe, sum, [&](T t, Vec3<T> way, T length, T growth) {
-          return kernel.template share_of_light<Digits>(*ray, probe, t, way, length, growth, samples, sum.missed);
+          return kernel.share_of_light(*ray, probe, t, way, length, growth, samples, sum.missed);
         });
       } else {
         shader.add(true, piece, probe, sum);
@@ -191,25 +201,8 @@ struct ShadeRay : Walk<T> {
   };
 
  private:
-  template <class Digits>
-  GV_HD void shade(int64_t number) const {
-    const Ray<T> ray(this->rays, number);
-    const Sight<T> sight(this->rays, number, ray.moved);
-    Intervals<T> at(ray, options.step, lengths);
-    Sum sum;
-    sum.begin(0, static_cast<T>(this->rays.clear(number)), this->hit_clear, features_rc + number * features);
-    for (int32_t c = 0; c < features; ++c) sum.feature_c[c] = 0;
-    Visitor<Shader, Digits> visitor{*this, shader, &ray, &sight, sum};
-    this->template follow<Digits>(ray, at, visitor);
-    if constexpr (Shader::kSurface) {
-      if (sum.depth < static_cast<T>(INFINITY)) surface<Digits>(ray, sight, sum);
-    }
-    finish(number, ray.moved, visitor.samples, sum);
-  }
-
   // How much light comes from `length` away to the place at distance t. The cone is as wide there as the ray's; its
   // first interval is left out, so that a place does not stand in its own shadow.
-  template <class Digits>
   GV_HD T share_of_light(const Ray<T>& ray, const Probe<T>& probe, T t, Vec3<T> way, T length, T growth,
                          int32_t& samples, bool& missed) const {
     const Vec3<T> place{ray.origin.x + t * ray.direction.x, ray.origin.y + t * ray.direction.y,
@@ -221,8 +214,8 @@ struct ShadeRay : Walk<T> {
     at.go(true, at.count + 1);
     const Veil<T, Shader> veil{shader};
     typename Veil<T, Shader>::Sum sum;
-    Visitor<Veil<T, Shader>, Digits> visitor{*this, veil, &beam, &sight, sum};
-    this->template follow<Digits>(beam, at, visitor);
+    Visitor<Veil<T, Shader>> visitor{*this, veil, &beam, &sight, sum};
+    this->follow(beam, at, visitor);
     samples += visitor.samples;
     missed = missed || sum.missed;
     return sum.clear;

@@ -23,7 +23,6 @@ struct Run {
 
 template <class T, class Voxel>
 struct TraceRay : Walk<T> {
-  using Walk<T>::tree;
   using Walk<T>::levels;
   using Walk<T>::options;
   BrickView<Voxel> bricks;
@@ -53,17 +52,13 @@ struct TraceRay : Walk<T> {
     Intervals<T> at(ray, options.step, lengths);
     Visitor visitor{*this, Transfer<T>(transfer)};
     visitor.sum.clear = static_cast<T>(this->rays.clear(number));
-    if (tree.digit_bits > 0) {
-      this->template follow<BitDigits<T>>(ray, at, visitor);
-    } else {
-      this->template follow<Digits<T>>(ray, at, visitor);
-    }
+    this->follow(ray, at, visitor);
     this->store(number, visitor.sum, ray.moved, visitor.samples);
   }
 
   // See Walk::follow.
   struct Visitor {
-    static constexpr bool kSeesEmpty = false;
+    static constexpr bool kPowers = true, kSeesEmpty = false;
     const TraceRay& kernel;
     const Transfer<T> shader;
     Accumulator<T> sum{};

@@ -92,8 +92,9 @@ struct Walk {
         stop_clear(1 - options.stop_alpha),
         hit_clear(1 - options.depth_alpha) {}
 
-  // Goes along a ray of a tree with digits of that kind, to its end or until the visitor has enough. A visitor has:
+  // Goes along a ray to its end, or until the visitor has enough. A visitor has:
   //
+  //   kPowers                          an N that is a power of two has code of its own
   //   kSeesEmpty                       EMPTY nodes count
   //   missed()                         a bool&: something that is seen was not there
   //   more()                           the ray goes on to another node
@@ -105,30 +106,33 @@ struct Walk {
   //                                    the far side; returns how many
   //   sees()                           the ray goes on in this node
   //   finish(node)                     all intervals of the visit have been taken
-  template <class Digits, class Visitor>
+  template <class Visitor>
   GV_HD void follow(const Ray<T>& ray, Intervals<T>& at, Visitor& visitor) const {
     int32_t wanted = 0;
+    const bool powers = Visitor::kPowers && tree.digit_bits > 0;
     while (at.inside() && visitor.more()) {
-      const T middle = at.middle();
-      Digits digits(tree, ray.at(middle));
-      const auto hides = [&](int32_t node) { return visitor.hides(node); };
-      Visit<T> visit = find(ray, digits, at.cone(middle), hides, wanted, visitor.missed());
-      visit.seen = middle;
-      const bool empty = !Visitor::kSeesEmpty && visit.fine.brick == kEmpty && visit.coarse.brick == kEmpty;
-      if (visit.hidden || visit.fine.node < 0 || empty) {
-        at.leave(true, visit);
-        continue;
-      }
-      auto node = visitor.enter(ray, visit, digits);
-      if (visitor.uniform(node)) {
-        const T entry = at.start;
-        at.leave(true, visit);
-        visitor.region(node, entry, smaller(at.start, at.stop));
-      } else {
-        march(visit, at, visitor, node);
-        visitor.finish(node);
-      }
+      powers ? visit<BitDigits<T>>(ray, at, visitor, wanted) : visit<Digits<T>>(ray, at, visitor, wanted);
     }
+  }
+
+  // One node: finds it, marks it, and takes all intervals whose middle lies in it.
+  template <class Digits, class Visitor>
+  GV_HD void visit(const Ray<T>& ray, Intervals<T>& at, Visitor& visitor, int32_t& wanted) const {
+    const T middle = at.middle();
+    Digits digits(tree, ray.at(middle));
+    const auto hides = [&](int32_t node) { return visitor.hides(node); };
+    Visit<T> visit = find(ray, digits, at.cone(middle), hides, wanted, visitor.missed());
+    visit.seen = middle;
+    const bool empty = !Visitor::kSeesEmpty && visit.fine.brick == kEmpty && visit.coarse.brick == kEmpty;
+    if (visit.hidden || visit.fine.node < 0 || empty) return at.leave(true, visit);
+    auto node = visitor.enter(ray, visit, digits);
+    if (visitor.uniform(node)) {
+      const T entry = at.start;
+      at.leave(true, visit);
+      return visitor.region(node, entry, smaller(at.start, at.stop));
+    }
+    march(visit, at, visitor, node);
+    visitor.finish(node);
   }
 
   // All intervals of a visit that are still to come.
