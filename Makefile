@@ -9,6 +9,7 @@
 PYTHON ?= python3
 VENV := .venv
 COMMA := ,
+SOURCES := $(wildcard gvtorch/cpp_ext/csrc/*.* gvtorch/cpp_ext/csrc/*/*)
 BIN := $(VENV)/bin
 TORCH := $(shell sed -n 's/.*"\(torch==[0-9.]*\)".*/\1/p' pyproject.toml)
 NATIVE := $(shell nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u | tr -d . | paste -sd ';')
@@ -38,12 +39,12 @@ lint: $(VENV)/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/clang-format --dry-run --Werror $(wildcard gvtorch/cpp_ext/csrc/* gvtorch/bench/*.h tests/cpp/* examples/*.h)
+	$(BIN)/clang-format --dry-run --Werror $(SOURCES) $(wildcard gvtorch/bench/*.h tests/cpp/* examples/*.h)
 
 format: $(VENV)/ready
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
-	$(BIN)/clang-format -i $(wildcard gvtorch/cpp_ext/csrc/* gvtorch/bench/*.h tests/cpp/* examples/*.h)
+	$(BIN)/clang-format -i $(SOURCES) $(wildcard gvtorch/bench/*.h tests/cpp/* examples/*.h)
 
 bench: $(VENV)/bench
 	for device in cpu $(if $(NATIVE),cuda); do $(BIN)/gvtorch bench all --device $$device -o docs/performance $(ARGS) || exit; done
@@ -61,7 +62,7 @@ $(VENV)/torch: pyproject.toml .ci/constraints.txt
 	$(PIP) setuptools wheel "$(TORCH)"
 	@touch $@
 
-$(VENV)/ready: $(VENV)/torch $(wildcard gvtorch/cpp_ext/csrc/*) gvtorch/cpp_ext/build.py gvtorch/cpp_ext/compilers.py
+$(VENV)/ready: $(VENV)/torch $(SOURCES) gvtorch/cpp_ext/build.py gvtorch/cpp_ext/compilers.py
 	$(PIP) --no-build-isolation -e ".[dev]"
 	@touch $@
 

@@ -51,7 +51,8 @@ def figures(checkout: Path, workload: str, settings: Settings) -> dict[Case, flo
     command = [sys.executable, "-m", "gvtorch", "bench", workload, "--json", "--peers", "none"]
     command += ["--device", settings.device, "--repeats", str(settings.repeats)]
     command += ["--only", settings.only, *(["--quick"] if settings.quick else [])]
-    environment = {**os.environ, "PYTHONPATH": str(checkout.resolve())}
+    paths = [str(checkout.resolve()), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     run = subprocess.run(
         command, cwd=checkout, env=environment, capture_output=True, text=True, check=False
     )

@@ -84,7 +84,7 @@ def test_unlink_clears_every_pointer_to_a_slot(backend, pointers, leaving, divis
 
 @fixed
 @given(data=st.data(), tiles=st.integers(1, 20))
-def test_link_writes_pointers_and_takes_wishes_back(backend, data, tiles):
+def test_link_writes_pointers_and_takes_requests_back(backend, data, tiles):
     nodes = tiles * 8
     device = DEVICES[backend]
     pointer = data.draw(st.lists(st.integers(-3, 99), min_size=nodes, max_size=nodes))

@@ -4,6 +4,7 @@ other."""
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from graphlib import TopologicalSorter
@@ -96,9 +97,22 @@ def test_ops_know_no_objects():
 
 
 def test_kernel_headers_know_no_torch():
-    for path in (PACKAGE / "cpp_ext" / "csrc").glob("*.h"):
+    headers = [*(PACKAGE / "cpp_ext" / "csrc").rglob("*.h")]
+    assert len(headers) > 20
+    for path in headers:
         if path.name not in ("entry.h", "for_each.h"):
             assert "torch/" not in path.read_text() and "ATen" not in path.read_text(), path
+
+
+def test_kernel_headers_include_only_downward():
+    floors = [{"base"}, {"walk"}, {"cache", "shaders"}, {"packets"}, {"entry"}]
+    csrc = PACKAGE / "cpp_ext" / "csrc"
+    number = {name: floor for floor, names in enumerate(floors) for name in names}
+    for path in csrc.glob("*/*.h"):
+        own = path.parent.name
+        for other in re.findall(r'#include "(\w+)/', path.read_text()):
+            below = number[other] < number[own] or other == own
+            assert below, f"{path.relative_to(csrc)} includes {other}"
 
 
 def test_import_loads_torch_and_nothing_heavier():

@@ -5,6 +5,7 @@ came.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import operator
 import os
@@ -105,20 +106,27 @@ def tensors(
     Raises:
         ValueError: See `tensor`; or `where: name must be contiguous`.
     """
-    known = dict(sizes or {})
+    known = {**_DIGITS, **(sizes or {})}
     for name, value, shape, dtype in fields:
-        expected = [int(part) if part.isdigit() else known.get(part, part) for part in shape]
-        tensor(where, name, value, expected, dtype, device)
-        for letter, size in zip(shape, value.shape, strict=True):
-            if not letter.isdigit() and known.setdefault(letter, size) != size:  # twice in a shape
-                raise ValueError(
-                    f"{where}: {name} must be ({', '.join(shape)}), got {describe(value)}"
-                )
+        if tuple(map(known.get, shape)) != getattr(value, "shape", None):  # wrong, or a new letter
+            expected = [known.get(letter, letter) for letter in shape]
+            tensor(where, name, value, expected, dtype, device)
+            for letter, size in zip(shape, value.shape, strict=True):
+                if known.setdefault(letter, size) != size:  # it stands twice in this shape
+                    raise ValueError(
+                        f"{where}: {name} must be ({', '.join(shape)}), got {describe(value)}"
+                    )
+        elif value.dtype != dtype or value.device != device:
+            tensor(where, name, value, value.shape, dtype, device)
         if not value.is_contiguous():
             raise ValueError(f"{where}: {name} must be contiguous")
     return known
 
 
+_DIGITS = {str(digit): digit for digit in range(10)}
+
+
+@functools.cache
 def shape_of(name: str) -> str:
     """Returns the shape that a name ends with, as in "r3" of origin_r3; bricks are cubes: "bsssc"
     of bricks_bzyxc.

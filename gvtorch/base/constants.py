@@ -25,16 +25,16 @@ MAX_VOXELS = 2**31
 #: Most intervals on one ray: their number is kept in a float32.
 MAX_INTERVALS = 2**23
 
-#: Node words, see cpp_ext/csrc/tree.h.
+#: Node words, see cpp_ext/csrc/walk/tree.h.
 ABSENT = -1
 TERMINAL = -2
 EMPTY = -2
 CONSTANT = -3
 
-#: Request words, see cpp_ext/csrc/hd.h: kind bits above a priority of 16 bits.
+#: Request words, see cpp_ext/csrc/base/hd.h: kind bits above a priority of 16 bits.
 REQUEST_PRIORITY = 0xFFFF
 REQUEST_LOAD = 1 << 16
 REQUEST_SUBDIVIDE = 1 << 17
 REQUEST_KINDS = REQUEST_LOAD | REQUEST_SUBDIVIDE
-#: Kinds shifted by this are pending: asked for, not here yet, see cpp_ext/csrc/cache.h.
+#: Kinds shifted by this are pending: asked for, not here yet, see cpp_ext/csrc/cache/cache.h.
 REQUEST_PENDING_SHIFT = 2

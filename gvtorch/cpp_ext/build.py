@@ -52,7 +52,7 @@ def commands(output: Path) -> dict[Path, list[list[str]]]:
     """
     source = FOLDER / "csrc"
     include, link = compilers.torch_flags()
-    cxx = [*compilers.find_cxx(), *compilers.CXX_FLAGS, "-Wall", "-Wextra"]
+    cxx = [*compilers.find_cxx(), *compilers.CXX_FLAGS, f"-I{source}", "-Wall", "-Wextra"]
     x86 = platform.machine().lower() in ("x86_64", "amd64")
     parts = {"cpu": (["-DGV_X86"] if x86 else []) + include}
     for name, flags in compilers.INSTRUCTION_SETS.items():
@@ -73,7 +73,7 @@ def commands(output: Path) -> dict[Path, list[list[str]]]:
         archs = os.environ.get("GVTORCH_CUDA_ARCHS", ARCHS).split(";")
         codes = compilers.machine_codes(archs)
         codes.append(f"-gencode=arch=compute_{archs[-1]},code=compute_{archs[-1]}")
-        call = [nvcc, *compilers.NVCC_FLAGS, "--threads=0", *codes, *include]
+        call = [nvcc, *compilers.NVCC_FLAGS, f"-I{source}", "--threads=0", *codes, *include]
         call += [str(source / "cuda.cu"), "-Xlinker=--no-as-needed", *link]
         calls[output / "libgvtorch_cuda.so"] = [call]
     return calls
@@ -81,7 +81,7 @@ def commands(output: Path) -> dict[Path, list[list[str]]]:
 
 def compile_libraries(output: Path) -> list[Path]:
     """Compiles what is missing or older than its sources or flags; returns the libraries."""
-    sources = sorted((FOLDER / "csrc").iterdir())
+    sources = sorted(path for path in (FOLDER / "csrc").rglob("*") if path.is_file())
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
     output.mkdir(parents=True, exist_ok=True)
     libraries = []

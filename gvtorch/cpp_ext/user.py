@@ -292,8 +292,8 @@ def _refused(reason: object) -> RuntimeError:
 @functools.cache
 def _own_sources() -> bytes:
     """Returns the digests of gvtorch's own sources, one after the other."""
-    digests = [hashlib.sha256(file.read_bytes()).digest() for file in sorted(SOURCES.iterdir())]
-    return b"".join(digests)
+    files = sorted(path for path in SOURCES.rglob("*") if path.is_file())
+    return b"".join(hashlib.sha256(path.read_bytes()).digest() for path in files)
 
 
 def _identity(command: Sequence[str]) -> str:

@@ -2,8 +2,8 @@
 and segments and samples, which some ops give and others take. `checks.py` checks them.
 
 A field is an argument of the ops' schemas, of the same name and in the same order as in
-cpp_ext/csrc/arguments.h, where the ops' lists stand. The last part of a tensor's name tells its
-shape, a letter or digit a dimension: r rays, t tiles, n nodes of a tile, b brick slots, z y x
+cpp_ext/csrc/base/arguments.h, where the ops' lists stand. The last part of a tensor's name tells
+its shape, a letter or digit a dimension: r rays, t tiles, n nodes of a tile, b brick slots, z y x
 voxels, c numbers of a voxel, l lengths of intervals, m rows of a table. All tensors are contiguous
 and on one device.
 """
@@ -86,7 +86,7 @@ class TraceArguments(NamedTuple):
 
 
 class ShadeArguments(NamedTuple):
-    """Which fused shader, or a user's, and what it reads beside; see csrc/shaders.h."""
+    """Which fused shader, or a user's, and what it reads beside; see csrc/shaders/shaders.h."""
 
     shader: int = 0  # a `shading.shader_number`; 0 for a user's op
     features: int = 0  # how many it gives: c for features, 1 (the value) for projections, else 0

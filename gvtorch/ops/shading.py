@@ -1,6 +1,6 @@
 """What `shade_rays` is told about a shader: which one, and 20 numbers of light, material and the
 shader's own. Declared once, for the shaders that write them and the torch twin that reads them;
-C++ reads the same numbers in cpp_ext/csrc/shaders.h.
+C++ reads the same numbers in cpp_ext/csrc/shaders/shaders.h.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Triple = Sequence[float] | Tensor
 
 
 def _declared_kinds() -> tuple[str, ...]:
-    """The kinds in the list `GV_SHADERS` of csrc/shaders.h."""
+    """The kinds in the list `GV_SHADERS` of csrc/shaders/shaders.h."""
     for header in sorted(cpp_ext.SOURCES.rglob("shaders.h")):
         found = re.search(r"#define GV_SHADERS\(X\)((?:.*\\\n)*.*)", header.read_text("utf-8"))
         if found is not None:

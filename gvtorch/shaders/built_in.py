@@ -1,7 +1,7 @@
 """The built-in shaders: what each reads, and what it tells the kernel.
 
-A shader stands in three files, once in each: its struct in cpp_ext/csrc/shaders.h, which tells what
-it does with an interval; its torch twin in ops/reference/shaders.py; and its class here.
+A shader stands in three files, once in each: its struct in cpp_ext/csrc/shaders/shaders.h, which
+tells what it does with an interval; its torch twin in ops/reference/shaders.py; and its class here.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from .shader import Shader
 
 
 class LitShader(Shader):
-    """A shader with a light and a material; see `Material` and csrc/shaders.h.
+    """A shader with a light and a material; see `Material` and csrc/shaders/shaders.h.
 
     Attributes:
         shadows: Whether a cone goes from each sample to the light: matter on the way takes from

@@ -7,10 +7,10 @@
 #include <cstring>
 #include <vector>
 
-#include "cache.h"
-#include "for_each.h"
-#include "shade_each.h"
-#include "trace_chunks.h"
+#include "base/for_each.h"
+#include "cache/cache.h"
+#include "packets/trace_chunks.h"
+#include "shaders/shade_each.h"
 
 namespace gvtorch {
 
@@ -163,8 +163,8 @@ void shade(const torch::stable::Tensor& like, ShadeArgs args, bool wide) {
 
 }  // namespace gvtorch
 
-#include "entry_cache.h"
-#include "entry_segments.h"
+#include "entry/entry_cache.h"
+#include "entry/entry_segments.h"
 
 STABLE_TORCH_LIBRARY(gvtorch, library) {
   gvtorch::define(library, gvtorch::RayOps{});

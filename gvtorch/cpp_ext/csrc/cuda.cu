@@ -4,10 +4,10 @@
 #include <cub/block/block_reduce.cuh>
 #include <cub/block/block_scan.cuh>
 
-#include "cache.h"
-#include "for_each.h"
-#include "shade_each.h"
-#include "trace.h"
+#include "base/for_each.h"
+#include "cache/cache.h"
+#include "shaders/shade_each.h"
+#include "walk/trace.h"
 
 namespace gvtorch {
 
@@ -214,8 +214,8 @@ void split(const torch::stable::Tensor& like, int64_t count, const Keep& keep, c
 
 }  // namespace gvtorch
 
-#include "entry_cache.h"
-#include "entry_segments.h"
+#include "entry/entry_cache.h"
+#include "entry/entry_segments.h"
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch, CUDA, library) {
   gvtorch::implement<gvtorch::Cuda>(library, gvtorch::RayOps{});

@@ -1,6 +1,6 @@
 // Tracing on the CPU in float32, compiled once for each instruction set (build.py), GV_NAMESPACE its name. Nothing of
 // torch or of the standard library's templates may stand here: see hd.h.
-#include "packet_walk.h"
+#include "packets/packet_walk.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {

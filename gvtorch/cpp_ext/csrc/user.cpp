@@ -11,12 +11,12 @@ using UserShaderOf = GV_USER_SHADER<T>;  // the name that CompiledShader was tol
 #include <type_traits>
 #include <utility>
 
-#include "entry.h"
-#include "shade_each.h"
+#include "entry/entry.h"
+#include "shaders/shade_each.h"
 #if !defined(__CUDACC__) && !defined(GV_RAY_BY_RAY)
 #define GV_PACKETS
-#include "packet_walk.h"
-#include "trace_chunks.h"
+#include "packets/packet_walk.h"
+#include "packets/trace_chunks.h"
 #endif
 
 namespace gvtorch {

@@ -21,7 +21,7 @@
 
 #include <type_traits>
 
-#include "shade_rays.h"
+#include "shaders/shade_rays.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {

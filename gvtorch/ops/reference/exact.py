@@ -1,6 +1,6 @@
 """Numbers that every backend rounds alike: plain operations in a fixed order, none fused.
 
-Equal to cpp_ext/csrc/hd.h to the last bit in float32.
+Equal to cpp_ext/csrc/base/hd.h to the last bit in float32.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Part of the torch twin: rays in tree units and their fixed intervals, as csrc/ray.h."""
+"""Part of the torch twin: rays in tree units and their fixed intervals, as csrc/walk/ray.h."""
 
 from __future__ import annotations
 

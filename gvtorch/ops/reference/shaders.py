@@ -1,5 +1,5 @@
-"""The torch twin of `shade_rays`: the fused shaders, right by definition. See csrc/shaders.h for
-what each does, and march.py for the walk along the rays.
+"""The torch twin of `shade_rays`: the fused shaders, right by definition. For what each does see
+csrc/shaders/shaders.h, for the walk along the rays march.py.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Part of the torch twin: the transfer function, and front-to-back compositing, as csrc/shade.h."""
+"""Part of the torch twin: the transfer function and compositing, as csrc/walk/shade.h."""
 
 from __future__ import annotations
 

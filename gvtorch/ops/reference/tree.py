@@ -1,5 +1,5 @@
-"""Part of the torch twin: descents to a node, marks, and samples of bricks, as csrc/tree.h, walk.h
-and brick.h.
+"""Part of the torch twin: descents to a node, marks, and samples of bricks, as tree.h, walk.h and
+brick.h of csrc/walk.
 """
 
 from __future__ import annotations

@@ -12,12 +12,12 @@
 // Method: Crassin et al., "GigaVoxels", I3D 2009, section 5 (usage stamps, LRU by compaction, request lists).
 #pragma once
 
-#include "tree.h"
+#include "walk/tree.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-// Pending bits stand above the kind bits: asked for, answer not here yet. Such a wish is not listed again.
+// Pending bits stand above the kind bits: asked for, answer not here yet. Such a request is not listed again.
 constexpr int32_t kPendingShift = 2;
 constexpr int32_t kKinds = kLoad | kSubdivide;
 constexpr int32_t kPending = kKinds << kPendingShift;
@@ -28,12 +28,12 @@ constexpr int32_t kListed = 1;   // it is to be put
 constexpr int32_t kSeen = 2;     // it is only counted
 constexpr int32_t kTouched = 4;  // it is to be touched
 
-// Lists requests and clears wishes; what a full list has no place for is only counted.
+// Lists requests and clears them; what a full list has no place for is only counted.
 struct ListRequests {
   int32_t* request_tn;
   int32_t* node_k;
   int32_t* word_k;
-  int64_t* count_3;  // kept, found, wished
+  int64_t* count_3;  // kept, found, requested
   int64_t capacity;
 
   GV_HD int32_t flags(int64_t node) const {

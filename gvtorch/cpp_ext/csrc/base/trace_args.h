@@ -3,7 +3,7 @@
 // stands here, so this header means the same in every file.
 #pragma once
 
-#include "arguments.h"
+#include "base/arguments.h"
 
 namespace gvtorch {
 

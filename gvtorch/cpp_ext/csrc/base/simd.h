@@ -7,7 +7,7 @@
 #include <immintrin.h>
 #endif
 
-#include "hd.h"
+#include "base/hd.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {

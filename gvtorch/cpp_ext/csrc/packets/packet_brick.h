@@ -2,7 +2,7 @@
 // only the loads differ.
 #pragma once
 
-#include "probe.h"
+#include "shaders/probe.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {

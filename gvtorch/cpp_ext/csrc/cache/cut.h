@@ -3,7 +3,7 @@
 
 #include <cstring>
 
-#include "arithmetic.h"
+#include "base/arithmetic.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {

@@ -33,8 +33,8 @@
 // shading", Graphics Hardware 2001; Levoy, "Display of surfaces from volume data", IEEE CG&A 1988.
 #pragma once
 
-#include "probe.h"
-#include "shade.h"
+#include "shaders/probe.h"
+#include "walk/shade.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {

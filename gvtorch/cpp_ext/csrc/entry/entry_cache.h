@@ -2,9 +2,9 @@
 // cuda.cu, each of which brings its own `compact` and `split`. How lists become ops: entry.h.
 #pragma once
 
-#include "cache.h"
-#include "cut.h"
-#include "entry.h"
+#include "cache/cache.h"
+#include "cache/cut.h"
+#include "entry/entry.h"
 
 namespace gvtorch {
 

@@ -1,9 +1,9 @@
 // Which rays the CPU traces in packets, and how it shares them out.
 #pragma once
 
-#include "for_each.h"
-#include "shaders.h"
-#include "walk.h"
+#include "base/for_each.h"
+#include "shaders/shaders.h"
+#include "walk/walk.h"
 
 namespace gvtorch {
 

@@ -13,7 +13,7 @@
 // "Interactive k-d tree GPU raytracing", I3D 2007, kd-restart; Crassin, PhD thesis 2011, 6.1).
 #pragma once
 
-#include "arithmetic.h"
+#include "base/arithmetic.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {

@@ -7,8 +7,8 @@
 // to count and to write. A ray may be walked by parts: `limit` samples, at least one visit, and on from `state_r3`.
 #pragma once
 
-#include "brick.h"
-#include "shade_rays.h"
+#include "shaders/shade_rays.h"
+#include "walk/brick.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {

@@ -6,7 +6,7 @@
 // that begins behind skipped space gets each of its samples, the first included.
 #pragma once
 
-#include "arithmetic.h"
+#include "base/arithmetic.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {

@@ -2,7 +2,7 @@
 // levels blend as in trace.h. The dtype is a switch at run time, the same for all threads.
 #pragma once
 
-#include "walk.h"
+#include "walk/walk.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {

@@ -1,8 +1,8 @@
 // Rays one by one, with any shader and on any device.
 #pragma once
 
-#include "for_each.h"
-#include "shade_rays.h"
+#include "base/for_each.h"
+#include "shaders/shade_rays.h"
 
 namespace gvtorch {
 

@@ -6,8 +6,8 @@
 // Rendering", I3D 2009, sections 3 and 4; Crassin, PhD thesis 2011, chapter 6.
 #pragma once
 
-#include "shade.h"
-#include "walk.h"
+#include "walk/shade.h"
+#include "walk/walk.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {

@@ -5,8 +5,8 @@
 // long as border >= 1: both interpolate the same two voxels. A place beyond the stored centres is clamped.
 #pragma once
 
-#include "trace_args.h"
-#include "tree.h"
+#include "base/trace_args.h"
+#include "walk/tree.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {

@@ -13,9 +13,9 @@
 // Mathematical Functions", 1964, 4.1.27 (logarithm by atanh) and 4.2.1 (exponential).
 #pragma once
 
-#include "hd.h"
+#include "base/hd.h"
 #ifndef __CUDACC__
-#include "simd.h"
+#include "base/simd.h"
 #endif
 
 namespace gvtorch {

@@ -5,7 +5,7 @@
 
 #include <type_traits>
 
-#include "shaders.h"
+#include "shaders/shaders.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {

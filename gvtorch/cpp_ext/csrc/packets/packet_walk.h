@@ -8,8 +8,8 @@
 // functions of a single ray.
 #pragma once
 
-#include "packet_brick.h"
-#include "shade_rays.h"
+#include "packets/packet_brick.h"
+#include "shaders/shade_rays.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {

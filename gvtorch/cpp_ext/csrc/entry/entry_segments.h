@@ -3,9 +3,9 @@
 
 #include <vector>
 
-#include "entry.h"
-#include "segments.h"
-#include "shade_each.h"
+#include "entry/entry.h"
+#include "shaders/segments.h"
+#include "shaders/shade_each.h"
 
 namespace gvtorch {
 

@@ -3,10 +3,10 @@
 // have a walk of their own (packet_walk.h).
 #pragma once
 
-#include "brick.h"
-#include "ray.h"
-#include "shade.h"
-#include "trace_args.h"
+#include "base/trace_args.h"
+#include "walk/brick.h"
+#include "walk/ray.h"
+#include "walk/shade.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {

@@ -19,9 +19,9 @@
 #include <tuple>
 #include <type_traits>
 
-#include "for_each.h"
-#include "shade_rays.h"
-#include "trace.h"
+#include "base/for_each.h"
+#include "shaders/shade_rays.h"
+#include "walk/trace.h"
 
 namespace gvtorch {
 
