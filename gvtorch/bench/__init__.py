@@ -21,7 +21,7 @@ WORKLOADS = {
     "opengl": "pictures out of OpenGL and into it, in shared buffers and through the host",
     "frame": "the engine: a steady frame and the cache's share of it, a cold start",
     "lru": "1 M slots ordered by use, beside torch.sort",
-    "compact": "wishes listed out of 8 M nodes, beside torch.nonzero",
+    "compact": "requests listed out of 8 M nodes, beside torch.nonzero",
     "produce": "10^3-voxel bricks made by a torch producer, eager and compiled",
     "stream": "10^3-voxel bricks from host memory into the pool, beside a plain copy",
     "convert": "a volume file to a store",

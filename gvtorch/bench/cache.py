@@ -10,7 +10,7 @@ from ..base.constants import REQUEST_KINDS, REQUEST_LOAD
 from ..ops import compact_requests, lru_partition
 from .record import Record, clock
 
-_WISHES = 1000  # of all nodes
+_REQUESTS = 1000  # of all nodes
 
 
 def lru(record: Record) -> None:
@@ -45,15 +45,15 @@ def lru(record: Record) -> None:
 
 
 def compact(record: Record) -> None:
-    """Few wishes out of many request words, which are cleared. Each call has words of its own."""
+    """Few requests out of many request words, which are cleared. Each call has words of its own."""
     settings = record.settings
     nodes = 1 << (12 if settings.quick else 23)
-    case = f"{nodes:,} nodes, {_WISHES:,} wishes"
+    case = f"{nodes:,} nodes, {_REQUESTS:,} requests"
     if not record.wants(case):
         return
     generator = torch.Generator().manual_seed(2)
     words = torch.zeros(nodes, dtype=torch.int32)
-    words[torch.randperm(nodes, generator=generator)[:_WISHES]] = REQUEST_LOAD | 77
+    words[torch.randperm(nodes, generator=generator)[:_REQUESTS]] = REQUEST_LOAD | 77
     words = words.view(-1, 8).to(settings.device)
     count = 16 if settings.device.type == "cuda" else 4
     copies = [words.clone() for _ in range(count)]
@@ -72,9 +72,9 @@ def compact(record: Record) -> None:
     )
     theirs = clock(peer, settings, calls=count, prepare=refill)
     refill()
-    wished = peer()[:, 0]
+    requested = peer()[:, 0]
     node, _, counts = compact_requests(copies[0], capacity)
-    same = torch.equal(node[: int(counts[0])].long(), wished)
+    same = torch.equal(node[: int(counts[0])].long(), requested)
     for who, timing in (("gvtorch", ours), ("torch.nonzero", theirs)):
         more = {} if who == "gvtorch" else {"times": timing.median / ours.median, "same": same}
         rate = 1e3 * words.nbytes / timing.median

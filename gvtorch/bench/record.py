@@ -25,7 +25,7 @@ _DISTURBED = 0.05  # share of the cores that others may take unnoticed
 
 
 def silent(_what: str) -> None:
-    """Tells nobody."""
+    """Does nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -114,7 +114,7 @@ class Cache:
                 raise ValueError(f"Cache: a {what}'s owner does not point to it")
             named = pointer[pointer >= 0].to(torch.int64)
             if bool(((owner[named] < 0) & ~shared[named]).any()):
-                raise ValueError(f"Cache: a pointer leads to a {what} that nobody owns")
+                raise ValueError(f"Cache: a pointer leads to a {what} without an owner")
 
     def __repr__(self) -> str:
         tiles, bricks = self.nodes.capacity, self.bricks.capacity

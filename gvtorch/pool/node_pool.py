@@ -35,7 +35,7 @@ class NodePool:
         shared_t: (t,) bool, whether other nodes may point to the tile as well (aliases).
         constants: For each channel (t, n, c): the value of CONSTANT nodes, the mean of EMPTY ones.
         ranges: For each channel (t, n, 2, c): smallest and largest value in reach of the node's
-            brick, at all levels; all that the dtype can hold where nobody has told.
+            brick, at all levels; all that the dtype can hold where it is not known.
     """
 
     def __init__(

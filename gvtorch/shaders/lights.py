@@ -141,8 +141,8 @@ def check_light(what: str, value: Any) -> None:
 def check_number(
     where: str, name: str, value: Any, *, low: float = -math.inf, high: float = math.inf
 ) -> None:
-    """Raises ValueError unless it is a finite number in [low, high], or a tensor of one; nobody
-    waits for a device, so what lies on CUDA is not looked at.
+    """Raises ValueError unless it is a finite number in [low, high], or a tensor of one. A tensor
+    on CUDA is not looked at, since that would block.
     """
     if isinstance(value, Tensor):
         if value.numel() != 1:
