@@ -17,7 +17,7 @@ from helpers.traces import SHADER, assert_equal, run
 from helpers.trees import forget
 
 import gvtorch as gv
-from gvtorch.tracing.composite import trace_pieces
+from gvtorch.tracing.composite import trace_pieces, trace_trees
 from gvtorch.tracing.tracer import Tracer
 
 
@@ -227,3 +227,38 @@ def test_a_projection_in_pieces_is_streamed_and_waits_for_nobody(blobs, compiled
     for one in (picture, frame, again):
         for name in ("color", "alpha", "depth", "features"):
             assert torch.equal(getattr(one, name), getattr(whole, name)), name
+
+
+def test_normals_of_three_trees_are_the_mean_by_the_light_that_each_takes():
+    """Boxes one behind the other along z, met in reverse by rays that go back."""
+    generator = torch.Generator().manual_seed(5)
+    boxes = [torch.tensor([[0.0, 0, z], [1, 1, z + 1]]) for z in (0, 2, 4)]
+    hits = [
+        gv.Hits(
+            color=torch.rand(2, 3, generator=generator),
+            alpha=torch.rand(2, 1, generator=generator),
+            depth=torch.rand(2, 1, generator=generator),
+            samples=torch.ones(2, dtype=torch.int32),
+            missed=torch.zeros(2, dtype=torch.bool),
+            normal=torch.nn.functional.normalize(torch.randn(2, 3, generator=generator), dim=1),
+        )
+        for _ in boxes
+    ]
+    rays = gv.Rays(
+        origin=torch.tensor([[0.5, 0.5, -9.0], [0.5, 0.5, 9.0]]),
+        direction=torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]),
+        cone=torch.zeros(2, 2),
+        range=torch.tensor([[0.0, torch.inf]]).repeat(2, 1),
+    )
+    trees = [(box, lambda _, one=one: one) for box, one in zip(boxes, hits, strict=True)]
+    found = trace_trees(trees, rays)
+    for ray, ranked in enumerate((hits, hits[::-1])):
+        a, b, c = (float(one.alpha[ray]) for one in ranked)
+        shares = a, (1 - a) * b, (1 - a) * (1 - b) * c
+        taken = sum(s * one.normal[ray] for s, one in zip(shares, ranked, strict=True))
+        color = sum(
+            w * one.color[ray] for w, one in zip((1, 1 - a, (1 - a) * (1 - b)), ranked, strict=True)
+        )
+        torch.testing.assert_close(found.normal[ray], taken / taken.norm())
+        torch.testing.assert_close(found.color[ray], color)
+        assert abs(float(found.alpha[ray]) - sum(shares)) < 1e-6

@@ -87,7 +87,20 @@ def trace_trees(trees: Sequence[tuple[Tensor, Trace]], rays: Rays) -> Hits:
     fields = {name: _ranked([vars(one)[name] for one in hits], order) for name in vars(hits[0])}
     ranks = zip(*fields.values(), strict=True)  # the nearest tree's hits of each ray come first
     columns: list[Any] = [dict(zip(fields, rank, strict=True)) for rank in ranks]
-    return reduce(over, [Hits(**column) for column in columns])
+    ranked = [Hits(**column) for column in columns]
+    return dataclasses.replace(reduce(over, ranked), normal=_mean_normal(ranked))
+
+
+def _mean_normal(ranked: Sequence[Hits]) -> Tensor | None:
+    """(r, 3) mean of the normals of trees, nearest first, by the light each takes; None without."""
+    total, alpha = None, torch.zeros_like(ranked[0].alpha)
+    for one in ranked:
+        if one.normal is None:
+            return None
+        taken = one.normal * one.alpha
+        total = taken if total is None else total + (1 - alpha) * taken
+        alpha = alpha + (1 - alpha) * one.alpha
+    return None if total is None else normalize(total, dim=1)
 
 
 def _ranked(fields: list[Tensor | None], order: Tensor) -> Sequence[Tensor | None]:

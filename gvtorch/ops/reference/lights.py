@@ -1,4 +1,4 @@
-"""Part of the torch twin: normals, and how a place answers light; see csrc/shaders/shaders.h.
+"""Part of the torch twin: normals, and how a place answers light; see csrc/shaders/light.h.
 
 Source: Blinn, "Models of light reflection for computer synthesized pictures", SIGGRAPH 1977.
 """

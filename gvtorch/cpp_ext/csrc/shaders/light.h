@@ -1,0 +1,144 @@
+// What the fused shaders share: an interval of a ray or of each of a packet, the sums of a shader, and how a place
+// answers light. T is float, double or Floats (arithmetic.h).
+//
+// Source: Blinn, "Models of light reflection for computer synthesized pictures", SIGGRAPH 1977.
+#pragma once
+
+#include "shaders/probe.h"
+#include "walk/shade.h"
+
+namespace gvtorch {
+inline namespace GV_NAMESPACE {
+
+template <class T>
+struct Piece {
+  T start, end, length, middle;  // distances, world units
+  IntOf<T> level{};              // step * 2^level is as long, unless `odd`
+  T value;                       // in the middle
+  T front, back;                 // at both ends, where the shader is of kEnds
+  bool odd = false;              // of any length, and of level 0
+};
+
+template <class T>
+struct ShadeSum : Accumulator<T> {
+  using Base = Accumulator<T>;
+  using typename Base::Mask;
+  using typename Base::Real;
+  Vec3<T> normal{};                        // towards the eye, weighted by share
+  Real hit_clear;                          // transmittance at which depth is taken
+  typename LanesOf<T>::Pointer feature_c;  // of each lane
+
+  GV_HD void add_normal(Vec3<T> n, T share, Mask which = all_lanes<T>()) {
+    for (int axis = 0; axis < 3; ++axis) normal[axis] = select(which, normal[axis] + share * n[axis], normal[axis]);
+  }
+
+  // A lane has a new ray.
+  GV_HD void begin(int lane, Real clear, Real hit_clear, Real* feature_c) {
+    set_lane(this->clear, lane, clear);
+    this->hit_clear = hit_clear;
+    set_lane(this->feature_c, lane, feature_c);
+  }
+  template <class Own, class Other, class Body>
+  GV_HD static void each(Own& own, Other& other, const Body& body) {
+    Base::each(own, other, body);
+    body(own.normal, other.normal);
+    body(own.hit_clear, other.hit_clear);
+    body(own.feature_c, other.feature_c);
+  }
+};
+
+// The function's colour of a value, and its alpha over an interval of any length.
+template <class T, class V>
+GV_HD Row<V> look_up(const Transfer<T>& transfer, V value, const Piece<V>& piece, T step,
+                     MaskOf<V> which = all_lanes<V>()) {
+  Row<V> row = transfer.look_up(value, piece.level, which);
+  if (piece.odd) row.alpha = stretch(row.alpha, piece.length / step);
+  return row;
+}
+
+// x^power for x in [0, 1].
+template <class T>
+GV_HD T power_of(T x, RealOf<T> power) {
+  const MaskOf<T> positive = x > static_cast<RealOf<T>>(1.1754944e-38f);
+  if (!any(positive)) return T{};
+  return select(positive, exp2_exact(log2_exact(x) * power), T{});
+}
+
+// A shader's own numbers by name: a struct of at most four.
+template <class Own, class T>
+GV_HD const Own& own_numbers(const Parameters<T>* parameters) {
+  static_assert(sizeof(Own) <= sizeof(parameters->own));
+  return *reinterpret_cast<const Own*>(parameters->own);
+}
+
+// Blinn-Phong, on both sides of a surface.
+template <class T>
+struct Light {
+  const Parameters<T>* parameters;
+
+  GV_HD LightKind kind() const { return static_cast<LightKind>(static_cast<int32_t>(parameters->light_kind)); }
+
+  // The normal at distance t, towards the eye: stored, or the gradient's. Of a ray or of each of a packet.
+  template <class Eye, class V = typename Eye::Number>
+  GV_HD Vec3<V> normal(const Eye& probe, typename Eye::Number t) const {
+    Vec3<V> n;
+    if (probe.channels.normal.given()) {
+      for (int axis = 0; axis < 3; ++axis) {
+        n[axis] =
+            probe.number_at(probe.channels.normal, axis, t) * parameters->normal_scale + parameters->normal_offset;
+      }
+    } else {
+      n = probe.gradient(t);
+    }
+    n = unit(n);
+    const MaskOf<V> away = dot(n, probe.sight.direction) > 0;
+    for (int axis = 0; axis < 3; ++axis) n[axis] = select(away, -n[axis], n[axis]);
+    return n;
+  }
+  // Colour of a place in the light. Where there is no normal, it is lit as if it faced the light, without a highlight.
+  template <class Eye, class V = typename Eye::Number, class... Shadow>
+  GV_HD Row<V> shade(Row<typename Eye::Number> base, Vec3<typename Eye::Number> n, const Eye& probe,
+                     typename Eye::Number t, const Shadow&... shadow) const {
+    const Parameters<T>& own = *parameters;
+    const Vec3<V> d = probe.sight.direction;
+    Vec3<V> to_light{-d.x, -d.y, -d.z};
+    V length = splat<V>(static_cast<T>(INFINITY)), growth = splat<V>(own.light_width);
+    if (kind() == LightKind::kDirectional) {
+      for (int axis = 0; axis < 3; ++axis) to_light[axis] = splat<V>(-own.light_place[axis]);
+      to_light = unit(to_light);
+    }
+    if (kind() == LightKind::kPoint) {
+      const Vec3<V> place = probe.sight.at(t);
+      Vec3<V> way;
+      for (int axis = 0; axis < 3; ++axis) way[axis] = own.light_place[axis] - place[axis];
+      to_light = unit(way);
+      length = square_root(dot(way, way));
+      growth = growth / length;
+    }
+    V facing = splat<V>(static_cast<T>(1)), highlight{};
+    const MaskOf<V> turned = dot(n, n) > 0;
+    if (any(turned)) {
+      facing = select(turned, larger(V{}, dot(n, to_light)), facing);
+      const Vec3<V> half = unit(Vec3<V>{to_light.x - d.x, to_light.y - d.y, to_light.z - d.z});
+      const MaskOf<V> faces = turned && facing > 0;
+      if (any(faces)) highlight = select(faces, power_of(larger(V{}, dot(n, half)), own.shininess), highlight);
+    }
+    if constexpr (sizeof...(shadow) > 0) {
+      if (facing > 0 && kind() != LightKind::kHeadlight) {
+        const T share = (shadow(t, to_light, length, growth), ...);
+        facing = facing * share;
+        highlight = highlight * share;
+      }
+    }
+    const V diffuse = own.diffuse * facing;
+    const V specular = own.specular * highlight;
+    const auto lit = [&](V color, int which) {
+      const T light = own.light_color[which];
+      return color * (own.ambient + diffuse * light) + specular * light;
+    };
+    return {lit(base.red, 0), lit(base.green, 1), lit(base.blue, 2), base.alpha};
+  }
+};
+
+}  // namespace GV_NAMESPACE
+}  // namespace gvtorch
