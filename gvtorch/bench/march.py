@@ -19,7 +19,7 @@ from ..cameras import Camera
 from ..io.resources import memory_free
 from ..pictures import Picture
 from ..pool import N3Tree
-from ..tracing.resident import trace
+from ..tracing import trace
 from .peers import Peer, Task, find
 from .record import Record, Settings, Timing, clock, once
 from .scenes import SCENES, Scene, shell_sparse

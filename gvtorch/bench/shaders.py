@@ -33,8 +33,7 @@ from ..shaders import (
     TransferModule,
 )
 from ..shaders.built_in import BY_NAME
-from ..tracing import Lighting
-from ..tracing.resident import trace
+from ..tracing import Lighting, trace
 from .march import Size, difference, op_milliseconds, rates, rgba
 from .record import Record, Settings, Timing, clock
 from .scenes import Scene, aneurism, fog_dense, worn

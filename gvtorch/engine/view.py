@@ -45,12 +45,12 @@ class View:
         """Makes the camera's rays and traces them, all or some of them again; they mark what they
         use and request what is missing.
         """
-        view = (self.camera, self.numbers.device, self.trace_rays, self.options)
-        return trace_camera(*view, progress, again=again, numbers=self.numbers)
+        view = (self.camera, self.numbers, self.trace_rays, self.options)
+        return trace_camera(*view, progress, again=again)
 
     def picture(self, hits: Hits, stats: RenderStats) -> Picture:
         """Puts the hits over the background."""
-        return develop(hits, self.camera, self.options, stats, self.numbers)
+        return develop(hits, self.camera, self.numbers, self.options, stats)
 
 
 def trace_scene(

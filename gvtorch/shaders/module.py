@@ -1,6 +1,6 @@
 """`ModuleShader`: any `nn.Module` as a shader, for whatever torch can compute and differentiate.
 
-Slower than a shader in the kernel, by an order of magnitude and more. tracing/module_march.py tells
+Slower than a shader in the kernel, by an order of magnitude and more. tracing/tracer.py tells
 how rays are walked for it.
 """
 

@@ -5,7 +5,7 @@ from .costs import Cost, cost
 from .layer import Layer
 from .lighting import Lighting
 from .options import RenderOptions, RenderSettings
-from .resident import render, trace
+from .pixels import render, trace
 from .thin_lens import ThinLens
 from .tree_tracer import TreeTracer
 

@@ -5,7 +5,7 @@ chapter 6, shows the cost per ray in this way).
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Unpack, get_args
 
 import torch
@@ -23,11 +23,9 @@ from ..shaders.module import TransferModule
 from ..shaders.shader import Shader
 from ..shaders.transfer_function import TransferFunction, check_transfer
 from .around import around
-from .module_march import Batch, march
 from .options import RenderOptions, RenderSettings, render_options
-from .pixels import trace_blocks
-from .resident import tree_stats
-from .tracer import Tracer
+from .pixels import trace_blocks, tree_stats
+from .tracer import Batch, Tracer, march
 
 Image = Literal["samples", "nodes", "lod", "age", "fill"]
 IMAGES = get_args(Image)
@@ -171,18 +169,9 @@ class _Counter(Tracer):
         """Returns as features, for each ray, sums over its samples weighted by what they add to
         alpha: of 1, the node's depth, whether it has a brick, the brick's age and its fill.
         """
-        own = (self.tree, self.arguments, self.channel, self.backend, self.shade, 5)
-        sums = march(rays, *own, limit=1, by_node=False)
-        nodes = sums.count[:, 1]
+        sums, hits, nodes = march(self, rays, self.shade, 5, limit=1, by_node=False)
         self._nodes = nodes if self._nodes is None else self._nodes + nodes
-        return Hits(
-            color=sums.total.new_zeros((len(sums.total), 3)),
-            alpha=(1 - sums.clear)[:, None],
-            depth=sums.depth[:, None],
-            samples=sums.count[:, 0].contiguous(),
-            missed=sums.missed,
-            features=sums.total,
-        )
+        return replace(hits, features=sums)
 
     def shade(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """(k, 5) of samples: 1, the node's depth, whether it has a brick, the brick's age and fill;

@@ -1,25 +1,148 @@
-"""From a camera to the hits of all its pixels, and from these to a picture."""
+"""From a camera to the hits of all its pixels, and from these to a picture; `render` and `trace` do
+so for a resident tree.
+"""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 from torch import Tensor
 
 from ..base import check
 from ..base.records import Hits, Rays, RenderStats
-from ..base.stage import Progress, stage
+from ..base.stage import Progress, collect_timings, no_progress, stage
 from ..cameras.camera import Camera
+from ..cameras.custom import as_camera
 from ..ops.shading import pack
+from ..ops.trace import choose_backend
 from ..pictures.background import Background
 from ..pictures.picture import Picture
+from ..pool import N3Tree
+from ..shaders.shader import Shader
+from .around import around
 from .composite import Trace
-from .options import RenderOptions
+from .options import RenderOptions, RenderSettings, render_options
+from .tracer import Tracer
 
 Pixels = slice | Tensor  # some of the pixels of all pictures of a camera, row by row
 _RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that progress shows
+
+
+def render(
+    tree: N3Tree,
+    camera: Camera | Rays,
+    shader: Shader,
+    *,
+    progress: Progress = no_progress,
+    **options: Unpack[RenderSettings],
+) -> Picture:
+    """Renders a resident tree.
+
+    Args:
+        tree: What to render, on the device that renders it; its stamps and request words are
+            written.
+        camera: One camera or a batch; an orbit camera stands around the tree's box. Or rays in
+            world units, which make a picture as wide as `Rays.width`, or of one row.
+        shader: The transfer function, in data units, or another shader.
+        progress: Told how many rows are done.
+        **options: Fields of `RenderOptions`.
+
+    Returns:
+        The picture, (h, w, c) for one camera and (n, h, w, c) for a batch.
+
+    Raises:
+        ValueError: An option is unknown or out of its range, or the backend can't be used.
+    """
+    camera = as_camera("render", camera)
+    chosen = render_options("render", options, camera)
+    check.instance("render", "tree", tree, N3Tree)
+    start = time.perf_counter()
+    with collect_timings(tree.device) as timings:
+        with stage("prepare"):
+            tree.frame += 1
+            traced = around(Tracer(tree, shader, chosen), chosen, tree.box)
+        placed = camera.placed(tree.box)
+        numbers = placed.numbers(tree.device)
+        hits = trace_camera(placed, numbers, traced, chosen, progress)
+        with stage("picture"):
+            stats = tree_stats(tree, chosen, hits.samples)
+            stats.tiles_used = int((tree.nodes.stamp_t == tree.frame).sum())
+            stats.bricks_used = int((tree.bricks.stamp_b == tree.frame).sum())
+            picture = develop(hits, placed, numbers, chosen, stats)
+    stats.stages = timings.as_dict()
+    stats.milliseconds = 1e3 * (time.perf_counter() - start)
+    return picture
+
+
+def trace(tree: N3Tree, rays: Rays, shader: Shader, **options: Unpack[RenderSettings]) -> Hits:
+    """Traces any world rays through a resident tree, as one frame.
+
+    Args:
+        tree: The tree; its stamps and request words are written.
+        rays: Rays in world units, on the tree's device.
+        shader: The transfer function, or another shader.
+        **options: Fields of `RenderOptions`; background and layer belong to pictures and have no
+            part in it.
+
+    Returns:
+        Colour, alpha, depth and samples of each ray, in the options' dtype.
+
+    Raises:
+        ValueError: An option is unknown or out of its range, the channel is unknown, or the backend
+            can't be used.
+    """
+    chosen = render_options("trace", options)
+    check.instance("trace", "tree", tree, N3Tree)
+    check.instance("trace", "rays", rays, Rays)
+    tree.frame += 1
+    return around(Tracer(tree, shader, chosen), chosen, tree.box)(rays)
+
+
+def tree_stats(tree: N3Tree, options: RenderOptions, samples: Tensor) -> RenderStats:
+    """Returns the statistics of a picture, given the samples (r,) of its rays."""
+    return RenderStats(
+        backend=choose_backend(options.backend, tree.device),
+        rays=samples.numel(),
+        samples=int(samples.sum(dtype=torch.int64)),
+        nodes=tree.nodes.child_tn.numel(),
+        bricks=tree.bricks.capacity,
+        bytes=tree.nbytes,
+    )
+
+
+def trace_camera(
+    camera: Camera,
+    numbers: Tensor,
+    trace: Trace,
+    options: RenderOptions,
+    progress: Progress,
+    *,
+    again: tuple[Hits, Tensor] | None = None,
+) -> Hits:
+    """Traces all rays of a camera, or of a batch; see `trace_blocks`. `again` has the hits of an
+    earlier pass, which are overwritten, and tells which (p,) bool of them are traced once more.
+
+    Raises:
+        ValueError: The picture is larger than the device's memory.
+    """
+    device, count = numbers.device, len(camera) * camera.height * camera.width
+    block = _RAYS_A_BLOCK[device.type]
+    size = count * (8 * options.dtype.itemsize + 5)  # the colour twice
+    check.memory("render", f"a picture of {count} pixels", size, device)
+    hits, where = again or (None, None)
+    if hits is None and len(list(camera.blocks(block))) > 1:
+        hits = empty_hits(device, options.dtype, count)  # too large: fails before the first ray
+    given = camera, numbers, trace, options, progress
+    for pixels, part in trace_blocks(*given, pixels=block, where=where):
+        if hits is None:
+            hits = part  # the only block
+        else:
+            _write(hits, pixels, part, count)
+    assert hits is not None
+    return hits
 
 
 def trace_blocks(
@@ -33,7 +156,7 @@ def trace_blocks(
     where: Tensor | None = None,
 ) -> Iterator[tuple[Pixels, Hits]]:
     """Traces a camera's rays block after block of whole rows, since rays take more memory than the
-    picture they make.
+    picture they make. Yields the pixels of a block that were traced, and their hits.
 
     Args:
         camera: Placed in the world.
@@ -43,9 +166,6 @@ def trace_blocks(
         progress: Told how many rows are done.
         pixels: Of a block.
         where: (p,) bool, which pixels are traced; all if left out.
-
-    Yields:
-        The pixels of a block that were traced, and their hits.
     """
     rows, width = len(camera) * camera.height, camera.width
     layer = None if options.layer is None else options.layer.pixels(numbers.device)
@@ -68,46 +188,15 @@ def trace_blocks(
         progress("rays", end, rows)
 
 
-def trace_camera(
-    camera: Camera,
-    device: torch.device,
-    trace: Trace,
-    options: RenderOptions,
-    progress: Progress,
-    *,
-    again: tuple[Hits, Tensor] | None = None,
-    numbers: Tensor | None = None,
-) -> Hits:
-    """Traces all rays of a camera, or of a batch.
-
-    Args:
-        camera: Placed in the world.
-        device: Where the rays are traced.
-        trace: Traces world rays.
-        options: The dtype of the hits, and the layer that voxels are composited with.
-        progress: Told how many rows are done.
-        again: Hits of an earlier pass, which are overwritten, and which (p,) bool of them are
-            traced once more.
-        numbers: What `camera.numbers` gave, where it lies on the device already.
-
-    Raises:
-        ValueError: The picture is larger than the device's memory.
+def _some_rays(numbers: Tensor, camera: Camera, top: int, which: Tensor) -> Rays:
+    """Rays of the pixels `which` (k,), rising, counted from row `top`: the rows that hold them are
+    made, then they alone are kept.
     """
-    count, block = len(camera) * camera.height * camera.width, _RAYS_A_BLOCK[device.type]
-    size = count * (8 * options.dtype.itemsize + 5)  # the colour twice
-    check.memory("render", f"a picture of {count} pixels", size, device)
-    numbers = camera.numbers(device) if numbers is None else numbers
-    hits, where = again or (None, None)
-    if hits is None and len(list(camera.blocks(block))) > 1:
-        hits = empty_hits(device, options.dtype, count)  # too large: fails before the first ray
-    given = camera, numbers, trace, options, progress
-    for pixels, part in trace_blocks(*given, pixels=block, where=where):
-        if hits is None:
-            hits = part  # the only block
-        else:
-            _write(hits, pixels, part, count)
-    assert hits is not None
-    return hits
+    width = camera.width
+    ends = torch.stack((which[0], which[-1])).tolist() if len(which) else (0, -1)
+    first, last = (end // width for end in ends)
+    rays = camera.pixel_rays(numbers, (top + first, top + last + 1))
+    return rays[which - first * width]
 
 
 def _write(hits: Hits, pixels: Pixels, part: Hits, count: int) -> None:
@@ -120,45 +209,25 @@ def _write(hits: Hits, pixels: Pixels, part: Hits, count: int) -> None:
         vars(hits)[name][pixels] = field
 
 
-def _some_rays(numbers: Tensor, camera: Camera, top: int, which: Tensor) -> Rays:
-    """Rays of the pixels `which` (k,), rising, counted from row `top`: the rows that hold them are
-    made, then they alone are kept.
-    """
-    width = camera.width
-    ends = torch.stack((which[0], which[-1])).tolist() if len(which) else (0, -1)
-    first, last = (end // width for end in ends)
-    rays = camera.pixel_rays(numbers, (top + first, top + last + 1))
-    return rays[which - first * width]
-
-
 def empty_hits(device: torch.device, dtype: torch.dtype, pixels: int) -> Hits:
     """Takes the memory of a picture."""
-    widths = {"color": (3,), "alpha": (1,), "depth": (1,)}
-    reals = {n: torch.empty((pixels, *w), dtype=dtype, device=device) for n, w in widths.items()}
+    color, alpha, depth = (
+        torch.empty((pixels, width), dtype=dtype, device=device) for width in (3, 1, 1)
+    )
     samples = torch.empty(pixels, dtype=torch.int32, device=device)
-    return Hits(**reals, samples=samples, missed=torch.empty_like(samples, dtype=torch.bool))
+    missed = torch.empty_like(samples, dtype=torch.bool)
+    return Hits(color=color, alpha=alpha, depth=depth, samples=samples, missed=missed)
 
 
 def develop(
-    hits: Hits,
-    camera: Camera,
-    options: RenderOptions,
-    stats: RenderStats,
-    numbers: Tensor | None = None,
+    hits: Hits, camera: Camera, numbers: Tensor, options: RenderOptions, stats: RenderStats
 ) -> Picture:
-    """Puts the hits of a camera's rays over the background, in the camera's shape.
-
-    Args:
-        hits: Of all pixels.
-        camera: Placed in the world.
-        options: What `render_options` gave.
-        stats: What the picture cost.
-        numbers: What `camera.numbers` gave, where it lies on the device already.
+    """Puts the hits of all of a camera's rays over the background, in the camera's shape. The
+    arguments are those of `trace_blocks`, and what the picture cost.
     """
     color, nearest = hits.color, hits.depth
     background: Any = options.background
     if isinstance(background, Background):
-        numbers = camera.numbers(color.device) if numbers is None else numbers
         color = color + (1 - hits.alpha) * background.behind(camera, numbers, color.dtype)
     elif background is not None and any(background):
         color = color + (1 - hits.alpha) * pack((background,), color.dtype, color.device)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..base.records import Hits, Rays
-from .spans import box_span
+from .spans import tree_span
 from .tracer import Tracer
 
 
@@ -63,7 +63,6 @@ class ProjectedPieces:
 
     def _length(self, rays: Rays) -> Tensor:
         """(r,) world length of each ray inside the tree's box."""
-        low, size, high = self._tracer.tree.place
-        enter, leave = box_span(low, low + size * high, rays.origin, rays.direction)
+        enter, leave = tree_span(self._tracer.tree.place, rays.origin, rays.direction)
         first, last = rays.range.unbind(1)
         return (torch.minimum(last, leave) - torch.maximum(first, enter)).clamp(min=0)

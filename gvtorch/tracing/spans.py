@@ -29,6 +29,12 @@ def box_span(low: Tensor, high: Tensor, origin: Tensor, direction: Tensor) -> tu
     return first.amax(1), last.amin(1)
 
 
+def tree_span(place_33: Tensor, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns `box_span` of the box of a tree, given `N3Tree.place`."""
+    low, size, high = place_33
+    return box_span(low, low + size * high, origin, direction)
+
+
 def convex_span(
     faces: Sequence[Face], rays: Rays, first: Tensor, last: Tensor
 ) -> tuple[Tensor, Tensor]:

@@ -1,23 +1,42 @@
-"""`Tracer`: one frame of a tree and a shader, from rays to hits."""
+"""`Tracer`: one frame of a tree and a shader, from rays to hits.
+
+Shaders in torch are marched: rays are walked part by part, the bricks that they meet are sampled, a
+function turns samples into features and alpha, and these are composited front to back. The host
+waits for the number of samples of each part.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from ..base.records import Hits, Rays
-from ..ops import RayArguments, TraceArguments, shade_rays, trace_rays
+from ..ops import (
+    RayArguments,
+    Samples,
+    Segments,
+    TraceArguments,
+    composite,
+    list_samples,
+    sample_bricks,
+    shade_rays,
+    trace_rays,
+    trace_segments,
+)
 from ..ops.trace import choose_backend, most_intervals
 from ..pool import N3Tree
-from ..shaders.module import ModuleShader
+from ..shaders.module import PART_SAMPLES, ModuleShader
 from ..shaders.shader import Shader, check_shader
 from ..shaders.tables import Sampling, interval_levels
-from .module_march import march_module
 from .options import RenderOptions
+from .spans import tree_span
 
 _FIELDS = ("color", "alpha", "depth", "samples", "missed", "normal", "features")
+_SAMPLES = {"cpu": 1 << 20, "cuda": 1 << 24}  # shaded at once
 
 
 class Tracer:
@@ -51,11 +70,10 @@ class Tracer:
         if frame_1 is None:
             frame_1 = torch.full((1,), tree.frame, dtype=torch.int32, device=tree.device)
         scale = options.cone_scale * tree.flatness if options.lod == "auto" else 0.0
-        levels = interval_levels(tree.root_voxel, step) if scale else 1
         sampling = Sampling(
             smallest_spacing=min(tree.spacing),
             step=step,
-            levels=levels,
+            levels=interval_levels(tree.root_voxel, step) if scale else 1,
             dtype=options.dtype,
             device=tree.device,
         )
@@ -88,14 +106,13 @@ class Tracer:
 
     def seeing(self, shader: Shader, options: RenderOptions) -> Tracer:
         """Returns what traces the same frame with another shader."""
-        frame: dict[str, Any] = {"by_level": self.arguments.by_level}
-        return Tracer(self.tree, shader, options, frame_1=self.arguments.frame_1, **frame)
+        known = self.arguments
+        return Tracer(self.tree, shader, options, by_level=known.by_level, frame_1=known.frame_1)
 
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays in world units."""
         if isinstance(self.shader, ModuleShader):
-            frame = (self.tree, self.arguments, self.channel, self.backend)
-            return march_module(self.shader, rays, *frame)
+            return self._march_module(self.shader, rays)
         given = RayArguments.of(rays)
         fields: tuple[Tensor, ...]
         if self.shading is None:
@@ -106,3 +123,159 @@ class Tracer:
                 given, self.arguments, *own, op=self.shader.op, backend=self.backend
             )
         return Hits(**dict(zip(_FIELDS, fields, strict=False)))
+
+    def _march_module(self, shader: ModuleShader, rays: Rays) -> Hits:
+        """Traces rays with a module, a block at a time."""
+
+        def shade(batch: Batch) -> tuple[Tensor, Tensor]:
+            values = batch.values(shader.channels)
+            color, alpha = shader(values, batch.positions, batch.directions, batch.lengths)
+            return color, alpha[:, 0]
+
+        def block(rays: Rays) -> Hits:
+            color, hits, _ = march(self, rays, shade, 3)
+            return replace(hits, color=color)
+
+        count = len(rays.origin)
+        size = (shader.samples or _SAMPLES[rays.origin.device.type]) // PART_SAMPLES
+        if count <= size:
+            return block(rays)
+        parts = [vars(block(rays[at : at + size])) for at in range(0, count, size)]
+        given = [name for name, field in parts[0].items() if field is not None]
+        return Hits(**{name: torch.cat([part[name] for part in parts]) for name in given})
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Samples of rays that were walked, and what can be read there."""
+
+    tracer: Tracer
+    rays: RayArguments
+    segments: Segments
+    listed: Samples
+
+    def values(self, channels: Sequence[str] = ()) -> Tensor:
+        """(k, c) values of channels side by side; of the tracer's channel where none are named."""
+        found, tree = [], self.tracer.tree
+        for name in channels or (self.tracer.channel,):
+            if name not in tree.bricks.bricks:
+                known = ", ".join(tree.channel_names)
+                raise ValueError(f"ModuleShader: unknown channel {name!r}; the tree has {known}")
+            arguments = self.tracer.arguments._replace(
+                bricks_bzyxc=tree.bricks.bricks[name], constant_tnc=tree.nodes.constants[name]
+            )
+            reads = (arguments, self.segments, self.listed)
+            found.append(sample_bricks(self.rays, *reads, backend=self.tracer.backend))
+        return found[0] if len(found) == 1 else torch.cat(found, 1)
+
+    @cached_property
+    def segment(self) -> Tensor:
+        """(k,) int64 segment of each sample."""
+        return self.listed.segment.to(torch.int64)
+
+    @cached_property
+    def ray(self) -> Tensor:
+        """(k,) int64 ray of each sample."""
+        return self.segments.ray_index.to(torch.int64)[self.segment]
+
+    @cached_property
+    def directions(self) -> Tensor:
+        """(k, 3) unit length."""
+        return self.rays.direction_r3[self.ray].to(self.segments.t0.dtype)
+
+    @cached_property
+    def lengths(self) -> Tensor:
+        """(k, 1) world length of each interval."""
+        base, end, _ = self.segments.distance[self.segment].unbind(1)
+        level = self.segments.interval[self.segment, 2]
+        whole = self.tracer.arguments.step * 2.0 ** level.clamp(min=0).to(base.dtype)
+        return torch.where(level < 0, end - base, whole)[:, None]
+
+    @cached_property
+    def starts(self) -> Tensor:
+        """(k,) where each interval starts, from where the ray enters the tree's box."""
+        first, _, level = self.segments.interval[self.segment].unbind(1)
+        base, number = self.segments.distance[self.segment, 0], first + self.listed.number
+        return base + torch.where(level < 0, 0, number).to(base.dtype) * self.lengths[:, 0]
+
+    @cached_property
+    def moved(self) -> Tensor:
+        """(r,) float64 distances from the camera to where rays enter the tree's box."""
+        near, _ = tree_span(self.tracer.arguments.place_33, *self.rays[:2])
+        return torch.where((near > 0) & (near < torch.inf), near, 0.0)
+
+    @cached_property
+    def positions(self) -> Tensor:
+        """(k, 3) world places of the samples, the middles of their intervals."""
+        t = self.moved[self.ray] + self.starts + 0.5 * self.lengths[:, 0]
+        origin, direction = (column[self.ray] for column in self.rays[:2])
+        return (origin + t[:, None] * direction).to(self.starts.dtype)
+
+
+def march(
+    tracer: Tracer,
+    rays: Rays,
+    shade: Callable[[Batch], tuple[Tensor, Tensor]],
+    features: int,
+    *,
+    limit: int = PART_SAMPLES,
+    by_node: bool = True,
+) -> tuple[Tensor, Hits, Tensor]:
+    """Walks rays part by part and shades and composites what each part sampled; rays that have
+    ended go no further.
+
+    Args:
+        tracer: A frame; its shader's table tells only what is hidden.
+        rays: World rays.
+        shade: Gives features (k, c) and alpha (k,) of samples.
+        features: How many there are.
+        limit: Samples of a ray in one part.
+        by_node: See `trace_segments`.
+
+    Returns:
+        Sums (r, c) of the features, hits without colour, and (r,) int32 nodes that were visited.
+    """
+    arguments, backend = tracer.arguments, tracer.backend
+    like, count = arguments.domain_2, len(rays.origin)
+    stop_alpha, hit_clear = arguments.stop_alpha, 1 - arguments.depth_alpha
+    going_on = RayArguments.of(rays)._replace(clear_r=None)  # a walk has no transmittance
+    sums = like.new_zeros((count, features))
+    clear = rays.light()[:, 0].to(like.dtype)
+    depth = like.new_full((count,), torch.inf)
+    samples, nodes = like.new_zeros((2, count), dtype=torch.int32)
+    missed = like.new_zeros(count, dtype=torch.bool)
+    which, state = torch.arange(count, device=like.device), None
+    if rays.transmittance is not None:  # some may have ended before
+        which = (clear > 1 - stop_alpha).nonzero()[:, 0]
+        going_on = going_on.some(which)
+    while len(which):
+        segments = trace_segments(
+            going_on, arguments, state, limit=limit, by_node=by_node, backend=backend
+        )
+        missed[which] |= segments.missed
+        nodes[which] += segments.counts[:, 2]
+        batch = Batch(tracer, going_on, segments, list_samples(segments))
+        if not len(batch.segment):
+            break  # all have ended
+        feature, alpha = shade(batch)
+        total, left, before = composite(
+            *(alpha.contiguous(), feature.contiguous(), batch.listed.offset, clear[which]),
+            stop_alpha=stop_alpha,
+            backend=backend,
+        )
+        sums = sums.index_add(0, which, total)
+        clear = clear.index_put((which,), left)
+        with torch.no_grad():
+            samples.index_add_(0, which[batch.ray], (before > 0).to(torch.int32))
+            hit = ((before >= hit_clear) & (before * (1 - alpha) < hit_clear)).nonzero()[:, 0]
+            share = torch.log(hit_clear / before[hit]) / torch.log1p(-alpha[hit])
+            share = torch.where(alpha[hit] < 1, share.clamp(0, 1), 0.0)
+            place = batch.starts[hit] + share * batch.lengths[hit, 0] + batch.moved[batch.ray[hit]]
+            depth[which[batch.ray[hit]]] = place.to(like.dtype)
+            going = (segments.counts[:, 1] >= limit) & (left > 1 - stop_alpha)
+            on = going.nonzero()[:, 0]
+        going_on, which, state = going_on.some(on), which[on], segments.state[on]
+    colorless = like.new_zeros((count, 3))
+    alpha, depth = (1 - clear)[:, None], depth[:, None]
+    hits = Hits(color=colorless, alpha=alpha, depth=depth, samples=samples, missed=missed)
+    return sums, hits, nodes
