@@ -13,10 +13,12 @@ import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+
+Kind = TypeVar("Kind")
 
 
 def describe(tensor: Any) -> str:
@@ -138,10 +140,11 @@ def _of_size(expected: int | str, size: int) -> bool:
     return expected == size or isinstance(expected, str)
 
 
-def instance(where: str, name: str, value: Any, kind: type) -> None:
-    """Raises ValueError unless `value` is of a class."""
+def instance(where: str, name: str, value: Any, kind: type[Kind]) -> Kind:
+    """Returns `value`; raises ValueError unless it is of a class."""
     if not isinstance(value, kind):
         raise ValueError(f"{where}: {name} must be a {kind.__name__}, got {type(value).__name__}")
+    return value
 
 
 def known(where: str, options: Mapping[str, Any], kind: type) -> None:

@@ -12,8 +12,8 @@ Source: OpenGL 4.6 core specification, sections 13.6 (clip space) and 13.8 (wind
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -94,21 +94,17 @@ def camera(projection: Tensor, modelview: Tensor, width: int, height: int) -> Ca
         ValueError: The matrix is not that of a pinhole camera, or see `Camera`.
     """
     where = "opengl.camera"
-    matrix = _Matrix.read(where, projection)
-    if matrix.orthographic:
+    matrix, orthographic = _projection(where, projection)
+    if orthographic:
         raise ValueError(f"{where}: projection must be perspective, got an orthographic one")
     check.whole(where, "width", width, low=1)
     check.whole(where, "height", height, low=1)
-    zero, one = torch.zeros_like(matrix.scale[:, 0]), torch.ones_like(matrix.scale[:, 0])
-    (sx, sy), (ax, ay) = matrix.scale.unbind(1), matrix.shift.unbind(1)
-    rows = (
-        (sx * width / 2, zero, (1 - ax) * width / 2),
-        (zero, sy * height / 2, (1 + ay) * height / 2),
-        (zero, zero, one),
-    )
-    intrinsics = torch.stack([torch.stack(row, 1) for row in rows], 1)
-    if not matrix.batched:
-        intrinsics = intrinsics[0]
+    intrinsics = torch.zeros_like(matrix[..., :3, :3])
+    intrinsics[..., 0, 0] = matrix[..., 0, 0] * width / 2
+    intrinsics[..., 0, 2] = (1 - matrix[..., 0, 2]) * width / 2
+    intrinsics[..., 1, 1] = matrix[..., 1, 1] * height / 2
+    intrinsics[..., 1, 2] = (1 + matrix[..., 1, 2]) * height / 2
+    intrinsics[..., 2, 2] = 1
     view = _AXES[:, None] * torch.as_tensor(modelview).detach().to("cpu", torch.float64)
     return Camera(view, intrinsics, width, height)
 
@@ -139,10 +135,10 @@ def ray_distance(
     Raises:
         ValueError: A wrong shape or dtype, or another kind of projection.
     """
-    matrix = _Matrix.read("opengl.ray_distance", projection)
-    pixels = matrix.pixels("opengl.ray_distance", "window_depth", window_depth, clip_depth)
+    where = "opengl.ray_distance"
+    pixels = _Pixels.of(where, "window_depth", window_depth, projection, clip_depth)
     depth = window_depth.to(torch.float64)
-    if matrix.orthographic:
+    if pixels.orthographic:
         along = (pixels.offset - depth) / pixels.slope
     else:
         along = pixels.offset / (depth + pixels.slope)
@@ -170,18 +166,16 @@ def window_depth(
     Raises:
         ValueError: See `ray_distance`.
     """
-    matrix = _Matrix.read("opengl.window_depth", projection)
-    pixels = matrix.pixels("opengl.window_depth", "distance", distance, clip_depth)
+    pixels = _Pixels.of("opengl.window_depth", "distance", distance, projection, clip_depth)
     along = distance.to(torch.float64) / pixels.stretch
-    if matrix.orthographic:
+    if pixels.orthographic:
         depth = pixels.offset - pixels.slope * along
     else:
         depth = pixels.offset / along - pixels.slope
     return depth.clamp(0, 1)
 
 
-@dataclass(frozen=True)
-class _Pixels:
+class _Pixels(NamedTuple):
     """What converts the depth of each pixel of an image, on the image's device.
 
     Window depth (0 to 1) from z along the view axis: offset / z - slope in a perspective, offset -
@@ -192,88 +186,69 @@ class _Pixels:
     offset: Tensor
     far: Tensor  # window depth of the far plane
     stretch: Tensor  # (n, h, w, 1) or (h, w, 1) distance along the ray over z
-
-
-@dataclass(frozen=True)
-class _Matrix:
-    """The numbers of n projection matrices, float64 on the CPU."""
-
-    scale: Tensor  # (n, 2) of x and y
-    shift: Tensor  # (n, 2), of a perspective
-    slope: Tensor  # (n,)
-    offset: Tensor  # (n,)
     orthographic: bool
-    batched: bool
 
     @classmethod
-    def read(cls, where: str, projection: Tensor) -> _Matrix:
-        """Takes (4, 4) or (n, 4, 4)."""
-        matrix = torch.as_tensor(projection).detach().to("cpu", torch.float64)
-        if matrix.dim() not in (2, 3) or matrix.shape[-2:] != (4, 4):
-            raise ValueError(
-                f"{where}: projection must be (4, 4) or (n, 4, 4), got {tuple(matrix.shape)}"
-            )
-        p = matrix.view(-1, 4, 4)
-        last = p[0, 3].tolist()
-        orthographic = last == [0, 0, 0, 1]
-        if not (orthographic or last == [0, 0, -1, 0]) or bool((p[:, 3] != p[:1, 3]).any()):
-            raise ValueError(
-                f"{where}: projection must end in the row (0, 0, -1, 0) (perspective) or "
-                f"(0, 0, 0, 1) (orthographic), got {last}"
-            )
-        other = 2 if orthographic else 3  # the column in which such a projection has no x and y
-        zeros = torch.stack((p[:, 0, 1], p[:, 1, 0], p[:, 2, 0], p[:, 2, 1]), 1)
-        zeros = torch.cat((zeros, p[:, :2, other]), 1)
-        moves = p[:, 2, 2 if orthographic else 3]
-        good = torch.isfinite(p).all() & (zeros == 0).all() & (moves != 0).all()
-        if not bool(good & (p[:, 0, 0] > 0).all() & (p[:, 1, 1] > 0).all()):
-            raise ValueError(
-                f"{where}: projection must be finite, without skew or rotation, scale x and y by "
-                f"more than 0 and tell depths apart, got {matrix.tolist()}"
-            )
-        return cls(
-            scale=p[:, (0, 1), (0, 1)],
-            shift=p[:, :2, 2],
-            slope=p[:, 2, 2],
-            offset=p[:, 2, 3],
-            orthographic=orthographic,
-            batched=matrix.dim() == 3,
-        )
-
-    def pixels(self, where: str, name: str, image: Tensor, clip_depth: ClipDepth) -> _Pixels:
-        """Returns these numbers for the pixels of an image."""
+    def of(
+        cls, where: str, name: str, image: Tensor, projection: Tensor, clip_depth: ClipDepth
+    ) -> _Pixels:
+        """Reads the projection of an image."""
+        matrix, orthographic = _projection(where, projection)
         if not isinstance(clip_depth, ClipDepth):
             raise ValueError(f"{where}: clip_depth must be a ClipDepth, got {clip_depth!r}")
-        count = len(self.scale)
+        batch = matrix.shape[:-2]
         fits = isinstance(image, Tensor) and image.is_floating_point() and image.shape[-1:] == (1,)
-        if (
-            not fits
-            or image.dim() != (4 if self.batched else 3)
-            or (self.batched and count != image.shape[0])
-        ):
-            wanted = f"({count}, h, w, 1)" if self.batched else "(h, w, 1)"
+        if not (fits and image.dim() == matrix.dim() + 1 and image.shape[:-3] == batch):
+            wanted = f"({batch[0]}, h, w, 1)" if batch else "(h, w, 1)"
             raise ValueError(
                 f"{where}: {name} must be {wanted} floats as projection is "
-                f"{'a batch' if self.batched else 'one'}, got {check.describe(image)}"
+                f"{'a batch' if batch else 'one'}, got {check.describe(image)}"
             )
-        slope, offset = self.slope, self.offset
+        slope, offset = matrix[..., 2, 2], matrix[..., 2, 3]
         if clip_depth is ClipDepth.NEGATIVE_ONE_TO_ONE:  # window depth is (z + 1) / 2
             slope, offset = slope / 2, offset / 2
-            if self.orthographic:
+            if orthographic:
                 offset = offset + 0.5
             else:
                 slope = slope - 0.5
-        rising = slope < 0 if self.orthographic else offset < 0
-        numbers = torch.cat((self.scale, self.shift, slope[:, None], offset[:, None]), 1)
-        numbers = torch.cat((numbers, rising[:, None].to(numbers)), 1)
-        numbers = sent(numbers, image.device)
-        columns = numbers if self.batched else numbers[0]
-        sx, sy, ax, ay, slope, offset, far = columns[..., None, None, None].unbind(-4)
+        far = (slope < 0 if orthographic else offset < 0).to(slope)
+        columns = (matrix[..., 0, 0], matrix[..., 1, 1], matrix[..., 0, 2], matrix[..., 1, 2])
+        numbers = sent(torch.stack((*columns, slope, offset, far), -1), image.device)
+        sx, sy, ax, ay, slope, offset, far = numbers[..., None, None, None].unbind(-4)
+        if orthographic:
+            return cls(slope, offset, far, torch.ones_like(slope), orthographic)
         *_, height, width, _ = image.shape
-        if self.orthographic:
-            return _Pixels(slope, offset, far, torch.ones_like(slope))
         x = torch.arange(width, dtype=torch.float64, device=image.device)[:, None]
         y = torch.arange(height, dtype=torch.float64, device=image.device)[:, None, None]
         across = ((2 * x + 1) / width - 1 + ax) / sx
         up = (1 - (2 * y + 1) / height + ay) / sy
-        return _Pixels(slope, offset, far, (1 + across * across + up * up).sqrt())
+        stretch = (1 + across * across + up * up).sqrt()
+        return cls(slope, offset, far, stretch, orthographic)
+
+
+def _projection(where: str, projection: Tensor) -> tuple[Tensor, bool]:
+    """Returns a projection, checked, in float64 on the CPU, and whether it is orthographic."""
+    matrix = torch.as_tensor(projection).detach().to("cpu", torch.float64)
+    if matrix.dim() not in (2, 3) or matrix.shape[-2:] != (4, 4):
+        raise ValueError(
+            f"{where}: projection must be (4, 4) or (n, 4, 4), got {tuple(matrix.shape)}"
+        )
+    p = matrix.view(-1, 4, 4)
+    last = p[0, 3].tolist()
+    orthographic = last == [0, 0, 0, 1]
+    if not (orthographic or last == [0, 0, -1, 0]) or bool((p[:, 3] != p[:1, 3]).any()):
+        raise ValueError(
+            f"{where}: projection must end in the row (0, 0, -1, 0) (perspective) or "
+            f"(0, 0, 0, 1) (orthographic), got {last}"
+        )
+    other = 2 if orthographic else 3  # the column in which such a projection has no x and y
+    zeros = torch.stack((p[:, 0, 1], p[:, 1, 0], p[:, 2, 0], p[:, 2, 1]), 1)
+    zeros = torch.cat((zeros, p[:, :2, other]), 1)
+    moves = p[:, 2, 2 if orthographic else 3]
+    good = torch.isfinite(p).all() & (zeros == 0).all() & (moves != 0).all()
+    if not bool(good & (p[:, 0, 0] > 0).all() & (p[:, 1, 1] > 0).all()):
+        raise ValueError(
+            f"{where}: projection must be finite, without skew or rotation, scale x and y by "
+            f"more than 0 and tell depths apart, got {matrix.tolist()}"
+        )
+    return matrix, orthographic

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..base import check
 from . import functions as gl
-from .transfer import Shared, ThroughHost, Way, why_not_shared
+from .transfer import Shared, ThroughHost, why_not_shared
 
 _VERTEX = """#version 150
 void main() {  // one triangle over all pixels
@@ -72,9 +72,9 @@ class Exchange:
         """Makes an exchange in the current context, OpenGL 3.2 or newer.
 
         Args:
-            width: Of the pictures, pixels.
-            height: Likewise.
-            device: Of the tensors that are read.
+            width: See the class.
+            height: See the class.
+            device: See the class.
             share: Whether buffers are shared with CUDA; default: wherever that is possible.
             load: Address of an OpenGL function by its name, from the library that made the
                 context (`glfw.get_proc_address`, for one); default: the system's library.
@@ -93,13 +93,14 @@ class Exchange:
         most = self._gl.integer(gl.MAX_TEXTURE_SIZE)
         self.width = check.whole(where, "width", width, low=1, high=most)
         self.height = check.whole(where, "height", height, low=1, high=most)
-        self.reason = "" if share is False else why_not_shared(self._gl, self.device)
+        self._size = [self.width, self.height]
+        off = share is False
+        self.reason = "share is False" if off else why_not_shared(self._gl, self.device)
         if share and self.reason:
             raise RuntimeError(f"{where}: buffers can't be shared: {self.reason}")
-        self.reason = "share is False" if share is False else self.reason
         self.shared = not self.reason
         self._most = torch.full((1,), 255.0, device=self.device)  # divides alike on every device
-        self._ways: dict[str, Way] = {}
+        self._ways: dict[str, ThroughHost] = {}
         self._textures: dict[str, tuple[int, int]] = {}  # name and format
         # No other program has an output of this name, by which our context is recognised.
         self._mark = f"result_{next(_NUMBERS)}"
@@ -141,9 +142,8 @@ class Exchange:
         """
         with self._work("read_depth", drawing=True), self._gl.temporary("Framebuffers") as frame:
             self._require_size(gl.DEPTH_ATTACHMENT, "depth")
-            size = (self.width, self.height)
             self._texture("copied depth", self._depth_format())
-            self._gl.CopyTexSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 0, 0, *size)
+            self._gl.CopyTexSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 0, 0, *self._size)
             self._gl.check(f"the framebuffer has a depth? {_ONE_SAMPLE}")
             shown = self._texture("shown depth", gl.R32F)
             self._gl.BindFramebuffer(gl.DRAW_FRAMEBUFFER, frame)
@@ -237,7 +237,7 @@ class Exchange:
         if not ours:
             raise RuntimeError(f"{where}: another OpenGL context is current than the exchange's")
 
-    def _way(self, kind: str) -> Way:
+    def _way(self, kind: str) -> ThroughHost:
         if kind not in self._ways:
             way = Shared if self.shared else ThroughHost
             self._ways[kind] = way(self._gl, self.device)
@@ -247,8 +247,7 @@ class Exchange:
         """Reads the framebuffer that is bound for reading; RGBA or RED."""
 
         def read(place: int) -> None:
-            size = (self.width, self.height)
-            self._gl.ReadPixels(0, 0, *size, channels, _TYPES[dtype], place)
+            self._gl.ReadPixels(0, 0, *self._size, channels, _TYPES[dtype], place)
             self._gl.check(f"the framebuffer has colours that are no integers? {_ONE_SAMPLE}")
 
         shape = (self.height, self.width, 4 if channels == gl.RGBA else 1)
@@ -258,16 +257,13 @@ class Exchange:
     def _texture(self, kind: str, stored: int) -> int:
         """Binds the texture of a kind, which is made again if its format has changed."""
         name, before = self._textures.get(kind, (0, 0))
-        if name and before != stored:
-            self._gl.drop("Textures", name)
-            name = 0
-        if not name:
+        if before != stored:
+            self._gl.drop("Textures", name)  # 0 is nothing
             name = self._gl.make("Textures")
             self._textures[kind] = name, stored
             self._gl.BindTexture(gl.TEXTURE_2D, name)
             layout = (gl.DEPTH_COMPONENT if stored in _DEPTHS.values() else gl.RED, gl.FLOAT)
-            size = (self.width, self.height)
-            self._gl.TexImage2D(gl.TEXTURE_2D, 0, stored, *size, 0, *layout, None)
+            self._gl.TexImage2D(gl.TEXTURE_2D, 0, stored, *self._size, 0, *layout, None)
             for parameter, value in _ONE_LEVEL.items():
                 self._gl.TexParameteri(gl.TEXTURE_2D, parameter, value)
             self._gl.check(f"a texture of {self.width}x{self.height} pixels")
@@ -307,9 +303,8 @@ class Exchange:
         name = self._texture(kind, stored)
 
         def write(place: int) -> None:
-            size = (self.width, self.height)
-            kind_of = _TYPES[image.dtype]
-            self._gl.TexSubImage2D(gl.TEXTURE_2D, 0, 0, 0, *size, channels, kind_of, place)
+            layout = (channels, _TYPES[image.dtype])
+            self._gl.TexSubImage2D(gl.TEXTURE_2D, 0, 0, 0, *self._size, *layout, place)
 
         self._way(f"write {kind}").push(image, write)
         self._gl.check("a texture's pixels could not be written")
@@ -353,13 +348,9 @@ class Exchange:
         )
         if not kind:
             raise RuntimeError(f"{frame} no {name}")
-        if kind == gl.RENDERBUFFER:
-            width, height = self._gl.renderbuffer_size(which)
-        elif size := self._gl.texture_size(which, level):
-            width, height = size
-        else:
-            return  # OpenGL reports by itself whether such a texture can be read
-        if (width, height) != (self.width, self.height):
+        size = self._gl.attached_size(kind, which, level)
+        # Whether a texture without a size can be read, OpenGL reports by itself.
+        if size is not None and size != self._size:
             raise RuntimeError(
-                f"{frame} {width}x{height} pixels, the exchange {self.width}x{self.height}"
+                f"{frame} {size[0]}x{size[1]} pixels, the exchange {self.width}x{self.height}"
             )

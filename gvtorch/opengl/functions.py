@@ -47,8 +47,8 @@ _SWITCHES = (0x0B44, 0x0BD0, 0x0C11, 0x0B90, 0x8C89, 0x8E51, 0x809E, 0x809F, 0x8
 _SWITCHES += (0x0BF2, 0x864F, 0x8DB9, *range(0x3000, 0x3008))
 #: Those with an index, of which only the first counts: blending and (from 4.1 on) scissors.
 _FIRST_SWITCHES = (0x0BE2, 0x0C11)
-#: Of compatibility profiles: the alpha test, stipple; whether colours are looked up in a table on
-#: their way, then scale and bias of red, green, blue, alpha and depth.
+#: Of compatibility profiles: the alpha test, stipple; what happens to pixels on their way: whether
+#: colours are looked up in a table, then scale and bias of red, green, blue, alpha and depth.
 _LEGACY_SWITCHES = (0x0BC0, 0x0B42)
 _TRANSFER = {0x0D10: 0.0, 0x0D14: 1.0, 0x0D15: 0.0}
 _TRANSFER |= {number: float(number % 2 == 0) for number in range(0x0D18, 0x0D20)}
@@ -63,60 +63,69 @@ _ERRORS = {0x0500: "INVALID_ENUM", 0x0501: "INVALID_VALUE", 0x0502: "INVALID_OPE
 _ERRORS |= {0x0505: "OUT_OF_MEMORY", 0x0506: "INVALID_FRAMEBUFFER_OPERATION"}
 _CONTEXT_LOST = 0x0507
 _ERRORS |= {_CONTEXT_LOST: "CONTEXT_LOST"}
+#: Numbers of the state: what sets them, and where; what asks for them; what they are while
+#: `Exchange` works (None: as each step needs it).
+_Number = tuple[str, tuple[int, ...], int, "int | None"]
+_STATE: list[_Number] = [
+    *(("PixelStorei", (number,), number, value) for number, value in _STORE.items()),
+    ("ClampColor", (CLAMP_READ_COLOR,), CLAMP_READ_COLOR, FIXED_ONLY),
+    *(("BindBuffer", (target,), asked, 0) for target, asked in _BUFFERS.items()),
+    *(("BindFramebuffer", (target,), asked, None) for target, asked in FRAMES.items()),
+    ("ActiveTexture", (), ACTIVE_TEXTURE, None),
+]
+_DRAWING_STATE: list[_Number] = [
+    ("UseProgram", (), PROGRAM, None),
+    ("BindVertexArray", (), VERTEX_ARRAY, None),
+    ("DepthMask", (), DEPTH_MASK, 1),
+    ("DepthFunc", (), DEPTH_FUNC, ALWAYS),
+]
+_LEGACY_STATE: list[_Number] = [
+    ("ClampColor", (CLAMP_FRAGMENT_COLOR,), CLAMP_FRAGMENT_COLOR, FIXED_ONLY)
+]
 #: Targets of textures of two sizes, with what asks for their binding and what for their size: 2D,
 #: rectangle, array, cube, 3D, array of cubes.
 _TARGETS = [(TEXTURE_2D, 0x8069, TEXTURE_2D), (0x84F5, 0x84F6, 0x84F5), (0x8C1A, 0x8C1D, 0x8C1A)]
 _TARGETS += [(0x8513, 0x8514, 0x8515), (0x806F, 0x806A, 0x806F), (0x9009, 0x900A, 0x9009)]
 
 _TYPES: dict[str, Any] = {
-    "i": c_int,
-    "u": c_uint,
-    "f": c_float,
-    "n": c_ssize_t,
-    "p": c_void_p,
-    "s": c_char_p,
-    "-": None,
+    **{"i": c_int, "u": c_uint, "f": c_float, "n": c_ssize_t},
+    **{"p": c_void_p, "s": c_char_p, "-": None},
 }
-#: Functions by their prototype: what they return, then what they take.
-_PROTOTYPES = {
-    "-u": (
-        "ActiveTexture BindVertexArray CompileShader DeleteProgram DeleteShader DepthFunc "
-        "Disable Enable LinkProgram UseProgram"
-    ),
-    "-uu": (
-        "AttachShader BindBuffer BindFramebuffer BindRenderbuffer BindTexture ClampColor "
-        "Disablei Enablei PolygonMode"
-    ),
-    "-unpu": "BufferData",
-    "-uiiii": "ColorMaski",
-    "-uiiiiiii": "CopyTexSubImage2D",
-    "u": "CreateProgram GetError",
-    "uu": "CreateShader",
-    "-ip": (
-        "DeleteBuffers DeleteFramebuffers DeleteTextures DeleteVertexArrays GenBuffers "
-        "GenFramebuffers GenTextures GenVertexArrays"
-    ),
-    "-i": "DepthMask",
-    "-uii": "DrawArrays",
-    "-uuuui": "FramebufferTexture2D",
-    "-uup": "GetBooleani_v GetProgramiv GetRenderbufferParameteriv GetShaderiv",
-    "iup": "GetFragDataLocation",
-    "-uuup": "GetFramebufferAttachmentParameteriv",
-    "-up": "GetIntegerv",
-    "su": "GetString",
-    "-uiup": "GetTexLevelParameteriv",
-    "ius": "GetUniformLocation",
-    "iu": "IsEnabled",
-    "iuu": "IsEnabledi",
-    "-ui": "PixelStorei",
-    "-iiiiuup": "ReadPixels",
-    "-uipp": "ShaderSource",
-    "-uiiiiiuup": "TexImage2D TexSubImage2D",
-    "-uui": "TexParameteri",
-    "-ii": "Uniform1i",
-    "-iiii": "Viewport",
-}
-_FUNCTIONS = {name: kinds for kinds, names in _PROTOTYPES.items() for name in names.split()}
+#: Functions behind their prototype: what they return, then what they take.
+_PROTOTYPES = """
+-u ActiveTexture BindVertexArray CompileShader DeleteProgram DeleteShader DepthFunc Disable Enable
+-u LinkProgram UseProgram
+-uu AttachShader BindBuffer BindFramebuffer BindRenderbuffer BindTexture ClampColor Disablei
+-uu Enablei PolygonMode
+-unpu BufferData
+-uiiii ColorMaski
+-uiiiiiii CopyTexSubImage2D
+u CreateProgram GetError
+uu CreateShader
+-ip DeleteBuffers DeleteFramebuffers DeleteTextures DeleteVertexArrays
+-ip GenBuffers GenFramebuffers GenTextures GenVertexArrays
+-i DepthMask
+-uii DrawArrays
+-uuuui FramebufferTexture2D
+-uup GetBooleani_v GetProgramiv GetRenderbufferParameteriv
+iup GetFragDataLocation
+-uuup GetFramebufferAttachmentParameteriv
+-up GetIntegerv
+su GetString
+-uiup GetTexLevelParameteriv
+ius GetUniformLocation
+iu IsEnabled
+iuu IsEnabledi
+-ui PixelStorei
+-iiiiuup ReadPixels
+-uipp ShaderSource
+-uiiiiiuup TexImage2D TexSubImage2D
+-uui TexParameteri
+-ii Uniform1i
+-iiii Viewport
+"""
+_LINES = [line.split() for line in _PROTOTYPES.strip().splitlines()]
+_FUNCTIONS = {name: kinds for kinds, *names in _LINES for name in names}
 _SINCE_3_3 = {"BindSampler": "-uu"}
 _SINCE_4_1 = {"GetFloati_v": "-uup", "ViewportIndexedf": "-uffff"}
 _LEGACY = {"GetFloatv": "-up", "PixelTransferf": "-uf"}
@@ -135,11 +144,7 @@ class Functions:
     """
 
     def __init__(self, where: str, load: Loader | None = None) -> None:
-        """Finds the functions.
-
-        Args:
-            where: Who asks, for messages.
-            load: Address of a function by its name; default: the system's library.
+        """Finds the functions, by `load` or in the system's library.
 
         Raises:
             ValueError: `load` is no function, or gives something else than addresses.
@@ -206,14 +211,23 @@ class Functions:
         return list(values)[:count]
 
     def parameter(self, get: str, *arguments: int) -> int:
-        """The number that a function such as glGetShaderiv writes; 0 if it writes none."""
+        """The number that a function such as glGetProgramiv writes; 0 if it writes none."""
         value = c_int()
         getattr(self, get)(*arguments, ctypes.byref(value))
         self.forget_errors()
         return value.value
 
-    def texture_size(self, name: int, level: int) -> list[int] | None:
-        """Width and height of a level of a texture; None of a kind that has not both."""
+    def attached_size(self, kind: int, name: int, level: int) -> list[int] | None:
+        """Width and height of a renderbuffer or of a level of a texture; None if its target has not
+        both.
+        """
+        if kind == RENDERBUFFER:
+            before = self.integer(RENDERBUFFER_BINDING)
+            self.BindRenderbuffer(RENDERBUFFER, name)
+            get, numbers = "GetRenderbufferParameteriv", (RENDERBUFFER_WIDTH, RENDERBUFFER_HEIGHT)
+            size = [self.parameter(get, RENDERBUFFER, number) for number in numbers]
+            self.BindRenderbuffer(RENDERBUFFER, before)
+            return size
         get, numbers = "GetTexLevelParameteriv", (TEXTURE_WIDTH, TEXTURE_HEIGHT)
         for target, binding, asked in _TARGETS:
             before = self.integer(binding)
@@ -224,15 +238,6 @@ class Functions:
                 return size
         self.forget_errors()
         return None
-
-    def renderbuffer_size(self, name: int) -> list[int]:
-        """Width and height of a renderbuffer."""
-        get, numbers = "GetRenderbufferParameteriv", (RENDERBUFFER_WIDTH, RENDERBUFFER_HEIGHT)
-        before = self.integer(RENDERBUFFER_BINDING)
-        self.BindRenderbuffer(RENDERBUFFER, name)
-        size = [self.parameter(get, RENDERBUFFER, number) for number in numbers]
-        self.BindRenderbuffer(RENDERBUFFER, before)
-        return size
 
     def view(self, width: int, height: int) -> None:
         """Sets the first viewport to so many pixels from the lower left corner on."""
@@ -289,18 +294,12 @@ class Functions:
         """
         with ExitStack() as later:
             later.callback(self.forget_errors)
-            for each, value in _STORE.items():
-                later.callback(self.PixelStorei, each, self.integer(each))
-                self.PixelStorei(each, value)
-            self._clamp(later, CLAMP_READ_COLOR)
-            if self._legacy:
-                self._pass_unchanged(later)
-            for target, query in _BUFFERS.items():
-                later.callback(self.BindBuffer, target, self.integer(query))
-                self.BindBuffer(target, 0)
-            for target, query in FRAMES.items():
-                later.callback(self.BindFramebuffer, target, self.integer(query))
-            later.callback(self.ActiveTexture, self.integer(ACTIVE_TEXTURE))
+            self._set(later, _STATE)
+            for each, neutral in _TRANSFER.items() if self._legacy else ():
+                before = c_float()
+                self.GetFloatv(each, ctypes.byref(before))
+                later.callback(self.PixelTransferf, each, before.value)
+                self.PixelTransferf(each, neutral)
             for unit in (1, 0):
                 self.ActiveTexture(TEXTURE0 + unit)
                 if self._samplers:
@@ -312,18 +311,13 @@ class Functions:
                 self._draw_plainly(later)
             yield
 
-    def _pass_unchanged(self, later: ExitStack) -> None:
-        """Turns off what a compatibility profile does to pixels on their way."""
-        for each, value in _TRANSFER.items():
-            before = c_float()
-            self.GetFloatv(each, ctypes.byref(before))
-            later.callback(self.PixelTransferf, each, before.value)
-            self.PixelTransferf(each, value)
-
-    def _clamp(self, later: ExitStack, colors: int) -> None:
-        """Clamps colours only where they are stored in fixed point."""
-        later.callback(self.ClampColor, colors, self.integer(colors))
-        self.ClampColor(colors, FIXED_ONLY)
+    def _set(self, later: ExitStack, states: list[_Number]) -> None:
+        """Sets numbers of the state; later they are put back."""
+        for function, place, asked, value in states:
+            put: Callable[..., None] = getattr(self, function)
+            later.callback(put, *place, self.integer(asked))
+            if value is not None:
+                put(*place, value)
 
     def _draw_plainly(self, later: ExitStack) -> None:
         """Sets the state of drawing; what has an index only at the first, but for the masks."""
@@ -334,12 +328,9 @@ class Functions:
         for each in filter(self.IsEnabled, _SWITCHES + _LEGACY_SWITCHES * self._legacy):
             later.callback(self.Enable, each)
             self.Disable(each)
-        if self._legacy:
-            self._clamp(later, CLAMP_FRAGMENT_COLOR)
         test = self.Enable if self.IsEnabled(DEPTH_TEST) else self.Disable
         later.callback(test, DEPTH_TEST)
-        later.callback(self.UseProgram, self.integer(PROGRAM))
-        later.callback(self.BindVertexArray, self.integer(VERTEX_ARRAY))
+        self._set(later, _DRAWING_STATE + _LEGACY_STATE * self._legacy)
         if self._viewports:
             box = (c_float * 4)()
             self.GetFloati_v(VIEWPORT, 0, box)
@@ -351,10 +342,6 @@ class Functions:
             self.GetBooleani_v(COLOR_MASK, each, mask)
             later.callback(self.ColorMaski, each, *mask)
             self.ColorMaski(each, *4 * [each == 0])
-        later.callback(self.DepthMask, self.integer(DEPTH_MASK))
-        self.DepthMask(1)
-        later.callback(self.DepthFunc, self.integer(DEPTH_FUNC))
-        self.DepthFunc(ALWAYS)
         faces = (FRONT, BACK) if self._legacy else (FRONT_AND_BACK,)
         for face, mode in zip(faces, self.integers(POLYGON_MODE, len(faces)), strict=True):
             later.callback(self.PolygonMode, face, mode)
@@ -386,5 +373,4 @@ def _system(where: str) -> Loader:
 
 
 def _address(library: ctypes.CDLL, function: str) -> int | None:
-    place = getattr(library, function, None)
-    return ctypes.cast(place, c_void_p).value if place else None
+    return ctypes.cast(getattr(library, function, 0), c_void_p).value

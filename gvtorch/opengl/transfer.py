@@ -5,67 +5,56 @@ Source: CUDA runtime API, section "OpenGL interoperability".
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Protocol
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from . import functions as gl
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
 #: A call of OpenGL that reads or writes pixels at an address, or at an offset in a bound buffer.
 Transfer = Callable[[int], None]
 
 
-class Way(Protocol):
-    """Moves the pixels of pictures of one kind, and flips their rows: OpenGL's go up."""
-
-    def pull(self, read: Transfer, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        """Returns what OpenGL reads."""
-
-    def push(self, image: Tensor, write: Transfer) -> None:
-        """Has OpenGL write an image."""
-
-    def close(self) -> None:
-        """Frees what it holds."""
-
-
 class ThroughHost:
-    """Copies through host memory, between any OpenGL and any device."""
+    """Moves pixels between any OpenGL and any device, by a copy in host memory; and flips their
+    rows, which go up in OpenGL.
+    """
 
     def __init__(self, functions: gl.Functions, device: torch.device) -> None:
         self._gl, self._device = functions, device
 
     def pull(self, read: Transfer, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+        """Returns what OpenGL reads."""
         host = torch.empty(shape, dtype=dtype, pin_memory=self._device.type == "cuda")
         self._gl.BindBuffer(gl.PIXEL_PACK_BUFFER, 0)
         read(host.data_ptr())
         return host.to(self._device).flip(0)
 
     def push(self, image: Tensor, write: Transfer) -> None:
+        """Has OpenGL write an image."""
         host = image.flip(0).cpu().contiguous()
         self._gl.BindBuffer(gl.PIXEL_UNPACK_BUFFER, 0)
         write(host.data_ptr())
 
     def close(self) -> None:
-        pass
+        """Frees what it holds."""
 
 
-class Shared:
-    """A buffer object of OpenGL that CUDA maps. The host does not wait: mapping and unmapping order
-    the work of each side after the other's.
+class Shared(ThroughHost):
+    """Moves them through a buffer object of OpenGL that CUDA maps. The host does not wait: mapping
+    and unmapping order the work of each side after the other's.
     """
 
     def __init__(self, functions: gl.Functions, device: torch.device) -> None:
-        self._gl, self._device = functions, device
+        super().__init__(functions, device)
         self._name, self._nbytes, self._resource = 0, 0, None
 
     def pull(self, read: Transfer, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        self._hold(_nbytes(shape, dtype))
+        self._hold(torch.Size(shape).numel() * dtype.itemsize)
         self._gl.BindBuffer(gl.PIXEL_PACK_BUFFER, self._name)
         read(0)
         with self._seen(shape, dtype) as pixels:
@@ -110,7 +99,9 @@ class Shared:
             self._cuda("cudaGraphicsMapResources", 1, self._resource, stream)
             try:
                 place, _ = self._cuda("cudaGraphicsResourceGetMappedPointer", self._resource)
-                memory = _Memory(int(place), _nbytes(shape, dtype))
+                array = {"shape": (self._nbytes,), "typestr": "|u1", "version": 3}
+                array["data"] = (int(place), False)
+                memory = SimpleNamespace(__cuda_array_interface__=array)
                 yield torch.as_tensor(memory, device=self._device).view(dtype).view(shape)
             finally:
                 self._cuda("cudaGraphicsUnmapResources", 1, self._resource, stream)
@@ -130,18 +121,6 @@ class Shared:
         return results[0] if len(results) == 1 else results
 
 
-class _Memory:
-    """Bytes on the device, for `torch.as_tensor`."""
-
-    def __init__(self, place: int, nbytes: int) -> None:
-        self.__cuda_array_interface__ = {
-            "shape": (nbytes,),
-            "typestr": "|u1",
-            "data": (place, False),
-            "version": 3,
-        }
-
-
 def why_not_shared(functions: gl.Functions, device: torch.device) -> str:
     """Why CUDA on the device (with its index) can't see the current context's buffers, or ""."""
     if device.type != "cuda" or torch.version.cuda is None:
@@ -158,7 +137,3 @@ def why_not_shared(functions: gl.Functions, device: torch.device) -> str:
     if int(error) or device.index not in [int(each) for each in devices[:count]]:
         return f"OpenGL draws on {renderer}, not on {device}"
     return ""
-
-
-def _nbytes(shape: tuple[int, ...], dtype: torch.dtype) -> int:
-    return torch.Size(shape).numel() * dtype.itemsize

@@ -94,16 +94,16 @@ _WIDTHS = (3, 1, 3, 1, 1, 1, 1, 1, 4, 1, 1, 2)
 
 
 class ShadeParameters(NamedTuple):
-    """The 20 numbers of `parameter_54`, in its order."""
+    """The 20 numbers of `parameter_54`, in its order; as they stand here for what is not lit."""
 
-    light: Triple  # where a point light stands, or the way a directional one shines, world
-    light_kind: Number  # a LightKind
-    light_color: Triple  # linear RGB
-    ambient: Number  # factor of the base colour
-    diffuse: Number  # factor of base colour, light and cosine
-    specular: Number  # factor of the highlight
-    shininess: Number  # exponent of the highlight
-    light_growth: Number  # of cones to the light, per unit of length; of a point light: width there
+    light: Triple = (0.0, 0.0, 0.0)  # where a point light stands, or which way a sun shines, world
+    light_kind: Number = LightKind.HEADLIGHT
+    light_color: Triple = (1.0, 1.0, 1.0)  # linear RGB
+    ambient: Number = 1.0  # factor of the base colour
+    diffuse: Number = 0.0  # factor of base colour, light and cosine
+    specular: Number = 0.0  # factor of the highlight
+    shininess: Number = 1.0  # exponent of the highlight
+    light_growth: Number = 0.0  # of cones to the light, per unit of length; of a point light: width
     own: Sequence[Number] | Tensor = ()  # the shader's own, up to four: a record above
     normal_scale: Number = 1.0  # a stored normal is number * scale + offset
     normal_offset: Number = 0.0

@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping
 from copy import copy
 from typing import Any, Literal, Self
 
+import torch
+
 from ..base import check
 from ..ops import ShadeArguments
 from ..ops.shading import (
@@ -20,15 +22,13 @@ from ..ops.shading import (
     ProjectionNumbers,
     StoredColorNumbers,
     Triple,
+    pack,
 )
 from ..pool import Channel, N3Tree
-from .integrated_table import integrated_table
-from .lights import check_number, check_triple
-from .lit import LitShader
+from .lights import LitShader, check_number, check_triple
 from .shader import CutSurface, Shader, number_of_one
-from .solid import Solid
 from .tables import ColorTable, Sampling, TableCache, one_color
-from .transfer_function import TransferFunction, check_transfer
+from .transfer_function import TransferFunction, integrated_table
 
 __all__ = [
     "DistanceField",
@@ -42,6 +42,9 @@ __all__ = [
 ]
 
 _WHITE = TransferFunction.from_points([(0, 1)])
+# Of a `Solid`: rows of its table; width of its ramp in intervals, at which penumbras agree best;
+# and of a distance field's ramp in voxels at most.
+_ROWS, _RAMP, _WIDEST = 1025, 3.0, 16
 
 
 class Lit(LitShader):
@@ -49,6 +52,7 @@ class Lit(LitShader):
 
     kind = "Lit"
     shadowed_kind = "ShadowedLit"
+    transfer: TransferFunction
 
     def __init__(self, transfer: TransferFunction, *, shadows: bool = False, **light: Any) -> None:
         """Takes a transfer function.
@@ -57,17 +61,13 @@ class Lit(LitShader):
             transfer: The transfer function.
             shadows: Whether matter takes light from what lies behind it; see `LitShader`.
             **light: `normals`, `light`, `ambient`, `diffuse`, `specular` and `shininess` as in
-                `Isosurface`.
+                `LitShader`.
         """
         super().__init__(**light)
-        self.transfer, self.shadows = check_transfer("Lit", "transfer", transfer), shadows
-
-    def table(self, sampling: Sampling) -> ColorTable:
-        """See `Shader`."""
-        return self.transfer.table(sampling)
+        self.transfer = check.instance("Lit", "transfer", transfer, TransferFunction)
+        self.shadows = shadows
 
     def blocker(self) -> TransferFunction:
-        """See `Shader`."""
         return self.transfer
 
 
@@ -77,14 +77,13 @@ class PreIntegrated(Shader):
     """
 
     kind = "PreIntegrated"
+    transfer: TransferFunction
 
     def __init__(self, transfer: TransferFunction) -> None:
-        """Takes a transfer function."""
-        self.transfer = check_transfer("PreIntegrated", "transfer", transfer)
+        self.transfer = check.instance("PreIntegrated", "transfer", transfer, TransferFunction)
         self._tables = TableCache()
 
     def table(self, sampling: Sampling) -> ColorTable:
-        """See `Shader`. The last tables are kept."""
         transfer = self.transfer
         key = transfer.key(sampling)
         return self._tables.get(key, lambda: integrated_table(transfer, sampling))
@@ -110,7 +109,7 @@ class StoredColor(LitShader):
         shadows: bool = False,
         **light: Any,
     ) -> None:
-        """Takes the channel's name.
+        """See the class.
 
         Args:
             channel: The channel.
@@ -119,12 +118,11 @@ class StoredColor(LitShader):
                 Then coarse levels keep the colours of what is opaque; else air's colour mixes in.
             lit: Whether it is lit; so it is where `normals` are named, and with shadows.
             shadows: As in `Lit`.
-            **light: `normals`, `light`, `ambient`, `diffuse`, `specular`, `shininess` as in
-                `Isosurface`; without `normals`, they are the gradient's of the opacity (towards
+            **light: As in `Lit`; without `normals`, they are the gradient's of the opacity (towards
                 +x, where there are six directions).
 
         Raises:
-            ValueError: The reference length is not positive, or see `Isosurface`.
+            ValueError: A number is out of its range.
         """
         super().__init__(**light)
         if reference is not None:
@@ -133,12 +131,7 @@ class StoredColor(LitShader):
         self.reference, self.premultiplied = reference, premultiplied
         self.lit, self.shadows = lit or self.normals is not None, shadows
 
-    def table(self, sampling: Sampling) -> ColorTable:
-        """Says how many lengths of intervals there are; its colours are not read."""
-        return one_color((1.0, 1.0, 1.0), sampling)
-
     def own_numbers(self, tree: N3Tree) -> StoredColorNumbers:
-        """See `Shader`."""
         scale = 1 / number_of_one(tree.bricks.channels[str(self.channel)].dtype)
         reference = self.reference or min(tree.spacing)
         directional = tree.bricks.channels[str(self.channel)].width != 4
@@ -150,19 +143,16 @@ class StoredColor(LitShader):
         )
 
     def unlit(self) -> Self:
-        """See `Shader`."""
         bare = super().unlit()
         bare.lit = True
         return bare
 
     def blocker(self) -> StoredColor:
-        """See `Shader`; it needs no normals."""
         bare = copy(self)
         bare.lit = bare.shadows = False
         return bare
 
     def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
-        """See `Shader`."""
         known = tree.bricks.channels.get(str(self.channel), Channel(width=4))
         if known.width not in (4, 24):
             raise ValueError(
@@ -201,9 +191,7 @@ class Isosurface(LitShader):
             color: Linear red, green, blue, or a transfer function of the second channel's value.
             color_channel: Name of the second channel, for a transfer function.
             color_component: Which number of it.
-            **light: normals: name of a channel of 3 numbers that holds normals (unsigned integers
-                stand for -1 to 1), the gradient's if left out. light: a `Headlight` if left out.
-                ambient, diffuse, specular: factors, 0.2, 0.8 and 0.3. shininess: exponent, 40.
+            **light: As in `Lit`.
 
         Raises:
             ValueError: A number is out of its range, or channel and colour do not fit.
@@ -218,31 +206,22 @@ class Isosurface(LitShader):
         self.other, self.other_component = color_channel, color_component
 
     def table(self, sampling: Sampling) -> ColorTable:
-        """See `Shader`."""
         if isinstance(self.color, TransferFunction):
             return self.color.table(sampling)
         return one_color(self.color, sampling)
 
     def own_numbers(self, tree: N3Tree) -> IsosurfaceNumbers:
-        """See `Shader`."""
         return IsosurfaceNumbers(self.value)
 
     def matter(self) -> Solid:
-        """See `Shader`.
-
-        Raises:
-            ValueError: It has no colour of its own.
-        """
         if isinstance(self.color, TransferFunction):
             raise ValueError("Isosurface: indirect light needs a surface of one colour")
-        return Solid(self, self.value, self.color, distance=self.distance)
+        return Solid(self, self.color)
 
     def blocker(self) -> Solid:
-        """See `Shader`."""
-        return Solid(self, self.value, None, distance=self.distance)
+        return Solid(self, None)
 
     def cut_surface(self) -> CutSurface:
-        """See `Shader`."""
         value, colors = Projection("maximum", _WHITE), None
         value.channel, value.component = self.channel, self.component
         color = self.color
@@ -272,6 +251,53 @@ class DistanceField(Isosurface):
         super().__init__(offset, color, **look)
 
 
+class Solid(Shader):
+    """An isosurface as a cone wider than a voxel meets it. Such a cone reads means. A mean tells
+    which share of the cone the surface fills, if one knows how fast the value changes there: a ramp
+    around the level, the wider the longer the interval is. So a surface that is a yes or no to thin
+    rays casts soft shadows.
+
+    Of a distance field, matter lies below the level and the value changes as places do. Else it
+    lies above, and a value changes from half of the level to three halves over four voxels.
+    """
+
+    def __init__(self, surface: Isosurface, color: Triple | None) -> None:
+        """Takes the surface and its colour; None where its alpha alone counts."""
+        self.kind = None if color is None else "Lit"
+        self.channel, self.component = surface.channel, surface.component
+        self.normals = surface.normals
+        self.level, self.distance = surface.value, surface.distance
+        self.color = (0.0, 0.0, 0.0) if color is None else color
+
+    def table(self, sampling: Sampling) -> ColorTable:
+        """See `Shader`; made on the device of the level. What is farther from the level than
+        `most_1`, in data units, can be skipped.
+        """
+        dtype, device = sampling.dtype, sampling.device
+        value_1 = pack((self.level,), dtype, device)
+        if self.distance:
+            most_1 = torch.full_like(value_1, _WIDEST / 2 * sampling.smallest_spacing)
+            slope_1 = torch.ones_like(value_1)
+        else:
+            most_1 = value_1.abs() / 2
+            slope_1 = most_1 / (2 * sampling.smallest_spacing)
+        most_1 = torch.maximum(most_1, 1e-5 * value_1.abs().clamp(min=1))  # else no ramp but a jump
+        length_l = sampling.step * 2 ** torch.arange(sampling.levels, dtype=dtype, device=device)
+        half_l = torch.minimum((_RAMP / 2 * slope_1 * length_l).clamp(min=1e-30), most_1)
+        away_m = most_1 * torch.linspace(-1, 1, _ROWS, dtype=dtype, device=device)
+        inside_m = -away_m if self.distance else away_m
+        table = pack((self.color, 0.0), dtype, device).expand(sampling.levels, _ROWS, 4).clone()
+        share_lm = (0.5 + inside_m / (2 * half_l[:, None])).clamp(0, 1)
+        # A cone that grazes a surface meets it in several intervals: each takes the fourth root.
+        table[:, :, 3] = 1 - (1 - share_lm).sqrt().sqrt()
+        seen_m = (table[:, :, 3] > 0).any(0)
+        return ColorTable(
+            table_lm4=table,
+            domain_2=torch.cat((value_1 - most_1, value_1 + most_1)),
+            opaque_m=seen_m.cumsum(0, dtype=torch.int32),
+        )
+
+
 class Projection(Shader):
     """The maximum, minimum or mean of the value along each ray, coloured by the transfer function's
     colours and opaque. `Hits.features` (r, 1) holds the value itself (0 beside the box), depth
@@ -293,19 +319,14 @@ class Projection(Shader):
             raise ValueError(
                 f"Projection: which must be 'maximum', 'minimum' or 'mean', got {which!r}"
             )
-        self.which, self.transfer = which, check_transfer("Projection", "transfer", transfer)
-
-    def table(self, sampling: Sampling) -> ColorTable:
-        """See `Shader`."""
-        return self.transfer.table(sampling)
+        self.which = which
+        self.transfer = check.instance("Projection", "transfer", transfer, TransferFunction)
 
     @property
     def projection(self) -> Literal["maximum", "minimum", "mean"]:
-        """See `Shader`."""
         return self.which
 
     def own_numbers(self, tree: N3Tree) -> ProjectionNumbers:
-        """See `Shader`."""
         return ProjectionNumbers(ProjectionKind[self.which.upper()])
 
     def feature_count(self, tree: N3Tree) -> int:
@@ -322,12 +343,8 @@ class Features(Shader):
 
     def __init__(self, transfer: TransferFunction, channel: str) -> None:
         """Takes the transfer function of the density, and the name of the features' channel."""
-        self.transfer = check_transfer("Features", "transfer", transfer)
+        self.transfer = check.instance("Features", "transfer", transfer, TransferFunction)
         self.other = _name("Features", channel)
-
-    def table(self, sampling: Sampling) -> ColorTable:
-        """See `Shader`."""
-        return self.transfer.table(sampling)
 
     def feature_count(self, tree: N3Tree) -> int:
         """As many as the channel holds."""
@@ -342,6 +359,7 @@ class GradientMagnitude(Shader):
     """
 
     kind = "GradientMagnitude"
+    transfer: TransferFunction
 
     def __init__(self, transfer: TransferFunction, full: Number | None = None) -> None:
         """Takes the transfer function, and the gradient at which its opacity is whole.
@@ -354,17 +372,12 @@ class GradientMagnitude(Shader):
         Raises:
             ValueError: `full` is not positive.
         """
-        self.transfer = check_transfer("GradientMagnitude", "transfer", transfer)
+        self.transfer = check.instance("GradientMagnitude", "transfer", transfer, TransferFunction)
         if full is not None:
             check_number("GradientMagnitude", "full", full, low=1e-30)
         self.full = full
 
-    def table(self, sampling: Sampling) -> ColorTable:
-        """See `Shader`."""
-        return self.transfer.table(sampling)
-
     def own_numbers(self, tree: N3Tree) -> GradientMagnitudeNumbers:
-        """See `Shader`."""
         low, high, _ = self.transfer.corners()
         domain = (high - low) / (8 * min(tree.spacing))
         return GradientMagnitudeNumbers(domain if self.full is None else self.full)

@@ -20,9 +20,8 @@ from ..ops import ShadeArguments
 from ..ops.registry import add_user_op
 from ..ops.shading import Number, pack
 from ..pool import N3Tree
-from .lit import LitShader
-from .tables import ColorTable, Sampling, one_color
-from .transfer_function import TransferFunction, check_transfer
+from .lights import LitShader
+from .transfer_function import TransferFunction
 
 Uniforms = MutableMapping[str, Number] | Tensor
 
@@ -80,7 +79,7 @@ class CompiledShader(LitShader):
         """
         super().__init__(**light)
         if transfer is not None:
-            check_transfer("CompiledShader", "transfer", transfer)
+            check.instance("CompiledShader", "transfer", transfer, TransferFunction)
         self.name = name
         self._take(user.load(header, name))
         self.transfer, self.channel, self.component = transfer, channel, component
@@ -105,12 +104,6 @@ class CompiledShader(LitShader):
         that only runs an archive or an exported program.
         """
         return user.libraries(self.op)
-
-    def table(self, sampling: Sampling) -> ColorTable:
-        """See `Shader`."""
-        if self.transfer is None:
-            return one_color((1.0, 1.0, 1.0), sampling)
-        return self.transfer.table(sampling)
 
     def feature_count(self, tree: N3Tree) -> int:
         """As many as the struct tells."""

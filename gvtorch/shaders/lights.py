@@ -1,4 +1,4 @@
-"""Lights and how a surface takes them: what the lit shaders hand to the kernel.
+"""Lights, and the base of the shaders that are lit.
 
 Each number may be a float or a tensor, and may be edited between frames; tensors are read when a
 frame is traced, so nothing is built again.
@@ -7,14 +7,18 @@ frame is traced, so nothing is built again.
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from ..base import check
-from ..ops.shading import LightKind, Number, ShadeParameters, Triple
+from ..ops import ShadeArguments
+from ..ops.shading import LightKind, Number, ShadeParameters, Triple, shader_number
+from ..pool import N3Tree
+from .shader import Shader
 
 #: Width of a cone over that of the disc of light it stands for. What it meets reaches as far again
 #: as its voxels are wide, and a cone that grazes takes more than its share: shadows agree best with
@@ -27,17 +31,13 @@ class Headlight:
     """A light at the eye of each ray."""
 
     color: Triple = (1.0, 1.0, 1.0)  # linear RGB
-    kind = LightKind.HEADLIGHT
-    width = 0.0
 
     def __post_init__(self) -> None:
-        """Checks the colour."""
         check_triple("Headlight", "color", self.color, low=0.0)
 
-    @property
-    def place(self) -> Triple:
-        """Nowhere in the world."""
-        return (0.0, 0.0, 0.0)
+    def parameters(self) -> ShadeParameters:
+        """Returns what the kernel is told of the light; its material is to be added."""
+        return ShadeParameters(light_color=self.color)
 
 
 @dataclass
@@ -47,25 +47,21 @@ class DirectionalLight:
     direction: Triple  # the way it shines, world; of any length but 0
     color: Triple = (1.0, 1.0, 1.0)  # linear RGB
     angle: Number = 0.0  # how wide it looks, degrees, for soft shadows; the sun: 0.53
-    kind = LightKind.DIRECTIONAL
 
     def __post_init__(self) -> None:
-        """Checks direction, colour and angle."""
         check_triple("DirectionalLight", "direction", self.direction, zero=False)
         check_triple("DirectionalLight", "color", self.color, low=0.0)
         check_number("DirectionalLight", "angle", self.angle, low=0, high=120.0)
 
-    @property
-    def place(self) -> Triple:
-        """The way it shines."""
-        return self.direction
-
-    @property
-    def width(self) -> Number:
-        """How much a cone that goes to it grows per unit of length."""
+    def parameters(self) -> ShadeParameters:
+        """See `Headlight`."""
         if isinstance(self.angle, Tensor):
-            return 2 * CONE_OF_DISC * torch.tan(torch.deg2rad(self.angle) / 2)
-        return 2 * CONE_OF_DISC * math.tan(math.radians(self.angle) / 2)
+            growth: Number = 2 * CONE_OF_DISC * torch.tan(torch.deg2rad(self.angle) / 2)
+        else:
+            growth = 2 * CONE_OF_DISC * math.tan(math.radians(self.angle) / 2)
+        return ShadeParameters(
+            self.direction, LightKind.DIRECTIONAL, self.color, light_growth=growth
+        )
 
 
 @dataclass
@@ -75,63 +71,90 @@ class PointLight:
     position: Triple  # world
     color: Triple = (1.0, 1.0, 1.0)  # linear RGB
     radius: Number = 0.0  # of the ball that shines, world units, for soft shadows
-    kind = LightKind.POINT
 
     def __post_init__(self) -> None:
-        """Checks position, colour and radius."""
         check_triple("PointLight", "position", self.position)
         check_triple("PointLight", "color", self.color, low=0.0)
         check_number("PointLight", "radius", self.radius, low=0)
 
-    @property
-    def place(self) -> Triple:
-        """Where it stands."""
-        return self.position
-
-    @property
-    def width(self) -> Number:
-        """Of a cone that goes to it, where it stands."""
-        return 2 * CONE_OF_DISC * self.radius
+    def parameters(self) -> ShadeParameters:
+        """See `Headlight`."""
+        width = 2 * CONE_OF_DISC * self.radius
+        return ShadeParameters(self.position, LightKind.POINT, self.color, light_growth=width)
 
 
 Light = Headlight | DirectionalLight | PointLight
 
 
-@dataclass(kw_only=True)
-class Material:
-    """How a place answers light (Blinn, 1977): base colour * (ambient + diffuse * cosine * light)
-    + specular * cosine^shininess * light.
+class LitShader(Shader):
+    """A shader with a light and a material (Blinn, 1977): base colour * (ambient + diffuse * cosine
+    * light) + specular * cosine^shininess * light.
+
+    Attributes:
+        shadows: Whether a cone goes from each sample to the light: matter on the way takes from
+            diffuse light and highlight. A `Headlight` throws no shadows.
+        shadowed_kind: Its `kind` with shadows; None: it can't have any.
     """
 
-    light: Light
-    ambient: Number
-    diffuse: Number
-    specular: Number
-    shininess: Number
+    shadows = False
+    shadowed_kind: str | None = None
 
-    def __post_init__(self) -> None:
-        """Checks every number that the host can see."""
+    def __init__(
+        self,
+        *,
+        normals: str | None = None,
+        light: Light | None = None,
+        ambient: Number = 0.2,
+        diffuse: Number = 0.8,
+        specular: Number = 0.3,
+        shininess: Number = 40.0,
+    ) -> None:
+        """Takes light and material.
+
+        Args:
+            normals: Name of a channel of 3 numbers that holds normals (unsigned integers stand for
+                -1 to 1); the gradient's if left out.
+            light: A `Headlight` if left out.
+            ambient: Factor of the base colour.
+            diffuse: Factor of base colour, light and cosine.
+            specular: Factor of the highlight.
+            shininess: Exponent of the highlight.
+
+        Raises:
+            ValueError: A number is negative or not finite.
+        """
+        self.normals, self.light = normals, light or Headlight()
+        self.ambient, self.diffuse = ambient, diffuse
+        self.specular, self.shininess = specular, shininess
+        self.material()
+
+    def material(self) -> ShadeParameters:
+        """See `Shader`; every number that the host can see is checked."""
         check_light("shader: light", self.light)
-        for name in ("ambient", "diffuse", "specular", "shininess"):
+        names = ("ambient", "diffuse", "specular", "shininess")
+        for name in names:
             check_number("shader", name, getattr(self, name), low=0)
+        return self.light.parameters()._replace(**{name: getattr(self, name) for name in names})
 
-    def parameters(self) -> ShadeParameters:
-        """What `shade_rays` is told of light and material."""
-        return ShadeParameters(
-            light=self.light.place,
-            light_kind=self.light.kind,
-            light_color=self.light.color,
-            ambient=self.ambient,
-            diffuse=self.diffuse,
-            specular=self.specular,
-            shininess=self.shininess,
-            light_growth=self.light.width,
-        )
+    def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
+        """See `Shader`."""
+        given = super().shading(where, tree)
+        if given is None or not self.shadows:
+            return given
+        if self.shadowed_kind is None:
+            raise ValueError(f"{where}: shadows per sample are for Lit and StoredColor")
+        return given._replace(shader=shader_number(self.shadowed_kind))
+
+    def unlit(self) -> Self:
+        """See `Shader`."""
+        bare = copy(self)
+        bare.ambient, bare.diffuse, bare.specular, bare.shadows = 1.0, 0.0, 0.0, False
+        return bare
 
 
 def check_light(what: str, value: Any) -> None:
     """Raises ValueError unless it is a light."""
-    if not isinstance(value, (Headlight, DirectionalLight, PointLight)):
+    if not isinstance(value, Light):
         raise ValueError(
             f"{what} must be a Headlight, DirectionalLight or PointLight, "
             f"got {type(value).__name__}"

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..base import check
 from .shader import Shader
 from .tables import ColorTable, Sampling
-from .transfer_function import TransferFunction, check_transfer
+from .transfer_function import TransferFunction
 
 #: Samples of a ray that are shaded at once; so the fewest of `ModuleShader.samples`.
 PART_SAMPLES = 64
@@ -65,7 +65,7 @@ class ModuleShader(Shader, torch.nn.Module):
         if isinstance(channels, str) or (channels is not None and not len(channels)):
             raise ValueError(f"ModuleShader: channels must be names, got {channels!r}")
         if hidden_by is not None:
-            check_transfer("ModuleShader", "hidden_by", hidden_by)
+            check.instance("ModuleShader", "hidden_by", hidden_by, TransferFunction)
         if samples is not None:
             check.whole("ModuleShader", "samples", samples, low=PART_SAMPLES)
         self.module, self.hidden_by, self.samples = module, hidden_by, samples

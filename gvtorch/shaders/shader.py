@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -12,12 +11,9 @@ from torch import Tensor
 
 from ..base import check
 from ..ops import ShadeArguments
-from ..ops.shading import Number, Triple, shader_number
+from ..ops.shading import Number, ShadeParameters, Triple, shader_number
 from ..pool import N3Tree
-from .lights import Headlight, Material
-from .tables import ColorTable, Sampling
-
-_UNLIT = Material(light=Headlight(), ambient=1.0, diffuse=0.0, specular=0.0, shininess=1.0)
+from .tables import ColorTable, Sampling, one_color
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,14 +29,15 @@ class CutSurface:
     colors: Shader | None  # shows the colour of another channel's value; None: that is white
 
 
-class Shader(ABC):
+class Shader:
     """What turns the values along a ray into colour. Attributes may be edited: the next picture is
     made with them, and nothing is compiled.
 
     Attributes:
-        kind: Name of its C++ struct, which the op `shade_rays` runs; None: its table
-            is all, and the op `trace_rays` draws it.
+        kind: Name of its C++ struct, which the op `shade_rays` runs; None: its table is all, and
+            the op `trace_rays` draws it.
         op: Name of a user's op, which runs in place of `shade_rays`.
+        transfer: The transfer function of its colours; None: they are white and opaque.
         channel: Name of the channel whose value it reads; None: that of the options.
         component: Which number of it; None: that of the options.
         normals: Name of a channel of 3 numbers that holds normals; None: the gradient's.
@@ -53,6 +50,7 @@ class Shader(ABC):
 
     kind: str | None = None
     op: str | None = None
+    transfer: Shader | None = None
     channel: str | None = None
     component: int | None = None
     normals: str | None = None
@@ -68,9 +66,11 @@ class Shader(ABC):
         parts = [f"{name}={check.shown(one)}" for name, one in given.items() if one is not None]
         return f"{type(self).__name__}({', '.join(parts)})"
 
-    @abstractmethod
     def table(self, sampling: Sampling) -> ColorTable:
         """Returns the colours as the kernel reads them."""
+        if self.transfer is None:
+            return one_color((1.0, 1.0, 1.0), sampling)
+        return self.transfer.table(sampling)
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -83,9 +83,9 @@ class Shader(ABC):
         """Returns the shader's own numbers, a record of `ops.shading`; most have none."""
         return ()
 
-    def material(self) -> Material:
-        """Returns light and material; shaders without a light have any."""
-        return _UNLIT
+    def material(self) -> ShadeParameters:
+        """Returns light and material."""
+        return ShadeParameters()
 
     def feature_count(self, tree: N3Tree) -> int:
         """Returns how many numbers `Hits.features` has."""
@@ -99,10 +99,8 @@ class Shader(ABC):
             scale = 1 / number_of_one(kind)
             if kind in (torch.uint8, torch.uint16):
                 scale, offset = 2 * scale, -1.0
-        parameters = (
-            self.material()
-            .parameters()
-            ._replace(own=self.own_numbers(tree), normal_scale=scale, normal_offset=offset)
+        parameters = self.material()._replace(
+            own=self.own_numbers(tree), normal_scale=scale, normal_offset=offset
         )
         return parameters.pack(dtype, tree.device)
 

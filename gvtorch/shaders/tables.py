@@ -5,9 +5,8 @@ for each length of interval.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
-from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -88,16 +87,3 @@ def one_color(color: Triple, sampling: Sampling) -> ColorTable:
 def interval_levels(root_voxel: float, step: float) -> int:
     """Returns how many lengths of intervals a tree needs: up to that of a voxel of its root."""
     return max(1, math.ceil(math.log2(root_voxel / step)) + 1)
-
-
-def common_cells(places: Iterable[float], most: int, tolerance: float = math.inf) -> int | None:
-    """Returns the fewest cells of [0, 1] at whose ends all places lie; None: it takes more than
-    `most`, or a place is off by more than `tolerance`.
-    """
-    cells = 1
-    for place in places:
-        fraction = Fraction(float(place)).limit_denominator(most)
-        cells = math.lcm(cells, fraction.denominator)
-        if cells > most or abs(float(fraction) - place) > tolerance:
-            return None
-    return cells

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
+from ..shaders.lights import LitShader
 from .caps import SurfaceSlab
 from .clip import Clipped
 from .composite import Trace
@@ -35,6 +36,7 @@ def around(tracer: Tracer, options: RenderOptions, box: Tensor) -> Trace:
         return _clipped(tracer, options, box, lens)
     shader = tracer.shader
     unlit = shader.unlit()
+    assert isinstance(shader, LitShader)  # others raise
     cones = replace(options, lod="auto")
     matter = None
     if options.lighting.indirect:
@@ -45,7 +47,7 @@ def around(tracer: Tracer, options: RenderOptions, box: Tensor) -> Trace:
         blocker=_clipped(tracer.seeing(shader.blocker(), cones), options, box),
         matter=matter,
         lighting=options.lighting.placed(box),
-        material=shader.material(),
+        shader=shader,
         voxel=max(tracer.tree.spacing),
         cone_scale=options.cone_scale,
         lens=lens,

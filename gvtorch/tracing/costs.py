@@ -21,7 +21,7 @@ from ..pictures.picture import Picture
 from ..pool import N3Tree
 from ..shaders.module import TransferModule
 from ..shaders.shader import Shader
-from ..shaders.transfer_function import TransferFunction, check_transfer
+from ..shaders.transfer_function import TransferFunction
 from .around import around
 from .options import RenderOptions, RenderSettings, render_options
 from .pixels import trace_blocks, tree_stats
@@ -120,7 +120,7 @@ def cost(
     camera = as_camera("cost", camera)
     chosen = render_options("cost", options, camera)
     check.instance("cost", "tree", tree, N3Tree)
-    transfer = check_transfer("cost", "shader", shader)
+    transfer = check.instance("cost", "shader", shader, TransferFunction)
     start = time.perf_counter()
     placed = camera.placed(tree.box)
     counter = _Counter(tree, transfer, chosen)

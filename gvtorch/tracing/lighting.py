@@ -31,7 +31,7 @@ from ..shaders.lights import (
     DirectionalLight,
     Headlight,
     Light,
-    Material,
+    LitShader,
     PointLight,
     check_light,
     check_triple,
@@ -140,7 +140,7 @@ class Lighted:
         blocker: Trace,
         matter: Trace | None,
         lighting: Lighting,
-        material: Material,
+        shader: LitShader,
         voxel: float,
         cone_scale: float,
         lens: ThinLens | None = None,
@@ -153,14 +153,14 @@ class Lighted:
             matter: Traces cones to matter that reflects light: unlit colours and normals; None
                 where there is no indirect light.
             lighting: In world units.
-            material: How matter reflects light.
+            shader: How matter reflects light, and its light, if the lighting has none.
             voxel: World size of the finest voxel's largest side.
             cone_scale: Factor by which the tracers widen cones.
             lens: Depth of field of the eye's rays, in world units.
         """
         self._trace, self._blocker, self._matter = trace, blocker, matter
-        self._lighting, self._material = lighting, material
-        self._lights = (material.light,) if lighting.lights is None else tuple(lighting.lights)
+        self._lighting, self._material = lighting, shader.material()
+        self._lights = (shader.light,) if lighting.lights is None else tuple(lighting.lights)
         self._voxel, self._cone_scale, self._lens = voxel, cone_scale, lens
 
     def __call__(self, rays: Rays) -> Hits:
