@@ -11,10 +11,9 @@ import dataclasses
 import itertools
 import math
 import multiprocessing
-import os
 import shutil
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -24,7 +23,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,11 +34,19 @@ from ..base import check
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume
 from . import resources, shard, unfinished
-from .level_reader import Deadline
 from .reading import open_source, placed, read_whole
 from .source import MemorySource, VolumeSource
 from .store import Store
-from .store_layout import BLOCKS, DTYPES, WORK, StoreLayout, context, kvstore, opened
+from .store_layout import (
+    BLOCKS,
+    DTYPES,
+    WORK,
+    Deadline,
+    StoreLayout,
+    context,
+    kvstore,
+    opened,
+)
 
 _FEW = 4  # tasks of level 0 up to which processes are not worth their start
 _AHEAD = 64  # tasks handed to an executor that does not tell how many workers it has
@@ -86,26 +93,14 @@ class Estimate:
 
 @dataclass(frozen=True, kw_only=True)
 class _Plan:
+    target: Path
     task: shard.Conversion
     settings: dict[str, Any]  # what must be the same to go on with a half-written store
     workers: int
 
     @property
-    def layout(self) -> StoreLayout:
-        return self.task.layout
-
-    @property
-    def source(self) -> VolumeSource:
-        return self.task.source
-
-    @property
     def uses_processes(self) -> bool:
-        return math.prod(self.layout.shards(0)) > _FEW
-
-    @property
-    def value_bytes(self) -> int:
-        """Of a voxel with all its channels."""
-        return self.layout.width * np.dtype(self.layout.dtype).itemsize
+        return math.prod(self.task.layout.shards(0)) > _FEW
 
 
 def convert(
@@ -159,25 +154,22 @@ def convert(
     """
     target = Path(store)
     begun = unfinished.is_begun(target, resume=resume)
-    opened_source = _source(source, shape, dtype, spacing, origin, key)
+    opened_source = _source(source, spacing, origin, shape=shape, dtype=dtype, key=key)
     plan = _plan(source, opened_source, target, block, threshold, nan, workers)
     if not begun:
-        _check_room(target, _estimate(plan, target))
+        _check_room(target, _estimate(plan))
     with unfinished.claimed(target, plan.settings, resume=begun) as work:
         with _executor(executor, plan) as pool:
-            task = _staged(plan, target, pool)
             try:
-                _write_levels(dataclasses.replace(plan, task=task), work, pool, progress)
-            except unfinished.NotFiniteError:
-                work.discard()
-                raise
+                _write_levels(_staged(plan, pool), work, pool, progress)
             except BrokenExecutor:
                 raise OSError(
                     f"{target}: a worker process ended (killed, out of memory, or started by a "
                     'script that converts outside of `if __name__ == "__main__":`); '
                     f"gvtorch convert {plan.settings['source']} {target} --resume goes on"
                 ) from None
-        work.finish(plan.layout, plan.settings, _value_range(plan.task))
+        layout = dataclasses.replace(plan.task.layout, value_range=_value_range(plan.task))
+        work.finish(layout, plan.settings)
     return Store.open(target)
 
 
@@ -197,10 +189,8 @@ def estimate(
 
     Args, Raises: as `convert`.
     """
-    target = Path(store)
-    opened_source = _source(source, shape, dtype, None, None, key)
-    plan = _plan(source, opened_source, target, block, threshold, nan, workers)
-    return _estimate(plan, target)
+    opened_source = _source(source, None, None, shape=shape, dtype=dtype, key=key)
+    return _estimate(_plan(source, opened_source, Path(store), block, threshold, nan, workers))
 
 
 # --- before the work
@@ -208,11 +198,9 @@ def estimate(
 
 def _source(
     source: str | Path | Volume,
-    shape: Sequence[int] | None,
-    dtype: str | None,
     spacing: Sequence[float] | None,
     origin: Sequence[float] | None,
-    key: str | None,
+    **options: Any,
 ) -> VolumeSource:
     """Opens the source; one that can only be read whole is read, once."""
     if isinstance(source, Volume):
@@ -225,7 +213,7 @@ def _source(
             raise ValueError(f"{source.name}: {source.data.dtype} has no place in a store")
         told = {"path": source.name, "spacing": source.spacing, "origin": source.origin}
         return placed("convert", MemorySource.of(source.data.numpy(), **told), spacing, origin)
-    found = open_source(source, shape=shape, dtype=dtype, spacing=spacing, origin=origin, key=key)
+    found = open_source(source, spacing=spacing, origin=origin, **options)
     if not found.whole:
         return found
     free = resources.memory_free()
@@ -255,14 +243,16 @@ def _plan(
     if nan is not None:
         most = float(np.finfo(source.dtype).max) if np.dtype(source.dtype).kind == "f" else math.inf
         nan = check.number("convert", "nan", nan, low=-most, high=most)
-    layout = StoreLayout(extent=source.extent, dtype=source.dtype, width=source.width, block=block)
-    if workers is None:
-        workers = resources.cores()
-    tasks = math.prod(layout.shards(0))
-    workers = min(check.whole("convert", "workers", workers, low=1), tasks)
-    task = shard.Conversion(
-        root=kvstore(target), layout=layout, source=source, threshold=threshold, nan=nan
+    layout = StoreLayout(
+        extent=source.extent,
+        dtype=source.dtype,
+        width=source.width,
+        block=block,
+        threshold=threshold,
     )
+    workers = resources.cores() if workers is None else workers
+    workers = min(check.whole("convert", "workers", workers, low=1), math.prod(layout.shards(0)))
+    task = shard.Conversion(root=kvstore(target), layout=layout, source=source, nan=nan)
     settings = {
         "source": source.path,
         "fingerprint": unfinished.fingerprint(given),
@@ -277,23 +267,23 @@ def _plan(
         "nan": nan,
         "tasks": sum(math.prod(layout.shards(level)) for level in range(layout.levels)),
     }
-    return _Plan(task=task, settings=settings, workers=workers)
+    return _Plan(target=target, task=task, settings=settings, workers=workers)
 
 
 def _places(layout: StoreLayout, level: int) -> Iterator[shard.Zyx]:
     return itertools.product(*map(range, layout.shards(level)))  # type: ignore[return-value]
 
 
-def _estimate(plan: _Plan, target: Path) -> Estimate:
-    layout = plan.layout
+def _estimate(plan: _Plan) -> Estimate:
+    layout, source = plan.task.layout, plan.task.source
     voxels = math.prod(layout.extent)
     below = sum(math.prod(layout.shape(level)) for level in range(1, layout.levels))
     plain, beside, seen, seconds = _sample(plan.task)
     share = (voxels + below) / seen
-    copies = _COPIES * (layout.shard + 2) ** 3 * plan.value_bytes
+    copies = _COPIES * (layout.shard + 2) ** 3 * layout.voxel_bytes
     cube = min(1.0, voxels / layout.shard**3)
     each = (_PROCESS if plan.uses_processes else 0) + int(copies * cube)
-    held = plan.source.nbytes if isinstance(plan.source, MemorySource) else 0
+    held = source.nbytes if isinstance(source, MemorySource) else 0
     staged = held if plan.uses_processes else 0
     start = 3.0 * plan.uses_processes
     return Estimate(
@@ -302,13 +292,13 @@ def _estimate(plan: _Plan, target: Path) -> Estimate:
         channels=layout.width,
         levels=layout.levels,
         tasks=plan.settings["tasks"],
-        source_bytes=plan.source.nbytes,
+        source_bytes=source.nbytes,
         disk_bytes=int((plain + beside) * share),
         temporary_bytes=int(2 * plain * below / seen) + staged,
         memory_bytes=_PROCESS + plan.workers * each + held,
         seconds=_DISK * seconds * (voxels + _BELOW * below) / seen / plan.workers + start,
         workers=plan.workers,
-        disk_free=shutil.disk_usage(resources.existing(target)).free,
+        disk_free=shutil.disk_usage(resources.existing(plan.target)).free,
         memory_free=resources.memory_free() + held,
     )
 
@@ -356,38 +346,33 @@ def _check_room(target: Path, needs: Estimate) -> None:
 # --- the work
 
 
-@contextmanager
-def _executor(given: Executor | None, plan: _Plan) -> Iterator[Executor]:
+def _executor(given: Executor | None, plan: _Plan) -> AbstractContextManager[Executor]:
     if given is not None:
-        yield given
-        return
-    own: Executor
+        return nullcontext(given)
     if plan.uses_processes and plan.workers > 1:
         spawn = multiprocessing.get_context("spawn")
-        own = ProcessPoolExecutor(plan.workers, spawn, resources.begin_worker, (os.getpid(),))
-    else:
-        own = ThreadPoolExecutor(plan.workers)
-    try:
-        yield own
-    finally:
-        own.shutdown(wait=True, cancel_futures=True)
+        return ProcessPoolExecutor(plan.workers, spawn, resources.begin_worker)
+    return ThreadPoolExecutor(plan.workers)
 
 
-def _staged(plan: _Plan, target: Path, pool: Executor) -> shard.Conversion:
+def _staged(plan: _Plan, pool: Executor) -> _Plan:
     """Writes a volume that lies in memory to a file, where other processes shall read it."""
-    if not isinstance(plan.source, MemorySource) or isinstance(pool, ThreadPoolExecutor):
-        return plan.task
-    file = target / WORK / "source.npy"
-    np.save(file, plan.source.data)
-    return dataclasses.replace(plan.task, source=open_source(file))
+    if not isinstance(plan.task.source, MemorySource) or isinstance(pool, ThreadPoolExecutor):
+        return plan
+    file = plan.target / WORK / "source.npy"
+    np.save(file, plan.task.source.data)
+    task = dataclasses.replace(plan.task, source=open_source(file))
+    return dataclasses.replace(plan, task=task)
 
 
 def _write_levels(
     plan: _Plan, work: unfinished.UnfinishedStore, pool: Executor, progress: Progress
 ) -> None:
-    layout = plan.layout
-    total = plan.value_bytes * sum(math.prod(layout.shape(level)) for level in range(layout.levels))
-    done = sum(work.done.values()) * plan.value_bytes
+    layout = plan.task.layout
+    total = sum(math.prod(layout.shape(level)) for level in range(layout.levels))
+
+    total *= layout.voxel_bytes
+    done = sum(work.done.values()) * layout.voxel_bytes
     progress("converting", done, total)
     counted = isinstance(pool, (ProcessPoolExecutor, ThreadPoolExecutor))
     ahead = 2 * plan.workers + 2 if counted else _AHEAD
@@ -397,34 +382,36 @@ def _write_levels(
             continue
         _create_arrays(plan.task, level)
         bad = 0
-        for result in _run(pool, plan.task, level, places, ahead):
-            bad += result.bad
-            if not result.bad:
-                work.note((level, *result.place), result.voxels)
-                done += result.voxels * plan.value_bytes
-                progress("converting", done, total)
+        with closing(_run(pool, plan.task, level, places, ahead)) as results:
+            for result in results:
+                bad += result.bad
+                if not result.bad:
+                    work.note({(level, *result.place): result.voxels})
+                    done += result.voxels * layout.voxel_bytes
+                    progress("converting", done, total)
         if bad:
-            raise unfinished.NotFiniteError(
+            shutil.rmtree(plan.target, ignore_errors=True)
+            raise ValueError(
                 f"{plan.settings['source']}: {bad} values are NaN or infinite (of "
                 f"{math.prod(layout.extent) * layout.width}); pass nan=VALUE (--nan VALUE) to "
                 "replace them"
             )
-        work.forget_bounds(level - 1)
+        for which in ("low", "high"):  # the bounds below are not needed any more
+            folder = plan.target / WORK / which / str(level - 1)
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _create_arrays(task: shard.Conversion, level: int) -> None:
     layout = task.layout
-    specs = [layout.plain(level), layout.blocks(level), layout.cells(level)]
-    if 0 < level < layout.levels - 1:
-        specs += [layout.bound(which, level) for which in ("low", "high")]
-    for spec in specs:
+    specs = (layout.plain(level), layout.blocks(level), layout.cells(level))
+    for spec in (*specs, *layout.bounds(level)):
         where = f"{task.root['path']}{spec['path']}"
         Deadline(_OPEN_TIMEOUT).wait(opened(task.root, spec, "create"), where)
 
 
 def _run(
     pool: Executor, task: shard.Conversion, level: int, places: Iterable[Any], ahead: int
-) -> Iterator[shard.ShardResult]:
+) -> Generator[shard.ShardResult, None, None]:
     """Runs the tasks of a level, a bounded number at a time, and yields what they tell."""
     waiting = iter(places)
     running: set[Future[shard.ShardResult]] = set()

@@ -1,4 +1,5 @@
-"""`LevelReader`: the tree levels of a multiscale image, read from whatever arrays it stores.
+"""`LevelReader`: the tree levels of a multiscale image, read from whatever arrays it stores;
+`open_arrays` opens these.
 
 A tree level is 2^L coarser along every axis. Where no array is, the level is averaged: from the
 coarsest array whose factors divide 2^L, or tile by tile from the tree level below, whichever
@@ -9,57 +10,23 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
 import threading
-import time
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ..pool.downsample import pool_mean
-from .store_layout import level_shape
+from . import boxes
+from .boxes import Zyx
+from .ngff import ImageArray, MultiscaleImage, read_json
+from .store_layout import MOST_VOXELS, Deadline, StoreError, StoreLayout, child, opened, short
 
 _TILE = 64  # voxels along a side of a tile that is made on demand
 _KEPT = 128 << 20  # bytes of such tiles
-
-Zyx = Sequence[int]
-
-
-class StoreError(OSError):
-    """A store could not be read or written."""
-
-
-class Deadline:
-    """A moment until which reads may take."""
-
-    def __init__(self, timeout: float) -> None:
-        """Starts the clock: `timeout` seconds from now."""
-        self.timeout = timeout
-        self._end = time.monotonic() + timeout
-
-    def wait(self, future: Any, where: str) -> Any:
-        """Returns the result of one of tensorstore's futures.
-
-        Raises:
-            TimeoutError: It took too long.
-            StoreError: It failed.
-        """
-        try:
-            return future.result(timeout=max(0.0, self._end - time.monotonic()))
-        except TimeoutError:
-            future.cancel()
-            raise TimeoutError(f"{where}: no answer within {self.timeout:g} s") from None
-        except Exception as error:  # tensorstore raises what its status maps to
-            raise StoreError(f"{where}: {short(error)}") from None
-
-
-def short(error: BaseException) -> str:
-    """tensorstore's message in one line, without its annotations."""
-    text = re.sub(r"\s*\[[a-z_]+(=| locations=).*", "", str(error), flags=re.DOTALL)
-    return " ".join(text.split())[:400] or type(error).__name__
+_MOST_CHUNK = 2**31  # bytes of one chunk of a foreign array
 
 
 @dataclass(frozen=True)
@@ -77,50 +44,105 @@ class StoredArray:
 
     def read(self, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         """Reads (z, y, x, c); voxels beyond the array repeat its outermost ones."""
-        start, stop = clamp_box(low, high, [self.size(axis) for axis in "zyx"])
-        inside = dict(zip("zyx", map(slice, start, stop), strict=True))
+        start, stop = boxes.clamp(low, high, [self.size(axis) for axis in "zyx"])
+        inside = dict(zip("zyx", boxes.index(start, stop), strict=True))
         place = tuple(inside.get(axis, slice(None)) for axis in self.axes)
         data = deadline.wait(self.array[place].read(order="C"), self.where)
-        missing = "".join(axis for axis in "zyxc" if axis not in self.axes)
-        letters = missing + self.axes
-        data = data[(None,) * len(missing)].transpose([letters.index(axis) for axis in "zyxc"])
-        return repeat_edges(data, start, low, high)
+        return boxes.repeat_edges(boxes.to_zyxc(data, self.axes), start, low, high)
 
 
-def clamp_box(low: Zyx, high: Zyx, shape: Zyx) -> tuple[list[int], list[int]]:
-    """The part of a box that lies in a grid, or what is next to it: at least one voxel a side."""
-    start = [min(max(a, 0), n - 1) for a, n in zip(low, shape, strict=True)]
-    stop = [max(min(b, n), a + 1) for a, b, n in zip(start, high, shape, strict=True)]
-    return start, stop
+def open_arrays(
+    where: str,
+    root: Any,
+    image: MultiscaleImage,
+    moment: int,
+    channels: Sequence[int] | None,
+    deadline: Deadline,
+) -> tuple[list[StoredArray], slice | list[int]]:
+    """Opens the image's arrays that fit the tree, the finest first, at one time point; returns
+    them and the index of their channels. What they say is checked before memory is taken.
+    """
+    finest = image.scales[0]
+    at = child(root, finest.path)
+    is_v3 = read_json(f"{where}/{finest.path}", at, "zarr.json", deadline) is not None
+    driver = "zarr3" if is_v3 else "zarr"
+    futures = [opened(root, {"driver": driver, "path": scale.path}) for scale in image.scales]
+    stored: list[StoredArray] = []
+    for scale, future in zip(image.scales, futures, strict=True):
+        name = f"{where}/{scale.path}"
+        try:
+            array = deadline.wait(future, name)
+        except StoreError as error:
+            raise ValueError(f"{name}: can't be opened: {short(error)}") from None
+        _check_array(name, array, image.axes)
+        if not stored:
+            chosen = _choose(where, array, image.axes, moment, channels)
+        picked: dict[str, Any] = {"t": moment, "c": chosen}
+        # Singleton axes of an index array would move: oindex leaves every axis where it is.
+        array = array.oindex[tuple(picked.get(axis, slice(None)) for axis in image.axes)]
+        found = StoredArray(array, image.axes.replace("t", ""), (1, 1, 1), name)
+        factors = _factors(stored[0], found, finest, scale) if stored else found.factors
+        if factors is not None:
+            stored.append(replace(found, factors=factors))
+    return stored, chosen
 
 
-def repeat_edges(data: np.ndarray, start: Zyx, low: Zyx, high: Zyx) -> np.ndarray:
-    """Extends (z, y, x, c) voxels, which begin at `start`, to a box; the outermost repeat."""
-    for axis, (at, a, b) in enumerate(zip(start, low, high, strict=True)):
-        size = data.shape[axis]
-        if (at, at + size) != (a, b):
-            data = data.take(np.arange(a - at, b - at).clip(0, size - 1), axis)
-    return data
+def _check_array(where: str, array: Any, axes: str) -> None:
+    if array.rank != len(axes):
+        raise ValueError(f"{where}: has {array.rank} axes, the metadata {len(axes)}: {axes}")
+    voxels = math.prod(array.shape[axes.index(axis)] for axis in "zyx" if axis in axes)
+    if voxels > MOST_VOXELS:
+        raise ValueError(f"{where}: {voxels} voxels are more than the {MOST_VOXELS} of a store")
+    if min(array.shape) < 1 or math.prod(array.shape) > MOST_VOXELS * 2**10:
+        raise ValueError(f"{where}: extent {tuple(array.shape)} is empty or far too large")
+    chunk = math.prod(array.chunk_layout.read_chunk.shape or (1,))
+    chunk *= array.dtype.numpy_dtype.itemsize
+    if chunk > _MOST_CHUNK:
+        raise ValueError(f"{where}: a chunk takes {chunk} bytes, more than {_MOST_CHUNK}")
+
+
+def _choose(
+    where: str, array: Any, axes: str, moment: int, channels: Sequence[int] | None
+) -> slice | list[int]:
+    size = {axis: int(n) for axis, n in zip(axes, array.shape, strict=True)}
+    moments, width = size.get("t", 1), size.get("c", 1)
+    if isinstance(moment, bool) or not isinstance(moment, int) or not 0 <= moment < moments:
+        raise ValueError(f"{where}: has no time {moment!r}; it has {moments}, from 0")
+    if channels is None:
+        return slice(None)
+    picked = list(channels)
+    if not picked or not all(isinstance(c, int) and 0 <= c < width for c in picked):
+        raise ValueError(f"{where}: has no channels {picked!r}; it has {width}, from 0")
+    return picked if "c" in axes else slice(None)
+
+
+def _factors(
+    first: StoredArray, other: StoredArray, fine: ImageArray, coarse: ImageArray
+) -> tuple[int, int, int] | None:
+    """Whole factors (z, y, x) between the finest array and another; None where there are none."""
+    found = []
+    for axis, a, b in zip("zyx", fine.scale, coarse.scale, strict=True):
+        big, small = first.size(axis), other.size(axis)
+        # Where scales don't tell, sizes do; a last voxel that is not full may have been dropped.
+        for factor in (round(b / a), round(big / small)):
+            if factor >= 1 and small in (-(-big // factor), big // factor):
+                found.append(factor)
+                break
+    return (found[0], found[1], found[2]) if len(found) == 3 else None
 
 
 class LevelReader:
     """Tree levels over stored arrays. Safe to use from several threads."""
 
-    def __init__(self, stored: Sequence[StoredArray], count: int, dtype: np.dtype) -> None:
-        """Plans how each level is read.
-
-        Args:
-            stored: Arrays, the finest first.
-            count: Number of tree levels.
-            dtype: What values are converted to.
-        """
-        first = stored[0]
-        self.extent = (first.size("x"), first.size("y"), first.size("z"))
-        self.dtype, self.width = dtype, first.size("c")
-        self._plans: list[tuple[StoredArray, tuple[int, ...]] | None] = []
+    def __init__(self, stored: Sequence[StoredArray], layout: StoreLayout) -> None:
+        """Plans how each level of the layout is read from arrays, the finest first."""
+        self._layout, self.width = layout, stored[0].size("c")
+        self._plans: list[tuple[StoredArray, list[int]] | None] = []
         cost = 1.0
-        for level in range(count):
-            base, rest = _coarsest(stored, 2**level)
+        for level in range(layout.levels):
+            fits = [s for s in stored if all(2**level % f == 0 for f in s.factors)]
+            base = max(fits, key=lambda s: math.prod(s.factors))
+            rest = [2**level // f for f in base.factors]  # what is left to average
             direct = math.prod(rest)
             if level == 0 or direct < 8 * cost:
                 self._plans.append((base, rest))
@@ -133,33 +155,31 @@ class LevelReader:
 
     def read(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         """Reads (z, y, x, c) voxels `low` to `high` of a level; beyond it the outermost repeat."""
-        start, stop = clamp_box(low, high, level_shape(self.extent, level))
+        start, stop = boxes.clamp(low, high, self._layout.shape(level))
         data = self._inside(level, start, stop, deadline)
-        return np.ascontiguousarray(repeat_edges(data, start, low, high))
+        return np.ascontiguousarray(boxes.repeat_edges(data, start, low, high))
 
     def _inside(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         plan = self._plans[level]
         if plan is None:
             return self._from_tiles(level, low, high, deadline)
         base, rest = plan
-        ends = [-(-n // f) for n, f in zip(self.extent[::-1], base.factors, strict=True)]
+        ends = [-(-n // f) for n, f in zip(self._layout.shape(0), base.factors, strict=True)]
         start = [a * r for a, r in zip(low, rest, strict=True)]
         stop = [min(b * r, n) for b, r, n in zip(high, rest, ends, strict=True)]
-        data = base.read(start, stop, deadline).astype(self.dtype, copy=False)
+        data = base.read(start, stop, deadline).astype(self._layout.dtype, copy=False)
         return data if math.prod(rest) == 1 else pool_mean(data, rest)
 
     def _from_tiles(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
-        out = np.empty((*[b - a for a, b in zip(low, high, strict=True)], self.width), self.dtype)
+        size = [b - a for a, b in zip(low, high, strict=True)]
+        out = np.empty((*size, self.width), self._layout.dtype)
         spans = [range(a // _TILE, -(-b // _TILE)) for a, b in zip(low, high, strict=True)]
         for place in itertools.product(*spans):
             tile = self._tile(level, place, deadline)
-            source, target = [], []
-            for axis, at in enumerate(place):
-                a = max(low[axis], at * _TILE)
-                b = min(high[axis], at * _TILE + tile.shape[axis])
-                source.append(slice(a - at * _TILE, b - at * _TILE))
-                target.append(slice(a - low[axis], b - low[axis]))
-            out[tuple(target)] = tile[tuple(source)]
+            corner = np.multiply(place, _TILE)
+            begin, end = np.maximum(low, corner), np.minimum(high, corner + tile.shape[:3])
+            part = tile[boxes.index(begin - corner, end - corner)]
+            out[boxes.index(begin - low, end - low)] = part
         return out
 
     def _tile(self, level: int, place: Zyx, deadline: Deadline) -> np.ndarray:
@@ -168,7 +188,7 @@ class LevelReader:
             if key in self._tiles:
                 self._tiles.move_to_end(key)
                 return self._tiles[key]
-        below = level_shape(self.extent, level - 1)
+        below = self._layout.shape(level - 1)
         low = [2 * _TILE * at for at in place]
         high = [min(a + 2 * _TILE, n) for a, n in zip(low, below, strict=True)]
         tile = pool_mean(self._inside(level - 1, low, high, deadline), 2)
@@ -180,10 +200,3 @@ class LevelReader:
                 victim = min(self._tiles, key=lambda key: key[0])
                 size -= self._tiles.pop(victim).nbytes
         return tile
-
-
-def _coarsest(stored: Sequence[StoredArray], factor: int) -> tuple[StoredArray, tuple[int, ...]]:
-    """The coarsest array whose factors divide `factor`, and what is left to average."""
-    fits = [s for s in stored if all(factor % f == 0 for f in s.factors)]
-    best = max(fits, key=lambda s: math.prod(s.factors))
-    return best, tuple(factor // f for f in best.factors)

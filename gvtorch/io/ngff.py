@@ -1,4 +1,4 @@
-"""OME-Zarr metadata: `parse_image` (NGFF 0.1 to 0.5) and `image_metadata` (0.5).
+"""OME-Zarr metadata: `find_image` (NGFF 0.1 to 0.5) and `image_metadata` (0.5).
 
 What a file says is checked here before anything is done with it. Arrays are not opened.
 Source: OME-NGFF specification, versions 0.4 and 0.5 (multiscales).
@@ -12,6 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from .store_layout import WORK, Deadline, StoreLayout, child, read_key
 
 _MOST_LEVELS = 64
 _MOST_JSON = 1 << 24  # bytes
@@ -29,12 +31,10 @@ class ImageArray:
 
 @dataclass(frozen=True)
 class MultiscaleImage:
-    """A multiscale image: its axes in stored order, one letter each, and its arrays, finest
-    first.
-    """
+    """A multiscale image."""
 
-    axes: str
-    scales: tuple[ImageArray, ...]
+    axes: str  # in stored order, a letter each
+    scales: tuple[ImageArray, ...]  # finest first
     name: str
     unit: str | None
 
@@ -45,6 +45,45 @@ def is_zarr(path: str | Path) -> bool:
     if "://" in text or text.rstrip("/").endswith(".zarr"):
         return True
     return any((Path(text) / name).is_file() for name in ("zarr.json", ".zattrs", ".zgroup"))
+
+
+def find_image(
+    where: str, root: Any, image: str | None, deadline: Deadline
+) -> tuple[Any, MultiscaleImage, StoreLayout | None]:
+    """Finds a multiscale image by its name, number or folder; None takes the first.
+
+    Returns:
+        Its group's kvstore, what the metadata tells, and the layout if it is a store of ours.
+
+    Raises:
+        ValueError: There is none, or the metadata is damaged.
+    """
+    attributes = _attributes(where, root, deadline)
+    if attributes is None:
+        raise _no_store(where, root, deadline)
+    own = attributes.get("gvtorch")
+    layout = None if own is None else StoreLayout.parse(where, own)
+    found = _parse_image(where, attributes, image)
+    if found is None and layout is None:
+        inner = "0" if image is None else image  # where converters of microscopy files put it
+        if ".." not in inner and not inner.startswith("/"):
+            root = child(root, inner)
+            deeper = _attributes(f"{where}/{inner}", root, deadline)
+            found = _parse_image(where, deeper, None) if deeper else None
+    if found is None:
+        asked = "no multiscale image" if image is None else f"no image {image!r}"
+        raise ValueError(f"{where}: has {asked} (NGFF multiscales)")
+    return root, found, layout
+
+
+def read_json(where: str, root: Any, name: str, deadline: Deadline) -> dict[str, Any] | None:
+    """Reads a JSON object of a folder; returns None if there is no such file.
+
+    Raises:
+        ValueError: See `parse_json`.
+    """
+    content = read_key(where, root, name, deadline)
+    return None if content is None else parse_json(f"{where}/{name}", content)
 
 
 def parse_json(where: str, content: bytes) -> dict[str, Any]:
@@ -64,31 +103,43 @@ def parse_json(where: str, content: bytes) -> dict[str, Any]:
     return found
 
 
-def parse_image(
+def _attributes(where: str, root: Any, deadline: Deadline) -> dict[str, Any] | None:
+    """A group's attributes: of zarr.json (v3), or .zattrs (v2)."""
+    group = read_json(where, root, "zarr.json", deadline)
+    if group is None:
+        return read_json(where, root, ".zattrs", deadline)
+    attributes = group.get("attributes", {})
+    if group.get("node_type") != "group" or not isinstance(attributes, dict):
+        raise ValueError(f"{where}: zarr.json is that of no group; expected an OME-Zarr image")
+    return attributes
+
+
+def _no_store(where: str, root: Any, deadline: Deadline) -> Exception:
+    if isinstance(root, dict) and not Path(where).exists():
+        return FileNotFoundError(f"store not found: {where}")
+    work = child(root, WORK)
+    manifest = read_json(where, work, "manifest.json", deadline)
+    if manifest is None:
+        return ValueError(f"{where}: not a store: has neither zarr.json nor .zattrs")
+    done = (read_key(where, work, "journal.jsonl", deadline) or b"").count(b"\n")
+    return ValueError(
+        f"{where}: half-written: {done} of {manifest.get('tasks', '?')} shards are done; "
+        f"gvtorch convert {manifest.get('source', 'SOURCE')} {where} --resume goes on"
+    )
+
+
+def _parse_image(
     where: str, attributes: dict[str, Any], image: str | None
 ) -> MultiscaleImage | None:
-    """Reads the multiscale image out of a group's attributes.
-
-    Args:
-        where: The group, for messages.
-        attributes: `ome` of version 0.5, or the whole of `.zattrs` before that.
-        image: Name or number of the image; None takes the first.
-
-    Returns:
-        The image, or None if the group has no image of this name.
-
-    Raises:
-        ValueError: The metadata is damaged.
-    """
-    images = attributes.get("multiscales")
+    """Reads an image out of a group's attributes (of 0.5 those in `ome`), if it is there."""
+    ome = attributes.get("ome")
+    images = (ome if isinstance(ome, dict) else attributes).get("multiscales")
     if not isinstance(images, list) or not images:
         return None
     if not all(isinstance(item, dict) for item in images):
         raise ValueError(f"{where}: multiscales must be objects")
-    if image is None:
-        return _image(where, images[0])
     for number, item in enumerate(images):
-        if image in (item.get("name"), str(number)):
+        if image in (None, item.get("name"), str(number)):
             return _image(where, item)
     return None
 
@@ -158,32 +209,23 @@ def image_metadata(
     spacing: Sequence[float],
     origin: Sequence[float],
     width: int,
-    unit: str | None = None,
+    unit: str | None,
 ) -> dict[str, Any]:
     """Returns the `ome` attribute (0.5) of a pyramid of factor 2 in the arrays "0", "1", ...
 
-    Args:
-        name: The image's name.
-        levels: Number of arrays.
-        spacing: (x, y, z) of level 0.
-        origin: (x, y, z) centre of voxel 0 of level 0.
-        width: Channels; an axis c comes first where there are several.
-        unit: Unit of length, where it is known.
+    `spacing` and `origin` are (x, y, z) of level 0; an axis c comes first where `width` is not 1.
     """
     axes: list[dict[str, str]] = [{"name": "c", "type": "channel"}] if width > 1 else []
-    for axis in "zyx":
-        axes.append({"name": axis, "type": "space"} | ({"unit": unit} if unit else {}))
-    first = [1.0] if width > 1 else []
+    axes += [{"name": axis, "type": "space"} | ({"unit": unit} if unit else {}) for axis in "zyx"]
     datasets = []
     for level in range(levels):
-        scale = [s * 2**level for s in reversed(spacing)]
-        move = [
-            o + (2**level - 1) / 2 * s
-            for o, s in zip(reversed(origin), reversed(spacing), strict=True)
-        ]
+        factor = 2**level
+        zyx = list(zip(spacing, origin, strict=True))[::-1]
+        scale = [1.0] * (len(axes) - 3) + [s * factor for s, _ in zyx]
+        move = [0.0] * (len(axes) - 3) + [o + (factor - 1) / 2 * s for s, o in zyx]
         transforms = [
-            {"type": "scale", "scale": first + scale},
-            {"type": "translation", "translation": [0.0] * len(first) + move},
+            {"type": "scale", "scale": scale},
+            {"type": "translation", "translation": move},
         ]
         datasets.append({"path": str(level), "coordinateTransformations": transforms})
     return {

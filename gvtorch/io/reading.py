@@ -16,10 +16,9 @@ from ..base import check
 from ..base.constants import MAX_VOXELS
 from ..base.volume import Volume, check_extent
 from .formats import FORMATS, Format, find_format
-from .level_reader import StoreError
 from .ngff import is_zarr
 from .source import VolumeSource, told_as
-from .store_layout import DTYPES, MOST_VOXELS
+from .store_layout import DTYPES, MOST_VOXELS, StoreError
 
 _MOST_CHANNELS = 2**10
 

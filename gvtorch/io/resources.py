@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import threading
-import time
 from pathlib import Path
-
-_LOOK = 1.0  # seconds between two looks whether the parent process still lives
 
 
 def existing(path: Path) -> Path:
@@ -38,13 +36,14 @@ def memory_free() -> int:
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
 
 
-def begin_worker(parent: int) -> None:
+def begin_worker() -> None:
     """Sets a worker process up: Ctrl-C is the parent's business, and it ends with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(_LOOK)
+    def end_with_parent() -> None:
+        parent = multiprocessing.parent_process()
+        assert parent is not None
+        parent.join()
         os._exit(1)
 
-    threading.Thread(target=watch, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()

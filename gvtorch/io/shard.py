@@ -12,12 +12,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
-from ..pool.downsample import extend, pool_max, pool_mean, pool_min, round_array, window
-from .level_reader import Deadline, StoredArray, StoreError, short
+from ..pool.downsample import pool_max, pool_mean, pool_min, round_array, window
+from . import boxes
+from .level_reader import StoredArray
 from .source import VolumeSource
 from .store import needed_cells
-from .store_layout import BORDER, CELL, StoreLayout, opened
+from .store_layout import BORDER, CELL, Deadline, StoreError, StoreLayout, opened, short
 
 _TIMEOUT = 3600.0  # seconds for one read of local data
 _SLAB = 32  # planes of a level made at a time: two chunks of the level below
@@ -33,7 +35,6 @@ class Conversion:
     root: dict[str, Any]  # kvstore of the store
     layout: StoreLayout
     source: VolumeSource
-    threshold: float | None
     nan: float | None
 
 
@@ -41,7 +42,6 @@ class Conversion:
 class ShardResult:
     """What a task reports back."""
 
-    level: int
     place: Zyx
     voxels: int
     bad: int  # values that are not finite; the shard is not written then
@@ -69,42 +69,36 @@ def write_shard(conversion: Conversion, level: int, place: Zyx) -> ShardResult:
     if level == 0:
         values, bad = _from_source(conversion, *box, inner)
         if bad:
-            return ShardResult(level, place, 0, bad)
+            return ShardResult(place, 0, bad)
         least = most = values
     else:
         values, least, most = _from_below(conversion, level, *box)
     writes = [_write(conversion, layout.plain(level), low, _plain(values[inner]))]
-    if 0 < level < layout.levels - 1:
-        for which, bound in (("low", least), ("high", most)):
-            writes.append(_write(conversion, layout.bound(which, level), low, _plain(bound[inner])))
+    for spec, bound in zip(layout.bounds(level), (least, most), strict=False):
+        writes.append(_write(conversion, spec, low, _plain(bound[inner])))
     cells = _cells(values, least, most, [-(-n // CELL) for n in size])
     writes.append(_write(conversion, layout.cells(level), [a // CELL for a in low], cells))
-    blocks = _blocks(layout, values, needed_cells(cells, conversion.threshold))
+    blocks = _blocks(layout, values, needed_cells(cells, layout.threshold))
     if blocks is not None:
-        writes.append(
-            _write(conversion, layout.blocks(level), [a // layout.block for a in low], blocks)
-        )
+        at = [a // layout.block for a in low]
+        writes.append(_write(conversion, layout.blocks(level), at, blocks))
     for write in writes:
         _finish(write, conversion.root.get("path", "store"))
-    return ShardResult(level, place, int(np.prod(size)), 0)
+    return ShardResult(place, int(np.prod(size)), 0)
 
 
 def _from_source(
     conversion: Conversion, low: list[int], high: list[int], inner: tuple[slice, ...]
 ) -> tuple[np.ndarray, int]:
-    shape = conversion.layout.shape(0)
-    start = [max(a, 0) for a in low]
-    stop = [min(b, n) for b, n in zip(high, shape, strict=True)]
-    values = conversion.source.read_region(start, stop)
-    bad = 0
-    if values.dtype.kind == "f":
-        wrong = ~np.isfinite(values)
-        if wrong.any():
-            if conversion.nan is not None:
-                values = np.where(wrong, values.dtype.type(conversion.nan), values)
-            else:
-                bad = int(_pad(wrong, low, high, start, stop)[inner].sum())
-    return _pad(values, low, high, start, stop), bad
+    """Reads a box; returns also how many of its `inner` values are not finite."""
+    start, stop = boxes.clamp(low, high, conversion.layout.shape(0))
+    values, bad = conversion.source.read_region(start, stop), 0
+    if values.dtype.kind == "f" and (wrong := ~np.isfinite(values)).any():
+        if conversion.nan is None:
+            bad = int(boxes.repeat_edges(wrong, start, low, high)[inner].sum())
+        else:
+            values = np.where(wrong, values.dtype.type(conversion.nan), values)
+    return boxes.repeat_edges(values, start, low, high), bad
 
 
 def _from_below(
@@ -113,36 +107,23 @@ def _from_below(
     """Makes a box of a level, voxels around it included, from the level below: means, smallest and
     largest finest values.
     """
-    layout = conversion.layout
-    shape, below = layout.shape(level), layout.shape(level - 1)
-    specs = [layout.plain(level - 1)]
-    if level > 1:  # below that, the values are their own smallest and largest
-        specs += [layout.bound(which, level - 1) for which in ("low", "high")]
-    deadline = Deadline(_TIMEOUT)
+    layout, deadline = conversion.layout, Deadline(_TIMEOUT)
     arrays = []
-    for spec in specs:
+    # The finest values are their own smallest and largest.
+    for spec in (layout.plain(level - 1), *layout.bounds(level - 1)):
         array = deadline.wait(opened(conversion.root, spec), spec["path"])
         arrays.append(StoredArray(array, "czyx"[-array.rank :], (1, 1, 1), spec["path"]))
-    start = [max(a, 0) for a in low]
-    stop = [min(b, n) for b, n in zip(high, shape, strict=True)]
+    start, stop = boxes.clamp(low, high, layout.shape(level))
     size = (*[b - a for a, b in zip(start, stop, strict=True)], layout.width)
     made = [np.empty(size, layout.dtype) for _ in _POOLS]
     for z in (start[0], *range((start[0] // _SLAB + 1) * _SLAB, stop[0], _SLAB)):
         end = min(stop[0], (z // _SLAB + 1) * _SLAB)
         first = [2 * z, 2 * start[1], 2 * start[2]]
-        last = [min(2 * b, n) for b, n in zip((end, *stop[1:]), below, strict=True)]
+        last = np.minimum([2 * end, 2 * stop[1], 2 * stop[2]], layout.shape(level - 1)).tolist()
         parts = [array.read(first, last, deadline) for array in arrays]
         for out, part, pool in zip(made, parts * (len(_POOLS) // len(parts)), _POOLS, strict=True):
             out[z - start[0] : end - start[0]] = pool(part, 2)
-    return [_pad(values, low, high, start, stop) for values in made]
-
-
-def _pad(
-    values: np.ndarray, low: list[int], high: list[int], start: list[int], stop: list[int]
-) -> np.ndarray:
-    for axis in range(3):
-        values = extend(values, axis, start[axis] - low[axis], high[axis] - stop[axis])
-    return values
+    return [boxes.repeat_edges(values, start, low, high) for values in made]
 
 
 def _plain(values: np.ndarray) -> np.ndarray:
@@ -165,36 +146,22 @@ def _blocks(layout: StoreLayout, values: np.ndarray, needed: np.ndarray) -> np.n
     """(gz, gy, gx, s, s, s, c) blocks of a cube; zero, which is not written, where no cell needs
     them.
     """
-    per, side = layout.block // CELL, layout.stored
-    grid = [-(-n // per) for n in needed.shape]
-    wanted = np.zeros([n * per for n in grid], bool)
-    wanted[tuple(slice(0, n) for n in needed.shape)] = needed
-    parts = wanted.reshape(grid[0], per, grid[1], per, grid[2], per)
-    wanted = np.asarray(parts.any((1, 3, 5)))
+    wanted = pool_max(needed[..., None], layout.block // CELL)[..., 0]
     if not wanted.any():
         return None
-    strides = values.strides
-    view = np.lib.stride_tricks.as_strided(
-        values,
-        (*grid, side, side, side, layout.width),
-        (*[step * layout.block for step in strides[:3]], *strides),
-        writeable=False,
-    )
-    blocks = np.zeros(view.shape, values.dtype)
-    blocks[wanted] = view[wanted]
+    every, side = slice(None, None, layout.block), layout.stored
+    view = sliding_window_view(values, (side, side, side), (0, 1, 2))[every, every, every]
+    blocks = np.zeros((*wanted.shape, side, side, side, layout.width), values.dtype)
+    blocks[wanted] = np.moveaxis(view, 3, 6)[wanted]
     return blocks
 
 
 def _write(conversion: Conversion, spec: dict[str, Any], low: list[int], data: np.ndarray) -> Any:
     """Begins to write a box into an array of the store."""
     array = Deadline(_TIMEOUT).wait(opened(conversion.root, spec, "write"), spec["path"])
-    sizes = data.shape
-    if len(sizes) == 4:  # (c, z, y, x)
-        low = [0, *low]
-    place = tuple(
-        slice(a, a + n) for a, n in zip([*low, *[0] * (len(sizes) - len(low))], sizes, strict=True)
-    )
-    return array[place].write(data)
+    low = [0, *low] if data.ndim == 4 else low  # (c, z, y, x)
+    low = [*low, *[0] * (data.ndim - len(low))]
+    return array[boxes.index(low, np.add(low, data.shape).tolist())].write(data)
 
 
 def _finish(write: Any, where: str) -> None:

@@ -1,8 +1,8 @@
 """`Store`: a volume on disk or behind a URL, read block by block, region by region.
 
-Opens what `convert` writes (see layout.py) and any other OME-Zarr image (NGFF on Zarr v2 or v3).
-The latter has no bordered blocks and no cells: its blocks are cut out of region reads, slower but
-right. Writing is in convert.py.
+Opens what `convert` writes (see store_layout.py) and any other OME-Zarr image (NGFF on Zarr v2 or
+v3). The latter has no bordered blocks and no cells: its blocks are cut out of region reads, slower
+but right. Writing is in conversion.py.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ import numpy as np
 import torch
 
 from ..base import check
-from . import ngff
-from .level_reader import Deadline, LevelReader, StoreError, clamp_box
-from .multiscale import find_image, open_arrays
+from . import boxes
+from .boxes import Zyx
+from .level_reader import LevelReader, open_arrays
+from .ngff import MultiscaleImage, find_image
 from .store_layout import (
-    BLOCKS,
     BORDER,
     CELL,
     DTYPES,
+    Deadline,
+    StoreError,
     StoreLayout,
     child,
-    context,
     kvstore,
-    level_count,
-    level_shape,
     opened,
+    read_key,
     value_dtype,
 )
 
 _OPEN_TIMEOUT = 20.0  # seconds
 _BATCH = 256  # blocks read at once; more only makes memory travel
-_AHEAD = 2  # batches on their way
+_AHEAD = 2 * _BATCH  # blocks on their way
 _GROUP = 4  # blocks along a side of a group that may be read as one region
 _READERS = 4  # threads that read such groups
 
@@ -68,37 +68,31 @@ class Store:
     def __init__(
         self,
         location: str,
+        image: MultiscaleImage,
+        layout: StoreLayout,
         levels: LevelReader,
-        count: int,
-        image: ngff.MultiscaleImage,
-        own: dict[str, Any] | None,
         channels: slice | list[int],
+        *,
+        has_blocks: bool,
     ) -> None:
         """Takes what `open` found."""
         self.location, self.name, self.unit = location, image.name, image.unit
-        self.extent, self.width = levels.extent, levels.width
-        z, y, x = image.scales[0].scale
-        self.spacing = (x, y, z)
-        z, y, x = image.scales[0].translation
-        self.origin = (x, y, z)
-        self.levels, self.border, self.cell = count, BORDER, CELL
-        self.dtype: torch.dtype = getattr(torch, levels.dtype.name)
-        self.has_blocks = own is not None
-        self.block: int = own["block"] if own else BLOCKS[0]
-        self.threshold: float | None = own["threshold"] if own else None
+        self.spacing = image.scales[0].scale[::-1]
+        self.origin = image.scales[0].translation[::-1]
+        self.extent, self.levels, self.block = layout.extent, layout.levels, layout.block
+        self.border, self.cell, self.threshold = BORDER, CELL, layout.threshold
+        self.dtype: torch.dtype = getattr(torch, layout.dtype)
+        self.width = levels.width
+        self.has_blocks = has_blocks
         self.value_range: list[tuple[float, float]] | None = None
-        self._levels, self._channels = levels, channels
+        if layout.value_range is not None:
+            ranges = [(float(low), float(high)) for low, high in layout.value_range]
+            self.value_range = [ranges[c] for c in np.arange(layout.width)[channels]]
+        self._layout, self._levels, self._channels = layout, levels, channels
+        self._root = kvstore(location)
         self._blocks: list[Any] = []
         self._cells: list[Any] = []
-        self._root = kvstore(location)
         self._seen: set[tuple[Any, ...]] = set()
-        if own is not None:
-            ranges = [(float(low), float(high)) for low, high in own["value_range"]]
-            picked = [ranges[c] for c in channels] if isinstance(channels, list) else ranges
-            self.value_range = picked
-            self._layout = StoreLayout(
-                extent=self.extent, dtype=own["dtype"], width=own["channels"], block=self.block
-            )
 
     @classmethod
     def open(
@@ -122,35 +116,33 @@ class Store:
                 place in a brick, or has no such image, time or channel.
             OSError: It can't be read.
         """
-        where = str(location)
-        root = kvstore(location)
-        deadline = Deadline(_OPEN_TIMEOUT)
+        where, root, deadline = str(location), kvstore(location), Deadline(_OPEN_TIMEOUT)
         root, found, own = find_image(where, root, image, deadline)
         stored, chosen = open_arrays(where, root, found, time, channels, deadline)
         dtype = value_dtype(stored[0].array.dtype.numpy_dtype)
         if dtype not in DTYPES:
             raise ValueError(f"{where}: dtype {dtype} is unknown; known: {', '.join(DTYPES)}")
-        extent = tuple(stored[0].size(axis) for axis in "xyz")
-        count = level_count(extent)
-        levels = LevelReader(stored, count, np.dtype(dtype))
-        if own and (list(extent) != own["extent"] or dtype != own["dtype"]):
+        x, y, z, width = (stored[0].size(axis) for axis in "xyzc")
+        layout = own or StoreLayout(extent=(x, y, z), dtype=dtype, width=width)
+        if (layout.extent, layout.dtype) != ((x, y, z), dtype):
             raise ValueError(f"{where}: damaged: metadata and level 0 differ in extent or dtype")
-        self = cls(where, levels, count, found, own, chosen)
+        levels = LevelReader(stored, layout)
+        self = cls(where, found, layout, levels, chosen, has_blocks=own is not None)
         if own:
             self._open_own(deadline)
         return self
 
     def _open_own(self, deadline: Deadline) -> None:
         """Opens blocks and cells of all levels, and compares them with what they must be."""
-        specs = [self._layout.blocks(level) for level in range(self.levels)]
-        specs += [self._layout.cells(level) for level in range(self.levels)]
-        for spec, future in [(spec, opened(self._root, spec)) for spec in specs]:
+        kinds = (self._layout.blocks, self._blocks), (self._layout.cells, self._cells)
+        specs = [(spec(at), arrays) for spec, arrays in kinds for at in range(self.levels)]
+        for spec, arrays, future in [(*pair, opened(self._root, pair[0])) for pair in specs]:
             where = f"{self.location}/{spec['path']}"
             array = deadline.wait(future, where)
             wanted = spec["metadata"]
             if list(array.shape) != wanted["shape"] or array.dtype.name != wanted["data_type"]:
                 raise ValueError(f"{where}: damaged: {array.shape} {array.dtype.name}")
-            (self._blocks if "blocks" in spec["path"] else self._cells).append(array)
+            arrays.append(array)
 
     def __repr__(self) -> str:
         """Shows location, extent, dtype, channels and levels."""
@@ -184,22 +176,17 @@ class Store:
 
     def level_extent(self, level: int) -> tuple[int, int, int]:
         """(x, y, z) voxels of a level, 0 the finest."""
-        z, y, x = level_shape(self.extent, self._checked(level))
-        return (x, y, z)
+        return self._layout.shape(self._checked(level))[::-1]
 
     def block_grid(self, level: int) -> tuple[int, int, int]:
         """(z, y, x) number of blocks of a level."""
-        z, y, x = (-(-n // self.block) for n in level_shape(self.extent, self._checked(level)))
-        return (z, y, x)
+        return self._layout.grid(self._checked(level), self.block)
 
     def cell_grid(self, level: int) -> tuple[int, int, int]:
         """(z, y, x) number of cells of a level."""
-        z, y, x = (-(-n // CELL) for n in level_shape(self.extent, self._checked(level)))
-        return (z, y, x)
+        return self._layout.grid(self._checked(level), CELL)
 
-    def read_region(
-        self, level: int, low: Sequence[int], high: Sequence[int], *, timeout: float = 60.0
-    ) -> np.ndarray:
+    def read_region(self, level: int, low: Zyx, high: Zyx, *, timeout: float = 60.0) -> np.ndarray:
         """Reads a box of voxels of a level.
 
         Args:
@@ -219,14 +206,12 @@ class Store:
         deadline = Deadline(timeout)
         data = self._levels.read(self._checked(level), low, high, deadline)
         if self.has_blocks:
-            start, stop = clamp_box(low, high, level_shape(self.extent, level))
-            box = data[tuple(slice(max(0, a - b), None) for a, b in zip(start, low, strict=True))]
-            self._check_shards(self._layout.plain(level), box, start, stop, 1, deadline)
+            start, stop = boxes.clamp(low, high, self._layout.shape(level))
+            inside = data[boxes.index(np.subtract(start, low).clip(0), data.shape[:3])]
+            self._check_shards(self._layout.plain(level), inside, start, stop, 1, deadline)
         return data
 
-    def read_cells(
-        self, level: int, low: Sequence[int], high: Sequence[int], *, timeout: float = 60.0
-    ) -> np.ndarray:
+    def read_cells(self, level: int, low: Zyx, high: Zyx, *, timeout: float = 60.0) -> np.ndarray:
         """Reads smallest, largest and mean value of a box of cells, of our own stores only.
 
         Args:
@@ -250,13 +235,13 @@ class Store:
         grid = self.cell_grid(level)
         if min(low) < 0 or any(b > n for b, n in zip(high, grid, strict=True)):
             raise ValueError(f"read_cells: {low} to {high} leaves the grid {grid} of level {level}")
-        deadline = Deadline(timeout)
-        where = f"{self.location}: cells of level {level}"
-        place = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-        data = deadline.wait(self._cells[level][place].read(order="C"), where)
-        spec = self._layout.cells(level)
-        self._check_shards(spec, data, low, high, CELL, deadline)
-        return data[..., self._channels]
+        return self._read_cells(level, low, high, Deadline(timeout))[..., self._channels]
+
+    def _read_cells(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
+        future = self._cells[level][boxes.index(low, high)].read(order="C")
+        data = deadline.wait(future, f"{self.location}: cells of level {level}")
+        self._check_shards(self._layout.cells(level), data, low, high, CELL, deadline)
+        return data
 
     def read_blocks(
         self, level: int, zyx: np.ndarray, *, timeout: float = 60.0
@@ -280,43 +265,55 @@ class Store:
         grid = self.block_grid(level)
         if zyx.size and (zyx.min() < 0 or (zyx >= grid).any()):
             raise ValueError(f"read_blocks: a place leaves the grid {grid} of level {level}")
-        deadline = Deadline(timeout)
-        side = self.block + 2 * self.border
-        kind = self._levels.dtype
+        deadline, layout = Deadline(timeout), self._layout
+        shape = (len(zyx), *[layout.stored] * 3)
         if not self.has_blocks:
-            out = np.zeros((len(zyx), *[side] * 3, self.width), kind)
+            out = np.zeros((*shape, self.width), layout.dtype)
             return out, self._cut_blocks(level, zyx, out, deadline)
-        out = np.empty((len(zyx), *[side] * 3, self._layout.width), kind)
-        errors = self._bulk(level, zyx, out, deadline)
-        for index in _blank(out):
-            if int(index) not in errors:
-                text = self._fill_in(level, zyx[index], out[index], deadline)
-                if text:
-                    errors[int(index)] = self._name(level, zyx[index], text)
+        out = np.empty((*shape, layout.width), layout.dtype)
+        shard = zyx // (layout.shard // self.block)
+        order = np.lexsort((*zyx.T[::-1], *shard.T[::-1]))
+        errors = self._read_stored(level, zyx, order, out, deadline)
+        for row in _blank(out):
+            if row not in errors:
+                try:
+                    self._fill_in(level, zyx[row], out[row], deadline)
+                except StoreError as error:
+                    errors[row] = self._error(level, zyx[row], error)
         return out[..., self._channels], errors
 
-    def _bulk(
-        self, level: int, zyx: np.ndarray, out: np.ndarray, deadline: Deadline
+    def _read_stored(
+        self,
+        level: int,
+        zyx: np.ndarray,
+        order: np.ndarray,
+        out: np.ndarray,
+        deadline: Deadline,
+        batch: int = _BATCH,
     ) -> dict[int, str]:
-        """Fills `out` in batches of neighbouring blocks, one batch ahead of the other."""
+        """Fills the rows `order` of `out` in batches, the next on its way meanwhile; those of a
+        batch that fails one by one, to tell the good from the bad.
+        """
         array, errors = self._blocks[level], dict[int, str]()
-        shard = zyx // (self._layout.shard // self.block)
-        order = np.lexsort((*zyx.T[::-1], *shard.T[::-1]))
         running: deque[tuple[np.ndarray, Any]] = deque()
 
         def finish() -> None:
-            index, future = running.popleft()
+            rows, future = running.popleft()
             try:
-                out[index] = deadline.wait(future, self.location)
-            except StoreError:
-                errors.update(self._one_by_one(level, zyx, index, out, deadline))
+                out[rows] = deadline.wait(future, self.location)
+            except StoreError as error:
+                if batch > 1:
+                    errors.update(self._read_stored(level, zyx, rows, out, deadline, 1))
+                else:
+                    out[rows] = 0
+                    errors[int(rows[0])] = self._error(level, zyx[rows[0]], error)
 
         try:
-            for start in range(0, len(order), _BATCH):
-                index = order[start : start + _BATCH]
-                z, y, x = zyx[index].T
-                running.append((index, array[z, y, x].read(order="C")))
-                if len(running) == _AHEAD:
+            for start in range(0, len(order), batch):
+                rows = order[start : start + batch]
+                z, y, x = zyx[rows].T
+                running.append((rows, array[z, y, x].read(order="C")))
+                if len(running) * batch >= _AHEAD:
                     finish()
             while running:
                 finish()
@@ -325,89 +322,47 @@ class Store:
                 future.cancel()
         return errors
 
-    def _one_by_one(
-        self, level: int, zyx: np.ndarray, index: np.ndarray, out: np.ndarray, deadline: Deadline
-    ) -> dict[int, str]:
-        """Reads a batch that failed block by block, to tell the good from the bad."""
-        errors = {}
-        array = self._blocks[level]
-        futures = [(int(i), array[tuple(map(int, zyx[i]))].read(order="C")) for i in index]
-        for i, future in futures:
-            try:
-                out[i] = deadline.wait(future, self._name(level, zyx[i]))
-            except StoreError as error:
-                errors[i] = str(error)
-                out[i] = 0
-        return errors
-
-    def _fill_in(self, level: int, at: np.ndarray, out: np.ndarray, deadline: Deadline) -> str:
-        """Gives a block that came back as all zeros the values that it should have; returns what
-        is wrong, if it should have been stored.
+    def _fill_in(self, level: int, at: np.ndarray, out: np.ndarray, deadline: Deadline) -> None:
+        """Gives a block that came back as all zeros the values that it should have; raises
+        StoreError if it should have been stored.
         """
         per = self.block // CELL
-        low = at * per
-        high = np.minimum(low + per, self.cell_grid(level))
-        place = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-        try:
-            where = self._name(level, at)
-            cells = deadline.wait(self._cells[level][place].read(order="C"), where)
-            spec = self._layout.cells(level)
-            self._check_shards(spec, cells, low.tolist(), high.tolist(), CELL, deadline)
-            if (cells == cells[:1, :1, :1, :1]).all():
-                out[:] = cells[0, 0, 0, 0]
-                return ""
-            start = at * self.block - self.border
-            box = start.tolist(), (start + self.block + 2 * self.border).tolist()
-            found = self._levels.read(level, *box, deadline)
-        except StoreError as error:
-            return str(error)
+        high = np.minimum((at + 1) * per, self.cell_grid(level))
+        cells = self._read_cells(level, (at * per).tolist(), high.tolist(), deadline)
+        if (cells == cells[:1, :1, :1, :1]).all():
+            out[:] = cells[0, 0, 0, 0]
+            return
+        low = at * self.block - BORDER
+        found = self._levels.read(level, low.tolist(), (low + len(out)).tolist(), deadline)
         if needed_cells(cells, self.threshold).any() and (
             level == 0 or found.any() or cells[..., 2, :].any()
         ):
-            return "missing chunk"
+            raise StoreError("missing chunk")
         out[..., self._channels] = found
-        return ""
 
     def _check_shards(
         self,
         spec: dict[str, Any],
         data: np.ndarray,
-        low: Sequence[int],
-        high: Sequence[int],
+        low: Zyx,
+        high: Zyx,
         unit: int,
         deadline: Deadline,
     ) -> None:
-        """Raises StoreError if zeros that were read come from a shard that is not there. Zeros of
-        these arrays are written, so they are no reason for it.
-
-        Args:
-            spec: Of the array that was read.
-            data: What was read, from `low` on.
-            low: (z, y, x) first item.
-            high: (z, y, x) one past the last item.
-            unit: Voxels along a side of an item.
-            deadline: Of the read.
+        """Raises StoreError if zeros in `data`, items `low` to `high` of an array, come from a
+        shard that is not there: zeros of these arrays are written. An item is `unit` voxels wide.
         """
-        import tensorstore as ts
-
-        per = self._layout.shard // unit
+        per, where = self._layout.shard // unit, f"{self.location}/{spec['path']}"
         spans = [range(a // per, (b - 1) // per + 1) for a, b in zip(low, high, strict=True)]
         for place in itertools.product(*spans):
             key = (spec["path"], *place)
-            part = tuple(
-                slice(max(0, at * per - a), (at + 1) * per - a)
-                for at, a in zip(place, low, strict=True)
-            )
-            if key in self._seen or data[part].any():
+            corner = np.multiply(place, per) - low
+            if key in self._seen or data[boxes.index(corner.clip(0), corner + per)].any():
                 continue
-            where = f"{self.location}/{spec['path']}: shard {place} z y x"
-            folder = child(self._root, spec["path"])
-            store = deadline.wait(ts.KvStore.open(folder, context=context()), where)
-            rank = len(spec["metadata"]["shape"])
-            before = ["0"] if rank == 4 else []  # (c, z, y, x)
-            name = "/".join(["c", *before, *map(str, place), *["0"] * (rank - 3 - len(before))])
-            if deadline.wait(store.read(name, byte_range=slice(0, 1)), where).state != "value":
-                raise StoreError(f"{where}: missing chunk")
+            chunk = {3: place, 4: (0, *place), 5: (*place, 0, 0)}[len(spec["metadata"]["shape"])]
+            name = "/".join(map(str, ("c", *chunk)))
+            if read_key(where, child(self._root, spec["path"]), name, deadline, 1) is None:
+                raise StoreError(f"{where}: shard {place} z y x: missing chunk")
             self._seen.add(key)
 
     def _cut_blocks(
@@ -415,7 +370,7 @@ class Store:
     ) -> dict[int, str]:
         """Cuts blocks out of region reads; neighbours share one where that reads less."""
         errors = dict[int, str]()
-        side = self.block + 2 * self.border
+        side = self._layout.stored
 
         def read(index: np.ndarray) -> None:
             low = zyx[index].min(0) * self.block - self.border
@@ -424,7 +379,7 @@ class Store:
                 data = self._levels.read(level, low.tolist(), high.tolist(), deadline)
             except StoreError as error:
                 if len(index) == 1:
-                    errors[int(index[0])] = self._name(level, zyx[index[0]], str(error))
+                    errors[int(index[0])] = self._error(level, zyx[index[0]], error)
                     return
                 for i in index:
                     read(np.array([i]))
@@ -438,12 +393,10 @@ class Store:
                 pass
         return errors
 
-    def _name(self, level: int, at: np.ndarray, text: str = "") -> str:
-        z, y, x = (int(n) for n in at)
-        text = text.removeprefix(f"{self.location}: ")
-        return f"{self.location}: block ({z}, {y}, {x}) z y x of level {level}" + (
-            f": {text}" if text else ""
-        )
+    def _error(self, level: int, at: np.ndarray, error: StoreError) -> str:
+        z, y, x = at.tolist()
+        text = str(error).removeprefix(f"{self.location}: ")
+        return f"{self.location}: block ({z}, {y}, {x}) z y x of level {level}: {text}"
 
     def _checked(self, level: int) -> int:
         return check.whole(self.location, "level", level, low=0, high=self.levels - 1)
@@ -458,11 +411,11 @@ def needed_cells(cells: np.ndarray, threshold: float | None) -> np.ndarray:
     return needed
 
 
-def _blank(out: np.ndarray) -> np.ndarray:
+def _blank(out: np.ndarray) -> list[int]:
     """Rows that are all zero."""
     rows = out.reshape(len(out), -1)
-    likely = np.flatnonzero(~rows[:, :64].any(1))
-    return np.array([i for i in likely if not rows[i].any()], np.int64)
+    likely = np.flatnonzero(~rows[:, :64].any(1)).tolist()
+    return [row for row in likely if not rows[row].any()]
 
 
 def _groups(zyx: np.ndarray, side: int) -> list[np.ndarray]:
@@ -481,7 +434,7 @@ def _groups(zyx: np.ndarray, side: int) -> list[np.ndarray]:
     return groups
 
 
-def _check_box(low: Sequence[int], high: Sequence[int]) -> None:
+def _check_box(low: Zyx, high: Zyx) -> None:
     fits = len(low) == len(high) == 3 and all(a < b for a, b in zip(low, high, strict=True))
     if not fits:
         raise ValueError(f"low and high must be (z, y, x) with low < high, got {low} and {high}")

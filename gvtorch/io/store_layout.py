@@ -1,4 +1,4 @@
-"""How a store lies on disk, and tensorstore's settings; nothing is read or written here.
+"""What a store is and how it lies on disk; and tensorstore: its settings, and waiting for it.
 
     STORE.zarr/zarr.json             metadata; written last, so a store that has it is whole
     STORE.zarr/0, 1, ...             (z, y, x) or (c, z, y, x), the mean pyramid, 0 the finest
@@ -16,6 +16,7 @@ from __future__ import annotations
 import functools
 import math
 import re
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,6 +46,225 @@ def value_dtype(stored: np.dtype) -> str:
     return "float32" if stored.kind in "iuf" and stored.name not in DTYPES else stored.name
 
 
+@dataclass(frozen=True, kw_only=True)
+class StoreLayout:
+    """What a store holds, of which the sizes of its arrays follow; picklable."""
+
+    extent: tuple[int, int, int]  # x y z
+    dtype: str
+    width: int
+    block: int = BLOCKS[0]
+    threshold: float | None = None  # what EMPTY was decided by
+    value_range: Sequence[Sequence[float]] | None = None  # [low, high] of each channel
+
+    @property
+    def levels(self) -> int:
+        """Number of levels: the last one is one cell."""
+        return 1 + max(0, math.ceil(math.log2(max(self.extent) / CELL)))
+
+    @property
+    def voxel_bytes(self) -> int:
+        """Bytes of a voxel with all its channels."""
+        return np.dtype(self.dtype).itemsize * self.width
+
+    @property
+    def shard(self) -> int:
+        """Voxels along a side of the cube that one shard covers."""
+        return 256 if self.voxel_bytes <= 2 else 128
+
+    @property
+    def stored(self) -> int:
+        """Voxels along a side of a block with its border."""
+        return self.block + 2 * BORDER
+
+    def shape(self, level: int) -> tuple[int, int, int]:
+        """(z, y, x) voxels of a level."""
+        x, y, z = (-(-n // 2**level) for n in self.extent)
+        return (z, y, x)
+
+    def grid(self, level: int, side: int) -> tuple[int, int, int]:
+        """(z, y, x) number of cubes of `side` voxels that cover a level."""
+        z, y, x = (-(-n // side) for n in self.shape(level))
+        return (z, y, x)
+
+    def shards(self, level: int) -> tuple[int, int, int]:
+        """(z, y, x) number of shards of a level: one a task of the converter."""
+        return self.grid(level, self.shard)
+
+    def plain(self, level: int, *, path: str = "") -> dict[str, Any]:
+        """Spec of the pyramid's array of a level."""
+        first = [self.width] if self.width > 1 else []
+        return self._array(
+            path or str(level),
+            shape=[*first, *self.shape(level)],
+            shard=[*first, *[self.shard] * 3],
+            chunk=[1] * len(first) + [_PLAIN_CHUNK] * 3,
+            names="czyx"[-3 - len(first) :],
+        )
+
+    def blocks(self, level: int) -> dict[str, Any]:
+        """Spec of the array of bordered blocks of a level."""
+        inside = [self.stored] * 3 + [self.width]
+        return self._array(
+            f"gvtorch/blocks/{level}",
+            shape=[*self.grid(level, self.block), *inside],
+            shard=[*[self.shard // self.block] * 3, *inside],
+            chunk=[1, 1, 1, *inside],
+            keep=False,
+        )
+
+    def cells(self, level: int) -> dict[str, Any]:
+        """Spec of the array of low, high, mean of a level."""
+        inside = [3, self.width]
+        return self._array(
+            f"gvtorch/cells/{level}",
+            shape=[*self.grid(level, CELL), *inside],
+            shard=[*[self.shard // CELL] * 3, *inside],
+            chunk=[*[_CELL_CHUNK] * 3, *inside],
+        )
+
+    def bounds(self, level: int) -> list[dict[str, Any]]:
+        """Specs of the temporary arrays of smallest and largest finest values, where a level needs
+        them: those of the finest are its values, and of the last nothing is made.
+        """
+        needed = 0 < level < self.levels - 1
+        paths = [f"{WORK}/{which}/{level}" for which in ("low", "high")]
+        return [self.plain(level, path=path) for path in paths] if needed else []
+
+    def _array(
+        self,
+        path: str,
+        *,
+        shape: list[int],
+        shard: list[int],
+        chunk: list[int],
+        names: str = "",
+        keep: bool = True,
+    ) -> dict[str, Any]:
+        kind = np.dtype(self.dtype)
+        wide = kind.itemsize > 1
+        little = {"name": "bytes", "configuration": {"endian": "little"}}
+        crc = {"name": "crc32c"}
+        packed = {
+            "cname": "lz4",
+            "clevel": 5,
+            "shuffle": "shuffle" if wide else "noshuffle",
+            "typesize": kind.itemsize,
+            "blocksize": 0,
+        }
+        sharding = {
+            "chunk_shape": chunk,
+            "codecs": [
+                little if wide else {"name": "bytes"},
+                {"name": "blosc", "configuration": packed},
+                crc,
+            ],
+            "index_codecs": [little, crc],
+        }
+        metadata: dict[str, Any] = {
+            "shape": shape,
+            "data_type": self.dtype,
+            "fill_value": 0.0 if kind.kind == "f" else 0,
+            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": shard}},
+            "codecs": [{"name": "sharding_indexed", "configuration": sharding}],
+        }
+        if names:
+            metadata["dimension_names"] = list(names)
+        return {"path": path, "driver": "zarr3", "metadata": metadata, _KEEP: keep}
+
+    def attributes(self, place: dict[str, Any]) -> dict[str, Any]:
+        """What the metadata says of a whole store; `place` is its spacing and origin."""
+        return {
+            "version": VERSION,
+            "extent": list(self.extent),
+            **place,
+            "dtype": self.dtype,
+            "channels": self.width,
+            "block": self.block,
+            "border": BORDER,
+            "cell": CELL,
+            "levels": self.levels,
+            "branching": 2,
+            "threshold": self.threshold,
+            "value_range": self.value_range,
+            "complete": True,
+        }
+
+    @classmethod
+    def parse(cls, where: str, own: Any) -> StoreLayout:
+        """Reads `attributes`; raises ValueError unless they are what `convert` writes."""
+        if not isinstance(own, dict) or own.get("complete") is not True:
+            raise ValueError(f"{where}: half-written or damaged: zarr.json does not say complete")
+        if own.get("version") != VERSION:
+            raise ValueError(f"{where}: store version {own.get('version')!r}, this reads {VERSION}")
+        extent: Any = own.get("extent")
+        ranges: Any = own.get("value_range")
+        fits = {
+            "extent": _is_list(extent, 3) and all(_is_whole(n, 1, MOST_VOXELS) for n in extent),
+            "dtype": own.get("dtype") in DTYPES,
+            "channels": _is_whole(own.get("channels"), 1, 2**16),
+            "block": own.get("block") in BLOCKS,
+            "border": own.get("border") == BORDER,
+            "cell": own.get("cell") == CELL,
+            "branching": own.get("branching") == 2,
+            "threshold": isinstance(own.get("threshold"), (int, float, type(None))),
+            "value_range": _is_list(ranges, own.get("channels"))
+            and all(_is_list(pair, 2) for pair in ranges)
+            and all(isinstance(value, (int, float)) for pair in ranges for value in pair),
+        }
+        for key, good in fits.items():
+            if not good:
+                raise ValueError(f"{where}: damaged: gvtorch.{key} is {own.get(key)!r}")
+        told = {key: own[key] for key in ("dtype", "block", "value_range")}
+        return cls(
+            extent=tuple(extent), width=own["channels"], threshold=own.get("threshold"), **told
+        )
+
+
+def _is_list(value: Any, size: Any) -> bool:
+    return isinstance(value, list) and len(value) == size
+
+
+def _is_whole(value: Any, low: int, high: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
+
+
+# --- tensorstore
+
+
+class StoreError(OSError):
+    """A store could not be read or written."""
+
+
+class Deadline:
+    """A moment until which reads may take: `timeout` seconds from when it is made."""
+
+    def __init__(self, timeout: float) -> None:
+        self.timeout = timeout
+        self._end = time.monotonic() + timeout
+
+    def wait(self, future: Any, where: str) -> Any:
+        """Returns the result of one of tensorstore's futures.
+
+        Raises:
+            TimeoutError: It took too long.
+            StoreError: It failed.
+        """
+        try:
+            return future.result(timeout=max(0.0, self._end - time.monotonic()))
+        except TimeoutError:
+            future.cancel()
+            raise TimeoutError(f"{where}: no answer within {self.timeout:g} s") from None
+        except Exception as error:  # tensorstore raises what its status maps to
+            raise StoreError(f"{where}: {short(error)}") from None
+
+
+def short(error: BaseException) -> str:
+    """tensorstore's message in one line, without its annotations."""
+    text = re.sub(r"\s*\[[a-z_]+(=| locations=).*", "", str(error), flags=re.DOTALL)
+    return " ".join(text.split())[:400] or type(error).__name__
+
+
 @functools.cache
 def context() -> Any:
     """tensorstore's resources: no cache (the pools and their host cache are it), few threads."""
@@ -68,93 +288,29 @@ def kvstore(location: str | Path) -> Any:
     return {"driver": "file", "path": f"{Path(text).absolute()}/"}
 
 
-@dataclass(frozen=True, kw_only=True)
-class StoreLayout:
-    """Sizes of a store; picklable."""
-
-    extent: tuple[int, int, int]  # x y z
-    dtype: str
-    width: int
-    block: int = 32
-
-    @property
-    def levels(self) -> int:
-        """Number of levels: the last one is one cell."""
-        return level_count(self.extent)
-
-    @property
-    def shard(self) -> int:
-        """Voxels along a side of the cube that one shard covers."""
-        return 256 if np.dtype(self.dtype).itemsize * self.width <= 2 else 128
-
-    @property
-    def stored(self) -> int:
-        """Voxels along a side of a block with its border."""
-        return self.block + 2 * BORDER
-
-    def shape(self, level: int) -> tuple[int, int, int]:
-        """(z, y, x) voxels of a level."""
-        return level_shape(self.extent, level)
-
-    def grid(self, level: int, side: int) -> tuple[int, int, int]:
-        """(z, y, x) number of cubes of `side` voxels that cover a level."""
-        z, y, x = (-(-n // side) for n in self.shape(level))
-        return (z, y, x)
-
-    def shards(self, level: int) -> tuple[int, int, int]:
-        """(z, y, x) number of shards of a level: one a task of the converter."""
-        return self.grid(level, self.shard)
-
-    def plain(self, level: int, *, path: str | None = None) -> dict[str, Any]:
-        """Spec of the pyramid's array of a level."""
-        first = [self.width] if self.width > 1 else []
-        return _array(
-            path or str(level),
-            shape=[*first, *self.shape(level)],
-            shard=[*first, *[self.shard] * 3],
-            chunk=[1] * len(first) + [_PLAIN_CHUNK] * 3,
-            dtype=self.dtype,
-            names="czyx"[-3 - len(first) :],
-            keep=True,
-        )
-
-    def blocks(self, level: int) -> dict[str, Any]:
-        """Spec of the array of bordered blocks of a level."""
-        inside = [self.stored] * 3 + [self.width]
-        return _array(
-            f"gvtorch/blocks/{level}",
-            shape=[*self.grid(level, self.block), *inside],
-            shard=[*[self.shard // self.block] * 3, *inside],
-            chunk=[1, 1, 1, *inside],
-            dtype=self.dtype,
-        )
-
-    def cells(self, level: int) -> dict[str, Any]:
-        """Spec of the array of low, high, mean of a level."""
-        inside = [3, self.width]
-        return _array(
-            f"gvtorch/cells/{level}",
-            shape=[*self.grid(level, CELL), *inside],
-            shard=[*[self.shard // CELL] * 3, *inside],
-            chunk=[*[_CELL_CHUNK] * 3, *inside],
-            dtype=self.dtype,
-            keep=True,
-        )
-
-    def bound(self, which: str, level: int) -> dict[str, Any]:
-        """Spec of the temporary array of smallest ("low") or largest ("high") finest values."""
-        return self.plain(level, path=f"{WORK}/{which}/{level}")
+def child(root: Any, path: str) -> Any:
+    """Spec of a folder inside a folder."""
+    if isinstance(root, str):
+        base, mark, query = root.partition("?")
+        return f"{base.rstrip('/')}/{path}/{mark}{query}"
+    return {**root, "path": f"{root.get('path', '')}{path}/"}
 
 
-def level_count(extent: Sequence[int]) -> int:
-    """Levels until a volume is one cell."""
-    return 1 + max(0, math.ceil(math.log2(max(extent) / CELL)))
+def read_key(where: str, root: Any, name: str, deadline: Deadline, last: int | None = None) -> Any:
+    """Returns the content of a file in a folder, up to byte `last`; None if there is no such file.
 
+    Raises:
+        ValueError: There can be no such folder.
+        TimeoutError, StoreError: See `Deadline.wait`.
+    """
+    import tensorstore as ts
 
-def level_shape(extent: Sequence[int], level: int) -> tuple[int, int, int]:
-    """(z, y, x) voxels of a level of a volume of `extent` (x, y, z)."""
-    x, y, z = (-(-n // 2**level) for n in extent)
-    return (z, y, x)
+    try:
+        folder = deadline.wait(ts.KvStore.open(root, context=context()), where)
+    except StoreError as error:
+        raise ValueError(f"{where}: not a store: {error}") from None
+    found = deadline.wait(folder.read(name, byte_range=slice(0, last)), f"{where}/{name}")
+    return found.value if found.state == "value" else None
 
 
 def opened(root: Any, spec: dict[str, Any], mode: str = "read") -> Any:
@@ -171,57 +327,3 @@ def opened(root: Any, spec: dict[str, Any], mode: str = "read") -> Any:
     store = {key: value for key, value in spec.items() if key not in left_out.get(mode, ("path",))}
     store["kvstore"] = child(root, spec["path"])
     return ts.open(store, context=context(), open=True, create=mode == "create")
-
-
-def child(root: Any, path: str) -> Any:
-    """Spec of a folder inside a folder."""
-    if isinstance(root, str):
-        base, mark, query = root.partition("?")
-        return f"{base.rstrip('/')}/{path}/{mark}{query}"
-    return {**root, "path": f"{root.get('path', '')}{path}/"}
-
-
-def _array(
-    path: str,
-    *,
-    shape: list[int],
-    shard: list[int],
-    chunk: list[int],
-    dtype: str,
-    names: str | None = None,
-    keep: bool = False,
-) -> dict[str, Any]:
-    little = {"name": "bytes", "configuration": {"endian": "little"}}
-    size = np.dtype(dtype).itemsize
-    packed = {
-        "cname": "lz4",
-        "clevel": 5,
-        "shuffle": "shuffle" if size > 1 else "noshuffle",
-        "typesize": size,
-        "blocksize": 0,
-    }
-    inner = [
-        little if size > 1 else {"name": "bytes"},
-        {"name": "blosc", "configuration": packed},
-        {"name": "crc32c"},
-    ]
-    sharding = {
-        "chunk_shape": chunk,
-        "codecs": inner,
-        "index_codecs": [little, {"name": "crc32c"}],
-    }
-    metadata: dict[str, Any] = {
-        "shape": shape,
-        "data_type": dtype,
-        "fill_value": 0 if np.dtype(dtype).kind != "f" else 0.0,
-        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": shard}},
-        "codecs": [{"name": "sharding_indexed", "configuration": sharding}],
-    }
-    if names:
-        metadata["dimension_names"] = list(names)
-    return {
-        "path": path,
-        "driver": "zarr3",
-        "metadata": metadata,
-        _KEEP: keep,
-    }

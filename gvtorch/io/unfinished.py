@@ -9,74 +9,49 @@ import json
 import os
 import shutil
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
 from ..base.volume import Volume, movable
 from .ngff import image_metadata, parse_json
-from .store_layout import BORDER, CELL, GROUPS, VERSION, WORK, StoreLayout
+from .store_layout import GROUPS, WORK, StoreLayout
 
-
-class NotFiniteError(ValueError):
-    """The source holds NaN or infinite values."""
+Task = tuple[int, ...]  # level, z, y, x
 
 
 class UnfinishedStore:
-    """A store that is being made, by this process alone: tasks that are done, and its metadata."""
+    """A store that is being made, by this process alone.
 
-    def __init__(self, target: Path, done: dict[tuple[int, ...], int], journal: IO[str]) -> None:
-        """Takes the folder over; `done` maps (level, z, y, x) of finished tasks to their voxels."""
-        self.target, self.done, self._journal = target, done, journal
+    Attributes:
+        done: The voxels of each finished task.
+    """
 
-    def note(self, task: tuple[int, ...], voxels: int) -> None:
-        """Writes down that a task is done; on disk when this returns."""
-        self.done[task] = voxels
-        self._journal.write(json.dumps({"task": task, "voxels": voxels}) + "\n")
+    def __init__(self, target: Path, journal: IO[str]) -> None:
+        """Takes the folder over."""
+        self.done: dict[Task, int] = {}
+        self._target, self._journal = target, journal
+
+    def note(self, done: Mapping[Task, int]) -> None:
+        """Writes down that tasks are done; on disk when this returns."""
+        self.done |= done
+        for task, voxels in done.items():
+            self._journal.write(json.dumps({"task": task, "voxels": voxels}) + "\n")
         self._journal.flush()
         os.fsync(self._journal.fileno())
 
-    def forget_bounds(self, level: int) -> None:
-        """Removes the temporary pyramids of a level that is not needed any more."""
-        for which in ("low", "high"):
-            shutil.rmtree(self.target / WORK / which / str(level), ignore_errors=True)
-
-    def discard(self) -> None:
-        """Removes the half-written store."""
-        shutil.rmtree(self.target, ignore_errors=True)
-
-    def finish(
-        self, layout: StoreLayout, settings: dict[str, Any], value_range: list[list[float]]
-    ) -> None:
+    def finish(self, layout: StoreLayout, settings: Mapping[str, Any]) -> None:
         """Writes the metadata, the root's last of all, and removes the hidden folder."""
         for group in GROUPS:
-            _write_json(self.target / group / "zarr.json", _group({}))
+            _write_json(self._target / group / "zarr.json", _group({}))
         place = {"spacing": settings["spacing"], "origin": settings["origin"]}
-        image = image_metadata(
-            self.target.name.removesuffix(".zarr"),
-            layout.levels,
-            width=layout.width,
-            unit=settings["unit"],
-            **place,
-        )
-        own = {
-            "version": VERSION,
-            "extent": list(layout.extent),
-            **place,
-            "dtype": layout.dtype,
-            "channels": layout.width,
-            "block": layout.block,
-            "border": BORDER,
-            "cell": CELL,
-            "levels": layout.levels,
-            "branching": 2,
-            "threshold": settings["threshold"],
-            "value_range": value_range,
-            "complete": True,
-        }
-        _write_json(self.target / "zarr.json", _group({"ome": image, "gvtorch": own}))
-        shutil.rmtree(self.target / WORK, ignore_errors=True)
+        name = self._target.name.removesuffix(".zarr")
+        told = {"width": layout.width, "unit": settings["unit"]}
+        image = image_metadata(name, layout.levels, **place, **told)
+        attributes = {"ome": image, "gvtorch": layout.attributes(place)}
+        _write_json(self._target / "zarr.json", _group(attributes))
+        shutil.rmtree(self._target / WORK, ignore_errors=True)
 
 
 def is_begun(target: Path, *, resume: bool) -> bool:
@@ -122,17 +97,15 @@ def claimed(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise OSError(f"{target}: another process is converting to it") from None
-        done: dict[tuple[int, ...], int] = {}
+        done = {}
         if resume:
             _compare(target, settings)
             done = _read_journal(folder / "journal.jsonl")
         with (folder / "journal.jsonl").open("w", encoding="utf-8") as journal:
-            for task, voxels in done.items():
-                journal.write(json.dumps({"task": task, "voxels": voxels}) + "\n")
-            journal.flush()
-            os.fsync(journal.fileno())
+            work = UnfinishedStore(target, journal)
+            work.note(done)
             _write_json(folder / "manifest.json", settings)
-            yield UnfinishedStore(target, done, journal)
+            yield work
 
 
 def _compare(target: Path, settings: dict[str, Any]) -> None:
@@ -152,7 +125,7 @@ def _compare(target: Path, settings: dict[str, Any]) -> None:
             )
 
 
-def _read_journal(path: Path) -> dict[tuple[int, ...], int]:
+def _read_journal(path: Path) -> dict[Task, int]:
     """Finished tasks; a last line that was cut off is none."""
     done = {}
     for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:

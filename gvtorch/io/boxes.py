@@ -1,0 +1,38 @@
+"""Boxes of voxels, `low` to `high` in z, y, x: their index, and what lies beyond a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+Zyx = Sequence[int]
+
+
+def index(low: Any, high: Any) -> tuple[slice, ...]:
+    """The NumPy index of a box."""
+    return tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+
+
+def clamp(low: Zyx, high: Zyx, shape: Zyx) -> tuple[list[int], list[int]]:
+    """The part of a box that lies in a grid, or what is next to it: at least one voxel a side."""
+    start = [min(max(a, 0), n - 1) for a, n in zip(low, shape, strict=True)]
+    stop = [max(min(b, n), a + 1) for a, b, n in zip(start, high, shape, strict=True)]
+    return start, stop
+
+
+def repeat_edges(data: np.ndarray, start: Zyx, low: Zyx, high: Zyx) -> np.ndarray:
+    """Extends (z, y, x, c) voxels, which begin at `start`, to a box; the outermost repeat."""
+    for axis, (at, a, b) in enumerate(zip(start, low, high, strict=True)):
+        size = data.shape[axis]
+        if (at, at + size) != (a, b):
+            data = data.take(np.arange(a - at, b - at).clip(0, size - 1), axis)
+    return data
+
+
+def to_zyxc(data: np.ndarray, axes: str) -> np.ndarray:
+    """Returns an array whose axes are `axes` as (z, y, x, c); those that it lacks have size 1."""
+    missing = "".join(axis for axis in "zyxc" if axis not in axes)
+    letters = missing + axes
+    return data[(None,) * len(missing)].transpose([letters.index(axis) for axis in "zyxc"])
