@@ -282,3 +282,19 @@ def triple(where: str, name: str, value: Any) -> tuple[float, float, float]:
         raise ValueError(f"{where}: {name} must be three numbers, got {len(items)}: {value!r}")
     x, y, z = (number(where, name, item) for item in items)
     return (x, y, z)
+
+
+def reals(where: str, name: str, value: Any) -> Tensor:
+    """Returns finite numbers, of any shape, as a float64 tensor on the CPU.
+
+    Raises:
+        ValueError: They are no numbers, or one is not finite.
+    """
+    try:
+        numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
+    except (TypeError, ValueError, RuntimeError):
+        raise ValueError(f"{where}: {name} must be numbers, got {value!r}") from None
+    if not bool(torch.isfinite(numbers).all()):
+        got = "NaN or infinity" if isinstance(value, Tensor) else repr(value)
+        raise ValueError(f"{where}: {name} must be finite, got {got}")
+    return numbers

@@ -109,7 +109,7 @@ class Camera:
         self.max_angle = torch.full((count,), math.radians(angle), dtype=torch.float64)
         self.radial_coeffs = torch.zeros(count, 4, dtype=torch.float64)
         if radial_coeffs is not None:
-            self._distort(_numbers("Camera", "radial_coeffs", radial_coeffs))
+            self._distort(check.reals("Camera", "radial_coeffs", radial_coeffs))
         self.distorted = bool((self.radial_coeffs != 0).any())
 
     def _distort(self, coefficients: Tensor) -> None:
@@ -386,25 +386,13 @@ def sent(numbers: Tensor, device: torch.device | str) -> Tensor:
     return numbers.to(device)
 
 
-def _numbers(where: str, name: str, value: Any) -> Tensor:
-    """Finite numbers as a float64 tensor on the CPU."""
-    try:
-        tensor = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
-    except (TypeError, ValueError, RuntimeError):
-        raise ValueError(f"{where}: {name} must be numbers, got {value!r}") from None
-    if not bool(torch.isfinite(tensor).all()):
-        got = "NaN or infinity" if isinstance(value, Tensor) else repr(value)
-        raise ValueError(f"{where}: {name} must be finite, got {got}")
-    return tensor
-
-
 def _batch(where: str, shape: tuple[int, ...], **values: Any) -> list[Tensor]:
     """Numbers of one camera, each of this shape, or of n cameras (n, *shape), broadcast against
     each other.
     """
     found = []
     for name, value in values.items():
-        numbers = _numbers(where, name, value)
+        numbers = check.reals(where, name, value)
         batch = numbers.dim() - len(shape)
         if batch not in (0, 1) or numbers.shape[batch:] != shape:
             many = "(" + ", ".join(["n", *map(str, shape)]) + ("," if not shape else "") + ")"

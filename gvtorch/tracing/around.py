@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 
+import torch
 from torch import Tensor
 
+from ..base.records import Hits, Rays
+from ..ops.shading import pack
 from ..shaders.lights import LitShader
-from .caps import SurfaceSlab
+from ..shaders.shader import CutSurface, Shader
 from .clip import Clipped
-from .composite import Trace
+from .composite import Trace, tree_span
 from .lighting import Lighted
 from .options import RenderOptions
-from .projection_pieces import ProjectedPieces
 from .thin_lens import ThinLens, ThroughLens
 from .tracer import Tracer
 
@@ -30,35 +34,35 @@ def around(tracer: Tracer, options: RenderOptions, box: Tensor) -> Trace:
         ValueError: The shader must see a ray in one go, and the options cut rays into pieces or
             draw caps; or it has no normals, and there is lighting.
     """
-    _check_whole(tracer, options)
+    _check_whole(tracer.shader, options)
     lens = options.lens and options.lens.placed(box)
     if options.lighting is None:
         return _clipped(tracer, options, box, lens)
     shader = tracer.shader
-    unlit = shader.unlit()
+    unlit = _clipped(tracer.seeing(shader.unlit(), options), options, box, lens)
     assert isinstance(shader, LitShader)  # others raise
+    lights = options.lighting.lights
     cones = replace(options, lod="auto")
     matter = None
     if options.lighting.indirect:
         early = replace(cones, depth_alpha=0.25 * options.stop_alpha)
         matter = _clipped(tracer.seeing(shader.matter(), early), options, box)
     return Lighted(
-        _clipped(tracer.seeing(unlit, options), options, box, lens),
+        trace=unlit,
         blocker=_clipped(tracer.seeing(shader.blocker(), cones), options, box),
         matter=matter,
         lighting=options.lighting.placed(box),
-        shader=shader,
+        lights=(shader.light,) if lights is None else lights,
+        material=shader.material(),
         voxel=max(tracer.tree.spacing),
         cone_scale=options.cone_scale,
         lens=lens,
     )
 
 
-def _check_whole(tracer: Tracer, options: RenderOptions) -> None:
+def _check_whole(shader: Shader, options: RenderOptions) -> None:
     """Raises ValueError if the shader must see a ray in one go, and the options do not let it."""
-    shader, clip, layer = tracer.shader, options.clip, options.layer
-    if not shader.whole_ray:
-        return
+    clip, layer = options.clip, options.layer
     cuts = {
         "lens": options.lens is not None,
         "clip with caps": clip is not None and clip.caps,
@@ -66,16 +70,13 @@ def _check_whole(tracer: Tracer, options: RenderOptions) -> None:
         "translucent layer": layer is not None and layer.alpha is not None,
     }
     for name, cut in cuts.items():
-        if cut:
+        if cut and shader.whole_ray:
             kind = type(shader).__name__
             raise ValueError(f"render: {kind} sees a ray in one go, so it has no {name}")
 
 
 def _clipped(
-    tracer: Tracer,
-    options: RenderOptions,
-    box: Tensor,
-    lens: ThinLens | None = None,
+    tracer: Tracer, options: RenderOptions, box: Tensor, lens: ThinLens | None = None
 ) -> Trace:
     """A tracer with the lens (in world units) and the options' clip."""
     trace: Trace = tracer
@@ -83,20 +84,94 @@ def _clipped(
         trace = ThroughLens(trace, lens, options.cone_scale)
     if options.clip is None:
         return trace
-    slab: Trace | None = None
-    together: ProjectedPieces | None = None
     surface = tracer.shader.cut_surface() if options.clip.caps else None
-    if surface is not None:
-        slab = SurfaceSlab(surface, lambda shader: tracer.seeing(shader, options))
+    together: Callable[[Iterable[Rays]], Hits] | None = None
     if tracer.shader.projection is not None:
-        together = ProjectedPieces(tracer, tracer.shader.projection)
+        together = partial(_project_pieces, tracer, tracer.shader.projection)
     return Clipped(
         trace,
         options.clip,
         box,
         step=tracer.arguments.step,
         depth_alpha=options.depth_alpha,
-        slab=slab,
+        slab=None if surface is None else _surface_slab(surface, tracer, options),
         unlit=options.lighting is not None,
         together=together,
     )
+
+
+def _surface_slab(surface: CutSurface, tracer: Tracer, options: RenderOptions) -> Trace:
+    """What traces the intervals behind cuts through isosurfaces: opaque where the first value lies
+    inside the surface, in its own colour, unlit. The isosurface shader itself shows nothing where a
+    ray begins inside.
+    """
+    trace_value = tracer.seeing(surface.value, options)
+    trace_colors = surface.colors and tracer.seeing(surface.colors, options)
+
+    def slab(rays: Rays) -> Hits:
+        hits = trace_value(rays)
+        assert hits.features is not None
+        colors = trace_colors(rays).color if trace_colors else hits.color
+        color = colors * pack((surface.color,), colors.dtype, colors.device)
+        level = pack((surface.level,), color.dtype, color.device)
+        inside = (hits.features >= level) != surface.below
+        inside = inside & (hits.depth < torch.inf)
+        return replace(
+            hits,
+            color=torch.where(inside, color, 0),
+            alpha=torch.where(inside, hits.alpha, 1 - rays.light().to(hits.alpha)),
+            depth=torch.where(inside, hits.depth, torch.inf),
+            features=None,
+        )
+
+    return slab
+
+
+def _project_pieces(tracer: Tracer, which: str, pieces: Iterable[Rays]) -> Hits:
+    """Projects pieces of the same rays: the largest or smallest value of all, at its nearest place,
+    or the mean of their means, weighted by their lengths inside the tree's box.
+    """
+    rays = list(pieces)
+    hits = [tracer(piece) for piece in rays]
+    depths = torch.stack([one.depth for one in hits])  # (pieces, r, 1)
+    known = depths < torch.inf
+    values = torch.stack([one.features for one in hits if one.features is not None])
+    if which == "mean":
+        lengths = torch.stack([_length_inside(tracer, piece) for piece in rays])
+        lengths = torch.where(known, lengths.to(values)[..., None], 0)
+        value = (values * lengths).sum(0) / lengths.sum(0).clamp(min=1e-30)
+    else:
+        sign = 1 if which == "maximum" else -1
+        best = torch.where(known, sign * values, -torch.inf).amax(0)
+        known, value = known & (sign * values == best), sign * best
+    depth = torch.where(known, depths, torch.inf).amin(0)
+    seen = depth < torch.inf
+    value = torch.where(seen, value, 0)
+    light = rays[0].light().to(depth)
+    return Hits(
+        color=torch.where(seen, light * _table_color(tracer, value), 0),
+        alpha=torch.where(seen, 1, 1 - light),
+        depth=depth,
+        samples=torch.stack([one.samples for one in hits]).sum(0, dtype=torch.int32),
+        missed=torch.stack([one.missed for one in hits]).any(0),
+        normal=hits[0].normal,
+        features=value,
+    )
+
+
+def _length_inside(tracer: Tracer, rays: Rays) -> Tensor:
+    """(r,) world length of each ray inside the tree's box."""
+    enter, leave = tree_span(tracer.tree.place, rays.origin, rays.direction)
+    first, last = rays.range.unbind(1)
+    return (torch.minimum(last, leave) - torch.maximum(first, enter)).clamp(min=0)
+
+
+def _table_color(tracer: Tracer, value: Tensor) -> Tensor:
+    """(r, 3) the transfer function's colours of values (r, 1), interpolated in its table."""
+    table = tracer.arguments.table_lm4[0, :, :3]  # (m, 3), at even distances
+    low, high = tracer.arguments.domain_2.unbind(0)
+    last = len(table) - 1
+    place = ((value - low) / (high - low) * last).clamp(0, last)
+    row = place.to(torch.int64).clamp(max=last - 1)
+    a, b = (table[(row + k)[:, 0]] for k in (0, 1))
+    return a + (place - row) * (b - a)

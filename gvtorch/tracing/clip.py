@@ -7,10 +7,9 @@ have as many pieces as the number of boxes allows for; those that a ray does not
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
@@ -20,9 +19,9 @@ from torch import Tensor
 from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.camera import Frame
-from .composite import Trace, behind, over, trace_pieces
-from .spans import Face, convex_span, dot, height_over
+from .composite import Trace, trace_pieces
 
+Face = tuple[float, ...]  # unit normal and offset (a, b, c, d): inside, a x + b y + c z + d >= 0
 Numbers = Sequence[Sequence[float]] | Tensor
 _SEEN = 1e-4  # a cap is drawn where one interval behind the cut has more alpha than this
 
@@ -58,7 +57,7 @@ class Clip:
 
     def __repr__(self) -> str:
         """Tells how many planes and boxes there are."""
-        counts = [f"{name}={len(getattr(self, name))}" for name in ("planes", "boxes", "without")]
+        counts = [f"{name}={len(getattr(self, name))}" for name in Faces._fields]
         frame = Frame(self.frame).value
         return f"Clip({', '.join(counts)}, caps={self.caps}, in {frame} units)"
 
@@ -70,13 +69,12 @@ class Clip:
     @cached_property
     def _own(self) -> Faces:
         """The faces in the units of `frame`."""
-        for name in ("planes", "boxes", "without"):
+        for name in Faces._fields:
             if not isinstance(getattr(self, name), (Sequence, Tensor)):
                 kind = type(getattr(self, name)).__name__
                 raise ValueError(f"Clip: {name} must be a list, got {kind}")
-        planes = list(self.planes)
         return Faces(
-            [_face(f"planes[{i}]", plane) for i, plane in enumerate(planes)],
+            [_face(f"planes[{i}]", plane) for i, plane in enumerate(self.planes)],
             [_box(f"boxes[{i}]", box) for i, box in enumerate(self.boxes)],
             [_box(f"without[{i}]", box) for i, box in enumerate(self.without)],
         )
@@ -88,7 +86,7 @@ class Clip:
         centre, side = ((box[0] + box[1]) / 2).tolist(), float((box[1] - box[0]).max())
 
         def place(faces: list[Face]) -> list[Face]:
-            return [(*n, d * side - dot(n, centre)) for *n, d in faces]
+            return [(*n, d * side - _dot(n, centre)) for *n, d in faces]
 
         planes, boxes, without = self._own
         return Faces(place(planes), [*map(place, boxes)], [*map(place, without)])
@@ -102,71 +100,47 @@ class Faces(NamedTuple):
     without: list[list[Face]]
 
 
+@dataclass(frozen=True, eq=False)
 class Clipped:
-    """Traces the kept pieces of rays, and the caps in front of them."""
+    """Traces the kept pieces of rays, and the caps in front of them, in one frame."""
 
-    def __init__(
-        self,
-        trace: Trace,
-        clip: Clip,
-        box: Tensor,
-        *,
-        step: float,
-        depth_alpha: float,
-        slab: Trace | None = None,
-        unlit: bool = False,
-        together: Callable[[Iterable[Rays]], Hits] | None = None,
-    ) -> None:
-        """Prepares a clip for one frame.
+    trace: Trace  # traces a piece
+    clip: Clip
+    box: Tensor  # (2, 3) world corners of the scene
+    step: float  # world length of the shortest interval: one behind a cut gives its cap the colour
+    depth_alpha: float  # depth is where alpha passes this
+    slab: Trace | None = None  # traces the intervals that give caps their colour; None: `trace`
+    unlit: bool = False  # caps are not lit here, because `Lighting` lights them later
+    #: Traces all pieces of each ray; None: each piece is composited over those behind it.
+    together: Callable[[Iterable[Rays]], Hits] | None = None
 
-        Args:
-            trace: Traces a piece.
-            clip: What is kept.
-            box: (2, 3) world corners of the scene.
-            step: World length of the shortest interval; a cap takes its colour from one such
-                interval behind the cut.
-            depth_alpha: Depth is where alpha passes this.
-            slab: Traces the intervals that give caps their colour; `trace` if left out.
-            unlit: Caps are not lit here, because `Lighting` lights them later.
-            together: Traces all pieces of each ray; if left out, each piece is composited over
-                those behind it.
-        """
-        self._trace, self._clip, self._slab = trace, clip, slab or trace
-        self._together = together or partial(trace_pieces, trace)
-        self._step, self._hit_transmittance = step, 1 - depth_alpha
-        self._cap_light = 0.0 if unlit else clip.cap_light
-        planes, boxes, self._without = clip.faces(box)
-        convex = len(boxes) == 1  # then the faces of the box act as planes
-        self._planes = planes + boxes[0] if convex else planes
-        self._boxes = [] if convex else boxes
+    @cached_property
+    def _faces(self) -> Faces:
+        planes, boxes, without = self.clip.faces(self.box)
+        if len(boxes) == 1:  # then its faces act as planes
+            return Faces(planes + boxes[0], [], without)
+        return Faces(planes, boxes, without)
 
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays in world units."""
-        rays = dataclasses.replace(rays, range=rays.range.to(torch.float64))
-        pieces = [dataclasses.replace(rays, range=kept) for kept in self.pieces(rays)]
-        if not self._clip.caps:
-            return self._together(pieces)
-        front: Hits | None = None
-        for piece in pieces:
-            left = piece if front is None else behind(piece, front)
-            cap = self._cap(left, rays.range[:, 0])
-            front = cap if front is None else over(front, cap, dimmed=True)
-            front = over(front, self._trace(behind(piece, front)), dimmed=True)
-        assert front is not None
-        return front
+        rays = replace(rays, range=rays.range.to(torch.float64))
+        pieces = [replace(rays, range=kept) for kept in self.pieces(rays)]
+        if self.together is not None and not self.clip.caps:
+            return self.together(pieces)
+        cap = partial(self._cap, rays.range[:, 0]) if self.clip.caps else None
+        return trace_pieces(self.trace, pieces, cap=cap)
 
     def pieces(self, rays: Rays) -> list[Tensor]:
         """Returns the kept (r, 2) ranges of rays, nearest first, as many as a ray can have; a range
         that a ray does not need ends where it begins.
         """
-        first, last = convex_span(self._planes, rays, *rays.range.unbind(1))
+        first, last = _convex_span(self._faces.planes, rays, *rays.range.unbind(1))
         last = torch.maximum(first, last)
-        if not (self._boxes or self._without):
+        if not (self._faces.boxes or self._faces.without):
             return [torch.stack((first, last), 1)]
         everything = torch.full_like(first, -torch.inf), torch.full_like(first, torch.inf)
         boxes, without = (
-            [convex_span(faces, rays, *everything) for faces in faces_of]
-            for faces_of in (self._boxes, self._without)
+            [_convex_span(faces, rays, *everything) for faces in sets] for sets in self._faces[1:]
         )
         all_ends = [end.clamp(first, last) for span in boxes + without for end in span]
         ends = torch.stack([first, last, *all_ends], 1).sort(1).values
@@ -189,23 +163,24 @@ class Clipped:
             pieces.append(torch.where((a < b)[:, None], span, first[:, None]))
         return pieces
 
-    def _cap(self, piece: Rays, begin: Tensor) -> Hits:
+    def _cap(self, begin: Tensor, piece: Rays) -> Hits:
         """The caps of pieces that begin at a cut, not at `begin` (r,). One interval behind the cut
         gives the colour, the features, and whether there is matter at all.
         """
         first, last = piece.range.unbind(1)
-        end = torch.where(first > begin, torch.minimum(first + self._step, last), first)
-        slab = self._slab(dataclasses.replace(piece, range=torch.stack((first, end), 1)))
+        end = torch.where(first > begin, torch.minimum(first + self.step, last), first)
+        slab = (self.slab or self.trace)(replace(piece, range=torch.stack((first, end), 1)))
         before = piece.light()[:, 0].to(slab.color)  # transmittance before the cap
         taken = before - (1 - slab.alpha[:, 0])  # by the slab, of the light
-        alpha = torch.where(taken > _SEEN * before, self._clip.cap_opacity, 0.0).to(before)
+        alpha = torch.where(taken > _SEEN * before, self.clip.cap_opacity, 0.0).to(before)
         facing, normal = self._facing(piece, first)
-        light = 1 - self._cap_light * (1 - facing)
+        light = 1 - (0.0 if self.unlit else self.clip.cap_light) * (1 - facing)
         taken = torch.where(alpha > 0, taken, 1.0)
         part = before * alpha / taken
         scale = before * alpha * light.to(before) / taken
         after = before * (1 - alpha)
-        hit = (after < self._hit_transmittance) & (before >= self._hit_transmittance)
+        hit_clear = 1 - self.depth_alpha
+        hit = (after < hit_clear) & (before >= hit_clear)
         return Hits(
             color=slab.color * scale[:, None],
             alpha=(1 - after)[:, None],
@@ -223,16 +198,16 @@ class Clipped:
         """
         nearest, cosine = torch.full_like(t, torch.inf), torch.ones_like(t)
         normal = [torch.zeros_like(t)] * 3
-        kept = [face for faces in (self._planes, *self._boxes) for face in faces]
-        cut = [face for faces in self._without for face in faces]
-        for side, faces in ((1, kept), (-1, cut)):
-            for face in faces:
-                height, rate = height_over(face, rays)
-                away = torch.where(side * rate > 0, (height + t * rate).abs(), torch.inf)
-                cosine = torch.where(away < nearest, rate.abs(), cosine)
-                sides = zip(face, normal, strict=False)
-                normal = [torch.where(away < nearest, -side * n, known) for n, known in sides]
-                nearest = torch.minimum(away, nearest)
+        planes, boxes, without = self._faces
+        kept = [(1, face) for faces in (planes, *boxes) for face in faces]
+        cut = [(-1, face) for faces in without for face in faces]
+        for side, face in kept + cut:
+            height, rate = _height_over(face, rays)
+            away = torch.where(side * rate > 0, (height + t * rate).abs(), torch.inf)
+            cosine = torch.where(away < nearest, rate.abs(), cosine)
+            sides = zip(face, normal, strict=False)
+            normal = [torch.where(away < nearest, -side * n, known) for n, known in sides]
+            nearest = torch.minimum(away, nearest)
         return cosine, torch.stack(normal, 1)
 
 
@@ -275,12 +250,37 @@ def _box(name: str, numbers: Any) -> list[Face]:
 
 def _matrix(name: str, numbers: Any, shape: tuple[int, int]) -> Tensor:
     """A float64 matrix of this shape, finite, on the CPU."""
-    try:
-        matrix = torch.as_tensor(numbers, dtype=torch.float64).detach().cpu()
-    except (TypeError, ValueError, RuntimeError):
-        raise ValueError(f"Clip: {name} must be {shape} numbers, got {numbers!r}") from None
+    matrix = check.reals("Clip", name, numbers)
     if matrix.shape != shape:
-        raise ValueError(f"Clip: {name} must be {shape}, got {tuple(matrix.shape)}")
-    if not bool(torch.isfinite(matrix).all()):
-        raise ValueError(f"Clip: {name} must be finite, got {numbers!r}")
+        raise ValueError(f"Clip: {name} must be {shape} numbers, got {tuple(matrix.shape)}")
     return matrix
+
+
+def _convex_span(
+    faces: Sequence[Face], rays: Rays, first: Tensor, last: Tensor
+) -> tuple[Tensor, Tensor]:
+    """(r,) distances between which rays lie inside all faces, cut out of [first, last];
+    last < first where they pass by. float64; numbers stay on the host, so nothing waits for it.
+    """
+    for face in faces:
+        height, rate = _height_over(face, rays)
+        t = -height / rate
+        first = torch.where(rate > 0, torch.maximum(first, t), first)
+        last = torch.where(rate < 0, torch.minimum(last, t), last)
+        last = torch.where((rate == 0) & (height < 0), -torch.inf, last)
+    return first, last
+
+
+def _height_over(face: Face, rays: Rays) -> tuple[Tensor, Tensor]:
+    """(r,) how far each ray's origin lies inside of a face, and by how much that grows per
+    unit distance.
+    """
+    *normal, offset = face
+    height = _dot(normal, rays.origin.to(torch.float64).unbind(1)) + offset
+    return height, _dot(normal, rays.direction.to(torch.float64).unbind(1))
+
+
+def _dot(normal: Sequence[float], vector: Sequence[Any]) -> Any:
+    """The dot product with a vector of three numbers or three (r,) columns."""
+    x, y, z = vector
+    return normal[0] * x + normal[1] * y + normal[2] * z

@@ -1,4 +1,5 @@
-"""Hits put over hits: of the pieces of a ray, of what another renderer drew, of several trees.
+"""Hits put over hits: of the pieces of a ray, of what another renderer drew, of several trees; and
+where rays enter and leave boxes.
 
 Source: Porter, Duff, "Compositing digital images", 1984 (over, premultiplied).
 """
@@ -16,7 +17,6 @@ from torch.nn.functional import normalize
 
 from ..base.records import Hits, Rays
 from ..ops.shading import pack
-from .spans import box_span
 
 Trace = Callable[[Rays], Hits]  # through one tree or several, with whatever the options put around
 
@@ -58,17 +58,16 @@ def behind(rays: Rays, front: Hits) -> Rays:
     return dataclasses.replace(rays, transmittance=1 - front.alpha[:, 0].to(torch.float64))
 
 
-def trace_pieces(trace: Trace, pieces: Iterable[Rays]) -> Hits:
+def trace_pieces(trace: Trace, pieces: Iterable[Rays], *, cap: Trace | None = None) -> Hits:
     """Traces pieces of the same rays, nearest first, as if each ray were traced in one go: one that
-    has ended takes no more samples, and its depth is found in whichever piece it lies.
+    has ended takes no more samples, and its depth is found in whichever piece it lies. `cap` traces
+    what lies in front of each piece.
     """
-    front: Hits | None = None
-    for piece in pieces:
-        if front is None:
-            front = trace(piece)
-        else:
-            front = over(front, trace(behind(piece, front)), dimmed=True)
-    assert front is not None
+    steps = ((one, piece) for piece in pieces for one in (cap, trace) if one is not None)
+    first, piece = next(steps)
+    front = first(piece)
+    for one, piece in steps:
+        front = over(front, one(behind(piece, front)), dimmed=True)
     return front
 
 
@@ -93,14 +92,14 @@ def trace_trees(trees: Sequence[tuple[Tensor, Trace]], rays: Rays) -> Hits:
 
 def _mean_normal(ranked: Sequence[Hits]) -> Tensor | None:
     """(r, 3) mean of the normals of trees, nearest first, by the light each takes; None without."""
-    total, alpha = None, torch.zeros_like(ranked[0].alpha)
-    for one in ranked:
-        if one.normal is None:
-            return None
-        taken = one.normal * one.alpha
-        total = taken if total is None else total + (1 - alpha) * taken
+    taken = [one.normal * one.alpha for one in ranked if one.normal is not None]
+    if not taken:
+        return None
+    total, alpha = taken[0], ranked[0].alpha
+    for more, one in zip(taken[1:], ranked[1:], strict=True):
+        total = total + (1 - alpha) * more
         alpha = alpha + (1 - alpha) * one.alpha
-    return None if total is None else normalize(total, dim=1)
+    return normalize(total, dim=1)
 
 
 def _ranked(fields: list[Tensor | None], order: Tensor) -> Sequence[Tensor | None]:
@@ -124,3 +123,25 @@ def _entry(box: Tensor, rays: Rays) -> Tensor:
     low, high = pack((box,), rays.origin.dtype, rays.origin.device).view(2, 3)
     first, last = box_span(low, high, rays.origin, rays.direction)
     return torch.where(first <= last, first.clamp(min=0), torch.inf)
+
+
+def box_span(low: Tensor, high: Tensor, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns (r,) first and last distance of lines inside a box; last < first where they pass by.
+
+    Args:
+        low: (3,) corner.
+        high: (3,) corner.
+        origin: (r, 3).
+        direction: (r, 3).
+    """
+    a, b = (low - origin) / direction, (high - origin) / direction
+    # 0 / 0: the line lies in a face, and no other place on it lies farther out.
+    first = torch.minimum(a, b).nan_to_num(-torch.inf, torch.inf, -torch.inf)
+    last = torch.maximum(a, b).nan_to_num(torch.inf, torch.inf, -torch.inf)
+    return first.amax(1), last.amin(1)
+
+
+def tree_span(place_33: Tensor, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns `box_span` of the box of a tree, given `N3Tree.place`."""
+    low, size, high = place_33
+    return box_span(low, low + size * high, origin, direction)

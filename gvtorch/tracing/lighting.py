@@ -25,13 +25,12 @@ from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.camera import Frame
 from ..ops.reference.exact import unit
-from ..ops.shading import Triple, pack
+from ..ops.shading import ShadeParameters, Triple, pack
 from ..shaders.lights import (
     CONE_OF_DISC,
     DirectionalLight,
     Headlight,
     Light,
-    LitShader,
     PointLight,
     check_light,
     check_triple,
@@ -130,47 +129,28 @@ class _Tally:
         return hits
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Lighted:
-    """Traces rays, then cones from the points that they met, and lights these points."""
+    """Traces rays of one frame, then cones from the points that they met, and lights these."""
 
-    def __init__(
-        self,
-        trace: Trace,
-        *,
-        blocker: Trace,
-        matter: Trace | None,
-        lighting: Lighting,
-        shader: LitShader,
-        voxel: float,
-        cone_scale: float,
-        lens: ThinLens | None = None,
-    ) -> None:
-        """Prepares the lighting of one frame.
-
-        Args:
-            trace: Traces the eye's rays: unlit colours and normals.
-            blocker: Traces cones of which only alpha is used.
-            matter: Traces cones to matter that reflects light: unlit colours and normals; None
-                where there is no indirect light.
-            lighting: In world units.
-            shader: How matter reflects light, and its light, if the lighting has none.
-            voxel: World size of the finest voxel's largest side.
-            cone_scale: Factor by which the tracers widen cones.
-            lens: Depth of field of the eye's rays, in world units.
-        """
-        self._trace, self._blocker, self._matter = trace, blocker, matter
-        self._lighting, self._material = lighting, shader.material()
-        self._lights = (shader.light,) if lighting.lights is None else tuple(lighting.lights)
-        self._voxel, self._cone_scale, self._lens = voxel, cone_scale, lens
+    trace: Trace  # traces the eye's rays: unlit colours and normals
+    blocker: Trace  # traces cones of which only alpha is used
+    matter: Trace | None  # traces cones to what reflects light: unlit colours and normals; None: no
+    lighting: Lighting  # in world units
+    lights: Sequence[Light]  # that shine on it
+    material: ShadeParameters  # how matter reflects light
+    voxel: float  # world size of the finest voxel's largest side
+    cone_scale: float  # factor by which the tracers widen cones
+    lens: ThinLens | None = None  # depth of field of the eye's rays, in world units
 
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays in world units."""
-        hits = self._trace(rays)
-        color, m = hits.color, self._material
-        look = (self._lighting.ambient, m.ambient, m.diffuse, m.specular)
+        hits = self.trace(rays)
+        color, m = hits.color, self.material
+        look = (self.lighting.ambient, m.ambient, m.diffuse, m.specular)
         sky, (ambient, diffuse, specular) = pack(look, color.dtype, color.device).split(3)
-        tally, points = _Tally(hits), self._points(rays, hits, self._lens)
-        direct, highlight = self._direct(points, tally, self._lighting.shadow_cones)
+        tally, points = _Tally(hits), self._points(rays, hits, self.lens)
+        direct, highlight = self._direct(points, tally, self.lighting.shadow_cones)
         unblocked, bounced = self._hemisphere(points, rays.origin.to(torch.float64), tally)
         light = ambient * sky * unblocked.to(color)
         light = light + diffuse * (direct + bounced).to(color)
@@ -187,7 +167,7 @@ class Lighted:
         origin, direction, cone = (
             column.to(torch.float64) for column in (rays.origin, rays.direction, rays.cone)
         )
-        width = (cone[:, 0] + cone[:, 1] * t) * self._cone_scale
+        width = (cone[:, 0] + cone[:, 1] * t) * self.cone_scale
         if lens is not None:
             width = width + lens.cone(t)
         normal = torch.zeros_like(direction) if hits.normal is None else hits.normal.to(direction)
@@ -207,33 +187,36 @@ class Lighted:
         """(r, 3) diffuse light and (r, 3) highlight of all lights, with their shadows. A point
         without a normal faces every light and has no highlight.
         """
-        (shininess,) = pack((self._material.shininess,), torch.float64, points.eye.device)
+        (shininess,) = pack((self.material.shininess,), torch.float64, points.eye.device)
         diffuse = shine = torch.zeros_like(points.position)
-        for light in self._lights:
+        for light in self.lights:
             color = pack((light.color,), torch.float64, points.eye.device)
-            beam, _ = _towards(light, points)
+            beam, *_ = _towards(light, points)
             facing = (points.normal * beam).sum(1).clamp(min=0)
             facing = torch.where(points.has_normal, facing, 1.0)
             half = normalize(beam + points.eye, dim=1)
             highlight = (points.normal * half).sum(1).clamp(0, 1) ** shininess
             highlight = torch.where(points.has_normal & (facing > 0), highlight, 0.0)
             count = 1 if _is_small(light) else cones
-            lit = self._visible(light, count, points, facing > 0, tally)[:, None] * color
+            lit = self._visible(light, count, points, beam, facing > 0, tally)[:, None] * color
             diffuse, shine = diffuse + facing[:, None] * lit, shine + highlight[:, None] * lit
         return diffuse, shine
 
     def _visible(
-        self, light: Light, cones: int, points: _Points, facing: Tensor, tally: _Tally
+        self,
+        light: Light,
+        cones: int,
+        points: _Points,
+        beam: Tensor,
+        facing: Tensor,
+        tally: _Tally,
     ) -> Tensor:
         """(r,) share of a light that reaches points; a `Headlight` reaches all the eye sees."""
-        if not self._lighting.shadows or (
-            isinstance(light, Headlight) and points.headlight is None
-        ):
+        at_eye = isinstance(light, Headlight) and points.headlight is None
+        if not self.lighting.shadows or at_eye:
             return torch.ones_like(points.width)
-        beam, _ = _towards(light, points)
         points = self._lifted(points, _OFF, beam)
-        beam, distance = _towards(light, points)
-        size = _size(light, distance)
+        beam, distance, size = _towards(light, points)
         growth = 2 * CONE_OF_DISC / math.sqrt(cones) * size
         right, up = _beside(beam)
         start = torch.zeros_like(distance)
@@ -241,9 +224,9 @@ class Lighted:
         blocked = torch.zeros_like(distance)
         for x, y in _disc(cones):
             aim = normalize(beam + size[:, None] * (x * right + y * up), dim=1)
-            hits = tally(self._blocker(self._cone(points, aim, growth, start, end)))
+            hits = tally(self.blocker(self._cone(points, aim, growth, start, end)))
             blocked = blocked + hits.alpha[:, 0] / cones
-        return 1 - self._lighting.shadows * blocked
+        return 1 - self.lighting.shadows * blocked
 
     def _hemisphere(self, points: _Points, eye: Tensor, tally: _Tally) -> tuple[Tensor, Tensor]:
         """(r, 1) share of the ambient light that is not occluded, and (r, 3) light that matter
@@ -252,13 +235,13 @@ class Lighted:
         """
         unblocked = torch.ones_like(points.position[:, :1])
         bounced = torch.zeros_like(points.position)
-        lighting, reach = self._lighting, self._lighting.reach
+        lighting, reach = self.lighting, self.lighting.reach
         if not (lighting.occlusion or lighting.indirect):
             return unblocked, bounced
         assert reach is not None
-        trace = self._blocker if self._matter is None else self._matter
+        trace = self.blocker if self.matter is None else self.matter
         some = points.seen.to(torch.float64)
-        start = _WAY * some * points.width.clamp(min=self._voxel)
+        start = _WAY * some * points.width.clamp(min=self.voxel)
         end = torch.maximum(start, reach * some)
         middle = torch.maximum(start, reach / 2 * some)
         growth = torch.full_like(end, _WIDE)
@@ -272,7 +255,7 @@ class Lighted:
             hits = tally(over(front, trace(behind(second, front)), dimmed=True))
             taken = (front.alpha + hits.alpha).to(unblocked) / 2
             unblocked = unblocked - lighting.occlusion * weight * taken
-            if self._matter is not None:
+            if self.matter is not None:
                 bounced = bounced + weight * self._reflected(first, hits, eye, tally)
         return unblocked, lighting.indirect * bounced
 
@@ -285,7 +268,7 @@ class Lighted:
         if beam is not None:
             rise = (way * beam).sum(1, keepdim=True)
             way = way + (beam - rise * way) / rise.clamp(min=_GRAZING)
-        height = off * points.width.clamp(min=self._voxel)[:, None]
+        height = off * points.width.clamp(min=self.voxel)[:, None]
         return dataclasses.replace(points, position=points.position + height * way)
 
     def _cone(
@@ -297,7 +280,7 @@ class Lighted:
         return Rays(
             origin=points.position,
             direction=direction,
-            cone=torch.stack((points.width, growth), 1) / self._cone_scale,
+            cone=torch.stack((points.width, growth), 1) / self.cone_scale,
             range=torch.stack((start, end), 1),
             width=points.row,
         )
@@ -307,40 +290,34 @@ class Lighted:
         points = self._points(rays, hits)
         points = dataclasses.replace(points, width=_FINER * points.width, headlight=eye)
         direct, _ = self._direct(points, tally, 1)
-        (diffuse,) = pack((self._material.diffuse,), torch.float64, direct.device)
+        (diffuse,) = pack((self.material.diffuse,), torch.float64, direct.device)
         return torch.where(points.seen[:, None], diffuse * direct * hits.color, 0.0)
 
 
-def _towards(light: Light, points: _Points) -> tuple[Tensor, Tensor]:
-    """(r, 3) unit directions to a light, and (r,) its distances."""
-    if isinstance(light, Headlight) and points.headlight is None:
-        return points.eye, torch.zeros_like(points.width)
+def _towards(light: Light, points: _Points) -> tuple[Tensor, Tensor, Tensor]:
+    """(r, 3) unit directions to a light, (r,) its distances, and (r,) its radius over these."""
+    nothing, device = torch.zeros_like(points.width), points.eye.device
     if isinstance(light, DirectionalLight):
-        way = -pack((light.direction,), torch.float64, points.eye.device)
+        way = -pack((light.direction,), torch.float64, device)
         beam = unit(way.expand_as(points.position))  # of any length but 0
-        return beam, torch.full_like(points.width, torch.inf)
-    position = points.headlight
+        angle = pack((light.angle,), torch.float64, device)
+        size = torch.tan(torch.deg2rad(angle) / 2).expand_as(nothing)
+        return beam, torch.full_like(nothing, torch.inf), size
     if isinstance(light, PointLight):
-        position = pack((light.position,), torch.float64, points.eye.device)
-    assert position is not None
+        position, radius = pack((light.position, light.radius), torch.float64, device).split((3, 1))
+    elif points.headlight is None:
+        return points.eye, nothing, nothing
+    else:
+        position, radius = points.headlight, nothing
     way = position - points.position
-    return normalize(way, dim=1), way.norm(dim=1)
+    distance = way.norm(dim=1)
+    return normalize(way, dim=1), distance, radius / distance.clamp(min=1e-30)
 
 
 def _is_small(light: Light) -> bool:
     """Whether a light is known to have no size, without reading tensors."""
     size = getattr(light, "angle", getattr(light, "radius", 0.0))
     return not isinstance(size, Tensor) and size == 0
-
-
-def _size(light: Light, distance: Tensor) -> Tensor:
-    """(r,) radius of a light over its distance."""
-    if isinstance(light, Headlight):
-        return torch.zeros_like(distance)
-    if isinstance(light, PointLight):
-        return pack((light.radius,), distance.dtype, distance.device) / distance.clamp(min=1e-30)
-    angle = pack((light.angle,), distance.dtype, distance.device)
-    return torch.tan(torch.deg2rad(angle) / 2).expand_as(distance)
 
 
 def _disc(count: int) -> Iterator[tuple[float, float]]:

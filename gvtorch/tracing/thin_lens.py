@@ -12,8 +12,7 @@ for the circle of confusion.
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -56,38 +55,34 @@ class ThinLens:
         if self.frame is Frame.WORLD:
             return self
         side = float((box[1] - box[0]).max())
-        return dataclasses.replace(
-            self, aperture=self.aperture * side, focus=self.focus * side, frame=Frame.WORLD
-        )
+        aperture, focus = self.aperture * side, self.focus * side
+        return ThinLens(aperture=aperture, focus=focus)
 
     def cone(self, t: Tensor) -> Tensor:
         """Returns the width of the lens's cone at distances t, for a lens in world units."""
         return _CONE_OF_DISC * self.aperture / self.focus * (t - self.focus).abs()
 
 
+@dataclass(frozen=True)
 class ThroughLens:
     """Traces rays whose cones are widened by a lens."""
 
-    def __init__(self, trace: Trace, lens: ThinLens, cone_scale: float) -> None:
-        """Takes a lens in world units, and the factor that the tracer puts on cones, which shall
-        not widen the lens's.
-        """
-        self._trace, self._focus = trace, lens.focus
-        self._wide = _CONE_OF_DISC * lens.aperture / cone_scale  # width of its cone at the eye
+    trace: Trace
+    lens: ThinLens  # in world units
+    cone_scale: float  # the tracer's factor on cones, which shall not widen the lens's
 
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays up to the focus, then from there on."""
-        return trace_pieces(self._trace, (self._piece(rays, -1), self._piece(rays, 1)))
+        return trace_pieces(self.trace, (self._piece(rays, -1), self._piece(rays, 1)))
 
     def _piece(self, rays: Rays, side: int) -> Rays:
         """The rays before the focus (`side` -1) or behind it (1)."""
         cone, (first, last) = rays.cone.to(torch.float64), rays.range.to(torch.float64).unbind(1)
-        growth = side * self._wide / self._focus
-        near, far = cone[:, 0] - side * self._wide, cone[:, 1] + growth
+        focus = self.lens.focus
+        wide = _CONE_OF_DISC * self.lens.aperture / self.cone_scale  # its cone at the eye
+        near, far = cone[:, 0] - side * wide, cone[:, 1] + side * wide / focus
         if side < 0:
-            last = last.clamp(max=self._focus)
+            last = last.clamp(max=focus)
         else:
-            first = first.clamp(min=self._focus)
-        return dataclasses.replace(
-            rays, cone=torch.stack((near, far), 1), range=torch.stack((first, last), 1)
-        )
+            first = first.clamp(min=focus)
+        return replace(rays, cone=torch.stack((near, far), 1), range=torch.stack((first, last), 1))

@@ -32,8 +32,8 @@ from ..pool import N3Tree
 from ..shaders.module import PART_SAMPLES, ModuleShader
 from ..shaders.shader import Shader, check_shader
 from ..shaders.tables import Sampling, interval_levels
+from .composite import tree_span
 from .options import RenderOptions
-from .spans import tree_span
 
 _FIELDS = ("color", "alpha", "depth", "samples", "missed", "normal", "features")
 _SAMPLES = {"cpu": 1 << 20, "cuda": 1 << 24}  # shaded at once
