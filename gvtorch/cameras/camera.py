@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.records import Rays
-from .models import CameraModel, last_rising_angle, model_of, pixel_rays
+from .models import MODELS, CameraModel, Plane, last_rising_angle, model_of
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
@@ -92,28 +92,19 @@ class Camera:
         self.width = check.whole("Camera", "width", width, low=1, high=65536)
         self.height = check.whole("Camera", "height", height, low=1, high=65536)
         self.window = (0, self.height)
-        (view,) = _batch("Camera", (4, 4), viewmats=viewmats)
-        (intrinsics,) = _batch("Camera", (3, 3), Ks=Ks)
-        self.batched = view.dim() == 3 or intrinsics.dim() == 3
-        count = max(m.shape[0] if m.dim() == 3 else 1 for m in (view, intrinsics))
-        try:
-            self.viewmats = view.expand(count, 4, 4).contiguous()
-            self.Ks = intrinsics.expand(count, 3, 3).contiguous()
-        except RuntimeError:
-            raise ValueError(
-                f"Camera: viewmats {tuple(view.shape)} and Ks {tuple(intrinsics.shape)} "
-                "do not match"
-            ) from None
+        view, K = _batch("Camera", viewmats=(viewmats, (4, 4)), Ks=(Ks, (3, 3)))
+        self.batched = view.dim() == 3
+        self.viewmats, self.Ks = view.reshape(-1, 4, 4), K.reshape(-1, 3, 3)
         _check_matrices(self.viewmats, self.Ks)
         angle = check.number("Camera", "max_angle", max_angle, low=0, high=180, open_low=True)
-        self.max_angle = torch.full((count,), math.radians(angle), dtype=torch.float64)
-        self.radial_coeffs = torch.zeros(count, 4, dtype=torch.float64)
+        self.max_angle = torch.full((len(self),), math.radians(angle), dtype=torch.float64)
+        self.radial_coeffs = torch.zeros(len(self), 4, dtype=torch.float64)
         if radial_coeffs is not None:
             self._distort(check.reals("Camera", "radial_coeffs", radial_coeffs))
         self.distorted = bool((self.radial_coeffs != 0).any())
 
     def _distort(self, coefficients: Tensor) -> None:
-        if not model_of("Camera", self.model).bends:
+        if not MODELS[self.model].bends:
             raise ValueError(f"Camera: radial_coeffs are for a fisheye, got model {self.model!r}")
         shape, count = tuple(coefficients.shape), len(self)
         if shape not in ((4,), (1, 4), (count, 4)):
@@ -142,7 +133,7 @@ class Camera:
             azimuth: Degrees; a number, or (n,) for a batch.
             elevation: Degrees, likewise.
             distance: In largest sides of the box, likewise, > 0.
-            fov: Vertical field of view, degrees; see `look_at`.
+            fov: See `look_at`, as for the rest.
             width: Pixels.
             height: Pixels.
             model: Name of the camera model.
@@ -151,8 +142,9 @@ class Camera:
             ValueError: A number is not finite or out of its range.
         """
         where = "Camera.orbit"
-        numbers = {"azimuth": azimuth, "elevation": elevation, "distance": distance}
-        turn, lift, far = _batch(where, (), **numbers)
+        turn, lift, far = _batch(
+            where, azimuth=(azimuth, ()), elevation=(elevation, ()), distance=(distance, ())
+        )
         if bool((far <= 0).any()):
             raise ValueError(f"{where}: distance must be > 0, got {distance!r}")
         turn, lift = turn.deg2rad(), lift.deg2rad()
@@ -193,7 +185,7 @@ class Camera:
             ValueError: A place is not finite, up is zero, or eye and target are the same.
         """
         where = "Camera.look_at"
-        eye_, target_, up_ = _batch(where, (3,), eye=eye, target=target, up=up)
+        eye_, target_, up_ = _batch(where, eye=(eye, (3,)), target=(target, (3,)), up=(up, (3,)))
         if bool((up_ == 0).all(-1).any()):
             raise ValueError(f"{where}: up must not be zero")
         forward = target_ - eye_
@@ -306,7 +298,7 @@ class Camera:
         view, Ks = self.viewmats.clone(), self.Ks
         rotation = view[:, :3, :3]
         view[:, :3, 3] = view[:, :3, 3] * side - rotation @ centre
-        if model_of("Camera", self.model).parallel:
+        if MODELS[self.model].parallel:
             Ks = Ks.clone()
             Ks[:, (0, 1), (0, 1)] /= side
         return self._changed(viewmats=view, Ks=Ks, frame=Frame.WORLD)
@@ -325,7 +317,9 @@ class Camera:
         return self.shifted(0, first)._changed(height=end - first, window=window)
 
     def numbers(self, device: torch.device | str = "cpu") -> Tensor:
-        """Returns (n, 25) float64, what `pixel_rays` reads; does not wait for the device.
+        """Returns what `pixel_rays` reads; does not wait for the device. (n, 25) float64: rotation
+        to the camera (9), position (3), focal lengths and principal point (2, 2; pixel centres at
+        integers), cone (2), range (2), a fisheye's coefficients (4) and largest angle (1).
 
         Raises:
             ValueError: The camera is relative to a box: call `placed(box)` first.
@@ -337,16 +331,23 @@ class Camera:
         position = -(translation[:, None] @ rotation)[:, 0]  # -R^T t
         zero = torch.zeros_like(focal[:, :1])
         pixel = 1 / focal.min(1, keepdim=True).values
-        parallel = model_of("Camera", self.model).parallel
-        cone = (pixel, zero) if parallel else (zero, pixel)
+        cone = (pixel, zero) if MODELS[self.model].parallel else (zero, pixel)
         range_ = (zero, zero + math.inf)
         bend = (self.radial_coeffs, self.max_angle[:, None])
         parts = (rotation.flatten(1), position, focal, centre, *cone, *range_, *bend)
         return sent(torch.cat(parts, 1), device)
 
     def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:
-        """Returns the rays of whole rows, counted through the batch, from what `numbers` gave."""
-        return pixel_rays(numbers, self.width, self.height, rows, self.model, self.distorted)
+        """Returns the rays through the pixel centres of whole rows, the first one and the one after
+        the last counted through the batch, from what `numbers` gave.
+        """
+        row = torch.arange(*rows, device=numbers.device)  # (y,)
+        if len(numbers) > 1:
+            numbers, row = numbers[row // self.height], row % self.height  # one for each row
+        (fx, fy), (cx, cy) = numbers[:, 12:14].unbind(1), numbers[:, 14:16].unbind(1)
+        column = torch.arange(self.width, dtype=torch.float64, device=numbers.device)
+        x, y = (column - cx[:, None]) / fx[:, None], (row - cy) / fy
+        return MODELS[self.model].rays(Plane(x, y, numbers, self.distorted))
 
     def blocks(self, pixels: int) -> Iterator[tuple[int, int]]:
         """Yields the rows of all pictures in blocks of about so many pixels, at least a row each:
@@ -386,12 +387,12 @@ def sent(numbers: Tensor, device: torch.device | str) -> Tensor:
     return numbers.to(device)
 
 
-def _batch(where: str, shape: tuple[int, ...], **values: Any) -> list[Tensor]:
-    """Numbers of one camera, each of this shape, or of n cameras (n, *shape), broadcast against
-    each other.
+def _batch(where: str, **values: tuple[Any, tuple[int, ...]]) -> list[Tensor]:
+    """Numbers of one camera, each of its shape, or of n cameras (n, *shape), broadcast against each
+    other.
     """
-    found = []
-    for name, value in values.items():
+    found, sizes = [], []
+    for name, (value, shape) in values.items():
         numbers = check.reals(where, name, value)
         batch = numbers.dim() - len(shape)
         if batch not in (0, 1) or numbers.shape[batch:] != shape:
@@ -400,26 +401,29 @@ def _batch(where: str, shape: tuple[int, ...], **values: Any) -> list[Tensor]:
                 f"{where}: {name} must be {shape or 'a number'} or {many}, "
                 f"got {tuple(numbers.shape)}"
             )
-        found.append(numbers)
+        found.append((numbers, shape))
+        sizes.append(numbers.shape[:batch])
     try:
-        return list(torch.broadcast_tensors(*found))
+        size = torch.broadcast_shapes(*sizes)
     except RuntimeError:
         raise ValueError(f"{where}: {', '.join(values)} have different lengths") from None
+    return [numbers.expand((*size, *shape)).contiguous() for numbers, shape in found]
 
 
 def _check_matrices(viewmats: Tensor, Ks: Tensor) -> None:
     """Raises ValueError unless these are poses (n, 4, 4) and intrinsics (n, 3, 3)."""
-    if bool((Ks[:, (0, 1), (0, 1)] <= 0).any()):
-        raise ValueError("Camera: Ks must have positive focal lengths")
-    rotation = viewmats[:, :3, :3]
+    rotation, bottom = viewmats[:, :3, :3], viewmats.new_tensor([0, 0, 0, 1])
     error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().max()
-    if error > 1e-3 or bool((torch.linalg.det(rotation) < 0).any()):
-        raise ValueError("Camera: viewmats must hold rotations (orthonormal, determinant +1)")
-    bottom = torch.tensor([0, 0, 0, 1], dtype=torch.float64)
-    if bool((viewmats[:, 3] != bottom).any() or (Ks[:, 2] != bottom[1:]).any()):
-        raise ValueError("Camera: last rows must be (0, 0, 0, 1) of viewmats, (0, 0, 1) of Ks")
-    if bool((Ks[:, (0, 1), (1, 0)] != 0).any()):
-        raise ValueError("Camera: Ks must have no skew")
+    rotates = error <= 1e-3 and (torch.linalg.det(rotation) >= 0).all()
+    last = (viewmats[:, 3] == bottom).all() and (Ks[:, 2] == bottom[1:]).all()
+    for wanted, holds in {
+        "Ks must have positive focal lengths": (Ks[:, (0, 1), (0, 1)] > 0).all(),
+        "viewmats must hold rotations (orthonormal, determinant +1)": rotates,
+        "last rows must be (0, 0, 0, 1) of viewmats, (0, 0, 1) of Ks": last,
+        "Ks must have no skew": (Ks[:, (0, 1), (1, 0)] == 0).all(),
+    }.items():
+        if not holds:
+            raise ValueError(f"Camera: {wanted}")
 
 
 def _viewmat(eye: Tensor, forward: Tensor, right: Tensor) -> Tensor:

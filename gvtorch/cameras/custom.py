@@ -32,20 +32,17 @@ class CustomCamera(Camera):
                 length.
         """
         columns: list[Tensor] = []
+        known: int | str = "r"
         for name, size in (("origin", 3), ("direction", 3), ("cone", 2), ("range", 2)):
-            column = getattr(rays, name, None)
-            known = columns[0].shape[0] if columns else "r"
-            if (
-                not isinstance(column, Tensor)
-                or column.dim() != 2
-                or not column.is_floating_point()
-                or (column.shape[0] if columns else known, column.shape[1]) != (known, size)
-            ):
+            column: Any = getattr(rays, name, None)
+            real = isinstance(column, Tensor) and column.is_floating_point() and column.dim() == 2
+            if not real or column.shape[1] != size or known not in ("r", len(column)):
                 raise ValueError(
                     f"CustomCamera: rays.{name} must be ({known}, {size}) float, "
                     f"got {describe(column)}"
                 )
             columns.append(column)
+            known = len(column)
         if rays.transmittance is not None:
             raise ValueError("CustomCamera: rays of a picture must have no transmittance, got some")
         count = len(rays.origin)

@@ -1,8 +1,5 @@
-"""Camera models: from pixels to rays, on the device.
-
-A model turns a place of the image plane, x = (u - cx) / fx and y = (v - cy) / fy, into a ray. Each
-is a class here, of which one instance stands in `MODELS`; all else asks that instance. Axes are
-OpenCV's: x right, y down, z forward.
+"""Camera models: from places of the image plane, x = (u - cx) / fx and y = (v - cy) / fy, to rays,
+on the device. Axes are OpenCV's: x right, y down, z forward.
 """
 
 from __future__ import annotations
@@ -28,7 +25,7 @@ class Plane:
 
     x: Tensor  # (k, w) float64; k is 1 where all rows are one camera's, else y
     y: Tensor  # (y,)
-    numbers: Tensor  # (k, 25), see `pixel_rays`
+    numbers: Tensor  # (k, 25), see `Camera.numbers`
     distorted: bool  # the coefficients of a fisheye are used
 
     @property
@@ -61,13 +58,9 @@ class Plane:
         widening: Tensor | None = None,
         inside: Tensor | None = None,
     ) -> Rays:
-        """Returns the rays of all pixels.
-
-        Args:
-            direction: (y, w, 3) or (r, 3) world, unit length.
-            origin: (y, w, 3) world; the camera's position if left out.
-            widening: (y, w) factor on the cones.
-            inside: (y, w) bool, the pixel has a ray; others get an empty range. All if left out.
+        """Returns the rays of all pixels. `direction` is (y, w, 3) or (r, 3), of unit length, and
+        `origin` (y, w, 3), the camera's position if left out; `widening` (y, w) is a factor on the
+        cones, and what is not `inside` (y, w) gets an empty range.
         """
         cone, limits = (self.spread(part) for part in self.numbers[:, 16:20].split(2, 1))
         if widening is not None:
@@ -201,36 +194,6 @@ def model_of(where: str, name: str) -> Model:
     if name not in MODELS:
         raise ValueError(f"{where}: model must be one of {', '.join(MODELS)}, got {name!r}")
     return MODELS[name]
-
-
-def pixel_rays(
-    numbers: Tensor,
-    width: int,
-    height: int,
-    rows: tuple[int, int],
-    model: str = "pinhole",
-    distorted: bool = False,
-) -> Rays:
-    """Returns the rays through the pixel centres of whole rows; does not wait for the device.
-
-    Args:
-        numbers: (n, 25) float64, a row a camera: world-to-camera rotation (9), position (3), focal
-            lengths and principal point (2, 2; pixel centres at integers), cone (2), range (2), the
-            fisheye's coefficients (4) and largest angle to the axis (1, radians).
-        width: Pixels.
-        height: Pixels.
-        rows: First row and the row after the last, counted through the batch.
-        model: One of `MODELS`.
-        distorted: Whether a fisheye's coefficients are used.
-    """
-    first, end = rows
-    row = torch.arange(first, end, device=numbers.device)  # (y,)
-    if len(numbers) > 1:
-        numbers, row = numbers[row // height], row % height  # one for each row
-    (fx, fy), (cx, cy) = numbers[:, 12:14].unbind(1), numbers[:, 14:16].unbind(1)
-    column = torch.arange(width, dtype=torch.float64, device=numbers.device)
-    x, y = (column - cx[:, None]) / fx[:, None], (row - cy) / fy
-    return MODELS[model].rays(Plane(x, y, numbers, distorted))
 
 
 def distort(angle: Tensor, k: Tensor) -> Tensor:

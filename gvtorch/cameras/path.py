@@ -18,7 +18,7 @@ from ..base import check
 from .camera import Camera
 from .models import CameraModel, model_of
 
-_KEYS = {"eye", "target", "up", "fov"}
+_UP, _FOV = (0.0, 1.0, 0.0), 30.0  # of keys that have none
 
 
 class CameraPath:
@@ -45,18 +45,18 @@ class CameraPath:
         count = len(eye)
         if count < 1:
             raise ValueError("CameraPath: at least one key is needed")
-        up = [(0.0, 1.0, 0.0)] * count if up is None else up
-        fov = [30.0] * count if fov is None else fov
-        rows = []
-        for name, values in (("eye", eye), ("target", target), ("up", up)):
+        up = [_UP] * count if up is None else up
+        fov = [_FOV] * count if fov is None else fov
+        lists: dict[str, Sequence[Any]] = {"eye": eye, "target": target, "up": up, "fov": fov}
+        for name, values in lists.items():
             if len(values) != count:
-                raise ValueError(
-                    f"CameraPath: {name} must have {count} rows as eye has, got {len(values)}"
-                )
-            rows.append([check.triple("CameraPath", name, value) for value in values])
-        if len(fov) != count:
-            raise ValueError(f"CameraPath: fov must have {count} numbers, got {len(fov)}")
+                kind = "numbers" if name == "fov" else "rows as eye has"
+                raise ValueError(f"CameraPath: {name} must have {count} {kind}, got {len(values)}")
         angles = [[check.number("CameraPath", "fov", angle, low=0, high=360)] for angle in fov]
+        rows = [
+            [check.triple("CameraPath", name, value) for value in lists[name]]
+            for name in ("eye", "target", "up")
+        ]
         parts = [torch.tensor(part, dtype=torch.float64) for part in (*rows, angles)]
         self._keys = torch.cat(parts, 1)  # (k, 10)
 
@@ -100,21 +100,14 @@ class CameraPath:
         if not isinstance(keys, list) or not all(isinstance(key, Mapping) for key in keys):
             raise ValueError(f'{path}: must be a list of keys {{"eye": ..., "target": ...}}')
         for number, key in enumerate(keys):
-            unknown, missing = sorted(set(key) - _KEYS), sorted({"eye", "target"} - set(key))
+            unknown = sorted(set(key) - {"eye", "target", "up", "fov"})
+            missing = sorted({"eye", "target"} - set(key))
             if unknown or missing:
                 what = f"unknown {unknown[0]!r}" if unknown else f"{missing[0]!r} is missing"
                 raise ValueError(f"{path}: key {number}: {what}")
-
-        def column(name: str, default: Any) -> list[Any]:
-            return [key.get(name, default) for key in keys]
-
+        full = [{"up": _UP, "fov": _FOV, **key} for key in keys]
         try:
-            return cls(
-                column("eye", None),
-                column("target", None),
-                column("up", (0.0, 1.0, 0.0)),
-                column("fov", 30.0),
-            )
+            return cls(*([key[name] for key in full] for name in ("eye", "target", "up", "fov")))
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
 
