@@ -14,19 +14,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from .. import ops
 from ..base.records import Hits, Rays
-from ..ops import (
-    RayArguments,
-    Samples,
-    Segments,
-    TraceArguments,
-    composite,
-    list_samples,
-    sample_bricks,
-    shade_rays,
-    trace_rays,
-    trace_segments,
-)
 from ..ops.trace import choose_backend, most_intervals
 from ..pool import N3Tree
 from ..shaders.module import PART_SAMPLES, ModuleShader
@@ -79,7 +68,7 @@ class Tracer:
         )
         self.dtype, self.backend = options.dtype, options.backend
         self.shading = shader.shading("render", tree)
-        self.arguments = TraceArguments(
+        self.arguments = ops.TraceArguments(
             place_33=tree.place,
             branching=tree.branching,
             max_depth=tree.depth,
@@ -113,13 +102,13 @@ class Tracer:
         """Traces rays in world units."""
         if isinstance(self.shader, ModuleShader):
             return self._march_module(self.shader, rays)
-        given = RayArguments.of(rays)
+        given = ops.RayArguments.of(rays)
         fields: tuple[Tensor, ...]
         if self.shading is None:
-            fields = trace_rays(given, self.arguments, backend=self.backend)
+            fields = ops.trace_rays(given, self.arguments, backend=self.backend)
         else:
             own = (self.shading, self.shader.parameter_tensor(self.tree, self.dtype))
-            fields = shade_rays(
+            fields = ops.shade_rays(
                 given, self.arguments, *own, op=self.shader.op, backend=self.backend
             )
         return Hits(**dict(zip(_FIELDS, fields, strict=False)))
@@ -150,9 +139,9 @@ class Batch:
     """Samples of rays that were walked, and what can be read there."""
 
     tracer: Tracer
-    rays: RayArguments
-    segments: Segments
-    listed: Samples
+    rays: ops.RayArguments
+    segments: ops.Segments
+    listed: ops.Samples
 
     def values(self, channels: Sequence[str] = ()) -> Tensor:
         """(k, c) values of channels side by side; of the tracer's channel where none are named."""
@@ -165,7 +154,7 @@ class Batch:
                 bricks_bzyxc=tree.bricks.bricks[name], constant_tnc=tree.nodes.constants[name]
             )
             reads = (arguments, self.segments, self.listed)
-            found.append(sample_bricks(self.rays, *reads, backend=self.tracer.backend))
+            found.append(ops.sample_bricks(self.rays, *reads, backend=self.tracer.backend))
         return found[0] if len(found) == 1 else torch.cat(found, 1)
 
     @cached_property
@@ -228,7 +217,7 @@ def march(
         tracer: A frame; its shader's table tells only what is hidden.
         rays: World rays.
         shade: Gives features (k, c) and alpha (k,) of samples.
-        features: How many there are.
+        features: Their number c.
         limit: Samples of a ray in one part.
         by_node: See `trace_segments`.
 
@@ -238,7 +227,7 @@ def march(
     arguments, backend = tracer.arguments, tracer.backend
     like, count = arguments.domain_2, len(rays.origin)
     stop_alpha, hit_clear = arguments.stop_alpha, 1 - arguments.depth_alpha
-    going_on = RayArguments.of(rays)._replace(clear_r=None)  # a walk has no transmittance
+    going_on = ops.RayArguments.of(rays)._replace(clear_r=None)  # a walk has no transmittance
     sums = like.new_zeros((count, features))
     clear = rays.light()[:, 0].to(like.dtype)
     depth = like.new_full((count,), torch.inf)
@@ -249,16 +238,16 @@ def march(
         which = (clear > 1 - stop_alpha).nonzero()[:, 0]
         going_on = going_on.some(which)
     while len(which):
-        segments = trace_segments(
+        segments = ops.trace_segments(
             going_on, arguments, state, limit=limit, by_node=by_node, backend=backend
         )
         missed[which] |= segments.missed
         nodes[which] += segments.counts[:, 2]
-        batch = Batch(tracer, going_on, segments, list_samples(segments))
+        batch = Batch(tracer, going_on, segments, ops.list_samples(segments))
         if not len(batch.segment):
             break  # all have ended
         feature, alpha = shade(batch)
-        total, left, before = composite(
+        total, left, before = ops.composite(
             *(alpha.contiguous(), feature.contiguous(), batch.listed.offset, clear[which]),
             stop_alpha=stop_alpha,
             backend=backend,

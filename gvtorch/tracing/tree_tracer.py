@@ -45,17 +45,8 @@ class TreeTracer(torch.nn.Module):
         depth_alpha: float = config.DEPTH_ALPHA,
         cone_scale: float = config.CONE_OVERESTIMATE,
     ) -> None:
-        """Shares the tree's pools, but for the usage stamps, which are its own.
-
-        Args:
-            tree: The tree.
-            shader: The transfer function, or another fused shader.
-            channel: Name of the channel it reads; the first if left out.
-            component: Which number of the channel.
-            step: Shortest interval, in voxels of the finest level.
-            stop_alpha: A ray ends at this alpha.
-            depth_alpha: Depth is where alpha passes this.
-            cone_scale: Factor on the cones of rays, as in `RenderOptions`.
+        """Shares the tree's pools, but for the usage stamps, which are its own. The shader is the
+        transfer function, or another fused one; the rest are fields of `RenderOptions`.
 
         Raises:
             RuntimeError: The compiled op is missing.
@@ -141,14 +132,8 @@ class TreeTracer(torch.nn.Module):
         """As `forward`, and returns also normal (r, 3) and features (r, c), (0, 3) and (0, 0) where
         the shader gives none.
         """
-        rays = RayArguments(
-            origin.to(torch.float64).contiguous(),
-            direction.to(torch.float64).contiguous(),
-            cone.to(torch.float64).contiguous(),
-            range.to(torch.float64).contiguous(),
-            0,
-            None,
-        )
+        columns = [c.to(torch.float64).contiguous() for c in (origin, direction, cone, range)]
+        rays = RayArguments(columns[0], columns[1], columns[2], columns[3], 0, None)
         arguments = self.arguments()
         if self.plain:
             color, alpha, depth, samples, _ = torch.ops.gvtorch.trace_rays(*rays, *arguments)
