@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from gvtorch import ops
 from gvtorch.base import constants as config
-from gvtorch.ops.reference import cache as reference_cache
 
 LOAD, SUBDIVIDE = config.REQUEST_LOAD, config.REQUEST_SUBDIVIDE
 PENDING = config.REQUEST_PENDING_SHIFT
@@ -217,7 +216,7 @@ def test_kernels_equal_twins_on_a_large_pool(compiled):
     request = torch.randint(0, 1 << 20, (200_000, 8), generator=generator, dtype=torch.int32)
     request *= torch.randint(0, 2, request.shape, generator=generator, dtype=torch.int32)
     there = request.clone().to(device)
-    expected = reference_cache.compact_requests(request, 300_000)
+    expected = ops.compact_requests(request, 300_000, backend="reference")
     actual = ops.compact_requests(there, 300_000, backend=compiled)
     assert all(torch.equal(a.cpu(), e) for a, e in zip(actual, expected, strict=True))
     assert torch.equal(there.cpu(), request) and int(expected[2][1]) > 300_000
@@ -225,7 +224,7 @@ def test_kernels_equal_twins_on_a_large_pool(compiled):
     order = torch.randperm(500_000, generator=generator).to(torch.int32)
     stamp = torch.randint(0, 3, (500_000,), generator=generator, dtype=torch.int32)
     frame = int32([1])
-    expected = reference_cache.lru_partition(order, stamp, frame)
+    expected = ops.lru_partition(order, stamp, frame, backend="reference")
     actual = ops.lru_partition(*(t.to(device) for t in (order, stamp, frame)), backend=compiled)
     assert all(torch.equal(a.cpu(), e) for a, e in zip(actual, expected, strict=True))
 
@@ -236,11 +235,11 @@ def test_kernels_equal_twins_on_a_large_pool(compiled):
     ]
     pool.append(torch.randint(0, 2, (tiles,), generator=generator).to(torch.bool))
     node = torch.randint(-5, tiles * per_tile + 5, (1_000_000,), generator=generator)
-    loc = reference_cache.locate(pool[1], node, 2, per_tile)
+    loc = ops.locate(pool[1], node, 2, per_tile, backend="reference")
     there = [words_.to(device) for words_ in (*pool, node, loc)]
     actual = ops.locate(there[1], there[5], 2, per_tile, backend=compiled)
     assert torch.equal(actual.cpu(), loc)
-    expected = reference_cache.lacking(*pool, node, loc, 1, 0, 2)
+    expected = ops.lacking(*pool, node, loc, 1, 0, 2, backend="reference")
     actual = ops.lacking(*there, 1, 0, 2, backend=compiled)
     assert torch.equal(actual.cpu(), expected) and 0 < int(expected.sum()) < len(node)
 

@@ -11,8 +11,8 @@ from torch import Tensor
 from ..base import check
 from .arguments import RayArguments, Samples, Segments, TraceArguments
 from .checks import check_channel, check_rays, check_real, check_trace, check_voxels
+from .op import Backend, choose_backend
 from .reference import segments as reference
-from .trace import Backend, choose_backend
 
 _SEGMENT_BYTES = 84  # at most, in float64
 

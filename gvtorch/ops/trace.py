@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,29 +11,8 @@ from torch import Tensor
 from ..base import constants as config
 from .arguments import RayArguments, ShadeArguments, TraceArguments
 from .checks import check_shade, check_trace
+from .op import Backend, choose_backend
 from .reference import march, shaders
-from .registry import available
-
-Backend = Literal["auto", "reference", "cpp", "cuda"]
-
-
-def choose_backend(backend: str, device: torch.device) -> str:
-    """Returns the backend that runs on `device`: `auto` takes the compiled one where there is one.
-
-    Raises:
-        ValueError: The backend is unknown, can't be used here, or does not run on `device`.
-    """
-    if backend not in ("auto", "reference", "cpp", "cuda"):
-        raise ValueError(f"backend must be auto, reference, cpp or cuda, got {backend!r}")
-    compiled = {"cpu": "cpp", "cuda": "cuda"}.get(device.type)
-    if backend == "auto":
-        return compiled if compiled and not available()[compiled] else "reference"
-    reason = available()[backend]
-    if reason:
-        raise ValueError(f"backend {backend!r} can't be used here: {reason}")
-    if backend not in ("reference", compiled):
-        raise ValueError(f"backend {backend!r} does not run on device {device}")
-    return backend
 
 
 def trace_rays(
