@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -339,6 +340,8 @@ def test_a_kind_has_a_struct_a_twin_and_a_class():
     """One name in csrc/shaders/shaders.h, in its twin and among the built-in classes."""
     assert [*TWINS] == [*SHADER_KINDS]
     structs = (cpp_ext.SOURCES / "shaders" / "shaders.h").read_text()
+    listed = structs[structs.index("#define GV_SHADERS(X)") : structs.index("#define GV_KIND")]
+    assert re.findall(r"X\((\w+), \w+, \w+\)", listed) == [*SHADER_KINDS]
     classes = [getattr(gv, name) for name in built_in.__all__]
     for kind in SHADER_KINDS:
         assert f"struct {kind} " in structs or kind.startswith("Shadowed"), kind

@@ -31,10 +31,6 @@ class Rays:
         """The rays on a device."""
         return self._each(lambda column: column.to(device), self.width)
 
-    def double(self) -> Rays:
-        """The rays in float64, each column contiguous."""
-        return self._each(lambda column: column.to(torch.float64).contiguous(), self.width)
-
     def light(self) -> Tensor:
         """Returns (r, 1) float64 transmittance at the first distance."""
         if self.transmittance is None:

@@ -30,8 +30,14 @@ class RayArguments(NamedTuple):
     @classmethod
     def of(cls, rays: Rays) -> "RayArguments":
         """Takes rays of any dtype."""
-        r = rays.double()
-        return cls(r.origin, r.direction, r.cone, r.range, r.width, r.transmittance)
+        return cls(
+            rays.origin.double().contiguous(),
+            rays.direction.double().contiguous(),
+            rays.cone.double().contiguous(),
+            rays.range.double().contiguous(),
+            rays.width,
+            None if rays.transmittance is None else rays.transmittance.double().contiguous(),
+        )
 
     def some(self, which: Tensor) -> "RayArguments":
         """The rays `which` (k,) int64 of them, without a transmittance."""

@@ -1,8 +1,9 @@
-"""Checks of the records in `arguments.py`: one line that says which op, argument and value."""
+"""Checks of the records in `arguments.py`: ValueErrors of one line that says which op, argument and
+value. They return the sizes that the letters of shapes stand for.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -14,16 +15,16 @@ from .arguments import RayArguments, ShadeArguments, TraceArguments
 from .shading import SHADER_KINDS
 
 
-def _tensors(record: Any, names: str, dtype: torch.dtype) -> Iterable[check.Field]:
-    for name in names.split():
-        yield name, getattr(record, name), check.shape_of(name), dtype
+def _fields(record: Any, dtype: torch.dtype, names: str) -> list[check.Field]:
+    return [(name, getattr(record, name), check.shape_of(name), dtype) for name in names.split()]
 
 
 def check_rays(where: str, rays: RayArguments) -> dict[str, int]:
-    """Raises ValueError unless rays are right; returns r."""
-    device, names = rays.origin_r3.device, "origin_r3 direction_r3 cone_r2 range_r2"
+    """Checks rays."""
+    names = "origin_r3 direction_r3 cone_r2 range_r2"
     names += "" if rays.clear_r is None else " clear_r"
-    sizes = check.tensors(where, device, _tensors(rays, names, torch.float64))
+    fields = _fields(rays, torch.float64, names)
+    sizes = check.tensors(where, rays.origin_r3.device, fields)
     check.whole(where, "width", rays.width, low=0)
     if rays.width and sizes["r"] % rays.width:
         raise ValueError(f"{where}: {sizes['r']} rays are no whole rows of {rays.width} pixels")
@@ -31,71 +32,49 @@ def check_rays(where: str, rays: RayArguments) -> dict[str, int]:
 
 
 def check_channel(where: str, arguments: TraceArguments, device: torch.device) -> dict[str, int]:
-    """Raises ValueError unless what tells where the tree lies, its bricks and constants are right;
-    returns b, s, t, n and c.
-    """
+    """Checks what tells where the tree lies, its bricks and constants."""
     check.whole(where, "branching", arguments.branching, low=2, high=16)
-    voxel = arguments.bricks_bzyxc.dtype
-    sizes = check.tensors(
-        where,
-        device,
-        (
-            *_tensors(arguments, "place_33", torch.float64),
-            *_tensors(arguments, "bricks_bzyxc constant_tnc", voxel),
-        ),
-    )
+    fields = _fields(arguments, arguments.bricks_bzyxc.dtype, "bricks_bzyxc constant_tnc")
+    place = _fields(arguments, torch.float64, "place_33")
+    sizes = check.tensors(where, device, place + fields)
     check.whole(where, "max_depth", arguments.max_depth, low=0, high=62)
     check.whole(where, "border", arguments.border, low=0, high=(sizes["s"] - 1) // 2)
-    for name in ("root_voxel", "step"):
-        check.number(where, name, getattr(arguments, name), low=0, open_low=True)
+    check.number(where, "root_voxel", arguments.root_voxel, low=0, open_low=True)
+    check.number(where, "step", arguments.step, low=0, open_low=True)
     check.number(where, "cone_scale", arguments.cone_scale, low=0)
     return sizes
 
 
 def check_voxels(where: str, arguments: TraceArguments) -> None:
-    """Raises ValueError where the bricks' dtype has no kernel."""
+    """Checks that the bricks' dtype has a kernel."""
     voxel = arguments.bricks_bzyxc.dtype
     if voxel not in CHANNEL_DTYPES:
         raise ValueError(f"{where}: bricks_bzyxc has dtype {voxel}, which no channel can have")
 
 
 def check_real(where: str, name: str, tensor: Tensor, shape: str) -> None:
-    """Raises ValueError unless a tensor is of float32 or float64."""
+    """Checks that a tensor is of float32 or float64; its shape is only told."""
     if tensor.dtype not in (torch.float32, torch.float64):
-        got = check.describe(tensor)
-        raise ValueError(f"{where}: {name} must be {shape} float32 or float64, got {got}")
+        wanted = f"({', '.join(shape)}{',' if len(shape) == 1 else ''}) float32 or float64"
+        raise ValueError(f"{where}: {name} must be {wanted}, got {check.describe(tensor)}")
 
 
 def check_trace(
     where: str, rays: RayArguments, arguments: TraceArguments, table_shape: str = "lm4"
 ) -> dict[str, int]:
-    """Raises ValueError unless rays and what they go through are right.
-
-    Args:
-        where: The op.
-        rays: The rays.
-        arguments: What they go through.
-        table_shape: A letter or digit a dimension.
-
-    Returns:
-        The sizes that the letters of shapes stand for.
-    """
+    """Checks rays and all that they go through."""
     table, device = arguments.table_lm4, rays.origin_r3.device
-    check_real(where, "table_lm4", table, f"({', '.join(table_shape)})")
+    check_real(where, "table_lm4", table, table_shape)
     check_voxels(where, arguments)
+    fields = [
+        *_fields(arguments, arguments.bricks_bzyxc.dtype, "range_tn2c"),
+        ("table_lm4", table, table_shape, table.dtype),
+        *_fields(arguments, table.dtype, "domain_2"),
+        *_fields(arguments, torch.int32, "child_tn brick_tn request_tn stamp_t stamp_b"),
+        *_fields(arguments, torch.int32, "opaque_m frame_1"),
+    ]
     sizes = check_rays(where, rays) | check_channel(where, arguments, device)
-    words = "child_tn brick_tn request_tn stamp_t stamp_b opaque_m frame_1"
-    sizes = check.tensors(
-        where,
-        device,
-        (
-            *_tensors(arguments, "range_tn2c", arguments.bricks_bzyxc.dtype),
-            ("table_lm4", table, table_shape, table.dtype),
-            *_tensors(arguments, "domain_2", table.dtype),
-            *_tensors(arguments, words, torch.int32),
-        ),
-        sizes,
-    )
+    sizes = check.tensors(where, device, fields, sizes)
     if sizes["n"] < arguments.branching**3:
         wanted = f"{arguments.branching}^3 nodes a tile"
         raise ValueError(f"{where}: child_tn must hold {wanted}, got {sizes['n']}")
@@ -104,8 +83,8 @@ def check_trace(
         raise ValueError(f"{where}: table_lm4 needs at least 1 length and 2 rows, got {got}")
     check.whole(where, "root", arguments.root, low=0, high=sizes["t"] * sizes["n"] - 1)
     check.whole(where, "component", arguments.component, low=0, high=sizes["c"] - 1)
-    for name in ("stop_alpha", "depth_alpha"):
-        check.number(where, name, getattr(arguments, name), low=0, high=1)
+    check.number(where, "stop_alpha", arguments.stop_alpha, low=0, high=1)
+    check.number(where, "depth_alpha", arguments.depth_alpha, low=0, high=1)
     return sizes
 
 
@@ -117,12 +96,12 @@ def check_shade(
     parameter_54: Tensor,
     own: bool,
 ) -> None:
-    """Raises ValueError unless all that a shader reads is right; `own`: it is a user's."""
+    """Checks all that a shader reads; `own`: it is a user's."""
     known = ("",) if own else SHADER_KINDS
     kind = known[check.whole(where, "shader", shading.shader, low=0, high=len(known) - 1)]
     sizes = check_trace(where, rays, arguments, "lmm4" if kind == "PreIntegrated" else "lm4")
-    table, device, shape = arguments.table_lm4, rays.origin_r3.device, "k" if own else "54"
-    parameters = ("parameter_54", parameter_54, shape, table.dtype)
+    device, shape = rays.origin_r3.device, "k" if own else "54"
+    parameters = ("parameter_54", parameter_54, shape, arguments.table_lm4.dtype)
     check.tensors(where, device, [parameters])
     others = 0
     for name, bricks, constants, width in (
@@ -144,10 +123,10 @@ def check_shade(
         )
     if kind == "Features" and not others:
         raise ValueError(f"{where}: features need other_bzyxc")
+    given = {"Features": others, "Projection": 1}.get(kind, 0)
     if own:
         check.whole(where, "features", shading.features, low=0)
     else:
-        given = {"Features": others, "Projection": 1}.get(kind, 0)
         check.whole(where, "features", shading.features, low=given, high=given)
     high = max(0, others - 1)
     check.whole(where, "other_component", shading.other_component, low=0, high=high)

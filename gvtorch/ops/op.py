@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable
-from typing import Annotated, Any, Literal, TypeVar, cast, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import torch
 from torch import Tensor
@@ -54,10 +54,9 @@ def op(also: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
 
     def made_of(twin: _Twin) -> _Twin:
         where, signature = twin.__name__, inspect.signature(twin)
+        names = [name for name in signature.parameters if name != "backend"]
         hints = get_type_hints(twin, include_extras=True).items()
-        marks = {
-            name: hint.__metadata__[0] for name, hint in hints if get_origin(hint) is Annotated
-        }
+        marks = {name: get_args(hint)[1] for name, hint in hints if get_origin(hint) is Annotated}
         ranges = {name: mark for name, mark in marks.items() if isinstance(mark, range)}
         tensors = [
             (name, check.shape_of(name) if "_" in name else "", dtype)
@@ -67,23 +66,24 @@ def op(also: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
         ]
 
         @functools.wraps(twin)
-        def run(*given: Any, **named: Any) -> Any:
-            bound = signature.bind(*given, **named)
-            bound.apply_defaults()
-            *arguments, backend = bound.arguments.values()
-            by_name, device = bound.arguments, arguments[0].device
-            fields = (
+        def run(*given: Any, backend: Backend = "auto", **named: Any) -> Any:
+            if named or len(given) != len(names):
+                bound = signature.bind(*given, **named)
+                bound.apply_defaults()
+                given = tuple(bound.arguments.values())[: len(names)]
+            by_name, device = dict(zip(names, given, strict=True)), given[0].device
+            fields = [
                 (name, by_name[name], shape or "abcd"[: by_name[name].dim()], dtype)
                 for name, shape, dtype in tensors
-            )
+            ]
             check.tensors(where, device, fields)
             for name, inside in ranges.items():
                 check.whole(where, name, by_name[name], low=inside[0], high=inside[-1])
             if also is not None:
                 also(**by_name)
             if choose_backend(backend, device) == "reference":
-                return twin(*arguments, backend="reference")
-            return getattr(torch.ops.gvtorch, where)(*arguments)
+                return twin(*given, backend="reference")
+            return getattr(torch.ops.gvtorch, where)(*given)
 
         return cast("_Twin", run)
 

@@ -1,8 +1,5 @@
 """Joins the compiled ops to torch: loads the libraries and gives each op its fake (shapes without
-data).
-
-The schema of an op stands once, in cpp_ext/csrc (arguments.h and the entry headers); fakes take
-what they need by the schema's names.
+data), which takes what it needs by the names of the op's schema in cpp_ext/csrc.
 """
 
 from __future__ import annotations
@@ -18,18 +15,15 @@ from .. import cpp_ext
 
 
 def available() -> dict[str, str]:
-    """Returns, for `reference`, `cpp` and `cuda`, an empty text or the reason why it can't be
-    used."""
+    """Returns for each of reference, cpp, cuda an empty text, or why it can't be used."""
     return {"reference": "", **_reasons}
 
 
 def _names(op: Any) -> tuple[str, ...]:
-    """The names of an op's arguments, as its schema has them."""
     return tuple(argument.name for argument in op.default._schema.arguments)
 
 
 def _register_fake(op: Any, fake: Callable[..., Any]) -> None:
-    """Gives an op its fake, which is called with all arguments by name."""
     names = _names(op)
 
     def by_name(*given: Any, **named: Any) -> Any:
@@ -130,19 +124,16 @@ FAKES: dict[str, Callable[..., Any]] = {
     "composite_backward": _composite_backward,
     "compact_requests": _compact_requests,
     "lru_partition": _lru_partition,
-    "unlink": _in_place,
-    "link": _in_place,
-    "link_bricks": _in_place,
-    "link_tiles": _in_place,
     "locate": _locate,
     "lacking": _lacking,
     "cut_bricks": _cut_bricks,
+    **dict.fromkeys(("unlink", "link", "link_bricks", "link_tiles"), _in_place),
 }
 
 
 @functools.cache
 def add_user_op(name: str) -> None:
-    """Gives the op of a user's shader, which is loaded, its fake; once."""
+    """Gives the op of a user's shader, which is loaded, its fake."""
     _register_fake(getattr(torch.ops.gvtorch_user, name), _shade_rays)
 
 

@@ -36,9 +36,8 @@ def trace_segments(
     Args:
         rays: The rays; no matter with which transmittance they begin.
         arguments: What they go through; of the table only its lengths of intervals matter.
-        state_r3: (r, 3) `Segments.state` of the part before; None: rays begin.
-        limit: A ray pauses behind the visit in which it has taken so many samples; 0: it goes to
-            its end.
+        state_r3: `Segments.state` of the part before; None: rays begin.
+        limit: A ray pauses behind the visit in which it has taken so many samples; 0: never.
         by_node: A region counts as one of one value only where one node answers: for shaders that
             read more than `component`.
         backend: auto, reference, cpp or cuda.
@@ -110,24 +109,20 @@ def sample_bricks(
     Raises:
         ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.
     """
-    where, device, listed = "sample_bricks", rays.origin_r3.device, segments[:6]
+    where, device = "sample_bricks", rays.origin_r3.device
     chosen = choose_backend(backend, device)
     if chosen != "reference":  # which also reads float64
         check_voxels(where, arguments)
     check_rays(where, rays)
     check_channel(where, arguments, device)
-    check_real(where, "distance", segments.distance, "(s, 3)")
-    words = zip(("s", "s2", "s2", "s3", "s3"), Segments._fields, listed, strict=False)
-    fields = (
-        *((name, tensor, shape, torch.int32) for shape, name, tensor in words),
-        ("distance", segments.distance, "s3", segments.distance.dtype),
-        ("segment", samples.segment, "k", torch.int32),
-        ("number", samples.number, "k", torch.int32),
-    )
-    check.tensors(where, device, fields)
+    check_real(where, "distance", segments.distance, "s3")
+    places = (*segments[:6], samples.segment, samples.number)
+    names = (*Segments._fields[:6], "segment", "number")
+    shapes = ("s", "s2", "s2", "s3", "s3", "s3", "k", "k")
+    dtypes = (*[torch.int32] * 5, segments.distance.dtype, torch.int32, torch.int32)
+    check.tensors(where, device, zip(names, places, shapes, dtypes, strict=True))
     if chosen == "reference":
         return reference.sample_bricks(rays, arguments, segments, samples)
-    places = (*listed, samples.segment, samples.number)
     return torch.ops.gvtorch.sample_bricks(*rays, *arguments.channel, *places)
 
 
@@ -159,12 +154,14 @@ def composite(
         ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.
     """
     where, device, real = "composite", alpha_k.device, alpha_k.dtype
-    check_real(where, "alpha_k", alpha_k, "(k,)")
+    check_real(where, "alpha_k", alpha_k, "k")
     rays = check.whole(where, "offset_r's length", offset_r.shape[0], low=1) - 1
     clear = alpha_k.new_ones(rays) if clear_r is None else clear_r
     fields = (
-        *(("alpha_k", alpha_k, "k", real), ("feature_kc", feature_kc, "kc", real)),
-        *(("offset_r", offset_r, "o", torch.int64), ("clear_r", clear, "r", real)),
+        ("alpha_k", alpha_k, "k", real),
+        ("feature_kc", feature_kc, "kc", real),
+        ("offset_r", offset_r, "o", torch.int64),
+        ("clear_r", clear, "r", real),
     )
     check.tensors(where, device, fields, {"r": rays, "o": rays + 1})
     stop_clear = 1 - check.number(where, "stop_alpha", stop_alpha, low=0, high=1, open_low=True)

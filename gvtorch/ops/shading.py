@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import inspect
 import math
-import re
 from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple, TypeVar
@@ -15,23 +14,22 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from .. import cpp_ext
-
 Number = float | Tensor
 Triple = Sequence[float] | Tensor
 
 
-def _declared_kinds() -> tuple[str, ...]:
-    """The kinds in the list `GV_SHADERS` of csrc/shaders/shaders.h."""
-    for header in sorted(cpp_ext.SOURCES.rglob("shaders.h")):
-        found = re.search(r"#define GV_SHADERS\(X\)((?:.*\\\n)*.*)", header.read_text("utf-8"))
-        if found is not None:
-            return tuple(re.findall(r"X\((\w+), \w+, \w+\)", found[1]))
-    raise RuntimeError(f"gvtorch: {cpp_ext.SOURCES} lists no shaders")
-
-
-#: The kinds of the fused shaders, in the order in which C++ numbers them.
-SHADER_KINDS = _declared_kinds()
+#: The kinds of the fused shaders, in the order of `GV_SHADERS` in csrc/shaders/shaders.h.
+SHADER_KINDS = (
+    "Lit",
+    "PreIntegrated",
+    "StoredColor",
+    "Isosurface",
+    "Projection",
+    "Features",
+    "ShadowedLit",
+    "ShadowedColor",
+    "GradientMagnitude",
+)
 
 
 def shader_number(kind: str) -> int:

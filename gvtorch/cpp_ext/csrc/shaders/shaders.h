@@ -474,7 +474,7 @@ struct GradientMagnitude : Plain<T> {
 };
 
 // The fused shaders: X(kind, struct, whether a cone goes from each sample to the light), in the order of their numbers.
-// ops/shading.py reads the kinds here.
+// SHADER_KINDS of ops/shading.py are the same.
 #define GV_SHADERS(X)                    \
   X(Lit, Lit, false)                     \
   X(PreIntegrated, PreIntegrated, false) \
