@@ -1,10 +1,9 @@
 """Node pool, brick pool, the tree over them, and the way of bricks to the device."""
 
-from .brick_pool import BrickPool
 from .brick_table import BrickTable, TableRows
 from .channel import Channel
 from .n3tree import N3Tree
-from .node_pool import NodePool
+from .pools import BrickPool, NodePool
 from .staging import Staging
 
 __all__ = [

@@ -16,14 +16,17 @@ Source: Crassin et al., "GigaVoxels", I3D 2009, section 3 (mip-mapped bricks); W
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
 from ..base.volume import DIRECTIONS
 
-Reduce = Callable[[np.ndarray], np.ndarray]
+Factors = Sequence[int]  # z y x
 
+_COMBINE = {"min": np.minimum, "max": np.maximum, "mean": np.add}
 _SLAB = 1 << 22  # voxels reduced at a time, so that intermediate arrays stay in a core's cache
 
 
@@ -45,19 +48,21 @@ def pool_mean(values: np.ndarray, factor: int | Sequence[int]) -> np.ndarray:
     Returns:
         (ceil(z / factor), ..., c) of the same dtype, rounded to nearest, ties to even.
     """
-    factors = _factors(factor)
-    voxels = int(np.prod(factors))
-    return _pool(values, factors, lambda part: _narrow(_sum(part, factors), voxels, values.dtype))
+
+    def reduce(part: np.ndarray, factors: Factors) -> np.ndarray:
+        return _narrow(_reduced(part, factors, np.add), math.prod(factors), values.dtype)
+
+    return _pool(values, factor, reduce)
 
 
 def pool_min(values: np.ndarray, factor: int | Sequence[int]) -> np.ndarray:
     """Returns the minimum of each block; arguments as for `pool_mean`."""
-    return _pool_extreme(values, factor, np.minimum)
+    return _pool(values, factor, partial(_reduced, combine=np.minimum))
 
 
 def pool_max(values: np.ndarray, factor: int | Sequence[int]) -> np.ndarray:
     """Returns the maximum of each block; arguments as for `pool_mean`."""
-    return _pool_extreme(values, factor, np.maximum)
+    return _pool(values, factor, partial(_reduced, combine=np.maximum))
 
 
 def pool_directional(
@@ -79,24 +84,23 @@ def pool_directional(
     Returns:
         (ceil(z / factor), ..., 24) of the same dtype.
     """
-    factors = _factors(factor)
 
-    def reduce(part: np.ndarray) -> np.ndarray:
+    def reduce(part: np.ndarray, factors: Factors) -> np.ndarray:
         seen = []
         for number in range(len(DIRECTIONS)):
             axis = 2 - number // 2
             rgba = part[..., 4 * number : 4 * number + 4].astype(np.float64)
             columns = list(range(factor))[:: 1 if number % 2 == 0 else -1]
             rgba = _of_length(rgba, sides_zyx[axis])
-            total = _every(rgba, axis, factor, columns[0])
+            total = _every(rgba, axis, columns[0], factor)
             for k in columns[1:]:
-                total = total + (1 - total[..., 3:]) * _every(rgba, axis, factor, k)
-            across = [1 if a == axis else factor for a in range(3)]
-            mean = _sum(total, _factors(across)) / factor**2
+                total = total + (1 - total[..., 3:]) * _every(rgba, axis, k, factor)
+            across = [1 if a == axis else f for a, f in enumerate(factors)]
+            mean = _reduced(total, across, np.add) / factor**2
             seen.append(_of_length(mean, 1 / (factor * sides_zyx[axis])))
         return np.concatenate(seen, -1)
 
-    return _pool(values, factors, reduce)
+    return _pool(values, factor, reduce)
 
 
 def _of_length(rgba: np.ndarray, lengths: float) -> np.ndarray:
@@ -121,9 +125,8 @@ def window(values: np.ndarray, how: str, *, size: int, step: int) -> np.ndarray:
         (gz, gy, gx, c), g = (n - size) // step + 1; of the same dtype for min and max, float32 for
         mean.
     """
-    counts = [(n - size) // step + 1 for n in values.shape[:3]]
     for axis in range(3):
-        values = _window_axis(values, axis, how, counts[axis], size, step)
+        values = _along(values, axis, _COMBINE[how], size, step)
     return (values / size**3).astype(np.float32) if how == "mean" else values
 
 
@@ -152,39 +155,38 @@ def by_node(values: np.ndarray, how: str, brick_size: int, border: int) -> np.nd
         count = -(-values.shape[axis] // brick_size)
         extra = count * brick_size - values.shape[axis]
         values = extend(values, axis, border, extra + border)
-        values = _window_axis(values, axis, how, count, size, brick_size)
+        values = _along(values, axis, _COMBINE[how], size, brick_size)
     return (values / size**3 if how == "mean" else values).astype(np.float32)
 
 
-def _window_axis(
-    values: np.ndarray, axis: int, how: str, count: int, size: int, step: int
+def _along(
+    values: np.ndarray,
+    axis: int,
+    combine: np.ufunc,
+    size: int,
+    step: int,
+    wide: np.dtype | None = None,
 ) -> np.ndarray:
-    """Reduces `count` windows along one axis; "mean" gives sums, to be divided at the end."""
-
-    def offset(k: int) -> np.ndarray:
-        place = [slice(None)] * values.ndim
-        place[axis] = slice(k, k + step * (count - 1) + 1, step)
-        return values[tuple(place)]
-
-    if how == "mean":
-        total = offset(0).astype(_wide(values.dtype, size))
-        for k in range(1, size):
-            total += offset(k)
-        return total
-    combine = np.minimum if how == "min" else np.maximum
-    found = offset(0).copy()
+    """Reduces windows of `size` voxels, `step` apart, along one axis, in order; sums are of the
+    dtype `wide`, or one that holds them.
+    """
+    if combine is np.add and wide is None:
+        wide = _wide(values.dtype, size)
+    count = (values.shape[axis] - size) // step + 1
+    found = _every(values, axis, 0, step, count)
+    found = found.copy() if wide is None else found.astype(wide)
     for k in range(1, size):
-        combine(found, offset(k), out=found)
+        combine(found, _every(values, axis, k, step, count), out=found)
     return found
 
 
-def _factors(factor: int | Sequence[int]) -> tuple[int, int, int]:
-    z, y, x = (factor,) * 3 if isinstance(factor, int) else factor
-    return (int(z), int(y), int(x))
-
-
-def _pool(values: np.ndarray, factors: tuple[int, int, int], reduce: Reduce) -> np.ndarray:
+def _pool(
+    values: np.ndarray,
+    factor: int | Sequence[int],
+    reduce: Callable[[np.ndarray, Factors], np.ndarray],
+) -> np.ndarray:
     """Runs `reduce`, which takes whole blocks to one voxel each, over slabs of an array."""
+    factors = [factor] * 3 if isinstance(factor, int) else list(factor)
     shape = [-(-n // f) for n, f in zip(values.shape[:3], factors, strict=True)]
     out = np.empty((*shape, values.shape[3]), values.dtype)
     rows = max(1, _SLAB // max(1, int(np.prod(values.shape[1:])) * factors[0]))
@@ -192,39 +194,24 @@ def _pool(values: np.ndarray, factors: tuple[int, int, int], reduce: Reduce) -> 
         part = values[start * factors[0] : (start + rows) * factors[0]]
         for axis in range(3):
             part = extend(part, axis, 0, -part.shape[axis] % factors[axis])
-        out[start : start + rows] = reduce(part)
+        out[start : start + rows] = reduce(part, factors)
     return out
 
 
-def _pool_extreme(values: np.ndarray, factor: int | Sequence[int], combine: np.ufunc) -> np.ndarray:
-    factors = _factors(factor)
-
-    def reduce(part: np.ndarray) -> np.ndarray:
-        for axis, f in enumerate(factors):
-            found = _every(part, axis, f, 0)
-            for k in range(1, f):
-                found = combine(found, _every(part, axis, f, k))
-            part = found
-        return part
-
-    return _pool(values, factors, reduce)
+def _reduced(part: np.ndarray, factors: Factors, combine: np.ufunc) -> np.ndarray:
+    """Reduces whole blocks to one voxel each, axis after axis."""
+    wide = _wide(part.dtype, math.prod(factors)) if combine is np.add else None
+    for axis, factor in enumerate(factors):
+        part = _along(part, axis, combine, factor, factor, wide)
+    return part if wide is None else part.astype(wide, copy=False)
 
 
-def _sum(part: np.ndarray, factors: tuple[int, int, int]) -> np.ndarray:
-    """Adds up whole blocks, axis after axis, in a dtype that holds the sums."""
-    wide = _wide(part.dtype, int(np.prod(factors)))
-    for axis, f in enumerate(factors):
-        total = _every(part, axis, f, 0)
-        for k in range(1, f):
-            total = np.add(total, _every(part, axis, f, k), dtype=wide)
-        part = total
-    return part.astype(wide, copy=False)
-
-
-def _every(values: np.ndarray, axis: int, step: int, first: int) -> np.ndarray:
-    """Returns every `step`-th slice along an axis."""
-    place = [slice(None)] * axis + [slice(first, None, step)]
-    return values[tuple(place)]
+def _every(
+    values: np.ndarray, axis: int, first: int, step: int, count: int | None = None
+) -> np.ndarray:
+    """Returns every `step`-th slice along an axis, `count` of them."""
+    stop = None if count is None else first + step * (count - 1) + 1
+    return values[(slice(None),) * axis + (slice(first, stop, step),)]
 
 
 def _wide(dtype: np.dtype, terms: int) -> np.dtype:

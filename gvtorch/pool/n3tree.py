@@ -12,11 +12,9 @@ from ..base.constants import CONSTANT, TERMINAL
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume
 from ..ops import locate
-from .brick_pool import BrickPool
 from .channel import Channel, volumes_by_channel
-from .node_pool import NodePool
-from .pyramid import levels_by_depth, tree_depth
-from .tree_plan import TreePlan
+from .pools import BrickPool, NodePool
+from .pyramid import TreePlan, levels_by_depth, tree_depth
 
 
 class N3Tree:
@@ -52,18 +50,10 @@ class N3Tree:
         branching: int | None = None,
         value_range: Mapping[str, tuple[float, float]] | None = None,
     ) -> None:
-        """Makes a tree over two pools; it writes nothing into them.
+        """Makes a tree over two pools, which trees may share; it writes nothing into them.
 
-        Args:
-            nodes: Node pool, which trees may share.
-            bricks: Brick pool, shared likewise.
-            depth: Depth of the finest level.
-            extent: Voxels of the finest level along x, y, z.
-            spacing: World size of a finest voxel.
-            origin: World place of the centre of voxel 0.
-            root: Node index of the root.
-            branching: N, at most the node pool's; None takes that.
-            value_range: For each channel, its smallest and largest value.
+        `origin` is the world place of the centre of voxel 0; `branching` is at most the node
+        pool's, which None takes. The others are the attributes.
         """
         self.nodes, self.bricks = nodes, bricks
         self.branching = nodes.branching if branching is None else branching
@@ -143,7 +133,6 @@ class N3Tree:
         return node
 
     def __repr__(self) -> str:
-        """Shows extent, depth, pools and memory."""
         extent = "x".join(str(n) for n in self.extent)
         return (
             f"N3Tree({extent} (x, y, z), N={self.branching}, depth={self.depth}, "

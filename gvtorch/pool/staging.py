@@ -16,6 +16,7 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import nullcontext
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -35,17 +36,18 @@ class _NoEvent:
         return True
 
 
+@dataclass(eq=False)
 class _RingSpan:
     """Bytes `begin` to `end` of the ring, taken by one chunk. They are free again when the copy is
     done and the chunk was read, or its `Chunk` was dropped unread.
     """
 
-    def __init__(self, begin: int, end: int) -> None:
-        self.begin, self.end = begin, end
-        self.copied: Any = None  # events, None until they are recorded
-        self.read: Any = None
-        self.chunk: Callable[[], Chunk | None] | None = None  # weak, None until it is sent
-        self.source: Any = None  # keeps pinned memory alive while it is copied from
+    begin: int
+    end: int
+    copied: Any = None  # events, None until they are recorded
+    read: Any = None
+    chunk: Callable[[], Chunk | None] | None = None  # weak, None until it is sent
+    source: Any = None  # keeps pinned memory alive while it is copied from
 
     def free(self) -> bool:
         if self.chunk is None or (self.copied is not None and not self.copied.query()):
@@ -59,13 +61,11 @@ class Chunk:
     """
 
     def __init__(self, begin: int, end: int, data: Mapping[str, Tensor], span: _RingSpan) -> None:
-        """Holds bricks whose copy was started."""
         self.begin, self.end = begin, end
         self._data, self._span = data, span
         self._device = next(iter(data.values())).device
 
     def __enter__(self) -> Mapping[str, Tensor]:
-        """Makes the current stream wait for the copy."""
         if self._device.type == "cuda":
             torch.cuda.current_stream(self._device).wait_event(self._span.copied)
         return self._data
@@ -77,18 +77,13 @@ class Chunk:
         self._span.read = stream.record_event() if stream else _NoEvent()
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class Shipment:
-    """Bricks that were sent, and those that found no room.
+    """Bricks that were sent, and those that found no room."""
 
-    Attributes:
-        chunks: The bricks on their way.
-        sent: Number of bricks in them.
-        rest: The other bricks, still on the host.
-    """
-
-    def __init__(self, chunks: Sequence[Chunk], sent: int, rest: Voxels) -> None:
-        """Holds them."""
-        self.chunks, self.sent, self.rest = chunks, sent, rest
+    chunks: Sequence[Chunk]  # the bricks on their way
+    sent: int  # number of bricks in them
+    rest: Voxels  # the other bricks, still on the host
 
 
 class Staging:

@@ -1,0 +1,173 @@
+"""`NodePool` and `BrickPool`: slots for node tiles and bricks, as flat tensors, a row a slot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from ..base.constants import ABSENT
+from ..base.volume import movable
+from .channel import Channel, phrase
+
+
+class _Pool:
+    channels: dict[str, Channel]
+
+    @property
+    def fields(self) -> dict[str, Tensor]:
+        """All tensors by name; those of a channel as `ranges.NAME`."""
+        found: dict[str, Tensor] = {}
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                found[name] = value
+            elif isinstance(value, dict) and name != "channels":
+                found |= {f"{name}.{channel}": tensor for channel, tensor in value.items()}
+        return found
+
+    @property
+    def capacity(self) -> int:
+        """Number of slots."""
+        return len(next(iter(self.fields.values())))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all fields."""
+        return sum(field.nbytes for field in self.fields.values())
+
+    def _shown(self, slots: str) -> str:
+        device = next(iter(self.fields.values())).device
+        return (
+            f"{type(self).__name__}({self.capacity} {slots}, "
+            f"{phrase(self.channels) or 'no channels'}, {self.nbytes / 1e6:.1f} MB on {device})"
+        )
+
+
+class NodePool(_Pool):
+    """Slots for `capacity` node tiles of n = branching ** 3 sibling nodes each.
+
+    Node index = tile * n + child, child = (z * branching + y) * branching + x. A fresh tile's nodes
+    have neither children nor brick. Trees of several N may share a pool, whose tiles are then as
+    wide as the widest: n = largest N ** 3.
+
+    Attributes:
+        branching: N of the widest tree.
+        channels: What each voxel holds, by name.
+        child_tn: (t, n) int32 tile of the node's children, or ABSENT (not loaded), TERMINAL (none).
+        brick_tn: (t, n) int32 slot of the node's brick, or ABSENT, EMPTY, CONSTANT.
+        request_tn: (t, n) int32 what rays have requested since the words were last cleared.
+        loc_t4: (t, 4) int32 x, y, z of the tile's parent node at its own depth, and the depth of
+            the tile's nodes; node x at that depth = loc x * N + child x.
+        parent_t: (t,) int32 index of the node whose children this tile holds, -1 for a root tile.
+        tree_t: (t,) int32 number of the tree that owns the tile.
+        stamp_t: (t,) int32 usage stamp: the last frame in which a ray passed through, or after
+            which the tile was written; -1 for never.
+        shared_t: (t,) bool, whether other nodes may point to the tile as well (aliases).
+        constants: For each channel (t, n, c): the value of CONSTANT nodes, the mean of EMPTY ones.
+        ranges: For each channel (t, n, 2, c): smallest and largest value in reach of the node's
+            brick, at all levels; all that the dtype can hold where it is not known.
+    """
+
+    def __init__(
+        self,
+        capacity: int,
+        channels: Mapping[str, Channel] | None = None,
+        *,
+        branching: int = 2,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """Allocates `capacity` >= 1 free tiles for trees of `branching` >= 2 at most.
+
+        Raises:
+            ValueError: A number is out of its range, or nodes could not be counted in int32.
+        """
+        check.whole("NodePool", "capacity", capacity, low=1)
+        check.whole("NodePool", "branching", branching, low=2, high=16)
+        n = branching**3
+        if capacity * n >= 2**31:
+            raise ValueError(
+                f"NodePool: {capacity} tiles of {n} nodes are more than int32 can name"
+            )
+        self.branching, self.channels = branching, dict(channels or {})
+
+        def words(value: int, *shape: int) -> Tensor:
+            return torch.full((capacity, *shape), value, dtype=torch.int32, device=device)
+
+        self.child_tn, self.brick_tn = words(ABSENT, n), words(ABSENT, n)
+        self.request_tn, self.loc_t4 = words(0, n), words(0, 4)
+        self.parent_t, self.tree_t, self.stamp_t = words(-1), words(0), words(-1)
+        self.shared_t = torch.zeros((capacity,), dtype=torch.bool, device=device)
+        self.constants: dict[str, Tensor] = {}
+        self.ranges: dict[str, Tensor] = {}
+        for name, channel in self.channels.items():
+            shape = (capacity, n, channel.width)
+            self.constants[name] = torch.zeros(shape, dtype=channel.dtype, device=device)
+            limits = torch.tensor(channel.limits, dtype=torch.float64).to(channel.dtype)
+            ends = movable(limits.to(device))[:, None].expand(capacity, n, 2, channel.width)
+            self.ranges[name] = ends.contiguous().view(channel.dtype)
+
+    @property
+    def nodes_per_tile(self) -> int:
+        """n = N ** 3."""
+        return self.child_tn.shape[1]
+
+    def __repr__(self) -> str:
+        return self._shown(f"tiles of {self.nodes_per_tile} nodes")
+
+
+class BrickPool(_Pool):
+    """Slots for `capacity` bricks of brick_size ** 3 voxels, with `border` voxels around each, in
+    any number of named, typed channels.
+
+    Attributes:
+        brick_size: Voxels along a side of a brick, without the border.
+        border: Voxels around a brick, copied from its neighbours.
+        channels: What each voxel holds, by name.
+        bricks: For each channel (b, z, y, x, c) voxels, sides of brick_size + 2 * border.
+        stamp_b: (b,) int32 usage stamp: the last frame in which a ray sampled the brick, or after
+            which it was written; -1 for never.
+        born_b: (b,) int32 first frame that could draw the brick, 0 if it was there from the start.
+        owner_b: (b,) int32 index of the node that the brick was made for, -1 for a free slot.
+        shared_b: (b,) bool, whether other nodes may point to the brick as well (aliases).
+    """
+
+    def __init__(
+        self,
+        capacity: int,
+        channels: Mapping[str, Channel],
+        *,
+        brick_size: int = 8,
+        border: int = 1,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """Allocates `capacity` free slots, 0 or more.
+
+        `brick_size` is at least 2, `border` 0 to 16; from 1 on, trilinear samples meet without a
+        seam.
+
+        Raises:
+            ValueError: A number is out of its range, or there is no channel.
+        """
+        check.whole("BrickPool", "capacity", capacity, low=0, high=2**31 - 1)
+        check.whole("BrickPool", "brick_size", brick_size, low=2, high=256)
+        check.whole("BrickPool", "border", border, low=0, high=16)
+        if not channels:
+            raise ValueError("BrickPool: channels must name at least one channel")
+        self.brick_size, self.border = brick_size, border
+        self.channels = dict(channels)
+        side = brick_size + 2 * border
+        self.bricks = {
+            name: torch.zeros((capacity, side, side, side, c.width), dtype=c.dtype, device=device)
+            for name, c in channels.items()
+        }
+
+        def words(value: int) -> Tensor:
+            return torch.full((capacity,), value, dtype=torch.int32, device=device)
+
+        self.stamp_b, self.born_b, self.owner_b = words(-1), words(0), words(-1)
+        self.shared_b = torch.zeros((capacity,), dtype=torch.bool, device=device)
+
+    def __repr__(self) -> str:
+        return self._shown(f"bricks of {self.brick_size}^3+{self.border}")
