@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import Literal, Unpack, get_args
+from typing import Any, Literal, Unpack, get_args
 
 import torch
 from torch import Tensor
@@ -157,12 +157,11 @@ class _Counter(Tracer):
         self.component = self.arguments.component
         self.module = TransferModule(shader, min(tree.spacing)).to(tree.device)
         self.fill_b = torch.full_like(tree.bricks.born_b, -1, dtype=torch.float32)
-        self._nodes: Tensor | None = None
+        self._nodes: Any = 0
 
-    def take_nodes(self) -> Tensor:
+    def take_nodes(self) -> Any:
         """Returns (r,) int32 nodes that rays visited since the last call."""
-        assert self._nodes is not None
-        nodes, self._nodes = self._nodes, None
+        nodes, self._nodes = self._nodes, 0
         return nodes
 
     def __call__(self, rays: Rays) -> Hits:
@@ -170,7 +169,7 @@ class _Counter(Tracer):
         alpha: of 1, the node's depth, whether it has a brick, the brick's age and its fill.
         """
         sums, hits, nodes = march(self, rays, self.shade, 5, limit=1, by_node=False)
-        self._nodes = nodes if self._nodes is None else self._nodes + nodes
+        self._nodes = self._nodes + nodes
         return replace(hits, features=sums)
 
     def shade(self, batch: Batch) -> tuple[Tensor, Tensor]:

@@ -7,8 +7,7 @@ behind is sampled or requested. Where it is translucent, a second trace goes on 
 from __future__ import annotations
 
 import copy
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -113,8 +112,11 @@ class Layer:
 
     def pixels(self, device: torch.device) -> LayerPixels:
         """Returns all pixels on a device, row by row through the batch."""
-        alpha = None if self.alpha is None else _flat(self.alpha, device)
-        return LayerPixels(_flat(self.color, device), self.distance(device), alpha)
+        distance, opaque = self.distance(device), self.alpha is None
+        shown = distance < torch.inf
+        alpha = shown if self.alpha is None else torch.where(shown, _flat(self.alpha, device), 0)
+        color = torch.where(shown, _flat(self.color, device), 0)
+        return LayerPixels(color, alpha, distance, opaque)
 
 
 def _flat(image: Tensor, device: torch.device) -> Tensor:
@@ -125,55 +127,44 @@ def _flat(image: Tensor, device: torch.device) -> Tensor:
 
 @dataclass(frozen=True)
 class LayerPixels:
-    """Pixels of a layer, on the device of their rays."""
+    """Pixels of a layer, on the device of their rays; 0 where nothing is shown."""
 
     color: Tensor  # (r, 3)
+    alpha: Tensor  # (r, 1)
     distance: Tensor  # (r, 1), +inf where nothing is shown
-    alpha: Tensor | None  # (r, 1)
+    opaque: bool  # no alpha was given
 
     def __getitem__(self, which: slice | Tensor) -> LayerPixels:
         """Some of the pixels."""
-        alpha = None if self.alpha is None else self.alpha[which]
-        return LayerPixels(self.color[which], self.distance[which], alpha)
+        columns = (column[which] for column in (self.color, self.alpha, self.distance))
+        return LayerPixels(*columns, self.opaque)
 
     def trace(self, trace_rays: Trace, rays: Rays, stop_alpha: float) -> Hits:
-        """Traces the rays of these pixels and composites voxels and layer.
-
-        Args:
-            trace_rays: Traces world rays through voxels.
-            rays: One for each pixel.
-            stop_alpha: A ray that has this alpha behind the layer does not go on.
-
-        Returns:
-            Color and alpha of both. Depth, normal and features are those of the voxels alone, the
-            normal by the light that the voxels in front of the layer and behind it take.
+        """Traces the rays of these pixels and composites voxels and layer. Depth, normal and
+        features are those of the voxels alone, the normal by the light that the voxels in front of
+        the layer and behind it take. A ray with `stop_alpha` behind the layer does not go on.
         """
         near, far = rays.range.split(1, dim=1)
         stop = self.distance.to(rays.range.dtype)
         first = torch.cat((near, torch.maximum(near, torch.minimum(far, stop))), 1)
-        front = trace_rays(dataclasses.replace(rays, range=first))
-        mixed = over(front, self._hits(front))
-        if self.alpha is None:
+        front = trace_rays(replace(rays, range=first))
+        layer = Hits(
+            color=self.color.to(front.color),
+            alpha=self.alpha.to(front.alpha),
+            depth=torch.full_like(front.depth, torch.inf),
+            samples=torch.zeros_like(front.samples),
+            missed=torch.zeros_like(front.missed),
+        )
+        mixed = over(front, layer)
+        if self.opaque:
             return mixed
         onward = (stop < torch.inf) & (mixed.alpha < stop_alpha)
         start = torch.where(onward, torch.maximum(near, stop), near)
         end = torch.where(onward, torch.maximum(start, far), start)
-        back = trace_rays(dataclasses.replace(rays, range=torch.cat((start, end), 1)))
+        back = trace_rays(replace(rays, range=torch.cat((start, end), 1)))
         total = over(mixed, back)
         if front.normal is None or back.normal is None:
             return total
         taken = (1 - mixed.alpha) * back.alpha  # of the light; the layer has no part in the normal
         normal = normalize(front.normal * front.alpha + back.normal * taken, dim=1)
-        return dataclasses.replace(total, normal=torch.where(taken > 0, normal, front.normal))
-
-    def _hits(self, like: Hits) -> Hits:
-        """The layer as hits in the dtype of others, without a depth of its own."""
-        shown = self.distance < torch.inf
-        alpha = shown if self.alpha is None else torch.where(shown, self.alpha, 0)
-        return Hits(
-            color=torch.where(shown, self.color, 0).to(like.color),
-            alpha=alpha.to(like.alpha),
-            depth=torch.full_like(like.depth, torch.inf),
-            samples=torch.zeros_like(like.samples),
-            missed=torch.zeros_like(like.missed),
-        )
+        return replace(total, normal=torch.where(taken > 0, normal, front.normal))

@@ -12,10 +12,9 @@ cone tracing", Computer Graphics Forum 2011; Crassin, PhD thesis 2011, on voxel 
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -100,7 +99,7 @@ class Lighting:
             return self
         side = float((box[1] - box[0]).max())
         reach = side * (0.25 if self.reach is None else self.reach)
-        return dataclasses.replace(self, reach=reach, frame=Frame.WORLD)
+        return replace(self, reach=reach, frame=Frame.WORLD)
 
 
 @dataclass(frozen=True)
@@ -115,6 +114,7 @@ class _Points:
     seen: Tensor  # (r,) bool, the ray met matter
     headlight: Tensor | None  # (r, 3) its position; None: where these rays came from
     row: int  # pixels of a row, see `Rays.width`
+    tally: _Tally  # of all rays of the pixels
 
 
 class _Tally:
@@ -149,41 +149,45 @@ class Lighted:
         color, m = hits.color, self.material
         look = (self.lighting.ambient, m.ambient, m.diffuse, m.specular)
         sky, (ambient, diffuse, specular) = pack(look, color.dtype, color.device).split(3)
-        tally, points = _Tally(hits), self._points(rays, hits, self.lens)
-        direct, highlight = self._direct(points, tally, self.lighting.shadow_cones)
-        unblocked, bounced = self._hemisphere(points, rays.origin.to(torch.float64), tally)
+        tally = _Tally(hits)
+        points = self._points(rays, hits, tally)
+        direct, highlight = self._direct(points, self.lighting.shadow_cones)
+        unblocked, bounced = self._hemisphere(points, rays.origin.to(torch.float64))
         light = ambient * sky * unblocked.to(color)
         light = light + diffuse * (direct + bounced).to(color)
         taken = hits.alpha - (1 - rays.light()).to(color)  # of the light, by these rays themselves
         color = color * light + taken * specular * highlight.to(color)
         color = torch.where(hits.alpha > 0, color, 0.0)  # a closed ray may have no direction
-        return dataclasses.replace(hits, color=color, samples=tally.samples, missed=tally.missed)
+        return replace(hits, color=color, samples=tally.samples, missed=tally.missed)
 
-    def _points(self, rays: Rays, hits: Hits, lens: ThinLens | None = None) -> _Points:
-        """The points that rays met; `lens` is the depth of field that they were traced with."""
-        depth = hits.depth[:, 0].to(torch.float64)
+    def _points(
+        self, rays: Rays, hits: Hits, tally: _Tally, headlight: Tensor | None = None
+    ) -> _Points:
+        """The points that the eye's rays met, or, if told where a `Headlight` stands, cones."""
+        rays, depth = rays.double(), hits.depth[:, 0].to(torch.float64)
         seen = depth < torch.inf
         t = torch.where(seen, depth, 0.0)
-        origin, direction, cone = (
-            column.to(torch.float64) for column in (rays.origin, rays.direction, rays.cone)
-        )
-        width = (cone[:, 0] + cone[:, 1] * t) * self.cone_scale
-        if lens is not None:
-            width = width + lens.cone(t)
-        normal = torch.zeros_like(direction) if hits.normal is None else hits.normal.to(direction)
+        width = (rays.cone[:, 0] + rays.cone[:, 1] * t) * self.cone_scale
+        if headlight is not None:
+            width = _FINER * width
+        elif self.lens is not None:
+            width = width + self.lens.cone(t)
+        eye = -rays.direction
+        normal = torch.zeros_like(eye) if hits.normal is None else hits.normal.to(eye)
         has_normal = (normal != 0).any(1)
         return _Points(
-            position=origin + t[:, None] * direction,
-            normal=torch.where(has_normal[:, None], normalize(normal, dim=1), -direction),
+            position=rays.origin + t[:, None] * rays.direction,
+            normal=torch.where(has_normal[:, None], normalize(normal, dim=1), eye),
             has_normal=has_normal & seen,
-            eye=-direction,
+            eye=eye,
             width=width,
             seen=seen,
-            headlight=None,
+            headlight=headlight,
             row=rays.width,
+            tally=tally,
         )
 
-    def _direct(self, points: _Points, tally: _Tally, cones: int) -> tuple[Tensor, Tensor]:
+    def _direct(self, points: _Points, cones: int) -> tuple[Tensor, Tensor]:
         """(r, 3) diffuse light and (r, 3) highlight of all lights, with their shadows. A point
         without a normal faces every light and has no highlight.
         """
@@ -198,18 +202,12 @@ class Lighted:
             highlight = (points.normal * half).sum(1).clamp(0, 1) ** shininess
             highlight = torch.where(points.has_normal & (facing > 0), highlight, 0.0)
             count = 1 if _is_small(light) else cones
-            lit = self._visible(light, count, points, beam, facing > 0, tally)[:, None] * color
+            lit = self._visible(light, count, points, beam, facing > 0)[:, None] * color
             diffuse, shine = diffuse + facing[:, None] * lit, shine + highlight[:, None] * lit
         return diffuse, shine
 
     def _visible(
-        self,
-        light: Light,
-        cones: int,
-        points: _Points,
-        beam: Tensor,
-        facing: Tensor,
-        tally: _Tally,
+        self, light: Light, cones: int, points: _Points, beam: Tensor, facing: Tensor
     ) -> Tensor:
         """(r,) share of a light that reaches points; a `Headlight` reaches all the eye sees."""
         at_eye = isinstance(light, Headlight) and points.headlight is None
@@ -224,11 +222,11 @@ class Lighted:
         blocked = torch.zeros_like(distance)
         for x, y in _disc(cones):
             aim = normalize(beam + size[:, None] * (x * right + y * up), dim=1)
-            hits = tally(self.blocker(self._cone(points, aim, growth, start, end)))
+            hits = points.tally(self.blocker(self._cone(points, aim, growth, start, end)))
             blocked = blocked + hits.alpha[:, 0] / cones
         return 1 - self.lighting.shadows * blocked
 
-    def _hemisphere(self, points: _Points, eye: Tensor, tally: _Tally) -> tuple[Tensor, Tensor]:
+    def _hemisphere(self, points: _Points, eye: Tensor) -> tuple[Tensor, Tensor]:
         """(r, 1) share of the ambient light that is not occluded, and (r, 3) light that matter
         around the points reflects; `eye` (r, 3) is where a `Headlight` stands. Matter farther away
         than half of the reach blocks half as much.
@@ -252,11 +250,13 @@ class Lighted:
                 for span in ((start, middle), (middle, end))
             )
             front = trace(first)
-            hits = tally(over(front, trace(behind(second, front)), dimmed=True))
+            hits = points.tally(over(front, trace(behind(second, front)), dimmed=True))
             taken = (front.alpha + hits.alpha).to(unblocked) / 2
             unblocked = unblocked - lighting.occlusion * weight * taken
             if self.matter is not None:
-                bounced = bounced + weight * self._reflected(first, hits, eye, tally)
+                bounced = bounced + weight * self._reflected(
+                    self._points(first, hits, points.tally, eye), hits
+                )
         return unblocked, lighting.indirect * bounced
 
     def _lifted(self, points: _Points, off: float, beam: Tensor | None = None) -> _Points:
@@ -269,7 +269,7 @@ class Lighted:
             rise = (way * beam).sum(1, keepdim=True)
             way = way + (beam - rise * way) / rise.clamp(min=_GRAZING)
         height = off * points.width.clamp(min=self.voxel)[:, None]
-        return dataclasses.replace(points, position=points.position + height * way)
+        return replace(points, position=points.position + height * way)
 
     def _cone(
         self, points: _Points, direction: Tensor, growth: Tensor, start: Tensor, end: Tensor
@@ -285,11 +285,9 @@ class Lighted:
             width=points.row,
         )
 
-    def _reflected(self, rays: Rays, hits: Hits, eye: Tensor, tally: _Tally) -> Tensor:
-        """(r, 3) light that the matter met by cones reflects; a `Headlight` stays at the eye."""
-        points = self._points(rays, hits)
-        points = dataclasses.replace(points, width=_FINER * points.width, headlight=eye)
-        direct, _ = self._direct(points, tally, 1)
+    def _reflected(self, points: _Points, hits: Hits) -> Tensor:
+        """(r, 3) light that the matter met by cones reflects."""
+        direct, _ = self._direct(points, 1)
         (diffuse,) = pack((self.material.diffuse,), torch.float64, direct.device)
         return torch.where(points.seen[:, None], diffuse * direct * hits.color, 0.0)
 
