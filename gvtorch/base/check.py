@@ -284,16 +284,18 @@ def triple(where: str, name: str, value: Any) -> tuple[float, float, float]:
     return (x, y, z)
 
 
-def reals(where: str, name: str, value: Any) -> Tensor:
-    """Returns finite numbers, of any shape, as a float64 tensor on the CPU.
+def reals(where: str, name: str, value: Any, shape: tuple[int, ...] | None = None) -> Tensor:
+    """Returns finite numbers, of any shape if none is given, as a float64 tensor on the CPU.
 
     Raises:
-        ValueError: They are no numbers, or one is not finite.
+        ValueError: They are no numbers, of another shape, or one is not finite.
     """
     try:
         numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
     except (TypeError, ValueError, RuntimeError):
         raise ValueError(f"{where}: {name} must be numbers, got {value!r}") from None
+    if shape is not None and numbers.shape != shape:
+        raise ValueError(f"{where}: {name} must be {shape} numbers, got {tuple(numbers.shape)}")
     if not bool(torch.isfinite(numbers).all()):
         got = "NaN or infinity" if isinstance(value, Tensor) else repr(value)
         raise ValueError(f"{where}: {name} must be finite, got {got}")

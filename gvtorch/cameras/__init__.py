@@ -1,7 +1,5 @@
 """Cameras: from pixels to rays."""
 
-from .camera import Camera
-from .custom import CustomCamera
-from .path import CameraPath
-
-__all__ = ["Camera", "CameraPath", "CustomCamera"]
+from .camera import Camera as Camera
+from .custom import CustomCamera as CustomCamera
+from .path import CameraPath as CameraPath

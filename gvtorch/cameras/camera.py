@@ -48,14 +48,10 @@ class Camera:
         viewmats: (n, 4, 4) float64, world (or box) to camera.
         Ks: (n, 3, 3) float64 intrinsics in pixels; focal lengths are pixels a unit of slope
             (pinhole), a radian (fisheye, panorama), or a world unit or side of the box (ortho).
-        width: Pixels.
-        height: Pixels.
-        model: Name of the camera model.
         radial_coeffs: (n, 4) float64 distortion of a fisheye.
         max_angle: (n,) float64 radians; a fisheye's rays farther from the axis are closed.
         window: First row of this camera, which may take a strip only, and number of rows of the
             whole picture.
-        frame: Whether positions are in the world or relative to the box of what is rendered.
         batched: False for one camera whose pictures have no batch dimension.
     """
 
@@ -71,7 +67,7 @@ class Camera:
         max_angle: float = 180.0,
         frame: Frame = Frame.WORLD,
     ) -> None:
-        """Takes matrices (4, 4) and (3, 3), or batches (n, 4, 4) and (n, 3, 3).
+        """Takes matrices (4, 4) and (3, 3), or batches (n, 4, 4) and (n, 3, 3); see the class.
 
         Args:
             viewmats: World to camera.
@@ -133,10 +129,7 @@ class Camera:
             azimuth: Degrees; a number, or (n,) for a batch.
             elevation: Degrees, likewise.
             distance: In largest sides of the box, likewise, > 0.
-            fov: See `look_at`, as for the rest.
-            width: Pixels.
-            height: Pixels.
-            model: Name of the camera model.
+            fov, width, height, model: See `look_at`.
 
         Raises:
             ValueError: A number is not finite or out of its range.
@@ -248,7 +241,6 @@ class Camera:
 
         if self.model != "pinhole":
             raise ValueError(f"Camera.to_kornia: the camera must be a pinhole, is {self.model!r}")
-
         intrinsics = torch.eye(4, dtype=torch.float64).repeat(len(self), 1, 1)
         intrinsics[:, :3, :3] = self.Ks
         intrinsics[:, :2, 2] -= 0.5
@@ -363,11 +355,8 @@ class Camera:
         return image if self.batched else image[0]
 
     def rays(self, device: torch.device | str = "cpu", rows: tuple[int, int] | None = None) -> Rays:
-        """Returns the rays through pixel centres, camera by camera, row by row, in float64.
-
-        Args:
-            device: Where they are made.
-            rows: First row and the row after the last, counted through the batch; all if left out.
+        """Returns the rays through pixel centres, camera by camera, row by row, in float64; of all
+        rows if left out, else as `pixel_rays`.
 
         Raises:
             ValueError: The camera is relative to a box: call `placed(box)` first.
@@ -406,7 +395,9 @@ def _batch(where: str, **values: tuple[Any, tuple[int, ...]]) -> list[Tensor]:
     try:
         size = torch.broadcast_shapes(*sizes)
     except RuntimeError:
-        raise ValueError(f"{where}: {', '.join(values)} have different lengths") from None
+        raise ValueError(
+            f"{where}: {', '.join(values)} do not match, they have different lengths"
+        ) from None
     return [numbers.expand((*size, *shape)).contiguous() for numbers, shape in found]
 
 

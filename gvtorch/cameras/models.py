@@ -92,9 +92,7 @@ class Model(ABC):
     bends = False
 
     def focal(self, fov: float, width: int, height: int) -> tuple[float, float]:
-        """Returns fx and fy for a vertical field of view in radians; of a parallel model for a
-        target at distance 1.
-        """
+        """Returns fx and fy for a vertical field of view, radians; if parallel, at distance 1."""
         length = 0.5 * height / math.tan(0.5 * fov)
         return length, length
 

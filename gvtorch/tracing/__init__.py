@@ -1,24 +1,13 @@
 """Tracing: from rays to hits, and from a camera to a picture of a resident tree."""
 
-from .clip import Clip
-from .costs import Cost, cost
-from .layer import Layer
-from .lighting import Lighting
-from .options import RenderOptions, RenderSettings
-from .pixels import render, trace
-from .thin_lens import ThinLens
-from .tree_tracer import TreeTracer
-
-__all__ = [
-    "Clip",
-    "Cost",
-    "Layer",
-    "Lighting",
-    "RenderOptions",
-    "RenderSettings",
-    "ThinLens",
-    "TreeTracer",
-    "cost",
-    "render",
-    "trace",
-]
+from .clip import Clip as Clip
+from .costs import Cost as Cost
+from .costs import cost as cost
+from .layer import Layer as Layer
+from .lighting import Lighting as Lighting
+from .options import RenderOptions as RenderOptions
+from .options import RenderSettings as RenderSettings
+from .pixels import render as render
+from .pixels import trace as trace
+from .thin_lens import ThinLens as ThinLens
+from .tree_tracer import TreeTracer as TreeTracer

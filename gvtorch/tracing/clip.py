@@ -1,8 +1,5 @@
-"""`Clip`: the region of interest, from planes and boxes.
-
-It cuts rays, so it works with every shader, and clipped space is neither sampled nor requested. A
-ray is cut in float64 into the pieces that are kept, which are traced one after the other. All rays
-have as many pieces as the number of boxes allows for; those that a ray does not need are empty.
+"""`Clip`: the region of interest, from planes and boxes. Rays are cut in float64 into pieces that
+are kept, so it works with every shader, and clipped space is neither sampled nor requested.
 """
 
 from __future__ import annotations
@@ -212,7 +209,7 @@ class Clipped:
 
 
 def _face(name: str, numbers: Any) -> Face:
-    a, b, c, d = _matrix(name, [numbers], (1, 4))[0].tolist()
+    a, b, c, d = check.reals("Clip", name, [numbers], (1, 4))[0].tolist()
     length = math.hypot(a, b, c)
     if length == 0:
         raise ValueError(f"Clip: {name} has a normal of length 0: {numbers!r}")
@@ -224,7 +221,7 @@ def _box(name: str, numbers: Any) -> list[Face]:
     if not hasattr(numbers, "__len__"):
         raise ValueError(f"Clip: {name} must be two corners or a (4, 4) matrix, got {numbers!r}")
     if len(numbers) == 2:
-        low, high = _matrix(name, numbers, (2, 3))
+        low, high = check.reals("Clip", name, numbers, (2, 3))
         if not bool((low < high).all()):
             raise ValueError(
                 f"Clip: {name} must have its low corner below its high one on each axis, "
@@ -232,7 +229,7 @@ def _box(name: str, numbers: Any) -> list[Face]:
             )
         axes, start, end = torch.eye(3, dtype=torch.float64), low, high
     else:
-        matrix = _matrix(name, numbers, (4, 4))
+        matrix = check.reals("Clip", name, numbers, (4, 4))
         volume, sides = torch.linalg.det(matrix).abs(), matrix[:3, :3].norm(dim=0)
         if matrix[3].tolist() != [0, 0, 0, 1] or not bool(volume > 1e-12 * sides.prod()):
             raise ValueError(
@@ -246,14 +243,6 @@ def _box(name: str, numbers: Any) -> list[Face]:
     for axis, a, b in zip(axes, start.tolist(), end.tolist(), strict=True):
         faces += [(*axis.tolist(), -a), (*(-axis).tolist(), b)]
     return faces
-
-
-def _matrix(name: str, numbers: Any, shape: tuple[int, int]) -> Tensor:
-    """A float64 matrix of this shape, finite, on the CPU."""
-    matrix = check.reals("Clip", name, numbers)
-    if matrix.shape != shape:
-        raise ValueError(f"Clip: {name} must be {shape} numbers, got {tuple(matrix.shape)}")
-    return matrix
 
 
 def _convex_span(

@@ -6,8 +6,8 @@ Source: Porter, Duff, "Compositing digital images", 1984 (over, premultiplied).
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import reduce
 from typing import Any
 
@@ -23,12 +23,8 @@ Trace = Callable[[Rays], Hits]  # through one tree or several, with whatever the
 
 def over(front: Hits, back: Hits, *, dimmed: bool = False) -> Hits:
     """Composites hits of the same rays; a normal is the mean of both, by the light each part takes.
-
-    Args:
-        front: Nearer.
-        back: Farther: of rays `behind(rays, front)` if `dimmed`, else of rays of full light.
-        dimmed: Whether `back` already has only the light that `front` lets through; its alpha then
-            includes that of `front`.
+    If `dimmed`, `back` is of rays `behind(rays, front)`, and its alpha includes that of `front`;
+    else of rays of full light.
     """
     color, alpha, features = back.color, back.alpha, back.features
     taken = None if back.normal is None else back.normal * (alpha - front.alpha)
@@ -55,7 +51,7 @@ def over(front: Hits, back: Hits, *, dimmed: bool = False) -> Hits:
 
 def behind(rays: Rays, front: Hits) -> Rays:
     """The rays with the light that `front` lets through."""
-    return dataclasses.replace(rays, transmittance=1 - front.alpha[:, 0].to(torch.float64))
+    return replace(rays, transmittance=1 - front.alpha[:, 0].to(torch.float64))
 
 
 def trace_pieces(trace: Trace, pieces: Iterable[Rays], *, cap: Trace | None = None) -> Hits:
@@ -87,7 +83,7 @@ def trace_trees(trees: Sequence[tuple[Tensor, Trace]], rays: Rays) -> Hits:
     ranks = zip(*fields.values(), strict=True)  # the nearest tree's hits of each ray come first
     columns: list[Any] = [dict(zip(fields, rank, strict=True)) for rank in ranks]
     ranked = [Hits(**column) for column in columns]
-    return dataclasses.replace(reduce(over, ranked), normal=_mean_normal(ranked))
+    return replace(reduce(over, ranked), normal=_mean_normal(ranked))
 
 
 def _mean_normal(ranked: Sequence[Hits]) -> Tensor | None:
@@ -126,13 +122,8 @@ def _entry(box: Tensor, rays: Rays) -> Tensor:
 
 
 def box_span(low: Tensor, high: Tensor, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns (r,) first and last distance of lines inside a box; last < first where they pass by.
-
-    Args:
-        low: (3,) corner.
-        high: (3,) corner.
-        origin: (r, 3).
-        direction: (r, 3).
+    """Returns (r,) first and last distance of lines (r, 3) inside a box, given its corners (3,);
+    last < first where they pass by.
     """
     a, b = (low - origin) / direction, (high - origin) / direction
     # 0 / 0: the line lies in a face, and no other place on it lies farther out.

@@ -136,8 +136,8 @@ class LayerPixels:
 
     def __getitem__(self, which: slice | Tensor) -> LayerPixels:
         """Some of the pixels."""
-        columns = (column[which] for column in (self.color, self.alpha, self.distance))
-        return LayerPixels(*columns, self.opaque)
+        color, alpha, distance = self.color[which], self.alpha[which], self.distance[which]
+        return LayerPixels(color, alpha, distance, self.opaque)
 
     def trace(self, trace_rays: Trace, rays: Rays, stop_alpha: float) -> Hits:
         """Traces the rays of these pixels and composites voxels and layer. Depth, normal and
