@@ -252,7 +252,6 @@ class Camera:
         return self.viewmats.shape[0]
 
     def __repr__(self) -> str:
-        """Tells number, size and model."""
         count = f"{len(self)} x " if self.batched else ""
         return (
             f"{type(self).__name__}({count}{self.width}x{self.height}, {self.model}, "

@@ -112,7 +112,6 @@ class CameraPath:
             raise ValueError(f"{path}: {error}") from None
 
     def __repr__(self) -> str:
-        """Tells the number of keys."""
         return f"CameraPath({len(self._keys)} keys)"
 
     def camera(self, at: float, width: int, height: int, model: CameraModel = "pinhole") -> Camera:

@@ -41,19 +41,12 @@ class Clip:
     cap_light: float = 0.5  # share of its light that comes from the eye; without `Lighting` only
 
     def __post_init__(self) -> None:
-        """Checks all numbers.
-
-        Raises:
-            ValueError: A number is not finite, a normal is zero, a box has no volume, or a shape is
-                wrong.
-        """
         object.__setattr__(self, "frame", Frame.of("Clip", self.frame))
         check.number("Clip", "cap_opacity", self.cap_opacity, low=0, high=1, open_low=True)
         check.number("Clip", "cap_light", self.cap_light, low=0, high=1)
         _ = self._own
 
     def __repr__(self) -> str:
-        """Tells how many planes and boxes there are."""
         counts = [f"{name}={len(getattr(self, name))}" for name in Faces._fields]
         frame = Frame(self.frame).value
         return f"Clip({', '.join(counts)}, caps={self.caps}, in {frame} units)"

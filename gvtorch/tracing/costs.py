@@ -50,7 +50,6 @@ class Cost:
     stats: RenderStats
 
     def __repr__(self) -> str:
-        """Tells the size."""
         *_, height, width, _ = self.samples.shape
         return f"Cost({width}x{height}, {self.stats.samples} samples)"
 

@@ -40,12 +40,6 @@ class Layer:
     alpha: Tensor | None = None
 
     def __post_init__(self) -> None:
-        """Checks shapes and values.
-
-        Raises:
-            ValueError: A wrong shape or dtype, a colour that is not finite, a depth that is NaN or
-                negative, an alpha out of its range.
-        """
         for name, part in vars(self).items():
             if part is None and name == "alpha":
                 continue
@@ -64,7 +58,6 @@ class Layer:
             raise ValueError("Layer: alpha must be finite and >= 0 and <= 1")
 
     def __repr__(self) -> str:
-        """Tells shape and device."""
         kind = "opaque" if self.alpha is None else "translucent"
         return f"Layer({kind}, color={check.describe(self.color)})"
 

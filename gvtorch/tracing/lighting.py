@@ -68,18 +68,12 @@ class Lighting:
     ambient: Triple = (1.0, 1.0, 1.0)  # light from all directions, linear RGB
 
     def __post_init__(self) -> None:
-        """Checks every number.
-
-        Raises:
-            ValueError: One is out of its range, or what should be a light is not.
-        """
         where = "Lighting"
-        if self.lights is not None:
-            if not isinstance(self.lights, Sequence):
-                kind = type(self.lights).__name__
-                raise ValueError(f"{where}: lights must be a sequence of lights, got {kind}")
-            for number, light in enumerate(self.lights):
-                check_light(f"{where}: lights[{number}]", light)
+        if not isinstance(self.lights, Sequence | None):
+            kind = type(self.lights).__name__
+            raise ValueError(f"{where}: lights must be a sequence of lights, got {kind}")
+        for number, light in enumerate(self.lights or ()):
+            check_light(f"{where}: lights[{number}]", light)
         check.number(where, "shadows", self.shadows, low=0, high=1)
         check.whole(where, "shadow_cones", self.shadow_cones, low=1, high=1024)
         check.number(where, "occlusion", self.occlusion, low=0, high=1)
@@ -90,7 +84,6 @@ class Lighting:
         check_triple(where, "ambient", self.ambient, low=0.0)
 
     def __repr__(self) -> str:
-        """Tells what differs from the defaults."""
         return check.brief(self)
 
     def placed(self, box: Tensor) -> Lighting:

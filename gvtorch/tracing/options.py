@@ -43,11 +43,6 @@ class RenderOptions:
     dtype: torch.dtype = torch.float32  # float64 for trees deeper than about 2^16 voxels
 
     def __post_init__(self) -> None:
-        """Checks every option.
-
-        Raises:
-            ValueError: One is of the wrong type or out of its range.
-        """
         where = "render"
         check.number(where, "step", self.step, low=0, open_low=True)
         if self.lod not in ("auto", "finest"):
@@ -71,7 +66,6 @@ class RenderOptions:
             raise ValueError(f"{where}: dtype must be float32 or float64, got {self.dtype}")
 
     def __repr__(self) -> str:
-        """Tells what differs from the defaults."""
         return check.brief(self)
 
 

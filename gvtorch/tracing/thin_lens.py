@@ -41,13 +41,11 @@ class ThinLens:
     frame: Frame | str = Frame.WORLD  # world units, or largest sides of the scene's box
 
     def __post_init__(self) -> None:
-        """Checks the numbers."""
         check.number("ThinLens", "aperture", self.aperture, low=0)
         check.number("ThinLens", "focus", self.focus, low=0, open_low=True)
         object.__setattr__(self, "frame", Frame.of("ThinLens", self.frame))
 
     def __repr__(self) -> str:
-        """Tells what differs from the defaults."""
         return check.brief(self)
 
     def placed(self, box: Tensor) -> ThinLens:

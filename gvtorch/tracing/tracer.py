@@ -24,7 +24,6 @@ from ..shaders.tables import Sampling, interval_levels
 from .composite import tree_span
 from .options import RenderOptions
 
-_FIELDS = ("color", "alpha", "depth", "samples", "missed", "normal", "features")
 _SAMPLES = {"cpu": 1 << 20, "cuda": 1 << 24}  # shaded at once
 
 
@@ -111,7 +110,7 @@ class Tracer:
             fields = ops.shade_rays(
                 given, self.arguments, *own, op=self.shader.op, backend=self.backend
             )
-        return Hits(**dict(zip(_FIELDS, fields, strict=False)))
+        return Hits(**dict(zip(Hits.__annotations__, fields, strict=False)))
 
     def _march_module(self, shader: ModuleShader, rays: Rays) -> Hits:
         """Traces rays with a module, a block at a time."""
@@ -147,9 +146,6 @@ class Batch:
         """(k, c) values of channels side by side; of the tracer's channel where none are named."""
         found, tree = [], self.tracer.tree
         for name in channels or (self.tracer.channel,):
-            if name not in tree.bricks.bricks:
-                known = ", ".join(tree.channel_names)
-                raise ValueError(f"ModuleShader: unknown channel {name!r}; the tree has {known}")
             arguments = self.tracer.arguments._replace(
                 bricks_bzyxc=tree.bricks.bricks[name], constant_tnc=tree.nodes.constants[name]
             )
