@@ -6,8 +6,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from ..base.check import describe, whole
+from ..base.check import describe, instance, whole
 from ..base.records import Rays
 from .camera import Camera, Frame, sent
 
@@ -94,23 +95,21 @@ class CustomCamera(Camera):
                 "CustomCamera: direction must be (h, w, 3) or (n, h, w, 3), "
                 f"got {describe(direction)}"
             )
-        direction = torch.nn.functional.normalize(direction.to(torch.float64), dim=-1, eps=1e-300)
+        direction = normalize(direction.to(torch.float64), dim=-1, eps=1e-300)
         if range is None:
             range = torch.stack((direction.new_zeros(()), direction.new_full((), torch.inf)))
-        parts = {"origin": (origin, 3), "cone": (cone, 2), "range": (range, 2)}
         shaped = {"direction": direction}
-        for name, (part, size) in parts.items():
+        for name, part, size in (("origin", origin, 3), ("cone", cone, 2), ("range", range, 2)):
+            shape = (*direction.shape[:-1], size)
             if part is None:
+                shaped[name] = _neighbour_cones(shaped["origin"], direction)
                 continue
             try:
-                shaped[name] = part.to(direction).expand(*direction.shape[:-1], size)
+                shaped[name] = part.to(direction).expand(shape)
             except RuntimeError:
                 raise ValueError(
-                    f"CustomCamera: {name} must broadcast to {(*direction.shape[:-1], size)}, "
-                    f"got {describe(part)}"
+                    f"CustomCamera: {name} must broadcast to {shape}, got {describe(part)}"
                 ) from None
-        if cone is None:
-            shaped["cone"] = _neighbour_cones(shaped["origin"], direction)
         flat: dict[str, Any] = {n: part.reshape(-1, part.shape[-1]) for n, part in shaped.items()}
         height, width = direction.shape[-3:-1]
         camera = cls(Rays(**flat), width, height)
@@ -163,33 +162,18 @@ class CustomCamera(Camera):
 
 
 def as_camera(where: str, camera: Camera | Rays) -> Camera:
-    """Returns a user's camera; rays become one.
-
-    Raises:
-        ValueError: It is neither.
-    """
+    """Returns a user's camera; rays become one. Raises ValueError if it is neither."""
     if isinstance(camera, Rays):
         return CustomCamera(camera)
-    if not isinstance(camera, Camera):
-        raise ValueError(f"{where}: camera must be a Camera, got {type(camera).__name__}")
-    return camera
+    return instance(where, "camera", camera, Camera)
 
 
 def _neighbour_cones(origin: Tensor, direction: Tensor) -> Tensor:
-    """Returns cones (..., h, w, 2) from the differences between neighbouring rays: width at the
-    origin and growth per unit distance, the larger of both axes of the picture.
-
-    Args:
-        origin: (..., h, w, 3).
-        direction: (..., h, w, 3), unit length.
-
-    Source: Igehy, "Tracing ray differentials", SIGGRAPH 1999.
+    """Cones (..., h, w, 2) from the differences between neighbouring rays, the larger of both axes
+    of the picture. Source: Igehy, "Tracing ray differentials", SIGGRAPH 1999.
     """
-    widths = []
-    for field in (origin, direction):
-        steps = [_ray_step(field, axis).norm(dim=-1) for axis in (-3, -2)]
-        widths.append(torch.maximum(*steps))
-    return torch.stack(widths, -1)
+    steps = [[_ray_step(f, axis).norm(dim=-1) for axis in (-3, -2)] for f in (origin, direction)]
+    return torch.stack([torch.maximum(*pair) for pair in steps], -1)
 
 
 def _ray_step(field: Tensor, axis: int) -> Tensor:

@@ -63,11 +63,12 @@ class Clip:
             if not isinstance(getattr(self, name), (Sequence, Tensor)):
                 kind = type(getattr(self, name)).__name__
                 raise ValueError(f"Clip: {name} must be a list, got {kind}")
-        return Faces(
-            [_face(f"planes[{i}]", plane) for i, plane in enumerate(self.planes)],
-            [_box(f"boxes[{i}]", box) for i, box in enumerate(self.boxes)],
-            [_box(f"without[{i}]", box) for i, box in enumerate(self.without)],
-        )
+        planes = [_face(f"planes[{i}]", plane) for i, plane in enumerate(self.planes)]
+        boxes = [_box(f"boxes[{i}]", box) for i, box in enumerate(self.boxes)]
+        without = [_box(f"without[{i}]", box) for i, box in enumerate(self.without)]
+        if len(boxes) == 1:  # then its faces act as planes
+            return Faces(planes + boxes[0], [], without)
+        return Faces(planes, boxes, without)
 
     def faces(self, box: Tensor) -> Faces:
         """Returns the faces in world units, given the (2, 3) box of the scene."""
@@ -106,10 +107,7 @@ class Clipped:
 
     @cached_property
     def _faces(self) -> Faces:
-        planes, boxes, without = self.clip.faces(self.box)
-        if len(boxes) == 1:  # then its faces act as planes
-            return Faces(planes + boxes[0], [], without)
-        return Faces(planes, boxes, without)
+        return self.clip.faces(self.box)
 
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays in world units."""

@@ -83,8 +83,7 @@ class Lighting:
         object.__setattr__(self, "frame", Frame.of(where, self.frame))
         check_triple(where, "ambient", self.ambient, low=0.0)
 
-    def __repr__(self) -> str:
-        return check.brief(self)
+    __repr__ = check.brief
 
     def placed(self, box: Tensor) -> Lighting:
         """Returns the lighting with its reach in world units, given the scene's (2, 3) box."""

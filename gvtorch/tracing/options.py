@@ -65,8 +65,7 @@ class RenderOptions:
         if self.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"{where}: dtype must be float32 or float64, got {self.dtype}")
 
-    def __repr__(self) -> str:
-        return check.brief(self)
+    __repr__ = check.brief
 
 
 _OBJECTS = {"clip": Clip, "layer": Layer, "lens": ThinLens, "lighting": Lighting}
