@@ -13,9 +13,9 @@ from helpers.pictures import GRAY, PARTS, VESSELS, assert_same_picture, camera
 from helpers.producers import Checked, Held, Late
 
 import gvtorch as gv
-import gvtorch.engine.view
 from gvtorch.engine.readback import Readback
 from gvtorch.ops import available
+from gvtorch.tracing.pixels import View
 
 
 @pytest.fixture
@@ -31,13 +31,13 @@ def cuda() -> str:
 def traced(monkeypatch):
     """Lists for each pass over a camera's rays whether it was one over scouts."""
     passes: list[bool] = []
-    trace = gvtorch.engine.view.trace_camera
+    trace = View.hits
 
-    def note(*args, again=None, **options):
+    def note(view, *progress, again=None):
         passes.append(again is not None)
-        return trace(*args, again=again, **options)
+        return trace(view, *progress, again=again)
 
-    monkeypatch.setattr(gvtorch.engine.view, "trace_camera", note)
+    monkeypatch.setattr(View, "hits", note)
     return passes
 
 

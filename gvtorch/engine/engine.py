@@ -29,7 +29,7 @@ from ..producers import Producer
 from ..shaders.shader import Shader
 from ..tracing import RenderOptions
 from ..tracing.options import RenderSettings, render_options
-from ..tracing.pixels import empty_hits
+from ..tracing.pixels import Again, View, empty_hits
 from .failures import Failure
 from .options import EngineOptions, EngineSettings
 from .production import Production
@@ -39,7 +39,7 @@ from .report import Report
 from .request_batch import ProducedTree
 from .setup import brick_bytes, make_pools, make_tree
 from .stats import FrameStats
-from .view import Again, Shaders, View, trace_scene
+from .view import Shaders, trace_scene
 
 Scene = Producer | Mapping[str, Producer]
 
@@ -240,7 +240,7 @@ class Engine:
     ) -> Hits:
         """Traces a picture's rays, all or some of them again, under a frame number of its own."""
         self.number_picture()
-        return view.hits(progress, again)
+        return view.hits(progress, again=again)
 
     def number_picture(self) -> None:
         """Gives the next picture its number: what rays stamp with it is in use."""

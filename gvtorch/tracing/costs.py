@@ -24,7 +24,7 @@ from ..shaders.shader import Shader
 from ..shaders.transfer_function import TransferFunction
 from .around import around
 from .options import RenderOptions, RenderSettings, render_options
-from .pixels import trace_blocks, tree_stats
+from .pixels import View, tree_stats
 from .tracer import Batch, Tracer, march
 
 Image = Literal["samples", "nodes", "lod", "age", "fill"]
@@ -123,10 +123,10 @@ def cost(
     start = time.perf_counter()
     placed = camera.placed(tree.box)
     counter = _Counter(tree, transfer, chosen)
-    given = placed, placed.numbers(tree.device), around(counter, chosen, tree.box), chosen, progress
+    view = View(placed, placed.numbers(tree.device), around(counter, chosen, tree.box), chosen)
     columns = [
         (hits.samples, counter.take_nodes(), *_means(hits))
-        for _, hits in trace_blocks(*given, pixels=_RAYS_A_BLOCK)
+        for _, hits in view.blocks(_RAYS_A_BLOCK, progress)
     ]
     joined = [torch.cat(parts) for parts in zip(*columns, strict=True)]
     stats = tree_stats(tree, chosen, joined[0])

@@ -23,6 +23,7 @@ from torch.nn.functional import normalize
 from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.camera import Frame
+from ..ops import RayArguments
 from ..ops.reference.exact import unit
 from ..ops.shading import ShadeParameters, Triple, pack
 from ..shaders.lights import (
@@ -129,7 +130,7 @@ class Lighted:
     blocker: Trace  # traces cones of which only alpha is used
     matter: Trace | None  # traces cones to what reflects light: unlit colours and normals; None: no
     lighting: Lighting  # in world units
-    lights: Sequence[Light]  # that shine on it
+    lights: Sequence[Light]  # in world units
     material: ShadeParameters  # how matter reflects light
     voxel: float  # world size of the finest voxel's largest side
     cone_scale: float  # factor by which the tracers widen cones
@@ -156,19 +157,20 @@ class Lighted:
         self, rays: Rays, hits: Hits, tally: _Tally, headlight: Tensor | None = None
     ) -> _Points:
         """The points that the eye's rays met, or, if told where a `Headlight` stands, cones."""
-        rays, depth = rays.double(), hits.depth[:, 0].to(torch.float64)
+        origin, direction, cone = RayArguments.of(rays)[:3]
+        depth = hits.depth[:, 0].to(torch.float64)
         seen = depth < torch.inf
         t = torch.where(seen, depth, 0.0)
-        width = (rays.cone[:, 0] + rays.cone[:, 1] * t) * self.cone_scale
+        width = (cone[:, 0] + cone[:, 1] * t) * self.cone_scale
         if headlight is not None:
             width = _FINER * width
         elif self.lens is not None:
             width = width + self.lens.cone(t)
-        eye = -rays.direction
+        eye = -direction
         normal = torch.zeros_like(eye) if hits.normal is None else hits.normal.to(eye)
         has_normal = (normal != 0).any(1)
         return _Points(
-            position=rays.origin + t[:, None] * rays.direction,
+            position=origin + t[:, None] * direction,
             normal=torch.where(has_normal[:, None], normalize(normal, dim=1), eye),
             has_normal=has_normal & seen,
             eye=eye,

@@ -1,11 +1,12 @@
-"""From a camera to the hits of all its pixels, and from these to a picture; `render` and `trace` do
-so for a resident tree.
+"""`View`: from a camera to the hits of all its pixels, and from these to a picture; `render` and
+`trace` do so for a resident tree.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, Unpack
 
 import torch
@@ -28,6 +29,8 @@ from .options import RenderOptions, RenderSettings, render_options
 from .tracer import Tracer
 
 Pixels = slice | Tensor  # some of the pixels of all pictures of a camera, row by row
+#: Hits of an earlier pass, which are overwritten, and which (r,) bool of their rays to trace again.
+Again = tuple[Hits, Tensor]
 _RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that progress shows
 
 
@@ -65,13 +68,13 @@ def render(
             tree.frame += 1
             traced = around(Tracer(tree, shader, chosen), chosen, tree.box)
         placed = camera.placed(tree.box)
-        numbers = placed.numbers(tree.device)
-        hits = trace_camera(placed, numbers, traced, chosen, progress)
+        view = View(placed, placed.numbers(tree.device), traced, chosen)
+        hits = view.hits(progress)
         with stage("picture"):
             stats = tree_stats(tree, chosen, hits.samples)
             stats.tiles_used = int((tree.nodes.stamp_t == tree.frame).sum())
             stats.bricks_used = int((tree.bricks.stamp_b == tree.frame).sum())
-            picture = develop(hits, placed, numbers, chosen, stats)
+            picture = view.picture(hits, stats)
     stats.stages = timings.as_dict()
     stats.milliseconds = 1e3 * (time.perf_counter() - start)
     return picture
@@ -113,79 +116,84 @@ def tree_stats(tree: N3Tree, options: RenderOptions, samples: Tensor) -> RenderS
     )
 
 
-def trace_camera(
-    camera: Camera,
-    numbers: Tensor,
-    trace: Trace,
-    options: RenderOptions,
-    progress: Progress,
-    *,
-    again: tuple[Hits, Tensor] | None = None,
-) -> Hits:
-    """Traces all rays of a camera, or of a batch; see `trace_blocks`. `again` has the hits of an
-    earlier pass, which are overwritten, and tells which (p,) bool of them are traced once more.
+@dataclass(frozen=True, eq=False, repr=False)
+class View:
+    """A camera in the world, what traces its rays, and how the picture is made."""
 
-    Raises:
-        ValueError: The picture is larger than the device's memory.
-    """
-    device, count = numbers.device, len(camera) * camera.height * camera.width
-    block = _RAYS_A_BLOCK[device.type]
-    size = count * (8 * options.dtype.itemsize + 5)  # the colour twice
-    check.memory("render", f"a picture of {count} pixels", size, device)
-    hits, where = again or (None, None)
-    if hits is None and len(list(camera.blocks(block))) > 1:
-        hits = empty_hits(device, options.dtype, count)  # too large: fails before the first ray
-    given = camera, numbers, trace, options, progress
-    for pixels, part in trace_blocks(*given, pixels=block, where=where):
-        if hits is None:
-            hits = part  # the only block
-        else:
-            _write(hits, pixels, part, count)
-    assert hits is not None
-    return hits
+    camera: Camera
+    numbers: Tensor  # of the camera, on the device that traces
+    trace_rays: Trace  # through all trees
+    options: RenderOptions
 
+    @property
+    def rays(self) -> int:
+        """Number of rays."""
+        return len(self.camera) * self.camera.height * self.camera.width
 
-def trace_blocks(
-    camera: Camera,
-    numbers: Tensor,
-    trace: Trace,
-    options: RenderOptions,
-    progress: Progress,
-    *,
-    pixels: int,
-    where: Tensor | None = None,
-) -> Iterator[tuple[Pixels, Hits]]:
-    """Traces a camera's rays block after block of whole rows, since rays take more memory than the
-    picture they make. Yields the pixels of a block that were traced, and their hits.
+    def hits(self, progress: Progress = no_progress, *, again: Again | None = None) -> Hits:
+        """Makes the camera's rays and traces them, all or some of them again; they mark what they
+        use and request what is missing. `progress` is told how many rows are done.
 
-    Args:
-        camera: Placed in the world.
-        numbers: What `camera.numbers` gave, on the device that traces.
-        trace: Traces world rays.
-        options: Of which the layer counts: voxels are composited with it.
-        progress: Told how many rows are done.
-        pixels: Of a block.
-        where: (p,) bool, which pixels are traced; all if left out.
-    """
-    rows, width = len(camera) * camera.height, camera.width
-    layer = None if options.layer is None else options.layer.pixels(numbers.device)
-    for first, end in camera.blocks(pixels):
-        some: Pixels = slice(first * width, end * width)
-        with stage("rays"):
-            if where is None:
-                rays = camera.pixel_rays(numbers, (first, end))
+        Raises:
+            ValueError: The picture is larger than the device's memory.
+        """
+        device = self.numbers.device
+        block = _RAYS_A_BLOCK[device.type]
+        size = self.rays * (8 * self.options.dtype.itemsize + 5)  # the colour twice
+        check.memory("render", f"a picture of {self.rays} pixels", size, device)
+        hits, where = again or (None, None)
+        if hits is None and len(list(self.camera.blocks(block))) > 1:  # fails before the first ray
+            hits = empty_hits(device, self.options.dtype, self.rays)
+        for pixels, part in self.blocks(block, progress, where):
+            if hits is None:
+                hits = part  # the only block
             else:
-                which = where[some].nonzero()[:, 0]
-                rays = _some_rays(numbers, camera, first, which)
-                some = which + first * width
-        if len(rays.origin):
-            with stage("trace"):
-                if layer is None:
-                    hits = trace(rays)
+                _write(hits, pixels, part, self.rays)
+        assert hits is not None
+        return hits
+
+    def blocks(
+        self, pixels: int, progress: Progress, where: Tensor | None = None
+    ) -> Iterator[tuple[Pixels, Hits]]:
+        """Traces block after block of whole rows, of about so many pixels, since rays take more
+        memory than the picture they make: all, or those `where` (p,) bool tells. Yields the pixels
+        of a block that were traced, and their hits, composited with the layer.
+        """
+        camera, numbers, layer = self.camera, self.numbers, self.options.layer
+        rows, width = len(camera) * camera.height, camera.width
+        drawn = None if layer is None else layer.pixels(numbers.device)
+        for first, end in camera.blocks(pixels):
+            some: Pixels = slice(first * width, end * width)
+            with stage("rays"):
+                if where is None:
+                    rays = camera.pixel_rays(numbers, (first, end))
                 else:
-                    hits = layer[some].trace(trace, rays, options.stop_alpha)
-            yield some, hits
-        progress("rays", end, rows)
+                    which = where[some].nonzero()[:, 0]
+                    rays = _some_rays(numbers, camera, first, which)
+                    some = which + first * width
+            if len(rays.origin):
+                with stage("trace"):
+                    if drawn is None:
+                        hits = self.trace_rays(rays)
+                    else:
+                        hits = drawn[some].trace(self.trace_rays, rays, self.options.stop_alpha)
+                yield some, hits
+            progress("rays", end, rows)
+
+    def picture(self, hits: Hits, stats: RenderStats) -> Picture:
+        """Puts the hits of all rays over the background, in the camera's shape."""
+        color, nearest, layer = hits.color, hits.depth, self.options.layer
+        background: Any = self.options.background
+        if isinstance(background, Background):
+            behind = background.behind(self.camera, self.numbers, color.dtype)
+            color = color + (1 - hits.alpha) * behind
+        elif background is not None and any(background):
+            color = color + (1 - hits.alpha) * pack((background,), color.dtype, color.device)
+        if layer is not None:
+            nearest = torch.minimum(nearest, layer.distance(nearest.device).to(nearest.dtype))
+        columns = {**vars(hits), "color": color, "nearest": nearest}
+        images = {name: self.camera.image(c) for name, c in columns.items() if c is not None}
+        return Picture(**images, transparent=background is None, stats=stats)
 
 
 def _some_rays(numbers: Tensor, camera: Camera, top: int, which: Tensor) -> Rays:
@@ -217,23 +225,3 @@ def empty_hits(device: torch.device, dtype: torch.dtype, pixels: int) -> Hits:
     samples = torch.empty(pixels, dtype=torch.int32, device=device)
     missed = torch.empty_like(samples, dtype=torch.bool)
     return Hits(color=color, alpha=alpha, depth=depth, samples=samples, missed=missed)
-
-
-def develop(
-    hits: Hits, camera: Camera, numbers: Tensor, options: RenderOptions, stats: RenderStats
-) -> Picture:
-    """Puts the hits of all of a camera's rays over the background, in the camera's shape. The
-    arguments are those of `trace_blocks`, and what the picture cost.
-    """
-    color, nearest = hits.color, hits.depth
-    background: Any = options.background
-    if isinstance(background, Background):
-        color = color + (1 - hits.alpha) * background.behind(camera, numbers, color.dtype)
-    elif background is not None and any(background):
-        color = color + (1 - hits.alpha) * pack((background,), color.dtype, color.device)
-    if options.layer is not None:
-        layer = options.layer.distance(hits.depth.device).to(hits.depth.dtype)
-        nearest = torch.minimum(hits.depth, layer)
-    columns = {**vars(hits), "color": color, "nearest": nearest}
-    images = {name: camera.image(c) for name, c in columns.items() if c is not None}
-    return Picture(**images, transparent=background is None, stats=stats)
