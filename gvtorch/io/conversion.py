@@ -1,8 +1,7 @@
 """`convert`: any volume -> a store, out of core, on all cores, resumable; `estimate`: its price.
 
 One task writes one cube of one level (shard.py); levels follow one another. A journal beside the
-data names the tasks that are done (unfinished.py). The store's own metadata is written last, so a
-store that is not whole is never opened. What lies where is in store_layout.py.
+data names the tasks that are done (unfinished.py).
 """
 
 from __future__ import annotations
@@ -78,7 +77,6 @@ class Estimate:
     memory_free: int
 
     def __repr__(self) -> str:
-        """Shows extent, disk, memory and time."""
         extent = "x".join(str(n) for n in self.extent)
         disk, memory = resources.amount(self.disk_bytes), resources.amount(self.memory_bytes)
         return (
@@ -97,10 +95,7 @@ class _Plan:
     task: shard.Conversion
     settings: dict[str, Any]  # what must be the same to go on with a half-written store
     workers: int
-
-    @property
-    def uses_processes(self) -> bool:
-        return math.prod(self.task.layout.shards(0)) > _FEW
+    uses_processes: bool
 
 
 def convert(
@@ -251,23 +246,26 @@ def _plan(
         threshold=threshold,
     )
     workers = resources.cores() if workers is None else workers
-    workers = min(check.whole("convert", "workers", workers, low=1), math.prod(layout.shards(0)))
-    task = shard.Conversion(root=kvstore(target), layout=layout, source=source, nan=nan)
+    workers = check.whole("convert", "workers", workers, low=1)
+    tasks = [math.prod(layout.shards(level)) for level in range(layout.levels)]
+    told = ("extent", "dtype", "spacing", "origin", "unit")
     settings = {
         "source": source.path,
         "fingerprint": unfinished.fingerprint(given),
-        "extent": list(source.extent),
-        "dtype": source.dtype,
+        **{name: getattr(source, name) for name in told},
         "channels": source.width,
-        "spacing": list(source.spacing),
-        "origin": list(source.origin),
-        "unit": source.unit,
         "block": block,
         "threshold": threshold,
         "nan": nan,
-        "tasks": sum(math.prod(layout.shards(level)) for level in range(layout.levels)),
+        "tasks": sum(tasks),
     }
-    return _Plan(target=target, task=task, settings=settings, workers=workers)
+    return _Plan(
+        target=target,
+        task=shard.Conversion(root=kvstore(target), layout=layout, source=source, nan=nan),
+        settings=settings,
+        workers=min(workers, tasks[0]),
+        uses_processes=tasks[0] > _FEW,
+    )
 
 
 def _places(layout: StoreLayout, level: int) -> Iterator[shard.Zyx]:
@@ -286,6 +284,8 @@ def _estimate(plan: _Plan) -> Estimate:
     held = source.nbytes if isinstance(source, MemorySource) else 0
     staged = held if plan.uses_processes else 0
     start = 3.0 * plan.uses_processes
+    target = plan.target.absolute()
+    folder = next(path for path in (target, *target.parents) if path.exists())
     return Estimate(
         extent=layout.extent,
         dtype=layout.dtype,
@@ -298,7 +298,7 @@ def _estimate(plan: _Plan) -> Estimate:
         memory_bytes=_PROCESS + plan.workers * each + held,
         seconds=_DISK * seconds * (voxels + _BELOW * below) / seen / plan.workers + start,
         workers=plan.workers,
-        disk_free=shutil.disk_usage(resources.existing(plan.target)).free,
+        disk_free=shutil.disk_usage(folder).free,
         memory_free=resources.memory_free() + held,
     )
 
@@ -313,8 +313,7 @@ def _sample(task: shard.Conversion) -> tuple[int, int, int, float]:
     root = {"driver": "memory", "path": f"gvtorch-estimate-{id(task)}/"}
     store = ts.KvStore.open(root, context=context()).result()
     trial = dataclasses.replace(task, root=root, nan=0.0 if task.nan is None else task.nan)
-    for spec in (layout.plain(0), layout.blocks(0), layout.cells(0)):
-        opened(root, spec, "create").result()
+    _create_arrays(trial, 0)
     start, seen = time.perf_counter(), 0
     for place in dict.fromkeys(picked):
         seen += shard.write_shard(trial, 0, place).voxels
@@ -403,8 +402,8 @@ def _write_levels(
 
 def _create_arrays(task: shard.Conversion, level: int) -> None:
     layout = task.layout
-    specs = (layout.plain(level), layout.blocks(level), layout.cells(level))
-    for spec in (*specs, *layout.bounds(level)):
+    arrays = (layout.plain(level), layout.blocks(level), layout.cells(level))
+    for spec in (*arrays, *layout.bounds(level)):
         where = f"{task.root['path']}{spec['path']}"
         Deadline(_OPEN_TIMEOUT).wait(opened(task.root, spec, "create"), where)
 

@@ -1,5 +1,4 @@
-"""`LevelReader`: the tree levels of a multiscale image, read from whatever arrays it stores;
-`open_arrays` opens these.
+"""`LevelReader`: the tree levels of a multiscale image, from the arrays that `open_arrays` opens.
 
 A tree level is 2^L coarser along every axis. Where no array is, the level is averaged: from the
 coarsest array whose factors divide 2^L, or tile by tile from the tree level below, whichever

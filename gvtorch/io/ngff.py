@@ -77,21 +77,13 @@ def find_image(
 
 
 def read_json(where: str, root: Any, name: str, deadline: Deadline) -> dict[str, Any] | None:
-    """Reads a JSON object of a folder; returns None if there is no such file.
-
-    Raises:
-        ValueError: See `parse_json`.
-    """
+    """Reads a JSON object of a folder, as `parse_json`; returns None if there is no such file."""
     content = read_key(where, root, name, deadline)
     return None if content is None else parse_json(f"{where}/{name}", content)
 
 
 def parse_json(where: str, content: bytes) -> dict[str, Any]:
-    """Reads a JSON object.
-
-    Raises:
-        ValueError: It is damaged, no object, or far too large.
-    """
+    """Reads a JSON object; raises ValueError if it is damaged, no object, or far too large."""
     if len(content) > _MOST_JSON:
         raise ValueError(f"{where}: {len(content)} bytes of JSON are too many")
     try:

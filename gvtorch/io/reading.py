@@ -1,13 +1,12 @@
 """`read_volume`: a file into memory; `open_source`: a file of any size, to be read in regions.
 
-Both read every format by its one entry in formats/. Every header is read first and refused if its
-extent does not fit, before memory is taken.
+Every header is read first and refused if its extent does not fit, before memory is taken.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy as np
 from ..base import check
 from ..base.constants import MAX_VOXELS
 from ..base.volume import Volume, check_extent
-from .formats import FORMATS, Format, find_format
+from .formats import FORMATS, find_format
 from .ngff import is_zarr
 from .source import VolumeSource, told_as
 from .store_layout import DTYPES, MOST_VOXELS, StoreError
@@ -88,7 +87,10 @@ def open_source(
     found = find_format(text)
     options = {"shape": shape, "dtype": dtype, "key": key}
     given = {name: value for name, value in options.items() if value is not None}
-    _check_options(text, found, given)
+    for name in set(given).difference(found.options):
+        owner = next(other for other in FORMATS if name in other.options)
+        those = " and ".join(owner.options) + (" are" if len(owner.options) > 1 else " is")
+        raise ValueError(f"{path}: {those} for {owner.name} files, this is {found.name}")
     found.need_library(text)
     with told_as(ValueError, text, f"can't be read as {found.name}", StoreError, TimeoutError):
         source = found.open(text, **given)
@@ -117,19 +119,7 @@ def placed(
 
 
 def read_whole(source: VolumeSource) -> np.ndarray:
-    """Reads all of a source, (z, y, x, c).
-
-    Raises:
-        ValueError: The file is damaged.
-    """
+    """Reads all of a source, (z, y, x, c); raises ValueError if the file is damaged."""
     text = f"can't be read as {find_format(source.path).name}"
     with told_as(ValueError, source.path, text, StoreError, TimeoutError):
         return source.read_whole()
-
-
-def _check_options(path: str, found: Format, given: Iterable[str]) -> None:
-    for name in given:
-        if name not in found.options:
-            owner = next(other for other in FORMATS if name in other.options)
-            those = " and ".join(owner.options) + (" are" if len(owner.options) > 1 else " is")
-            raise ValueError(f"{path}: {those} for {owner.name} files, this is {found.name}")

@@ -9,12 +9,6 @@ import threading
 from pathlib import Path
 
 
-def existing(path: Path) -> Path:
-    """The nearest folder above that is there."""
-    path = path.absolute()
-    return path if path.exists() else existing(path.parent)
-
-
 def amount(nbytes: float) -> str:
     """Bytes for people: "3.2 MB", "1.50 GB"."""
     return f"{nbytes / 1e9:.2f} GB" if nbytes >= 1e9 else f"{nbytes / 1e6:.1f} MB"

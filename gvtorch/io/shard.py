@@ -48,12 +48,7 @@ class ShardResult:
 
 
 def write_shard(conversion: Conversion, level: int, place: Zyx) -> ShardResult:
-    """Writes the shards of one cube of a level.
-
-    Args:
-        conversion: The conversion.
-        level: 0 is the finest.
-        place: (z, y, x) of the cube, in shards.
+    """Writes the shards of one cube of a level, `place` (z, y, x) in shards; level 0 is the finest.
 
     Raises:
         OSError: The source can't be read, or the store can't be written (ENOSPC: the disk is full).

@@ -2,7 +2,8 @@
 
 A source is plain data (path, shape, offset, ...) that can be pickled, so that worker processes can
 have it; files are opened in the process that reads. The formats (formats/) make sources;
-`ArraySource` serves all of those that hold their numbers one after another.
+`ArraySource` serves all of those that hold their numbers one after another, `place_axes` those that
+tell how their axes lie in the world.
 """
 
 from __future__ import annotations
@@ -13,15 +14,18 @@ import gzip
 import math
 import os
 import time
+import warnings
 import zipfile
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
+from . import boxes
 from .store_layout import value_dtype
 
 Index = tuple[slice, ...]
@@ -29,30 +33,18 @@ Index = tuple[slice, ...]
 
 @dataclass(frozen=True, kw_only=True)
 class VolumeSource(ABC):
-    """What a header tells: an array whose axes lie in any order, and its place in the world.
+    """What a header tells: an array whose axes lie in any order, and its place in the world."""
 
-    Attributes:
-        path: The file, folder or URL, as the user named it.
-        shape: Of the array as it is stored.
-        axes: A letter for each of its axes: z, y, x, c, or - for one of size 1 to drop.
-        stored: NumPy dtype as it is stored, with byte order.
-        flips: Letters of axes that run backwards.
-        spacing: (x, y, z) world units, distance of neighbouring voxel centres.
-        origin: (x, y, z) world units, centre of voxel 0.
-        unit: Unit of length, or None.
-        whole: Whether every read unpacks the whole file, so that one read of all is better.
-        opened: When (ns): tells sources of one path apart, for what is kept open between reads.
-    """
-
-    path: str
-    shape: tuple[int, ...]
-    axes: str
-    stored: str
-    flips: str = ""
-    spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    unit: str | None = None
-    whole: bool = False
+    path: str  # the file, folder or URL, as the user named it
+    shape: tuple[int, ...]  # of the array as it is stored
+    axes: str  # a letter for each of its axes: z, y, x, c, or - for one of size 1 to drop
+    stored: str  # NumPy dtype as it is stored, with byte order
+    flips: str = ""  # letters of axes that run backwards
+    spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)  # x y z, world units
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x y z, centre of voxel 0
+    unit: str | None = None  # of length
+    whole: bool = False  # every read unpacks the whole file: one read of all is better
+    # When (ns): tells sources of one path apart, for what is kept open between reads.
     opened: int = dataclasses.field(default_factory=time.time_ns)
 
     @property
@@ -122,9 +114,7 @@ class VolumeSource(ABC):
             index.append(slice(size - stop, size - start) if backwards else slice(start, stop))
         data = self.read_stored(tuple(index))
         data = data.squeeze(tuple(i for i, axis in enumerate(self.axes) if axis == "-"))
-        missing = "".join(axis for axis in "zyxc" if axis not in self.axes)
-        letters = missing + self.axes.replace("-", "")
-        data = data[(None,) * len(missing)].transpose([letters.index(axis) for axis in "zyxc"])
+        data = boxes.to_zyxc(data, self.axes.replace("-", ""))
         data = np.flip(data, tuple("zyx".index(axis) for axis in self.flips))
         with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite
             return np.asarray(data).astype(self.dtype, order="C", copy=False)
@@ -132,21 +122,13 @@ class VolumeSource(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class ArraySource(VolumeSource):
-    """Numbers one after another in a file: mapped into memory, or unpacked whole.
+    """Numbers one after another in a file: mapped into memory, or unpacked whole."""
 
-    Attributes:
-        file: Where they lie.
-        member: Which file inside it, where it is a ZIP archive.
-        offset: Bytes before the array, unpacked.
-        fortran: First axis fastest.
-        exact: Whether nothing may follow the array.
-    """
-
-    file: str
-    member: str = ""
-    offset: int = 0
-    fortran: bool = False
-    exact: bool = False
+    file: str  # where they lie
+    member: str = ""  # which file inside it, where it is a ZIP archive
+    offset: int = 0  # bytes before the array, unpacked
+    fortran: bool = False  # first axis fastest
+    exact: bool = False  # nothing may follow the array
 
     def check_file(self) -> None:
         """Compares the file's size with what the array takes."""
@@ -182,13 +164,9 @@ class ArraySource(VolumeSource):
 
 @dataclass(frozen=True, kw_only=True)
 class MemorySource(VolumeSource):
-    """A volume that lies in memory.
+    """A volume that lies in memory."""
 
-    Attributes:
-        data: (z, y, x, c).
-    """
-
-    data: np.ndarray = dataclasses.field(repr=False)
+    data: np.ndarray = dataclasses.field(repr=False)  # (z, y, x, c)
 
     @classmethod
     def of(cls, data: np.ndarray, **told: Any) -> MemorySource:
@@ -201,7 +179,46 @@ class MemorySource(VolumeSource):
 
     def read_region(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
         """Returns the box `low` to `high`, (z, y, x), as a view."""
-        return self.data[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+        return self.data[boxes.index(low, high)]
+
+
+def place_axes(
+    path: str, affine: np.ndarray, shape: Sequence[int], component: int | None = None
+) -> dict[str, Any]:
+    """Lays voxel axes along the world's, by `affine` (4, 4) from voxel indices to the world;
+    oblique ones stay as they are. The axis `component` of the array counts components.
+
+    Returns:
+        The fields axes, flips, spacing and origin of a `VolumeSource`.
+    """
+    matrix, origin = affine[:3, :3], affine[:3, 3].astype(np.float64)
+    lengths = np.linalg.norm(matrix, axis=0)
+    if not np.isfinite(affine).all() or (lengths == 0).any():
+        raise ValueError(f"{path}: the header's voxel axes are degenerate: {matrix.tolist()}")
+    spatial = [axis for axis in range(len(shape)) if axis != component]
+    world_axis = np.abs(matrix).argmax(axis=0)  # of each voxel axis
+    along = np.abs(matrix[world_axis, [0, 1, 2]]) / lengths
+    if sorted(world_axis.tolist()) != [0, 1, 2] or (along < 1 - 1e-4).any():
+        warnings.warn(
+            f"{Path(path).name}: voxel axes are oblique; the world's axes are taken along them",
+            stacklevel=2,
+        )
+        order, spacing = np.arange(3), lengths
+    else:
+        order = np.argsort(world_axis)
+        spacing = matrix[[0, 1, 2], order]
+    letters = ["c"] * len(shape)
+    for axis, letter in enumerate("xyz"):
+        voxel_axis = spatial[order[axis]]
+        letters[voxel_axis] = letter
+        if spacing[axis] < 0:
+            origin[axis] += spacing[axis] * (shape[voxel_axis] - 1)
+    return {
+        "axes": "".join(letters),
+        "flips": "".join(letter for letter, step in zip("xyz", spacing, strict=True) if step < 0),
+        "spacing": tuple(np.abs(spacing).tolist()),
+        "origin": tuple(origin.tolist()),
+    }
 
 
 def open_unpacked(file: str, member: str = "") -> IO[bytes]:
@@ -218,13 +235,8 @@ def open_unpacked(file: str, member: str = "") -> IO[bytes]:
 def told_as(
     kind: type[Exception], path: str, what: str, *through: type[Exception]
 ) -> Iterator[None]:
-    """Turns what a format library raises for a damaged file, which may be anything, into one line.
-
-    Args:
-        kind: What to raise.
-        path: The file that the user named.
-        what: "can't be read".
-        through: What passes as it is, beside missing libraries and files.
+    """Turns what a format library raises for a damaged file, which may be anything, into one line:
+    `kind`(path: what: reason). Missing libraries and files pass as they are, as `through` do.
     """
     try:
         yield

@@ -145,7 +145,6 @@ class Store:
             arrays.append(array)
 
     def __repr__(self) -> str:
-        """Shows location, extent, dtype, channels and levels."""
         extent = "x".join(str(n) for n in self.extent)
         dtype = str(self.dtype).removeprefix("torch.")
         kind = f"blocks of {self.block}^3+{self.border}" if self.has_blocks else "no blocks"
@@ -214,11 +213,7 @@ class Store:
     def read_cells(self, level: int, low: Zyx, high: Zyx, *, timeout: float = 60.0) -> np.ndarray:
         """Reads smallest, largest and mean value of a box of cells, of our own stores only.
 
-        Args:
-            level: 0 is the finest.
-            low: (z, y, x) first cell, inside `cell_grid(level)`.
-            high: (z, y, x) one past the last cell.
-            timeout: Seconds.
+        `low` and `high` are (z, y, x) cells inside `cell_grid(level)`.
 
         Returns:
             (z, y, x, 3, c) of the store's dtype: low and high over the finest voxels in reach (one
@@ -226,8 +221,7 @@ class Store:
 
         Raises:
             ValueError: The store has no cells, or the box leaves the grid.
-            TimeoutError: It took longer.
-            OSError: A chunk is damaged, missing or can't be read.
+            TimeoutError, OSError: As `read_region`; also for a missing chunk.
         """
         if not self.has_blocks:
             raise ValueError(f"{self.location}: has no cells; gvtorch convert makes a store of it")
@@ -246,12 +240,7 @@ class Store:
     def read_blocks(
         self, level: int, zyx: np.ndarray, *, timeout: float = 60.0
     ) -> tuple[np.ndarray, dict[int, str]]:
-        """Reads many blocks with their borders, in bulk.
-
-        Args:
-            level: 0 is the finest.
-            zyx: (k, 3) whole numbers, places inside `block_grid(level)`.
-            timeout: Seconds, for all of them.
+        """Reads many blocks with their borders, in bulk: (k, 3) z, y, x inside `block_grid(level)`.
 
         Returns:
             (k, s, s, s, c) with s = block + 2 * border, and for each place in `zyx` that could not
@@ -259,7 +248,7 @@ class Store:
 
         Raises:
             ValueError: A place lies outside the grid.
-            TimeoutError: It took longer.
+            TimeoutError: All of them together took longer.
         """
         zyx = np.asarray(zyx, np.int64).reshape(-1, 3)
         grid = self.block_grid(level)

@@ -20,11 +20,12 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from .resources import cores
+
+if TYPE_CHECKING:
+    import numpy as np  # not when the program starts: `gvtorch --help` comes this way
 
 VERSION = 1
 CELL = 8  # voxels along a side of a cell
@@ -32,7 +33,7 @@ BORDER = 1  # voxels around a block, and around a cell for its low and high
 BLOCKS = (32, 64)  # voxels along a side of a block
 WORK = ".gvtorch-work"
 MOST_VOXELS = 2**40
-DTYPES = ("uint8", "int8", "uint16", "int16", "float16", "float32")
+DTYPES = {"uint8": 1, "int8": 1, "uint16": 2, "int16": 2, "float16": 2, "float32": 4}  # bytes
 GROUPS = ("gvtorch", "gvtorch/blocks", "gvtorch/cells")
 _PLAIN_CHUNK = 64  # voxels
 _CELL_CHUNK = 16  # cells
@@ -65,7 +66,7 @@ class StoreLayout:
     @property
     def voxel_bytes(self) -> int:
         """Bytes of a voxel with all its channels."""
-        return np.dtype(self.dtype).itemsize * self.width
+        return DTYPES[self.dtype] * self.width
 
     @property
     def shard(self) -> int:
@@ -141,15 +142,15 @@ class StoreLayout:
         names: str = "",
         keep: bool = True,
     ) -> dict[str, Any]:
-        kind = np.dtype(self.dtype)
-        wide = kind.itemsize > 1
+        size = DTYPES[self.dtype]
+        wide = size > 1
         little = {"name": "bytes", "configuration": {"endian": "little"}}
         crc = {"name": "crc32c"}
         packed = {
             "cname": "lz4",
             "clevel": 5,
             "shuffle": "shuffle" if wide else "noshuffle",
-            "typesize": kind.itemsize,
+            "typesize": size,
             "blocksize": 0,
         }
         sharding = {
@@ -164,7 +165,7 @@ class StoreLayout:
         metadata: dict[str, Any] = {
             "shape": shape,
             "data_type": self.dtype,
-            "fill_value": 0.0 if kind.kind == "f" else 0,
+            "fill_value": 0.0 if self.dtype.startswith("float") else 0,
             "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": shard}},
             "codecs": [{"name": "sharding_indexed", "configuration": sharding}],
         }
@@ -244,11 +245,8 @@ class Deadline:
         self._end = time.monotonic() + timeout
 
     def wait(self, future: Any, where: str) -> Any:
-        """Returns the result of one of tensorstore's futures.
-
-        Raises:
-            TimeoutError: It took too long.
-            StoreError: It failed.
+        """Returns the result of one of tensorstore's futures; raises TimeoutError if it took too
+        long, StoreError if it failed.
         """
         try:
             return future.result(timeout=max(0.0, self._end - time.monotonic()))
@@ -298,10 +296,7 @@ def child(root: Any, path: str) -> Any:
 
 def read_key(where: str, root: Any, name: str, deadline: Deadline, last: int | None = None) -> Any:
     """Returns the content of a file in a folder, up to byte `last`; None if there is no such file.
-
-    Raises:
-        ValueError: There can be no such folder.
-        TimeoutError, StoreError: See `Deadline.wait`.
+    Raises as `Deadline.wait`, and ValueError if there can be no such folder.
     """
     import tensorstore as ts
 
@@ -316,10 +311,8 @@ def read_key(where: str, root: Any, name: str, deadline: Deadline, last: int | N
 def opened(root: Any, spec: dict[str, Any], mode: str = "read") -> Any:
     """Begins to open an array of a store; returns tensorstore's future.
 
-    Args:
-        root: What `kvstore` returned.
-        spec: What a method of `StoreLayout` returned.
-        mode: "read"; "write" to it; "create" it if it is not there.
+    `root` comes from `kvstore`, `spec` from `StoreLayout`; `mode` is "read", "write" or "create"
+    (if it is not there).
     """
     import tensorstore as ts
 

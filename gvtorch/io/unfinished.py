@@ -22,11 +22,7 @@ Task = tuple[int, ...]  # level, z, y, x
 
 
 class UnfinishedStore:
-    """A store that is being made, by this process alone.
-
-    Attributes:
-        done: The voxels of each finished task.
-    """
+    """A store that is being made, by this process alone."""
 
     def __init__(self, target: Path, journal: IO[str]) -> None:
         """Takes the folder over."""
@@ -82,11 +78,8 @@ def is_begun(target: Path, *, resume: bool) -> bool:
 
 @contextmanager
 def claimed(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator[UnfinishedStore]:
-    """Makes or takes over the hidden folder, for this process alone.
-
-    Raises:
-        OSError: Another process is at work there.
-        ValueError: `resume`, and settings or source differ.
+    """Makes or takes over the hidden folder; raises OSError if another process is at work there,
+    and ValueError if settings or source differ from those of the store that it shall resume.
     """
     import fcntl
 

@@ -18,9 +18,6 @@ _WORDS = {8: torch.int64, 4: torch.int32, 2: torch.int16, 1: torch.uint8}
 class BrickTable:
     """Bricks that lie ready in host memory. A producer answers with `table[row]`: the bricks are
     gathered once, on their way to the device.
-
-    Attributes:
-        bricks: (n, z, y, x, c) on the CPU, borders included.
     """
 
     def __init__(self, bricks: Tensor) -> None:
@@ -39,22 +36,16 @@ class BrickTable:
         self.bricks = bricks
 
     def __len__(self) -> int:
-        """Number of bricks."""
         return len(self.bricks)
 
     def __getitem__(self, row: Tensor) -> TableRows:
-        """Names bricks by their (k,) int64 rows.
-
-        Raises:
-            ValueError: A row is outside the table.
-        """
+        """Names bricks by their (k,) int64 rows; ValueError if one is outside the table."""
         row = row.to(device="cpu", dtype=torch.int64)
         if len(row) and (int(row.min()) < 0 or int(row.max()) >= len(self)):
             raise ValueError(f"BrickTable: rows must be 0 to {len(self) - 1}")
         return TableRows(self.bricks, row)
 
     def __repr__(self) -> str:
-        """Shows shape, dtype and memory."""
         return f"BrickTable({check.describe(self.bricks)}, {self.bricks.nbytes / 1e6:.1f} MB)"
 
 
@@ -66,11 +57,9 @@ class TableRows:
         self.table, self.row = table, row
 
     def __len__(self) -> int:
-        """Number of bricks, k."""
         return len(self.row)
 
     def __getitem__(self, index: slice | Tensor) -> TableRows:
-        """Returns some of the bricks."""
         return TableRows(self.table, self.row[index.cpu() if isinstance(index, Tensor) else index])
 
     @property

@@ -55,9 +55,7 @@ def phrase(channels: Mapping[str, Channel]) -> str:
 def volumes_by_channel(where: str, volume: Volume | Mapping[str, Volume]) -> dict[str, Volume]:
     """Returns volumes by channel name; one volume alone becomes channel "value".
 
-    Raises:
-        ValueError: There is no volume, one is no `Volume`, or they differ in extent, spacing or
-            origin.
+    Raises ValueError if there is none, one is no `Volume`, or they differ in place or extent.
     """
     volumes = dict(volume) if isinstance(volume, Mapping) else {"value": volume}
     if not volumes:

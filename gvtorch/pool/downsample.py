@@ -36,14 +36,11 @@ def round_array(values: np.ndarray, dtype: np.dtype) -> np.ndarray:
 
 
 def pool_mean(values: np.ndarray, factor: int | Sequence[int]) -> np.ndarray:
-    """Averages blocks of voxels.
+    """Averages blocks of voxels, (z, y, x, c) integers of at most 16 bits, float16 or float32.
 
-    Sums are exact for integers and float64 for float32, always in the same order.
-
-    Args:
-        values: (z, y, x, c) integers of at most 16 bits, float16 or float32.
-        factor: Voxels along a block's side, one number or (z, y, x). A last block that is not full
-            repeats its last voxel.
+    Sums are exact for integers and float64 for float32, always in the same order. `factor` is the
+    voxels along a block's side, one number or (z, y, x); a last block that is not full repeats its
+    last voxel.
 
     Returns:
         (ceil(z / factor), ..., c) of the same dtype, rounded to nearest, ties to even.
@@ -78,11 +75,8 @@ def pool_directional(
 
     Args:
         values: (z, y, x, 24) as `Volume.directional` lays them out.
-        factor: Voxels along a block's side. A last block that is not full repeats its last voxel.
+        factor: As for `pool_mean`, one number.
         sides_zyx: Sides of a voxel of `values`, in reference lengths.
-
-    Returns:
-        (ceil(z / factor), ..., 24) of the same dtype.
     """
 
     def reduce(part: np.ndarray, factors: Factors) -> np.ndarray:
@@ -113,13 +107,8 @@ def _of_length(rgba: np.ndarray, lengths: float) -> np.ndarray:
 
 
 def window(values: np.ndarray, how: str, *, size: int, step: int) -> np.ndarray:
-    """Reduces overlapping windows of size^3 voxels, `step` apart, the first at the array's corner.
-
-    Args:
-        values: (z, y, x, c), borders included.
-        how: "min", "max" or "mean".
-        size: Voxels along a window's side.
-        step: Voxels from one window to the next.
+    """Reduces windows of size^3 voxels, `step` apart, by "min", "max" or "mean"; the first lies at
+    the corner of the array (z, y, x, c).
 
     Returns:
         (gz, gy, gx, c), g = (n - size) // step + 1; of the same dtype for min and max, float32 for
@@ -139,13 +128,8 @@ def extend(values: np.ndarray, axis: int, before: int, after: int) -> np.ndarray
 
 
 def by_node(values: np.ndarray, how: str, brick_size: int, border: int) -> np.ndarray:
-    """Reduces the voxels of each node's brick and `border` voxels around, repeated at the faces.
-
-    Args:
-        values: (z, y, x, c) a whole level.
-        how: "min", "max" or "mean".
-        brick_size: Voxels along a side of a brick, without the border.
-        border: Voxels around that count as well.
+    """Reduces the voxels (z, y, x, c) of a level by "min", "max" or "mean": those of each node's
+    brick and `border` voxels around, repeated at the level's faces.
 
     Returns:
         (gz, gy, gx, c) float32, g = ceil(n / brick_size).

@@ -142,11 +142,8 @@ class N3Tree:
         )
 
     def validate(self) -> None:
-        """Checks that every pointer leads to a tile or brick that exists, that only shared ones are
-        pointed to twice, and that each tile's place is that of its parent.
-
-        Raises:
-            ValueError: One of these does not hold.
+        """Raises ValueError unless every pointer leads to a tile or brick that exists, only shared
+        ones are pointed to twice, and each tile's place is that of its parent.
         """
         child, brick = self.nodes.child_tn, self.nodes.brick_tn
         if bool(((child < TERMINAL) | (child >= self.nodes.capacity)).any()):

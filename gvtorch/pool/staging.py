@@ -71,7 +71,6 @@ class Chunk:
         return self._data
 
     def __exit__(self, *_error: object) -> None:
-        """Gives the bytes back once the current stream has read them."""
         on_cuda = self._device.type == "cuda"
         stream = torch.cuda.current_stream(self._device) if on_cuda else None
         self._span.read = stream.record_event() if stream else _NoEvent()
@@ -90,12 +89,8 @@ class Staging:
     """A ring of pinned memory and one of the same size on the device. Any thread may send."""
 
     def __init__(self, payload: int, brick_bytes: int, device: torch.device) -> None:
-        """Chooses sizes; memory is allocated when something is sent first.
-
-        Args:
-            payload: Most bytes that a frame sends.
-            brick_bytes: Bytes of a brick, all channels.
-            device: Where bricks go; on the CPU, for tests, nothing is pinned.
+        """Chooses sizes for `payload` bytes a frame at most, in bricks of `brick_bytes`; memory is
+        allocated when something is sent first. On the CPU, for tests, nothing is pinned.
         """
         least, most = _CHUNKS
         room = brick_bytes + 64 * _ALIGN  # as many channels, and more
@@ -109,10 +104,8 @@ class Staging:
         self._stream: Any = None
 
     def send(self, data: Voxels) -> Shipment:
-        """Sends bricks from the host, as many as there is room for.
-
-        Raises:
-            ValueError: A brick is larger than the ring was made for.
+        """Sends bricks from the host, as many as there is room for; ValueError if one is larger
+        than the ring was made for.
         """
         count = len(next(iter(data.values())))
         if count == 0:

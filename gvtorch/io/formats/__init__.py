@@ -13,11 +13,7 @@ for _module in sorted(module.name for module in pkgutil.iter_modules(__path__)):
 
 
 def find_format(path: str) -> Format:
-    """Returns the format of a file, folder or URL, by its name and kind.
-
-    Raises:
-        ValueError: It is none of the known ones.
-    """
+    """Returns the format of a file, folder or URL, by its name and kind; ValueError if none."""
     for candidate in FORMATS:
         if candidate.matches(path):
             return candidate

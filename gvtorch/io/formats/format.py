@@ -54,7 +54,6 @@ class Format:
         return opener
 
     def __repr__(self) -> str:
-        """Shows name and endings."""
         return f"Format({self.name!r}, endings {self.endings})"
 
     @property

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..placement import place_axes
-from ..source import Index, VolumeSource
+from ..source import Index, VolumeSource, place_axes
 from .format import Format
 
 

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..placement import place_axes
-from ..source import ArraySource, Index, VolumeSource
+from ..source import ArraySource, Index, VolumeSource, place_axes
 from .format import Format
 
 _TYPES = {

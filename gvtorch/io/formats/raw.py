@@ -19,12 +19,8 @@ _HINT = "name it *_XxYxZ_dtype.raw or pass"
 def open_raw(
     path: str, shape: Sequence[int] | None = None, dtype: str | np.dtype | None = None
 ) -> ArraySource:
-    """Opens a RAW file.
-
-    Args:
-        path: The file; its name may hold `_XxYxZ_dtype`, as in `scan_512x512x300_int16.raw`.
-        shape: (x, y, z) voxels; the name's if left out.
-        dtype: A NumPy dtype; the name's, little endian unless it says "be", if left out.
+    """Opens a RAW file of (x, y, z) voxels; what is not given its name tells, `_XxYxZ_dtype` as in
+    `scan_512x512x300_int16.raw`, little endian unless it says "be".
     """
     named = _NAME.search(Path(path).name.lower())
     if shape is None:

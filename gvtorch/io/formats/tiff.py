@@ -39,13 +39,9 @@ class TiffSource(VolumeSource):
 
 @dataclass(frozen=True, kw_only=True)
 class SlicesSource(VolumeSource):
-    """A folder of slices.
+    """A folder of slices."""
 
-    Attributes:
-        files: One a slice.
-    """
-
-    files: tuple[str, ...]
+    files: tuple[str, ...]  # one a slice
 
     def read_stored(self, index: Index) -> np.ndarray:
         """Reads the files of a part."""
