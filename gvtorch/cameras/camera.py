@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.records import Rays
+from ..pool.staging import upload
 from .models import MODELS, CameraModel, Plane, last_rising_angle, model_of
 
 if TYPE_CHECKING:
@@ -326,7 +327,7 @@ class Camera:
         range_ = (zero, zero + math.inf)
         bend = (self.radial_coeffs, self.max_angle[:, None])
         parts = (rotation.flatten(1), position, focal, centre, *cone, *range_, *bend)
-        return sent(torch.cat(parts, 1), device)
+        return upload(torch.cat(parts, 1), torch.device(device))
 
     def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:
         """Returns the rays through the pixel centres of whole rows, the first one and the one after
@@ -365,14 +366,6 @@ class Camera:
 
 
 _ROWS = ("viewmats", "Ks", "radial_coeffs", "max_angle")  # a row a camera
-
-
-def sent(numbers: Tensor, device: torch.device | str) -> Tensor:
-    """Returns numbers on a device; does not wait for it."""
-    device = torch.device(device)
-    if device.type == "cuda" and not numbers.is_cuda:
-        return numbers.pin_memory().to(device, non_blocking=True)
-    return numbers.to(device)
 
 
 def _batch(where: str, **values: tuple[Any, tuple[int, ...]]) -> list[Tensor]:

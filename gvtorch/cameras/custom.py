@@ -10,7 +10,8 @@ from torch.nn.functional import normalize
 
 from ..base.check import describe, instance, whole
 from ..base.records import Rays
-from .camera import Camera, Frame, sent
+from ..pool.staging import upload
+from .camera import Camera, Frame
 
 
 class CustomCamera(Camera):
@@ -152,7 +153,7 @@ class CustomCamera(Camera):
 
     def numbers(self, device: torch.device | str = "cpu") -> Tensor:
         """Returns (r, 10) float64: origin, direction, cone and range."""
-        return sent(self._rays, device)
+        return upload(self._rays, torch.device(device))
 
     def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:
         """Returns the rays of whole rows, from what `numbers` gave."""

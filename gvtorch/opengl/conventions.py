@@ -19,7 +19,8 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..cameras.camera import Camera, Frame, sent
+from ..cameras.camera import Camera, Frame
+from ..pool.staging import upload
 
 _AXES = torch.tensor([1, -1, -1, 1], dtype=torch.float64)  # turns y and z
 
@@ -213,7 +214,7 @@ class _Pixels(NamedTuple):
                 slope = slope - 0.5
         far = (slope < 0 if orthographic else offset < 0).to(slope)
         columns = (matrix[..., 0, 0], matrix[..., 1, 1], matrix[..., 0, 2], matrix[..., 1, 2])
-        numbers = sent(torch.stack((*columns, slope, offset, far), -1), image.device)
+        numbers = upload(torch.stack((*columns, slope, offset, far), -1), image.device)
         sx, sy, ax, ay, slope, offset, far = numbers[..., None, None, None].unbind(-4)
         if orthographic:
             return cls(slope, offset, far, torch.ones_like(slope), orthographic)
