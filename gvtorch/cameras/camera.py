@@ -210,14 +210,10 @@ class Camera:
         the camera model by its name there, and (..., 4) coefficients of a fisheye. Leading
         dimensions are flattened to one batch.
         """
-
-        def flat(values: Tensor, dims: int) -> Tensor:
-            return values.flatten(0, -dims - 1) if values.dim() > dims + 1 else values
-
-        if radial_coeffs is not None:
-            radial_coeffs = flat(radial_coeffs, 1)
-        matrices = flat(viewmats, 2), flat(Ks, 2)
-        return Camera(*matrices, width, height, model=camera_model, radial_coeffs=radial_coeffs)
+        view, K = (m.flatten(0, -3) if m.dim() > 3 else m for m in (viewmats, Ks))
+        if radial_coeffs is not None and radial_coeffs.dim() > 2:
+            radial_coeffs = radial_coeffs.flatten(0, -2)
+        return Camera(view, K, width, height, model=camera_model, radial_coeffs=radial_coeffs)
 
     @classmethod
     def from_kornia(cls, camera: PinholeCamera) -> Camera:
@@ -377,11 +373,9 @@ def _batch(where: str, **values: tuple[Any, tuple[int, ...]]) -> list[Tensor]:
         numbers = check.reals(where, name, value)
         batch = numbers.dim() - len(shape)
         if batch not in (0, 1) or numbers.shape[batch:] != shape:
-            many = "(" + ", ".join(["n", *map(str, shape)]) + ("," if not shape else "") + ")"
-            raise ValueError(
-                f"{where}: {name} must be {shape or 'a number'} or {many}, "
-                f"got {tuple(numbers.shape)}"
-            )
+            many = str(("n", *shape)).replace("'", "")
+            got = tuple(numbers.shape)
+            raise ValueError(f"{where}: {name} must be {shape or 'a number'} or {many}, got {got}")
         found.append((numbers, shape))
         sizes.append(numbers.shape[:batch])
     try:

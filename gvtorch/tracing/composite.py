@@ -78,11 +78,9 @@ def trace_trees(trees: Sequence[tuple[Tensor, Trace]], rays: Rays) -> Hits:
         return trees[0][1](rays)
     near = torch.stack([_entry(box, rays) for box, _ in trees])  # (m, r)
     order = near.argsort(dim=0, stable=True)
-    hits = [trace(rays) for _, trace in trees]
-    fields = {name: _ranked([vars(one)[name] for one in hits], order) for name in vars(hits[0])}
-    ranks = zip(*fields.values(), strict=True)  # the nearest tree's hits of each ray come first
-    columns: list[Any] = [dict(zip(fields, rank, strict=True)) for rank in ranks]
-    ranked = [Hits(**column) for column in columns]
+    hits = [vars(trace(rays)) for _, trace in trees]
+    fields = {name: _ranked([one[name] for one in hits], order) for name in hits[0]}
+    ranked = [Hits(**{name: f[rank] for name, f in fields.items()}) for rank in range(len(trees))]
     return replace(reduce(over, ranked), normal=_mean_normal(ranked))
 
 
@@ -98,7 +96,7 @@ def _mean_normal(ranked: Sequence[Hits]) -> Tensor | None:
     return normalize(total, dim=1)
 
 
-def _ranked(fields: list[Tensor | None], order: Tensor) -> Sequence[Tensor | None]:
+def _ranked(fields: list[Tensor | None], order: Tensor) -> Sequence[Any]:
     """The same field (r, ...) of m trees, in the order (m, r) of the trees along each ray; zeros
     stand for a tree that does not give it.
     """

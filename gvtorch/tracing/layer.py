@@ -105,11 +105,8 @@ class Layer:
 
     def pixels(self, device: torch.device) -> LayerPixels:
         """Returns all pixels on a device, row by row through the batch."""
-        distance, opaque = self.distance(device), self.alpha is None
-        shown = distance < torch.inf
-        alpha = shown if self.alpha is None else torch.where(shown, _flat(self.alpha, device), 0)
-        color = torch.where(shown, _flat(self.color, device), 0)
-        return LayerPixels(color, alpha, distance, opaque)
+        alpha = None if self.alpha is None else _flat(self.alpha, device)
+        return LayerPixels(_flat(self.color, device), self.distance(device), alpha)
 
 
 def _flat(image: Tensor, device: torch.device) -> Tensor:
@@ -120,17 +117,16 @@ def _flat(image: Tensor, device: torch.device) -> Tensor:
 
 @dataclass(frozen=True)
 class LayerPixels:
-    """Pixels of a layer, on the device of their rays; 0 where nothing is shown."""
+    """Pixels of a layer, on the device of their rays."""
 
     color: Tensor  # (r, 3)
-    alpha: Tensor  # (r, 1)
     distance: Tensor  # (r, 1), +inf where nothing is shown
-    opaque: bool  # no alpha was given
+    alpha: Tensor | None  # (r, 1)
 
     def __getitem__(self, which: slice | Tensor) -> LayerPixels:
         """Some of the pixels."""
-        color, alpha, distance = self.color[which], self.alpha[which], self.distance[which]
-        return LayerPixels(color, alpha, distance, self.opaque)
+        alpha = None if self.alpha is None else self.alpha[which]
+        return LayerPixels(self.color[which], self.distance[which], alpha)
 
     def trace(self, trace_rays: Trace, rays: Rays, stop_alpha: float) -> Hits:
         """Traces the rays of these pixels and composites voxels and layer. Depth, normal and
@@ -141,15 +137,17 @@ class LayerPixels:
         stop = self.distance.to(rays.range.dtype)
         first = torch.cat((near, torch.maximum(near, torch.minimum(far, stop))), 1)
         front = trace_rays(replace(rays, range=first))
+        shown = self.distance < torch.inf
+        alpha = shown if self.alpha is None else torch.where(shown, self.alpha, 0)
         layer = Hits(
-            color=self.color.to(front.color),
-            alpha=self.alpha.to(front.alpha),
+            color=torch.where(shown, self.color, 0).to(front.color),
+            alpha=alpha.to(front.alpha),
             depth=torch.full_like(front.depth, torch.inf),
             samples=torch.zeros_like(front.samples),
             missed=torch.zeros_like(front.missed),
         )
         mixed = over(front, layer)
-        if self.opaque:
+        if self.alpha is None:
             return mixed
         onward = (stop < torch.inf) & (mixed.alpha < stop_alpha)
         start = torch.where(onward, torch.maximum(near, stop), near)
