@@ -15,8 +15,7 @@ from helpers.producers import Held
 
 import gvtorch as gv
 from gvtorch.ops import available
-from gvtorch.pictures.progressive import jitter
-from gvtorch.pictures.strips import strip_rows
+from gvtorch.pictures.progressive import jitter, strip_rows
 
 PARTS = ("color", "alpha", "depth")
 

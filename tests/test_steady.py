@@ -13,7 +13,7 @@ from helpers.pictures import GRAY, PARTS, VESSELS, assert_same_picture, camera
 from helpers.producers import Checked, Held, Late
 
 import gvtorch as gv
-from gvtorch.engine.readback import Readback
+from gvtorch.engine.stats import Readback
 from gvtorch.ops import available
 from gvtorch.tracing.pixels import View
 

@@ -19,7 +19,7 @@ from gvtorch.bench.storage import Memory
 from gvtorch.engine import ProductionError
 from gvtorch.io.conversion import convert
 from gvtorch.io.store import Store
-from gvtorch.producers.host_cache import HostCache
+from gvtorch.producers.stored import HostCache
 
 GRAY = gv.TransferFunction.preset("gray", 0, 255)
 VIEW = camera(distance=1.4)

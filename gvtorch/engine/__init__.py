@@ -1,8 +1,8 @@
 """The engine: frames that stream what the rays ask for."""
 
 from .engine import Engine, FrameGraph
-from .failures import Failure, ProductionError
-from .options import EngineOptions, EngineSettings
+from .production import Failure, ProductionError
+from .setup import EngineOptions, EngineSettings
 from .stats import FrameStats
 
 __all__ = [

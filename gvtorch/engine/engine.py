@@ -7,6 +7,7 @@ Detailed Voxel Rendering", I3D 2009; Crassin, PhD thesis 2011.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
@@ -30,20 +31,17 @@ from ..shaders.shader import Shader
 from ..tracing import RenderOptions
 from ..tracing.options import RenderSettings, render_options
 from ..tracing.pixels import Again, View, empty_hits
-from .failures import Failure
-from .options import EngineOptions, EngineSettings
-from .production import Production
+from .production import Failure, Production
 from .ray_subsets import RaySubsets, scouts
-from .readback import Collected, Counts, Readbacks
-from .report import Report
 from .request_batch import ProducedTree
-from .setup import brick_bytes, make_pools, make_tree
-from .stats import FrameStats
+from .setup import EngineOptions, EngineSettings, brick_bytes, make_pools, make_tree
+from .stats import Collected, Counts, FrameStats, Readback, Readbacks, Report
 from .view import Shaders, trace_scene
 
 Scene = Producer | Mapping[str, Producer]
 
 _MOST_LISTED = 1 << 17  # nodes whose requests one frame lists
+_KEPT = 1000  # frames in a report
 _MOST_PRODUCED = 256 * 10**6  # bytes of voxels produced in one frame
 
 
@@ -92,7 +90,7 @@ class Engine:
         self.frames, self._closed = 0, False
         self._frame_1 = torch.zeros(1, dtype=torch.int32, device=self.device)
         self._missed: Tensor | None = None  # (r,) bool, of the last picture's rays
-        self._report = Report()
+        self._last: deque[FrameStats] = deque(maxlen=_KEPT)  # for the report
         self.trees: dict[str, ProducedTree] = {}
         try:
             for number, (name, producer) in enumerate(producers.items()):
@@ -163,14 +161,23 @@ class Engine:
             pending=sum(self.production.pending.values()),
             failed=len(self.production.failures),
         )
+        monitor, start = self.options.monitor, mark(self.device)
         try:
-            with self._timed(stats):
+            with collect_timings(self.device) if monitor else nullcontext() as timings:
                 yield stats
         except BaseException:
             self.production.restore_pending()
             raise
-        if self.options.monitor:
-            self._report.add(stats)
+        end = mark(self.device)
+
+        def complete() -> None:
+            stats.milliseconds += milliseconds(start, end)
+            if timings is not None:
+                add(stats.stages, timings.as_dict())
+
+        stats.later(complete)
+        if monitor:
+            self._last.append(stats)
         self.production.failures.raise_if_strict()
 
     def serve_last_frame(self, stats: FrameStats, wait: bool = False) -> None:
@@ -231,7 +238,7 @@ class Engine:
                     hits.missed.fill_(True)
             view.hits(again=(hits, scouts(hits.missed, view.camera.width)))
             collected = self.collect_requests_and_use(hits.samples[:0])
-            counts = collected.read()  # a frame that misses something waits anyway
+            counts = Counts(*collected.numbers.tolist())  # what misses something waits anyway
             add(stats.requests, counts.by_kind())
             self.serve(collected.requests, counts, stats)
 
@@ -270,22 +277,7 @@ class Engine:
         stats.rays, stats.bytes = len(hits.missed), nodes.nbytes + bricks.nbytes
         self._missed = hits.missed
         self.cache.make_room(0, 0)
-        self.readbacks.start(stats, collected)
-
-    @contextmanager
-    def _timed(self, stats: FrameStats) -> Iterator[None]:
-        """Adds the time of a block to a frame's; of each stage, too, if the engine is monitored."""
-        start = mark(self.device)
-        with collect_timings(self.device) if self.options.monitor else nullcontext() as timings:
-            yield
-        end = mark(self.device)
-
-        def complete() -> None:
-            stats.milliseconds += milliseconds(start, end)
-            if timings is not None:
-                add(stats.stages, timings.as_dict())
-
-        stats.later(complete)
+        self.readbacks.append(Readback(stats, collected))
 
     def render(
         self,
@@ -298,11 +290,11 @@ class Engine:
         progress: Progress = no_progress,
         **options: Unpack[RenderSettings],
     ) -> Picture:
-        """Renders a picture over one or more frames.
+        """Renders a picture over one or more frames; camera, shader and options as in `frame`.
 
         Args:
-            camera: See `frame`.
-            shader: See `frame`.
+            camera: One camera, a batch, or rays.
+            shader: For all trees, or one for each.
             mode: interactive: one frame, as `frame` gives it; balanced: `productions` frames, of
                 which the last is shown; converge: until no ray misses anything that can be served.
                 Rays that miss nothing are done; where the pools are too small for all rays, subsets
@@ -324,13 +316,18 @@ class Engine:
             ValueError: The mode is unknown, or see `frame`.
             ProductionError: See `frame`.
         """
-        most = _most_frames(mode, productions, max_frames)
+        check.whole("render", "productions", productions, low=1)
+        check.whole("render", "max_frames", max_frames, low=1)
+        if mode not in ("interactive", "balanced", "converge"):
+            raise ValueError(
+                f"render: mode must be 'interactive', 'balanced' or 'converge', got {mode!r}"
+            )
         if mode == "interactive":
             return self.frame(camera, shader, **options)[0]
         view = self.view("render", camera, shader, options)
         if mode == "balanced":
-            return view.picture(*self._balance(view, most))
-        return view.picture(*self._converge(view, most, progress))
+            return view.picture(*self._balance(view, productions))
+        return view.picture(*self._converge(view, max_frames, progress))
 
     def _balance(self, view: View, most: int) -> tuple[Hits, FrameStats]:
         """Renders frames until one has converged, `most` at most."""
@@ -381,13 +378,8 @@ class Engine:
     ) -> FrameGraph:
         """Records a frame as a CUDA graph, for cameras of this number and size.
 
-        Renders a frame first, as `frame` does.
-
-        Args:
-            camera: See `frame`.
-            shader: See `frame`.
-            **options: Fields of `RenderOptions`; a replay reads the layer's tensors where they
-                lie.
+        Renders a frame first, as `frame` does with the same arguments. A replay reads the layer's
+        tensors where they lie.
 
         Raises:
             ValueError: The engine is on no CUDA device, the layer is on another, a shader is a
@@ -425,7 +417,8 @@ class Engine:
 
     def forget_failures(self) -> None:
         """Lets nodes that could not be produced be asked for again."""
-        self.production.forget_failures()
+        self.production.failures.forget()
+        self.production.restore_pending()
 
     def memory(self) -> dict[str, int]:
         """Returns bytes: what the pools hold, and the bookkeeping apart."""
@@ -433,12 +426,10 @@ class Engine:
 
     def report(self) -> Report:
         """Returns what the last frames took: print it, or `as_dict()` for JSON."""
-        self._report.occupancy = {
-            "tiles": float((self.cache.nodes.parent_t >= 0).float().mean()),
-            "bricks": float((self.cache.bricks.owner_b >= 0).float().mean()),
-        }
-        self._report.memory = self.memory()
-        return self._report
+        tiles, bricks = self.cache.nodes.parent_t, self.cache.bricks.owner_b
+        slots = {"tiles": tiles, "bricks": bricks}
+        occupancy = {name: float((owner >= 0).float().mean()) for name, owner in slots.items()}
+        return Report(self._last, occupancy, self.memory())
 
     def validate(self) -> None:
         """Raises ValueError unless the pools are in order: see `N3Tree` and `Cache`."""
@@ -455,11 +446,9 @@ class Engine:
             source.producer.layout = None
 
     def __enter__(self) -> Engine:
-        """Returns itself; leaving the block closes it."""
         return self
 
     def __exit__(self, *_error: object) -> None:
-        """Closes it."""
         self.close()
 
     def __repr__(self) -> str:
@@ -521,14 +510,3 @@ class FrameGraph:
 
     def __repr__(self) -> str:
         return f"FrameGraph({self._view.camera!r})"
-
-
-def _most_frames(mode: str, productions: int, max_frames: int) -> int:
-    check.whole("render", "productions", productions, low=1)
-    check.whole("render", "max_frames", max_frames, low=1)
-    limits = {"interactive": 1, "balanced": productions, "converge": max_frames}
-    if mode not in limits:
-        raise ValueError(
-            f"render: mode must be 'interactive', 'balanced' or 'converge', got {mode!r}"
-        )
-    return limits[mode]

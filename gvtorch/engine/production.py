@@ -1,16 +1,13 @@
-"""`Production`: asks producers for what was requested, and writes their answers, at once or later.
-
-It joins producers, which know places, and the cache, which knows slots. A node that fails is
-counted and named, is not asked for again, and takes no other with it: its ancestors stand in for
-it. Bricks in host memory go to a CUDA device through `Staging`: those that come later are sent by
-the thread that answers, and those that find no room are held back until the next frame.
+"""`Production`: asks producers, which know places, for what was requested, and writes their answers
+into the slots of the cache, at once or later. A node that fails is counted and named, is not asked
+for again, and takes no other with it: its ancestors stand in for it.
 """
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future
 from concurrent.futures import wait as wait_for
 from dataclasses import dataclass
@@ -23,17 +20,14 @@ from ..base.constants import ABSENT, CONSTANT, EMPTY, REQUEST_LOAD
 from ..cache import KINDS, Cache, Scheduler, write
 from ..cache.write import Targets, Written
 from ..pool import Staging
-from ..pool.staging import upload
+from ..pool.staging import Shipment, upload
 from ..producers import Bricks, Region, Regions
-from .failures import Failures
 from .request_batch import (
     Answered,
     ProducedTree,
     RequestBatch,
-    Sent,
     by_kind,
     children_of,
-    select,
     send_ahead,
     shipped,
 )
@@ -41,21 +35,70 @@ from .stats import FrameStats
 
 _MOST_RAISES = 256  # calls in one frame that may raise before whole batches are given up
 _LONGEST = 1e6  # seconds
+_KEPT = 1000  # failures by name; all are counted
 
 
-@dataclass(frozen=True, eq=False)
-class _Raised:
-    """What a producer raised instead of an answer."""
-
-    error: Exception
+class ProductionError(RuntimeError):
+    """A producer failed, and the engine is strict."""
 
 
-def _outcome(call: Callable[[], Any]) -> Any:
-    """Returns what a call to a producer gave: `_Raised`, a `Future`, or the answer itself."""
-    try:
-        return call()
-    except Exception as error:
-        return _Raised(error)
+@dataclass(frozen=True, kw_only=True)
+class Failure:
+    """A node that could not be produced."""
+
+    tree: str
+    kind: str  # load or subdivide
+    loc: tuple[int, ...]  # x, y, z, depth
+    message: str
+
+    def __str__(self) -> str:
+        """Names tree, level, node and reason in one line."""
+        *xyz, depth = self.loc
+        return f"tree {self.tree!r}, depth {depth}, node {tuple(xyz)}, {self.kind}: {self.message}"
+
+
+class Failures:
+    """All nodes that failed, by place: a node's tile may be given away and come back."""
+
+    def __init__(self, strict: bool) -> None:
+        self.strict = strict
+        self.newest: deque[Failure] = deque(maxlen=_KEPT)
+        self._places: set[tuple[str, int, tuple[int, ...]]] = set()  # tree, kind, loc
+        self._first: tuple[Failure, BaseException | None] | None = None
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def add(self, batch: RequestBatch, message: str, cause: BaseException | None) -> None:
+        """Takes note of a batch's nodes."""
+        text = " ".join(message.split())
+        for loc in map(tuple, batch.targets.loc.tolist()):
+            self.newest.append(
+                Failure(tree=batch.source.name, kind=batch.kind_name, loc=loc, message=text)
+            )
+            self._places.add((batch.source.name, batch.kind, loc))
+        self._first = self._first or (self.newest[-1], cause)
+
+    def among(self, batch: RequestBatch) -> Tensor | None:
+        """(k,) bool, which nodes of a batch failed before; None if none did."""
+        if not self._places:
+            return None
+        name, kind = batch.source.name, batch.kind
+        failed = [(name, kind, tuple(loc)) in self._places for loc in batch.targets.loc.tolist()]
+        return torch.tensor(failed, device=batch.targets.node.device) if any(failed) else None
+
+    def raise_if_strict(self) -> None:
+        """Raises `ProductionError` for the first failure since the last call, if strict: at the end
+        of a frame, when the pools are in order.
+        """
+        first, self._first = self._first, None
+        if self.strict and first is not None:
+            failure, cause = first
+            raise ProductionError(str(failure)) from cause
+
+    def forget(self) -> None:
+        self.newest.clear()
+        self._places.clear()
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +126,7 @@ class Production:
     """
 
     def __init__(self, cache: Cache, scheduler: Scheduler, patience: float, strict: bool) -> None:
-        """Waits for nothing yet."""
-        self.cache, self.scheduler = cache, scheduler
-        self.patience = patience
+        self.cache, self.scheduler, self.patience = cache, scheduler, patience
         self.failures = Failures(strict)
         self._raised = self._skipped = 0
         self._waiting: list[_Waiting] = []
@@ -111,19 +152,19 @@ class Production:
         return {kind: sum(len(b) for b in batches if b.kind == kind) for kind in KINDS.values()}
 
     def ask(self, trees: Sequence[ProducedTree], chosen: Mapping[int, Tensor]) -> list[Answered]:
-        """Asks for what was chosen; returns the answers that are here at once.
-
-        Args:
-            trees: All trees.
-            chosen: For each kind the (k,) int64 nodes.
-        """
+        """Asks for the chosen (k,) nodes of each kind; returns answers that are here at once."""
         self._raised = 0
         answered: list[Answered] = []
         for kind, nodes in chosen.items():
             self.scheduler.spent[kind] += len(nodes)
             for source, node in self._by_tree(trees, nodes):
                 targets = Targets(source.tree, node, source.tree.loc(node))
-                batch = self._without_failed(RequestBatch(source, kind, targets))
+                batch = RequestBatch(source, kind, targets)
+                failed = self.failures.among(batch)
+                if failed is not None:  # before its tile was given away: it is marked again
+                    again, batch = batch[failed], batch[~failed]
+                    self._mark(again)
+                    self._skipped += len(again)
                 if len(batch):
                     answered += self._submit(batch)
         return answered
@@ -136,7 +177,7 @@ class Production:
             if item.future.done():
                 seconds = time.monotonic() - item.since
                 self.scheduler.learn(item.batch.kind, len(item.batch), 1e3 * seconds)
-                answered += self._settle(item.batch, _outcome(item.future.result))
+                answered += self._settle(item.batch, item.future)
                 self._waiting.remove(item)
             elif item.left < 0:
                 self._waiting.remove(item)
@@ -153,8 +194,8 @@ class Production:
             if isinstance(answer, Regions):
                 children = children_of(batch, answer, self.cache)
                 self._add_up(batch, write.tiles(self.cache, batch.targets, children), stats)
-            elif isinstance(answer, Sent):
-                self._write_sent(batch, answer, stats)
+            elif isinstance(answer, Shipment):
+                self._write_shipment(batch, answer, stats)
             else:
                 for kind, part in by_kind(batch, answer).items():
                     queue += self._write_bricks(kind, *part, stats)
@@ -171,15 +212,8 @@ class Production:
             wait_for(futures, timeout=longest, return_when=FIRST_COMPLETED)
             wait_for(futures, timeout=more)
 
-    def forget_failures(self) -> None:
-        """Lets what failed be asked for again."""
-        self.failures.forget()
-        self.restore_pending()
-
     def restore_pending(self) -> None:
-        """Marks as pending what is on its way and nothing else: after a frame that was broken off,
-        or to forget failures.
-        """
+        """Marks as pending what is on its way, and nothing else."""
         words = self.cache.nodes.request_tn
         everything = torch.arange(words.numel(), device=words.device)
         for kind in KINDS.values():
@@ -214,36 +248,20 @@ class Production:
             if count
         ]
 
-    def _without_failed(self, batch: RequestBatch) -> RequestBatch:
-        """Leaves out what failed before its tile was given away: it is marked again."""
-        failed = self.failures.among(batch)
-        if failed is None:
-            return batch
-        again = batch[failed]
-        self._mark(again)
-        self._skipped += len(again)
-        return batch[~failed]
-
     def _submit(self, batch: RequestBatch) -> list[Answered]:
         """Asks for a batch; returns what is answered at once."""
         start = time.perf_counter()
-        outcome = _outcome(batch.ask)
-        if isinstance(outcome, Future):
-            if not outcome.done():
-                self._wait_for(batch, outcome)
-                return []
-            outcome = _outcome(outcome.result)
-        answered = self._settle(batch, outcome)
-        self.scheduler.learn(batch.kind, len(batch), 1e3 * (time.perf_counter() - start))
-        return answered
-
-    def _wait_for(self, batch: RequestBatch, asked: Future) -> None:
-        """Remembers that an answer comes later."""
+        asked = batch.ask()
+        if asked.done():
+            answered = self._settle(batch, asked)
+            self.scheduler.learn(batch.kind, len(batch), 1e3 * (time.perf_counter() - start))
+            return answered
         self._mark(batch)
         own = batch.source.producer.patience
         patience = self.patience if own is None else own
         future = self._sent_ahead(batch, asked)
         self._waiting.append(_Waiting(batch, asked, future, patience, time.monotonic()))
+        return []
 
     def _sent_ahead(self, batch: RequestBatch, asked: Future) -> Future:
         """A future that is done once bricks from the host are checked and on their way: all that is
@@ -263,25 +281,31 @@ class Production:
         asked.add_done_callback(send)
         return ahead
 
-    def _settle(self, batch: RequestBatch, outcome: Any) -> list[Answered]:
+    def _settle(self, batch: RequestBatch, asked: Future) -> list[Answered]:
         """Checks an answer, or deals with an error. A producer that raised is asked again for each
         half of the batch, so that one bad node does not take the others with it.
         """
-        if isinstance(outcome, _Raised):
+        raised: Exception | None = None
+        try:
+            answer = asked.result()
+        except Exception as error:
+            raised = error
+        if raised is not None:
             self._raised += 1
             if len(batch) == 1 or self._raised > _MOST_RAISES:
-                error = outcome.error
-                self._fail(batch, f"{type(error).__name__}: {error}", error)
+                self._fail(batch, f"{type(raised).__name__}: {raised}", raised)
                 return []
             half = len(batch) // 2
             return [*self._submit(batch[:half]), *self._submit(batch[half:])]
+        if isinstance(answer, Shipment):
+            return [Answered(batch, answer)]
         try:
-            checked = batch.check(outcome)
+            checked = batch.check(answer)
         except ValueError as error:
             self._fail(batch, str(error), error)
             return []
         if checked.errors:
-            per_node = 1 if batch.kind == REQUEST_LOAD else len(batch.children) // len(batch)
+            per_node = len(batch.nodes) // len(batch)
             named: dict[int, str] = {}
             for index in sorted(checked.errors):
                 named.setdefault(index // per_node, checked.errors[index])
@@ -290,38 +314,31 @@ class Production:
             keep = torch.ones(len(batch), dtype=torch.bool)
             keep[list(named)] = False
             rows = keep.repeat_interleave(per_node).nonzero()[:, 0]
-            batch, checked = batch[keep.nonzero()[:, 0]], select(checked, rows)
+            batch, checked = batch[keep.nonzero()[:, 0]], checked.rows(rows)
         return [Answered(batch, shipped(batch, checked, self.staging))] if len(batch) else []
 
     def _write_bricks(
         self, kind: Region, batch: RequestBatch, answer: Any, stats: FrameStats
     ) -> list[Answered]:
-        """Writes bricks of one kind; returns further answers: bricks made for aliases whose target
-        is not here.
-        """
+        """Writes bricks of one kind; returns further ones, made for aliases of what is not here."""
         if kind is Region.ALIAS:
             return self._write_aliases(batch, upload(answer.alias, batch.targets.node.device))
-        if kind is Region.CONSTANT:
+        if kind is Region.EMPTY:
             device = batch.targets.node.device
             word = torch.where(answer.kind == Region.CONSTANT, CONSTANT, EMPTY).to(torch.int32)
             constants = {name: upload(rows, device) for name, rows in answer.constants.items()}
-            word = upload(word, device)
-            written = write.uniform(self.cache, batch.targets, word, constants)
+            written = write.uniform(self.cache, batch.targets, upload(word, device), constants)
             self._add_up(batch, written, stats)
             return []
-        answer = shipped(batch, answer, self.staging)
-        if isinstance(answer, Sent):
-            self._write_sent(batch, answer, stats)
+        sent = shipped(batch, answer, self.staging)
+        if isinstance(sent, Shipment):
+            self._write_shipment(batch, sent, stats)
         else:
-            written = write.bricks(self.cache, batch.targets, answer.data)
-            self._add_up(batch, written, stats)
+            self._add_up(batch, write.bricks(self.cache, batch.targets, answer.data), stats)
         return []
 
-    def _write_sent(self, batch: RequestBatch, answer: Sent, stats: FrameStats) -> None:
-        """Writes voxels that are on their way to the device; holds back those that found no room
-        there.
-        """
-        shipment = answer.shipment
+    def _write_shipment(self, batch: RequestBatch, shipment: Shipment, stats: FrameStats) -> None:
+        """Writes voxels that are on their way; holds back those that found no room there."""
         sent, rest = batch[: shipment.sent], batch[shipment.sent :]
         if len(rest):
             self._mark(rest)
@@ -330,9 +347,7 @@ class Production:
             self._add_up(sent, write.bricks(self.cache, sent.targets, shipment.chunks), stats)
 
     def _write_aliases(self, batch: RequestBatch, alias: Tensor) -> list[Answered]:
-        """Shares the bricks of alias targets (k, 4); where such a brick is not here, it is made for
-        the alias alone.
-        """
+        """Shares bricks of alias targets (k, 4); those that are not here are made for the alias."""
         tree, targets = batch.source.tree, batch.targets
         other = tree.find(alias)
         words = self.cache.nodes.brick_tn.view(-1)
@@ -347,9 +362,7 @@ class Production:
         return self._submit(RequestBatch(batch.source, batch.kind, alone.targets, alias[~there]))
 
     def _add_up(self, batch: RequestBatch, written: Written, stats: FrameStats) -> None:
-        """Adds what a write did to a frame's statistics; what found no slot may be asked for
-        again.
-        """
+        """Adds up what a write did; what found no slot may be asked for again."""
         name = "bricks" if batch.kind == REQUEST_LOAD else "tiles"
         stats.produced[name] += written.items
         stats.produced["constant"] += written.constant

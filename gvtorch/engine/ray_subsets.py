@@ -1,4 +1,4 @@
-"""`RaySubsets`: which rays of a converging picture are traced next.
+"""Which rays are traced next: `RaySubsets` of a converging picture, `scouts` of the next frame.
 
 A ray that missed nothing is done; the others are traced again. At first these are scouts, one of
 4 x 4 pixels: a brick is wider than that on the screen, so they miss almost all that the others
@@ -19,24 +19,17 @@ _STRIDE = 4  # pixels from scout to scout
 
 
 class RaySubsets:
-    """The state of a picture's rays.
+    """The state of a picture's `count` rays.
 
     Attributes:
-        count: Number of rays.
-        done: Rays that need no more passes.
+        done: Number of rays that need no more passes.
         next: (count,) bool, to be traced next.
         over: Nothing is left to trace, or tracing does not help.
         crowded: The pools were too small for all rays at once.
     """
 
     def __init__(self, count: int, width: int, device: torch.device) -> None:
-        """Starts with all rays, so that each has a colour.
-
-        Args:
-            count: Number of rays.
-            width: Pixels of a row.
-            device: Where the hits lie.
-        """
+        """Starts with all rays, so that each has a colour; `width` is a row's, in pixels."""
         self.count = count
         self._scouts = _grid(count, width, device)
         self._open = torch.ones(count, dtype=torch.bool, device=device)
@@ -51,12 +44,8 @@ class RaySubsets:
         return not self._given_up and self.done == self.count
 
     def update(self, missed: Tensor, stats: FrameStats, failed: int) -> None:
-        """Chooses the next subset from what a pass did; waits for the device.
-
-        Args:
-            missed: (count,) bool, of the rays that were traced.
-            stats: What the pass cost.
-            failed: Nodes that had failed before it.
+        """Chooses the next subset; waits for the device. The last pass cost `stats`, its rays
+        `missed` (count,) something, and `failed` nodes had failed before it.
         """
         # Where nothing could be served, what is missing has failed: these rays are as good as ever.
         finished = self.next if stats.converged else self.next & ~missed
@@ -79,26 +68,20 @@ class RaySubsets:
                 self._size, remaining = 1, 0
         elif not remaining:
             self._size = min(self.count, 2 * self._size)
-        self._choose(left if remaining else self._open)
+        group = left if remaining else self._open
+        ahead = group & self._scouts
+        first = torch.where(ahead.any(), ahead, group)
+        self.next = first & (first.cumsum(0) <= self._size)
+        self.over = self.done == self.count
 
     def trace_all(self) -> None:
         """Lets all rays that are not done be traced next: it is the last pass."""
         self.next = self._open.clone()
 
-    def _choose(self, group: Tensor) -> None:
-        scouts = group & self._scouts
-        first = torch.where(scouts.any(), scouts, group)
-        self.next = first & (first.cumsum(0) <= self._size)
-        self.over = self.done == self.count
-
 
 def scouts(missed: Tensor, width: int) -> Tensor:
-    """Returns which rays are sent ahead of the next picture: all that missed something where these
-    are at most a sixteenth, else one of 4 x 4 pixels.
-
-    Args:
-        missed: (r,) bool, of the rays of the last picture.
-        width: Pixels of a row.
+    """Returns which rays are sent ahead of the next picture, whose rows have `width` pixels: all
+    that `missed` (r,) something where these are at most a sixteenth, else one of 4 x 4 pixels.
     """
     few = missed.sum() * _STRIDE**2 <= len(missed)
     return missed & (few | _grid(len(missed), width, missed.device))

@@ -1,13 +1,12 @@
-"""`RequestBatch`: what a producer is asked, and its answer: checked, sent to the device, or turned
-into the words of tiles.
-"""
+"""`RequestBatch`: what a producer is asked, and how its answer is made ready to be written."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from concurrent.futures import Future
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,6 +20,13 @@ from ..pool.brick_table import on_host
 from ..pool.staging import Shipment, upload
 from ..producers import Bricks, Layout, Nodes, Producer, Region, Regions
 from ..producers.answer import checked_bricks, checked_regions, count_kinds
+
+#: Kinds of bricks that are written alike, from the first to the last.
+_WRITTEN_ALIKE = (
+    (Region.ALIAS, Region.ALIAS),
+    (Region.EMPTY, Region.CONSTANT),
+    (Region.DATA, Region.DATA_MAX_DEPTH),
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,11 +52,9 @@ class RequestBatch:
     fill_loc: Tensor | None = None  # (k, 4) filled in their stead: alias targets
 
     def __len__(self) -> int:
-        """Number of nodes."""
         return len(self.targets)
 
     def __getitem__(self, index: slice | Tensor) -> RequestBatch:
-        """Some of the requests."""
         if isinstance(index, Tensor):
             index = upload(index, self.targets.node.device)
         fill_loc = None if self.fill_loc is None else self.fill_loc[index]
@@ -61,61 +65,53 @@ class RequestBatch:
         """Load or subdivide."""
         return next(name for name, kind in KINDS.items() if kind == self.kind)
 
-    @property
-    def bricks(self) -> Nodes:
-        """What a producer is asked to fill."""
-        loc = self.targets.loc if self.fill_loc is None else self.fill_loc
-        return Nodes(loc, self.source.layout)
-
     @cached_property
-    def children(self) -> Nodes:
-        """What a producer is asked to classify: all children of all nodes, node after node."""
-        n, loc = self.source.layout.branching, self.targets.loc
+    def nodes(self) -> Nodes:
+        """What the producer is asked about: nodes to fill, or all children of the nodes to
+        subdivide, node after node.
+        """
+        layout, loc = self.source.layout, self.targets.loc
+        if self.kind == REQUEST_LOAD:
+            return Nodes(loc if self.fill_loc is None else self.fill_loc, layout)
+        n = layout.branching
         child = torch.arange(n**3, device=loc.device)
         digits = torch.stack((child % n, child // n % n, child // n**2, torch.ones_like(child)), 1)
         low = torch.cat((loc[:, :3] * n, loc[:, 3:]), 1)
-        return Nodes((low[:, None] + digits).flatten(0, 1), self.source.layout)
+        return Nodes((low[:, None] + digits).flatten(0, 1), layout)
 
-    def ask(self) -> Any:
-        """Calls the producer."""
-        if self.kind == REQUEST_LOAD:
-            return self.source.producer.fill(self.bricks)
-        return self.source.producer.classify(self.children)
-
-    def check(self, answer: Any) -> Answer:
-        """Checks an answer; see producers/answer.py."""
-        if isinstance(answer, Sent):
+    def ask(self) -> Future:
+        """Calls the producer; returns a future of its answer, done unless that comes later."""
+        producer, answered = self.source.producer, Future[Any]()
+        try:
+            fills = self.kind == REQUEST_LOAD
+            answer = producer.fill(self.nodes) if fills else producer.classify(self.nodes)
+        except Exception as error:
+            answered.set_exception(error)
+            return answered
+        if isinstance(answer, Future):
             return answer
-        if self.kind == REQUEST_LOAD:
-            return checked_bricks(answer, self.bricks, self.source.producer)
-        return checked_regions(answer, self.children, self.source.producer)
+        answered.set_result(answer)
+        return answered
+
+    def check(self, answer: Any) -> Regions | Bricks:
+        """Checks an answer; see producers/answer.py."""
+        check = checked_bricks if self.kind == REQUEST_LOAD else checked_regions
+        return check(answer, self.nodes, self.source.producer)
 
     def __repr__(self) -> str:
         return f"RequestBatch({self.kind_name} {len(self)} of {self.source.name!r})"
 
 
-@dataclass(frozen=True, eq=False)
-class Sent:
-    """Voxels that were checked, found right, and are on their way to the device."""
-
-    shipment: Shipment
-    errors: Mapping[int, str] = field(default_factory=dict)
-
-
-Answer = Regions | Bricks | Sent
-AnyAnswer = TypeVar("AnyAnswer", bound=Answer)
-
-
 class Answered(NamedTuple):
-    """A batch and its answer, checked; items that failed are left out of both."""
+    """A batch and its answer, checked, without items that failed."""
 
     batch: RequestBatch
-    answer: Answer
+    answer: Regions | Bricks | Shipment
 
 
 def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
     """Turns a producer's regions into the words of tiles."""
-    layout, nodes = batch.source.layout, batch.children
+    layout, nodes = batch.source.layout, batch.nodes
     low = nodes.loc[:, :3] * (nodes.scale * layout.brick_size)[:, None]
     kind = torch.where((low >= layout.extent_3).any(1), Region.EMPTY, answer.kind)
     leaf = (kind == Region.EMPTY) | (kind == Region.CONSTANT) | (kind == Region.DATA_MAX_DEPTH)
@@ -123,12 +119,10 @@ def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
     child = torch.where(leaf, TERMINAL, ABSENT).to(torch.int32)
     brick = torch.where(kind == Region.EMPTY, EMPTY, ABSENT)
     brick = torch.where(kind == Region.CONSTANT, CONSTANT, brick).to(torch.int32)
-    constants = dict(answer.constants)
+    constants, ranges = dict(answer.constants), dict(answer.ranges)
     for name, words in cache.nodes.constants.items():  # also what another tree left in these tiles
         if name not in constants:
             constants[name] = words.new_zeros((len(kind), words.shape[-1]))
-    ranges = dict(answer.ranges)
-    for name in cache.nodes.ranges:
         if name not in ranges:
             ranges[name] = _untold_range(cache, name, kind, answer.constants.get(name))
 
@@ -159,28 +153,32 @@ def _untold_range(cache: Cache, name: str, kind: Tensor, constant: Tensor | None
     return widest.view(channel.dtype)
 
 
-def by_kind(batch: RequestBatch, answer: Bricks) -> dict[Region, Answered]:
-    """Splits an answer by how it is written: ALIAS, CONSTANT for what needs no brick, DATA for
-    voxels, in this order. An answer on a device is looked at once.
-    """
-    kind = answer.kind
-    if kind is None:
-        return {Region.DATA: Answered(batch, answer)}
-    empty, constant, data, last, alias = count_kinds(kind).tolist()
-    counts = {Region.ALIAS: alias, Region.CONSTANT: empty + constant, Region.DATA: data + last}
-    found = [what for what, count in counts.items() if count]
-    if len(found) == 1:
-        return {found[0]: Answered(batch, answer)}
-    masks = {
-        Region.ALIAS: kind == Region.ALIAS,
-        Region.CONSTANT: (kind == Region.EMPTY) | (kind == Region.CONSTANT),
-        Region.DATA: (kind == Region.DATA) | (kind == Region.DATA_MAX_DEPTH),
-    }
-    groups = {}
-    for what in found:
-        rows = torch.nonzero_static(masks[what], size=counts[what])[:, 0]
-        groups[what] = Answered(batch[rows], select(answer, rows))
+def by_kind(batch: RequestBatch, answer: Bricks) -> dict[Region, tuple[RequestBatch, Bricks]]:
+    """Splits an answer by how it is written: ALIAS, EMPTY (needs no brick), DATA, in this order."""
+    if answer.kind is None:
+        return {Region.DATA: (batch, answer)}
+    counts, groups = count_kinds(answer.kind).tolist(), {}
+    for first, last in _WRITTEN_ALIKE:
+        size = sum(counts[first : last + 1])
+        if size == len(batch):
+            return {first: (batch, answer)}
+        if size:
+            mask = (answer.kind >= first) & (answer.kind <= last)
+            row = torch.nonzero_static(mask, size=size)[:, 0]
+            groups[first] = batch[row], answer.rows(row)
     return groups
+
+
+def shipped(
+    batch: RequestBatch, answer: Regions | Bricks, staging: Staging | None
+) -> Regions | Bricks | Shipment:
+    """Sends a checked answer to the device if it is voxels from the host and nothing else."""
+    if staging is None or not isinstance(answer, Bricks) or not on_host(answer.data):
+        return answer
+    kind = answer.kind
+    if kind is not None and int(count_kinds(kind)[Region.DATA : Region.ALIAS].sum()) < len(batch):
+        return answer
+    return staging.send(answer.data)
 
 
 def send_ahead(batch: RequestBatch, answer: Any, staging: Staging) -> Any:
@@ -197,33 +195,5 @@ def send_ahead(batch: RequestBatch, answer: Any, staging: Staging) -> Any:
         checked = batch.check(answer)
     except ValueError:
         return answer  # the frame tells of it
-    if checked.errors:
-        return answer
-    sent = shipped(batch, checked, staging)
-    return sent if isinstance(sent, Sent) else answer
-
-
-def shipped(batch: RequestBatch, answer: AnyAnswer, staging: Staging | None) -> AnyAnswer | Sent:
-    """Sends a checked answer to the device if it is voxels from the host and nothing else."""
-    if staging is None or not isinstance(answer, Bricks) or not on_host(answer.data):
-        return answer
-    if answer.kind is not None:
-        if int(count_kinds(answer.kind)[Region.DATA : Region.ALIAS].sum()) < len(batch):
-            return answer
-    return Sent(staging.send(answer.data))
-
-
-def select(answer: Any, row: Tensor) -> Any:
-    """The items of an answer that `row` (m,) names, errors left out."""
-
-    def rows(value: Any) -> Any:
-        if isinstance(value, TableRows):
-            return value[row]
-        if isinstance(value, Tensor):
-            return movable(value)[row.to(value.device)].view(value.dtype)
-        if isinstance(value, dict):
-            return {name: rows(tensor) for name, tensor in value.items()}
-        return value
-
-    fields = {name: rows(value) for name, value in vars(answer).items() if name != "errors"}
-    return type(answer)(**fields, errors={})
+    sent = answer if checked.errors else shipped(batch, checked, staging)
+    return sent if isinstance(sent, Shipment) else answer

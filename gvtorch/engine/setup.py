@@ -1,9 +1,10 @@
-"""What an engine is made of: pools, and a tree with its root for every producer."""
+"""What an engine is made of: its options, pools, and a tree with its root for every producer."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal, TypedDict
 
 import torch
 
@@ -15,9 +16,62 @@ from ..cache.write import put_bricks
 from ..pool import BrickPool, Channel, N3Tree, NodePool
 from ..producers import Layout, Nodes, Producer, Region
 from ..producers.answer import checked_bricks, checked_regions
-from .failures import ProductionError
-from .options import EngineOptions
+from .production import ProductionError
 from .request_batch import ProducedTree
+
+
+@dataclass(frozen=True, kw_only=True)
+class EngineOptions:
+    """How the engine keeps its scene."""
+
+    node_pool: int | str = "8 MB"  # bytes of node words, constants and ranges
+    brick_pool: int | str = "256 MB"  # bytes of voxels
+    device: torch.device | str = "cpu"
+    brick_size: int = 8  # voxels along a side, without the border
+    border: int = 1  # voxels around a brick; from 1 on no seam shows
+    loading: Literal["straight", "levels"] = "straight"  # to the wanted level, or one by one
+    order: Literal["coarse", "fine"] = "coarse"  # which levels are served first
+    load_budget: int = 4096  # most bricks a frame
+    subdivide_budget: int = 4096  # most node tiles a frame
+    time_budget: float | None = None  # most milliseconds of production a frame
+    scout_rounds: int = 2  # rounds of a sixteenth of the rays before a frame that missed something
+    patience: float = 120.0  # seconds until an answer that does not come is given up
+    strict: bool = False  # raise when something can't be produced
+    monitor: bool = True  # time the stages and remember the last frames, for `report`
+
+    def __post_init__(self) -> None:
+        names = {"loading": ("straight", "levels"), "order": ("coarse", "fine")}
+        for name, (one, other) in names.items():
+            value = getattr(self, name)
+            if value not in (one, other):
+                raise ValueError(f"Engine: {name} must be {one!r} or {other!r}, got {value!r}")
+        check.number("Engine", "patience", self.patience, low=0, open_low=True)
+        if self.time_budget is not None:
+            check.number("Engine", "time_budget", self.time_budget, low=0, open_low=True)
+        for name, low in (("load_budget", 1), ("subdivide_budget", 1), ("scout_rounds", 0)):
+            check.whole("Engine", name, getattr(self, name), low=low)
+        for name in ("strict", "monitor"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"Engine: {name} must be bool, got {getattr(self, name)!r}")
+
+
+class EngineSettings(TypedDict, total=False):
+    """The fields of `EngineOptions` as keyword arguments of `Engine`, for editors."""
+
+    node_pool: int | str
+    brick_pool: int | str
+    device: torch.device | str
+    brick_size: int
+    border: int
+    loading: Literal["straight", "levels"]
+    order: Literal["coarse", "fine"]
+    load_budget: int
+    subdivide_budget: int
+    time_budget: float | None
+    scout_rounds: int
+    patience: float
+    strict: bool
+    monitor: bool
 
 
 def make_pools(
@@ -74,12 +128,7 @@ def brick_bytes(channels: Mapping[str, Channel], options: EngineOptions) -> int:
 def make_tree(
     cache: Cache, options: EngineOptions, number: int, name: str, producer: Producer
 ) -> ProducedTree:
-    """Makes a tree with its root node, which is never given away.
-
-    Raises:
-        ValueError: The producer serves another engine.
-        ProductionError: The root can't be produced.
-    """
+    """Makes a tree with its root node, which is never given away."""
     nodes = cache.nodes
     device = nodes.child_tn.device
     layout = Layout.of(producer, options.brick_size, options.border, device)
@@ -116,7 +165,7 @@ def make_tree(
 
 
 def _fill_root(cache: Cache, made: ProducedTree, patience: float) -> None:
-    """Asks for the root's content and writes it into the first slots, which are the roots'."""
+    """Writes the root's content into the first slots, which are the roots'."""
     nodes, index, producer = cache.nodes, made.tree.root, made.producer
     number = index // nodes.nodes_per_tile
     root = Nodes(torch.zeros((1, 4), dtype=torch.int64, device=nodes.child_tn.device), made.layout)

@@ -1,39 +1,26 @@
-"""`FrameStats`: what a frame cost. Some of it is known only when the device has finished the frame:
-these fields are declared with `waits`.
+"""What frames cost: `FrameStats` of one, the `Readback` that completes it, and the `Report` of the
+last ones. On CUDA a frame's counts come by a copy to pinned memory, and the host goes on meanwhile:
+its requests are served once its readback has arrived.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import statistics
+from collections import deque
+from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
 
 from ..base.records import RenderStats, add
+from ..cache import KINDS, RequestList
 
-T = TypeVar("T")
-
-
-class _Waits:
-    """A field that waits for the device when it is read."""
-
-    def __init__(self, make: Callable[[], Any]) -> None:
-        self._make = make
-
-    def __set_name__(self, _owner: type, name: str) -> None:
-        self._name = name
-
-    def __get__(self, stats: FrameStats | None, _owner: type) -> Any:
-        return None if stats is None else vars(stats.settle())[self._name]
-
-    def __set__(self, stats: FrameStats, value: Any) -> None:
-        vars(stats)[self._name] = self._make() if value is None else value
-
-
-def waits(make: Callable[[], T]) -> T:
-    """Declares a field that is read back from the device, `make()` at first. Reading it waits until
-    the device has finished the frame: see `FrameStats.settle`.
-    """
-    return cast(T, _Waits(make))
+_AHEAD = 3  # most frames that the host may be ahead of the device
+#: Fields of `FrameStats` that are known when the device has finished the frame.
+_LATE = {"milliseconds", "stages", "samples", "tiles_used", "bricks_used"}
+_LATE |= {"requests", "misses", "overflow", "converged"}
 
 
 @dataclass(kw_only=True, repr=False)
@@ -47,15 +34,10 @@ class FrameStats(RenderStats):
     the picture alone.
     """
 
-    milliseconds: float = waits(float)  # of the frame; on CUDA, of the device
-    stages: dict[str, float] = waits(dict)  # noqa: RUF009 - milliseconds by stage
-    samples: int = waits(int)  # places at which the shader was evaluated
-    tiles_used: int = waits(int)  # node tiles that rays passed through
-    bricks_used: int = waits(int)  # bricks that rays sampled
-    requests: dict[str, int] = waits(dict)  # noqa: RUF009 - by kind: load, subdivide
-    misses: int = waits(int)  # nodes that rays missed, those whose answer is pending included
-    overflow: int = waits(int)  # nodes with a request that the list had no place for
-    converged: bool = waits(bool)  # nothing that could be served was missing
+    requests: dict[str, int] = field(default_factory=dict)  # by kind: load, subdivide
+    misses: int = 0  # nodes that rays missed, those whose answer is pending included
+    overflow: int = 0  # nodes with a request that the list had no place for
+    converged: bool = False  # nothing that could be served was missing
 
     frame: int = 0  # number of the frame, from 1
     frames: int = 1  # frames that this picture took
@@ -73,8 +55,12 @@ class FrameStats(RenderStats):
     capacity_exceeded: bool = False  # a request found no slot that this frame had not used itself
 
     def __post_init__(self) -> None:
-        """Nothing is on its way yet."""
         self._unread: tuple[Callable[[], None], ...] = ()
+
+    def __getattribute__(self, name: str) -> Any:
+        if name in _LATE and self._unread:
+            self.settle()
+        return super().__getattribute__(name)
 
     def later(self, complete: Callable[[], None]) -> None:
         """Lets `settle` call `complete`, which waits for the device and sets fields."""
@@ -129,3 +115,183 @@ class FrameStats(RenderStats):
 
     def __getstate__(self) -> dict[str, Any]:
         return vars(self.settle())
+
+
+class Counts(NamedTuple):
+    """What the host is told of a frame."""
+
+    listed: int  # nodes with a request, as far as the list has places
+    found: int  # nodes with a request
+    misses: int  # and those whose answer is pending
+    load: int  # requests of each kind
+    subdivide: int
+    tiles_unused: int
+    tiles_used: int
+    bricks_unused: int
+    bricks_used: int
+    samples: int
+
+    def by_kind(self) -> dict[str, int]:
+        """Returns the number of requests by the name of their kind."""
+        return {name: getattr(self, name) for name in KINDS}
+
+
+class Collected(NamedTuple):
+    """What a traced frame leaves on the device."""
+
+    requests: RequestList
+    numbers: Tensor  # (10,) int64 `Counts`
+
+
+class Readback:
+    """A frame whose counts are on their way to the host; completes its statistics."""
+
+    def __init__(self, stats: FrameStats, collected: Collected) -> None:
+        """Starts the copy."""
+        self.stats, (self.requests, numbers) = stats, collected
+        self._pending = stats.pending > 0  # answers were on their way while it was traced
+        self._numbers, self._event = numbers, None
+        self._counts: Counts | None = None
+        if numbers.is_cuda:
+            self._numbers = torch.empty(numbers.shape, dtype=numbers.dtype, pin_memory=True)
+            self._numbers.copy_(numbers, non_blocking=True)
+            self._event = torch.cuda.Event()
+            self._event.record(torch.cuda.current_stream(numbers.device))
+        stats.later(self._complete)
+
+    @property
+    def arrived(self) -> bool:
+        """Whether the counts are here."""
+        return self._event is None or self._event.query()
+
+    def wait(self) -> Counts:
+        """Returns the counts; waits until they are here."""
+        if self._counts is None:
+            if self._event is not None:
+                self._event.synchronize()
+            self._counts = Counts(*self._numbers.tolist())
+        return self._counts
+
+    def converged(self) -> bool:
+        """Whether nothing that could be served was missing; waits until the counts are here."""
+        return not (self.wait().found or self._pending)
+
+    def _complete(self) -> None:
+        stats, counts = self.stats, self.wait()
+        add(stats.requests, counts.by_kind())
+        stats.overflow, stats.converged = counts.found - counts.listed, self.converged()
+        for name in ("misses", "tiles_used", "bricks_used", "samples"):
+            setattr(stats, name, getattr(counts, name))
+
+
+class Readbacks(deque[Readback]):
+    """The frames whose counts are on their way, oldest first."""
+
+    _steady = False
+
+    def catch_up(self, wait: bool) -> Readback | None:
+        """Takes all frames whose counts are here. Waits for those of the others if `wait` is true,
+        if a frame is known to have requests, or if the host is too far ahead. Returns the newest.
+        """
+        newest = None
+        while self and (
+            self[0].arrived
+            or (wait or len(self) > _AHEAD)
+            or (newest is not None and newest.wait().listed > 0)
+        ):
+            newest = self._take()
+        return newest
+
+    def hold_back(self) -> None:
+        """Waits for the oldest frames while the host is too far ahead of the device."""
+        while len(self) > _AHEAD:
+            self._take()
+
+    @property
+    def steady(self) -> bool:
+        """True if the newest frame read back had converged; does not block."""
+        for readback in self:
+            if readback.arrived:
+                self._steady = readback.converged()
+        return self._steady
+
+    def _take(self) -> Readback:
+        readback = self.popleft()
+        self._steady = readback.converged()
+        readback.stats.settle()
+        return readback
+
+
+@dataclass(frozen=True, repr=False)
+class Report:
+    """What the last frames took, as a table and as plain values."""
+
+    frames: Collection[FrameStats]  # the oldest first
+    occupancy: dict[str, float]  # for each pool, the share of slots that hold something
+    memory: dict[str, int]  # bytes of the pools and of the bookkeeping
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns plain values: milliseconds by stage (median, 95th percentile), rates, misses."""
+        frames = list(self.frames)
+        seconds = sum(stats.milliseconds for stats in frames) / 1e3
+        names = dict.fromkeys(name for stats in frames for name in stats.stages)
+        used = sum(stats.bricks_used for stats in frames)
+        missed = sum(stats.requests.get("load", 0) for stats in frames)
+        amounts = {
+            "rays": sum(stats.rays for stats in frames),
+            "samples": sum(stats.samples for stats in frames),
+            "bricks": sum(stats.produced.get("bricks", 0) for stats in frames),
+            "tiles": sum(stats.produced.get("tiles", 0) for stats in frames),
+            "megabytes": sum(stats.bytes_uploaded for stats in frames) / 1e6,
+        }
+        rates = {n: amount / seconds if seconds > 0 else 0.0 for n, amount in amounts.items()}
+        return {
+            "frames": len(frames),
+            "milliseconds": _spread([stats.milliseconds for stats in frames]),
+            "stages": {n: _spread([s.stages.get(n, 0.0) for s in frames]) for n in names},
+            **{f"{name}_per_second": rate for name, rate in rates.items()},
+            "hit_rate": used / max(1, used + missed),
+            "miss_rate": missed / max(1, used + missed),
+            "failed": frames[-1].failed if frames else 0,
+            "occupancy": self.occupancy,
+            "memory": self.memory,
+        }
+
+    def __rich__(self) -> Any:
+        """Returns the table that rich prints."""
+        from rich.table import Table
+
+        content = self.as_dict()
+        table = Table(title=f"{content['frames']} frames", show_header=True)
+        for column in ("", "median", "95 %"):
+            table.add_column(column, justify="left" if not column else "right")
+        for name, spread in {**content["stages"], "frame": content["milliseconds"]}.items():
+            table.add_row(f"{name}, ms", f"{spread['median']:.2f}", f"{spread['p95']:.2f}")
+        for name in ("samples", "bricks", "tiles", "megabytes"):
+            table.add_row(f"{name} / s", f"{content[f'{name}_per_second']:,.0f}", "")
+        table.add_row("bricks missed, of those wanted", f"{content['miss_rate']:.2%}", "")
+        for name, share in content["occupancy"].items():
+            table.add_row(f"{name} in use", f"{share:.1%}", "")
+        for name, size in content["memory"].items():
+            table.add_row(f"{name}, MB", f"{size / 1e6:.1f}", "")
+        return table
+
+    def __repr__(self) -> str:
+        return f"Report({len(self.frames)} frames)"
+
+    def __str__(self) -> str:
+        """Shows the table as plain text."""
+        from rich.console import Console
+
+        console = Console(width=60, color_system=None)
+        with console.capture() as capture:
+            console.print(self)
+        return capture.get()
+
+
+def _spread(values: list[float]) -> dict[str, float]:
+    ordered = sorted(values) or [0.0]
+    return {
+        "median": statistics.median(ordered),
+        "p95": ordered[round(0.95 * (len(ordered) - 1))],
+    }

@@ -27,14 +27,7 @@ def trace_scene(
     box: Tensor,
     **frame: Any,
 ) -> Trace:
-    """Returns what traces rays through all trees.
-
-    Args:
-        trees: By name.
-        shaders: One for all, or one for each by name.
-        options: Of the picture.
-        box: (2, 3) world corners around all trees.
-        **frame: See `Tracer`.
+    """Returns what traces rays through all trees, which `box` (2, 3) holds; `frame` as in `Tracer`.
 
     Raises:
         ValueError: A tree has no shader, or not the channel that its shader reads.

@@ -3,8 +3,7 @@
 from .background import Backdrop, Environment, Gradient
 from .files import read_image
 from .picture import Picture
-from .progressive import Progressive
-from .strips import render_tiles
+from .progressive import Progressive, render_tiles
 
 __all__ = [
     "Backdrop",

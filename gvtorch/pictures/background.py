@@ -1,9 +1,8 @@
-"""What stands behind a picture, in linear light: a colour, a gradient, an image of the picture's
-size, or an environment map looked up by the directions of the rays.
-"""
+"""What stands behind a picture, in linear light."""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
@@ -43,22 +42,19 @@ class Gradient(Background):
 
     def __init__(self, top: Color, bottom: Color) -> None:
         """Takes two colours, linear RGB, finite and >= 0."""
-        self.ends = [_color("Gradient", n, c) for n, c in (("top", top), ("bottom", bottom))]
+        self.ends = [_color("Gradient", "top", top), _color("Gradient", "bottom", bottom)]
 
     def __repr__(self) -> str:
-        """Tells both colours."""
         top, bottom = self.ends
         return f"Gradient(top={top}, bottom={bottom})"
 
     def behind(self, camera: Camera, numbers: Tensor, dtype: torch.dtype) -> Tensor:
-        """Returns (r, 3)."""
         options: Any = {"dtype": dtype, "device": numbers.device}
         top_row, rows = camera.window
         place = (torch.arange(top_row, top_row + camera.height, **options) + 0.5) / rows
         ends = zip(*self.ends, strict=True)
         column = torch.stack([top + (bottom - top) * place for top, bottom in ends], -1)
-        shape = (len(camera), camera.height, camera.width, 3)
-        return column[:, None].expand(shape).reshape(-1, 3)
+        return _by_pixel(column[:, None], camera)
 
 
 class Backdrop(Background):
@@ -75,25 +71,21 @@ class Backdrop(Background):
         self._there: dict[torch.device, Tensor] = {}
 
     def __repr__(self) -> str:
-        """Tells the shape."""
         return f"Backdrop({check.describe(self.image)})"
 
     def check(self, where: str, camera: Camera) -> None:
-        """Compares the sizes."""
         shape, size = tuple(self.image.shape), (camera.window[1], camera.width, 3)
         if shape[-3:] != size or (len(shape) == 4 and shape[0] not in (1, len(camera))):
             wanted = (len(camera), *size) if camera.batched else size
             raise ValueError(f"{where}: background image must be {wanted}, got {shape}")
 
     def behind(self, camera: Camera, numbers: Tensor, dtype: torch.dtype) -> Tensor:
-        """Returns (r, 3)."""
         device = numbers.device
         if self.image.device != device and device not in self._there:
             self._there[device] = self.image.to(device)
         top = camera.window[0]
         image = self._there.get(device, self.image)[..., top : top + camera.height, :, :].to(dtype)
-        shape = (len(camera), camera.height, camera.width, 3)
-        return image.expand(shape).reshape(-1, 3)
+        return _by_pixel(image, camera)
 
 
 class Environment(Background):
@@ -131,13 +123,10 @@ class Environment(Background):
         return cls(read_image(path)[..., :3])
 
     def __repr__(self) -> str:
-        """Tells the shape."""
         return f"Environment({check.describe(self.image)})"
 
     def _on(self, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        """The map (1, 3, h, w + 2) with a column repeated on either side, and the rotation;
-        uploaded once per device.
-        """
+        """The map (1, 3, h, w + 2) with a column repeated on either side, and the rotation."""
         if (device, dtype) not in self._there:
             image = self.image.to(device, dtype).movedim(-1, 0)[None]
             around = torch.cat((image[..., -1:], image, image[..., :1]), -1)
@@ -158,28 +147,27 @@ class Environment(Background):
         return found[0, :, 0].mT
 
     def behind(self, camera: Camera, numbers: Tensor, dtype: torch.dtype) -> Tensor:
-        """Returns (r, 3)."""
         blocks = camera.blocks(_PIXELS_A_BLOCK)
         rays = (camera.pixel_rays(numbers, rows) for rows in blocks)
         return torch.cat([self.look_up(some.direction, dtype) for some in rays])
 
 
 def checked_background(where: str, value: Any) -> Background | Color | None:
-    """Returns a user's background: an object of a class of this file, a colour, or None
-    (transparent).
-    """
+    """Returns a user's background: an object of this file, a colour, or None (transparent)."""
     if value is None or isinstance(value, Background):
         return value
     if isinstance(value, Tensor) and value.dim() > 1:
         return Backdrop(value)
-    color = check.triple(where, "background", value)
+    return _color(where, "background", value, high=1)
+
+
+def _color(where: str, name: str, value: Sequence[float], high: float = math.inf) -> Color:
+    color = check.triple(where, name, value)
     for part in color:
-        check.number(where, "background", part, low=0, high=1)
+        check.number(where, name, part, low=0, high=high)
     return color
 
 
-def _color(where: str, name: str, value: Sequence[float]) -> Color:
-    red, green, blue = check.triple(where, name, value)
-    for part in (red, green, blue):
-        check.number(where, name, part, low=0)
-    return (red, green, blue)
+def _by_pixel(image: Tensor, camera: Camera) -> Tensor:
+    """(r, 3) of an image (..., h, w, 3) that is as large as the picture or is repeated over it."""
+    return image.expand(len(camera), camera.height, camera.width, 3).reshape(-1, 3)

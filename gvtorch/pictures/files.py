@@ -7,10 +7,11 @@ introduction).
 
 from __future__ import annotations
 
+import importlib
 import os
 import tempfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,11 +29,8 @@ _BITS = {".png": (8, 16), ".tif": (8, 16, 32), ".exr": (32, 16), ".npy": (32,), 
 
 
 def checked_path(where: str, path: Path, bits: int | None, known: tuple[str, ...]) -> int:
-    """Returns the bits of a number in a file to be written.
-
-    Raises:
-        ValueError: The ending is not among those known, or has no such number of bits.
-        FileNotFoundError: The folder does not exist.
+    """Returns the bits of a number in a file to be written; raises ValueError if the ending is not
+    known or has no such number of bits, FileNotFoundError if there is no such folder.
     """
     if path.suffix not in known:
         wanted = f"{', '.join(known[:-1])} or {known[-1]}"
@@ -58,7 +56,7 @@ def write_image(path: Path, layers: Layers, *, transparent: bool, bits: int | No
             _write_exr(part, layers, bits)
         elif path.suffix == ".tif":
             image = tiff_pixels(side_by_side(layers), transparent, bits)
-            write_tiff(part, image.shape, image.dtype, iter([image]), len(image))
+            write_tiff(part, image.shape, image.dtype, [image], len(image))
         else:
             write_png(part, layers, transparent=transparent, bits=bits)
 
@@ -93,12 +91,8 @@ def stacked(layers: Layers) -> np.ndarray:
 
 
 def display_pixels(color: Tensor, alpha: Tensor | None, bits: int) -> np.ndarray:
-    """Returns sRGB (..., 3), or with alpha straight sRGB and alpha (..., 4), as uint8 or uint16.
-
-    Args:
-        color: (..., 3) linear RGB, premultiplied if there is alpha.
-        alpha: (..., 1).
-        bits: 8 or 16.
+    """Returns sRGB (..., 3), or with alpha (..., 1) straight sRGB and alpha (..., 4), as uint8 or
+    uint16, of linear RGB, which is premultiplied if there is alpha.
     """
     color = color.detach().to("cpu", torch.float32 if bits == 8 else torch.float64)
     if alpha is None:
@@ -132,25 +126,13 @@ def write_tiff(
     path: Path,
     shape: tuple[int, ...],
     dtype: np.dtype[Any],
-    strips: Iterator[np.ndarray],
+    strips: Iterable[np.ndarray],
     rows: int,
 ) -> None:
-    """Writes a BigTIFF as its strips of rows come.
-
-    Args:
-        path: The file.
-        shape: (h, w, c) of the whole image; c is 3, or 4 with alpha.
-        dtype: Of its numbers.
-        strips: Arrays (rows, w, c), the last of what is left.
-        rows: Of a strip.
-
-    Raises:
-        ImportError: tifffile is missing.
+    """Writes a BigTIFF (h, w, c), c 3, or 4 with alpha, as its strips (rows, w, c) come, the last
+    of what rows are left.
     """
-    try:
-        import tifffile
-    except ImportError:
-        raise ImportError(".tif needs tifffile: pip install 'gvtorch[image]'") from None
+    tifffile = _library("tifffile", ".tif")
     kind = "assocalpha" if dtype.kind == "f" else "unassalpha"
     with tifffile.TiffWriter(path, bigtiff=True) as file:
         file.write(
@@ -165,26 +147,23 @@ def write_tiff(
         )
 
 
-def _openexr() -> Any:
+def _library(name: str, ending: str) -> Any:
+    """Loads what only files with this ending need."""
     try:
-        import OpenEXR
+        return importlib.import_module(name)
     except ImportError:
-        raise ImportError(".exr needs OpenEXR: pip install 'gvtorch[image]'") from None
-    return OpenEXR
+        raise ImportError(f"{ending} needs {name}: pip install 'gvtorch[image]'") from None
 
 
 def _write_exr(path: Path, layers: Layers, bits: int) -> None:
-    OpenEXR, layers = _openexr(), side_by_side(layers)
+    OpenEXR, layers = _library("OpenEXR", ".exr"), side_by_side(layers)
     kind = np.float16 if bits == 16 else np.float32
     light = np.concatenate((layers["color"], layers["alpha"]), -1)
     if bits == 16:
         light = np.clip(light, -65504, 65504)  # the largest half
-    channels = {
-        name: np.ascontiguousarray(light[..., index].astype(kind))
-        for index, name in enumerate("RGBA")
-    }
+    channels = {name: light[..., index].astype(kind, "C") for index, name in enumerate("RGBA")}
     channels["Z"] = np.ascontiguousarray(layers["depth"][..., 0])
-    channels["samples"] = np.ascontiguousarray(layers["samples"][..., 0].astype(np.uint32))
+    channels["samples"] = layers["samples"][..., 0].astype(np.uint32, "C")
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     OpenEXR.File(header, channels).write(str(path))
 
@@ -237,22 +216,15 @@ def _read_png(path: Path) -> np.ndarray:
 
 
 def _read_exr(path: Path) -> np.ndarray:
-    channels = _openexr().File(str(path), separate_channels=True).channels()
+    file = _library("OpenEXR", ".exr").File(str(path), separate_channels=True)
+    channels = file.channels()
     names = "RGBA" if "A" in channels else "RGB"
     return np.stack([channels[name].pixels for name in names], -1)
-
-
-def _read_tiff(path: Path) -> np.ndarray:
-    try:
-        import tifffile
-    except ImportError:
-        raise ImportError(".tif needs tifffile: pip install 'gvtorch[image]'") from None
-    return tifffile.imread(path)
 
 
 _READERS: dict[str, Callable[[Path], np.ndarray]] = {
     ".png": _read_png,
     ".exr": _read_exr,
     ".npy": np.load,
-    ".tif": _read_tiff,
+    ".tif": lambda path: _library("tifffile", ".tif").imread(path),
 }

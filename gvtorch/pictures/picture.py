@@ -40,17 +40,16 @@ class Picture:
         """Returns the picture with its light mapped to what a display shows, still linear.
 
         Args:
-            curve: none (clipped), reinhard or aces.
-            exposure: Stops.
-            white: Smallest luminance that Reinhard's curve shows as 1.
+            curve: none: clipped; reinhard: luminance is compressed so that `white` becomes 1, hue
+                stays; aces: a filmic curve for each primary.
+            exposure: Stops: the colour is multiplied by 2^exposure first.
+            white: Smallest luminance, after exposure, that Reinhard's curve shows as 1.
 
         Raises:
-            ValueError: See `tone.tone_map`.
+            ValueError: The curve is unknown, or a number is out of its range.
         """
-        if not self.transparent:
-            return replace(self, color=tone_map(self.color, curve, exposure=exposure, white=white))
-        straight = tone_map(self.straight(), curve, exposure=exposure, white=white)
-        return replace(self, color=straight * self.alpha)
+        color = tone_map(self.straight(), curve, exposure=exposure, white=white)
+        return replace(self, color=color * self.alpha if self.transparent else color)
 
     def straight(self) -> Tensor:
         """Returns the colour (h, w, 3), not premultiplied; 0 where there is nothing."""
@@ -103,7 +102,6 @@ class Picture:
             return path.read_bytes()
 
     def __repr__(self) -> str:
-        """Shows the size."""
         *_, height, width, _ = self.color.shape
         count = "" if self.color.dim() == 3 else f"{self.color.shape[0]} x "
         return f"Picture({count}{width}x{height}, {self.stats.milliseconds:.0f} ms)"

@@ -1,31 +1,37 @@
-"""`Progressive`: pictures of a camera at rest that get better from frame to frame.
+"""Pictures of several renders: `Progressive`, of a camera at rest, gets better frame by frame;
+`render_tiles` goes strip of rows by strip of rows to a file, and may be larger than memory.
 
-The first frame samples the centres of the pixels, each later one another place in every pixel: a
-point of Roberts' R2 sequence and, in the next frame, its mirror image through the centre. So
-samples cover a pixel evenly after any number of frames, and what varies linearly across it cancels
-out (antithetic sampling). The mean of the frames converges to the picture under a box filter.
+The first frame of a camera at rest samples the centres of the pixels, each later one another place
+in every pixel: a point of Roberts' R2 sequence and, in the next frame, its mirror image through the
+centre. So samples cover a pixel evenly after any number of frames, and what varies linearly across
+it cancels out (antithetic sampling). The mean converges to the picture under a box filter.
 
 Source: Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from torch import Tensor
 
 from ..base import check
-from ..base.records import Rays
+from ..base.records import Rays, RenderStats
 from ..base.stage import Progress, no_progress
 from ..cameras.camera import Camera
 from ..cameras.custom import as_camera
+from .files import checked_path, stacked, tiff_pixels, whole_file, write_tiff
 from .picture import Picture
 
 _OF_CENTRES = ("depth", "nearest", "normal", "features")  # the first frame's are kept
 _PLASTIC = 1.32471795724474602596  # the real root of x^3 = x + 1
+_PIXEL_BYTES = 400  # of a strip on its way: rays (80), hits twice, layers and their encoding
+_TILE = 4  # rows of the tiles in which rays are traced
 
 
 def jitter(index: int) -> tuple[float, float]:
@@ -33,6 +39,18 @@ def jitter(index: int) -> tuple[float, float]:
     pair, side = (index + 1) // 2, 1 if index % 2 else -1
     x, y = (side * ((0.5 + pair / _PLASTIC**power) % 1 - 0.5) for power in (1, 2))
     return x, y
+
+
+def _renderer(where: str, render: Callable[[Camera], Any]) -> Callable[[Camera], Picture]:
+    """Returns what renders a picture, without the statistics that `render` may give with it."""
+    if not callable(render):
+        raise ValueError(f"{where}: render must be callable, got {type(render).__name__}")
+
+    def picture(camera: Camera) -> Picture:
+        made = render(camera)
+        return made[0] if isinstance(made, tuple) else made
+
+    return picture
 
 
 class Progressive:
@@ -50,13 +68,10 @@ class Progressive:
         `partial(gv.render, tree, shader=shader)`, `partial(engine.frame, shader=shader)` or the
         `replay` of a graph.
         """
-        if not callable(render):
-            raise ValueError(f"Progressive: render must be callable, got {type(render).__name__}")
-        self._render = render
+        self._render = _renderer("Progressive", render)
         self.reset()
 
     def __repr__(self) -> str:
-        """Tells camera and frames."""
         return f"Progressive({self._camera}, {self.count} frames)"
 
     def reset(self) -> None:
@@ -80,8 +95,7 @@ class Progressive:
                 self.reset()
             self._given, self._camera = camera, own
         view = self._camera
-        made = self._render(view.shifted(*jitter(self.count)) if self.count else view)
-        picture: Picture = made[0] if isinstance(made, tuple) else made
+        picture = self._render(view.shifted(*jitter(self.count)) if self.count else view)
         light = torch.cat((picture.color, picture.alpha), -1).double()
         missed = picture.missed
         whole = torch.ones_like(picture.alpha, dtype=torch.bool) if missed is None else ~missed
@@ -98,9 +112,9 @@ class Progressive:
                 self._still[name] = torch.where(seen, self._still[name], image)
             self._frames = self._frames + whole
         self.count += 1
-        color, alpha = self._mean(picture.color.dtype)
-        missed = self._frames == 0
-        return replace(picture, color=color, alpha=alpha, missed=missed, **self._still)
+        mean = (self._sum / self._frames.clamp(min=1)).to(picture.color.dtype)
+        color, alpha = mean[..., :3], mean[..., 3:]
+        return replace(picture, color=color, alpha=alpha, missed=self._frames == 0, **self._still)
 
     def refine(
         self, camera: Camera | Rays, samples: int, progress: Progress = no_progress
@@ -119,6 +133,91 @@ class Progressive:
             if self.count >= most:
                 return picture
 
-    def _mean(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        mean = (self._sum / self._frames.clamp(min=1)).to(dtype)
-        return mean[..., :3], mean[..., 3:]
+
+def render_tiles(
+    render: Callable[[Camera], Any],
+    camera: Camera | Rays,
+    path: str | Path,
+    *,
+    bits: int | None = None,
+    memory: int | str = "256 MB",
+    progress: Progress = no_progress,
+) -> RenderStats:
+    """Renders a picture of any size and writes it as it comes.
+
+    - .tif: BigTIFF, Deflate; sRGB of 8 or 16 bits, or linear float of 32.
+    - .npy: (h, w, 6) float32: linear color, alpha, depth, samples.
+
+    Args:
+        render: From the camera of a strip to its `Picture`, as `partial(gv.render, tree,
+            shader=shader)` or `partial(engine.render, shader=shader)`; what it does to the picture,
+            such as `tone_map`, must treat pixels one by one.
+        camera: One camera; an orbit camera must be placed by what renders.
+        path: The file; it appears when it is complete.
+        bits: Of a number; 8 for .tif if left out.
+        memory: Most bytes that a strip takes, but for scene and libraries; a strip has at least
+            one row.
+        progress: Told how many rows are done.
+
+    Returns:
+        Statistics of the last strip, with milliseconds, rays and samples of all.
+
+    Raises:
+        ValueError: The path ends in neither, the camera is a batch, or an argument is out of range.
+        FileNotFoundError: The folder does not exist.
+        ImportError: .tif without tifffile.
+    """
+    picture_of = _renderer("render_tiles", render)
+    path, camera = Path(path), as_camera("render_tiles", camera)
+    if len(camera) != 1:
+        raise ValueError(f"render_tiles: camera must be one, got a batch of {len(camera)}")
+    bits = checked_path("render_tiles", path, bits, (".tif", ".npy"))
+    limit = check.nbytes("render_tiles", "memory", memory)
+    height, width = camera.height, camera.width
+    rows = strip_rows(limit, width, height)
+    stats: RenderStats | None = None
+
+    def pictures() -> Iterator[Picture]:
+        nonlocal stats
+        for top in range(0, height, rows):
+            end = min(top + rows, height)
+            picture = picture_of(camera.strip(top, end))
+            stats = picture.stats if stats is None else picture.stats.after(stats)
+            yield picture
+            progress("rows", end, height)
+
+    with whole_file(path) as part:
+        strips = pictures()
+        first = next(strips)
+        everything = itertools.chain((first,), strips)
+        if path.suffix == ".npy":
+            _write_npy(part, everything, (height, width, 6))
+        else:
+            pixels = (_pixels(picture, bits) for picture in everything)
+            kind = {8: np.uint8, 16: np.uint16, 32: np.float32}[bits]
+            shape = (height, width, 4 if first.transparent else 3)
+            write_tiff(part, shape, np.dtype(kind), pixels, rows)
+    assert stats is not None
+    return stats
+
+
+def strip_rows(limit: int, width: int, height: int) -> int:
+    """Returns how many rows of a picture are rendered at once within `limit` bytes."""
+    most = limit // (_PIXEL_BYTES * width)
+    return max(1, min(height, most - most % _TILE or most))
+
+
+def _pixels(picture: Picture, bits: int) -> np.ndarray:
+    rows = picture.color.shape[:-2].numel()
+    layers = {
+        name: layer.reshape(rows, *layer.shape[-2:]) for name, layer in picture.layers().items()
+    }
+    return tiff_pixels(layers, picture.transparent, bits)
+
+
+def _write_npy(path: Path, pictures: Iterator[Picture], shape: tuple[int, ...]) -> None:
+    header = {"descr": "<f4", "fortran_order": False, "shape": shape}
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+        for picture in pictures:
+            file.write(stacked(picture.layers()).astype("<f4").tobytes())

@@ -21,17 +21,8 @@ _LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear RGB with the primaries of Rec
 def tone_map(
     color: Tensor, curve: ToneCurve = "aces", *, exposure: float = 0.0, white: float = 4.0
 ) -> Tensor:
-    """Returns display-referred linear RGB in [0, 1].
-
-    Args:
-        color: (..., 3) linear RGB, not premultiplied. NaN becomes 0.
-        curve: none: clipped; reinhard: luminance is compressed so that `white` becomes 1, hue
-            stays; aces: a filmic curve for each primary.
-        exposure: Stops: the colour is multiplied by 2^exposure first.
-        white: Smallest luminance, after exposure, that Reinhard's curve shows as 1.
-
-    Raises:
-        ValueError: The curve is unknown, or a number is out of its range.
+    """Returns display-referred linear RGB in [0, 1] of linear RGB (..., 3), not premultiplied; NaN
+    becomes 0. See `Picture.tone_map`.
     """
     stops = checked_curve("tone_map", curve, exposure)
     white = check.number("tone_map", "white", white, low=0, open_low=True)

@@ -1,9 +1,12 @@
-"""Checks of what a producer answered, item by item: a bad one becomes an error, the others stay."""
+"""Checks of what a producer answered, item by item: a bad one becomes an error, the others stay. An
+answer of the wrong type, shape or dtype raises ValueError.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -15,69 +18,36 @@ from ..pool.pyramid import NodeSummary
 from ..pool.staging import upload
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 
+Form = TypeVar("Form", bound=Regions | Bricks)
+
 
 def checked_regions(answer: Any, nodes: Nodes, producer: Producer) -> Regions:
-    """Returns a producer's answer to `classify(nodes)` as `Regions` on the layout's device.
-
-    Raises:
-        ValueError: The answer is of the wrong type, shape or dtype.
-    """
-    where = f"{type(producer).__name__}.classify"
+    """Returns a producer's answer to `classify(nodes)` as `Regions` on the layout's device."""
     if isinstance(answer, Tensor):
         answer = Regions(kind=answer)
+    where = f"{type(producer).__name__}.classify"
     if not isinstance(answer, Regions):
         came = type(answer).__name__
         raise ValueError(f"{where}: must return Regions or a tensor, got {came}")
-    count, device = len(nodes), nodes.layout.device
-    errors = _known_errors(where, answer.errors, count)
-    kind = _kind(where, answer.kind, count)
-    shapes = {"constants": (), "ranges": (2,)}
-    fields = {
-        name: _by_channel(where, name, getattr(answer, name), (count, *shape), producer)
-        for name, shape in shapes.items()
-    }
-    counts = _refuse_bad(kind, [*fields.values()], errors)
-    _need_constants(where, counts, fields["constants"], producer)
-    alias = _alias(where, answer.alias, kind, counts, nodes.layout, errors)
-    return Regions(
-        kind=upload(kind, device),
-        alias=None if alias is None else upload(alias, device),
-        errors=errors,
-        **{
-            name: {channel: upload(values, device) for channel, values in by_channel.items()}
-            for name, by_channel in fields.items()
-        },
-    )
+    regions = _checked(where, answer, nodes, producer)
+    return regions.each(lambda tensor: upload(tensor, nodes.layout.device))
 
 
 def checked_bricks(answer: Any, nodes: Nodes, producer: Producer) -> Bricks:
     """Returns a producer's answer to `fill(nodes)` as `Bricks`. Voxels stay where they are, unless
     some channels lie on the host and others on the device: then all go to the device.
-
-    Raises:
-        ValueError: The answer is of the wrong type, shape or dtype.
     """
-    where = f"{type(producer).__name__}.fill"
     if isinstance(answer, Mapping):
         answer = Bricks(data=answer)
+    where = f"{type(producer).__name__}.fill"
     if not isinstance(answer, Bricks):
         came = type(answer).__name__
         raise ValueError(f"{where}: must return Bricks or a dict of tensors, got {came}")
-    layout, count = nodes.layout, len(nodes)
-    errors = _known_errors(where, answer.errors, count)
-    kind = None if answer.kind is None else _kind(where, answer.kind, count)
-    missing = sorted(set(producer.channels) - set(answer.data))
-    if missing:
-        raise ValueError(f"{where}: channel {missing[0]!r} is missing")
-    shape = (count, *(layout.side,) * 3)
-    data = _by_channel(where, "data", answer.data, shape, producer)
-    if any(on_host({name: rows}) != on_host(data) for name, rows in data.items()):
-        data = {name: on_device(rows, layout.device) for name, rows in data.items()}
-    constants = _by_channel(where, "constants", answer.constants, (count,), producer)
-    counts = _refuse_bad(kind, (data, constants), errors)
-    _need_constants(where, counts, constants, producer)
-    alias = None if kind is None else _alias(where, answer.alias, kind, counts, layout, errors)
-    return Bricks(data=data, kind=kind, constants=constants, alias=alias, errors=errors)
+    bricks = _checked(where, answer, nodes, producer)
+    if len({on_host({name: rows}) for name, rows in bricks.data.items()}) == 1:
+        return bricks
+    device = nodes.layout.device
+    return replace(bricks, data={n: on_device(rows, device) for n, rows in bricks.data.items()})
 
 
 def count_kinds(kind: Tensor) -> Tensor:
@@ -102,24 +72,37 @@ def regions_of(
     )
 
 
-def _known_errors(where: str, errors: Mapping[int, str], count: int) -> dict[int, str]:
+def _checked(where: str, answer: Form, nodes: Nodes, producer: Producer) -> Form:
+    """Returns the answer with a width in every shape, and with errors in place of bad items."""
+    kind: Any
+    layout, count, kind, errors = nodes.layout, len(nodes), answer.kind, dict(answer.errors)
     if any(not 0 <= index < count for index in errors):
         raise ValueError(f"{where}: errors names an item that is not in the batch of {count}")
-    return dict(errors)
-
-
-def _kind(where: str, kind: Any, count: int) -> Tensor:
-    if not isinstance(kind, Tensor) or kind.shape != (count,) or kind.is_floating_point():
-        raise ValueError(f"{where}: kind must be ({count},) of Region, got {check.describe(kind)}")
-    return kind.to(torch.int64)
+    if kind is not None or isinstance(answer, Regions):
+        if not isinstance(kind, Tensor) or kind.shape != (count,) or kind.is_floating_point():
+            came = check.describe(kind)
+            raise ValueError(f"{where}: kind must be ({count},) of Region, got {came}")
+        kind = kind.to(torch.int64)
+    brick = (layout.side,) * 3
+    shapes: dict[str, tuple[int, ...]] = {"data": brick, "constants": (), "ranges": (2,)}
+    given = {name: getattr(answer, name) for name in shapes if hasattr(answer, name)}
+    missing = sorted(set(producer.channels) - set(given.get("data", producer.channels)))
+    if missing:
+        raise ValueError(f"{where}: channel {missing[0]!r} is missing")
+    fields: dict[str, Any] = {
+        name: _by_channel(where, name, by_channel, (count, *shapes[name]), producer)
+        for name, by_channel in given.items()
+    }
+    counts = _refuse_bad(kind, [*fields.values()], errors)
+    missing = sorted(set(producer.channels) - set(fields["constants"]))
+    if missing and counts[Region.CONSTANT]:
+        raise ValueError(f"{where}: constants must hold channel {missing[0]!r} of CONSTANT items")
+    alias = _alias(where, answer.alias, kind, layout, errors) if counts[Region.ALIAS] else None
+    return type(answer)(kind=kind, alias=alias, errors=errors, **fields)
 
 
 def _by_channel(
-    where: str,
-    name: str,
-    values: Mapping[str, Any],
-    shape: tuple[int, ...],
-    producer: Producer,
+    where: str, name: str, values: Mapping[str, Any], shape: tuple[int, ...], producer: Producer
 ) -> dict[str, Any]:
     """Returns the values of each channel as (*shape, width); a width of 1 may be left out."""
     result = {}
@@ -131,10 +114,8 @@ def _by_channel(
         wanted = (*shape, what.width)
         plain = isinstance(value, Tensor) and what.width == 1 and value.shape == shape
         tensor = value[..., None] if plain else value
-        known_type = isinstance(tensor, Tensor) or (
-            isinstance(tensor, TableRows) and name == "data"
-        )
-        fits = known_type and tensor.shape == wanted and tensor.dtype == what.dtype
+        types = (Tensor, TableRows) if name == "data" else (Tensor,)
+        fits = isinstance(tensor, types) and tensor.shape == wanted and tensor.dtype == what.dtype
         if not fits:
             sizes = ", ".join(str(size) for size in wanted)
             dtype = str(what.dtype).removeprefix("torch.")
@@ -146,25 +127,8 @@ def _by_channel(
     return result
 
 
-def _need_constants(
-    where: str, counts: Sequence[int], constants: Mapping[str, Tensor], producer: Producer
-) -> None:
-    missing = sorted(set(producer.channels) - set(constants))
-    if missing and counts[Region.CONSTANT]:
-        raise ValueError(f"{where}: constants must hold channel {missing[0]!r} of CONSTANT items")
-
-
-def _alias(
-    where: str,
-    alias: Any,
-    kind: Tensor,
-    counts: Sequence[int],
-    layout: Layout,
-    errors: dict[int, str],
-) -> Tensor | None:
-    """Returns (k, 4) alias targets, None if no item is ALIAS; wrong places become errors."""
-    if not counts[Region.ALIAS]:
-        return None
+def _alias(where: str, alias: Any, kind: Tensor, layout: Layout, errors: dict[int, str]) -> Tensor:
+    """Returns (k, 4) alias targets; wrong places become errors."""
     if not isinstance(alias, Tensor) or alias.shape != (len(kind), 4):
         raise ValueError(
             f"{where}: alias must be ({len(kind)}, 4) where an item is ALIAS, "
@@ -181,16 +145,11 @@ def _alias(
 
 
 def _refuse_bad(
-    kind: Tensor | None,
-    fields: Sequence[Mapping[str, Tensor | TableRows]],
-    errors: dict[int, str],
+    kind: Tensor | None, fields: Sequence[Mapping[str, Tensor | TableRows]], errors: dict[int, str]
 ) -> list[int]:
     """Adds items of an unknown kind, and those that hold NaN or infinite values, to the errors.
-    Rows of a table are not looked at: `BrickTable` has checked them.
-
-    Returns:
-        How many items are of each kind, zeros where `kind` is None. The host waits for the device
-        once, if anything lies there.
+    Rows of a table are not looked at: `BrickTable` has checked them. Returns how many items are of
+    each kind, zeros where `kind` is None; the host waits for the device once.
     """
     floats = [
         (channel, values)
@@ -200,28 +159,19 @@ def _refuse_bad(
     ]
     if kind is None and not floats:
         return [0] * len(Region)
-    sums = [torch.isfinite(values.sum(dtype=torch.float32)) for _, values in floats]
-    kinds = torch.zeros(len(Region), dtype=torch.int64) if kind is None else count_kinds(kind)
-    counts, *finite = _read([kinds, *(flag[None] for flag in sums)])
+    sums = [values.sum(dtype=torch.float32).view(1) for _, values in floats]
+    known = [count_kinds(kind) if kind is not None else sums[0].new_zeros(len(Region))]
+    flags = known + [torch.isfinite(number) for number in sums]
+    there = max((flag.device for flag in flags), key=lambda device: device.type != "cpu")
+    read = torch.cat([flag.to(there, torch.int64) for flag in flags]).tolist()
+    counts, finite = read[: len(Region)], read[len(Region) :]
     if kind is not None and sum(counts) < len(kind):
         for index in ((kind < Region.EMPTY) | (kind > Region.ALIAS)).nonzero()[:, 0].tolist():
             errors[index] = f"{int(kind[index])} is no Region"
-    for (channel, values), (whole,) in zip(floats, finite, strict=True):
+    for (channel, values), whole in zip(floats, finite, strict=True):
         if whole:
             continue
         bad = ~torch.isfinite(values).flatten(1).all(1)
         for index in bad.nonzero()[:, 0].tolist():
             errors.setdefault(index, f"channel {channel!r} holds NaN or infinite values")
     return counts
-
-
-def _read(values: Sequence[Tensor]) -> list[list[int]]:
-    """Returns small tensors of integers as lists, with one transfer for each device."""
-    result: dict[int, list[int]] = {}
-    for device in {value.device for value in values}:
-        here = [index for index, value in enumerate(values) if value.device == device]
-        flat = torch.cat([values[index].to(torch.int64) for index in here]).tolist()
-        for index in here:
-            size = len(values[index])
-            result[index], flat = flat[:size], flat[size:]
-    return [result[index] for index in range(len(values))]

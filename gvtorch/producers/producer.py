@@ -1,7 +1,6 @@
-"""`Producer`: makes the content of a tree, and the records that it is asked and answers with.
+"""`Producer`: makes the content of a tree, and the records that it is asked and answers with. It
+knows nodes by place only, never pools and slots.
 
-It answers two questions, both for a batch of nodes: what do these nodes hold (`classify`), and what
-are the voxels of their bricks (`fill`). It knows nodes by place only, never pools and slots.
 Source: Crassin et al., "GigaVoxels", I3D 2009, section 5; Crassin, PhD thesis 2011, chapter 7 (a
     producer may decline).
 """
@@ -9,17 +8,19 @@ Source: Crassin et al., "GigaVoxels", I3D 2009, section 5; Crassin, PhD thesis 2
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.volume import movable
 from ..pool import Channel
-from ..pool.brick_table import Voxels
+from ..pool.brick_table import TableRows, Voxels
 from ..pool.channel import phrase
 from ..pool.pyramid import tree_depth
 
@@ -111,7 +112,6 @@ class Nodes:
         self._known: dict[str, Tensor] = {}  # a cache of properties that torch.compile can trace
 
     def __len__(self) -> int:
-        """Number of nodes."""
         return self.loc.shape[0]
 
     def __getitem__(self, index: slice | Tensor) -> Nodes:
@@ -189,7 +189,6 @@ class Nodes:
         return finest * layout.spacing_3.to(finest.device) + layout.origin_3.to(finest.device)
 
     def __repr__(self) -> str:
-        """Shows how many nodes there are, and the tree's bricks and depth."""
         layout = self.layout
         return (
             f"Nodes({len(self)} on {self.loc.device}, "
@@ -197,8 +196,36 @@ class Nodes:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Regions:
+class Answer:
+    """What a producer answers: tensors, a row for each of k items, most of them by channel."""
+
+    def rows(self, row: Tensor) -> Self:
+        """The items that `row` (m,) names, errors left out."""
+
+        def some(value: Any) -> Any:
+            if isinstance(value, TableRows):
+                return value[row]
+            return movable(value)[row.to(value.device)].view(value.dtype)
+
+        return self.each(some, errors={})
+
+    def each(self, change: Callable[[Any], Any], **others: Any) -> Self:
+        """The answer with all tensors and rows of tables changed, and with `others` as fields."""
+
+        def changed(value: Any) -> Any:
+            if isinstance(value, Mapping):
+                return {name: changed(one) for name, one in value.items()}
+            return change(value) if isinstance(value, (Tensor, TableRows)) else value
+
+        fields = {name: changed(value) for name, value in vars(self).items()}
+        return type(self)(**fields | others)
+
+    def __repr__(self) -> str:
+        return check.brief(self)
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Regions(Answer):
     """Answer of `classify`: what each of k nodes holds. Constants and ranges go by channel."""
 
     kind: Tensor  # (k,) of `Region`
@@ -207,13 +234,9 @@ class Regions:
     alias: Tensor | None = None  # (k, 4) int64 places of alias targets; other rows are not read
     errors: Mapping[int, str] = field(default_factory=dict, repr=False)  # by item, why it failed
 
-    def __repr__(self) -> str:
-        """Shows shapes and dtypes."""
-        return check.brief(self)
 
-
-@dataclass(frozen=True, kw_only=True)
-class Bricks:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Bricks(Answer):
     """Answer of `fill`: the voxels of k bricks, or why a brick has none.
 
     Voxels may lie on the engine's device or in host memory; from there they are sent through pinned
@@ -228,24 +251,16 @@ class Bricks:
     alias: Tensor | None = None  # as in `Regions`
     errors: Mapping[int, str] = field(default_factory=dict, repr=False)  # as in `Regions`
 
-    def __repr__(self) -> str:
-        """Shows shapes and dtypes."""
-        return check.brief(self)
-
 
 class Producer(torch.nn.Module):
-    """Base of producers. A subclass writes `fill`, and `classify` where that saves work.
+    """Base of producers. A subclass writes `fill`, which makes the bricks of a batch of nodes, and
+    where that saves work `classify`, which tells what nodes hold.
 
     Attributes:
-        extent: (x, y, z) voxels of the finest level.
-        spacing: (x, y, z) world size of a finest voxel.
-        origin: (x, y, z) world place of the centre of voxel 0.
-        branching: N of its tree.
-        channels: What a voxel holds, by name.
-        value_range: For each channel its smallest and largest value, where they are known.
         patience: Seconds after which an answer that has not come counts as failed; None: the
             engine's.
         layout: Set by the engine that uses this producer; None while none does.
+        extent, spacing, origin, branching, channels, value_range: See `__init__`.
     """
 
     patience: float | None = None
@@ -331,7 +346,6 @@ class Producer(torch.nn.Module):
         """Closes files and ends threads; does nothing unless overridden."""
 
     def __repr__(self) -> str:
-        """Shows extent, branching and channels."""
         extent = "x".join(str(n) for n in self.extent)
         channels = phrase(self.channels)
         return f"{type(self).__name__}({extent} (x, y, z), N={self.branching}, {channels})"

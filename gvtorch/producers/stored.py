@@ -1,18 +1,17 @@
-"""`StoredProducer`: bricks from a store on disk or behind a URL, read while the engine goes on.
-
-Threads read and answer in batches. A block of the store holds many bricks, so blocks are kept in a
-bounded host cache. The cells of the store (smallest, largest and mean value of 8^3 voxels) tell
-which nodes are CONSTANT or EMPTY, and which a transfer function does not show, before any voxel is
-read.
+"""`StoredProducer`: bricks from a store on disk or behind a URL, read while the engine goes on. A
+block of the store holds many bricks, so blocks are kept in a bounded host cache. Cells (smallest,
+largest and mean value of 8^3 voxels) tell which nodes need no bricks before any voxel is read.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,12 +23,68 @@ from ..pool import Channel
 from ..pool.downsample import pool_mean
 from ..pool.pyramid import NodeSummary
 from .answer import regions_of
-from .host_cache import Found, HostCache, Key
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 
 _TILE = 32  # cells along a side of what is read at once
 _GROUP_BYTES = 32 * 10**6  # of cubes held at a time beside the cache
 _CHANNEL = "value"
+
+
+Key = tuple[Any, ...]
+Found = np.ndarray | str  # an array, or why it can't be read
+Read = Callable[[list[Key]], dict[Key, Found]]
+
+
+class HostCache:
+    """Arrays by key; beyond `limit` bytes the least recently used are dropped. What several threads
+    ask for at once is read by one of them.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self.limit, self.nbytes = limit, 0
+        self._kept: OrderedDict[Key, np.ndarray] = OrderedDict()
+        self._reading: dict[Key, Future[Found]] = {}
+        self._lock = threading.Lock()
+
+    def get(self, keys: Sequence[Key], read: Read) -> list[Found]:
+        """Returns for each key, given once, an array, or a text that says why there is none. `read`
+        is called with the keys that are neither kept nor being read; texts are not kept.
+        """
+        found: dict[Key, Found] = {}
+        mine: list[Key] = []
+        others: dict[Key, Future[Found]] = {}
+        with self._lock:
+            for key in keys:
+                if key in self._kept:
+                    self._kept.move_to_end(key)
+                    found[key] = self._kept[key]
+                elif key in self._reading:
+                    others[key] = self._reading[key]
+                else:
+                    mine.append(key)
+                    self._reading[key] = Future()
+        if mine:
+            found.update(self._read(mine, read))
+        for key, future in others.items():
+            found[key] = future.result()
+        return [found[key] for key in keys]
+
+    def _read(self, mine: list[Key], read: Read) -> dict[Key, Found]:
+        arrived: dict[Key, Found] = {}
+        try:
+            arrived = read(mine)
+        finally:
+            with self._lock:
+                for key in mine:
+                    value = arrived.get(key, "the read was broken off")
+                    self._reading.pop(key).set_result(value)
+                    if isinstance(value, np.ndarray) and value.nbytes <= self.limit:
+                        self._kept[key] = value
+                        self.nbytes += value.nbytes
+                while self.nbytes > self.limit:
+                    _, dropped = self._kept.popitem(last=False)
+                    self.nbytes -= dropped.nbytes
+        return arrived
 
 
 @dataclass(frozen=True)
@@ -243,11 +298,7 @@ class StoredProducer(Producer):
         return errors
 
     def _read(self, cubes: _Cubes, level: int, places: list[Key]) -> list[Found]:
-        """Reads cubes (z, y, x) of a level, borders included.
-
-        Raises:
-            TimeoutError: They did not come in time.
-        """
+        """Reads cubes (z, y, x) of a level, borders included; raises TimeoutError."""
         store = self.store
         if cubes.blocks:
             data, wrong = store.read_blocks(level, np.array(places), timeout=self.timeout)
