@@ -11,8 +11,8 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from functools import cached_property
-from typing import Literal, Unpack
+from functools import cached_property, partial
+from typing import Any, Literal, Unpack
 
 import torch
 from torch import Tensor
@@ -27,18 +27,22 @@ from ..cameras.custom import as_camera
 from ..ops.trace import choose_backend
 from ..pictures import Picture
 from ..producers import Producer
-from ..shaders.shader import Shader
+from ..shaders.shader import Shader, check_shader
 from ..tracing import RenderOptions
+from ..tracing.around import around
+from ..tracing.composite import Trace, trace_trees
 from ..tracing.options import RenderSettings, render_options
 from ..tracing.pixels import Again, View, empty_hits
+from ..tracing.tracer import Tracer
 from .production import Failure, Production
 from .ray_subsets import RaySubsets, scouts
 from .request_batch import ProducedTree
 from .setup import EngineOptions, EngineSettings, brick_bytes, make_pools, make_tree
 from .stats import Collected, Counts, FrameStats, Readback, Readbacks, Report
-from .view import Shaders, trace_scene
 
 Scene = Producer | Mapping[str, Producer]
+#: A shader for all trees, or one for each by name.
+Shaders = Shader | Mapping[str, Shader]
 
 _MOST_LISTED = 1 << 17  # nodes whose requests one frame lists
 _KEPT = 1000  # frames in a report
@@ -143,10 +147,27 @@ class Engine:
         """Checks what a frame is to show; see `frame`. Errors begin with `where`."""
         placed = as_camera(where, camera).placed(self.box)
         chosen = render_options(where, options, placed)
-        by_level = self.options.loading == "levels"
-        frame = {"by_level": by_level, "frame_1": self._frame_1}
-        trace = trace_scene(self.trees, shader, chosen, self.box, **frame)
+        trace = partial(trace_trees, self._tracers(shader, chosen))
         return View(placed, placed.numbers(self.device), trace, chosen)
+
+    def _tracers(self, shaders: Shaders, options: RenderOptions) -> list[tuple[Tensor, Trace]]:
+        """For each tree its box and what traces rays through it."""
+        by_level, tracers = self.options.loading == "levels", []
+        for name, source in self.trees.items():
+            tree, channels = source.tree, source.producer.channels
+            shader: Any = shaders.get(name) if isinstance(shaders, Mapping) else shaders
+            check_shader("frame", f"shader of tree {name!r}", shader)
+            channel = options.channel or next(iter(channels))
+            for needed in (channel, *shader.channels):
+                if needed not in channels:
+                    known = ", ".join(channels)
+                    raise ValueError(
+                        f"frame: tree {name!r} has no channel {needed!r}; it has {known}"
+                    )
+            chosen = replace(options, channel=channel)
+            tracer = Tracer(tree, shader, chosen, by_level=by_level, frame_1=self._frame_1)
+            tracers.append((tree.box, around(tracer, chosen, self.box)))
+        return tracers
 
     @contextmanager
     def new_frame(self, options: RenderOptions) -> Iterator[FrameStats]:
