@@ -71,12 +71,11 @@ class Failures:
 
     def add(self, batch: RequestBatch, message: str, cause: BaseException | None) -> None:
         """Takes note of a batch's nodes."""
-        text = " ".join(message.split())
+        tree, text = batch.source.name, " ".join(message.split())
+        kind = next(name for name, kind in KINDS.items() if kind == batch.kind)
         for loc in map(tuple, batch.targets.loc.tolist()):
-            self.newest.append(
-                Failure(tree=batch.source.name, kind=batch.kind_name, loc=loc, message=text)
-            )
-            self._places.add((batch.source.name, batch.kind, loc))
+            self.newest.append(Failure(tree=tree, kind=kind, loc=loc, message=text))
+            self._places.add((tree, batch.kind, loc))
         self._first = self._first or (self.newest[-1], cause)
 
     def among(self, batch: RequestBatch) -> Tensor | None:

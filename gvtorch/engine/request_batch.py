@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..base.constants import ABSENT, CONSTANT, EMPTY, REQUEST_LOAD, TERMINAL
 from ..base.volume import movable
-from ..cache import KINDS, Cache
+from ..cache import Cache
 from ..cache.write import Children, Targets
 from ..pool import N3Tree, Staging, TableRows
 from ..pool.brick_table import on_host
@@ -60,11 +60,6 @@ class RequestBatch:
         fill_loc = None if self.fill_loc is None else self.fill_loc[index]
         return RequestBatch(self.source, self.kind, self.targets[index], fill_loc)
 
-    @property
-    def kind_name(self) -> str:
-        """Load or subdivide."""
-        return next(name for name, kind in KINDS.items() if kind == self.kind)
-
     @cached_property
     def nodes(self) -> Nodes:
         """What the producer is asked about: nodes to fill, or all children of the nodes to
@@ -97,9 +92,6 @@ class RequestBatch:
         """Checks an answer; see producers/answer.py."""
         check = checked_bricks if self.kind == REQUEST_LOAD else checked_regions
         return check(answer, self.nodes, self.source.producer)
-
-    def __repr__(self) -> str:
-        return f"RequestBatch({self.kind_name} {len(self)} of {self.source.name!r})"
 
 
 class Answered(NamedTuple):

@@ -191,7 +191,11 @@ def render_tiles(
         first = next(strips)
         everything = itertools.chain((first,), strips)
         if path.suffix == ".npy":
-            _write_npy(part, everything, (height, width, 6))
+            header = {"descr": "<f4", "fortran_order": False, "shape": (height, width, 6)}
+            with part.open("wb") as file:
+                np.lib.format.write_array_header_1_0(file, header)
+                for picture in everything:
+                    file.write(stacked(picture.layers()).astype("<f4").tobytes())
         else:
             pixels = (_pixels(picture, bits) for picture in everything)
             kind = {8: np.uint8, 16: np.uint16, 32: np.float32}[bits]
@@ -213,11 +217,3 @@ def _pixels(picture: Picture, bits: int) -> np.ndarray:
         name: layer.reshape(rows, *layer.shape[-2:]) for name, layer in picture.layers().items()
     }
     return tiff_pixels(layers, picture.transparent, bits)
-
-
-def _write_npy(path: Path, pictures: Iterator[Picture], shape: tuple[int, ...]) -> None:
-    header = {"descr": "<f4", "fortran_order": False, "shape": shape}
-    with path.open("wb") as file:
-        np.lib.format.write_array_header_1_0(file, header)
-        for picture in pictures:
-            file.write(stacked(picture.layers()).astype("<f4").tobytes())
