@@ -248,9 +248,8 @@ class Lighted:
             taken = (front.alpha + hits.alpha).to(unblocked) / 2
             unblocked = unblocked - lighting.occlusion * weight * taken
             if self.matter is not None:
-                bounced = bounced + weight * self._reflected(
-                    self._points(first, hits, points.tally, eye), hits
-                )
+                met = self._points(first, hits, points.tally, eye)
+                bounced = bounced + weight * self._reflected(met, hits)
         return unblocked, lighting.indirect * bounced
 
     def _lifted(self, points: _Points, off: float, beam: Tensor | None = None) -> _Points:
