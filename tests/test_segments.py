@@ -26,7 +26,7 @@ from gvtorch.ops import (
     trace_rays,
     trace_segments,
 )
-from gvtorch.shaders.tables import Sampling
+from gvtorch.shaders.shader import Sampling
 from gvtorch.tracing.tracer import Tracer
 
 MARKS = ("request_tn", "stamp_t", "stamp_b")

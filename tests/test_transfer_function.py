@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gvtorch as gv
-from gvtorch.shaders.tables import Sampling
+from gvtorch.shaders.shader import Sampling
 from gvtorch.shaders.transfer_function import PRESETS
 
 

@@ -4,7 +4,6 @@ came.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 import operator
@@ -25,9 +24,7 @@ def describe(tensor: Any) -> str:
     """Returns shape, dtype and device of a tensor as one phrase, or the type of anything else."""
     if not isinstance(tensor, Tensor):
         return type(tensor).__name__
-    shape = ", ".join(str(size) for size in tensor.shape)
-    dtype = str(tensor.dtype).removeprefix("torch.")
-    return f"({shape}{',' if tensor.dim() == 1 else ''}) {dtype} on {tensor.device}"
+    return f"{shown(tensor)} on {tensor.device}"
 
 
 def brief(record: Any) -> str:
@@ -35,7 +32,7 @@ def brief(record: Any) -> str:
     their defaults, of tensors only shape and dtype.
     """
     parts = []
-    for field in dataclasses.fields(record):
+    for field in fields(record):
         value = getattr(record, field.name)
         if field.repr and (isinstance(value, Tensor) or value not in (field.default, {})):
             parts.append(f"{field.name}={shown(value)}")
@@ -59,32 +56,24 @@ def tensor(
     dtype: torch.dtype,
     device: torch.device,
 ) -> None:
-    """Raises unless `value` has the shape, dtype and device.
-
-    Args:
-        where: The function that the user called.
-        name: The argument's name.
-        value: What came.
-        shape: An int where a size is fixed, a letter where it is free.
-        dtype: The dtype expected.
-        device: The device expected.
-
-    Raises:
-        ValueError: `where: name must be (r, 3) float32 on cpu, got (4, 2) float64 on cpu`.
+    """Raises ValueError unless `value` is a tensor of this shape (a letter: of any size), dtype and
+    device: `where: name must be (r, 3) float32 on cpu, got (4, 2) float64 on cpu`.
     """
     fits = isinstance(value, Tensor) and value.dtype == dtype and value.device == device
-    if fits and value.dim() == len(shape) and all(map(_of_size, shape, value.shape)):
-        return
-    wanted = ", ".join(str(s) for s in shape) + ("," if len(shape) == 1 else "")
+    if fits and value.dim() == len(shape):
+        pairs = zip(shape, value.shape, strict=True)
+        if all(isinstance(expected, str) or expected == size for expected, size in pairs):
+            return
+    wanted = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
     kind = str(dtype).removeprefix("torch.")
     raise ValueError(
         f"{where}: {name} must be ({wanted}) {kind} on {device}, got {describe(value)}"
     )
 
 
-Field = tuple[
-    str, Tensor, str, torch.dtype
-]  # name, tensor, shape (a letter or digit a size), dtype
+_DIGITS = {str(digit): digit for digit in range(10)}
+#: Name, tensor, shape (a letter or digit a size), dtype: ("origin_r3", origin_r3, "r3", float64).
+Field = tuple[str, Tensor, str, torch.dtype]
 
 
 def tensors(
@@ -93,20 +82,11 @@ def tensors(
     fields: Iterable[Field],
     sizes: Mapping[str, int] | None = None,
 ) -> dict[str, int]:
-    """Raises unless all tensors are contiguous and of the shapes, dtypes and device.
-
-    Args:
-        where: The function that the user called.
-        device: The device expected.
-        fields: What came and what was expected: ("origin_r3", origin_r3, "r3", torch.float64) for
-            (r, 3). A letter stands for the same size in all of them.
-        sizes: Of letters that are known before.
-
-    Returns:
-        What letters stand for.
+    """Returns the sizes that letters stand for, each for the same in all fields; `sizes` are known
+    before.
 
     Raises:
-        ValueError: See `tensor`; or `where: name must be contiguous`.
+        ValueError: A tensor is not contiguous or not of its shape, dtype and device.
     """
     known = {**_DIGITS, **(sizes or {})}
     for name, value, shape, dtype in fields:
@@ -125,19 +105,12 @@ def tensors(
     return known
 
 
-_DIGITS = {str(digit): digit for digit in range(10)}
-
-
 @functools.cache
 def shape_of(name: str) -> str:
     """Returns the shape that a name ends with, as in "r3" of origin_r3; bricks are cubes: "bsssc"
     of bricks_bzyxc.
     """
     return name.rpartition("_")[2].replace("bzyx", "bsss")
-
-
-def _of_size(expected: int | str, size: int) -> bool:
-    return expected == size or isinstance(expected, str)
 
 
 def instance(where: str, name: str, value: Any, kind: type[Kind]) -> Kind:
@@ -172,10 +145,8 @@ def images(where: str, name: str, value: Any, channels: int, *, batch: bool = Tr
 
 
 def device(where: str, value: Any) -> torch.device:
-    """Returns the device of a name, a CUDA device with its index, as tensors name theirs.
-
-    Raises:
-        ValueError: There is none of this name.
+    """Returns the device of a name, a CUDA device with its index, as tensors name theirs; raises
+    ValueError where there is none.
     """
     try:
         found = torch.device(value)
@@ -209,10 +180,8 @@ _UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30, "TIB": 2**40}
 
 
 def nbytes(where: str, name: str, value: Any) -> int:
-    """Returns bytes from a number or a text such as "8 MB" (10^6) or "8 MiB" (2^20).
-
-    Raises:
-        ValueError: It is neither, or not positive.
+    """Returns bytes from a number or a text such as "8 MB" (10^6) or "8 MiB" (2^20); raises
+    ValueError unless it is one of these, and positive.
     """
     if isinstance(value, str):
         match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([A-Za-z]*)\s*", value)
@@ -232,10 +201,8 @@ def number(
     high: float = math.inf,
     open_low: bool = False,
 ) -> float:
-    """Returns `value` as a finite float inside [low, high] (or (low, high]).
-
-    Raises:
-        ValueError: It is no number, not finite, or out of the range.
+    """Returns `value` as a float; raises ValueError unless it is finite and inside [low, high] (or
+    (low, high]).
     """
     try:
         result = float(value)
@@ -243,22 +210,14 @@ def number(
         raise ValueError(f"{where}: {name} must be a number, got {value!r}") from None
     inside = low < result <= high if open_low else low <= result <= high
     if not (math.isfinite(result) and inside):
-        bounds = []
-        if low > -math.inf:
-            bounds.append(f"{'>' if open_low else '>='} {low:g}")
-        if high < math.inf:
-            bounds.append(f"<= {high:g}")
-        wanted = " and ".join(["finite", *bounds])
-        raise ValueError(f"{where}: {name} must be {wanted}, got {value!r}")
+        lower = f" and {'>' if open_low else '>='} {low:g}" if low > -math.inf else ""
+        upper = f" and <= {high:g}" if high < math.inf else ""
+        raise ValueError(f"{where}: {name} must be finite{lower}{upper}, got {value!r}")
     return result
 
 
 def whole(where: str, name: str, value: Any, *, low: int, high: int = sys.maxsize) -> int:
-    """Returns `value` as an int inside [low, high].
-
-    Raises:
-        ValueError: It is no whole number, or out of the range.
-    """
+    """Returns `value` as an int; raises ValueError unless it is a whole number in [low, high]."""
     plain = operator.index(value) if hasattr(value, "__index__") else None
     if isinstance(value, bool) or plain is None or not low <= plain <= high:
         upper = f" and <= {high}" if high < sys.maxsize else ""
@@ -267,11 +226,7 @@ def whole(where: str, name: str, value: Any, *, low: int, high: int = sys.maxsiz
 
 
 def triple(where: str, name: str, value: Any) -> tuple[float, float, float]:
-    """Returns three finite floats (x, y, z).
-
-    Raises:
-        ValueError: There are not three, or one is no finite number.
-    """
+    """Returns (x, y, z); raises ValueError unless these are three finite numbers."""
     if isinstance(value, Tensor):
         value = value.tolist()
     try:

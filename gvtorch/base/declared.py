@@ -11,14 +11,8 @@ _PACKAGE = Path(__file__).parents[1]
 
 
 def declared_names(module: str, variable: str) -> list[str]:
-    """Returns the texts of the list, or the keys of the dict, that a module assigns to a variable.
-
-    Args:
-        module: Its name within gvtorch, as in `shaders.built_in`.
-        variable: Assigned once, at the module's top level.
-
-    Raises:
-        KeyError: There is no such variable.
+    """Returns the texts of the list, or the keys of the dict, that a module, named as in
+    `shaders.built_in`, assigns to a variable once, at its top level.
     """
     path = _PACKAGE.joinpath(*module.split(".")).with_suffix(".py")
     for node in ast.parse(path.read_text("utf-8")).body:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass, field
 
 import torch
 
@@ -39,22 +40,17 @@ def milliseconds(start: Mark, end: Mark) -> float:
     return start.elapsed_time(end)
 
 
+@dataclass
 class Timings:
     """Times of stages on one device."""
 
-    def __init__(self, device: torch.device) -> None:
-        """Has measured nothing yet."""
-        self.device = device
-        self._spans: list[tuple[str, Mark, Mark]] = []
-
-    def add(self, name: str, start: Mark, end: Mark) -> None:
-        """Adds a stage."""
-        self._spans.append((name, start, end))
+    device: torch.device
+    spans: list[tuple[str, Mark, Mark]] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, float]:
         """Returns milliseconds by stage; waits until the device has come to the last one's end."""
         total: dict[str, float] = {}
-        for name, start, end in self._spans:
+        for name, start, end in self.spans:
             total[name] = total.get(name, 0.0) + milliseconds(start, end)
         return total
 
@@ -79,7 +75,7 @@ def stage(name: str) -> Iterator[None]:
         try:
             yield
         finally:
-            timings.add(name, start, mark(timings.device))
+            timings.spans.append((name, start, mark(timings.device)))
 
 
 @contextmanager

@@ -89,11 +89,8 @@ class Volume:
         where = f"Volume {name!r}" if name != "volume" else "Volume"
         tensor = _as_tensor(where, data)
         if tensor.dim() not in (3, 4):
-            raise ValueError(
-                f"{where}: data must be (z, y, x) or (z, y, x, c), got {check.describe(data)}"
-                if isinstance(data, Tensor)
-                else f"{where}: data must be (z, y, x) or (z, y, x, c), got shape {data.shape}"
-            )
+            got = check.shown(data)
+            raise ValueError(f"{where}: data must be (z, y, x) or (z, y, x, c), got {got}")
         if tensor.dim() == 3:
             tensor = tensor[..., None]
         check_extent(where, tensor.shape[:3], what="data")
@@ -114,7 +111,8 @@ class Volume:
     @property
     def value_range(self) -> tuple[float, float]:
         """Smallest and largest value over all channels."""
-        low, high = torch.aminmax(_orderable(self.data))
+        unordered = self.data.dtype == torch.uint16  # torch does not compare them
+        low, high = torch.aminmax(self.data.to(torch.int32) if unordered else self.data)
         return (float(low), float(high))
 
     def directional(
@@ -161,11 +159,7 @@ class Volume:
         return volume
 
     def describe(self, bins: int = 32) -> dict[str, Any]:
-        """Returns extent, dtype, place, range and histogram as plain values.
-
-        Args:
-            bins: Of the histogram, over the range of all channels.
-        """
+        """Returns extent, dtype, place, range and a histogram of so many bins as plain values."""
         check.whole("Volume.describe", "bins", bins, low=1)
         low, high = self.value_range
         values = (self.data.float() if self.data.dtype == torch.bfloat16 else self.data).numpy()
@@ -185,7 +179,6 @@ class Volume:
         }
 
     def __repr__(self) -> str:
-        """Shows extent, dtype, channels and spacing."""
         dtype = str(self.data.dtype).removeprefix("torch.")
         extent = "x".join(str(size) for size in self.extent)
         return (
@@ -199,11 +192,6 @@ def movable(tensor: Tensor) -> Tensor:
     int16.
     """
     return tensor.view(torch.int16) if tensor.dtype == torch.uint16 else tensor
-
-
-def _orderable(data: Tensor) -> Tensor:
-    """uint16 has no comparisons in torch: int32 has the same order."""
-    return data.to(torch.int32) if data.dtype == torch.uint16 else data
 
 
 def _as_tensor(where: str, data: Tensor | np.ndarray) -> Tensor:

@@ -19,11 +19,8 @@ SOURCES = Path(__file__).parent / "csrc"
 
 @functools.cache
 def load() -> dict[str, str]:
-    """Loads each library once.
-
-    Returns:
-        For each backend, `cpp` and `cuda`, an empty text if it can be used and else the reason why
-        not.
+    """Loads each library once; returns for each backend, `cpp` and `cuda`, an empty text if it can
+    be used and else the reason why not.
     """
     reasons = {"cpp": _load("libgvtorch_cpu.so")}
     if reasons["cpp"]:

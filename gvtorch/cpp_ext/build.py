@@ -104,31 +104,25 @@ def _run(call: list[str]) -> None:
 
 
 class BuildExt(build_ext):
-    """Puts the libraries beside cpp_ext/__init__.py: in the source tree (editable) and in the
-    wheel.
-    """
+    """Puts the libraries beside cpp_ext/__init__.py, in the source tree and in the wheel."""
 
     def run(self) -> None:
-        """Compiles in the source tree, where the next build finds them, and copies to the build
-        folder.
-        """
-        self._libraries = compile_libraries(FOLDER / "lib")
+        """Compiles in the source tree, where the next build finds them, and copies from there."""
+        libraries = compile_libraries(FOLDER / "lib")
         if not (self.inplace or self.editable_mode):
-            for library in self._libraries:
+            for library in libraries:
                 target = Path(self.build_lib) / library
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(library, target)
 
     def get_outputs(self) -> list[str]:
         """Returns the libraries as they lie in the build folder."""
-        return [str(Path(self.build_lib) / library) for library in commands(FOLDER / "lib")]
+        return list(self.get_output_mapping())
 
     def get_output_mapping(self) -> dict[str, str]:
         """Returns build folder path -> source tree path, for editable installs."""
-        return {
-            str(Path(self.build_lib) / library): str(library)
-            for library in commands(FOLDER / "lib")
-        }
+        libraries = commands(FOLDER / "lib")
+        return {str(Path(self.build_lib) / library): str(library) for library in libraries}
 
 
 class BdistWheel(bdist_wheel):

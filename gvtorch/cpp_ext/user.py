@@ -1,14 +1,10 @@
-"""Compiles a user's shader, a C++ header, into a library of one op, and caches the library.
+"""Compiles a user's shader, a C++ header, into a library of one op, and keeps the library.
 
 csrc/user_shader.h says what a header holds, csrc/user.cpp how it becomes an op. A library is found
 by a digest of all that it is made of: the header and what it includes from its folder, gvtorch's
 headers, the flags (and with them the CPU's instruction set), torch's version, and the compilers
-(path, size, time of change, and the environment variables that they read).
-
-What keeps the cache safe: a library is written beside its place and then renamed, so two processes
-may compile the same one at once; its last 32 bytes are the digest of the others, so one that a
-crash or a full disk cut short is compiled again; and a folder that others can write to is refused,
-for a library is code.
+(path, size, time of change, and the environment variables that they read). It is written beside its
+place and then renamed, so two processes may compile the same one at once.
 
 Environment:
     GVTORCH_CACHE  folder of the libraries; else gvtorch in XDG_CACHE_HOME or in ~/.cache. gvtorch
@@ -36,9 +32,8 @@ from pathlib import Path
 
 import torch
 
-from . import compilers, instructions
+from . import SOURCES, compilers, instructions
 
-SOURCES = Path(__file__).parent / "csrc"
 _INCLUDE = re.compile(r'^[ \t]*#[ \t]*include[ \t]*"([^"\n]+)"', re.MULTILINE)
 _NAME = re.compile(r"(?=.{1,128}$)[A-Za-z_]\w*(::[A-Za-z_]\w*)*", re.ASCII)
 _READ_BY_COMPILERS = ("CPATH", "CPLUS_INCLUDE_PATH", "NVCC_PREPEND_FLAGS", "NVCC_APPEND_FLAGS")
@@ -57,8 +52,8 @@ class ShaderSource:
     name: str  # of the struct, with its namespaces
     digest: str
 
-    @classmethod
-    def read(cls, header: Path, name: str) -> ShaderSource:
+    @staticmethod
+    def read(header: Path, name: str) -> ShaderSource:
         """Reads the header, all that it includes from its folder, and gvtorch's own headers."""
         known: dict[Path, bytes] = {}
         waiting = [header]
@@ -73,38 +68,32 @@ class ShaderSource:
         for file in sorted(known):
             digest.update(os.fsencode(os.path.relpath(file, header.parent)) + b"\0")
             digest.update(hashlib.sha256(known[file]).digest())
-        return cls(header, name, digest.hexdigest())
+        return ShaderSource(header, name, digest.hexdigest())
 
     @property
     def op(self) -> str:
         """Name of the op, in the namespace gvtorch_user."""
         return f"{self.name.replace('::', '_')}_{self.digest[:16]}"
 
+    def require_unchanged(self) -> None:
+        """Raises RuntimeError if the code has changed since it was read."""
+        header = self.header
+        if not header.is_file() or self.read(header, self.name).digest != self.digest:
+            raise RuntimeError(f"CompiledShader: {header} has changed: make the shader anew")
+
 
 @dataclass(frozen=True)
-class UserShader:
+class UserShader(ShaderSource):
     """A compiled shader, and what its struct says of itself."""
 
-    header: Path
-    name: str
-    op: str  # in the namespace gvtorch_user
     features: int  # numbers it gives for each ray; -1: as many as the second channel holds
     whole: bool  # a ray must not be traced in pieces
     uniforms: tuple[str, ...] | None  # their names; None: any number, without names
 
 
 def load(header: str | os.PathLike[str], name: str) -> UserShader:
-    """Loads the op of a header's struct for the CPU; compiles it unless the cache has it.
-
-    Args:
-        header: Path of the C++ header.
-        name: The struct's name, with its namespaces.
-
-    Raises:
-        ValueError: There is no such file, it is no text, or the name is no C++ name.
-        CompileError: The compiler refuses it.
-        RuntimeError: There is no compiler, the header changes meanwhile, the cache's folder can't
-            be written or is not the user's own, or the library can't be loaded.
+    """Loads the op of a header's struct for the CPU; compiles it unless the cache has it. Raises
+    what `CompiledShader` does.
     """
     if not isinstance(header, (str, os.PathLike)) or "\0" in str(header):
         raise ValueError(f"CompiledShader: header must be a path, got {header!r}")
@@ -125,9 +114,7 @@ def load(header: str | os.PathLike[str], name: str) -> UserShader:
     library.gvtorch_uniforms.restype = ctypes.c_char_p
     names = library.gvtorch_uniforms().decode()
     return UserShader(
-        header=path,
-        name=name,
-        op=source.op,
+        **vars(source),
         features=library.gvtorch_features(),
         whole=bool(library.gvtorch_whole()),
         uniforms=tuple(re.findall(r"\w+", names)) if library.gvtorch_named() else None,
@@ -136,26 +123,19 @@ def load(header: str | os.PathLike[str], name: str) -> UserShader:
 
 def load_cuda(shader: UserShader) -> None:
     """Loads a shader's CUDA kernel; compiles it for this machine's devices unless the cache has it.
-
-    Raises:
-        RuntimeError: The header has changed since `load`, or see there.
+    Raises what `CompiledShader` does.
     """
     if (shader.op, "cuda") in _libraries:
         return
-    source = ShaderSource.read(shader.header, shader.name) if shader.header.is_file() else None
-    if source is None or source.op != shader.op:
-        raise _changed(shader.header)
+    shader.require_unchanged()
     devices = range(torch.cuda.device_count())
     found = {"".join(map(str, torch.cuda.get_device_capability(device))) for device in devices}
-    _loaded(source, sorted(found))
+    _loaded(shader, sorted(found))
 
 
 def reload(shader: UserShader) -> UserShader:
     """Returns a shader that another process compiled (an unpickled one, say) as it is if its op is
     loaded here, else made anew from its header.
-
-    Raises:
-        ValueError, CompileError, RuntimeError: See `load`.
     """
     return shader if (shader.op, "cpu") in _libraries else load(shader.header, shader.name)
 
@@ -183,15 +163,8 @@ def _loaded(source: ShaderSource, archs: Sequence[str]) -> Path:
 
 
 def compiled(source: ShaderSource, archs: Sequence[str]) -> Path:
-    """Returns the path of a library in the cache, after compiling it if it is not there.
-
-    Args:
-        source: The struct and its code.
-        archs: CUDA compute capabilities, as in ("90",); none for the CPU.
-
-    Raises:
-        CompileError: The compiler refuses it.
-        RuntimeError: See `load`.
+    """Returns the path of a library in the cache, after compiling it if it is not there. `archs`
+    are CUDA compute capabilities, as in ("90",); none for the CPU.
     """
     header, name, op = source.header, source.name, source.op
     kind, for_whom = ("cuda", "CUDA") if archs else ("cpu", "the CPU")
@@ -228,8 +201,7 @@ def compiled(source: ShaderSource, archs: Sequence[str]) -> Path:
                 f"{header}: {name} did not compile for {for_whom} with: {shlex.join(call)}\n"
                 f"{run.stdout}"
             )
-        if not header.is_file() or ShaderSource.read(header, name) != source:
-            raise _changed(header)
+        source.require_unchanged()
         with target.open("ab") as file:
             file.write(hashlib.sha256(target.read_bytes()).digest())
         target.chmod(0o644)
@@ -238,7 +210,9 @@ def compiled(source: ShaderSource, archs: Sequence[str]) -> Path:
 
 
 def _is_intact(library: Path) -> bool:
-    """Returns whether a library is in the cache and ends with the digest of its other bytes."""
+    """Returns whether a library is in the cache and ends with the digest of its other bytes, which
+    it lacks where a crash or a full disk cut it short.
+    """
     try:
         kept = library.read_bytes()
     except FileNotFoundError:
@@ -259,10 +233,8 @@ def _compiler(archs: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def _folder() -> Path:
-    """Returns the absolute path of the cache's folder; makes it, for its owner alone.
-
-    Raises:
-        RuntimeError: It can't be made, is another user's, or others may write to it.
+    """Returns the folder of the cache; makes it, for its owner alone. One that others can write
+    to is refused, for a library is code.
     """
     try:
         named = os.environ.get("GVTORCH_CACHE")
@@ -277,10 +249,6 @@ def _folder() -> Path:
     if state.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         raise _refused(f"others may write to {folder}")
     return folder
-
-
-def _changed(header: Path) -> RuntimeError:
-    return RuntimeError(f"CompiledShader: {header} has changed: make the shader anew")
 
 
 def _refused(reason: object) -> RuntimeError:

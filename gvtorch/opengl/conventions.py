@@ -63,8 +63,7 @@ def matrices(
     check.number(where, "near", near, low=0, open_low=True)
     if far != math.inf:
         check.number(where, "far", far, low=near, open_low=True)
-    if not isinstance(clip_depth, ClipDepth):
-        raise ValueError(f"{where}: clip_depth must be a ClipDepth, got {clip_depth!r}")
+    check.instance(where, "clip_depth", clip_depth, ClipDepth)
     (fx, fy), (cx, cy) = camera.Ks[:, (0, 1), (0, 1)].unbind(1), camera.Ks[:, :2, 2].unbind(1)
     projection = torch.zeros(len(camera), 4, 4, dtype=torch.float64)
     projection[:, 0, 0], projection[:, 0, 2] = 2 * fx / camera.width, 1 - 2 * cx / camera.width
@@ -157,15 +156,11 @@ def window_depth(
 
     Args:
         distance: (h, w, 1) or (n, h, w, 1) floats, such as `Picture.depth`.
-        projection: See `ray_distance`.
-        clip_depth: See `ray_distance`.
+        projection: See `ray_distance`; so for `clip_depth`, and errors.
 
     Returns:
         As `distance`, float64 from 0 to 1; what is nearer than the near plane has its depth, and
         what is beyond the far plane, +inf too, has that of the far one.
-
-    Raises:
-        ValueError: See `ray_distance`.
     """
     pixels = _Pixels.of("opengl.window_depth", "distance", distance, projection, clip_depth)
     along = distance.to(torch.float64) / pixels.stretch
@@ -195,8 +190,7 @@ class _Pixels(NamedTuple):
     ) -> _Pixels:
         """Reads the projection of an image."""
         matrix, orthographic = _projection(where, projection)
-        if not isinstance(clip_depth, ClipDepth):
-            raise ValueError(f"{where}: clip_depth must be a ClipDepth, got {clip_depth!r}")
+        check.instance(where, "clip_depth", clip_depth, ClipDepth)
         batch = matrix.shape[:-2]
         fits = isinstance(image, Tensor) and image.is_floating_point() and image.shape[-1:] == (1,)
         if not (fits and image.dim() == matrix.dim() + 1 and image.shape[:-3] == batch):

@@ -4,20 +4,25 @@ Colours and depths are read as tensors from the framebuffer bound for reading, a
 one bound for drawing. Each moves in the type in which OpenGL stores it, because drivers convert
 types on the host. They do so for most formats of depth, in both directions, so depth is turned into
 a colour (or back) by drawing one triangle.
+
+Source: CUDA runtime API, section "OpenGL interoperability".
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..base import check
 from . import functions as gl
-from .transfer import Shared, ThroughHost, why_not_shared
 
 _VERTEX = """#version 150
 void main() {  // one triangle over all pixels
@@ -34,7 +39,6 @@ void main() {
 }
 """
 _NUMBERS = itertools.count()
-_UNITS = {"color": 0, "depth": 1}
 _READ_TYPES = {gl.UNSIGNED_BYTE: torch.uint8, gl.HALF_FLOAT: torch.float16}
 _TYPES = {torch.uint8: gl.UNSIGNED_BYTE, torch.float16: gl.HALF_FLOAT, torch.float32: gl.FLOAT}
 _STORED = {torch.uint8: gl.RGBA8, torch.float16: gl.RGBA16F, torch.float32: gl.RGBA32F}
@@ -53,9 +57,7 @@ class Exchange:
     closed leaves its buffers and textures to the context.
 
     Attributes:
-        width: Of the pictures, pixels.
-        height: Likewise.
-        device: Of the tensors that are read.
+        width, height, device: As they were given.
         shared: Whether CUDA maps OpenGL's buffers; else pixels are copied through the host.
         reason: Why they are not shared, or "".
     """
@@ -72,9 +74,9 @@ class Exchange:
         """Makes an exchange in the current context, OpenGL 3.2 or newer.
 
         Args:
-            width: See the class.
-            height: See the class.
-            device: See the class.
+            width: Of the pictures, pixels.
+            height: Likewise.
+            device: Of the tensors that are read.
             share: Whether buffers are shared with CUDA; default: wherever that is possible.
             load: Address of an OpenGL function by its name, from the library that made the
                 context (`glfw.get_proc_address`, for one); default: the system's library.
@@ -95,19 +97,20 @@ class Exchange:
         self.height = check.whole(where, "height", height, low=1, high=most)
         self._size = [self.width, self.height]
         off = share is False
-        self.reason = "share is False" if off else why_not_shared(self._gl, self.device)
+        self.reason = "share is False" if off else _why_not_shared(self._gl, self.device)
         if share and self.reason:
             raise RuntimeError(f"{where}: buffers can't be shared: {self.reason}")
         self.shared = not self.reason
         self._most = torch.full((1,), 255.0, device=self.device)  # divides alike on every device
-        self._ways: dict[str, ThroughHost] = {}
+        way = _Shared if self.shared else _ThroughHost
+        self._ways = defaultdict[str, _ThroughHost](partial(way, self._gl, self.device))
         self._textures: dict[str, tuple[int, int]] = {}  # name and format
         # No other program has an output of this name, by which our context is recognised.
         self._mark = f"result_{next(_NUMBERS)}"
         with self._gl.unchanged(drawing=True):
             self._program = self._gl.program(_VERTEX, _FRAGMENT.replace("result", self._mark))
             self._gl.UseProgram(self._program)
-            for name, unit in _UNITS.items():
+            for name, unit in (("color", 0), ("depth", 1)):
                 place = self._gl.GetUniformLocation(self._program, name.encode())
                 self._gl.Uniform1i(place, unit)
 
@@ -142,7 +145,9 @@ class Exchange:
         """
         with self._work("read_depth", drawing=True), self._gl.temporary("Framebuffers") as frame:
             self._require_size(gl.DEPTH_ATTACHMENT, "depth")
-            self._texture("copied depth", self._depth_format())
+            place = (gl.READ_FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.ATTACHED_DEPTH_SIZE)
+            bits = self._attached(*place)
+            self._texture("copied depth", _DEPTHS.get(bits, gl.DEPTH_COMPONENT24))
             self._gl.CopyTexSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 0, 0, *self._size)
             self._gl.check(f"the framebuffer has a depth? {_ONE_SAMPLE}")
             shown = self._texture("shown depth", gl.R32F)
@@ -188,31 +193,29 @@ class Exchange:
         """
         with self._work("draw", drawing=True):
             self._upload(color, depth)
-            if depth is not None and not self._attached(
-                gl.DRAW_FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.ATTACHED_KIND
-            ):
+            place = (gl.DRAW_FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.ATTACHED_KIND)
+            if depth is not None and not self._attached(*place):
                 raise RuntimeError(
                     f"{self._gl.where}: the framebuffer that is bound for drawing has no depth"
                 )
             self._draw("color", None if depth is None else "depth")
 
     def close(self) -> None:
-        """Frees buffers, textures and program; the exchange can't be used afterwards.
-
-        Raises:
-            RuntimeError: Its context is not current; it still has to be closed.
+        """Frees buffers, textures and program; the exchange can't be used afterwards. Raises
+        RuntimeError if its context is not current; then it still has to be closed.
         """
         if not self._program:
             return
         self._require_context("close")
         with ExitStack() as later:
             later.callback(self._gl.forget_errors)
+            later.callback(self._ways.clear)
             for way in self._ways.values():
                 later.callback(way.close)
             for name, _ in self._textures.values():
                 later.callback(self._gl.drop, "Textures", name)
             later.callback(self._gl.DeleteProgram, self._program)
-            self._ways, self._textures, self._program = {}, {}, 0
+            self._textures, self._program = {}, 0
 
     def __enter__(self) -> Exchange:
         return self
@@ -237,12 +240,6 @@ class Exchange:
         if not ours:
             raise RuntimeError(f"{where}: another OpenGL context is current than the exchange's")
 
-    def _way(self, kind: str) -> ThroughHost:
-        if kind not in self._ways:
-            way = Shared if self.shared else ThroughHost
-            self._ways[kind] = way(self._gl, self.device)
-        return self._ways[kind]
-
     def _pull(self, kind: str, channels: int, dtype: torch.dtype) -> Tensor:
         """Reads the framebuffer that is bound for reading; RGBA or RED."""
 
@@ -251,7 +248,7 @@ class Exchange:
             self._gl.check(f"the framebuffer has colours that are no integers? {_ONE_SAMPLE}")
 
         shape = (self.height, self.width, 4 if channels == gl.RGBA else 1)
-        image = self._way(kind).pull(read, shape, dtype).float()
+        image = self._ways[kind].pull(read, shape, dtype).float()
         return image / self._most if dtype == torch.uint8 else image
 
     def _texture(self, kind: str, stored: int) -> int:
@@ -306,7 +303,7 @@ class Exchange:
             layout = (channels, _TYPES[image.dtype])
             self._gl.TexSubImage2D(gl.TEXTURE_2D, 0, 0, 0, *self._size, *layout, place)
 
-        self._way(f"write {kind}").push(image, write)
+        self._ways[f"write {kind}"].push(image, write)
         self._gl.check("a texture's pixels could not be written")
         return name
 
@@ -330,11 +327,6 @@ class Exchange:
         get = "GetFramebufferAttachmentParameteriv"
         return self._gl.parameter(get, target, attachment, what)
 
-    def _depth_format(self) -> int:
-        """The format of depth that comes next to that of the framebuffer bound for reading."""
-        what = (gl.DEPTH_ATTACHMENT, gl.ATTACHED_DEPTH_SIZE)
-        return _DEPTHS.get(self._attached(gl.READ_FRAMEBUFFER, *what), gl.DEPTH_COMPONENT24)
-
     def _require_size(self, attachment: int, name: str) -> None:
         """Raises unless something of the exchange's size is attached to the framebuffer bound for
         reading. The size of a window's own framebuffer is not known to OpenGL.
@@ -354,3 +346,123 @@ class Exchange:
             raise RuntimeError(
                 f"{frame} {size[0]}x{size[1]} pixels, the exchange {self.width}x{self.height}"
             )
+
+
+class _ThroughHost:
+    """Moves pixels between any OpenGL and any device, by a copy in host memory; and flips their
+    rows, which go up in OpenGL.
+    """
+
+    def __init__(self, functions: gl.Functions, device: torch.device) -> None:
+        self._gl, self._device = functions, device
+
+    def pull(
+        self, read: Callable[[int], None], shape: tuple[int, ...], dtype: torch.dtype
+    ) -> Tensor:
+        """Returns what OpenGL reads at an address, or at an offset in the bound buffer."""
+        host = torch.empty(shape, dtype=dtype, pin_memory=self._device.type == "cuda")
+        self._gl.BindBuffer(gl.PIXEL_PACK_BUFFER, 0)
+        read(host.data_ptr())
+        return host.to(self._device).flip(0)
+
+    def push(self, image: Tensor, write: Callable[[int], None]) -> None:
+        """Has OpenGL write an image from there."""
+        host = image.flip(0).cpu().contiguous()
+        self._gl.BindBuffer(gl.PIXEL_UNPACK_BUFFER, 0)
+        write(host.data_ptr())
+
+    def close(self) -> None:
+        """Frees what it holds."""
+
+
+class _Shared(_ThroughHost):
+    """Moves them through a buffer object of OpenGL that CUDA maps. The host does not wait: mapping
+    and unmapping order the work of each side after the other's.
+    """
+
+    def __init__(self, functions: gl.Functions, device: torch.device) -> None:
+        super().__init__(functions, device)
+        self._name, self._nbytes, self._resource = 0, 0, None
+
+    def pull(
+        self, read: Callable[[int], None], shape: tuple[int, ...], dtype: torch.dtype
+    ) -> Tensor:
+        self._hold(torch.Size(shape).numel() * dtype.itemsize)
+        self._gl.BindBuffer(gl.PIXEL_PACK_BUFFER, self._name)
+        read(0)
+        with self._seen(shape, dtype) as pixels:
+            return pixels.flip(0)
+
+    def push(self, image: Tensor, write: Callable[[int], None]) -> None:
+        self._hold(image.nbytes)
+        with self._seen(tuple(image.shape), image.dtype) as pixels:
+            pixels.copy_(image.flip(0))
+        self._gl.BindBuffer(gl.PIXEL_UNPACK_BUFFER, self._name)
+        write(0)
+        self._gl.BindBuffer(gl.PIXEL_UNPACK_BUFFER, 0)
+
+    def close(self) -> None:
+        name, resource = self._name, self._resource
+        self._name, self._nbytes, self._resource = 0, 0, None
+        try:
+            if resource is not None:
+                with torch.cuda.device(self._device):
+                    self._cuda("cudaGraphicsUnregisterResource", resource)
+        finally:
+            self._gl.drop("Buffers", name)  # 0 is nothing
+
+    def _hold(self, nbytes: int) -> None:
+        """Makes sure that the buffer has so many bytes."""
+        if self._nbytes == nbytes:
+            return
+        self.close()
+        self._name = self._gl.make("Buffers")
+        self._gl.BindBuffer(gl.PIXEL_PACK_BUFFER, self._name)
+        self._gl.BufferData(gl.PIXEL_PACK_BUFFER, nbytes, None, gl.DYNAMIC_COPY)
+        self._gl.check(f"a buffer of {nbytes} bytes for pixels")
+        with torch.cuda.device(self._device):
+            self._resource = self._cuda("cudaGraphicsGLRegisterBuffer", self._name, 0)
+        self._nbytes = nbytes
+
+    @contextmanager
+    def _seen(self, shape: tuple[int, ...], dtype: torch.dtype) -> Iterator[Tensor]:
+        """The buffer's memory as a tensor, while it is mapped to CUDA."""
+        with torch.cuda.device(self._device):
+            stream = torch.cuda.current_stream(self._device).cuda_stream
+            self._cuda("cudaGraphicsMapResources", 1, self._resource, stream)
+            try:
+                place, _ = self._cuda("cudaGraphicsResourceGetMappedPointer", self._resource)
+                array = {"shape": (self._nbytes,), "typestr": "|u1", "version": 3}
+                array["data"] = (int(place), False)
+                memory = SimpleNamespace(__cuda_array_interface__=array)
+                yield torch.as_tensor(memory, device=self._device).view(dtype).view(shape)
+            finally:
+                self._cuda("cudaGraphicsUnmapResources", 1, self._resource, stream)
+
+    def _cuda(self, function: str, *arguments: Any) -> Any:
+        """Calls CUDA's runtime; raises RuntimeError if it fails."""
+        from cuda.bindings import runtime
+
+        error, *results = getattr(runtime, function)(*arguments)
+        if int(error):
+            reason = runtime.cudaGetErrorString(error)[1].decode()
+            raise RuntimeError(f"{self._gl.where}: {function}: {reason}")
+        return results[0] if len(results) == 1 else results
+
+
+def _why_not_shared(functions: gl.Functions, device: torch.device) -> str:
+    """Why CUDA on the device (with its index) can't see the current context's buffers, or ""."""
+    if device.type != "cuda" or torch.version.cuda is None:
+        return f"{device} is not a CUDA device"
+    try:
+        from cuda.bindings import runtime
+    except ImportError:
+        return "cuda-bindings is not installed"
+    renderer = functions.GetString(gl.RENDERER).decode(errors="replace")
+    with torch.cuda.device(device):
+        torch.cuda.current_stream(device).query()  # makes CUDA's context current
+        every = runtime.cudaGLDeviceList.cudaGLDeviceListAll
+        error, count, devices = runtime.cudaGLGetDevices(16, every)
+    if int(error) or device.index not in [int(each) for each in devices[:count]]:
+        return f"OpenGL draws on {renderer}, not on {device}"
+    return ""

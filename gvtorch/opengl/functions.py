@@ -1,8 +1,5 @@
-"""OpenGL's functions and constants that `Exchange` needs, for the current context.
-
-Functions are loaded from the system's library, which dispatches to the current context, or by the
-loader of the library that made the context. Python's bindings of OpenGL do not help: they must be
-told the window system, or make the context themselves.
+"""OpenGL's functions and constants that `Exchange` needs, for the current context. Python's
+bindings of OpenGL do not help: they must know the window system, or make the context themselves.
 
 Source: OpenGL 3.2 core specification, and its registry for the numbers.
 """
@@ -144,12 +141,7 @@ class Functions:
     """
 
     def __init__(self, where: str, load: Loader | None = None) -> None:
-        """Finds the functions, by `load` or in the system's library.
-
-        Raises:
-            ValueError: `load` is no function, or gives something else than addresses.
-            RuntimeError: There is no library, no context, or an older OpenGL.
-        """
+        """Finds the functions, by `load` or in the system's library; raises as `Exchange`."""
         self.where = where
         if load is None:
             load = _system(where)
@@ -200,22 +192,25 @@ class Functions:
         while self.GetError() not in (0, _CONTEXT_LOST):  # the latter stays for ever
             pass
 
+    def read(self, get: str, kind: Any, count: int, *arguments: int) -> list[Any]:
+        """The numbers that a function such as glGetIntegerv writes; 0 where it writes none."""
+        values = (kind * max(count, 4))()
+        getattr(self, get)(*arguments, values)
+        return list(values)[:count]
+
     def integer(self, what: int) -> int:
         """A number of the context's state."""
         return self.integers(what, 1)[0]
 
     def integers(self, what: int, count: int) -> list[int]:
         """Several numbers of the context's state."""
-        values = (c_int * max(count, 4))()
-        self.GetIntegerv(what, values)
-        return list(values)[:count]
+        return self.read("GetIntegerv", c_int, count, what)
 
     def parameter(self, get: str, *arguments: int) -> int:
-        """The number that a function such as glGetProgramiv writes; 0 if it writes none."""
-        value = c_int()
-        getattr(self, get)(*arguments, ctypes.byref(value))
+        """The number that a function such as glGetProgramiv writes; 0 if there is none."""
+        (value,) = self.read(get, c_int, 1, *arguments)
         self.forget_errors()
-        return value.value
+        return value
 
     def attached_size(self, kind: int, name: int, level: int) -> list[int] | None:
         """Width and height of a renderbuffer or of a level of a texture; None if its target has not
@@ -266,11 +261,7 @@ class Functions:
             self.drop(kind, name)
 
     def program(self, vertex: str, fragment: str) -> int:
-        """Links two shaders.
-
-        Raises:
-            RuntimeError: They do not compile or link.
-        """
+        """Links two shaders; raises RuntimeError if they do not compile or link."""
         program = self.CreateProgram()
         for kind, text in ((VERTEX_SHADER, vertex), (FRAGMENT_SHADER, fragment)):
             shader = self.CreateShader(kind)
@@ -296,9 +287,7 @@ class Functions:
             later.callback(self.forget_errors)
             self._set(later, _STATE)
             for each, neutral in _TRANSFER.items() if self._legacy else ():
-                before = c_float()
-                self.GetFloatv(each, ctypes.byref(before))
-                later.callback(self.PixelTransferf, each, before.value)
+                later.callback(self.PixelTransferf, each, *self.read("GetFloatv", c_float, 1, each))
                 self.PixelTransferf(each, neutral)
             for unit in (1, 0):
                 self.ActiveTexture(TEXTURE0 + unit)
@@ -332,14 +321,12 @@ class Functions:
         later.callback(test, DEPTH_TEST)
         self._set(later, _DRAWING_STATE + _LEGACY_STATE * self._legacy)
         if self._viewports:
-            box = (c_float * 4)()
-            self.GetFloati_v(VIEWPORT, 0, box)
+            box = self.read("GetFloati_v", c_float, 4, VIEWPORT, 0)
             later.callback(self.ViewportIndexedf, 0, *box)
         else:
             later.callback(self.Viewport, *self.integers(VIEWPORT, 4))
         for each in range(self.integer(MAX_DRAW_BUFFERS)):
-            mask = (c_ubyte * 4)()
-            self.GetBooleani_v(COLOR_MASK, each, mask)
+            mask = self.read("GetBooleani_v", c_ubyte, 4, COLOR_MASK, each)
             later.callback(self.ColorMaski, each, *mask)
             self.ColorMaski(each, *4 * [each == 0])
         faces = (FRONT, BACK) if self._legacy else (FRONT_AND_BACK,)
@@ -351,9 +338,6 @@ class Functions:
 def _system(where: str) -> Loader:
     """The functions of the system's library that knows the current context. Libglvnd's (the first
     two) hand calls on to any driver; OSMesa's contexts are its own.
-
-    Raises:
-        RuntimeError: There is no library, or no context is current.
     """
     found = False
     for name in ("libOpenGL.so.0", "libGL.so.1", "libOSMesa.so.8"):

@@ -26,8 +26,7 @@ from ..ops.shading import (
 )
 from ..pool import Channel, N3Tree
 from .lights import LitShader, check_number, check_triple
-from .shader import CutSurface, Shader, number_of_one
-from .tables import ColorTable, Sampling, TableCache, one_color
+from .shader import ColorTable, CutSurface, Sampling, Shader, number_of_one, one_color
 from .transfer_function import TransferFunction, integrated_table
 
 __all__ = [
@@ -55,13 +54,8 @@ class Lit(LitShader):
     transfer: TransferFunction
 
     def __init__(self, transfer: TransferFunction, *, shadows: bool = False, **light: Any) -> None:
-        """Takes a transfer function.
-
-        Args:
-            transfer: The transfer function.
-            shadows: Whether matter takes light from what lies behind it; see `LitShader`.
-            **light: `normals`, `light`, `ambient`, `diffuse`, `specular` and `shininess` as in
-                `LitShader`.
+        """Takes a transfer function, `shadows` (whether matter takes light from what lies behind
+        it) and `normals`, `light`, `ambient`, `diffuse`, `specular`, `shininess` of `LitShader`.
         """
         super().__init__(**light)
         self.transfer = check.instance("Lit", "transfer", transfer, TransferFunction)
@@ -81,12 +75,9 @@ class PreIntegrated(Shader):
 
     def __init__(self, transfer: TransferFunction) -> None:
         self.transfer = check.instance("PreIntegrated", "transfer", transfer, TransferFunction)
-        self._tables = TableCache()
 
     def table(self, sampling: Sampling) -> ColorTable:
-        transfer = self.transfer
-        key = transfer.key(sampling)
-        return self._tables.get(key, lambda: integrated_table(transfer, sampling))
+        return self.transfer.kept(integrated_table, sampling)
 
 
 class StoredColor(LitShader):
@@ -330,7 +321,6 @@ class Projection(Shader):
         return ProjectionNumbers(ProjectionKind[self.which.upper()])
 
     def feature_count(self, tree: N3Tree) -> int:
-        """The value."""
         return 1
 
 
@@ -347,7 +337,6 @@ class Features(Shader):
         self.other = _name("Features", channel)
 
     def feature_count(self, tree: N3Tree) -> int:
-        """As many as the channel holds."""
         return tree.bricks.channels[str(self.other)].width
 
 

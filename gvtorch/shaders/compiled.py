@@ -34,10 +34,7 @@ class CompiledShader(LitShader):
 
     Attributes:
         header: The file, as a full path.
-        name: The struct's name.
         op: Name of its op in `torch.ops.gvtorch_user`.
-        uniforms: Its numbers: by the names that the struct gives them, or (k,) in their order.
-        transfer: A transfer function for the struct's own use; None: white and opaque.
     """
 
     op: str
@@ -114,18 +111,13 @@ class CompiledShader(LitShader):
         return tree.bricks.channels[self.other].width
 
     def parameter_tensor(self, tree: N3Tree, dtype: torch.dtype) -> Tensor:
-        """Returns (20 + k,): light and material, and the uniforms, as they are now."""
+        """Returns (20 + k,): that of every shader, and the uniforms as they are now."""
         fixed = super().parameter_tensor(tree, dtype).reshape(-1)
         numbers = self._numbers()
         return torch.cat((fixed, pack(numbers, dtype, tree.device))) if numbers else fixed
 
     def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
-        """See `Shader`; compiles for CUDA where the tree lies there.
-
-        Raises:
-            CompileError, RuntimeError: See the constructor.
-            ValueError: See `Shader`.
-        """
+        """See `Shader`; compiles for CUDA where the tree lies there, and raises as `__init__`."""
         if tree.device.type == "cuda":
             user.load_cuda(self._compiled)
         return super().shading(where, tree)
@@ -134,29 +126,23 @@ class CompiledShader(LitShader):
         """The uniforms in the struct's order, checked."""
         names, given = self._compiled.uniforms, self.uniforms
         if isinstance(given, Tensor):
+            parts: dict[str, Any] = {"uniforms": given}
             count: int | str = "k" if names is None else len(names)
             check.tensor(self.name, "uniforms", given, (count,), given.dtype, given.device)
-            _check_real(self.name, "uniforms", given)
-            return [given]
-        if not isinstance(given, Mapping):
+        elif not isinstance(given, Mapping):
             raise ValueError(f"{self.name}: uniforms must be a dict or a tensor, got {given!r}")
-        if set(given) != set(names or ()):
+        elif set(given) != set(names or ()):
             known = ", ".join(names) if names else "none" if names is not None else "a (k,) tensor"
             came = ", ".join(map(str, given)) or "none"
             raise ValueError(f"{self.name}: uniforms must be {known}, got {came}")
-        for name, value in given.items():
-            if isinstance(value, Tensor):
-                if value.numel() != 1:
-                    raise ValueError(
-                        f"{self.name}: uniform {name} must be one number, "
-                        f"got {check.describe(value)}"
-                    )
-                _check_real(self.name, f"uniform {name}", value)
-            else:
-                check.number(self.name, f"uniform {name}", value)
-        return [given[name] for name in names or ()]
-
-
-def _check_real(where: str, what: str, value: Tensor) -> None:
-    if value.is_complex():
-        raise ValueError(f"{where}: {what} must be real, got {check.describe(value)}")
+        else:
+            parts = {f"uniform {name}": given[name] for name in names or ()}
+        for what, value in parts.items():
+            if not isinstance(value, Tensor):
+                check.number(self.name, what, value)
+            elif value.numel() != 1 and value is not given:
+                got = check.describe(value)
+                raise ValueError(f"{self.name}: {what} must be one number, got {got}")
+            elif value.is_complex():
+                raise ValueError(f"{self.name}: {what} must be real, got {check.describe(value)}")
+        return list(parts.values())

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from .shader import Shader
-from .tables import ColorTable, Sampling
+from .shader import ColorTable, Sampling, Shader
 from .transfer_function import TransferFunction
 
 #: Samples of a ray that are shaded at once; so the fewest of `ModuleShader.samples`.

@@ -1,19 +1,62 @@
-"""`Shader`: what every shader tells the tracer, and the effects around it."""
+"""`Shader`: what every shader tells the tracer, and the effects around it; and the tables that the
+kernels read, rows of colour and alpha at even distances of the value.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ..base import check
 from ..ops import ShadeArguments
-from ..ops.shading import Number, ShadeParameters, Triple, shader_number
+from ..ops.shading import Number, ShadeParameters, Triple, pack, shader_number
 from ..pool import N3Tree
-from .tables import ColorTable, Sampling, one_color
+
+_MOST_BYTES = 64 * 2**20  # of a table in float32
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sampling:
+    """How rays are cut into intervals; in which dtype, and on which device they are traced."""
+
+    smallest_spacing: float  # world units; opacity's reference length where none was given
+    step: float  # world length of the shortest interval
+    levels: int  # lengths of intervals, each twice the one before
+    dtype: torch.dtype
+    device: torch.device
+
+    def fitting(self, rows: int) -> int:
+        """Returns for how many lengths a table is made, where each takes this many rows: fewer than
+        `levels` where the table would take more than 64 MB.
+        """
+        return max(1, min(self.levels, _MOST_BYTES // (16 * rows)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColorTable:
+    """Colour and alpha by value, for each length of interval; linear between rows."""
+
+    table_lm4: Tensor  # (l, m, 4) linear RGB, alpha of an interval of step * 2^l; or (l, m, m, 4)
+    domain_2: Tensor  # (2,) value of the first row, of the last row
+    opaque_m: Tensor  # (m,) int32, how many rows up to this one have an opacity
+
+    @classmethod
+    def of(
+        cls, table: np.ndarray, domain: tuple[float, float], seen_m: np.ndarray, sampling: Sampling
+    ) -> ColorTable:
+        """Moves a table that was made in float64 to where rays are traced."""
+        dtype, device = sampling.dtype, sampling.device
+        return cls(
+            table_lm4=torch.tensor(table, dtype=dtype, device=device),
+            domain_2=torch.tensor(domain, dtype=dtype, device=device),
+            opaque_m=torch.tensor(np.cumsum(seen_m), dtype=torch.int32, device=device),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +180,7 @@ class Shader:
             other_component=self.other_component,
         )
 
-    # What the effects around it are told.
+    # What the effects around it are told; ValueError where that asks for a light it has not.
 
     @property
     def projection(self) -> Literal["maximum", "minimum", "mean"] | None:
@@ -151,31 +194,34 @@ class Shader:
         return None
 
     def unlit(self) -> Shader:
-        """Returns the shader without its light, for light by cones: base colours, and normals.
-
-        Raises:
-            ValueError: It has no light.
-        """
+        """Returns the shader without its light, for light by cones: base colours, and normals."""
         raise ValueError(
             "render: lighting needs normals: the shader must be Lit, StoredColor, Isosurface or "
             f"DistanceField, got {type(self).__name__}"
         )
 
     def matter(self) -> Shader:
-        """Returns what a wide cone meets: base colours, alpha, and normals.
-
-        Raises:
-            ValueError: It has no light, or no colour of its own.
-        """
+        """Returns what a wide cone meets: base colours, alpha, and normals."""
         return self.unlit()
 
     def blocker(self) -> Shader:
-        """Returns what stands in the way of light: only its alpha counts.
-
-        Raises:
-            ValueError: It has no light.
-        """
+        """Returns what stands in the way of light: only its alpha counts."""
         return self.matter()
+
+
+def one_color(color: Triple, sampling: Sampling) -> ColorTable:
+    """Returns the table of one opaque colour, linear RGB."""
+    row = pack((color, 1.0), sampling.dtype, sampling.device)
+    return ColorTable(
+        table_lm4=row.expand(sampling.levels, 2, 4).contiguous(),
+        domain_2=pack((0.0, 1.0), sampling.dtype, sampling.device),
+        opaque_m=torch.arange(1, 3, dtype=torch.int32, device=sampling.device),
+    )
+
+
+def interval_levels(root_voxel: float, step: float) -> int:
+    """Returns how many lengths of intervals a tree needs: up to that of a voxel of its root."""
+    return max(1, math.ceil(math.log2(root_voxel / step)) + 1)
 
 
 def check_shader(where: str, name: str, value: Any) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..base import check
-from .shader import Shader
-from .tables import ColorTable, Sampling, TableCache
+from .shader import ColorTable, Sampling, Shader
 
 Points = Sequence[Sequence[float]]
 
@@ -44,6 +43,7 @@ PRESETS: dict[str, tuple[Points, Points]] = {
     ),
 }
 
+_KEPT = 8  # tables of a function
 # Cells of a table.
 _FEWEST_CELLS = 2**10
 _FEWEST_SAMPLED = 2**12  # where corners fall beside rows
@@ -66,21 +66,9 @@ class TransferFunction(Shader):
         reference: World units, or None for the smallest spacing of what is rendered.
     """
 
-    def __init__(self, opacity: Points, color: Points, reference: float | None = None) -> None:
-        """See `from_points`."""
-        self.opacity = _points("opacity", opacity, 2)
-        self.color = _points("color", color, 4)
-        if reference is not None:
-            reference = check.number(
-                "TransferFunction", "reference", reference, low=0, open_low=True
-            )
-        self.reference = reference
-        self._tables = TableCache()
-
-    @classmethod
-    def from_points(
-        cls, opacity: Points, color: Points = ((0, 1, 1, 1),), reference: float | None = None
-    ) -> TransferFunction:
+    def __init__(
+        self, opacity: Points, color: Points = ((0, 1, 1, 1),), reference: float | None = None
+    ) -> None:
         """Makes a transfer function from its corner points.
 
         Args:
@@ -92,6 +80,20 @@ class TransferFunction(Shader):
         Raises:
             ValueError: No points, values that do not increase, numbers out of [0, 1] or not finite.
         """
+        self.opacity = _points("opacity", opacity, 2)
+        self.color = _points("color", color, 4)
+        if reference is not None:
+            reference = check.number(
+                "TransferFunction", "reference", reference, low=0, open_low=True
+            )
+        self.reference = reference
+        self._tables: dict[Any, ColorTable] = {}
+
+    @classmethod
+    def from_points(
+        cls, opacity: Points, color: Points = ((0, 1, 1, 1),), reference: float | None = None
+    ) -> TransferFunction:
+        """Does the same as the class itself."""
         return cls(opacity, color, reference)
 
     @classmethod
@@ -164,10 +166,6 @@ class TransferFunction(Shader):
             high = low + max(1.0, abs(low))
         return low, high, (values - low) / (high - low)
 
-    def key(self, sampling: Sampling) -> tuple[Any, ...]:
-        """Returns what a table is made of, as a key of `TableCache`."""
-        return self.opacity.tobytes(), self.color.tobytes(), self.reference, sampling
-
     def length(self, sampling: Sampling) -> float:
         """Returns the length of the shortest interval in reference lengths."""
         return sampling.step / (self.reference or sampling.smallest_spacing)
@@ -183,7 +181,19 @@ class TransferFunction(Shader):
         Raises:
             ValueError: Two points are too close to each other.
         """
-        return self._tables.get(self.key(sampling), lambda: self._make_table(sampling))
+        return self.kept(TransferFunction._make_table, sampling)
+
+    def kept(
+        self, make: Callable[[TransferFunction, Sampling], ColorTable], sampling: Sampling
+    ) -> ColorTable:
+        """Returns a table of the function as it is now; the last few are kept."""
+        key = make, self.opacity.tobytes(), self.color.tobytes(), self.reference, sampling
+        if key not in self._tables:
+            table = make(self, sampling)
+            if len(self._tables) == _KEPT:
+                self._tables.pop(next(iter(self._tables)))
+            self._tables[key] = table
+        return self._tables[key]
 
     def _make_table(self, sampling: Sampling) -> ColorTable:
         low, high, places = self.corners()

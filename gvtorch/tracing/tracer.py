@@ -19,8 +19,7 @@ from ..base.records import Hits, Rays
 from ..ops.trace import choose_backend, most_intervals
 from ..pool import N3Tree
 from ..shaders.module import PART_SAMPLES, ModuleShader
-from ..shaders.shader import Shader, check_shader
-from ..shaders.tables import Sampling, interval_levels
+from ..shaders.shader import Sampling, Shader, check_shader, interval_levels
 from .composite import tree_span
 from .options import RenderOptions
 
