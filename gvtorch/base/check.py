@@ -240,10 +240,8 @@ def triple(where: str, name: str, value: Any) -> tuple[float, float, float]:
 
 
 def reals(where: str, name: str, value: Any, shape: tuple[int, ...] | None = None) -> Tensor:
-    """Returns finite numbers, of any shape if none is given, as a float64 tensor on the CPU.
-
-    Raises:
-        ValueError: They are no numbers, of another shape, or one is not finite.
+    """Returns numbers, of any shape if none is given, as a float64 tensor on the CPU; raises
+    ValueError unless they have the shape and are finite.
     """
     try:
         numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu()

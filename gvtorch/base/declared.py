@@ -16,14 +16,10 @@ def declared_names(module: str, variable: str) -> list[str]:
     """
     path = _PACKAGE.joinpath(*module.split(".")).with_suffix(".py")
     for node in ast.parse(path.read_text("utf-8")).body:
-        if isinstance(node, ast.Assign):
-            target, value = node.targets[0], node.value
-        elif isinstance(node, ast.AnnAssign) and node.value is not None:
-            target, value = node.target, node.value
-        else:
-            continue
-        if isinstance(target, ast.Name) and target.id == variable:
-            if isinstance(value, ast.Dict):
-                return [ast.literal_eval(key) for key in value.keys if key is not None]
-            return ast.literal_eval(value)
+        if isinstance(node, (ast.Assign, ast.AnnAssign)):
+            target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+            if isinstance(target, ast.Name) and target.id == variable:
+                assert isinstance(node.value, (ast.Dict, ast.List))
+                names = node.value.keys if isinstance(node.value, ast.Dict) else node.value.elts
+                return [ast.literal_eval(name) for name in names if name is not None]
     raise KeyError(f"{module} has no {variable}")

@@ -54,9 +54,7 @@ class Volume:
 
     Attributes:
         data: (z, y, x, c) tensor on the CPU, one of `CHANNEL_DTYPES`.
-        spacing: (x, y, z) world units, distance of neighbouring voxel centres.
-        origin: (x, y, z) world units, centre of voxel 0.
-        name: Where it came from, for messages.
+        spacing, origin, name: See the constructor.
         filter: How coarse levels are made: the mean, or what is seen along six directions, see
             `directional`.
     """
@@ -77,9 +75,9 @@ class Volume:
         Args:
             data: (z, y, x) or (z, y, x, c). Any byte order. bool becomes uint8; 32 and 64 bit
                 integers and float64 become float32.
-            spacing: (x, y, z) world units, positive.
-            origin: (x, y, z) world units.
-            name: Shown in messages.
+            spacing: (x, y, z) world units, distance of neighbouring voxel centres.
+            origin: (x, y, z) world units, centre of voxel 0.
+            name: Where it came from, for messages.
             nan: The value that voxels which are not finite get; None refuses them.
 
         Raises:
@@ -124,11 +122,8 @@ class Volume:
         lies in front hides what lies behind. So thin walls let no light through, and their two
         sides keep their colours.
 
-        Opacity is that of the smallest spacing.
-
-        Args:
-            premultiplied: Whether colours are given times opacity.
-            dtype: float16, bfloat16 or float32.
+        Opacity is that of the smallest spacing. `premultiplied` tells whether colours are given
+        times opacity, `dtype` is float16, bfloat16 or float32.
 
         Raises:
             ValueError: A voxel holds no 4 numbers, an opacity lies beyond 0 to 1 (integers stand

@@ -84,10 +84,8 @@ _LEGACY_STATE: list[_Number] = [
 _TARGETS = [(TEXTURE_2D, 0x8069, TEXTURE_2D), (0x84F5, 0x84F6, 0x84F5), (0x8C1A, 0x8C1D, 0x8C1A)]
 _TARGETS += [(0x8513, 0x8514, 0x8515), (0x806F, 0x806A, 0x806F), (0x9009, 0x900A, 0x9009)]
 
-_TYPES: dict[str, Any] = {
-    **{"i": c_int, "u": c_uint, "f": c_float, "n": c_ssize_t},
-    **{"p": c_void_p, "s": c_char_p, "-": None},
-}
+_TYPES: dict[str, Any] = {"i": c_int, "u": c_uint, "f": c_float, "n": c_ssize_t}
+_TYPES |= {"p": c_void_p, "s": c_char_p, "-": None}
 #: Functions behind their prototype: what they return, then what they take.
 _PROTOTYPES = """
 -u ActiveTexture BindVertexArray CompileShader DeleteProgram DeleteShader DepthFunc Disable Enable
@@ -143,9 +141,8 @@ class Functions:
     def __init__(self, where: str, load: Loader | None = None) -> None:
         """Finds the functions, by `load` or in the system's library; raises as `Exchange`."""
         self.where = where
-        if load is None:
-            load = _system(where)
-        elif not callable(load):
+        load = _system(where) if load is None else load
+        if not callable(load):
             raise ValueError(f"{where}: load must be a function of a name, got {load!r}")
         self._take(load, _FUNCTIONS)
         self.require_context()

@@ -61,12 +61,8 @@ class CompiledShader(LitShader):
             uniforms: Its numbers, by name; a float, a tensor of one number each. Or all in a (k,)
                 tensor, which is read where it lies; a struct without names takes any k.
             transfer: The transfer function that `look_up` and `hides` read.
-            channel: Name of the channel whose value it reads; that of the options if left out.
-            component: Which number of it; that of the options if left out.
-            other: Name of a second channel.
-            other_component: Which number of it the struct is told.
-            **light: `normals`, `light`, `ambient`, `diffuse`, `specular`, `shininess` as in
-                `Isosurface`, for structs that use `light`.
+            channel, component, other, other_component: See `Shader`.
+            **light: As in `Lit`, for structs that use `light`.
 
         Raises:
             CompileError: The compiler refuses it; holds what the compiler says, as it is.

@@ -53,10 +53,8 @@ class ModuleShader(Shader, torch.nn.Module):
         hidden_by: TransferFunction | None = None,
         samples: int | None = None,
     ) -> None:
-        """See the class.
-
-        Raises:
-            ValueError: The module can't be called, or a number is out of its range.
+        """See the class; raises ValueError where the module can't be called, or a number is out of
+        its range.
         """
         super().__init__()
         if not callable(module):
@@ -71,7 +69,6 @@ class ModuleShader(Shader, torch.nn.Module):
         self.channels = tuple(channels or ())
 
     def __repr__(self) -> str:
-        """Names the module and its channels."""
         name = getattr(self.module, "__name__", type(self.module).__name__)
         return f"ModuleShader({name}, channels={self.channels})"
 
@@ -111,12 +108,8 @@ class TransferModule(torch.nn.Module):
     """
 
     def __init__(self, shader: TransferFunction, spacing: float) -> None:
-        """Copies a transfer function.
-
-        Args:
-            shader: The function.
-            spacing: Smallest spacing of the volume, world units: opacity's reference length where
-                the function has none of its own.
+        """Copies a transfer function; `spacing`, the smallest of the volume in world units, is
+        opacity's reference length where the function has none of its own.
         """
         super().__init__()
         self.reference = float(shader.reference or spacing)

@@ -56,7 +56,6 @@ _FEWEST_PARTS, _MOST_PARTS = 8, 4096  # in which each of these is integrated
 
 class TransferFunction(Shader):
     """Two piecewise linear functions of a value in data units; constant beyond their end points.
-
     The plain shader, and a part of most others. Attributes may be edited: the next picture is made
     with them (a `TreeTracer` or a captured frame keeps those it was made with).
 
@@ -125,10 +124,8 @@ class TransferFunction(Shader):
 
     @classmethod
     def preset(cls, name: str, low: float, high: float) -> TransferFunction:
-        """Stretches a named preset over the data range [low, high].
-
-        Raises:
-            ValueError: The name is unknown.
+        """Stretches a named preset over the data range [low, high]; raises ValueError where the
+        name is unknown.
         """
         if name not in PRESETS:
             raise ValueError(f"unknown preset {name!r}; known: {', '.join(sorted(PRESETS))}")
