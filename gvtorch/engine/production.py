@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future
 from concurrent.futures import wait as wait_for
 from dataclasses import dataclass
@@ -116,6 +116,14 @@ class _Waiting:
         return self.since + self.patience - time.monotonic()
 
 
+def _outcome(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
+    """Returns what a call to a producer gave, and what it raised instead."""
+    try:
+        return call(), None
+    except Exception as error:
+        return None, error
+
+
 class Production:
     """What is on its way from the producers into the pools.
 
@@ -176,7 +184,7 @@ class Production:
             if item.future.done():
                 seconds = time.monotonic() - item.since
                 self.scheduler.learn(item.batch.kind, len(item.batch), 1e3 * seconds)
-                answered += self._settle(item.batch, item.future)
+                answered += self._settle(item.batch, *_outcome(item.future.result))
                 self._waiting.remove(item)
             elif item.left < 0:
                 self._waiting.remove(item)
@@ -250,17 +258,22 @@ class Production:
     def _submit(self, batch: RequestBatch) -> list[Answered]:
         """Asks for a batch; returns what is answered at once."""
         start = time.perf_counter()
-        asked = batch.ask()
-        if asked.done():
-            answered = self._settle(batch, asked)
-            self.scheduler.learn(batch.kind, len(batch), 1e3 * (time.perf_counter() - start))
-            return answered
+        answer, raised = _outcome(batch.ask)
+        if isinstance(answer, Future):
+            if not answer.done():
+                self._wait_for(batch, answer)
+                return []
+            answer, raised = _outcome(answer.result)
+        answered = self._settle(batch, answer, raised)
+        self.scheduler.learn(batch.kind, len(batch), 1e3 * (time.perf_counter() - start))
+        return answered
+
+    def _wait_for(self, batch: RequestBatch, asked: Future) -> None:
         self._mark(batch)
         own = batch.source.producer.patience
         patience = self.patience if own is None else own
         future = self._sent_ahead(batch, asked)
         self._waiting.append(_Waiting(batch, asked, future, patience, time.monotonic()))
-        return []
 
     def _sent_ahead(self, batch: RequestBatch, asked: Future) -> Future:
         """A future that is done once bricks from the host are checked and on their way: all that is
@@ -280,15 +293,10 @@ class Production:
         asked.add_done_callback(send)
         return ahead
 
-    def _settle(self, batch: RequestBatch, asked: Future) -> list[Answered]:
+    def _settle(self, batch: RequestBatch, answer: Any, raised: Exception | None) -> list[Answered]:
         """Checks an answer, or deals with an error. A producer that raised is asked again for each
         half of the batch, so that one bad node does not take the others with it.
         """
-        raised: Exception | None = None
-        try:
-            answer = asked.result()
-        except Exception as error:
-            raised = error
         if raised is not None:
             self._raised += 1
             if len(batch) == 1 or self._raised > _MOST_RAISES:
@@ -304,7 +312,7 @@ class Production:
             self._fail(batch, str(error), error)
             return []
         if checked.errors:
-            per_node = len(batch.nodes) // len(batch)
+            per_node = len(batch.loc) // len(batch)
             named: dict[int, str] = {}
             for index in sorted(checked.errors):
                 named.setdefault(index // per_node, checked.errors[index])

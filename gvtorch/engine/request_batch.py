@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -60,33 +59,27 @@ class RequestBatch:
         fill_loc = None if self.fill_loc is None else self.fill_loc[index]
         return RequestBatch(self.source, self.kind, self.targets[index], fill_loc)
 
-    @cached_property
+    @property
     def nodes(self) -> Nodes:
-        """What the producer is asked about: nodes to fill, or all children of the nodes to
-        subdivide, node after node.
-        """
-        layout, loc = self.source.layout, self.targets.loc
+        """What the producer is asked about; made anew, for `Nodes` keep positions once computed."""
+        return Nodes(self.loc, self.source.layout)
+
+    @cached_property
+    def loc(self) -> Tensor:
+        """(m, 4) nodes to fill, or all children of the nodes to subdivide, node after node."""
+        loc, n = self.targets.loc, self.source.layout.branching
         if self.kind == REQUEST_LOAD:
-            return Nodes(loc if self.fill_loc is None else self.fill_loc, layout)
-        n = layout.branching
+            return loc if self.fill_loc is None else self.fill_loc
         child = torch.arange(n**3, device=loc.device)
         digits = torch.stack((child % n, child // n % n, child // n**2, torch.ones_like(child)), 1)
         low = torch.cat((loc[:, :3] * n, loc[:, 3:]), 1)
-        return Nodes((low[:, None] + digits).flatten(0, 1), layout)
+        return (low[:, None] + digits).flatten(0, 1)
 
-    def ask(self) -> Future:
-        """Calls the producer; returns a future of its answer, done unless that comes later."""
-        producer, answered = self.source.producer, Future[Any]()
-        try:
-            fills = self.kind == REQUEST_LOAD
-            answer = producer.fill(self.nodes) if fills else producer.classify(self.nodes)
-        except Exception as error:
-            answered.set_exception(error)
-            return answered
-        if isinstance(answer, Future):
-            return answer
-        answered.set_result(answer)
-        return answered
+    def ask(self) -> Any:
+        """Calls the producer."""
+        producer = self.source.producer
+        ask = producer.fill if self.kind == REQUEST_LOAD else producer.classify
+        return ask(self.nodes)
 
     def check(self, answer: Any) -> Regions | Bricks:
         """Checks an answer; see producers/answer.py."""

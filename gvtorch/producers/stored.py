@@ -63,20 +63,12 @@ class HostCache:
                 else:
                     mine.append(key)
                     self._reading[key] = Future()
-        if mine:
-            found.update(self._read(mine, read))
-        for key, future in others.items():
-            found[key] = future.result()
-        return [found[key] for key in keys]
-
-    def _read(self, mine: list[Key], read: Read) -> dict[Key, Found]:
-        arrived: dict[Key, Found] = {}
         try:
-            arrived = read(mine)
+            found |= read(mine) if mine else {}
         finally:
             with self._lock:
                 for key in mine:
-                    value = arrived.get(key, "the read was broken off")
+                    value = found.get(key, "the read was broken off")
                     self._reading.pop(key).set_result(value)
                     if isinstance(value, np.ndarray) and value.nbytes <= self.limit:
                         self._kept[key] = value
@@ -84,7 +76,9 @@ class HostCache:
                 while self.nbytes > self.limit:
                     _, dropped = self._kept.popitem(last=False)
                     self.nbytes -= dropped.nbytes
-        return arrived
+        for key, future in others.items():
+            found[key] = future.result()
+        return [found[key] for key in keys]
 
 
 @dataclass(frozen=True)
