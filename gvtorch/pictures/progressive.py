@@ -155,8 +155,7 @@ def render_tiles(
         camera: One camera; an orbit camera must be placed by what renders.
         path: The file; it appears when it is complete.
         bits: Of a number; 8 for .tif if left out.
-        memory: Most bytes that a strip takes, but for scene and libraries; a strip has at least
-            one row.
+        memory: Most bytes that a strip, of at least one row, takes beside scene and libraries.
         progress: Told how many rows are done.
 
     Returns:
@@ -172,9 +171,8 @@ def render_tiles(
     if len(camera) != 1:
         raise ValueError(f"render_tiles: camera must be one, got a batch of {len(camera)}")
     bits = checked_path("render_tiles", path, bits, (".tif", ".npy"))
-    limit = check.nbytes("render_tiles", "memory", memory)
     height, width = camera.height, camera.width
-    rows = strip_rows(limit, width, height)
+    rows = strip_rows(check.nbytes("render_tiles", "memory", memory), width, height)
     stats: RenderStats | None = None
 
     def pictures() -> Iterator[Picture]:
