@@ -27,11 +27,11 @@ _LATE |= {"requests", "misses", "overflow", "converged"}
 class FrameStats(RenderStats):
     """What a frame of the engine cost, and what it asked for.
 
-    Times, and what rays used and missed, are known when the device has finished the frame: reading
-    one of these fields waits for that frame; `settle` waits for all of them. What this frame
-    produced are answers to requests of the frame before and of its own scouts, and answers that
-    came late. Requests and deferred count those of scouts too; use, misses and samples are those of
-    the picture alone.
+    Times, on CUDA those of the device, and what rays used and missed are known when the device has
+    finished the frame: reading one of these fields waits for it; `settle` waits for all. What this
+    frame produced are answers to requests of the frame before and of its own scouts, and answers
+    that came late. Requests and deferred count those of scouts too; use, misses and samples are
+    those of the picture alone.
     """
 
     requests: dict[str, int] = field(default_factory=dict)  # by kind: load, subdivide
