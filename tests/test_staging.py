@@ -17,7 +17,7 @@ import gvtorch as gv
 from gvtorch.base import constants as config
 from gvtorch.ops import available
 from gvtorch.pool import BrickTable, Staging, TableRows
-from gvtorch.pool.brick_table import wide_rows
+from gvtorch.pool.staging import wide_rows
 
 
 def landed(shipment, channel="value") -> torch.Tensor:

@@ -18,8 +18,7 @@ from ..base.constants import ABSENT, REQUEST_LOAD, REQUEST_SUBDIVIDE, TERMINAL
 from ..base.volume import movable
 from ..ops import lacking, link, link_bricks, link_tiles, unlink
 from ..pool import N3Tree
-from ..pool.brick_table import Voxels, on_device, wide_rows
-from ..pool.staging import Chunk, joined
+from ..pool.staging import Chunk, Voxels, joined, on_device, wide_rows
 from .cache import Cache
 
 

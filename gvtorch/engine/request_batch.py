@@ -15,8 +15,7 @@ from ..base.volume import movable
 from ..cache import Cache
 from ..cache.write import Children, Targets
 from ..pool import N3Tree, Staging, TableRows
-from ..pool.brick_table import on_host
-from ..pool.staging import Shipment, upload
+from ..pool.staging import Shipment, on_host, upload
 from ..producers import Bricks, Layout, Nodes, Producer, Region, Regions
 from ..producers.answer import checked_bricks, checked_regions, count_kinds
 

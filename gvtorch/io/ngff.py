@@ -173,8 +173,7 @@ def _axes(where: str, axes: Any) -> tuple[str, str | None]:
 
 def _transform(where: str, items: Any, axes: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Scale and translation along z, y, x; 1 and 0 where they are not told."""
-    scale: dict[str, float] = {}
-    move: dict[str, float] = {}
+    told = {"scale": dict.fromkeys("zyx", 1.0), "translation": dict.fromkeys("zyx", 0.0)}
     for item in items if isinstance(items, list) else []:
         kind = item.get("type") if isinstance(item, dict) else None
         if kind not in ("scale", "translation"):
@@ -185,13 +184,11 @@ def _transform(where: str, items: Any, axes: str) -> tuple[tuple[float, ...], tu
         )
         if not plain or len(values) != len(axes):
             raise ValueError(f"{where}: {kind} must be {len(axes)} numbers, got {values!r}")
-        (scale if kind == "scale" else move).update(zip(axes, map(float, values), strict=True))
-    if any(scale.get(axis, 1.0) <= 0 for axis in "zyx"):
-        raise ValueError(f"{where}: scale must be positive, got {scale}")
-    return (
-        tuple(scale.get(axis, 1.0) for axis in "zyx"),
-        tuple(move.get(axis, 0.0) for axis in "zyx"),
-    )
+        told[kind].update(zip(axes, map(float, values), strict=True))
+    scale, move = (tuple(told[kind][axis] for axis in "zyx") for kind in told)
+    if min(scale) <= 0:
+        raise ValueError(f"{where}: scale must be positive, got {scale} (z, y, x)")
+    return scale, move
 
 
 def image_metadata(

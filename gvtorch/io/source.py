@@ -174,7 +174,6 @@ class MemorySource(VolumeSource):
         return cls(data=data, shape=data.shape, axes="zyxc", stored=data.dtype.str, **told)
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Returns a view."""
         return self.data[index]
 
     def read_region(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:

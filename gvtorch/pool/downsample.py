@@ -1,11 +1,7 @@
 """Reductions of voxels in NumPy, of which coarse levels and summaries of nodes are made.
 
-`pool_mean` is the filter of a level: a coarse voxel is the mean of the N^3 voxels below it (a box
-filter), the average over just the space that it covers. So a cone as wide as a voxel reads its own
-footprint, and sums over a region, and how much light a thin medium absorbs, stay the same from
-level to level. Wider kernels blur more and need more border; a maximum keeps thin shells opaque but
-lets them grow. `pool_directional` is the filter of volumes with six directions, see
-`Volume.directional`.
+`pool_mean` is the filter of a level (docs/design.md, section 2, tells why), `pool_directional` that
+of volumes with six directions, see `Volume.directional`.
 
 All functions take (z, y, x, c) arrays. Each gives the same bits on any part of an array whose
 corner is a multiple of the factor as on the whole, so volumes are also converted part by part.

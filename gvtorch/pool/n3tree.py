@@ -12,8 +12,7 @@ from ..base.constants import CONSTANT, TERMINAL
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume
 from ..ops import locate
-from .channel import Channel, volumes_by_channel
-from .pools import BrickPool, NodePool
+from .pools import BrickPool, Channel, NodePool, volumes_by_channel
 from .pyramid import TreePlan, levels_by_depth, tree_depth
 
 

@@ -1,4 +1,5 @@
-"""`Staging`: sends bricks from the host to the device while the device renders.
+"""`Staging`: sends bricks from the host to the device while the device renders; `BrickTable`: those
+that lie ready for it.
 
 Bricks are gathered chunk by chunk into a ring of pinned memory, copied on a stream of their own,
 and written into their slots by the stream that renders, which waits for each copy by an event. One
@@ -22,18 +23,104 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .brick_table import TableRows, Voxels, on_device
+from ..base import check
 
 _MOST = 256 * 10**6  # bytes of a ring
 _CHUNKS = (2 * 10**6, 16 * 10**6)  # bytes of a chunk: fewer are all overhead, more overlap less
 _ALIGN = 16  # bytes: where a channel begins in a chunk
+_WORDS = {8: torch.int64, 4: torch.int32, 2: torch.int16, 1: torch.uint8}
 
 
-class _NoEvent:
-    """Stands for a CUDA event on a device that does everything at once."""
+class BrickTable:
+    """Bricks that lie ready in host memory. A producer answers with `table[row]`: the bricks are
+    gathered once, on their way to the device.
+    """
 
-    def query(self) -> bool:
-        return True
+    def __init__(self, bricks: Tensor) -> None:
+        """Takes over (n, z, y, x, c) bricks on the CPU, borders included.
+
+        Raises:
+            ValueError: They are no contiguous tensor on the CPU, or hold NaN or infinite values.
+        """
+        if bricks.dim() != 5 or bricks.device.type != "cpu" or not bricks.is_contiguous():
+            raise ValueError(
+                "BrickTable: bricks must be contiguous (n, z, y, x, c) on the CPU, "
+                f"got {check.describe(bricks)}"
+            )
+        if bricks.is_floating_point() and not torch.isfinite(bricks.sum(dtype=torch.float64)):
+            raise ValueError("BrickTable: bricks hold NaN or infinite values")
+        self.bricks = bricks
+
+    def __len__(self) -> int:
+        return len(self.bricks)
+
+    def __getitem__(self, row: Tensor) -> TableRows:
+        """Names bricks by their (k,) int64 rows; ValueError if one is outside the table."""
+        row = row.to(device="cpu", dtype=torch.int64)
+        if len(row) and (int(row.min()) < 0 or int(row.max()) >= len(self)):
+            raise ValueError(f"BrickTable: rows must be 0 to {len(self) - 1}")
+        return TableRows(self.bricks, row)
+
+    def __repr__(self) -> str:
+        return f"BrickTable({check.describe(self.bricks)}, {self.bricks.nbytes / 1e6:.1f} MB)"
+
+
+class TableRows:
+    """Some bricks of a table, not gathered yet: like a tensor (k, z, y, x, c) on the CPU."""
+
+    def __init__(self, table: Tensor, row: Tensor) -> None:
+        """Names rows (k,) int64 of a table (n, z, y, x, c)."""
+        self.table, self.row = table, row
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    def __getitem__(self, index: slice | Tensor) -> TableRows:
+        return TableRows(self.table, self.row[index.cpu() if isinstance(index, Tensor) else index])
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(k, z, y, x, c)."""
+        return (len(self.row), *self.table.shape[1:])
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The table's dtype."""
+        return self.table.dtype
+
+    def gather(self, out: Tensor | None = None) -> Tensor:
+        """Returns the bricks, in `out` if that is given."""
+        out = torch.empty(self.shape, dtype=self.dtype) if out is None else out
+        table, rows = wide_rows(self.table, out)
+        torch.index_select(table, 0, self.row, out=rows)
+        return out
+
+
+Voxels = Mapping[str, Tensor | TableRows]  # for each channel (k, z, y, x, c)
+
+
+def wide_rows(*tensors: Tensor) -> list[Tensor]:
+    """Returns (k, w) views of contiguous tensors in the widest integers that fit all of their rows:
+    fewer elements move, and uint16, which torch can't index, becomes int16.
+    """
+    widest = 8
+    for tensor in tensors:
+        row = math.prod(tensor.shape[1:]) * tensor.itemsize
+        widest = math.gcd(widest, row, tensor.storage_offset() * tensor.itemsize)
+        widest = math.gcd(widest, tensor.data_ptr())
+    word = _WORDS[widest]
+    return [t.view(len(t), math.prod(t.shape[1:])).view(word) for t in tensors]
+
+
+def on_host(data: Voxels) -> bool:
+    """Returns whether any channel lies in host memory."""
+    return any(isinstance(rows, TableRows) or rows.device.type == "cpu" for rows in data.values())
+
+
+def on_device(rows: Tensor | TableRows, device: torch.device) -> Tensor:
+    """Returns contiguous bricks on the device; the host waits for the copy."""
+    gathered = rows.gather() if isinstance(rows, TableRows) else rows
+    return gathered.to(device).contiguous()
 
 
 @dataclass(eq=False)
@@ -44,7 +131,7 @@ class _RingSpan:
 
     begin: int
     end: int
-    copied: Any = None  # events, None until they are recorded
+    copied: Any = None  # CUDA events, None until they are recorded
     read: Any = None
     chunk: Callable[[], Chunk | None] | None = None  # weak, None until it is sent
     source: Any = None  # keeps pinned memory alive while it is copied from
@@ -71,9 +158,10 @@ class Chunk:
         return self._data
 
     def __exit__(self, *_error: object) -> None:
-        on_cuda = self._device.type == "cuda"
-        stream = torch.cuda.current_stream(self._device) if on_cuda else None
-        self._span.read = stream.record_event() if stream else _NoEvent()
+        if self._device.type == "cuda":
+            self._span.read = torch.cuda.current_stream(self._device).record_event()
+        else:
+            self._span.chunk = lambda: None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -111,7 +199,8 @@ class Staging:
         if count == 0:
             return Shipment([], 0, data)
         row_bytes = [_row_bytes(rows) for rows in data.values()]
-        pinned = {name for name, rows in data.items() if self._is_pinned(rows)}
+        cuda = self._device.type == "cuda"
+        pinned = {name for name, rows in data.items() if cuda and _is_pinned(rows)}
         room = self.chunk if len(pinned) < len(data) else self.nbytes // 4  # nothing to overlap
         per_chunk = (room - _ALIGN * len(data)) // sum(row_bytes)
         if per_chunk < 1:
@@ -141,28 +230,21 @@ class Staging:
         """Gathers bricks into the ring and starts their copy; returns where they arrive."""
         assert self._host is not None and self._target is not None
         offset, arriving = span.begin, {}
-        copies: list[tuple[Tensor, Tensor]] = []  # to, from
-        for (name, rows), size in zip(bricks.items(), sizes, strict=True):
-            at = slice(offset, offset + len(rows) * _row_bytes(rows))
-            offset += size
-            arriving[name] = self._target[at].view(rows.dtype).view(rows.shape)
-            if isinstance(rows, Tensor) and name in pinned:
-                source = rows
-            else:
-                source = self._host[at].view(rows.dtype).view(rows.shape)
-                rows.gather(source) if isinstance(rows, TableRows) else source.copy_(rows)
-            copies.append((arriving[name], source))
         with torch.cuda.stream(self._stream) if self._stream else nullcontext():
-            for to, source in copies:
-                to.copy_(source, non_blocking=True)
-            span.copied = self._stream.record_event() if self._stream else _NoEvent()
+            for (name, rows), size in zip(bricks.items(), sizes, strict=True):
+                at = slice(offset, offset + len(rows) * _row_bytes(rows))
+                offset += size
+                arriving[name] = self._target[at].view(rows.dtype).view(rows.shape)
+                if isinstance(rows, Tensor) and name in pinned:
+                    source = rows
+                else:
+                    source = self._host[at].view(rows.dtype).view(rows.shape)
+                    rows.gather(source) if isinstance(rows, TableRows) else source.copy_(rows)
+                arriving[name].copy_(source, non_blocking=True)
+            if self._stream:
+                span.copied = self._stream.record_event()
         span.source = bricks
         return arriving
-
-    def _is_pinned(self, rows: Tensor | TableRows) -> bool:
-        if self._device.type != "cuda" or not isinstance(rows, Tensor):
-            return False
-        return rows.is_contiguous() and rows.is_pinned()
 
     def _take(self, nbytes: int) -> _RingSpan | None:
         """Takes the next bytes of the ring; returns None if they are not free."""
@@ -211,6 +293,10 @@ def upload(tensor: Tensor, device: torch.device) -> Tensor:
     if device.type != "cuda" or tensor.device.type != "cpu" or tensor.numel() == 0:
         return tensor.to(device)
     return tensor.pin_memory().to(device, non_blocking=True)
+
+
+def _is_pinned(rows: Tensor | TableRows) -> bool:
+    return isinstance(rows, Tensor) and rows.is_contiguous() and rows.is_pinned()
 
 
 def _row_bytes(rows: Tensor | TableRows) -> int:

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from ..base import check
 from ..pool import Channel, TableRows
-from ..pool.brick_table import on_device, on_host
 from ..pool.pyramid import NodeSummary
-from ..pool.staging import upload
+from ..pool.staging import on_device, on_host, upload
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 
 Form = TypeVar("Form", bound=Regions | Bricks)

@@ -20,9 +20,9 @@ from torch import Tensor
 from ..base import check
 from ..base.volume import movable
 from ..pool import Channel
-from ..pool.brick_table import TableRows, Voxels
-from ..pool.channel import phrase
+from ..pool.pools import phrase
 from ..pool.pyramid import tree_depth
+from ..pool.staging import TableRows, Voxels
 
 
 class Region(IntEnum):

@@ -12,9 +12,9 @@ from ..base import check
 from ..base.volume import Volume
 from ..ops import cut_bricks
 from ..pool import BrickTable, Channel
-from ..pool.brick_table import wide_rows
-from ..pool.channel import volumes_by_channel
+from ..pool.pools import volumes_by_channel
 from ..pool.pyramid import Level, NodeSummary, levels_by_depth
+from ..pool.staging import wide_rows
 from .answer import regions_of
 from .producer import Bricks, Layout, Nodes, Producer, Regions
 

@@ -21,7 +21,6 @@ class FitsSource(VolumeSource):
     """An image that is scaled or packed: plane by plane, or all at once."""
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Reads a part."""
         from astropy.io import fits
 
         with fits.open(self.path, memmap=False) as units:

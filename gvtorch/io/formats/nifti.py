@@ -16,7 +16,6 @@ class NiftiSource(VolumeSource):
     """A NIfTI image, its values scaled as the header tells."""
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Reads a part."""
         return np.asanyarray(_load(self.path).dataobj[index])
 
 

@@ -20,7 +20,6 @@ class OmeZarrSource(VolumeSource):
     """The finest level of an image."""
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Reads a part."""
         low, high = [s.start for s in index[:3]], [s.stop for s in index[:3]]
         return _store(self).read_region(0, low, high, timeout=_TIMEOUT)
 
