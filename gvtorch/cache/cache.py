@@ -1,7 +1,4 @@
-"""`Cache`: a node pool and a brick pool with their order of use and requests.
-
-What is written into the pools, and in which order, is in `write.py`.
-"""
+"""`Cache`: a node pool and a brick pool with their orders of use. `write.py` writes into it."""
 
 from __future__ import annotations
 
@@ -9,17 +6,56 @@ import torch
 from torch import Tensor
 
 from ..base.constants import REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUEST_SUBDIVIDE
+from ..ops import lru_partition
 from ..pool import BrickPool, NodePool
-from .lru import LRU
-from .requests import RequestList
+
+
+class LRU:
+    """The order in which slots of a pool are given away: least recently used first.
+
+    Attributes:
+        order: (k,) int32 slots without the locked ones, changed in place: CUDA graphs read it.
+        unused: How many at the front the last picture did not use; these may be taken.
+    """
+
+    def __init__(self, capacity: int, locked: int, device: torch.device) -> None:
+        """Starts with slots `locked` to `capacity`, all free."""
+        self.order = torch.arange(locked, capacity, dtype=torch.int32, device=device)
+        self.unused = len(self.order)
+
+    def sort(self, stamp: Tensor, frame: Tensor) -> Tensor:
+        """Moves the slots that `frame` (1,) int32 did not use to the front, each part in its old
+        order, by the frames (capacity,) int32 that used each slot last.
+
+        Returns:
+            (1,) int64 number of unused slots; `unused` is set once the host knows it.
+        """
+        order, unused = lru_partition(self.order, stamp, frame)
+        self.order.copy_(order)
+        return unused
+
+    def take(self, count: int) -> Tensor:
+        """Returns (count,) int32 slots from the front, and moves them to the back.
+
+        Raises:
+            ValueError: Fewer slots are unused.
+        """
+        if count > self.unused:
+            raise ValueError(f"LRU: {count} slots wanted, {self.unused} are unused")
+        taken = self.order[:count].clone()
+        self.order.copy_(self.order.roll(-count))
+        self.unused -= count
+        return taken
+
+    def __repr__(self) -> str:
+        return f"LRU({len(self.order)} slots, {self.unused} may be taken)"
 
 
 class Cache:
     """The pools of several trees. The first slots belong to the roots and are never given away.
 
     Attributes:
-        nodes: The node pool.
-        bricks: The brick pool.
+        nodes, bricks: The pools.
         lru: The order of use of tiles (REQUEST_SUBDIVIDE) and of bricks (REQUEST_LOAD).
         frame: Number of the last picture; what is written counts as used in it.
     """
@@ -36,20 +72,12 @@ class Cache:
     def memory(self) -> dict[str, int]:
         """Returns bytes: what the pools hold, and the bookkeeping apart."""
         nodes, bricks = self.nodes, self.bricks
-        words = (nodes.child_tn, nodes.brick_tn)
-        content = (*words, *nodes.constants.values(), *nodes.ranges.values())
-        node_bytes = sum(tensor.nbytes for tensor in content)
+        content = (*nodes.constants.values(), *nodes.ranges.values())
+        node_bytes = sum(words.nbytes for words in (nodes.child_tn, nodes.brick_tn, *content))
         brick_bytes = sum(tensor.nbytes for tensor in bricks.bricks.values())
         order = sum(lru.order.nbytes for lru in self.lru.values())
-        return {
-            "node_pool": node_bytes,
-            "brick_pool": brick_bytes,
-            "bookkeeping": nodes.nbytes + bricks.nbytes - node_bytes - brick_bytes + order,
-        }
-
-    def collect_requests(self, capacity: int) -> RequestList:
-        """Takes the frame's requests out of the node pool, at most `capacity` nodes."""
-        return RequestList.collect(self.nodes, capacity)
+        rest = nodes.nbytes + bricks.nbytes - node_bytes - brick_bytes + order
+        return {"node_pool": node_bytes, "brick_pool": brick_bytes, "bookkeeping": rest}
 
     def sort_by_use(self, frame: Tensor) -> Tensor:
         """Orders tiles and bricks by use in `frame` (1,); the host does not wait.
@@ -58,12 +86,8 @@ class Cache:
             (4,) int64 tiles unused and used, bricks unused and used; `make_room` is told the unused
             ones, once the host knows them.
         """
-        counts = []
-        for kind, stamp in (
-            (REQUEST_SUBDIVIDE, self.nodes.stamp_t),
-            (REQUEST_LOAD, self.bricks.stamp_b),
-        ):
-            lru = self.lru[kind]
+        counts, stamps = [], (self.nodes.stamp_t, self.bricks.stamp_b)
+        for lru, stamp in zip(self.lru.values(), stamps, strict=True):
             unused, size = lru.sort(stamp, frame), len(lru.order)
             locked = (stamp[: len(stamp) - size] == frame).sum()
             counts += [unused, locked + size - unused]
@@ -97,13 +121,10 @@ class Cache:
         Pointers that lead nowhere are found by `N3Tree.validate`.
         """
         nodes, bricks = self.nodes, self.bricks
-        for kind, capacity in (
-            (REQUEST_SUBDIVIDE, nodes.capacity),
-            (REQUEST_LOAD, bricks.capacity),
-        ):
-            order = self.lru[kind].order.sort().values
-            locked = capacity - len(order)
-            if not torch.equal(order, torch.arange(locked, capacity).to(order)):
+        sizes = (nodes.capacity, bricks.capacity)
+        for lru, capacity in zip(self.lru.values(), sizes, strict=True):
+            order = lru.order.sort().values
+            if not torch.equal(order, torch.arange(capacity - len(order), capacity).to(order)):
                 raise ValueError("Cache: the order of use is no permutation of the slots")
         for what, owner, pointer, shared in (
             ("brick", bricks.owner_b, nodes.brick_tn.view(-1), bricks.shared_b),

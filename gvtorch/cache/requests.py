@@ -1,13 +1,15 @@
-"""Requests: the nodes that the rays of a frame wanted subdivided or loaded.
+"""Requests, the nodes that the rays of a frame wanted subdivided or loaded, and which are served.
 
 Rays write them into the node pool's request words. `RequestList` is what one pass over these words
-leaves on the device; `Requests` are its rows of one kind, once the host knows how many there are.
+leaves on the device, `Requests` its rows of one kind, once the host knows how many there are, and
+`Scheduler` chooses among these by priority and within the budgets.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,6 +26,8 @@ from ..pool import NodePool
 
 #: The kinds of request by the names that statistics show.
 KINDS = {"load": REQUEST_LOAD, "subdivide": REQUEST_SUBDIVIDE}
+_LEARN_FROM = 64  # items: smaller batches tell more about overhead than about throughput
+_LEARN_RATE = 0.3  # weight of the newest frame
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -33,6 +37,12 @@ class Requests:
     node: Tensor  # (k,) int64
     depth: Tensor  # (k,) int64 of the node
     priority: Tensor  # (k,) int32 width of one of its voxels on the screen, 1/16 pixel
+
+    @classmethod
+    def of(cls, nodes: NodePool, node: Tensor, priority: Tensor) -> Requests:
+        """Requests of (k,) nodes of a pool."""
+        depth = nodes.loc_t4[node // nodes.nodes_per_tile, 3].to(torch.int64)
+        return cls(node=node, depth=depth, priority=priority)
 
     def __len__(self) -> int:
         """Number of requests."""
@@ -53,30 +63,22 @@ class RequestList:
 
     @classmethod
     def collect(cls, nodes: NodePool, capacity: int) -> RequestList:
-        """Takes the requests out of a pool's request words; the host does not wait.
-
-        Args:
-            nodes: The pool; its request words are cleared, their pending bits excepted.
-            capacity: Most nodes listed.
+        """Takes the requests, at most `capacity` nodes, out of a pool's request words, which are
+        cleared, their pending bits excepted; the host does not wait.
         """
         node, word, count = compact_requests(nodes.request_tn, capacity)
         kinds = [(word & kind).ne(0).sum().view(1) for kind in KINDS.values()]
         return cls(node=node, word=word, count=torch.cat((count, *kinds)))
 
     def by_kind(self, nodes: NodePool, counts: Mapping[str, int]) -> dict[int, Requests]:
-        """Returns the requests of each kind; the host does not wait.
-
-        Args:
-            nodes: The pool.
-            counts: How many there are of each kind, by name; the host has read them back.
+        """Returns the requests of each kind; the host does not wait. It has read back the `counts`,
+        how many there are of each kind, by name.
         """
         requests = {}
         for name, kind in KINDS.items():
             row = torch.nonzero_static((self.word & kind).ne(0), size=counts[name])[:, 0]
-            node = self.node[row].to(torch.int64)
-            depth = nodes.loc_t4[node // nodes.nodes_per_tile, 3].to(torch.int64)
-            priority = self.word[row] & REQUEST_PRIORITY
-            requests[kind] = Requests(node=node, depth=depth, priority=priority)
+            node, priority = self.node[row].to(torch.int64), self.word[row] & REQUEST_PRIORITY
+            requests[kind] = Requests.of(nodes, node, priority)
         return requests
 
 
@@ -116,9 +118,94 @@ def coarser_requests(
     node = node[(words == ABSENT) & (pending == 0)]
     if not len(node):
         return requests
-    loads = Requests(
-        node=node,
-        depth=nodes.loc_t4[node // nodes.nodes_per_tile, 3].to(torch.int64),
-        priority=torch.zeros_like(node, dtype=torch.int32),
-    )
+    loads = Requests.of(nodes, node, torch.zeros_like(node, dtype=torch.int32))
     return {REQUEST_LOAD: loads, REQUEST_SUBDIVIDE: subdivide}
+
+
+class Choice(NamedTuple):
+    """Which requests are served."""
+
+    nodes: dict[int, Tensor]  # for each kind (k,) int64, most wanted first
+    deferred: int  # requests that the budgets put off
+    exceeded: bool  # whether slots were too few
+
+
+class Scheduler:
+    """Orders requests and trims them to budgets.
+
+    Attributes:
+        most: For each kind, most items a frame.
+        rate: For each kind, items a millisecond, learned from what production took; None at first.
+        spent: For each kind, items that were asked for in this frame, which are off its budget.
+    """
+
+    def __init__(
+        self,
+        *,
+        order: Literal["coarse", "fine"] = "coarse",
+        loads: int = 4096,
+        subdivisions: int = 4096,
+        milliseconds: float | None = None,
+    ) -> None:
+        """Sets the budgets of a frame.
+
+        Args:
+            order: Coarse levels first, which shows something everywhere soon, or fine ones; then
+                by size on the screen.
+            loads: Most bricks a frame.
+            subdivisions: Most node tiles a frame.
+            milliseconds: Most time a frame for production, shared by both kinds; None: no limit.
+        """
+        self.order, self.milliseconds = order, milliseconds
+        self.most = {REQUEST_LOAD: loads, REQUEST_SUBDIVIDE: subdivisions}
+        self.rate: dict[int, float | None] = dict.fromkeys(self.most)
+        self._budget = dict(self.most)
+        self.begin()
+
+    def begin(self) -> None:
+        """Starts a frame: its budgets are whole."""
+        self.spent = dict.fromkeys(self.most, 0)
+
+    def choose(self, requests: RequestsByKind, room: Mapping[int, int]) -> Choice:
+        """Returns which of a frame's requests are served, where `room` tells for each kind how many
+        slots may be taken.
+        """
+        nodes: dict[int, Tensor] = {}
+        deferred, exceeded = 0, False
+        for kind, most in self.most.items():
+            asked = requests[kind]
+            self._budget[kind] = min(most, self._in_time(kind))
+            budget = max(0, self._budget[kind] - self.spent[kind])
+            deferred += max(0, min(len(asked), room[kind]) - budget)
+            exceeded |= len(asked) > room[kind]
+            nodes[kind] = asked.node[self._rank(asked)[: min(budget, room[kind])]]
+        return Choice(nodes, deferred, exceeded)
+
+    def learn(self, kind: int, items: int, milliseconds: float) -> None:
+        """Learns the throughput from a batch that took `milliseconds`. Small ones tell little,
+        unless the budget itself made them small.
+        """
+        if items < min(_LEARN_FROM, self._budget[kind]) or milliseconds <= 0:
+            return
+        seen, known = items / milliseconds, self.rate[kind]
+        self.rate[kind] = seen if known is None else known + _LEARN_RATE * (seen - known)
+
+    def _rank(self, requests: Requests) -> Tensor:
+        """(k,) int64 rows by level, then by size on the screen, then by node, so that the order
+        does not depend on chance.
+        """
+        level = requests.depth if self.order == "coarse" else -requests.depth
+        small = REQUEST_PRIORITY - requests.priority.to(torch.int64)
+        return (level * (REQUEST_PRIORITY + 1) + small).argsort(stable=True)
+
+    def _in_time(self, kind: int) -> int:
+        """How many items half of the time is enough for."""
+        if self.milliseconds is None:
+            return self.most[kind]
+        rate = self.rate[kind]
+        return _LEARN_FROM if rate is None else max(1, int(rate * 0.5 * self.milliseconds))
+
+    def __repr__(self) -> str:
+        loads, tiles = self.most[REQUEST_LOAD], self.most[REQUEST_SUBDIVIDE]
+        time = "" if self.milliseconds is None else f", {self.milliseconds:g} ms"
+        return f"Scheduler({self.order} first, at most {loads} bricks, {tiles} tiles{time} a frame)"

@@ -90,8 +90,8 @@ def tiles(cache: Cache, targets: Targets, children: Children) -> Written:
     used = (pool.parent_t[tile_k.to(torch.int64)] >= 0) & _among_first(tile_k, fit.sum())
     counts = torch.stack([rows.sum() for rows in (wanted, first, fit, used)]).tolist()
     lasting, taken, items, evicted = counts
-    done = Written(items=items, evicted=evicted)
-    done.stale, done.unplaced = len(node) - lasting, lasting - taken
+    stale, unplaced = len(node) - lasting, lasting - taken
+    done = Written(items=items, evicted=evicted, stale=stale, unplaced=unplaced)
     done.lost = wanted & ~fit if items < lasting else None
     tile_k = lru.take(taken)[:items]
     if not items:
@@ -99,7 +99,7 @@ def tiles(cache: Cache, targets: Targets, children: Children) -> Written:
     unlink(pool.child_tn, tile_k, pool.capacity)
     unlink(pool.parent_t, tile_k, pool.capacity, per_tile)
     unlink(cache.bricks.owner_b, tile_k, pool.capacity, per_tile)
-    rows, tile = _rows(fit, items), tile_k.to(torch.int64)
+    rows, tile = torch.nonzero_static(fit, size=items)[:, 0], tile_k.to(torch.int64)
     width = children.child.shape[1]
     for held, values in ((pool.constants, children.constants), (pool.ranges, children.ranges)):
         for name, tensor in values.items():
@@ -129,12 +129,8 @@ def _alias(cache: Cache, node: Tensor, target: Tensor) -> None:
 
 
 def bricks(cache: Cache, targets: Targets, data: Voxels | Sequence[Chunk]) -> Written:
-    """Gives nodes their bricks: takes slots, unlinks, writes and links them.
-
-    Args:
-        cache: The pools.
-        targets: The k nodes.
-        data: For each channel (k, z, y, x, c), or what is on its way to the device.
+    """Gives (k,) nodes their bricks: takes slots, unlinks, writes and links them. `data` is for
+    each channel (k, z, y, x, c), or what is on its way to the device.
     """
     lru, node = cache.lru[REQUEST_LOAD], targets.node
     wanted = targets.lacking(cache, REQUEST_LOAD)
@@ -142,15 +138,14 @@ def bricks(cache: Cache, targets: Targets, data: Voxels | Sequence[Chunk]) -> Wr
     used = (cache.bricks.owner_b[slot] >= 0) & _among_first(slot, wanted.sum())
     lasting, evicted = torch.stack((wanted.sum(), used.sum())).tolist()
     items = min(lasting, lru.unused)
-    done = Written(items=items, evicted=evicted)
-    done.stale, done.unplaced = len(node) - lasting, lasting - items
-    if items < lasting:
-        done.lost = wanted & (wanted.cumsum(0) > items)
+    stale, unplaced = len(node) - lasting, lasting - items
+    done = Written(items=items, evicted=evicted, stale=stale, unplaced=unplaced)
+    done.lost = wanted & (wanted.cumsum(0) > items) if unplaced else None
     if not items:
         return done
     slot_k = lru.take(items)
     if items < len(node):
-        rows = _rows(wanted, lasting)[:items]
+        rows = torch.nonzero_static(wanted, size=lasting)[:items, 0]
         whole = joined(data, node.device)
         data = {name: movable(some)[rows].view(some.dtype) for name, some in whole.items()}
         node = node[rows]
@@ -159,24 +154,16 @@ def bricks(cache: Cache, targets: Targets, data: Voxels | Sequence[Chunk]) -> Wr
 
 
 def put_bricks(cache: Cache, slot_k: Tensor, node: Tensor, data: Voxels | Sequence[Chunk]) -> int:
-    """Writes voxels into slots, which lose what they held, and links nodes to them.
-
-    Args:
-        cache: The pools.
-        slot_k: (k,) int32 slots, each once.
-        node: (k,) int64 nodes.
-        data: For each channel (k, z, y, x, c), or what is on its way to the device.
-
-    Returns:
-        Bytes moved.
+    """Writes voxels (see `bricks`) into (k,) int32 slots, each once, which lose what they held, and
+    links (k,) int64 nodes to them; returns bytes moved.
     """
     nodes, pool, slot = cache.nodes, cache.bricks, slot_k.to(torch.int64)
     unlink(nodes.brick_tn, slot_k, pool.capacity)
-    nbytes = 0
     if isinstance(data, Mapping):
         there = {name: on_device(rows, slot.device) for name, rows in data.items()}
-        nbytes += _fill_slots(cache, slot, there)
+        nbytes = _fill_slots(cache, slot, there)
     else:
+        nbytes = 0
         for chunk in data:
             with chunk as arrived:
                 nbytes += _fill_slots(cache, slot[chunk.begin : chunk.end], arrived)
@@ -187,80 +174,60 @@ def put_bricks(cache: Cache, slot_k: Tensor, node: Tensor, data: Voxels | Sequen
 
 def _fill_slots(cache: Cache, slot: Tensor, data: Mapping[str, Tensor]) -> int:
     """Writes voxels that are on the device; returns how many bytes they are."""
-    channels = cache.bricks.bricks
-    for name, held in channels.items():
+    nbytes = 0
+    for name, held in cache.bricks.bricks.items():
         if name in data:
             to, rows = wide_rows(held, data[name])
             to.index_copy_(0, slot, rows)
+            nbytes += rows.nbytes
         else:
             wide_rows(held)[0].index_fill_(0, slot, 0)  # a tree without this channel
-    return sum(rows.nbytes for name, rows in data.items() if name in channels)
+    return nbytes
 
 
 def uniform(
     cache: Cache, targets: Targets, word: Tensor, constants: Mapping[str, Tensor]
 ) -> Written:
-    """Marks nodes as EMPTY or CONSTANT: they need no bricks.
-
-    Args:
-        cache: The pools.
-        targets: The k nodes.
-        word: (k,) int32 EMPTY or CONSTANT.
-        constants: For each channel (k, c); 0 for channels that are left out.
+    """Marks (k,) nodes as EMPTY or CONSTANT, as `word` (k,) int32 tells: they need no bricks.
+    `constants` are (k, c) for each channel; 0 for channels that are left out.
     """
     wanted = targets.lacking(cache, REQUEST_LOAD)
     lasting = int(wanted.sum())
     done = Written(constant=lasting, stale=len(targets) - lasting)
     if not lasting:
         return done
-    rows = _rows(wanted, lasting)
-    node = targets.node[rows]
-    for name, words in cache.nodes.constants.items():
+    rows = torch.nonzero_static(wanted, size=lasting)[:, 0]
+    node, pool = targets.node[rows], cache.nodes
+    for name, words in pool.constants.items():
         flat = movable(words).flatten(0, 1)
         if name in constants:
             flat[node] = movable(constants[name])[rows]
         else:
             flat.index_fill_(0, node, 0)
-    _link_words(cache, node, word[rows])
-    child = cache.nodes.child_tn.view(-1)
+    link(pool.brick_tn, pool.request_tn, node.to(torch.int32), word[rows], REQUEST_LOAD)
+    child = pool.child_tn.view(-1)
     below = child[node]
     child[node] = torch.where(below == ABSENT, TERMINAL, below)
     return done
 
 
 def share_bricks(cache: Cache, targets: Targets, other: Tensor) -> None:
-    """Points nodes to the bricks of their alias targets, be they voxels, EMPTY or CONSTANT.
-
-    Args:
-        cache: The pools.
-        targets: The k nodes; those that are gone or served already are left alone.
-        other: (k,) int64 alias targets.
+    """Points (k,) nodes to the bricks of their alias targets `other` (k,) int64, be they voxels,
+    EMPTY or CONSTANT; nodes that are gone or served already are left alone.
     """
-    wanted = targets.lacking(cache, REQUEST_LOAD)
+    wanted, pool = targets.lacking(cache, REQUEST_LOAD), cache.nodes
     node, other = targets.node[wanted], other[wanted]
-    word = cache.nodes.brick_tn.view(-1)[other]
+    word = pool.brick_tn.view(-1)[other]
     cache.bricks.shared_b[word[word >= 0].to(torch.int64)] = True
-    for words in cache.nodes.constants.values():
+    for words in pool.constants.values():
         _copy_rows(words, node, other)
-    _link_words(cache, node, word)
+    link(pool.brick_tn, pool.request_tn, node.to(torch.int32), word, REQUEST_LOAD)
 
 
 def _copy_rows(words: Tensor, to: Tensor, source: Tensor) -> None:
     """Copies the rows of some nodes to others; words are (t, n, ...)."""
     flat = movable(words).flatten(0, 1)
     flat[to] = flat[source]
-
-
-def _link_words(cache: Cache, node: Tensor, word: Tensor) -> None:
-    """Sets (k,) nodes' brick words and clears their pending bits."""
-    nodes = cache.nodes
-    node_k, word_k = node.to(torch.int32), word.to(torch.int32)
-    link(nodes.brick_tn, nodes.request_tn, node_k, word_k, REQUEST_LOAD)
-
-
-def _rows(keep: Tensor, count: int) -> Tensor:
-    """(count,) int64 rows where `keep` is true; the host knows how many."""
-    return torch.nonzero_static(keep, size=count)[:, 0]
 
 
 def _among_first(rows: Tensor, count: Tensor) -> Tensor:

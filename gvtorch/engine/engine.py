@@ -284,7 +284,7 @@ class Engine:
         """
         with stage("requests"):
             most = min(_MOST_LISTED, self.cache.nodes.child_tn.numel())
-            requests = self.cache.collect_requests(most)
+            requests = RequestList.collect(self.cache.nodes, most)
         with stage("lru"):
             use = self.cache.sort_by_use(self._frame_1)
         with stage("count"):
