@@ -1,4 +1,5 @@
-"""Part of the torch twin: normals, and how a place answers light; see csrc/shaders/light.h.
+"""Part of the torch twin: normals, how a place answers light, and shadows, which are cones from
+samples to the light; see csrc/shaders/light.h.
 
 Source: Blinn, "Models of light reflection for computer synthesized pictures", SIGGRAPH 1977.
 """
@@ -6,15 +7,16 @@ Source: Blinn, "Models of light reflection for computer synthesized pictures", S
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from ..shading import LightKind, Number, ShadeParameters
+from ..shading import LightKind, ShadeParameters
 from .exact import dot, larger, power, sqrt_exact, unit
-from .march import Probe
-from .rays import INF
+from .march import Plain, Probe, Visitor, Walk
+from .rays import INF, Intervals
+from .transfer import Piece
 from .tree import Bricks
 
 
@@ -28,11 +30,6 @@ class Light:
     along: Tensor  # (r, 3)
     moved: Tensor  # (r,) distance from the eye to where distances begin
     cube: Tensor  # (3,) size of the root cube
-
-    @property
-    def kind(self) -> Number:
-        """A LightKind."""
-        return self.parameters.light_kind
 
     def normal_at(self, probe: Probe, t: Tensor) -> Tensor:
         """(r, 3) normals towards the eye, stored or the gradient's; 0 where there is none."""
@@ -51,9 +48,9 @@ class Light:
         back, place = -self.along, torch.as_tensor(self.parameters.light)
         length = torch.full_like(t, INF)
         growth = torch.zeros_like(t) + self.parameters.light_growth
-        if self.kind == LightKind.DIRECTIONAL:
+        if self.parameters.light_kind == LightKind.DIRECTIONAL:
             return unit(-place.expand_as(back)), length, growth
-        if self.kind == LightKind.POINT:
+        if self.parameters.light_kind == LightKind.POINT:
             way = place - (self.eye + (t + self.moved)[:, None] * self.along)
             length = sqrt_exact(dot(way, way))
             return unit(way), length, growth / length
@@ -64,7 +61,7 @@ class Light:
         base: Tensor,
         normal: Tensor,
         t: Tensor,
-        share: Callable[[Tensor], Tensor] | None = None,
+        share: Callable[[Tensor], Tensor] = torch.ones_like,
     ) -> Tensor:
         """(r, 3) colours in the light of base colours (r, 3). `share` gives the share of light that
         comes to those places that face the light, (r,) bool.
@@ -76,10 +73,68 @@ class Light:
         half = unit(to_light - self.along)
         highlight = power(larger(zero, dot(normal, half)), p.shininess)
         highlight = torch.where((facing > 0) & ~bare, highlight, zero)
-        if share is not None:
-            comes = share(facing > 0)
-            facing, highlight = facing * comes, highlight * comes
+        comes = share(facing > 0)
+        facing, highlight = facing * comes, highlight * comes
         diffuse = (p.diffuse * facing)[:, None]
         specular = (p.specular * highlight)[:, None]
         light = torch.as_tensor(p.light_color)
         return base * (p.ambient + diffuse * light) + specular * light
+
+
+class Shadows:
+    """What cones from samples to the light go through, and what they cost."""
+
+    def __init__(self, walk: Walk, cube: Tensor, cone_scale: float) -> None:
+        self.walk, self.cube, self.cone_scale = walk, cube, cone_scale  # the eye's; see `Light`
+        self.samples, self.missed = torch.zeros_like(walk.samples), torch.zeros_like(walk.missed)
+
+    def share(
+        self, matter: Plain, t: Tensor, way: Tensor, length: Tensor, growth: Tensor, where: Tensor
+    ) -> Tensor:
+        """(r,) share of a light, `length` (r,) away, that comes to places t (r,), where `where` is
+        true. A cone is as wide there as the eye's; its first interval is left out, so that a place
+        does not stand in its own shadow.
+        """
+        which = where.nonzero()[:, 0]
+        t, way, eye = t[which], way[which], self.walk.at.beam[which]
+        beam = replace(
+            eye,
+            origin=eye.origin + t[:, None] * eye.direction,
+            direction=way / self.cube,
+            cone_near=eye.cone(t),
+            cone_growth=growth[which] * self.cone_scale,
+            first=torch.zeros_like(t),
+            last=length[which],
+            moved=torch.zeros_like(t),
+        ).clipped()
+        length_l = self.walk.at.length_l
+        at = Intervals(beam, length_l[0], len(length_l))
+        at.next(torch.ones_like(where[which]))
+        veil = Veil(matter.transfer, matter.channel, matter, way, torch.ones_like(t))
+        walk = Walk(at, self.walk.tree, matter.channel)
+        walk.go(veil)
+        self.samples[which] += walk.samples
+        self.missed[which] |= walk.missed
+        return torch.ones_like(length).index_put((which,), veil.clear)
+
+
+@dataclass
+class Veil(Visitor):
+    """What matter takes from the light that goes through."""
+
+    matter: Plain
+    along: Tensor  # (r, 3) world
+    clear: Tensor  # (r,) transmittance
+
+    def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        return self.matter.hides(which, low, high)
+
+    def same(self, fine: Tensor, coarse: Tensor) -> Tensor:
+        return self.matter.same(fine, coarse)
+
+    def goes_on(self, leaves: Tensor) -> Tensor:
+        return self.clear > self.matter.stop_clear
+
+    def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
+        clear = self.clear * (1 - self.matter.alpha(piece, probe, self.along))
+        self.clear = torch.where(where, clear, self.clear)

@@ -1,20 +1,19 @@
-"""The torch twins of the compiled ops, right by definition: plain tensor code, in float32 or
-float64. Here: the walk of rays through a tree, what a visitor of it may ask, and `trace_rays`.
+"""The torch twins of the ops on rays, right by definition: plain tensors, float32 or float64. Here:
+the walk of rays through a tree, what a visitor of it may ask, and `trace_rays`.
 
 Every float operation stands in the order of the kernel (cpp_ext/csrc), and no two of them are
 fused, so integers come out equal and colours equal to rounding. All rays walk in lockstep: a row of
-every tensor is a ray.
+every tensor is a ray. docs/design.md, section 3, tells the method.
 
-Sources: Crassin, Neyret, Lefebvre, Eisemann, "GigaVoxels: Ray-Guided Streaming for Efficient and
-Detailed Voxel Rendering", I3D 2009; Crassin, PhD thesis 2011, chapter 6. The method is told in
-docs/design.md, section 3.
+Sources: Crassin, Neyret, Lefebvre, Eisemann, "GigaVoxels", I3D 2009; Crassin, PhD thesis 2011,
+chapter 6.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Self
 
@@ -37,11 +36,6 @@ class Answer(Rows):
     coarse: Holder  # the fine one again where only one answers
     voxel: Tensor  # (r,) world size of a voxel at the wanted depth
     above: Tensor  # (r,) and at the depth above it
-
-    @property
-    def mixed(self) -> Tensor:
-        """(r,) bool: two nodes answer."""
-        return self.fine.node != self.coarse.node
 
 
 @dataclass
@@ -108,13 +102,12 @@ class Probe:
         as wide as the node's voxels to 1 where it is as wide as its parent's.
         """
         answer = self.answer
-        value = ask(answer.fine)
-        if not answer.mixed.any():
+        two, value = answer.fine.node != answer.coarse.node, ask(answer.fine)
+        if not two.any():
             return value
         share = divide(1.0, answer.above - answer.voxel, answer.voxel)
         weight = clamp((self.beam.cone(t) - answer.voxel) * share, 0, 1)
-        mixed = value + weight * (ask(answer.coarse) - value)
-        return torch.where(answer.mixed, mixed, value)
+        return torch.where(two, value + weight * (ask(answer.coarse) - value), value)
 
 
 @dataclass
@@ -142,30 +135,20 @@ class Visitor(ABC):
         """Takes an interval where `where` (r,) is true."""
 
 
-@dataclass
 class Walk:
     """Rays on their way through a tree."""
 
-    at: Intervals
-    tree: Tree
-    channel: Bricks
-    visit: Visit = field(init=False)
-    samples: Tensor = field(init=False)  # (r,) int32
-    visits: Tensor = field(init=False)  # (r,) int32
-    missed: Tensor = field(init=False)  # (r,) bool: something that was seen was not there
+    def __init__(self, at: Intervals, tree: Tree, channel: Bricks) -> None:
+        self.at, self.tree, self.channel = at, tree, channel
+        self.visit = Visit.none(at.start)
+        self.samples = self.visits = torch.zeros_like(at.start, dtype=torch.int32)
+        self.missed = torch.zeros_like(at.start, dtype=torch.bool)  # something that was seen
 
     @classmethod
     def enter(cls, rays: RayArguments, a: TraceArguments, channel: type[Bricks] = Bricks) -> Walk:
         """World rays where they enter the scene."""
         beam = Beam.enter(rays, a, a.table_lm4.dtype)
-        return cls(Intervals.begin(beam, a.step, len(a.table_lm4)), Tree.of(a), channel.of(a))
-
-    def __post_init__(self) -> None:
-        """Stands before the first node."""
-        first = self.at.beam.first
-        self.visit = Visit.none(first)
-        self.samples = self.visits = torch.zeros_like(first, dtype=torch.int32)
-        self.missed = torch.zeros_like(first, dtype=torch.bool)
+        return cls(Intervals(beam, a.step, len(a.table_lm4)), Tree(a), channel.of(a))
 
     def go(self, visitor: Visitor) -> None:
         """Takes every ray from where it stands to the scene's far side, or until it ends."""
@@ -186,27 +169,14 @@ class Walk:
                 moves = whole & visit.stays(at)
             end = smaller(at.start, at.beam.last)
             length = torch.where(odd, end - start, length)
-            piece = Piece(
-                start=start,
-                end=end,
-                middle=torch.where(visit.uniform, start + length * 0.5, middle),
-                length=length,
-                lengths=divide(length, at.length_l[0], length),
-                odd=odd,
-                level=level,
-                base=base,
-                count=count,
-            )
+            middle = torch.where(visit.uniform, start + length * 0.5, middle)
+            lengths = divide(length, at.length_l[0], length)
+            piece = Piece(start, end, middle, length, lengths, odd, level, base, count)
             seen = active & ~visit.nothing
             self.samples = self.samples + seen.to(torch.int32)
-            visitor.add(piece, self.probe, seen)
+            visitor.add(piece, Probe(at.beam, visit, self.channel), seen)
             leaves = whole | ~visit.stays(at)
             active = at.inside() & visitor.goes_on(leaves)
-
-    @property
-    def probe(self) -> Probe:
-        """Asks the nodes in which the rays stand."""
-        return Probe(self.at.beam, self.visit, self.channel)
 
     def look_up(self, which: Tensor, t: Tensor, visitor: Visitor) -> None:
         """Finds the nodes of some rays `which` (k,) at distances t (r,); marks what they use and
@@ -225,11 +195,9 @@ class Walk:
         blends = reaches & (wanted > 0)
         alone = ~blends | (found.coarse < 0)
         fine = tree.holder(found.fine, found.fine_depth, position)
-        coarse = tree.holder(
-            torch.where(alone, found.fine, found.coarse),
-            torch.where(alone, found.fine_depth, found.coarse_depth),
-            position,
-        )
+        coarse_node = torch.where(alone, found.fine, found.coarse)
+        coarse_depth = torch.where(alone, found.fine_depth, found.coarse_depth)
+        coarse = tree.holder(coarse_node, coarse_depth, position)
         unseen = found.hidden & ((found.depth < wanted) | ~blends)
         tree.stamp(torch.cat((fine.brick[~unseen], coarse.brick[~unseen])))
         missed = tree.mark(found, wanted, blends, cone, ~unseen)
@@ -256,20 +224,17 @@ class Plain(Visitor):
     @classmethod
     def begin(cls, rays: RayArguments, a: TraceArguments, walk: Walk, *more: Any) -> Self:
         """A shader before its first interval; `more` are a subclass's own fields."""
-        transfer = Transfer(a.table_lm4, a.domain_2, a.opaque_m)
         hit_clear, stop_clear = (
             1 - torch.tensor(alpha, dtype=a.table_lm4.dtype).to(a.table_lm4)
             for alpha in (a.depth_alpha, a.stop_alpha)
         )
-        sum_ = Accumulator.begin(walk.at.beam, hit_clear, rays.clear_r)
-        return cls(transfer, walk.channel, sum_, stop_clear, *more)
+        sums = Accumulator(walk.at.beam, hit_clear, rays.clear_r)
+        return cls(Transfer(a), walk.channel, sums, stop_clear, *more)
 
     def goes_on(self, leaves: Tensor) -> Tensor:
-        """See `Visitor`."""
         return self.sum.clear > self.stop_clear
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
-        """See `Visitor`."""
         self.sum.add(self.rgba(piece, probe), piece, where)
 
     def rgba(self, piece: Piece, probe: Probe) -> Tensor:
@@ -284,10 +249,7 @@ class Plain(Visitor):
 def trace_rays(
     rays: RayArguments, arguments: TraceArguments
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Twin of `torch.ops.gvtorch.trace_rays`; see `gvtorch.ops.trace_rays`.
-
-    Writes request_tn, stamp_t and stamp_b in place. `width` orders the rays, which changes nothing.
-    """
+    """Twin of `ops.trace_rays`. The rays' `width` orders them, which changes nothing."""
     walk = Walk.enter(rays, arguments)
     plain = Plain.begin(rays, arguments, walk)
     walk.go(plain)

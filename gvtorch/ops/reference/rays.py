@@ -103,30 +103,22 @@ class Beam(Rows):
         return smaller(smaller(smaller(inf, t[:, 0]), t[:, 1]), t[:, 2])
 
 
-@dataclass
 class Intervals:
     """Where each ray stands in its fixed sequence of intervals, which are step * 2^level long, the
     longest not longer than the cone is wide where they start. See ray.h.
     """
 
-    beam: Beam
-    length_l: Tensor  # (l,) world units
-    level: Tensor  # (r,) int64
-    base: Tensor  # (r,) where the level was chosen
-    count: Tensor  # (r,) intervals since base, as a float
-    start: Tensor  # (r,)
-
-    @classmethod
-    def begin(cls, beam: Beam, step: float | Tensor, levels: int) -> Intervals:
-        """Stands at the first interval of every ray."""
+    def __init__(self, beam: Beam, step: float | Tensor, levels: int) -> None:
         first = beam.first
         length = [torch.as_tensor(step, dtype=first.dtype).to(first)]
         for _ in range(levels - 1):
             length.append(length[-1] + length[-1])
-        level, count = torch.zeros_like(first, dtype=torch.int64), torch.zeros_like(first)
-        at = cls(beam, torch.stack(length), level, first, count, first)
-        at._choose_level(torch.ones_like(first, dtype=torch.bool))
-        return at
+        self.beam, self.start = beam, first
+        self.length_l = torch.stack(length)  # (l,) world units
+        self.level = torch.zeros_like(first, dtype=torch.int64)
+        self.base = first  # (r,) where the level was chosen
+        self.count = torch.zeros_like(first)  # intervals since base
+        self._choose_level(torch.ones_like(first, dtype=torch.bool))
 
     @property
     def state(self) -> Tensor:

@@ -37,12 +37,10 @@ class SegmentWriter(Visitor):
         self.parts = [empty]
 
     def same(self, fine: Tensor, coarse: Tensor) -> Tensor:
-        """See `Visitor`."""
         same = super().same(fine, coarse)
         return same & (fine == coarse) if self.by_node else same
 
     def goes_on(self, leaves: Tensor) -> Tensor:
-        """See `Visitor`."""
         return ~(leaves & (self.limit > 0) & (self.walk.samples >= self.limit))
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
@@ -93,22 +91,13 @@ class SegmentWriter(Visitor):
 
 
 def walk_segments(
-    rays: RayArguments,
-    arguments: TraceArguments,
-    state_r3: Tensor | None,
-    limit: int,
-    by_node: bool,
+    rays: RayArguments, a: TraceArguments, state_r3: Tensor | None, limit: int, by_node: bool
 ) -> Segments:
-    """Twin of `torch.ops.gvtorch.count_segments` and `write_segments` in one; see
-    `gvtorch.ops.trace_segments`.
-
-    Writes request_tn, stamp_t and stamp_b in place.
-    """
-    a, walk = arguments, Walk.enter(rays, arguments)
+    """Twin of `torch.ops.gvtorch.count_segments` and `write_segments` in one."""
+    walk = Walk.enter(rays, a)
     if state_r3 is not None:
         walk.at.resume(state_r3)
-    transfer = Transfer(a.table_lm4, a.domain_2, a.opaque_m)
-    writer = SegmentWriter(transfer, walk.channel, walk, limit, by_node)
+    writer = SegmentWriter(Transfer(a), walk.channel, walk, limit, by_node)
     walk.go(writer)
     return writer.segments()
 
@@ -127,7 +116,7 @@ def sample_bricks(
 
     words = (segments.node, segments.brick, segments.depth)
     nodes, bricks, depths = (word.to(torch.int64)[segment].unbind(1) for word in words)
-    levels, place = Levels.of(a, real), beam.at(seen)
+    levels, place = Levels(a, real), beam.at(seen)
     fine, coarse = (
         Holder(node, brick, depth, levels.corner(place, depth), levels.size_d[depth])
         for node, brick, depth in zip(nodes, bricks, depths[:2], strict=True)

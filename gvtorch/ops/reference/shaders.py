@@ -5,6 +5,7 @@ csrc/shaders/shaders.h, for the walk along the rays march.py.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -21,10 +22,9 @@ from ..shading import (
     StoredColorNumbers,
 )
 from .exact import clamp, dot, larger, sqrt_exact, stretch, unit
-from .lights import Light
+from .lights import Light, Shadows
 from .march import Plain, Probe, Walk
 from .rays import INF
-from .shadows import Shadows
 from .transfer import Piece, above, below, mix
 from .tree import Bricks
 
@@ -46,38 +46,38 @@ class Shade(Plain):
         self.normal = torch.zeros_like(self.light.along)  # (r, 3) sum
 
     def same(self, fine: Tensor, coarse: Tensor) -> Tensor:
-        """See `Visitor`. Shadows differ from place to place, and near a light so does a stored
+        """Shadows differ from place to place, and near a light so does a stored
         normal's light.
         """
         same = torch.ones_like(fine, dtype=torch.bool)
         for channel in (self.channel, *self.light.normals[:1], *self.others[:1]):
             numbers = channel.constant_nc
             same = same & (numbers[fine] == numbers[coarse]).all(1)
-        near = bool(self.light.normals) and bool(self.light.kind == LightKind.POINT)
+        near = self.light.parameters.light_kind == LightKind.POINT and bool(self.light.normals)
         return (same | (fine == coarse)) & (self.shadows is None) & (not near)
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
-        """See `Visitor`."""
         self.lit(self.rgba(piece, probe), piece, probe, where)
 
     def lit(self, rgba: Tensor, piece: Piece, probe: Probe, where: Tensor) -> None:
         """Adds an interval in the light."""
-        t, seen, shadows = piece.middle, where & (rgba[:, 3] > 0), self.shadows
-
-        def share(facing: Tensor) -> Tensor:
-            if shadows is None or self.light.kind == LightKind.HEADLIGHT:
-                return torch.ones_like(t)
-            matter = replace(self, shadows=None)
-            return shadows.share(matter, t, *self.light.towards(t), seen & facing)
-
+        t, seen = piece.middle, where & (rgba[:, 3] > 0)
         normal = self.light.normal_at(probe, t)
-        color = self.light.shade(rgba[:, :3], normal, t, share)
+        color = self.light.shade(rgba[:, :3], normal, t, partial(self.comes, t, seen))
         color = torch.where(seen[:, None], color, rgba[:, :3])
         weight = self.sum.clear * rgba[:, 3]
         self.normal = torch.where(
             seen[:, None], self.normal + weight[:, None] * normal, self.normal
         )
         self.sum.add(torch.cat((color, rgba[:, 3:]), 1), piece, where)
+
+    def comes(self, t: Tensor, seen: Tensor, facing: Tensor) -> Tensor:
+        """(r,) share of the light that comes to places t (r,), where they are seen and face it."""
+        at_eye = self.light.parameters.light_kind == LightKind.HEADLIGHT
+        if self.shadows is None or at_eye:
+            return torch.ones_like(t)
+        matter = replace(self, shadows=None)
+        return self.shadows.share(matter, t, *self.light.towards(t), seen & facing)
 
     def done(self, walk: Walk) -> None:
         """After the last interval."""
@@ -89,7 +89,6 @@ class Sided(Bricks):
     """
 
     def ends(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
-        """Over all directions, see `Bricks`."""
         low, high = self.range_n2c[node, :, 3::4].to(real).unbind(1)
         return low.amin(1), high.amax(1)
 
@@ -103,11 +102,9 @@ class StoredColor(Shade):
         return self.light.parameters.own_as(StoredColorNumbers)
 
     def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        """See `Visitor`."""
         return ~(above(high) > 0)
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
-        """See `Visitor`."""
         own = self.own
         opacity = self.opacity(piece, probe, self.light.along)
         seen = where & (opacity > 0)
@@ -122,7 +119,6 @@ class StoredColor(Shade):
             self.sum.add(rgba, piece, seen)
 
     def alpha(self, piece: Piece, probe: Probe, along: Tensor) -> Tensor:
-        """See `Plain`."""
         return stretch(self.opacity(piece, probe, along), piece.length / self.own.reference)
 
     def opacity(self, piece: Piece, probe: Probe, along: Tensor) -> Tensor:
@@ -151,7 +147,6 @@ class PreIntegrated(Shade):
     """A table over the values at both ends of an interval, (l, m, m, 4)."""
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
-        """See `Visitor`."""
         lengths = torch.where(piece.odd, piece.lengths, 1.0)
         level = torch.where(piece.odd, 0, piece.level)
         ends = probe.value(piece.start), probe.value(piece.end)
@@ -195,12 +190,10 @@ class Isosurface(Shade):
         self.before, self.before_end, self.share = nothing, nothing - INF, nothing
 
     def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        """See `Visitor`."""
         level = self.level
         return ((above(high) < level) | (below(low) >= level)) & ~self.found[which]
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
-        """See `Visitor`."""
         level = self.level
         front, back = probe.value(piece.start), probe.value(piece.end)
         under = front < level
@@ -229,7 +222,7 @@ class Isosurface(Shade):
         self.found = self.sum.depth < INF
         t = torch.where(self.found, self.sum.depth, 0.0)
         walk.look_up(self.found.nonzero()[:, 0], t, self)
-        probe = walk.probe
+        probe = Probe(walk.at.beam, walk.visit, self.channel)
         normal = self.light.normal_at(probe, t)
         value = self.level.expand_as(t)
         if self.others:
@@ -252,7 +245,6 @@ class Projection(Shade):
         self.found, self.length, self.at = (torch.zeros_like(self.sum.clear) for _ in range(3))
 
     def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        """See `Visitor`."""
         kind, found = self.kind, self.found[which]
         useless = ((kind == ProjectionKind.MAXIMUM) & (above(high) <= found)) | (
             (kind == ProjectionKind.MINIMUM) & (below(low) >= found)
@@ -260,7 +252,6 @@ class Projection(Shade):
         return useless & (self.length[which] > 0)
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
-        """See `Visitor`."""
         kind, value = self.kind, probe.value(piece.middle)
         first = ~(self.length > 0)
         if kind == ProjectionKind.MEAN:
@@ -290,7 +281,6 @@ class Features(Shade):
     """All numbers of a second channel, composited with the transfer function's alpha."""
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
-        """See `Visitor`."""
         rgba = self.rgba(piece, probe)
         share = torch.where(where, self.sum.clear * rgba[:, 3], 0.0)
         numbers = torch.stack([probe.number(channel, piece.middle) for channel in self.others], 1)
@@ -298,12 +288,10 @@ class Features(Shade):
         self.sum.add(rgba, piece, where)
 
 
-#: Twins by the names of C++'s structs.
 class GradientMagnitude(Shade):
     """The transfer function, the denser the faster the value changes."""
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
-        """See `Visitor`."""
         own = self.light.parameters.own_as(GradientMagnitudeNumbers)
         rgba = self.rgba(piece, probe)
         slope = probe.gradient(piece.middle, self.light.cube)
@@ -312,6 +300,7 @@ class GradientMagnitude(Shade):
         self.sum.add(torch.cat((rgba[:, :3], alpha[:, None]), 1), piece, where)
 
 
+#: Twins by the names of C++'s structs.
 TWINS: dict[str, type[Shade]] = {
     "Lit": Shade,
     "PreIntegrated": PreIntegrated,
@@ -328,7 +317,7 @@ TWINS: dict[str, type[Shade]] = {
 def shade_rays(
     rays: RayArguments, arguments: TraceArguments, shading: ShadeArguments, parameter_54: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Twin of `torch.ops.gvtorch.shade_rays`; see `gvtorch.ops.shade_rays`."""
+    """Twin of `ops.shade_rays`."""
     kind = SHADER_KINDS[shading.shader]
     twin = TWINS[kind]
     walk = Walk.enter(rays, arguments, Sided if twin is StoredColor else Bricks)

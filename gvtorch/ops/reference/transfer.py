@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..arguments import TraceArguments
 from .exact import TINY, clamp, divide, larger, log2_exact, smaller, stretch
 from .rays import INF, Beam
 
@@ -28,21 +29,15 @@ class Piece:
     count: Tensor  # (r,) its number since then, as a float
 
 
-@dataclass
 class Accumulator:
     """Front-to-back sums of every ray."""
 
-    color: Tensor  # (r, 3) premultiplied
-    clear: Tensor  # (r,) transmittance
-    depth: Tensor  # (r,) where the transmittance falls to hit_clear; +inf: nowhere
-    hit_clear: Tensor  # ()
-
-    @classmethod
-    def begin(cls, beam: Beam, hit_clear: Tensor, clear_r: Tensor | None = None) -> Accumulator:
-        """Nothing yet, but for what a ray lost before."""
-        zero = torch.zeros_like(beam.first)
-        clear = zero + 1 if clear_r is None else clear_r.to(zero.dtype)
-        return cls(torch.zeros_like(beam.origin), clear, zero + INF, hit_clear)
+    def __init__(self, beam: Beam, hit_clear: Tensor, clear_r: Tensor | None) -> None:
+        one = torch.ones_like(beam.first)
+        self.color = torch.zeros_like(beam.origin)  # (r, 3) premultiplied
+        self.clear = one if clear_r is None else clear_r.to(one)  # (r,) transmittance
+        self.depth = one * INF  # (r,) where the transmittance falls to hit_clear; +inf: nowhere
+        self.hit_clear = hit_clear  # ()
 
     def hits(self, beam: Beam) -> tuple[Tensor, Tensor, Tensor]:
         """Colours (r, 3), alphas (r, 1) and world depths (r, 1)."""
@@ -73,13 +68,11 @@ class Accumulator:
         self.clear = torch.where(where, left, self.clear)
 
 
-@dataclass
 class Transfer:
-    """The transfer function: rows at even distances over a domain."""
+    """The transfer function: rows at even distances over a domain; see `TraceArguments`."""
 
-    table_lm4: Tensor  # linear RGB, alpha of an interval of step * 2^l
-    domain_2: Tensor  # value of the first row, of the last row
-    opaque_m: Tensor  # rows with an opacity up to this one
+    def __init__(self, a: TraceArguments) -> None:
+        self.table_lm4, self.domain_2, self.opaque_m = a.table_lm4, a.domain_2, a.opaque_m
 
     def place(self, value: Tensor) -> Tensor:
         """(r,) rows of values, with a fraction."""

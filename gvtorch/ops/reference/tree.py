@@ -1,6 +1,4 @@
-"""Part of the torch twin: descents to a node, marks, and samples of bricks, as tree.h, walk.h and
-brick.h of csrc/walk.
-"""
+"""Part of the torch twin: descents, marks, samples of bricks, as csrc/walk/tree.h and brick.h."""
 
 from __future__ import annotations
 
@@ -17,24 +15,19 @@ from .exact import clamp, divide, smaller
 from .rays import INF, Beam, Rows
 
 
-@dataclass
 class Levels:
     """The sizes of nodes and voxels at each depth, from the root's by repeated division."""
 
-    branching: int
-    size_d: Tensor  # (d,) side of a node, tree units
-    voxel_d: Tensor  # (d,) side of a voxel, world units
-
-    @classmethod
-    def of(cls, a: TraceArguments, real: torch.dtype) -> Levels:
-        """Levels from 0 to the deepest."""
+    def __init__(self, a: TraceArguments, real: torch.dtype) -> None:
         device = a.place_33.device
         size = [torch.ones((), dtype=real, device=device)]
         voxel = [torch.tensor(a.root_voxel, dtype=real, device=device)]
         for _ in range(a.max_depth):
             size.append(divide(size[-1], a.branching, size[-1]))
             voxel.append(divide(voxel[-1], a.branching, voxel[-1]))
-        return cls(a.branching, torch.stack(size), torch.stack(voxel))
+        self.branching = a.branching
+        self.size_d = torch.stack(size)  # (d,) side of a node, tree units
+        self.voxel_d = torch.stack(voxel)  # (d,) side of a voxel, world units
 
     def wanted(self, cone: Tensor) -> Tensor:
         """(r,) first depths whose voxels are not wider than the cone: the level of detail."""
@@ -88,36 +81,13 @@ class Descent(Rows):
     coarse_depth: Tensor  # (r,)
 
 
-@dataclass
 class Tree:
-    """The node pool as flat words, and the numbers of one tree in it."""
+    """The tree of an op's arguments, with the node pool as flat words."""
 
-    child_n: Tensor
-    brick_n: Tensor
-    request_n: Tensor
-    stamp_t: Tensor
-    stamp_b: Tensor
-    frame: Tensor  # ()
-    levels: Levels
-    nodes_per_tile: int
-    root: int
-    by_level: bool
-
-    @classmethod
-    def of(cls, a: TraceArguments) -> Tree:
-        """The tree of an op's arguments."""
-        return cls(
-            child_n=a.child_tn.view(-1),
-            brick_n=a.brick_tn.view(-1),
-            request_n=a.request_tn.view(-1),
-            stamp_t=a.stamp_t,
-            stamp_b=a.stamp_b,
-            frame=a.frame_1[0],
-            levels=Levels.of(a, a.table_lm4.dtype),
-            nodes_per_tile=a.child_tn.shape[1],
-            root=a.root,
-            by_level=a.by_level,
-        )
+    def __init__(self, a: TraceArguments) -> None:
+        self.arguments, self.levels = a, Levels(a, a.table_lm4.dtype)
+        self.child_n, self.brick_n = a.child_tn.view(-1), a.brick_tn.view(-1)
+        self.request_n, self.per_tile = a.request_tn.view(-1), a.child_tn.shape[1]
 
     def descend(
         self, position_r3: Tensor, wanted_r: Tensor, hides: Callable[[Tensor], Tensor]
@@ -125,14 +95,14 @@ class Tree:
         """Descends from the root to the wanted depth, or as far as tiles exist and something is
         seen; stamps the tiles.
         """
-        n = self.levels.branching
-        node, depth = torch.full_like(wanted_r, self.root), torch.zeros_like(wanted_r)
+        a, n = self.arguments, self.levels.branching
+        node, depth = torch.full_like(wanted_r, a.root), torch.zeros_like(wanted_r)
         none = torch.full_like(node, -1)
         at = Descent(node, depth, none, hides(node), none, depth, none, depth)
         going = torch.ones_like(node, dtype=torch.bool)
         digits = self.levels.digits(position_r3)
         while True:
-            self.stamp_t[torch.unique(at.node[going] // self.nodes_per_tile)] = self.frame
+            a.stamp_t[torch.unique(at.node[going] // self.per_tile)] = a.frame_1[0]
             answers = going & (self.brick_n[at.node] != ABSENT)
             at.fine = torch.where(answers, at.node, at.fine)
             at.fine_depth = torch.where(answers, at.depth, at.fine_depth)
@@ -145,7 +115,7 @@ class Tree:
             if not going.any():
                 return at
             x, y, z = next(digits).to(torch.int64).unbind(1)
-            child = tile * self.nodes_per_tile + (z * n + y) * n + x
+            child = tile * self.per_tile + (z * n + y) * n + x
             at.parent = torch.where(going, at.node, at.parent)
             at.node = torch.where(going, child, at.node)
             at.depth = torch.where(going, at.depth + 1, at.depth)
@@ -165,10 +135,10 @@ class Tree:
         Straight to the wanted level, or level by level: then a brick is there before its node is
         subdivided.
         """
-        absent = self.brick_n[found.node] == ABSENT
+        by_level, absent = self.arguments.by_level, self.brick_n[found.node] == ABSENT
         deeper = (found.depth < wanted) & (self.child_n[found.node] == ABSENT)
-        short = seen & deeper & ~(self.by_level & absent)
-        missing = seen & absent & (self.by_level | ~deeper | (found.fine < 0))
+        short = seen & deeper & ~(by_level & absent)
+        missing = seen & absent & (by_level | ~deeper | (found.fine < 0))
         parent = found.parent.clamp(min=0)
         above = seen & blends & (found.depth == wanted) & (self.brick_n[parent] == ABSENT)
         self.request(found.node[short], found.depth[short], cone[short], REQUEST_SUBDIVIDE)
@@ -178,7 +148,8 @@ class Tree:
 
     def stamp(self, brick: Tensor) -> None:
         """Stamps brick slots as used in this frame; words below 0 name none."""
-        self.stamp_b[torch.unique(brick[brick >= 0])] = self.frame
+        a = self.arguments
+        a.stamp_b[torch.unique(brick[brick >= 0])] = a.frame_1[0]
 
     def request(self, node: Tensor, depth: Tensor, cone: Tensor, kind: int) -> None:
         """Joins requests into the request words: kinds by OR, priorities by maximum.
@@ -230,11 +201,7 @@ class Bricks:
         return constant[a] == constant[b]
 
     def sample(
-        self,
-        holder: Holder,
-        beam: Beam,
-        t: Tensor,
-        shift: Sequence[float] = (0, 0, 0),
+        self, holder: Holder, beam: Beam, t: Tensor, shift: Sequence[float] = (0, 0, 0)
     ) -> Tensor:
         """(r,) trilinear values at distances t (r,), `shift` voxels beside the ray; the node's
         constant where it has no brick, 0 where there is no node.
