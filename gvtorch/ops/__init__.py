@@ -4,6 +4,7 @@ archives and exported programs that hold `gvtorch::` ops can be loaded."""
 from .arguments import RayArguments, Samples, Segments, ShadeArguments, TraceArguments
 from .cache import (
     compact_requests,
+    cut_bricks,
     lacking,
     link,
     link_bricks,
@@ -12,7 +13,6 @@ from .cache import (
     lru_partition,
     unlink,
 )
-from .cut import cut_bricks
 from .registry import available
 from .segments import composite, list_samples, sample_bricks, trace_segments
 from .trace import shade_rays, trace_rays

@@ -1,5 +1,5 @@
 """The records that the ops of rays take: rays, what they go through, and how a shader colours it;
-and segments and samples, which some ops give and others take. `checks.py` checks them.
+and segments and samples, which some ops give and others take. `trace.py` checks them.
 
 A field is an argument of the ops' schemas, of the same name and in the same order as in
 cpp_ext/csrc/base/arguments.h, where the ops' lists stand. The last part of a tensor's name tells

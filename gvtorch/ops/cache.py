@@ -1,5 +1,6 @@
 """The cache's ops: requests listed, nodes located, slots ordered by use, pointers cleared and
-written. The body of each is its twin in plain torch, right by definition; see `op`.
+written. The body of each is its twin in plain torch, right by definition; see `op`. And bricks cut
+out of a level that is in memory.
 
 Lists have a fixed capacity and a count that stays on the device, so that a frame needs no host
 synchronisation; places that are not taken hold -1. Fields of pools: see `NodePool`, `BrickPool`.
@@ -14,6 +15,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
+from ..base import check
 from ..base.constants import (
     ABSENT,
     EMPTY,
@@ -24,7 +26,8 @@ from ..base.constants import (
     REQUEST_SUBDIVIDE,
     TERMINAL,
 )
-from .op import Backend, Flags, Longs, Words, op
+from ..base.volume import movable
+from .registry import Backend, Flags, Longs, Words, choose_backend, op
 
 Count = Annotated[int, range(2**31)]
 Positive = Annotated[int, range(1, 2**31)]
@@ -242,3 +245,48 @@ def lacking(
     there = (locate(loc_t4, node, branching, per_tile, backend=backend) == loc_k4).all(1)
     bare = pointer_tn.view(-1)[node] == ABSENT
     return known & linked & (tree_t[tile] == tree) & there & bare
+
+
+def cut_bricks(
+    values_zyxc: Tensor,
+    place_k3: Tensor,
+    brick_size: int,
+    border: int,
+    *,
+    backend: Backend = "auto",
+) -> Tensor:
+    """Cuts bricks out of a level, borders from the neighbours, clamped at the level's faces.
+
+    Args:
+        values_zyxc: (z, y, x, c) a whole level, of any dtype.
+        place_k3: (k, 3) int64 brick indices, z y x.
+        brick_size: Voxels along a side, without the border.
+        border: Voxels around.
+
+    Returns:
+        (k, s, s, s, c), s = brick_size + 2 * border.
+
+    Raises:
+        ValueError: A tensor of the wrong shape, dtype or device, a number out of its range, or a
+            level without voxels.
+    """
+    where = "cut_bricks"
+    shape = ("z", "y", "x", "c")
+    check.tensor(where, "values_zyxc", values_zyxc, shape, values_zyxc.dtype, place_k3.device)
+    check.tensor(where, "place_k3", place_k3, ("k", 3), torch.int64, place_k3.device)
+    check.whole(where, "brick_size", brick_size, low=1, high=2**10)
+    check.whole(where, "border", border, low=0, high=2**10)
+    if not values_zyxc.numel():
+        raise ValueError(f"{where}: values_zyxc has no voxels, got {check.describe(values_zyxc)}")
+    arguments = (values_zyxc.contiguous(), place_k3.contiguous(), brick_size, border)
+    if choose_backend(backend, place_k3.device) == "reference":
+        return _cut_twin(*arguments)
+    return torch.ops.gvtorch.cut_bricks(*arguments)
+
+
+def _cut_twin(values_zyxc: Tensor, place_k3: Tensor, brick_size: int, border: int) -> Tensor:
+    reach = torch.arange(-border, brick_size + border, device=place_k3.device)
+    corner = place_k3[:, :, None] * brick_size + reach  # (k, 3, s)
+    z, y, x = (corner[:, axis].clamp(0, values_zyxc.shape[axis] - 1) for axis in range(3))
+    index = (z[:, :, None, None], y[:, None, :, None], x[:, None, None, :])
+    return movable(values_zyxc)[index].view(values_zyxc.dtype)

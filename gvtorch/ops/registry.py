@@ -1,22 +1,101 @@
-"""Joins the compiled ops to torch: loads the libraries and gives each op its fake (shapes without
-data), which takes what it needs by the names of the op's schema in cpp_ext/csrc.
+"""Joins the compiled ops to torch: loads the libraries, chooses the backend of a call, makes ops of
+their twins, and gives each op its fake (shapes without data), which takes what it needs by the
+names of the op's schema in cpp_ext/csrc.
 """
 
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import torch
 from torch import Tensor
 
 from .. import cpp_ext
+from ..base import check
+
+Backend = Literal["auto", "reference", "cpp", "cuda"]
+Words = Annotated[Tensor, torch.int32]
+Longs = Annotated[Tensor, torch.int64]
+Flags = Annotated[Tensor, torch.bool]
+_Twin = TypeVar("_Twin", bound=Callable[..., Any])
 
 
 def available() -> dict[str, str]:
     """Returns for each of reference, cpp, cuda an empty text, or why it can't be used."""
     return {"reference": "", **_reasons}
+
+
+@functools.cache
+def choose_backend(backend: str, device: torch.device) -> str:
+    """Returns the backend that runs on `device`: `auto` takes the compiled one where there is one.
+
+    Raises:
+        ValueError: The backend is unknown, can't be used here, or does not run on `device`.
+    """
+    if backend not in ("auto", "reference", "cpp", "cuda"):
+        raise ValueError(f"backend must be auto, reference, cpp or cuda, got {backend!r}")
+    compiled = {"cpu": "cpp", "cuda": "cuda"}.get(device.type)
+    if backend == "auto":
+        return compiled if compiled and not available()[compiled] else "reference"
+    reason = available()[backend]
+    if reason:
+        raise ValueError(f"backend {backend!r} can't be used here: {reason}")
+    if backend not in ("reference", compiled):
+        raise ValueError(f"backend {backend!r} does not run on device {device}")
+    return backend
+
+
+def op(also: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
+    """Makes an op of its twin: checks what comes, and calls the compiled op of the twin's name, or
+    the twin, as its argument `backend` says: auto, reference, cpp or cuda.
+
+    Tensors must be contiguous, on one device, and of the shape that their name ends with (of any,
+    if it has no such end) and the dtype of Words, Longs or Flags; numbers inside their range. Else
+    the op raises ValueError.
+
+    Args:
+        also: One more check, which gets the arguments by name.
+    """
+
+    def made_of(twin: _Twin) -> _Twin:
+        where, signature = twin.__name__, inspect.signature(twin)
+        names = [name for name in signature.parameters if name != "backend"]
+        hints = get_type_hints(twin, include_extras=True).items()
+        marks = {name: get_args(hint)[1] for name, hint in hints if get_origin(hint) is Annotated}
+        ranges = {name: mark for name, mark in marks.items() if isinstance(mark, range)}
+        tensors = [
+            (name, check.shape_of(name) if "_" in name else "", dtype)
+            for dtype in (torch.int32, torch.int64, torch.bool)
+            for name, mark in marks.items()
+            if mark == dtype
+        ]
+
+        @functools.wraps(twin)
+        def run(*given: Any, backend: Backend = "auto", **named: Any) -> Any:
+            if named or len(given) != len(names):
+                bound = signature.bind(*given, **named)
+                bound.apply_defaults()
+                given = tuple(bound.arguments.values())[: len(names)]
+            by_name, device = dict(zip(names, given, strict=True)), given[0].device
+            fields = [
+                (name, by_name[name], shape or "abcd"[: by_name[name].dim()], dtype)
+                for name, shape, dtype in tensors
+            ]
+            check.tensors(where, device, fields)
+            for name, inside in ranges.items():
+                check.whole(where, name, by_name[name], low=inside[0], high=inside[-1])
+            if also is not None:
+                also(**by_name)
+            if choose_backend(backend, device) == "reference":
+                return twin(*given, backend="reference")
+            return getattr(torch.ops.gvtorch, where)(*given)
+
+        return cast("_Twin", run)
+
+    return made_of
 
 
 def _names(op: Any) -> tuple[str, ...]:
@@ -87,30 +166,9 @@ def _composite_backward(
     return torch.empty_like(alpha_k), torch.empty_like(feature_kc), torch.empty_like(grad_left_r)
 
 
-def _compact_requests(*, request_tn: Tensor, capacity: int) -> tuple[Tensor, Tensor, Tensor]:
-    words = request_tn.new_empty((capacity,))
-    return words, torch.empty_like(words), request_tn.new_empty((3,), dtype=torch.int64)
-
-
-def _lru_partition(*, order_k: Tensor, **_: Any) -> tuple[Tensor, Tensor]:
-    return torch.empty_like(order_k), order_k.new_empty((1,), dtype=torch.int64)
-
-
-def _locate(*, node_k: Tensor, **_: Any) -> Tensor:
-    return node_k.new_empty((node_k.shape[0], 4))
-
-
-def _lacking(*, node_k: Tensor, **_: Any) -> Tensor:
-    return torch.empty_like(node_k, dtype=torch.bool)
-
-
 def _cut_bricks(*, values_zyxc: Tensor, place_k3: Tensor, brick_size: int, border: int) -> Tensor:
     side = brick_size + 2 * border
     return values_zyxc.new_empty((place_k3.shape[0], side, side, side, values_zyxc.shape[3]))
-
-
-def _in_place(**_: Any) -> None:
-    return None
 
 
 FAKES: dict[str, Callable[..., Any]] = {
@@ -122,12 +180,19 @@ FAKES: dict[str, Callable[..., Any]] = {
     "sample_bricks_backward": _sample_bricks_backward,
     "composite": _composite,
     "composite_backward": _composite_backward,
-    "compact_requests": _compact_requests,
-    "lru_partition": _lru_partition,
-    "locate": _locate,
-    "lacking": _lacking,
+    "compact_requests": lambda *, request_tn, capacity: (
+        request_tn.new_empty((capacity,)),
+        request_tn.new_empty((capacity,)),
+        request_tn.new_empty((3,), dtype=torch.int64),
+    ),
+    "lru_partition": lambda *, order_k, **_: (
+        torch.empty_like(order_k),
+        order_k.new_empty((1,), dtype=torch.int64),
+    ),
+    "locate": lambda *, node_k, **_: node_k.new_empty((node_k.shape[0], 4)),
+    "lacking": lambda *, node_k, **_: torch.empty_like(node_k, dtype=torch.bool),
     "cut_bricks": _cut_bricks,
-    **dict.fromkeys(("unlink", "link", "link_bricks", "link_tiles"), _in_place),
+    **dict.fromkeys(("unlink", "link", "link_bricks", "link_tiles"), lambda **_: None),
 }
 
 

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from ..base import check
 from .arguments import RayArguments, Samples, Segments, TraceArguments
-from .checks import check_channel, check_rays, check_real, check_trace, check_voxels
-from .op import Backend, choose_backend
 from .reference import segments as reference
+from .registry import Backend, choose_backend
+from .trace import check_channel, check_rays, check_real, check_trace, check_voxels
 
 _SEGMENT_BYTES = 84  # at most, in float64
 
@@ -35,22 +35,20 @@ def trace_segments(
 
     Args:
         rays: The rays; no matter with which transmittance they begin.
-        arguments: What they go through; of the table only its lengths of intervals matter.
+        arguments: What they go through; of the table only the lengths of its intervals matter.
         state_r3: `Segments.state` of the part before; None: rays begin.
         limit: A ray pauses behind the visit in which it has taken so many samples; 0: never.
         by_node: A region counts as one of one value only where one node answers: for shaders that
             read more than `component`.
-        backend: auto, reference, cpp or cuda.
 
     Raises:
-        ValueError: A tensor of the wrong shape, dtype or device, a number out of its range, or
-            more segments than the device has memory for.
+        ValueError: See `trace_rays`; or there are more segments than the device has memory for.
     """
     where, device = "trace_segments", rays.origin_r3.device
     sizes = check_trace(where, rays, arguments)
     if state_r3 is not None:
-        state = ("state_r3", state_r3, "r3", arguments.table_lm4.dtype)
-        check.tensors(where, device, [state], sizes)
+        wanted = [("state_r3", state_r3, "r3", arguments.table_lm4.dtype)]
+        check.tensors(where, device, wanted, sizes)
     check.whole(where, "limit", limit, low=0, high=2**31 - 1)
     given = (*rays, *arguments, state_r3, limit, by_node)
     with torch.no_grad():
@@ -101,13 +99,9 @@ def sample_bricks(
         segments: What `trace_segments` gave.
         samples: What `list_samples` gave, or any of them. A sample of no segment, or of one that
             names what is not there, is 0.
-        backend: auto, reference, cpp or cuda.
 
     Returns:
         (k, c) in the segments' dtype.
-
-    Raises:
-        ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.
     """
     where, device = "sample_bricks", rays.origin_r3.device
     chosen = choose_backend(backend, device)
@@ -143,15 +137,11 @@ def composite(
         feature_kc: (k, c) same dtype: colour, or any numbers; not premultiplied.
         offset_r: (r + 1,) int64 `Samples.offset`, rising from 0 to k.
         clear_r: (r,) what is left of the light before a ray's first sample; None: all of it.
-        stop_alpha: A ray ends at this alpha; 1: it goes to its end.
-        backend: auto, reference, cpp or cuda.
+        stop_alpha: A ray ends at this alpha.
 
     Returns:
         Sums (r, c), light that is left (r,), and what of it came to each sample (k,), 0 behind
         the end of a ray; the last one has no gradient.
-
-    Raises:
-        ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.
     """
     where, device, real = "composite", alpha_k.device, alpha_k.dtype
     check_real(where, "alpha_k", alpha_k, "k")

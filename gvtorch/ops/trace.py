@@ -1,4 +1,9 @@
-"""`trace_rays` and `shade_rays`: rays through an N3 tree, checked and sent to a backend."""
+"""`trace_rays` and `shade_rays`: rays through an N3 tree, checked and sent to a backend.
+
+The ops, and the checks that they share, raise ValueError for a tensor of the wrong shape, dtype or
+device and for a number out of its range, in a line that says which op, argument and value. Checks
+return the sizes that the letters of shapes stand for.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +13,130 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..base import check
 from ..base import constants as config
+from ..base.volume import CHANNEL_DTYPES
 from .arguments import RayArguments, ShadeArguments, TraceArguments
-from .checks import check_shade, check_trace
-from .op import Backend, choose_backend
 from .reference import march, shaders
+from .registry import Backend, choose_backend
+from .shading import SHADER_KINDS
+
+
+def _fields(record: Any, dtype: torch.dtype, names: str) -> list[check.Field]:
+    return [(name, getattr(record, name), check.shape_of(name), dtype) for name in names.split()]
+
+
+def check_rays(where: str, rays: RayArguments) -> dict[str, int]:
+    """Checks rays."""
+    names = "origin_r3 direction_r3 cone_r2 range_r2"
+    names += "" if rays.clear_r is None else " clear_r"
+    fields = _fields(rays, torch.float64, names)
+    sizes = check.tensors(where, rays.origin_r3.device, fields)
+    check.whole(where, "width", rays.width, low=0)
+    if rays.width and sizes["r"] % rays.width:
+        raise ValueError(f"{where}: {sizes['r']} rays are no whole rows of {rays.width} pixels")
+    return sizes
+
+
+def check_channel(where: str, arguments: TraceArguments, device: torch.device) -> dict[str, int]:
+    """Checks what tells where the tree lies, its bricks and constants."""
+    check.whole(where, "branching", arguments.branching, low=2, high=16)
+    fields = _fields(arguments, arguments.bricks_bzyxc.dtype, "bricks_bzyxc constant_tnc")
+    place = _fields(arguments, torch.float64, "place_33")
+    sizes = check.tensors(where, device, place + fields)
+    check.whole(where, "max_depth", arguments.max_depth, low=0, high=62)
+    check.whole(where, "border", arguments.border, low=0, high=(sizes["s"] - 1) // 2)
+    check.number(where, "root_voxel", arguments.root_voxel, low=0, open_low=True)
+    check.number(where, "step", arguments.step, low=0, open_low=True)
+    check.number(where, "cone_scale", arguments.cone_scale, low=0)
+    return sizes
+
+
+def check_voxels(where: str, arguments: TraceArguments) -> None:
+    """Checks that the bricks' dtype has a kernel."""
+    voxel = arguments.bricks_bzyxc.dtype
+    if voxel not in CHANNEL_DTYPES:
+        raise ValueError(f"{where}: bricks_bzyxc has dtype {voxel}, which no channel can have")
+
+
+def check_real(where: str, name: str, tensor: Tensor, shape: str) -> None:
+    """Checks that a tensor is of float32 or float64; its shape is only told."""
+    if tensor.dtype not in (torch.float32, torch.float64):
+        wanted = f"({', '.join(shape)}{',' if len(shape) == 1 else ''}) float32 or float64"
+        raise ValueError(f"{where}: {name} must be {wanted}, got {check.describe(tensor)}")
+
+
+def check_trace(
+    where: str, rays: RayArguments, arguments: TraceArguments, table_shape: str = "lm4"
+) -> dict[str, int]:
+    """Checks rays and all that they go through."""
+    table, device = arguments.table_lm4, rays.origin_r3.device
+    check_real(where, "table_lm4", table, table_shape)
+    check_voxels(where, arguments)
+    fields = [
+        *_fields(arguments, arguments.bricks_bzyxc.dtype, "range_tn2c"),
+        ("table_lm4", table, table_shape, table.dtype),
+        *_fields(arguments, table.dtype, "domain_2"),
+        *_fields(arguments, torch.int32, "child_tn brick_tn request_tn stamp_t stamp_b"),
+        *_fields(arguments, torch.int32, "opaque_m frame_1"),
+    ]
+    sizes = check_rays(where, rays) | check_channel(where, arguments, device)
+    sizes = check.tensors(where, device, fields, sizes)
+    if sizes["n"] < arguments.branching**3:
+        wanted = f"{arguments.branching}^3 nodes a tile"
+        raise ValueError(f"{where}: child_tn must hold {wanted}, got {sizes['n']}")
+    if sizes["l"] < 1 or sizes["m"] < 2:
+        got = check.describe(table)
+        raise ValueError(f"{where}: table_lm4 needs at least 1 length and 2 rows, got {got}")
+    check.whole(where, "root", arguments.root, low=0, high=sizes["t"] * sizes["n"] - 1)
+    check.whole(where, "component", arguments.component, low=0, high=sizes["c"] - 1)
+    check.number(where, "stop_alpha", arguments.stop_alpha, low=0, high=1)
+    check.number(where, "depth_alpha", arguments.depth_alpha, low=0, high=1)
+    return sizes
+
+
+def check_shade(
+    where: str,
+    rays: RayArguments,
+    arguments: TraceArguments,
+    shading: ShadeArguments,
+    parameter_54: Tensor,
+    own: bool,
+) -> None:
+    """Checks all that a shader reads; `own`: it is a user's."""
+    known = ("",) if own else SHADER_KINDS
+    kind = known[check.whole(where, "shader", shading.shader, low=0, high=len(known) - 1)]
+    sizes = check_trace(where, rays, arguments, "lmm4" if kind == "PreIntegrated" else "lm4")
+    device, shape = rays.origin_r3.device, "k" if own else "54"
+    parameters = ("parameter_54", parameter_54, shape, arguments.table_lm4.dtype)
+    check.tensors(where, device, [parameters])
+    others = 0
+    for name, bricks, constants, width in (
+        ("normal", shading.normal_bzyxc, shading.normal_tnc, "3"),
+        ("other", shading.other_bzyxc, shading.other_tnc, "d"),
+    ):
+        if (bricks is None) != (constants is None):
+            raise ValueError(f"{where}: {name}_bzyxc and {name}_tnc belong together")
+        if bricks is not None and constants is not None:
+            fields = (
+                (f"{name}_bzyxc", bricks, f"bsss{width}", bricks.dtype),
+                (f"{name}_tnc", constants, f"tn{width}", bricks.dtype),
+            )
+            others = check.tensors(where, device, fields, sizes).get("d", 0)
+    colored = sizes["c"] in (4, 24) and arguments.component == 3
+    if kind in ("StoredColor", "ShadowedColor") and not colored:
+        raise ValueError(
+            f"{where}: stored colour needs a channel of 4 or 24 numbers and component 3"
+        )
+    if kind == "Features" and not others:
+        raise ValueError(f"{where}: features need other_bzyxc")
+    given = {"Features": others, "Projection": 1}.get(kind, 0)
+    if own:
+        check.whole(where, "features", shading.features, low=0)
+    else:
+        check.whole(where, "features", shading.features, low=given, high=given)
+    high = max(0, others - 1)
+    check.whole(where, "other_component", shading.other_component, low=0, high=high)
 
 
 def trace_rays(
@@ -22,19 +146,13 @@ def trace_rays(
 
     Mutates `request_tn` (what rays missed), `stamp_t` and `stamp_b` (what rays used).
 
-    Args:
-        rays: The rays. Where they begin with a transmittance, the colour is what these pieces of
-            rays add, and alpha is the whole rays' so far.
-        arguments: What they go through.
-        backend: auto, reference, cpp or cuda.
+    Where rays begin with a transmittance, the colour is what these pieces of rays add, and alpha is
+    the whole rays' so far.
 
     Returns:
         color (r, 3) premultiplied linear RGB, alpha (r, 1), depth (r, 1) world units or +inf, in
         the table's dtype; samples (r,) int32, missed (r,) bool: something that the ray saw was not
         there.
-
-    Raises:
-        ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.
 
     Source: Crassin, Neyret, Lefebvre, Eisemann, "GigaVoxels", I3D 2009, sections 3 and 4.
     """
@@ -57,19 +175,15 @@ def shade_rays(
 
     Args:
         rays: The rays.
-        arguments: What they go through.
+        arguments: What they go through; marks are written as by `trace_rays`.
         shading: Which shader, and its channels.
         parameter_54: (5, 4) in the table's dtype, as `shading.ShadeParameters` packs them. For a
             user's op (20 + k,): the same and its own k numbers.
         op: Name of a user's op, see `cpp_ext.user`; None: `shading.shader` tells which.
-        backend: auto, reference, cpp or cuda.
 
     Returns:
         color, alpha, depth, samples, missed as `trace_rays`; normal (r, 3) in the world, towards
         the eye, unit or zero; features (r, c).
-
-    Raises:
-        ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.
 
     Source: Blinn, SIGGRAPH 1977; Engel, Kraus, Ertl, Graphics Hardware 2001.
     """
