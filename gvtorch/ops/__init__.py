@@ -14,8 +14,14 @@ from .cache import (
     unlink,
 )
 from .registry import available
-from .segments import composite, list_samples, sample_bricks, trace_segments
-from .trace import shade_rays, trace_rays
+from .trace import (
+    composite,
+    list_samples,
+    sample_bricks,
+    shade_rays,
+    trace_rays,
+    trace_segments,
+)
 
 __all__ = [
     "RayArguments",

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from ..arguments import RayArguments, Samples, Segments, TraceArguments
-from .march import Answer, Probe, Visitor, Walk
+from .march import Answer, Piece, Probe, Transfer, Visitor, Walk
 from .rays import Beam
-from .transfer import Piece, Transfer
 from .tree import Bricks, Holder, Levels
 
 _PIECE = -1  # level of an interval of any length
@@ -29,7 +28,6 @@ class SegmentWriter(Visitor):
     by_node: bool  # only one node alone shows one value
 
     def __post_init__(self) -> None:
-        """Nothing noted: lists of length 0."""
         real = self.walk.at.start[:0]
         whole = real.to(torch.int64)
         tables = (whole.view(0, 2), whole.view(0, 2), whole.view(0, 3))
@@ -44,7 +42,6 @@ class SegmentWriter(Visitor):
         return ~(leaves & (self.limit > 0) & (self.walk.samples >= self.limit))
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
-        """Notes an interval of each ray where `where` is true."""
         visit, odd, ray = self.walk.visit, piece.odd, where.nonzero()[:, 0]
         fine, coarse = visit.fine, visit.coarse
         columns = (
