@@ -1,6 +1,5 @@
 """What `shade_rays` is told about a shader: which one, and 20 numbers of light, material and the
-shader's own. Declared once, for the shaders that write them and the torch twin that reads them;
-C++ reads the same numbers in cpp_ext/csrc/shaders/shaders.h.
+shader's own. Shaders write them; the torch twin and csrc/shaders/shaders.h read them.
 """
 
 from __future__ import annotations
@@ -33,11 +32,7 @@ SHADER_KINDS = (
 
 
 def shader_number(kind: str) -> int:
-    """Returns the number of a fused shader.
-
-    Raises:
-        ValueError: There is none of this name.
-    """
+    """Returns the number of a fused shader; raises ValueError if there is none of this name."""
     if kind not in SHADER_KINDS:
         raise ValueError(f"shader: kind must be {', '.join(SHADER_KINDS)}, got {kind!r}")
     return SHADER_KINDS.index(kind)
@@ -127,10 +122,7 @@ class ShadeParameters(NamedTuple):
 def pack(parts: Sequence[Any], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Joins numbers, triples and tensors to one (k,) tensor on the device. Numbers go as arguments
     of kernels and tensors of the device stay there: it does not block, and a CUDA graph reads them
-    anew.
-
-    Raises:
-        ValueError: A number is beyond what the dtype holds.
+    anew. Raises ValueError if a number is beyond what the dtype holds.
     """
     out: list[Tensor] = []
     for part in parts:

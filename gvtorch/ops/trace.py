@@ -66,10 +66,10 @@ def check_voxels(where: str, arguments: TraceArguments) -> None:
 
 
 def check_real(where: str, name: str, tensor: Tensor, shape: str) -> None:
-    """Checks that a tensor is of float32 or float64; its shape is only told."""
+    """Checks that a tensor is of float32 or float64; its shape, as in "(k,)", is only told."""
     if tensor.dtype not in (torch.float32, torch.float64):
-        wanted = f"({', '.join(shape)}{',' if len(shape) == 1 else ''}) float32 or float64"
-        raise ValueError(f"{where}: {name} must be {wanted}, got {check.describe(tensor)}")
+        got = check.describe(tensor)
+        raise ValueError(f"{where}: {name} must be {shape} float32 or float64, got {got}")
 
 
 def check_trace(
@@ -77,7 +77,7 @@ def check_trace(
 ) -> dict[str, int]:
     """Checks rays and all that they go through."""
     table, device = arguments.table_lm4, rays.origin_r3.device
-    check_real(where, "table_lm4", table, table_shape)
+    check_real(where, "table_lm4", table, f"({', '.join(table_shape)})")
     check_voxels(where, arguments)
     fields = [
         *_fields(arguments, arguments.bricks_bzyxc.dtype, "range_tn2c"),
@@ -293,7 +293,7 @@ def sample_bricks(
         check_voxels(where, arguments)
     check_rays(where, rays)
     check_channel(where, arguments, device)
-    check_real(where, "distance", segments.distance, "s3")
+    check_real(where, "distance", segments.distance, "(s, 3)")
     places = (*segments[:6], samples.segment, samples.number)
     names = (*Segments._fields[:6], "segment", "number")
     shapes = ("s", "s2", "s2", "s3", "s3", "s3", "k", "k")
@@ -328,7 +328,7 @@ def composite(
         the end of a ray; the last one has no gradient.
     """
     where, device, real = "composite", alpha_k.device, alpha_k.dtype
-    check_real(where, "alpha_k", alpha_k, "k")
+    check_real(where, "alpha_k", alpha_k, "(k,)")
     rays = check.whole(where, "offset_r's length", offset_r.shape[0], low=1) - 1
     clear = alpha_k.new_ones(rays) if clear_r is None else clear_r
     fields = (
@@ -354,11 +354,7 @@ def op_of(name: str | None) -> Any:
 
 
 def most_intervals(length: float, step: float) -> int:
-    """Returns how many intervals a ray of `length` can have.
-
-    Raises:
-        ValueError: More than a ray can count.
-    """
+    """Returns how many intervals a ray of `length` has; raises ValueError if it can't count them."""
     count = math.ceil(length / step)
     if count > config.MAX_INTERVALS:
         raise ValueError(

@@ -1,7 +1,4 @@
-"""Numbers that every backend rounds alike: plain operations in a fixed order, none fused.
-
-Equal to cpp_ext/csrc/base/hd.h to the last bit in float32.
-"""
+"""Numbers that every backend rounds alike, as csrc/base/hd.h in every bit of float32."""
 
 from __future__ import annotations
 
@@ -19,8 +16,7 @@ def clamp(value: Tensor, low: float | Tensor, high: float | Tensor) -> Tensor:
 
 
 def divide(a: Tensor | float, b: Tensor | float, like: Tensor) -> Tensor:
-    """Returns a / b, rounded once: torch turns a number on either side into a product with a
-    reciprocal."""
+    """a / b, rounded once: torch turns a number on either side into a product with a reciprocal."""
     return torch.div(torch.as_tensor(a).to(like), torch.as_tensor(b).to(like).expand(like.shape))
 
 
@@ -39,6 +35,13 @@ def sqrt_exact(value: Tensor) -> Tensor:
     return torch.sqrt(value.to(torch.float64)).to(value.dtype)
 
 
+def _polynomial(x: Tensor, highest: float, *coefficients: float) -> Tensor:
+    total = torch.full_like(x, highest)
+    for coefficient in coefficients:
+        total = total * x + coefficient
+    return total
+
+
 def log2_exact(value: Tensor) -> Tensor:
     """Base-2 logarithm of positive normal floats, from + - * / alone (float64: torch.log2).
 
@@ -54,9 +57,7 @@ def log2_exact(value: Tensor) -> Tensor:
     exponent = torch.where(high, exponent + 1, exponent)
     s = (mantissa - 1) / (mantissa + 1)
     z = s * s
-    series = torch.full_like(z, 0.320598898)
-    for coefficient in (0.412198583, 0.577078016, 0.961796694, 2.885390082):
-        series = series * z + coefficient
+    series = _polynomial(z, 0.320598898, 0.412198583, 0.577078016, 0.961796694, 2.885390082)
     return exponent + series * s
 
 
@@ -71,17 +72,8 @@ def exp2_exact(value: Tensor) -> Tensor:
     x = torch.where(tiny, 0.0, smaller(value, torch.full_like(value, 126.0)))
     whole = torch.floor(x + 0.5)
     f = x - whole
-    series = torch.full_like(f, 1.52527338e-5)
-    for coefficient in (
-        1.54035304e-4,
-        1.33335581e-3,
-        9.61812911e-3,
-        5.55041087e-2,
-        2.40226507e-1,
-        6.93147181e-1,
-        1.0,
-    ):
-        series = series * f + coefficient
+    low = (1.52527338e-5, 1.54035304e-4, 1.33335581e-3, 9.61812911e-3)
+    series = _polynomial(f, *low, 5.55041087e-2, 2.40226507e-1, 6.93147181e-1, 1.0)
     power = ((whole.to(torch.int32) + 127) << 23).view(torch.float32)
     return torch.where(tiny, 0.0, series * power)
 

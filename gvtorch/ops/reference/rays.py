@@ -73,8 +73,8 @@ class Beam(Rows):
         """
         first, last = self.first, self.last
         for axis in range(3):
-            columns = (self.origin[:, axis], self.direction[:, axis], self.high[:, axis])
-            origin, direction, high = columns
+            columns = (self.origin, self.direction, self.high)
+            origin, direction, high = (column[:, axis] for column in columns)
             a, b = -origin / direction, (high - origin) / direction
             flat = direction == 0
             beside = flat & ~((origin >= 0) & (origin <= high))
@@ -99,8 +99,7 @@ class Beam(Rows):
         face = torch.where(self.direction > 0, corner + size[:, None], corner)
         inverse = divide(1.0, self.direction, self.direction)
         t = torch.where(self.direction == 0, INF, (face - self.origin) * inverse)
-        inf = torch.full_like(size, INF)
-        return smaller(smaller(smaller(inf, t[:, 0]), t[:, 1]), t[:, 2])
+        return smaller(smaller(smaller(torch.full_like(size, INF), t[:, 0]), t[:, 1]), t[:, 2])
 
 
 class Intervals:

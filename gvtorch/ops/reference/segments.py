@@ -1,5 +1,5 @@
-"""The torch twins of the ops for shaders that are no kernel, right by definition: segments of rays,
-samples of their bricks, and what they add up to. See cpp_ext/csrc/shaders/segments.h.
+"""The torch twins of the ops for shaders that are no kernel: segments of rays, samples of their
+bricks, and what they add up to. See cpp_ext/csrc/shaders/segments.h.
 """
 
 from __future__ import annotations

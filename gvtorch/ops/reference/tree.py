@@ -68,7 +68,7 @@ class Holder(Rows):
 
 
 @dataclass
-class Descent(Rows):
+class Descent:
     """Where a descent ended, and the two nodes whose bricks answer (-1: none)."""
 
     node: Tensor  # (r,) last node reached
@@ -130,10 +130,8 @@ class Tree:
     def mark(
         self, found: Descent, wanted: Tensor, blends: Tensor, cone: Tensor, seen: Tensor
     ) -> Tensor:
-        """Requests what is not there where something is seen, and returns (r,) bool whether it did.
-
-        Straight to the wanted level, or level by level: then a brick is there before its node is
-        subdivided.
+        """Requests what is not there where something is seen, straight to the wanted level or level
+        by level; returns (r,) bool whether it did.
         """
         by_level, absent = self.arguments.by_level, self.brick_n[found.node] == ABSENT
         deeper = (found.depth < wanted) & (self.child_n[found.node] == ABSENT)
@@ -152,9 +150,8 @@ class Tree:
         a.stamp_b[torch.unique(brick[brick >= 0])] = a.frame_1[0]
 
     def request(self, node: Tensor, depth: Tensor, cone: Tensor, kind: int) -> None:
-        """Joins requests into the request words: kinds by OR, priorities by maximum.
-
-        The priority is the width of one voxel of the node on the screen in sixteenths of a pixel.
+        """Joins requests into the request words: kinds by OR, priorities, widths of one voxel on
+        the screen in sixteenths of a pixel, by maximum.
         """
         voxel = self.levels.voxel_d[depth]
         priority = torch.where(cone > 0, voxel / cone * 16, REQUEST_PRIORITY)
@@ -179,7 +176,6 @@ class Bricks:
 
     @classmethod
     def of(cls, a: TraceArguments) -> Self:
-        """The channel of an op's arguments."""
         constant_nc, range_n2c = a.constant_tnc.flatten(0, 1), a.range_tn2c.flatten(0, 1)
         return cls(a.bricks_bzyxc, constant_nc, range_n2c, a.border, a.component)
 
@@ -215,8 +211,7 @@ class Bricks:
         offset = (beam.origin - holder.corner) * scale + (self.border - 0.5)
         place = offset + t[:, None] * (beam.direction * scale)
         columns = zip(place.unbind(1), shift, strict=True)
-        place = torch.stack([p + d if d else p for p, d in columns], 1)
-        place = clamp(place, 0, side - 1)
+        place = clamp(torch.stack([p + d if d else p for p, d in columns], 1), 0, side - 1)
         cell = smaller(torch.floor(place), torch.full_like(place, side - 2))
         wx, wy, wz = (place - cell).unbind(1)
         x, y, z = cell.to(torch.int64).unbind(1)
