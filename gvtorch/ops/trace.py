@@ -354,7 +354,7 @@ def op_of(name: str | None) -> Any:
 
 
 def most_intervals(length: float, step: float) -> int:
-    """Returns how many intervals a ray of `length` has; raises ValueError if it can't count them."""
+    """Returns how many intervals a ray of `length` has; raises ValueError if they are too many."""
     count = math.ceil(length / step)
     if count > config.MAX_INTERVALS:
         raise ValueError(
