@@ -131,6 +131,14 @@ struct CalledShader : Kind<T> {
   // Values that are hidden change nothing, unless a Sum of the user's own counts them.
   static constexpr bool kLeavesOut = kHidesByTransfer<Base> && std::is_same_v<Sum, ShadeSum<T>> && !Base::kEnds;
 
+  using Base::hides;
+  GV_HD Mask hides(Floats low, Floats high, const UserSums<Sum>& sums) const {
+    Mask out{};
+    for (int lane = 0; lane < kLanes; ++lane) {
+      set_lane(out, lane, Base::hides(low[lane], high[lane], sums.of_lane[lane]));
+    }
+    return out;
+  }
   template <class Packet>
   GV_HD void add(Mask which, const Piece<Floats>& pieces, Packet& packet, UserSums<Sum>& sums) const {
     if constexpr (kLeavesOut) which = which && !this->transfer.transparent(pieces.value, pieces.value);

@@ -14,10 +14,18 @@ inline namespace GV_NAMESPACE {
 
 #if defined(__AVX512F__)
 constexpr int kLanes = 16;
+using Native = __m512;
+#define GV_MM(name) _mm512_##name
 #elif defined(__AVX2__)
 constexpr int kLanes = 8;
+using Native = __m256;
+#define GV_MM(name) _mm256_##name
 #else
 constexpr int kLanes = 4;
+#if defined(__SSE2__)
+using Native = __m128;
+#define GV_MM(name) _mm_##name
+#endif
 #endif
 typedef float Floats __attribute__((vector_size(kLanes * 4)));
 typedef int32_t Ints __attribute__((vector_size(kLanes * 4)));
@@ -33,45 +41,22 @@ GV_HD Ints lane_numbers() {
 }
 
 // As in arithmetic.h: which of two comes out where one is no number is the same.
-GV_HD Floats smaller(Floats a, Floats b) {
-#if defined(__AVX512F__)
-  return (Floats)_mm512_min_ps((__m512)b, (__m512)a);
-#elif defined(__AVX2__)
-  return (Floats)_mm256_min_ps((__m256)b, (__m256)a);
-#elif defined(__SSE2__)
-  return (Floats)_mm_min_ps((__m128)b, (__m128)a);
+#ifdef GV_MM
+GV_HD Floats smaller(Floats a, Floats b) { return (Floats)GV_MM(min_ps)((Native)b, (Native)a); }
+GV_HD Floats larger(Floats a, Floats b) { return (Floats)GV_MM(max_ps)((Native)b, (Native)a); }
+GV_HD Floats square_root(Floats value) { return (Floats)GV_MM(sqrt_ps)((Native)value); }
 #else
-  return b < a ? b : a;
-#endif
+GV_HD Floats smaller(Floats a, Floats b) { return b < a ? b : a; }
+GV_HD Floats larger(Floats a, Floats b) { return b > a ? b : a; }
+GV_HD Floats square_root(Floats value) {
+  for (int i = 0; i < kLanes; ++i) value[i] = sqrt(value[i]);
+  return value;
 }
-GV_HD Floats larger(Floats a, Floats b) {
-#if defined(__AVX512F__)
-  return (Floats)_mm512_max_ps((__m512)b, (__m512)a);
-#elif defined(__AVX2__)
-  return (Floats)_mm256_max_ps((__m256)b, (__m256)a);
-#elif defined(__SSE2__)
-  return (Floats)_mm_max_ps((__m128)b, (__m128)a);
-#else
-  return b > a ? b : a;
 #endif
-}
 GV_HD Ints smaller(Ints a, Ints b) { return b < a ? b : a; }
 GV_HD Ints larger(Ints a, Ints b) { return b > a ? b : a; }
 // value > low ? value : low, then raised < high ? raised : high.
 GV_HD Floats clamp(Floats value, Floats low, Floats high) { return smaller(high, larger(low, value)); }
-GV_HD Floats square_root(Floats value) {
-#if defined(__AVX512F__)
-  return (Floats)_mm512_sqrt_ps((__m512)value);
-#elif defined(__AVX2__)
-  return (Floats)_mm256_sqrt_ps((__m256)value);
-#elif defined(__SSE2__)
-  return (Floats)_mm_sqrt_ps((__m128)value);
-#else
-  for (int i = 0; i < kLanes; ++i) value[i] = sqrt(value[i]);
-  return value;
-#endif
-}
-
 // A bit for each lane that is set.
 GV_HD uint32_t bits(Mask mask) {
 #if defined(__AVX512F__)
@@ -113,6 +98,39 @@ GV_HD Ints gather(const void* base, Ints offset) {
 }
 GV_HD Ints pick(const int32_t* table, Ints index) { return gather(table, index << 2); }
 GV_HD Floats pick(const float* table, Ints index) { return (Floats)gather(table, index << 2); }
+
+// Four floats at each address base + offset (a multiple of 16 bytes), the first of all lanes in row[0], and so on: a
+// load for each lane and a transposition, where four gathers would load each number alone.
+GV_HD void load_rows(const void* base, Ints offset, Floats row[4]) {
+#ifdef GV_MM
+  int32_t lane[kLanes];
+  memcpy(lane, &offset, sizeof(lane));
+  const auto four = [&](int i) {
+    return _mm_load_ps(reinterpret_cast<const float*>(static_cast<const char*>(base) + lane[i]));
+  };
+  Native own[4];  // own[i]: the lanes i, i + 4, i + 8, ...
+  for (int i = 0; i < 4; ++i) {
+#if defined(__AVX512F__)
+    own[i] = _mm512_castps128_ps512(four(i));
+    own[i] = _mm512_insertf32x4(own[i], four(i + 4), 1);
+    own[i] = _mm512_insertf32x4(own[i], four(i + 8), 2);
+    own[i] = _mm512_insertf32x4(own[i], four(i + 12), 3);
+#elif defined(__AVX2__)
+    own[i] = _mm256_insertf128_ps(_mm256_castps128_ps256(four(i)), four(i + 4), 1);
+#else
+    own[i] = four(i);
+#endif
+  }
+  const Native a = GV_MM(unpacklo_ps)(own[0], own[1]), b = GV_MM(unpacklo_ps)(own[2], own[3]);
+  const Native c = GV_MM(unpackhi_ps)(own[0], own[1]), d = GV_MM(unpackhi_ps)(own[2], own[3]);
+  row[0] = (Floats)GV_MM(shuffle_ps)(a, b, 0x44);
+  row[1] = (Floats)GV_MM(shuffle_ps)(a, b, 0xee);
+  row[2] = (Floats)GV_MM(shuffle_ps)(c, d, 0x44);
+  row[3] = (Floats)GV_MM(shuffle_ps)(c, d, 0xee);
+#else
+  for (int i = 0; i < 4; ++i) row[i] = (Floats)gather(static_cast<const float*>(base) + i, offset);
+#endif
+}
 
 // The voxel in the low bytes of each word, as a number.
 template <class Voxel>

@@ -68,10 +68,29 @@ GV_HD Floats trilinear(const PacketPool& pool, Ints brick, const Vec3<Floats>& a
   });
 }
 
+// One component, `shift` bytes behind the first, of bricks that are told by their numbers.
 template <class Voxel, bool kFar>
-GV_CALL Floats read_packet(PacketPool pool, int64_t shift, Ints brick, Floats x, Floats y, Floats z) {
+GV_HD Floats read_shifted(PacketPool pool, int64_t shift, Ints brick, const Vec3<Floats>& at) {
   pool.first = static_cast<const char*>(pool.first) + shift;
-  return trilinear<Voxel, kFar>(pool, kFar ? brick : brick * static_cast<int32_t>(pool.stride), {x, y, z});
+  return trilinear<Voxel, kFar>(pool, kFar ? brick : brick * static_cast<int32_t>(pool.stride), at);
+}
+template <class Voxel, bool kFar>
+GV_CALL Floats read_packet(const PacketPool& pool, int64_t shift, Ints brick, Floats x, Floats y, Floats z) {
+  return read_shifted<Voxel, kFar>(pool, shift, brick, {x, y, z});
+}
+
+// How much it grows along each axis over one voxel, half a voxel to each side.
+template <class Voxel, bool kFar>
+GV_CALL Vec3<Floats> read_rise(const PacketPool& pool, int64_t shift, Ints brick, Floats x, Floats y, Floats z) {
+  Vec3<Floats> rise;
+  for (int axis = 0; axis < 3; ++axis) {
+    Vec3<Floats> below{x, y, z}, above{x, y, z};
+    below[axis] = below[axis] - 0.5f;
+    above[axis] = above[axis] + 0.5f;
+    rise[axis] =
+        read_shifted<Voxel, kFar>(pool, shift, brick, above) - read_shifted<Voxel, kFar>(pool, shift, brick, below);
+  }
+  return rise;
 }
 
 // A channel whose dtype is known at run time. Bricks are told by their numbers.
@@ -79,6 +98,7 @@ struct PacketChannel : ChannelView {
   PacketPool pool;
   int64_t bytes;  // of a number
   decltype(&read_packet<float, false>) reader;
+  decltype(&read_rise<float, false>) rise_reader;
 
   PacketChannel(const ChannelView& channel, int32_t side, int64_t bricks)
       : ChannelView(channel), pool(bricks_bzyxc, type, side, width, 0) {
@@ -86,10 +106,14 @@ struct PacketChannel : ChannelView {
       using Voxel = decltype(voxel);
       bytes = sizeof(Voxel);
       reader = pool.far(bricks) ? &read_packet<Voxel, true> : &read_packet<Voxel, false>;
+      rise_reader = pool.far(bricks) ? &read_rise<Voxel, true> : &read_rise<Voxel, false>;
     });
   }
   GV_HD Floats read(int32_t component, Ints brick, const Vec3<Floats>& at) const {
     return reader(pool, component * bytes, brick, at.x, at.y, at.z);
+  }
+  GV_HD Vec3<Floats> rise(int32_t component, Ints brick, const Vec3<Floats>& at) const {
+    return rise_reader(pool, component * bytes, brick, at.x, at.y, at.z);
   }
   GV_HD float constant(int32_t component, int32_t node) const {
     return read_number<float>(constant_tnc, type, static_cast<int64_t>(node) * width + component);
@@ -114,6 +138,7 @@ struct AnyValues {
       : channel(channel, side, bricks), component(component) {}
   GV_HD Ints first_of(Ints brick) const { return brick; }
   GV_HD Floats read(Ints brick, const Vec3<Floats>& at) const { return channel.read(component, brick, at); }
+  GV_HD Vec3<Floats> rise(Ints brick, const Vec3<Floats>& at) const { return channel.rise(component, brick, at); }
 };
 
 }  // namespace GV_NAMESPACE

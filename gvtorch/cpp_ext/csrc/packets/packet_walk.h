@@ -101,9 +101,9 @@ struct PacketWalk {
   GV_HD void trace(int64_t begin, int64_t end) {
     load(begin, end);
     while (any(alive)) {
-      const Mask waiting = alive && left == 0;
+      const Mask waiting = alive & (left == 0);
       if (any(waiting)) go_on(waiting);
-      Mask marching = alive && left > 0;
+      Mask marching = alive & (left > 0);
       const int32_t enough = count(alive) / 2 + 1;
       while (count(marching) >= enough) marching = march(marching);
     }
@@ -115,18 +115,18 @@ struct PacketWalk {
   // As those of Probe, for all lanes that march.
   GV_HD Floats value(Floats t) const {
     const Floats value = value_in(fine, t);
-    if (!any(mixed && marching)) return value;
+    if (!any(mixed & marching)) return value;
     return mixed ? value + weight(t) * (value_in(coarse, t) - value) : value;
   }
   GV_HD Floats number_at(const PacketChannel& channel, int32_t component, Floats t) const {
     const Floats number = number_in(channel, component, fine, fine_depth, t);
-    if (!any(mixed && marching)) return number;
+    if (!any(mixed & marching)) return number;
     const Floats other = number_in(channel, component, coarse, coarse_depth, t);
     return mixed ? number + weight(t) * (other - number) : number;
   }
   GV_HD Vec3<Floats> gradient(Floats t) const {
     Vec3<Floats> slope = differences(fine, fine_depth, t);
-    if (!any(mixed && marching)) return slope;
+    if (!any(mixed & marching)) return slope;
     const Vec3<Floats> other = differences(coarse, coarse_depth, t);
     const Floats part = weight(t);
     for (int axis = 0; axis < 3; ++axis) {
@@ -185,7 +185,7 @@ struct PacketWalk {
       alive[lane] = -1;
     }
     at.choose_level(alive);
-    alive = alive && at.inside() && sum.clear > stop_clear;
+    alive = alive & at.inside() & (sum.clear > stop_clear);
   }
 
   GV_HD void end_ray(int lane) {
@@ -201,14 +201,14 @@ struct PacketWalk {
 
   // Lanes without a run: begins the next one in the same node, or visits the next node.
   GV_HD void go_on(Mask waiting) {
-    const Mask ran = waiting && number > at.count;
+    const Mask ran = waiting & (number > at.count);
     at.go(ran, number);
-    alive = alive && !(waiting && !(at.inside() && sum.clear > stop_clear));
-    const Mask again = ran && alive && at.stays(extent);
-    const Mask next = waiting && alive && !again;
+    alive = alive & ~(waiting & ~(at.inside() & (sum.clear > stop_clear)));
+    const Mask again = ran & alive & at.stays(extent);
+    const Mask next = waiting & alive & ~again;
     if (any(again)) begin_run(again);
     if (any(next)) visit(next);
-    alive = alive && !(waiting && left == 0 && !(at.inside() && sum.clear > stop_clear));
+    alive = alive & ~(waiting & (left == 0) & ~(at.inside() & (sum.clear > stop_clear)));
   }
 
   // As Walk::find, and what Walk::follow does with the visit.
@@ -298,10 +298,10 @@ struct PacketWalk {
       aim(runs, fine_level, fine_brick, fine);
       const Mask both = runs & differ;
       if (any(both)) aim(both, coarse_level, coarse_brick, coarse);
-      Mask flat = runs && !fine.stored && (!differ || !coarse.stored);
+      Mask flat = runs & ~fine.stored & (~differ | ~coarse.stored);
       if (kernel.shades_each_place()) flat = Mask{};
-      each(flat && differ, [&](int lane, const Probe<float>& probe) { set_lane(flat, lane, probe.uniform()); });
-      runs = runs && !flat;
+      each(flat & differ, [&](int lane, const Probe<float>& probe) { set_lane(flat, lane, probe.uniform()); });
+      runs = runs & ~flat;
       if (any(runs)) begin_run(runs);
       if (any(flat)) add_region(flat);
     }
@@ -360,17 +360,18 @@ struct PacketWalk {
   }
 
   GV_HD Mask hidden(Mask here, Ints node) {
-    Mask hides{}, unknown = here;
-    if constexpr (kKeepsPath) {
-      const Ints known = gather(hidden_tn, node) & 0xff;
-      hides = here && known == kHidden;
-      unknown = here && known == kUnknown;
+    if constexpr (!kKeepsPath) {
+      Floats low{}, high{};
+      for_lanes(here, [&](int lane) {
+        const auto range = kernel.range_of(node[lane]);
+        low[lane] = range.low;
+        high[lane] = range.high;
+      });
+      return here && shader.hides(low, high, sum);
     }
-    for_lanes(unknown, [&](int lane) {
-      const bool found = kernel.hides(shader, node[lane], sum_of<Sum>(sum, lane));
-      if (kKeepsPath) store_byte(&hidden_tn[node[lane]], found ? kHidden : kShown);
-      set_lane(hides, lane, found);
-    });
+    const Ints known = gather(hidden_tn, node) & 0xff;
+    Mask hides = here & (known == kHidden);
+    for_lanes(here & (known == kUnknown), [&](int lane) { set_lane(hides, lane, kernel.hides(node[lane])); });
     return hides;
   }
 
@@ -420,13 +421,13 @@ struct PacketWalk {
   // Begins the run of intervals that are alike; lanes that need care are done with the node at once.
   GV_HD void begin_run(Mask which) {
     const Ints last = values.first_of(Ints{} + static_cast<int32_t>(bricks - 1));
-    const Mask end = (fine.stored && fine.brick == last) || (mixed && coarse.stored && coarse.brick == last);
-    const Mask careful = which && (at.cut() || end);
+    const Mask end = (fine.stored & (fine.brick == last)) | (mixed & coarse.stored & (coarse.brick == last));
+    const Mask careful = which & (at.cut() | end);
     if (any(careful)) {
       march_alone(careful);
       fine.brick = careful ? Ints{} : fine.brick;  // what other lanes read in vain must lie in the pool
       coarse.brick = careful ? Ints{} : coarse.brick;
-      which = which && !careful;
+      which = which & ~careful;
     }
     left = which ? at.run(which, extent) : left;
     number = which ? at.count : number;
@@ -469,10 +470,10 @@ struct PacketWalk {
     } else {
       piece.value = value(piece.middle);
     }
-    const Mask seeing = which && sum.clear > stop_clear;
+    const Mask seeing = which & (sum.clear > stop_clear);
     samples = samples - seeing;
     shader.add(seeing, piece, *this, sum);
-    return which && left > 0;
+    return which & (left > 0);
   }
 
   __attribute__((noinline)) void march_alone(Mask which) {
@@ -496,21 +497,16 @@ struct PacketWalk {
   GV_HD Floats number_in(const PacketChannel& channel, int32_t component, const PacketBrick& brick, Ints depth,
                          Floats t) const {
     Floats number = channel.read(component, brick.brick, brick.at(t));
-    for_lanes(marching && !brick.stored,
+    for_lanes(marching & ~brick.stored,
               [&](int lane) { number[lane] = channel.constant(component, node_of(lane, depth)); });
     return number;
   }
   GV_HD Vec3<Floats> differences(const PacketBrick& brick, Ints depth, Floats t) const {
-    const Vec3<Floats> place = brick.at(t);
     const Floats scale = pick(walk.levels.scale, depth);
-    Vec3<Floats> slope;
+    Vec3<Floats> slope = values.rise(brick.brick, brick.at(t));
     for (int axis = 0; axis < 3; ++axis) {
-      Vec3<Floats> below = place, above = place;
-      below[axis] = place[axis] - 0.5f;
-      above[axis] = place[axis] + 0.5f;
-      const Floats rise = values.read(brick.brick, above) - values.read(brick.brick, below);
       const Floats per_unit = scale / static_cast<float>(walk.rays.place_33[3 + axis]);
-      slope[axis] = brick.stored ? rise * per_unit : Floats{};
+      slope[axis] = brick.stored ? slope[axis] * per_unit : Floats{};
     }
     return slope;
   }

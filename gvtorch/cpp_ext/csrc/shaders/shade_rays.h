@@ -68,17 +68,25 @@ struct ShadeRay : Walk<T> {
     finish(number, ray.moved, visitor.samples, sum);
   }
 
+  // Smallest and largest value of the node, in any direction.
+  struct Range {
+    T low, high;
+  };
+  GV_HD Range range_of(int32_t node) const {
+    const int64_t row = int64_t{2} * node * channels.value.width + channels.component;
+    const auto read = [&](int64_t index) { return read_number<T>(range_tn2c, channels.value.type, index); };
+    Range range{read(row), read(row + channels.value.width)};
+    for (int32_t other = 1; other < directions; ++other) {
+      range.low = smaller(range.low, read(row + 4 * other));
+      range.high = larger(range.high, read(row + channels.value.width + 4 * other));
+    }
+    return range;
+  }
   // Nothing between the ends of the node's range changes the sum.
   template <class Any>
   GV_HD bool hides(const Any& shader, int32_t node, const typename Any::Sum& sum) const {
-    const int64_t row = int64_t{2} * node * channels.value.width + channels.component;
-    T low = read_number<T>(range_tn2c, channels.value.type, row);
-    T high = read_number<T>(range_tn2c, channels.value.type, row + channels.value.width);
-    for (int32_t other = 1; other < directions; ++other) {
-      low = smaller(low, read_number<T>(range_tn2c, channels.value.type, row + 4 * other));
-      high = larger(high, read_number<T>(range_tn2c, channels.value.type, row + channels.value.width + 4 * other));
-    }
-    return shader.hides(low, high, sum);
+    const Range range = range_of(node);
+    return shader.hides(range.low, range.high, sum);
   }
 
   // The same for all rays: looked at once.

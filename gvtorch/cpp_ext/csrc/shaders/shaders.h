@@ -7,7 +7,8 @@
 //   kEnds                                         its values are those at an interval's two ends, else in the middle
 //   kSeesEmpty                                    EMPTY nodes count, with their mean value
 //   SumOf<V> : ShadeSum<V>, Sum = SumOf<T>        what it keeps of a ray; `clear` at 1 - stop_alpha ends the ray
-//   hides(low, high, sum)                         true: no value in [low, high] changes the sum. The node is left out
+//   hides(low, high, sum)                         true: no value in [low, high] changes the sum. The node is left out;
+//                                                 without kHidesAlike, of V as `add`
 //   kHidesAlike                                   it does not look at the sum: nodes are hidden from all rays alike
 //   add(which, piece, probe, sum)                 adds an interval; `probe` reads any channel at any distance
 //   kSurface, surface(probe, sum)                 where depth was set: `probe` then stands in the node of that place
@@ -388,10 +389,12 @@ struct Projection : ShaderFacts {
   GV_HD ProjectionKind kind() const {
     return static_cast<ProjectionKind>(static_cast<int32_t>(own_numbers<Own>(parameters).kind));
   }
-  GV_HD bool hides(T low, T high, const Sum& sum) const {
-    if (!(sum.length > 0)) return false;
-    return kind() == ProjectionKind::kMaximum ? a_little_above(high) <= sum.found
-                                              : kind() == ProjectionKind::kMinimum && a_little_below(low) >= sum.found;
+  template <class V>
+  GV_HD MaskOf<V> hides(V low, V high, const SumOf<V>& sum) const {
+    if (kind() == ProjectionKind::kMean) return MaskOf<V>{};
+    const bool highest = kind() == ProjectionKind::kMaximum;
+    const MaskOf<V> within = highest ? a_little_above(high) <= sum.found : a_little_below(low) >= sum.found;
+    return sum.length > 0 && within;
   }
   template <class V, class Eye>
   GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye&, SumOf<V>& sum) const {
@@ -433,14 +436,18 @@ struct Features : Plain<T> {
   GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
     const Row<V> row = look_up(Transfer<T>(this->transfer), piece.value, piece, this->step, which);
     const V share = sum.clear * row.alpha;
-    probe.each(which && share > 0, [&](int lane, const Probe<T>& own) {
-      const ChannelView& features = own.channels.other;
-      T* feature_c = lane_of(sum.feature_c, lane);
+    const MaskOf<V> shown = which && share > 0;
+    if (any(shown)) {
+      probe.narrow(shown);
+      const auto& features = probe.channels.other;
       for (int32_t c = 0; c < features.width; ++c) {
-        const T number = own.number_at(features, c, lane_of(piece.middle, lane));
-        feature_c[c] = feature_c[c] + lane_of(share, lane) * number;
+        const V number = probe.number_at(features, c, piece.middle);
+        for_lanes(shown, [&](int lane) {
+          T& feature = lane_of(sum.feature_c, lane)[c];
+          feature = feature + lane_of(share, lane) * lane_of(number, lane);
+        });
       }
-    });
+    }
     sum.add(row, piece.start, piece.length, sum.hit_clear, which);
   }
 };

@@ -42,16 +42,6 @@ struct Cell {
   T weight;
 };
 
-#ifndef __CUDACC__
-// A row of the table for each lane, of which a number is read when it is asked for.
-struct PacketRow {
-  const float* table;
-  Ints offset;  // bytes
-
-  GV_HD Floats operator[](int which) const { return (Floats)gather(table + which, offset); }
-};
-#endif
-
 // Values a little apart: interpolation may round beyond the ends of a range.
 template <class T>
 GV_HD T a_little_below(T value) {
@@ -112,7 +102,11 @@ struct Transfer {
   // The row `index`, or the one that lies so many behind it.
   GV_HD const Row<T>& row_at(int64_t index, int32_t behind) const { return table_lm[index + behind]; }
 #ifndef __CUDACC__
-  GV_HD PacketRow row_at(Ints index, int32_t behind) const { return {&table_lm[behind].red, index << 4}; }
+  GV_HD Row<Floats> row_at(Ints index, int32_t behind) const {
+    Row<Floats> row;
+    load_rows(table_lm + behind, index << 4, &row.red);
+    return row;
+  }
 #endif
 
   // Colour and alpha of a value, for a level of intervals. Lanes that are not asked for may get anything.
