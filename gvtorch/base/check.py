@@ -121,8 +121,8 @@ def instance(where: str, name: str, value: Any, kind: type[Kind]) -> Kind:
 
 
 def known(where: str, options: Mapping[str, Any], kind: type) -> None:
-    """Raises ValueError unless all options are fields of a dataclass."""
-    names = [field.name for field in fields(kind)]
+    """Raises ValueError unless all options are keys of a `TypedDict`."""
+    names = kind.__annotations__
     unknown = sorted(set(options) - set(names))
     if unknown:
         raise ValueError(f"{where}: unknown option {unknown[0]!r}; known: {', '.join(names)}")

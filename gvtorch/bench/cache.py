@@ -15,18 +15,18 @@ _REQUESTS = 1000  # of all nodes
 
 def lru(record: Record) -> None:
     """Slots in the order of their last use, half of them used in this frame."""
-    settings = record.settings
+    settings, device = record.settings, record.settings.device
     slots = 1 << (12 if settings.quick else 20)
     case = f"{slots:,} slots, half used"
     if not record.wants(case):
         return
     generator = torch.Generator().manual_seed(1)
     stamp = torch.randint(0, 99, (slots,), generator=generator, dtype=torch.int32)
-    order = torch.sort(stamp, stable=True).indices.to(torch.int32).to(settings.device)
+    order = torch.sort(stamp, stable=True).indices.to(torch.int32).to(device)
     stamp[torch.randperm(slots, generator=generator)[: slots // 2]] = 100
-    stamp = stamp.to(settings.device)
-    frame = torch.tensor([100], dtype=torch.int32, device=settings.device)
-    calls = 20 if settings.device.type == "cuda" else 1
+    stamp = stamp.to(device)
+    frame = torch.tensor([100], dtype=torch.int32, device=device)
+    calls = 20 if device.type == "cuda" else 1
 
     ours = clock(lambda: lru_partition(order, stamp, frame), settings, calls=calls)
     theirs = clock(lambda: torch.sort(stamp, stable=True), settings, calls=calls)
@@ -51,9 +51,9 @@ def compact(record: Record) -> None:
     case = f"{nodes:,} nodes, {_REQUESTS:,} requests"
     if not record.wants(case):
         return
-    generator = torch.Generator().manual_seed(2)
+    some = torch.randperm(nodes, generator=torch.Generator().manual_seed(2))[:_REQUESTS]
     words = torch.zeros(nodes, dtype=torch.int32)
-    words[torch.randperm(nodes, generator=generator)[:_REQUESTS]] = REQUEST_LOAD | 77
+    words[some] = REQUEST_LOAD | 77
     words = words.view(-1, 8).to(settings.device)
     count = 16 if settings.device.type == "cuda" else 4
     copies = [words.clone() for _ in range(count)]

@@ -74,7 +74,7 @@ class Engine:
                 roots, or producers do not agree on a channel.
             ProductionError: A root can't be produced.
         """
-        check.known("Engine", options, EngineOptions)
+        check.known("Engine", options, EngineSettings)
         self.options = EngineOptions(**options)
         self.device = check.device("Engine", self.options.device)
         producers = dict(scene) if isinstance(scene, Mapping) else {"scene": scene}

@@ -25,7 +25,7 @@ from concurrent.futures import (
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -33,7 +33,7 @@ from ..base import check
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume
 from . import resources, shard, unfinished
-from .reading import open_source, placed, read_whole
+from .reading import FormatSettings, open_source, placed, read_whole
 from .source import MemorySource, VolumeSource
 from .store import Store
 from .store_layout import (
@@ -104,16 +104,14 @@ def convert(
     *,
     block: int = 32,
     threshold: float | None = None,
-    shape: Sequence[int] | None = None,
-    dtype: str | None = None,
     spacing: Sequence[float] | None = None,
     origin: Sequence[float] | None = None,
-    key: str | None = None,
     nan: float | None = None,
     executor: Executor | None = None,
     workers: int | None = None,
     resume: bool = False,
     progress: Progress = no_progress,
+    **options: Unpack[FormatSettings],
 ) -> Store:
     """Writes a store: a mean pyramid, blocks with borders, and the range of every cell.
 
@@ -125,17 +123,15 @@ def convert(
         store: The folder to make.
         block: Voxels along a side of a block, 32 or 64.
         threshold: Blocks with no value above it are not written; see `N3Tree.from_volume`.
-        shape: RAW only: (x, y, z) voxels.
-        dtype: RAW only: a NumPy dtype.
         spacing: (x, y, z) world units; overrides the file's.
         origin: (x, y, z) world units; overrides the file's.
-        key: `.npz` only: which array.
         nan: Value for voxels that are NaN or infinite; they are refused if left out.
         executor: Runs the tasks, such as a dask client's `get_executor()`; the store's folder must
             be the same for all of its workers. A pool of processes if left out.
         workers: Number of processes of that pool; one a core if left out.
         resume: Go on with a half-written store.
         progress: Told ("converting", bytes done, bytes in all).
+        **options: shape, dtype and key, as of `read_volume`.
 
     Returns:
         The store, open.
@@ -149,7 +145,7 @@ def convert(
     """
     target = Path(store)
     begun = unfinished.is_begun(target, resume=resume)
-    opened_source = _source(source, spacing, origin, shape=shape, dtype=dtype, key=key)
+    opened_source = _source(source, spacing, origin, options)
     plan = _plan(source, opened_source, target, block, threshold, nan, workers)
     if not begun:
         _check_room(target, _estimate(plan))
@@ -174,17 +170,15 @@ def estimate(
     *,
     block: int = 32,
     threshold: float | None = None,
-    shape: Sequence[int] | None = None,
-    dtype: str | None = None,
-    key: str | None = None,
     nan: float | None = None,
     workers: int | None = None,
+    **options: Unpack[FormatSettings],
 ) -> Estimate:
     """Tells what `convert` would take, from a few cubes converted in memory. Writes nothing.
 
     Args, Raises: as `convert`.
     """
-    opened_source = _source(source, None, None, shape=shape, dtype=dtype, key=key)
+    opened_source = _source(source, None, None, options)
     return _estimate(_plan(source, opened_source, Path(store), block, threshold, nan, workers))
 
 
@@ -195,9 +189,10 @@ def _source(
     source: str | Path | Volume,
     spacing: Sequence[float] | None,
     origin: Sequence[float] | None,
-    **options: Any,
+    options: FormatSettings,
 ) -> VolumeSource:
     """Opens the source; one that can only be read whole is read, once."""
+    check.known("convert", options, FormatSettings)
     if isinstance(source, Volume):
         if source.filter != "mean":
             raise ValueError(

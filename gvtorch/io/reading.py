@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypedDict, Unpack
 
 import numpy as np
 
@@ -22,15 +23,21 @@ from .store_layout import DTYPES, MOST_VOXELS, StoreError
 _MOST_CHANNELS = 2**10
 
 
+class FormatSettings(TypedDict, total=False):
+    """Options of `read_volume` that only some formats take."""
+
+    shape: Sequence[int] | None
+    dtype: str | np.dtype | None
+    key: str | None
+
+
 def read_volume(
     path: str | Path,
     *,
-    shape: Sequence[int] | None = None,
-    dtype: str | np.dtype | None = None,
     spacing: Sequence[float] | None = None,
     origin: Sequence[float] | None = None,
-    key: str | None = None,
     nan: float | None = None,
+    **options: Unpack[FormatSettings],
 ) -> Volume:
     """Reads a volume.
 
@@ -42,13 +49,13 @@ def read_volume(
 
     Args:
         path: The file, or a folder of TIFF slices.
-        shape: RAW only: (x, y, z) voxels; the name's `_XxYxZ_dtype` if left out.
-        dtype: RAW only: a NumPy dtype, as in "int16" or ">i2"; the name's if left out.
         spacing: (x, y, z) world units; overrides the file's. 1 where neither tells.
         origin: (x, y, z) world place of the first voxel's centre; overrides the file's. 0 where
             neither tells.
-        key: `.npz` only: which array; needed where there are several.
         nan: Value for voxels that are NaN or infinite; they are refused if left out.
+        **options: RAW only: shape, (x, y, z) voxels, and dtype, a NumPy dtype as in "int16" or
+            ">i2"; the name's `_XxYxZ_dtype` if left out. `.npz` only: key, which array; needed
+            where there are several.
 
     Returns:
         The volume, dtype kept (64 and 32 bit integers and float64 become float32).
@@ -59,9 +66,7 @@ def read_volume(
             not fit.
         ImportError: A library is missing; the message tells which pip command brings it.
     """
-    source = open_source(
-        path, shape=shape, dtype=dtype, spacing=spacing, origin=origin, key=key, most=MAX_VOXELS
-    )
+    source = open_source(path, spacing=spacing, origin=origin, most=MAX_VOXELS, **options)
     data, name = read_whole(source), Path(path).name
     return Volume(data, source.spacing, source.origin, name=name, nan=nan)
 
@@ -69,12 +74,10 @@ def read_volume(
 def open_source(
     path: str | Path,
     *,
-    shape: Sequence[int] | None = None,
-    dtype: str | np.dtype | None = None,
     spacing: Sequence[float] | None = None,
     origin: Sequence[float] | None = None,
-    key: str | None = None,
     most: int = MOST_VOXELS * _MOST_CHANNELS,
+    **options: Unpack[FormatSettings],
 ) -> VolumeSource:
     """Reads a volume's header: what there is, where it lies, what reading will take.
 
@@ -82,10 +85,10 @@ def open_source(
         most: Values (voxels times channels); a larger volume is refused.
     """
     text = str(path)
+    check.known("read_volume", options, FormatSettings)
     if not is_zarr(text) and not Path(text).exists():
         raise FileNotFoundError(f"volume not found: {path}")
     found = find_format(text)
-    options = {"shape": shape, "dtype": dtype, "key": key}
     given = {name: value for name, value in options.items() if value is not None}
     for name in set(given).difference(found.options):
         owner = next(other for other in FORMATS if name in other.options)

@@ -24,11 +24,7 @@ def checked_regions(answer: Any, nodes: Nodes, producer: Producer) -> Regions:
     """Returns a producer's answer to `classify(nodes)` as `Regions` on the layout's device."""
     if isinstance(answer, Tensor):
         answer = Regions(kind=answer)
-    where = f"{type(producer).__name__}.classify"
-    if not isinstance(answer, Regions):
-        came = type(answer).__name__
-        raise ValueError(f"{where}: must return Regions or a tensor, got {came}")
-    regions = _checked(where, answer, nodes, producer)
+    regions = _checked("classify", answer, Regions, "a tensor", nodes, producer)
     return regions.each(lambda tensor: upload(tensor, nodes.layout.device))
 
 
@@ -38,11 +34,7 @@ def checked_bricks(answer: Any, nodes: Nodes, producer: Producer) -> Bricks:
     """
     if isinstance(answer, Mapping):
         answer = Bricks(data=answer)
-    where = f"{type(producer).__name__}.fill"
-    if not isinstance(answer, Bricks):
-        came = type(answer).__name__
-        raise ValueError(f"{where}: must return Bricks or a dict of tensors, got {came}")
-    bricks = _checked(where, answer, nodes, producer)
+    bricks = _checked("fill", answer, Bricks, "a dict of tensors", nodes, producer)
     if len({on_host({name: rows}) for name, rows in bricks.data.items()}) == 1:
         return bricks
     device = nodes.layout.device
@@ -71,8 +63,14 @@ def regions_of(
     )
 
 
-def _checked(where: str, answer: Form, nodes: Nodes, producer: Producer) -> Form:
+def _checked(
+    method: str, answer: Any, form: type[Form], other: str, nodes: Nodes, producer: Producer
+) -> Form:
     """Returns the answer with a width in every shape, and with errors in place of bad items."""
+    where = f"{type(producer).__name__}.{method}"
+    if not isinstance(answer, form):
+        came = type(answer).__name__
+        raise ValueError(f"{where}: must return {form.__name__} or {other}, got {came}")
     kind: Any
     layout, count, kind, errors = nodes.layout, len(nodes), answer.kind, dict(answer.errors)
     if any(not 0 <= index < count for index in errors):
@@ -97,7 +95,7 @@ def _checked(where: str, answer: Form, nodes: Nodes, producer: Producer) -> Form
     if missing and counts[Region.CONSTANT]:
         raise ValueError(f"{where}: constants must hold channel {missing[0]!r} of CONSTANT items")
     alias = _alias(where, answer.alias, kind, layout, errors) if counts[Region.ALIAS] else None
-    return type(answer)(kind=kind, alias=alias, errors=errors, **fields)
+    return form(kind=kind, alias=alias, errors=errors, **fields)
 
 
 def _by_channel(

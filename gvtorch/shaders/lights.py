@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from copy import copy
 from dataclasses import dataclass
+from math import inf
 from typing import Any, Self
 
 import torch
@@ -162,7 +163,7 @@ def check_light(what: str, value: Any) -> None:
 
 
 def check_number(
-    where: str, name: str, value: Any, *, low: float = -math.inf, high: float = math.inf
+    where: str, name: str, value: Any, *, low: float = -inf, high: float = inf
 ) -> None:
     """Raises ValueError unless it is a finite number in [low, high], or a tensor of one. A tensor
     on CUDA is not looked at, since that would block.
@@ -178,13 +179,7 @@ def check_number(
 
 
 def check_triple(
-    where: str,
-    name: str,
-    value: Any,
-    *,
-    low: float = -math.inf,
-    high: float = math.inf,
-    zero: bool = True,
+    where: str, name: str, value: Any, *, low: float = -inf, high: float = inf, zero: bool = True
 ) -> None:
     """Raises ValueError unless these are three finite numbers in [low, high], or a tensor of them,
     as for `check_number`; `zero` tells whether all may be 0.

@@ -99,7 +99,7 @@ def render_options(
         ValueError: One is unknown, of the wrong type or out of its range, or does not fit the
             camera's pictures.
     """
-    check.known(where, settings, RenderOptions)
+    check.known(where, settings, RenderSettings)
     options = RenderOptions(**settings)
     if camera is None:
         return options
