@@ -171,8 +171,8 @@ class Engine:
 
     @contextmanager
     def new_frame(self, options: RenderOptions) -> Iterator[FrameStats]:
-        """Keeps the statistics of the frame that the block renders. If the block raises, nothing
-        stays marked as pending that is not.
+        """Keeps the statistics of the frame that the block renders. If the block raises, only what
+        is on its way stays marked as pending.
         """
         if self._closed:
             raise ValueError("Engine: it is closed")
@@ -318,9 +318,9 @@ class Engine:
             shader: For all trees, or one for each.
             mode: interactive: one frame, as `frame` gives it; balanced: `productions` frames, of
                 which the last is shown; converge: until no ray misses anything that can be served.
-                Rays that miss nothing are done; where the pools are too small for all rays, subsets
-                of them are traced one after the other, so that pools that hold what one ray needs,
-                and the coarser bricks that stand in for it on the way, give the whole picture.
+                Where the pools are too small for all rays, subsets are traced one after the other,
+                so the pools need only hold what one ray needs and the coarser bricks that stand in
+                for it on the way.
             productions: Frames of a balanced picture.
             max_frames: Most frames of a converged picture; `stats.converged` tells whether they
                 were enough.
@@ -328,9 +328,9 @@ class Engine:
             **options: Fields of `RenderOptions`.
 
         Returns:
-            The picture; its `stats` add up milliseconds, produced, evicted and bytes over all
-            frames, tell the most tiles and bricks that one frame used, and else the last frame.
-            `capacity_exceeded` tells that rays had to be traced in subsets, or that some got
+            The picture; its `stats` are those of the last frame, but milliseconds, produced,
+            evicted and bytes are sums over all frames, and tiles and bricks the most that one frame
+            used. `capacity_exceeded` tells that rays had to be traced in subsets, or that some got
             nothing.
 
         Raises:
@@ -351,7 +351,7 @@ class Engine:
         return view.picture(*self._converge(view, max_frames, progress))
 
     def _balance(self, view: View, most: int) -> tuple[Hits, FrameStats]:
-        """Renders frames until one has converged, `most` at most."""
+        """Renders at most `most` frames, until one has converged."""
         total = FrameStats()
         for number in range(1, most + 1):
             hits, stats = self._served_frame(view)
@@ -364,7 +364,7 @@ class Engine:
         return hits, total
 
     def _converge(self, view: View, most: int, progress: Progress) -> tuple[Hits, FrameStats]:
-        """Renders frames, `most` at most, each of those rays that still miss something."""
+        """Renders at most `most` frames, each of the rays that still miss something."""
         subsets = RaySubsets(view.rays, view.camera.width, self.device)
         total, again = FrameStats(), None
         for number in range(1, most + 1):
@@ -479,9 +479,9 @@ class Engine:
 class FrameGraph:
     """A frame as one CUDA graph, which costs the host a single call. `Engine.capture` makes it.
 
-    A replay is the frame that `Engine.frame` would render, but it produces nothing. Where the
-    engine is not steady any more, something was missed or an answer is on its way, and
-    `Engine.frame` goes on until it is::
+    A replay is the frame that `Engine.frame` would render, but it produces nothing. Where
+    `Engine.steady` is false, something was missed or an answer is on its way: then call
+    `Engine.frame` until it is true::
 
         render = graph.replay if engine.steady else partial(engine.frame, shader=shader)
         picture, stats = render(camera)

@@ -1,6 +1,6 @@
-"""`Production`: asks producers, which know places, for what was requested, and writes their answers
-into the slots of the cache, at once or later. A node that fails is counted and named, is not asked
-for again, and takes no other with it: its ancestors stand in for it.
+"""`Production`: asks producers for what was requested, and writes their answers into the slots of
+the cache, at once or later. A node that fails is counted and named, and not asked for again; its
+ancestors stand in for it, and other nodes are not affected.
 """
 
 from __future__ import annotations

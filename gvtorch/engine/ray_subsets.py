@@ -44,8 +44,8 @@ class RaySubsets:
         return not self._given_up and self.done == self.count
 
     def update(self, missed: Tensor, stats: FrameStats, failed: int) -> None:
-        """Chooses the next subset; waits for the device. The last pass cost `stats`, its rays
-        `missed` (count,) something, and `failed` nodes had failed before it.
+        """Chooses the next subset, given what the last pass cost, which rays `missed` (count,)
+        something in it, and how many nodes had `failed` before it. Waits for the device.
         """
         # Where nothing could be served, what is missing has failed: these rays are as good as ever.
         finished = self.next if stats.converged else self.next & ~missed

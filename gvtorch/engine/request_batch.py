@@ -166,8 +166,8 @@ def shipped(
 
 
 def send_ahead(batch: RequestBatch, answer: Any, staging: Staging) -> Any:
-    """Checks an answer and sends it; returns it as it is unless it is voxels from the host and
-    nothing else, all of them right.
+    """Checks an answer and sends it if it is valid voxels from the host and nothing else; any other
+    answer is returned as it is.
     """
     data = answer.data if isinstance(answer, Bricks) else answer
     if not isinstance(data, Mapping) or not all(

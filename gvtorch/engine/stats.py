@@ -98,9 +98,7 @@ class FrameStats(RenderStats):
 
     @property
     def miss_rate(self) -> float:
-        """Bricks asked for over bricks asked for and bricks used. A brick on its way is asked for
-        once, and counts once.
-        """
+        """Requested bricks over requested and used ones. A brick on its way counts once."""
         asked = self.requests.get("load", 0)
         return asked / max(1, asked + self.bricks_used)
 

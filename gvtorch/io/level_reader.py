@@ -1,8 +1,8 @@
 """`LevelReader`: the tree levels of a multiscale image, from the arrays that `open_arrays` opens.
 
-A tree level is 2^L coarser along every axis. Where no array is, the level is averaged: from the
-coarsest array whose factors divide 2^L, or tile by tile from the tree level below, whichever
-reads less. Memory stays bounded, and tiles that were made are kept for a while.
+A tree level is 2^L coarser along every axis. A level without an array is averaged: from the
+coarsest array whose factors divide 2^L, or tile by tile from the tree level below, whichever reads
+less. Memory stays bounded, and tiles that were made are kept for a while.
 """
 
 from __future__ import annotations

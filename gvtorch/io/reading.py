@@ -111,7 +111,7 @@ def placed(
     spacing: Sequence[float] | None,
     origin: Sequence[float] | None,
 ) -> VolumeSource:
-    """Returns the source at a place of the user's; None leaves what the file tells."""
+    """Returns the source with the user's spacing and origin; None keeps those of the file."""
     if spacing is not None:
         source = dataclasses.replace(source, spacing=check.triple(where, "spacing", spacing))
     if origin is not None:

@@ -31,7 +31,7 @@ def memory_free() -> int:
 
 
 def begin_worker() -> None:
-    """Sets a worker process up: Ctrl-C is the parent's business, and it ends with its parent."""
+    """Sets up a worker process, which leaves Ctrl-C to its parent and ends with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def end_with_parent() -> None:

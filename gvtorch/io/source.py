@@ -1,9 +1,9 @@
 """`VolumeSource`: a volume in a file, its header read, its voxels read region by region.
 
 A source is plain data (path, shape, offset, ...) that can be pickled, so that worker processes can
-have it; files are opened in the process that reads. The formats (formats/) make sources;
-`ArraySource` serves all of those that hold their numbers one after another, `place_axes` those that
-tell how their axes lie in the world.
+have it; files are opened in the process that reads. The formats (formats/) make sources:
+`ArraySource` where numbers lie one after another; `place_axes` where the header tells how axes lie
+in the world.
 """
 
 from __future__ import annotations

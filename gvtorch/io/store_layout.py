@@ -49,7 +49,7 @@ def value_dtype(stored: np.dtype) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class StoreLayout:
-    """What a store holds, of which the sizes of its arrays follow; picklable."""
+    """What a store holds; the sizes of its arrays follow from it. Picklable."""
 
     extent: tuple[int, int, int]  # x y z
     dtype: str
@@ -126,7 +126,7 @@ class StoreLayout:
 
     def bounds(self, level: int) -> list[dict[str, Any]]:
         """Specs of the temporary arrays of smallest and largest finest values, where a level needs
-        them: those of the finest are its values, and of the last nothing is made.
+        them: the finest values are their own, and nothing is made of the last.
         """
         needed = 0 < level < self.levels - 1
         paths = [f"{WORK}/{which}/{level}" for which in ("low", "high")]
@@ -238,7 +238,7 @@ class StoreError(OSError):
 
 
 class Deadline:
-    """A moment until which reads may take: `timeout` seconds from when it is made."""
+    """The time at which reads are given up: `timeout` seconds after this is made."""
 
     def __init__(self, timeout: float) -> None:
         self.timeout = timeout

@@ -1,5 +1,5 @@
-"""`UnfinishedStore`: a store while it is made: its lock, manifest and journal, and the last step,
-which makes it a store. The work itself is in conversion.py.
+"""`UnfinishedStore`: lock, manifest and journal of a store in the making, and the last step, which
+makes it a store. The work itself is in conversion.py.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def is_begun(target: Path, *, resume: bool) -> bool:
     Raises:
         FileExistsError: There is a whole store, a half-written one without `resume`, or something
             else.
-        FileNotFoundError: The folder that it shall be in is not there.
+        FileNotFoundError: Its parent folder is not there.
     """
     if (target / "zarr.json").exists():
         raise FileExistsError(f"{target}: there is a store already; remove it or choose a new name")
@@ -79,7 +79,7 @@ def is_begun(target: Path, *, resume: bool) -> bool:
 @contextmanager
 def claimed(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator[UnfinishedStore]:
     """Makes or takes over the hidden folder; raises OSError if another process is at work there,
-    and ValueError if settings or source differ from those of the store that it shall resume.
+    and ValueError if settings or source differ from those of the store to resume.
     """
     import fcntl
 
@@ -150,7 +150,7 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 def fingerprint(source: str | Path | Volume) -> list[Any]:
-    """Sizes and times of change of a source, or a checksum: equal as long as it is unchanged."""
+    """Sizes and modification times of a source, or a checksum: equal while it is unchanged."""
     if isinstance(source, Volume):
         data = movable(source.data)
         return [list(data.shape), str(source.data.dtype), zlib.crc32(data.numpy().tobytes())]

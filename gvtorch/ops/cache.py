@@ -138,8 +138,8 @@ def link_bricks(
     *,
     backend: Backend = "auto",
 ) -> None:
-    """Gives nodes the bricks in slots, which are theirs alone from now on, and takes back that they
-    asked for them. The slots count as used in `frame`, and are first seen in the one behind it.
+    """Links nodes to bricks in slots, of which they become the only owners, and clears their
+    requests. The slots count as used in `frame`, and are first drawn in the next one.
 
     Mutates the first six.
     """
@@ -179,8 +179,8 @@ def link_tiles(
     *,
     backend: Backend = "auto",
 ) -> None:
-    """Writes tiles, hangs them below nodes, and takes back that these asked for them. Words beyond
-    the `w` of the tree become TERMINAL and EMPTY.
+    """Writes tiles, links them to their parent nodes, and clears the requests of these. Words
+    beyond the `w` of the tree become TERMINAL and EMPTY.
 
     Mutates the first eight.
     """

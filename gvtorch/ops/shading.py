@@ -87,7 +87,7 @@ _WIDTHS = (3, 1, 3, 1, 1, 1, 1, 1, 4, 1, 1, 2)
 
 
 class ShadeParameters(NamedTuple):
-    """The 20 numbers of `parameter_54`, in its order; as they stand here for what is not lit."""
+    """The 20 numbers of `parameter_54`, in its order; the defaults are for what is not lit."""
 
     light: Triple = (0.0, 0.0, 0.0)  # where a point light stands, or which way a sun shines, world
     light_kind: Number = LightKind.HEADLIGHT

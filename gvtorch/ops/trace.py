@@ -1,7 +1,7 @@
-"""The ops on rays, checked and sent to a backend: `trace_rays`, `shade_rays`, and the open road, of
-which a shader that is no kernel is made. `trace_segments` lists the runs of samples that rays take
-in bricks, `sample_bricks` reads any channel there, and `composite` adds up what the shader makes of
-it. All but the walk is differentiable.
+"""The ops on rays, checked and sent to a backend: `trace_rays`, `shade_rays`, and what shaders
+outside the kernels are made of: `trace_segments` lists the runs of samples that rays take in
+bricks, `sample_bricks` reads any channel there, and `composite` adds up what the shader makes of
+it. The last two are differentiable.
 
 The ops, and the checks that they share, raise ValueError for a tensor of the wrong shape, dtype or
 device and for a number out of its range, in a line that says which op, argument and value. Checks
@@ -152,8 +152,8 @@ def trace_rays(
 
     Mutates `request_tn` (what rays missed), `stamp_t` and `stamp_b` (what rays used).
 
-    Where rays begin with a transmittance, the colour is what these pieces of rays add, and alpha is
-    the whole rays' so far.
+    Where rays begin with a transmittance, colour is what these pieces add, and alpha that of the
+    whole rays so far.
 
     Returns:
         color (r, 3) premultiplied linear RGB, alpha (r, 1), depth (r, 1) world units or +inf, in
@@ -212,18 +212,18 @@ def trace_segments(
 ) -> Segments:
     """Walks rays through a tree as `trace_rays` does, and lists what they would sample.
 
-    The same nodes are visited, stamped, requested and skipped, and the same samples taken, but for
-    the early end of a ray, which only a shader can tell: `limit` walks rays by parts instead, and
-    what is behind the point where a ray ends need not be walked. Lists have exactly the size that
-    is needed: rays are walked twice, and the host waits for the count in between.
+    The same nodes are visited, stamped, requested and skipped, and the same samples taken, but rays
+    do not end early, which only a shader can decide: with `limit` they are walked in parts, and
+    those that have ended need not go on. Lists have exactly the size that is needed: rays are
+    walked twice, and the host waits for the count in between.
 
     Args:
-        rays: The rays; no matter with which transmittance they begin.
+        rays: The rays; their transmittance does not matter.
         arguments: What they go through; of the table only the lengths of its intervals matter.
-        state_r3: `Segments.state` of the part before; None: rays begin.
-        limit: A ray pauses behind the visit in which it has taken so many samples; 0: never.
-        by_node: A region counts as one of one value only where one node answers: for shaders that
-            read more than `component`.
+        state_r3: `Segments.state` of the part before; None: from the start.
+        limit: A ray pauses after the visit in which it has taken this many samples; 0: never.
+        by_node: A region counts as constant only where one node answers, for shaders that read more
+            than `component`.
 
     Raises:
         ValueError: See `trace_rays`; or there are more segments than the device has memory for.
@@ -324,7 +324,7 @@ def composite(
         stop_alpha: A ray ends at this alpha.
 
     Returns:
-        Sums (r, c), light that is left (r,), and what of it came to each sample (k,), 0 behind
+        Sums (r, c), light that is left (r,), and the light that reached each sample (k,), 0 behind
         the end of a ray; the last one has no gradient.
     """
     where, device, real = "composite", alpha_k.device, alpha_k.dtype

@@ -1,5 +1,5 @@
-"""`Staging`: sends bricks from the host to the device while the device renders; `BrickTable`: those
-that lie ready for it.
+"""`Staging`: sends bricks from the host to the device while the device renders; `BrickTable`:
+bricks that a producer keeps ready in host memory.
 
 Bricks are gathered chunk by chunk into a ring of pinned memory, copied on a stream of their own,
 and written into their slots by the stream that renders, which waits for each copy by an event. One

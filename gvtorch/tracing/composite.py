@@ -22,9 +22,9 @@ Trace = Callable[[Rays], Hits]  # through one tree or several, with whatever the
 
 
 def over(front: Hits, back: Hits, *, dimmed: bool = False) -> Hits:
-    """Composites hits of the same rays; a normal is the mean of both, by the light each part takes.
-    If `dimmed`, `back` is of rays `behind(rays, front)`, and its alpha includes that of `front`;
-    else of rays of full light.
+    """Composites `front` over `back`, hits of the same rays; a normal is the mean of both, weighted
+    by the light each takes. If `dimmed`, `back` was traced with `behind(rays, front)` and its alpha
+    includes that of `front`; else with rays of full light.
     """
     color, alpha, features = back.color, back.alpha, back.features
     taken = None if back.normal is None else back.normal * (alpha - front.alpha)
@@ -68,8 +68,8 @@ def trace_pieces(trace: Trace, pieces: Iterable[Rays], *, cap: Trace | None = No
 
 
 def trace_trees(trees: Sequence[tuple[Tensor, Trace]], rays: Rays) -> Hits:
-    """Traces rays through several trees, each a (2, 3) world box and what traces it, and composites
-    the trees, the one whose box a ray enters first in front.
+    """Traces rays through several trees, each a (2, 3) world box and its tracer, and composites
+    them in the order in which a ray enters their boxes.
 
     Right wherever boxes do not overlap along a ray; where they do, the nearer box as a whole comes
     first.

@@ -23,9 +23,9 @@ from .composite import Trace, over
 class Layer:
     """What another renderer drew for the same pixels, on any device.
 
-    The tensors are read where they lie, in every frame anew: what is written into them later is
-    what the next picture shows. They are checked once, here; on CUDA that waits for the device, so
-    make a layer once and write into it. A depth that becomes NaN later counts as +inf.
+    The tensors are kept, not copied, and read anew in every frame: write into them to change the
+    layer. They are checked once, here; on CUDA that waits for the device. A depth that becomes NaN
+    later counts as +inf.
 
     Attributes:
         color: (h, w, 3) or, for a batch of cameras, (n, h, w, 3); linear RGB, premultiplied by
@@ -131,7 +131,8 @@ class LayerPixels:
     def trace(self, trace_rays: Trace, rays: Rays, stop_alpha: float) -> Hits:
         """Traces the rays of these pixels and composites voxels and layer. Depth, normal and
         features are those of the voxels alone, the normal by the light that the voxels in front of
-        the layer and behind it take. A ray with `stop_alpha` behind the layer does not go on.
+        the layer and behind it take. A ray that has reached `stop_alpha` with the layer goes no
+        further.
         """
         near, far = rays.range.split(1, dim=1)
         stop = self.distance.to(rays.range.dtype)

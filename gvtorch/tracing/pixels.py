@@ -155,9 +155,9 @@ class View:
     def blocks(
         self, pixels: int, progress: Progress, where: Tensor | None = None
     ) -> Iterator[tuple[Pixels, Hits]]:
-        """Traces block after block of whole rows, of about so many pixels, since rays take more
-        memory than the picture they make: all, or those `where` (p,) bool tells. Yields the pixels
-        of a block that were traced, and their hits, composited with the layer.
+        """Traces all pixels, or those that `where` (p,) bool tells, in blocks of whole rows, since
+        rays take more memory than their picture. Yields the traced pixels of each block, and their
+        hits, composited with the layer.
         """
         camera, numbers, layer = self.camera, self.numbers, self.options.layer
         rows, width = len(camera) * camera.height, camera.width
@@ -197,9 +197,7 @@ class View:
 
 
 def _some_rays(numbers: Tensor, camera: Camera, top: int, which: Tensor) -> Rays:
-    """Rays of the pixels `which` (k,), rising, counted from row `top`: the rows that hold them are
-    made, then they alone are kept.
-    """
+    """Rays of the pixels `which` (k,), rising, counted from row `top`, made in whole rows."""
     width = camera.width
     ends = torch.stack((which[0], which[-1])).tolist() if len(which) else (0, -1)
     first, last = (end // width for end in ends)

@@ -92,7 +92,7 @@ class Tracer:
         )
 
     def seeing(self, shader: Shader, options: RenderOptions) -> Tracer:
-        """Returns what traces the same frame with another shader."""
+        """Returns a tracer of the same frame with another shader."""
         known = self.arguments
         return Tracer(self.tree, shader, options, by_level=known.by_level, frame_1=known.frame_1)
 

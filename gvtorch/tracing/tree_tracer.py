@@ -129,8 +129,8 @@ class TreeTracer(torch.nn.Module):
     def hits(
         self, origin: Tensor, direction: Tensor, cone: Tensor, range: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """As `forward`, and returns also normal (r, 3) and features (r, c), (0, 3) and (0, 0) where
-        the shader gives none.
+        """As `forward`; also returns normal (r, 3) and features (r, c), which are (0, 3) and (0, 0)
+        where the shader gives none.
         """
         columns = [c.to(torch.float64).contiguous() for c in (origin, direction, cone, range)]
         rays = RayArguments(columns[0], columns[1], columns[2], columns[3], 0, None)

@@ -1,6 +1,6 @@
 """FITS, through astropy: the first image of three dimensions.
 
-Spacing is 1: FITS axes have units of their own (degrees, m/s), a box in space has one.
+Spacing is 1, since FITS axes have units of their own (degrees, m/s).
 """
 
 from __future__ import annotations

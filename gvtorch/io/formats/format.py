@@ -16,7 +16,7 @@ FORMATS: list[Format] = []
 
 
 class Format:
-    """A file format; decorates the function that opens its files, which enters it into `FORMATS`.
+    """A file format: decorates the function that opens its files and enters it into `FORMATS`.
 
     That function is called with the path (str) and the options that the user gave. It reads the
     header alone and returns a source. It may raise anything if the file is damaged.
@@ -37,7 +37,7 @@ class Format:
 
         Args:
             name: As users know it.
-            endings: Of file names, in small letters.
+            endings: Of file names, in lower case.
             matches: Tells whether a path is of this format, where endings do not (folders, URLs).
             options: Arguments of `read_volume` that this format takes.
             library: The module that reading needs; it is there when files are opened.

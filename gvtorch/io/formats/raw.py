@@ -19,8 +19,8 @@ _HINT = "name it *_XxYxZ_dtype.raw or pass"
 def open_raw(
     path: str, shape: Sequence[int] | None = None, dtype: str | np.dtype | None = None
 ) -> ArraySource:
-    """Opens a RAW file of (x, y, z) voxels; what is not given its name tells, `_XxYxZ_dtype` as in
-    `scan_512x512x300_int16.raw`, little endian unless it says "be".
+    """Opens a RAW file of (x, y, z) voxels. What is not given is read from its name, as in
+    `scan_512x512x300_int16.raw`, little endian unless that says "be".
     """
     named = _NAME.search(Path(path).name.lower())
     if shape is None:

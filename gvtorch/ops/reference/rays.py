@@ -103,8 +103,8 @@ class Beam(Rows):
 
 
 class Intervals:
-    """Where each ray stands in its fixed sequence of intervals, which are step * 2^level long, the
-    longest not longer than the cone is wide where they start. See ray.h.
+    """Where each ray stands in its fixed sequence of intervals: step * 2^level long, the longest
+    that is at most the cone's width where it starts. See ray.h.
     """
 
     def __init__(self, beam: Beam, step: float | Tensor, levels: int) -> None:
