@@ -5,6 +5,7 @@ came.
 from __future__ import annotations
 
 import functools
+import json
 import math
 import operator
 import os
@@ -12,6 +13,7 @@ import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
+from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
@@ -225,8 +227,10 @@ def whole(where: str, name: str, value: Any, *, low: int, high: int = sys.maxsiz
     return plain
 
 
-def triple(where: str, name: str, value: Any) -> tuple[float, float, float]:
-    """Returns (x, y, z); raises ValueError unless these are three finite numbers."""
+def triple(
+    where: str, name: str, value: Any, *, positive: bool = False
+) -> tuple[float, float, float]:
+    """Returns (x, y, z); raises ValueError unless they are finite and, if asked, positive."""
     if isinstance(value, Tensor):
         value = value.tolist()
     try:
@@ -236,7 +240,20 @@ def triple(where: str, name: str, value: Any) -> tuple[float, float, float]:
     if len(items) != 3:
         raise ValueError(f"{where}: {name} must be three numbers, got {len(items)}: {value!r}")
     x, y, z = (number(where, name, item) for item in items)
+    if positive and min(x, y, z) <= 0:
+        raise ValueError(f"{where}: {name} must be positive, got {(x, y, z)}")
     return (x, y, z)
+
+
+def json_file(what: str, path: str | Path) -> Any:
+    """Returns what a user's JSON file holds; FileNotFoundError or ValueError if it is none."""
+    file = Path(path)
+    if not file.is_file():
+        raise FileNotFoundError(f"{what} not found: {file}")
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{file}: not a JSON file: {error}") from None
 
 
 def reals(where: str, name: str, value: Any, shape: tuple[int, ...] | None = None) -> Tensor:

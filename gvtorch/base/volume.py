@@ -94,9 +94,7 @@ class Volume:
         check_extent(where, tensor.shape[:3], what="data")
         check_extent(where, tensor.shape, what="data with its channels")
         self.data = _finite(where, tensor.contiguous(), nan)
-        self.spacing = check.triple(where, "spacing", spacing)
-        if min(self.spacing) <= 0:
-            raise ValueError(f"{where}: spacing must be positive, got {self.spacing}")
+        self.spacing = check.triple(where, "spacing", spacing, positive=True)
         self.origin = check.triple(where, "origin", origin)
         self.name = name
 

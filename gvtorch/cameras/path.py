@@ -6,7 +6,6 @@ have no corners. Source: Catmull and Rom, "A class of local interpolating spline
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -90,13 +89,7 @@ class CameraPath:
             FileNotFoundError: There is no such file.
             ValueError: The file holds something else; the message names the file.
         """
-        path = Path(path)
-        if not path.is_file():
-            raise FileNotFoundError(f"camera path not found: {path}")
-        try:
-            keys = json.loads(path.read_text(encoding="utf-8"))
-        except (UnicodeDecodeError, json.JSONDecodeError) as error:
-            raise ValueError(f"{path}: no JSON: {error}") from None
+        keys = check.json_file("camera path", path)
         if not isinstance(keys, list) or not all(isinstance(key, Mapping) for key in keys):
             raise ValueError(f'{path}: must be a list of keys {{"eye": ..., "target": ...}}')
         for number, key in enumerate(keys):

@@ -112,13 +112,13 @@ def placed(
     origin: Sequence[float] | None,
 ) -> VolumeSource:
     """Returns the source with the user's spacing and origin; None keeps those of the file."""
-    if spacing is not None:
-        source = dataclasses.replace(source, spacing=check.triple(where, "spacing", spacing))
-    if origin is not None:
-        source = dataclasses.replace(source, origin=check.triple(where, "origin", origin))
-    if min(source.spacing) <= 0:
-        raise ValueError(f"{where}: spacing must be positive, got {source.spacing}")
-    return source
+    steps = source.spacing if spacing is None else spacing
+    place = source.origin if origin is None else origin
+    return dataclasses.replace(
+        source,
+        spacing=check.triple(where, "spacing", steps, positive=True),
+        origin=check.triple(where, "origin", place),
+    )
 
 
 def read_whole(source: VolumeSource) -> np.ndarray:

@@ -307,9 +307,7 @@ class Producer(torch.nn.Module):
             origin = [a + 0.5 * s for a, s in zip(low, spacing, strict=True)]
         if isinstance(spacing, (int, float)):
             spacing = (spacing,) * 3
-        self.spacing = check.triple(where, "spacing", spacing)
-        if min(self.spacing) <= 0:
-            raise ValueError(f"{where}: spacing must be positive, got {self.spacing}")
+        self.spacing = check.triple(where, "spacing", spacing, positive=True)
         self.origin = check.triple(where, "origin", origin)
         self.branching = check.whole(where, "branching", branching, low=2, high=16)
         self.channels = dict(channels) if channels is not None else {"value": Channel()}

@@ -107,7 +107,7 @@ class StoredColor(LitShader):
             reference: World units; the smallest spacing if left out, and for six directions.
             premultiplied: Whether colours are stored times opacity, as they are for six directions.
                 Then coarse levels keep the colours of what is opaque; else air's colour mixes in.
-            lit: Whether it is lit; so it is where `normals` are named, and with shadows.
+            lit: Whether it is lit; always where `normals` are named, and with shadows.
             shadows: As in `Lit`.
             **light: As in `Lit`; without `normals`, they are the gradient's of the opacity (towards
                 +x, where there are six directions).
@@ -243,13 +243,13 @@ class DistanceField(Isosurface):
 
 
 class Solid(Shader):
-    """An isosurface as a cone wider than a voxel meets it. Such a cone reads means. A mean tells
-    which share of the cone the surface fills, if one knows how fast the value changes there: a ramp
-    around the level, the wider the longer the interval is. So a surface that is a yes or no to thin
-    rays casts soft shadows.
+    """An isosurface as cones wider than a voxel see it. They read means, and a mean tells which
+    share of the cone the surface fills: opacity is a ramp around the level, wider for longer
+    intervals, so that shadows are soft.
 
-    Of a distance field, matter lies below the level and the value changes as places do. Else it
-    lies above, and a value changes from half of the level to three halves over four voxels.
+    In a distance field matter lies below the level, and the value changes by 1 per unit of length.
+    Else matter lies above, and the value is taken to rise from half of the level to three halves
+    over four voxels.
     """
 
     def __init__(self, surface: Isosurface, color: Triple | None) -> None:
@@ -341,8 +341,8 @@ class Features(Shader):
 
 
 class GradientMagnitude(Shader):
-    """The transfer function, the denser the faster the value changes: optical depth is times the
-    gradient's length over `full`, 1 at most. So boundaries show, and what lies between them clears.
+    """The transfer function, its optical depth multiplied by the gradient's length over `full`, 1
+    at most: boundaries show, and what lies between them clears.
 
     Source: Levoy, "Display of surfaces from volume data", IEEE CG&A 1988 (opacity by gradient).
     """

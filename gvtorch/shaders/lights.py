@@ -21,9 +21,8 @@ from ..ops.shading import LightKind, Number, ShadeParameters, Triple, shader_num
 from ..pool import N3Tree
 from .shader import Shader
 
-#: Width of a cone over that of the disc of light it stands for. What it meets reaches as far again
-#: as its voxels are wide, and a cone that grazes takes more than its share: shadows agree best with
-#: this.
+#: Width of a cone over that of the light's disc; fitted, below 1 because prefiltering widens what
+#: the cone meets.
 CONE_OF_DISC = 0.35
 
 

@@ -103,13 +103,7 @@ class TransferFunction(Shader):
             FileNotFoundError: There is no such file.
             ValueError: It is no such JSON, or its points are refused by `from_points`.
         """
-        path = Path(path)
-        if not path.is_file():
-            raise FileNotFoundError(f"transfer function file not found: {path}")
-        try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-        except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-            raise ValueError(f"{path}: not a JSON file: {error}") from None
+        content = check.json_file("transfer function file", path)
         if not isinstance(content, dict) or "opacity" not in content:
             raise ValueError(f'{path}: expected an object with "opacity", "color" and "reference"')
         unknown = sorted(set(content) - {"opacity", "color", "reference"})
