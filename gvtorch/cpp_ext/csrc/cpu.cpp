@@ -1,170 +1,100 @@
 // The CPU library: defines the ops (entry.h) and runs every functor on torch's threads.
 
 #include <algorithm>
-#include <atomic>
 #include <cstdint>
 #include <cstdlib>
-#include <cstring>
+#include <string_view>
 #include <vector>
 
-#include "base/for_each.h"
-#include "cache/cache.h"
+#include "entry/entry_cache.h"
+#include "entry/entry_segments.h"
 #include "packets/trace_chunks.h"
-#include "shaders/shade_each.h"
 
 namespace gvtorch {
 
 // packet.cpp, compiled once for each instruction set.
+using ShadeChunk = void(const ShadeArgs& args, int64_t begin, int64_t end);
 namespace baseline {
-void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end);
-void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end);
-}  // namespace baseline
+ShadeChunk shade_chunk;
+}
 #ifdef GV_X86
 namespace avx2 {
-void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end);
-void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end);
-}  // namespace avx2
+ShadeChunk shade_chunk;
+}
 namespace avx512 {
-void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end);
-void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end);
-}  // namespace avx512
+ShadeChunk shade_chunk;
+}
 #endif
 
-// The widest instructions that this processor has; GVTORCH_CPU=baseline, avx2 or avx512 asks for fewer.
 struct Processor {
-  const char* name = "baseline";
-  decltype(&baseline::trace_chunk) trace_chunk = &baseline::trace_chunk;
-  decltype(&baseline::shade_chunk) shade_chunk = &baseline::shade_chunk;
-  Processor() {
-#ifdef GV_X86
-    const char* asked = std::getenv("GVTORCH_CPU");
-    const auto allows = [&](const char* set) { return asked == nullptr || std::strcmp(asked, set) == 0; };
-    __builtin_cpu_init();
-    const bool wide = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("f16c");
-    if (allows("avx512") && wide && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl")) {
-      name = "avx512";
-      trace_chunk = &avx512::trace_chunk;
-      shade_chunk = &avx512::shade_chunk;
-    } else if ((allows("avx512") || allows("avx2")) && wide) {
-      name = "avx2";
-      trace_chunk = &avx2::trace_chunk;
-      shade_chunk = &avx2::shade_chunk;
-    }
-#endif
-  }
+  const char* name;
+  ShadeChunk* shade_chunk;
 };
 
+// The widest instructions that this processor has; GVTORCH_CPU=baseline, avx2 or avx512 asks for fewer.
+inline Processor find_processor() {
+#ifdef GV_X86
+  const char* named = std::getenv("GVTORCH_CPU");
+  const std::string_view asked = named == nullptr ? "avx512" : named;
+  __builtin_cpu_init();
+  const bool wide = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("f16c");
+  if (asked == "avx512" && wide && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+      __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl")) {
+    return {"avx512", &avx512::shade_chunk};
+  }
+  if ((asked == "avx512" || asked == "avx2") && wide) return {"avx2", &avx2::shade_chunk};
+#endif
+  return {"baseline", &baseline::shade_chunk};
+}
+
 inline const Processor& processor() {
-  static const Processor found;
+  static const Processor found = find_processor();
   return found;
 }
 
 // A user's shader is compiled for the same (cpp_ext/user.py).
 extern "C" __attribute__((visibility("default"))) const char* gvtorch_instructions() { return processor().name; }
 
-// The primitives of cache.h. Threads count chunks, then place them: ranks do not depend on the number of threads.
-struct Chunks {
-  static constexpr int64_t kSize = 1 << 11;
-  std::vector<int64_t> first;  // kept before each chunk, and in all
-
-  // found(begin, end): how many are kept.
-  template <class Found>
-  Chunks(const torch::stable::Tensor& like, int64_t count, const Found& found)
-      : first(static_cast<size_t>((count + kSize - 1) / kSize) + 1, 0) {
-    for_each<Cpu>(
-        like, static_cast<int64_t>(first.size()) - 1,
-        [&](int64_t chunk) { first[chunk + 1] = found(chunk * kSize, std::min(count, (chunk + 1) * kSize)); }, 1);
-    for (size_t chunk = 1; chunk < first.size(); ++chunk) first[chunk] += first[chunk - 1];
-  }
-  // body(begin, end, chunk) for each chunk.
-  template <class Body>
-  void place(const torch::stable::Tensor& like, int64_t count, const Body& body) const {
-    for_each<Cpu>(
-        like, static_cast<int64_t>(first.size()) - 1,
-        [&](int64_t chunk) { body(chunk * kSize, std::min(count, (chunk + 1) * kSize), chunk); }, 1);
-  }
-};
-
-template <class Device, class List>
-void compact(const torch::stable::Tensor& like, int64_t count, const List& list) {
-  std::atomic<int64_t> seen{0};
-  std::vector<uint8_t> touched(static_cast<size_t>((count + Chunks::kSize - 1) / Chunks::kSize), 0);
-  const Chunks chunks(like, count, [&](int64_t begin, int64_t end) {
-    int32_t listed = 0, counted = 0, any = 0;
-    for (int64_t index = begin; index < end; ++index) {
-      const int32_t flags = list.flags(index);
-      listed += flags & kListed;
-      counted += (flags & kSeen) / kSeen;
-      any |= flags;
-    }
-    touched[begin / Chunks::kSize] = (any & kTouched) != 0;
-    seen += counted;
-    return listed;
-  });
-  chunks.place(like, count, [&](int64_t begin, int64_t end, int64_t chunk) {
-    int64_t rank = chunks.first[chunk];
-    if (!touched[chunk]) return;
-    for (int64_t index = begin; index < end; ++index) {
-      const int32_t flags = list.flags(index);
-      if ((flags & kListed) != 0) list.put(index, rank++);
-      if ((flags & kTouched) != 0) list.touch(index);
-    }
-  });
-  const int64_t total = chunks.first.back();
-  for (int64_t rank = total; rank < list.places(); ++rank) list.blank(rank);
-  list.total(total, seen);
+void FusedShaders::run(const Tensor& like, ShadeArgs args, bool wide) {
+  const auto each = [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); };
+  if (wide) return with_rays<double>(args, each);
+  if (!(args.shader == kPlainShader ? packs(args) : shades(args))) return with_rays<float>(args, each);
+  trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) { processor().shade_chunk(args, begin, end); });
 }
 
-template <class Device, class Keep, class Put>
-void split(const torch::stable::Tensor& like, int64_t count, const Keep& keep, const Put& put, int64_t* kept) {
-  const Chunks chunks(like, count, [&](int64_t begin, int64_t end) {
-    int32_t found = 0;
-    for (int64_t index = begin; index < end; ++index) found += keep(index) ? 1 : 0;
-    return found;
-  });
-  const int64_t total = chunks.first.back();
-  chunks.place(like, count, [&](int64_t begin, int64_t end, int64_t chunk) {
-    int64_t rank = chunks.first[chunk];
-    int64_t behind = total + begin - rank;
-    for (int64_t index = begin; index < end; ++index) {
-      const int64_t mask = -static_cast<int64_t>(keep(index));  // no branch: half of them would be guessed wrong
-      put(index, behind + ((rank - behind) & mask));
-      rank -= mask;
-      behind += 1 + mask;
+// See cache.h. Threads count chunks, then take them: ranks do not depend on the number of threads.
+template <class List>
+void compact(const Tensor& like, int64_t count, const List& list) {
+  constexpr int64_t kChunk = 1 << 11;
+  const int64_t chunks = (count + kChunk - 1) / kChunk;
+  std::vector<Counts> before(static_cast<size_t>(chunks) + 1);  // each chunk; all stand behind the last
+  const auto count_chunk = [&](int64_t chunk) {
+    const int64_t end = std::min(count, (chunk + 1) * kChunk);
+    Counts own{};
+    for (int64_t index = chunk * kChunk; index < end; ++index) own.add(list.flags(index));
+    before[chunk + 1] = own;
+  };
+  for_each(like, chunks, count_chunk, 1);
+  for (int64_t chunk = 0; chunk < chunks; ++chunk) before[chunk + 1] = before[chunk] + before[chunk + 1];
+  const Counts all = before.back();
+  const auto take_chunk = [&](int64_t chunk) {
+    if (before[chunk].any == before[chunk + 1].any) return;
+    const int64_t end = std::min(count, (chunk + 1) * kChunk);
+    const List own = list;  // which nothing written can alias
+    int64_t rank = before[chunk].listed;
+    for (int64_t index = chunk * kChunk; index < end; ++index) {
+      const int32_t flags = own.flags(index);
+      if ((flags & kTouched) == 0) continue;
+      own.take(index, flags, rank, all.listed);
+      rank += flags & kListed;
     }
-  });
-  *kept = total;
-}
-
-template <class Device>
-void trace(const torch::stable::Tensor& like, TraceArgs args, bool wide) {
-  const PlainArgs plain(args);
-  if (wide) {
-    shade_each<Device>(like, args.nodes, ShadeRay<double, Plain<double>>(plain));
-  } else if (packs(args)) {
-    trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) { processor().trace_chunk(args, begin, end); });
-  } else {
-    shade_each<Device>(like, args.nodes, ShadeRay<float, Plain<float>>(plain));
-  }
-}
-
-template <class Device>
-void shade(const torch::stable::Tensor& like, ShadeArgs args, bool wide) {
-  const auto run = [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); };
-  if (wide) {
-    with_rays<double>(args, run);
-  } else if (shades(args)) {
-    trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) { processor().shade_chunk(args, begin, end); });
-  } else {
-    with_rays<float>(args, run);
-  }
+  };
+  for_each(like, chunks, take_chunk, 1);
+  for (int64_t rank = all.listed; rank < list.places(); ++rank) list.blank(rank);
+  list.total(all.listed, all.seen);
 }
 
 }  // namespace gvtorch
-
-#include "entry/entry_cache.h"
-#include "entry/entry_segments.h"
 
 STABLE_TORCH_LIBRARY(gvtorch, library) {
   gvtorch::define(library, gvtorch::RayOps{});
@@ -173,7 +103,7 @@ STABLE_TORCH_LIBRARY(gvtorch, library) {
 }
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) {
-  gvtorch::implement<gvtorch::Cpu>(library, gvtorch::RayOps{});
-  gvtorch::implement<gvtorch::Cpu>(library, gvtorch::SegmentOps{});
-  gvtorch::implement<gvtorch::Cpu>(library, gvtorch::CacheOps{});
+  gvtorch::implement(library, gvtorch::RayOps{});
+  gvtorch::implement(library, gvtorch::SegmentOps{});
+  gvtorch::implement(library, gvtorch::CacheOps{});
 }

@@ -5,20 +5,18 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-void trace_chunk(const TraceArgs& args, int64_t begin, int64_t end) {
-  const PlainArgs plain(args);
+void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end) {
+  if (args.shader != kPlainShader) {
+    return with_shader<float>(args.shader, [&](auto type) {
+      using Type = decltype(type);
+      if constexpr (!Type::kShadows) trace_packets<typename Type::Shader, AnyValues>(args, begin, end);
+    });
+  }
   const bool far = brick_bytes(args.voxel, args.side, args.channels) * args.bricks > INT32_MAX;
   with_voxel(args.voxel, [&](auto voxel) {
     using Voxel = decltype(voxel);
-    if (far) return trace_packets<Plain<float>, TypedValues<Voxel, true>>(plain, begin, end);
-    return trace_packets<Plain<float>, TypedValues<Voxel, false>>(plain, begin, end);
-  });
-}
-
-void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end) {
-  with_shader<float>(args.shader, [&](auto type) {
-    using Type = decltype(type);
-    if constexpr (!Type::kShadows) trace_packets<typename Type::Shader, AnyValues>(args, begin, end);
+    if (far) return trace_packets<Plain<float>, TypedValues<Voxel, true>>(args, begin, end);
+    return trace_packets<Plain<float>, TypedValues<Voxel, false>>(args, begin, end);
   });
 }
 

@@ -9,7 +9,6 @@ template <class T>
 using UserShaderOf = GV_USER_SHADER<T>;  // the name that CompiledShader was told: a template <class T> struct
 
 #include <type_traits>
-#include <utility>
 
 #include "entry/entry.h"
 #include "shaders/shade_each.h"
@@ -21,31 +20,27 @@ using UserShaderOf = GV_USER_SHADER<T>;  // the name that CompiledShader was tol
 
 namespace gvtorch {
 
+// Never called: asked whether they could be.
+constexpr auto kCallAdd = [](auto& shader, auto& piece, auto& probe,
+                             auto& sum) -> decltype(shader.add(piece, probe, sum), void()) {};
+constexpr auto kCallSurface = [](auto& shader, auto& probe, auto& sum) -> decltype(shader.surface(probe, sum), void()) {
+};
+
 // What a shader must have, told in words.
 template <class T, class Shader>
 struct Interface {
   using Sum = typename Shader::Sum;
-  template <class S>
-  static auto adds(int) -> decltype(std::declval<const S&>().add(std::declval<const Piece<T>&>(),
-                                                                 std::declval<const Probe<T>&>(), std::declval<Sum&>()),
-                                    std::true_type());
-  template <class S>
-  static std::false_type adds(...);
-  template <class S>
-  static auto has_surface(int)
-      -> decltype(std::declval<const S&>().surface(std::declval<const Probe<T>&>(), std::declval<Sum&>()),
-                  std::true_type());
-  template <class S>
-  static std::false_type has_surface(...);
+  static constexpr bool kAdds =
+      std::is_invocable_v<decltype(kCallAdd), const Shader&, const Piece<T>&, const Probe<T>&, Sum&>;
+  static constexpr bool kHasSurface = std::is_invocable_v<decltype(kCallSurface), const Shader&, const Probe<T>&, Sum&>;
 
   static_assert(std::is_base_of_v<UserShader<T>, Shader>, "a shader is derived from gv::UserShader<T>");
   static_assert(std::is_constructible_v<Shader, const ShadeArgs&>,
                 "a shader is made from gv::ShadeArgs: using gv::UserShader<T>::UserShader;");
   static_assert(std::is_trivially_copyable_v<Shader>, "a shader is copied into the kernel: plain values only");
   static_assert(std::is_base_of_v<ShadeSum<T>, Sum>, "a shader's Sum is derived from gv::ShadeSum<T>");
-  static_assert(decltype(adds<Shader>(0))::value,
-                "a shader has GV_HD void add(const gv::Piece<T>&, const gv::Probe<T>&, Sum&) const");
-  static_assert(!Shader::kSurface || decltype(has_surface<Shader>(0))::value,
+  static_assert(kAdds, "a shader has GV_HD void add(const gv::Piece<T>&, const gv::Probe<T>&, Sum&) const");
+  static_assert(!Shader::kSurface || kHasSurface,
                 "a shader of kSurface has GV_HD void surface(const gv::Probe<T>&, Sum&) const");
   static_assert(Shader::kFeatures >= Shader::kAsOther, "kFeatures is a number, or kAsOther");
 };
@@ -53,20 +48,19 @@ struct Interface {
 template struct Interface<float, UserShaderOf<float>>;
 template struct Interface<double, UserShaderOf<double>>;
 
-// See FusedShaders in entry.h.
+// The shader of the library, see FusedShaders in entry.h.
 struct OneShader {
   using Known = UserShaderOf<float>;
   static bool integrates(int64_t) { return false; }
-  static void check(const ShadeArgs& args, int64_t shader) {
+  static void check(const ShadeArgs& args) {
     constexpr int32_t features = Known::kFeatures, uniforms = Known::kUniforms;
-    STD_TORCH_CHECK(shader == 0, "gvtorch: shader must be 0");
+    STD_TORCH_CHECK(args.shader == 0, "gvtorch: shader must be 0");
     const int32_t given = features == Known::kAsOther ? args.other_channels : features;
     STD_TORCH_CHECK(args.features == given, "gvtorch: features must be ", given, ", got ", args.features);
     const int32_t own = args.parameters - kParameters;
     STD_TORCH_CHECK(own >= 0 && (uniforms < 0 || own == uniforms),
                     "gvtorch: parameter_54 holds the wrong number of uniforms: ", own);
   }
-  template <class Device>
   static void run(const Tensor& like, ShadeArgs args, bool wide) {
     const auto each = [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); };
     if (wide) return each(ShadeRay<double, CalledShader<UserShaderOf, double>>(args));
@@ -84,6 +78,9 @@ struct OneShader {
   }
 };
 
+struct UserOp : ShadeRaysOp {};
+inline auto run(const UserOp& a) { return shade_rays<OneShader>(a); }
+
 }  // namespace gvtorch
 
 #define GV_TEXT_OF(name) #name
@@ -91,7 +88,7 @@ struct OneShader {
 
 #ifdef __CUDACC__
 STABLE_TORCH_LIBRARY_IMPL(gvtorch_user, CUDA, library) {
-  gvtorch::implement_as<gvtorch::Cuda, gvtorch::ShadeRaysOp, gvtorch::OneShader>(library, GV_TEXT(GV_USER_OP));
+  gvtorch::implement_as<gvtorch::UserOp>(library, GV_TEXT(GV_USER_OP));
 }
 #else
 STABLE_TORCH_LIBRARY_FRAGMENT(gvtorch_user, library) {
@@ -99,7 +96,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(gvtorch_user, library) {
 }
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch_user, CPU, library) {
-  gvtorch::implement_as<gvtorch::Cpu, gvtorch::ShadeRaysOp, gvtorch::OneShader>(library, GV_TEXT(GV_USER_OP));
+  gvtorch::implement_as<gvtorch::UserOp>(library, GV_TEXT(GV_USER_OP));
 }
 
 // What Python asks of the struct.

@@ -80,14 +80,6 @@ template <template <class> class Kind, class T>
 constexpr bool kHidesByTransfer<Kind<T>, std::void_t<decltype(&Kind<T>::hides)>> =
     std::is_same_v<decltype(&Kind<T>::hides), decltype(&UserShader<T>::hides)>;
 
-template <class Shader, class = void>
-constexpr bool kTellsHiding = false;
-template <class Shader>
-constexpr bool kTellsHiding<Shader, std::void_t<decltype(Shader::kHidesAlike)>> = true;
-
-template <template <class> class Kind, class T>
-struct HidesAlike<Kind<T>, std::enable_if_t<kHidesByTransfer<Kind<T>> && !kTellsHiding<Kind<T>>>> : std::true_type {};
-
 #ifndef __CUDACC__
 // The Sums of a packet's rays, each a user's own. The walk looks at what a ray lets through, and tells what it missed.
 template <class Sum>
@@ -121,7 +113,7 @@ struct CalledShader : Kind<T> {
   using Base = Kind<T>;
   using Base::Base;
   using Sum = typename Base::Sum;
-  static constexpr bool kHidesAlike = HidesAlike<Base>::value;
+  static constexpr bool kHidesAlike = kHidesByTransfer<Base> || HidesAlike<Base>::value;
 
   GV_HD void add(bool, const Piece<T>& piece, const Probe<T>& probe, Sum& sum) const { Base::add(piece, probe, sum); }
 

@@ -1,25 +1,25 @@
-// The arguments of the ops on rays, each declared once, in lists of lines
+// What ops and kernels are given, each argument declared once, in lists of lines
 //
 //   X(kind, name, limit)
 //
 // `kind` is one of the types below: what the argument is in the op's schema, what torch hands over, which dtype a
 // tensor must have, and what the kernels get. `limit` keeps memory safe: how many numbers a tensor holds, or what an
 // int stays below (it is never negative); kAny where that is told elsewhere. It is an expression of the sizes that the
-// function knows in which the list is checked (check_rays, check_trace in entry.h). An X makes one thing of each line:
+// function knows in which the list is taken. An X makes one thing of each line:
 //
-//   GV_VIEW    a member of the struct that kernels read   here, for trace_args.h
-//   GV_FIELD   a member of the struct that torch fills    entry.h, as the others
+//   GV_VIEW    a member of the struct that kernels read, here and in cache.h
+//   GV_FIELD   a member of the struct that torch fills (entry.h, as the others)
 //   GV_WORD    its words in the schema
 //   GV_TYPE    its type, in the order of the schema
-//   GV_CHECK   its check
-//   GV_LAY     the step from torch's struct to the kernels'
+//   GV_TAKE    its check, and the step from torch's struct to the kernels'
 //
-// An op's list is a row of groups: trace_rays has GV_RAYS, GV_CHANNEL and GV_WALK, shade_rays these and GV_SHADE (see
-// entry.h, entry_segments.h; the lists of the cache's ops stand in entry_cache.h). ops/arguments.py holds the
-// same fields with what they mean, shape by shape; tests/test_arguments.py holds the two equal.
+// An op's list is a row of groups: trace_rays has GV_RAYS, GV_CHANNEL and GV_WALK, shade_rays these and GV_SHADE; those
+// of segments stand in entry_segments.h, the cache's in cache.h. ops/arguments.py holds the fields on rays with what
+// they mean, shape by shape; tests/test_arguments.py holds the two equal.
 #pragma once
 
 #include <cstdint>
+#include <type_traits>
 
 namespace gvtorch {
 
@@ -32,47 +32,34 @@ namespace kinds {
 struct AnyReal;   // float32 or float64: the dtype in which an op computes
 struct AnyVoxel;  // that of a channel
 
-// A tensor of T. alias: it is written in place, under this letter of the schema.
-template <class T, char kAliasLetter = 0, bool kMayBeNone = false>
+// A tensor of T. kAlias: it is written in place, under this letter of the schema. kOptional: it may be None.
+template <class T, char kAlias = 0, bool kOptional = false>
 struct TensorOf {
-  using Value = T;
-  using View = const T*;
-  static constexpr char kAlias = kAliasLetter;
-  static constexpr bool kOptional = kMayBeNone;
+  using Number = std::conditional_t<std::is_class_v<T>, void, T>;
+  using View = std::conditional_t<kAlias == 0, const Number*, Number*>;
 };
-template <char kAlias, class T = int32_t>
-struct Written : TensorOf<T, kAlias> {
-  using View = T*;
-};
-template <char kAlias>
-using WrittenFlags = Written<kAlias, bool>;
-template <class Any, bool kOptional = false>
-struct Untyped : TensorOf<Any, 0, kOptional> {
-  using View = const void*;
-};
-
 using World = TensorOf<double>;
 using MaybeWorld = TensorOf<double, 0, true>;
 using Words = TensorOf<int32_t>;
 using Longs = TensorOf<int64_t>;
 using Flags = TensorOf<bool>;
-using Reals = Untyped<AnyReal>;
-using MaybeReals = Untyped<AnyReal, true>;
-using Voxels = Untyped<AnyVoxel>;
-using MaybeVoxels = Untyped<AnyVoxel, true>;
+using Reals = TensorOf<AnyReal>;
+using MaybeReals = TensorOf<AnyReal, 0, true>;
+using Voxels = TensorOf<AnyVoxel>;
+using MaybeVoxels = TensorOf<AnyVoxel, 0, true>;  // each of a dtype of its own
+template <char kAlias>
+using Written = TensorOf<int32_t, kAlias>;
+template <char kAlias>
+using WrittenFlags = TensorOf<bool, kAlias>;
 
-struct Int {
-  using View = int32_t;
+template <class T>
+struct NumberOf {
+  using View = T;
 };
-struct Count {  // an int that torch.compile need not know, of any size
-  using View = int64_t;
-};
-struct Float {
-  using View = double;
-};
-struct Bool {
-  using View = bool;
-};
+using Int = NumberOf<int32_t>;
+using Count = NumberOf<int64_t>;  // an int that torch.compile need not know, of any size
+using Float = NumberOf<double>;
+using Bool = NumberOf<bool>;
 
 }  // namespace kinds
 
@@ -127,5 +114,49 @@ struct Bool {
   X(Reals, parameter_54, kAny)
 
 #define GV_VIEW(kind, name, limit) kinds::kind::View name;
+
+struct TraceArgs {
+  GV_RAYS(GV_VIEW)
+  GV_CHANNEL(GV_VIEW)
+  GV_WALK(GV_VIEW)
+
+  void *color_r3, *alpha_r1, *depth_r1;
+  int32_t* samples_r;
+  bool* missed_r;
+  uint8_t* hidden_tn;  // scratch, see hide_nodes
+
+  int64_t rays, bricks, nodes;
+  VoxelType voxel;
+  int32_t nodes_per_tile, side, channels, rows, levels;
+};
+
+enum class LightKind { kHeadlight, kDirectional, kPoint };
+enum class ProjectionKind { kMaximum, kMinimum, kMean };
+constexpr int32_t kDirections = 6;  // +x -x +y -y +z -z: a stored colour may have four numbers for each
+
+// The numbers of a fused shader, `parameter_54`, by name; a user's own stand behind them.
+template <class T>
+struct Parameters {
+  T light_place[3];  // of a point light; of a directional one: the way it shines
+  T light_kind;      // a LightKind
+  T light_color[3], ambient;
+  T diffuse, specular, shininess;
+  T light_width;  // of a cone to the light: its growth (directional), or the width at the light (point)
+  T own[4];       // the shader's own: its Own, see shaders.h
+  T normal_scale, normal_offset, unused[2];  // a stored normal is number * scale + offset
+};
+constexpr int32_t kParameters = sizeof(Parameters<float>) / sizeof(float);
+
+constexpr int32_t kPlainShader = -1;  // the transfer function alone
+
+// Of what is optional, null: there is no such channel.
+struct ShadeArgs : TraceArgs {
+  GV_SHADE(GV_VIEW)
+
+  VoxelType normal_voxel, other_voxel;
+  int32_t other_channels;
+  int32_t parameters;  // how many numbers there are: 20, and behind them a user's own
+  void *normal_r3, *features_rc;
+};
 
 }  // namespace gvtorch

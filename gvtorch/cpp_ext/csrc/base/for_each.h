@@ -1,5 +1,5 @@
-// How a functor of one index is run: `for_each<Device>(like, count, functor)` on the device of the tensor `like`. Every
-// library has it once, for the CPU where a C++ compiler reads this, for CUDA where nvcc does.
+// How a functor of one index is run: `for_each(like, count, functor)` on the device of the tensor `like`. Every library
+// has it once, for the CPU where a C++ compiler reads this, for CUDA where nvcc does.
 #pragma once
 
 #ifdef __CUDACC__
@@ -7,22 +7,32 @@
 #include <torch/csrc/inductor/aoti_torch/c/shim.h>
 #include <torch/csrc/stable/accelerator.h>
 #else
-#include <algorithm>
 #include <atomic>
 #endif
 #include <torch/csrc/stable/ops.h>
 #include <torch/csrc/stable/tensor.h>
 
+#include <algorithm>
 #include <cstdint>
 #include <type_traits>
 
 namespace gvtorch {
 
+struct Device {};  // of this library
+
 #ifdef __CUDACC__
 
-struct Cuda {
-  static constexpr bool kReadsAtRandom = true;
-};
+// Starts a kernel on the device of `like`, in torch's current stream.
+template <class... Parameter, class... Argument>
+void launch(const torch::stable::Tensor& like, void (*kernel)(Parameter...), int64_t blocks, int threads,
+            const Argument&... arguments) {
+  const torch::stable::accelerator::DeviceGuard guard(like.get_device_index());
+  void* stream = nullptr;
+  TORCH_ERROR_CODE_CHECK(aoti_torch_get_current_cuda_stream(like.get_device_index(), &stream));
+  kernel<<<static_cast<unsigned>(blocks), threads, 0, static_cast<cudaStream_t>(stream)>>>(arguments...);
+  const cudaError_t status = cudaGetLastError();
+  STD_TORCH_CHECK(status == cudaSuccess, "gvtorch: kernel launch failed: ", cudaGetErrorString(status));
+}
 
 // That many blocks on a multiprocessor leave 64 registers to a thread: waiting for memory is what tracing must hide.
 constexpr int kBlock = 128;
@@ -39,28 +49,18 @@ __global__ void __launch_bounds__(kBlock, kBlocksAtOnce<Functor>) run_functor(Fu
   }
 }
 
-template <class Device, class Functor>
+template <class On = Device, class Functor>
 void for_each(const torch::stable::Tensor& like, int64_t count, const Functor& functor) {
   if (count == 0) return;
-  const torch::stable::accelerator::DeviceGuard guard(like.get_device_index());
-  void* stream = nullptr;
-  TORCH_ERROR_CODE_CHECK(aoti_torch_get_current_cuda_stream(like.get_device_index(), &stream));
-  const int64_t blocks = (count + kBlock - 1) / kBlock;
-  const auto grid = static_cast<unsigned>(blocks < 0x7fffffff ? blocks : 0x7fffffff);
-  run_functor<<<grid, kBlock, 0, static_cast<cudaStream_t>(stream)>>>(functor, count);
-  const cudaError_t status = cudaGetLastError();
-  STD_TORCH_CHECK(status == cudaSuccess, "gvtorch: kernel launch failed: ", cudaGetErrorString(status));
+  const int64_t blocks = std::min<int64_t>((count + kBlock - 1) / kBlock, INT32_MAX);
+  launch(like, run_functor<Functor>, blocks, kBlock, functor, count);
 }
 
 #else
 
-struct Cpu {
-  static constexpr bool kReadsAtRandom = false;
-};
-
 // Threads draw `share` neighbouring indices at a time from a counter: long rays do not leave a thread idle. Nothing
 // that a functor writes depends on which thread ran it.
-template <class Device, class Functor>
+template <class On = Device, class Functor>
 void for_each(const torch::stable::Tensor&, int64_t count, const Functor& functor, int64_t share = 256) {
   const int64_t chunks = (count + share - 1) / share;
   const int64_t workers = std::min<int64_t>(torch::stable::get_num_threads(), chunks);

@@ -1,21 +1,41 @@
 // The cache's ops on bare words: what rays asked for becomes a list, nodes tell their places and whether they still
 // lack what they asked for, slots are ordered by use, pointers to slots that change hands are cleared, new pointers are
-// written.
+// written, and bricks are cut out of a level. Each op's arguments stand before its functors, see arguments.h.
 //
-// Equal to ops/reference/cache.py in every integer. What a device brings (cpu.cpp, cuda.cu):
-//   for_each(n, body)     body(index)
-//   compact(n, list)      list.flags(index) says whether an index is listed and whether it is touched at all, and
-//                         list.put(index, rank) is called for those that are, ranks rising with the index,
-//                         list.touch(index) for all that are touched, list.blank(rank) for every place left over,
-//                         list.total(listed, seen) once
-//   split(n, keep, put, kept)  put(index, rank) for all: those that keep accepts first, then the others
+// Equal to the twins in ops/cache.py in every integer. What a device brings (cpu.cpp, cuda.cu):
+//   compact(n, list)   list.flags(index) says for each index what of kListed, kSeen and kTouched it is
+//                      list.take(index, flags, rank, listed)  for all that are touched, as all listed and seen are;
+//                                                             rank: those listed before it; listed: all
+//                      list.blank(rank)                       for every place left over of list.places()
+//                      list.total(listed, seen)               once
 // Method: Crassin et al., "GigaVoxels", I3D 2009, section 5 (usage stamps, LRU by compaction, request lists).
 #pragma once
 
+#include <cstring>
+
+#include "base/arguments.h"
 #include "walk/tree.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
+
+constexpr int32_t kListed = 1, kSeen = 2, kTouched = 4;
+
+// How many indices are listed and seen; any: not 0 where one has a flag.
+struct Counts {
+  int32_t listed, seen, any;
+
+  GV_HD void add(int32_t flags) {
+    listed += flags & kListed;
+    seen += (flags & kSeen) / kSeen;
+    any |= flags;
+  }
+  GV_HD Counts operator+(const Counts& other) const {
+    return {listed + other.listed, seen + other.seen, any + other.any};
+  }
+};
+
+// --- Requests
 
 // Pending bits stand above the kind bits: asked for, answer not here yet. Such a request is not listed again.
 constexpr int32_t kPendingShift = 2;
@@ -24,96 +44,104 @@ constexpr int32_t kPending = kKinds << kPendingShift;
 
 GV_HD int32_t open_kinds(int32_t word) { return word & kKinds & ~(word >> kPendingShift); }
 
-constexpr int32_t kListed = 1;   // it is to be put
-constexpr int32_t kSeen = 2;     // it is only counted
-constexpr int32_t kTouched = 4;  // it is to be touched
+#define GV_COMPACT_REQUESTS(X) X(Written<'a'>, request_tn, kAny) X(Int, capacity, kAny)
 
 // Lists requests and clears them; what a full list has no place for is only counted.
 struct ListRequests {
-  int32_t* request_tn;
-  int32_t* node_k;
-  int32_t* word_k;
+  GV_COMPACT_REQUESTS(GV_VIEW)
+  int32_t *node_k, *word_k;
   int64_t* count_3;  // kept, found, requested
-  int64_t capacity;
 
   GV_HD int32_t flags(int64_t node) const {
     const int32_t word = request_tn[node];
     return (open_kinds(word) != 0 ? kListed : 0) | ((word & kKinds) != 0 ? kSeen : 0) |
            ((word & ~kPending) != 0 ? kTouched : 0);
   }
-  GV_HD void put(int64_t node, int64_t rank) const {
-    if (rank >= capacity) return;
-    const int32_t word = request_tn[node];
-    node_k[rank] = static_cast<int32_t>(node);
-    word_k[rank] = open_kinds(word) | (word & kPriorityMask);
+  GV_HD void take(int64_t node, int32_t flags, int64_t rank, int64_t) const {
+    if ((flags & kListed) != 0 && rank < capacity) {
+      const int32_t word = request_tn[node];
+      node_k[rank] = static_cast<int32_t>(node);
+      word_k[rank] = open_kinds(word) | (word & kPriorityMask);
+    }
+    request_tn[node] &= kPending;
   }
-  GV_HD void touch(int64_t node) const { request_tn[node] &= kPending; }
   GV_HD int64_t places() const { return capacity; }
   GV_HD void blank(int64_t rank) const {
     node_k[rank] = -1;
     word_k[rank] = 0;
   }
   GV_HD void total(int64_t listed, int64_t seen) const {
-    count_3[0] = smaller(listed, capacity);
+    count_3[0] = smaller<int64_t>(listed, capacity);
     count_3[1] = listed;
     count_3[2] = seen;
   }
 };
 
-// Stamps as one bit a slot, eight to an index: the order of use visits slots at random, and bits fit near caches.
-struct PackUse {
-  const int32_t* stamp_s;
+// --- The order of use
+
+#define GV_LRU_PARTITION(X) X(Words, order_k, kAny) X(Words, stamp_s, kAny) X(Words, frame_1, 1)
+
+struct UseArgs {
+  GV_LRU_PARTITION(GV_VIEW)
   int64_t slots;
-  const int32_t* frame_1;
-  uint8_t* bits;
+  uint8_t *used_s, *used_k;  // of the slots a bit each, of the order a byte each
+  int32_t* sorted_k;
+  int64_t* unused_1;
+};
+
+// Stamps as one bit a slot, eight to an index: the order of use visits slots at random, and bits fit near caches.
+struct PackUse : UseArgs {
   GV_HD void operator()(int64_t index) const {
     const int32_t frame = *frame_1;
     const int64_t first = 8 * index;
     const int64_t here = smaller<int64_t>(8, slots - first);
     int32_t word = 0;
     for (int64_t slot = 0; slot < here; ++slot) word |= (stamp_s[first + slot] == frame ? 1 : 0) << slot;
-    bits[index] = static_cast<uint8_t>(word);
+    used_s[index] = static_cast<uint8_t>(word);
   }
 };
 
-struct FlagUse {
-  const int32_t* order_k;
-  const uint8_t* bits;
-  uint64_t slots;
-  uint8_t* used_k;
+struct FlagUse : UseArgs {
   GV_HD void operator()(int64_t index) const {
     const auto slot = static_cast<uint32_t>(order_k[index]);  // a negative one is out of range
-    used_k[index] = slot < slots ? (bits[slot / 8] >> (slot % 8)) & 1 : 0;
+    used_k[index] = slot < slots ? (used_s[slot / 8] >> (slot % 8)) & 1 : 0;
   }
 };
 
-struct KeepUnused {
-  const uint8_t* used_k;
-  GV_HD bool operator()(int64_t index) const { return used_k[index] == 0; }
-};
-
-// The same from the stamps, for a device that reads at random without waiting.
-struct KeepUnstamped {
-  const int32_t* order_k;
-  const int32_t* stamp_s;
-  uint64_t slots;
-  const int32_t* frame_1;
-  GV_HD bool operator()(int64_t index) const {
+// Puts slots that the frame did not use before the others. kFromStamps: for a device that reads at random without
+// waiting; else FlagUse has run.
+template <bool kFromStamps>
+struct SplitByUse : UseArgs {
+  GV_HD bool used(int64_t index) const {
+    if constexpr (!kFromStamps) return used_k[index] != 0;
     const auto slot = static_cast<uint32_t>(order_k[index]);
-    return !(slot < slots && stamp_s[slot] == *frame_1);
+    return slot < slots && stamp_s[slot] == *frame_1;
   }
+  GV_HD int32_t flags(int64_t index) const { return kTouched | static_cast<int32_t>(!used(index)); }
+  GV_HD void take(int64_t index, int32_t flags, int64_t rank, int64_t listed) const {
+    const int64_t behind = listed + index - rank;
+    const int64_t mask = -static_cast<int64_t>(flags & kListed);  // no branch: half of them would be guessed wrong
+    sorted_k[behind + ((rank - behind) & mask)] = order_k[index];
+  }
+  GV_HD int64_t places() const { return 0; }
+  GV_HD void blank(int64_t) const {}
+  GV_HD void total(int64_t listed, int64_t) const { *unused_1 = listed; }
 };
 
-struct PutSlot {
-  const int32_t* order_k;
-  int32_t* out_k;
-  GV_HD void operator()(int64_t index, int64_t rank) const { out_k[rank] = order_k[index]; }
-};
+// --- Pointers
 
-struct MarkSlot {
-  const int32_t* slot_k;
+#define GV_UNLINK(X)             \
+  X(Written<'a'>, pointer, kAny) \
+  X(Words, slot_k, kAny)         \
+  X(Int, slots, kAny)            \
+  X(Int, divisor, kAny)
+
+struct UnlinkArgs {
+  GV_UNLINK(GV_VIEW)
   uint8_t* leaving_s;
-  int64_t slots;
+};
+
+struct MarkSlot : UnlinkArgs {
   GV_HD void operator()(int64_t index) const {
     const int32_t slot = slot_k[index];
     if (slot >= 0 && slot < slots) leaving_s[slot] = 1;
@@ -121,25 +149,25 @@ struct MarkSlot {
 };
 
 // A word names a slot when it is >= 0; `divisor` turns node indices into tiles.
-struct ClearPointer {
-  int32_t* pointer_m;
-  const uint8_t* leaving_s;
-  int64_t slots;
-  int32_t divisor;
+struct ClearPointer : UnlinkArgs {
   GV_HD void operator()(int64_t index) const {
-    const int32_t word = pointer_m[index];
-    if (word >= 0 && word / divisor < slots && leaving_s[word / divisor]) pointer_m[index] = -1;
+    const int32_t word = pointer[index];
+    if (word >= 0 && word / divisor < slots && leaving_s[word / divisor]) pointer[index] = -1;
   }
 };
 
+#define GV_LINK(X)                   \
+  X(Written<'a'>, pointer_tn, kAny)  \
+  X(Written<'b'>, request_tn, nodes) \
+  X(Words, node_k, kAny)             \
+  X(Words, word_k, count)            \
+  X(Int, kind, kAny)
+
 // node_k names each node once; -1 is a place that is not taken.
 struct WritePointer {
-  int32_t* pointer_tn;
-  int32_t* request_tn;
-  const int32_t* node_k;
-  const int32_t* word_k;
+  GV_LINK(GV_VIEW)
   int64_t nodes;
-  int32_t kind;
+
   GV_HD void operator()(int64_t index) const {
     const int32_t node = node_k[index];
     if (node < 0 || node >= nodes) return;
@@ -148,18 +176,21 @@ struct WritePointer {
   }
 };
 
+#define GV_LINK_BRICKS(X)               \
+  X(Written<'a'>, brick_tn, kAny)       \
+  X(Written<'b'>, request_tn, nodes)    \
+  X(Written<'c'>, owner_b, kAny)        \
+  X(Written<'d'>, stamp_b, slots)       \
+  X(Written<'e'>, born_b, slots)        \
+  X(WrittenFlags<'f'>, shared_b, slots) \
+  X(Longs, node_k, kAny)                \
+  X(Words, slot_k, count)               \
+  X(Int, frame, kAny)
+
 // Gives nodes the bricks in slots, which are theirs from now on.
 struct LinkBrick {
-  int32_t* brick_tn;
-  int32_t* request_tn;
-  int32_t* owner_b;
-  int32_t* stamp_b;
-  int32_t* born_b;
-  bool* shared_b;
-  const int64_t* node_k;
-  const int32_t* slot_k;
+  GV_LINK_BRICKS(GV_VIEW)
   int64_t nodes, slots;
-  int32_t frame;
 
   GV_HD void operator()(int64_t index) const {
     const int64_t node = node_k[index];
@@ -174,25 +205,30 @@ struct LinkBrick {
   }
 };
 
+#define GV_LINK_TILES(X)                       \
+  X(Written<'a'>, child_tn, tiles* per_tile)   \
+  X(Written<'b'>, brick_tn, tiles* per_tile)   \
+  X(Written<'c'>, request_tn, tiles* per_tile) \
+  X(Written<'d'>, loc_t4, 4 * tiles)           \
+  X(Written<'e'>, parent_t, tiles)             \
+  X(Written<'f'>, tree_t, tiles)               \
+  X(Written<'g'>, stamp_t, tiles)              \
+  X(WrittenFlags<'h'>, shared_t, tiles)        \
+  X(Words, child_jw, rows* width)              \
+  X(Words, brick_jw, rows* width)              \
+  X(Longs, node_j, rows)                       \
+  X(Longs, loc_j4, 4 * rows)                   \
+  X(Longs, row_k, kAny)                        \
+  X(Words, tile_k, count)                      \
+  X(Int, tree, kAny)                           \
+  X(Int, frame, kAny)
+
 // Writes tiles and hangs them below nodes: an index is a word of a tile. Words beyond those of the tree are TERMINAL
 // and EMPTY. A node's own tile is not among those written.
 struct LinkTile {
-  int32_t* child_tn;
-  int32_t* brick_tn;
-  int32_t* request_tn;
-  int32_t* loc_t4;
-  int32_t* parent_t;
-  int32_t* tree_t;
-  int32_t* stamp_t;
-  bool* shared_t;
-  const int32_t* child_jw;
-  const int32_t* brick_jw;
-  const int64_t* node_j;
-  const int64_t* loc_j4;
-  const int64_t* row_k;
-  const int32_t* tile_k;
+  GV_LINK_TILES(GV_VIEW)
   int64_t tiles, rows;
-  int32_t per_tile, width, tree, frame;
+  int32_t per_tile, width;
 
   GV_HD void operator()(int64_t index) const {
     const int64_t which = index / per_tile;
@@ -219,13 +255,19 @@ struct LinkTile {
   }
 };
 
+// --- Places
+
+#define GV_LOCATE(X)               \
+  X(Words, loc_t4, 4 * tiles)      \
+  X(Longs, node_k, kAny)           \
+  X(Int, branching, INT16_MAX + 1) \
+  X(Int, per_tile, kAny)
+
 // Where nodes lie: x, y, z and depth of each, from those of its tile; -1 for an index that is no node's.
 struct LocateNodes {
-  const int32_t* loc_t4;
-  const int64_t* node_k;
+  GV_LOCATE(GV_VIEW)
   int64_t* loc_k4;
   int64_t nodes;
-  int32_t per_tile, branching;
 
   GV_HD void operator()(int64_t index) const {
     const int64_t node = node_k[index];
@@ -243,21 +285,27 @@ struct LocateNodes {
   }
 };
 
+#define GV_LACKING(X)                   \
+  X(Words, pointer_tn, tiles* per_tile) \
+  X(Words, loc_t4, 4 * tiles)           \
+  X(Words, parent_t, tiles)             \
+  X(Words, tree_t, tiles)               \
+  X(Flags, shared_t, tiles)             \
+  X(Longs, node_k, kAny)                \
+  X(Longs, loc_k4, 4 * count)           \
+  X(Int, tree, kAny)                    \
+  X(Int, root, kAny)                    \
+  X(Int, branching, INT16_MAX + 1)
+
 // Which nodes still stand for the places that were asked for, reached from a parent or from an alias, and still have
 // nothing there.
 struct FindLacking {
+  GV_LACKING(GV_VIEW)
   LocateNodes places;  // its loc_k4 is not written
-  const int32_t* pointer_tn;
-  const int32_t* parent_t;
-  const int32_t* tree_t;
-  const bool* shared_t;
-  const int64_t* loc_k4;
   bool* lacks_k;
-  int32_t tree;
-  int64_t root;
 
   GV_HD void operator()(int64_t index) const {
-    const int64_t node = places.node_k[index];
+    const int64_t node = node_k[index];
     bool lacks = node >= 0 && node < places.nodes;
     if (lacks) {
       const int64_t tile = node / places.per_tile;
@@ -266,6 +314,58 @@ struct FindLacking {
       for (int32_t part = 0; part < 4; ++part) lacks = lacks && places.at(node, part) == loc_k4[4 * index + part];
     }
     lacks_k[index] = lacks;
+  }
+};
+
+// --- Bricks out of a level
+
+#define GV_CUT_BRICKS(X)         \
+  X(Voxels, values_zyxc, kAny)   \
+  X(Longs, place_k3, 3 * bricks) \
+  X(Int, brick_size, 1025)       \
+  X(Int, border, 1025)
+
+// Borders are from the neighbours, clamped at the level's faces. An index is a plane of a brick. Sizes in voxels, of z,
+// y, x; a voxel is `bytes` bytes, all its channels. Bricks lie anywhere in a level, so that each row is a miss: the
+// rows of a later plane are fetched ahead.
+struct CutBricks {
+  GV_CUT_BRICKS(GV_VIEW)
+  char* bricks_kzyxc;
+  int64_t size_3[3];
+  int64_t bytes, planes;
+
+  GV_HD int32_t side() const { return brick_size + 2 * border; }
+  GV_HD int64_t low(int64_t plane, int32_t axis) const {
+    return place_k3[3 * (plane / side()) + axis] * brick_size - border;
+  }
+  GV_HD int64_t inside(int64_t at, int32_t axis) const {
+    return larger<int64_t>(0, smaller<int64_t>(at, size_3[axis] - 1));
+  }
+  // The voxel x = 0 of a row.
+  GV_HD const char* row(int64_t plane, int32_t y) const {
+    const int64_t z = inside(low(plane, 0) + plane % side(), 0);
+    return static_cast<const char*>(values_zyxc) + (z * size_3[1] + inside(low(plane, 1) + y, 1)) * size_3[2] * bytes;
+  }
+
+  GV_HD void operator()(int64_t plane) const {
+#ifndef __CUDA_ARCH__
+    constexpr int64_t kAhead = 4;
+    if (plane + kAhead < planes) {
+      const int64_t x = inside(low(plane + kAhead, 2), 2);
+      for (int32_t y = 0; y < side(); ++y) __builtin_prefetch(row(plane + kAhead, y) + x * bytes);
+    }
+#endif
+    const int64_t first = low(plane, 2);
+    const bool whole = first >= 0 && first + side() <= size_3[2];
+    char* to = bricks_kzyxc + plane * side() * side() * bytes;
+    for (int32_t y = 0; y < side(); ++y, to += side() * bytes) {
+      const char* from = row(plane, y);
+      if (whole) {
+        memcpy(to, from + first * bytes, side() * bytes);
+        continue;
+      }
+      for (int32_t x = 0; x < side(); ++x) memcpy(to + x * bytes, from + inside(first + x, 2) * bytes, bytes);
+    }
   }
 };
 

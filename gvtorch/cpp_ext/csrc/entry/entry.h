@@ -1,8 +1,8 @@
 // Where torch meets the kernels: how the lists of arguments.h become ops, and the ops that trace rays. Included once by
-// cpu.cpp and once by cuda.cu, each of which brings its own `trace` and `shade`; and by every user's shader (user.cpp),
-// which needs neither. The cache's ops and those of segments: entry_cache.h, entry_segments.h.
+// cpu.cpp and once by cuda.cu, and by every user's shader (user.cpp). The cache's ops and those of segments:
+// entry_cache.h, entry_segments.h.
 //
-// An op is a struct of its arguments (GV_OP), and a function `run<Device>` of it, which checks them and runs kernels.
+// An op is a struct of its arguments (GV_OP), and a function `run` of it, which checks them and runs kernels.
 //
 // Only the LibTorch Stable ABI is used (torch/csrc/stable), so that one binary serves every torch >= 2.11.
 // Messages for users are made in gvtorch/ops/*.py; the checks here only keep memory safe.
@@ -13,7 +13,9 @@
 #include <torch/csrc/stable/tensor.h>
 #include <torch/headeronly/core/ScalarType.h>
 
+#include <algorithm>
 #include <initializer_list>
+#include <limits>
 #include <optional>
 #include <string>
 #include <tuple>
@@ -21,36 +23,29 @@
 
 #include "base/for_each.h"
 #include "shaders/shade_rays.h"
-#include "walk/trace.h"
 
 namespace gvtorch {
 
+using torch::headeronly::CppTypeToScalarType;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 
-template <class Device>
-void trace(const Tensor& like, TraceArgs args, bool wide);
-template <class Device>
-void shade(const Tensor& like, ShadeArgs args, bool wide);
+// --- From a kind to what torch hands over, and to its word in a schema.
 
-// --- From a kind to what torch hands over, and to words.
-
-template <class Kind, class = void>
-struct Handed {
-  using Type = std::conditional_t<std::is_same_v<Kind, kinds::Float>, double,
-                                  std::conditional_t<std::is_same_v<Kind, kinds::Bool>, bool, int64_t>>;
-  static std::string word() {
-    if (std::is_same_v<Kind, kinds::Float>) return "float ";
-    if (std::is_same_v<Kind, kinds::Bool>) return "bool ";
-    return std::is_same_v<Kind, kinds::Count> ? "SymInt " : "int ";
-  }
-};
 template <class Kind>
-struct Handed<Kind, std::void_t<typename Kind::Value>> {
-  using Type = std::conditional_t<Kind::kOptional, std::optional<Tensor>, Tensor>;
+struct Handed;
+template <class T>
+struct Handed<kinds::NumberOf<T>> {
+  static constexpr bool kFloat = std::is_same_v<T, double>, kBool = std::is_same_v<T, bool>;
+  using Type = std::conditional_t<kFloat || kBool, T, int64_t>;
+  static std::string word() { return kFloat ? "float " : kBool ? "bool " : sizeof(T) == 8 ? "SymInt " : "int "; }
+};
+template <class T, char kAlias, bool kOptional>
+struct Handed<kinds::TensorOf<T, kAlias, kOptional>> {
+  using Type = std::conditional_t<kOptional, std::optional<Tensor>, Tensor>;
   static std::string word() {
-    if (Kind::kAlias != 0) return std::string("Tensor(") + Kind::kAlias + "!) ";
-    return Kind::kOptional ? "Tensor? " : "Tensor ";
+    if (kAlias != 0) return std::string("Tensor(") + kAlias + "!) ";
+    return kOptional ? "Tensor? " : "Tensor ";
   }
 };
 
@@ -71,8 +66,6 @@ struct Types {};
 #define GV_FIELD(kind, name, limit) Handed<kinds::kind>::Type name;
 #define GV_TYPE(kind, name, limit) , Handed<kinds::kind>::Type
 #define GV_WORD(kind, name, limit) Handed<kinds::kind>::word() + #name,
-#define GV_CHECK(kind, name, limit) require<kinds::kind>(a.name, #name, like, limit);
-#define GV_LAY(kind, name, limit) lay(args.name, a.name);
 
 // Declares the struct of an op.
 #define GV_OP(Op, op_name, LIST, returns)                                                                     \
@@ -83,89 +76,105 @@ struct Types {};
     static std::string schema(const char* name = kName) { return schema_of(name, {LIST(GV_WORD)}, returns); } \
   }
 
-template <class Device>
-void run(Begin);  // each op has an overload
 // `call` is an op's function as torch calls it, with one parameter for each argument.
-template <class Device, class Op, class List, class... Extra>
+template <class Op, class List = typename Op::List>
 struct Called;
-template <class Device, class Op, class... Type, class... Extra>
-struct Called<Device, Op, Types<Begin, Type...>, Extra...> {
-  static auto call(const Type&... values) { return run<Device, Extra...>(Op{values...}); }
+template <class Op, class... Type>
+struct Called<Op, Types<Begin, Type...>> {
+  static auto call(const Type&... values) { return run(Op{values...}); }
 };
 
-// Defines ops, and adds a device's kernels to them.
+// Defines ops, and adds this library's kernels to them.
 template <class Library, class... Op>
 void define(Library& library, Types<Op...>) {
   (library.def(Op::schema().c_str()), ...);
 }
-template <class Device, class Op, class... Extra, class Library>
+template <class Op, class Library>
 void implement_as(Library& library, const char* name) {
-  static constexpr auto kCall = &Called<Device, Op, typename Op::List, Extra...>::call;
+  static constexpr auto kCall = &Called<Op>::call;
   library.impl(name, TORCH_BOX(kCall));
 }
-template <class Device, class Library, class... Op>
+template <class Library, class... Op>
 void implement(Library& library, Types<Op...>) {
-  (implement_as<Device, Op>(library, Op::kName), ...);
+  (implement_as<Op>(library, Op::kName), ...);
 }
 
-// --- Checks
+// --- From torch's struct to the kernels'
 
 // What tensors of an op have in common.
 struct Like {
   const Tensor& tensor;  // on whose device all lie
   ScalarType real = ScalarType::Float;
   ScalarType voxel = ScalarType::Float;
+
+  template <class T>
+  ScalarType dtype() const {
+    if constexpr (std::is_same_v<T, kinds::AnyReal>) return real;
+    if constexpr (std::is_same_v<T, kinds::AnyVoxel>) return voxel;
+    if constexpr (!std::is_class_v<T>) return CppTypeToScalarType<T>::value;
+  }
 };
 
-template <class Kind>
-void require(const Tensor& tensor, const char* name, const Like& like, int64_t numel) {
-  using T = typename Kind::Value;
+template <class T, char kAlias, bool kOptional>
+void check(kinds::TensorOf<T, kAlias, kOptional>, const Tensor& tensor, const char* name, const Like& like,
+           int64_t numel) {
+  constexpr bool any_dtype = kOptional && std::is_same_v<T, kinds::AnyVoxel>;
   STD_TORCH_CHECK(tensor.is_contiguous(), "gvtorch: ", name, " must be contiguous");
   STD_TORCH_CHECK(tensor.device() == like.tensor.device(), "gvtorch: ", name, " lies on another device");
-  ScalarType dtype = tensor.scalar_type();
-  if (std::is_same_v<T, double>) dtype = ScalarType::Double;
-  if (std::is_same_v<T, int32_t>) dtype = ScalarType::Int;
-  if (std::is_same_v<T, int64_t>) dtype = ScalarType::Long;
-  if (std::is_same_v<T, bool>) dtype = ScalarType::Bool;
-  if (std::is_same_v<T, kinds::AnyReal>) dtype = like.real;
-  if (std::is_same_v<T, kinds::AnyVoxel> && !Kind::kOptional) dtype = like.voxel;
-  STD_TORCH_CHECK(tensor.scalar_type() == dtype, "gvtorch: ", name, " has the wrong dtype");
+  STD_TORCH_CHECK(any_dtype || tensor.scalar_type() == like.dtype<T>(), "gvtorch: ", name, " has the wrong dtype");
   STD_TORCH_CHECK(numel == kAny || tensor.numel() == numel, "gvtorch: ", name, " must hold ", numel, " elements, got ",
                   tensor.numel());
 }
 template <class Kind>
-void require(const std::optional<Tensor>& tensor, const char* name, const Like& like, int64_t numel) {
-  if (tensor.has_value()) require<Kind>(*tensor, name, like, numel);
+void check(Kind kind, const std::optional<Tensor>& tensor, const char* name, const Like& like, int64_t numel) {
+  if (tensor.has_value()) check(kind, *tensor, name, like, numel);
 }
-template <class Kind>
-void require(int64_t number, const char* name, const Like&, int64_t end) {
-  const int64_t most = end != kAny ? end - 1 : std::is_same_v<Kind, kinds::Count> ? INT64_MAX : INT32_MAX;
+template <class T>
+void check(kinds::NumberOf<T>, int64_t number, const char* name, const Like&, int64_t end) {
+  const int64_t most = end != kAny ? end - 1 : std::numeric_limits<T>::max();
   STD_TORCH_CHECK(number >= 0 && number <= most, "gvtorch: ", name, " out of range: ", number);
 }
-template <class Kind>
-void require(double, const char*, const Like&, int64_t) {}
-template <class Kind>
-void require(bool, const char*, const Like&, int64_t) {}
+inline void check(kinds::Float, double, const char*, const Like&, int64_t) {}
+inline void check(kinds::Bool, bool, const char*, const Like&, int64_t) {}
+
+// The memory of a tensor, as a pointer of whatever type a kernel has for it; null where none was given.
+struct Memory {
+  const Tensor* tensor;
+
+  template <class T>
+  operator T*() const {
+    if (tensor == nullptr) return nullptr;
+    if constexpr (std::is_const_v<T>) return static_cast<T*>(tensor->const_data_ptr());
+    if constexpr (!std::is_const_v<T>) return static_cast<T*>(tensor->mutable_data_ptr());
+  }
+};
+inline Memory lay(const Tensor& tensor) { return {&tensor}; }
+inline Memory lay(const std::optional<Tensor>& tensor) { return {tensor.has_value() ? &*tensor : nullptr}; }
+template <class Number>
+Number lay(Number number) {
+  return number;
+}
+
+#define GV_CHECK(kind, name, limit) check(kinds::kind{}, a.name, #name, like, limit);
+// Checks an argument of `a`, and lays it ready in the kernels' `args`.
+#define GV_TAKE(kind, name, limit) GV_CHECK(kind, name, limit) args.name = lay(a.name);
+
+// Makes a tensor for the kernels to fill; where they do not tell its dtype, it is that of `like`.
+template <class T>
+Tensor give(T*& pointer, const Tensor& like, std::initializer_list<int64_t> shape) {
+  ScalarType dtype = like.scalar_type();
+  if constexpr (!std::is_void_v<T>) dtype = CppTypeToScalarType<T>::value;
+  Tensor made = torch::stable::new_empty(like, shape, dtype);
+  pointer = lay(made);
+  return made;
+}
 
 inline VoxelType voxel_type(ScalarType dtype) {
-  switch (dtype) {
-    case ScalarType::Byte:
-      return VoxelType::kUInt8;
-    case ScalarType::Char:
-      return VoxelType::kInt8;
-    case ScalarType::Short:
-      return VoxelType::kInt16;
-    case ScalarType::UInt16:
-      return VoxelType::kUInt16;
-    case ScalarType::Half:
-      return VoxelType::kHalf;
-    case ScalarType::BFloat16:
-      return VoxelType::kBFloat16;
-    case ScalarType::Float:
-      return VoxelType::kFloat;
-    default:
-      STD_TORCH_CHECK(false, "gvtorch: this channel dtype has no kernel");
-  }
+  constexpr ScalarType kInOrder[] = {ScalarType::Byte, ScalarType::Char,     ScalarType::Short, ScalarType::UInt16,
+                                     ScalarType::Half, ScalarType::BFloat16, ScalarType::Float};
+  const auto* found = std::find(std::begin(kInOrder), std::end(kInOrder), dtype);
+  STD_TORCH_CHECK(found != std::end(kInOrder), "gvtorch: this channel dtype has no kernel");
+  return static_cast<VoxelType>(found - kInOrder);
 }
 
 // Whether an op computes in float64, not in float32.
@@ -173,12 +182,6 @@ inline bool is_wide(const Tensor& tensor) {
   const ScalarType dtype = tensor.scalar_type();
   STD_TORCH_CHECK(dtype == ScalarType::Float || dtype == ScalarType::Double, "gvtorch: must be float32 or float64");
   return dtype == ScalarType::Double;
-}
-
-inline int64_t check_rays(const Tensor& origin_r3) {
-  STD_TORCH_CHECK(origin_r3.dim() == 2 && origin_r3.size(1) == 3 && origin_r3.size(0) <= INT32_MAX,
-                  "gvtorch: origin_r3 must be (r, 3)");
-  return origin_r3.size(0);
 }
 
 // Returns the side of bricks of any channel.
@@ -191,125 +194,72 @@ inline int64_t check_bricks(const Tensor& bricks_bzyxc) {
   return side;
 }
 
+// Takes what all ops on rays and bricks have in common.
 template <class Op>
-void check_numbers(const Op& a) {
+void take_channel(TraceArgs& args, const Op& a, const Like& like, int64_t nodes) {
+  STD_TORCH_CHECK(a.origin_r3.dim() == 2 && a.origin_r3.size(1) == 3 && a.origin_r3.size(0) <= INT32_MAX,
+                  "gvtorch: origin_r3 must be (r, 3)");
+  const int64_t rays = a.origin_r3.size(0), side = check_bricks(a.bricks_bzyxc), channels = a.bricks_bzyxc.size(4);
+  GV_RAYS(GV_TAKE)
+  GV_CHANNEL(GV_TAKE)
+  STD_TORCH_CHECK(nodes <= INT32_MAX, "gvtorch: too many nodes");
   STD_TORCH_CHECK(a.branching >= 2, "gvtorch: branching out of range");
   STD_TORCH_CHECK(a.step > 0 && a.root_voxel > 0, "gvtorch: step and root_voxel must be positive");
-}
-
-// --- From torch's struct to the kernels'.
-
-template <class T>
-T* data(const Tensor& tensor) {
-  if constexpr (std::is_const_v<T>) {
-    return static_cast<T*>(tensor.const_data_ptr());
-  } else {
-    return static_cast<T*>(tensor.mutable_data_ptr());
-  }
-}
-template <class T>
-void lay(T*& pointer, const Tensor& tensor) {
-  pointer = data<T>(tensor);
-}
-template <class T>
-void lay(T*& pointer, const std::optional<Tensor>& tensor) {
-  pointer = tensor.has_value() ? data<T>(*tensor) : nullptr;
-}
-template <class To, class From, class = std::enable_if_t<!std::is_pointer_v<To>>>
-void lay(To& number, From from) {
-  number = static_cast<To>(from);
-}
-
-// Checks what all ops that walk rays have in common and lays it ready. integrates: the table is (l, m, m, 4).
-template <class Op>
-void lay_ready(TraceArgs& args, const Op& a, bool integrates = false) {
-  const Like like{a.origin_r3, a.table_lm4.scalar_type(), a.bricks_bzyxc.scalar_type()};
-  const int64_t rays = check_rays(a.origin_r3), side = check_bricks(a.bricks_bzyxc);
-  const int64_t bricks = a.bricks_bzyxc.size(0), channels = a.bricks_bzyxc.size(4);
-  STD_TORCH_CHECK(a.child_tn.dim() == 2, "gvtorch: child_tn must be (t, n)");
-  const int64_t tiles = a.child_tn.size(0), nodes = a.child_tn.numel();
-  STD_TORCH_CHECK(a.table_lm4.dim() == (integrates ? 4 : 3) && a.table_lm4.size(0) >= 1 && a.table_lm4.size(1) >= 2,
-                  "gvtorch: table_lm4 must be (l, m, 4) with m >= 2");
-  const int64_t levels = a.table_lm4.size(0), rows = a.table_lm4.size(1);
-  const int64_t table = 4 * levels * rows * (integrates ? rows : 1);
-  GV_RAYS(GV_CHECK)
-  GV_CHANNEL(GV_CHECK)
-  GV_WALK(GV_CHECK)
-  check_numbers(a);
-  STD_TORCH_CHECK(a.child_tn.size(1) >= a.branching * a.branching * a.branching && nodes <= INT32_MAX,
-                  "gvtorch: child_tn has too few or too many nodes");
-  STD_TORCH_CHECK(a.width == 0 || rays % a.width == 0, "gvtorch: rays are no rows of this width");
-  STD_TORCH_CHECK(levels <= INT32_MAX && rows <= INT32_MAX, "gvtorch: table_lm4 is too large");
-  STD_TORCH_CHECK(reinterpret_cast<uintptr_t>(a.table_lm4.const_data_ptr()) % 16 == 0,
-                  "gvtorch: table_lm4 must begin at a multiple of 16 bytes");
-  GV_RAYS(GV_LAY)
-  GV_CHANNEL(GV_LAY)
-  GV_WALK(GV_LAY)
   args.rays = rays;
-  args.bricks = bricks;
+  args.bricks = a.bricks_bzyxc.size(0);
   args.nodes = nodes;
   args.voxel = voxel_type(like.voxel);
-  lay(args.nodes_per_tile, a.child_tn.size(1));
-  lay(args.side, side);
-  lay(args.channels, channels);
-  lay(args.rows, rows);
-  lay(args.levels, levels);
+  args.side = static_cast<int32_t>(side);
+  args.channels = static_cast<int32_t>(channels);
+}
+
+// Takes what all ops that walk rays have in common. integrates: the table is (l, m, m, 4).
+template <class Op>
+ShadeArgs take_walk(const Op& a, bool integrates = false) {
+  ShadeArgs args{};
+  args.shader = kPlainShader;
+  const Like like{a.origin_r3, a.table_lm4.scalar_type(), a.bricks_bzyxc.scalar_type()};
+  STD_TORCH_CHECK(a.child_tn.dim() == 2, "gvtorch: child_tn must be (t, n)");
+  const int64_t tiles = a.child_tn.size(0), nodes = a.child_tn.numel();
+  take_channel(args, a, like, nodes);
+  STD_TORCH_CHECK(a.table_lm4.dim() == (integrates ? 4 : 3) && a.table_lm4.size(0) >= 1 && a.table_lm4.size(1) >= 2,
+                  "gvtorch: table_lm4 must be (l, m, 4) with m >= 2");
+  const int64_t bricks = args.bricks, channels = args.channels;
+  const int64_t levels = a.table_lm4.size(0), rows = a.table_lm4.size(1);
+  const int64_t table = 4 * levels * rows * (integrates ? rows : 1);
+  GV_WALK(GV_TAKE)
+  STD_TORCH_CHECK(a.child_tn.size(1) >= a.branching * a.branching * a.branching, "gvtorch: child_tn has too few nodes");
+  STD_TORCH_CHECK(a.width == 0 || args.rays % a.width == 0, "gvtorch: rays are no rows of this width");
+  STD_TORCH_CHECK(levels <= INT32_MAX && rows <= INT32_MAX, "gvtorch: table_lm4 is too large");
+  STD_TORCH_CHECK(reinterpret_cast<uintptr_t>(args.table_lm4) % 16 == 0,
+                  "gvtorch: table_lm4 must begin at a multiple of 16 bytes");
+  args.nodes_per_tile = static_cast<int32_t>(a.child_tn.size(1));
+  args.rows = static_cast<int32_t>(rows);
+  args.levels = static_cast<int32_t>(levels);
+  return args;
 }
 
 // --- The ops
 
-// Makes a tensor for the kernels to fill, of the dtype of `like` or another.
-template <class T>
-Tensor give(T*& pointer, const Tensor& like, std::initializer_list<int64_t> shape) {
-  Tensor made = torch::stable::new_empty(like, shape);
-  lay(pointer, made);
-  return made;
-}
-template <class T>
-Tensor give(T*& pointer, const Tensor& like, std::initializer_list<int64_t> shape, ScalarType dtype) {
-  Tensor made = torch::stable::new_empty(like, shape, dtype);
-  lay(pointer, made);
-  return made;
-}
-
 // What a traced ray gives.
 inline std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> give_hits(TraceArgs& args, const Tensor& table) {
   return {give(args.color_r3, table, {args.rays, 3}), give(args.alpha_r1, table, {args.rays, 1}),
-          give(args.depth_r1, table, {args.rays, 1}), give(args.samples_r, table, {args.rays}, ScalarType::Int),
-          give(args.missed_r, table, {args.rays}, ScalarType::Bool)};
+          give(args.depth_r1, table, {args.rays, 1}), give(args.samples_r, table, {args.rays}),
+          give(args.missed_r, table, {args.rays})};
 }
-
-#define GV_TRACE_RAYS(X) GV_RAYS(X) GV_CHANNEL(X) GV_WALK(X)
-#define GV_HITS "Tensor color_r3, Tensor alpha_r1, Tensor depth_r1, Tensor samples_r, Tensor missed_r"
-GV_OP(TraceRaysOp, "trace_rays", GV_TRACE_RAYS, "(" GV_HITS ")");
-
-template <class Device>
-auto run(const TraceRaysOp& a) {
-  TraceArgs args{};
-  lay_ready(args, a);
-  auto hits = give_hits(args, a.table_lm4);
-  trace<Device>(a.origin_r3, args, is_wide(a.table_lm4));
-  return hits;
-}
-
-// Tensor shape of features: (r, features).
-#define GV_SHADE_RAYS(X) GV_TRACE_RAYS(X) GV_SHADE(X)
-GV_OP(ShadeRaysOp, "shade_rays", GV_SHADE_RAYS, "(" GV_HITS ", Tensor normal_r3, Tensor features_rc)");
 
 // Checks a second channel of the same pool, with `width` numbers a voxel (0: any); returns them, 0 where there is none.
 inline int32_t check_second(const std::optional<Tensor>& bricks_bzyxc, const std::optional<Tensor>& constant_tnc,
-                            const char* name, int64_t width, const Tensor& like_bzyxc, int64_t nodes,
-                            VoxelType& voxel) {
+                            const char* name, int64_t width, const TraceArgs& args, VoxelType& voxel) {
   STD_TORCH_CHECK(bricks_bzyxc.has_value() == constant_tnc.has_value(), "gvtorch: ", name,
                   " needs bricks and constants");
   if (!bricks_bzyxc.has_value()) return 0;
-  check_bricks(*bricks_bzyxc);
-  const int64_t channels = bricks_bzyxc->size(4);
-  STD_TORCH_CHECK(bricks_bzyxc->size(0) == like_bzyxc.size(0) && bricks_bzyxc->size(1) == like_bzyxc.size(1) &&
-                      channels >= 1 && (width == 0 || channels == width),
-                  "gvtorch: ", name, " has the wrong shape");
+  const int64_t side = check_bricks(*bricks_bzyxc), channels = bricks_bzyxc->size(4);
   STD_TORCH_CHECK(
-      constant_tnc->scalar_type() == bricks_bzyxc->scalar_type() && constant_tnc->numel() == nodes * channels,
+      bricks_bzyxc->size(0) == args.bricks && side == args.side && channels >= 1 && (width == 0 || channels == width),
+      "gvtorch: ", name, " has the wrong shape");
+  STD_TORCH_CHECK(
+      constant_tnc->scalar_type() == bricks_bzyxc->scalar_type() && constant_tnc->numel() == args.nodes * channels,
       "gvtorch: the constants of ", name, " have the wrong dtype or size");
   voxel = voxel_type(bricks_bzyxc->scalar_type());
   return static_cast<int32_t>(channels);
@@ -323,8 +273,8 @@ struct FusedShaders {
     return with_shader<float>(static_cast<int32_t>(shader),
                               [](auto type) { return decltype(type)::Shader::kIntegrates; });
   }
-  static void check(const ShadeArgs& args, int64_t shader) {
-    with_shader<float>(static_cast<int32_t>(shader), [&](auto type) {
+  static void check(const ShadeArgs& args) {
+    with_shader<float>(args.shader, [&](auto type) {
       using Shader = typename decltype(type)::Shader;
       const bool by_other = Shader::kFeatures == Shader::kAsOther;
       STD_TORCH_CHECK(!by_other || args.other_channels > 0, "gvtorch: other_bzyxc is missing");
@@ -336,33 +286,44 @@ struct FusedShaders {
     STD_TORCH_CHECK(args.parameters == kParameters, "gvtorch: parameter_54 must hold 20 elements, got ",
                     args.parameters);
   }
-  template <class Device>
-  static void run(const Tensor& like, const ShadeArgs& args, bool wide) {
-    shade<Device>(like, args, wide);
-  }
+  static void run(const Tensor& like, ShadeArgs args, bool wide);  // in cpu.cpp and in cuda.cu
 };
 
-template <class Device, class Shaders = FusedShaders>
-auto run(const ShadeRaysOp& a) {
-  ShadeArgs args{};
-  lay_ready(args, a, Shaders::integrates(a.shader));
+#define GV_TRACE_RAYS(X) GV_RAYS(X) GV_CHANNEL(X) GV_WALK(X)
+#define GV_HITS "Tensor color_r3, Tensor alpha_r1, Tensor depth_r1, Tensor samples_r, Tensor missed_r"
+GV_OP(TraceRaysOp, "trace_rays", GV_TRACE_RAYS, "(" GV_HITS ")");
+
+inline auto run(const TraceRaysOp& a) {
+  ShadeArgs args = take_walk(a);
+  auto hits = give_hits(args, a.table_lm4);
+  FusedShaders::run(a.origin_r3, args, is_wide(a.table_lm4));
+  return hits;
+}
+
+// Shape of features: (r, features).
+#define GV_SHADE_RAYS(X) GV_TRACE_RAYS(X) GV_SHADE(X)
+GV_OP(ShadeRaysOp, "shade_rays", GV_SHADE_RAYS, "(" GV_HITS ", Tensor normal_r3, Tensor features_rc)");
+
+template <class Shaders>
+auto shade_rays(const ShadeRaysOp& a) {
+  ShadeArgs args = take_walk(a, Shaders::integrates(a.shader));
   const Like like{a.origin_r3, a.table_lm4.scalar_type()};
-  GV_SHADE(GV_CHECK)
-  GV_SHADE(GV_LAY)
-  check_second(a.normal_bzyxc, a.normal_tnc, "normal_bzyxc", 3, a.bricks_bzyxc, args.nodes, args.normal_voxel);
-  args.other_channels =
-      check_second(a.other_bzyxc, a.other_tnc, "other_bzyxc", 0, a.bricks_bzyxc, args.nodes, args.other_voxel);
+  GV_SHADE(GV_TAKE)
+  check_second(a.normal_bzyxc, a.normal_tnc, "normal_bzyxc", 3, args, args.normal_voxel);
+  args.other_channels = check_second(a.other_bzyxc, a.other_tnc, "other_bzyxc", 0, args, args.other_voxel);
   STD_TORCH_CHECK(!a.other_bzyxc.has_value() || a.other_component < args.other_channels,
                   "gvtorch: other_component out of range");
   STD_TORCH_CHECK(a.parameter_54.numel() <= INT32_MAX, "gvtorch: parameter_54 is too large");
-  lay(args.parameters, a.parameter_54.numel());
-  Shaders::check(args, a.shader);
+  args.parameters = static_cast<int32_t>(a.parameter_54.numel());
+  Shaders::check(args);
   auto hits = give_hits(args, a.table_lm4);
   Tensor normal_r3 = give(args.normal_r3, a.table_lm4, {args.rays, 3});
   Tensor features_rc = give(args.features_rc, a.table_lm4, {args.rays, a.features});
-  Shaders::template run<Device>(a.origin_r3, args, is_wide(a.table_lm4));
+  Shaders::run(a.origin_r3, args, is_wide(a.table_lm4));
   return std::tuple_cat(hits, std::make_tuple(normal_r3, features_rc));
 }
+
+inline auto run(const ShadeRaysOp& a) { return shade_rays<FusedShaders>(a); }
 
 using RayOps = Types<TraceRaysOp, ShadeRaysOp>;
 

@@ -5,7 +5,7 @@
 // long as border >= 1: both interpolate the same two voxels. A place beyond the stored centres is clamped.
 #pragma once
 
-#include "base/trace_args.h"
+#include "base/arguments.h"
 #include "walk/tree.h"
 
 namespace gvtorch {

@@ -1,8 +1,8 @@
 // The transfer function as a table, and front-to-back compositing. T is as in arithmetic.h.
 #pragma once
 
+#include "base/arguments.h"
 #include "base/arithmetic.h"
-#include "base/trace_args.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {

@@ -3,7 +3,7 @@
 // have a walk of their own (packet_walk.h).
 #pragma once
 
-#include "base/trace_args.h"
+#include "base/arguments.h"
 #include "walk/brick.h"
 #include "walk/ray.h"
 #include "walk/shade.h"
