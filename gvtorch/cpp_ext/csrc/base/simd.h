@@ -106,7 +106,7 @@ GV_HD void load_rows(const void* base, Ints offset, Floats row[4]) {
   int32_t lane[kLanes];
   memcpy(lane, &offset, sizeof(lane));
   const auto four = [&](int i) {
-    return _mm_load_ps(reinterpret_cast<const float*>(static_cast<const char*>(base) + lane[i]));
+    return _mm_loadu_ps(reinterpret_cast<const float*>(static_cast<const char*>(base) + lane[i]));
   };
   Native own[4];  // own[i]: the lanes i, i + 4, i + 8, ...
   for (int i = 0; i < 4; ++i) {
