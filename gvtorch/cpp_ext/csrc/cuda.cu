@@ -97,9 +97,10 @@ void compact(const Tensor& like, int64_t count, const List& list) {
   const int64_t bytes = (chunks + 1) * static_cast<int64_t>(sizeof(Counts));
   const Tensor scratch = torch::stable::new_empty(like, {bytes}, ScalarType::Byte);
   auto* chunk_c = static_cast<Counts*>(scratch.mutable_data_ptr());
-  launch(like, count_chunks<List>, chunks, kThreads, list, count, chunk_c);
-  launch(like, add_chunks, 1, kScanThreads, chunk_c, chunks);
-  launch(like, take_chunks<List>, chunks, kThreads, list, count, chunk_c);
+  const Launcher launch(like);
+  launch(count_chunks<List>, chunks, kThreads, list, count, chunk_c);
+  launch(add_chunks, 1, kScanThreads, chunk_c, chunks);
+  launch(take_chunks<List>, chunks, kThreads, list, count, chunk_c);
 }
 
 }  // namespace gvtorch

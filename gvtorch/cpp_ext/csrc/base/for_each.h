@@ -22,17 +22,25 @@ struct Device {};  // of this library
 
 #ifdef __CUDACC__
 
-// Starts a kernel on the device of `like`, in torch's current stream.
-template <class... Parameter, class... Argument>
-void launch(const torch::stable::Tensor& like, void (*kernel)(Parameter...), int64_t blocks, int threads,
-            const Argument&... arguments) {
-  const torch::stable::accelerator::DeviceGuard guard(like.get_device_index());
-  void* stream = nullptr;
-  TORCH_ERROR_CODE_CHECK(aoti_torch_get_current_cuda_stream(like.get_device_index(), &stream));
-  kernel<<<static_cast<unsigned>(blocks), threads, 0, static_cast<cudaStream_t>(stream)>>>(arguments...);
-  const cudaError_t status = cudaGetLastError();
-  STD_TORCH_CHECK(status == cudaSuccess, "gvtorch: kernel launch failed: ", cudaGetErrorString(status));
-}
+// Starts kernels on the device of `like`, in torch's current stream.
+class Launcher {
+ public:
+  explicit Launcher(const torch::stable::Tensor& like) : guard(like.get_device_index()) {
+    void* current = nullptr;
+    TORCH_ERROR_CODE_CHECK(aoti_torch_get_current_cuda_stream(like.get_device_index(), &current));
+    stream = static_cast<cudaStream_t>(current);
+  }
+  template <class... Parameter, class... Argument>
+  void operator()(void (*kernel)(Parameter...), int64_t blocks, int threads, const Argument&... arguments) const {
+    kernel<<<static_cast<unsigned>(blocks), threads, 0, stream>>>(arguments...);
+    const cudaError_t status = cudaGetLastError();
+    STD_TORCH_CHECK(status == cudaSuccess, "gvtorch: kernel launch failed: ", cudaGetErrorString(status));
+  }
+
+ private:
+  const torch::stable::accelerator::DeviceGuard guard;
+  cudaStream_t stream;
+};
 
 // That many blocks on a multiprocessor leave 64 registers to a thread: waiting for memory is what tracing must hide.
 constexpr int kBlock = 128;
@@ -53,7 +61,7 @@ template <class On = Device, class Functor>
 void for_each(const torch::stable::Tensor& like, int64_t count, const Functor& functor) {
   if (count == 0) return;
   const int64_t blocks = std::min<int64_t>((count + kBlock - 1) / kBlock, INT32_MAX);
-  launch(like, run_functor<Functor>, blocks, kBlock, functor, count);
+  Launcher{like}(run_functor<Functor>, blocks, kBlock, functor, count);
 }
 
 #else
