@@ -212,10 +212,10 @@ def quick(s: Settings) -> bool:
 
 
 def promised(s: Settings, backend: str) -> bool:
-    """Whether a backend has the bits of `cpp`, and is tried."""
+    """Whether a backend has the bits of `cpp`, and is tried: the slow twin with every other scene."""
     if backend == "cpp":
         return True
-    return s["dtype"] == "float32" and (backend == "cuda" or quick(s))
+    return s["dtype"] == "float32" and (backend == "cuda" or (quick(s) and s["seed"] % 2 == 0))
 
 
 @cache

@@ -121,8 +121,9 @@ struct PacketChannel : ChannelView {
 };
 
 // The values that a packet walks on: of a dtype known to the compiler, or only at run time.
-template <class Voxel, bool kFar>
+template <class Known, bool kFar>
 struct TypedValues {
+  using Voxel = Known;
   const PacketPool pool;
 
   TypedValues(const ChannelView& channel, int32_t side, int32_t component, int64_t)
@@ -131,6 +132,7 @@ struct TypedValues {
   GV_HD Floats read(Ints brick, const Vec3<Floats>& at) const { return trilinear<Voxel, kFar>(pool, brick, at); }
 };
 struct AnyValues {
+  using Voxel = void;
   const PacketChannel channel;
   const int32_t component;
 

@@ -43,7 +43,8 @@ struct PacketChannels {
 template <class Shader, class Values>
 struct PacketWalk {
   using Number = Floats;
-  using Kernel = ShadeRay<float, Shader>;
+  using Kernel = ShadeRay<float, Shader, false, true, typename Values::Voxel>;
+  using Eye = typename Kernel::Eye;
   using Sum = typename Shader::Sum;
   static constexpr bool kEnds = Shader::kEnds;
   static constexpr bool kKeepsPath = Kernel::kHidesAlike;  // else the nodes that are hidden differ from ray to ray
@@ -144,9 +145,9 @@ struct PacketWalk {
       const Sight<float> own_sight = take_lane<Sight<float>>(sight, lane);
       const Spot<float> one = spot_of(lane, fine, fine_depth);
       const bool two = mixed[lane] != 0;
-      Probe<float> probe(kernel.channels, own_sight, one, two ? spot_of(lane, coarse, coarse_depth) : one, two,
-                         at.near[lane], at.growth[lane], voxel[lane], blend_scale[lane],
-                         {static_cast<float>(cube[0]), static_cast<float>(cube[1]), static_cast<float>(cube[2])});
+      Eye probe(kernel.channels, own_sight, one, two ? spot_of(lane, coarse, coarse_depth) : one, two, at.near[lane],
+                at.growth[lane], voxel[lane], blend_scale[lane],
+                {static_cast<float>(cube[0]), static_cast<float>(cube[1]), static_cast<float>(cube[2])});
       probe.known = known;
       body(lane, probe);
     });
@@ -477,7 +478,7 @@ struct PacketWalk {
   }
 
   __attribute__((noinline)) void march_alone(Mask which) {
-    each(which, [&](int lane, const Probe<float>& probe) {
+    each(which, [&](int lane, const Eye& probe) {
       auto one = take_lane<Intervals<float>>(at, lane);
       const Extent<float> own{extent.exit[lane], extent.cone_low[lane], extent.cone_high[lane]};
       auto&& own_sum = sum_of<Sum>(sum, lane);
@@ -521,7 +522,7 @@ struct PacketWalk {
 // Traces a share of the rays.
 template <class Shader, class Values>
 void trace_packets(const ShadeArgs& args, int64_t begin, int64_t end) {
-  const ShadeRay<float, Shader> kernel(args);
+  const typename PacketWalk<Shader, Values>::Kernel kernel(args);
   PacketWalk<Shader, Values> packet(kernel, args);
   for (int64_t index = begin; index < end; index += kLanes) packet.trace(index, smaller(index + kLanes, end));
 }

@@ -2,6 +2,8 @@
 // levels blend as in trace.h. The dtype is a switch at run time, the same for all threads.
 #pragma once
 
+#include <type_traits>
+
 #include "walk/walk.h"
 
 namespace gvtorch {
@@ -159,9 +161,7 @@ struct Probe {
 
   // A number of a channel at distance t.
   GV_HD T number_at(const ChannelView& channel, int32_t component, T t) const {
-    const T value = read(channel, component, fine, fine.at(t));
-    if (!mixed) return value;
-    return value + weight(t) * (read(channel, component, coarse, coarse.at(t)) - value);
+    return blended(t, [&](const Spot<T>& spot) { return read(channel, component, spot, spot.at(t)); });
   }
 
   // Gradient of the value at distance t, per world unit: differences over one voxel, half a voxel to each side, which a
@@ -187,6 +187,19 @@ struct Probe {
     return !mixed || (same(channels.value) && same(channels.normal) && same(channels.other));
   }
 
+ protected:
+  // A number that both levels have, told by read(spot).
+  template <class Read>
+  GV_HD T blended(T t, const Read& read) const {
+    const T number = read(fine);
+    if (!mixed) return number;
+    return number + weight(t) * (read(coarse) - number);
+  }
+  GV_HD int64_t first_of(const ChannelView& channel, int32_t component, const Spot<T>& spot) const {
+    const int64_t volume = static_cast<int64_t>(channels.side) * channels.side * channels.side;
+    return spot.brick * volume * channel.width + component;
+  }
+
  private:
   template <class Digits>
   GV_HD Spot<T> spot(const Levels<T>& levels, const Holder& holder, const Digits& digits, const Ray<T>& ray) const {
@@ -205,8 +218,7 @@ struct Probe {
       return read_number<T>(channel.constant_tnc, channel.type,
                             static_cast<int64_t>(spot.node) * channel.width + component);
     }
-    const int64_t volume = static_cast<int64_t>(channels.side) * channels.side * channels.side;
-    const int64_t first = spot.brick * volume * channel.width + component;
+    const int64_t first = first_of(channel, component, spot);
     return read_brick(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, at);
   }
   GV_HD Vec3<T> differences(const Spot<T>& spot, T t) const {
@@ -239,6 +251,26 @@ struct Probe {
     return true;
   }
 };
+
+// A probe whose value is of a dtype that the compiler knows, and whose reads are no calls.
+template <class T, class Voxel>
+struct TypedProbe : Probe<T> {
+  using Probe<T>::Probe;
+
+  GV_HD T value(T t) const {
+    const ChannelView& channel = this->channels.value;
+    const int32_t component = this->channels.component;
+    return this->blended(t, [&](const Spot<T>& spot) {
+      const auto* constants = static_cast<const Voxel*>(channel.constant_tnc);
+      const auto* voxels = static_cast<const Voxel*>(channel.bricks_bzyxc);
+      if (spot.brick < 0) return number<T>(constants[static_cast<int64_t>(spot.node) * channel.width + component]);
+      const Voxel* first = voxels + this->first_of(channel, component, spot);
+      return trilinear(first, this->channels.side, channel.width, spot.at(t));
+    });
+  }
+};
+template <class T, class Voxel>
+using ProbeOf = std::conditional_t<std::is_void_v<Voxel>, Probe<T>, TypedProbe<T, Voxel>>;
 
 }  // namespace GV_NAMESPACE
 }  // namespace gvtorch

@@ -15,9 +15,10 @@ struct HidesAlike : std::false_type {};
 template <class Shader>
 struct HidesAlike<Shader, std::void_t<decltype(Shader::kHidesAlike)>> : std::bool_constant<Shader::kHidesAlike> {};
 
-// kOwnPowers: an N that is a power of two has code of its own.
-template <class T, class Shader, bool kShadows = false, bool kOwnPowers = true>
+// kOwnPowers: an N that is a power of two has code of its own. Voxel: of the shader's value; void: told at run time.
+template <class T, class Shader, bool kShadows = false, bool kOwnPowers = true, class Voxel = void>
 struct ShadeRay : Walk<T> {
+  using Eye = ProbeOf<T, Voxel>;
   using Walk<T>::tree;
   using Walk<T>::options;
   using Sum = typename Shader::Sum;
@@ -148,13 +149,13 @@ struct ShadeRay : Walk<T> {
       return kernel.hides(shader, node, sum);
     }
     template <class Digits>
-    GV_HD Probe<T> enter(const Ray<T>& ray, const Visit<T>& visit, const Digits& digits) const {
-      return Probe<T>(kernel.channels, *sight, kernel.rays, ray, kernel.levels, visit, digits);
+    GV_HD Eye enter(const Ray<T>& ray, const Visit<T>& visit, const Digits& digits) const {
+      return Eye(kernel.channels, *sight, kernel.rays, ray, kernel.levels, visit, digits);
     }
-    GV_HD bool uniform(const Probe<T>& probe) const {  // shadows differ within it
+    GV_HD bool uniform(const Eye& probe) const {  // shadows differ within it
       return !kShadowed && probe.uniform() && !kernel.shades_each_place();
     }
-    GV_HD void region(const Probe<T>& probe, T start, T end) {
+    GV_HD void region(const Eye& probe, T start, T end) {
       Piece<T> piece;
       piece.start = start;
       piece.end = end;
@@ -163,7 +164,7 @@ struct ShadeRay : Walk<T> {
       shader.add(true, piece, probe, sum);
       ++samples;
     }
-    GV_HD int32_t take(const Probe<T>& probe, const Intervals<T>& at, int32_t alike, bool last) {
+    GV_HD int32_t take(const Eye& probe, const Intervals<T>& at, int32_t alike, bool last) {
       Piece<T> piece;
       int32_t taken = 0;
       if (kEnds) piece.back = probe.value(at.start);
@@ -197,7 +198,7 @@ struct ShadeRay : Walk<T> {
       piece.length = piece.end - piece.start;
       piece.middle = piece.start + piece.length * static_cast<T>(0.5);
     }
-    GV_HD void add(const Piece<T>& piece, const Probe<T>& probe) {
+    GV_HD void add(const Piece<T>& piece, const Eye& probe) {
       if constexpr (kShadowed) {
         shader.add(true, piece, probe, sum, [&](T t, Vec3<T> way, T length, T growth) {
           return kernel.share_of_light(*ray, probe, t, way, length, growth, samples, sum.missed);
