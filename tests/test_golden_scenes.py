@@ -146,13 +146,15 @@ def _streamed(s: Settings, backend: str, device: str) -> Found:
         producers[name].branching = s["branching"]
     widths = [v.data.shape[3] * v.data.element_size() for v in scene["one"].values()]
     slot = (s["brick"] + 2 * s["border"]) ** 3 * sum(widths)
+    around = s.get("lighting") in ("occlusion", "indirect", "everything")
+    slots = (2 if around else 1) * s["slots"]  # a ray's cones see many bricks, which must fit
     options = options_of(s)
     camera, shader = camera_of(s), shader_of(s)
     if isinstance(shader, gv.ModuleShader):
         shader.module.to(device)
     with gv.Engine(
         producers,
-        brick_pool=s["slots"] * slot * len(producers),
+        brick_pool=slots * slot * len(producers),
         node_pool=(8 + 3 * sum(widths)) * s["branching"] ** 3 * 400,
         brick_size=s["brick"],
         border=s["border"],

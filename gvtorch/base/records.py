@@ -22,6 +22,9 @@ class Rays:
     range: Tensor  # (r, 2) first and last distance along the ray; +inf is allowed for the last
     width: int = 0  # pixels of a row, if these are whole rows of a picture: traced in tiles
     transmittance: Tensor | None = None  # (r,) at the first distance; None: 1
+    # (r,) int64: number of the pixel in its picture + 2^32 * that of the pixel's sample; None: rays
+    # are counted from 0. Directions of `Lighting` follow from it.
+    sample: Tensor | None = None
 
     def __getitem__(self, index: Tensor | slice) -> Rays:
         """Some of the rays, which are no rows any more."""

@@ -53,8 +53,11 @@ class Camera:
         max_angle: (n,) float64 radians; a fisheye's rays farther from the axis are closed.
         window: First row of this camera, which may take a strip only, and number of rows of the
             whole picture.
+        sample: Which of the samples of its pixels this is; see `Rays.sample`.
         batched: False for one camera whose pictures have no batch dimension.
     """
+
+    sample = 0
 
     def __init__(
         self,
@@ -291,13 +294,13 @@ class Camera:
             Ks[:, (0, 1), (0, 1)] /= side
         return self._changed(viewmats=view, Ks=Ks, frame=Frame.WORLD)
 
-    def shifted(self, dx: float, dy: float) -> Camera:
+    def shifted(self, dx: float, dy: float, sample: int | None = None) -> Camera:
         """Returns the camera whose rays go through (dx, dy) pixels right of and below the centres
-        of the pixels.
+        of the pixels, as another `sample` of these if given.
         """
         Ks = self.Ks.clone()
         Ks[:, :2, 2] -= torch.tensor([dx, dy], dtype=torch.float64)
-        return self._changed(Ks=Ks)
+        return self._changed(Ks=Ks, sample=self.sample if sample is None else sample)
 
     def strip(self, first: int, end: int) -> Camera:
         """Returns the camera of the rows [first, end) of each picture."""
@@ -305,9 +308,10 @@ class Camera:
         return self.shifted(0, first)._changed(height=end - first, window=window)
 
     def numbers(self, device: torch.device | str = "cpu") -> Tensor:
-        """Returns what `pixel_rays` reads; does not wait for the device. (n, 25) float64: rotation
+        """Returns what `pixel_rays` reads; does not wait for the device. (n, 26) float64: rotation
         to the camera (9), position (3), focal lengths and principal point (2, 2; pixel centres at
-        integers), cone (2), range (2), a fisheye's coefficients (4) and largest angle (1).
+        integers), cone (2), range (2), a fisheye's coefficients (4) and largest angle (1), and the
+        sample (1).
 
         Raises:
             ValueError: The camera is relative to a box: call `placed(box)` first.
@@ -323,7 +327,7 @@ class Camera:
         range_ = (zero, zero + math.inf)
         bend = (self.radial_coeffs, self.max_angle[:, None])
         parts = (rotation.flatten(1), position, focal, centre, *cone, *range_, *bend)
-        return upload(torch.cat(parts, 1), torch.device(device))
+        return upload(torch.cat((*parts, zero + self.sample), 1), torch.device(device))
 
     def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:
         """Returns the rays through the pixel centres of whole rows, the first one and the one after
@@ -336,6 +340,15 @@ class Camera:
         column = torch.arange(self.width, dtype=torch.float64, device=numbers.device)
         x, y = (column - cx[:, None]) / fx[:, None], (row - cy) / fy
         return MODELS[self.model].rays(Plane(x, y, numbers, self.distorted))
+
+    def pixel_samples(self, numbers: Tensor, rows: tuple[int, int]) -> Tensor:
+        """Returns `Rays.sample` of whole rows, counted as for `pixel_rays`."""
+        row = torch.arange(*rows, device=numbers.device)
+        column = torch.arange(self.width, device=numbers.device)
+        pictures = numbers[:, -1].view(len(self), -1)[:, 0]  # of rays, each has the number
+        sample = pictures[row // self.height].to(torch.int64) << 32
+        first = (self.window[0] + row % self.height) * self.width
+        return ((sample + first)[:, None] + column).flatten()
 
     def blocks(self, pixels: int) -> Iterator[tuple[int, int]]:
         """Yields the rows of all pictures in blocks of about so many pixels, at least a row each:

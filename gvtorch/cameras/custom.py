@@ -57,7 +57,8 @@ class CustomCamera(Camera):
             raise ValueError(
                 f"CustomCamera: {count} rays are no pictures of {self.width}x{self.height} pixels"
             )
-        self._rays = torch.cat([column.to(torch.float64) for column in columns], 1)  # (r, 10)
+        columns.append(torch.zeros_like(columns[0][:, :1]))
+        self._rays = torch.cat([column.to(torch.float64) for column in columns], 1)  # (r, 11)
         if rays.direction.device.type == "cpu":
             lost = self._rays.isnan().any(1)
             if bool(lost.any()):
@@ -122,11 +123,11 @@ class CustomCamera(Camera):
         return len(self._rays) // (self.width * self.height)
 
     def _pictures(self) -> Tensor:
-        return self._rays.view(-1, self.height, self.width, 10)
+        return self._rays.view(-1, self.height, self.width, 11)
 
     def __getitem__(self, index: int) -> Camera:
         """Returns one camera of the batch."""
-        return self._changed(_rays=self._pictures()[index].reshape(-1, 10), batched=False)
+        return self._changed(_rays=self._pictures()[index].reshape(-1, 11), batched=False)
 
     def same(self, other: Camera) -> bool:
         """Whether the other has the same tensor of rays."""
@@ -136,29 +137,31 @@ class CustomCamera(Camera):
         """Returns itself: rays are in world units."""
         return self
 
-    def shifted(self, dx: float, dy: float) -> Camera:
+    def shifted(self, dx: float, dy: float, sample: int | None = None) -> Camera:
         """Returns the camera with its rays moved by a part of the step to their neighbours."""
         lines = self._pictures()[..., :6]
         moved = lines + dx * _ray_step(lines, -2) + dy * _ray_step(lines, -3)
         origin, direction = moved.split(3, -1)
         direction = direction / direction.norm(dim=-1, keepdim=True)
-        rays = torch.cat((origin, direction, self._pictures()[..., 6:]), -1)
-        return self._changed(_rays=rays.reshape(-1, 10))
+        rays = torch.cat((origin, direction, self._pictures()[..., 6:]), -1).reshape(-1, 11)
+        if sample is not None:
+            rays[:, -1] = sample
+        return self._changed(_rays=rays)
 
     def strip(self, first: int, end: int) -> Camera:
         """Returns the camera of the rows [first, end) of each picture."""
-        rays = self._pictures()[:, first:end].reshape(-1, 10)
+        rays = self._pictures()[:, first:end].reshape(-1, 11)
         window = (self.window[0] + first, self.window[1])
         return self._changed(_rays=rays, height=end - first, window=window)
 
     def numbers(self, device: torch.device | str = "cpu") -> Tensor:
-        """Returns (r, 10) float64: origin, direction, cone and range."""
+        """Returns (r, 11) float64: origin, direction, cone, range and sample."""
         return upload(self._rays, torch.device(device))
 
     def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:
         """Returns the rays of whole rows, from what `numbers` gave."""
         part = numbers[rows[0] * self.width : rows[1] * self.width]
-        origin, direction, cone, limits = part.split((3, 3, 2, 2), 1)
+        origin, direction, cone, limits, _ = part.split((3, 3, 2, 2, 1), 1)
         return Rays(origin=origin, direction=direction, cone=cone, range=limits, width=self.width)
 
 

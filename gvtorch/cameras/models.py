@@ -25,7 +25,7 @@ class Plane:
 
     x: Tensor  # (k, w) float64; k is 1 where all rows are one camera's, else y
     y: Tensor  # (y,)
-    numbers: Tensor  # (k, 25), see `Camera.numbers`
+    numbers: Tensor  # (k, 26), see `Camera.numbers`
     distorted: bool  # the coefficients of a fisheye are used
 
     @property
@@ -140,7 +140,7 @@ class Fisheye(Model):
 
     def rays(self, plane: Plane) -> Rays:
         x, y = plane.x, plane.y[:, None]
-        k, limit = plane.numbers[:, 20:24], plane.numbers[:, 24:]
+        k, limit = plane.numbers[:, 20:24], plane.numbers[:, 24:25]
         radius = (x * x + (y * y)).sqrt()  # (y, w)
         angle = undistort(radius, k, limit) if plane.distorted else radius
         scale = torch.where(radius > 0, angle.sin() / radius, 1.0)

@@ -95,7 +95,9 @@ class Progressive:
                 self.reset()
             self._given, self._camera = camera, own
         view = self._camera
-        picture = self._render(view.shifted(*jitter(self.count)) if self.count else view)
+        picture = self._render(
+            view.shifted(*jitter(self.count), sample=self.count) if self.count else view
+        )
         light = torch.cat((picture.color, picture.alpha), -1).double()
         missed = picture.missed
         whole = torch.ones_like(picture.alpha, dtype=torch.bool) if missed is None else ~missed

@@ -24,7 +24,7 @@ from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.camera import Frame
 from ..ops import RayArguments
-from ..ops.reference.exact import unit
+from ..ops.reference.exact import dot, unit
 from ..ops.shading import ShadeParameters, Triple, pack
 from ..shaders.lights import (
     CONE_OF_DISC,
@@ -40,13 +40,12 @@ from .thin_lens import ThinLens
 
 #: Where cones begin, in voxels. Cones to lights are lifted `_OFF` above the surface. Hemisphere
 #: cones are lifted less, `_CLOSE`, to sample crevices, and start marching after `_WAY` voxels.
-_OFF, _CLOSE, _WAY = 1.5, 0.75, 1.5
+_OFF, _CLOSE, _WAY = 1.5, 1.0, 1.5
 _GRAZING = 0.5  # smallest cosine to the normal along which a light's cone is lifted
-#: The upright cone of a hemisphere stands for directions up to 30 degrees off the normal: its share
-#: of the cosine-weighted light. Five tilted cones share the rest.
-_UPRIGHT = 0.25
-_TILT = math.radians(50)  # cosine-weighted mean angle of the directions they stand for
-_WIDE = 2 * math.tan(math.radians(17))  # growth of all six; wider cones hit their own surface
+_WIDE = 2 * math.tan(math.radians(1))  # growth of hemisphere cones; wider ones blur what they meet
+#: Steps of the sequence of directions: 2^32 over the plastic number, and over its square.
+_STEPS = (3242174889, 2447445414)
+_WORD = (1 << 32) - 1
 _FINER = 0.5  # width of the shadow cones of bounced light, relative to the cone that met matter
 
 
@@ -64,6 +63,7 @@ class Lighting:
     shadow_cones: int = 1  # to each light that has a size; more give more exact penumbras
     occlusion: float = 0.0  # share of the ambient light that matter nearby can block, 0 to 1
     indirect: float = 0.0  # factor of the light that comes from lit matter nearby
+    cones: int = 16  # over the hemisphere, for occlusion and indirect light
     reach: float | None = None  # of occlusion and indirect light; None: a quarter of the box
     frame: Frame | str = Frame.WORLD  # of reach: world units, or largest sides of the scene's box
     ambient: Triple = (1.0, 1.0, 1.0)  # light from all directions, linear RGB
@@ -79,6 +79,7 @@ class Lighting:
         check.whole(where, "shadow_cones", self.shadow_cones, low=1, high=1024)
         check.number(where, "occlusion", self.occlusion, low=0, high=1)
         check.number(where, "indirect", self.indirect, low=0)
+        check.whole(where, "cones", self.cones, low=1, high=1024)
         if self.reach is not None:
             check.number(where, "reach", self.reach, low=0, open_low=True)
         object.__setattr__(self, "frame", Frame.of(where, self.frame))
@@ -145,7 +146,7 @@ class Lighted:
         tally = _Tally(hits)
         points = self._points(rays, hits, tally)
         direct, highlight = self._direct(points, self.lighting.shadow_cones)
-        unblocked, bounced = self._hemisphere(points, rays.origin.to(torch.float64))
+        unblocked, bounced = self._hemisphere(points, rays)
         light = ambient * sky * unblocked.to(color)
         light = light + diffuse * (direct + bounced).to(color)
         taken = hits.alpha - (1 - rays.light()).to(color)  # of the light, by these rays themselves
@@ -220,10 +221,10 @@ class Lighted:
             blocked = blocked + hits.alpha[:, 0] / cones
         return 1 - self.lighting.shadows * blocked
 
-    def _hemisphere(self, points: _Points, eye: Tensor) -> tuple[Tensor, Tensor]:
+    def _hemisphere(self, points: _Points, rays: Rays) -> tuple[Tensor, Tensor]:
         """(r, 1) share of the ambient light that is not occluded, and (r, 3) light that matter
-        around the points reflects; `eye` (r, 3) is where a `Headlight` stands. Matter farther away
-        than half of the reach blocks half as much.
+        around the points reflects; a `Headlight` stands where the eye's rays begin. Matter farther
+        away than half of the reach blocks half as much.
         """
         unblocked = torch.ones_like(points.position[:, :1])
         bounced = torch.zeros_like(points.position)
@@ -236,9 +237,12 @@ class Lighted:
         start = _WAY * some * points.width.clamp(min=self.voxel)
         end = torch.maximum(start, reach * some)
         middle = torch.maximum(start, reach / 2 * some)
-        growth = torch.full_like(end, _WIDE)
         lifted = self._lifted(points, _CLOSE)
-        for weight, direction in _cones_over(points.normal):
+        eye, weight, sample = rays.origin.to(torch.float64), 1 / lighting.cones, rays.sample
+        if sample is None:
+            sample = torch.arange(len(eye), device=eye.device)
+        for direction in _cones_over(points.normal, sample, lighting.cones):
+            growth = dot(direction, points.normal).clamp(0, _WIDE)  # none dips into a floor
             first, second = (
                 self._cone(lifted, direction, growth, *span)
                 for span in ((start, middle), (middle, end))
@@ -331,11 +335,42 @@ def _beside(axis: Tensor) -> tuple[Tensor, Tensor]:
     return right, torch.stack((b, sign + y * y * a, -y), 1)
 
 
-def _cones_over(normal: Tensor) -> Iterator[tuple[float, Tensor]]:
-    """Six cones that cover a hemisphere: weights that add up to 1, and (r, 3) directions."""
-    yield _UPRIGHT, normal
+def _cones_over(normal: Tensor, sample: Tensor, count: int) -> Iterator[Tensor]:
+    """Directions (r, 3), cosine-weighted around (r, 3) normals, the next `count` of a sequence that
+    fills the unit square evenly (Roberts, 2018). It begins at another place for each pixel, and
+    goes on from sample to sample. Integers, + - * / and square roots: same bits on every device.
+    """
     right, up = _beside(normal)
-    for number in range(5):
-        turn = number * 2 * math.pi / 5
-        flat = math.cos(turn) * right + math.sin(turn) * up
-        yield (1 - _UPRIGHT) / 5, math.cos(_TILT) * normal + math.sin(_TILT) * flat
+    begin_x = _scrambled((sample & _WORD) + 1)
+    begin_y = _scrambled(begin_x + _STEPS[0])
+    first = (sample >> 32) * count
+    for number in range(count):
+        x, y = (
+            ((begin + (first + number) * step) & _WORD).to(torch.float64) * 2.0**-32
+            for begin, step in zip((begin_x, begin_y), _STEPS, strict=True)
+        )
+        cosine, sine = _turned(y)
+        flat = cosine[:, None] * right + sine[:, None] * up
+        yield unit((1 - x).sqrt()[:, None] * normal + x.sqrt()[:, None] * flat)
+
+
+def _scrambled(number: Tensor) -> Tensor:
+    """(r,) numbers below 2^32, of which neighbours have nothing in common any more (a hash as
+    Wellons' lowbias32, 2018).
+    """
+    for shift in (16, 15):
+        number = ((number ^ (number >> shift)) * 0x7FEB352D) & _WORD
+    return number ^ (number >> 16)
+
+
+def _turned(turns: Tensor) -> tuple[Tensor, Tensor]:
+    """Cosine and sine of (r,) turns in [0, 1), to 4e-6."""
+    quarter = torch.floor(4 * turns + 0.5)
+    angle = (4 * turns - quarter) * (math.pi / 2)
+    square = angle * angle
+    cosine = 1 - square * (1 / 2 - square * (1 / 24 - square / 720))
+    sine = angle * (1 - square * (1 / 6 - square * (1 / 120 - square / 5040)))
+    odd, far = quarter % 2 == 1, (quarter == 2) | (quarter == 3)
+    far_x = (quarter == 1) | (quarter == 2)
+    a, b = torch.where(odd, sine, cosine), torch.where(odd, cosine, sine)
+    return torch.where(far_x, -a, a), torch.where(far, -b, b)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Unpack
 
 import torch
@@ -166,10 +166,10 @@ class View:
             some: Pixels = slice(first * width, end * width)
             with stage("rays"):
                 if where is None:
-                    rays = camera.pixel_rays(numbers, (first, end))
+                    rays = self._rows((first, end))
                 else:
                     which = where[some].nonzero()[:, 0]
-                    rays = _some_rays(numbers, camera, first, which)
+                    rays = self._some_rays(first, which)
                     some = which + first * width
             if len(rays.origin):
                 with stage("trace"):
@@ -179,6 +179,20 @@ class View:
                         hits = drawn[some].trace(self.trace_rays, rays, self.options.stop_alpha)
                 yield some, hits
             progress("rays", end, rows)
+
+    def _rows(self, rows: tuple[int, int]) -> Rays:
+        """Rays of whole rows."""
+        rays = self.camera.pixel_rays(self.numbers, rows)
+        if self.options.lighting is None:
+            return rays
+        return replace(rays, sample=self.camera.pixel_samples(self.numbers, rows))
+
+    def _some_rays(self, top: int, which: Tensor) -> Rays:
+        """Rays of the pixels `which` (k,), rising, counted from row `top`, made in whole rows."""
+        width = self.camera.width
+        ends = torch.stack((which[0], which[-1])).tolist() if len(which) else (0, -1)
+        first, last = (end // width for end in ends)
+        return self._rows((top + first, top + last + 1))[which - first * width]
 
     def picture(self, hits: Hits, stats: RenderStats) -> Picture:
         """Puts the hits of all rays over the background, in the camera's shape."""
@@ -194,15 +208,6 @@ class View:
         columns = {**vars(hits), "color": color, "nearest": nearest}
         images = {name: self.camera.image(c) for name, c in columns.items() if c is not None}
         return Picture(**images, transparent=background is None, stats=stats)
-
-
-def _some_rays(numbers: Tensor, camera: Camera, top: int, which: Tensor) -> Rays:
-    """Rays of the pixels `which` (k,), rising, counted from row `top`, made in whole rows."""
-    width = camera.width
-    ends = torch.stack((which[0], which[-1])).tolist() if len(which) else (0, -1)
-    first, last = (end // width for end in ends)
-    rays = camera.pixel_rays(numbers, (top + first, top + last + 1))
-    return rays[which - first * width]
 
 
 def _write(hits: Hits, pixels: Pixels, part: Hits, count: int) -> None:

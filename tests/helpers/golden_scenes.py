@@ -494,7 +494,9 @@ def options_of(s: Settings) -> dict[str, Any]:
         found["lens"] = gv.ThinLens(aperture=aperture * unit_, focus=focus * unit_, frame=frame)
     if "lighting" in s:
         cones = {"shadow_cones": 3, "shadows": 0.8}
-        light, around = {"occlusion": 0.8}, {"indirect": 0.7, "ambient": (0.5, 0.6, 0.7)}
+        few = {"cones": 2 + s["seed"] % 4}  # what they see must fit in small pools
+        light = few | {"occlusion": 0.8}
+        around = few | {"indirect": 0.7, "ambient": (0.5, 0.6, 0.7)}
         what = {
             "shadows": {},
             "cones": cones,
