@@ -96,7 +96,7 @@ class _Pool:
     @property
     def capacity(self) -> int:
         """Number of slots."""
-        return len(next(iter(self.fields.values())))
+        return next(len(field) for field in vars(self).values() if isinstance(field, Tensor))
 
     @property
     def nbytes(self) -> int:
