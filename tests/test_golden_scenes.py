@@ -214,7 +214,7 @@ def quick(s: Settings) -> bool:
 
 
 def promised(s: Settings, backend: str) -> bool:
-    """Whether a backend has the bits of `cpp`, and is tried: the slow twin with every other scene."""
+    """Whether a backend has the bits of `cpp`, and is tried: the twin with every other scene."""
     if backend == "cpp":
         return True
     return s["dtype"] == "float32" and (backend == "cuda" or (quick(s) and s["seed"] % 2 == 0))
