@@ -104,6 +104,12 @@ GV_HD void put_sum(UserSums<Sum>& sums, int lane, const Sum& one) {
   sums.clear[lane] = one.clear;
   set_lane(sums.missed, lane, one.missed);
 }
+template <class Shader, class Sum>
+GV_HD Mask hides_of(const Shader& shader, Mask which, Floats low, Floats high, UserSums<Sum>& sums) {
+  Mask hides{};
+  for_lanes(which, [&](int lane) { set_lane(hides, lane, shader.hides(low[lane], high[lane], sum_of(sums, lane))); });
+  return hides;
+}
 #endif
 
 // A user's shader as the walks call it. In a packet the walk and the values are those of all lanes at once; the user's
@@ -123,14 +129,6 @@ struct CalledShader : Kind<T> {
   // Values that are hidden change nothing, unless a Sum of the user's own counts them.
   static constexpr bool kLeavesOut = kHidesByTransfer<Base> && std::is_same_v<Sum, ShadeSum<T>> && !Base::kEnds;
 
-  using Base::hides;
-  GV_HD Mask hides(Floats low, Floats high, const UserSums<Sum>& sums) const {
-    Mask out{};
-    for (int lane = 0; lane < kLanes; ++lane) {
-      set_lane(out, lane, Base::hides(low[lane], high[lane], sums.of_lane[lane]));
-    }
-    return out;
-  }
   template <class Packet>
   GV_HD void add(Mask which, const Piece<Floats>& pieces, Packet& packet, UserSums<Sum>& sums) const {
     if constexpr (kLeavesOut) which = which && !this->transfer.transparent(pieces.value, pieces.value);

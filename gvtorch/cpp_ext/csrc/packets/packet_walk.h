@@ -34,6 +34,11 @@ template <class Sums, class Sum>
 GV_HD void put_sum(Sums& sums, int lane, const Sum& one) {
   put_lane(sums, lane, one);
 }
+// Of the lanes `which`, those in which nothing between low and high changes the sum.
+template <class Shader, class Sums>
+GV_HD Mask hides_of(const Shader& shader, Mask which, Floats low, Floats high, const Sums& sums) {
+  return which && shader.hides(low, high, sums);
+}
 
 struct PacketChannels {
   const PacketChannel value, normal, other;
@@ -368,7 +373,7 @@ struct PacketWalk {
         low[lane] = range.low;
         high[lane] = range.high;
       });
-      return here && shader.hides(low, high, sum);
+      return hides_of(shader, here, low, high, sum);
     }
     const Ints known = gather(hidden_tn, node) & 0xff;
     Mask hides = here & (known == kHidden);

@@ -1,6 +1,7 @@
-// ShadeRay: one ray through the tree with any shader of shaders.h. As TraceRay (trace.h), but dtypes are switches at
-// run time, and each interval goes to the shader. With shadows, a cone goes from each sample to the light, through the
-// same tree; its samples, stamps and requests count as the ray's own.
+// ShadeRay: one ray through the tree with any shader of shaders.h. As TraceRay (trace.h, the plain function on CUDA),
+// but dtypes are switches at run time unless the kernel is told, and each interval goes to the shader. With shadows, a
+// cone goes from each sample to the light, through the same tree; its samples, stamps and requests count as the ray's
+// own.
 #pragma once
 
 #include <type_traits>
