@@ -368,8 +368,8 @@ def _turned(turns: Tensor) -> tuple[Tensor, Tensor]:
     quarter = torch.floor(4 * turns + 0.5)
     angle = (4 * turns - quarter) * (math.pi / 2)
     square = angle * angle
-    cosine = 1 - square * (1 / 2 - square * (1 / 24 - square / 720))
-    sine = angle * (1 - square * (1 / 6 - square * (1 / 120 - square / 5040)))
+    cosine = 1 - square * (1 / 2 - square * (1 / 24 - square * (1 / 720)))
+    sine = angle * (1 - square * (1 / 6 - square * (1 / 120 - square * (1 / 5040))))
     odd, far = quarter % 2 == 1, (quarter == 2) | (quarter == 3)
     far_x = (quarter == 1) | (quarter == 2)
     a, b = torch.where(odd, sine, cosine), torch.where(odd, cosine, sine)

@@ -55,17 +55,9 @@ inline const Processor& processor() {
 // A user's shader is compiled for the same (cpp_ext/user.py).
 extern "C" __attribute__((visibility("default"))) const char* gvtorch_instructions() { return processor().name; }
 
-// Rays one by one, those of the plain function with voxels of a known dtype.
-template <class T>
-void shade(const Tensor& like, const ShadeArgs& args) {
-  const auto each = [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); };
-  if (args.shader != kPlainShader) return with_rays<T>(args, each);
-  with_voxel(args.voxel, [&](auto voxel) { each(ShadeRay<T, Plain<T>, false, true, decltype(voxel)>(args)); });
-}
-
 void FusedShaders::run(const Tensor& like, ShadeArgs args, bool wide) {
-  if (wide) return shade<double>(like, args);
-  if (!(args.shader == kPlainShader ? packs(args) : shades(args))) return shade<float>(like, args);
+  if (wide) return shade_fused<double>(like, args);
+  if (!(args.shader == kPlainShader ? packs(args) : shades(args))) return shade_fused<float>(like, args);
   trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) { processor().shade_chunk(args, begin, end); });
 }
 

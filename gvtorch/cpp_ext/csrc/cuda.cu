@@ -5,26 +5,11 @@
 
 #include "entry/entry_cache.h"
 #include "entry/entry_segments.h"
-#include "walk/trace.h"
 
 namespace gvtorch {
 
-template <class T>
-void shade(const Tensor& like, ShadeArgs args) {
-  if (args.shader != kPlainShader) {
-    return with_rays<T>(args, [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); });
-  }
-  ShadeRay<T, Plain<T>> hider(args);
-  const Tensor hidden_tn = hide_nodes<Device>(like, args.nodes, hider);
-  args.hidden_tn = hider.hidden_tn;
-  with_voxel(args.voxel, [&](auto voxel) {
-    const TraceRay<T, decltype(voxel)> kernel(args);
-    for_each(like, kernel.order.count(), kernel);
-  });
-}
-
 void FusedShaders::run(const Tensor& like, ShadeArgs args, bool wide) {
-  wide ? shade<double>(like, args) : shade<float>(like, args);
+  wide ? shade_fused<double>(like, args) : shade_fused<float>(like, args);
 }
 
 // `compact` of cache.h in three kernels: blocks count chunks, one block adds the counts up, and blocks take their

@@ -118,11 +118,10 @@ void aim_samples(const Op& a, const Make& make) {
       using Voxel = decltype(voxel);
       const auto* stored = static_cast<const Voxel*>(args.bricks_bzyxc);
       const auto* constants = static_cast<const Voxel*>(args.constant_tnc);
-      const BrickView<Voxel> bricks{stored,    constants,   nullptr,       nullptr, args.bricks,
-                                    args.side, args.border, args.channels, 0};
-      const AimSample<T, Voxel> aim{walk.rays, walk.tree,        walk.levels,      bricks,
-                                    read,      lay(a.segment_k), lay(a.number_k),  args.rays,
-                                    segments,  args.nodes,       walk.options.step};
+      const BrickView<Voxel> bricks{stored, constants, args.side, args.border, args.channels};
+      const AimSample<T, Voxel> aim{walk.rays, walk.tree,        walk.levels,     bricks,
+                                    read,      lay(a.segment_k), lay(a.number_k), args.rays,
+                                    segments,  args.nodes,       args.bricks,     walk.options.step};
       for_each(a.origin_r3, samples, make(aim, real, voxel));
     });
   });
@@ -145,7 +144,7 @@ inline auto run(const SampleBricksBackwardOp& a) {
     const Like like{a.origin_r3, a.distance_s3.scalar_type()};
     SpreadGradient<decltype(real), decltype(voxel)> args{aim, nullptr, nullptr, nullptr};
     GV_GRADIENT(GV_TAKE)
-    grad_bzyxc = give(args.grad_bzyxc, a.grad_kc, {aim.bricks.bricks, side, side, side, channels});
+    grad_bzyxc = give(args.grad_bzyxc, a.grad_kc, {aim.brick_count, side, side, side, channels});
     grad_tnc = give(args.grad_tnc, a.grad_kc, {a.constant_tnc.size(0), a.constant_tnc.size(1), channels});
     torch::stable::zero_(grad_bzyxc);
     torch::stable::zero_(grad_tnc);

@@ -7,7 +7,7 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-// As BrickRay. A lane with a constant has no slope and reads the pool's first voxels in vain.
+// As Spot. A lane with a constant has no slope and reads the pool's first voxels in vain.
 struct PacketBrick {
   Vec3<Floats> offset, slope;
   Floats constant;

@@ -1,5 +1,6 @@
-// What a shader may ask of the tree at a place of its ray: values of any channel, of any dtype, and gradients. Two
-// levels blend as in trace.h. The dtype is a switch at run time, the same for all threads.
+// What a shader may ask of the tree at a place of its ray: values of any channel, of any dtype, and gradients. Where
+// two levels blend, the coarse one gets the weight (cone - voxel) * blend, linear from the one's voxel to the other's.
+// The dtype is a switch at run time, the same for all threads, unless the compiler is told.
 #pragma once
 
 #include <type_traits>
@@ -52,16 +53,6 @@ GV_HD Vec3<T> unit(Vec3<T> v) {
   for (int axis = 0; axis < 3; ++axis) scaled[axis] = select(some, scaled[axis] / length, T{});
   return scaled;
 }
-
-// One node seen along one ray: place in its brick, in voxels = offset + t * slope.
-template <class T>
-struct Spot {
-  int32_t node, brick;
-  T scale;  // voxels a tree unit
-  Vec3<T> offset, slope;
-
-  GV_HD Vec3<T> at(T t) const { return {offset.x + t * slope.x, offset.y + t * slope.y, offset.z + t * slope.z}; }
-};
 
 // The eye's ray in the world.
 template <class T>
@@ -124,14 +115,14 @@ struct Probe {
               const Levels<T>& levels, const Visit<T>& visit, const Digits& digits)
       : channels(channels),
         sight(sight),
-        fine(spot(levels, visit.fine, digits, ray)),
+        fine(levels, visit.fine, digits, ray, channels.border),
         coarse(fine),
         mixed(visit.coarse.node != visit.fine.node),
         near(ray.cone_near),
         growth(ray.cone_growth),
         voxel(visit.voxel),
         blend(1 / (visit.above - visit.voxel)) {
-    if (mixed) coarse = spot(levels, visit.coarse, digits, ray);
+    if (mixed) coarse = Spot<T>(levels, visit.coarse, digits, ray, channels.border);
     for (int axis = 0; axis < 3; ++axis) cube[axis] = static_cast<T>(rays.place_33[3 + axis]);
   }
 
@@ -158,6 +149,11 @@ struct Probe {
 
   // The shader's own value at distance t.
   GV_HD T value(T t) const { return number_at(channels.value, channels.component, t); }
+  // Calls body(value), where value(t) is that: in the quickest way there is for this visit.
+  template <class Body>
+  GV_HD int32_t with_value(const Body& body) const {
+    return body([this](T t) { return value(t); });
+  }
 
   // A number of a channel at distance t.
   GV_HD T number_at(const ChannelView& channel, int32_t component, T t) const {
@@ -201,17 +197,6 @@ struct Probe {
   }
 
  private:
-  template <class Digits>
-  GV_HD Spot<T> spot(const Levels<T>& levels, const Holder& holder, const Digits& digits, const Ray<T>& ray) const {
-    Spot<T> spot{holder.node, holder.brick, levels.scale[holder.depth], {0, 0, 0}, {0, 0, 0}};
-    const Vec3<T> corner = digits.corner(holder.depth, levels);
-    const T first = static_cast<T>(channels.border) - static_cast<T>(0.5);
-    for (int axis = 0; axis < 3; ++axis) {
-      spot.offset[axis] = (ray.origin[axis] - corner[axis]) * spot.scale + first;
-      spot.slope[axis] = ray.direction[axis] * spot.scale;
-    }
-    return spot;
-  }
   GV_HD T weight(T t) const { return clamp((near + growth * t - voxel) * blend, static_cast<T>(0), static_cast<T>(1)); }
   GV_HD T read(const ChannelView& channel, int32_t component, const Spot<T>& spot, Vec3<T> at) const {
     if (spot.brick < 0) {
@@ -262,11 +247,27 @@ struct TypedProbe : Probe<T> {
     const int32_t component = this->channels.component;
     return this->blended(t, [&](const Spot<T>& spot) {
       const auto* constants = static_cast<const Voxel*>(channel.constant_tnc);
-      const auto* voxels = static_cast<const Voxel*>(channel.bricks_bzyxc);
       if (spot.brick < 0) return number<T>(constants[static_cast<int64_t>(spot.node) * channel.width + component]);
-      const Voxel* first = voxels + this->first_of(channel, component, spot);
-      return trilinear(first, this->channels.side, channel.width, spot.at(t));
+      return trilinear(first(spot), this->channels.side, channel.width, spot.at(t));
     });
+  }
+  template <class Body>
+  GV_HD int32_t with_value(const Body& body) const {
+#ifdef __CUDA_ARCH__
+    // The usual bricks, 8 and 16 voxels wide with a border of 1.
+    if (!this->mixed && this->fine.brick >= 0 && this->channels.value.width == 1) {
+      const Voxel* voxels = first(this->fine);
+      if (this->channels.side == 10) return body([&](T t) { return trilinear<10>(voxels, 10, 1, this->fine.at(t)); });
+      if (this->channels.side == 18) return body([&](T t) { return trilinear<18>(voxels, 18, 1, this->fine.at(t)); });
+    }
+#endif
+    return body([this](T t) { return value(t); });
+  }
+
+ private:
+  GV_HD const Voxel* first(const Spot<T>& spot) const {
+    const ChannelView& channel = this->channels.value;
+    return static_cast<const Voxel*>(channel.bricks_bzyxc) + this->first_of(channel, this->channels.component, spot);
   }
 };
 template <class T, class Voxel>

@@ -1,6 +1,7 @@
 // Segments: the runs of intervals that rays take in the bricks they pass, for shaders that are no kernel. Rays are
-// walked as in trace.h (the same visits, marks and intervals), but nothing is shaded: what a sample needs is written
-// down. SampleBricks then reads any channel at any sample, to the bit as the renderer does; CompositeRay adds up.
+// walked as in shade_rays.h (the same visits, marks and intervals), but nothing is shaded: what a sample needs is
+// written down. SampleBricks then reads any channel at any sample, to the bit as the renderer does; CompositeRay adds
+// up.
 //
 // A segment is all the whole intervals of one visit that have one length and one base, or one piece of any length: the
 // last interval of a ray, cut at the far side, or a region of one value. Lists have exact sizes: rays are walked twice,
@@ -207,6 +208,15 @@ GV_HD void add_to(T* sum, T value) {
 #endif
 }
 
+// A channel of a dtype that the compiler knows.
+template <class Voxel>
+struct BrickView {
+  const Voxel *bricks_bzyxc, *constant_tnc;
+  int32_t side, border, channels;
+
+  GV_HD int64_t first(int32_t brick) const { return static_cast<int64_t>(brick) * side * side * side * channels; }
+};
+
 // What a sample of a segment reads: the bricks (or constants) of two nodes, and the weight of the coarse one.
 template <class T, class Voxel>
 struct AimSample {
@@ -216,12 +226,11 @@ struct AimSample {
   BrickView<Voxel> bricks;
   SegmentView<T> segments;  // read
   const int32_t *segment_k, *number_k;
-  int64_t ray_count, segment_count, node_count;
+  int64_t ray_count, segment_count, node_count, brick_count;
   T step;
 
   struct Aimed {
-    BrickRay<T, Voxel> fine, coarse;
-    Holder fine_holder, coarse_holder;
+    Spot<T> fine, coarse;
     T t, weight;
     bool known = false;  // all that the segment names exists
   };
@@ -237,11 +246,12 @@ struct AimSample {
     if (segment < 0 || segment >= segment_count) return aimed;
     const int32_t wanted = segments.depth_s3[3 * segment + 2];
     const int64_t ray_number = segments.ray_s[segment];
+    Holder holders[2];
     for (int which = 0; which < 2; ++which) {
-      Holder& holder = which == 0 ? aimed.fine_holder : aimed.coarse_holder;
+      Holder& holder = holders[which];
       holder = {segments.node_s2[2 * segment + which], segments.brick_s2[2 * segment + which],
                 segments.depth_s3[3 * segment + which]};
-      if (holder.node < 0 || holder.node >= node_count || holder.brick >= bricks.bricks || holder.depth < 0 ||
+      if (holder.node < 0 || holder.node >= node_count || holder.brick >= brick_count || holder.depth < 0 ||
           holder.depth > tree.max_depth)
         return aimed;
     }
@@ -249,11 +259,11 @@ struct AimSample {
     aimed.known = true;
     const Ray<T> ray(rays, ray_number);
     Digits digits(tree, ray.at(segments.distance_s3[3 * segment + 2]));
-    aimed.fine = aimed.coarse = aim(bricks, levels, aimed.fine_holder, digits, ray.origin, ray.direction);
+    aimed.fine = aimed.coarse = Spot<T>(levels, holders[0], digits, ray, bricks.border);
     aimed.t = place(segment, number_k[k]);
     aimed.weight = 0;
-    if (aimed.coarse_holder.node != aimed.fine_holder.node) {
-      aimed.coarse = aim(bricks, levels, aimed.coarse_holder, digits, ray.origin, ray.direction);
+    if (holders[1].node != holders[0].node) {
+      aimed.coarse = Spot<T>(levels, holders[1], digits, ray, bricks.border);
       const T voxel = levels.voxel[wanted];
       const T blend = 1 / ((wanted > 0 ? levels.voxel[wanted - 1] : static_cast<T>(INFINITY)) - voxel);
       const T cone = ray.cone_near + ray.cone_growth * aimed.t;
@@ -280,24 +290,24 @@ struct SampleBricks {
   T* value_kc;
 
   GV_HD void operator()(int64_t k) const {
-    auto aimed = aim_sample(k);
+    const auto aimed = aim_sample(k);
     const BrickView<Voxel>& bricks = aim_sample.bricks;
-    const bool mixed = aimed.coarse_holder.node != aimed.fine_holder.node;
+    const bool mixed = aimed.coarse.node != aimed.fine.node;
     for (int32_t channel = 0; channel < bricks.channels; ++channel) {
       T value = 0;
       if (aimed.known) {
-        value = read(aimed.fine, aimed.fine_holder, aimed.t, channel);
-        if (mixed) value = value + aimed.weight * (read(aimed.coarse, aimed.coarse_holder, aimed.t, channel) - value);
+        value = read(aimed.fine, aimed.t, channel);
+        if (mixed) value = value + aimed.weight * (read(aimed.coarse, aimed.t, channel) - value);
       }
       value_kc[k * bricks.channels + channel] = value;
     }
   }
-  GV_HD T read(BrickRay<T, Voxel> ray, const Holder& holder, T t, int32_t channel) const {
+  GV_HD T read(const Spot<T>& spot, T t, int32_t channel) const {
     const BrickView<Voxel>& bricks = aim_sample.bricks;
-    if (ray.voxels == nullptr)
-      return number<T>(bricks.constant_tnc[static_cast<int64_t>(holder.node) * bricks.channels + channel]);
-    ray.voxels += channel;
-    return sample(bricks, ray, t);
+    if (spot.brick < 0)
+      return number<T>(bricks.constant_tnc[static_cast<int64_t>(spot.node) * bricks.channels + channel]);
+    const Voxel* voxels = bricks.bricks_bzyxc + bricks.first(spot.brick) + channel;
+    return trilinear(voxels, bricks.side, bricks.channels, spot.at(t));
   }
 };
 
@@ -311,31 +321,29 @@ struct SpreadGradient {
   GV_HD void operator()(int64_t k) const {
     const auto aimed = aim_sample(k);
     if (!aimed.known) return;
-    const bool mixed = aimed.coarse_holder.node != aimed.fine_holder.node;
-    spread(aimed.fine, aimed.fine_holder, aimed.t, k, 1 - aimed.weight);
-    if (mixed) spread(aimed.coarse, aimed.coarse_holder, aimed.t, k, aimed.weight);
+    spread(aimed.fine, aimed.t, k, 1 - aimed.weight);
+    if (aimed.coarse.node != aimed.fine.node) spread(aimed.coarse, aimed.t, k, aimed.weight);
   }
-  GV_HD void spread(const BrickRay<T, Voxel>& ray, const Holder& holder, T t, int64_t k, T share) const {
+  GV_HD void spread(const Spot<T>& spot, T t, int64_t k, T share) const {
     const BrickView<Voxel>& bricks = aim_sample.bricks;
     const T* grad_c = grad_kc + k * bricks.channels;
-    if (ray.voxels == nullptr) {
-      T* constant = grad_tnc + static_cast<int64_t>(holder.node) * bricks.channels;
+    if (spot.brick < 0) {
+      T* constant = grad_tnc + static_cast<int64_t>(spot.node) * bricks.channels;
       for (int32_t channel = 0; channel < bricks.channels; ++channel)
         add_to(constant + channel, share * grad_c[channel]);
       return;
     }
-    const Vec3<T> at{ray.offset.x + t * ray.slope.x, ray.offset.y + t * ray.slope.y, ray.offset.z + t * ray.slope.z};
-    const Eight<T> eight(at, bricks.side);
+    const Eight<T> eight(spot.at(t), bricks.side);
     const auto& weight = eight.weight;
-    const int64_t first = static_cast<int64_t>(holder.brick) * bricks.side * bricks.side * bricks.side;
+    T* first = grad_bzyxc + bricks.first(spot.brick);
     for (int which = 0; which < 8; ++which) {
       const int dx = which & 1, dy = which >> 1 & 1, dz = which >> 2;
       const T part = share * (dx ? weight[0] : 1 - weight[0]) * (dy ? weight[1] : 1 - weight[1]) *
                      (dz ? weight[2] : 1 - weight[2]);
       const int64_t z = eight.cell[2] + dz, y = eight.cell[1] + dy, x = eight.cell[0] + dx;
-      const int64_t voxel = first + (z * bricks.side + y) * bricks.side + x;
+      T* voxel_c = first + ((z * bricks.side + y) * bricks.side + x) * bricks.channels;
       for (int32_t channel = 0; channel < bricks.channels; ++channel) {
-        add_to(grad_bzyxc + voxel * bricks.channels + channel, part * grad_c[channel]);
+        add_to(voxel_c + channel, part * grad_c[channel]);
       }
     }
   }

@@ -1,7 +1,10 @@
-// ShadeRay: one ray through the tree with any shader of shaders.h. As TraceRay (trace.h, the plain function on CUDA),
-// but dtypes are switches at run time unless the kernel is told, and each interval goes to the shader. With shadows, a
-// cone goes from each sample to the light, through the same tree; its samples, stamps and requests count as the ray's
-// own.
+// ShadeRay: one ray from the scene's near side to its far side. Descend, skip or sample, give each interval to a shader
+// of shaders.h, which composites front to back, and mark what was used and what was missed. With shadows, a cone goes
+// from each sample to the light, through the same tree; its samples, stamps and requests count as the ray's own.
+//
+// Equal to ops/reference/march.py and shaders.py: integers exactly, and every float operation in the same order.
+// Method: Crassin, Neyret, Lefebvre, Eisemann, "GigaVoxels: Ray-Guided Streaming for Efficient and Detailed Voxel
+// Rendering", I3D 2009, sections 3 and 4; Crassin, PhD thesis 2011, chapter 6.
 #pragma once
 
 #include <type_traits>
@@ -23,7 +26,7 @@ struct ShadeRay : Walk<T> {
   using Walk<T>::tree;
   using Walk<T>::options;
   using Sum = typename Shader::Sum;
-  static constexpr int kBlocksAtOnce = 4;  // on a multiprocessor of CUDA: 128 registers
+  static constexpr int kBlocksAtOnce = std::is_void_v<Voxel> ? 4 : 8;  // of CUDA: 128 or 64 registers, see for_each.h
   static constexpr bool kHidesAlike = HidesAlike<Shader>::value;
   Shader shader;
   Channels channels;
@@ -60,7 +63,8 @@ struct ShadeRay : Walk<T> {
     Sum sum;
     sum.begin(0, static_cast<T>(this->rays.clear(number)), this->hit_clear, features_rc + number * features);
     for (int32_t c = 0; c < features; ++c) sum.feature_c[c] = 0;
-    Visitor<Shader> visitor{*this, shader, &ray, &sight, sum};
+    const auto& ready = ready_for_ray(shader);
+    Visitor<std::decay_t<decltype(ready)>> visitor{*this, ready, &ray, &sight, sum};
     this->follow(ray, at, visitor);
     if constexpr (Shader::kSurface) {
       if (sum.depth < static_cast<T>(INFINITY)) {
@@ -166,11 +170,20 @@ struct ShadeRay : Walk<T> {
       ++samples;
     }
     GV_HD int32_t take(const Eye& probe, const Intervals<T>& at, int32_t alike, bool last) {
+      // Most shaders are too long to be there twice.
+      constexpr bool kShort = !std::is_void_v<Voxel>;
+      if (kShort && last) return take_by([&](T t) { return probe.value(t); }, probe, at, 1, true);
+      return probe.with_value([&](const auto& value) { return take_by(value, probe, at, alike, !kShort && last); });
+    }
+
+   private:
+    template <class Value>
+    GV_HD int32_t take_by(const Value& value, const Eye& probe, const Intervals<T>& at, int32_t alike, bool last) {
       Piece<T> piece;
-      int32_t taken = 0;
-      if (kEnds) piece.back = probe.value(at.start);
+      T number = at.count;
+      const T end = number + static_cast<T>(alike);
+      if (kEnds) piece.back = value(at.start);
       do {
-        const T number = at.count + static_cast<T>(taken);
         piece.start = at.start_of(number);
         piece.end = last ? at.stop : at.start_of(number + 1);
         if (last) {
@@ -182,18 +195,17 @@ struct ShadeRay : Walk<T> {
         }
         if (kEnds) {
           piece.front = piece.back;
-          piece.back = probe.value(piece.end);
+          piece.back = value(piece.end);
         } else {
-          piece.value = probe.value(piece.middle);
+          piece.value = value(piece.middle);
         }
         add(piece, probe);
-        ++taken;
-      } while (taken < alike && sees());
+        number = number + 1;
+      } while (number < end && sees());
+      const int32_t taken = static_cast<int32_t>(number - at.count);
       samples += taken;
       return taken;
     }
-
-   private:
     GV_HD static void cut(Piece<T>& piece) {
       piece.odd = true;
       piece.length = piece.end - piece.start;

@@ -49,16 +49,18 @@ struct ShaderFacts {
   static bool packs(const ShadeArgs&) { return true; }  // packets may take its rays
 };
 
-// The plain transfer function.
-template <class T>
+// The plain transfer function. Table: TransferTable or Transfer.
+template <class T, class Table = TransferTable<T>>
 struct Plain : ShaderFacts {
   template <class V>
   using SumOf = ShadeSum<V>;
   using Sum = SumOf<T>;
-  TransferTable<T> transfer;
+  Table transfer;
   T step;
 
   explicit Plain(const TraceArgs& args) : transfer(args), step(static_cast<T>(args.step)) {}
+  template <class Other>
+  GV_HD explicit Plain(const Plain<T, Other>& other) : transfer(other.transfer), step(other.step) {}
 
   template <class Any>
   GV_HD bool hides(T low, T high, const Any&) const {
@@ -71,6 +73,16 @@ struct Plain : ShaderFacts {
   }
   GV_HD void done(Sum&) const {}
 };
+
+// A shader as a ray takes it along: what is read once for all its samples has been read.
+template <class Shader>
+GV_HD const Shader& ready_for_ray(const Shader& shader) {
+  return shader;
+}
+template <class T>
+GV_HD Plain<T, Transfer<T>> ready_for_ray(const Plain<T>& shader) {
+  return Plain<T, Transfer<T>>(shader);
+}
 
 // The transfer function, lit.
 template <class T>

@@ -6,6 +6,7 @@
 #pragma once
 
 #include "base/arguments.h"
+#include "walk/ray.h"
 #include "walk/tree.h"
 
 namespace gvtorch {
@@ -41,48 +42,28 @@ inline int64_t brick_bytes(VoxelType type, int32_t side, int32_t channels) {
   return bytes;
 }
 
-template <class Voxel>
-struct BrickView {
-  const Voxel* bricks_bzyxc;
-  const Voxel* constant_tnc;
-  const Voxel* range_tn2c;  // smallest and largest value in reach of the node's brick
-  int32_t* stamp_b;
-  int64_t bricks;
-  int32_t side;  // B + 2 * border
-  int32_t border;
-  int32_t channels;
-  int32_t component;
-};
+// One node seen along one ray: place in its brick, in voxels = offset + t * slope.
+template <class T>
+struct Spot {
+  int32_t node = kAbsent, brick = kAbsent;
+  T scale = 0;  // voxels a tree unit
+  Vec3<T> offset{0, 0, 0}, slope{0, 0, 0};
 
-// One brick (or constant) seen along one ray: voxel coordinate = offset + t * slope.
-template <class T, class Voxel>
-struct BrickRay {
-  const Voxel* voxels = nullptr;  // the brick's first voxel; null: `constant` everywhere
-  T constant = 0;
-  Vec3<T> offset{0, 0, 0};
-  Vec3<T> slope{0, 0, 0};
+  Spot() = default;
+  GV_HD Spot(int32_t node, int32_t brick, T scale, Vec3<T> offset, Vec3<T> slope)
+      : node(node), brick(brick), scale(scale), offset(offset), slope(slope) {}
+  template <class Digits>
+  GV_HD Spot(const Levels<T>& levels, const Holder& holder, const Digits& digits, const Ray<T>& ray, int32_t border)
+      : node(holder.node), brick(holder.brick), scale(levels.scale[holder.depth]) {
+    const Vec3<T> corner = digits.corner(holder.depth, levels);
+    const T first = static_cast<T>(border) - static_cast<T>(0.5);
+    for (int axis = 0; axis < 3; ++axis) {
+      offset[axis] = (ray.origin[axis] - corner[axis]) * scale + first;
+      slope[axis] = ray.direction[axis] * scale;
+    }
+  }
+  GV_HD Vec3<T> at(T t) const { return {offset.x + t * slope.x, offset.y + t * slope.y, offset.z + t * slope.z}; }
 };
-
-template <class T, class Voxel, class Number>
-GV_HD BrickRay<T, Voxel> aim(const BrickView<Voxel>& view, const Levels<T>& levels, const Holder& holder,
-                             const Number& digits, Vec3<T> origin, Vec3<T> direction) {
-  BrickRay<T, Voxel> ray;
-  if (holder.brick < 0) {
-    if (holder.node >= 0)
-      ray.constant = number<T>(view.constant_tnc[static_cast<int64_t>(holder.node) * view.channels + view.component]);
-    return ray;
-  }
-  const int64_t volume = static_cast<int64_t>(view.side) * view.side * view.side;
-  ray.voxels = view.bricks_bzyxc + (holder.brick * volume * view.channels + view.component);
-  const T scale = levels.scale[holder.depth];
-  const Vec3<T> corner = digits.corner(holder.depth, levels);
-  const T first = static_cast<T>(view.border) - static_cast<T>(0.5);
-  for (int axis = 0; axis < 3; ++axis) {
-    ray.offset[axis] = (origin[axis] - corner[axis]) * scale + first;
-    ray.slope[axis] = direction[axis] * scale;
-  }
-  return ray;
-}
 
 // The lower of the two voxels beside a place, along one axis; the upper one exists. A packet multiplies floats faster.
 template <class T>
@@ -142,13 +123,6 @@ GV_HD T trilinear(const Voxel* voxels, int32_t any_side, int32_t channels, Vec3<
     left = number<T>(first[0]);
     right = number<T>(first[step_x]);
   });
-}
-
-template <int32_t kSide = 0, class T, class Voxel>
-GV_HD T sample(const BrickView<Voxel>& view, const BrickRay<T, Voxel>& ray, T t) {
-  if (ray.voxels == nullptr) return ray.constant;
-  const Vec3<T> at{ray.offset.x + t * ray.slope.x, ray.offset.y + t * ray.slope.y, ray.offset.z + t * ray.slope.z};
-  return trilinear<kSide>(ray.voxels, view.side, view.channels, at);
 }
 
 }  // namespace GV_NAMESPACE

@@ -1,5 +1,5 @@
 // From node to node along a ray: which node a visit stands in, what is marked there, where the visit ends, and which
-// intervals are taken in it. What is made of them a visitor tells: that of trace.h, shade_rays.h or segments.h. Packets
+// intervals are taken in it. What is made of them a visitor tells: that of shade_rays.h or segments.h. Packets
 // have a walk of their own (packet_walk.h).
 #pragma once
 
