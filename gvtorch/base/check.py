@@ -92,16 +92,16 @@ def tensors(
     """
     known = {**_DIGITS, **(sizes or {})}
     for name, value, shape, dtype in fields:
-        if tuple(map(known.get, shape)) != getattr(value, "shape", None):  # wrong, or a new letter
-            expected = [known.get(letter, letter) for letter in shape]
-            tensor(where, name, value, expected, dtype, device)
-            for letter, size in zip(shape, value.shape, strict=True):
-                if known.setdefault(letter, size) != size:  # it stands twice in this shape
-                    raise ValueError(
-                        f"{where}: {name} must be ({', '.join(shape)}), got {describe(value)}"
-                    )
-        elif value.dtype != dtype or value.device != device:
-            tensor(where, name, value, value.shape, dtype, device)
+        expected = [known.get(letter, letter) for letter in shape]
+        fits = isinstance(value, Tensor) and value.dtype == dtype and value.device == device
+        if not fits or value.dim() != len(shape):
+            tensor(where, name, value, expected, dtype, device)  # raises
+        for letter, size in zip(shape, value.shape, strict=True):
+            if known.setdefault(letter, size) != size:
+                tensor(where, name, value, expected, dtype, device)  # raises, unless it is new
+                raise ValueError(
+                    f"{where}: {name} must be ({', '.join(shape)}), got {describe(value)}"
+                )
         if not value.is_contiguous():
             raise ValueError(f"{where}: {name} must be contiguous")
     return known

@@ -66,8 +66,9 @@ def op(also: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
         hints = get_type_hints(twin, include_extras=True).items()
         marks = {name: get_args(hint)[1] for name, hint in hints if get_origin(hint) is Annotated}
         ranges = {name: mark for name, mark in marks.items() if isinstance(mark, range)}
+        places = {name: place for place, name in enumerate(names)}
         tensors = [
-            (name, check.shape_of(name) if "_" in name else "", dtype)
+            (places[name], name, check.shape_of(name) if "_" in name else "", dtype)
             for dtype in (torch.int32, torch.int64, torch.bool)
             for name, mark in marks.items()
             if mark == dtype
@@ -79,16 +80,16 @@ def op(also: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
                 bound = signature.bind(*given, **named)
                 bound.apply_defaults()
                 given = tuple(bound.arguments.values())[: len(names)]
-            by_name, device = dict(zip(names, given, strict=True)), given[0].device
+            device = given[0].device
             fields = [
-                (name, by_name[name], shape or "abcd"[: by_name[name].dim()], dtype)
-                for name, shape, dtype in tensors
+                (name, given[place], shape or "abcd"[: given[place].dim()], dtype)
+                for place, name, shape, dtype in tensors
             ]
             check.tensors(where, device, fields)
             for name, inside in ranges.items():
-                check.whole(where, name, by_name[name], low=inside[0], high=inside[-1])
+                check.whole(where, name, given[places[name]], low=inside[0], high=inside[-1])
             if also is not None:
-                also(**by_name)
+                also(**dict(zip(names, given, strict=True)))
             if choose_backend(backend, device) == "reference":
                 return twin(*given, backend="reference")
             return getattr(torch.ops.gvtorch, where)(*given)

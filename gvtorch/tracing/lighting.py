@@ -338,7 +338,8 @@ def _beside(axis: Tensor) -> tuple[Tensor, Tensor]:
 def _cones_over(normal: Tensor, sample: Tensor, count: int) -> Iterator[Tensor]:
     """Directions (r, 3), cosine-weighted around (r, 3) normals, the next `count` of a sequence that
     fills the unit square evenly (Roberts, 2018). It begins at another place for each pixel, and
-    goes on from sample to sample. Integers, + - * / and square roots: same bits on every device.
+    goes on from sample to sample. Made of integers, + - * / and roots: to an ulp the same on every
+    device.
     """
     right, up = _beside(normal)
     begin_x = _scrambled((sample & _WORD) + 1)
