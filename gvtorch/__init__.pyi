@@ -33,6 +33,7 @@ from .cpp_ext.user import CompileError as CompileError
 from .shaders import (
     CompiledShader as CompiledShader,
     DirectionalLight as DirectionalLight,
+    Filtered as Filtered,
     Headlight as Headlight,
     ModuleShader as ModuleShader,
     PointLight as PointLight,

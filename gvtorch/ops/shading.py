@@ -28,6 +28,7 @@ SHADER_KINDS = (
     "ShadowedLit",
     "ShadowedColor",
     "GradientMagnitude",
+    "Filtered",
 )
 
 
@@ -79,6 +80,12 @@ class GradientMagnitudeNumbers(NamedTuple):
     """The own number of a shader by gradient magnitude."""
 
     full: Number  # the gradient's length at which opacity is whole, value per world unit
+
+
+class FilteredNumbers(NamedTuple):
+    """The own number of a transfer function with filtered colours."""
+
+    side: Number  # of the root cube, its smallest, world length
 
 
 _Record = TypeVar("_Record")

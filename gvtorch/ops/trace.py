@@ -116,7 +116,7 @@ def check_shade(
     device, shape = rays.origin_r3.device, "k" if own else "54"
     parameters = ("parameter_54", parameter_54, shape, arguments.table_lm4.dtype)
     check.tensors(where, device, [parameters])
-    others = 0
+    others, pool = 0, "e" if kind == "Filtered" else "b"
     for name, bricks, constants, width in (
         ("normal", shading.normal_bzyxc, shading.normal_tnc, "3"),
         ("other", shading.other_bzyxc, shading.other_tnc, "d"),
@@ -125,10 +125,11 @@ def check_shade(
             raise ValueError(f"{where}: {name}_bzyxc and {name}_tnc belong together")
         if bricks is not None and constants is not None:
             fields = (
-                (f"{name}_bzyxc", bricks, f"bsss{width}", bricks.dtype),
+                (f"{name}_bzyxc", bricks, f"{pool}sss{width}", bricks.dtype),
                 (f"{name}_tnc", constants, f"tn{width}", bricks.dtype),
             )
             others = check.tensors(where, device, fields, sizes).get("d", 0)
+            check.whole(where, f"bricks of {name}_bzyxc", len(bricks), low=0, high=sizes["b"])
     colored = sizes["c"] in (4, 24) and arguments.component == 3
     if kind in ("StoredColor", "ShadowedColor") and not colored:
         raise ValueError(
@@ -136,6 +137,8 @@ def check_shade(
         )
     if kind == "Features" and not others:
         raise ValueError(f"{where}: features need other_bzyxc")
+    if kind == "Filtered" and others not in (4, 24):
+        raise ValueError(f"{where}: filtered colours need an other_bzyxc of 4 or 24 numbers")
     given = {"Features": others, "Projection": 1}.get(kind, 0)
     if own:
         check.whole(where, "features", shading.features, low=0)

@@ -3,6 +3,7 @@
 from .built_in import *  # noqa: F403
 from .built_in import __all__ as _built_in
 from .compiled import CompiledShader
+from .filtered import Filtered
 from .lights import DirectionalLight, Headlight, PointLight
 from .module import ModuleShader, TransferModule
 from .shader import Shader
@@ -11,6 +12,7 @@ from .transfer_function import TransferFunction
 __all__ = [  # noqa: PLE0604
     "CompiledShader",
     "DirectionalLight",
+    "Filtered",
     "Headlight",
     "ModuleShader",
     "PointLight",

@@ -86,6 +86,7 @@ class Shader:
         normals: Name of a channel of 3 numbers that holds normals; None: the gradient's.
         other: Name of a second channel that it reads, or None.
         other_component: Which number of it colours a surface.
+        finer: Levels are chosen as if voxels were so many times as large as they are.
         whole_ray: It must see a ray in one go: what cuts rays into pieces refuses it.
         uses_torch: Its colours are made in torch, outside of the kernel. The host waits for the
             device meanwhile, so it is not recorded as a CUDA graph.
@@ -99,6 +100,7 @@ class Shader:
     normals: str | None = None
     other: str | None = None
     other_component: int = 0
+    finer: float = 1.0
     whole_ray: bool = False
     uses_torch: bool = False
 

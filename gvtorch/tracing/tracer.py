@@ -71,7 +71,7 @@ class Tracer:
             branching=tree.branching,
             max_depth=tree.depth,
             border=tree.bricks.border,
-            root_voxel=tree.root_voxel,
+            root_voxel=tree.root_voxel * shader.finer,
             cone_scale=scale,
             step=step,
             bricks_bzyxc=tree.bricks.bricks[channel],

@@ -20,6 +20,8 @@ def on(tree: gv.N3Tree, device: str) -> gv.N3Tree:
         border=tree.bricks.border,
         device=device,
     )
+    for name, voxels in tree.bricks.bricks.items():  # some channels are those of the first bricks
+        bricks.bricks[name] = torch.empty_like(voxels, device=device)
     half = 0.5 * torch.tensor(tree.spacing, dtype=torch.float64)
     origin = tuple((tree.box[0] + half).tolist())
     copy = gv.N3Tree(

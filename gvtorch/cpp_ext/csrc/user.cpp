@@ -52,6 +52,7 @@ template struct Interface<double, UserShaderOf<double>>;
 struct OneShader {
   using Known = UserShaderOf<float>;
   static bool integrates(int64_t) { return false; }
+  static bool filtered(int64_t) { return false; }
   static void check(const ShadeArgs& args) {
     constexpr int32_t features = Known::kFeatures, uniforms = Known::kUniforms;
     STD_TORCH_CHECK(args.shader == 0, "gvtorch: shader must be 0");

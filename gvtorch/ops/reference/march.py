@@ -100,8 +100,8 @@ class Probe:
         return torch.stack([self.blend(t, partial(slope, axis)) for axis in range(3)], 1)
 
     def blend(self, t: Tensor, ask: Callable[[Holder], Tensor]) -> Tensor:
-        """What the node says and what its parent says, whose weight grows from 0 where the cone is
-        as wide as the node's voxels to 1 where it is as wide as its parent's.
+        """(r,) or (r, c): what the node says and what its parent says, whose weight grows from 0
+        where the cone is as wide as the node's voxels to 1 where it is as wide as its parent's.
         """
         answer = self.answer
         two, value = answer.fine.node != answer.coarse.node, ask(answer.fine)
@@ -109,6 +109,8 @@ class Probe:
             return value
         share = divide(1.0, answer.above - answer.voxel, answer.voxel)
         weight = clamp((self.beam.cone(t) - answer.voxel) * share, 0, 1)
+        if value.dim() == 2:
+            weight, two = weight[:, None], two[:, None]
         return torch.where(two, value + weight * (ask(answer.coarse) - value), value)
 
 

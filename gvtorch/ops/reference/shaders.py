@@ -14,9 +14,11 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from ...base.constants import EMPTY
 from ..arguments import RayArguments, ShadeArguments, TraceArguments
 from ..shading import (
     SHADER_KINDS,
+    FilteredNumbers,
     GradientMagnitudeNumbers,
     IsosurfaceNumbers,
     LightKind,
@@ -25,10 +27,10 @@ from ..shading import (
     ShadeParameters,
     StoredColorNumbers,
 )
-from .exact import clamp, dot, larger, power, sqrt_exact, stretch, unit
+from .exact import clamp, divide, dot, larger, power, sqrt_exact, stretch, unit
 from .march import Piece, Plain, Probe, Visitor, Walk, above, below, mix
 from .rays import INF, Intervals
-from .tree import Bricks
+from .tree import Bricks, Holder
 
 _BISECTIONS = 4
 
@@ -253,14 +255,7 @@ class StoredColor(Shade):
         def read(component: int) -> Tensor:
             return probe.number(replace(self.channel, component=component), t)
 
-        if self.channel.bricks_bzyxc.shape[4] == 4:
-            return read(number)
-        side = [
-            torch.where(d < 0, read(8 * axis + 4 + number), read(8 * axis + number))
-            for axis, d in enumerate(along.unbind(1))
-        ]
-        x, y, _ = (along * along).unbind(1)
-        return side[2] + x * (side[0] - side[2]) + y * (side[1] - side[2])
+        return _by_direction(along, self.channel.bricks_bzyxc.shape[4], number, read)
 
 
 class PreIntegrated(Shade):
@@ -417,6 +412,63 @@ class GradientMagnitude(Shade):
         self.sum.add(torch.cat((rgba[:, :3], alpha[:, None]), 1), piece, where)
 
 
+class Filtered(Shade):
+    """The transfer function, and the colours that the pool's first bricks have."""
+
+    def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
+        fine, coarse = probe.answer.fine, probe.answer.coarse
+        stored = self.stored(fine) | self.stored(coarse)
+        rgba = self.rgba(piece, probe)
+        self.sum.add(rgba, piece, where & ~stored)
+        if not (where & stored).any():
+            return
+        rgba = probe.blend(piece.middle, lambda holder: self.look(piece, probe, holder))
+        self.sum.add_light(self.sum.clear[:, None] * rgba[:, :3], where & stored)
+        self.sum.absorb(rgba[:, 3], piece, where & stored)
+
+    def stored(self, holder: Holder) -> Tensor:
+        """(r,) bool: the node's brick has colours."""
+        bricks = self.others[0].bricks_bzyxc if self.others else self.channel.bricks_bzyxc[:0]
+        return (holder.brick >= 0) & (holder.brick < len(bricks))
+
+    def look(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
+        """(r, 4) premultiplied colours and alphas of intervals, as one of the nodes shows them."""
+        t, stored = piece.middle, self.stored(holder)
+        value = self.channel.sample(holder, probe.beam, t)
+        row = self.transfer.interval(value, piece)
+        row = torch.cat((row[:, :3] * row[:, 3:], row[:, 3:]), 1)
+        known = replace(holder, brick=torch.where(stored, holder.brick, EMPTY))
+
+        def number(component: int) -> Tensor:
+            return self.others[component].sample(known, probe.beam, t)
+
+        along, width = self.light.along, len(self.others)
+        seen = [_by_direction(along, width, i, number) for i in range(4)]
+        whole = clamp(seen[3], 0, 1)
+        inner = self.channel.bricks_bzyxc.shape[1] - 2 * self.channel.border
+        scale = divide(inner, holder.size, holder.size)
+        side = self.light.parameters.own_as(FilteredNumbers).side
+        alpha = stretch(whole, piece.length * scale / side)
+        part = alpha / torch.where(whole > 0, whole, 1.0)
+        colors = torch.stack([*(one * part for one in seen[:3]), alpha], 1)
+        colors = torch.where((whole > 0)[:, None], colors, 0.0)
+        return torch.where(stored[:, None], colors, row)
+
+
+def _by_direction(along: Tensor, width: int, number: int, read: Callable[[int], Tensor]) -> Tensor:
+    """(r,) one of the four numbers of a voxel, as it is seen along rays (r, 3): of three
+    directions, where a channel holds 24 numbers; `read` gives one of them.
+    """
+    if width == 4:
+        return read(number)
+    side = [
+        torch.where(d < 0, read(8 * axis + 4 + number), read(8 * axis + number))
+        for axis, d in enumerate(along.unbind(1))
+    ]
+    x, y, _ = (along * along).unbind(1)
+    return side[2] + x * (side[0] - side[2]) + y * (side[1] - side[2])
+
+
 #: Twins by the names of C++'s structs.
 TWINS: dict[str, type[Shade]] = {
     "Lit": Shade,
@@ -428,6 +480,7 @@ TWINS: dict[str, type[Shade]] = {
     "ShadowedLit": Shade,
     "ShadowedColor": StoredColor,
     "GradientMagnitude": GradientMagnitude,
+    "Filtered": Filtered,
 }
 
 

@@ -154,7 +154,7 @@ struct ShadeArgs : TraceArgs {
   GV_SHADE(GV_VIEW)
 
   VoxelType normal_voxel, other_voxel;
-  int32_t other_channels;
+  int32_t other_channels, other_bricks;
   int32_t parameters;  // how many numbers there are: 20, and behind them a user's own
   void *normal_r3, *features_rc;
 };

@@ -248,16 +248,18 @@ inline std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> give_hits(TraceArgs& a
           give(args.missed_r, table, {args.rays})};
 }
 
-// Checks a second channel of the same pool, with `width` numbers a voxel (0: any); returns them, 0 where there is none.
+// Checks a second channel of the same pool (fewer: of its first bricks), with `width` numbers a voxel (0: any); returns
+// them, 0 where there is none.
 inline int32_t check_second(const std::optional<Tensor>& bricks_bzyxc, const std::optional<Tensor>& constant_tnc,
-                            const char* name, int64_t width, const TraceArgs& args, VoxelType& voxel) {
+                            const char* name, int64_t width, const TraceArgs& args, VoxelType& voxel,
+                            bool fewer = false) {
   STD_TORCH_CHECK(bricks_bzyxc.has_value() == constant_tnc.has_value(), "gvtorch: ", name,
                   " needs bricks and constants");
   if (!bricks_bzyxc.has_value()) return 0;
-  const int64_t side = check_bricks(*bricks_bzyxc), channels = bricks_bzyxc->size(4);
-  STD_TORCH_CHECK(
-      bricks_bzyxc->size(0) == args.bricks && side == args.side && channels >= 1 && (width == 0 || channels == width),
-      "gvtorch: ", name, " has the wrong shape");
+  const int64_t side = check_bricks(*bricks_bzyxc), channels = bricks_bzyxc->size(4), bricks = bricks_bzyxc->size(0);
+  STD_TORCH_CHECK((bricks == args.bricks || (fewer && bricks < args.bricks)) && side == args.side && channels >= 1 &&
+                      (width == 0 || channels == width),
+                  "gvtorch: ", name, " has the wrong shape");
   STD_TORCH_CHECK(
       constant_tnc->scalar_type() == bricks_bzyxc->scalar_type() && constant_tnc->numel() == args.nodes * channels,
       "gvtorch: the constants of ", name, " have the wrong dtype or size");
@@ -273,6 +275,10 @@ struct FusedShaders {
     return with_shader<float>(static_cast<int32_t>(shader),
                               [](auto type) { return decltype(type)::Shader::kIntegrates; });
   }
+  static bool filtered(int64_t shader) {
+    return with_shader<float>(static_cast<int32_t>(shader),
+                              [](auto type) { return decltype(type)::Shader::kFiltered; });
+  }
   static void check(const ShadeArgs& args) {
     with_shader<float>(args.shader, [&](auto type) {
       using Shader = typename decltype(type)::Shader;
@@ -280,6 +286,8 @@ struct FusedShaders {
       STD_TORCH_CHECK(!by_other || args.other_channels > 0, "gvtorch: other_bzyxc is missing");
       const bool colored = (args.channels == 4 || args.channels == 4 * kDirections) && args.component == 3;
       STD_TORCH_CHECK(!Shader::kColored || colored, "gvtorch: bricks_bzyxc must hold red, green, blue and opacity");
+      const bool sided = args.other_channels == 4 || args.other_channels == 4 * kDirections;
+      STD_TORCH_CHECK(!Shader::kFiltered || sided, "gvtorch: other_bzyxc must hold red, green, blue and opacity");
       STD_TORCH_CHECK(args.features == (by_other ? args.other_channels : Shader::kFeatures),
                       "gvtorch: features is not what the shader gives");
     });
@@ -310,9 +318,11 @@ auto shade_rays(const ShadeRaysOp& a) {
   const Like like{a.origin_r3, a.table_lm4.scalar_type()};
   GV_SHADE(GV_TAKE)
   check_second(a.normal_bzyxc, a.normal_tnc, "normal_bzyxc", 3, args, args.normal_voxel);
-  args.other_channels = check_second(a.other_bzyxc, a.other_tnc, "other_bzyxc", 0, args, args.other_voxel);
+  args.other_channels =
+      check_second(a.other_bzyxc, a.other_tnc, "other_bzyxc", 0, args, args.other_voxel, Shaders::filtered(a.shader));
   STD_TORCH_CHECK(!a.other_bzyxc.has_value() || a.other_component < args.other_channels,
                   "gvtorch: other_component out of range");
+  args.other_bricks = a.other_bzyxc.has_value() ? static_cast<int32_t>(a.other_bzyxc->size(0)) : 0;
   STD_TORCH_CHECK(a.parameter_54.numel() <= INT32_MAX, "gvtorch: parameter_54 is too large");
   args.parameters = static_cast<int32_t>(a.parameter_54.numel());
   Shaders::check(args);

@@ -141,6 +141,11 @@ struct PacketWalk {
     return slope;
   }
 
+  GV_HD Mask among(int32_t count) const {  // of bricks that are told by their numbers
+    const auto first = [&](const PacketBrick& brick) { return brick.stored & (brick.brick < count); };
+    return first(fine) | (mixed & first(coarse));
+  }
+
   GV_HD void narrow(Mask which) { marching = which; }
   // body(lane, probe) with each lane's own.
   template <class Body>

@@ -177,6 +177,15 @@ struct Probe {
     return slope;
   }
 
+  // What one of the two nodes says of a number, and how much the coarse one's counts.
+  GV_HD T number_of(const ChannelView& channel, int32_t component, const Spot<T>& spot, T t) const {
+    return read(channel, component, spot, spot.at(t));
+  }
+  GV_HD T weight(T t) const { return clamp((near + growth * t - voxel) * blend, static_cast<T>(0), static_cast<T>(1)); }
+
+  // A brick that answers has one of the first `count` slots.
+  GV_HD bool among(int32_t count) const { return fine.among(count) || coarse.among(count); }
+
   // No node that answers has a brick, and all numbers of both are equal: one value all over the visit.
   GV_HD bool uniform() const {
     if (fine.brick >= 0 || coarse.brick >= 0) return false;
@@ -197,7 +206,6 @@ struct Probe {
   }
 
  private:
-  GV_HD T weight(T t) const { return clamp((near + growth * t - voxel) * blend, static_cast<T>(0), static_cast<T>(1)); }
   GV_HD T read(const ChannelView& channel, int32_t component, const Spot<T>& spot, Vec3<T> at) const {
     if (spot.brick < 0) {
       return read_number<T>(channel.constant_tnc, channel.type,

@@ -44,6 +44,7 @@ struct ShaderFacts {
   static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
   static constexpr bool kIntegrates = false;  // its table is (l, m, m, 4)
   static constexpr bool kColored = false;     // its channel holds red, green, blue and opacity, once or by direction
+  static constexpr bool kFiltered = false;    // its second channel holds such numbers, of the pool's first bricks
   static constexpr int32_t kFeatures = 0;     // numbers of sum.feature_c
   static constexpr int32_t kAsOther = -1;     // for kFeatures: as many as the second channel holds
   static bool packs(const ShadeArgs&) { return true; }  // packets may take its rays
@@ -111,9 +112,25 @@ struct Lit : Plain<T> {
   }
 };
 
-// Colour and opacity of each voxel; the value is the opacity. A channel may hold four numbers for each of six
-// directions (Crassin et al., "Interactive indirect illumination using voxel cone tracing", CGF 2011): a ray reads
-// the three that it goes along, weighted by the squares of its direction, whose sum is 1. No packet reads those.
+// One of four numbers of a voxel, as it is seen along a direction. A channel may hold them for each of six directions
+// (Crassin et al., "Interactive indirect illumination using voxel cone tracing", CGF 2011): then three are read,
+// weighted by the squares of the direction, whose sum is 1. To the bit that of one direction, where all six are equal.
+template <class T, class Read>
+GV_HD T by_direction(const Vec3<T>& d, int32_t width, int32_t number, const Read& read) {
+  if (width == 4) return read(number);
+  const T z = read(number + 16 + (d.z < 0 ? 4 : 0));
+  T value = z;
+#ifdef __CUDA_ARCH__
+#pragma unroll 1
+#endif
+  for (int axis = 0; axis < 2; ++axis) {
+    const T other = read(number + 8 * axis + (d[axis] < 0 ? 4 : 0));
+    value = value + d[axis] * d[axis] * (other - z);
+  }
+  return value;
+}
+
+// Colour and opacity of each voxel, once or by direction, which no packet reads; the value is the opacity.
 template <class T>
 struct StoredColor : ShaderFacts {
   static constexpr bool kColored = true;
@@ -165,28 +182,91 @@ struct StoredColor : ShaderFacts {
     }
     sum.add(row, piece.start, piece.length, sum.hit_clear, shown);
   }
-  // One of the four numbers, as it is seen along the ray: to the bit that of one direction, where all six are equal.
+  // One of the four numbers, as it is seen along the ray.
   template <class Eye, class V>
   GV_HD static V seen(const Eye& probe, int32_t number, V t) {
     const auto& channel = probe.channels.value;
     if constexpr (kPacket<V>) {
       return probe.number_at(channel, number, t);
     } else {
-      const Vec3<T> d = probe.sight.direction;
-      const bool directional = channel.width > 4;
-      const T z = probe.number_at(channel, directional ? number + 16 + (d.z < 0 ? 4 : 0) : number, t);
-      T value = z;
-#ifdef __CUDA_ARCH__
-#pragma unroll 1
-#endif
-      for (int axis = 0; directional && axis < 2; ++axis) {
-        const T other = probe.number_at(channel, number + 8 * axis + (d[axis] < 0 ? 4 : 0), t);
-        value = value + d[axis] * d[axis] * (other - z);
-      }
-      return value;
+      const auto read = [&](int32_t which) { return probe.number_at(channel, which, t); };
+      return by_direction(probe.sight.direction, channel.width, number, read);
     }
   }
   GV_HD void done(Sum&) const {}
+};
+
+// The transfer function, right from afar too: a second channel, which the first bricks of the pool have, holds what the
+// function makes of the finest voxels below each of theirs: premultiplied colour and alpha of an interval as long as
+// the voxel, once or by direction, as StoredColor reads them. Other bricks, and nodes without one, are seen through the
+// function as ever; where two levels blend, their colours do.
+template <class T>
+struct Filtered : Plain<T> {
+  static constexpr bool kFiltered = true;
+  template <class V>
+  using SumOf = ShadeSum<V>;
+  struct Own {
+    T side;  // of the root cube, world
+  };
+  const Parameters<T>* parameters;
+  int32_t bricks;  // that the second channel has
+
+  explicit Filtered(const ShadeArgs& args)
+      : Plain<T>(args), parameters(static_cast<const Parameters<T>*>(args.parameter_54)), bricks(args.other_bricks) {}
+
+  template <class V, class Eye>
+  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
+    const MaskOf<V> stored = which && probe.among(bricks), not_stored = which && !stored;
+    if (any(not_stored)) Plain<T>::add(not_stored, piece, probe, sum);
+    if (!any(stored)) return;
+    Row<V> row{};
+    probe.each(stored, [&](int lane, const auto& own) {
+      Piece<T> one;
+      one.middle = lane_of(piece.middle, lane);
+      one.length = lane_of(piece.length, lane);
+      one.level = lane_of(piece.level, lane);
+      one.odd = piece.odd;
+      const Row<T> seen = look(one, own);
+      set_lane(row.red, lane, seen.red);
+      set_lane(row.green, lane, seen.green);
+      set_lane(row.blue, lane, seen.blue);
+      set_lane(row.alpha, lane, seen.alpha);
+    });
+    sum.add_light(row, sum.clear, stored);
+    sum.absorb(row.alpha, piece.start, piece.length, sum.hit_clear, stored);
+  }
+  // Premultiplied colour and alpha of an interval.
+  GV_HD Row<T> look(const Piece<T>& piece, const Probe<T>& probe) const {
+    const Row<T> fine = look(piece, probe, probe.fine);
+    if (!probe.mixed) return fine;
+    const Row<T> coarse = look(piece, probe, probe.coarse);
+    const T weight = probe.weight(piece.middle);
+    const auto mix = [&](T a, T b) { return a + weight * (b - a); };
+    return {mix(fine.red, coarse.red), mix(fine.green, coarse.green), mix(fine.blue, coarse.blue),
+            mix(fine.alpha, coarse.alpha)};
+  }
+  GV_HD Row<T> look(const Piece<T>& piece, const Probe<T>& probe, const Spot<T>& spot) const {
+    const T t = piece.middle;
+    if (!spot.among(bricks)) {
+      const auto& channels = probe.channels;
+      const T value = probe.number_of(channels.value, channels.component, spot, t);
+      const Row<T> row = look_up(Transfer<T>(this->transfer), value, piece, this->step);
+      return {row.red * row.alpha, row.green * row.alpha, row.blue * row.alpha, row.alpha};
+    }
+    const ChannelView& colors = probe.channels.other;
+    const auto number = [&](int32_t which) { return probe.number_of(colors, which, spot, t); };
+    const T whole =
+        clamp(by_direction(probe.sight.direction, colors.width, 3, number), static_cast<T>(0), static_cast<T>(1));
+    if (!(whole > 0)) return {};
+    const T alpha = stretch(whole, piece.length * spot.scale / own_numbers<Own>(parameters).side);
+    const T part = alpha / whole;
+    T color[3];
+#ifdef __CUDA_ARCH__
+#pragma unroll 1
+#endif
+    for (int i = 0; i < 3; ++i) color[i] = by_direction(probe.sight.direction, colors.width, i, number) * part;
+    return {color[0], color[1], color[2], alpha};
+  }
 };
 
 // What a shader takes from the light that goes through: the shader of rays that go to a light.
@@ -494,16 +574,17 @@ struct GradientMagnitude : Plain<T> {
 
 // The fused shaders: X(kind, struct, whether a cone goes from each sample to the light), in the order of their numbers.
 // SHADER_KINDS of ops/shading.py are the same.
-#define GV_SHADERS(X)                    \
-  X(Lit, Lit, false)                     \
-  X(PreIntegrated, PreIntegrated, false) \
-  X(StoredColor, StoredColor, false)     \
-  X(Isosurface, Isosurface, false)       \
-  X(Projection, Projection, false)       \
-  X(Features, Features, false)           \
-  X(ShadowedLit, Lit, true)              \
-  X(ShadowedColor, StoredColor, true)    \
-  X(GradientMagnitude, GradientMagnitude, false)
+#define GV_SHADERS(X)                            \
+  X(Lit, Lit, false)                             \
+  X(PreIntegrated, PreIntegrated, false)         \
+  X(StoredColor, StoredColor, false)             \
+  X(Isosurface, Isosurface, false)               \
+  X(Projection, Projection, false)               \
+  X(Features, Features, false)                   \
+  X(ShadowedLit, Lit, true)                      \
+  X(ShadowedColor, StoredColor, true)            \
+  X(GradientMagnitude, GradientMagnitude, false) \
+  X(Filtered, Filtered, false)
 
 #define GV_KIND(kind, Shader, shadows) k##kind,
 enum class ShaderKind : int32_t { GV_SHADERS(GV_KIND) kCount };

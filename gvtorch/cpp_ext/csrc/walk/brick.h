@@ -63,6 +63,8 @@ struct Spot {
     }
   }
   GV_HD Vec3<T> at(T t) const { return {offset.x + t * slope.x, offset.y + t * slope.y, offset.z + t * slope.z}; }
+  // It has one of the first `count` slots.
+  GV_HD bool among(int32_t count) const { return brick >= 0 && brick < count; }
 };
 
 // The lower of the two voxels beside a place, along one axis; the upper one exists. A packet multiplies floats faster.

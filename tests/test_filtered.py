@@ -1,0 +1,204 @@
+"""`Filtered`: the transfer function seen from afar. Every backend gives the twin's bits, and the
+picture is that of 256 rays a pixel.
+"""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from helpers.packets import INSTRUCTIONS, result, start
+from helpers.rays import camera_rays
+from helpers.traces import SHADER, assert_equal, run
+from helpers.trees import forget
+
+import gvtorch as gv
+
+MISTY = gv.TransferFunction(
+    [(0.2, 0), (0.5, 0.02), (0.9, 0.08)], [(0.2, 1, 0.3, 0.1), (1, 1, 1, 1)]
+)
+
+
+def matter(branching: int = 2, spacing=(1.0, 1.0, 1.0)) -> gv.Volume:
+    """Rough and smooth matter, between a region of zeros and one of another single value."""
+    generator = torch.Generator().manual_seed(4)
+    coarse = torch.rand((1, 1, 12, 12, 12), generator=generator)
+    value = torch.nn.functional.interpolate(coarse, size=(37, 33, 41), mode="trilinear")[0, 0]
+    value = value + 0.2 * torch.rand(value.shape, generator=generator)
+    value[:14], value[:, 24:, :20] = 0.0, 0.35
+    return gv.Volume(value, spacing)
+
+
+def filtered(transfer: gv.TransferFunction, **options) -> tuple[gv.N3Tree, gv.Filtered]:
+    volume = matter(**{k: options.pop(k) for k in ("spacing",) if k in options})
+    tree = gv.N3Tree.from_volume(volume, 4, branching=options.pop("branching", 2), threshold=0.0)
+    return tree, gv.Filtered.of(tree, volume, transfer, **options)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("branching", [2, 3])
+@pytest.mark.parametrize("directions", [True, False])
+def test_compiled_equals_reference(compiled, directions, branching, dtype):
+    tree, shader = filtered(SHADER, directions=directions, branching=branching)
+    for distance, step in ((0.3, 0.5), (1.3, 0.4), (5.0, 2.3)):
+        rays = camera_rays(tree, 14, distance=distance)
+        for which in (tree, forget(tree, 0.3, 5)):
+            options = {"dtype": dtype, "step": step}
+            found, _ = assert_equal(which, compiled, rays, shader, **options)
+            if compiled == "cpp" and dtype == torch.float32:
+                actual, _ = run(which, compiled, rays, shader, **options)
+                for field in ("color", "alpha", "depth"):
+                    assert torch.equal(actual[field], found[field]), field
+        if distance == 1.3:
+            assert found["alpha"].max() > 0.3, "the test must see something"
+
+
+def all_shaded() -> list[torch.Tensor]:
+    return shaded("cpp")
+
+
+def shaded(backend: str) -> list[torch.Tensor]:
+    found = []
+    for directions in (True, False):
+        tree, shader = filtered(SHADER, directions=directions)
+        for size, distance in ((21, 1.5), (9, 1.5), (13, 4.0)):
+            result, marks = run(tree, backend, camera_rays(tree, size, distance=distance), shader)
+            found += [*result.values(), *marks.values()]
+    return found
+
+
+@pytest.mark.backend("cpp")
+def test_every_bit_is_the_same_for_all_instruction_sets(tmp_path):
+    expected = shaded("reference")
+    runs = [start(all_shaded, tmp_path, name) for name in INSTRUCTIONS]
+    for found in map(result, runs):
+        for one, other in zip(found, expected, strict=True):
+            assert torch.equal(one.nan_to_num(7), other.nan_to_num(7))
+
+
+@pytest.mark.backend("cpp")
+def test_close_by_it_is_the_transfer_function():
+    tree, shader = filtered(SHADER)
+    rays = camera_rays(tree, 17)
+    near, plain = (gv.trace(tree, rays, one, lod="finest") for one in (shader, SHADER))
+    for field in ("color", "alpha", "depth", "samples"):
+        assert torch.equal(getattr(near, field), getattr(plain, field)), field
+
+
+def rays(origin: torch.Tensor, direction: torch.Tensor, cone: torch.Tensor) -> gv.Rays:
+    limits = torch.tensor([[0.0, 1e9]], dtype=torch.float64).expand(len(origin), 2)
+    columns = (one.contiguous() for one in (origin, direction, cone, limits))
+    return gv.Rays(**dict(zip(("origin", "direction", "cone", "range"), columns, strict=True)))
+
+
+def parallel(tree: gv.N3Tree, way: tuple[float, float, float], pixel: float, parts: int) -> gv.Rays:
+    """Rays of an orthographic picture through a whole tree, parts^2 a pixel, wide ones if it is
+    one.
+    """
+    forward = torch.nn.functional.normalize(torch.tensor(way, dtype=torch.float64), dim=0)
+    right = torch.nn.functional.normalize(
+        torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]).double(), forward), dim=0
+    )
+    up = torch.linalg.cross(forward, right)
+    reach = float((tree.box[1] - tree.box[0]).norm()) / 2
+    count = math.ceil(2 * reach / pixel)
+    at = ((torch.arange(count * parts, dtype=torch.float64) + 0.5) / parts - count / 2) * pixel
+    y, x = torch.meshgrid(at + 0.37, at + 0.61, indexing="ij")
+    origin = tree.box.mean(0) + x.reshape(-1, 1) * right + y.reshape(-1, 1) * up
+    origin = origin - 2 * reach * forward
+    cone = torch.zeros(len(origin), 2, dtype=torch.float64)
+    if parts == 1:
+        cone[:, 0] = pixel
+    return rays(origin, forward.expand(len(origin), 3), cone)
+
+
+def picture(tree: gv.N3Tree, shader: gv.Shader, way, pixel: float, parts: int = 1) -> torch.Tensor:
+    """(h, w, 4) means over the rays of each pixel."""
+    given = parallel(tree, way, pixel, parts)
+    hits = gv.trace(tree, given, shader, lod="finest" if parts > 1 else "auto")
+    side = math.isqrt(len(given.origin)) // parts
+    colors = torch.cat((hits.color, hits.alpha), 1).double()
+    return colors.reshape(side, parts, side, parts, 4).mean((1, 3))
+
+
+def compare(found: torch.Tensor, truth: torch.Tensor) -> tuple[float, float]:
+    """Light over the truth's, and PSNR over pixels that show something."""
+    shown = (truth[..., 3] > 1e-3) | (found[..., 3] > 1e-3)
+    error = float((found - truth)[..., :3][shown].square().mean())
+    return float(found[..., :3].mean() / truth[..., :3].mean()), -10 * math.log10(error)
+
+
+def walls() -> gv.Volume:
+    """Walls one and a half voxels thick, upright and slanted, threads, and a ball of noise."""
+    n = 96
+    z, y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float32),) * 3, indexing="ij")
+    inside = (x > 15) & (x < 60) & (y > 15) & (y < 80) & (z > 15) & (z < 80)
+    value = (1.25 - (0.6 * x + 0.2 * y + 0.7746 * z - 50).abs()).clamp(0, 1) * inside
+    flat = (1.25 - (x - 72.6).abs()).clamp(0, 1) * ((z > 20) & (z < 75) & (y > 50) & (y < 85))
+    thread = (1.6 - torch.hypot(x - 65 + 0.2 * (z - 48), y - 25)).clamp(0, 1) * ((z > 8) & (z < 85))
+    noise = torch.rand(x.shape, generator=torch.Generator().manual_seed(1))
+    ball = noise * ((x - 30) ** 2 + (y - 66) ** 2 + (z - 70) ** 2 < 18**2)
+    return gv.Volume(torch.stack((value, flat, thread, ball)).amax(0))
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("pixel", [4.0, 16.0])
+@pytest.mark.parametrize("way", [(0.0, 0.0, 1.0), (0.37, 0.23, 1.0)])
+@pytest.mark.parametrize("look", ["misty", "opaque"])
+def test_from_afar_it_shows_what_many_fine_rays_show(look, way, pixel):
+    transfer = MISTY if look == "misty" else gv.TransferFunction([(0.4, 0), (0.5, 0.95)])
+    volume = walls()
+    tree = gv.N3Tree.from_volume(volume, 8)
+    shader = gv.Filtered.of(tree, volume, transfer)
+    assert tree.bricks.channels["filtered"].width == (4 if look == "misty" else 24)
+    truth = picture(tree, transfer, way, pixel, 16)
+    light, psnr = compare(picture(tree, shader, way, pixel), truth)
+    means, before = compare(picture(tree, transfer, way, pixel), truth)
+    print(look, way, pixel, f"{light:.3f} {psnr:.1f} dB, means {means:.3f} {before:.1f} dB")
+    assert psnr > before + 5
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("directions", [True, False])
+def test_homogeneous_matter_stays_as_dense_at_every_level(directions):
+    volume = gv.Volume(torch.full((32, 32, 32), 0.5), (1.0, 1.0, 2.0))
+    volume.data[0, 0, 0] = 0.4999  # else there would be no bricks
+    tree = gv.N3Tree.from_volume(volume, 4)
+    transfer = gv.TransferFunction([(0, 0.02)], [(0, 0.3, 0.6, 0.9)])
+    shader = gv.Filtered.of(tree, volume, transfer, directions=directions)
+    for way, length in (((0.0, 0.0, 1.0), 64.0), ((1.0, 0.0, 0.0), 32.0)):
+        forward = torch.tensor([way], dtype=torch.float64)
+        for width in (0.1, 2.0, 9.0):
+            cone = torch.tensor([[width, 0.0]], dtype=torch.float64)
+            given = rays(tree.box.mean(0) - 100 * forward, forward, cone)
+            hits = gv.trace(tree, given, shader, stop_alpha=1.0)
+            alpha = 1 - 0.98**length
+            assert float(hits.alpha) == pytest.approx(alpha, rel=2e-3)
+            expected = alpha * torch.tensor([[0.3, 0.6, 0.9]])
+            torch.testing.assert_close(hits.color, expected, rtol=3e-3, atol=0)
+
+
+@pytest.mark.backend("cpp")
+def test_a_tree_tracer_draws_it():
+    tree, shader = filtered(SHADER)
+    rays = camera_rays(tree, 12, distance=3.0)
+    expected = gv.trace(tree, rays, shader)
+    tracer = torch.jit.script(gv.TreeTracer(tree, shader))
+    color, alpha, _, _ = tracer(rays.origin, rays.direction, rays.cone, rays.range)
+    assert torch.equal(color, expected.color) and torch.equal(alpha, expected.alpha)
+
+
+def test_mistakes_are_told():
+    volume = matter()
+    tree = gv.N3Tree.from_volume(volume, 4)
+    with pytest.raises(ValueError, match="of one place"):
+        gv.Filtered.of(tree, gv.Volume(torch.zeros(8, 8, 8)), SHADER)
+    with pytest.raises(ValueError, match="component must be"):
+        gv.Filtered.of(tree, volume, SHADER, component=1)
+    with pytest.raises(ValueError, match="that of the values"):
+        gv.Filtered.of(tree, volume, SHADER, channel="value")
+    with pytest.raises(ValueError, match="unknown channel 'filtered'"):
+        gv.trace(tree, camera_rays(tree, 3), gv.Filtered(SHADER))
+    with pytest.raises(ValueError, match="need 4 numbers a voxel"):
+        gv.trace(tree, camera_rays(tree, 3), gv.Filtered(SHADER, "value"))
