@@ -14,6 +14,9 @@ struct PacketBrick {
   Mask stored;
   Ints brick;  // as `first_of` of what reads it has it
 
+  // It has one of the first `count` slots; of bricks that are told by their numbers.
+  GV_HD Mask among(int32_t count) const { return stored & (brick < count); }
+
   GV_HD Vec3<Floats> at(Floats t) const {
     return {offset.x + t * slope.x, offset.y + t * slope.y, offset.z + t * slope.z};
   }

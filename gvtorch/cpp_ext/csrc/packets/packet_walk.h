@@ -141,10 +141,15 @@ struct PacketWalk {
     return slope;
   }
 
-  GV_HD Mask among(int32_t count) const {  // of bricks that are told by their numbers
-    const auto first = [&](const PacketBrick& brick) { return brick.stored & (brick.brick < count); };
-    return first(fine) | (mixed & first(coarse));
+  GV_HD Floats value_of(const PacketBrick& brick, Floats t) const { return value_in(brick, t); }
+  GV_HD Floats number_of(Mask which, const PacketChannel& channel, int32_t component, const PacketBrick& brick,
+                         Floats t) const {
+    return channel.read(component, which ? brick.brick : Ints{}, brick.at(t));
   }
+  GV_HD Floats scale_of(const PacketBrick& brick) const {
+    return pick(walk.levels.scale, &brick == &fine ? fine_depth : coarse_depth);
+  }
+  GV_HD Floats weight(Floats t) const { return clamp((at.cone(t) - voxel) * blend_scale, 0.0f, 1.0f); }
 
   GV_HD void narrow(Mask which) { marching = which; }
   // body(lane, probe) with each lane's own.
@@ -431,9 +436,12 @@ struct PacketWalk {
 
   // Begins the run of intervals that are alike; lanes that need care are done with the node at once.
   GV_HD void begin_run(Mask which) {
-    const Ints last = values.first_of(Ints{} + static_cast<int32_t>(bricks - 1));
-    const Mask end = (fine.stored & (fine.brick == last)) | (mixed & coarse.stored & (coarse.brick == last));
-    const Mask careful = which & (at.cut() | end);
+    const auto reads = [&](Ints slot) {
+      return (fine.stored & (fine.brick == slot)) | (mixed & coarse.stored & (coarse.brick == slot));
+    };
+    Mask careful = at.cut() | reads(values.first_of(Ints{} + static_cast<int32_t>(bricks - 1)));
+    if constexpr (Shader::kFiltered) careful = careful | reads(Ints{} + (shader.bricks - 1));
+    careful = careful & which;
     if (any(careful)) {
       march_alone(careful);
       fine.brick = careful ? Ints{} : fine.brick;  // what other lanes read in vain must lie in the pool
@@ -521,8 +529,6 @@ struct PacketWalk {
     }
     return slope;
   }
-  // Of the coarse node.
-  GV_HD Floats weight(Floats t) const { return clamp((at.cone(t) - voxel) * blend_scale, 0.0f, 1.0f); }
   GV_HD Spot<float> spot_of(int lane, const PacketBrick& brick, Ints depth) const {
     return {node_of(lane, depth), brick.stored[lane] ? path_brick[depth[lane]][lane] : kAbsent,
             walk.levels.scale[depth[lane]], lane_of(brick.offset, lane), lane_of(brick.slope, lane)};

@@ -177,14 +177,16 @@ struct Probe {
     return slope;
   }
 
-  // What one of the two nodes says of a number, and how much the coarse one's counts.
-  GV_HD T number_of(const ChannelView& channel, int32_t component, const Spot<T>& spot, T t) const {
+  // What one of the two nodes, fine or coarse, says of the value and of another number; how large it is, and how much
+  // the coarse one counts.
+  GV_HD T value_of(const Spot<T>& spot, T t) const {
+    return read(channels.value, channels.component, spot, spot.at(t));
+  }
+  GV_HD T number_of(bool, const ChannelView& channel, int32_t component, const Spot<T>& spot, T t) const {
     return read(channel, component, spot, spot.at(t));
   }
+  GV_HD static T scale_of(const Spot<T>& spot) { return spot.scale; }
   GV_HD T weight(T t) const { return clamp((near + growth * t - voxel) * blend, static_cast<T>(0), static_cast<T>(1)); }
-
-  // A brick that answers has one of the first `count` slots.
-  GV_HD bool among(int32_t count) const { return fine.among(count) || coarse.among(count); }
 
   // No node that answers has a brick, and all numbers of both are equal: one value all over the visit.
   GV_HD bool uniform() const {
@@ -251,13 +253,13 @@ struct TypedProbe : Probe<T> {
   using Probe<T>::Probe;
 
   GV_HD T value(T t) const {
+    return this->blended(t, [&](const Spot<T>& spot) { return value_of(spot, t); });
+  }
+  GV_HD T value_of(const Spot<T>& spot, T t) const {
     const ChannelView& channel = this->channels.value;
-    const int32_t component = this->channels.component;
-    return this->blended(t, [&](const Spot<T>& spot) {
-      const auto* constants = static_cast<const Voxel*>(channel.constant_tnc);
-      if (spot.brick < 0) return number<T>(constants[static_cast<int64_t>(spot.node) * channel.width + component]);
-      return trilinear(first(spot), this->channels.side, channel.width, spot.at(t));
-    });
+    const auto* constants = static_cast<const Voxel*>(channel.constant_tnc);
+    if (spot.brick >= 0) return trilinear(first(spot), this->channels.side, channel.width, spot.at(t));
+    return number<T>(constants[static_cast<int64_t>(spot.node) * channel.width + this->channels.component]);
   }
   template <class Body>
   GV_HD int32_t with_value(const Body& body) const {

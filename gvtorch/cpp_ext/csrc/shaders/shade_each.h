@@ -31,12 +31,17 @@ void shade_each(const torch::stable::Tensor& like, int64_t nodes, Kernel kernel)
   for_each<Device>(like, kernel.order.count(), kernel);
 }
 
-// Rays with a fused shader; those of the plain function with voxels of a known dtype.
+// Rays with a fused shader; those of the plain function, filtered or not, with voxels of a known dtype.
 template <class T>
 void shade_fused(const torch::stable::Tensor& like, const ShadeArgs& args) {
   const auto each = [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); };
-  if (args.shader != kPlainShader) return with_rays<T>(args, each);
-  with_voxel(args.voxel, [&](auto voxel) { each(ShadeRay<T, Plain<T>, false, true, decltype(voxel)>(args)); });
+  const bool plain = args.shader == kPlainShader;
+  if (!plain && args.shader != static_cast<int32_t>(ShaderKind::kFiltered)) return with_rays<T>(args, each);
+  with_voxel(args.voxel, [&](auto voxel) {
+    using Voxel = decltype(voxel);
+    plain ? each(ShadeRay<T, Plain<T>, false, true, Voxel>(args))
+          : each(ShadeRay<T, Filtered<T>, false, true, Voxel>(args));
+  });
 }
 
 }  // namespace gvtorch

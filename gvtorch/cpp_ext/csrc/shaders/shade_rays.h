@@ -15,6 +15,11 @@ namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
 template <class Shader, class = void>
+struct IsFiltered : std::false_type {};
+template <class Shader>
+struct IsFiltered<Shader, std::void_t<decltype(Shader::kFiltered)>> : std::bool_constant<Shader::kFiltered> {};
+
+template <class Shader, class = void>
 struct HidesAlike : std::false_type {};
 template <class Shader>
 struct HidesAlike<Shader, std::void_t<decltype(Shader::kHidesAlike)>> : std::bool_constant<Shader::kHidesAlike> {};
@@ -26,7 +31,8 @@ struct ShadeRay : Walk<T> {
   using Walk<T>::tree;
   using Walk<T>::options;
   using Sum = typename Shader::Sum;
-  static constexpr int kBlocksAtOnce = std::is_void_v<Voxel> ? 4 : 8;  // of CUDA: 128 or 64 registers, see for_each.h
+  static constexpr int kBlocksAtOnce =
+      std::is_void_v<Voxel> || IsFiltered<Shader>::value ? 4 : 8;  // of CUDA: 128 or 64 registers, see for_each.h
   static constexpr bool kHidesAlike = HidesAlike<Shader>::value;
   Shader shader;
   Channels channels;
@@ -170,15 +176,26 @@ struct ShadeRay : Walk<T> {
       ++samples;
     }
     GV_HD int32_t take(const Eye& probe, const Intervals<T>& at, int32_t alike, bool last) {
-      // Most shaders are too long to be there twice.
-      constexpr bool kShort = !std::is_void_v<Voxel>;
-      if (kShort && last) return take_by([&](T t) { return probe.value(t); }, probe, at, 1, true);
-      return probe.with_value([&](const auto& value) { return take_by(value, probe, at, alike, !kShort && last); });
+      if constexpr (IsFiltered<Any>::value) {  // no node of a visit has colours, or the value is not asked for
+        if (shader.stored(probe)) return take_by(shader, [](T) { return T{}; }, probe, at, alike, last);
+        return take(ready_for_ray(shader.plain()), probe, at, alike, last);
+      } else {
+        return take(shader, probe, at, alike, last);
+      }
     }
 
    private:
-    template <class Value>
-    GV_HD int32_t take_by(const Value& value, const Eye& probe, const Intervals<T>& at, int32_t alike, bool last) {
+    template <class Adds>
+    GV_HD int32_t take(const Adds& adds, const Eye& probe, const Intervals<T>& at, int32_t alike, bool last) {
+      // Most shaders are too long to be there twice.
+      constexpr bool kShort = !std::is_void_v<Voxel>;
+      if (kShort && last) return take_by(adds, [&](T t) { return probe.value(t); }, probe, at, 1, true);
+      return probe.with_value(
+          [&](const auto& value) { return take_by(adds, value, probe, at, alike, !kShort && last); });
+    }
+    template <class Adds, class Value>
+    GV_HD int32_t take_by(const Adds& adds, const Value& value, const Eye& probe, const Intervals<T>& at, int32_t alike,
+                          bool last) {
       Piece<T> piece;
       T number = at.count;
       const T end = number + static_cast<T>(alike);
@@ -199,7 +216,7 @@ struct ShadeRay : Walk<T> {
         } else {
           piece.value = value(piece.middle);
         }
-        add(piece, probe);
+        add(adds, piece, probe);
         number = number + 1;
       } while (number < end && sees());
       const int32_t taken = static_cast<int32_t>(number - at.count);
@@ -211,13 +228,14 @@ struct ShadeRay : Walk<T> {
       piece.length = piece.end - piece.start;
       piece.middle = piece.start + piece.length * static_cast<T>(0.5);
     }
-    GV_HD void add(const Piece<T>& piece, const Eye& probe) {
+    template <class Adds>
+    GV_HD void add(const Adds& adds, const Piece<T>& piece, const Eye& probe) {
       if constexpr (kShadowed) {
-        shader.add(true, piece, probe, sum, [&](T t, Vec3<T> way, T length, T growth) {
+        adds.add(true, piece, probe, sum, [&](T t, Vec3<T> way, T length, T growth) {
           return kernel.share_of_light(*ray, probe, t, way, length, growth, samples, sum.missed);
         });
       } else {
-        shader.add(true, piece, probe, sum);
+        adds.add(true, piece, probe, sum);
       }
     }
   };

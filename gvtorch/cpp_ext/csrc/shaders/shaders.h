@@ -115,16 +115,23 @@ struct Lit : Plain<T> {
 // One of four numbers of a voxel, as it is seen along a direction. A channel may hold them for each of six directions
 // (Crassin et al., "Interactive indirect illumination using voxel cone tracing", CGF 2011): then three are read,
 // weighted by the squares of the direction, whose sum is 1. To the bit that of one direction, where all six are equal.
-template <class T, class Read>
-GV_HD T by_direction(const Vec3<T>& d, int32_t width, int32_t number, const Read& read) {
+template <class V, class Read>
+GV_HD V by_direction(MaskOf<V> which, const Vec3<V>& d, int32_t width, int32_t number, const Read& read) {
   if (width == 4) return read(number);
-  const T z = read(number + 16 + (d.z < 0 ? 4 : 0));
-  T value = z;
+  const auto side = [&](int axis) {
+    const MaskOf<V> back = which && d[axis] < 0, ahead = which && !back;
+    const int32_t first = number + 8 * axis;
+    if (!any(back)) return read(first);
+    if (!any(ahead)) return read(first + 4);
+    return select(back, read(first + 4), read(first));
+  };
+  const V z = side(2);
+  V value = z;
 #ifdef __CUDA_ARCH__
 #pragma unroll 1
 #endif
   for (int axis = 0; axis < 2; ++axis) {
-    const T other = read(number + 8 * axis + (d[axis] < 0 ? 4 : 0));
+    const V other = side(axis);
     value = value + d[axis] * d[axis] * (other - z);
   }
   return value;
@@ -190,7 +197,7 @@ struct StoredColor : ShaderFacts {
       return probe.number_at(channel, number, t);
     } else {
       const auto read = [&](int32_t which) { return probe.number_at(channel, which, t); };
-      return by_direction(probe.sight.direction, channel.width, number, read);
+      return by_direction(true, probe.sight.direction, channel.width, number, read);
     }
   }
   GV_HD void done(Sum&) const {}
@@ -214,58 +221,64 @@ struct Filtered : Plain<T> {
   explicit Filtered(const ShadeArgs& args)
       : Plain<T>(args), parameters(static_cast<const Parameters<T>*>(args.parameter_54)), bricks(args.other_bricks) {}
 
+  GV_HD const Plain<T>& plain() const { return *this; }
+  // A node that answers has colours.
+  template <class Eye>
+  GV_HD auto stored(const Eye& probe) const {
+    return probe.fine.among(bricks) || (probe.mixed && probe.coarse.among(bricks));
+  }
   template <class V, class Eye>
   GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
-    const MaskOf<V> stored = which && probe.among(bricks), not_stored = which && !stored;
-    if (any(not_stored)) Plain<T>::add(not_stored, piece, probe, sum);
-    if (!any(stored)) return;
-    Row<V> row{};
-    probe.each(stored, [&](int lane, const auto& own) {
-      Piece<T> one;
-      one.middle = lane_of(piece.middle, lane);
-      one.length = lane_of(piece.length, lane);
-      one.level = lane_of(piece.level, lane);
-      one.odd = piece.odd;
-      const Row<T> seen = look(one, own);
-      set_lane(row.red, lane, seen.red);
-      set_lane(row.green, lane, seen.green);
-      set_lane(row.blue, lane, seen.blue);
-      set_lane(row.alpha, lane, seen.alpha);
-    });
-    sum.add_light(row, sum.clear, stored);
-    sum.absorb(row.alpha, piece.start, piece.length, sum.hit_clear, stored);
-  }
-  // Premultiplied colour and alpha of an interval.
-  GV_HD Row<T> look(const Piece<T>& piece, const Probe<T>& probe) const {
-    const Row<T> fine = look(piece, probe, probe.fine);
-    if (!probe.mixed) return fine;
-    const Row<T> coarse = look(piece, probe, probe.coarse);
-    const T weight = probe.weight(piece.middle);
-    const auto mix = [&](T a, T b) { return a + weight * (b - a); };
-    return {mix(fine.red, coarse.red), mix(fine.green, coarse.green), mix(fine.blue, coarse.blue),
-            mix(fine.alpha, coarse.alpha)};
-  }
-  GV_HD Row<T> look(const Piece<T>& piece, const Probe<T>& probe, const Spot<T>& spot) const {
-    const T t = piece.middle;
-    if (!spot.among(bricks)) {
-      const auto& channels = probe.channels;
-      const T value = probe.number_of(channels.value, channels.component, spot, t);
-      const Row<T> row = look_up(Transfer<T>(this->transfer), value, piece, this->step);
-      return {row.red * row.alpha, row.green * row.alpha, row.blue * row.alpha, row.alpha};
+    const MaskOf<V> seen = which && stored(probe), others = which && !seen;
+    if (any(others)) Plain<T>::add(others, piece, probe, sum);
+    if (!any(seen)) return;
+    Row<V> row = look(seen, piece, probe, probe.fine);
+    const MaskOf<V> mixed = seen && probe.mixed;
+    if (any(mixed)) {
+      const Row<V> coarse = look(mixed, piece, probe, probe.coarse);
+      const V weight = probe.weight(piece.middle);
+      const auto mix = [&](V a, V b) { return select(mixed, a + weight * (b - a), a); };
+      row = {mix(row.red, coarse.red), mix(row.green, coarse.green), mix(row.blue, coarse.blue),
+             mix(row.alpha, coarse.alpha)};
     }
-    const ChannelView& colors = probe.channels.other;
-    const auto number = [&](int32_t which) { return probe.number_of(colors, which, spot, t); };
-    const T whole =
-        clamp(by_direction(probe.sight.direction, colors.width, 3, number), static_cast<T>(0), static_cast<T>(1));
-    if (!(whole > 0)) return {};
-    const T alpha = stretch(whole, piece.length * spot.scale / own_numbers<Own>(parameters).side);
-    const T part = alpha / whole;
-    T color[3];
+    sum.add_light(row, sum.clear, seen);
+    sum.absorb(row.alpha, piece.start, piece.length, sum.hit_clear, seen);
+  }
+  // Premultiplied colour and alpha of an interval, as one of the nodes shows them.
+  template <class V, class Eye, class Node>
+  GV_HD Row<V> look(MaskOf<V> which, const Piece<V>& piece, Eye& probe, const Node& node) const {
+    const V t = piece.middle;
+    const MaskOf<V> colored = which && node.among(bricks), others = which && !colored;
+    Row<V> row{};
+    if (any(others)) {
+      const Row<V> plain = look_up(Transfer<T>(this->transfer), probe.value_of(node, t), piece, this->step, others);
+      row = {plain.red * plain.alpha, plain.green * plain.alpha, plain.blue * plain.alpha, plain.alpha};
+    }
+    if (!any(colored)) return row;
+    probe.narrow(colored);
+    const auto& colors = probe.channels.other;
+    const Vec3<V> d = probe.sight.direction;
+    const auto number = [&](int32_t which) {
+      return by_direction(colored, d, colors.width, which,
+                          [&](int32_t component) { return probe.number_of(colored, colors, component, node, t); });
+    };
+    const V whole = clamp(number(3), static_cast<T>(0), static_cast<T>(1));
+    const MaskOf<V> shown = colored && whole > 0;
+    if (!any(shown)) return unless(colored, row);
+    const V alpha = stretch(whole, piece.length * probe.scale_of(node) / own_numbers<Own>(parameters).side);
+    const V part = alpha / whole;
+    V color[3];
 #ifdef __CUDA_ARCH__
 #pragma unroll 1
 #endif
-    for (int i = 0; i < 3; ++i) color[i] = by_direction(probe.sight.direction, colors.width, i, number) * part;
-    return {color[0], color[1], color[2], alpha};
+    for (int i = 0; i < 3; ++i) color[i] = select(shown, number(i) * part, V{});
+    return {select(colored, color[0], row.red), select(colored, color[1], row.green),
+            select(colored, color[2], row.blue), select(colored, select(shown, alpha, V{}), row.alpha)};
+  }
+  template <class V>
+  GV_HD static Row<V> unless(MaskOf<V> which, const Row<V>& row) {
+    return {select(which, V{}, row.red), select(which, V{}, row.green), select(which, V{}, row.blue),
+            select(which, V{}, row.alpha)};
   }
 };
 

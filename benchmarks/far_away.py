@@ -1,0 +1,154 @@
+"""How right a scan is from afar: means of the values, and `gv.Filtered`, beside 256 rays a pixel.
+
+    python benchmarks/far_away.py ../shared/data/volumes --picture docs/images/far_away.png
+
+Orthographic pictures, obliquely through each scan, at several voxels a pixel. Light is the mean of
+ours over the truth's; PSNR (peak 1, linear light) and SSIM (window 7) are those of pixels where
+either shows something. Prints Markdown.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import tyro
+from kornia.metrics import ssim
+from torch import Tensor
+from tyro.conf import Positional
+
+import gvtorch as gv
+
+#: File, then corner points of a translucent and an opaque function; None stands for the least
+#: value, opacities are those of a voxel.
+SCANS = {
+    "aneurism": ("aneurism_256x256x256_uint8.raw.gz", (20, 255, 0.15), (60, 70)),
+    "VisMale": ("vismale_128x256x256_uint8.raw.gz", (20, 255, 0.06), (120, 130)),
+    "stent": ("stent_256x128x128_int16.npz", (140, 900, 0.1), (380, 430)),
+    "tooth": ("tooth_103x94x161_uint8.raw.gz", (85, 255, 0.06), (100, 110)),
+    "brain": ("mni_icbm152_t1_197x233x189_uint8.nii.gz", (40, 255, 0.05), (185, 195)),
+}
+PARTS = 16  # rays a pixel, along each side
+
+
+@dataclass
+class Settings:
+    """What to measure."""
+
+    folder: Positional[Path]
+    """with the scans of docs/picture.md"""
+    pixels: tuple[float, ...] = (2.0, 8.0, 32.0)
+    """voxels a pixel"""
+    only: str = ""
+    """scans that have it in their name"""
+    device: str = "cpu"
+    """of the trees"""
+    picture: Path | None = None
+    """file for the scans side by side, at the second size"""
+
+
+def functions(scan: str) -> dict[str, gv.TransferFunction]:
+    """The two transfer functions of a scan."""
+    _, (low, high, most), (clear, solid) = SCANS[scan]
+    ramp = [(low, 0.5, 0.2, 0.1), ((low + high) / 2, 0.9, 0.7, 0.4), (high, 1, 1, 1)]
+    skin = [(clear, 0.8, 0.4, 0.25), (2 * solid, 1, 0.9, 0.7)]
+    return {
+        "translucent": gv.TransferFunction([(low, 0), (high, most)], ramp),
+        "opaque": gv.TransferFunction([(clear, 0), (solid, 0.95)], skin),
+    }
+
+
+def parallel(tree: gv.N3Tree, pixel: float, parts: int) -> gv.Rays:
+    """Rays through the whole tree, parts^2 a pixel; one alone is as wide as the pixel."""
+    real = {"dtype": torch.float64}
+    way = torch.nn.functional.normalize(torch.tensor([0.37, 0.23, 1.0], **real), dim=0)
+    across = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], **real), way)
+    across = across / across.norm()
+    up = torch.linalg.cross(way, across)
+    reach = float((tree.box[1] - tree.box[0]).norm()) / 2
+    pixel = pixel * min(tree.spacing)
+    side = math.ceil(2 * reach / pixel)
+    at = ((torch.arange(side * parts, **real) + 0.5) / parts - side / 2 + 0.37) * pixel
+    y, x = torch.meshgrid(at, at, indexing="ij")
+    origin = tree.box.mean(0) + x.reshape(-1, 1) * across + y.reshape(-1, 1) * up - 2 * reach * way
+    wide = torch.tensor([pixel if parts == 1 else 0.0, 0.0], **real)
+    columns = (way, wide, torch.tensor([0.0, 1e9], **real))
+    direction, cone, limits = (one.expand(len(origin), -1).contiguous() for one in columns)
+    rays = gv.Rays(origin=origin, direction=direction, cone=cone, range=limits)
+    return rays.to(tree.device)
+
+
+def draw(
+    tree: gv.N3Tree, shader: gv.Shader, pixel: float, parts: int = 1, lod: str = "auto"
+) -> tuple[Tensor, int]:
+    """(h, w, 4) linear premultiplied colour and alpha, and how many samples it took."""
+    rays = parallel(tree, pixel, parts)
+    hits = gv.trace(tree, rays, shader, lod=lod)
+    side = math.isqrt(len(rays.origin)) // parts
+    found = torch.cat((hits.color, hits.alpha), 1).double()
+    found = found.reshape(side, parts, side, parts, 4).mean((1, 3)).cpu()
+    return found, int(hits.samples.sum())
+
+
+def compare(found: Tensor, truth: Tensor) -> str:
+    """Light, PSNR and SSIM."""
+    shown = (truth[..., 3] > 1e-3) | (found[..., 3] > 1e-3)
+    error = float((found - truth)[..., :3][shown].square().mean())
+    planes = (one[..., :3].movedim(-1, 0)[None].float() for one in (found, truth))
+    alike = float(ssim(*planes, window_size=7).mean(1)[0][shown].mean())
+    light = float(found[..., :3].sum() / truth[..., :3].sum())
+    return f"{light:.2f} / {-10 * math.log10(error + 1e-12):.1f} / {alike:.2f}"
+
+
+def main(settings: Settings) -> None:
+    """Measures all and prints the table."""
+    rows: list[Tensor] = []
+    print("| scan | function | voxels a pixel | one ray | means | filtered | samples |")
+    print("|---|---|---|---|---|---|---|")
+    for scan in SCANS:
+        if settings.only not in scan:
+            continue
+        volume = gv.read_volume(settings.folder / SCANS[scan][0])
+        tree = gv.N3Tree.from_volume(volume, device=settings.device)
+        for name, transfer in functions(scan).items():
+            begin = time.perf_counter()
+            shader = gv.Filtered.of(tree, volume, transfer)
+            took = time.perf_counter() - begin
+            size = tree.bricks.bricks["filtered"].nbytes / volume.data[..., 0].numel()
+            print(f"{scan}, {name}: {took:.1f} s, {size:.2f} bytes a voxel", file=sys.stderr)
+            for pixel in settings.pixels:
+                truth, _ = draw(tree, transfer, pixel, PARTS, "finest")
+                one, _ = draw(tree, transfer, pixel, 1, "finest")
+                means, before = draw(tree, transfer, pixel)
+                found, after = draw(tree, shader, pixel)
+                scores = " | ".join(compare(each, truth) for each in (one, means, found))
+                ratio = after / before
+                print(f"| {scan} | {name} | {pixel:g} | {scores} | {ratio:.2f} |", flush=True)
+                if pixel == settings.pixels[min(1, len(settings.pixels) - 1)]:
+                    rows.append(torch.stack((truth, found, means, one)))
+    if settings.picture is not None:
+        save(rows, settings.picture)
+
+
+def save(rows: list[Tensor], path: Path) -> None:
+    """Draws pairs of rows side by side, on one size."""
+    side = max(row.shape[1] for row in rows)
+    scale = 3
+    tiles = []
+    for row in rows:
+        missing = side - row.shape[1]
+        pad = (0, 0, missing // 2, missing - missing // 2, missing // 2, missing - missing // 2)
+        wide = torch.nn.functional.pad(row[..., :3], pad)
+        wide = wide.repeat_interleave(scale, 1).repeat_interleave(scale, 2)
+        tiles.append(torch.cat(list(wide), 1))
+    left, right = torch.cat(tiles[::2]), torch.cat(tiles[1::2])
+    color = torch.cat((left, right), 1).float()
+    write_image(path, {"": gv.to_srgb8(color)}, transparent=False)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings, description=__doc__))
