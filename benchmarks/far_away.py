@@ -22,6 +22,7 @@ from torch import Tensor
 from tyro.conf import Positional
 
 import gvtorch as gv
+from gvtorch.pictures.files import write_image
 
 #: File, then corner points of a translucent and an opaque function; None stands for the least
 #: value, opacities are those of a voxel.
@@ -33,6 +34,7 @@ SCANS = {
     "brain": ("mni_icbm152_t1_197x233x189_uint8.nii.gz", (40, 255, 0.05), (185, 195)),
 }
 PARTS = 16  # rays a pixel, along each side
+SCALE = 5  # pixels of the file for one of a picture
 
 
 @dataclass
@@ -135,19 +137,31 @@ def main(settings: Settings) -> None:
 
 
 def save(rows: list[Tensor], path: Path) -> None:
-    """Draws pairs of rows side by side, on one size."""
-    side = max(row.shape[1] for row in rows)
-    scale = 3
-    tiles = []
+    """Draws the rows, two side by side, each cut to what it shows."""
+    boxes = []
     for row in rows:
-        missing = side - row.shape[1]
-        pad = (0, 0, missing // 2, missing - missing // 2, missing // 2, missing - missing // 2)
-        wide = torch.nn.functional.pad(row[..., :3], pad)
-        wide = wide.repeat_interleave(scale, 1).repeat_interleave(scale, 2)
-        tiles.append(torch.cat(list(wide), 1))
-    left, right = torch.cat(tiles[::2]), torch.cat(tiles[1::2])
-    color = torch.cat((left, right), 1).float()
-    write_image(path, {"": gv.to_srgb8(color)}, transparent=False)
+        shown = row[0, ..., 3] > 0.02
+        y, x = (shown.any(axis).nonzero()[:, 0] for axis in (1, 0))
+        boxes.append((int(y[0]), int(y[-1]) + 1, int(x[0]), int(x[-1]) + 1))
+    wide = max(right - left for _, _, left, right in boxes) + 2
+    tiles = []
+    for row, (top, bottom, left, right) in zip(rows, boxes, strict=True):
+        missing = wide - (right - left)
+        cut = row[:, top:bottom, left:right, :3]
+        cut = torch.nn.functional.pad(cut, (0, 0, missing // 2, missing - missing // 2, 1, 1))
+        cut = cut.repeat_interleave(SCALE, 1).repeat_interleave(SCALE, 2)
+        tiles.append(torch.cat(list(cut), 1))
+    lines = []
+    for left_tile, right_tile in zip(tiles[::2], tiles[1::2], strict=True):
+        high = max(len(left_tile), len(right_tile))
+        both = [
+            torch.nn.functional.pad(tile, (0, 0, 0, 0, 0, high - len(tile)))
+            for tile in (left_tile, right_tile)
+        ]
+        lines.append(torch.cat(both, 1))
+    color = torch.cat(lines).float()
+    layers = {"color": color.numpy(), "alpha": torch.ones_like(color[..., :1]).numpy()}
+    write_image(path, layers, transparent=False)
 
 
 if __name__ == "__main__":

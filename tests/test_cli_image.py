@@ -36,6 +36,21 @@ def test_camera_models(small, tmp_path, model):
 
 
 @pytest.mark.backend("cpp")
+def test_filtered(small, tmp_path):
+    far = ("--shader", "filtered", "--size", "24x16", "--tf", "hot", "--camera", "orbit:20,10,9")
+    done = gvtorch("render", small, "-o", tmp_path / "a.npy", *far)
+    assert done.returncode == 0, done.stderr
+    volume = gv.read_volume(small)
+    tree = gv.N3Tree.from_volume(volume)
+    shader = gv.Filtered.of(tree, volume, gv.TransferFunction.preset("hot", *volume.value_range))
+    camera = gv.Camera.orbit(20, 10, 9, None, 24, 16)
+    expected = gv.render(tree, camera, shader)
+    np.testing.assert_allclose(np.load(tmp_path / "a.npy")[..., :3], expected.color, atol=1e-6)
+    plain = picture(small, camera)
+    assert not torch.equal(plain.color, expected.color)
+
+
+@pytest.mark.backend("cpp")
 def test_backgrounds_tone_and_samples(small, tmp_path):
     camera = gv.Camera.orbit(20, 10, 0.8, None, 24, 16)
     sky = torch.rand(8, 16, 3)

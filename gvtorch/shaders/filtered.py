@@ -31,7 +31,7 @@ from .transfer_function import TransferFunction
 _DIRECTIONS = 6
 _TILE_VOXELS = 1 << 17  # columns are worked out so many voxels at a time
 _LEAST = 0.001  # weight of a column that no light comes to
-_OPAQUE = 0.1  # alpha of a finest voxel from which on directions matter
+_OPAQUE = 0.2  # alpha of a finest voxel from which on directions matter
 _BATCH = 4096  # bricks cut at a time
 
 
@@ -79,7 +79,7 @@ class Filtered(Shader):
             channel: Name of the channel, which replaces one of this name.
             component: Which number of a voxel the function takes.
             directions: Whether colours are kept for each of six directions, or their mean, which
-                takes a sixth of the memory. None: where a voxel hides a tenth of what is behind.
+                takes a sixth of the memory. None: where a voxel may hide a fifth of what is behind.
             progress: Called with what is made, how many axes of it are done, and of how many.
 
         Raises:

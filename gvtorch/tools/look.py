@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     ShaderName = str
 else:
     CameraModel = str  # checked by the camera, since its module would load torch
-    ShaderName = Literal[tuple(declared_names("shaders.built_in", "BY_NAME"))]
+    ShaderName = Literal[(*declared_names("shaders.built_in", "BY_NAME"), "filtered")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,7 @@ class Look:
     """transfer function: a JSON file, or a preset over the data's range: gray, hot, vessels, bone,
     tissue"""
     shader: ShaderName = "plain"
-    """what is made of the values"""
+    """what is made of the values; filtered: plain, but right from afar, for volume files"""
     value: Annotated[float | None, arg(metavar="VALUE")] = None
     """of the isosurface"""
     step: Annotated[float, arg(metavar="VOXELS")] = 0.5
@@ -101,7 +101,7 @@ class Look:
 
     def chosen(self, low: float, high: float) -> Shader:
         """Returns the shader asked for, its transfer function read or spanned over the range."""
-        from ..shaders import TransferFunction
+        from ..shaders import Filtered, TransferFunction
         from ..shaders.built_in import BY_NAME
 
         if self.tf.endswith(".json") or Path(self.tf).is_file():
@@ -110,6 +110,8 @@ class Look:
             transfer = TransferFunction.preset(self.tf, low, high)
         if (self.value is None) == (self.shader == "isosurface"):
             raise ValueError("--value and --shader isosurface belong together")
+        if self.shader == "filtered":  # its colours are made with the tree
+            return Filtered(transfer)
         return BY_NAME[self.shader](transfer, self.value or 0.0)
 
 

@@ -106,6 +106,7 @@ class Render:
     ) -> tuple[RenderStats, tuple[int, ...]]:
         """Builds the whole tree of a volume file."""
         from ..pool import N3Tree
+        from ..shaders import Filtered
         from ..tracing import cost, render
 
         flags = given(self.streaming)
@@ -121,6 +122,10 @@ class Render:
             device=look.device(),
             progress=bar,
         )
+        if isinstance(shader, Filtered):
+            shader = Filtered.of(
+                tree, volume, shader.transfer, component=look.component, progress=bar
+            )
         stats = self._take(
             partial(render, tree, shader=shader, **options),
             partial(cost, tree, shader=shader, **options),

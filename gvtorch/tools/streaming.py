@@ -51,6 +51,8 @@ class Streaming:
         from ..io.store import Store
         from ..producers import StoredProducer
 
+        if look.shader == "filtered":
+            raise ValueError("--shader filtered is for volume files; stores have levels of means")
         store = Store.open(path, image=self.image, time=self.time)
         producer = StoredProducer(store, host_cache=self.host_cache)
         shader = look.chosen(*value_range(store))

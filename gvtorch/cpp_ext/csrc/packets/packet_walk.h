@@ -142,9 +142,9 @@ struct PacketWalk {
   }
 
   GV_HD Floats value_of(const PacketBrick& brick, Floats t) const { return value_in(brick, t); }
-  GV_HD Floats number_of(Mask which, const PacketChannel& channel, int32_t component, const PacketBrick& brick,
-                         Floats t) const {
-    return channel.read(component, which ? brick.brick : Ints{}, brick.at(t));
+  GV_HD Row<Floats> four_of(Mask which, const PacketChannel& channel, int32_t component, const PacketBrick& brick,
+                            Floats t) const {
+    return channel.four(component, which ? brick.brick : Ints{}, brick.at(t));
   }
   GV_HD Floats scale_of(const PacketBrick& brick) const {
     return pick(walk.levels.scale, &brick == &fine ? fine_depth : coarse_depth);
@@ -436,12 +436,9 @@ struct PacketWalk {
 
   // Begins the run of intervals that are alike; lanes that need care are done with the node at once.
   GV_HD void begin_run(Mask which) {
-    const auto reads = [&](Ints slot) {
-      return (fine.stored & (fine.brick == slot)) | (mixed & coarse.stored & (coarse.brick == slot));
-    };
-    Mask careful = at.cut() | reads(values.first_of(Ints{} + static_cast<int32_t>(bricks - 1)));
-    if constexpr (Shader::kFiltered) careful = careful | reads(Ints{} + (shader.bricks - 1));
-    careful = careful & which;
+    const Ints last = values.first_of(Ints{} + static_cast<int32_t>(bricks - 1));
+    const Mask end = (fine.stored & (fine.brick == last)) | (mixed & coarse.stored & (coarse.brick == last));
+    const Mask careful = which & (at.cut() | end);
     if (any(careful)) {
       march_alone(careful);
       fine.brick = careful ? Ints{} : fine.brick;  // what other lanes read in vain must lie in the pool

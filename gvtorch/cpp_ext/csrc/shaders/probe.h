@@ -5,6 +5,7 @@
 
 #include <type_traits>
 
+#include "walk/shade.h"
 #include "walk/walk.h"
 
 namespace gvtorch {
@@ -34,6 +35,27 @@ GV_CALL T read_brick(const void* voxels, VoxelType type, int32_t width, int64_t 
   with_voxel(
       type, [&](auto voxel) { out = trilinear(static_cast<const decltype(voxel)*>(voxels) + first, side, width, at); });
   return out;
+}
+
+// Four numbers of each voxel, from one on.
+template <class T>
+GV_CALL Row<T> read_four(const void* voxels, VoxelType type, int32_t width, int64_t first, int32_t side, Vec3<T> at) {
+  Row<T> row{};
+  with_voxel(type, [&](auto voxel) {
+    const Eight<T> eight(at, side);
+    const int32_t step_y = width * side, step_z = step_y * side;
+    const auto* corner = static_cast<const decltype(voxel)*>(voxels) + first +
+                         (eight.cell[2] * step_z + eight.cell[1] * step_y + eight.cell[0] * width);
+    const auto blend = [&](int32_t which) {
+      return eight.blend([&](int y, int z, T& left, T& right) {
+        const auto* pair = corner + (z * step_z + y * step_y) + which;
+        left = number<T>(pair[0]);
+        right = number<T>(pair[width]);
+      });
+    };
+    row = {blend(0), blend(1), blend(2), blend(3)};
+  });
+  return row;
 }
 
 template <class T>
@@ -177,13 +199,14 @@ struct Probe {
     return slope;
   }
 
-  // What one of the two nodes, fine or coarse, says of the value and of another number; how large it is, and how much
-  // the coarse one counts.
+  // What one of the two nodes, fine or coarse, says of the value, and its brick of four numbers of another channel; how
+  // large it is, and how much the coarse one counts.
   GV_HD T value_of(const Spot<T>& spot, T t) const {
     return read(channels.value, channels.component, spot, spot.at(t));
   }
-  GV_HD T number_of(bool, const ChannelView& channel, int32_t component, const Spot<T>& spot, T t) const {
-    return read(channel, component, spot, spot.at(t));
+  GV_HD Row<T> four_of(bool, const ChannelView& channel, int32_t component, const Spot<T>& spot, T t) const {
+    const int64_t first = first_of(channel, component, spot);
+    return read_four(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, spot.at(t));
   }
   GV_HD static T scale_of(const Spot<T>& spot) { return spot.scale; }
   GV_HD T weight(T t) const { return clamp((near + growth * t - voxel) * blend, static_cast<T>(0), static_cast<T>(1)); }

@@ -112,29 +112,39 @@ struct Lit : Plain<T> {
   }
 };
 
-// One of four numbers of a voxel, as it is seen along a direction. A channel may hold them for each of six directions
+// f(a, b) of numbers, or of each of rows.
+template <class V, class F>
+GV_HD V combined(V a, V b, const F& f) {
+  return f(a, b);
+}
+template <class V, class F>
+GV_HD Row<V> combined(const Row<V>& a, const Row<V>& b, const F& f) {
+  return {f(a.red, b.red), f(a.green, b.green), f(a.blue, b.blue), f(a.alpha, b.alpha)};
+}
+
+// A number of a voxel, or four, as they are seen along a direction; read(k) gives the one `k` behind the first, or the
+// four from there on. A channel may hold them for each of six directions
 // (Crassin et al., "Interactive indirect illumination using voxel cone tracing", CGF 2011): then three are read,
 // weighted by the squares of the direction, whose sum is 1. To the bit that of one direction, where all six are equal.
 template <class V, class Read>
-GV_HD V by_direction(MaskOf<V> which, const Vec3<V>& d, int32_t width, int32_t number, const Read& read) {
-  if (width == 4) return read(number);
+GV_HD auto by_direction(MaskOf<V> which, const Vec3<V>& d, int32_t width, const Read& read) {
+  if (width == 4) return read(0);
   const auto side = [&](int axis) {
     const MaskOf<V> back = which && d[axis] < 0, ahead = which && !back;
-    const int32_t first = number + 8 * axis;
-    if (!any(back)) return read(first);
-    if (!any(ahead)) return read(first + 4);
-    return select(back, read(first + 4), read(first));
+    if (!any(back)) return read(8 * axis);
+    if (!any(ahead)) return read(8 * axis + 4);
+    return combined(read(8 * axis + 4), read(8 * axis), [&](V a, V b) { return select(back, a, b); });
   };
-  const V z = side(2);
-  V value = z;
+  const auto z = side(2);
+  auto seen = z;
 #ifdef __CUDA_ARCH__
 #pragma unroll 1
 #endif
   for (int axis = 0; axis < 2; ++axis) {
-    const V other = side(axis);
-    value = value + d[axis] * d[axis] * (other - z);
+    const auto more = combined(side(axis), z, [&](V a, V b) { return d[axis] * d[axis] * (a - b); });
+    seen = combined(seen, more, [](V a, V b) { return a + b; });
   }
-  return value;
+  return seen;
 }
 
 // Colour and opacity of each voxel, once or by direction, which no packet reads; the value is the opacity.
@@ -196,8 +206,8 @@ struct StoredColor : ShaderFacts {
     if constexpr (kPacket<V>) {
       return probe.number_at(channel, number, t);
     } else {
-      const auto read = [&](int32_t which) { return probe.number_at(channel, which, t); };
-      return by_direction(true, probe.sight.direction, channel.width, number, read);
+      const auto read = [&](int32_t behind) { return probe.number_at(channel, number + behind, t); };
+      return by_direction(true, probe.sight.direction, channel.width, read);
     }
   }
   GV_HD void done(Sum&) const {}
@@ -258,27 +268,15 @@ struct Filtered : Plain<T> {
     probe.narrow(colored);
     const auto& colors = probe.channels.other;
     const Vec3<V> d = probe.sight.direction;
-    const auto number = [&](int32_t which) {
-      return by_direction(colored, d, colors.width, which,
-                          [&](int32_t component) { return probe.number_of(colored, colors, component, node, t); });
-    };
-    const V whole = clamp(number(3), static_cast<T>(0), static_cast<T>(1));
-    const MaskOf<V> shown = colored && whole > 0;
-    if (!any(shown)) return unless(colored, row);
+    const Row<V> seen = by_direction(colored, d, colors.width,
+                                     [&](int32_t first) { return probe.four_of(colored, colors, first, node, t); });
+    const V whole = clamp(seen.alpha, static_cast<T>(0), static_cast<T>(1));
     const V alpha = stretch(whole, piece.length * probe.scale_of(node) / own_numbers<Own>(parameters).side);
     const V part = alpha / whole;
-    V color[3];
-#ifdef __CUDA_ARCH__
-#pragma unroll 1
-#endif
-    for (int i = 0; i < 3; ++i) color[i] = select(shown, number(i) * part, V{});
-    return {select(colored, color[0], row.red), select(colored, color[1], row.green),
-            select(colored, color[2], row.blue), select(colored, select(shown, alpha, V{}), row.alpha)};
-  }
-  template <class V>
-  GV_HD static Row<V> unless(MaskOf<V> which, const Row<V>& row) {
-    return {select(which, V{}, row.red), select(which, V{}, row.green), select(which, V{}, row.blue),
-            select(which, V{}, row.alpha)};
+    const MaskOf<V> shown = colored && whole > 0;
+    const auto choose = [&](V color, V plain) { return select(shown, color, select(colored, V{}, plain)); };
+    return {choose(seen.red * part, row.red), choose(seen.green * part, row.green), choose(seen.blue * part, row.blue),
+            choose(alpha, row.alpha)};
   }
 };
 
