@@ -189,6 +189,17 @@ def test_a_tree_tracer_draws_it():
     assert torch.equal(color, expected.color) and torch.equal(alpha, expected.alpha)
 
 
+@pytest.mark.backend("cpp")
+def test_a_tree_of_one_brick_has_no_colours():
+    volume = gv.Volume(torch.rand(4, 4, 4, generator=torch.Generator().manual_seed(1)))
+    tree = gv.N3Tree.from_volume(volume, 4)
+    shader = gv.Filtered.of(tree, volume, SHADER)
+    assert tree.depth == 0 and len(tree.bricks.bricks["filtered"]) == 0
+    rays = camera_rays(tree, 9, distance=5.0)
+    found, plain = (gv.trace(tree, rays, one) for one in (shader, SHADER))
+    assert torch.equal(found.color, plain.color) and plain.alpha.max() > 0
+
+
 def test_mistakes_are_told():
     volume = matter()
     tree = gv.N3Tree.from_volume(volume, 4)
@@ -202,3 +213,8 @@ def test_mistakes_are_told():
         gv.trace(tree, camera_rays(tree, 3), gv.Filtered(SHADER))
     with pytest.raises(ValueError, match="need 4 numbers a voxel"):
         gv.trace(tree, camera_rays(tree, 3), gv.Filtered(SHADER, "value"))
+    transfer = gv.TransferFunction([(0, 0), (1, 0.5)])
+    shader = gv.Filtered.of(tree, volume, transfer)
+    transfer.opacity[1, 1] = 0.6
+    with pytest.raises(ValueError, match="the function was edited"):
+        gv.trace(tree, camera_rays(tree, 3), shader)

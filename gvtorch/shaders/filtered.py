@@ -55,6 +55,7 @@ class Filtered(Shader):
         """
         self.transfer = check.instance("Filtered", "transfer", transfer, TransferFunction)
         self.other, self.component = channel, component
+        self._made_of: tuple[bytes, ...] | None = None  # the function, where colours were made here
 
     @classmethod
     def of(
@@ -75,7 +76,8 @@ class Filtered(Shader):
         Args:
             tree: What `N3Tree.from_volume` made of the volume.
             volume: The volume.
-            transfer: The transfer function. If it is edited, the colours have to be made anew.
+            transfer: The transfer function. Once it is edited, tracing raises ValueError: the
+                colours have to be made anew.
             channel: Name of the channel, which replaces one of this name.
             component: Which number of a voxel the function takes.
             directions: Whether colours are kept for each of six directions, or their mean, which
@@ -122,12 +124,17 @@ class Filtered(Shader):
             (nodes.ranges, (tiles, siblings, 2, kind.width)),
         ):
             words[channel] = torch.zeros(shape, dtype=kind.dtype, device=tree.device)
+        shader._made_of = _content(transfer)
         return shader
 
     def own_numbers(self, tree: N3Tree) -> FilteredNumbers:
         return FilteredNumbers(min(tree.spacing) * tree.side)
 
     def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
+        if self._made_of not in (None, _content(self.transfer)):
+            raise ValueError(
+                f"{where}: the function was edited; make its colours anew: Filtered.of"
+            )
         known = tree.bricks.channels.get(str(self.other), Channel(width=4))
         if known.width not in (4, 24):
             raise ValueError(
@@ -148,6 +155,11 @@ class Filtered(Shader):
             progress("filtered", axis + 1, 3)
         for level in range(tree.depth):
             yield torch.cat([side[level] for side in sides], 3)
+
+
+def _content(transfer: TransferFunction) -> tuple[bytes, ...]:
+    reference = str(transfer.reference).encode()
+    return (transfer.opacity.tobytes(), transfer.color.tobytes(), reference)
 
 
 def _sampling(tree: N3Tree, step: float) -> Sampling:
