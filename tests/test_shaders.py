@@ -64,6 +64,21 @@ def test_compiled_equals_reference_for_steps_and_dtypes(channels, compiled, name
         assert_same_fields(tree, compiled, rays, SHADERS[name], dtype=dtype, step=step)
 
 
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("ends", [[(0.5, 0), (0.6, 0.9)], [(0.3, 0), (0.4, 0.5), (0.5, 0)]])
+def test_pre_integration_skips_what_its_function_does_not_show(ends):
+    values = 0.2 * torch.rand((32, 32, 32), generator=torch.Generator().manual_seed(3))
+    values[:, :, 16:] += 0.7  # beyond the second function's domain
+    values[12:20, 12:20, 4:12] = 0.45 if ends[-1][1] == 0 else 1.0
+    tree = gv.N3Tree.from_volume(gv.Volume(values), 4)
+    rays, transfer = camera_rays(tree, 16), gv.TransferFunction(ends)
+    plain, found = (
+        gv.trace(tree, rays, one, lod="finest", stop_alpha=1.0)
+        for one in (transfer, gv.PreIntegrated(transfer))
+    )
+    assert 0 < int(found.samples.sum()) <= 1.1 * int(plain.samples.sum())
+
+
 @pytest.mark.parametrize(
     "dtype", ["uint8", "int8", "int16", "uint16", "float16", "bfloat16", "float32"]
 )
