@@ -231,8 +231,8 @@ def integrated_table(transfer: TransferFunction, sampling: Sampling) -> ColorTab
     rows = transfer(low + (high - low) * np.arange(cells + 1) / cells)
     lengths = transfer.length(sampling) * 2.0 ** np.arange(sampling.fitting(len(rows) ** 2))
     table = np.stack([_pairs(rows, thickness, color, length) for length in lengths])
-    # Whatever reaches into a cell is asked for both its ends, so one of them may tell of it: not the
-    # first or last row, which also stand for all that lies beyond the domain.
+    # Whatever reaches into a cell is asked for both its ends, so one of them may tell of it: not
+    # the first or last row, which also stand for all that lies beyond the domain.
     seen = rows[:, 3] > 0
     seen[1:-1] |= thickness[:-1] > 0
     seen[-2] |= thickness[-1] > 0
