@@ -110,11 +110,15 @@ def channels(blobs) -> dict[str, gv.Volume]:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Notes the backends of a test, which its report takes along, from whatever process."""
+    """Notes the backends of a test, which its report takes along, from whatever process; skips it
+    where it is marked for CUDA and there is none.
+    """
     values = getattr(item, "callspec", None)
     names = {v for v in (values.params.values() if values else ()) if v in tuple(DEVICES)}
-    names |= {mark.args[0] for mark in item.iter_markers("backend")}
-    item.user_properties += [("backend", name) for name in sorted(names or {"no backend"})]
+    marked = {mark.args[0] for mark in item.iter_markers("backend")}
+    item.user_properties += [("backend", name) for name in sorted(names | marked or {"no backend"})]
+    if "cuda" in marked and (reason := available()["cuda"]):
+        pytest.skip(f"backend cuda: {reason}")
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:

@@ -10,11 +10,8 @@ from helpers.traces import SHADER
 from helpers.trees import on
 
 import gvtorch as gv
-from gvtorch.ops import available
 
 FIELDS = ("color", "alpha", "depth", "samples")
-
-needs_cuda = pytest.mark.skipif(bool(available()["cuda"]), reason=available()["cuda"] or "-")
 
 
 def traced() -> list[torch.Tensor]:
@@ -38,7 +35,6 @@ def test_every_instruction_set_gives_the_same_bits(instructions, tmp_path):
         assert torch.equal(one, other)
 
 
-@needs_cuda
 @pytest.mark.backend("cuda")
 def test_cuda_brick_pool_of_more_than_4_gib(blobs):
     small = gv.N3Tree.from_volume(blobs, 8, device="cuda")
@@ -57,7 +53,6 @@ def test_cuda_brick_pool_of_more_than_4_gib(blobs):
     assert (large.stamp_b[first:] == small.frame).any() and expected.alpha.max() > 0.3
 
 
-@needs_cuda
 @pytest.mark.backend("cuda")
 def test_cuda_sixteen_million_rays_in_one_call(blobs):
     tree = gv.N3Tree.from_volume(blobs, 8, device="cuda")
@@ -70,7 +65,6 @@ def test_cuda_sixteen_million_rays_in_one_call(blobs):
             assert torch.equal(getattr(whole, name)[begin : begin + part], getattr(some, name))
 
 
-@needs_cuda
 @pytest.mark.backend("cuda")
 def test_cuda_streams(blobs):
     tree = on(gv.N3Tree.from_volume(blobs, 8), "cuda")
@@ -86,7 +80,6 @@ def test_cuda_streams(blobs):
     assert all(torch.equal(getattr(actual, n), getattr(expected, n)) for n in FIELDS)
 
 
-@needs_cuda
 @pytest.mark.backend("cuda")
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="one CUDA device")
 def test_cuda_second_device(blobs):

@@ -184,10 +184,6 @@ def test_parts_of_a_picture_have_its_light(compiled, sample):
 
 @pytest.mark.backend("cuda")
 def test_the_samples_of_a_captured_frame_differ(blobs):
-    from gvtorch.ops import available
-
-    if available()["cuda"]:
-        pytest.skip(f"backend cuda: {available()['cuda']}")
     camera = gv.Camera.orbit(20, 30, 1.2, width=32, height=32)
     given = {"shader": gv.Isosurface(0.5, ambient=1.0), "lighting": gv.Lighting(occlusion=1)}
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4, device="cuda") as engine:

@@ -276,8 +276,6 @@ def test_tensors_are_read_where_they_lie(blobs):
 @pytest.mark.backend("cuda")
 @pytest.mark.parametrize("alpha", [None, 0.4])
 def test_on_cuda_nobody_waits_and_a_graph_reads_the_layer(blobs, alpha):
-    if available()["cuda"]:
-        pytest.skip(f"backend cuda: {available()['cuda']}")
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4, device="cuda") as engine:
         view = camera(64).placed(engine.box)
         depth = screen(view, middle(blobs), (0, 0, 1)).to(engine.device)

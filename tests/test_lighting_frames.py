@@ -12,7 +12,6 @@ from helpers import DEVICES
 from helpers.shading import MATT, grid
 
 import gvtorch as gv
-from gvtorch.ops import available
 
 FLOOR = 8.0
 LOOKS = {
@@ -208,8 +207,6 @@ def test_without_lighting_pictures_keep_every_bit(blobs, compiled):
 @pytest.mark.backend("cuda")
 @pytest.mark.parametrize("look", LOOKS)
 def test_on_cuda_nobody_waits_and_a_graph_is_the_frame(blobs, look):
-    if available()["cuda"]:
-        pytest.skip(f"backend cuda: {available()['cuda']}")
     camera = gv.Camera.orbit(20, 30, 1.2, width=64, height=64)
     given = {"lighting": LOOKS[look]}
     shader = SURFACES["isosurface"]

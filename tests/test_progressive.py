@@ -14,7 +14,6 @@ from helpers.pictures import GRAY
 from helpers.producers import Held
 
 import gvtorch as gv
-from gvtorch.ops import available
 from gvtorch.pictures.progressive import jitter, strip_rows
 
 PARTS = ("color", "alpha", "depth")
@@ -144,8 +143,6 @@ def test_frames_that_miss_something_do_not_stay_in_the_mean(blobs):
 
 @pytest.mark.backend("cuda")
 def test_refining_on_cuda_waits_for_nobody(blobs):
-    if available()["cuda"]:
-        pytest.skip(f"backend cuda: {available()['cuda']}")
     camera = gv.Camera.orbit(distance=1.2, width=32, height=24)
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4, device="cuda") as engine:
         progressive = gv.Progressive(partial(engine.render, shader=GRAY))

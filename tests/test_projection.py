@@ -21,7 +21,6 @@ from gvtorch.cameras.models import (
     last_rising_angle,
     undistort,
 )
-from gvtorch.ops import available
 
 BEND = [0.08, -0.03, 0.004, -0.0005]
 WIDTH, HEIGHT = 14, 10
@@ -349,8 +348,6 @@ def test_gsplat_words_are_taken():
 @pytest.mark.backend("cuda")
 @pytest.mark.parametrize("model", [*MODELS, "bent", "custom"])
 def test_graphs_on_cuda_replay_every_model(blobs, model):
-    if available()["cuda"]:
-        pytest.skip(f"backend cuda: {available()['cuda']}")
     sky = gv.Environment(torch.rand(8, 16, 3))
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4, device="cuda") as engine:
         kind = model if model in MODELS else "fisheye" if model == "bent" else "pinhole"

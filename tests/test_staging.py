@@ -115,8 +115,6 @@ def test_a_brick_larger_than_a_chunk_has_a_ring_of_its_size(device):
 
 @pytest.mark.parametrize("device", [pytest.param("cuda", marks=pytest.mark.backend("cuda"))])
 def test_pinned_bricks_are_copied_from_where_they_are(device):
-    if available()["cuda"]:
-        pytest.skip(f"backend cuda: {available()['cuda']}")
     ring = Staging(8_000_000, 1000, torch.device(device))
     bricks = voxels(5000).pin_memory()
     shipment = ring.send({"value": bricks, "pageable": voxels(5000, seed=3)})
@@ -282,8 +280,6 @@ def test_slots_hold_what_the_producer_made(device, where):
 @pytest.mark.parametrize("device", [pytest.param("cuda", marks=pytest.mark.backend("cuda"))])
 @pytest.mark.parametrize("where", ["host", "device"])
 def test_the_host_waits_a_few_times_a_batch_whatever_its_size(device, where):
-    if available()["cuda"]:
-        pytest.skip(f"backend cuda: {available()['cuda']}")
     producer = Numbered()
     producer.where = where
     with grown(producer, device) as engine:

@@ -116,16 +116,16 @@ def check_shade(
     device, shape = rays.origin_r3.device, "k" if own else "54"
     parameters = ("parameter_54", parameter_54, shape, arguments.table_lm4.dtype)
     check.tensors(where, device, [parameters])
-    others, pool = 0, "e" if kind == "Filtered" else "b"
-    for name, bricks, constants, width in (
-        ("normal", shading.normal_bzyxc, shading.normal_tnc, "3"),
-        ("other", shading.other_bzyxc, shading.other_tnc, "d"),
+    others, some = 0, "e" if kind == "Filtered" else "b"  # colours of the pool's first bricks
+    for name, bricks, constants, slots, width in (
+        ("normal", shading.normal_bzyxc, shading.normal_tnc, "b", "3"),
+        ("other", shading.other_bzyxc, shading.other_tnc, some, "d"),
     ):
         if (bricks is None) != (constants is None):
             raise ValueError(f"{where}: {name}_bzyxc and {name}_tnc belong together")
         if bricks is not None and constants is not None:
             fields = (
-                (f"{name}_bzyxc", bricks, f"{pool}sss{width}", bricks.dtype),
+                (f"{name}_bzyxc", bricks, f"{slots}sss{width}", bricks.dtype),
                 (f"{name}_tnc", constants, f"tn{width}", bricks.dtype),
             )
             others = check.tensors(where, device, fields, sizes).get("d", 0)

@@ -38,7 +38,7 @@ _BATCH = 4096  # bricks cut at a time
 class Filtered(Shader):
     """The transfer function, and for coarse bricks the colours that it makes of the finest voxels
     below them, a channel of their own. Near by it draws as the transfer function does; from afar
-    nothing fades and nothing grows solid. `Filtered.of` makes both.
+    it shows about what many rays a pixel would. `Filtered.of` makes both.
 
     Levels are chosen 1.6 times as fine as for other shaders, whose wide cones have to filter.
     """
@@ -71,7 +71,8 @@ class Filtered(Shader):
     ) -> Self:
         """Works the colours out on the device of a resident tree, and keeps them as a channel of
         it: (b, z, y, x, 4 or 24) float16 for its first b bricks, those above the finest level.
-        Premultiplied linear colour, and the alpha of a voxel. Working takes some 40 bytes a finest
+        Premultiplied linear colour, and the alpha of a voxel. What a tree's threshold made EMPTY
+        counts here as it is. Working takes some 40 bytes a finest
         voxel on the device, the channel included.
 
         Args:

@@ -176,7 +176,8 @@ struct ShadeRay : Walk<T> {
       ++samples;
     }
     GV_HD int32_t take(const Eye& probe, const Intervals<T>& at, int32_t alike, bool last) {
-      if constexpr (IsFiltered<Any>::value) {  // no node of a visit has colours, or the value is not asked for
+      if constexpr (IsFiltered<Any>::value) {  // it reads colours by itself; a visit without any is the plain
+                                               // function's
         if (shader.stored(probe)) return take_by(shader, [](T) { return T{}; }, probe, at, alike, last);
         return take(ready_for_ray(shader.plain()), probe, at, alike, last);
       } else {

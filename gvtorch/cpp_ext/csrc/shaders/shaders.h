@@ -75,7 +75,7 @@ struct Plain : ShaderFacts {
   GV_HD void done(Sum&) const {}
 };
 
-// A shader as a ray takes it along: what is read once for all its samples has been read.
+// The shader that a ray carries: what all of its samples need has been read from memory.
 template <class Shader>
 GV_HD const Shader& ready_for_ray(const Shader& shader) {
   return shader;
@@ -122,10 +122,10 @@ GV_HD Row<V> combined(const Row<V>& a, const Row<V>& b, const F& f) {
   return {f(a.red, b.red), f(a.green, b.green), f(a.blue, b.blue), f(a.alpha, b.alpha)};
 }
 
-// A number of a voxel, or four, as they are seen along a direction; read(k) gives the one `k` behind the first, or the
-// four from there on. A channel may hold them for each of six directions
-// (Crassin et al., "Interactive indirect illumination using voxel cone tracing", CGF 2011): then three are read,
-// weighted by the squares of the direction, whose sum is 1. To the bit that of one direction, where all six are equal.
+// A voxel's number, or four of them, as seen along direction d; read(k) gives the number k places behind the first, or
+// the four that begin there. A channel may hold them for each of six directions (Crassin et al., "Interactive indirect
+// illumination using voxel cone tracing", CGF 2011): then the three that d goes along are read, weighted by the squares
+// of d, whose sum is 1. Where all six are equal, the result has the bits of one.
 template <class V, class Read>
 GV_HD auto by_direction(MaskOf<V> which, const Vec3<V>& d, int32_t width, const Read& read) {
   if (width == 4) return read(0);
