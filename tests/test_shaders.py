@@ -352,10 +352,12 @@ def test_every_shader_is_a_shader():
 
 
 def test_a_kind_has_a_struct_a_twin_and_a_class():
-    """One name in csrc/shaders/shaders.h, in its twin and among the built-in classes."""
+    """One name in csrc/shaders, in its twin and among the built-in classes."""
     assert [*TWINS] == [*SHADER_KINDS]
-    structs = (cpp_ext.SOURCES / "shaders" / "shaders.h").read_text()
-    listed = structs[structs.index("#define GV_SHADERS(X)") : structs.index("#define GV_KIND")]
+    folder = cpp_ext.SOURCES / "shaders"
+    structs = "".join(path.read_text() for path in folder.glob("*.h"))
+    listed = (folder / "shaders.h").read_text().partition("#define GV_SHADERS(X)")[2]
+    listed = listed.partition("#define GV_KIND")[0]
     assert re.findall(r"X\((\w+), \w+, \w+\)", listed) == [*SHADER_KINDS]
     classes = [gv.Filtered, *(getattr(gv, name) for name in built_in.__all__)]
     for kind in SHADER_KINDS:

@@ -1,0 +1,56 @@
+// The plain transfer function, and what shaders say of themselves; the head of shaders.h tells what a shader is.
+#pragma once
+
+#include "shaders/light.h"
+
+namespace gvtorch {
+inline namespace GV_NAMESPACE {
+
+// What a shader says of itself, where it does not say otherwise; see the head of this file.
+struct ShaderFacts {
+  static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
+  static constexpr bool kIntegrates = false;  // its table is (l, m, m, 4)
+  static constexpr bool kColored = false;     // its channel holds red, green, blue and opacity, once or by direction
+  static constexpr bool kFiltered = false;    // its second channel holds such numbers, of the pool's first bricks
+  static constexpr int32_t kFeatures = 0;     // numbers of sum.feature_c
+  static constexpr int32_t kAsOther = -1;     // for kFeatures: as many as the second channel holds
+  static bool packs(const ShadeArgs&) { return true; }  // packets may take its rays
+};
+
+// The plain transfer function. Table: TransferTable or Transfer.
+template <class T, class Table = TransferTable<T>>
+struct Plain : ShaderFacts {
+  template <class V>
+  using SumOf = ShadeSum<V>;
+  using Sum = SumOf<T>;
+  Table transfer;
+  T step;
+
+  explicit Plain(const TraceArgs& args) : transfer(args), step(static_cast<T>(args.step)) {}
+  template <class Other>
+  GV_HD explicit Plain(const Plain<T, Other>& other) : transfer(other.transfer), step(other.step) {}
+
+  template <class Any>
+  GV_HD bool hides(T low, T high, const Any&) const {
+    return Transfer<T>(transfer).transparent(low, high);
+  }
+  template <class V, class Eye>
+  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye&, SumOf<V>& sum) const {
+    const Row<V> row = look_up(Transfer<T>(transfer), piece.value, piece, step, which);
+    if (!unseen(which, row.alpha)) sum.add(row, piece.start, piece.length, sum.hit_clear, which);
+  }
+  GV_HD void done(Sum&) const {}
+};
+
+// The shader that a ray carries: what all of its samples need has been read from memory.
+template <class Shader>
+GV_HD const Shader& ready_for_ray(const Shader& shader) {
+  return shader;
+}
+template <class T>
+GV_HD Plain<T, Transfer<T>> ready_for_ray(const Plain<T>& shader) {
+  return Plain<T, Transfer<T>>(shader);
+}
+
+}  // namespace GV_NAMESPACE
+}  // namespace gvtorch

@@ -1,0 +1,180 @@
+// Shaders whose voxels hold colours: those of a channel, and those that a transfer function made of finer voxels.
+//
+// Equal to ops/reference/shaders.py.
+#pragma once
+
+#include "shaders/plain.h"
+
+namespace gvtorch {
+inline namespace GV_NAMESPACE {
+
+// f(a, b) of numbers, or of each of rows.
+template <class V, class F>
+GV_HD V combined(V a, V b, const F& f) {
+  return f(a, b);
+}
+template <class V, class F>
+GV_HD Row<V> combined(const Row<V>& a, const Row<V>& b, const F& f) {
+  return {f(a.red, b.red), f(a.green, b.green), f(a.blue, b.blue), f(a.alpha, b.alpha)};
+}
+
+// A voxel's number, or four of them, as seen along direction d; read(k) gives the number k places behind the first, or
+// the four that begin there. A channel may hold them for each of six directions (Crassin et al., "Interactive indirect
+// illumination using voxel cone tracing", CGF 2011): then the three that d goes along are read, weighted by the squares
+// of d, whose sum is 1. Where all six are equal, the result has the bits of one.
+template <class V, class Read>
+GV_HD auto by_direction(MaskOf<V> which, const Vec3<V>& d, int32_t width, const Read& read) {
+  if (width == 4) return read(0);
+  const auto side = [&](int axis) {
+    const MaskOf<V> back = which && d[axis] < 0, ahead = which && !back;
+    if (!any(back)) return read(8 * axis);
+    if (!any(ahead)) return read(8 * axis + 4);
+    return combined(read(8 * axis + 4), read(8 * axis), [&](V a, V b) { return select(back, a, b); });
+  };
+  const auto z = side(2);
+  auto seen = z;
+#ifdef __CUDA_ARCH__
+#pragma unroll 1
+#endif
+  for (int axis = 0; axis < 2; ++axis) {
+    const auto more = combined(side(axis), z, [&](V a, V b) { return d[axis] * d[axis] * (a - b); });
+    seen = combined(seen, more, [](V a, V b) { return a + b; });
+  }
+  return seen;
+}
+
+// Colour and opacity of each voxel, once or by direction, which no packet reads; the value is the opacity.
+template <class T>
+struct StoredColor : ShaderFacts {
+  static constexpr bool kColored = true;
+  static bool packs(const ShadeArgs& args) { return args.channels == 4; }
+  template <class V>
+  using SumOf = ShadeSum<V>;
+  using Sum = SumOf<T>;
+  Light<T> light;
+
+  explicit StoredColor(const ShadeArgs& args) : light{static_cast<const Parameters<T>*>(args.parameter_54)} {}
+
+  template <class Any>
+  GV_HD bool hides(T, T high, const Any&) const {
+    return !(a_little_above(high) > 0);
+  }
+  struct Own {
+    T scale;               // of the numbers stored
+    T reference_length;    // of which they tell the opacity
+    T premultiplied, lit;  // 1 or 0
+  };
+  GV_HD const Own& own() const { return own_numbers<Own>(light.parameters); }
+  template <class V, class Eye>
+  GV_HD V opacity_of(const Piece<V>& piece, const Eye& probe) const {
+    const V value = probe.channels.value.width == 4 ? piece.value : seen(probe, 3, piece.middle);
+    return clamp(value * own().scale, static_cast<T>(0), static_cast<T>(1));
+  }
+  GV_HD T alpha(const Piece<T>& piece, const Probe<T>& probe) const {
+    return stretch(opacity_of(piece, probe), piece.length / own().reference_length);
+  }
+  template <class V, class Eye, class... Shadow>
+  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum, const Shadow&... shadow) const {
+    const V opacity = opacity_of(piece, probe);
+    const MaskOf<V> shown = which && opacity > 0;
+    if (!any(shown)) return;
+    probe.narrow(shown);
+    V color[3];
+#ifdef __CUDA_ARCH__
+#pragma unroll 1
+#endif
+    for (int i = 0; i < 3; ++i) {
+      color[i] = seen(probe, i, piece.middle) * own().scale;
+      if (own().premultiplied > 0) color[i] = color[i] / opacity;
+    }
+    Row<V> row{color[0], color[1], color[2], stretch(opacity, piece.length / own().reference_length)};
+    if (own().lit > 0) {
+      const Vec3<V> n = light.normal(probe, piece.middle);
+      row = light.shade(row, n, probe, piece.middle, shadow...);
+      sum.add_normal(n, sum.clear * row.alpha, shown);
+    }
+    sum.add(row, piece.start, piece.length, sum.hit_clear, shown);
+  }
+  // One of the four numbers, as it is seen along the ray.
+  template <class Eye, class V>
+  GV_HD static V seen(const Eye& probe, int32_t number, V t) {
+    const auto& channel = probe.channels.value;
+    if constexpr (kPacket<V>) {
+      return probe.number_at(channel, number, t);
+    } else {
+      const auto read = [&](int32_t behind) { return probe.number_at(channel, number + behind, t); };
+      return by_direction(true, probe.sight.direction, channel.width, read);
+    }
+  }
+  GV_HD void done(Sum&) const {}
+};
+
+// The transfer function, right from afar too: a second channel, which the first bricks of the pool have, holds what the
+// function makes of the finest voxels below each of theirs: premultiplied colour and alpha of an interval as long as
+// the voxel, once or by direction, as StoredColor reads them. Other bricks, and nodes without one, are seen through the
+// function as ever; where two levels blend, their colours do.
+template <class T>
+struct Filtered : Plain<T> {
+  static constexpr bool kFiltered = true;
+  template <class V>
+  using SumOf = ShadeSum<V>;
+  struct Own {
+    T side;  // of the root cube, world
+  };
+  const Parameters<T>* parameters;
+  int32_t bricks;  // that the second channel has
+
+  explicit Filtered(const ShadeArgs& args)
+      : Plain<T>(args), parameters(static_cast<const Parameters<T>*>(args.parameter_54)), bricks(args.other_bricks) {}
+
+  GV_HD const Plain<T>& plain() const { return *this; }
+  // A node that answers has colours.
+  template <class Eye>
+  GV_HD auto stored(const Eye& probe) const {
+    return probe.fine.among(bricks) || (probe.mixed && probe.coarse.among(bricks));
+  }
+  template <class V, class Eye>
+  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
+    const MaskOf<V> seen = which && stored(probe), others = which && !seen;
+    if (any(others)) Plain<T>::add(others, piece, probe, sum);
+    if (!any(seen)) return;
+    Row<V> row = look(seen, piece, probe, probe.fine);
+    const MaskOf<V> mixed = seen && probe.mixed;
+    if (any(mixed)) {
+      const Row<V> coarse = look(mixed, piece, probe, probe.coarse);
+      const V weight = probe.weight(piece.middle);
+      const auto mix = [&](V a, V b) { return select(mixed, a + weight * (b - a), a); };
+      row = {mix(row.red, coarse.red), mix(row.green, coarse.green), mix(row.blue, coarse.blue),
+             mix(row.alpha, coarse.alpha)};
+    }
+    sum.add_light(row, sum.clear, seen);
+    sum.absorb(row.alpha, piece.start, piece.length, sum.hit_clear, seen);
+  }
+  // Premultiplied colour and alpha of an interval, as one of the nodes shows them.
+  template <class V, class Eye, class Node>
+  GV_HD Row<V> look(MaskOf<V> which, const Piece<V>& piece, Eye& probe, const Node& node) const {
+    const V t = piece.middle;
+    const MaskOf<V> colored = which && node.among(bricks), others = which && !colored;
+    Row<V> row{};
+    if (any(others)) {
+      const Row<V> plain = look_up(Transfer<T>(this->transfer), probe.value_of(node, t), piece, this->step, others);
+      row = {plain.red * plain.alpha, plain.green * plain.alpha, plain.blue * plain.alpha, plain.alpha};
+    }
+    if (!any(colored)) return row;
+    probe.narrow(colored);
+    const auto& colors = probe.channels.other;
+    const Vec3<V> d = probe.sight.direction;
+    const Row<V> seen = by_direction(colored, d, colors.width,
+                                     [&](int32_t first) { return probe.four_of(colored, colors, first, node, t); });
+    const V whole = clamp(seen.alpha, static_cast<T>(0), static_cast<T>(1));
+    const V alpha = stretch(whole, piece.length * probe.scale_of(node) / own_numbers<Own>(parameters).side);
+    const V part = alpha / whole;
+    const MaskOf<V> shown = colored && whole > 0;
+    const auto choose = [&](V color, V plain) { return select(shown, color, select(colored, V{}, plain)); };
+    return {choose(seen.red * part, row.red), choose(seen.green * part, row.green), choose(seen.blue * part, row.blue),
+            choose(alpha, row.alpha)};
+  }
+};
+
+}  // namespace GV_NAMESPACE
+}  // namespace gvtorch
