@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gvtorch as gv
+from gvtorch.base.constants import REQUEST_LOAD
 from gvtorch.engine import EngineSettings
 from gvtorch.engine.ray_subsets import scouts
 
@@ -343,7 +344,7 @@ def test_pools_are_honoured_to_the_byte():
         assert 256e6 - 4000 < memory["brick_pool"] <= 256e6
         managed = memory["node_pool"] + memory["brick_pool"]
         assert memory["bookkeeping"] <= 0.031 * managed
-        lru = engine.cache.lru.values()
+        lru = [one for group in engine.cache.lru.values() for one in group]
         fields = [*engine.cache.nodes.fields.values(), *engine.cache.bricks.fields.values()]
         total = sum(field.nbytes for field in fields) + sum(one.order.nbytes for one in lru)
         assert total == sum(memory.values())
@@ -526,7 +527,7 @@ def test_engine_objects_show_themselves_in_a_line(blobs):
         stats = engine.render(camera(), haze).stats
         assert "converged" in repr(stats)
         rays = camera().placed(engine.box).rays()
-        shown = [engine, engine.cache, *engine.cache.lru.values(), engine.scheduler, stats, rays]
-        shown += [engine.production, *engine.trees.values(), engine.report()]
+        shown = [engine, engine.cache, *engine.cache.lru[REQUEST_LOAD], engine.scheduler, stats]
+        shown += [rays, engine.production, *engine.trees.values(), engine.report()]
         for one in shown:
             assert len(repr(one)) < 100 and "\n" not in repr(one) and " at 0x" not in repr(one)

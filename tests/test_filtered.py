@@ -200,6 +200,88 @@ def test_a_tree_of_one_brick_has_no_colours():
     assert torch.equal(found.color, plain.color) and plain.alpha.max() > 0
 
 
+@pytest.mark.parametrize("hold", ["voxels", "bricks"])
+@pytest.mark.parametrize("directions", [True, False])
+def test_streamed_equals_resident(compiled, directions, hold):
+    """From pools that hold all, and from pools with room for a part of the bricks."""
+    device = "cuda" if compiled == "cuda" else "cpu"
+    volume = matter()
+    tree = gv.N3Tree.from_volume(volume, 4, device=device)
+    resident = gv.Filtered.of(tree, volume, SHADER, directions=directions)
+    for size, share in ((4_000_000, 0.5), (150_000, 0.25)):
+        shader = gv.Filtered(SHADER, directions=directions)
+        producer = gv.VolumeProducer(volume, hold=hold, filtered=shader)
+        pools = {"brick_size": 4, "brick_pool": size, "coarse_share": share, "device": device}
+        with gv.Engine(producer, **pools) as engine:
+            bricks, crowded = engine.cache.bricks, False
+            assert size - 12_000 < engine.memory()["brick_pool"] <= size
+            assert bricks.coarse == pytest.approx(share * bricks.capacity, rel=0.3)
+            for distance in (1.5, 4.0, 10.0, 0.7):
+                camera = gv.Camera.orbit(width=40, height=30, distance=distance)
+                found = engine.render(camera, shader)
+                expected = gv.render(tree, camera, resident)
+                assert found.stats.converged
+                crowded |= found.stats.capacity_exceeded
+                for field in ("color", "alpha", "depth"):
+                    assert torch.equal(getattr(found, field), getattr(expected, field)), field
+                engine.validate()
+                depth = engine.trees["scene"].tree.loc(bricks.owner_b.clamp(min=0).long())[:, 3]
+                coarse = depth[: bricks.coarse][bricks.owner_b[: bricks.coarse] >= 0]
+                fine = depth[bricks.coarse :][bricks.owner_b[bricks.coarse :] >= 0]
+                assert (coarse < tree.depth).all() and (fine == tree.depth).all()
+            assert crowded == (size < 4_000_000)
+
+
+@pytest.mark.backend("cpp")
+def test_two_trees_share_coarse_slots():
+    """One with filtered colours, one of a single brick, one without."""
+    volume, small = matter(), gv.Volume(torch.rand(4, 4, 4), (9.0, 9.0, 9.0))
+    shader, other = gv.Filtered(SHADER), gv.Filtered(SHADER)
+    scene = {
+        "far": gv.VolumeProducer(volume, filtered=shader),
+        "small": gv.VolumeProducer(small, filtered=other),
+        "plain": gv.VolumeProducer(volume),
+    }
+    shaders = {"far": shader, "small": other, "plain": SHADER}
+    tree = gv.N3Tree.from_volume(volume, 4)
+    with gv.Engine(scene, brick_size=4) as engine:
+        for name, view in (("far", 5.0), ("small", 3.0), ("plain", 5.0)):
+            alone = {
+                n: one if n == name else gv.TransferFunction([(0, 0)]) for n, one in shaders.items()
+            }
+            camera = gv.Camera.orbit(width=30, height=30, distance=view)
+            found = engine.render(camera, alone)
+            assert found.stats.converged and found.alpha.max() > 0.5
+            engine.validate()
+            if name != "small":
+                placed = camera.placed(engine.box)
+                expected = gv.Filtered.of(tree, volume, SHADER) if name == "far" else SHADER
+                assert torch.equal(found.color, gv.render(tree, placed, expected).color)
+
+
+def test_mistakes_of_a_producer_with_coarse_channels_are_told():
+    volume = matter()
+    with pytest.raises(ValueError, match="'value' is a volume's"):
+        gv.VolumeProducer(volume, filtered=gv.Filtered(SHADER, "value"))
+    with pytest.raises(ValueError, match="brick_pool of 50000 bytes holds"):
+        pool = {"brick_pool": 50_000, "brick_size": 8}
+        gv.Engine(gv.VolumeProducer(volume, filtered=gv.Filtered(SHADER)), **pool)
+    with pytest.raises(ValueError, match="coarse_share must be"):
+        gv.Engine(gv.VolumeProducer(volume), coarse_share=0.0)
+
+    class Wrong(gv.VolumeProducer):
+        def fill(self, nodes):
+            data = dict(super().fill(nodes).data)
+            if not nodes.coarse:
+                data["filtered"] = torch.zeros((*data["value"].shape[:4], 4)).half()
+            return data
+
+    shader = gv.Filtered(SHADER, directions=False)
+    with gv.Engine(Wrong(volume, filtered=shader), brick_size=4) as engine:
+        engine.render(gv.Camera.orbit(width=40, height=40, distance=0.5), shader)
+        assert "which only bricks above the finest level hold" in engine.failures[0].message
+
+
 def test_mistakes_are_told():
     volume = matter()
     tree = gv.N3Tree.from_volume(volume, 4)

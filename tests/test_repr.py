@@ -57,7 +57,7 @@ def test_data_and_producers_tell_of_themselves_in_one_line(tmp_path):
     layout = Layout.of(gv.Producer(100), 8, 1, torch.device("cpu"))
     kind = torch.zeros(5, dtype=torch.int64)
     for thing, begin in (
-        (channels["b"], "Channel(dtype=torch.uint8, width=4)"),
+        (channels["b"], "Channel(dtype=torch.uint8, width=4, coarse=False)"),
         (
             gv.NodePool(20, channels),
             "NodePool(20 tiles of 8 nodes, a int16x1, b uint8x4, 0.0 MB",

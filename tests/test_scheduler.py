@@ -21,12 +21,13 @@ def test_lru_takes_from_the_front_and_refuses_more_than_is_unused():
         lru.take(2)
 
 
-def requests(depth, priority) -> dict[int, Requests]:
+def requests(depth, priority, coarse=None) -> dict[int, Requests]:
     none = torch.zeros(0, dtype=torch.int64)
     loads = Requests(
         node=torch.arange(len(depth)),
         depth=torch.tensor(depth),
         priority=torch.tensor(priority, dtype=torch.int32),
+        coarse=coarse,
     )
     tiles = Requests(node=none, depth=none, priority=none.int())
     return {LOAD: loads, SUBDIVIDE: tiles}
@@ -34,13 +35,13 @@ def requests(depth, priority) -> dict[int, Requests]:
 
 def test_the_scheduler_serves_by_level_then_by_size_and_trims():
     asked = requests([3, 1, 2, 1], [5, 7, 1, 9])
-    room = {LOAD: 10, SUBDIVIDE: 10}
+    room = {LOAD: [10], SUBDIVIDE: [10]}
     for order, expected in (("coarse", [3, 1, 2, 0]), ("fine", [0, 2, 3, 1])):
         served, deferred, exceeded = Scheduler(order=order).choose(asked, room)
         assert served[LOAD].tolist() == expected and deferred == 0 and not exceeded
     served, deferred, _ = Scheduler(loads=3).choose(asked, room)
     assert served[LOAD].tolist() == [3, 1, 2] and deferred == 1
-    room[LOAD] = 2
+    room[LOAD] = [2]
     served, deferred, exceeded = Scheduler().choose(asked, room)
     assert served[LOAD].tolist() == [3, 1] and exceeded
 
@@ -48,7 +49,7 @@ def test_the_scheduler_serves_by_level_then_by_size_and_trims():
 def test_the_time_budget_learns_what_fits():
     scheduler = Scheduler(milliseconds=4.0)
     asked = requests([0] * 1000, [1] * 1000)
-    room = {LOAD: 5000, SUBDIVIDE: 5000}
+    room = {LOAD: [5000], SUBDIVIDE: [5000]}
     first, deferred, _ = scheduler.choose(asked, room)
     assert 0 < len(first[LOAD]) < 1000 and deferred == 1000 - len(first[LOAD])
     scheduler.learn(LOAD, 10, 1e-6)  # too few to tell
@@ -57,3 +58,15 @@ def test_the_time_budget_learns_what_fits():
     for _ in range(40):
         scheduler.learn(LOAD, 100, 1.0)  # 100 bricks a millisecond
     assert len(scheduler.choose(asked, room)[0][LOAD]) >= 199, "half of the time is for bricks"
+
+
+def test_each_kind_of_slot_serves_its_own_requests():
+    """Where coarse bricks need slots of their own, the most wanted of each kind are served."""
+    coarse = torch.tensor([True, False, True, False, True, False])
+    asked = requests([0] * 6, [9, 8, 7, 6, 5, 4], coarse)
+    room = {LOAD: [1, 2], SUBDIVIDE: [0]}
+    served, deferred, exceeded = Scheduler().choose(asked, room)
+    assert served[LOAD].tolist() == [0, 1, 2] and exceeded and not deferred
+    room[LOAD] = [3, 3]
+    served, deferred, exceeded = Scheduler(loads=4).choose(asked, room)
+    assert served[LOAD].tolist() == [0, 1, 2, 3] and not exceeded and deferred == 2

@@ -21,7 +21,7 @@ class LRU:
     def __init__(self, capacity: int, locked: int, device: torch.device) -> None:
         """Starts with slots `locked` to `capacity`, all free."""
         self.order = torch.arange(locked, capacity, dtype=torch.int32, device=device)
-        self.unused = len(self.order)
+        self.unused = len(self)
 
     def sort(self, stamp: Tensor, frame: Tensor) -> Tensor:
         """Moves the slots that `frame` (1,) int32 did not use to the front, each part in its old
@@ -47,8 +47,12 @@ class LRU:
         self.unused -= count
         return taken
 
+    def __len__(self) -> int:
+        """Number of slots."""
+        return len(self.order)
+
     def __repr__(self) -> str:
-        return f"LRU({len(self.order)} slots, {self.unused} may be taken)"
+        return f"LRU({len(self)} slots, {self.unused} may be taken)"
 
 
 class Cache:
@@ -56,7 +60,10 @@ class Cache:
 
     Attributes:
         nodes, bricks: The pools.
-        lru: The order of use of tiles (REQUEST_SUBDIVIDE) and of bricks (REQUEST_LOAD).
+        lru: The orders of use of tiles (REQUEST_SUBDIVIDE) and of bricks (REQUEST_LOAD): one for
+            all bricks; or, where the pool has coarse slots, one of the others and one of these.
+        finest: (trees,) int64 depth from which on a tree's bricks need no coarse slots; 0: none
+            needs one.
         frame: Number of the last picture; what is written counts as used in it.
     """
 
@@ -64,10 +71,12 @@ class Cache:
         """Locks the first `roots` tiles and bricks."""
         self.nodes, self.bricks, self.frame = nodes, bricks, 0
         device = nodes.child_tn.device
-        self.lru = {
-            REQUEST_SUBDIVIDE: LRU(nodes.capacity, roots, device),
-            REQUEST_LOAD: LRU(bricks.capacity, roots, device),
-        }
+        loads = [LRU(bricks.capacity, max(roots, bricks.coarse), device)]
+        if bricks.coarse:
+            loads.append(LRU(bricks.coarse, roots, device))
+        self.lru = {REQUEST_SUBDIVIDE: [LRU(nodes.capacity, roots, device)], REQUEST_LOAD: loads}
+        self.finest = torch.zeros(roots, dtype=torch.int64, device=device)
+        self._no_coarse = torch.zeros(1, dtype=torch.int64, device=device)
 
     def memory(self) -> dict[str, int]:
         """Returns bytes: what the pools hold, and the bookkeeping apart."""
@@ -75,7 +84,7 @@ class Cache:
         content = (*nodes.constants.values(), *nodes.ranges.values())
         node_bytes = sum(words.nbytes for words in (nodes.child_tn, nodes.brick_tn, *content))
         brick_bytes = sum(tensor.nbytes for tensor in bricks.bricks.values())
-        order = sum(lru.order.nbytes for lru in self.lru.values())
+        order = sum(lru.order.nbytes for group in self.lru.values() for lru in group)
         rest = nodes.nbytes + bricks.nbytes - node_bytes - brick_bytes + order
         return {"node_pool": node_bytes, "brick_pool": brick_bytes, "bookkeeping": rest}
 
@@ -83,23 +92,35 @@ class Cache:
         """Orders tiles and bricks by use in `frame` (1,); the host does not wait.
 
         Returns:
-            (4,) int64 tiles unused and used, bricks unused and used; `make_room` is told the unused
-            ones, once the host knows them.
+            (5,) int64 tiles unused and used, bricks unused and used, and how many of the unused
+            are coarse; `make_room` is told the unused ones, once the host knows them.
         """
         counts, stamps = [], (self.nodes.stamp_t, self.bricks.stamp_b)
-        for lru, stamp in zip(self.lru.values(), stamps, strict=True):
-            unused, size = lru.sort(stamp, frame), len(lru.order)
+        for group, stamp in zip(self.lru.values(), stamps, strict=True):
+            unused, size = [lru.sort(stamp, frame) for lru in group], sum(map(len, group))
             locked = (stamp[: len(stamp) - size] == frame).sum()
-            counts += [unused, locked + size - unused]
-        return torch.cat(counts)
+            whole = unused[0] + unused[1] if len(group) > 1 else unused[0]
+            counts += [whole, locked + size - whole]
+        return torch.cat((*counts, unused[1] if len(unused) > 1 else self._no_coarse))
 
-    def make_room(self, tiles: int, bricks: int) -> None:
-        """Sets how many slots may be taken: those that the last picture did not use."""
-        self.lru[REQUEST_SUBDIVIDE].unused, self.lru[REQUEST_LOAD].unused = tiles, bricks
+    def make_room(self, tiles: int, bricks: int, coarse: int = 0) -> None:
+        """Sets how many slots may be taken: those that the last picture did not use. `coarse` of
+        the `bricks` are coarse slots.
+        """
+        self.lru[REQUEST_SUBDIVIDE][0].unused = tiles
+        for lru, unused in zip(self.lru[REQUEST_LOAD], (bricks - coarse, coarse), strict=False):
+            lru.unused = unused
 
-    def room(self) -> dict[int, int]:
-        """For each kind, how many slots may be taken."""
-        return {kind: lru.unused for kind, lru in self.lru.items()}
+    def room(self) -> dict[int, list[int]]:
+        """For each kind, how many slots of each of its orders of use may be taken."""
+        return {kind: [lru.unused for lru in group] for kind, group in self.lru.items()}
+
+    def needs_coarse(self, node: Tensor) -> Tensor | None:
+        """Returns which of (k,) nodes need a coarse slot, (k,) bool; None where there are none."""
+        if not self.bricks.coarse:
+            return None
+        tile, nodes = node // self.nodes.nodes_per_tile, self.nodes
+        return nodes.loc_t4[tile, 3] < self.finest[nodes.tree_t[tile].to(torch.int64)]
 
     def mark_pending(self, node: Tensor, kind: int, pending: bool | Tensor = True) -> None:
         """Marks that answers are on their way: these requests are not listed again.
@@ -122,8 +143,8 @@ class Cache:
         """
         nodes, bricks = self.nodes, self.bricks
         sizes = (nodes.capacity, bricks.capacity)
-        for lru, capacity in zip(self.lru.values(), sizes, strict=True):
-            order = lru.order.sort().values
+        for group, capacity in zip(self.lru.values(), sizes, strict=True):
+            order = torch.cat([lru.order for lru in group]).sort().values
             if not torch.equal(order, torch.arange(capacity - len(order), capacity).to(order)):
                 raise ValueError("Cache: the order of use is no permutation of the slots")
         for what, owner, pointer, shared in (

@@ -7,7 +7,7 @@ leaves on the device, `Requests` its rows of one kind, once the host knows how m
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -23,6 +23,7 @@ from ..base.constants import (
 )
 from ..ops import compact_requests
 from ..pool import NodePool
+from .cache import Cache
 
 #: The kinds of request by the names that statistics show.
 KINDS = {"load": REQUEST_LOAD, "subdivide": REQUEST_SUBDIVIDE}
@@ -37,16 +38,27 @@ class Requests:
     node: Tensor  # (k,) int64
     depth: Tensor  # (k,) int64 of the node
     priority: Tensor  # (k,) int32 width of one of its voxels on the screen, 1/16 pixel
+    coarse: Tensor | None = None  # (k,) bool, whether it needs a coarse slot; None: none does
 
     @classmethod
-    def of(cls, nodes: NodePool, node: Tensor, priority: Tensor) -> Requests:
-        """Requests of (k,) nodes of a pool."""
+    def of(cls, cache: Cache, kind: int, node: Tensor, priority: Tensor) -> Requests:
+        """Requests of (k,) nodes of a cache."""
+        nodes = cache.nodes
         depth = nodes.loc_t4[node // nodes.nodes_per_tile, 3].to(torch.int64)
-        return cls(node=node, depth=depth, priority=priority)
+        coarse = cache.needs_coarse(node) if kind == REQUEST_LOAD else None
+        return cls(node=node, depth=depth, priority=priority, coarse=coarse)
 
     def __len__(self) -> int:
         """Number of requests."""
         return self.node.shape[0]
+
+    def fitting(self, rank: Tensor, room: Sequence[int]) -> Tensor:
+        """Returns those of the rows `rank` (k,), the most wanted first, that find a slot; `room`
+        tells how many slots there are, and how many coarse ones.
+        """
+        if self.coarse is None:
+            return rank[: sum(room)]
+        return rank[_fits(self.coarse[rank], room)]
 
 
 #: `Requests` for each of REQUEST_LOAD and REQUEST_SUBDIVIDE.
@@ -70,7 +82,7 @@ class RequestList:
         kinds = [(word & kind).ne(0).sum().view(1) for kind in KINDS.values()]
         return cls(node=node, word=word, count=torch.cat((count, *kinds)))
 
-    def by_kind(self, nodes: NodePool, counts: Mapping[str, int]) -> dict[int, Requests]:
+    def by_kind(self, cache: Cache, counts: Mapping[str, int]) -> dict[int, Requests]:
         """Returns the requests of each kind; the host does not wait. It has read back the `counts`,
         how many there are of each kind, by name.
         """
@@ -78,12 +90,20 @@ class RequestList:
         for name, kind in KINDS.items():
             row = torch.nonzero_static((self.word & kind).ne(0), size=counts[name])[:, 0]
             node, priority = self.node[row].to(torch.int64), self.word[row] & REQUEST_PRIORITY
-            requests[kind] = Requests.of(nodes, node, priority)
+            requests[kind] = Requests.of(cache, kind, node, priority)
         return requests
 
 
+def _fits(coarse: Tensor, room: Sequence[int]) -> Tensor:
+    """(k,) bool, whether a slot is left for a row, those before it served."""
+    fine, wide = (
+        mask & (mask.cumsum(0) <= n) for mask, n in zip((~coarse, coarse), room, strict=True)
+    )
+    return fine | wide
+
+
 def coarser_requests(
-    nodes: NodePool, requests: RequestsByKind, room: Mapping[int, int]
+    cache: Cache, requests: RequestsByKind, room: Mapping[int, Sequence[int]]
 ) -> RequestsByKind:
     """Asks for coarser bricks where slots are too few for all requests, so that what gets no slot
     is drawn from a near ancestor and not from the root.
@@ -92,23 +112,23 @@ def coarser_requests(
     there are slots.
 
     Args:
-        nodes: The node pool.
+        cache: The pools.
         requests: All requests of a frame.
-        room: For each kind, how many slots may be taken.
+        room: For each kind, how many slots may be taken, and how many coarse ones.
 
     Returns:
         The subdivisions as they are, and loads of the coarser nodes; or all of `requests` where
         those nodes have bricks already.
     """
-    most = room[REQUEST_LOAD]
+    nodes, most = cache.nodes, room[REQUEST_LOAD]
     node, subdivide = requests[REQUEST_LOAD].node, requests[REQUEST_SUBDIVIDE]
-    if len(subdivide) > room[REQUEST_SUBDIVIDE]:
+    if len(subdivide) > sum(room[REQUEST_SUBDIVIDE]):
         node = torch.cat((node, subdivide.node)).unique()  # too deep for the pool
-    while len(node) > most:
+    while bool((crowded := _crowded(cache, node, most)).any()):
         tile = node // nodes.nodes_per_tile
-        depth = nodes.loc_t4[tile, 3]
+        depth = torch.where(crowded, nodes.loc_t4[tile, 3], 0)
         deepest = depth.max()
-        if most == 0 or deepest == 0:
+        if sum(most) == 0 or deepest == 0:
             return requests
         parent = nodes.parent_t[tile].to(torch.int64)
         node = torch.where(depth == deepest, parent, node).unique()
@@ -118,8 +138,17 @@ def coarser_requests(
     node = node[(words == ABSENT) & (pending == 0)]
     if not len(node):
         return requests
-    loads = Requests.of(nodes, node, torch.zeros_like(node, dtype=torch.int32))
+    loads = Requests.of(cache, REQUEST_LOAD, node, torch.zeros_like(node, dtype=torch.int32))
     return {REQUEST_LOAD: loads, REQUEST_SUBDIVIDE: subdivide}
+
+
+def _crowded(cache: Cache, node: Tensor, room: Sequence[int]) -> Tensor:
+    """(k,) bool, for which nodes there are too few slots of the kind that they need."""
+    coarse = cache.needs_coarse(node)
+    if coarse is None:
+        return torch.full_like(node, len(node) > sum(room), dtype=torch.bool)
+    few = [mask.sum() > n for mask, n in zip((~coarse, coarse), room, strict=True)]
+    return torch.where(coarse, few[1], few[0])
 
 
 class Choice(NamedTuple):
@@ -166,9 +195,9 @@ class Scheduler:
         """Starts a frame: its budgets are whole."""
         self.spent = dict.fromkeys(self.most, 0)
 
-    def choose(self, requests: RequestsByKind, room: Mapping[int, int]) -> Choice:
+    def choose(self, requests: RequestsByKind, room: Mapping[int, Sequence[int]]) -> Choice:
         """Returns which of a frame's requests are served, where `room` tells for each kind how many
-        slots may be taken.
+        slots may be taken, and how many coarse ones.
         """
         nodes: dict[int, Tensor] = {}
         deferred, exceeded = 0, False
@@ -176,9 +205,10 @@ class Scheduler:
             asked = requests[kind]
             self._budget[kind] = min(most, self._in_time(kind))
             budget = max(0, self._budget[kind] - self.spent[kind])
-            deferred += max(0, min(len(asked), room[kind]) - budget)
-            exceeded |= len(asked) > room[kind]
-            nodes[kind] = asked.node[self._rank(asked)[: min(budget, room[kind])]]
+            fitting = asked.fitting(self._rank(asked), room[kind])
+            deferred += max(0, len(fitting) - budget)
+            exceeded |= len(asked) > len(fitting)
+            nodes[kind] = asked.node[fitting[:budget]]
         return Choice(nodes, deferred, exceeded)
 
     def learn(self, kind: int, items: int, milliseconds: float) -> None:

@@ -77,7 +77,7 @@ class Children:
 
 def tiles(cache: Cache, targets: Targets, children: Children) -> Written:
     """Gives nodes their children: takes tiles, unlinks, writes and links them."""
-    lru, pool, per_tile = cache.lru[REQUEST_SUBDIVIDE], cache.nodes, cache.nodes.nodes_per_tile
+    (lru,), pool, per_tile = cache.lru[REQUEST_SUBDIVIDE], cache.nodes, cache.nodes.nodes_per_tile
     tree, node = targets.tree, targets.node
     wanted = targets.lacking(cache, REQUEST_SUBDIVIDE)
     first = wanted & (wanted.cumsum(0) <= lru.unused)
@@ -130,9 +130,12 @@ def _alias(cache: Cache, node: Tensor, target: Tensor) -> None:
 
 def bricks(cache: Cache, targets: Targets, data: Voxels | Sequence[Chunk]) -> Written:
     """Gives (k,) nodes their bricks: takes slots, unlinks, writes and links them. `data` is for
-    each channel (k, z, y, x, c), or what is on its way to the device.
+    each channel (k, z, y, x, c), or what is on its way to the device; with a coarse channel they
+    get coarse slots.
     """
-    lru, node = cache.lru[REQUEST_LOAD], targets.node
+    first = data if isinstance(data, Mapping) else data[0].channels
+    coarse = any(cache.bricks.channels[name].coarse for name in first)
+    lru, node = cache.lru[REQUEST_LOAD][coarse], targets.node
     wanted = targets.lacking(cache, REQUEST_LOAD)
     slot = lru.order[: min(len(node), lru.unused)].to(torch.int64)
     used = (cache.bricks.owner_b[slot] >= 0) & _among_first(slot, wanted.sum())
@@ -180,7 +183,7 @@ def _fill_slots(cache: Cache, slot: Tensor, data: Mapping[str, Tensor]) -> int:
             to, rows = wide_rows(held, data[name])
             to.index_copy_(0, slot, rows)
             nbytes += rows.nbytes
-        else:
+        elif not cache.bricks.channels[name].coarse:
             wide_rows(held)[0].index_fill_(0, slot, 0)  # a tree without this channel
     return nbytes
 

@@ -221,16 +221,15 @@ class Engine:
         """Lets slots be taken again, chooses requests, asks the producers, and writes the answers
         that are here at once.
         """
-        self.cache.make_room(counts.tiles_unused, counts.bricks_unused)
+        self.cache.make_room(counts.tiles_unused, counts.bricks_unused, counts.coarse_unused)
         if not counts.listed:
             return
         with stage("schedule"):
-            requests = listed.by_kind(self.cache.nodes, counts.by_kind())
-            pending = self.production.pending
-            room = {kind: max(0, n - pending[kind]) for kind, n in self.cache.room().items()}
+            requests = listed.by_kind(self.cache, counts.by_kind())
+            room = self.production.room()
             nodes, deferred, exceeded = self.scheduler.choose(requests, room)
             if exceeded:
-                coarser = coarser_requests(self.cache.nodes, requests, room)
+                coarser = coarser_requests(self.cache, requests, room)
                 nodes, deferred, _ = self.scheduler.choose(coarser, room)
             stats.deferred += deferred
             stats.capacity_exceeded |= exceeded

@@ -158,6 +158,17 @@ class Production:
         batches = self._under_way()
         return {kind: sum(len(b) for b in batches if b.kind == kind) for kind in KINDS.values()}
 
+    def room(self) -> dict[int, list[int]]:
+        """For each kind, how many slots may be taken that no answer on its way needs; see
+        `Cache.room`.
+        """
+        room, batches = self.cache.room(), self._under_way()
+        for kind, free in room.items():
+            for number in range(len(free)):
+                known = (b for b in batches if b.kind == kind and b.order == number)
+                free[number] = max(0, free[number] - sum(map(len, known)))
+        return room
+
     def ask(self, trees: Sequence[ProducedTree], chosen: Mapping[int, Tensor]) -> list[Answered]:
         """Asks for the chosen (k,) nodes of each kind; returns answers that are here at once."""
         self._raised = 0
@@ -172,8 +183,8 @@ class Production:
                     again, batch = batch[failed], batch[~failed]
                     self._mark(again)
                     self._skipped += len(again)
-                if len(batch):
-                    answered += self._submit(batch)
+                for part in batch.by_order():
+                    answered += self._submit(part)
         return answered
 
     def late(self) -> list[Answered]:
@@ -366,7 +377,8 @@ class Production:
         if batch.fill_loc is not None:
             self._fail(alone, "an ALIAS of an ALIAS whose brick is not here")
             return []
-        return self._submit(RequestBatch(batch.source, batch.kind, alone.targets, alias[~there]))
+        made = RequestBatch(batch.source, batch.kind, alone.targets, alias[~there])
+        return [answered for part in made.by_order() for answered in self._submit(part)]
 
     def _add_up(self, batch: RequestBatch, written: Written, stats: FrameStats) -> None:
         """Adds up what a write did; what found no slot may be asked for again."""

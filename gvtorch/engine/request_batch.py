@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -48,20 +48,37 @@ class RequestBatch:
     kind: int
     targets: Targets  # nodes to fill, or to subdivide
     fill_loc: Tensor | None = None  # (k, 4) filled in their stead: alias targets
+    order: int = 0  # number of their order of use; see `Cache.lru`
 
     def __len__(self) -> int:
         return len(self.targets)
+
+    def by_order(self) -> list[RequestBatch]:
+        """The batch; or, where its bricks take two kinds of slots, those of each kind there are."""
+        tree = self.source.tree
+        coarse_too = any(channel.coarse for channel in self.source.producer.channels.values())
+        if not len(self) or self.kind != REQUEST_LOAD or not coarse_too:
+            return [self] if len(self) else []
+        coarse = self.loc[:, 3] < tree.depth
+        count = int(coarse.sum())
+        parts = []
+        for order, mask, size in ((0, ~coarse, len(self) - count), (1, coarse, count)):
+            if size:
+                row = torch.nonzero_static(mask, size=size)[:, 0]
+                part = self if size == len(self) else self[row]
+                parts.append(replace(part, order=order))
+        return parts
 
     def __getitem__(self, index: slice | Tensor) -> RequestBatch:
         if isinstance(index, Tensor):
             index = upload(index, self.targets.node.device)
         fill_loc = None if self.fill_loc is None else self.fill_loc[index]
-        return RequestBatch(self.source, self.kind, self.targets[index], fill_loc)
+        return replace(self, targets=self.targets[index], fill_loc=fill_loc)
 
     @property
     def nodes(self) -> Nodes:
         """What the producer is asked about; made anew, for `Nodes` keep positions once computed."""
-        return Nodes(self.loc, self.source.layout)
+        return Nodes(self.loc, self.source.layout, coarse=self.order > 0)
 
     @cached_property
     def loc(self) -> Tensor:

@@ -36,6 +36,7 @@ class EngineOptions:
     time_budget: float | None = None  # most milliseconds of production a frame
     scout_rounds: int = 2  # rounds of a sixteenth of the rays before a frame that missed something
     patience: float = 120.0  # seconds until an answer that does not come is given up
+    coarse_share: float = 0.25  # of brick slots: those that hold coarse channels, if there are any
     strict: bool = False  # raise when something can't be produced
     monitor: bool = True  # time the stages and remember the last frames, for `report`
 
@@ -46,6 +47,7 @@ class EngineOptions:
             if value not in (one, other):
                 raise ValueError(f"Engine: {name} must be {one!r} or {other!r}, got {value!r}")
         check.number("Engine", "patience", self.patience, low=0, open_low=True)
+        check.number("Engine", "coarse_share", self.coarse_share, low=0, high=1, open_low=True)
         if self.time_budget is not None:
             check.number("Engine", "time_budget", self.time_budget, low=0, open_low=True)
         for name, low in (("load_budget", 1), ("subdivide_budget", 1), ("scout_rounds", 0)):
@@ -70,6 +72,7 @@ class EngineSettings(TypedDict, total=False):
     time_budget: float | None
     scout_rounds: int
     patience: float
+    coarse_share: float
     strict: bool
     monitor: bool
 
@@ -81,24 +84,28 @@ def make_pools(
     if not producers:
         raise ValueError("Engine: scene must have at least one producer")
     channels = _all_channels(producers)
+    fine = {name: channel for name, channel in channels.items() if not channel.coarse}
     branching = max(producer.branching for producer in producers.values())
-    node_bytes = 8 + 3 * sum(channel.nbytes for channel in channels.values())
-    roots, capacity = len(producers), {}
-    for name, slot in (
-        ("node_pool", branching**3 * node_bytes),
-        ("brick_pool", brick_bytes(channels, options)),
-    ):
+    node_bytes = 8 + 3 * sum(channel.nbytes for channel in fine.values())
+    roots, capacity, coarse, extra = len(producers), {}, 0, 0
+    brick, whole = brick_bytes(fine, options), brick_bytes(channels, options)
+    for name, slot in (("node_pool", branching**3 * node_bytes), ("brick_pool", brick)):
         size = check.nbytes("Engine", name, getattr(options, name))
-        capacity[name] = size // slot
         least = roots + 1 + (branching if name == "node_pool" else 0)
+        if name == "brick_pool" and whole > brick:
+            average = brick + options.coarse_share * (whole - brick)
+            coarse = max(roots + 1, int(options.coarse_share * size / average))
+            extra, least = coarse * (whole - brick), coarse + 1
+        capacity[name] = max(0, size - extra) // slot
         if capacity[name] < least:
+            kinds = f" beside {extra} for coarse channels" if extra else ""
             raise ValueError(
-                f"Engine: {name} of {size} bytes holds {capacity[name]} slots of {slot} bytes, "
-                f"at least {least} are needed ({least * slot} bytes)"
+                f"Engine: {name} of {size} bytes holds {capacity[name]} slots of {slot} bytes"
+                f"{kinds}, at least {least} are needed ({least * slot + extra} bytes)"
             )
         check.memory("Engine", name, size, device)
     nodes = NodePool(capacity["node_pool"], channels, branching=branching, device=device)
-    shape = {"brick_size": options.brick_size, "border": options.border}
+    shape = {"brick_size": options.brick_size, "border": options.border, "coarse": coarse}
     return nodes, BrickPool(capacity["brick_pool"], channels, **shape, device=device)
 
 
@@ -151,6 +158,8 @@ def make_tree(
     )
     nodes.child_tn[number], nodes.brick_tn[number] = TERMINAL, EMPTY
     nodes.tree_t[number] = number
+    if any(channel.coarse for channel in producer.channels.values()):
+        cache.finest[number] = layout.depth
     made = ProducedTree(name, tree, producer, layout)
     try:
         _fill_root(cache, made, options.patience)
@@ -168,7 +177,8 @@ def _fill_root(cache: Cache, made: ProducedTree, patience: float) -> None:
     """Writes the root's content into the first slots, which are the roots'."""
     nodes, index, producer = cache.nodes, made.tree.root, made.producer
     number = index // nodes.nodes_per_tile
-    root = Nodes(torch.zeros((1, 4), dtype=torch.int64, device=nodes.child_tn.device), made.layout)
+    loc = torch.zeros((1, 4), dtype=torch.int64, device=nodes.child_tn.device)
+    root = Nodes(loc, made.layout, coarse=bool(cache.finest[number] > 0))
     regions = checked_regions(_now(producer.classify(root), patience), root, producer)
     _raise_first(regions.errors)
     for channel, tensor in regions.ranges.items():

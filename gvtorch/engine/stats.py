@@ -127,6 +127,7 @@ class Counts(NamedTuple):
     tiles_used: int
     bricks_unused: int
     bricks_used: int
+    coarse_unused: int  # of the bricks unused
     samples: int
 
     def by_kind(self) -> dict[str, int]:
@@ -138,7 +139,7 @@ class Collected(NamedTuple):
     """What a traced frame leaves on the device."""
 
     requests: RequestList
-    numbers: Tensor  # (10,) int64 `Counts`
+    numbers: Tensor  # (11,) int64 `Counts`
 
 
 class Readback:

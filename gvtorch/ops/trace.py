@@ -121,13 +121,12 @@ def check_shade(
         ("normal", shading.normal_bzyxc, shading.normal_tnc, "b", "3"),
         ("other", shading.other_bzyxc, shading.other_tnc, some, "d"),
     ):
-        if (bricks is None) != (constants is None):
+        if (bricks is None) != (constants is None) and slots == "b":
             raise ValueError(f"{where}: {name}_bzyxc and {name}_tnc belong together")
-        if bricks is not None and constants is not None:
-            fields = (
-                (f"{name}_bzyxc", bricks, f"{slots}sss{width}", bricks.dtype),
-                (f"{name}_tnc", constants, f"tn{width}", bricks.dtype),
-            )
+        if bricks is not None:
+            fields = [(f"{name}_bzyxc", bricks, f"{slots}sss{width}", bricks.dtype)]
+            if constants is not None:
+                fields.append((f"{name}_tnc", constants, f"tn{width}", bricks.dtype))
             others = check.tensors(where, device, fields, sizes).get("d", 0)
             check.whole(where, f"bricks of {name}_bzyxc", len(bricks), low=0, high=sizes["b"])
     colored = sizes["c"] in (4, 24) and arguments.component == 3

@@ -19,10 +19,13 @@ _COMMON = ("extent", "spacing", "origin")  # what the volumes of one tree share
 
 @dataclass(frozen=True)
 class Channel:
-    """What a voxel of a channel holds: `width` numbers of `dtype`."""
+    """What a voxel of a channel holds: `width` numbers of `dtype`. A coarse channel is one that the
+    finest level has not: it adds to what coarse voxels tell of the finest ones below them.
+    """
 
     dtype: torch.dtype = torch.float32
     width: int = 1
+    coarse: bool = False
 
     def __post_init__(self) -> None:
         """Checks dtype and width."""
@@ -52,6 +55,7 @@ def phrase(channels: Mapping[str, Channel]) -> str:
     """Returns channels as one phrase for a repr, as in "density float32x1, color uint8x4"."""
     return ", ".join(
         f"{name} {str(channel.dtype).removeprefix('torch.')}x{channel.width}"
+        + " of coarse bricks" * channel.coarse
         for name, channel in channels.items()
     )
 
@@ -131,8 +135,9 @@ class NodePool(_Pool):
         stamp_t: (t,) int32 usage stamp: the last frame in which a ray passed through, or after
             which the tile was written; -1 for never.
         shared_t: (t,) bool, whether other nodes may point to the tile as well (aliases).
-        constants: For each channel (t, n, c): the value of CONSTANT nodes, the mean of EMPTY ones.
-        ranges: For each channel (t, n, 2, c): smallest and largest value in reach of the node's
+        constants: For each channel that is not coarse (t, n, c): the value of CONSTANT nodes, the
+            mean of EMPTY ones.
+        ranges: For each of these (t, n, 2, c): smallest and largest value in reach of the node's
             brick, at all levels; all that the dtype can hold where it is not known.
     """
 
@@ -168,6 +173,8 @@ class NodePool(_Pool):
         self.constants: dict[str, Tensor] = {}
         self.ranges: dict[str, Tensor] = {}
         for name, channel in self.channels.items():
+            if channel.coarse:
+                continue
             shape = (capacity, n, channel.width)
             self.constants[name] = torch.zeros(shape, dtype=channel.dtype, device=device)
             limits = torch.tensor(channel.limits, dtype=torch.float64).to(channel.dtype)
@@ -191,7 +198,10 @@ class BrickPool(_Pool):
         brick_size: Voxels along a side of a brick, without the border.
         border: Voxels around a brick, copied from its neighbours.
         channels: What each voxel holds, by name.
-        bricks: For each channel (b, z, y, x, c) voxels, sides of brick_size + 2 * border.
+        coarse: How many slots, the first ones, hold coarse channels as well. All bricks that have
+            such channels lie there, and no others but those of roots.
+        bricks: For each channel (b, z, y, x, c) voxels, sides of brick_size + 2 * border; a coarse
+            channel has `coarse` bricks.
         stamp_b: (b,) int32 usage stamp: the last frame in which a ray sampled the brick, or after
             which it was written; -1 for never.
         born_b: (b,) int32 first frame that could draw the brick, 0 if it was there from the start.
@@ -206,6 +216,7 @@ class BrickPool(_Pool):
         *,
         brick_size: int = 8,
         border: int = 1,
+        coarse: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
         """Allocates `capacity` free slots, 0 or more.
@@ -222,10 +233,13 @@ class BrickPool(_Pool):
         if not channels:
             raise ValueError("BrickPool: channels must name at least one channel")
         self.brick_size, self.border = brick_size, border
+        self.coarse = check.whole("BrickPool", "coarse", coarse, low=0, high=capacity)
         self.channels = dict(channels)
-        side = brick_size + 2 * border
+        cube = (brick_size + 2 * border,) * 3
         self.bricks = {
-            name: torch.zeros((capacity, side, side, side, c.width), dtype=c.dtype, device=device)
+            name: torch.zeros(
+                (coarse if c.coarse else capacity, *cube, c.width), dtype=c.dtype, device=device
+            )
             for name, c in channels.items()
         }
 

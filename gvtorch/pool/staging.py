@@ -152,6 +152,11 @@ class Chunk:
         self._data, self._span = data, span
         self._device = next(iter(data.values())).device
 
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of what it holds."""
+        return tuple(self._data)
+
     def __enter__(self) -> Mapping[str, Tensor]:
         if self._device.type == "cuda":
             torch.cuda.current_stream(self._device).wait_event(self._span.copied)

@@ -83,15 +83,21 @@ def _checked(
     brick = (layout.side,) * 3
     shapes: dict[str, tuple[int, ...]] = {"data": brick, "constants": (), "ranges": (2,)}
     given = {name: getattr(answer, name) for name in shapes if hasattr(answer, name)}
-    missing = sorted(set(producer.channels) - set(given.get("data", producer.channels)))
-    if missing:
+    fine = {name for name, channel in producer.channels.items() if not channel.coarse}
+    wanted = {*producer.channels} if nodes.coarse else fine
+    if missing := sorted(wanted - {*given.get("data", wanted)}):
         raise ValueError(f"{where}: channel {missing[0]!r} is missing")
+    for name, values in given.items():
+        spare = {*values} & {*producer.channels} - (wanted if name == "data" else fine)
+        if spare:
+            only = "only bricks above the finest level hold"
+            raise ValueError(f"{where}: {name} has channel {min(spare)!r}, which {only}")
     fields: dict[str, Any] = {
         name: _by_channel(where, name, by_channel, (count, *shapes[name]), producer)
         for name, by_channel in given.items()
     }
     counts = _refuse_bad(kind, [*fields.values()], errors)
-    missing = sorted(set(producer.channels) - set(fields["constants"]))
+    missing = sorted(fine - {*fields["constants"]})
     if missing and counts[Region.CONSTANT]:
         raise ValueError(f"{where}: constants must hold channel {missing[0]!r} of CONSTANT items")
     alias = _alias(where, answer.alias, kind, layout, errors) if counts[Region.ALIAS] else None

@@ -104,11 +104,13 @@ class Nodes:
         loc: (k, 4) int64 x, y, z, depth: node x of its level covers voxels x * brick_size to
             (x + 1) * brick_size of that level.
         layout: How the tree's world is cut: brick size, border, spacing and the like.
+        coarse: Whether their bricks hold coarse channels as well: then all are above the finest
+            level; where a producer has such channels and this is False, all are of the finest.
     """
 
-    def __init__(self, loc: Tensor, layout: Layout) -> None:
+    def __init__(self, loc: Tensor, layout: Layout, *, coarse: bool = False) -> None:
         """Holds the places."""
-        self.loc, self.layout = loc, layout
+        self.loc, self.layout, self.coarse = loc, layout, coarse
         self._known: dict[str, Tensor] = {}  # a cache of properties that torch.compile can trace
 
     def __len__(self) -> int:
@@ -116,7 +118,7 @@ class Nodes:
 
     def __getitem__(self, index: slice | Tensor) -> Nodes:
         """Returns some of the nodes."""
-        return Nodes(self.loc[index], self.layout)
+        return Nodes(self.loc[index], self.layout, coarse=self.coarse)
 
     @property
     def depth(self) -> Tensor:
@@ -336,7 +338,8 @@ class Producer(torch.nn.Module):
         Coarse levels must be pre-filtered: a voxel is the mean over the space that it covers.
 
         Returns:
-            `Bricks`, or their voxels {channel: (k, z, y, x, c)} alone, now or as a future.
+            `Bricks`, or their voxels {channel: (k, z, y, x, c)} alone, now or as a future. Coarse
+            channels (`Channel.coarse`) are there if `nodes.coarse` is true, and only then.
         """
         raise NotImplementedError(f"{type(self).__name__}: fill is not written")
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Literal
+from collections.abc import Iterator, Mapping
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -21,6 +21,20 @@ from .producer import Bricks, Layout, Nodes, Producer, Regions
 _BATCH = 4096  # bricks cut from a level at a time
 
 
+class CoarseColors(Protocol):
+    """What makes a coarse channel of a volume: `Filtered` does."""
+
+    other: str | None  # name of the channel
+
+    def colors(self, spacing: tuple[float, float, float]) -> Channel:
+        """Returns the channel, for voxels of this size."""
+
+    def levels(
+        self, volume: Volume, branching: int, depth: int, device: torch.device
+    ) -> Iterator[Tensor]:
+        """Yields (z, y, x, c) of the coarse levels, the finest of them first, on the CPU."""
+
+
 class VolumeProducer(Producer):
     """Cuts bricks out of the levels of a volume; the same bits as `N3Tree.from_volume`."""
 
@@ -30,6 +44,7 @@ class VolumeProducer(Producer):
         *,
         threshold: float | None = None,
         hold: Literal["voxels", "bricks"] = "voxels",
+        filtered: CoarseColors | None = None,
     ) -> None:
         """Takes a volume, which becomes channel "value", or one for each channel.
 
@@ -39,6 +54,8 @@ class VolumeProducer(Producer):
             hold: What is held in memory. "voxels": all levels, 8 / 7 of the volume. "bricks": all
                 bricks of all levels, with their borders, as well (2.2 times the volume for 8^3 and
                 a border of 1); answers then come many times as fast.
+            filtered: A `Filtered` shader: coarse bricks hold colours for it as well, made of the
+                first channel; to be rendered with this shader.
 
         Raises:
             ValueError: Channels differ in extent, spacing or origin, or `hold` is unknown.
@@ -47,9 +64,15 @@ class VolumeProducer(Producer):
             raise ValueError(f"VolumeProducer: hold must be 'voxels' or 'bricks', got {hold!r}")
         volumes = volumes_by_channel("VolumeProducer", volume)
         first = next(iter(volumes.values()))
+        channels = {name: Channel.of(volume) for name, volume in volumes.items()}
+        if filtered is not None:
+            name = str(filtered.other)
+            if name in channels:
+                raise ValueError(f"VolumeProducer: channel {name!r} is a volume's")
+            channels[name] = filtered.colors(first.spacing)
         super().__init__(
             first.extent,
-            channels={name: Channel.of(volume) for name, volume in volumes.items()},
+            channels=channels,
             spacing=first.spacing,
             origin=first.origin,
             value_range={name: volume.value_range for name, volume in volumes.items()},
@@ -57,7 +80,9 @@ class VolumeProducer(Producer):
         if threshold is not None:
             threshold = check.number("VolumeProducer", "threshold", threshold)
         self._volumes, self._threshold, self._hold = volumes, threshold, hold
+        self._filtered = filtered
         self._levels: dict[str, list[Level]] = {}  # by channel, the root's first
+        self._values: dict[str, list[Tensor]] = {}  # voxels of these levels, and coarse channels
         self._tables: dict[str, BrickTable] = {}  # by channel, depth after depth, in order z, y, x
         self._grids: Tensor | None = None  # (d, 4) of each depth: bricks along x, y, z; first row
 
@@ -65,9 +90,16 @@ class VolumeProducer(Producer):
         """Makes all levels, and all bricks if they are to be held."""
         sizes = (layout.branching, layout.brick_size, layout.border)
         self._levels = levels_by_depth(self._volumes, layout.depth, *sizes)
+        self._values = {name: [one.values for one in own] for name, own in self._levels.items()}
+        levels = next(iter(self._levels.values()))
+        if self._filtered is not None:
+            first = next(iter(self._volumes.values()))
+            made = self._filtered.levels(first, layout.branching, layout.depth, layout.device)
+            self._values[str(self._filtered.other)] = [*made][::-1]
         if self._hold == "bricks":
-            for name, levels in self._levels.items():
-                self._tables[name] = BrickTable(_all_bricks(levels, layout))
+            for name, values in self._values.items():
+                if values:  # a tree of one brick has no coarse ones
+                    self._tables[name] = BrickTable(_all_bricks(values, levels, layout))
             grids = torch.tensor([level.grid[::-1] for level in levels])
             count = grids.prod(1, keepdim=True)
             self._grids = torch.cat((grids, count.cumsum(0) - count), 1).to(layout.device)
@@ -81,17 +113,17 @@ class VolumeProducer(Producer):
 
     def fill(self, nodes: Nodes) -> Bricks:
         """Cuts the bricks, or names their rows where they are held."""
-        layout = nodes.layout
+        layout, data = nodes.layout, {}
+        held = {name: c for name, c in self.channels.items() if nodes.coarse or not c.coarse}
         if self._grids is not None:
             (x, y, z), grid = nodes.loc[:, :3].unbind(1), self._grids[nodes.depth]
             row = (grid[:, 3] + (z * grid[:, 1] + y) * grid[:, 0] + x).cpu()
-            return Bricks(data={name: table[row] for name, table in self._tables.items()})
-        data = {}
-        for name, channel in self.channels.items():
+            return Bricks(data={name: self._tables[name][row] for name in held})
+        for name, channel in held.items():
             shape = (len(nodes), *(layout.side,) * 3, channel.width)
             bricks = data[name] = torch.empty(shape, dtype=channel.dtype)
             for depth, here, zyx in _by_depth(nodes):
-                values = self._levels[name][depth].values
+                values = self._values[name][depth]
                 cut = cut_bricks(values, zyx, layout.brick_size, layout.border)
                 rows, found = wide_rows(bricks, cut)
                 rows[here] = found
@@ -115,15 +147,16 @@ def _by_depth(nodes: Nodes) -> list[tuple[int, Tensor, Tensor]]:
     return [(at, here, loc[here, :3].flip(1)) for at, here in rows]
 
 
-def _all_bricks(levels: list[Level], layout: Layout) -> Tensor:
-    """Returns (n, s, s, s, c) the bricks of all levels, level after level, in the order z, y, x."""
-    places = [torch.cartesian_prod(*map(torch.arange, level.grid)) for level in levels]
-    values = levels[0].values
-    shape = (sum(map(len, places)), *(layout.side,) * 3, values.shape[3])
-    bricks, begin = torch.empty(shape, dtype=values.dtype), 0
-    for level, zyx in zip(levels, places, strict=True):
+def _all_bricks(values: list[Tensor], levels: list[Level], layout: Layout) -> Tensor:
+    """Returns (n, s, s, s, c) the bricks of a channel's values (z, y, x, c) of each level, level
+    after level, in the order z, y, x.
+    """
+    places = [torch.cartesian_prod(*map(torch.arange, one.grid)) for one in levels[: len(values)]]
+    shape = (sum(map(len, places)), *(layout.side,) * 3, values[0].shape[3])
+    bricks, begin = torch.empty(shape, dtype=values[0].dtype), 0
+    for level, zyx in zip(values, places, strict=True):
         for part in zyx.split(_BATCH):
-            cut = cut_bricks(level.values, part, layout.brick_size, layout.border)
+            cut = cut_bricks(level, part, layout.brick_size, layout.border)
             bricks[begin : begin + len(part)] = cut
             begin += len(part)
     return bricks

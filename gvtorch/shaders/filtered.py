@@ -48,13 +48,25 @@ class Filtered(Shader):
     transfer: TransferFunction
 
     def __init__(
-        self, transfer: TransferFunction, channel: str = "filtered", component: int | None = None
+        self,
+        transfer: TransferFunction,
+        channel: str = "filtered",
+        component: int | None = None,
+        *,
+        directions: bool | None = None,
     ) -> None:
-        """Takes the transfer function, the name of the colours that were made with it, and which
-        number of a voxel it takes.
+        """Tells the transfer function, and where its colours lie.
+
+        Args:
+            transfer: The transfer function. Once it is edited, tracing raises ValueError where the
+                colours were made for this shader: they have to be made anew.
+            channel: Name of the channel that holds the colours.
+            component: Which number of a voxel the function takes.
+            directions: Whether colours are made for each of six directions, or their mean, which
+                takes a sixth of the memory. None: where a voxel may hide a fifth of what is behind.
         """
         self.transfer = check.instance("Filtered", "transfer", transfer, TransferFunction)
-        self.other, self.component = channel, component
+        self.other, self.component, self._directions = channel, component, directions
         self._made_of: tuple[bytes, ...] | None = None  # the function, where colours were made here
 
     @classmethod
@@ -78,12 +90,9 @@ class Filtered(Shader):
         Args:
             tree: What `N3Tree.from_volume` made of the volume.
             volume: The volume.
-            transfer: The transfer function. Once it is edited, tracing raises ValueError: the
-                colours have to be made anew.
+            transfer: The transfer function.
             channel: Name of the channel, which replaces one of this name.
-            component: Which number of a voxel the function takes.
-            directions: Whether colours are kept for each of six directions, or their mean, which
-                takes a sixth of the memory. None: where a voxel may hide a fifth of what is behind.
+            component, directions: See `Filtered`.
             progress: Called with what is made, how many axes of it are done, and of how many.
 
         Raises:
@@ -91,9 +100,8 @@ class Filtered(Shader):
         """
         check.instance("Filtered", "volume", volume, Volume)
         last = volume.data.shape[3] - 1
-        shader = cls(
-            transfer, channel, check.whole("Filtered", "component", component, low=0, high=last)
-        )
+        check.whole("Filtered", "component", component, low=0, high=last)
+        shader = cls(transfer, channel, component, directions=directions)
         if (volume.extent, volume.spacing) != (tree.extent, tree.spacing):
             raise ValueError(f"Filtered: tree and volume must be of one place: {tree}, {volume}")
         if channel == tree.channel_names[0]:
@@ -104,29 +112,56 @@ class Filtered(Shader):
         count = int(upper.sum())
         if not bool(upper[:count].all()):
             raise ValueError("Filtered: the tree's coarse bricks must come first in its pool")
-        if directions is None:
-            table = transfer.table(_sampling(tree, min(tree.spacing)))
-            directions = float(table.table_lm4[0, :, 3].max()) > _OPAQUE
-        kind = Channel(torch.float16, 4 * (_DIRECTIONS if directions else 1))
-        bricks, nodes = tree.bricks, tree.nodes
+        bricks, kind = tree.bricks, shader.colors(tree.spacing)
         side = bricks.brick_size + 2 * bricks.border
         colors = torch.zeros((count, side, side, side, kind.width), dtype=kind.dtype)
-        for level, found in enumerate(shader._levels(tree, volume, progress), 1):
-            values = (found if directions else _mean_of_directions(found)).cpu()
+        levels = shader.levels(volume, tree.branching, tree.depth, tree.device, progress)
+        for level, values in enumerate(levels, 1):
             mine = (places[:count, 3] == tree.depth - level).nonzero()[:, 0]
             for some in mine.split(_BATCH):
                 place = places[some, :3].flip(1)
                 colors[some] = cut_bricks(values, place, bricks.brick_size, bricks.border)
-        bricks.channels[channel] = nodes.channels[channel] = kind
-        bricks.bricks[channel] = colors.to(tree.device)
-        tiles, siblings = nodes.brick_tn.shape
-        for words, shape in (
-            (nodes.constants, (tiles, siblings, kind.width)),
-            (nodes.ranges, (tiles, siblings, 2, kind.width)),
-        ):
-            words[channel] = torch.zeros(shape, dtype=kind.dtype, device=tree.device)
-        shader._made_of = _content(transfer)
+        bricks.channels[channel] = tree.nodes.channels[channel] = kind
+        bricks.bricks[channel], bricks.coarse = colors.to(tree.device), count
         return shader
+
+    def colors(self, spacing: tuple[float, float, float]) -> Channel:
+        """Returns the channel that holds the colours of voxels of this size."""
+        directions = self._directions
+        if directions is None:
+            table = self.transfer.table(_sampling(min(spacing), min(spacing), torch.device("cpu")))
+            directions = float(table.table_lm4[0, :, 3].max()) > _OPAQUE
+        return Channel(torch.float16, 4 * (_DIRECTIONS if directions else 1), coarse=True)
+
+    def levels(
+        self,
+        volume: Volume,
+        branching: int,
+        depth: int,
+        device: torch.device,
+        progress: Progress = no_progress,
+    ) -> Iterator[Tensor]:
+        """Yields the colours of a volume's coarse levels, (z, y, x, 4 or 24) float16 on the CPU,
+        the finest of them first, worked out on a device; see `of`.
+        """
+        values, sides = volume.data[..., self.component or 0], []
+        smallest, width = min(volume.spacing), self.colors(volume.spacing).width
+        self._made_of = _content(self.transfer)
+        for axis in range(3):
+            spacing = volume.spacing[axis]
+            table = self.transfer.table(_sampling(smallest, spacing / 2, device))
+            columns = values.movedim(2 - axis, 0)
+            found = _seen_along(columns, table, branching, depth, device)
+            sides.append(
+                [
+                    _of_length(one, smallest / spacing).to(torch.float16).movedim(0, 2 - axis)
+                    for one in found
+                ]
+            )
+            progress("filtered", axis + 1, 3)
+        for _ in range(depth):
+            level = torch.cat([side.pop(0) for side in sides], 3)
+            yield (level if width > 4 else _mean_of_directions(level)).cpu()
 
     def own_numbers(self, tree: N3Tree) -> FilteredNumbers:
         return FilteredNumbers(min(tree.spacing) * tree.side)
@@ -144,34 +179,15 @@ class Filtered(Shader):
             )
         return super().shading(where, tree)
 
-    def _levels(self, tree: N3Tree, volume: Volume, progress: Progress) -> Iterator[Tensor]:
-        """Yields (z, y, x, 24) float16 colours of each level, the finest coarse one first."""
-        values, sides = volume.data[..., self.component or 0], []
-        for axis in range(3):
-            table = self.transfer.table(_sampling(tree, tree.spacing[axis] / 2))
-            columns = values.movedim(2 - axis, 0)
-            found = _seen_along(columns, table, tree.branching, tree.depth, tree.device)
-            share = min(tree.spacing) / tree.spacing[axis]
-            sides.append(
-                [_of_length(one, share).to(torch.float16).movedim(0, 2 - axis) for one in found]
-            )
-            progress("filtered", axis + 1, 3)
-        for _ in range(tree.depth):
-            yield torch.cat([side.pop(0) for side in sides], 3)
-
 
 def _content(transfer: TransferFunction) -> tuple[bytes, ...]:
     reference = str(transfer.reference).encode()
     return (transfer.opacity.tobytes(), transfer.color.tobytes(), reference)
 
 
-def _sampling(tree: N3Tree, step: float) -> Sampling:
+def _sampling(smallest: float, step: float, device: torch.device) -> Sampling:
     return Sampling(
-        smallest_spacing=min(tree.spacing),
-        step=step,
-        levels=1,
-        dtype=torch.float32,
-        device=tree.device,
+        smallest_spacing=smallest, step=step, levels=1, dtype=torch.float32, device=device
     )
 
 

@@ -171,14 +171,16 @@ class Shader:
         if self.other is not None:
             last = channels[self.other].width - 1
             check.whole(where, "component of the colour", self.other_component, low=0, high=last)
-        bricks, constants = tree.bricks.bricks, tree.nodes.constants
+        bricks, constants = dict(tree.bricks.bricks), tree.nodes.constants
+        if tree.depth == 0:  # the root is of the finest level
+            bricks |= {name: bricks[name][:0] for name, one in channels.items() if one.coarse}
         return ShadeArguments(
             shader=0 if self.op else shader_number(self.kind),
             features=self.feature_count(tree),
             normal_bzyxc=None if self.normals is None else bricks[self.normals],
             normal_tnc=None if self.normals is None else constants[self.normals],
             other_bzyxc=None if self.other is None else bricks[self.other],
-            other_tnc=None if self.other is None else constants[self.other],
+            other_tnc=constants.get(str(self.other)),
             other_component=self.other_component,
         )
 

@@ -174,13 +174,17 @@ class TreeTracer(torch.nn.Module):
 
     def shading(self) -> ShadeArguments:
         """Which shader, and its channels."""
-        with_normals, with_others = len(self.normal_tnc) > 0, len(self.other_tnc) > 0
         return ShadeArguments(
             shader=self.shader,
             features=self.features,
-            normal_bzyxc=self.normal_bzyxc if with_normals else None,
-            normal_tnc=self.normal_tnc if with_normals else None,
-            other_bzyxc=self.other_bzyxc if with_others else None,
-            other_tnc=self.other_tnc if with_others else None,
+            normal_bzyxc=_given(self.normal_bzyxc),
+            normal_tnc=_given(self.normal_tnc),
+            other_bzyxc=_given(self.other_bzyxc),
+            other_tnc=_given(self.other_tnc),
             other_component=self.other_component,
         )
+
+
+def _given(buffer: Tensor) -> Tensor | None:
+    """Returns what a buffer holds; None if it stands for None."""
+    return buffer if buffer.dim() > 1 else None

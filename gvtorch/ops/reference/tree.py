@@ -181,8 +181,10 @@ class Bricks:
 
     def components(self, bricks: Tensor | None, constants: Tensor | None) -> tuple[Self, ...]:
         """Every number of another channel of the same nodes; none where there is no channel."""
-        if bricks is None or constants is None:
+        if bricks is None:
             return ()
+        if constants is None:  # of coarse bricks, which are not asked for them
+            constants = bricks.new_zeros((1, len(self.constant_nc), bricks.shape[4]))
         other = replace(self, bricks_bzyxc=bricks, constant_nc=constants.flatten(0, 1))
         return tuple(replace(other, component=c) for c in range(bricks.shape[4]))
 

@@ -248,21 +248,23 @@ inline std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> give_hits(TraceArgs& a
           give(args.missed_r, table, {args.rays})};
 }
 
-// Checks a second channel of the same pool (fewer: of its first bricks), with `width` numbers a voxel (0: any); returns
-// them, 0 where there is none.
+// Checks a second channel of the same pool (coarse: of its first bricks, and then it may have no constants), with
+// `width` numbers a voxel (0: any); returns them, 0 where there is none.
 inline int32_t check_second(const std::optional<Tensor>& bricks_bzyxc, const std::optional<Tensor>& constant_tnc,
                             const char* name, int64_t width, const TraceArgs& args, VoxelType& voxel,
-                            bool fewer = false) {
-  STD_TORCH_CHECK(bricks_bzyxc.has_value() == constant_tnc.has_value(), "gvtorch: ", name,
+                            bool coarse = false) {
+  STD_TORCH_CHECK(coarse || bricks_bzyxc.has_value() == constant_tnc.has_value(), "gvtorch: ", name,
                   " needs bricks and constants");
   if (!bricks_bzyxc.has_value()) return 0;
   const int64_t side = check_bricks(*bricks_bzyxc), channels = bricks_bzyxc->size(4), bricks = bricks_bzyxc->size(0);
-  STD_TORCH_CHECK((bricks == args.bricks || (fewer && bricks < args.bricks)) && side == args.side && channels >= 1 &&
+  STD_TORCH_CHECK((bricks == args.bricks || (coarse && bricks < args.bricks)) && side == args.side && channels >= 1 &&
                       (width == 0 || channels == width),
                   "gvtorch: ", name, " has the wrong shape");
-  STD_TORCH_CHECK(
-      constant_tnc->scalar_type() == bricks_bzyxc->scalar_type() && constant_tnc->numel() == args.nodes * channels,
-      "gvtorch: the constants of ", name, " have the wrong dtype or size");
+  if (constant_tnc.has_value()) {
+    STD_TORCH_CHECK(
+        constant_tnc->scalar_type() == bricks_bzyxc->scalar_type() && constant_tnc->numel() == args.nodes * channels,
+        "gvtorch: the constants of ", name, " have the wrong dtype or size");
+  }
   voxel = voxel_type(bricks_bzyxc->scalar_type());
   return static_cast<int32_t>(channels);
 }
