@@ -68,17 +68,17 @@ def write_shard(conversion: Conversion, level: int, place: Zyx) -> ShardResult:
         least = most = values
     else:
         values, least, most = _from_below(conversion, level, *box)
-    writes = [_write(conversion, layout.plain(level), low, _plain(values[inner]))]
+    writes = [write(conversion.root, layout.plain(level), low, _plain(values[inner]))]
     for spec, bound in zip(layout.bounds(level), (least, most), strict=False):
-        writes.append(_write(conversion, spec, low, _plain(bound[inner])))
+        writes.append(write(conversion.root, spec, low, _plain(bound[inner])))
     cells = _cells(values, least, most, [-(-n // CELL) for n in size])
-    writes.append(_write(conversion, layout.cells(level), [a // CELL for a in low], cells))
+    writes.append(write(conversion.root, layout.cells(level), [a // CELL for a in low], cells))
     blocks = _blocks(layout, values, needed_cells(cells, layout.threshold))
     if blocks is not None:
         at = [a // layout.block for a in low]
-        writes.append(_write(conversion, layout.blocks(level), at, blocks))
-    for write in writes:
-        _finish(write, conversion.root.get("path", "store"))
+        writes.append(write(conversion.root, layout.blocks(level), at, blocks))
+    for begun in writes:
+        finish(begun, conversion.root.get("path", "store"))
     return ShardResult(place, int(np.prod(size)), 0)
 
 
@@ -151,17 +151,18 @@ def _blocks(layout: StoreLayout, values: np.ndarray, needed: np.ndarray) -> np.n
     return blocks
 
 
-def _write(conversion: Conversion, spec: dict[str, Any], low: list[int], data: np.ndarray) -> Any:
+def write(root: dict[str, Any], spec: dict[str, Any], low: list[int], data: np.ndarray) -> Any:
     """Begins to write a box into an array of the store."""
-    array = Deadline(_TIMEOUT).wait(opened(conversion.root, spec, "write"), spec["path"])
+    array = Deadline(_TIMEOUT).wait(opened(root, spec, "write"), spec["path"])
     low = [0, *low] if data.ndim == 4 else low  # (c, z, y, x)
     low = [*low, *[0] * (data.ndim - len(low))]
     return array[boxes.index(low, np.add(low, data.shape).tolist())].write(data)
 
 
-def _finish(write: Any, where: str) -> None:
+def finish(begun: Any, where: str) -> None:
+    """Waits until it is written."""
     try:
-        write.result()
+        begun.result()
     except Exception as error:  # tensorstore raises what its status maps to
         if "No space left" in str(error):
             text = "the disk is full; with room again, --resume (resume=True) goes on"

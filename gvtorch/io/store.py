@@ -22,11 +22,12 @@ from ..base import check
 from . import boxes
 from .boxes import Zyx
 from .level_reader import LevelReader, open_arrays
-from .ngff import MultiscaleImage, find_image
+from .ngff import MultiscaleImage, find_image, read_json
 from .store_layout import (
     BORDER,
     CELL,
     DTYPES,
+    CoarseChannel,
     Deadline,
     StoreError,
     StoreLayout,
@@ -38,6 +39,7 @@ from .store_layout import (
 )
 
 _OPEN_TIMEOUT = 20.0  # seconds
+_COARSE = "gvtorch/coarse"
 _BATCH = 256  # blocks read at once; more only makes memory travel
 _AHEAD = 2 * _BATCH  # blocks on their way
 _GROUP = 4  # blocks along a side of a group that may be read as one region
@@ -63,6 +65,9 @@ class Store:
         has_blocks: Whether blocks are stored with their border, and cells are there.
         value_range: [low, high] of each channel, or None where the store does not tell.
         threshold: What EMPTY was decided by, or None.
+        coarse: Its coarse channels by name; see coarse.py.
+        layout: What lies where on disk.
+        root: tensorstore's spec of its folder.
     """
 
     def __init__(
@@ -88,8 +93,9 @@ class Store:
         if layout.value_range is not None:
             ranges = [(float(low), float(high)) for low, high in layout.value_range]
             self.value_range = [ranges[c] for c in np.arange(layout.width)[channels]]
-        self._layout, self._levels, self._channels = layout, levels, channels
-        self._root = kvstore(location)
+        self.layout, self._levels, self._channels = layout, levels, channels
+        self.root = kvstore(location)
+        self.coarse: dict[str, CoarseChannel] = {}
         self._blocks: list[Any] = []
         self._cells: list[Any] = []
         self._seen: set[tuple[Any, ...]] = set()
@@ -134,15 +140,18 @@ class Store:
 
     def _open_own(self, deadline: Deadline) -> None:
         """Opens blocks and cells of all levels, and compares them with what they must be."""
-        kinds = (self._layout.blocks, self._blocks), (self._layout.cells, self._cells)
+        kinds = (self.layout.blocks, self._blocks), (self.layout.cells, self._cells)
         specs = [(spec(at), arrays) for spec, arrays in kinds for at in range(self.levels)]
-        for spec, arrays, future in [(*pair, opened(self._root, pair[0])) for pair in specs]:
+        for spec, arrays, future in [(*pair, opened(self.root, pair[0])) for pair in specs]:
             where = f"{self.location}/{spec['path']}"
             array = deadline.wait(future, where)
             wanted = spec["metadata"]
             if list(array.shape) != wanted["shape"] or array.dtype.name != wanted["data_type"]:
                 raise ValueError(f"{where}: damaged: {array.shape} {array.dtype.name}")
             arrays.append(array)
+        told = read_json(self.location, child(self.root, _COARSE), "zarr.json", deadline)
+        if told is not None:
+            self.coarse = CoarseChannel.parse(self.location, told.get("attributes"))
 
     def __repr__(self) -> str:
         extent = "x".join(str(n) for n in self.extent)
@@ -170,20 +179,21 @@ class Store:
             "blocks": f"{self.block}^3+{self.border}" if self.has_blocks else "none",
             "threshold": self.threshold,
             "range": [list(pair) for pair in self.value_range] if self.value_range else None,
+            "coarse channels": ", ".join(self.coarse) or "none",
             "disk bytes": sum(file.stat().st_size for file in files),
         }
 
     def level_extent(self, level: int) -> tuple[int, int, int]:
         """(x, y, z) voxels of a level, 0 the finest."""
-        return self._layout.shape(self._checked(level))[::-1]
+        return self.layout.shape(self._checked(level))[::-1]
 
     def block_grid(self, level: int) -> tuple[int, int, int]:
         """(z, y, x) number of blocks of a level."""
-        return self._layout.grid(self._checked(level), self.block)
+        return self.layout.grid(self._checked(level), self.block)
 
     def cell_grid(self, level: int) -> tuple[int, int, int]:
         """(z, y, x) number of cells of a level."""
-        return self._layout.grid(self._checked(level), CELL)
+        return self.layout.grid(self._checked(level), CELL)
 
     def read_region(self, level: int, low: Zyx, high: Zyx, *, timeout: float = 60.0) -> np.ndarray:
         """Reads a box of voxels of a level.
@@ -205,9 +215,9 @@ class Store:
         deadline = Deadline(timeout)
         data = self._levels.read(self._checked(level), low, high, deadline)
         if self.has_blocks:
-            start, stop = boxes.clamp(low, high, self._layout.shape(level))
+            start, stop = boxes.clamp(low, high, self.layout.shape(level))
             inside = data[boxes.index(np.subtract(start, low).clip(0), data.shape[:3])]
-            self._check_shards(self._layout.plain(level), inside, start, stop, 1, deadline)
+            self._check_shards(self.layout.plain(level), inside, start, stop, deadline)
         return data
 
     def read_cells(self, level: int, low: Zyx, high: Zyx, *, timeout: float = 60.0) -> np.ndarray:
@@ -234,7 +244,7 @@ class Store:
     def _read_cells(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         future = self._cells[level][boxes.index(low, high)].read(order="C")
         data = deadline.wait(future, f"{self.location}: cells of level {level}")
-        self._check_shards(self._layout.cells(level), data, low, high, CELL, deadline)
+        self._check_shards(self.layout.cells(level), data, low, high, deadline)
         return data
 
     def read_blocks(
@@ -254,7 +264,7 @@ class Store:
         grid = self.block_grid(level)
         if zyx.size and (zyx.min() < 0 or (zyx >= grid).any()):
             raise ValueError(f"read_blocks: a place leaves the grid {grid} of level {level}")
-        deadline, layout = Deadline(timeout), self._layout
+        deadline, layout = Deadline(timeout), self.layout
         shape = (len(zyx), *[layout.stored] * 3)
         if not self.has_blocks:
             out = np.zeros((*shape, self.width), layout.dtype)
@@ -262,7 +272,7 @@ class Store:
         out = np.empty((*shape, layout.width), layout.dtype)
         shard = zyx // (layout.shard // self.block)
         order = np.lexsort((*zyx.T[::-1], *shard.T[::-1]))
-        errors = self._read_stored(level, zyx, order, out, deadline)
+        errors = self._read_stored(self._blocks[level], level, zyx, order, out, deadline)
         for row in _blank(out):
             if row not in errors:
                 try:
@@ -271,8 +281,42 @@ class Store:
                     errors[row] = self._error(level, zyx[row], error)
         return out[..., self._channels], errors
 
+    def read_coarse(
+        self, name: str, level: int, zyx: np.ndarray, *, timeout: float = 60.0
+    ) -> tuple[np.ndarray, dict[int, str]]:
+        """Reads blocks of a coarse channel, of levels from 1 on, as `read_blocks` does.
+
+        Returns:
+            (k, s, s, s, c) float16, and what was wrong with which.
+
+        Raises:
+            KeyError: There is no such channel.
+            ValueError, TimeoutError: As `read_blocks`.
+        """
+        channel, grid = self.coarse[name], self.block_grid(level)
+        if level == 0 or (zyx.size and (zyx.min() < 0 or (zyx >= grid).any())):
+            raise ValueError(f"read_coarse: a place leaves the grid {grid} of level {level}")
+        deadline, spec = Deadline(timeout), self.layout.coarse(level, name, channel.width)
+        where = f"{self.location}/{spec['path']}"
+        array = deadline.wait(opened(self.root, spec), where)
+        if list(array.shape) != spec["metadata"]["shape"] or array.dtype.name != "float16":
+            raise ValueError(f"{where}: damaged: {array.shape} {array.dtype.name}")
+        out = np.empty((len(zyx), *array.shape[3:]), np.float16)
+        order = np.lexsort(zyx.T[::-1])
+        errors = self._read_stored(array, level, zyx, order, out, deadline)
+        for row in _blank(out):  # also zeros are written
+            try:
+                if row not in errors:
+                    at = zyx[row].tolist()
+                    end = [n + 1 for n in at]
+                    self._check_shards(spec, out[row][None, None, None], at, end, deadline)
+            except StoreError as error:
+                errors[row] = self._error(level, zyx[row], error)
+        return out, errors
+
     def _read_stored(
         self,
+        array: Any,
         level: int,
         zyx: np.ndarray,
         order: np.ndarray,
@@ -283,7 +327,7 @@ class Store:
         """Fills the rows `order` of `out` in batches, the next on its way meanwhile; those of a
         batch that fails one by one, to tell the good from the bad.
         """
-        array, errors = self._blocks[level], dict[int, str]()
+        errors = dict[int, str]()
         running: deque[tuple[np.ndarray, Any]] = deque()
 
         def finish() -> None:
@@ -292,7 +336,7 @@ class Store:
                 out[rows] = deadline.wait(future, self.location)
             except StoreError as error:
                 if batch > 1:
-                    errors.update(self._read_stored(level, zyx, rows, out, deadline, 1))
+                    errors.update(self._read_stored(array, level, zyx, rows, out, deadline, 1))
                 else:
                     out[rows] = 0
                     errors[int(rows[0])] = self._error(level, zyx[rows[0]], error)
@@ -335,22 +379,24 @@ class Store:
         data: np.ndarray,
         low: Zyx,
         high: Zyx,
-        unit: int,
         deadline: Deadline,
     ) -> None:
         """Raises StoreError if zeros in `data`, items `low` to `high` of an array, come from a
-        shard that is not there: zeros of these arrays are written. An item is `unit` voxels wide.
+        shard that is not there: zeros of these arrays are written.
         """
-        per, where = self._layout.shard // unit, f"{self.location}/{spec['path']}"
+        where, metadata = f"{self.location}/{spec['path']}", spec["metadata"]
+        shape = metadata["chunk_grid"]["configuration"]["chunk_shape"]
+        first = len(shape) == 4  # c, z, y, x
+        per = shape[first]
         spans = [range(a // per, (b - 1) // per + 1) for a, b in zip(low, high, strict=True)]
         for place in itertools.product(*spans):
             key = (spec["path"], *place)
             corner = np.multiply(place, per) - low
             if key in self._seen or data[boxes.index(corner.clip(0), corner + per)].any():
                 continue
-            chunk = {3: place, 4: (0, *place), 5: (*place, 0, 0)}[len(spec["metadata"]["shape"])]
+            chunk = (0, *place) if first else (*place, *[0] * (len(shape) - 3))
             name = "/".join(map(str, ("c", *chunk)))
-            if read_key(where, child(self._root, spec["path"]), name, deadline, 1) is None:
+            if read_key(where, child(self.root, spec["path"]), name, deadline, 1) is None:
                 raise StoreError(f"{where}: shard {place} z y x: missing chunk")
             self._seen.add(key)
 
@@ -359,7 +405,7 @@ class Store:
     ) -> dict[int, str]:
         """Cuts blocks out of region reads; neighbours share one where that reads less."""
         errors = dict[int, str]()
-        side = self._layout.stored
+        side = self.layout.stored
 
         def read(index: np.ndarray) -> None:
             low = zyx[index].min(0) * self.block - self.border

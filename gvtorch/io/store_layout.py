@@ -6,6 +6,7 @@
                                      its border the true neighbours, repeated at the volume's faces;
                                      blocks of CONSTANT and EMPTY cells only are not written
     STORE.zarr/gvtorch/cells/0 ...   (gz, gy, gx, 3, c) low, high, mean of every cell of 8^3 voxels
+    STORE.zarr/gvtorch/coarse/ ...   what coarse voxels hold beside means; see coarse.py
     STORE.zarr/.gvtorch-work         only while it is made: manifest, journal, low and high pyramids
 
 A shard of any array covers the same cube of voxels, and one task of the converter writes it.
@@ -13,6 +14,7 @@ A shard of any array covers the same cube of voxels, and one task of the convert
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 import re
@@ -37,6 +39,7 @@ DTYPES = {"uint8": 1, "int8": 1, "uint16": 2, "int16": 2, "float16": 2, "float32
 GROUPS = ("gvtorch", "gvtorch/blocks", "gvtorch/cells")
 _PLAIN_CHUNK = 64  # voxels
 _CELL_CHUNK = 16  # cells
+_COARSE_SHARD = 128  # voxels along a side of a shard of a coarse channel
 _KEEP = "store_data_equal_to_fill_value"  # zeros are written too: what is missing then shows
 
 
@@ -122,6 +125,16 @@ class StoreLayout:
             shape=[*self.grid(level, CELL), *inside],
             shard=[*[self.shard // CELL] * 3, *inside],
             chunk=[*[_CELL_CHUNK] * 3, *inside],
+        )
+
+    def coarse(self, level: int, name: str, width: int) -> dict[str, Any]:
+        """Spec of the array of bordered blocks of a coarse channel, from level 1 on."""
+        inside = [self.stored] * 3 + [width]
+        return dataclasses.replace(self, dtype="float16")._array(
+            f"gvtorch/coarse/{name}/{level}",
+            shape=[*self.grid(level, self.block), *inside],
+            shard=[*[_COARSE_SHARD // self.block] * 3, *inside],
+            chunk=[1, 1, 1, *inside],
         )
 
     def bounds(self, level: int) -> list[dict[str, Any]]:
@@ -220,6 +233,34 @@ class StoreLayout:
         return cls(
             extent=tuple(extent), width=own["channels"], threshold=own.get("threshold"), **told
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoarseChannel:
+    """A coarse channel of a store: float16 numbers of all voxels above the finest level."""
+
+    width: int
+    made_of: dict[str, Any]  # what made it, as JSON
+
+    def attributes(self) -> dict[str, Any]:
+        """What the metadata says of it."""
+        return {"version": VERSION, "width": self.width, "made_of": self.made_of}
+
+    @classmethod
+    def parse(cls, where: str, told: Any) -> dict[str, CoarseChannel]:
+        """Reads the channels that a store's metadata tells, by name; raises ValueError unless they
+        are what `write_channel` writes.
+        """
+        channels = told.get("channels") if isinstance(told, dict) else None
+        if not isinstance(channels, dict):
+            raise ValueError(f"{where}: damaged: gvtorch/coarse names no channels")
+        found = {}
+        for name, own in channels.items():
+            whole = isinstance(own, dict) and isinstance(own.get("made_of"), dict)
+            if not whole or own.get("version") != VERSION or not _is_whole(own["width"], 1, 2**12):
+                raise ValueError(f"{where}: damaged: gvtorch/coarse tells {own!r} of {name!r}")
+            found[name] = cls(width=own["width"], made_of=own["made_of"])
+        return found
 
 
 def _is_list(value: Any, size: Any) -> bool:

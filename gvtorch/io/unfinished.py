@@ -39,14 +39,14 @@ class UnfinishedStore:
 
     def finish(self, layout: StoreLayout, settings: Mapping[str, Any]) -> None:
         """Writes the metadata, the root's last of all, and removes the hidden folder."""
-        for group in GROUPS:
-            _write_json(self._target / group / "zarr.json", _group({}))
+        for name in GROUPS:
+            write_json(self._target / name / "zarr.json", group({}))
         place = {"spacing": settings["spacing"], "origin": settings["origin"]}
         name = self._target.name.removesuffix(".zarr")
         told = {"width": layout.width, "unit": settings["unit"]}
         image = image_metadata(name, layout.levels, **place, **told)
         attributes = {"ome": image, "gvtorch": layout.attributes(place)}
-        _write_json(self._target / "zarr.json", _group(attributes))
+        write_json(self._target / "zarr.json", group(attributes))
         shutil.rmtree(self._target / WORK, ignore_errors=True)
 
 
@@ -97,7 +97,7 @@ def claimed(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator
         with (folder / "journal.jsonl").open("w", encoding="utf-8") as journal:
             work = UnfinishedStore(target, journal)
             work.note(done)
-            _write_json(folder / "manifest.json", settings)
+            write_json(folder / "manifest.json", settings)
             yield work
 
 
@@ -130,11 +130,12 @@ def _read_journal(path: Path) -> dict[Task, int]:
     return done
 
 
-def _group(attributes: dict[str, Any]) -> dict[str, Any]:
+def group(attributes: dict[str, Any]) -> dict[str, Any]:
+    """Returns the metadata of a Zarr group."""
     return {"zarr_format": 3, "node_type": "group", "attributes": attributes}
 
 
-def _write_json(path: Path, content: dict[str, Any]) -> None:
+def write_json(path: Path, content: dict[str, Any]) -> None:
     """Writes a file that is either there as a whole or not at all."""
     draft = path.with_name(f".{path.name}.draft")
     with draft.open("w", encoding="utf-8") as file:

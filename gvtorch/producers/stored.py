@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -105,6 +105,16 @@ class _Cubes:
         return self.bricks * self.brick_size
 
 
+class StoredColors(Protocol):
+    """What colours of a store are made of: `Filtered` tells."""
+
+    other: str | None  # name of the channel
+
+    @property
+    def made_of(self) -> Mapping[str, Any]:
+        """The function and what else matters, as JSON."""
+
+
 class StoredProducer(Producer):
     """Streams a `gvtorch convert` store, or any OME-Zarr image. Its channel is "value"."""
 
@@ -120,6 +130,7 @@ class StoredProducer(Producer):
         image: str | None = None,
         time: int = 0,
         channels: Sequence[int] | None = None,
+        filtered: StoredColors | None = None,
     ) -> None:
         """Opens the store and starts the threads.
 
@@ -132,9 +143,12 @@ class StoredProducer(Producer):
             image: Which image, see `Store.open`.
             time: Which time point.
             channels: Which channels, as components of "value"; None takes all.
+            filtered: A `Filtered` shader whose colours the store holds (`Filtered.stored`): coarse
+                bricks bring them along, to be rendered with this shader.
 
         Raises:
-            ValueError: A number is out of its range, or see `Store.open`.
+            ValueError: A number is out of its range, the store has no such colours, or see
+                `Store.open`.
             OSError: The store can't be read.
         """
         limit = check.nbytes("StoredProducer", "host_cache", host_cache)
@@ -146,9 +160,20 @@ class StoredProducer(Producer):
         if store.value_range is not None:
             lows, highs = zip(*store.value_range, strict=True)
             value_range[_CHANNEL] = (min(lows), max(highs))
+        kinds = {_CHANNEL: Channel(store.dtype, store.width)}
+        if filtered is not None:
+            name = str(filtered.other)
+            known = store.coarse.get(name)
+            if known is None or known.made_of != filtered.made_of:
+                what = "other ones of this name" if known else ", ".join(store.coarse) or "none"
+                raise ValueError(
+                    f"{store.location}: has no colours {name!r} of this function ({what}); "
+                    "Filtered.add_to (gvtorch filter) makes them"
+                )
+            kinds[name] = Channel(torch.float16, known.width, coarse=True)
         super().__init__(
             store.extent,
-            channels={_CHANNEL: Channel(store.dtype, store.width)},
+            channels=kinds,
             spacing=store.spacing,
             origin=store.origin,
             value_range=value_range,
@@ -157,6 +182,17 @@ class StoredProducer(Producer):
         self._cache = HostCache(limit)
         self._closed = threading.Event()
         self._threads = ThreadPoolExecutor(workers, thread_name_prefix="gvtorch-store")
+
+    def prepare(self, layout: Layout) -> None:
+        """Checks that bricks can be cut out of blocks, where the store has coarse channels."""
+        cut = _Cubes.of(self.store, layout).blocks and layout.depth < self.store.levels
+        if len(self.channels) > 1 and not cut:
+            sizes = [n for n in (8, 16, 32, 64) if self.store.block % n == 0]
+            raise ValueError(
+                f"{self.store.location}: filtered colours are stored for bricks of "
+                f"{', '.join(map(str, sizes))} voxels with a border of at most 1, got bricks of "
+                f"{layout.brick_size} with {layout.border}"
+            )
 
     def classify(self, nodes: Nodes) -> Regions | Future:
         """Tells later what the cells say; all DATA at once if the store has none."""
@@ -236,16 +272,23 @@ class StoredProducer(Producer):
         layout, store = nodes.layout, self.store
         loc = nodes.loc.cpu().numpy()
         level = layout.depth - loc[:, 3]
-        dtype = np.dtype(str(store.dtype).removeprefix("torch."))
-        out = np.zeros((len(loc), *(layout.side,) * 3, store.width), dtype)
+        found: dict[str, torch.Tensor] = {}
         errors: dict[int, str] = {}
-        for here in np.unique(level).tolist():
-            rows = np.flatnonzero(level == here)
-            fill = self._fill_level if here < store.levels else self._fill_coarser
-            errors |= fill(out, rows, loc[rows, 2::-1], here, layout)
-        data = torch.from_numpy(out)
+        for name, channel in self.channels.items():
+            if channel.coarse and not nodes.coarse:
+                continue
+            dtype = np.dtype(str(channel.dtype).removeprefix("torch."))
+            out = np.zeros((len(loc), *(layout.side,) * 3, channel.width), dtype)
+            for here in np.unique(level).tolist():
+                rows = np.flatnonzero(level == here)
+                if here < store.levels:
+                    errors |= self._fill_level(out, rows, loc[rows, 2::-1], name, here, layout)
+                else:
+                    errors |= self._fill_coarser(out, rows, loc[rows, 2::-1], here, layout)
+            found[name] = torch.from_numpy(out)
         if store.has_blocks:
-            return Bricks(data={_CHANNEL: data}, errors=errors)
+            return Bricks(data=found, errors=errors)
+        data, out = found[_CHANNEL], found[_CHANNEL].numpy()
         # Without cells, only the voxels show which nodes of the finest level are uniform.
         flat = (out == out[:, :1, :1, :1]).all((1, 2, 3, 4)) & (level == 0)
         kind = torch.where(torch.from_numpy(flat), Region.CONSTANT, Region.DATA)
@@ -253,10 +296,16 @@ class StoredProducer(Producer):
         return Bricks(data={_CHANNEL: data}, kind=kind, constants=constants, errors=errors)
 
     def _fill_level(
-        self, out: np.ndarray, rows: np.ndarray, zyx: np.ndarray, level: int, layout: Layout
+        self,
+        out: np.ndarray,
+        rows: np.ndarray,
+        zyx: np.ndarray,
+        channel: str,
+        level: int,
+        layout: Layout,
     ) -> dict[int, str]:
-        """Writes bricks (m, 3) z y x of one level into rows (m,) of `out`, cut from one group of
-        cubes after the other; returns errors by row. After a timeout no more cubes are read.
+        """Writes bricks (m, 3) z y x of a channel and a level into rows (m,) of `out`, cut from one
+        group of cubes after the other; returns errors by row. After a timeout no more are read.
         """
         cubes = _Cubes.of(self.store, layout)
         places, which = np.unique(zyx // cubes.bricks, axis=0, return_inverse=True)
@@ -271,16 +320,17 @@ class StoredProducer(Producer):
             if self._closed.is_set() or late:
                 return dict.fromkeys(missing, late or f"{self.store.location}: closed")
             try:
-                cubes_read = self._read(cubes, level, [key[2:] for key in missing])
+                cubes_read = self._read(cubes, channel, level, [key[3:] for key in missing])
             except (OSError, ValueError) as error:
                 late = str(error) if isinstance(error, TimeoutError) else ""
                 return dict.fromkeys(missing, str(error))
             return dict(zip(missing, cubes_read, strict=True))
 
-        nbytes = (cubes.side + 2 * cubes.border) ** 3 * self.store.width * out.itemsize
+        nbytes = (cubes.side + 2 * cubes.border) ** 3 * out.shape[4] * out.itemsize
         group = max(1, _GROUP_BYTES // nbytes)
         for begin in range(0, len(places), group):
-            keys = [(cubes, level, *at) for at in places[begin : begin + group].tolist()]
+            some = places[begin : begin + group].tolist()
+            keys: list[Key] = [(channel, cubes, level, *at) for at in some]
             for number, cube in enumerate(self._cache.get(keys, read), begin):
                 here = order[starts[number] : starts[number + 1]]
                 if isinstance(cube, str):
@@ -291,11 +341,14 @@ class StoredProducer(Producer):
                 out[rows[here]] = as_strided(cube, shape, strides)[tuple(corner[here].T)]
         return errors
 
-    def _read(self, cubes: _Cubes, level: int, places: list[Key]) -> list[Found]:
-        """Reads cubes (z, y, x) of a level, borders included; raises TimeoutError."""
-        store = self.store
+    def _read(self, cubes: _Cubes, channel: str, level: int, places: list[Key]) -> list[Found]:
+        """Reads cubes (z, y, x) of a channel and a level, borders included; raises TimeoutError."""
+        store, zyx = self.store, np.array(places, np.int64)
         if cubes.blocks:
-            data, wrong = store.read_blocks(level, np.array(places), timeout=self.timeout)
+            if channel == _CHANNEL:
+                data, wrong = store.read_blocks(level, zyx, timeout=self.timeout)
+            else:
+                data, wrong = store.read_coarse(channel, level, zyx, timeout=self.timeout)
             return [wrong.get(index) or block.copy() for index, block in enumerate(data)]
         found: list[Found] = []
         for place in places:

@@ -13,22 +13,28 @@ rendering", EuroVis 2006 (why). The weight is ours; docs/picture.md measures wha
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Self
+from pathlib import Path
+from typing import Any, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ..base import check
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume
+from ..io.coarse import temporary_levels, write_channel
+from ..io.store import Store
+from ..io.store_layout import CoarseChannel
 from ..ops import ShadeArguments, cut_bricks
 from ..ops.shading import FilteredNumbers
 from ..pool import Channel, N3Tree
-from .coarse_colors import Field, VolumeField, mean_of_directions, write_colors
+from .coarse_colors import Field, VolumeField, Zyx, mean_of_directions, write_colors
 from .shader import Sampling, Shader
 from .transfer_function import TransferFunction
 
 _OPAQUE = 0.2  # alpha of a finest voxel from which on directions matter
+_TIMEOUT = 3600.0  # seconds for one read of local data
 _BATCH = 4096  # bricks cut at a time
 
 
@@ -122,6 +128,88 @@ class Filtered(Shader):
         bricks.bricks[channel], bricks.coarse = colors.to(tree.device), count
         return shader
 
+    @classmethod
+    def add_to(
+        cls,
+        store: Store | str | Path,
+        transfer: TransferFunction,
+        *,
+        channel: str = "filtered",
+        component: int = 0,
+        directions: bool | None = None,
+        device: torch.device | str = "cpu",
+        progress: Progress = no_progress,
+    ) -> Self:
+        """Works the colours out for a store, out of core, and writes them into it as a coarse
+        channel, which `StoredProducer(store, filtered=shader)` streams. The store's own voxels are
+        read and stay as they are. On disk it takes at most 1.2 (7.3) bytes a finest voxel, half as
+        much again as 7 while it is made.
+
+        Args:
+            store: A store that `convert` made, in a folder.
+            transfer: The transfer function.
+            channel: Name of the colours; those of this name are replaced.
+            component, directions: See `Filtered`.
+            device: Where the work is done.
+            progress: Told ("filtered", voxels done, voxels in all), then of "writing".
+
+        Raises:
+            ValueError: It is no such store, or an argument is out of its range.
+            OSError: It can't be read or written.
+        """
+        opened = store if isinstance(store, Store) else Store.open(store)
+        check.whole("Filtered", "component", component, low=0, high=opened.width - 1)
+        shader = cls(transfer, channel, component, directions=directions)
+        kind, place = shader.colors(opened.spacing), opened.spacing
+        with temporary_levels(opened, 24) as levels:
+            out, field = (
+                [torch.from_numpy(level) for level in levels],
+                _StoreField(opened, component),
+            )
+            shader.write(field, place, 2, out, check.device("Filtered", device), progress)
+
+            def read(level: int, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
+                box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+                return shader.kept(out[level - 1][box], place).numpy()
+
+            told = CoarseChannel(width=kind.width, made_of=shader.made_of)
+            write_channel(opened, channel, told, read, progress)
+        return shader
+
+    @classmethod
+    def stored(cls, store: Store | str | Path, channel: str = "filtered") -> Self:
+        """Returns the shader whose colours a store holds, with the function they were made with.
+
+        Raises:
+            ValueError: The store has no such colours, or they are damaged.
+        """
+        opened = store if isinstance(store, Store) else Store.open(store)
+        if channel not in opened.coarse:
+            known = ", ".join(opened.coarse) or "none"
+            raise ValueError(
+                f"{opened.location}: has no filtered colours {channel!r} ({known}); "
+                "Filtered.add_to (gvtorch filter) makes them"
+            )
+        told = opened.coarse[channel]
+        names = ("opacity", "color", "reference", "component")
+        if sorted(told.made_of) != sorted(names) or told.width not in (4, 24):
+            raise ValueError(f"{opened.location}: damaged: {channel!r} holds no filtered colours")
+        opacity, color, reference, component = (told.made_of[name] for name in names)
+        transfer = TransferFunction(opacity, color, reference)
+        shader = cls(transfer, channel, component, directions=told.width == 24)
+        shader._made_of = _content(transfer)
+        return shader
+
+    @property
+    def made_of(self) -> dict[str, Any]:
+        """What the colours depend on, as JSON."""
+        return {
+            "opacity": self.transfer.opacity.tolist(),
+            "color": self.transfer.color.tolist(),
+            "reference": self.transfer.reference,
+            "component": self.component or 0,
+        }
+
     def colors(self, spacing: tuple[float, float, float]) -> Channel:
         """Returns the channel that holds the colours of voxels of this size."""
         directions = self._directions
@@ -185,6 +273,21 @@ class Filtered(Shader):
                 f"{self.other!r} has {known.width}"
             )
         return super().shading(where, tree)
+
+
+class _StoreField:
+    """One number of the finest voxels of a store."""
+
+    across = 64  # as wide as its chunks
+
+    def __init__(self, store: Store, component: int) -> None:
+        self._store, self._component = store, component
+        x, y, z = store.extent
+        self.shape = (z, y, x)
+
+    def read(self, low: Zyx, high: Zyx) -> Tensor:
+        values = self._store.read_region(0, low, high, timeout=_TIMEOUT)[..., self._component]
+        return torch.from_numpy(np.ascontiguousarray(values))
 
 
 def _content(transfer: TransferFunction) -> tuple[bytes, ...]:
