@@ -165,10 +165,10 @@ class StoredProducer(Producer):
             name = str(filtered.other)
             known = store.coarse.get(name)
             if known is None or known.made_of != filtered.made_of:
-                what = "other ones of this name" if known else ", ".join(store.coarse) or "none"
+                what = "were made with another function" if known else "are not there"
                 raise ValueError(
-                    f"{store.location}: has no colours {name!r} of this function ({what}); "
-                    "Filtered.add_to (gvtorch filter) makes them"
+                    f"{store.location}: filtered colours {name!r} {what}; "
+                    "gvtorch filter (Filtered.add_to) makes them"
                 )
             kinds[name] = Channel(torch.float16, known.width, coarse=True)
         super().__init__(

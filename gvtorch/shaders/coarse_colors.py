@@ -16,7 +16,7 @@ from ..base.stage import Progress
 from ..base.volume import Volume, movable
 from .shader import ColorTable
 
-_TILE_VOXELS = 1 << 17  # columns are worked out so many voxels at a time
+_TILE_VOXELS = {"cpu": 1 << 17, "cuda": 1 << 20}  # whose columns are worked out at a time
 _LEAST = 0.001  # weight of a column that no light comes to
 _DIRECTIONS = 6
 
@@ -113,8 +113,8 @@ def _see_along(
     length = field.shape[along]
     sides = [axis for axis in range(3) if axis != along]
     across = [field.shape[axis] for axis in sides]
-    tile = branching
-    while tile * branching <= max(across) and length * (tile * branching) ** 2 <= _TILE_VOXELS:
+    tile, most = branching, _TILE_VOXELS[device.type]
+    while tile * branching <= max(across) and length * (tile * branching) ** 2 <= most:
         tile *= branching
     slab = tile * max(1, field.across // tile)
     whole = [branching ** (level + 1) for level in range(levels)]  # finest voxels along a side

@@ -87,8 +87,8 @@ class Filtered(Shader):
         """Works the colours out on the device of a resident tree, and keeps them as a channel of
         it: (b, z, y, x, 4 or 24) float16 for its first b bricks, those above the finest level.
         Premultiplied linear colour, and the alpha of a voxel. What a tree's threshold made EMPTY
-        counts here as it is. Working takes some 40 bytes a finest
-        voxel on the device, the channel included.
+        counts here as it is. Working takes 14 to 25 bytes a finest voxel on the device, the
+        channel included.
 
         Args:
             tree: What `N3Tree.from_volume` made of the volume.
@@ -96,7 +96,7 @@ class Filtered(Shader):
             transfer: The transfer function.
             channel: Name of the channel, which replaces one of this name.
             component, directions: See `Filtered`.
-            progress: Called with what is made, how many axes of it are done, and of how many.
+            progress: Told ("filtered", voxels done, voxels in all).
 
         Raises:
             ValueError: Tree and volume do not belong together, or an argument is out of its range.
@@ -142,8 +142,8 @@ class Filtered(Shader):
     ) -> Self:
         """Works the colours out for a store, out of core, and writes them into it as a coarse
         channel, which `StoredProducer(store, filtered=shader)` streams. The store's own voxels are
-        read and stay as they are. On disk it takes at most 1.2 (7.3) bytes a finest voxel, half as
-        much again as 7 while it is made.
+        read and stay as they are. While they are made, files of 7 bytes a finest voxel lie in the
+        store's folder; the colours themselves compress well.
 
         Args:
             store: A store that `convert` made, in a folder.
@@ -185,17 +185,21 @@ class Filtered(Shader):
         """
         opened = store if isinstance(store, Store) else Store.open(store)
         if channel not in opened.coarse:
-            known = ", ".join(opened.coarse) or "none"
+            known = "".join(f", only {name!r}" for name in opened.coarse)
             raise ValueError(
-                f"{opened.location}: has no filtered colours {channel!r} ({known}); "
-                "Filtered.add_to (gvtorch filter) makes them"
+                f"{opened.location}: has no filtered colours {channel!r}{known}; "
+                "gvtorch filter (Filtered.add_to) makes them"
             )
         told = opened.coarse[channel]
         names = ("opacity", "color", "reference", "component")
         if sorted(told.made_of) != sorted(names) or told.width not in (4, 24):
             raise ValueError(f"{opened.location}: damaged: {channel!r} holds no filtered colours")
         opacity, color, reference, component = (told.made_of[name] for name in names)
-        transfer = TransferFunction(opacity, color, reference)
+        try:
+            transfer = TransferFunction(opacity, color, reference)
+            check.whole("Filtered", "component", component, low=0, high=opened.width - 1)
+        except ValueError as error:
+            raise ValueError(f"{opened.location}: damaged: {channel!r}: {error}") from None
         shader = cls(transfer, channel, component, directions=told.width == 24)
         shader._made_of = _content(transfer)
         return shader

@@ -1,4 +1,4 @@
-"""The command line: `gvtorch info`, `render`, `fly`, `convert` and `bench`.
+"""The command line: `gvtorch info`, `render`, `fly`, `convert`, `filter` and `bench`.
 
 torch is imported inside the commands, so that `--help` answers at once. A mistake of the user ends
 in one line on standard error and status 2.
@@ -125,6 +125,48 @@ class Convert:
             yield client.get_executor()
 
 
+@dataclass(frozen=True, kw_only=True)
+class Filter:
+    """Give a store filtered colours: `--shader filtered` then shows it right from afar."""
+
+    store: Positional[Annotated[Path, arg(metavar="STORE.zarr")]]
+    """a store that gvtorch convert made; its voxels are read and stay as they are"""
+    tf: Annotated[str, arg(metavar="FILE|PRESET")] = "gray"
+    """transfer function that the colours are made with: a JSON file, or a preset over the data's
+    range: gray, hot, vessels, bone, tissue"""
+    component: Annotated[int, arg(metavar="N")] = 0
+    """which number of a voxel is shown"""
+    directions: Literal["auto", "six", "one"] = "auto"
+    """colours for each of six directions, or their mean; auto: six where a voxel may hide a fifth
+    of what is behind"""
+    backend: Literal["cpp", "cuda"] | None = None
+    """where it is worked out; CUDA if left out, where it runs"""
+
+    def run(self) -> None:
+        """Adds the colours."""
+        from ..io.resources import amount
+        from ..io.store import Store
+        from ..ops import available
+        from ..shaders import Filtered
+        from .look import parse_transfer
+        from .streaming import value_range
+
+        on_cuda = self.backend == "cuda" or (self.backend is None and not available()["cuda"])
+        start, store = time.perf_counter(), Store.open(self.store)
+        before = store.describe()["disk bytes"]
+        with Bar() as bar:
+            Filtered.add_to(
+                store,
+                parse_transfer(self.tf, *value_range(store)),
+                component=self.component,
+                directions={"auto": None, "six": True, "one": False}[self.directions],
+                device="cuda" if on_cuda else "cpu",
+                progress=bar,
+            )
+        added = amount(max(0, store.describe()["disk bytes"] - before))
+        print(f"{self.store}: {added} of colours in {time.perf_counter() - start:.1f} s")
+
+
 def installation() -> dict[str, Any]:
     """Returns versions, what each backend can do here, the devices, and the file formats."""
     import platform
@@ -204,7 +246,7 @@ def main(args: list[str] | None = None) -> None:
             command = tyro.extras.subcommand_cli_from_dict(
                 {
                     **{"info": Info, "render": Render, "fly": Fly, "convert": Convert},
-                    "bench": Bench,
+                    **{"filter": Filter, "bench": Bench},
                 },
                 args=args,
                 prog="gvtorch",

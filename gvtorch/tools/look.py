@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from ..cameras import Camera
     from ..cameras.models import CameraModel
-    from ..shaders import Shader
+    from ..shaders import Shader, TransferFunction
     from ..tracing import Clip, ThinLens
 
     ShaderName = str
@@ -37,11 +37,11 @@ class Look:
     """vertical field of view; 30, or 180 of a fisheye or panorama, if left out"""
     size: Annotated[str, arg(metavar="WxH")] = "512x512"
     """pixels"""
-    tf: Annotated[str, arg(metavar="FILE|PRESET")] = "gray"
+    tf: Annotated[str | None, arg(metavar="FILE|PRESET")] = None
     """transfer function: a JSON file, or a preset over the data's range: gray, hot, vessels, bone,
-    tissue"""
+    tissue; gray if left out, or the function of a store's filtered colours"""
     shader: ShaderName = "plain"
-    """what is made of the values; filtered: plain, but right from afar, for volume files"""
+    """what is made of the values; filtered: plain, but right from afar (stores: gvtorch filter)"""
     value: Annotated[float | None, arg(metavar="VALUE")] = None
     """of the isosurface"""
     step: Annotated[float, arg(metavar="VOXELS")] = 0.5
@@ -101,18 +101,24 @@ class Look:
 
     def chosen(self, low: float, high: float) -> Shader:
         """Returns the shader asked for, its transfer function read or spanned over the range."""
-        from ..shaders import Filtered, TransferFunction
+        from ..shaders import Filtered
         from ..shaders.built_in import BY_NAME
 
-        if self.tf.endswith(".json") or Path(self.tf).is_file():
-            transfer = TransferFunction.from_json(self.tf)
-        else:
-            transfer = TransferFunction.preset(self.tf, low, high)
+        transfer = parse_transfer(self.tf or "gray", low, high)
         if (self.value is None) == (self.shader == "isosurface"):
             raise ValueError("--value and --shader isosurface belong together")
         if self.shader == "filtered":  # its colours are made with the tree
-            return Filtered(transfer)
+            return Filtered(transfer, component=self.component)
         return BY_NAME[self.shader](transfer, self.value or 0.0)
+
+
+def parse_transfer(text: str, low: float, high: float) -> TransferFunction:
+    """Reads a transfer function from a JSON file, or spans a preset over the range."""
+    from ..shaders import TransferFunction
+
+    if text.endswith(".json") or Path(text).is_file():
+        return TransferFunction.from_json(text)
+    return TransferFunction.preset(text, low, high)
 
 
 def parse_camera(

@@ -50,12 +50,14 @@ class Streaming:
         from ..engine.engine import Engine
         from ..io.store import Store
         from ..producers import StoredProducer
+        from ..shaders import Filtered
 
-        if look.shader == "filtered":
-            raise ValueError("--shader filtered is for volume files; stores have levels of means")
         store = Store.open(path, image=self.image, time=self.time)
-        producer = StoredProducer(store, host_cache=self.host_cache)
         shader = look.chosen(*value_range(store))
+        filtered = shader if isinstance(shader, Filtered) else None
+        if filtered is not None and look.tf is None:
+            shader = filtered = Filtered.stored(store)
+        producer = StoredProducer(store, host_cache=self.host_cache, filtered=filtered)
         with Engine(
             producer,
             node_pool=self.node_pool,

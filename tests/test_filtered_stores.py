@@ -1,0 +1,226 @@
+"""Filtered colours in stores: streamed from disk they have the bits of a resident tree, and what is
+missing or damaged is told.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from helpers import gvtorch
+
+import gvtorch as gv
+from gvtorch.io.store_layout import WORK
+
+MISTY = gv.TransferFunction([(30, 0), (250, 0.08)], [(30, 1, 0.3, 0.1), (250, 1, 1, 1)])
+OPAQUE = gv.TransferFunction([(100, 0), (120, 0.9)], [(100, 1, 0.3, 0.1), (250, 1, 1, 1)])
+
+
+def matter(dtype: torch.dtype = torch.uint8, width: int = 1) -> gv.Volume:
+    """Rough matter beside a region of zeros, more than one block wide, of odd extent."""
+    generator = torch.Generator().manual_seed(2)
+    coarse = torch.rand((width, 1, 9, 10, 11), generator=generator)
+    value = torch.nn.functional.interpolate(coarse, size=(51, 39, 77), mode="trilinear")[:, 0]
+    value = 200 * value + 55 * torch.rand(value.shape, generator=generator)
+    value[:, :20] = 0
+    data = value.movedim(0, -1).contiguous()
+    if not dtype.is_floating_point:
+        data = data.round()
+    return gv.Volume(data.to(torch.int32).to(dtype) if dtype == torch.uint16 else data.to(dtype))
+
+
+@pytest.fixture
+def store(tmp_path):
+    gv.convert(matter(), tmp_path / "a.zarr")
+    return tmp_path / "a.zarr"
+
+
+def check_streamed(path, volume, shader, size=8, **pools) -> None:
+    tree = gv.N3Tree.from_volume(volume, size)
+    resident = gv.Filtered.of(
+        *(tree, volume, shader.transfer), component=shader.component or 0, directions=None
+    )
+    own = gv.Filtered.stored(path)
+    with gv.Engine(gv.StoredProducer(path, filtered=own), brick_size=size, **pools) as engine:
+        for distance in (1.0, 4.0, 12.0):
+            camera = gv.Camera.orbit(width=32, height=24, distance=distance)
+            found, expected = engine.render(camera, own), gv.render(tree, camera, resident)
+            assert found.stats.converged and not engine.failures
+            for field in ("color", "alpha", "depth"):
+                assert torch.equal(getattr(found, field), getattr(expected, field)), field
+        assert found.alpha.max() > 0.05
+        engine.validate()
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("size", [8, 16])
+@pytest.mark.parametrize("transfer", [MISTY, OPAQUE])
+def test_streamed_from_disk_equals_resident(store, transfer, size):
+    before = {file: file.read_bytes() for file in store.rglob("*") if file.is_file()}
+    shader = gv.Filtered.add_to(store, transfer)
+    assert not (store / WORK).exists()
+    assert all(file.read_bytes() == content for file, content in before.items())
+    width = 4 if transfer is MISTY else 24
+    assert {n: c.width for n, c in gv.Store.open(store).coarse.items()} == {"filtered": width}
+    check_streamed(store, matter(), shader, size)
+    check_streamed(store, matter(), shader, size, brick_pool=60 * (size + 2) ** 3 * (2 * width))
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("dtype", [torch.uint16, torch.float16, torch.float32])
+def test_dtypes_and_components(tmp_path, dtype):
+    volume = matter(dtype, width=2)
+    gv.convert(volume, tmp_path / "a.zarr")
+    shader = gv.Filtered.add_to(tmp_path / "a.zarr", MISTY, component=1)
+    check_streamed(tmp_path / "a.zarr", volume, shader)
+
+
+@pytest.mark.backend("cpp")
+def test_colours_of_several_functions_and_new_ones_of_a_name(store):
+    first = gv.Filtered.add_to(store, MISTY, channel="mist")
+    second = gv.Filtered.add_to(store, OPAQUE)
+    assert sorted(gv.Store.open(store).coarse) == ["filtered", "mist"]
+    for name, shader in (("mist", first), ("filtered", second)):
+        assert gv.Filtered.stored(store, name).made_of == shader.made_of
+    with pytest.raises(ValueError, match="'filtered' were made with another function"):
+        gv.StoredProducer(store, filtered=gv.Filtered(MISTY))
+    gv.Filtered.add_to(store, MISTY)
+    gv.StoredProducer(store, filtered=gv.Filtered(MISTY)).close()
+    check_streamed(store, matter(), gv.Filtered(MISTY))
+    described = gv.Store.open(store).describe()
+    assert described["coarse channels"] == "mist, filtered"
+
+
+@pytest.mark.backend("cpp")
+def test_a_store_of_one_brick(tmp_path):
+    volume = gv.Volume(torch.randint(0, 255, (8, 7, 6), dtype=torch.uint8))
+    gv.convert(volume, tmp_path / "a.zarr")
+    shader = gv.Filtered.add_to(tmp_path / "a.zarr", OPAQUE)
+    check_streamed(tmp_path / "a.zarr", volume, shader)
+
+
+def test_broken_off_work_leaves_the_store_as_it_was(store):
+    gv.Filtered.add_to(store, MISTY)
+    kept = gv.Filtered.stored(store).made_of
+
+    def stop(at: str):
+        def progress(what: str, done: int, total: int) -> None:
+            if what == at:
+                raise KeyboardInterrupt
+
+        return progress
+
+    with pytest.raises(KeyboardInterrupt):
+        gv.Filtered.add_to(store, OPAQUE, progress=stop("filtered"))
+    assert not (store / WORK).exists() and gv.Filtered.stored(store).made_of == kept
+    with pytest.raises(KeyboardInterrupt):
+        gv.Filtered.add_to(store, OPAQUE, progress=stop("writing"))
+    assert not (store / WORK).exists()
+    with pytest.raises(ValueError, match="has no filtered colours 'filtered'; gvtorch filter"):
+        gv.Filtered.stored(store)
+    gv.Filtered.add_to(store, OPAQUE)
+    gv.Filtered.stored(store)
+
+
+def failures(path) -> list[str]:
+    shader = gv.Filtered.stored(path)
+    with gv.Engine(gv.StoredProducer(path, filtered=shader)) as engine:
+        engine.render(gv.Camera.orbit(width=24, height=24, distance=3.0), shader)
+        return [failure.message for failure in engine.failures]
+
+
+@pytest.mark.backend("cpp")
+def test_what_is_missing_or_damaged_is_told(store):
+    gv.Filtered.add_to(store, OPAQUE)
+    level = store / "gvtorch" / "coarse" / "filtered" / "1"
+    (shard,) = (file for file in (level / "c").rglob("*") if file.is_file())
+    whole = shard.read_bytes()
+    shard.unlink()
+    assert any("block" in text and "missing chunk" in text for text in failures(store))
+    for damage in (whole[: len(whole) // 2], whole[:200] + b"\0" * 50 + whole[250:]):
+        shard.write_bytes(damage)
+        assert any("block" in text for text in failures(store))
+    shard.write_bytes(whole)
+    assert not failures(store)
+    shutil.rmtree(level)
+    assert any("coarse/filtered/1" in text for text in failures(store))
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"channels": 3},
+        {"channels": {"filtered": {}}},
+        {"channels": {"filtered": {"version": 9, "width": 4, "made_of": {}}}},
+        {"channels": {"filtered": {"version": 1, "width": True, "made_of": {}}}},
+        {"channels": {"filtered": {"version": 1, "width": 4, "made_of": {"opacity": 1}}}},
+        {
+            "channels": {
+                "filtered": {
+                    "version": 1,
+                    "width": 4,
+                    "made_of": {"opacity": "x", "color": [], "reference": 0, "component": 0},
+                }
+            }
+        },
+        None,
+    ],
+)
+def test_damaged_metadata_is_told(store, told):
+    gv.Filtered.add_to(store, MISTY)
+    file = store / "gvtorch" / "coarse" / "zarr.json"
+    content = json.loads(file.read_text())
+    content["attributes"] = told
+    file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"a\.zarr: damaged"):
+        gv.Filtered.stored(store)
+
+
+def test_mistakes_are_told(store, tmp_path):
+    with pytest.raises(ValueError, match="component must be"):
+        gv.Filtered.add_to(store, MISTY, component=1)
+    for name in ("", "../x", "a/b", "x" * 65, "é"):
+        with pytest.raises(ValueError, match="a channel's name is made of"):
+            gv.Filtered.add_to(store, MISTY, channel=name)
+    with pytest.raises(ValueError, match="'filtered' are not there; gvtorch filter"):
+        gv.StoredProducer(store, filtered=gv.Filtered(MISTY))
+    gv.Filtered.add_to(store, MISTY)
+    shader = gv.Filtered.stored(store)
+    for options in ({"brick_size": 4}, {"border": 2}, {"brick_size": 12}):
+        with pytest.raises(ValueError, match="bricks of 8, 16, 32 voxels with a border of at most"):
+            gv.Engine(gv.StoredProducer(store, filtered=shader), **options)
+    other = tmp_path / "b.zarr"
+    (other / "0").mkdir(parents=True)
+    shutil.copytree(store / "0", other / "0", dirs_exist_ok=True)
+    attributes = json.loads((store / "zarr.json").read_text())
+    del attributes["attributes"]["gvtorch"]
+    for image in attributes["attributes"]["ome"]["multiscales"]:
+        image["datasets"] = image["datasets"][:1]
+    (other / "zarr.json").write_text(json.dumps(attributes))
+    with pytest.raises(ValueError, match=r"b\.zarr: coarse channels are written into folders that"):
+        gv.Filtered.add_to(other, MISTY)
+
+
+@pytest.mark.backend("cpp")
+def test_the_command_line(store, tmp_path):
+    far = ("--size", "24x16", "--camera", "orbit:20,10,9", "-o", tmp_path / "a.npy")
+    done = gvtorch("render", store, "--shader", "filtered", *far)
+    assert done.returncode == 2 and "gvtorch filter" in done.stderr
+    done = gvtorch("filter", store, "--tf", "hot", "--directions", "six")
+    assert done.returncode == 0 and "of colours in" in done.stdout, done.stderr
+    for given in ((), ("--tf", "hot")):  # the function that the store tells
+        done = gvtorch("render", store, "--shader", "filtered", *far, *given)
+        assert done.returncode == 0, done.stderr
+        volume = matter()
+        tree = gv.N3Tree.from_volume(volume)
+        hot = gv.TransferFunction.preset("hot", *volume.value_range)
+        shader = gv.Filtered.of(tree, volume, hot, directions=True)
+        expected = gv.render(tree, gv.Camera.orbit(20, 10, 9, None, 24, 16), shader)
+        np.testing.assert_allclose(np.load(tmp_path / "a.npy")[..., :3], expected.color, atol=1e-6)
+    done = gvtorch("render", store, "--shader", "filtered", *far, "--tf", "bone")
+    assert done.returncode == 2 and "made with another function" in done.stderr
+    done = gvtorch("filter", tmp_path / "nothing.zarr")
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
