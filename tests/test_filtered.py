@@ -160,6 +160,31 @@ def test_from_afar_it_shows_what_many_fine_rays_show(look, way, pixel):
 
 
 @pytest.mark.backend("cpp")
+def test_soft_shadows_are_as_dark_as_those_of_many_fine_rays():
+    volume = walls()
+    tree = gv.N3Tree.from_volume(volume, 8)
+    transfer = gv.TransferFunction([(0.4, 0), (0.5, 0.95)])
+    filtered = gv.Filtered.of(tree, volume, transfer)
+    camera = gv.Camera.orbit(30, 20, 1.7, 16.0, 60, 60)
+    sun = gv.DirectionalLight((-1.0, -1.2, -0.6), angle=25.0)
+
+    def picture(cones: int, in_the_way: gv.Shader | None, **options) -> torch.Tensor:
+        shader = gv.Lit(transfer, in_the_way=in_the_way, ambient=0.0, diffuse=1.0, specular=0.0)
+        lighting = gv.Lighting(lights=[sun], shadow_cones=cones)
+        return gv.render(tree, camera, shader, lighting=lighting, **options).color
+
+    truth = picture(100, None, lod="finest")
+    for cones in (1, 4, 16):
+        means, ours = (
+            float((picture(cones, one) - truth).square().mean().sqrt()) for one in (None, filtered)
+        )
+        print(cones, f"means {means:.4f} filtered {ours:.4f}")
+        assert ours < 0.7 * means
+    with pytest.raises(ValueError, match="in_the_way must be a Shader"):
+        gv.Lit(transfer, in_the_way=3)
+
+
+@pytest.mark.backend("cpp")
 @pytest.mark.parametrize("directions", [True, False])
 def test_homogeneous_matter_stays_as_dense_at_every_level(directions):
     volume = gv.Volume(torch.full((32, 32, 32), 0.5), (1.0, 1.0, 2.0))

@@ -47,22 +47,44 @@ _ROWS, _RAMP, _WIDEST = 1025, 3.0, 16
 
 
 class Lit(LitShader):
-    """The transfer function, lit by Blinn and Phong on both sides of a surface."""
+    """The transfer function, lit by Blinn and Phong on both sides of a surface.
+
+    Attributes:
+        in_the_way: What the cones of `Lighting` are blocked by; None: the transfer function.
+    """
 
     kind = "Lit"
     shadowed_kind = "ShadowedLit"
     transfer: TransferFunction
 
-    def __init__(self, transfer: TransferFunction, *, shadows: bool = False, **light: Any) -> None:
-        """Takes a transfer function, `shadows` (whether matter takes light from what lies behind
-        it) and `normals`, `light`, `ambient`, `diffuse`, `specular`, `shininess` of `LitShader`.
+    def __init__(
+        self,
+        transfer: TransferFunction,
+        *,
+        shadows: bool = False,
+        in_the_way: Shader | None = None,
+        **light: Any,
+    ) -> None:
+        """See the class.
+
+        Args:
+            transfer: The transfer function.
+            shadows: Whether each sample stands in the shadow of what lies before its light.
+            in_the_way: What the cones of `Lighting` are blocked by, such as a `Filtered` of the
+                same function: these cones are wide, and means let through too much. None: the
+                transfer function.
+            **light: `normals`, `light`, `ambient`, `diffuse`, `specular` and `shininess` of
+                `LitShader`.
         """
         super().__init__(**light)
         self.transfer = check.instance("Lit", "transfer", transfer, TransferFunction)
         self.shadows = shadows
+        self.in_the_way = in_the_way
+        if in_the_way is not None:
+            check.instance("Lit", "in_the_way", in_the_way, Shader)
 
-    def blocker(self) -> TransferFunction:
-        return self.transfer
+    def blocker(self) -> Shader:
+        return self.in_the_way or self.transfer
 
 
 class PreIntegrated(Shader):
