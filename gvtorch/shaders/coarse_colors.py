@@ -5,7 +5,8 @@ of them along each axis, coloured and composited, and of the columns the mean.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -73,28 +74,18 @@ def write_colors(
             colour and alpha of its voxels as seen along +x -x +y -y +z -z.
         progress: Told ("filtered", voxels done, voxels in all).
     """
-    done, total = 0, 3 * field.shape[0] * field.shape[1] * field.shape[2]
+    done, total = 0, 3 * math.prod(field.shape)
     for axis, (table, share) in enumerate(zip(tables, shares, strict=True)):
         along = 2 - axis
-
-        def write(
-            level: int,
-            sums: Tensor,
-            a: int,
-            b: int,
-            axis: int = axis,
-            along: int = along,
-            share: float = share,
-        ) -> None:
+        for level, a, b, sums in _see_along(field, along, table, branching, len(out)):
             means = (sums[:, :4] / sums[:, 4:]).flatten(0, 1).movedim(0, 3)
             colors = _of_length(means, share).to(torch.float16)
             _, high, wide, _ = colors.shape
             columns = out[level].movedim(along, 0)[..., 8 * axis : 8 * axis + 8]
             columns[:, a : a + high, b : b + wide] = colors
-
-        for voxels in _see_along(field, along, table, branching, len(out), write):
-            done += voxels
-            progress("filtered", done, total)
+            if level == 0:
+                done += field.shape[along] * high * wide * branching**2
+                progress("filtered", min(done, total), total)
 
 
 def _see_along(
@@ -103,11 +94,10 @@ def _see_along(
     table: ColorTable,
     branching: int,
     levels: int,
-    write: Callable[[int, Tensor, int, int], None],
-) -> Iterator[int]:
-    """Works out what is seen along an axis of the field. `write` gets a level and the weighted sums
-    (2, 5, n, a, b) of its voxels, seen forwards and backwards: premultiplied colour, alpha and
-    weight; and where they begin. Yields the number of finest voxels that are done.
+) -> Iterator[tuple[int, int, int, Tensor]]:
+    """Yields what is seen along an axis of the field: a coarse level, two places across, and of the
+    voxels that begin there the weighted sums (2, 5, n, a, b), forwards and backwards: premultiplied
+    colour, alpha and weight. Each voxel comes once.
     """
     device = table.table_lm4.device
     length = field.shape[along]
@@ -116,7 +106,6 @@ def _see_along(
     tile, most = branching, _TILE_VOXELS[device.type]
     while tile * branching <= max(across) and length * (tile * branching) ** 2 <= most:
         tile *= branching
-    slab = tile * max(1, field.across // tile)
     whole = [branching ** (level + 1) for level in range(levels)]  # finest voxels along a side
     coarse = {  # sums of columns of a tile, where a voxel is wider than a tile
         level: torch.zeros(
@@ -125,35 +114,54 @@ def _see_along(
         for level, side in enumerate(whole)
         if side > tile
     }
-    for corner in itertools.product(*(range(0, n, slab) for n in across)):
-        ends = [min(n, at + slab) for n, at in zip(across, corner, strict=True)]
-        low, high = [0, 0, 0], [length, length, length]
-        for axis, first, end in zip(sides, corner, ends, strict=True):
-            low[axis], high[axis] = first - 1, end + 1
-        values = field.read(tuple(low), tuple(high)).movedim(along, 0)  # type: ignore[arg-type]
-        tiles = (range(at, end, tile) for at, end in zip(corner, ends, strict=True))
-        for a, b in itertools.product(*tiles):
-            x, y = a - corner[0], b - corner[1]
-            part = values[:, x : min(a + tile, ends[0]) - corner[0] + 2]
-            part = part[:, :, y : min(b + tile, ends[1]) - corner[1] + 2]
-            columns = _colored(_finer(part.to(device).to(torch.float32)), table)
-            empty = bool((columns.clear == 1).all())
-            columns = columns.joined(2)
-            for level, side in enumerate(whole):
-                if not empty or level == 0:
-                    columns = columns.joined(branching)
-                    weighted = columns.weighted()
-                if empty:  # the same in all intervals
-                    weighted = weighted[:, :, :1]
-                block = min(side, tile)
-                seen = _pooled(weighted, 2 * block)
-                if level in coarse:
-                    coarse[level][..., a // tile, b // tile] = seen[..., 0, 0]
-                else:
-                    write(level, seen, a // block, b // block)
-        yield length * (ends[0] - corner[0]) * (ends[1] - corner[1])
+    for a, b, part in _parts(field, along, tile):
+        values = part.to(device).to(torch.float32)
+        empty = not _shows(values, table)
+        if empty:  # as few intervals as make a voxel of the first level
+            high, wide = (2 * n - 4 for n in part.shape[1:])
+            columns = _Columns.empty((2 * branching, high, wide), device)
+        else:
+            columns = _colored(_finer(values), table)
+        columns = columns.joined(2)
+        for level, side in enumerate(whole):
+            if not empty or level == 0:
+                columns = columns.joined(branching)
+                weighted = columns.weighted()
+            block = min(side, tile)
+            seen = _pooled(weighted, 2 * block)
+            if level in coarse:
+                coarse[level][..., a // tile, b // tile] = seen[..., 0, 0]
+            else:
+                yield level, a // block, b // block, seen
     for level, sums in coarse.items():
-        write(level, _pooled(sums, whole[level] // tile), 0, 0)
+        yield level, 0, 0, _pooled(sums, whole[level] // tile)
+
+
+def _parts(field: Field, along: int, tile: int) -> Iterator[tuple[int, int, Tensor]]:
+    """Yields the field in columns along an axis, tile by tile: where a tile begins across, and its
+    values (n, a + 2, b + 2) with a neighbour on each side. They are read in slabs of many tiles.
+    """
+    slab = tile * max(1, field.across // tile)
+    size, sides = field.shape, [axis for axis in range(3) if axis != along]
+    across = [range(0, size[axis], slab) for axis in sides]
+    for corner in itertools.product(*across):
+        low, high = [0, 0, 0], list(size)
+        for axis, first in zip(sides, corner, strict=True):
+            low[axis], high[axis] = first - 1, min(first + slab, size[axis]) + 1
+        values = field.read(tuple(low), tuple(high)).movedim(along, 0)  # type: ignore[arg-type]
+        _, *ends = values.shape
+        for a, b in itertools.product(*(range(0, end - 2, tile) for end in ends)):
+            yield corner[0] + a, corner[1] + b, values[:, a : a + tile + 2, b : b + tile + 2]
+
+
+def _shows(part: Tensor, table: ColorTable) -> bool:
+    """Whether any value between the smallest and the largest of a part has an opacity."""
+    last = len(table.opaque_m) - 1
+    low, high = table.domain_2.tolist()
+    ends = (torch.stack(part.aminmax()) - low) * (last / (high - low))
+    first, end = (int(end) for end in ends.clamp(0, last).tolist())
+    rows = table.opaque_m[[max(first - 1, 0), min(end + 1, last)]].tolist()
+    return rows[1] > (rows[0] if first > 0 else 0)
 
 
 def _finer(part: Tensor) -> Tensor:
@@ -180,6 +188,12 @@ class _Columns:
     front: Tensor  # (3, n, a, b) premultiplied colour as seen from the front
     back: Tensor  # (3, n, a, b) and from behind
     clear: Tensor  # (n, a, b) transmittance
+
+    @classmethod
+    def empty(cls, shape: tuple[int, ...], device: torch.device) -> _Columns:
+        """Returns intervals of nothing."""
+        color = torch.zeros((3, *shape), device=device)
+        return cls(color, color, torch.ones(shape, device=device))
 
     def joined(self, count: int) -> _Columns:
         """Makes one of every `count` intervals; the last is repeated where there are too few."""
