@@ -261,15 +261,15 @@ def test_a_full_disk_is_told_and_goes_on(tmp_path, raw, data, monkeypatch):
         def result(self):
             raise ValueError("RESOURCE_EXHAUSTED: Error writing: [OS error 28: No space left on")
 
-    original = shard._write
+    original = shard.write
     with monkeypatch.context() as patch:
         patch.setattr(
             shard,
-            "_write",
-            lambda job, spec, *rest: (
+            "write",
+            lambda root, spec, *rest: (
                 Full()
-                if spec["path"] == "gvtorch/blocks/0" and job.root["driver"] == "file"
-                else original(job, spec, *rest)
+                if spec["path"] == "gvtorch/blocks/0" and root["driver"] == "file"
+                else original(root, spec, *rest)
             ),
         )
         with pytest.raises(OSError, match="the disk is full") as caught:

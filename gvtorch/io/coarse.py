@@ -8,7 +8,9 @@ of a `Filtered` shader. They are written into a store that is there already.
 
 from __future__ import annotations
 
+import errno
 import itertools
+import os
 import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -21,6 +23,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ..base.stage import Progress, no_progress
 from . import boxes
+from .resources import amount
 from .shard import finish, write
 from .store import Store
 from .store_layout import BORDER, WORK, CoarseChannel, Deadline, StoreLayout, opened
@@ -42,11 +45,18 @@ def temporary_levels(store: Store, width: int) -> Iterator[Sequence[np.ndarray]]
         arrays = []
         for level in range(1, store.levels):
             shape = (*store.level_extent(level)[::-1], width)
-            mapped = np.lib.format.open_memmap(
-                folder / f"{level}.npy", mode="w+", dtype=np.float16, shape=shape
-            )
+            file = folder / f"{level}.npy"
+            mapped = np.lib.format.open_memmap(file, mode="w+", dtype=np.float16, shape=shape)
+            with file.open("r+b") as opened_file:  # writing to what has no place on disk would kill
+                os.posix_fallocate(opened_file.fileno(), 0, file.stat().st_size)
             arrays.append(mapped)
         yield arrays
+    except OSError as error:
+        if error.errno != errno.ENOSPC or error.filename is not None:
+            raise
+        size = 2 * width * sum(_voxels(store.level_extent(n)) for n in range(1, store.levels))
+        text = f"the disk is full: while it is made, files take {amount(size)}"
+        raise OSError(errno.ENOSPC, text, store.location) from None
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -88,7 +98,7 @@ def write_channel(
             high = [min(a + _CUBE, n) for a, n in zip(low, shape, strict=True)]
             blocks = _blocks(layout, level, low, high, read)
             at = [a // layout.block for a in low]
-            finish(write(root, spec, at, blocks), store.location)
+            finish(write(root, spec, at, blocks), store.location, "make it anew")
             done += _voxels(np.subtract(high, low))
             progress("writing", done, total)
     (folder / name).mkdir(exist_ok=True)  # of a store of one level

@@ -159,12 +159,12 @@ def write(root: dict[str, Any], spec: dict[str, Any], low: list[int], data: np.n
     return array[boxes.index(low, np.add(low, data.shape).tolist())].write(data)
 
 
-def finish(begun: Any, where: str) -> None:
-    """Waits until it is written."""
+def finish(begun: Any, where: str, then: str = "--resume (resume=True) goes on") -> None:
+    """Waits until it is written; `then` tells what helps after a full disk."""
     try:
         begun.result()
     except Exception as error:  # tensorstore raises what its status maps to
         if "No space left" in str(error):
-            text = "the disk is full; with room again, --resume (resume=True) goes on"
+            text = f"the disk is full; with room again, {then}"
             raise OSError(errno.ENOSPC, text, where) from None
         raise StoreError(f"{where}: can't be written: {short(error)}") from None
