@@ -284,8 +284,40 @@ def test_two_trees_share_coarse_slots():
                 assert torch.equal(found.color, gv.render(tree, placed, expected).color)
 
 
+def test_a_streamed_function_may_not_be_edited_nor_another_number_drawn():
+    volume = gv.Volume(torch.rand(20, 20, 20, 2, generator=torch.Generator().manual_seed(1)))
+    transfer = gv.TransferFunction([(0, 0), (1, 0.5)])
+    shader, camera = gv.Filtered(transfer), gv.Camera.orbit(width=9, height=9)
+    other = gv.Volume(volume.data.flip(0))
+    producer = gv.VolumeProducer({"a": volume, "b": other}, filtered=shader)
+    tree = gv.N3Tree.from_volume(volume, 8)
+    expected = gv.render(tree, camera, gv.Filtered.of(tree, volume, transfer)).color
+    with gv.Engine(producer) as engine:
+        assert torch.equal(engine.render(camera, shader, component=1).color, expected)
+        with pytest.raises(ValueError, match="'filtered' was made of 'a', not of 'b'"):
+            engine.render(camera, shader, channel="b")
+        transfer.opacity[1, 1] = 0.6
+        with pytest.raises(ValueError, match="another function or component, or it was edited"):
+            engine.render(camera, shader)
+    mist = gv.TransferFunction([(0, 0), (1, 0.1)])
+    producer = gv.VolumeProducer(volume, filtered=gv.Filtered(mist, component=1))
+    mist.opacity[1, 1] = 0.9  # past the alpha from which on directions would be kept
+    with gv.Engine(producer) as engine:
+        assert engine.render(camera, gv.Filtered(mist, component=1)).stats.converged
+
+
 def test_mistakes_of_a_producer_with_coarse_channels_are_told():
     volume = matter()
+    with pytest.raises(ValueError, match="filtered must be a Filtered, got TransferFunction"):
+        gv.VolumeProducer(volume, filtered=SHADER)
+    with pytest.raises(ValueError, match="component of filtered must be"):
+        gv.VolumeProducer(volume, filtered=gv.Filtered(SHADER, component=5))
+
+    class AllCoarse(gv.Producer):
+        pass
+
+    with pytest.raises(ValueError, match="must have a channel that is not coarse"):
+        gv.Engine(AllCoarse(9, channels={"a": gv.Channel(coarse=True)}))
     with pytest.raises(ValueError, match="'value' is a volume's"):
         gv.VolumeProducer(volume, filtered=gv.Filtered(SHADER, "value"))
     with pytest.raises(ValueError, match="brick_pool of 50000 bytes holds"):
@@ -323,5 +355,6 @@ def test_mistakes_are_told():
     transfer = gv.TransferFunction([(0, 0), (1, 0.5)])
     shader = gv.Filtered.of(tree, volume, transfer)
     transfer.opacity[1, 1] = 0.6
-    with pytest.raises(ValueError, match="the function was edited"):
-        gv.trace(tree, camera_rays(tree, 3), shader)
+    for other in (shader, gv.Filtered(SHADER)):
+        with pytest.raises(ValueError, match="made of another function or component"):
+            gv.trace(tree, camera_rays(tree, 3), other)

@@ -85,7 +85,7 @@ def test_colours_of_several_functions_and_new_ones_of_a_name(store):
     assert sorted(gv.Store.open(store).coarse) == ["filtered", "mist"]
     for name, shader in (("mist", first), ("filtered", second)):
         assert gv.Filtered.stored(store, name).made_of == shader.made_of
-    with pytest.raises(ValueError, match="'filtered' were made with another function"):
+    with pytest.raises(ValueError, match="'filtered' were made with another function or compon"):
         gv.StoredProducer(store, filtered=gv.Filtered(MISTY))
     gv.Filtered.add_to(store, MISTY)
     gv.StoredProducer(store, filtered=gv.Filtered(MISTY)).close()
@@ -113,16 +113,54 @@ def test_broken_off_work_leaves_the_store_as_it_was(store):
 
         return progress
 
-    with pytest.raises(KeyboardInterrupt):
-        gv.Filtered.add_to(store, OPAQUE, progress=stop("filtered"))
-    assert not (store / WORK).exists() and gv.Filtered.stored(store).made_of == kept
-    with pytest.raises(KeyboardInterrupt):
-        gv.Filtered.add_to(store, OPAQUE, progress=stop("writing"))
-    assert not (store / WORK).exists()
-    with pytest.raises(ValueError, match="has no filtered colours 'filtered'; gvtorch filter"):
-        gv.Filtered.stored(store)
-    gv.Filtered.add_to(store, OPAQUE)
-    gv.Filtered.stored(store)
+    for step in ("filtered", "writing"):
+        with pytest.raises(KeyboardInterrupt):
+            gv.Filtered.add_to(store, OPAQUE, progress=stop(step))
+        assert not (store / WORK).exists() and gv.Filtered.stored(store).made_of == kept
+        check_streamed(store, matter(), gv.Filtered(MISTY))
+    bad = gv.TransferFunction([(30, 0), (250, 0.08)])
+    bad.opacity[1, 1] = float("nan")
+    with pytest.raises(ValueError, match="what 'filtered' is made of is not finite"):
+        gv.Filtered.add_to(store, bad)
+    shader = gv.Filtered.add_to(store, OPAQUE)
+    check_streamed(store, matter(), shader)
+    folders = {file.name for file in (store / "gvtorch" / "coarse").iterdir()}
+    assert folders == {"filtered.1", "zarr.json", ".lock"}
+
+
+def test_one_at_a_time_and_nothing_is_forgotten(store):
+    """Channels made through one open store, by two makers at once, and under a reader's eyes."""
+    opened, old = gv.Store.open(store), gv.Store.open(store)
+    gv.Filtered.add_to(opened, MISTY, channel="mist")
+    shader = gv.Filtered.add_to(opened, OPAQUE)
+    assert sorted(gv.Store.open(store).coarse) == sorted(opened.coarse) == ["filtered", "mist"]
+    gv.Filtered.add_to(old, MISTY, channel="late")  # it was opened before the others were made
+    assert sorted(gv.Store.open(store).coarse) == ["filtered", "late", "mist"]
+
+    def meanwhile(what: str, done: int, total: int) -> None:
+        with pytest.raises(OSError, match="another process makes a coarse channel"):
+            gv.Filtered.add_to(store, MISTY)
+
+    gv.Filtered.add_to(store, MISTY, channel="two", progress=meanwhile)
+    with gv.Engine(gv.StoredProducer(opened, filtered=shader)) as engine:
+        gv.Filtered.add_to(store, OPAQUE)  # anew: the reader of the old ones is told
+        engine.render(gv.Camera.orbit(width=24, height=24, distance=3.0), shader)
+        assert any("filtered.0" in failure.message for failure in engine.failures)
+
+
+@pytest.mark.backend("cpp")
+def test_channels_that_were_picked_are_refused(tmp_path):
+    gv.convert(matter(width=2), tmp_path / "a.zarr")
+    picked = gv.Store.open(tmp_path / "a.zarr", channels=[1])
+    with pytest.raises(ValueError, match="are written into whole folders"):
+        gv.Filtered.add_to(picked, MISTY)
+    shader = gv.Filtered.add_to(tmp_path / "a.zarr", MISTY, component=1)
+    with pytest.raises(ValueError, match="of all channels: leave channels out"):
+        gv.StoredProducer(tmp_path / "a.zarr", channels=[1], filtered=shader)
+    with pytest.raises(ValueError, match="another function or component"):
+        gv.StoredProducer(tmp_path / "a.zarr", filtered=gv.Filtered(MISTY))
+    with pytest.raises(ValueError, match="filtered must be a Filtered, got TransferFunction"):
+        gv.StoredProducer(tmp_path / "a.zarr", filtered=MISTY)
 
 
 def failures(path) -> list[str]:
@@ -135,7 +173,7 @@ def failures(path) -> list[str]:
 @pytest.mark.backend("cpp")
 def test_what_is_missing_or_damaged_is_told(store):
     gv.Filtered.add_to(store, OPAQUE)
-    level = store / "gvtorch" / "coarse" / "filtered" / "1"
+    level = store / "gvtorch" / "coarse" / "filtered.0" / "1"
     (shard,) = (file for file in (level / "c").rglob("*") if file.is_file())
     whole = shard.read_bytes()
     shard.unlink()
@@ -146,7 +184,7 @@ def test_what_is_missing_or_damaged_is_told(store):
     shard.write_bytes(whole)
     assert not failures(store)
     shutil.rmtree(level)
-    assert any("coarse/filtered/1" in text for text in failures(store))
+    assert any("coarse/filtered.0/1" in text for text in failures(store))
 
 
 @pytest.mark.parametrize(
@@ -154,15 +192,22 @@ def test_what_is_missing_or_damaged_is_told(store):
     [
         {"channels": 3},
         {"channels": {"filtered": {}}},
+        {"channels": {"filtered": {"version": 1, "made_of": {}}}},
+        {"channels": {"../x": {"version": 1, "width": 4, "made_of": {}, "generation": 0}}},
         {"channels": {"filtered": {"version": 9, "width": 4, "made_of": {}}}},
-        {"channels": {"filtered": {"version": 1, "width": True, "made_of": {}}}},
-        {"channels": {"filtered": {"version": 1, "width": 4, "made_of": {"opacity": 1}}}},
+        {"channels": {"filtered": {"version": 1, "width": True, "made_of": {}, "generation": 0}}},
+        {
+            "channels": {
+                "filtered": {"version": 1, "width": 4, "made_of": {"opacity": 1}, "generation": 0}
+            }
+        },
         {
             "channels": {
                 "filtered": {
                     "version": 1,
                     "width": 4,
                     "made_of": {"opacity": "x", "color": [], "reference": 0, "component": 0},
+                    "generation": 0,
                 }
             }
         },
@@ -182,8 +227,8 @@ def test_damaged_metadata_is_told(store, told):
 def test_mistakes_are_told(store, tmp_path):
     with pytest.raises(ValueError, match="component must be"):
         gv.Filtered.add_to(store, MISTY, component=1)
-    for name in ("", "../x", "a/b", "x" * 65, "é"):
-        with pytest.raises(ValueError, match="a channel's name is made of"):
+    for name in ("", "../x", "a/b", "x" * 65, "é", "value"):
+        with pytest.raises(ValueError, match="channel's name is made of"):
             gv.Filtered.add_to(store, MISTY, channel=name)
     with pytest.raises(ValueError, match="'filtered' are not there; gvtorch filter"):
         gv.StoredProducer(store, filtered=gv.Filtered(MISTY))
@@ -200,7 +245,7 @@ def test_mistakes_are_told(store, tmp_path):
     for image in attributes["attributes"]["ome"]["multiscales"]:
         image["datasets"] = image["datasets"][:1]
     (other / "zarr.json").write_text(json.dumps(attributes))
-    with pytest.raises(ValueError, match=r"b\.zarr: coarse channels are written into folders that"):
+    with pytest.raises(ValueError, match=r"b\.zarr: coarse channels are written into whole"):
         gv.Filtered.add_to(other, MISTY)
 
 

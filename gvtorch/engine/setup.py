@@ -85,28 +85,38 @@ def make_pools(
         raise ValueError("Engine: scene must have at least one producer")
     channels = _all_channels(producers)
     fine = {name: channel for name, channel in channels.items() if not channel.coarse}
+    if not fine:
+        raise ValueError("Engine: producers must have a channel that is not coarse")
     branching = max(producer.branching for producer in producers.values())
-    node_bytes = 8 + 3 * sum(channel.nbytes for channel in fine.values())
-    roots, capacity, coarse, extra = len(producers), {}, 0, 0
+    tile = branching**3 * (8 + 3 * sum(channel.nbytes for channel in fine.values()))
     brick, whole = brick_bytes(fine, options), brick_bytes(channels, options)
-    for name, slot in (("node_pool", branching**3 * node_bytes), ("brick_pool", brick)):
-        size = check.nbytes("Engine", name, getattr(options, name))
-        least = roots + 1 + (branching if name == "node_pool" else 0)
-        if name == "brick_pool" and whole > brick:
-            average = brick + options.coarse_share * (whole - brick)
-            coarse = max(roots + 1, int(options.coarse_share * size / average))
-            extra, least = coarse * (whole - brick), coarse + 1
-        capacity[name] = max(0, size - extra) // slot
-        if capacity[name] < least:
-            kinds = f" beside {extra} for coarse channels" if extra else ""
-            raise ValueError(
-                f"Engine: {name} of {size} bytes holds {capacity[name]} slots of {slot} bytes"
-                f"{kinds}, at least {least} are needed ({least * slot + extra} bytes)"
-            )
-        check.memory("Engine", name, size, device)
-    nodes = NodePool(capacity["node_pool"], channels, branching=branching, device=device)
+    roots, coarse = len(producers), 0
+    if whole > brick:
+        size = check.nbytes("Engine", "brick_pool", options.brick_pool)
+        average = brick + options.coarse_share * (whole - brick)
+        coarse = max(roots + 1, int(options.coarse_share * size / average))
+    beside = coarse * (whole - brick)
+    tiles = _slots("node_pool", options.node_pool, tile, roots + 1 + branching, device)
+    bricks = _slots("brick_pool", options.brick_pool, brick, max(roots, coarse) + 1, device, beside)
+    nodes = NodePool(tiles, channels, branching=branching, device=device)
     shape = {"brick_size": options.brick_size, "border": options.border, "coarse": coarse}
-    return nodes, BrickPool(capacity["brick_pool"], channels, **shape, device=device)
+    return nodes, BrickPool(bricks, channels, **shape, device=device)
+
+
+def _slots(
+    name: str, given: int | str, slot: int, least: int, device: torch.device, beside: int = 0
+) -> int:
+    """Returns how many slots a pool's bytes hold; `beside` of them are for coarse channels."""
+    size = check.nbytes("Engine", name, given)
+    count = max(0, size - beside) // slot
+    if count < least:
+        kinds = f" beside {beside} for coarse channels" if beside else ""
+        raise ValueError(
+            f"Engine: {name} of {size} bytes holds {count} slots of {slot} bytes{kinds}, "
+            f"at least {least} are needed ({least * slot + beside} bytes)"
+        )
+    check.memory("Engine", name, size, device)
+    return count
 
 
 def _all_channels(producers: Mapping[str, Producer]) -> dict[str, Channel]:
@@ -156,6 +166,7 @@ def make_tree(
         branching=producer.branching,
         value_range=producer.value_range,
     )
+    tree.made_of = dict(producer.made_of)
     nodes.child_tn[number], nodes.brick_tn[number] = TERMINAL, EMPTY
     nodes.tree_t[number] = number
     if any(channel.coarse for channel in producer.channels.values()):

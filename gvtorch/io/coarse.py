@@ -2,27 +2,29 @@
 of a `Filtered` shader. They are written into a store that is there already.
 
     STORE.zarr/gvtorch/coarse/zarr.json    tells of each channel; written when it is whole
-    STORE.zarr/gvtorch/coarse/NAME/1 ...   (gz, gy, gx, s, s, s, c) float16 bordered blocks of a
+    STORE.zarr/gvtorch/coarse/NAME.0/1   (gz, gy, gx, s, s, s, c) float16 bordered blocks of a
                                            level, cut as the store's own; all are written
 """
 
 from __future__ import annotations
 
-import errno
 import itertools
+import json
+import math
 import os
 import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..base.stage import Progress, no_progress
 from . import boxes
+from .ngff import parse_json
 from .resources import amount
 from .shard import finish, write
 from .store import Store
@@ -33,103 +35,151 @@ _OPEN_TIMEOUT = 60.0  # seconds
 _CUBE = 128  # voxels along a side of what is written at once
 
 
-@contextmanager
-def temporary_levels(store: Store, width: int) -> Iterator[Sequence[np.ndarray]]:
-    """Gives an array (z, y, x, width) float16 in a file for each coarse level, the finest of them
-    first; the files lie in the store's folder, and go when the block ends.
+def make_channel(
+    store: Store,
+    name: str,
+    channel: CoarseChannel,
+    wide: int,
+    fill: Callable[[Sequence[np.ndarray]], None],
+    keep: Callable[[np.ndarray], np.ndarray],
+    progress: Progress = no_progress,
+) -> None:
+    """Makes a coarse channel; one of the same name is replaced when the new one is whole, and stays
+    as it is if the work is broken off.
+
+    Args:
+        store: A store that `convert` made, in a folder.
+        name: Letters, digits, "-" and "_"; not "value".
+        channel: What it is.
+        wide: Numbers of a voxel that `fill` writes.
+        fill: Writes an array (z, y, x, wide) float16, mapped from a file, for each coarse level,
+            the finest of them first.
+        keep: Turns boxes (z, y, x, wide) of these into what the channel holds, (z, y, x, c).
+        progress: Told ("writing", voxels done, voxels in all), after `fill`.
+
+    Raises:
+        ValueError: The store is not of ours, or name or channel do not do.
+        OSError: It can't be written, or another process makes a channel of this store.
     """
-    folder = _folder(store) / WORK
+    target = Path(store.location)
+    if not store.has_blocks or not store.all_channels or not target.is_dir():
+        raise ValueError(
+            f"{store.location}: coarse channels are written into whole folders that gvtorch "
+            "convert made"
+        )
+    if not re.fullmatch(r"[\w-]{1,64}", str(name), re.ASCII) or name == "value":
+        raise ValueError(
+            f"{name!r}: a coarse channel's name is made of letters, digits, - and _, not 'value'"
+        )
+    try:
+        json.dumps(channel.attributes(), allow_nan=False)
+    except ValueError:
+        raise ValueError(f"{store.location}: what {name!r} is made of is not finite") from None
+    folder = target / "gvtorch" / "coarse"
+    folder.mkdir(exist_ok=True)
+    with _alone(folder), _levels_in_files(store, wide) as levels:
+        fill(levels)
+        known = _known(folder)
+        before = known.get(name)
+        made = replace(channel, generation=before.generation + 1 if before else 0)
+        _write_blocks(store, made.folder(name), made.width, levels, keep, progress)
+        known[name] = made
+        told = {one: other.attributes() for one, other in known.items()}
+        write_json(folder / "zarr.json", group({"channels": told}))
+        store.coarse = known
+        if before is not None:
+            shutil.rmtree(folder / before.folder(name), ignore_errors=True)
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    import fcntl
+
+    with (folder / ".lock").open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise OSError(f"{folder}: another process makes a coarse channel") from None
+        yield
+
+
+def _known(folder: Path) -> dict[str, CoarseChannel]:
+    """The channels that are on disk now."""
+    file = folder / "zarr.json"
+    if not file.exists():
+        return {}
+    content = parse_json(str(file), file.read_bytes())
+    return CoarseChannel.parse(str(file), content.get("attributes"))
+
+
+@contextmanager
+def _levels_in_files(store: Store, wide: int) -> Iterator[Sequence[np.ndarray]]:
+    """Gives an array for each coarse level, in files of the store's folder, which go again."""
+    folder = Path(store.location) / WORK
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     try:
-        arrays = []
-        for level in range(1, store.levels):
-            shape = (*store.level_extent(level)[::-1], width)
-            file = folder / f"{level}.npy"
-            mapped = np.lib.format.open_memmap(file, mode="w+", dtype=np.float16, shape=shape)
-            with file.open("r+b") as opened_file:  # writing to what has no place on disk would kill
-                os.posix_fallocate(opened_file.fileno(), 0, file.stat().st_size)
-            arrays.append(mapped)
-        yield arrays
-    except OSError as error:
-        if error.errno != errno.ENOSPC or error.filename is not None:
-            raise
-        size = 2 * width * sum(_voxels(store.level_extent(n)) for n in range(1, store.levels))
-        text = f"the disk is full: while it is made, files take {amount(size)}"
-        raise OSError(errno.ENOSPC, text, store.location) from None
+        yield [_mapped(store, folder, level, wide) for level in range(1, store.levels)]
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def write_channel(
+def _mapped(store: Store, folder: Path, level: int, wide: int) -> np.ndarray:
+    shape, file = (*store.level_extent(level)[::-1], wide), folder / f"{level}.npy"
+    mapped = np.lib.format.open_memmap(file, mode="w+", dtype=np.float16, shape=shape)
+    with file.open("r+b") as place:  # writing to what has no place on disk would end the process
+        try:
+            os.posix_fallocate(place.fileno(), 0, file.stat().st_size)
+        except OSError as error:
+            sizes = [_voxels(store.level_extent(one)) for one in range(1, store.levels)]
+            text = f"{error.strerror}: while it is made, files take {amount(2 * wide * sum(sizes))}"
+            raise OSError(error.errno, text, store.location) from None
+    return mapped
+
+
+def _write_blocks(
     store: Store,
-    name: str,
-    channel: CoarseChannel,
-    read: Callable[[int, Sequence[int], Sequence[int]], np.ndarray],
-    progress: Progress = no_progress,
+    folder: str,
+    width: int,
+    levels: Sequence[np.ndarray],
+    keep: Callable[[np.ndarray], np.ndarray],
+    progress: Progress,
 ) -> None:
-    """Writes a coarse channel; one of the same name is replaced.
-
-    Args:
-        store: A store that `convert` made, in a folder.
-        name: Letters, digits, "-" and "_".
-        channel: What it is.
-        read: Gives a box (z, y, x, c) float16 of a level: level, low and high inside the level.
-        progress: Told ("writing", voxels done, voxels in all).
-
-    Raises:
-        ValueError: The store is not of ours, or the name does not do.
-        OSError: It can't be written.
-    """
-    layout, folder = store.layout, _folder(store) / "gvtorch" / "coarse"
-    if not re.fullmatch(r"[\w-]{1,64}", name, re.ASCII):
-        raise ValueError(f"{name!r}: a channel's name is made of letters, digits, - and _")
-    known = {n: c.attributes() for n, c in store.coarse.items() if n != name}
-    folder.mkdir(exist_ok=True)
-    write_json(folder / "zarr.json", group({"channels": known}))
-    shutil.rmtree(folder / name, ignore_errors=True)
-    shapes = {level: layout.shape(level) for level in range(1, store.levels)}
-    done, total = 0, sum(map(_voxels, shapes.values()))
-    for level, shape in shapes.items():
-        spec = layout.coarse(level, name, channel.width)
-        root = store.root
-        Deadline(_OPEN_TIMEOUT).wait(opened(root, spec, "create"), spec["path"])
-        for low in itertools.product(*(range(0, n, _CUBE) for n in shape)):
-            high = [min(a + _CUBE, n) for a, n in zip(low, shape, strict=True)]
-            blocks = _blocks(layout, level, low, high, read)
-            at = [a // layout.block for a in low]
-            finish(write(root, spec, at, blocks), store.location, "make it anew")
-            done += _voxels(np.subtract(high, low))
+    place = Path(store.location) / "gvtorch" / "coarse" / folder
+    shutil.rmtree(place, ignore_errors=True)  # of work that was broken off
+    place.mkdir()
+    done, total = 0, sum(_voxels(values.shape[:3]) for values in levels)
+    for level, values in enumerate(levels, 1):
+        spec = store.layout.coarse(level, folder, width)
+        Deadline(_OPEN_TIMEOUT).wait(opened(store.root, spec, "create"), spec["path"])
+        for low in itertools.product(*(range(0, n, _CUBE) for n in values.shape[:3])):
+            size = [min(_CUBE, n - a) for a, n in zip(low, values.shape, strict=False)]
+            blocks = _blocks(store.layout, values, low, size, keep)
+            at = [a // store.layout.block for a in low]
+            finish(write(store.root, spec, at, blocks), store.location, "make it anew")
+            done += _voxels(size)
             progress("writing", done, total)
-    (folder / name).mkdir(exist_ok=True)  # of a store of one level
-    write_json(folder / name / "zarr.json", group({}))
-    known[name] = channel.attributes()
-    write_json(folder / "zarr.json", group({"channels": known}))
+    write_json(place / "zarr.json", group({}))
 
 
 def _blocks(
-    layout: StoreLayout, level: int, low: Sequence[int], high: Sequence[int], read: Any
+    layout: StoreLayout,
+    values: np.ndarray,
+    low: Sequence[int],
+    size: Sequence[int],
+    keep: Callable[[np.ndarray], np.ndarray],
 ) -> np.ndarray:
     """(gz, gy, gx, s, s, s, c) blocks of a cube of a level, borders included."""
-    shape, block = layout.shape(level), layout.block
-    counts = [-(-(b - a) // block) for a, b in zip(low, high, strict=True)]
     begin = [a - BORDER for a in low]
-    end = [a + n * block + BORDER for a, n in zip(low, counts, strict=True)]
-    start, stop = boxes.clamp(begin, end, shape)
-    values = boxes.repeat_edges(read(level, start, stop), start, begin, end)
-    side = layout.stored
-    view = sliding_window_view(values, (side, side, side), (0, 1, 2))[::block, ::block, ::block]
+    end = [
+        a + -(-n // layout.block) * layout.block + BORDER for a, n in zip(low, size, strict=True)
+    ]
+    start, stop = boxes.clamp(begin, end, values.shape[:3])
+    inside = boxes.repeat_edges(keep(values[boxes.index(start, stop)]), start, begin, end)
+    side, every = layout.stored, slice(None, None, layout.block)
+    view = sliding_window_view(inside, (side, side, side), (0, 1, 2))[every, every, every]
     return np.ascontiguousarray(np.moveaxis(view, 3, 6))
 
 
-def _folder(store: Store) -> Path:
-    folder = Path(store.location)
-    if not store.has_blocks or not folder.is_dir():
-        raise ValueError(
-            f"{store.location}: coarse channels are written into folders that gvtorch convert made"
-        )
-    return folder
-
-
-def _voxels(size: Any) -> int:
-    return int(np.prod(size, dtype=np.int64))
+def _voxels(size: Sequence[int]) -> int:
+    return math.prod(map(int, size))

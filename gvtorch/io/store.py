@@ -65,6 +65,7 @@ class Store:
         has_blocks: Whether blocks are stored with their border, and cells are there.
         value_range: [low, high] of each channel, or None where the store does not tell.
         threshold: What EMPTY was decided by, or None.
+        all_channels: Whether it was opened with all of its channels, as they are.
         coarse: Its coarse channels by name; see coarse.py.
         layout: What lies where on disk.
         root: tensorstore's spec of its folder.
@@ -95,6 +96,7 @@ class Store:
             self.value_range = [ranges[c] for c in np.arange(layout.width)[channels]]
         self.layout, self._levels, self._channels = layout, levels, channels
         self.root = kvstore(location)
+        self.all_channels = isinstance(channels, slice)
         self.coarse: dict[str, CoarseChannel] = {}
         self._blocks: list[Any] = []
         self._cells: list[Any] = []
@@ -296,7 +298,8 @@ class Store:
         channel, grid = self.coarse[name], self.block_grid(level)
         if level == 0 or (zyx.size and (zyx.min() < 0 or (zyx >= grid).any())):
             raise ValueError(f"read_coarse: a place leaves the grid {grid} of level {level}")
-        deadline, spec = Deadline(timeout), self.layout.coarse(level, name, channel.width)
+        deadline = Deadline(timeout)
+        spec = self.layout.coarse(level, channel.folder(name), channel.width)
         where = f"{self.location}/{spec['path']}"
         array = deadline.wait(opened(self.root, spec), where)
         if list(array.shape) != spec["metadata"]["shape"] or array.dtype.name != "float16":

@@ -127,11 +127,11 @@ class StoreLayout:
             chunk=[*[_CELL_CHUNK] * 3, *inside],
         )
 
-    def coarse(self, level: int, name: str, width: int) -> dict[str, Any]:
+    def coarse(self, level: int, folder: str, width: int) -> dict[str, Any]:
         """Spec of the array of bordered blocks of a coarse channel, from level 1 on."""
         inside = [self.stored] * 3 + [width]
         return dataclasses.replace(self, dtype="float16")._array(
-            f"gvtorch/coarse/{name}/{level}",
+            f"gvtorch/coarse/{folder}/{level}",
             shape=[*self.grid(level, self.block), *inside],
             shard=[*[_COARSE_SHARD // self.block] * 3, *inside],
             chunk=[1, 1, 1, *inside],
@@ -241,10 +241,15 @@ class CoarseChannel:
 
     width: int
     made_of: dict[str, Any]  # what made it, as JSON
+    generation: int = 0  # how often it was made anew: readers of the one before find nothing
 
     def attributes(self) -> dict[str, Any]:
         """What the metadata says of it."""
-        return {"version": VERSION, "width": self.width, "made_of": self.made_of}
+        return {"version": VERSION, **dataclasses.asdict(self)}
+
+    def folder(self, name: str) -> str:
+        """Where it lies."""
+        return f"{name}.{self.generation}"
 
     @classmethod
     def parse(cls, where: str, told: Any) -> dict[str, CoarseChannel]:
@@ -257,9 +262,15 @@ class CoarseChannel:
         found = {}
         for name, own in channels.items():
             whole = isinstance(own, dict) and isinstance(own.get("made_of"), dict)
-            if not whole or own.get("version") != VERSION or not _is_whole(own["width"], 1, 2**12):
+            if not (
+                whole
+                and re.fullmatch(r"[\w-]{1,64}", name, re.ASCII)
+                and own.get("version") == VERSION
+                and _is_whole(own.get("width"), 1, 2**12)
+                and _is_whole(own.get("generation"), 0, 2**31)
+            ):
                 raise ValueError(f"{where}: damaged: gvtorch/coarse tells {own!r} of {name!r}")
-            found[name] = cls(width=own["width"], made_of=own["made_of"])
+            found[name] = cls(**{field.name: own[field.name] for field in dataclasses.fields(cls)})
         return found
 
 

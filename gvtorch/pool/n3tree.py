@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,6 +35,7 @@ class N3Tree:
         spacing: (x, y, z) world size of a finest voxel.
         value_range: For each channel, the smallest and largest value of the finest level.
         frame: Number of the last frame traced; usage stamps hold it.
+        made_of: For coarse channels, what they were made of, as plain values.
     """
 
     def __init__(
@@ -63,6 +65,7 @@ class N3Tree:
         self.box = torch.tensor([low, high], dtype=torch.float64)
         self.value_range = dict(value_range or {})
         self.frame = 0
+        self.made_of: dict[str, Any] = {}
         self._place: Tensor | None = None
 
     @property

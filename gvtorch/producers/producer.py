@@ -262,6 +262,7 @@ class Producer(torch.nn.Module):
         patience: Seconds after which an answer that has not come counts as failed; None: the
             engine's.
         layout: Set by the engine that uses this producer; None while none does.
+        made_of: For coarse channels, what they are made of: shaders compare it with what they need.
         extent, spacing, origin, branching, channels, value_range: See `__init__`.
     """
 
@@ -317,6 +318,7 @@ class Producer(torch.nn.Module):
             if not isinstance(channel, Channel):
                 raise ValueError(f"{where}: channels[{name!r}] must be a Channel, got {channel!r}")
         self.value_range = dict(value_range or {})
+        self.made_of: dict[str, Any] = {}
 
     def prepare(self, layout: Layout) -> None:
         """Is called once by the engine, before anything else, with how it cuts the world."""

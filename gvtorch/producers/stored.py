@@ -160,16 +160,24 @@ class StoredProducer(Producer):
         if store.value_range is not None:
             lows, highs = zip(*store.value_range, strict=True)
             value_range[_CHANNEL] = (min(lows), max(highs))
-        kinds = {_CHANNEL: Channel(store.dtype, store.width)}
+        kinds, made_of = {_CHANNEL: Channel(store.dtype, store.width)}, dict[str, Any]()
         if filtered is not None:
+            if not hasattr(filtered, "made_of"):
+                kind = type(filtered).__name__
+                raise ValueError(f"StoredProducer: filtered must be a Filtered, got {kind}")
+            if not store.all_channels:
+                raise ValueError(
+                    f"{store.location}: filtered colours are of all channels: leave channels out"
+                )
             name = str(filtered.other)
             known = store.coarse.get(name)
             if known is None or known.made_of != filtered.made_of:
-                what = "were made with another function" if known else "are not there"
+                what = "were made with another function or component" if known else "are not there"
                 raise ValueError(
                     f"{store.location}: filtered colours {name!r} {what}; "
                     "gvtorch filter (Filtered.add_to) makes them"
                 )
+            made_of[name] = known.made_of
             kinds[name] = Channel(torch.float16, known.width, coarse=True)
         super().__init__(
             store.extent,
@@ -178,7 +186,7 @@ class StoredProducer(Producer):
             origin=store.origin,
             value_range=value_range,
         )
-        self.store, self.timeout = store, seconds
+        self.store, self.timeout, self.made_of = store, seconds, made_of
         self._cache = HostCache(limit)
         self._closed = threading.Event()
         self._threads = ThreadPoolExecutor(workers, thread_name_prefix="gvtorch-store")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -25,14 +25,19 @@ class CoarseColors(Protocol):
     """What makes a coarse channel of a volume: `Filtered` does."""
 
     other: str | None  # name of the channel
+    component: int | None  # which number of a voxel it is made of
+
+    @property
+    def made_of(self) -> Mapping[str, Any]:
+        """What it is made of, as plain values."""
 
     def colors(self, spacing: tuple[float, float, float]) -> Channel:
         """Returns the channel, for voxels of this size."""
 
     def levels(
-        self, volume: Volume, branching: int, depth: int, device: torch.device
+        self, volume: Volume, branching: int, depth: int, device: torch.device, width: int
     ) -> Iterator[Tensor]:
-        """Yields (z, y, x, c) of the coarse levels, the finest of them first, on the CPU."""
+        """Yields (z, y, x, width) of the coarse levels, the finest of them first, on the CPU."""
 
 
 class VolumeProducer(Producer):
@@ -66,7 +71,12 @@ class VolumeProducer(Producer):
         first = next(iter(volumes.values()))
         channels = {name: Channel.of(volume) for name, volume in volumes.items()}
         if filtered is not None:
-            name = str(filtered.other)
+            if not hasattr(filtered, "levels"):
+                kind = type(filtered).__name__
+                raise ValueError(f"VolumeProducer: filtered must be a Filtered, got {kind}")
+            name, last = str(filtered.other), first.data.shape[3] - 1
+            what = "component of filtered"
+            check.whole("VolumeProducer", what, filtered.component, low=0, high=last)
             if name in channels:
                 raise ValueError(f"VolumeProducer: channel {name!r} is a volume's")
             channels[name] = filtered.colors(first.spacing)
@@ -88,14 +98,16 @@ class VolumeProducer(Producer):
 
     def prepare(self, layout: Layout) -> None:
         """Makes all levels, and all bricks if they are to be held."""
-        sizes = (layout.branching, layout.brick_size, layout.border)
-        self._levels = levels_by_depth(self._volumes, layout.depth, *sizes)
+        cuts = (layout.branching, layout.brick_size, layout.border)
+        self._levels = levels_by_depth(self._volumes, layout.depth, *cuts)
         self._values = {name: [one.values for one in own] for name, own in self._levels.items()}
         levels = next(iter(self._levels.values()))
         if self._filtered is not None:
             first = next(iter(self._volumes.values()))
-            made = self._filtered.levels(first, layout.branching, layout.depth, layout.device)
-            self._values[str(self._filtered.other)] = [*made][::-1]
+            name = str(self._filtered.other)
+            sizes = (layout.branching, layout.depth, layout.device, self.channels[name].width)
+            self.made_of[name] = self._filtered.made_of
+            self._values[name] = [*self._filtered.levels(first, *sizes)][::-1]
         if self._hold == "bricks":
             for name, values in self._values.items():
                 if values:  # a tree of one brick has no coarse ones

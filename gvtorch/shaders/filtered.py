@@ -23,7 +23,7 @@ from torch import Tensor
 from ..base import check
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume
-from ..io.coarse import temporary_levels, write_channel
+from ..io.coarse import make_channel
 from ..io.store import Store
 from ..io.store_layout import CoarseChannel
 from ..ops import ShadeArguments, cut_bricks
@@ -54,15 +54,15 @@ class Filtered(Shader):
         self,
         transfer: TransferFunction,
         channel: str = "filtered",
-        component: int | None = None,
+        component: int = 0,
         *,
         directions: bool | None = None,
     ) -> None:
         """Tells the transfer function, and where its colours lie.
 
         Args:
-            transfer: The transfer function. Once it is edited, tracing raises ValueError where the
-                colours were made for this shader: they have to be made anew.
+            transfer: The transfer function. Where colours were made of another one, or it is
+                edited, tracing raises ValueError: they have to be made anew.
             channel: Name of the channel that holds the colours.
             component: Which number of a voxel the function takes.
             directions: Whether colours are made for each of six directions, or their mean, which
@@ -70,7 +70,6 @@ class Filtered(Shader):
         """
         self.transfer = check.instance("Filtered", "transfer", transfer, TransferFunction)
         self.other, self.component, self._directions = channel, component, directions
-        self._made_of: tuple[bytes, ...] | None = None  # the function, where colours were made here
 
     @classmethod
     def of(
@@ -118,7 +117,8 @@ class Filtered(Shader):
         bricks, kind = tree.bricks, shader.colors(tree.spacing)
         side = bricks.brick_size + 2 * bricks.border
         colors = torch.zeros((count, side, side, side, kind.width), dtype=kind.dtype)
-        levels = shader.levels(volume, tree.branching, tree.depth, tree.device, progress)
+        sizes = (tree.branching, tree.depth, tree.device, kind.width)
+        levels = shader.levels(volume, *sizes, progress)
         for level, values in enumerate(levels, 1):
             mine = (places[:count, 3] == tree.depth - level).nonzero()[:, 0]
             for some in mine.split(_BATCH):
@@ -126,6 +126,7 @@ class Filtered(Shader):
                 colors[some] = cut_bricks(values, place, bricks.brick_size, bricks.border)
         bricks.channels[channel] = tree.nodes.channels[channel] = kind
         bricks.bricks[channel], bricks.coarse = colors.to(tree.device), count
+        tree.made_of[channel] = shader.made_of
         return shader
 
     @classmethod
@@ -160,20 +161,21 @@ class Filtered(Shader):
         opened = store if isinstance(store, Store) else Store.open(store)
         check.whole("Filtered", "component", component, low=0, high=opened.width - 1)
         shader = cls(transfer, channel, component, directions=directions)
-        kind, place = shader.colors(opened.spacing), opened.spacing
-        with temporary_levels(opened, 24) as levels:
-            out, field = (
-                [torch.from_numpy(level) for level in levels],
-                _StoreField(opened, component),
+        place = check.device("Filtered", device)
+        kind, made_of = shader.colors(opened.spacing), shader.made_of
+
+        def fill(levels: Sequence[np.ndarray]) -> None:
+            out = [torch.from_numpy(level) for level in levels]
+            field = _StoreField(opened, component)
+            shader.write(field, opened.spacing, 2, out, place, progress)
+
+        def keep(colors: np.ndarray) -> np.ndarray:
+            return (
+                colors if kind.width == 24 else mean_of_directions(torch.from_numpy(colors)).numpy()
             )
-            shader.write(field, place, 2, out, check.device("Filtered", device), progress)
 
-            def read(level: int, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
-                box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-                return shader.kept(out[level - 1][box], place).numpy()
-
-            told = CoarseChannel(width=kind.width, made_of=shader.made_of)
-            write_channel(opened, channel, told, read, progress)
+        told = CoarseChannel(width=kind.width, made_of=made_of)
+        make_channel(opened, channel, told, 24, fill, keep, progress)
         return shader
 
     @classmethod
@@ -185,9 +187,9 @@ class Filtered(Shader):
         """
         opened = store if isinstance(store, Store) else Store.open(store)
         if channel not in opened.coarse:
-            known = "".join(f", only {name!r}" for name in opened.coarse)
+            known = ", ".join(map(repr, opened.coarse)) or "none"
             raise ValueError(
-                f"{opened.location}: has no filtered colours {channel!r}{known}; "
+                f"{opened.location}: has no filtered colours {channel!r} (it has {known}); "
                 "gvtorch filter (Filtered.add_to) makes them"
             )
         told = opened.coarse[channel]
@@ -200,9 +202,7 @@ class Filtered(Shader):
             check.whole("Filtered", "component", component, low=0, high=opened.width - 1)
         except ValueError as error:
             raise ValueError(f"{opened.location}: damaged: {channel!r}: {error}") from None
-        shader = cls(transfer, channel, component, directions=told.width == 24)
-        shader._made_of = _content(transfer)
-        return shader
+        return cls(transfer, channel, component, directions=told.width == 24)
 
     @property
     def made_of(self) -> dict[str, Any]:
@@ -211,7 +211,7 @@ class Filtered(Shader):
             "opacity": self.transfer.opacity.tolist(),
             "color": self.transfer.color.tolist(),
             "reference": self.transfer.reference,
-            "component": self.component or 0,
+            "component": self.component,
         }
 
     def colors(self, spacing: tuple[float, float, float]) -> Channel:
@@ -228,10 +228,11 @@ class Filtered(Shader):
         branching: int,
         depth: int,
         device: torch.device,
+        width: int,
         progress: Progress = no_progress,
     ) -> Iterator[Tensor]:
-        """Yields the colours of a volume's coarse levels, (z, y, x, 4 or 24) float16 on the CPU,
-        the finest of them first, worked out on a device; see `of`.
+        """Yields the colours of a volume's coarse levels, (z, y, x, width) float16 on the CPU, the
+        finest of them first, worked out on a device; see `of`. The width is 4 or 24.
         """
         field = VolumeField(volume, self.component or 0)
         sides = [branching ** (level + 1) for level in range(depth)]
@@ -239,7 +240,7 @@ class Filtered(Shader):
         out = [torch.empty((*n, 24), dtype=torch.float16, device=device) for n in shapes]
         self.write(field, volume.spacing, branching, out, device, progress)
         for colors in out:
-            yield self.kept(colors, volume.spacing).cpu()
+            yield (colors if width == 24 else mean_of_directions(colors)).cpu()
 
     def write(
         self,
@@ -253,22 +254,18 @@ class Filtered(Shader):
         """Writes the colours of coarse levels, worked out on a device, into tensors, which may be
         mapped from files; see `write_colors`.
         """
-        self._made_of = _content(self.transfer)
         smallest = min(spacing)
         tables = [self.transfer.table(_sampling(smallest, side / 2, device)) for side in spacing]
         write_colors(field, tables, [smallest / side for side in spacing], branching, out, progress)
-
-    def kept(self, colors: Tensor, spacing: tuple[float, float, float]) -> Tensor:
-        """Returns what the channel keeps of colours (..., 24): themselves, or their mean."""
-        return colors if self.colors(spacing).width == 24 else mean_of_directions(colors)
 
     def own_numbers(self, tree: N3Tree) -> FilteredNumbers:
         return FilteredNumbers(min(tree.spacing) * tree.side)
 
     def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
-        if self._made_of not in (None, _content(self.transfer)):
+        if tree.made_of.get(str(self.other), self.made_of) != self.made_of:
             raise ValueError(
-                f"{where}: the function was edited; make its colours anew: Filtered.of"
+                f"{where}: the colours {self.other!r} were made of another function or component, "
+                "or it was edited: make them anew (Filtered.of, Filtered.add_to, or a new producer)"
             )
         known = tree.bricks.channels.get(str(self.other), Channel(width=4))
         if known.width not in (4, 24):
@@ -292,11 +289,6 @@ class _StoreField:
     def read(self, low: Zyx, high: Zyx) -> Tensor:
         values = self._store.read_region(0, low, high, timeout=_TIMEOUT)[..., self._component]
         return torch.from_numpy(np.ascontiguousarray(values))
-
-
-def _content(transfer: TransferFunction) -> tuple[bytes, ...]:
-    reference = str(transfer.reference).encode()
-    return (transfer.opacity.tobytes(), transfer.color.tobytes(), reference)
 
 
 def _sampling(smallest: float, step: float, device: torch.device) -> Sampling:

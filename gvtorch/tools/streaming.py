@@ -57,6 +57,8 @@ class Streaming:
         filtered = shader if isinstance(shader, Filtered) else None
         if filtered is not None and look.tf is None:
             shader = filtered = Filtered.stored(store)
+        if filtered is not None and filtered.component != look.component:
+            raise ValueError(f"--component must be that of the colours, {filtered.component}")
         producer = StoredProducer(store, host_cache=self.host_cache, filtered=filtered)
         with Engine(
             producer,

@@ -51,6 +51,11 @@ class Tracer:
         if channel not in tree.bricks.bricks:
             known = ", ".join(tree.channel_names)
             raise ValueError(f"render: unknown channel {channel!r}; the tree has {known}")
+        other, first = tree.bricks.channels.get(str(shader.other)), tree.channel_names[0]
+        if other is not None and other.coarse and channel != first:
+            raise ValueError(
+                f"render: channel {shader.other!r} was made of {first!r}, not of {channel!r}"
+            )
         step = options.step * min(tree.spacing)
         most_intervals(float((tree.box[1] - tree.box[0]).norm()), step)
         self.tree, self.shader, self.channel = tree, shader, channel
