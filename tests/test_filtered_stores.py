@@ -38,13 +38,13 @@ def store(tmp_path):
     return tmp_path / "a.zarr"
 
 
-def check_streamed(path, volume, shader, size=8, **pools) -> None:
-    tree = gv.N3Tree.from_volume(volume, size)
+def check_streamed(path, volume, shader, size=8, device="cpu", **pools) -> None:
+    tree = gv.N3Tree.from_volume(volume, size, device=device)
     resident = gv.Filtered.of(
         *(tree, volume, shader.transfer), component=shader.component or 0, directions=None
     )
-    own = gv.Filtered.stored(path)
-    with gv.Engine(gv.StoredProducer(path, filtered=own), brick_size=size, **pools) as engine:
+    own, pools = gv.Filtered.stored(path), {"brick_size": size, "device": device, **pools}
+    with gv.Engine(gv.StoredProducer(path, filtered=own), **pools) as engine:
         for distance in (1.0, 4.0, 12.0):
             camera = gv.Camera.orbit(width=32, height=24, distance=distance)
             found, expected = engine.render(camera, own), gv.render(tree, camera, resident)
@@ -55,18 +55,19 @@ def check_streamed(path, volume, shader, size=8, **pools) -> None:
         engine.validate()
 
 
-@pytest.mark.backend("cpp")
 @pytest.mark.parametrize("size", [8, 16])
 @pytest.mark.parametrize("transfer", [MISTY, OPAQUE])
-def test_streamed_from_disk_equals_resident(store, transfer, size):
+def test_streamed_from_disk_equals_resident(compiled, store, transfer, size):
+    device = "cuda" if compiled == "cuda" else "cpu"
     before = {file: file.read_bytes() for file in store.rglob("*") if file.is_file()}
-    shader = gv.Filtered.add_to(store, transfer)
+    shader = gv.Filtered.add_to(store, transfer, device=device)
     assert not (store / WORK).exists()
     assert all(file.read_bytes() == content for file, content in before.items())
     width = 4 if transfer is MISTY else 24
     assert {n: c.width for n, c in gv.Store.open(store).coarse.items()} == {"filtered": width}
-    check_streamed(store, matter(), shader, size)
-    check_streamed(store, matter(), shader, size, brick_pool=60 * (size + 2) ** 3 * (2 * width))
+    check_streamed(store, matter(), shader, size, device)
+    pool = 60 * (size + 2) ** 3 * (2 * width)
+    check_streamed(store, matter(), shader, size, device, brick_pool=pool)
 
 
 @pytest.mark.backend("cpp")

@@ -1,9 +1,9 @@
 """Coarse channels of a store: what its coarse voxels hold beside their means, such as the colours
 of a `Filtered` shader. They are written into a store that is there already.
 
-    STORE.zarr/gvtorch/coarse/zarr.json    tells of each channel; written when it is whole
-    STORE.zarr/gvtorch/coarse/NAME.0/1   (gz, gy, gx, s, s, s, c) float16 bordered blocks of a
-                                           level, cut as the store's own; all are written
+    STORE.zarr/gvtorch/coarse/zarr.json        tells of each channel; written when it is whole
+    STORE.zarr/gvtorch/coarse/NAME.0/1 ...     (gz, gy, gx, s, s, s, c) float16 bordered blocks of
+                                               a level, cut as the store's own; all are written
 """
 
 from __future__ import annotations
