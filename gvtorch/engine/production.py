@@ -165,7 +165,7 @@ class Production:
         room, batches = self.cache.room(), self._under_way()
         for kind, free in room.items():
             for number in range(len(free)):
-                known = (b for b in batches if b.kind == kind and b.order == number)
+                known = (b for b in batches if b.kind == kind and b.coarse == number)
                 free[number] = max(0, free[number] - sum(map(len, known)))
         return room
 
@@ -183,7 +183,7 @@ class Production:
                     again, batch = batch[failed], batch[~failed]
                     self._mark(again)
                     self._skipped += len(again)
-                for part in batch.by_order():
+                for part in batch.by_slots():
                     answered += self._submit(part)
         return answered
 
@@ -378,7 +378,7 @@ class Production:
             self._fail(alone, "an ALIAS of an ALIAS whose brick is not here")
             return []
         made = RequestBatch(batch.source, batch.kind, alone.targets, alias[~there])
-        return [answered for part in made.by_order() for answered in self._submit(part)]
+        return [answered for part in made.by_slots() for answered in self._submit(part)]
 
     def _add_up(self, batch: RequestBatch, written: Written, stats: FrameStats) -> None:
         """Adds up what a write did; what found no slot may be asked for again."""

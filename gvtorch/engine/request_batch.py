@@ -48,25 +48,23 @@ class RequestBatch:
     kind: int
     targets: Targets  # nodes to fill, or to subdivide
     fill_loc: Tensor | None = None  # (k, 4) filled in their stead: alias targets
-    order: int = 0  # number of their order of use; see `Cache.lru`
+    coarse: bool = False  # their bricks take coarse slots
 
     def __len__(self) -> int:
         return len(self.targets)
 
-    def by_order(self) -> list[RequestBatch]:
-        """The batch; or, where its bricks take two kinds of slots, those of each kind there are."""
-        tree = self.source.tree
-        coarse_too = any(channel.coarse for channel in self.source.producer.channels.values())
-        if not len(self) or self.kind != REQUEST_LOAD or not coarse_too:
+    def by_slots(self) -> list[RequestBatch]:
+        """The batch; or, where its bricks take both kinds of slots, a batch for each."""
+        channels = self.source.producer.channels.values()
+        if not len(self) or self.kind != REQUEST_LOAD or not any(one.coarse for one in channels):
             return [self] if len(self) else []
-        coarse = self.loc[:, 3] < tree.depth
-        count = int(coarse.sum())
-        parts = []
-        for order, mask, size in ((0, ~coarse, len(self) - count), (1, coarse, count)):
+        coarse = self.loc[:, 3] < self.source.tree.depth
+        count, parts = int(coarse.sum()), []
+        for mask, size in ((~coarse, len(self) - count), (coarse, count)):
             if size:
                 row = torch.nonzero_static(mask, size=size)[:, 0]
                 part = self if size == len(self) else self[row]
-                parts.append(replace(part, order=order))
+                parts.append(replace(part, coarse=mask is coarse))
         return parts
 
     def __getitem__(self, index: slice | Tensor) -> RequestBatch:
@@ -78,7 +76,7 @@ class RequestBatch:
     @property
     def nodes(self) -> Nodes:
         """What the producer is asked about; made anew, for `Nodes` keep positions once computed."""
-        return Nodes(self.loc, self.source.layout, coarse=self.order > 0)
+        return Nodes(self.loc, self.source.layout, coarse=self.coarse)
 
     @cached_property
     def loc(self) -> Tensor:
