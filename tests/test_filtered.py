@@ -339,6 +339,19 @@ def test_mistakes_of_a_producer_with_coarse_channels_are_told():
         assert "which only bricks above the finest level hold" in engine.failures[0].message
 
 
+def test_a_coarse_channel_is_for_those_who_know_it():
+    tree, shader = filtered(SHADER)
+    rays = camera_rays(tree, 3)
+    module = gv.ModuleShader(torch.nn.Identity(), channels=["filtered"])
+    others = (gv.StoredColor("filtered"), gv.Lit(SHADER, normals="filtered"), module)
+    for other in (*others, gv.Features(SHADER, "filtered")):
+        with pytest.raises(ValueError, match="only coarse bricks have channel 'filtered'"):
+            gv.trace(tree, rays, other)
+    with pytest.raises(ValueError, match="only coarse bricks have channel 'filtered'"):
+        gv.trace(tree, rays, SHADER, channel="filtered")
+    gv.trace(tree, rays, shader)
+
+
 def test_mistakes_are_told():
     volume = matter()
     tree = gv.N3Tree.from_volume(volume, 4)

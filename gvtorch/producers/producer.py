@@ -8,17 +8,17 @@ Source: Crassin et al., "GigaVoxels", I3D 2009, section 5; Crassin, PhD thesis 2
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, Self
+from typing import Any, Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.volume import movable
+from ..base.volume import Volume, movable
 from ..pool import Channel
 from ..pool.pools import phrase
 from ..pool.pyramid import tree_depth
@@ -252,6 +252,33 @@ class Bricks(Answer):
     constants: Mapping[str, Tensor] = field(default_factory=dict)  # as in `Regions`
     alias: Tensor | None = None  # as in `Regions`
     errors: Mapping[int, str] = field(default_factory=dict, repr=False)  # as in `Regions`
+
+
+@runtime_checkable
+class CoarseColors(Protocol):
+    """What makes a coarse channel: `Filtered`, which stands on the same floor, has this form."""
+
+    other: str | None  # name of the channel
+    component: int | None  # which number of a voxel it is made of
+
+    @property
+    def made_of(self) -> Mapping[str, Any]:
+        """What it is made of, as plain values."""
+
+    def colors(self, spacing: tuple[float, float, float]) -> Channel:
+        """Returns the channel, for voxels of this size."""
+
+    def levels(
+        self, volume: Volume, branching: int, depth: int, device: torch.device, width: int
+    ) -> Iterator[Tensor]:
+        """Yields (z, y, x, width) of the coarse levels, the finest of them first, on the CPU."""
+
+
+def check_filtered(where: str, value: Any) -> None:
+    """Raises ValueError unless a user's argument has the form of `CoarseColors`."""
+    if not isinstance(value, CoarseColors):
+        kind = type(value).__name__
+        raise ValueError(f"{where}: filtered must be a Filtered, got {kind}")
 
 
 class Producer(torch.nn.Module):

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +23,16 @@ from ..pool import Channel
 from ..pool.downsample import pool_mean
 from ..pool.pyramid import NodeSummary
 from .answer import regions_of
-from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
+from .producer import (
+    Bricks,
+    CoarseColors,
+    Layout,
+    Nodes,
+    Producer,
+    Region,
+    Regions,
+    check_filtered,
+)
 
 _TILE = 32  # cells along a side of what is read at once
 _GROUP_BYTES = 32 * 10**6  # of cubes held at a time beside the cache
@@ -105,16 +114,6 @@ class _Cubes:
         return self.bricks * self.brick_size
 
 
-class StoredColors(Protocol):
-    """What colours of a store are made of: `Filtered` tells."""
-
-    other: str | None  # name of the channel
-
-    @property
-    def made_of(self) -> Mapping[str, Any]:
-        """The function and what else matters, as JSON."""
-
-
 class StoredProducer(Producer):
     """Streams a `gvtorch convert` store, or any OME-Zarr image. Its channel is "value"."""
 
@@ -130,7 +129,7 @@ class StoredProducer(Producer):
         image: str | None = None,
         time: int = 0,
         channels: Sequence[int] | None = None,
-        filtered: StoredColors | None = None,
+        filtered: CoarseColors | None = None,
     ) -> None:
         """Opens the store and starts the threads.
 
@@ -162,9 +161,7 @@ class StoredProducer(Producer):
             value_range[_CHANNEL] = (min(lows), max(highs))
         kinds, made_of = {_CHANNEL: Channel(store.dtype, store.width)}, dict[str, Any]()
         if filtered is not None:
-            if not hasattr(filtered, "made_of"):
-                kind = type(filtered).__name__
-                raise ValueError(f"StoredProducer: filtered must be a Filtered, got {kind}")
+            check_filtered("StoredProducer", filtered)
             if not store.all_channels:
                 raise ValueError(
                     f"{store.location}: filtered colours are of all channels: leave channels out"

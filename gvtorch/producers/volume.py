@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any, Literal, Protocol
+from collections.abc import Mapping
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -16,28 +16,9 @@ from ..pool.pools import volumes_by_channel
 from ..pool.pyramid import Level, NodeSummary, levels_by_depth
 from ..pool.staging import wide_rows
 from .answer import regions_of
-from .producer import Bricks, Layout, Nodes, Producer, Regions
+from .producer import Bricks, CoarseColors, Layout, Nodes, Producer, Regions, check_filtered
 
 _BATCH = 4096  # bricks cut from a level at a time
-
-
-class CoarseColors(Protocol):
-    """What makes a coarse channel of a volume: `Filtered` does."""
-
-    other: str | None  # name of the channel
-    component: int | None  # which number of a voxel it is made of
-
-    @property
-    def made_of(self) -> Mapping[str, Any]:
-        """What it is made of, as plain values."""
-
-    def colors(self, spacing: tuple[float, float, float]) -> Channel:
-        """Returns the channel, for voxels of this size."""
-
-    def levels(
-        self, volume: Volume, branching: int, depth: int, device: torch.device, width: int
-    ) -> Iterator[Tensor]:
-        """Yields (z, y, x, width) of the coarse levels, the finest of them first, on the CPU."""
 
 
 class VolumeProducer(Producer):
@@ -71,9 +52,7 @@ class VolumeProducer(Producer):
         first = next(iter(volumes.values()))
         channels = {name: Channel.of(volume) for name, volume in volumes.items()}
         if filtered is not None:
-            if not hasattr(filtered, "levels"):
-                kind = type(filtered).__name__
-                raise ValueError(f"VolumeProducer: filtered must be a Filtered, got {kind}")
+            check_filtered("VolumeProducer", filtered)
             name, last = str(filtered.other), first.data.shape[3] - 1
             what = "component of filtered"
             check.whole("VolumeProducer", what, filtered.component, low=0, high=last)

@@ -21,16 +21,14 @@ _TILE_VOXELS = {"cpu": 1 << 17, "cuda": 1 << 20}  # whose columns are worked out
 _LEAST = 0.001  # weight of a column that no light comes to
 _DIRECTIONS = 6
 
-Zyx = tuple[int, int, int]
-
 
 class Field(Protocol):
     """The finest voxels, which may be more than memory holds."""
 
-    shape: Zyx
+    shape: tuple[int, int, int]  # z, y, x
     across: int  # voxels that are read at once on either side of what they are read along
 
-    def read(self, low: Zyx, high: Zyx) -> Tensor:
+    def read(self, low: Sequence[int], high: Sequence[int]) -> Tensor:
         """Returns a box (z, y, x) on the CPU; beyond the field its outermost voxels repeat."""
 
 
@@ -44,7 +42,8 @@ class VolumeField:
         z, y, x = self._values.shape
         self.shape = (z, y, x)
 
-    def read(self, low: Zyx, high: Zyx) -> Tensor:
+    def read(self, low: Sequence[int], high: Sequence[int]) -> Tensor:
+        """See `Field`."""
         found = movable(self._values)
         for axis, (first, end, size) in enumerate(zip(low, high, self.shape, strict=True)):
             if first >= 0 and end <= size:
@@ -148,7 +147,7 @@ def _parts(field: Field, along: int, tile: int) -> Iterator[tuple[int, int, Tens
         low, high = [0, 0, 0], list(size)
         for axis, first in zip(sides, corner, strict=True):
             low[axis], high[axis] = first - 1, min(first + slab, size[axis]) + 1
-        values = field.read(tuple(low), tuple(high)).movedim(along, 0)  # type: ignore[arg-type]
+        values = field.read(low, high).movedim(along, 0)
         _, *ends = values.shape
         for a, b in itertools.product(*(range(0, end - 2, tile) for end in ends)):
             yield corner[0] + a, corner[1] + b, values[:, a : a + tile + 2, b : b + tile + 2]

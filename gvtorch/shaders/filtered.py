@@ -29,7 +29,7 @@ from ..io.store_layout import CoarseChannel
 from ..ops import ShadeArguments, cut_bricks
 from ..ops.shading import FilteredNumbers
 from ..pool import Channel, N3Tree
-from .coarse_colors import Field, VolumeField, Zyx, mean_of_directions, write_colors
+from .coarse_colors import Field, VolumeField, mean_of_directions, write_colors
 from .shader import Sampling, Shader
 from .transfer_function import TransferFunction
 
@@ -46,7 +46,7 @@ class Filtered(Shader):
     Levels are chosen 1.6 times as fine as for other shaders, whose wide cones have to filter.
     """
 
-    kind = "Filtered"
+    kind, reads_coarse = "Filtered", True
     finer = 1.6  # a fine voxel is at least five eighths of an interval
     transfer: TransferFunction
 
@@ -286,7 +286,8 @@ class _StoreField:
         x, y, z = store.extent
         self.shape = (z, y, x)
 
-    def read(self, low: Zyx, high: Zyx) -> Tensor:
+    def read(self, low: Sequence[int], high: Sequence[int]) -> Tensor:
+        """See `Field`."""
         values = self._store.read_region(0, low, high, timeout=_TIMEOUT)[..., self._component]
         return torch.from_numpy(np.ascontiguousarray(values))
 

@@ -86,6 +86,7 @@ class Shader:
         normals: Name of a channel of 3 numbers that holds normals; None: the gradient's.
         other: Name of a second channel that it reads, or None.
         other_component: Which number of it colours a surface.
+        reads_coarse: The second channel may be a coarse one, which only coarse bricks have.
         finer: Levels are chosen as if voxels were so many times as large as they are.
         whole_ray: It must see a ray in one go: what cuts rays into pieces refuses it.
         uses_torch: Its colours are made in torch, outside of the kernel. The host waits for the
@@ -100,6 +101,7 @@ class Shader:
     normals: str | None = None
     other: str | None = None
     other_component: int = 0
+    reads_coarse: bool = False
     finer: float = 1.0
     whole_ray: bool = False
     uses_torch: bool = False
@@ -161,6 +163,8 @@ class Shader:
             if name not in channels:
                 known = ", ".join(tree.channel_names)
                 raise ValueError(f"{where}: unknown channel {name!r}; the tree has {known}")
+            if channels[name].coarse and not (self.reads_coarse and name == self.other):
+                raise ValueError(f"{where}: only coarse bricks have channel {name!r}")
         if self.kind is None:
             return None
         if self.normals is not None and channels[self.normals].width != 3:

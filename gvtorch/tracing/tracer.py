@@ -51,6 +51,8 @@ class Tracer:
         if channel not in tree.bricks.bricks:
             known = ", ".join(tree.channel_names)
             raise ValueError(f"render: unknown channel {channel!r}; the tree has {known}")
+        if tree.bricks.channels[channel].coarse:
+            raise ValueError(f"render: only coarse bricks have channel {channel!r}")
         other, first = tree.bricks.channels.get(str(shader.other)), tree.channel_names[0]
         if other is not None and other.coarse and channel != first:
             raise ValueError(
