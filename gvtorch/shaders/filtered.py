@@ -46,7 +46,8 @@ class Filtered(Shader):
     Levels are chosen 1.6 times as fine as for other shaders, whose wide cones have to filter.
     """
 
-    kind, reads_coarse = "Filtered", True
+    kind = "Filtered"
+    reads_coarse = True
     finer = 1.6  # a fine voxel is at least five eighths of an interval
     transfer: TransferFunction
 
