@@ -202,7 +202,7 @@ TF = '{"opacity": [[5, 0], [1, 1]]}'
             "opacity values must increase",
         ),
         (lambda t, s: [s, "--step", "0"], "step must be finite and > 0"),
-        (lambda t, s: [s, "--step", "1e-9"], "intervals"),
+        (lambda t, s: [s, "--step", "1e-20"], "intervals"),
         (lambda t, s: [s, "--background", "1,1"], "--background must be 3 numbers"),
         (lambda t, s: [s, "--clip", "ball:1"], "--clip must hold plane:, box:, cut: or caps"),
         (lambda t, s: [s, "--clip", "plane:1,0,0"], "--clip plane must be 4 numbers"),

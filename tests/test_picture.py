@@ -325,7 +325,7 @@ def test_wrong_arguments_are_named(blobs):
     with pytest.raises(ValueError, match="unknown channel 'density'; the tree has value"):
         gv.render(tree, camera, shader, channel="density")
     with pytest.raises(ValueError, match="intervals"):
-        gv.render(tree, camera, shader, step=1e-9)
+        gv.render(tree, camera, shader, step=1e-20)
     with pytest.raises(ValueError, match=r"can't be used here|does not run"):
         gv.render(tree, camera, shader, backend="cuda")
 

@@ -22,8 +22,15 @@ STEP = 0.5
 #: Most voxels that a volume read at once may have (2^31).
 MAX_VOXELS = 2**31
 
-#: Most intervals on one ray: their number is kept in a float32.
+#: Most intervals that a ray counts from one base: their number is kept in a float32.
 MAX_INTERVALS = 2**23
+
+#: Above so many voxels a side of the root cube, places are worked out in float64: float32 would
+#: tell them to 1/128 of a voxel at best.
+DEEP_VOXELS = 2**18
+
+#: Most nodes of the finest level along a side of the root cube: float64 counts them.
+MOST_NODES = 2**50
 
 #: Node words, see cpp_ext/csrc/walk/tree.h.
 ABSENT = -1

@@ -10,7 +10,6 @@ return the sizes that the letters of shapes stand for.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
@@ -51,6 +50,11 @@ def check_channel(where: str, arguments: TraceArguments, device: torch.device) -
     place = _fields(arguments, torch.float64, "place_33")
     sizes = check.tensors(where, device, place + fields)
     check.whole(where, "max_depth", arguments.max_depth, low=0, high=62)
+    if arguments.branching**arguments.max_depth > config.MOST_NODES:
+        raise ValueError(
+            f"{where}: branching {arguments.branching} and max_depth {arguments.max_depth} make "
+            f"more than 2^50 nodes a side"
+        )
     check.whole(where, "border", arguments.border, low=0, high=(sizes["s"] - 1) // 2)
     check.number(where, "root_voxel", arguments.root_voxel, low=0, open_low=True)
     check.number(where, "step", arguments.step, low=0, open_low=True)
@@ -353,14 +357,3 @@ def op_of(name: str | None) -> Any:
     if name is None:
         return torch.ops.gvtorch.shade_rays
     return getattr(torch.ops.gvtorch_user, name)
-
-
-def most_intervals(length: float, step: float) -> int:
-    """Returns how many intervals a ray of `length` has; raises ValueError if they are too many."""
-    count = math.ceil(length / step)
-    if count > config.MAX_INTERVALS:
-        raise ValueError(
-            f"step: {step:g} world units cuts a ray of {length:g} into {count} intervals, "
-            f"more than {config.MAX_INTERVALS}"
-        )
-    return count

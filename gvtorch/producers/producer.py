@@ -161,19 +161,42 @@ class Nodes:
     def axes(self) -> tuple[Tensor, Tensor, Tensor]:
         """float32 world coordinates of the voxel centres along x (k, 1, 1, s), y (k, 1, s, 1) and
         z (k, s, 1, 1), border included. A function of them broadcasts to (k, z, y, x) and reads a
-        hundredth of the memory that `positions` take.
+        hundredth of the memory that `positions` take. In worlds of more than about 2^20 voxels a
+        side float32 can't tell neighbours apart: see `local_axes`.
         """
-        x, y, z = self._places.unbind(1)
-        return x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]
+        return _broadcast(self._places)
+
+    @property
+    def local_axes(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The same from the brick's `center` on: exact at any depth. `center` is float64, so that
+        `nodes.center[:, 0, None, None, None] + x` gives world coordinates in float64.
+        """
+        return _broadcast(self._local)
 
     @property
     def positions(self) -> Tensor:
         """(k, z, y, x, 3) float32 world positions of the voxel centres, border included."""
-        if "positions" not in self._known:
-            side = self.layout.side
-            places = self._places.flatten(1).index_select(1, self.layout.grid.to(self.loc.device))
-            self._known["positions"] = places.view(-1, side, side, side, 3)
-        return self._known["positions"]
+        return self._grid("positions", self._places)
+
+    @property
+    def local_positions(self) -> Tensor:
+        """(k, z, y, x, 3) float32, the same from the brick's `center` on: see `local_axes`."""
+        return self._grid("local_positions", self._local)
+
+    def _grid(self, name: str, places: Tensor) -> Tensor:
+        """(k, z, y, x, 3) of (k, 3, s) coordinates along each axis, kept under a name."""
+        if name not in self._known:
+            side, grid = self.layout.side, self.layout.grid.to(places.device)
+            flat = places.flatten(1).index_select(1, grid)
+            self._known[name] = flat.view(-1, side, side, side, 3)
+        return self._known[name]
+
+    @property
+    def _local(self) -> Tensor:
+        """(k, 3, s) float32 coordinates along each axis of the voxel centres from `center` on."""
+        middle = 0.5 * (self.layout.brick_size - 1)
+        reach = self.layout.reach.to(self.loc.device) - middle
+        return (self.voxel_size[:, :, None] * reach).to(torch.float32)
 
     @property
     def _places(self) -> Tensor:
@@ -196,6 +219,12 @@ class Nodes:
             f"Nodes({len(self)} on {self.loc.device}, "
             f"bricks of {layout.brick_size}^3+{layout.border}, tree depth {layout.depth})"
         )
+
+
+def _broadcast(places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """(k, 3, s) coordinates along each axis, so that they broadcast to (k, z, y, x)."""
+    x, y, z = places.unbind(1)
+    return x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]
 
 
 class Answer:

@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from .. import ops
+from ..base.constants import MAX_INTERVALS
 from ..base.records import Hits, Rays
-from ..ops.trace import choose_backend, most_intervals
+from ..ops.trace import choose_backend
 from ..pool import N3Tree
 from ..shaders.module import PART_SAMPLES, ModuleShader
 from ..shaders.shader import Sampling, Shader, check_shader, interval_levels
@@ -59,7 +60,7 @@ class Tracer:
                 f"render: channel {shader.other!r} was made of {first!r}, not of {channel!r}"
             )
         step = options.step * min(tree.spacing)
-        most_intervals(float((tree.box[1] - tree.box[0]).norm()), step)
+        _check_step(tree, step, options)
         self.tree, self.shader, self.channel = tree, shader, channel
         if frame_1 is None:
             frame_1 = torch.full((1,), tree.frame, dtype=torch.int32, device=tree.device)
@@ -137,6 +138,23 @@ class Tracer:
         parts = [vars(block(rays[at : at + size])) for at in range(0, count, size)]
         given = [name for name, field in parts[0].items() if field is not None]
         return Hits(**{name: torch.cat([part[name] for part in parts]) for name in given})
+
+
+def _check_step(tree: N3Tree, step: float, options: RenderOptions) -> None:
+    """Raises ValueError where the ends of intervals can't be told apart. Those of cones can: an
+    interval is about as long as its cone is wide, and a distance is known far better than that.
+    """
+    length = float((tree.box[1] - tree.box[0]).norm())
+    most, hint = 2**46, "take a longer step"
+    if options.lod == "finest":
+        most, hint = 2**50, "lod='auto' takes longer ones where voxels are small"
+        if options.dtype == torch.float32:
+            most, hint = MAX_INTERVALS, f"{hint}; dtype=torch.float64 tells more apart"
+    if not length / step <= most:
+        raise ValueError(
+            f"render: step cuts a ray of {length:g} into {length / step:.4g} intervals of "
+            f"{step:g}, more than {most:.4g} ({hint})"
+        )
 
 
 @dataclass(frozen=True)

@@ -64,18 +64,19 @@ struct OneShader {
   }
   static void run(const Tensor& like, ShadeArgs args, bool wide) {
     const auto each = [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); };
-    if (wide) return each(ShadeRay<double, CalledShader<UserShaderOf, double>>(args));
+    if (wide) return each(ShadeRay<double, CalledShader<UserShaderOf, double>, Digits<double>>(args));
 #ifdef GV_PACKETS
     if (packs(args)) {
       return trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) {
         trace_packets<CalledShader<UserShaderOf, float>, AnyValues>(args, begin, end);
       });
     }
-    constexpr bool powers = false;  // what is left is mostly of another N
+    each(ShadeRay<float, CalledShader<UserShaderOf, float>, Digits<float>>(args));  // what is left is mostly deep
 #else
-    constexpr bool powers = true;
+    with_digits<float>(args, [&](auto* digits) {
+      each(ShadeRay<float, CalledShader<UserShaderOf, float>, std::decay_t<decltype(*digits)>>(args));
+    });
 #endif
-    each(ShadeRay<float, CalledShader<UserShaderOf, float>, false, powers>(args));
   }
 };
 

@@ -56,7 +56,7 @@ class Visit(Answer):
         """Rays that have not looked up any node yet."""
         zero, no = torch.zeros_like(like), torch.zeros_like(like, dtype=torch.bool)
         word = zero.to(torch.int64)
-        holder = Holder(word, word, word, torch.stack((zero,) * 3, 1), zero + 1)
+        holder = Holder(word, word, word, torch.stack((zero,) * 3, 1).double(), zero)
         return cls(holder, holder, zero, zero, zero, word, no, zero, no, no)
 
     def stays(self, at: Intervals) -> Tensor:
@@ -90,12 +90,11 @@ class Probe:
         is the world size of the root cube.
         """
         channel = self.channel
-        side = channel.bricks_bzyxc.shape[1] - 2 * channel.border
 
         def slope(axis: int, holder: Holder) -> Tensor:
             shifts = [[way if a == axis else 0.0 for a in range(3)] for way in (-0.5, 0.5)]
             low, high = (channel.sample(holder, self.beam, t, shift) for shift in shifts)
-            return (high - low) * (divide(side, holder.size, holder.size) / cube[axis])
+            return (high - low) * (holder.scale / cube[axis])
 
         return torch.stack([self.blend(t, partial(slope, axis)) for axis in range(3)], 1)
 
@@ -318,8 +317,7 @@ class Walk:
         nothing = unseen | (found.fine < 0) | (empty & (not visitor.sees_empty))
         same = visitor.same(fine.node.clamp(min=0), coarse.node.clamp(min=0))
         uniform = ~nothing & (fine.brick < 0) & (coarse.brick < 0) & same
-        corner, size = tree.levels.corner(position, found.depth), tree.levels.size_d[found.depth]
-        leave = beam.leave(corner, size)
+        leave = beam.leave(*tree.levels.corners(position, found.depth))
         visit = Visit(fine, coarse, voxel, above, t, wanted, reaches, leave, nothing, uniform)
         self.visit = self.visit.index_put((which,), visit)
         self.visits = self.visits.index_add(0, which, torch.ones_like(which, dtype=torch.int32))

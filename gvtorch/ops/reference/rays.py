@@ -9,7 +9,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from ...base.constants import MAX_INTERVALS
+from ...base.constants import DEEP_VOXELS, MAX_INTERVALS
 from ..arguments import RayArguments, TraceArguments
 from .exact import clamp, divide, larger, smaller
 
@@ -35,8 +35,10 @@ class Beam(Rows):
     """Rays in tree units, begun where they enter the scene; distances stay world lengths."""
 
     origin: Tensor  # (r, 3)
+    rest: Tensor  # (r, 3) what rounding took from it where the tree is deep, else 0
+    deep: Tensor  # (r,) bool, see `is_deep`
     direction: Tensor  # (r, 3)
-    high: Tensor  # (r, 3) corner of the scene; its low corner is 0
+    high: Tensor  # (r, 3) float64 corner of the scene; its low corner is 0
     cone_near: Tensor  # (r,)
     cone_growth: Tensor  # (r,)
     first: Tensor  # (r,)
@@ -55,17 +57,23 @@ class Beam(Rows):
             near = torch.where(direction[:, axis] != 0, entry, near)
         moved = torch.where((near > 0) & (near < INF), near, 0.0)
         near_cone, growth = (rays.cone_r2 * a.cone_scale).unbind(1)
+        deep = torch.full_like(moved, is_deep(a), dtype=torch.bool)
         columns = (
-            origin + moved[:, None] * direction,
             direction,
-            high.expand_as(origin),
             near_cone + growth * moved,
             growth,
             rays.range_r2[:, 0] - moved,
             rays.range_r2[:, 1] - moved,
             moved,
         )
-        return cls(*(column.to(real) for column in columns)).clipped()
+        way, *numbers = (column.to(real) for column in columns)
+        start = split(origin + moved[:, None] * direction, deep, real)
+        return cls(*start, deep, way, high.expand_as(origin), *numbers).clipped()
+
+    @property
+    def place(self) -> Tensor:
+        """(r, 3) float64 places where the rays begin."""
+        return self.origin.double() + self.rest.double()
 
     def clipped(self) -> Beam:
         """The same with distances cut at the scene (slab test, Kay and Kajiya, 1986); what no face
@@ -73,11 +81,12 @@ class Beam(Rows):
         """
         first, last = self.first, self.last
         for axis in range(3):
-            columns = (self.origin, self.direction, self.high)
-            origin, direction, high = (column[:, axis] for column in columns)
-            a, b = -origin / direction, (high - origin) / direction
+            columns = (self.place, self.direction, self.high)
+            place, direction, high = (column[:, axis] for column in columns)
+            to_high = (high - place).to(direction)
+            a, b = -self.origin[:, axis] / direction, to_high / direction
             flat = direction == 0
-            beside = flat & ~((origin >= 0) & (origin <= high))
+            beside = flat & ~((place >= 0) & (place <= high))
             last = torch.where(beside, first, last)
             first = torch.where(flat, first, larger(first, smaller(a, b)))
             last = torch.where(flat, last, smaller(last, larger(a, b)))
@@ -87,19 +96,46 @@ class Beam(Rows):
         """(r,) world widths of the cones at distances t (r,)."""
         return self.cone_near + self.cone_growth * t
 
-    def at(self, t: Tensor) -> Tensor:
-        """(r, 3) places inside the root cube at distances t (r,): a place on the scene's high face
-        belongs to the scene.
-        """
-        inside = self.high * torch.tensor(0.9999999).to(self.high)
-        return clamp(self.origin + t[:, None] * self.direction, 0, inside)
+    def along(self, t: Tensor) -> Tensor:
+        """(r, 3) float64 places at distances t (r,), worked out in float64 in deep trees."""
+        near = (self.origin + t[:, None] * self.direction).double()
+        exact = self.place + t[:, None].double() * self.direction.double()
+        return torch.where(self.deep[:, None], exact, near)
 
-    def leave(self, corner: Tensor, size: Tensor) -> Tensor:
-        """(r,) distances at which rays leave boxes (+inf without a direction)."""
-        face = torch.where(self.direction > 0, corner + size[:, None], corner)
+    def at(self, t: Tensor) -> Tensor:
+        """The same inside the root cube: a place on the scene's high face belongs to the scene."""
+        high = self.high.to(self.origin)
+        inside = (high * torch.tensor(0.9999999).to(high)).double()
+        inside = torch.where(self.deep[:, None], self.high * (1 - 2.0**-50), inside)
+        return clamp(self.along(t), 0, inside)
+
+    def leave(self, low: Tensor, high: Tensor) -> Tensor:
+        """(r,) distances at which rays leave boxes, told by float64 corners (r, 3); +inf without a
+        direction.
+        """
+        face = torch.where(self.direction > 0, high, low)
         inverse = divide(1.0, self.direction, self.direction)
-        t = torch.where(self.direction == 0, INF, (face - self.origin) * inverse)
-        return smaller(smaller(smaller(torch.full_like(size, INF), t[:, 0]), t[:, 1]), t[:, 2])
+        way = (face - self.place).to(self.direction)
+        x, y, z = torch.where(self.direction == 0, INF, way * inverse).unbind(1)
+        return smaller(smaller(smaller(torch.full_like(x, INF), x), y), z)
+
+
+def is_deep(a: TraceArguments) -> bool:
+    """Whether places are worked out in float64: where the root cube has more than 2^18 voxels a
+    side, and where N is no power of two, so that no float32 is the corner of a node.
+    """
+    brick = a.bricks_bzyxc.shape[1] - 2 * a.border
+    power = a.branching & (a.branching - 1) == 0
+    return not power or brick * a.branching**a.max_depth > DEEP_VOXELS
+
+
+def split(place: Tensor, deep: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Float64 places (r, 3) as a number of `real` and what rounding takes, which only the deep
+    ones (r,) keep.
+    """
+    origin = place.to(real)
+    rest = torch.where(deep[:, None], place - origin.double(), 0)
+    return origin, rest.to(real)
 
 
 class Intervals:
@@ -153,7 +189,7 @@ class Intervals:
 
     def inside(self) -> Tensor:
         """(r,) bool: the interval lies before the far side."""
-        return (self.start < self.beam.last) & (self.count < MAX_INTERVALS)
+        return self.start < self.beam.last
 
     def next(self, move: Tensor) -> None:
         """Goes to the next interval where `move` (r,) is true."""
@@ -168,7 +204,11 @@ class Intervals:
         short, long = self.level > 0, self.level < top
         fits = (~short | ~(width < self.length)) & (~long | ~(width >= self.length + self.length))
         level = (width[:, None] >= self.length_l[1:]).sum(1)
-        change = move & ~fits
+        full = self.count >= MAX_INTERVALS  # as many as are counted from one base
+        self.start = torch.where(
+            move & full & ~(self.start > self.base), self.beam.last, self.start
+        )
+        change = move & (full | ~fits)
         self.base = torch.where(change, self.start, self.base)
         self.count = torch.where(change, 0.0, self.count)
         self.level = torch.where(change, level, self.level)

@@ -12,7 +12,7 @@ from torch import Tensor
 from ..arguments import RayArguments, Samples, Segments, TraceArguments
 from .march import Answer, Piece, Probe, Transfer, Visitor, Walk
 from .rays import Beam
-from .tree import Bricks, Holder, Levels
+from .tree import Bricks, Levels
 
 _PIECE = -1  # level of an interval of any length
 
@@ -115,7 +115,7 @@ def sample_bricks(
     nodes, bricks, depths = (word.to(torch.int64)[segment].unbind(1) for word in words)
     levels, place = Levels(a, real), beam.at(seen)
     fine, coarse = (
-        Holder(node, brick, depth, levels.corner(place, depth), levels.size_d[depth])
+        levels.holder(node, brick, depth, place)
         for node, brick, depth in zip(nodes, bricks, depths[:2], strict=True)
     )
     channel = Bricks.of(a)

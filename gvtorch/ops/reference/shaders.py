@@ -27,9 +27,9 @@ from ..shading import (
     ShadeParameters,
     StoredColorNumbers,
 )
-from .exact import clamp, divide, dot, larger, power, sqrt_exact, stretch, unit
+from .exact import clamp, dot, larger, power, sqrt_exact, stretch, unit
 from .march import Piece, Plain, Probe, Visitor, Walk, above, below, mix
-from .rays import INF, Intervals
+from .rays import INF, Intervals, split
 from .tree import Bricks, Holder
 
 _BISECTIONS = 4
@@ -112,9 +112,11 @@ class Shadows:
         """
         which = where.nonzero()[:, 0]
         t, way, eye = t[which], way[which], self.walk.at.beam[which]
+        origin, rest = split(eye.along(t), eye.deep, t.dtype)
         beam = replace(
             eye,
-            origin=eye.origin + t[:, None] * eye.direction,
+            origin=origin,
+            rest=rest,
             direction=way / self.cube,
             cone_near=eye.cone(t),
             cone_growth=growth[which] * self.cone_scale,
@@ -445,10 +447,8 @@ class Filtered(Shade):
         along, width = self.light.along, len(self.others)
         seen = [_by_direction(along, width, i, number) for i in range(4)]
         whole = clamp(seen[3], 0, 1)
-        inner = self.channel.bricks_bzyxc.shape[1] - 2 * self.channel.border
-        scale = divide(inner, holder.size, holder.size)
         side = self.light.parameters.own_as(FilteredNumbers).side
-        alpha = stretch(whole, piece.length * scale / side)
+        alpha = stretch(whole, piece.length * holder.scale / side)
         part = alpha / torch.where(whole > 0, whole, 1.0)
         colors = torch.stack([*(one * part for one in seen[:3]), alpha], 1)
         colors = torch.where((whole > 0)[:, None], colors, 0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -11,23 +11,22 @@ from torch import Tensor
 
 from ...base.constants import ABSENT, REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
 from ..arguments import TraceArguments
-from .exact import clamp, divide, smaller
+from .exact import clamp, smaller
 from .rays import INF, Beam, Rows
 
 
 class Levels:
-    """The sizes of nodes and voxels at each depth, from the root's by repeated division."""
+    """The nodes and voxels of each depth."""
 
     def __init__(self, a: TraceArguments, real: torch.dtype) -> None:
-        device = a.place_33.device
-        size = [torch.ones((), dtype=real, device=device)]
-        voxel = [torch.tensor(a.root_voxel, dtype=real, device=device)]
-        for _ in range(a.max_depth):
-            size.append(divide(size[-1], a.branching, size[-1]))
-            voxel.append(divide(voxel[-1], a.branching, voxel[-1]))
+        counts = [float(a.branching**depth) for depth in range(a.max_depth + 1)]
         self.branching = a.branching
-        self.size_d = torch.stack(size)  # (d,) side of a node, tree units
-        self.voxel_d = torch.stack(voxel)  # (d,) side of a voxel, world units
+        self.count_d = torch.tensor(counts, dtype=torch.float64, device=a.place_33.device)
+        # (d,) nodes along a side of the root cube, and the side of a node in tree units
+        self.size_d = 1 / self.count_d
+        brick = a.bricks_bzyxc.shape[1] - 2 * a.border
+        self.scale_d = (brick * self.count_d).to(real)  # (d,) voxels a tree unit
+        self.voxel_d = (a.root_voxel / self.count_d).to(real)  # (d,) side of a voxel, world units
 
     def wanted(self, cone: Tensor) -> Tensor:
         """(r,) first depths whose voxels are not wider than the cone: the level of detail."""
@@ -38,22 +37,21 @@ class Levels:
         above = torch.where(depth > 0, self.voxel_d[(depth - 1).clamp(min=0)], INF)
         return self.voxel_d[depth], above
 
-    def digits(self, position_r3: Tensor) -> Iterator[Tensor]:
-        """Yields (r, 3) digits x, y, z of places, from depth 1 on: which child, along each axis."""
-        local = position_r3
-        for _ in range(len(self.size_d) - 1):
-            scaled = local * self.branching
-            digit = clamp(torch.floor(scaled), 0, self.branching - 1)
-            local = scaled - digit
-            yield digit
+    def cells(self, position_r3: Tensor, depth: Tensor) -> Tensor:
+        """(r, 3) int64 places x, y, z of the nodes at a depth (r,) in which float64 places lie."""
+        finest = torch.floor(position_r3 * self.count_d[-1]).to(torch.int64)
+        up = self.count_d[len(self.count_d) - 1 - depth].to(torch.int64)
+        return finest // up[:, None]
 
-    def corner(self, position_r3: Tensor, depth: Tensor) -> Tensor:
-        """(r, 3) low corners of the nodes at a depth in which places lie."""
-        corner = torch.zeros_like(position_r3)
-        for level, digit in enumerate(self.digits(position_r3), 1):
-            inside = (depth >= level)[:, None]
-            corner = torch.where(inside, corner + digit * self.size_d[level], corner)
-        return corner
+    def corners(self, position_r3: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
+        """(r, 3) float64 low and high corners of these nodes."""
+        cell, size = self.cells(position_r3, depth), self.size_d[depth, None]
+        return cell * size, (cell + 1) * size
+
+    def holder(self, node: Tensor, brick: Tensor, depth: Tensor, position_r3: Tensor) -> Holder:
+        """Nodes (r,) with their brick words, found at a depth around places."""
+        corner, _ = self.corners(position_r3, depth)
+        return Holder(node, brick, depth, corner, self.scale_d[depth])
 
 
 @dataclass
@@ -63,8 +61,8 @@ class Holder(Rows):
     node: Tensor  # (r,) int64; -1: no node answers
     brick: Tensor  # (r,) int64 slot, or the node's brick word below 0
     depth: Tensor  # (r,) int64
-    corner: Tensor  # (r, 3) tree units
-    size: Tensor  # (r,)
+    corner: Tensor  # (r, 3) float64, tree units
+    scale: Tensor  # (r,) voxels a tree unit
 
 
 @dataclass
@@ -100,7 +98,6 @@ class Tree:
         none = torch.full_like(node, -1)
         at = Descent(node, depth, none, hides(node), none, depth, none, depth)
         going = torch.ones_like(node, dtype=torch.bool)
-        digits = self.levels.digits(position_r3)
         while True:
             a.stamp_t[torch.unique(at.node[going] // self.per_tile)] = a.frame_1[0]
             answers = going & (self.brick_n[at.node] != ABSENT)
@@ -114,7 +111,7 @@ class Tree:
             going = going & (at.depth < wanted_r) & (tile >= 0) & ~at.hidden
             if not going.any():
                 return at
-            x, y, z = next(digits).to(torch.int64).unbind(1)
+            x, y, z = (self.levels.cells(position_r3, at.depth + going) % n).unbind(1)
             child = tile * self.per_tile + (z * n + y) * n + x
             at.parent = torch.where(going, at.node, at.parent)
             at.node = torch.where(going, child, at.node)
@@ -124,8 +121,7 @@ class Tree:
     def holder(self, node: Tensor, depth: Tensor, position_r3: Tensor) -> Holder:
         """The nodes (r,), or -1, that were found at a depth around places."""
         brick = torch.where(node >= 0, self.brick_n[node.clamp(min=0)].to(torch.int64), ABSENT)
-        corner = self.levels.corner(position_r3, depth)
-        return Holder(node, brick, depth, corner, self.levels.size_d[depth])
+        return self.levels.holder(node, brick, depth, position_r3)
 
     def mark(
         self, found: Descent, wanted: Tensor, blends: Tensor, cone: Tensor, seen: Tensor
@@ -209,8 +205,8 @@ class Bricks:
         constant = torch.where(holder.node >= 0, constant, 0.0)
         if self.bricks_bzyxc.shape[0] == 0:
             return constant
-        scale = divide(side - 2 * self.border, holder.size, holder.size)[:, None]
-        offset = (beam.origin - holder.corner) * scale + (self.border - 0.5)
+        scale = holder.scale[:, None]
+        offset = (beam.place - holder.corner).to(real) * scale + (self.border - 0.5)
         place = offset + t[:, None] * (beam.direction * scale)
         columns = zip(place.unbind(1), shift, strict=True)
         place = clamp(torch.stack([p + d if d else p for p, d in columns], 1), 0, side - 1)

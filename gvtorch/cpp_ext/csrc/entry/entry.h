@@ -203,7 +203,8 @@ void take_channel(TraceArgs& args, const Op& a, const Like& like, int64_t nodes)
   GV_RAYS(GV_TAKE)
   GV_CHANNEL(GV_TAKE)
   STD_TORCH_CHECK(nodes <= INT32_MAX, "gvtorch: too many nodes");
-  STD_TORCH_CHECK(a.branching >= 2, "gvtorch: branching out of range");
+  STD_TORCH_CHECK(a.branching >= 2 && std::pow(a.branching, a.max_depth) <= kMostNodes,
+                  "gvtorch: branching or max_depth out of range");
   STD_TORCH_CHECK(a.step > 0 && a.root_voxel > 0, "gvtorch: step and root_voxel must be positive");
   args.rays = rays;
   args.bricks = a.bricks_bzyxc.size(0);

@@ -40,10 +40,13 @@ void walk_rays(const Op& a, const Make& make) {
   const Like like{a.origin_r3, a.table_lm4.scalar_type()};
   with_real(a.table_lm4, [&](auto real) {
     using T = decltype(real);
-    WalkRay<T> args{ShadeRay<T, Plain<T>>(walked), nullptr, 0, false};
-    GV_PART(GV_TAKE)
-    const Tensor hidden_tn = hide_nodes<Device>(a.origin_r3, walked.nodes, args.kernel);
-    for_each(a.origin_r3, args.kernel.order.count(), make(args, real));
+    with_digits<T>(walked, [&](auto* digits) {
+      using Digits = std::decay_t<decltype(*digits)>;
+      WalkRay<T, Digits> args{ShadeRay<T, Plain<T>, Digits>(walked), nullptr, 0, false};
+      GV_PART(GV_TAKE)
+      const Tensor hidden_tn = hide_nodes<Device>(a.origin_r3, walked.nodes, args.kernel);
+      for_each(a.origin_r3, args.kernel.order.count(), make(args, real));
+    });
   });
 }
 

@@ -1,5 +1,5 @@
 // kLanes rays at once through the tree with any shader of shaders.h, each lane in a node and an interval of its own,
-// for float32 and an N that is a power of two. Each lane does what its ray does alone, so every bit is the same.
+// for float32 and a tree that is not deep. Each lane does what its ray does alone, so every bit is the same.
 //
 // A second walk beside that of walk.h, for two reasons. Lanes keep the path of their last descent and go on from where
 // the next one parts from it; a GPU's threads would have to keep it in local memory, which takes twice as long as to
@@ -48,7 +48,7 @@ struct PacketChannels {
 template <class Shader, class Values>
 struct PacketWalk {
   using Number = Floats;
-  using Kernel = ShadeRay<float, Shader, false, true, typename Values::Voxel>;
+  using Kernel = ShadeRay<float, Shader, BitDigits, false, typename Values::Voxel>;
   using Eye = typename Kernel::Eye;
   using Sum = typename Shader::Sum;
   static constexpr bool kEnds = Shader::kEnds;
@@ -209,7 +209,7 @@ struct PacketWalk {
     if constexpr (Shader::kSurface) {
       if (one.depth < INFINITY) {
         const Ray<float> own(walk.rays, numbers[lane]);
-        kernel.template surface<BitDigits<float>>(own, take_lane<Sight<float>>(sight, lane), one);
+        kernel.surface(own, take_lane<Sight<float>>(sight, lane), one);
       }
     }
     kernel.finish(numbers[lane], ray.moved[lane], samples[lane], one);
@@ -257,8 +257,11 @@ struct PacketWalk {
     Ints reach, node, brick, tile;
     descend(which, middle, reach, node, brick, tile);
     const Mask hides = node < 0;
-    const Floats face = ray.leave(corner(reach), pick(levels.size, reach));
-    extent.exit = which ? face : extent.exit;
+    const Ints shift = tree.digit_bits * (tree.max_depth - reach);
+    const Floats size = pick(levels.size, reach);
+    const Floats exit = ray.leave(
+        [&](int axis, Mask upper) { return to_floats((cell[axis] >> shift) - upper) * size - ray.origin[axis]; });
+    extent.exit = which ? exit : extent.exit;
 
     // The nodes whose bricks answer.
     Ints fine_level = reach, fine_brick = brick;

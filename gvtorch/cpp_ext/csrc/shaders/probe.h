@@ -134,17 +134,17 @@ struct Probe {
 
   template <class Digits>
   GV_HD Probe(const Channels& channels, const Sight<T>& sight, const RayView& rays, const Ray<T>& ray,
-              const Levels<T>& levels, const Visit<T>& visit, const Digits& digits)
+              const Visit<T>& visit, const Digits& digits)
       : channels(channels),
         sight(sight),
-        fine(levels, visit.fine, digits, ray, channels.border),
+        fine(visit.fine, digits, ray, channels.border),
         coarse(fine),
         mixed(visit.coarse.node != visit.fine.node),
         near(ray.cone_near),
         growth(ray.cone_growth),
         voxel(visit.voxel),
         blend(1 / (visit.above - visit.voxel)) {
-    if (mixed) coarse = Spot<T>(levels, visit.coarse, digits, ray, channels.border);
+    if (mixed) coarse = Spot<T>(visit.coarse, digits, ray, channels.border);
     for (int axis = 0; axis < 3; ++axis) cube[axis] = static_cast<T>(rays.place_33[3 + axis]);
   }
 

@@ -52,9 +52,9 @@ struct SegmentView {
 };
 
 // Walks a ray, and calls emit(segment) for what it samples.
-template <class T>
+template <class T, class Digits>
 struct WalkRay {
-  ShadeRay<T, Plain<T>> kernel;
+  ShadeRay<T, Plain<T>, Digits> kernel;
   const T* state_r3;  // base, count and level that each ray goes on with; null: rays begin
   int32_t limit;      // a ray pauses behind the visit in which it has taken so many samples; 0: it goes to its end
   bool by_node;       // a region is of one value only where one node answers
@@ -75,7 +75,7 @@ struct WalkRay {
   // See Walk::follow.
   template <class Emit>
   struct Visitor {
-    static constexpr bool kPowers = true, kSeesEmpty = false;
+    static constexpr bool kSeesEmpty = false;
     const WalkRay& walk;
     Emit& emit;
     int32_t segments = 0, samples = 0, visits = 0;
@@ -89,7 +89,6 @@ struct WalkRay {
       return true;
     }
     GV_HD bool hides(int32_t node) const { return walk.kernel.hides(node); }
-    template <class Digits>
     GV_HD Segment<T> enter(const Ray<T>&, const Visit<T>& visit, const Digits&) const {
       Segment<T> segment;
       segment.fine = visit.fine;
@@ -140,7 +139,7 @@ struct WalkRay {
   template <class Emit>
   GV_HD Visitor<Emit> walk(const Ray<T>& ray, Intervals<T>& at, Emit& emit) const {
     Visitor<Emit> visitor{*this, emit};
-    kernel.follow(ray, at, visitor);
+    kernel.template follow<Digits>(ray, at, visitor);
     return visitor;
   }
 
@@ -236,11 +235,6 @@ struct AimSample {
   };
 
   GV_HD Aimed operator()(int64_t k) const {
-    const bool powers = tree.digit_bits > 0;
-    return powers ? aim_at<BitDigits<T>>(k) : aim_at<Digits<T>>(k);
-  }
-  template <class Digits>
-  GV_HD Aimed aim_at(int64_t k) const {
     Aimed aimed;
     const int64_t segment = segment_k[k];
     if (segment < 0 || segment >= segment_count) return aimed;
@@ -258,12 +252,12 @@ struct AimSample {
     if (ray_number < 0 || ray_number >= ray_count || wanted < 0 || wanted > tree.max_depth) return aimed;
     aimed.known = true;
     const Ray<T> ray(rays, ray_number);
-    Digits digits(tree, ray.at(segments.distance_s3[3 * segment + 2]));
-    aimed.fine = aimed.coarse = Spot<T>(levels, holders[0], digits, ray, bricks.border);
+    const Digits<T> digits(tree, levels, rays, ray, segments.distance_s3[3 * segment + 2]);
+    aimed.fine = aimed.coarse = Spot<T>(holders[0], digits, ray, bricks.border);
     aimed.t = place(segment, number_k[k]);
     aimed.weight = 0;
     if (holders[1].node != holders[0].node) {
-      aimed.coarse = Spot<T>(levels, holders[1], digits, ray, bricks.border);
+      aimed.coarse = Spot<T>(holders[1], digits, ray, bricks.border);
       const T voxel = levels.voxel[wanted];
       const T blend = 1 / ((wanted > 0 ? levels.voxel[wanted - 1] : static_cast<T>(INFINITY)) - voxel);
       const T cone = ray.cone_near + ray.cone_growth * aimed.t;

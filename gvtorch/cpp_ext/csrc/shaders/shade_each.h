@@ -38,9 +38,12 @@ void shade_fused(const torch::stable::Tensor& like, const ShadeArgs& args) {
   const bool plain = args.shader == kPlainShader;
   if (!plain && args.shader != static_cast<int32_t>(ShaderKind::kFiltered)) return with_rays<T>(args, each);
   with_voxel(args.voxel, [&](auto voxel) {
-    using Voxel = decltype(voxel);
-    plain ? each(ShadeRay<T, Plain<T>, false, true, Voxel>(args))
-          : each(ShadeRay<T, Filtered<T>, false, true, Voxel>(args));
+    with_digits<T>(args, [&](auto* digits) {
+      using Voxel = decltype(voxel);
+      using Digits = std::decay_t<decltype(*digits)>;
+      plain ? each(ShadeRay<T, Plain<T>, Digits, false, Voxel>(args))
+            : each(ShadeRay<T, Filtered<T>, Digits, false, Voxel>(args));
+    });
   });
 }
 

@@ -24,8 +24,8 @@ struct HidesAlike : std::false_type {};
 template <class Shader>
 struct HidesAlike<Shader, std::void_t<decltype(Shader::kHidesAlike)>> : std::bool_constant<Shader::kHidesAlike> {};
 
-// kOwnPowers: an N that is a power of two has code of its own. Voxel: of the shader's value; void: told at run time.
-template <class T, class Shader, bool kShadows = false, bool kOwnPowers = true, class Voxel = void>
+// Digits: see `with_digits`. Voxel: of the shader's value; void: told at run time.
+template <class T, class Shader, class Digits, bool kShadows = false, class Voxel = void>
 struct ShadeRay : Walk<T> {
   using Eye = ProbeOf<T, Voxel>;
   using Walk<T>::tree;
@@ -71,10 +71,10 @@ struct ShadeRay : Walk<T> {
     for (int32_t c = 0; c < features; ++c) sum.feature_c[c] = 0;
     const auto& ready = ready_for_ray(shader);
     Visitor<std::decay_t<decltype(ready)>> visitor{*this, ready, &ray, &sight, sum};
-    this->follow(ray, at, visitor);
+    this->template follow<Digits>(ray, at, visitor);
     if constexpr (Shader::kSurface) {
       if (sum.depth < static_cast<T>(INFINITY)) {
-        kOwnPowers&& tree.digit_bits > 0 ? surface<BitDigits<T>>(ray, sight, sum) : surface<Digits<T>>(ray, sight, sum);
+        surface(ray, sight, sum);
       }
     }
     finish(number, ray.moved, visitor.samples, sum);
@@ -116,14 +116,13 @@ struct ShadeRay : Walk<T> {
   }
 
   // The place where depth was set may lie half an interval beside the node that found it.
-  template <class Digits>
   GV_HD void surface(const Ray<T>& ray, const Sight<T>& sight, Sum& sum) const {
-    Digits digits(tree, ray.at(sum.depth));
+    Digits digits(tree, this->levels, this->rays, ray, sum.depth);
     int32_t wanted = 0;
     const auto hides = [](int32_t) { return false; };
     const T cone = ray.cone_near + ray.cone_growth * sum.depth;
     const Visit<T> visit = this->find(ray, digits, cone, hides, wanted, sum.missed);
-    shader.surface(Probe<T>(channels, sight, this->rays, ray, this->levels, visit, digits), sum);
+    shader.surface(Probe<T>(channels, sight, this->rays, ray, visit, digits), sum);
   }
 
   // What comes after the last interval.
@@ -141,7 +140,7 @@ struct ShadeRay : Walk<T> {
   // See Walk::follow. Any: the shader, or its Veil on the way to a light.
   template <class Any>
   struct Visitor {
-    static constexpr bool kPowers = kOwnPowers, kSeesEmpty = Any::kSeesEmpty, kEnds = Any::kEnds;
+    static constexpr bool kSeesEmpty = Any::kSeesEmpty, kEnds = Any::kEnds;
     static constexpr bool kShadowed = kShadows && std::is_same_v<Any, Shader>;  // none on the way to a light
     const ShadeRay& kernel;
     const Any& shader;
@@ -159,9 +158,8 @@ struct ShadeRay : Walk<T> {
       if constexpr (HidesAlike<Any>::value) return kernel.hides(node);
       return kernel.hides(shader, node, sum);
     }
-    template <class Digits>
     GV_HD Eye enter(const Ray<T>& ray, const Visit<T>& visit, const Digits& digits) const {
-      return Eye(kernel.channels, *sight, kernel.rays, ray, kernel.levels, visit, digits);
+      return Eye(kernel.channels, *sight, kernel.rays, ray, visit, digits);
     }
     GV_HD bool uniform(const Eye& probe) const {  // shadows differ within it
       return !kShadowed && probe.uniform() && !kernel.shades_each_place();
@@ -246,17 +244,17 @@ struct ShadeRay : Walk<T> {
   // first interval is left out, so that a place does not stand in its own shadow.
   GV_HD T share_of_light(const Ray<T>& ray, const Probe<T>& probe, T t, Vec3<T> way, T length, T growth,
                          int32_t& samples, bool& missed) const {
-    const Vec3<T> place{ray.origin.x + t * ray.direction.x, ray.origin.y + t * ray.direction.y,
-                        ray.origin.z + t * ray.direction.z};
-    const Ray<T> beam(place, way, probe.cube, ray.high, ray.cone_near + ray.cone_growth * t,
-                      growth * static_cast<T>(this->rays.cone_scale), length);
+    const RayView& rays = this->rays;
+    const Vec3<double> place = ray.along(t, Digits::kDeep && rays.deep);
+    const Ray<T> beam(rays, place, way, probe.cube, ray.cone_near + ray.cone_growth * t,
+                      growth * static_cast<T>(rays.cone_scale), length);
     const Sight<T> sight(probe.sight.at(t), way);
     Intervals<T> at(beam, options.step, lengths);
     at.go(true, at.count + 1);
     const Veil<T, Shader> veil{shader};
     typename Veil<T, Shader>::Sum sum;
     Visitor<Veil<T, Shader>> visitor{*this, veil, &beam, &sight, sum};
-    this->follow(beam, at, visitor);
+    this->template follow<Digits>(beam, at, visitor);
     samples += visitor.samples;
     missed = missed || sum.missed;
     return sum.clear;
@@ -279,7 +277,9 @@ template <class T, class Body>
 void with_rays(const ShadeArgs& args, const Body& body) {
   with_shader<T>(args.shader, [&](auto type) {
     using Type = decltype(type);
-    body(ShadeRay<T, typename Type::Shader, Type::kShadows>(args));
+    with_digits<T>(args, [&](auto* digits) {
+      body(ShadeRay<T, typename Type::Shader, std::decay_t<decltype(*digits)>, Type::kShadows>(args));
+    });
   });
 }
 

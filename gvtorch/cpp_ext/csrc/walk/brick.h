@@ -53,12 +53,11 @@ struct Spot {
   GV_HD Spot(int32_t node, int32_t brick, T scale, Vec3<T> offset, Vec3<T> slope)
       : node(node), brick(brick), scale(scale), offset(offset), slope(slope) {}
   template <class Digits>
-  GV_HD Spot(const Levels<T>& levels, const Holder& holder, const Digits& digits, const Ray<T>& ray, int32_t border)
-      : node(holder.node), brick(holder.brick), scale(levels.scale[holder.depth]) {
-    const Vec3<T> corner = digits.corner(holder.depth, levels);
+  GV_HD Spot(const Holder& holder, const Digits& digits, const Ray<T>& ray, int32_t border)
+      : node(holder.node), brick(holder.brick), scale(digits.levels.scale[holder.depth]) {
     const T first = static_cast<T>(border) - static_cast<T>(0.5);
     for (int axis = 0; axis < 3; ++axis) {
-      offset[axis] = (ray.origin[axis] - corner[axis]) * scale + first;
+      offset[axis] = -digits.face(axis, holder.depth, false) * scale + first;
       slope[axis] = ray.direction[axis] * scale;
     }
   }

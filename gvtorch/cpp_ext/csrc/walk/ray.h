@@ -18,17 +18,20 @@ struct RayView {
   const double* range_r2;      // world: first and last distance
   const double* place_33;      // world: low corner of the scene, size of the root cube; tree units: its high corner
   double cone_scale;
+  bool deep;                        // places are worked out in float64, see tree.h
   const double* clear_r = nullptr;  // transmittance with which a ray begins; null: 1
 
   GV_HD double clear(int64_t index) const { return clear_r == nullptr ? 1.0 : clear_r[index]; }
 };
 
 // One ray in tree units (a distance along it stays a world length), begun where it enters the scene: float32 then
-// counts from there, however far the camera is. Or the rays of a packet.
+// counts from there, however far the camera is. Or the rays of a packet. A distance is never less exact than a cone is
+// wide there; a place is, so in a deep tree it is the difference of two float64 before it is rounded.
 template <class T>
 struct Ray {
   using Real = RealOf<T>;
   Vec3<T> origin, direction;
+  Vec3<T> rest;     // what rounding took from the origin, in a deep tree; else 0
   Vec3<T> inverse;  // of the direction
   Vec3<Real> high;  // corner of the scene; its low corner is 0
   T cone_near, cone_growth;
@@ -37,7 +40,7 @@ struct Ray {
 
   Ray() = default;
   GV_HD Ray(const RayView& rays, int64_t index) {
-    Vec3<double> from, along;
+    Vec3<double> from, along, start;
     double near = -INFINITY;
     for (int axis = 0; axis < 3; ++axis) {
       const double size = rays.place_33[3 + axis];
@@ -55,60 +58,73 @@ struct Ray {
     last = static_cast<T>(rays.range_r2[2 * index + 1] - shift);
     moved = static_cast<T>(shift);
     for (int axis = 0; axis < 3; ++axis) {
-      origin[axis] = static_cast<T>(from[axis] + shift * along[axis]);
+      start[axis] = from[axis] + shift * along[axis];
       direction[axis] = static_cast<T>(along[axis]);
-      inverse[axis] = 1 / direction[axis];
-      high[axis] = static_cast<T>(rays.place_33[6 + axis]);
     }
-    clip();
+    begin(rays, start);
   }
 
   // A cone of its own from a place inside the scene; `way` in the world.
-  GV_HD Ray(Vec3<T> place, Vec3<T> way, Vec3<T> cube, Vec3<T> high, T cone_near, T cone_growth, T last)
-      : origin(place),
-        direction{way.x / cube.x, way.y / cube.y, way.z / cube.z},
-        inverse{1 / direction.x, 1 / direction.y, 1 / direction.z},
-        high(high),
+  GV_HD Ray(const RayView& rays, Vec3<double> start, Vec3<T> way, Vec3<T> cube, T cone_near, T cone_growth, T last)
+      : direction{way.x / cube.x, way.y / cube.y, way.z / cube.z},
         cone_near(cone_near),
         cone_growth(cone_growth),
         first(0),
         last(last),
         moved(0) {
-    clip();
+    begin(rays, start);
   }
 
   // Slab test (Kay and Kajiya, "Ray tracing complex scenes", 1986).
   // A ray that no face bounds (no direction, NaN, infinite) is closed, so that no loop runs on for ever.
-  GV_HD void clip() {
+  GV_HD void begin(const RayView& rays, Vec3<double> start) {
     for (int axis = 0; axis < 3; ++axis) {
+      origin[axis] = static_cast<T>(start[axis]);
+      rest[axis] = rays.deep ? static_cast<T>(start[axis] - static_cast<double>(origin[axis])) : T{};
+      inverse[axis] = 1 / direction[axis];
+      high[axis] = static_cast<T>(rays.place_33[6 + axis]);
+      const double from = place(axis), to = rays.place_33[6 + axis];
       if (direction[axis] == 0) {
-        if (!(origin[axis] >= 0 && origin[axis] <= high[axis])) last = first;
+        if (!(from >= 0 && from <= to)) last = first;
         continue;
       }
       const T a = -origin[axis] / direction[axis];
-      const T b = (high[axis] - origin[axis]) / direction[axis];
+      const T b = static_cast<T>(to - from) / direction[axis];
       first = larger(first, smaller(a, b));
       last = smaller(last, larger(a, b));
     }
     if (!(last < static_cast<T>(INFINITY))) last = first;
   }
 
-  // Where the ray is at distance t, inside the root cube: a place on the scene's high face belongs to the scene.
+  // Where the ray begins, as exactly as it is known.
+  GV_HD double place(int axis) const { return static_cast<double>(origin[axis]) + static_cast<double>(rest[axis]); }
+
+  // Where it is at distance t.
+  GV_HD Vec3<double> along(T t, bool deep) const {
+    Vec3<double> found;
+    for (int axis = 0; axis < 3; ++axis) {
+      found[axis] = deep ? place(axis) + static_cast<double>(t) * static_cast<double>(direction[axis])
+                         : static_cast<double>(origin[axis] + t * direction[axis]);
+    }
+    return found;
+  }
+
+  // The same inside the root cube: a place on the scene's high face belongs to the scene.
   GV_HD Vec3<T> at(T t) const {
-    const Real inner = static_cast<Real>(0.9999999);
     Vec3<T> place;
     for (int axis = 0; axis < 3; ++axis) {
-      place[axis] = clamp(origin[axis] + t * direction[axis], static_cast<Real>(0), high[axis] * inner);
+      place[axis] = clamp(origin[axis] + t * direction[axis], static_cast<Real>(0), inner(axis));
     }
     return place;
   }
+  GV_HD Real inner(int axis) const { return high[axis] * static_cast<Real>(0.9999999); }
 
-  // Distance at which the ray leaves a box.
-  GV_HD T leave(Vec3<T> corner, T size) const {
+  // Distance at which the ray leaves a box; face(axis, upper) tells how far its lower or upper face is from the origin.
+  template <class Face>
+  GV_HD T leave(const Face& face) const {
     T exit = splat<T>(static_cast<Real>(INFINITY));
     for (int axis = 0; axis < 3; ++axis) {
-      const T face = select(direction[axis] > 0, corner[axis] + size, corner[axis]);
-      const T distance = (face - origin[axis]) * inverse[axis];
+      const T distance = face(axis, direction[axis] > 0) * inverse[axis];
       exit = select(direction[axis] == 0, exit, smaller(exit, distance));
     }
     return exit;
@@ -132,7 +148,7 @@ struct Extent {
   GV_HD MaskOf<T> holds(T t, T cone) const { return t < exit && cone >= cone_low && cone < cone_high; }
 };
 
-constexpr int32_t kMostIntervals = 1 << 23;  // counted in a float32
+constexpr int32_t kMostIntervals = 1 << 23;  // counted from one base, in a float32
 
 // Where a ray stands in its fixed sequence of intervals. Starts are products, not sums of roundings. `which`: the lanes
 // that a change or a question is for.
@@ -164,7 +180,7 @@ struct Intervals {
   GV_HD T cone(T t) const { return near + growth * t; }
   GV_HD T start_of(T number) const { return base + number * length; }
   GV_HD T middle_of(T number) const { return base + (number + static_cast<Real>(0.5)) * length; }
-  GV_HD Mask inside() const { return start < stop && count < static_cast<Real>(kMostIntervals); }
+  GV_HD Mask inside() const { return start < stop; }
   // The last interval, which ends at the far side.
   GV_HD Mask cut() const { return !(start_of(count + static_cast<Real>(1)) <= stop); }
   GV_HD T middle() const { return select(cut(), start + (stop - start) * static_cast<Real>(0.5), middle_of(count)); }
@@ -174,8 +190,10 @@ struct Intervals {
   }
   GV_HD void choose_level(Mask which) {
     const T width = cone(start);
-    const Mask wrong = which && !fits(width);
+    const Mask full = count >= static_cast<Real>(kMostIntervals);
+    const Mask wrong = which && (full || !fits(width));
     if (!any(wrong)) return;
+    start = select(which && full && !(start > base), stop, start);  // intervals too short to be told apart
     base = select(wrong, start, base);
     count = select(wrong, T{}, count);
     level = select(wrong, IntOf<T>{}, level);

@@ -9,11 +9,16 @@
 //   brick_tn    >= 0 brick slot | kAbsent: not loaded yet | kEmpty | kConstant: one value, see constant_tnc
 //   request_tn  what rays ask for, see post_request in hd.h
 //
-// Tree units: the root is the cube [0,1]^3. A descent that restarts from the root needs no stack (Horn et al.,
-// "Interactive k-d tree GPU raytracing", I3D 2007, kd-restart; Crassin, PhD thesis 2011, 6.1).
+// Tree units: the root is the cube [0,1]^3. float32 tells the corners of nodes where N is a power of two and the root
+// is at most kMostShallow voxels wide; other trees are *deep*: places in them are float64. A descent that restarts from
+// the root needs no stack (Horn et al., "Interactive k-d tree GPU raytracing", I3D 2007, kd-restart; Crassin, PhD
+// thesis 2011, 6.1).
 #pragma once
 
-#include "base/arithmetic.h"
+#include <type_traits>
+
+#include "base/arguments.h"
+#include "walk/ray.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
@@ -23,21 +28,27 @@ constexpr int32_t kTerminal = -2;
 constexpr int32_t kEmpty = -2;
 constexpr int32_t kConstant = -3;
 constexpr int32_t kMostLevels = 63;
+constexpr double kMostShallow = 1 << 18;
+constexpr double kMostNodes = 1LL << 50;  // along a side of the root cube: float64 counts them
 
-// Numbers of each depth, divided down from the root's.
+// Numbers of each depth.
 template <class T>
 struct Levels {
-  T voxel[kMostLevels];  // world size of a voxel
-  T size[kMostLevels];   // tree units: a node's box
-  T scale[kMostLevels];  // voxels a tree unit
+  T voxel[kMostLevels];            // world size of a voxel
+  T scale[kMostLevels];            // voxels a tree unit
+  T size[kMostLevels];             // tree units: a node's box
+  double exact_size[kMostLevels];  // the same
+  double count[kMostLevels];       // nodes along a side of the root cube
 
-  Levels(T root_voxel, T brick, int32_t branching) {
-    voxel[0] = root_voxel;
-    size[0] = 1;
+  Levels(double root_voxel, double brick, int32_t branching) {
+    double nodes = 1;
     for (int32_t depth = 0; depth < kMostLevels; ++depth) {
-      if (depth > 0) voxel[depth] = voxel[depth - 1] / static_cast<T>(branching);
-      if (depth > 0) size[depth] = size[depth - 1] / static_cast<T>(branching);
-      scale[depth] = brick / size[depth];
+      voxel[depth] = static_cast<T>(root_voxel / nodes);
+      scale[depth] = static_cast<T>(brick * nodes);
+      exact_size[depth] = 1 / nodes;
+      size[depth] = static_cast<T>(exact_size[depth]);
+      count[depth] = nodes;
+      nodes *= branching;
     }
   }
 };
@@ -51,12 +62,14 @@ struct TreeView {
   int32_t branching;  // N
   int32_t nodes_per_tile;
   int32_t max_depth;
-  int32_t digit_bits;  // where N is a power of two and all digits of a place fit a word, else 0
+  int32_t digit_bits;  // of a tree that is not deep: N is 2 to the power of it; else 0
 };
 
-inline int32_t digit_bits_of(int32_t branching, int32_t max_depth) {
-  const int32_t bits = branching == 2 ? 1 : branching == 4 ? 2 : branching == 8 ? 3 : branching == 16 ? 4 : 0;
-  return bits * max_depth <= 30 ? bits : 0;
+inline int32_t digit_bits_of(const TraceArgs& args) {
+  const int32_t bits = args.branching == 2 ? 1 : args.branching == 4 ? 2 : args.branching == 8 ? 3 : 4;
+  double voxels = args.side - 2 * args.border;
+  for (int32_t depth = 0; depth < args.max_depth; ++depth) voxels *= args.branching;
+  return (args.branching == 1 << bits) && voxels <= kMostShallow ? bits : 0;
 }
 
 // A node whose brick answers for a place. node < 0: nobody answers.
@@ -79,48 +92,67 @@ struct Place {
   Holder coarse;
 };
 
-// The digits of a place in base N, from the root down. Any N: each digit from what the one above left over.
+// Which nodes the place at distance t of a ray lies in, by the digits of its number in base N. `child`, asked for level
+// after level, is which child of the node above; `face`, how far the node's lower or upper face is from the ray's
+// origin.
+//
+// In any tree, in float64.
 template <class T>
 struct Digits {
-  Vec3<T> position, local;
-  int32_t branching;
+  static constexpr bool kDeep = true;  // as RayView tells
+  const Levels<T>& levels;
+  Vec3<double> origin;
+  Vec3<double> cell;            // number of the node at the finest level
+  Vec3<double> upper{0, 0, 0};  // and of the one above the next child
+  int32_t branching, max_depth;
 
-  GV_HD Digits(const TreeView& tree, Vec3<T> position)
-      : position(position), local(position), branching(tree.branching) {}
-  GV_HD int32_t step(Vec3<T>& left, int axis) const {
-    const T scaled = left[axis] * static_cast<T>(branching);
-    const int32_t digit = clamp(floor_int(scaled), 0, branching - 1);
-    left[axis] = scaled - static_cast<T>(digit);
-    return digit;
-  }
-  // Which child of the node at level - 1; asked for level after level.
-  GV_HD int32_t child(int32_t) {
-    const int32_t z = step(local, 2), y = step(local, 1), x = step(local, 0);
-    return (z * branching + y) * branching + x;
-  }
-  // Low corner of the node at a level.
-  GV_HD Vec3<T> corner(int32_t level, const Levels<T>& levels) const {
-    Vec3<T> left = position;
-    Vec3<T> sum{0, 0, 0};
-    for (int32_t depth = 1; depth <= level; ++depth) {
-      for (int axis = 0; axis < 3; ++axis) {
-        sum[axis] = sum[axis] + static_cast<T>(step(left, axis)) * levels.size[depth];
-      }
+  GV_HD Digits(const TreeView& tree, const Levels<T>& levels, const RayView& rays, const Ray<T>& ray, T t)
+      : levels(levels), branching(tree.branching), max_depth(tree.max_depth) {
+    const Vec3<double> place = ray.along(t, rays.deep);
+    for (int axis = 0; axis < 3; ++axis) {
+      const double high = rays.deep ? rays.place_33[6 + axis] * (1 - 8.8817841970012523e-16)  // 2^-50
+                                    : static_cast<double>(ray.inner(axis));
+      origin[axis] = ray.place(axis);
+      cell[axis] = whole(clamp(place[axis], 0.0, high) * levels.count[max_depth]);
     }
-    return sum;
+  }
+  GV_HD int32_t child(int32_t level) {
+    Vec3<int32_t> digit;
+    for (int axis = 0; axis < 3; ++axis) {
+      const double here = cell_of(axis, level);
+      digit[axis] = static_cast<int32_t>(here - upper[axis] * branching);
+      upper[axis] = here;
+    }
+    return (digit.z * branching + digit.y) * branching + digit.x;
+  }
+  GV_HD T face(int axis, int32_t level, bool upper) const {
+    return static_cast<T>((cell_of(axis, level) + upper) * levels.exact_size[level] - origin[axis]);
+  }
+
+ private:
+  GV_HD static double whole(double value) { return static_cast<double>(static_cast<int64_t>(value)); }
+  // Divided by a product that may be off by one: all numbers are whole and below 2^51.
+  GV_HD double cell_of(int axis, int32_t level) const {
+    const double below = levels.count[max_depth - level];
+    const double found = whole(cell[axis] * levels.exact_size[max_depth - level]);
+    const double left = cell[axis] - found * below;
+    return left < 0 ? found - 1 : left < below ? found : found + 1;
   }
 };
 
-// N a power of two: all digits are the bits of one number, and every corner is exact.
-template <class T>
+// Where a tree is not deep: digits are the bits of one number, and float32 tells every corner.
 struct BitDigits {
+  static constexpr bool kDeep = false;
+  const Levels<float>& levels;
+  Vec3<float> origin;
   Vec3<int32_t> cell;
   int32_t bits, top;
 
-  GV_HD BitDigits(const TreeView& tree, Vec3<T> position)
-      : bits(tree.digit_bits), top(tree.digit_bits * tree.max_depth) {
-    const T cells = static_cast<T>(1 << top);
-    for (int axis = 0; axis < 3; ++axis) cell[axis] = static_cast<int32_t>(position[axis] * cells);
+  GV_HD BitDigits(const TreeView& tree, const Levels<float>& levels, const RayView&, const Ray<float>& ray, float t)
+      : levels(levels), origin(ray.origin), bits(tree.digit_bits), top(tree.digit_bits * tree.max_depth) {
+    const Vec3<float> place = ray.at(t);
+    const float cells = static_cast<float>(1 << top);
+    for (int axis = 0; axis < 3; ++axis) cell[axis] = static_cast<int32_t>(place[axis] * cells);
   }
   GV_HD int32_t child(int32_t level) const {
     const int32_t shift = top - level * bits;
@@ -128,13 +160,19 @@ struct BitDigits {
     const int32_t y = (cell.y >> shift) & mask;
     return (((cell.z >> shift) & mask) << (2 * bits)) | (y << bits) | ((cell.x >> shift) & mask);
   }
-  GV_HD Vec3<T> corner(int32_t level, const Levels<T>& levels) const {
-    const int32_t shift = top - level * bits;
-    const T size = levels.size[level];
-    return {static_cast<T>(cell.x >> shift) * size, static_cast<T>(cell.y >> shift) * size,
-            static_cast<T>(cell.z >> shift) * size};
+  GV_HD float face(int axis, int32_t level, bool upper) const {
+    return static_cast<float>((cell[axis] >> (top - level * bits)) + upper) * levels.size[level] - origin[axis];
   }
 };
+
+// Calls body(Digits{}) with the type that rays of T and a tree go with; as a null pointer, for it has no default.
+template <class T, class Body>
+void with_digits(const TraceArgs& args, const Body& body) {
+  if constexpr (std::is_same_v<T, float>) {
+    if (digit_bits_of(args) > 0) return body(static_cast<BitDigits*>(nullptr));
+  }
+  body(static_cast<Digits<T>*>(nullptr));
+}
 
 // Descends to `wanted` depth, or as far as tiles exist and something is seen; stamps every tile on the way.
 // The coarse holder is looked for where two levels blend.

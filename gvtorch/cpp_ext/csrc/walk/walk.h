@@ -74,15 +74,14 @@ struct Walk {
   T stop_clear, hit_clear;  // transmittance at which a ray ends, and at which its depth is taken
 
   explicit Walk(const TraceArgs& args)
-      : rays{args.origin_r3, args.direction_r3, args.cone_r2, args.range_r2,
-             args.place_33,  args.cone_scale,   args.clear_r},
+      : rays{args.origin_r3,  args.direction_r3,        args.cone_r2, args.range_r2, args.place_33,
+             args.cone_scale, digit_bits_of(args) == 0, args.clear_r},
         order{args.rays, args.width},
-        tree{args.child_tn,   args.brick_tn,
-             args.request_tn, args.stamp_t,
-             args.root,       args.root / args.nodes_per_tile,
-             args.branching,  args.nodes_per_tile,
-             args.max_depth,  digit_bits_of(args.branching, args.max_depth)},
-        levels(static_cast<T>(args.root_voxel), static_cast<T>(args.side - 2 * args.border), args.branching),
+        tree{args.child_tn,      args.brick_tn,       args.request_tn,
+             args.stamp_t,       args.root,           args.root / args.nodes_per_tile,
+             args.branching,     args.nodes_per_tile, args.max_depth,
+             digit_bits_of(args)},
+        levels(args.root_voxel, args.side - 2 * args.border, args.branching),
         options{static_cast<T>(args.step), static_cast<T>(args.stop_alpha), static_cast<T>(args.depth_alpha),
                 args.by_level},
         hits{static_cast<T*>(args.color_r3), static_cast<T*>(args.alpha_r1), static_cast<T*>(args.depth_r1),
@@ -92,9 +91,8 @@ struct Walk {
         stop_clear(1 - options.stop_alpha),
         hit_clear(1 - options.depth_alpha) {}
 
-  // Goes along a ray to its end, or until the visitor has enough. A visitor has:
+  // Goes along a ray to its end, or until the visitor has enough. Digits: see `with_digits`. A visitor has:
   //
-  //   kPowers                          an N that is a power of two has code of its own
   //   kSeesEmpty                       EMPTY nodes count
   //   missed()                         a bool&: something that is seen was not there
   //   more()                           the ray goes on to another node
@@ -106,20 +104,17 @@ struct Walk {
   //                                    the far side; returns how many
   //   sees()                           the ray goes on in this node
   //   finish(node)                     all intervals of the visit have been taken
-  template <class Visitor>
+  template <class Digits, class Visitor>
   GV_HD void follow(const Ray<T>& ray, Intervals<T>& at, Visitor& visitor) const {
     int32_t wanted = 0;
-    const bool powers = Visitor::kPowers && tree.digit_bits > 0;
-    while (at.inside() && visitor.more()) {
-      powers ? visit<BitDigits<T>>(ray, at, visitor, wanted) : visit<Digits<T>>(ray, at, visitor, wanted);
-    }
+    while (at.inside() && visitor.more()) visit<Digits>(ray, at, visitor, wanted);
   }
 
   // One node: finds it, marks it, and takes all intervals whose middle lies in it.
   template <class Digits, class Visitor>
   GV_HD void visit(const Ray<T>& ray, Intervals<T>& at, Visitor& visitor, int32_t& wanted) const {
     const T middle = at.middle();
-    Digits digits(tree, ray.at(middle));
+    Digits digits(tree, levels, rays, ray, middle);
     const auto hides = [&](int32_t node) { return visitor.hides(node); };
     Visit<T> visit = find(ray, digits, at.cone(middle), hides, wanted, visitor.missed());
     visit.seen = middle;
@@ -166,7 +161,7 @@ struct Walk {
     visit.cone_high = reached ? visit.above : visit.voxel;
 
     const Place place = descend(tree, digits, wanted, blend, *frame_1, hides);
-    visit.exit = ray.leave(digits.corner(place.depth, levels), levels.size[place.depth]);
+    visit.exit = ray.leave([&](int axis, bool upper) { return digits.face(axis, place.depth, upper); });
     visit.hidden = place.hidden && (place.depth < wanted || !blend);
     if (!visit.hidden && mark_missing(place, wanted, blend, cone)) missed = true;
 
