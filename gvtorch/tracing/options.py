@@ -40,7 +40,7 @@ class RenderOptions:
     lens: ThinLens | None = None  # depth of field; None: all is sharp
     lighting: Lighting | None = None  # shadows and light from all around; None: the shader's own
     backend: Backend = "auto"
-    dtype: torch.dtype = torch.float32  # float64 for trees deeper than about 2^16 voxels
+    dtype: torch.dtype = torch.float32  # float64 for very thin media, very narrow cones
 
     def __post_init__(self) -> None:
         where = "render"

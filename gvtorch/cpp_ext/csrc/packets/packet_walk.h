@@ -184,7 +184,7 @@ struct PacketWalk {
     at.top = kernel.lengths - 1;
     at.length = splat<Floats>(at.step);
     at.shortness = 1.0f / at.length;
-    for (int axis = 0; axis < 3; ++axis) ray.high[axis] = static_cast<float>(walk.rays.place_33[6 + axis]);
+    for (int axis = 0; axis < 3; ++axis) ray.inner[axis] = Ray<Floats>::inner_of(walk.rays, axis);
     for (int lane = 0; lane < kLanes; ++lane) {
       numbers[lane] = begin + lane < end ? walk.order(begin + lane) : -1;
       if (numbers[lane] < 0) continue;

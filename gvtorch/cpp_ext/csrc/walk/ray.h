@@ -31,9 +31,9 @@ template <class T>
 struct Ray {
   using Real = RealOf<T>;
   Vec3<T> origin, direction;
-  Vec3<T> rest;     // what rounding took from the origin, in a deep tree; else 0
-  Vec3<T> inverse;  // of the direction
-  Vec3<Real> high;  // corner of the scene; its low corner is 0
+  Vec3<T> rest;      // what rounding took from the origin, in a deep tree; else 0
+  Vec3<T> inverse;   // of the direction
+  Vec3<Real> inner;  // the last place of the scene along each axis: what lies on its high face belongs to it
   T cone_near, cone_growth;
   T first, last;
   T moved;  // distance from the camera to the origin
@@ -82,7 +82,7 @@ struct Ray {
       origin[axis] = static_cast<T>(start[axis]);
       rest[axis] = rays.deep ? static_cast<T>(start[axis] - static_cast<double>(origin[axis])) : T{};
       inverse[axis] = 1 / direction[axis];
-      high[axis] = static_cast<T>(rays.place_33[6 + axis]);
+      inner[axis] = inner_of(rays, axis);
       const double from = place(axis), to = rays.place_33[6 + axis];
       if (direction[axis] == 0) {
         if (!(from >= 0 && from <= to)) last = first;
@@ -109,15 +109,17 @@ struct Ray {
     return found;
   }
 
-  // The same inside the root cube: a place on the scene's high face belongs to the scene.
+  // The same inside the scene.
   GV_HD Vec3<T> at(T t) const {
     Vec3<T> place;
     for (int axis = 0; axis < 3; ++axis) {
-      place[axis] = clamp(origin[axis] + t * direction[axis], static_cast<Real>(0), inner(axis));
+      place[axis] = clamp(origin[axis] + t * direction[axis], static_cast<Real>(0), inner[axis]);
     }
     return place;
   }
-  GV_HD Real inner(int axis) const { return high[axis] * static_cast<Real>(0.9999999); }
+  GV_HD static Real inner_of(const RayView& rays, int axis) {
+    return static_cast<Real>(rays.place_33[6 + axis]) * static_cast<Real>(0.9999999);
+  }
 
   // Distance at which the ray leaves a box; face(axis, upper) tells how far its lower or upper face is from the origin.
   template <class Face>
