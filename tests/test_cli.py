@@ -267,8 +267,8 @@ def test_flags_give_light(small, tmp_path):
         ("lamp", "lamp:-50,60,0,2;shadows:0;indirect:1"),
     ):
         file = tmp_path / f"{name}.npz"
-        shown = ("--shader", "isosurface", "--value", "100", "--lighting", light)
-        args = ("--npz", file, "--size", "24x24", *shown, "-o", tmp_path / "a.png")
+        args = ("--npz", file, "--size", "24x24", "--shader", "lit", "--lighting", light)
+        args = (*args, "-o", tmp_path / "a.png")
         run = gvtorch("render", small, *args)
         assert run.returncode == 0, run.stderr
         mean[name] = float(np.load(file)["color"].mean())

@@ -151,7 +151,7 @@ def test_every_shader_is_cut_by_planes_and_boxes(channels, compiled, name):
     first = torch.where(inward, torch.maximum(rays.range[:, 0], -height / rate), rays.range[:, 0])
     last = torch.where(inward, rays.range[:, 1], torch.minimum(rays.range[:, 1], -height / rate))
     ends = torch.stack((first, torch.maximum(first, last)), 1)
-    cut, _ = run(tree, compiled, dataclasses.replace(rays, range=ends), shader)
+    cut, _ = run(tree, compiled, dataclasses.replace(rays, range=ends), shader.opened())
     clipped, _ = run(tree, compiled, rays, shader, clip=gv.Clip(planes=[plane]))
     whole, _ = run(tree, compiled, rays, shader)
     for field in ("color", "alpha", "depth", "features"):

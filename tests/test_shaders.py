@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 from dataclasses import replace
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import DEVICES, ROOT
-from helpers.rays import camera_rays, world_rays
+from helpers.rays import camera_rays, rays_along, world_rays
 from helpers.shaders import POINT, SHADERS
 from helpers.traces import SHADER, assert_equal, changed, op_arguments, run
 from helpers.trees import forget, on
@@ -381,3 +382,41 @@ def test_what_effects_ask_of_a_shader_without_a_light():
             with pytest.raises(ValueError, match=f"lighting needs .*, got {type(shader).__name__}"):
                 ask()
         assert shader.cut_surface() is None and shader.projection is None
+
+
+@pytest.mark.parametrize("kind", ["isosurface", "distance field"])
+def test_a_surface_is_filled(backend, kind):
+    """Half a ball under the box's high face: its cut is seen from above, matter from within; the
+    inner side of a hollow one.
+    """
+    place = torch.arange(40.0)
+    z, y, x = torch.meshgrid(place[:28], place, place, indexing="ij")
+    gap = 12 - ((x - 19.5) ** 2 + (y - 19.5) ** 2 + (z - 27.5) ** 2).sqrt()
+    field = kind == "distance field"
+    tree = gv.N3Tree.from_volume(gv.Volume(-gap if field else gap), 8)
+    across = torch.linspace(5, 34, 9, dtype=torch.float64)
+    origin = torch.stack((across, torch.full_like(across, 18.0), torch.full_like(across, 60.0)), 1)
+    beside = ((origin[:, 0] - 19.5) ** 2 + 1.5**2).sqrt()
+    down = rays_along(origin, (0.0, 0.0, -1.0))
+    within = rays_along(torch.tensor([[19.0, 19.0, 24.0]]).double(), (0.3, 0.1, -1.0))
+    met = {}
+    for filled in (True, False):
+        shader = gv.DistanceField(filled=filled) if field else gv.Isosurface(0, filled=filled)
+        assert shader.opened().filled is False and shader.filled is filled
+        for name, rays in (("down", down), ("within", within)):
+            result, _ = run(tree, backend, rays, shader)
+            met[name, filled] = result
+    cut = beside < 12
+    assert 3 < cut.sum() < 9
+    depth = met["down", True]["depth"][:, 0]
+    assert torch.equal(depth < math.inf, cut)
+    assert (depth[cut] - 32.5).abs().max() < 1e-4, "the box's face"
+    assert (met["down", True]["color"][cut] > 0.2).all()
+    hollow = met["down", False]["depth"][:, 0].double()[cut]
+    assert (hollow - (32.5 + (144 - beside[cut] ** 2).sqrt())).abs().max() < 0.1
+    assert float(met["within", True]["depth"]) == 0
+    assert 8 < float(met["within", False]["depth"]) < 12
+    assert float(met["within", True]["alpha"]) == float(met["within", False]["alpha"]) == 1
+    bare, _ = run(tree, backend, down, shader.opened(), clip=gv.Clip(planes=[(0, 0, -1, 20)]))
+    clip, _ = run(tree, backend, down, shader, clip=gv.Clip(planes=[(0, 0, -1, 20)]))
+    assert torch.equal(bare["depth"], clip["depth"]), "a clip without caps opens it"

@@ -101,7 +101,7 @@ def test_phong_on_a_sphere(backend, kind, stored):
     to_light = to_light / np.linalg.norm(to_light, axis=1, keepdims=True) + 0 * normal
     look = {"ambient": 0.1, "diffuse": 0.7, "specular": 0.4, "shininess": 12.0}
     normals = "n" if stored else None
-    shader = gv.Isosurface(0, (0.9, 0.5, 0.3), normals=normals, light=light, **look)
+    shader = gv.DistanceField((0.9, 0.5, 0.3), normals=normals, light=light, **look)
     hits = shoot(tree, rays, shader, backend)
     base = np.array([0.9, 0.5, 0.3])
     expected = phong(normal, to_light, eye, base, np.array(color), **look)
@@ -270,7 +270,7 @@ def test_parameters_read_back_as_they_were_packed():
     )  # fmt: skip
     packed = given.pack(torch.float64, torch.device("cpu"))
     assert packed.tolist() == [
-        [1, 2, 3, LightKind.POINT], [4, 5, 6, 7], [8, 9, 10, 11], [0.25, 0, 0, 0], [2, -1, 0, 0],
+        [1, 2, 3, LightKind.POINT], [4, 5, 6, 7], [8, 9, 10, 11], [0.25, 1, 0, 0], [2, -1, 0, 0],
     ]  # fmt: skip
     read = ShadeParameters.read(packed)
     assert read.own_as(IsosurfaceNumbers) == IsosurfaceNumbers(level)

@@ -65,9 +65,10 @@ class StoredColorNumbers(NamedTuple):
 
 
 class IsosurfaceNumbers(NamedTuple):
-    """An isosurface's own number."""
+    """An isosurface's own numbers."""
 
     level: Number  # the value at the surface
+    filled: float = 1.0  # 1: with what is not below the level; -1: with what is; 0: with nothing
 
 
 class ProjectionNumbers(NamedTuple):

@@ -181,8 +181,8 @@ class StoredColor(LitShader):
 
 
 class Isosurface(LitShader):
-    """The first place where the value passes a level, opaque and lit. Where a cap cuts it, it
-    is filled with what is not below the level.
+    """The first place where the value passes a level, opaque and lit. It is filled with what is not
+    below the level: that is seen where the scene's box cuts it, and from within.
     """
 
     kind = "Isosurface"
@@ -195,6 +195,7 @@ class Isosurface(LitShader):
         *,
         color_channel: str | None = None,
         color_component: int = 0,
+        filled: bool = True,
         **light: Any,
     ) -> None:
         """Takes the level and how the surface looks.
@@ -204,6 +205,8 @@ class Isosurface(LitShader):
             color: Linear red, green, blue, or a transfer function of the second channel's value.
             color_channel: Name of the second channel, for a transfer function.
             color_component: Which number of it.
+            filled: False: a hollow shell, whose inner side a ray sees that begins within. So it is
+                where a `Clip` without caps cuts it.
             **light: As in `Lit`.
 
         Raises:
@@ -215,7 +218,7 @@ class Isosurface(LitShader):
             raise ValueError("Isosurface: a transfer function and color_channel belong together")
         if not isinstance(color, TransferFunction):
             check_triple("Isosurface", "color", color, low=0, high=1)
-        self.value, self.color = value, color
+        self.value, self.color, self.filled = value, color, filled
         self.other, self.other_component = color_channel, color_component
 
     def table(self, sampling: Sampling) -> ColorTable:
@@ -224,7 +227,12 @@ class Isosurface(LitShader):
         return one_color(self.color, sampling)
 
     def own_numbers(self, tree: N3Tree) -> IsosurfaceNumbers:
-        return IsosurfaceNumbers(self.value)
+        return IsosurfaceNumbers(self.value, (-1.0 if self.distance else 1.0) * self.filled)
+
+    def opened(self) -> Isosurface:
+        hollow = copy(self)
+        hollow.filled = False
+        return hollow
 
     def matter(self) -> Solid:
         if isinstance(self.color, TransferFunction):

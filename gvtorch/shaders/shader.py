@@ -201,6 +201,10 @@ class Shader:
         """Returns what a cut through its inside shows; None: it is a volume, and shows itself."""
         return None
 
+    def opened(self) -> Shader:
+        """Returns what a cut without a cap shows: the inside of a surface, too."""
+        return self
+
     def unlit(self) -> Shader:
         """Returns the shader without its light, for light by cones: base colours, and normals."""
         raise ValueError(

@@ -79,6 +79,9 @@ def _clipped(
     tracer: Tracer, options: RenderOptions, box: Tensor, lens: ThinLens | None = None
 ) -> Trace:
     """A tracer with the lens (in world units) and the options' clip."""
+    opened = tracer.shader if options.clip is None else tracer.shader.opened()
+    if opened is not tracer.shader:
+        tracer = tracer.seeing(opened, options)
     trace: Trace = tracer
     if lens is not None:
         trace = ThroughLens(trace, lens, options.cone_scale)
@@ -102,8 +105,7 @@ def _clipped(
 
 def _surface_slab(surface: CutSurface, tracer: Tracer, options: RenderOptions) -> Trace:
     """What traces the intervals behind cuts through isosurfaces: opaque where the first value lies
-    inside the surface, in its own colour, unlit. The isosurface shader itself shows nothing where a
-    ray begins inside.
+    inside the surface, in its own colour, unlit. The isosurface itself is hollow under a clip.
     """
     trace_value = tracer.seeing(surface.value, options)
     trace_colors = surface.colors and tracer.seeing(surface.colors, options)

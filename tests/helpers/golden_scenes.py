@@ -342,16 +342,17 @@ def shader_of(s: Settings) -> Any:
         lit |= {} if look == "six" else {"reference": s["reference"]}
         return gv.StoredColor("color", **lit)
     colored = gv.TransferFunction.from_points([(0, 1)], [(0, 0.2, 0.1, 0.9), (200, 1, 0.8, 0)])
+    surface = lit | {"filled": s["seed"] % 2 == 0}
     return {
         "lit": lambda: gv.Lit(transfer, **lit),
         "lit by normals": lambda: gv.Lit(transfer, normals="normal", **lit),
         "lit with shadows": lambda: gv.Lit(transfer, shadows=True, **lit),
         "pre-integrated": lambda: gv.PreIntegrated(transfer),
-        "isosurface": lambda: gv.Isosurface(level, s["glow"], **lit),
+        "isosurface": lambda: gv.Isosurface(level, s["glow"], **surface),
         "coloured isosurface": lambda: gv.Isosurface(
-            level, colored, color_channel="color", color_component=s["seed"] % 4, **lit
+            level, colored, color_channel="color", color_component=s["seed"] % 4, **surface
         ),
-        "distance field": lambda: gv.DistanceField(s["glow"], offset=s["level"], **lit),
+        "distance field": lambda: gv.DistanceField(s["glow"], offset=s["level"], **surface),
         "features": lambda: gv.Features(transfer, "color"),
         "module": lambda: gv.ModuleShader(
             Ink(low, high), ("value", "color"), hidden_by=transfer if s["level"] > 0.5 else None

@@ -301,22 +301,32 @@ class Isosurface(Shade):
     def __post_init__(self) -> None:
         super().__post_init__()
         nothing = torch.zeros_like(self.sum.clear)
-        self.level = torch.as_tensor(self.light.parameters.own_as(IsosurfaceNumbers).level)
+        own = self.light.parameters.own_as(IsosurfaceNumbers)
+        self.level, self.filled = torch.as_tensor(own.level), own.filled
         self.found = torch.zeros_like(nothing, dtype=torch.bool)
         self.before, self.before_end, self.share = nothing, nothing - INF, nothing
 
     def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        level = self.level
-        return ((above(high) < level) | (below(low) >= level)) & ~self.found[which]
+        level, filled, hides = self.level, self.filled, torch.zeros_like(self.found[which])
+        if filled >= 0:
+            hides = hides | (above(high) < level)
+        if filled <= 0:
+            hides = hides | (below(low) >= level)
+        return hides & ~self.found[which]
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
         level = self.level
         front, back = probe.value(piece.start), probe.value(piece.end)
         under = front < level
-        early = where & (self.before_end == piece.start) & ((self.before < level) != under)
+        early = (self.before_end == piece.start) & ((self.before < level) != under)
+        if self.filled != 0:
+            early = early | (~under if self.filled > 0 else under)
+        early = where & early
+        begins = early & (self.before_end == -INF)  # within, where no surface is
         crosses = where & ~early & (under != (back < level))
         self.before = torch.where(where, back, self.before)
         self.before_end = torch.where(where, piece.end, self.before_end)
+        self.before_end = torch.where(begins, INF, self.before_end)
         if not (early | crosses).any():
             return
         near, far, near_value, far_value = piece.start, piece.end, front, back
@@ -340,6 +350,7 @@ class Isosurface(Shade):
         walk.look_up(self.found.nonzero()[:, 0], t, self)
         probe = Probe(walk.at.beam, walk.visit, self.channel)
         normal = self.light.normal_at(probe, t)
+        normal = torch.where((self.before_end < INF)[:, None], normal, 0.0)
         value = self.level.expand_as(t)
         if self.others:
             value = probe.number(self.others[self.other_component], t)

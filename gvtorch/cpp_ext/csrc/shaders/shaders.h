@@ -171,8 +171,8 @@ struct Isosurface : ShaderFacts {
   template <class V>
   struct SumOf : ShadeSum<V> {
     V before{};
-    V before_end = splat<V>(static_cast<T>(-INFINITY));
-    V share{};  // of the light, that came to the surface
+    V before_end = splat<V>(static_cast<T>(-INFINITY));  // +INFINITY: the ray began within, where no surface is
+    V share{};                                           // of the light, that came to the surface
 
     template <class Own, class Other, class Body>
     GV_HD static void each(Own& own, Other& other, const Body& body) {
@@ -194,17 +194,21 @@ struct Isosurface : ShaderFacts {
 
   struct Own {
     T level;
+    T filled;  // 1: with what is not below the level; -1: with what is; 0: with nothing
   };
   GV_HD T iso() const { return own_numbers<Own>(light.parameters).level; }
+  GV_HD T filled() const { return own_numbers<Own>(light.parameters).filled; }
   GV_HD bool hides(T low, T high, const Sum&) const {
-    return a_little_above(high) < iso() || a_little_below(low) >= iso();
+    return (!(filled() < 0) && a_little_above(high) < iso()) || (!(filled() > 0) && a_little_below(low) >= iso());
   }
   template <class V, class Eye>
   GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
     using Mask = MaskOf<V>;
     const T level = iso();
     const Mask below = piece.front < level;
-    const Mask parted = which && sum.before_end == piece.start && (sum.before < level) != below;
+    const Mask leapt = sum.before_end == piece.start && (sum.before < level) != below;
+    const Mask within = filled() == 0 ? Mask{} : filled() > 0 ? !below : below;
+    const Mask parted = which && (leapt || within);
     const Mask crosses = which && !parted && below != (piece.back < level);
     V place = piece.start;
     if (any(crosses)) {
@@ -226,15 +230,17 @@ struct Isosurface : ShaderFacts {
       place = select(crosses, near + part * (far - near), place);
     }
     const Mask hit = parted || crosses, passed = which && !hit;
+    const Mask begins = parted && !leapt && sum.before_end == static_cast<T>(-INFINITY);
     sum.share = select(hit, sum.clear, sum.share);
     sum.clear = select(hit, V{}, sum.clear);
     sum.depth = select(hit, place, sum.depth);
     sum.before = select(passed, piece.back, sum.before);
     sum.before_end = select(passed, piece.end, sum.before_end);
+    sum.before_end = select(begins, splat<V>(static_cast<T>(INFINITY)), sum.before_end);
   }
   GV_HD void surface(const Probe<T>& probe, Sum& sum) const {
     const T t = sum.depth;
-    const Vec3<T> n = light.normal(probe, t);
+    const Vec3<T> n = sum.before_end == static_cast<T>(INFINITY) ? Vec3<T>{0, 0, 0} : light.normal(probe, t);
     const T value = probe.channels.other.given() ? probe.number_at(probe.channels.other, color_component, t) : iso();
     const Row<T> row = light.shade(Transfer<T>(transfer).look_up(value, 0), n, probe, t);
     sum.red = sum.share * row.red;
