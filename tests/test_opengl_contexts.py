@@ -54,6 +54,7 @@ def use(context: ctypes.c_void_p | None) -> None:
 def device(request):
     if request.param == "cuda" and (reason := available()["cuda"]):
         pytest.skip(f"backend cuda: {reason}")
+    opengl_context()  # and EGL's display, which others may have ended
     yield request.param
     use(None)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import importlib.util
 import subprocess
@@ -10,14 +11,24 @@ import sys
 import pytest
 
 
-@functools.cache
+_context = []
+
+
 def opengl_context():
-    """moderngl's context without a window, one a process, or a skip."""
+    """moderngl's context without a window, current, or a skip. One a process, until VTK closes a
+    window: that ends EGL's display, for all who have it.
+    """
     moderngl = pytest.importorskip("moderngl")
-    try:
-        return moderngl.create_context(standalone=True, backend="egl")
-    except Exception as error:  # it raises no other class
-        pytest.skip(f"no OpenGL through EGL: {error}")
+    if _context:
+        _context[0].__enter__()
+        if not ctypes.CDLL("libEGL.so.1").eglGetCurrentContext():
+            _context.clear()
+    if not _context:
+        try:
+            _context.append(moderngl.create_context(standalone=True, backend="egl"))
+        except Exception as error:  # it raises no other class
+            pytest.skip(f"no OpenGL through EGL: {error}")
+    return _context[0]
 
 
 @functools.cache
