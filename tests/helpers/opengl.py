@@ -10,7 +10,6 @@ import sys
 
 import pytest
 
-
 _context = []
 
 
