@@ -1,6 +1,6 @@
 """A flight into Menger's sponge, down to a billionth of its size, and back.
 
-Its finest level has 3^21 cells a side; the pools have room for some ten thousand bricks. Cells of
+Its finest level has 3^21 cells a side; the pool has room for 24,000 bricks of 9^3. Cells of
 every size look alike, and so should the pictures. Writes four of them, side by side.
 """
 
