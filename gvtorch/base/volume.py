@@ -12,6 +12,7 @@ from torch import Tensor
 
 from . import check
 from . import constants as config
+from .image_info import ImageInfo
 
 #: The dtypes that a brick channel can have. Wider ones are narrowed on the way in, see `Volume`.
 CHANNEL_DTYPES = (
@@ -54,7 +55,7 @@ class Volume:
 
     Attributes:
         data: (z, y, x, c) tensor on the CPU, one of `CHANNEL_DTYPES`.
-        spacing, origin, name: See the constructor.
+        spacing, origin, name, info: See the constructor.
         filter: How coarse levels are made: the mean, or what is seen along six directions, see
             `directional`.
     """
@@ -69,6 +70,7 @@ class Volume:
         *,
         name: str = "volume",
         nan: float | None = None,
+        info: ImageInfo | None = None,
     ) -> None:
         """Checks and takes over a grid.
 
@@ -79,6 +81,7 @@ class Volume:
             origin: (x, y, z) world units, centre of voxel 0.
             name: Where it came from, for messages.
             nan: The value that voxels which are not finite get; None refuses them.
+            info: Unit, names and colours of channels, ...; nothing is known if left out.
 
         Raises:
             ValueError: data is empty, of another shape or dtype, has more than 2^31 voxels or
@@ -97,6 +100,7 @@ class Volume:
         self.spacing = check.triple(where, "spacing", spacing, positive=True)
         self.origin = check.triple(where, "origin", origin)
         self.name = name
+        self.info = ImageInfo() if info is None else info
 
     @property
     def extent(self) -> tuple[int, int, int]:

@@ -201,7 +201,8 @@ def _source(
             )
         if str(source.data.dtype).removeprefix("torch.") not in DTYPES:
             raise ValueError(f"{source.name}: {source.data.dtype} has no place in a store")
-        told = {"path": source.name, "spacing": source.spacing, "origin": source.origin}
+        told = {"path": source.name, "info": source.info}
+        told |= {"spacing": source.spacing, "origin": source.origin}
         return placed("convert", MemorySource.of(source.data.numpy(), **told), spacing, origin)
     found = open_source(source, spacing=spacing, origin=origin, **options)
     if not found.whole:
@@ -213,7 +214,7 @@ def _source(
             f"{resources.amount(found.peak_bytes)}, and {resources.amount(free)} of memory are "
             "free: unpack it first"
         )
-    told = {name: getattr(found, name) for name in ("path", "spacing", "origin", "unit")}
+    told = {name: getattr(found, name) for name in ("path", "spacing", "origin", "info")}
     return MemorySource.of(read_whole(found), **told)
 
 
@@ -243,11 +244,12 @@ def _plan(
     workers = resources.cores() if workers is None else workers
     workers = check.whole("convert", "workers", workers, low=1)
     tasks = [math.prod(layout.shards(level)) for level in range(layout.levels)]
-    told = ("extent", "dtype", "spacing", "origin", "unit")
+    told = ("extent", "dtype", "spacing", "origin")
     settings = {
         "source": source.path,
         "fingerprint": unfinished.fingerprint(given),
         **{name: getattr(source, name) for name in told},
+        "unit": source.info.unit,
         "channels": source.width,
         "block": block,
         "threshold": threshold,

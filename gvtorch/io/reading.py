@@ -6,6 +6,7 @@ Every header is read first and refused if its extent does not fit, before memory
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypedDict, Unpack
@@ -68,7 +69,7 @@ def read_volume(
     """
     source = open_source(path, spacing=spacing, origin=origin, most=MAX_VOXELS, **options)
     data, name = read_whole(source), Path(path).name
-    return Volume(data, source.spacing, source.origin, name=name, nan=nan)
+    return Volume(data, source.spacing, source.origin, name=name, nan=nan, info=source.info)
 
 
 def open_source(
@@ -102,6 +103,8 @@ def open_source(
         if source.dtype not in DTYPES:
             raise ValueError(f"{path}: values must be real numbers, got dtype {source.dtype}")
         source.check_file()
+    if source.lost:
+        warnings.warn(f"{path}: not kept: {'; '.join(source.lost)}", stacklevel=2)
     return placed(text, source, spacing, origin)
 
 

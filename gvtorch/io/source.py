@@ -13,7 +13,6 @@ import dataclasses
 import gzip
 import math
 import os
-import time
 import warnings
 import zipfile
 from abc import ABC, abstractmethod
@@ -21,10 +20,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from time import time_ns
 from typing import IO, Any
 
 import numpy as np
 
+from ..base.image_info import ImageInfo
 from . import boxes
 from .store_layout import value_dtype
 
@@ -37,15 +38,17 @@ class VolumeSource(ABC):
 
     path: str  # the file, folder or URL, as the user named it
     shape: tuple[int, ...]  # of the array as it is stored
-    axes: str  # a letter for each of its axes: z, y, x, c, or - for one of size 1 to drop
+    axes: str  # a letter for each of its axes: t, c, z, y, x, or - for one of size 1 to drop
     stored: str  # NumPy dtype as it is stored, with byte order
     flips: str = ""  # letters of axes that run backwards
     spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)  # x y z, world units
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x y z, centre of voxel 0
-    unit: str | None = None  # of length
+    info: ImageInfo = dataclasses.field(default_factory=ImageInfo)  # unit, channels, ...
+    lost: tuple[str, ...] = ()  # what the file tells and this can't keep, a few words each
+    time: int = 0  # the time point that is read
     whole: bool = False  # every read unpacks the whole file: one read of all is better
     # When (ns): tells sources of one path apart, for what is kept open between reads.
-    opened: int = dataclasses.field(default_factory=time.time_ns)
+    opened: int = dataclasses.field(default_factory=time_ns)
 
     @property
     def extent(self) -> tuple[int, int, int]:
@@ -58,6 +61,11 @@ class VolumeSource(ABC):
         return self.size("c")
 
     @property
+    def times(self) -> int:
+        """Number of time points."""
+        return self.size("t")
+
+    @property
     def dtype(self) -> str:
         """What values are read as: wide numbers become float32, as in `Volume`."""
         return value_dtype(np.dtype(self.stored))
@@ -65,12 +73,15 @@ class VolumeSource(ABC):
     @property
     def nbytes(self) -> int:
         """Bytes of all values as they are read."""
-        return math.prod(self.shape) * np.dtype(self.dtype).itemsize
+        return math.prod(self.shape) // self.times * np.dtype(self.dtype).itemsize
 
     @property
     def peak_bytes(self) -> int:
         """Bytes of memory that reading all at once takes: as it is stored, and as it is read."""
-        return math.prod(self.shape) * np.dtype(self.stored).itemsize + self.nbytes
+        unpacked = self.times if self.whole else 1  # a file that is packed is unpacked whole
+        return self.nbytes + self.nbytes // np.dtype(self.dtype).itemsize * unpacked * (
+            np.dtype(self.stored).itemsize
+        )
 
     def size(self, axis: str) -> int:
         """Voxels along an axis, 1 where it has none."""
@@ -108,13 +119,14 @@ class VolumeSource(ABC):
     def _read(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
         spans = dict(zip("zyx", zip(low, high, strict=True), strict=True))
         index = []
+        spans["t"] = (self.time, self.time + 1)
         for axis, size in zip(self.axes, self.shape, strict=True):
             start, stop = spans.get(axis, (0, size))
             backwards = axis in self.flips
             index.append(slice(size - stop, size - start) if backwards else slice(start, stop))
         data = self.read_stored(tuple(index))
-        data = data.squeeze(tuple(i for i, axis in enumerate(self.axes) if axis == "-"))
-        data = boxes.to_zyxc(data, self.axes.replace("-", ""))
+        data = data.squeeze(tuple(i for i, axis in enumerate(self.axes) if axis in "-t"))
+        data = boxes.to_zyxc(data, self.axes.replace("-", "").replace("t", ""))
         data = np.flip(data, tuple("zyx".index(axis) for axis in self.flips))
         with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite
             return np.asarray(data).astype(self.dtype, order="C", copy=False)
@@ -170,7 +182,7 @@ class MemorySource(VolumeSource):
 
     @classmethod
     def of(cls, data: np.ndarray, **told: Any) -> MemorySource:
-        """Takes (z, y, x, c) values; `told` are path, spacing, origin and unit."""
+        """Takes (z, y, x, c) values; `told` are path, spacing, origin and info."""
         return cls(data=data, shape=data.shape, axes="zyxc", stored=data.dtype.str, **told)
 
     def read_stored(self, index: Index) -> np.ndarray:

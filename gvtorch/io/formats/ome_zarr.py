@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ...base.image_info import ImageInfo
 from ..ngff import is_zarr
 from ..source import Index, VolumeSource
 from .format import Format
@@ -45,5 +46,5 @@ def open_ome_zarr(path: str) -> OmeZarrSource:
         stored=str(store.dtype).removeprefix("torch."),
         spacing=store.spacing,
         origin=store.origin,
-        unit=store.unit,
+        info=ImageInfo(unit=store.unit),
     )
