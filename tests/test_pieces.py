@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,8 +18,9 @@ from helpers.traces import SHADER, assert_equal, run
 from helpers.trees import forget
 
 import gvtorch as gv
-from gvtorch.tracing.composite import trace_pieces, trace_trees
+from gvtorch.tracing.composite import trace_pieces
 from gvtorch.tracing.tracer import Tracer
+from gvtorch.tracing.trees import TreeTrace, trace_trees
 
 
 @pytest.fixture(scope="module")
@@ -250,7 +252,14 @@ def test_normals_of_three_trees_are_the_mean_by_the_light_that_each_takes():
         cone=torch.zeros(2, 2),
         range=torch.tensor([[0.0, torch.inf]]).repeat(2, 1),
     )
-    trees = [(box, lambda _, one=one: one) for box, one in zip(boxes, hits, strict=True)]
+    trees = [
+        TreeTrace(
+            box.double(),
+            lambda _, one=one: one,
+            SimpleNamespace(shader=gv.TransferFunction([(0, 0), (1, 1)])),
+        )
+        for box, one in zip(boxes, hits, strict=True)
+    ]
     found = trace_trees(trees, rays)
     for ray, ranked in enumerate((hits, hits[::-1])):
         a, b, c = (float(one.alpha[ray]) for one in ranked)

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import Any, Literal, Unpack
+from typing import Literal, Unpack
 
 import torch
 from torch import Tensor
@@ -27,13 +27,18 @@ from ..cameras.custom import as_camera
 from ..ops.trace import choose_backend
 from ..pictures import Picture
 from ..producers import Producer
-from ..shaders.shader import Shader, check_shader
+from ..shaders.shader import Shader
 from ..tracing import RenderOptions
-from ..tracing.around import around
-from ..tracing.composite import Trace, trace_trees
 from ..tracing.options import RenderSettings, render_options
 from ..tracing.pixels import Again, View, empty_hits
-from ..tracing.tracer import Tracer
+from ..tracing.trees import (
+    Shaders,
+    TreeTrace,
+    box_around,
+    overlaps,
+    trace_trees,
+    tree_traces,
+)
 from .production import Failure, Production
 from .ray_subsets import RaySubsets, scouts
 from .request_batch import ProducedTree
@@ -41,8 +46,6 @@ from .setup import EngineOptions, EngineSettings, brick_bytes, make_pools, make_
 from .stats import Collected, Counts, FrameStats, Readback, Readbacks, Report
 
 Scene = Producer | Mapping[str, Producer]
-#: A shader for all trees, or one for each by name.
-Shaders = Shader | Mapping[str, Shader]
 
 _MOST_LISTED = 1 << 17  # nodes whose requests one frame lists
 _KEPT = 1000  # frames in a report
@@ -150,24 +153,13 @@ class Engine:
         trace = partial(trace_trees, self._tracers(shader, chosen))
         return View(placed, placed.numbers(self.device), trace, chosen)
 
-    def _tracers(self, shaders: Shaders, options: RenderOptions) -> list[tuple[Tensor, Trace]]:
-        """For each tree its box and what traces rays through it."""
-        by_level, tracers = self.options.loading == "levels", []
-        for name, source in self.trees.items():
-            tree, channels = source.tree, source.producer.channels
-            shader: Any = shaders.get(name) if isinstance(shaders, Mapping) else shaders
-            check_shader("frame", f"shader of tree {name!r}", shader)
-            channel = options.channel or next(iter(channels))
-            for needed in (channel, *shader.channels):
-                if needed not in channels:
-                    known = ", ".join(channels)
-                    raise ValueError(
-                        f"frame: tree {name!r} has no channel {needed!r}; it has {known}"
-                    )
-            chosen = replace(options, channel=channel)
-            tracer = Tracer(tree, shader, chosen, by_level=by_level, frame_1=self._frame_1)
-            tracers.append((tree.box, around(tracer, chosen, self.box)))
-        return tracers
+    def _tracers(self, shaders: Shaders, options: RenderOptions) -> list[TreeTrace]:
+        """What traces rays through each tree."""
+        scene = {name: (one.tree, one.producer.channels) for name, one in self.trees.items()}
+        by_level = self.options.loading == "levels"
+        return tree_traces(
+            *("frame", scene, shaders, options, self.box), by_level=by_level, frame_1=self._frame_1
+        )
 
     @contextmanager
     def new_frame(self, options: RenderOptions) -> Iterator[FrameStats]:
@@ -414,6 +406,10 @@ class Engine:
         if self.device.type != "cuda":
             raise ValueError(f"Engine.capture: the engine must be on CUDA, it is on {self.device}")
         view = self.view("capture", camera, shader, options)
+        if overlaps(self._tracers(shader, view.options)):
+            raise ValueError(
+                "Engine.capture: trees that overlap can't be recorded: the host waits for them"
+            )
         if view.options.layer is not None:
             view.options.layer.check_device("capture", self.device)
         self.frame(camera, shader, **options)  # loads what is loaded at first use
@@ -427,8 +423,7 @@ class Engine:
     @cached_property
     def box(self) -> Tensor:
         """(2, 3) float64 world corners around all trees."""
-        boxes = torch.stack([source.tree.box for source in self.trees.values()])
-        return torch.stack((boxes[:, 0].amin(0), boxes[:, 1].amax(0)))
+        return box_around([source.tree for source in self.trees.values()])
 
     @property
     def failures(self) -> list[Failure]:

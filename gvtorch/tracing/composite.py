@@ -1,24 +1,21 @@
-"""Hits put over hits: of the pieces of a ray, of what another renderer drew, of several trees; and
-where rays enter and leave boxes.
+"""Hits put over hits: of the pieces of a ray, of what another renderer drew; and where rays enter
+and leave boxes.
 
 Source: Porter, Duff, "Compositing digital images", 1984 (over, premultiplied).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import reduce
-from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from ..base.records import Hits, Rays
-from ..ops.shading import pack
 
-Trace = Callable[[Rays], Hits]  # through one tree or several, with whatever the options put around
+Trace = Callable[[Rays], Hits]  # with whatever the options put around
 
 
 def over(front: Hits, back: Hits, *, dimmed: bool = False) -> Hits:
@@ -65,58 +62,6 @@ def trace_pieces(trace: Trace, pieces: Iterable[Rays], *, cap: Trace | None = No
     for one, piece in steps:
         front = over(front, one(behind(piece, front)), dimmed=True)
     return front
-
-
-def trace_trees(trees: Sequence[tuple[Tensor, Trace]], rays: Rays) -> Hits:
-    """Traces rays through several trees, each a (2, 3) world box and its tracer, and composites
-    them in the order in which a ray enters their boxes.
-
-    Right wherever boxes do not overlap along a ray; where they do, the nearer box as a whole comes
-    first.
-    """
-    if len(trees) == 1:
-        return trees[0][1](rays)
-    near = torch.stack([_entry(box, rays) for box, _ in trees])  # (m, r)
-    order = near.argsort(dim=0, stable=True)
-    hits = [vars(trace(rays)) for _, trace in trees]
-    fields = {name: _ranked([one[name] for one in hits], order) for name in hits[0]}
-    ranked = [Hits(**{name: f[rank] for name, f in fields.items()}) for rank in range(len(trees))]
-    return replace(reduce(over, ranked), normal=_mean_normal(ranked))
-
-
-def _mean_normal(ranked: Sequence[Hits]) -> Tensor | None:
-    """(r, 3) mean of the normals of trees, nearest first, by the light each takes; None without."""
-    taken = [one.normal * one.alpha for one in ranked if one.normal is not None]
-    if not taken:
-        return None
-    total, alpha = taken[0], ranked[0].alpha
-    for more, one in zip(taken[1:], ranked[1:], strict=True):
-        total = total + (1 - alpha) * more
-        alpha = alpha + (1 - alpha) * one.alpha
-    return normalize(total, dim=1)
-
-
-def _ranked(fields: list[Tensor | None], order: Tensor) -> Sequence[Any]:
-    """The same field (r, ...) of m trees, in the order (m, r) of the trees along each ray; zeros
-    stand for a tree that does not give it.
-    """
-    given = [field for field in fields if field is not None]
-    if not given:
-        return fields
-    if len({field.shape[1:] for field in given}) > 1:
-        raise ValueError("render: trees must give as many features each")
-    nothing = torch.zeros_like(given[0])
-    stacked = torch.stack([nothing if field is None else field for field in fields])
-    if stacked.dim() == 3:
-        order = order[:, :, None].expand_as(stacked)
-    return stacked.gather(0, order).unbind(0)
-
-
-def _entry(box: Tensor, rays: Rays) -> Tensor:
-    """(r,) distance at which rays enter a (2, 3) box, +inf where they pass it by."""
-    low, high = pack((box,), rays.origin.dtype, rays.origin.device).view(2, 3)
-    first, last = box_span(low, high, rays.origin, rays.direction)
-    return torch.where(first <= last, first.clamp(min=0), torch.inf)
 
 
 def box_span(low: Tensor, high: Tensor, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:

@@ -129,7 +129,7 @@ def cost(
         for _, hits in view.blocks(_RAYS_A_BLOCK, progress)
     ]
     joined = [torch.cat(parts) for parts in zip(*columns, strict=True)]
-    stats = tree_stats(tree, chosen, joined[0])
+    stats = tree_stats([tree], chosen, joined[0])
     stats.milliseconds = 1e3 * (time.perf_counter() - start)
     images = {name: camera.image(column) for name, column in zip(IMAGES, joined, strict=True)}
     return Cost(**images, stats=stats)

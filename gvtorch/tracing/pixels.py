@@ -5,8 +5,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Unpack
 
 import torch
@@ -22,11 +23,13 @@ from ..ops.trace import choose_backend
 from ..pictures.background import Background
 from ..pictures.picture import Picture
 from ..pool import N3Tree
-from ..shaders.shader import Shader
 from .around import around
 from .composite import Trace
 from .options import RenderOptions, RenderSettings, render_options
 from .tracer import Tracer
+from .trees import Shaders, box_around, trace_trees, tree_traces
+
+Scene = N3Tree | Mapping[str, N3Tree]
 
 Pixels = slice | Tensor  # some of the pixels of all pictures of a camera, row by row
 #: Hits of an earlier pass, which are overwritten, and which (r,) bool of their rays to trace again.
@@ -35,21 +38,23 @@ _RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that p
 
 
 def render(
-    tree: N3Tree,
+    tree: Scene,
     camera: Camera | Rays,
-    shader: Shader,
+    shader: Shaders,
     *,
     progress: Progress = no_progress,
     **options: Unpack[RenderSettings],
 ) -> Picture:
-    """Renders a resident tree.
+    """Renders a resident tree, or several.
 
     Args:
         tree: What to render, on the device that renders it; its stamps and request words are
-            written.
-        camera: One camera or a batch; an orbit camera stands around the tree's box. Or rays in
+            written. Or trees by name, on one device: where they overlap, they are composited by
+            sample.
+        camera: One camera or a batch; an orbit camera stands around the scene's box. Or rays in
             world units, which make a picture as wide as `Rays.width`, or of one row.
-        shader: The transfer function, in data units, or another shader.
+        shader: The transfer function, in data units, or another shader; or one for each tree by
+            name.
         progress: Told how many rows are done.
         **options: Fields of `RenderOptions`.
 
@@ -61,32 +66,32 @@ def render(
     """
     camera = as_camera("render", camera)
     chosen = render_options("render", options, camera)
-    check.instance("render", "tree", tree, N3Tree)
-    start = time.perf_counter()
-    with collect_timings(tree.device) as timings:
+    trees = _trees("render", tree)
+    device, start = trees[0].device, time.perf_counter()
+    with collect_timings(device) as timings:
         with stage("prepare"):
-            tree.frame += 1
-            traced = around(Tracer(tree, shader, chosen), chosen, tree.box)
-        placed = camera.placed(tree.box)
-        view = View(placed, placed.numbers(tree.device), traced, chosen)
+            traced, box = _traced("render", tree, shader, chosen)
+        placed = camera.placed(box)
+        view = View(placed, placed.numbers(device), traced, chosen)
         hits = view.hits(progress)
         with stage("picture"):
-            stats = tree_stats(tree, chosen, hits.samples)
-            stats.tiles_used = int((tree.nodes.stamp_t == tree.frame).sum())
-            stats.bricks_used = int((tree.bricks.stamp_b == tree.frame).sum())
+            stats = tree_stats(trees, chosen, hits.samples)
+            for one in trees:
+                stats.tiles_used += int((one.nodes.stamp_t == one.frame).sum())
+                stats.bricks_used += int((one.bricks.stamp_b == one.frame).sum())
             picture = view.picture(hits, stats)
     stats.stages = timings.as_dict()
     stats.milliseconds = 1e3 * (time.perf_counter() - start)
     return picture
 
 
-def trace(tree: N3Tree, rays: Rays, shader: Shader, **options: Unpack[RenderSettings]) -> Hits:
-    """Traces any world rays through a resident tree, as one frame.
+def trace(tree: Scene, rays: Rays, shader: Shaders, **options: Unpack[RenderSettings]) -> Hits:
+    """Traces any world rays through a resident tree, or several, as one frame.
 
     Args:
-        tree: The tree; its stamps and request words are written.
+        tree: The tree, or trees by name; stamps and request words are written.
         rays: Rays in world units, on the tree's device.
-        shader: The transfer function, or another shader.
+        shader: The transfer function, or another shader; or one for each tree by name.
         **options: Fields of `RenderOptions`; background and layer belong to pictures and have no
             part in it.
 
@@ -98,21 +103,48 @@ def trace(tree: N3Tree, rays: Rays, shader: Shader, **options: Unpack[RenderSett
             can't be used.
     """
     chosen = render_options("trace", options)
-    check.instance("trace", "tree", tree, N3Tree)
     check.instance("trace", "rays", rays, Rays)
-    tree.frame += 1
-    return around(Tracer(tree, shader, chosen), chosen, tree.box)(rays)
+    return _traced("trace", tree, shader, chosen)[0](rays)
 
 
-def tree_stats(tree: N3Tree, options: RenderOptions, samples: Tensor) -> RenderStats:
+def _trees(where: str, scene: Scene) -> list[N3Tree]:
+    """The trees of a scene; raises ValueError unless there is one, and all are on one device."""
+    trees = [*scene.values()] if isinstance(scene, Mapping) else [scene]
+    if not trees:
+        raise ValueError(f"{where}: there must be a tree, got none")
+    for tree in trees:
+        check.instance(where, "tree", tree, N3Tree)
+    devices = sorted({str(tree.device) for tree in trees})
+    if len(devices) > 1:
+        raise ValueError(f"{where}: trees must be on one device, got {', '.join(devices)}")
+    return trees
+
+
+def _traced(
+    where: str, scene: Scene, shaders: Shaders, options: RenderOptions
+) -> tuple[Trace, Tensor]:
+    """Begins a frame: what traces rays through a scene, and its box."""
+    trees = _trees(where, scene)
+    for tree in trees:
+        tree.frame += 1
+    if not isinstance(scene, Mapping):
+        if isinstance(shaders, Mapping):
+            raise ValueError(f"{where}: shaders by name are for trees by name")
+        return around(Tracer(scene, shaders, options), options, scene.box), scene.box
+    box = box_around(trees)
+    named = {name: (tree, tree.channel_names) for name, tree in scene.items()}
+    return partial(trace_trees, tree_traces(where, named, shaders, options, box)), box
+
+
+def tree_stats(trees: Sequence[N3Tree], options: RenderOptions, samples: Tensor) -> RenderStats:
     """Returns the statistics of a picture, given the samples (r,) of its rays."""
     return RenderStats(
-        backend=choose_backend(options.backend, tree.device),
+        backend=choose_backend(options.backend, trees[0].device),
         rays=samples.numel(),
         samples=int(samples.sum(dtype=torch.int64)),
-        nodes=tree.nodes.child_tn.numel(),
-        bricks=tree.bricks.capacity,
-        bytes=tree.nbytes,
+        nodes=sum(tree.nodes.child_tn.numel() for tree in trees),
+        bricks=sum(tree.bricks.capacity for tree in trees),
+        bytes=sum(tree.nbytes for tree in trees),
     )
 
 

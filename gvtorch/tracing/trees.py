@@ -1,0 +1,463 @@
+"""Rays through several trees: `trace_trees`.
+
+Where boxes do not overlap along a ray, trees are traced one by one and composited in the order in
+which the ray enters them. Where they do, they are composited by sample, as media that fill the same
+space: the ray is cut wherever an interval of one of the trees begins or ends, each tree tells what
+a piece shows of it, and in a piece extinctions add. Surfaces are opaque: they end the ray for all.
+
+Source: Max, "Optical models for direct volume rendering", IEEE TVCG 1995 (emission and absorption).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from itertools import combinations, pairwise
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from .. import ops
+from ..base.records import Hits, Rays
+from ..ops.shading import pack
+from ..pool import N3Tree
+from ..shaders.shader import Shader, check_shader
+from .around import around
+from .composite import Trace, behind, box_span, over
+from .options import RenderOptions
+from .tracer import Batch, Tracer
+
+_PARTS = 8  # of what several trees fill: rays that have ended ask for nothing in those behind
+_RAYS = {"cpu": 1 << 14, "cuda": 1 << 18}  # composited by sample at once
+_SLIVER = 1e-3  # steps: ends of intervals that are closer are one
+_MOST_ALPHA = 1 - 1e-9  # of a sample: an opaque one has no extinction that could be added
+
+
+#: A shader for all trees, or one for each by name.
+Shaders = Shader | Mapping[str, Shader]
+
+
+@dataclass(frozen=True, eq=False)
+class TreeTrace:
+    """What traces rays through one of several trees."""
+
+    box: Tensor  # (2, 3) float64 world corners
+    trace: Trace  # with whatever the options put around
+    tracer: Tracer  # the tree alone
+
+
+def tree_traces(
+    where: str,
+    scene: Mapping[str, tuple[N3Tree, Collection[str]]],
+    shaders: Shaders,
+    options: RenderOptions,
+    box: Tensor,
+    **settings: Any,
+) -> list[TreeTrace]:
+    """Lays ready what traces rays through trees, in one frame.
+
+    Args:
+        where: Who complains.
+        scene: Trees, and the names of the channels that each has, by name.
+        shaders: For all trees, or for each by name.
+        options: How the picture is made; its channel is the first of each tree if left out.
+        box: (2, 3) world corners of the scene.
+        **settings: Of `Tracer`.
+
+    Raises:
+        ValueError: A shader is missing, or a tree has no such channel; see `Tracer` and `around`.
+    """
+    traces = []
+    for name, (tree, channels) in scene.items():
+        shader: Any = shaders.get(name) if isinstance(shaders, Mapping) else shaders
+        check_shader(where, f"shader of tree {name!r}", shader)
+        channel = options.channel or next(iter(channels))
+        for needed in (channel, *shader.channels):
+            if needed not in channels:
+                known = ", ".join(channels)
+                raise ValueError(
+                    f"{where}: tree {name!r} has no channel {needed!r}; it has {known}"
+                )
+        chosen = replace(options, channel=channel)
+        tracer = Tracer(tree, shader, chosen, **settings)
+        traces.append(TreeTrace(tree.box, around(tracer, chosen, box), tracer))
+    return traces
+
+
+def box_around(trees: Sequence[N3Tree]) -> Tensor:
+    """Returns (2, 3) float64 world corners around all trees."""
+    boxes = torch.stack([tree.box for tree in trees])
+    return torch.stack((boxes[:, 0].amin(0), boxes[:, 1].amax(0)))
+
+
+def trace_trees(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
+    """Traces rays through several trees; see the head of this file.
+
+    Projections, and shaders that must see a ray in one go, are not composited by sample: the tree
+    whose box is entered first comes first as a whole.
+    """
+    if len(trees) == 1:
+        return trees[0].trace(rays)
+    if not overlaps(trees):
+        return _in_order(trees, rays)
+    span = _spans(trees, rays)
+    first, last = span.unbind(2)
+    pairs = combinations(range(len(trees)), 2)
+    shared = [torch.maximum(first[a], first[b]) < torch.minimum(last[a], last[b]) for a, b in pairs]
+    both = torch.stack(shared).any(0)
+    mixed, apart = both.nonzero()[:, 0], (~both).nonzero()[:, 0]
+    if not len(mixed):
+        return _in_order(trees, rays)
+    if not len(apart):
+        return _by_sample(trees, rays)
+    found = _in_order(trees, rays[apart]), _by_sample(trees, rays[mixed])
+    return _scattered(found, (apart, mixed))
+
+
+def overlaps(trees: Sequence[TreeTrace]) -> bool:
+    """Whether trees are composited by sample, which makes the host wait for the device."""
+    if any(one.tracer.shader.projection or one.tracer.shader.whole_ray for one in trees):
+        return False
+    return any(
+        bool((torch.maximum(a.box[0], b.box[0]) < torch.minimum(a.box[1], b.box[1])).all())
+        for a, b in combinations(trees, 2)
+    )
+
+
+# --- one tree behind the other
+
+
+def _in_order(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
+    """Composites trees in the order in which rays enter their boxes."""
+    first, last = _spans(trees, rays).unbind(2)
+    order = torch.where(first <= last, first, torch.inf).argsort(dim=0, stable=True)  # (m, r)
+    hits = [vars(one.trace(rays)) for one in trees]
+    fields = {name: _ranked([one[name] for one in hits], order) for name in hits[0]}
+    ranked = [Hits(**{name: f[rank] for name, f in fields.items()}) for rank in range(len(trees))]
+    return replace(reduce(over, ranked), normal=_mean_normal(ranked))
+
+
+def _mean_normal(ranked: Sequence[Hits]) -> Tensor | None:
+    """(r, 3) mean of the normals of trees, nearest first, by the light each takes; None without."""
+    taken = [one.normal * one.alpha for one in ranked if one.normal is not None]
+    if not taken:
+        return None
+    total, alpha = taken[0], ranked[0].alpha
+    for more, one in zip(taken[1:], ranked[1:], strict=True):
+        total = total + (1 - alpha) * more
+        alpha = alpha + (1 - alpha) * one.alpha
+    return normalize(total, dim=1)
+
+
+def _ranked(fields: list[Tensor | None], order: Tensor) -> Sequence[Any]:
+    """The same field (r, ...) of m trees, in the order (m, r) of the trees along each ray; zeros
+    stand for a tree that does not give it.
+    """
+    filled = _filled(fields)
+    if filled is None:
+        return fields
+    stacked = torch.stack(filled)
+    if stacked.dim() == 3:
+        order = order[:, :, None].expand_as(stacked)
+    return stacked.gather(0, order).unbind(0)
+
+
+def _filled(fields: Sequence[Tensor | None]) -> list[Tensor] | None:
+    """The same field (r, ...) of several hits; zeros stand for those that do not give it."""
+    given = [field for field in fields if field is not None]
+    if not given:
+        return None
+    if len({field.shape[1:] for field in given}) > 1:
+        raise ValueError("render: trees must give as many features each")
+    return [_zeros_if_none(field, given[0]) for field in fields]
+
+
+# --- several trees in the same space
+
+
+def _by_sample(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
+    """Composites trees by sample, a block of rays at a time."""
+    size = _RAYS[rays.origin.device.type]
+    blocks = [
+        torch.arange(at, min(at + size, len(rays.origin)), device=rays.origin.device)
+        for at in range(0, len(rays.origin), size)
+    ]
+    return _scattered([_block(trees, rays[block]) for block in blocks], blocks)
+
+
+def _block(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
+    """The media in front of the nearest surface, over it."""
+    surfaces = [one for one in trees if one.tracer.shader.cut_surface() is not None]
+    media = [one for one in trees if one not in surfaces]
+    if not surfaces:
+        return _media(media, rays)
+    back = reduce(_nearer, [one.trace(replace(rays, transmittance=None)) for one in surfaces])
+    depth = back.depth.to(rays.range.dtype)
+    front_range = torch.cat((rays.range[:, :1], torch.minimum(rays.range[:, 1:], depth)), 1)
+    front = _media(media, replace(rays, range=front_range))
+    hit_clear = 1 - trees[0].tracer.arguments.depth_alpha
+    gone = rays.light() < hit_clear  # depth was found before these rays begin
+    return over(front, replace(back, depth=torch.where(gone, torch.inf, back.depth)))
+
+
+def _nearer(one: Hits, two: Hits) -> Hits:
+    """Of two hits of each ray the nearer one."""
+    first, fields = (one.depth <= two.depth)[:, 0], {}
+    for name in vars(one):
+        pair = _filled([getattr(one, name), getattr(two, name)])
+        if pair is not None:
+            a, b = pair
+            fields[name] = torch.where(first if a.dim() == 1 else first[:, None], a, b)
+    fields |= {"samples": one.samples + two.samples, "missed": one.missed | two.missed}
+    return Hits(**fields)
+
+
+def _media(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
+    """Goes along rays from box to box: where a ray is in one of them its tree is traced as ever."""
+    span = _spans(trees, rays)
+    ends = span.transpose(0, 1).flatten(1).sort(1).values  # (r, 2m)
+    hits = _nothing(rays, trees[0].tracer.dtype)
+    stop = trees[0].tracer.arguments.stop_alpha
+    for near, far in pairwise(ends.unbind(1)):
+        middle = (near + far) / 2
+        inside = (span[:, :, 0] <= middle) & (middle <= span[:, :, 1]) & (near < far)  # (m, r)
+        for one, mine in zip(trees, inside, strict=True):
+            alone = mine & (inside.sum(0) == 1)
+            hits = _further(hits, rays, alone, (near, far), stop, one.trace)
+        several = inside.sum(0) > 1
+        if not bool(several.any()):
+            continue
+        for part in range(_PARTS):
+            low, high = (near + (far - near) * (at / _PARTS) for at in (part, part + 1))
+            high = far if part == _PARTS - 1 else high
+            hits = _further(hits, rays, several, (low, high), stop, lambda r: _together(trees, r))
+    return hits
+
+
+def _further(
+    hits: Hits, rays: Rays, which: Tensor, span: tuple[Tensor, Tensor], stop: float, trace: Trace
+) -> Hits:
+    """Traces a stretch of the rays `which` (r,) bool that have not ended, behind their `hits`."""
+    at = (which & (hits.alpha[:, 0] < stop)).nonzero()[:, 0]
+    if not len(at):
+        return hits
+    part = replace(rays[at], range=torch.stack(span, 1)[at])
+    fields: dict[str, Any] = vars(hits).copy()
+    front = Hits(**{name: field if field is None else field[at] for name, field in fields.items()})
+    found = over(front, trace(behind(part, front)), dimmed=True)
+    for name, field in vars(found).items():
+        if field is not None:
+            whole = fields[name]
+            if whole is None:
+                whole = field.new_zeros((len(which), *field.shape[1:]))
+            fields[name] = whole.index_copy(0, at, field)
+    return Hits(**fields)
+
+
+def _together(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
+    """Traces rays through media that fill the same space."""
+    pieces, missed = _cut(trees, rays)
+    shown = _Shown(pieces, trees[0].tracer.dtype)
+    for one, covered in zip(trees, pieces.covered, strict=True):
+        at = covered.nonzero()[:, 0]
+        if len(at):
+            hits = one.trace(pieces.rays(rays, at))
+            shown.add(at, hits)
+            missed = missed.index_put((pieces.ray[at[hits.missed]],), missed.new_ones(()))
+    known, backend = trees[0].tracer.arguments, trees[0].tracer.backend
+    clear = rays.light()[:, 0].contiguous()
+    alpha, features = shown.alpha(), shown.features()
+    total, left, before = ops.composite(
+        *(alpha, features, pieces.offset(len(clear)), clear),
+        stop_alpha=known.stop_alpha,
+        backend=backend,
+    )
+    hit_clear = 1 - known.depth_alpha
+    hit = ((before >= hit_clear) & (before * (1 - alpha) < hit_clear)).nonzero()[:, 0]
+    near, far = pieces.span[hit].unbind(1)
+    place = near + torch.log(before[hit] / hit_clear) / shown.extinction[hit, 0] * (far - near)
+    for one, covered in zip(trees, pieces.covered, strict=True):
+        alone = (covered & (pieces.covered.sum(0) == 1))[hit].nonzero()[:, 0]
+        if len(alone):  # a run of samples: its tree finds the place
+            part = pieces.rays(rays, hit[alone], before[hit[alone]])
+            found = one.trace(part).depth[:, 0].to(place)
+            place[alone] = torch.where(found < torch.inf, found, place[alone])
+    depth = left.new_full((len(clear),), torch.inf).index_put((pieces.ray[hit],), place)
+    samples = torch.zeros(len(clear), dtype=torch.int32, device=clear.device)
+    samples.index_add_(0, pieces.ray, torch.where(before > 0, shown.samples, 0))
+    return shown.hits(total, left, depth, samples, missed)
+
+
+class _Shown:
+    """What pieces of rays show: sums over the trees that are sampled there, by extinction."""
+
+    def __init__(self, pieces: _Pieces, dtype: torch.dtype) -> None:
+        count, device = len(pieces.ray), pieces.ray.device
+        self.dtype = dtype
+        self.extinction = torch.zeros(count, 1, dtype=torch.float64, device=device)
+        self.samples = torch.zeros(count, dtype=torch.int32, device=device)
+        self.sums: dict[str, Tensor] = {}
+
+    def add(self, at: Tensor, hits: Hits) -> None:
+        """Adds what a tree shows in the pieces `at` (k,)."""
+        alpha = hits.alpha.to(torch.float64)
+        thick = -torch.log1p(-alpha.clamp(max=_MOST_ALPHA))
+        self.extinction.index_add_(0, at, thick)
+        self.samples.index_add_(0, at, hits.samples)
+        share = thick / alpha.clamp(min=1e-300)  # of what is premultiplied
+        normal = None if hits.normal is None else hits.normal * hits.alpha
+        given = {"color": hits.color, "normal": normal, "features": hits.features}
+        for name, field in given.items():
+            if field is None:
+                continue
+            shape = (len(self.extinction), field.shape[1])
+            known = self.sums.setdefault(name, self.extinction.new_zeros(shape))
+            if known.shape != shape:
+                raise ValueError("render: trees must give as many features each")
+            known.index_add_(0, at, share * field)
+
+    def alpha(self) -> Tensor:
+        """(k,) of the pieces."""
+        return -torch.expm1(-self.extinction)[:, 0]
+
+    def features(self) -> Tensor:
+        """(k, c) of the pieces, all that `sums` has side by side, not premultiplied."""
+        columns = [*self.sums.values()] or [self.extinction[:, :0]]
+        return torch.cat(columns, 1) / self.extinction.clamp(min=1e-300)
+
+    def hits(
+        self, total: Tensor, left: Tensor, depth: Tensor, samples: Tensor, missed: Tensor
+    ) -> Hits:
+        """What rays bring back, of sums (r, c) of the features and what is left of the light."""
+        widths = [one.shape[1] for one in self.sums.values()]
+        given = dict(zip(self.sums, total.to(self.dtype).split(widths, 1), strict=True))
+        color = given.get("color", total.new_zeros((len(total), 3), dtype=self.dtype))
+        return Hits(
+            color=color,
+            alpha=(1 - left)[:, None].to(self.dtype),
+            depth=depth[:, None].to(self.dtype),
+            samples=samples,
+            missed=missed,
+            normal=normalize(given["normal"], dim=1) if "normal" in given else None,
+            features=given.get("features"),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Pieces:
+    """Pieces of rays, ray after ray and front to back along each."""
+
+    ray: Tensor  # (k,) int64
+    span: Tensor  # (k, 2) float64 distances from the camera
+    covered: Tensor  # (m, k) bool, which trees are sampled there
+
+    def rays(self, rays: Rays, at: Tensor, transmittance: Tensor | None = None) -> Rays:
+        """The pieces `at` (k,) as rays of their own."""
+        return replace(rays[self.ray[at]], range=self.span[at], transmittance=transmittance)
+
+    def offset(self, rays: int) -> Tensor:
+        """(r + 1,) int64 where each ray's pieces begin, and how many there are."""
+        count = torch.bincount(self.ray, minlength=rays)
+        return torch.cat((count.new_zeros(1), count.cumsum(0)))
+
+
+def _cut(trees: Sequence[TreeTrace], rays: Rays) -> tuple[_Pieces, Tensor]:
+    """Cuts rays wherever an interval that one of the trees samples begins or ends; where only one
+    is sampled, its intervals stay together. Also tells (r,) bool which rays missed something.
+    """
+    given = ops.RayArguments.of(replace(rays, transmittance=None))
+    missed = torch.zeros(len(rays.origin), dtype=torch.bool, device=rays.origin.device)
+    ray, place, change = [], [], []
+    for number, one in enumerate(trees):
+        tracer = one.tracer
+        segments = ops.trace_segments(given, tracer.arguments, by_node=True, backend=tracer.backend)
+        missed |= segments.missed
+        batch = Batch(tracer, given, segments, ops.list_samples(segments))
+        first = batch.moved[batch.ray] + batch.starts
+        last = first + batch.lengths[:, 0]
+        ends = [end.to(torch.float64).clamp(*rays.range[batch.ray].T) for end in (first, last)]
+        for end, step in zip(ends, (1, -1), strict=True):
+            ray.append(batch.ray)
+            place.append(end)
+            change.append(torch.zeros(len(end), len(trees), dtype=torch.int32, device=end.device))
+            change[-1][:, number] = step
+    rays_k, places_k = torch.cat(ray), torch.cat(place)
+    order = places_k.argsort(stable=True)
+    order = order[rays_k[order].argsort(stable=True)]
+    rays_k, places_k = rays_k[order], places_k[order]
+    covered = torch.cat(change)[order].cumsum(0) > 0  # behind each end
+    sliver = _SLIVER * min(one.tracer.arguments.step for one in trees)
+    return _joined(rays_k, places_k, covered, sliver), missed
+
+
+def _joined(ray: Tensor, place: Tensor, covered: Tensor, sliver: float) -> _Pieces:
+    """Makes pieces of the ends (k,) of intervals, sorted; `covered` (k, m) tells behind each."""
+    if not len(ray):
+        return _Pieces(ray, place.new_zeros((0, 2)), covered.T)
+    same = ray[1:] == ray[:-1]
+    near, far = place[:-1], place[1:]
+    kept = (same & covered[:-1].any(1) & (far - near > sliver)).nonzero()[:, 0]
+    ray, near, far, covered = ray[:-1][kept], near[kept], far[kept], covered[:-1][kept]
+    if not len(ray):
+        return _Pieces(ray, place.new_zeros((0, 2)), covered.T)
+    # Slivers between pieces go to the one behind; runs of one tree alone stay in one piece.
+    joins = (ray[1:] == ray[:-1]) & (near[1:] - far[:-1] <= 8 * sliver)
+    near = torch.cat((near[:1], torch.where(joins, far[:-1], near[1:])))
+    alone = covered.sum(1) == 1
+    run = joins & alone[1:] & alone[:-1] & (covered[1:] == covered[:-1]).all(1)
+    starts = torch.cat((run.new_ones(1), ~run)).nonzero()[:, 0]
+    ends = torch.cat((starts[1:] - 1, starts.new_tensor([len(ray) - 1])))
+    return _Pieces(ray[starts], torch.stack((near[starts], far[ends]), 1), covered[starts].T)
+
+
+# --- helpers
+
+
+def _spans(trees: Sequence[TreeTrace], rays: Rays) -> Tensor:
+    """(m, r, 2) where rays are in the boxes of trees; the last before the first where they are
+    not.
+    """
+    spans = []
+    for one in trees:
+        low, high = pack((one.box,), rays.origin.dtype, rays.origin.device).view(2, 3)
+        first, last = box_span(low, high, rays.origin, rays.direction)
+        near, far = rays.range.to(first).unbind(1)
+        spans.append(torch.stack((torch.maximum(first, near), torch.minimum(last, far)), 1))
+    return torch.stack(spans)
+
+
+def _nothing(rays: Rays, dtype: torch.dtype) -> Hits:
+    """Hits of rays before they have met anything."""
+    column = torch.zeros(len(rays.origin), 1, dtype=dtype, device=rays.origin.device)
+    return Hits(
+        color=column.expand(-1, 3).contiguous(),
+        alpha=1 - rays.light().to(dtype),
+        depth=torch.full_like(column, torch.inf),
+        samples=torch.zeros_like(column[:, 0], dtype=torch.int32),
+        missed=torch.zeros_like(column[:, 0], dtype=torch.bool),
+    )
+
+
+def _scattered(found: Sequence[Hits], places: Sequence[Tensor]) -> Hits:
+    """Hits (r,) of which each of `found` holds those at its `places` (k,)."""
+    if len(found) == 1:
+        return found[0]
+    at = torch.cat(list(places)).argsort()
+    fields = {}
+    for name in vars(found[0]):
+        filled = [getattr(one, name) for one in found]
+        like = next((field for field in filled if field is not None), None)
+        if like is not None:
+            parts = [
+                like.new_zeros((len(one.alpha), *like.shape[1:])) if field is None else field
+                for one, field in zip(found, filled, strict=True)
+            ]
+            fields[name] = torch.cat(parts)[at]
+    return Hits(**fields)
+
+
+def _zeros_if_none(field: Tensor | None, like: Tensor) -> Tensor:
+    return torch.zeros_like(like) if field is None else field
