@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from helpers import DEVICES
 
 import gvtorch as gv
-from helpers import DEVICES
 
 WARM = gv.TransferFunction([(0, 0), (0.1, 0), (1, 0.5)], [(0, 0.2, 0, 0), (1, 1, 0.8, 0.3)])
 COLD = gv.TransferFunction([(0, 0), (0.2, 0), (1, 0.4)], [(0, 0, 0.1, 0.4), (1, 0.4, 0.9, 1)])
@@ -97,3 +97,165 @@ def test_trees_that_overlap_are_composited_by_sample_as_by_a_dense_marcher(volum
     apart = [gv.render(trees[n], view(size), shaders[n], lod="finest") for n in trees]
     both = (apart[0].alpha > 0.1) & (apart[1].alpha > 0.1)
     assert both.float().mean() > 0.05, "they are seen through each other"
+
+
+def pictures(volumes, shaders, order=("ct", "pet"), size=24, **options) -> gv.Picture:
+    trees = {name: gv.N3Tree.from_volume(volumes[name], 8) for name in order}
+    return gv.render(trees, view(size), shaders, **options)
+
+
+@pytest.mark.backend("cpp")
+def test_the_order_of_trees_does_not_matter(volumes):
+    shaders = {"ct": gv.Lit(WARM), "pet": COLD}
+    one, two = (pictures(volumes, shaders, order) for order in (("ct", "pet"), ("pet", "ct")))
+    for name in ("color", "alpha", "depth", "normal"):
+        torch.testing.assert_close(getattr(one, name), getattr(two, name), atol=1e-6, rtol=1e-6)
+    assert torch.equal(one.samples, two.samples)
+    assert (one.normal.norm(dim=-1) > 0.9).any()
+
+
+@pytest.mark.backend("cpp")
+def test_a_medium_twice_in_the_same_place_has_twice_the_extinction(volumes):
+    """The ends of intervals fall together but for rounding; the slivers between them go nowhere."""
+    volume = volumes["ct"]
+    trees = {name: gv.N3Tree.from_volume(volume, 8) for name in ("a", "b")}
+    for lod in ("auto", "finest"):
+        options = {"lod": lod, "stop_alpha": 1}
+        twice = gv.render(trees, view(), WARM, **options)
+        once = gv.render(trees["a"], view(), WARM, **options)
+        torch.testing.assert_close(1 - twice.alpha, (1 - once.alpha) ** 2, atol=4e-3, rtol=0)
+        seen = once.alpha > 0.01
+        assert seen.float().mean() > 0.2
+        assert bool((twice.depth[seen] <= once.depth[seen] + 1e-4).all())
+
+
+@pytest.mark.backend("cpp")
+def test_depth_is_where_both_together_pass_it(volumes):
+    """In finer and finer steps the depth comes to that of the dense marcher's light."""
+    both = {"ct": WARM, "pet": COLD}
+    fine = pictures(volumes, both, step=0.02, lod="finest", stop_alpha=1)
+    usual = pictures(volumes, both)
+    rays = view().rays()
+    depth = fine.depth.ravel().double()
+    hit = depth < torch.inf
+    assert hit.float().mean() > 0.1
+    cut = gv.Rays(
+        origin=rays.origin[hit],
+        direction=rays.direction[hit],
+        cone=rays.cone[hit],
+        range=torch.stack((torch.zeros(int(hit.sum())), depth[hit]), 1).double(),
+    )
+    trees = {name: gv.N3Tree.from_volume(volumes[name], 8) for name in volumes}
+    front = gv.trace(trees, cut, both, step=0.02, lod="finest", stop_alpha=1)
+    assert (front.alpha - 0.1).abs().max() < 2e-3, "a tenth of the light is gone there"
+    far = (usual.depth.ravel().double()[hit] - depth[hit]).abs()
+    assert far.median() < 0.1 and bool((far < 2).all())
+
+
+@pytest.mark.backend("cpp")
+def test_a_surface_among_media_ends_the_ray_for_all(volumes):
+    """The surface hides what is behind it, and what is in front dims it."""
+    trees = {name: gv.N3Tree.from_volume(volumes[name], 8) for name in volumes}
+    surface = gv.Isosurface(0.6)
+    found = gv.render(trees, view(), {"ct": surface, "pet": COLD}, lod="finest", step=0.1)
+    alone = gv.render(trees["ct"], view(), surface, lod="finest", step=0.1)
+    depth = alone.depth.ravel().double()
+    hit = depth < torch.inf
+    rays = view().rays()
+    limits = torch.stack((torch.zeros_like(depth), depth), 1)
+    front = gv.trace(
+        trees["pet"],
+        gv.Rays(origin=rays.origin, direction=rays.direction, cone=rays.cone, range=limits),
+        COLD,
+        lod="finest",
+        step=0.1,
+    )
+    expected = front.color + (1 - front.alpha) * alone.color.reshape(-1, 3) * hit[:, None]
+    torch.testing.assert_close(found.color.reshape(-1, 3), expected, atol=2e-5, rtol=0)
+    assert (found.alpha.ravel()[hit] == 1).all() and 20 < int(hit.sum()) < len(hit)
+    assert bool((front.alpha[hit] > 0.05).any())
+
+
+@pytest.mark.backend("cpp")
+def test_a_layer_and_a_clip_cut_trees_that_overlap(volumes):
+    shaders = {"ct": WARM, "pet": COLD}
+    half = gv.Clip(planes=[(1, 0, 0, -12)])
+    clipped = pictures(volumes, shaders, clip=half, stop_alpha=1)
+    assert (
+        0.05
+        < (clipped.alpha > 0.02).float().mean()
+        < (pictures(volumes, shaders, stop_alpha=1).alpha > 0.02).float().mean()
+    )
+    size = view().height
+    wall = torch.full((size, size, 1), 45.0)
+    layer = gv.Layer(torch.ones(size, size, 3), wall)
+    drawn = pictures(volumes, shaders, layer=layer, stop_alpha=1)
+    rays = view().rays()
+    limits = torch.stack((torch.zeros(len(rays.origin)), torch.full((len(rays.origin),), 45.0)), 1)
+    trees = {name: gv.N3Tree.from_volume(volumes[name], 8) for name in volumes}
+    front = gv.trace(
+        trees,
+        gv.Rays(
+            origin=rays.origin, direction=rays.direction, cone=rays.cone, range=limits.double()
+        ),
+        shaders,
+        stop_alpha=1,
+    )
+    expected = front.color + (1 - front.alpha)
+    torch.testing.assert_close(drawn.color.reshape(-1, 3), expected, atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize("brick_pool", ["8 MB", "120 kB"])
+@pytest.mark.backend("cpp")
+def test_streamed_trees_that_overlap_equal_resident_ones(volumes, brick_pool):
+    shaders = {"ct": WARM, "pet": gv.Lit(COLD)}
+    resident = pictures(volumes, shaders, size=12)
+    scene = {name: gv.VolumeProducer(volume) for name, volume in volumes.items()}
+    with gv.Engine(scene, brick_pool=brick_pool) as engine:
+        streamed = engine.render(view(12), shaders)
+        engine.validate()
+        assert streamed.stats.converged
+        if engine.cache.bricks.capacity < 30:
+            assert streamed.stats.capacity_exceeded, "rays took turns"
+    for name in ("color", "alpha", "depth", "normal", "samples"):
+        assert torch.equal(getattr(streamed, name), getattr(resident, name)), name
+
+
+@pytest.mark.backend("cpp")
+def test_rays_that_have_ended_ask_for_nothing_behind(volumes):
+    """An opaque ball around the middle: what lies behind it in the other tree is not loaded."""
+    solid = gv.TransferFunction([(0.2, 0), (0.25, 1)])
+    faint = gv.TransferFunction([(0, 0.01)])
+    big = gv.Volume(np.random.default_rng(1).random((64, 64, 64), np.float32), (0.4,) * 3)
+    scene = {"ball": gv.VolumeProducer(volumes["ct"]), "all": gv.VolumeProducer(big)}
+    camera = gv.Camera.look_at((12, 11, 60), (12, 11, 12), (0, 1, 0), 4, 16, 16)
+    with gv.Engine(scene, brick_pool="16 MB") as engine:
+        picture = engine.render(camera, {"ball": solid, "all": faint})
+        assert (picture.alpha > 0.99).all()
+        tree = engine.trees["all"].tree
+        tiles = (engine.cache.nodes.tree_t == tree.number).nonzero()[:, 0]
+        nodes = (tiles[:, None] * 8 + torch.arange(8)).flatten()
+        loaded = nodes[engine.cache.nodes.brick_tn.view(-1)[nodes] >= 0]
+        loc = tree.loc(loaded)
+        finest = loc[loc[:, 3] == tree.depth]
+        z = finest[:, 2].double() * 8 * 0.4
+    assert len(finest) > 4 and z.max() > 20
+    assert z.min() > 5, "the far side of the ball's tree"
+
+
+@pytest.mark.parametrize(
+    "make, told",
+    [
+        (lambda t: gv.render({}, view(), WARM), "there must be a tree"),
+        (lambda t: gv.render({"ct": t}, view(), {"pt": WARM}), "shader of tree 'ct'"),
+        (lambda t: gv.render(t, view(), {"ct": WARM}), "shaders by name"),
+        (lambda t: gv.render({"ct": 3}, view(), WARM), "tree must be"),
+        (lambda t: gv.render({"ct": t}, view(), WARM, channel="x"), "tree 'ct' has no channel 'x'"),
+    ],
+)
+@pytest.mark.backend("cpp")
+def test_mistakes_are_told_in_a_line(volumes, make, told):
+    tree = gv.N3Tree.from_volume(volumes["pet"], 8)
+    with pytest.raises(ValueError, match=told) as error:
+        make(tree)
+    assert "\n" not in str(error.value)

@@ -18,7 +18,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from .. import ops
 from ..base.records import Hits, Rays
@@ -26,7 +25,7 @@ from ..ops.shading import pack
 from ..pool import N3Tree
 from ..shaders.shader import Shader, check_shader
 from .around import around
-from .composite import Trace, behind, box_span, over
+from .composite import Trace, box_span, over, unit
 from .options import RenderOptions
 from .tracer import Batch, Tracer
 
@@ -149,7 +148,7 @@ def _mean_normal(ranked: Sequence[Hits]) -> Tensor | None:
     for more, one in zip(taken[1:], ranked[1:], strict=True):
         total = total + (1 - alpha) * more
         alpha = alpha + (1 - alpha) * one.alpha
-    return normalize(total, dim=1)
+    return unit(total)
 
 
 def _ranked(fields: list[Tensor | None], order: Tensor) -> Sequence[Any]:
@@ -219,7 +218,8 @@ def _media(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     """Goes along rays from box to box: where a ray is in one of them its tree is traced as ever."""
     span = _spans(trees, rays)
     ends = span.transpose(0, 1).flatten(1).sort(1).values  # (r, 2m)
-    hits = _nothing(rays, trees[0].tracer.dtype)
+    normals = any(one.tracer.shading is not None for one in trees)
+    hits = _nothing(rays, trees[0].tracer.dtype, normals)
     stop = trees[0].tracer.arguments.stop_alpha
     for near, far in pairwise(ends.unbind(1)):
         middle = (near + far) / 2
@@ -234,26 +234,34 @@ def _media(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
             low, high = (near + (far - near) * (at / _PARTS) for at in (part, part + 1))
             high = far if part == _PARTS - 1 else high
             hits = _further(hits, rays, several, (low, high), stop, lambda r: _together(trees, r))
-    return hits
+    return hits if hits.normal is None else replace(hits, normal=unit(hits.normal))
 
 
 def _further(
     hits: Hits, rays: Rays, which: Tensor, span: tuple[Tensor, Tensor], stop: float, trace: Trace
 ) -> Hits:
-    """Traces a stretch of the rays `which` (r,) bool that have not ended, behind their `hits`."""
+    """Traces a stretch of the rays `which` (r,) bool that have not ended, behind their `hits`,
+    whose normals are sums by light.
+    """
     at = (which & (hits.alpha[:, 0] < stop)).nonzero()[:, 0]
     if not len(at):
         return hits
-    part = replace(rays[at], range=torch.stack(span, 1)[at])
+    before = hits.alpha[at]
+    light = (1 - before[:, 0]).to(torch.float64)
+    part = replace(rays[at], range=torch.stack(span, 1)[at], transmittance=light)
+    found = vars(trace(part)).copy()
+    if found["normal"] is not None:
+        found["normal"] = found["normal"] * (found["alpha"] - before)
+    join: dict[str, Any] = {"depth": torch.minimum, "missed": torch.logical_or}
+    join["alpha"] = lambda _, whole: whole
     fields: dict[str, Any] = vars(hits).copy()
-    front = Hits(**{name: field if field is None else field[at] for name, field in fields.items()})
-    found = over(front, trace(behind(part, front)), dimmed=True)
-    for name, field in vars(found).items():
-        if field is not None:
-            whole = fields[name]
-            if whole is None:
-                whole = field.new_zeros((len(which), *field.shape[1:]))
-            fields[name] = whole.index_copy(0, at, field)
+    for name, more in found.items():
+        if more is None:
+            continue
+        known = fields[name]
+        if known is None:
+            known = more.new_zeros((len(which), *more.shape[1:]))
+        fields[name] = known.index_copy(0, at, join.get(name, torch.add)(known[at], more))
     return Hits(**fields)
 
 
@@ -341,7 +349,7 @@ class _Shown:
             depth=depth[:, None].to(self.dtype),
             samples=samples,
             missed=missed,
-            normal=normalize(given["normal"], dim=1) if "normal" in given else None,
+            normal=unit(given["normal"]) if "normal" in given else None,
             features=given.get("features"),
         )
 
@@ -429,11 +437,13 @@ def _spans(trees: Sequence[TreeTrace], rays: Rays) -> Tensor:
     return torch.stack(spans)
 
 
-def _nothing(rays: Rays, dtype: torch.dtype) -> Hits:
+def _nothing(rays: Rays, dtype: torch.dtype, normals: bool) -> Hits:
     """Hits of rays before they have met anything."""
     column = torch.zeros(len(rays.origin), 1, dtype=dtype, device=rays.origin.device)
+    color = column.expand(-1, 3).contiguous()
     return Hits(
-        color=column.expand(-1, 3).contiguous(),
+        color=color,
+        normal=color if normals else None,
         alpha=1 - rays.light().to(dtype),
         depth=torch.full_like(column, torch.inf),
         samples=torch.zeros_like(column[:, 0], dtype=torch.int32),
