@@ -158,22 +158,21 @@ def convert(
     if not begun:
         _check_room(target, _estimate(plan))
     with unfinished.claimed(target, plan.settings, resume=begun) as work:
-        with _executor(executor, plan) as pool:
-            names = shlex.join((plan.settings["source"], str(target)))
-            goes_on = f"gvtorch convert {names} --resume goes on"
-            try:
+        names = shlex.join((plan.settings["source"], str(target)))
+        goes_on = f"gvtorch convert {names} --resume goes on"
+        try:
+            with _executor(executor, plan) as pool:
                 _write_levels(_staged(plan, pool), work, pool, progress)
-            except BrokenExecutor:
-                raise OSError(
-                    f"{target}: a worker process ended (killed, out of memory, or started by a "
-                    'script that converts outside of `if __name__ == "__main__":`); '
-                    f"{goes_on}"
-                ) from None
-            except KeyboardInterrupt:
-                tasks = plan.settings["tasks"]
-                raise KeyboardInterrupt(
-                    f"{target}: interrupted, {len(work.done)} of {tasks} shards are done; {goes_on}"
-                ) from None
+        except BrokenExecutor:
+            raise OSError(
+                f"{target}: a worker process ended (killed, out of memory, or started by a "
+                f'script that converts outside of `if __name__ == "__main__":`); {goes_on}'
+            ) from None
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"{target}: interrupted, {len(work.done)} of {plan.settings['tasks']} shards are "
+                f"done; {goes_on}"
+            ) from None
         layout = dataclasses.replace(plan.task.layout, value_range=_value_range(plan.task))
         work.finish(layout, plan.task.source.info, plan.settings)
     return Store.open(target)
