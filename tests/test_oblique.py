@@ -190,7 +190,7 @@ def test_a_tilt_of_less_than_half_a_voxel_is_none(tmp_path):
         gv.read_volume(save(tmp_path / "b.nii", data, affine_of((0, 0, 0.6))))
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     degrees=st.tuples(*[st.floats(-180, 180)] * 3),
     spacing=st.tuples(*[st.floats(0.3, 3)] * 3),

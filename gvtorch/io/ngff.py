@@ -16,7 +16,7 @@ from typing import Any
 
 from ..base.image_info import ImageInfo
 from .omero import forget_assumed, read_channels, write_channels
-from .store_layout import WORK, Deadline, StoreError, StoreLayout, child, read_key
+from .store_layout import WORK, Deadline, StoreLayout, child, read_key
 
 _MOST_LEVELS = 64
 _MOST_JSON = 1 << 24  # bytes
