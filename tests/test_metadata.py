@@ -328,6 +328,86 @@ TOLD = (
 )
 
 
+def test_an_image_that_yaozarrs_wrote(tmp_path):
+    """0.5: five axes with units, `omero`, labels beside it, and several series in a file."""
+    from yaozarrs import v05
+    from yaozarrs.write.v05 import write_bioformats2raw, write_image
+
+    data = noise((3, 2 * 9, 20, 30), "uint16").reshape(3, 2, 9, 20, 30)
+    axes = [
+        v05.TimeAxis(name="t", unit="second"),
+        v05.ChannelAxis(name="c"),
+        *(v05.SpaceAxis(name=name, unit="micrometer") for name in "zyx"),
+    ]
+
+    def image(axes: list, scale: list[float], move: list[float]) -> v05.Image:
+        transforms = [
+            v05.ScaleTransformation(scale=scale),
+            v05.TranslationTransformation(translation=move),
+        ]
+        dataset = v05.Dataset(path="0", coordinateTransformations=transforms)
+        scales = v05.Multiscale(name="cells", axes=axes, datasets=[dataset])
+        return v05.Image(multiscales=[scales], omero=v05.Omero.model_validate(OMERO))
+
+    whole = image(axes, [30, 1, 2, 0.5, 0.25], [60, 0, 10, 20, 30])
+    flat = image(axes[2:], [2, 0.5, 0.25], [0, 0, 0])
+    label = v05.LabelImage.model_validate(
+        {
+            "multiscales": flat.multiscales,
+            "image-label": {"colors": [{"label-value": 1, "rgba": [255, 0, 0, 255]}]},
+        }
+    )
+    write_image(tmp_path / "a.zarr", whole, data, labels={"nuclei": (label, data[0, 0])})
+    with pytest.warns(UserWarning, match=r"a\.zarr: not kept: the labels labels/nuclei"):
+        store = convert(tmp_path / "a.zarr", tmp_path / "b.zarr")
+    for found in (Store.open(tmp_path / "a.zarr"), store):
+        info = found.info
+        assert found.times == 3 and info.channels == TOLD
+        assert (info.unit, info.time_unit) == ("micrometer", "second")
+        assert (info.time_step, info.time_origin) == (30, 60)
+        assert found.spacing == (0.25, 0.5, 2) and found.origin == (30, 20, 10)
+    assert Store.open(tmp_path / "a.zarr").lost == ("the labels labels/nuclei",)
+    volume, told = read(tmp_path / "b.zarr", time=2)
+    assert np.array_equal(volume.data.numpy(), data[2].transpose(1, 2, 3, 0)) and not told
+    nuclei = Store.open(tmp_path / "a.zarr", image="labels/nuclei")
+    assert nuclei.info.labels and nuclei.lost == ("colors of the labels",)
+    series = {name: (image(axes, [1.0] * 5, [0] * 5), data) for name in ("0", "1")}
+    write_bioformats2raw(tmp_path / "two.zarr", series)
+    assert Store.open(tmp_path / "two.zarr").lost == (
+        "the images 1 beside 'cells' (key= or image= names one)",
+    )
+
+
+def test_an_image_that_ome_zarr_models_wrote(tmp_path):
+    """0.4 on Zarr v2."""
+    import zarr
+    from ome_zarr_models.v04 import Image
+    from ome_zarr_models.v04.axes import Axis
+    from pydantic_zarr.v2 import ArraySpec
+
+    data = noise((2 * 9, 20, 30, 1), "int16")[..., 0].reshape(2, 9, 20, 30)
+    made = Image.new(
+        array_specs=[ArraySpec.from_array(data, chunks=(1, 9, 16, 16))],
+        paths=["full"],
+        axes=[
+            Axis(name="t", type="time", unit="hour"),
+            *(Axis(name=name, type="space", unit="millimeter") for name in "zyx"),
+        ],
+        scales=[[0.5, 3, 2, 1]],
+        translations=[[0, 1, 2, 3]],
+        name="heart",
+    )
+    group = made.to_zarr(zarr.storage.LocalStore(tmp_path / "a"), path="")
+    group["full"][...] = data
+    store = convert(tmp_path / "a", tmp_path / "b.zarr")
+    assert store.spacing == (1, 2, 3) and store.origin == (3, 2, 1) and store.times == 2
+    assert (store.info.unit, store.info.time_unit) == ("millimeter", "hour")
+    assert store.info.time_step == 0.5
+    for time in range(2):
+        volume, told = read(tmp_path / "a", time=time)
+        assert np.array_equal(volume.data[..., 0].numpy(), data[time]) and not told
+
+
 def with_omero(folder: Path, omero: object, version: int) -> Path:
     """Two channels, written by zarr-python."""
     data = noise((6, 7, 8, 2), "uint16").transpose(3, 0, 1, 2)

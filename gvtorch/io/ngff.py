@@ -152,9 +152,19 @@ def _parse_image(
     for number, item in enumerate(images):
         if image in (None, item.get("name"), str(number)):
             found = _image(where, item, _member(attributes, "omero"))
+            found = _as_labels(found, _member(attributes, "image-label"))
             others = [str(one.get("name", at)) for at, one in enumerate(images) if at != number]
             return _told_beside(found, others if image is None else [])
     return None
+
+
+def _as_labels(found: MultiscaleImage, told: Any) -> MultiscaleImage:
+    """An image whose values are labels, if `image-label` says so."""
+    if not isinstance(told, dict):
+        return found
+    beside = [f"{name} of the labels" for name in ("colors", "properties") if told.get(name)]
+    info = replace(found.info, labels=True)
+    return replace(found, info=info, lost=(*found.lost, *beside))
 
 
 def _member(attributes: dict[str, Any], name: str) -> Any:
