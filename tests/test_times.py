@@ -260,7 +260,7 @@ def test_the_command_line_takes_a_time(tmp_path, npy, capsys):
     code, out, err = run(capsys, "convert", npy, target)
     assert code == 2 and err.count("\n") == 1 and "--axes" in err and "'tzyx'" in err
     code, out, err = run(capsys, "convert", npy, target, "--axes", "tzyx")
-    assert (code, err) == (0, "")
+    assert (code, err) == (0, "") and "150x37x20 at 3 times, 6 levels" in out
     code, out, err = run(capsys, "info", target, "--time", 2, "--json")
     assert code == 0 and (json.loads(out)["times"], json.loads(out)["time"]) == (3, 2)
     code, out, err = run(capsys, "info", target, "--time", 3)

@@ -118,7 +118,8 @@ class Convert:
         seconds = time.perf_counter() - start
         size = amount(store.describe()["disk bytes"])
         extent = "x".join(str(n) for n in store.extent)
-        print(f"{self.store}: {extent}, {store.levels} levels, {size} in {seconds:.1f} s")
+        times = f" at {store.times} times" if store.times > 1 else ""
+        print(f"{self.store}: {extent}{times}, {store.levels} levels, {size} in {seconds:.1f} s")
 
     @contextlib.contextmanager
     def _cluster(self) -> Iterator[Executor | None]:
