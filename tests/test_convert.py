@@ -169,7 +169,7 @@ def test_arguments_are_checked_before_the_work(tmp_path, raw):
         ({"spacing": (1, 0, 1)}, "spacing must be positive"),
         ({"shape": (300, 20, 10), "dtype": "uint8"}, "takes 60000 bytes, the file has 54000"),
         ({"dtype": "text"}, "dtype must be a NumPy dtype"),
-        ({"key": "a"}, "key is for NPZ files"),
+        ({"key": "a"}, "key is for NPZ, OME-Zarr files, this is RAW"),
     ):
         with pytest.raises(ValueError, match=message):
             convert(raw, target, **options)

@@ -48,12 +48,20 @@ class Info:
         elif is_zarr(self.path):
             from ..io.store import Store
 
-            refuse_for_store(self.source)
-            content = Store.open(self.path).describe()
+            refuse_for_store(self.source, "--key")
+            store = Store.open(self.path, image=self.source.key, time=self.source.time or 0)
+            content = store.describe()
         else:
+            from ..io.reading import MAX_VOXELS, open_source, volume_of
+
+            options = self.source.options()
+            nan = options.pop("nan")
             with Bar() as bar:
                 bar("reading", 0, 0)
-                content = self.source.read(self.path).describe()
+                source = open_source(self.path, most=MAX_VOXELS, **options)
+                content = volume_of(source, nan).describe()
+            if source.times > 1:
+                content |= {"times": source.times, "time": source.time}
         if self.json:
             print(json.dumps(content))
         else:
@@ -110,7 +118,8 @@ class Convert:
         seconds = time.perf_counter() - start
         size = amount(store.describe()["disk bytes"])
         extent = "x".join(str(n) for n in store.extent)
-        print(f"{self.store}: {extent}, {store.levels} levels, {size} in {seconds:.1f} s")
+        times = f" at {store.times} times" if store.times > 1 else ""
+        print(f"{self.store}: {extent}{times}, {store.levels} levels, {size} in {seconds:.1f} s")
 
     @contextlib.contextmanager
     def _cluster(self) -> Iterator[Executor | None]:
@@ -155,14 +164,15 @@ class Filter:
         start, store = time.perf_counter(), Store.open(self.store)
         before = store.describe()["disk bytes"]
         with Bar() as bar:
-            Filtered.add_to(
-                store,
-                parse_transfer(self.tf, *value_range(store)),
-                component=self.component,
-                directions={"auto": None, "six": True, "one": False}[self.directions],
-                device="cuda" if on_cuda else "cpu",
-                progress=bar,
-            )
+            for moment in range(store.times):
+                Filtered.add_to(
+                    store if moment == 0 else Store.open(self.store, time=moment),
+                    parse_transfer(self.tf, *value_range(store)),
+                    component=self.component,
+                    directions={"auto": None, "six": True, "one": False}[self.directions],
+                    device="cuda" if on_cuda else "cpu",
+                    progress=bar,
+                )
         added = amount(max(0, store.describe()["disk bytes"] - before))
         print(f"{self.store}: {added} of colours in {time.perf_counter() - start:.1f} s")
 
@@ -277,7 +287,9 @@ def main(args: list[str] | None = None) -> None:
         text = " ".join(str(error).split())
         print(f"gvtorch: error: not enough memory: {text}", file=sys.stderr)
         sys.exit(2)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
+        if str(stop):
+            print(f"gvtorch: {stop}", file=sys.stderr)
         sys.exit(130)
 
 
