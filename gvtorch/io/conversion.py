@@ -157,8 +157,8 @@ def convert(
     plan = _plan(source, opened_source, target, block, threshold, nan, time, workers)
     if not begun:
         _check_room(target, _estimate(plan))
-    with unfinished.claimed(target, plan.settings, resume=begun) as work:
-        with _told_how_to_go_on(plan, work), _executor(executor, plan) as pool:
+    with _told_how_to_go_on(plan), unfinished.claimed(target, plan.settings, resume=begun) as work:
+        with _executor(executor, plan) as pool:
             _write_levels(_staged(plan, pool), work, pool, progress)
         layout = dataclasses.replace(plan.task.layout, value_range=_value_range(plan.task))
         work.finish(layout, plan.task.source.info, plan.settings)
@@ -373,7 +373,7 @@ def _executor(given: Executor | None, plan: _Plan) -> AbstractContextManager[Exe
 
 
 @contextmanager
-def _told_how_to_go_on(plan: _Plan, work: unfinished.UnfinishedStore) -> Iterator[None]:
+def _told_how_to_go_on(plan: _Plan) -> Iterator[None]:
     """Tells how to resume where the work is broken off from outside."""
     target = plan.target
     command = shlex.join(("gvtorch", "convert", plan.settings["source"], str(target), "--resume"))
@@ -385,8 +385,9 @@ def _told_how_to_go_on(plan: _Plan, work: unfinished.UnfinishedStore) -> Iterato
             f'that converts outside of `if __name__ == "__main__":`); {command} goes on'
         ) from None
     except KeyboardInterrupt:
+        done = unfinished.count_done(target)
         raise KeyboardInterrupt(
-            f"{target}: interrupted, {len(work.done)} of {plan.settings['tasks']} shards are done; "
+            f"{target}: interrupted, {done} of {plan.settings['tasks']} shards are done; "
             f"{command} goes on"
         ) from None
 

@@ -40,11 +40,28 @@ def worker_processes(count: int) -> Iterator[Executor]:
     with ProcessPoolExecutor(count, spawn, begin_worker) as pool:
         before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         try:
-            for _ in range(count):  # each task starts a process, which inherits what is blocked
-                pool.submit(int)
+            with _interrupts_later():
+                for _ in range(count):  # each task starts a process, which inherits what is blocked
+                    pool.submit(int)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         yield pool
+
+
+@contextmanager
+def _interrupts_later() -> Iterator[None]:
+    """Starts processes in one piece: Ctrl-C, which any thread may receive, comes behind."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # never interrupted
+        return
+    came: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _frame: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if came:
+        raise KeyboardInterrupt
 
 
 def begin_worker() -> None:

@@ -119,6 +119,12 @@ def _compare(target: Path, settings: dict[str, Any]) -> None:
             )
 
 
+def count_done(target: Path) -> int:
+    """Number of tasks that a journal names as done."""
+    journal = target / WORK / "journal.jsonl"
+    return journal.read_bytes().count(b"\n") if journal.exists() else 0
+
+
 def _read_journal(path: Path) -> dict[Task, int]:
     """Finished tasks; a last line that was cut off is none."""
     done = {}
