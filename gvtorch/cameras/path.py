@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from .camera import Camera
+from .camera import Camera, Up, upward
 from .models import CameraModel, model_of
 
 _UP, _FOV = (0.0, 1.0, 0.0), 30.0  # of keys that have none
@@ -68,18 +68,37 @@ class CameraPath:
         *,
         azimuth: float = 30.0,
         elevation: float = 20.0,
-        distance: float = 2.4,
+        distance: float | None = None,
+        up: Up = "+y",
+        fit: tuple[int, int] | None = None,
     ) -> CameraPath:
-        """Goes once around a box (2, 3); see `Camera.orbit` for the numbers. If left out, the field
-        of view is the model's own.
+        """Goes once around a box (2, 3); see `Camera.orbit` for the numbers.
+
+        Args:
+            box: World.
+            model: Name of the camera model.
+            fov: Degrees; the model's own if left out.
+            azimuth, elevation, distance, up: Of the start.
+            fit: (width, height) of pictures in which the whole box is all the way around: finds
+                the distance, which stays the same.
+
+        Raises:
+            ValueError: As `Camera.orbit`.
         """
-        fov = model_of("CameraPath.orbit", model).fov if fov is None else fov
+        where = "CameraPath.orbit"
+        fov = model_of(where, model).fov if fov is None else fov
         turn = azimuth + torch.linspace(0, 360, 37)
-        cameras = Camera.orbit(turn, elevation, distance, width=1, height=1).placed(box)
-        rotation, move = cameras.viewmats[:, :3, :3], cameras.viewmats[:, :3, 3:]
-        eye = -(rotation.mT @ move)[..., 0]
+        if fit is not None:
+            if distance is not None:
+                raise ValueError(f"{where}: fit finds the distance: leave it out, got {distance}")
+            seen = Camera.orbit(turn, elevation, None, fov, *fit, model, up=up, fit=True)
+            farthest = (box.mean(0) - _places(seen.placed(box))).norm(dim=1).amax()
+            distance = float(farthest / (box[1] - box[0]).max())
+        cameras = Camera.orbit(turn, elevation, distance, width=1, height=1, up=up).placed(box)
+        eye = _places(cameras)
         center = box.mean(0).expand_as(eye)
-        return cls(eye.tolist(), center.tolist(), fov=[fov] * len(eye))
+        ups = [upward(where, up).tolist()] * len(eye)
+        return cls(eye.tolist(), center.tolist(), ups, [fov] * len(eye))
 
     @classmethod
     def from_json(cls, path: str | Path) -> CameraPath:
@@ -127,3 +146,9 @@ class CameraPath:
         line = b + 0.5 * t * (c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a)))
         eye, target, up, fov = line[:3], line[3:6], line[6:9], float(line[9])
         return Camera.look_at(eye, target, up, fov, width, height, model)
+
+
+def _places(cameras: Camera) -> Tensor:
+    """(n, 3) world places of cameras."""
+    rotation, move = cameras.viewmats[:, :3, :3], cameras.viewmats[:, :3, 3:]
+    return -(rotation.mT @ move)[..., 0]
