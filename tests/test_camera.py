@@ -179,14 +179,18 @@ def test_a_fitted_box_is_whole_and_fills_the_picture(data):
     placed = camera.placed(box)
     at, depth = seen_corners(placed, box)
     assert at.abs().max() < 0.985 and depth.min() > 0
-    angle = None if fov is None else min(fov, fov * size[0] / size[1])
-    wide = {"fisheye": 90 if angle is None else angle, "panorama": 90 if fov is None else fov}
     if model in ("pinhole", "ortho"):
         assert at.abs().max() > 0.95
-    elif wide[model] >= 90:
+    else:  # no nearer than where the box spans 90 degrees
+        half = (fov or 180) / 2
+        wide = half * size[0] / size[1] if model == "fisheye" else 2 * half
         x, y, z = _corners_along(placed, box)
-        span = torch.atan2(torch.hypot(x, y) if model == "fisheye" else torch.maximum(x, y), z)
-        assert math.degrees(span.max()) == pytest.approx(45, abs=2)
+        spans = [math.tan(math.radians(min(45, 0.98 * part))) for part in (wide, half)]
+        if model == "fisheye":
+            filled = torch.hypot(x, y) / z / min(spans)
+        else:
+            filled = torch.maximum(x / spans[0], y / spans[1]) / z
+        assert float(filled.max()) == pytest.approx(1)
     # The same in strips and for the samples of a pixel: what is fitted is the whole picture.
     strip = camera.strip(3, 7).placed(box)
     assert torch.equal(strip.viewmats, placed.viewmats)
