@@ -63,7 +63,8 @@ def test_render_takes_other_shaders(small, tmp_path, shader):
     arrays = {}
     for name in ("plain", shader):
         file, flags = tmp_path / f"{name}.npz", level if name == shader else ()
-        look = ("--size", "24x24", "--tf", "gray", "--npz", file, "--shader", name, *flags)
+        colors = () if name == "isosurface" else ("--tf", "gray")
+        look = ("--size", "24x24", *colors, "--npz", file, "--shader", name, *flags)
         run = gvtorch("render", small, "-o", tmp_path / "a.png", *look)
         assert run.returncode == 0, run.stderr
         arrays[name] = np.load(file)
@@ -191,7 +192,10 @@ TF = '{"opacity": [[5, 0], [1, 1]]}'
         (lambda t, s: [s, "--camera", "orbit:nan,0,2"], "azimuth must be finite"),
         (lambda t, s: [s, "--camera", "look:0,0,inf,0,0,0"], "eye must be finite"),
         (lambda t, s: [s, "--camera", "look:0,0,1,0,0"], "--camera look must be 6 numbers"),
-        (lambda t, s: [s, "--camera", "fish:1"], "--camera must be orbit:AZ,EL,DIST or look:"),
+        (
+            lambda t, s: [s, "--camera", "fish:1"],
+            "--camera must be orbit:AZ,EL, orbit:AZ,EL,DIST or look:",
+        ),
         (lambda t, s: [s, "--fov", "nan"], "fov must be finite"),
         (lambda t, s: [s, "--size", "0x5"], "--size must be WIDTHxHEIGHT"),
         (lambda t, s: [s, "--size", "99999x5"], "width must be an int >= 1 and <= 65536"),

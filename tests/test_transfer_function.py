@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gvtorch as gv
+from gvtorch.shaders.presets import PRESETS
 from gvtorch.shaders.shader import Sampling
-from gvtorch.shaders.transfer_function import PRESETS
 
 
 def table_of(function, spacing=1.0, step=1.0, levels=1, dtype=torch.float32):
@@ -178,5 +178,5 @@ def test_bad_files_are_named(tmp_path, text, message):
 def test_missing_file_and_preset():
     with pytest.raises(FileNotFoundError, match=r"nowhere\.json"):
         gv.TransferFunction.from_json("nowhere.json")
-    with pytest.raises(ValueError, match="unknown preset 'lungs'; known: bone, gray"):
+    with pytest.raises(ValueError, match="unknown preset 'lungs'; known: bone, ct-bone, ct-lung"):
         gv.TransferFunction.preset("lungs", 0, 1)

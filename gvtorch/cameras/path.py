@@ -101,12 +101,16 @@ class CameraPath:
         return cls(eye.tolist(), center.tolist(), ups, [fov] * len(eye))
 
     @classmethod
-    def from_json(cls, path: str | Path) -> CameraPath:
+    def from_json(
+        cls, path: str | Path, *, up: Up | None = None, fov: float | None = None
+    ) -> CameraPath:
         """Reads a list of keys: [{"eye": [x, y, z], "target": [x, y, z], "up": ..., "fov": ...}].
+        `up` and `fov` are of keys that have none; +y and 30 degrees if left out.
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: The file holds something else; the message names the file.
+            ValueError: The file holds something else, or every key has its own up, or fov, and one
+                is given; the message names the file.
         """
         keys = check.json_file("camera path", path)
         if not isinstance(keys, list) or not all(isinstance(key, Mapping) for key in keys):
@@ -117,7 +121,14 @@ class CameraPath:
             if unknown or missing:
                 what = f"unknown {unknown[0]!r}" if unknown else f"{missing[0]!r} is missing"
                 raise ValueError(f"{path}: key {number}: {what}")
-        full = [{"up": _UP, "fov": _FOV, **key} for key in keys]
+        for name, value in (("up", up), ("fov", fov)):
+            if value is not None and all(name in key for key in keys):
+                raise ValueError(f"{path}: each key has its own {name}: leave out {name}={value}")
+        others = {
+            "up": _UP if up is None else upward("CameraPath", up).tolist(),
+            "fov": _FOV if fov is None else fov,
+        }
+        full = [{**others, **key} for key in keys]
         try:
             return cls(*([key[name] for key in full] for name in ("eye", "target", "up", "fov")))
         except ValueError as error:
