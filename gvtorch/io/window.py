@@ -19,7 +19,7 @@ from .store import Store
 
 _MOST = 2**22  # voxels that are looked at
 _BOXES = 4  # along each axis, of voxels that stand for all
-_BINS = 512  # of the histogram, at most
+_BINS = 64  # of the histogram, at most: values of a scan may have gaps
 _DOMINATES = 0.25  # share of all values that makes the highest peak the background
 _TAIL = 1.0  # percent of the values, at either end of the window, that lie beyond
 

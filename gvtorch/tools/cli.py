@@ -256,9 +256,23 @@ def _told(said: str) -> str:
     return f"{first}{close}; gvtorch COMMAND --help tells all"
 
 
+def _joined(args: list[str]) -> list[str]:
+    """The arguments with values that begin with a minus joined to their flags, as in `--up -z` and
+    `--at -4mm`, which the parser would take for flags.
+    """
+    joined: list[str] = []
+    for word in args:
+        value = re.fullmatch(r"-([xyz]|\.?\d.*)", word)
+        if value and joined and re.fullmatch(r"--[a-z][\w-]*", joined[-1]):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
+
+
 def main(args: list[str] | None = None) -> None:
     """Runs the command line and ends the process."""
-    args = sys.argv[1:] if args is None else args
+    args = _joined(sys.argv[1:] if args is None else args)
     if args == ["--version"]:
         from .. import __version__
 

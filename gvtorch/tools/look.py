@@ -29,6 +29,8 @@ else:
     CameraModel = str  # checked by the camera, since its module would load torch
     ShaderName = Literal[(*declared_names("shaders.built_in", "BY_NAME"), "filtered")]
 
+_WHOLE = ("isosurface", "maximum", "minimum", "mean")  # see one value, or a whole ray
+
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
@@ -85,6 +87,8 @@ class Look:
 
     def options(self) -> dict[str, Any]:
         """Fields of `RenderOptions`."""
+        if self.shader in _WHOLE and self.stop_alpha != Look().stop_alpha:
+            raise ValueError(f"--stop-alpha is for what adds up along a ray, not for {self.shader}")
         return {
             "step": self.step,
             "lod": self.lod,
