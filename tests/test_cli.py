@@ -297,17 +297,6 @@ def test_package_runs_as_a_module():
     assert (ROOT / "gvtorch" / "py.typed").exists()
 
 
-@pytest.fixture(scope="module")
-def scan_store(tmp_path_factory) -> Path:
-    """A ball of 40 x 48 x 56 voxels as a store, made by the command."""
-    folder = tmp_path_factory.mktemp("store")
-    z, y, x = np.mgrid[-1:1:56j, -1:1:48j, -1:1:40j]
-    np.save(folder / "ball.npy", (255 * np.clip(1.2 - x**2 - y**2 - z**2, 0, 1)).astype(np.uint8))
-    run = gvtorch("convert", folder / "ball.npy", folder / "ball.zarr", "--spacing", "1,1,2")
-    assert run.returncode == 0, run.stderr
-    return folder / "ball.zarr"
-
-
 @pytest.mark.backend("cpp")
 def test_a_store_renders_as_its_volume_does(scan_store, tmp_path):
     """Through a pool of a few bricks, in every mode, with what it cost."""
@@ -377,183 +366,6 @@ def test_fly_along_keys_to_a_video(scan_store, tmp_path):
     assert not list(tmp_path.glob(".*")), "nothing half-written is left"
 
 
-@pytest.mark.backend("cpp")
-def test_films_of_a_volume_loop(small, tmp_path):
-    """GIF and WebP of a RAW file: each picture is the one that `render` gives from there."""
-    from PIL import Image, ImageSequence
-
-    picture = tmp_path / "a.npz"
-    flags = ("--size", "32x24", "--tf", "hot", "--up", "+z")
-    for name, fps in (("a.gif", 30), ("a.webp", 10)):
-        out = tmp_path / name
-        run = gvtorch("fly", small, "-o", out, "--turntable", "0.4", "--fps", fps, *flags)
-        assert run.returncode == 0, run.stderr
-        with Image.open(out) as film:
-            assert film.info["loop"] == 0
-            frames = [
-                (np.array(f.convert("RGB")), f.info.get("duration"))
-                for f in ImageSequence.Iterator(film)
-            ]
-        assert len(frames) == round(0.4 * fps)
-        if name == "a.gif":
-            assert sum(duration for _, duration in frames) == 400
-        assert len(out.with_suffix(".jsonl").read_text().splitlines()) == len(frames)
-        path = gv.CameraPath.orbit(
-            gv.N3Tree.from_volume(gv.read_volume(small)).box, up="+z", fit=(32, 24)
-        )
-        volume = gv.read_volume(small)
-        shader = gv.TransferFunction.preset("hot", *gv.window(volume))
-        tree = gv.N3Tree.from_volume(volume)
-        for number in (0, len(frames) // 3):
-            camera = path.camera(number / len(frames), 32, 24)
-            expected = gv.render(tree, camera, shader).to_srgb8().numpy().astype(int)
-            error = np.abs(frames[number][0] - expected)
-            assert error.mean() < 4 and expected.max() > 150, (name, error.mean())
-    assert not picture.exists() and not list(tmp_path.glob("tmp*")), "nothing half-written is left"
-
-
-@pytest.mark.backend("cpp")
-def test_the_first_picture_of_a_flight_is_whole(scan_store, tmp_path):
-    flags = ("--size", "40x32", "--tf", "gray", "--loading", "levels")
-    run = gvtorch("fly", scan_store, "-o", tmp_path / "f", "--frames", "2", *flags)
-    assert run.returncode == 0, run.stderr
-    lines = (tmp_path / "f/stats.jsonl").read_text().splitlines()
-    assert all(json.loads(line)["converged"] for line in lines)
-    run = gvtorch(
-        *("fly", scan_store.with_name("ball.npy"), "-o", tmp_path / "v", "--frames", "2"),
-        *(*flags[:4], "--spacing", "1,1,2"),
-    )
-    assert run.returncode == 0, run.stderr
-    for name in ("0000.png", "0001.png"):
-        pictures = [(tmp_path / folder / name).read_bytes() for folder in "fv"]
-        assert pictures[0] == pictures[1], "streamed = resident, with the same window and camera"
-
-
-@pytest.mark.backend("cpp")
-def test_up_turns_orbits_flights_and_keys(small, tmp_path):
-    """And the default shows the whole ball, in the middle."""
-    seen = {}
-    for up in (None, "+y", "+z", "0,0,1", "-x"):
-        file = tmp_path / "a.npz"
-        flags = () if up is None else ("--up", up)
-        run = gvtorch("render", small, "-o", file, "--size", "48x32", *flags)
-        assert run.returncode == 0, run.stderr
-        seen[up] = np.load(file)["alpha"]
-        border = np.concatenate([seen[up][(0, -1), :, 0].ravel(), seen[up][:, (0, -1), 0].ravel()])
-        assert not border.any() and seen[up].max() > 0.3
-    assert np.array_equal(seen[None], seen["+y"]) and np.array_equal(seen["+z"], seen["0,0,1"])
-    keys = [{"eye": [60, 20, 8], "target": [12, 10, 8]}, {"eye": [70, 0, 8], "target": [12, 10, 8]}]
-    path = keys_file(tmp_path, json.dumps(keys))
-    pictures = set()
-    for number, flags in enumerate(((), ("--up", "+z"), ("--fov", "15"))):
-        folder = tmp_path / str(number)
-        args = ("--path", path, "--frames", "1", "--size", "24x24", *flags)
-        run = gvtorch("fly", small, "-o", folder, *args)
-        assert run.returncode == 0, run.stderr
-        pictures.add((folder / "0000.png").read_bytes())
-    assert len(pictures) == 3
-
-
-def test_a_misspelt_word_gets_the_right_one(small, tmp_path):
-    for args, message in (
-        (["rendr", small], "unknown command 'rendr'; known: info, render, fly, slice"),
-        (["rendr", small], "(did you mean render?)"),
-        (["render", small, "-o", "a.png", "--camra", "orbit:1,2"], "(did you mean --camera?)"),
-        (["slice", small, "-o", "a.png", "--axes", "z"], "Unrecognized options: --axes"),
-        (["render", small, "-o", "a.png", "--tf", "bnoe"], "(did you mean bone"),
-        (["render", small, "-o", "a.png", "--tf", "virids"], "(did you mean viridis"),
-    ):
-        run = gvtorch(*args, cwd=tmp_path)
-        assert run.returncode == 2 and len(run.stderr.splitlines()) == 1, run.stderr
-        assert message in run.stderr, run.stderr
-
-
-OWN_KEYS = '[{"eye": [1, 2, 3], "target": [0, 0, 0], "up": [0, 1, 0], "fov": 20}]'
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (
-            lambda t: ["fly", "S", "-o", t / "f", "--fps", "30"],
-            "--fps is for a film or --turntable",
-        ),
-        (
-            lambda t: ["fly", "S", "-o", t / "f", "--turntable", "2", "--frames", "3"],
-            "--turntable and --frames both tell how many",
-        ),
-        (
-            lambda t: ["fly", "S", "-o", t / "f", "--turntable", "2", "--path", "k.json"],
-            "--turntable goes once around",
-        ),
-        (lambda t: ["fly", "S", "-o", t / "f", "--turntable", "0"], "--turntable must be finite"),
-        (
-            lambda t: ["fly", "S", "-o", t / "f", "--orbit", "1,2", "--path", "k.json"],
-            "--orbit is for --path orbit",
-        ),
-        (lambda t: ["fly", "S", "-o", t / "f", "--orbit", "1"], "--orbit must be 3 numbers"),
-        (
-            lambda t: ["fly", "S", "-o", t / "f", "--up", "+z", "--path", keys_file(t, OWN_KEYS)],
-            "each key has its own up",
-        ),
-        (
-            lambda t: ["fly", "S", "-o", t / "f", "--fov", "9", "--path", keys_file(t, OWN_KEYS)],
-            "each key has its own fov",
-        ),
-        (
-            lambda t: ["fly", "S", "-o", t / "a.gif", "--background", "transparent"],
-            "--background transparent is for pictures",
-        ),
-        (
-            lambda t: ["fly", "S", "-o", t / "a.gif", "--fps", "60"],
-            "fps must be an int >= 1 and <= 50",
-        ),
-        (
-            lambda t: ["fly", "S", "-o", t / "f", "--brick-pool", "1 GB"],
-            "--brick-pool is for stores",
-        ),
-        (lambda t: ["fly", "STORE", "-o", t / "f", "--shape", "1,2,3"], "--shape is for volume"),
-        (
-            lambda t: ["fly", "STORE", "-o", t / "f", "--threshold", "3"],
-            "--threshold is for volumes",
-        ),
-        (
-            lambda t: (
-                ["render", "STORE", "-o", t / "a.png", "--mode", "balanced", "--max-frames", "5"]
-            ),
-            "--max-frames is for --mode converge",
-        ),
-        (lambda t: ["render", "S", "-o", t / "a.png", "--up", "up"], "--up must be 3 numbers"),
-        (lambda t: ["render", "S", "-o", t / "a.png", "--up", "+w"], "up must be one of +x, -x"),
-        (
-            lambda t: ["render", "S", "-o", t / "a.png", "--show", "lod", "--tone", "aces"],
-            "--tone is for pictures, not for --show lod",
-        ),
-        (
-            lambda t: [
-                *("render", "S", "-o", t / "a.png"),
-                *("--shader", "isosurface", "--value", "9", "--tf", "hot"),
-            ],
-            "--tf is for values: an isosurface has one",
-        ),
-        (
-            lambda t: (
-                ["render", "S", "-o", t / "a.png", "--shader", "maximum", "--stop-alpha", "0.5"]
-            ),
-            "--stop-alpha is for what adds up",
-        ),
-        (lambda t: ["render", "S", "-o", t / "a.png", "--value", "9"], "--value and --shader iso"),
-        (lambda t: ["render", "S", "-o", t / "a.png", "--window", "5,1"], "LO,HI with LO < HI"),
-        (lambda t: ["info", "--shape", "1,2,3"], "--shape is for volume files: name one"),
-    ],
-)
-def test_flags_that_would_do_nothing_are_refused(small, scan_store, tmp_path, make, message):
-    paths = {"S": small, "STORE": scan_store}
-    run = gvtorch(*(paths.get(arg, arg) for arg in make(tmp_path)))
-    assert run.returncode == 2 and len(run.stderr.splitlines()) == 1, run.stderr
-    assert message in run.stderr and not [*tmp_path.glob("*.png"), *tmp_path.glob("a.*")]
-
-
 def broken_root(folder: Path, store: Path) -> Path:
     copy = shutil.copytree(store, folder / "broken.zarr")
     levels = sorted((copy / "gvtorch/blocks").glob("[0-9]*"))
@@ -574,7 +386,7 @@ def keys_file(folder: Path, text: str) -> Path:
             "--output must be a folder or end in .mp4, .gif, .webp",
         ),
         (lambda t, s: ["fly", s, "-o", t / "x" / "a.mp4"], "folder not found"),
-        (lambda t, s: ["fly", s, "-o", t / "a.mp4", "--size", "33x20"], "--size must be even"),
+        (lambda t, s: ["fly", s, "-o", t / "a.mp4", "--size", "33x20"], "size must be even"),
         (lambda t, s: ["fly", s, "-o", t / "a", "--frames", "0"], "--frames must be an int >= 1"),
         (lambda t, s: ["fly", t / "no.zarr", "-o", t / "a"], "no.zarr"),
         (lambda t, s: ["fly", s, "-o", t / "a", "--path", "k.json"], "camera path not found"),

@@ -15,7 +15,7 @@ from ..base import check
 from .files import whole_file
 from .picture import Picture
 
-FILMS = (".mp4", ".gif", ".webp")
+FILMS = [".mp4", ".gif", ".webp"]
 _FASTEST_GIF = 50  # pictures a second; viewers slow down what is faster
 _OF_PALETTE = 16  # pictures from which the colours of a GIF are taken
 
@@ -49,7 +49,7 @@ class Video:
             raise FileNotFoundError(f"folder not found: {self._path.parent}")
         check.whole("Video", "fps", fps, low=1, high=_FASTEST_GIF if suffix == ".gif" else 1000)
         if suffix == ".mp4" and (width % 2 or height % 2):
-            raise ValueError(f"--size must be even for .mp4, got {width}x{height}")
+            raise ValueError(f"Video: size must be even for .mp4, got {width}x{height}")
         kind = _Mp4 if suffix == ".mp4" else _Loop
         self._stack = ExitStack()
         self._film: _Film = kind(suffix, width, height, fps)

@@ -104,14 +104,22 @@ class Convert:
             _print_table(_readable(estimate(self.path, self.store, **common).as_dict()))
             return
         start = time.perf_counter()
-        with Bar(speed=True) as bar, self._cluster() as executor:
-            store = convert(
-                *(self.path, self.store),
-                **common,
-                executor=executor,
-                resume=self.resume,
-                progress=bar,
-            )
+        try:
+            with Bar(speed=True) as bar, self._cluster() as executor:
+                store = convert(
+                    *(self.path, self.store),
+                    **common,
+                    executor=executor,
+                    resume=self.resume,
+                    progress=bar,
+                )
+        except KeyboardInterrupt:
+            if self.store.exists():
+                print(
+                    f"gvtorch: stopped; the same command with --resume goes on with {self.store}",
+                    file=sys.stderr,
+                )
+            raise
         seconds = time.perf_counter() - start
         size = amount(store.describe()["disk bytes"])
         extent = "x".join(str(n) for n in store.extent)

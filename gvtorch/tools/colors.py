@@ -15,6 +15,21 @@ if TYPE_CHECKING:
 _ENDINGS = (".json", ".vp", ".xml")  # of files of transfer functions
 
 
+def check_component(data: Volume | Store, component: int) -> None:
+    """Raises ValueError, which tells what there is, where voxels have no such number."""
+    from ..io.store import Store
+
+    width = data.width if isinstance(data, Store) else data.data.shape[3]
+    if 0 <= component < width:
+        return
+    known = getattr(data, "info", None)
+    names = [channel.name for channel in known.channels] if known is not None else []
+    names += [""] * (width - len(names))
+    told = ", ".join(f"{n} ({name})" if name else str(n) for n, name in enumerate(names))
+    what = "one number" if width == 1 else f"{width} numbers"
+    raise ValueError(f"--component {component}: a voxel has {what}: {told}")
+
+
 def chosen_transfer(
     name: str | None,
     span: str | None,
@@ -31,6 +46,7 @@ def chosen_transfer(
     from ..shaders import TransferFunction
     from ..shaders.presets import CT_PRESETS, IN_HU
 
+    check_component(data, component)
     name = name or "gray"
     file, _, inner = name.rpartition(":")
     known = getattr(data, "info", None)
@@ -61,6 +77,7 @@ def parse_window(
     """
     from ..io.window import value_range, window
 
+    check_component(data, component)
     if text == "auto":
         return window(data, component=component, background=background)
     if text == "full":

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from tyro.conf import Positional, arg
 
+from ..base.declared import declared_names
 from .common import Bar, size, volume_formats
 from .look import parse_orbit
 from .scene import SceneFlags
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
     from ..cameras.path import CameraPath
 
-_FILMS = (".mp4", ".gif", ".webp")
+_FILMS = tuple(declared_names("pictures.video", "FILMS"))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import arg
 
 from ..base.declared import declared_names
-from .colors import chosen_transfer
+from .colors import check_component, chosen_transfer
 from .common import numbers
 from .image import parse_background
 from .light import parse_lighting
@@ -130,6 +130,7 @@ class Look:
             for flag, given in (("--tf", self.tf), ("--window", self.window)):
                 if given is not None:
                     raise ValueError(f"{flag} is for values: an isosurface has one")
+            check_component(data, self.component)
             return BY_NAME[self.shader](TransferFunction([(0, 1)]), self.value or 0.0)
         transfer = chosen_transfer(self.tf, self.window, data, self.component)
         if self.shader == "filtered":  # its colours are made with the tree
