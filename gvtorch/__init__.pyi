@@ -6,6 +6,7 @@ from .base.volume import Volume as Volume
 from .io.conversion import convert as convert, estimate as estimate
 from .io.reading import read_volume as read_volume
 from .io.store import Store as Store
+from .io.window import window as window
 from .pool import (
     BrickPool as BrickPool,
     BrickTable as BrickTable,
@@ -56,6 +57,7 @@ from .tracing import (
     TreeTracer as TreeTracer,
     cost as cost,
     render as render,
+    slice_picture as slice_picture,
     trace as trace,
 )
 
@@ -74,6 +76,7 @@ from .pictures import (
     Gradient as Gradient,
     Picture as Picture,
     Progressive as Progressive,
+    Video as Video,
     read_image as read_image,
     render_tiles as render_tiles,
 )

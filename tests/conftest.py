@@ -16,7 +16,7 @@ import gvtorch as gv
 from gvtorch.ops import available
 
 pytest.register_assert_rewrite("helpers")
-from helpers import ABSENT, DATA, DEVICES  # noqa: E402
+from helpers import ABSENT, DATA, DEVICES, gvtorch  # noqa: E402
 
 _REQUIRED = os.environ.get("GVTORCH_REQUIRE", "")
 _ran: Counter[str] = Counter()
@@ -64,6 +64,17 @@ def small(tmp_path_factory):
     ball = np.clip(8 - np.sqrt((x - 12) ** 2 + (y - 10) ** 2 + (z - 8) ** 2), 0, 1) * 200
     file.write_bytes(ball.astype(np.uint8).tobytes())
     return file
+
+
+@pytest.fixture(scope="session")
+def scan_store(tmp_path_factory) -> Path:
+    """A ball of 40 x 48 x 56 voxels as a store, made by the command."""
+    folder = tmp_path_factory.mktemp("store")
+    z, y, x = np.mgrid[-1:1:56j, -1:1:48j, -1:1:40j]
+    np.save(folder / "ball.npy", (255 * np.clip(1.2 - x**2 - y**2 - z**2, 0, 1)).astype(np.uint8))
+    run = gvtorch("convert", folder / "ball.npy", folder / "ball.zarr", "--spacing", "1,1,2")
+    assert run.returncode == 0, run.stderr
+    return folder / "ball.zarr"
 
 
 @pytest.fixture(scope="session")
@@ -157,6 +168,16 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 def _missing() -> list[str]:
     """What must run, and did not."""
     libraries = ("nibabel", "nrrd", "tifffile", "imagecodecs", "astropy", "OpenEXR")
-    libraries += ("av", "distributed", "zarr", "yaozarrs", "ome_zarr_models", "vtk", "moderngl")
+    libraries += (
+        "av",
+        "PIL",
+        "matplotlib",
+        "distributed",
+        "zarr",
+        "yaozarrs",
+        "ome_zarr_models",
+        "vtk",
+        "moderngl",
+    )
     _ran["io"] = int(all(importlib.util.find_spec(name) for name in libraries))
     return [name for name in filter(None, _REQUIRED.split(",")) if not _ran[name]]

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.depth import unproject_meshgrid
 
 import gvtorch as gv
+from gvtorch.base.volume import DIRECTIONS
 from gvtorch.tracing import pixels
 
 BOX = torch.tensor([[1.0, 2.0, 3.0], [5.0, 4.0, 4.0]], dtype=torch.float64)
@@ -105,6 +109,125 @@ def test_up_is_plus_y_beyond_the_pole():
     torch.testing.assert_close(camera.rays().direction, other.rays().direction)
 
 
+@pytest.mark.parametrize("up", [*DIRECTIONS, (1.0, 2.0, -0.5)])
+def test_orbits_around_any_axis_are_turned_ones(up):
+    """The eye is as far above the plane around that axis, its picture upright; right is +x."""
+    angles = torch.linspace(-180, 180, 13), 25.0, 2.0
+    camera = gv.Camera.orbit(*angles, 30, 9, 9, up=up).placed(BOX)
+    axis = torch.tensor(up, dtype=torch.float64) if isinstance(up, tuple) else None
+    if axis is None:
+        axis = torch.zeros(3, dtype=torch.float64)
+        axis["xyz".index(up[1])] = 1 if up[0] == "+" else -1
+    axis = axis / axis.norm()
+    eye = centre_of(camera) - BOX.mean(0)
+    height = torch.full((13,), 8 * math.sin(math.radians(25)), dtype=torch.float64)
+    torch.testing.assert_close(eye @ axis, height)
+    other = gv.Camera.look_at(centre_of(camera), BOX.mean(0), axis, 30, 9, 9)
+    torch.testing.assert_close(camera.viewmats, other.viewmats)
+    right = gv.Camera.orbit(0, 0, 2.0, up=up).viewmats[0, 0, :3]
+    assert right[0] > 0.5 or (up[1] == "x" and right[1] == 1)
+    turning = gv.Camera.orbit([0, 90], 0, 2.0, up=up)
+    across = torch.linalg.cross(*centre_of(turning))
+    torch.testing.assert_close(across / 4, axis)
+
+
+def test_up_plus_y_has_the_bits_it_had():
+    """By name; in numbers it is a rotation by nothing."""
+    plain = gv.Camera.orbit([10, 200, -30], [20, 95, 0], 1.7)
+    named = gv.Camera.orbit([10, 200, -30], [20, 95, 0], 1.7, up="+y")
+    assert plain.same(named)
+    torch.testing.assert_close(
+        plain.viewmats,
+        gv.Camera.orbit([10, 200, -30], [20, 95, 0], 1.7, up=(0, 3, 0)).viewmats,
+        atol=1e-15,
+        rtol=0,
+    )
+
+
+def seen_corners(camera: gv.Camera, box: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where the corners of a box are in the picture, -1 to 1 in x and y, and their depths."""
+    corners = torch.stack([box[at, (0, 1, 2)] for at in itertools.product((0, 1), repeat=3)])
+    view, K = camera.viewmats[0], camera.Ks[0]
+    x, y, z = (corners @ view[:3, :3].T + view[:3, 3]).unbind(1)
+    if camera.model == "pinhole":
+        plane = torch.stack((x / z, y / z))
+    elif camera.model == "ortho":
+        plane = torch.stack((x, y))
+    elif camera.model == "fisheye":
+        angle = torch.atan2(torch.hypot(x, y), z)
+        plane = torch.stack((x, y)) * angle / torch.hypot(x, y)
+    else:
+        plane = torch.stack((torch.atan2(x, z), torch.atan2(y, torch.hypot(x, z))))
+    pixel = plane * K[(0, 1), (0, 1), None] + K[:2, 2:]
+    size = torch.tensor([[camera.width], [camera.height]])
+    return 2 * pixel / size - 1, z
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.data())
+def test_a_fitted_box_is_whole_and_fills_the_picture(data):
+    model = data.draw(st.sampled_from(["pinhole", "ortho", "fisheye", "panorama"]))
+    widest = {"pinhole": 150, "ortho": 150, "fisheye": 360, "panorama": 180}[model]
+    fov = data.draw(st.one_of(st.none(), st.floats(2, widest)))
+    size = data.draw(st.tuples(st.integers(8, 900), st.integers(8, 900)))
+    sides = torch.tensor(data.draw(st.tuples(*[st.floats(0.05, 20)] * 3)), dtype=torch.float64)
+    low = torch.tensor(data.draw(st.tuples(*[st.floats(-90, 90)] * 3)), dtype=torch.float64)
+    up = data.draw(st.sampled_from([*DIRECTIONS, (1, 1, 3)]))
+    angles = data.draw(st.tuples(st.floats(-400, 400), st.floats(-180, 180)))
+    box = torch.stack((low, low + sides))
+    camera = gv.Camera.orbit(*angles, None, fov, *size, model, up=up, fit=True)
+    placed = camera.placed(box)
+    at, depth = seen_corners(placed, box)
+    assert at.abs().max() < 0.985 and depth.min() > 0
+    if model in ("pinhole", "ortho"):
+        assert at.abs().max() > 0.95
+    else:  # no nearer than where the box spans 90 degrees
+        half = (fov or 180) / 2
+        wide = half * size[0] / size[1] if model == "fisheye" else 2 * half
+        x, y, z = _corners_along(placed, box)
+        spans = [math.tan(math.radians(min(45, 0.98 * part))) for part in (wide, half)]
+        if model == "fisheye":
+            filled = torch.hypot(x, y) / z / min(spans)
+        else:
+            filled = torch.maximum(x / spans[0], y / spans[1]) / z
+        assert float(filled.max()) == pytest.approx(1)
+    # The same in strips and for the samples of a pixel: what is fitted is the whole picture.
+    strip = camera.strip(3, 7).placed(box)
+    assert torch.equal(strip.viewmats, placed.viewmats)
+    assert torch.equal(camera.shifted(0.3, -0.2).placed(box).viewmats, placed.viewmats)
+    fitted = gv.Camera.fit(box, *angles, fov, *size, model, up=up)
+    assert fitted.same(placed) and not camera.same(gv.Camera.orbit(*angles, 1.0, fov, *size, model))
+
+
+def _corners_along(camera: gv.Camera, box: torch.Tensor) -> list[torch.Tensor]:
+    corners = torch.stack([box[at, (0, 1, 2)] for at in itertools.product((0, 1), repeat=3)])
+    view = camera.viewmats[0]
+    return list((corners @ view[:3, :3].T + view[:3, 3]).abs().unbind(1))
+
+
+@pytest.mark.parametrize("model", ["pinhole", "ortho"])
+@pytest.mark.parametrize("up", ["+y", "-z"])
+def test_a_path_around_a_box_keeps_it_whole_and_its_distance(model, up):
+    size = (300, 200)
+    path = gv.CameraPath.orbit(BOX, model, 25, elevation=35, up=up, fit=size)
+    cameras = [path.camera(place / 60, *size, model) for place in range(61)]
+    most = [float(seen_corners(camera, BOX)[0].abs().max()) for camera in cameras]
+    assert max(most) < 1 and max(most) > 0.95
+    eyes = torch.cat([centre_of(camera) for camera in cameras])
+    far = (eyes - BOX.mean(0)).norm(dim=1)
+    assert far.max() / far.min() < 1.002  # an open curve: its ends bend
+    axis = "xyz".index(up[1])
+    assert (eyes[:, axis] - eyes[0, axis]).abs().max() < 1e-9
+
+
+def test_a_batch_that_fits_has_a_distance_each():
+    cameras = gv.Camera.orbit([0, 90], 0, fov=30, fit=True).placed(BOX)
+    assert len(cameras) == 2
+    far = (centre_of(cameras) - BOX.mean(0)).norm(dim=1)
+    assert abs(float(far[0] - far[1])) > 0.5
+    assert cameras[1].same(gv.Camera.orbit(90, 0, fov=30, fit=True).placed(BOX))
+
+
 def test_leading_dimensions_are_one_batch():
     view = torch.eye(4).expand(2, 3, 4, 4)
     camera = gv.Camera.from_viewmat_K(view, torch.eye(3), 4, 4)
@@ -169,6 +292,12 @@ def test_small_cameras_share_calls(monkeypatch):
         (lambda: gv.Camera.orbit(azimuth=math.nan), "azimuth must be finite"),
         (lambda: gv.Camera.orbit(elevation=math.inf), "elevation must be finite"),
         (lambda: gv.Camera.orbit(distance=0), "distance must be > 0"),
+        (lambda: gv.Camera.orbit(distance=2, fit=True), "fit finds the distance: leave it out"),
+        (lambda: gv.Camera.orbit(up="z"), r"up must be one of \+x, -x, .* got 'z'"),
+        (lambda: gv.Camera.orbit(up=(0, 0, 0)), "up must not be zero"),
+        (lambda: gv.Camera.orbit(up=(0, 1)), "up must be three numbers"),
+        (lambda: gv.Camera.fit([[0, 0, 0], [1, 0, 1]]), "must have its low corner below"),
+        (lambda: gv.CameraPath.orbit(BOX, distance=2, fit=(8, 8)), "fit finds the distance"),
         (lambda: gv.Camera.orbit(fov=0), "fov must be finite and > 0 and <= 179"),
         (lambda: gv.Camera.orbit(fov=math.nan), "fov must be finite"),
         (lambda: gv.Camera.orbit(width=0), "width must be an int >= 1"),

@@ -63,7 +63,8 @@ def test_render_takes_other_shaders(small, tmp_path, shader):
     arrays = {}
     for name in ("plain", shader):
         file, flags = tmp_path / f"{name}.npz", level if name == shader else ()
-        look = ("--size", "24x24", "--tf", "gray", "--npz", file, "--shader", name, *flags)
+        colors = () if name == "isosurface" else ("--tf", "gray")
+        look = ("--size", "24x24", *colors, "--npz", file, "--shader", name, *flags)
         run = gvtorch("render", small, "-o", tmp_path / "a.png", *look)
         assert run.returncode == 0, run.stderr
         arrays[name] = np.load(file)
@@ -191,7 +192,10 @@ TF = '{"opacity": [[5, 0], [1, 1]]}'
         (lambda t, s: [s, "--camera", "orbit:nan,0,2"], "azimuth must be finite"),
         (lambda t, s: [s, "--camera", "look:0,0,inf,0,0,0"], "eye must be finite"),
         (lambda t, s: [s, "--camera", "look:0,0,1,0,0"], "--camera look must be 6 numbers"),
-        (lambda t, s: [s, "--camera", "fish:1"], "--camera must be orbit:AZ,EL,DIST or look:"),
+        (
+            lambda t, s: [s, "--camera", "fish:1"],
+            "--camera must be orbit:AZ,EL, orbit:AZ,EL,DIST or look:",
+        ),
         (lambda t, s: [s, "--fov", "nan"], "fov must be finite"),
         (lambda t, s: [s, "--size", "0x5"], "--size must be WIDTHxHEIGHT"),
         (lambda t, s: [s, "--size", "99999x5"], "width must be an int >= 1 and <= 65536"),
@@ -293,17 +297,6 @@ def test_package_runs_as_a_module():
     assert (ROOT / "gvtorch" / "py.typed").exists()
 
 
-@pytest.fixture(scope="module")
-def scan_store(tmp_path_factory) -> Path:
-    """A ball of 40 x 48 x 56 voxels as a store, made by the command."""
-    folder = tmp_path_factory.mktemp("store")
-    z, y, x = np.mgrid[-1:1:56j, -1:1:48j, -1:1:40j]
-    np.save(folder / "ball.npy", (255 * np.clip(1.2 - x**2 - y**2 - z**2, 0, 1)).astype(np.uint8))
-    run = gvtorch("convert", folder / "ball.npy", folder / "ball.zarr", "--spacing", "1,1,2")
-    assert run.returncode == 0, run.stderr
-    return folder / "ball.zarr"
-
-
 @pytest.mark.backend("cpp")
 def test_a_store_renders_as_its_volume_does(scan_store, tmp_path):
     """Through a pool of a few bricks, in every mode, with what it cost."""
@@ -388,9 +381,12 @@ def keys_file(folder: Path, text: str) -> Path:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda t, s: ["fly", s, "-o", t / "a.avi"], "--output must be a folder or end in .mp4"),
+        (
+            lambda t, s: ["fly", s, "-o", t / "a.avi"],
+            "--output must be a folder or end in .mp4, .gif, .webp",
+        ),
         (lambda t, s: ["fly", s, "-o", t / "x" / "a.mp4"], "folder not found"),
-        (lambda t, s: ["fly", s, "-o", t / "a.mp4", "--size", "33x20"], "--size must be even"),
+        (lambda t, s: ["fly", s, "-o", t / "a.mp4", "--size", "33x20"], "size must be even"),
         (lambda t, s: ["fly", s, "-o", t / "a", "--frames", "0"], "--frames must be an int >= 1"),
         (lambda t, s: ["fly", t / "no.zarr", "-o", t / "a"], "no.zarr"),
         (lambda t, s: ["fly", s, "-o", t / "a", "--path", "k.json"], "camera path not found"),

@@ -16,7 +16,7 @@ LOOK = ("--size", "24x16", "--tf", "hot", "--camera", "orbit:20,10,0.8")
 
 def picture(path, camera, **options) -> gv.Picture:
     volume = gv.read_volume(path)
-    shader = gv.TransferFunction.preset("hot", *volume.value_range)
+    shader = gv.TransferFunction.preset("hot", *gv.window(volume))
     return gv.render(gv.N3Tree.from_volume(volume), camera, shader, **options)
 
 
@@ -42,7 +42,7 @@ def test_filtered(small, tmp_path):
     assert done.returncode == 0, done.stderr
     volume = gv.read_volume(small)
     tree = gv.N3Tree.from_volume(volume)
-    shader = gv.Filtered.of(tree, volume, gv.TransferFunction.preset("hot", *volume.value_range))
+    shader = gv.Filtered.of(tree, volume, gv.TransferFunction.preset("hot", *gv.window(volume)))
     camera = gv.Camera.orbit(20, 10, 9, None, 24, 16)
     expected = gv.render(tree, camera, shader)
     np.testing.assert_allclose(np.load(tmp_path / "a.npy")[..., :3], expected.color, atol=1e-6)

@@ -262,7 +262,7 @@ def test_the_command_line(store, tmp_path):
         assert done.returncode == 0, done.stderr
         volume = matter()
         tree = gv.N3Tree.from_volume(volume)
-        hot = gv.TransferFunction.preset("hot", *volume.value_range)
+        hot = gv.TransferFunction.preset("hot", *gv.window(volume))
         shader = gv.Filtered.of(tree, volume, hot, directions=True)
         expected = gv.render(tree, gv.Camera.orbit(20, 10, 9, None, 24, 16), shader)
         np.testing.assert_allclose(np.load(tmp_path / "a.npy")[..., :3], expected.color, atol=1e-6)

@@ -530,7 +530,7 @@ def test_the_command_line_tells_and_names_components(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["render", str(folder), "-o", str(tmp_path / "a.png"), "--component", "2"])
     err = capsys.readouterr().err
-    assert err == "gvtorch: error: --component 2: a voxel has 2 numbers: 0 DAPI, 1 GFP\n"
+    assert err == "gvtorch: error: --component 2: a voxel has 2 numbers: 0 (DAPI), 1 (GFP)\n"
     volume = gv.Volume(torch.zeros(3, 3, 3, 2), info=ImageInfo(channels=TOLD[:1]))
     with pytest.raises(ValueError, match="its info names 1 channels, it has 2"):
         convert(volume, tmp_path / "b.zarr")

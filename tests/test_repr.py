@@ -38,6 +38,7 @@ def test_objects_tell_of_themselves_in_one_line(tree):
         (gv.Gradient((0, 0, 0), (1, 1, 1)), "Gradient(top=(0.0, 0.0, 0.0), bottom="),
         (gv.Environment(IMAGE), "Environment((6, 8, 3) float32 on cpu)"),
         (gv.Progressive(print), "Progressive(None, 0 frames)"),
+        (gv.Video("a.gif", 8, 6), "Video('a.gif', 8x6)"),
         (tree, "N3Tree(8x8x8"),
         (GRAY, "TransferFunction(3 opacities, 2 colours, from 0 to 1)"),
         (gv.Lit(GRAY, normals="n"), "Lit(normals='n', transfer=TransferFunction("),

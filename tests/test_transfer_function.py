@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -11,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gvtorch as gv
+from gvtorch.shaders.presets import CT_PRESETS, PRESETS
 from gvtorch.shaders.shader import Sampling
-from gvtorch.shaders.transfer_function import PRESETS
 
 
 def table_of(function, spacing=1.0, step=1.0, levels=1, dtype=torch.float32):
@@ -138,6 +139,226 @@ def test_presets_stretch_over_the_data(name):
     gv.TransferFunction.preset(name, 3, 3)
 
 
+def srgb(linear: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1."""
+    root = 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, 12.92 * linear, root)
+
+
+@pytest.mark.parametrize("name", sorted(CT_PRESETS))
+def test_presets_of_scans_have_values_of_their_own(name):
+    function = gv.TransferFunction.preset(name)
+    low, high, _ = function.corners()
+    assert low >= -1000 and -300 < high <= 1500
+    assert function(np.array([-1024.0]))[0, 3] == 0, "air is clear"
+    other = gv.TransferFunction.preset(name, 0, 1)
+    np.testing.assert_allclose(other.opacity[:, 1], function.opacity[:, 1])
+    np.testing.assert_allclose(other.opacity[:, 0], (function.opacity[:, 0] - low) / (high - low))
+
+
+@pytest.mark.parametrize("name", ["viridis", "tab10", "matplotlib:bone"])
+def test_colour_maps_are_those_of_matplotlib(name):
+    maps = pytest.importorskip("matplotlib").colormaps
+    function = gv.TransferFunction.preset(name, 10, 20)
+    at = np.arange(256) / 255
+    expected = maps[name.removeprefix("matplotlib:")](at)[:, :3]
+    found = function(10 + 10 * at)
+    np.testing.assert_allclose(srgb(found[:, :3]), expected, atol=1e-6)
+    assert found[0, 3] == 0 and found[-1, 3] == 0.5 and table_of(function).table_lm4.shape[1] < 5000
+
+
+def test_presets_need_values_or_have_them():
+    with pytest.raises(ValueError, match="preset 'gray' is stretched over values: give low and hi"):
+        gv.TransferFunction.preset("gray")
+    with pytest.raises(ValueError, match="give low and high"):
+        gv.TransferFunction.preset("ct-bone", 3)
+    with pytest.raises(ValueError, match=r"unknown preset 'bnoe'.*\(did you mean bone"):
+        gv.TransferFunction.preset("bnoe", 0, 1)
+
+
+def test_without_matplotlib_the_command_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ValueError, match=r"pip install 'gvtorch\[color\]'"):
+        gv.TransferFunction.preset("viridis", 0, 1)
+
+
+def test_saved_functions_come_back(tmp_path):
+    function = gv.TransferFunction([(0, 0), (3, 1)], [(1, 1, 0.5, 0)], reference=2)
+    function.save(tmp_path / "a.json")
+    again = gv.TransferFunction.from_file(tmp_path / "a.json")
+    assert again.to_json() == function.to_json() and not again.relative
+    with pytest.raises(ValueError, match=r"path must end in \.json"):
+        function.save(tmp_path / "a.txt")
+    with pytest.raises(ValueError, match="holds one function"):
+        gv.TransferFunction.from_file(tmp_path / "a.json", "a")
+
+
+def paraview(tmp_path, **item):
+    item = {"Name": "one", "RGBPoints": [0, 0, 0, 0, 1, 1, 1, 1], **item}
+    other = {"Name": "two", "RGBPoints": [0, 1, 0, 0, 1, 1, 0, 0]}
+    (tmp_path / "pv.json").write_text(json.dumps([other, item]))
+    return gv.TransferFunction.from_file(tmp_path / "pv.json", "one")
+
+
+COOL_WARM = [0, 0.231, 0.298, 0.753, 10, 0.706, 0.016, 0.149]
+
+
+@pytest.mark.parametrize(
+    ("space", "wrap", "points"),
+    [
+        ("RGB", False, [-4, 0.9, 0.1, 0.2, 0, 0.2, 0.8, 0.5, 7, 0, 0, 0.4]),
+        ("HSV", False, [0, 0, 0, 1, 10, 1, 0, 0]),
+        ("HSV", True, [0, 1, 0, 1, 3, 1, 0.9, 0, 10, 0.1, 0, 0.9]),
+        ("Lab", False, [0, 0.1, 0, 0.4, 4, 0.8, 0.3, 0.3, 10, 1, 1, 0.8]),
+        ("Diverging", False, COOL_WARM),
+        ("Diverging", False, [0, 0.231, 0.298, 0.753, 5, 0.865, 0.865, 0.865, 10, 0.7, 0.02, 0.15]),
+        ("Diverging", False, [0, 0.1, 0.5, 0.2, 10, 0.5, 0.1, 0.6]),
+    ],
+)
+def test_colours_of_paraview_are_those_of_vtk(tmp_path, space, wrap, points):
+    vtk = pytest.importorskip("vtkmodules.vtkRenderingCore")
+    expected = vtk.vtkColorTransferFunction()
+    getattr(expected, f"SetColorSpaceTo{space}")()
+    expected.SetHSVWrap(int(wrap))
+    for at in range(0, len(points), 4):
+        expected.AddRGBPoint(*points[at : at + 4])
+    function = paraview(tmp_path, ColorSpace=space, HSVWrap=wrap, RGBPoints=points)
+    assert function.relative and table_of(function).table_lm4.shape[1] < 20_000
+    values = np.linspace(points[0], points[-4], 301)
+    found = srgb(function(values)[:, :3])
+    np.testing.assert_allclose(found, [expected.GetColor(v) for v in values], atol=0.02)
+
+
+def test_steps_of_paraview(tmp_path):
+    vtk = pytest.importorskip("vtkmodules.vtkRenderingCore")
+    points = [0, 1, 0, 0, 4, 0, 1, 0, 10, 0, 0, 1]
+    expected = vtk.vtkColorTransferFunction()
+    expected.SetColorSpaceToStep()
+    for at in range(0, len(points), 4):
+        expected.AddRGBPoint(*points[at : at + 4])
+    function = paraview(tmp_path, ColorSpace="Step", RGBPoints=points)
+    for value in (0.01, 1, 3.99, 4.01, 6, 9.9):
+        assert function(np.array([value]))[0, :3].tolist() == list(expected.GetColor(value))
+
+
+@given(
+    middle=st.floats(0.05, 0.95),
+    sharp=st.one_of(st.just(0.0), st.floats(0.02, 1.0)),
+    alphas=st.tuples(st.floats(0, 1), st.floats(0, 1)),
+)
+def test_bent_opacities_are_those_of_vtk(tmp_path_factory, middle, sharp, alphas):
+    vtk = pytest.importorskip("vtkmodules.vtkCommonDataModel")
+    expected = vtk.vtkPiecewiseFunction()
+    expected.AddPoint(-3, alphas[0], middle, sharp)
+    expected.AddPoint(5, alphas[1], 0.5, 0)
+    points = [-3, alphas[0], middle, sharp, 5, alphas[1], 0.5, 0]
+    folder = tmp_path_factory.mktemp("pv")
+    function = paraview(folder, RGBPoints=[-3, 0, 0, 0, 5, 1, 1, 1], Points=points)
+    values = np.linspace(-3, 5, 97)
+    found = function(values)[:, 3]
+    np.testing.assert_allclose(found, [expected.GetValue(v) for v in values], atol=0.02)
+
+
+OPACITY, COLOR = "6 -1000 0 100 0.25 2000 1", "12 -1000 0 0 0 100 0.5 0.25 0 2000 1 1 1"
+LINES = ["1", "0", "0.9", "0.1", "0.2", "10", OPACITY, "4 0 1 255 1", COLOR]
+
+
+def mrml(name: str, **texts: str) -> str:
+    texts = {
+        "scalarOpacity": OPACITY,
+        "colorTransfer": COLOR,
+        "gradientOpacity": "4 0 1 9 1",
+    } | texts
+    return (
+        f'<VolumeProperty name="{name}" ' + " ".join(f'{k}="{v}"' for k, v in texts.items()) + "/>"
+    )
+
+
+def test_presets_of_slicer(tmp_path):
+    """As .vp, as .vp.json, and by name out of many."""
+    (tmp_path / "a.vp").write_text("\n".join(LINES) + "\n")
+    both = mrml("CT-One") + mrml("CT-Two", shade="1", scalarOpacity="4 0 0 1 1")
+    (tmp_path / "presets.xml").write_text(f"<MRML>{both}</MRML>")
+    component = {
+        "rgbTransferFunction": {
+            "points": [
+                {"x": -1000, "color": [0, 0, 0]},
+                {"x": 100, "color": [0.5, 0.25, 0]},
+                {"x": 2000, "color": [1, 1, 1]},
+            ]
+        },
+        "scalarOpacity": {
+            "points": [{"x": -1000, "y": 0}, {"x": 100, "y": 0.25}, {"x": 2000, "y": 1}]
+        },
+        "scalarOpacityUnitDistance": 2.5,
+    }
+    content = {"volumeProperties": [{"components": [component]}]}
+    (tmp_path / "a.vp.json").write_text(json.dumps(content))
+    for file, name in (("a.vp", None), ("presets.xml", "CT-One"), ("a.vp.json", None)):
+        function = gv.TransferFunction.from_file(tmp_path / file, name)
+        found = function(np.array([-1000, 100, 1050, 2000.0]))
+        np.testing.assert_allclose(found[:, 3], [0, 0.25, 0.625, 1], atol=1e-4)
+        expected = np.array([[0, 0, 0], [0.5, 0.25, 0], [0.75, 0.625, 0.5], [1, 1, 1]])
+        np.testing.assert_allclose(srgb(found[:, :3]), expected, atol=2e-3)
+        assert not function.relative and function.reference == (2.5 if "json" in file else None)
+    with pytest.warns(UserWarning, match="not kept: shading"):
+        gv.TransferFunction.from_file(tmp_path / "presets.xml", "CT-Two")
+
+
+def test_jumps_and_doubled_points_of_slicer(tmp_path):
+    jump = mrml("A", scalarOpacity="12 0 0 0 0 10 0 10 1 20 1 20 1")
+    (tmp_path / "a.xml").write_text(f"<MRML>{jump}</MRML>")
+    function = gv.TransferFunction.from_file(tmp_path / "a.xml")
+    assert function(np.array([9.7, 10.3]))[:, 3].tolist() == [0, 1]
+    assert table_of(function).table_lm4.shape[1] < 20_000
+
+
+def test_what_is_lost_is_told(tmp_path):
+    lines = [*LINES[:7], "4 0 0 255 1", LINES[8]]
+    (tmp_path / "a.vp").write_text("\n".join(lines))
+    with pytest.warns(UserWarning, match="not kept: opacity by gradient"):
+        gv.TransferFunction.from_file(tmp_path / "a.vp")
+    with pytest.warns(UserWarning, match="taken as 'Lab'"):
+        paraview(tmp_path, ColorSpace="Lab/CIEDE2000")
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "name", "message"),
+    [
+        ("a.vp", "1\n2\n", None, "a .vp file has 9 lines, this one 2"),
+        ("a.vp", "\n".join([*LINES[:6], "5 1 2", *LINES[7:]]), None, "must be a count and as many"),
+        ("a.vp", "\n".join([*LINES[:6], "2 x y", *LINES[7:]]), None, "could not convert"),
+        ("a.vp", "\n".join([*LINES[:6], "2 nan 1", *LINES[7:]]), None, "must be finite"),
+        ("a.vp", "\n".join([*LINES[:6], "2 1 7", *LINES[7:]]), None, r"must lie in \[0, 1\]"),
+        ("a.vp", "\n".join(LINES), "CT", "holds one preset, without a name: leave 'CT' out"),
+        ("a.xml", "<MRML><", None, "no such file as its ending tells"),
+        (
+            "a.xml",
+            "<MRML></MRML>",
+            None,
+            "has several presets, name one as in FILE:NAME; it has none",
+        ),
+        ("a.xml", mrml("CT-A"), "CT-B", r"no preset 'CT-B'; it has CT-A \(did you mean CT-A\?\)"),
+        ("a.json", "[{}]", None, "expected {.opacity.*a list of ParaView presets"),
+        ("a.json", '[{"RGBPoints": [0, 1]}]', None, "cannot reshape"),
+        (
+            "a.json",
+            '[{"RGBPoints": [0,0,0,0], "ColorSpace": "XYZ"}]',
+            None,
+            "ColorSpace must be one",
+        ),
+        ("a.json", '{"volumeProperties": []}', None, "no such file as its ending tells"),
+        ("a.json", '{"color": []}', None, 'expected an object with "opacity"'),
+        ("a.txt", "", None, "not a JSON file"),
+    ],
+)
+def test_bad_files_of_others_get_one_line(tmp_path, file, text, name, message):
+    (tmp_path / file).write_text(text)
+    with pytest.raises(ValueError, match=message) as error:
+        gv.TransferFunction.from_file(tmp_path / file, name)
+    assert str(error.value).startswith(str(tmp_path)) and "\n" not in str(error.value)
+
+
 @pytest.mark.parametrize(
     ("opacity", "color", "message"),
     [
@@ -178,5 +399,5 @@ def test_bad_files_are_named(tmp_path, text, message):
 def test_missing_file_and_preset():
     with pytest.raises(FileNotFoundError, match=r"nowhere\.json"):
         gv.TransferFunction.from_json("nowhere.json")
-    with pytest.raises(ValueError, match="unknown preset 'lungs'; known: bone, gray"):
+    with pytest.raises(ValueError, match="unknown preset 'lungs'; known: bone, ct-bone, ct-lung"):
         gv.TransferFunction.preset("lungs", 0, 1)

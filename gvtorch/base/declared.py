@@ -1,10 +1,12 @@
 """`declared_names`: names that a file declares, read without running it, so that `gvtorch --help`
-does not wait for torch.
+does not wait for torch. `did_you_mean`: which name was meant.
 """
 
 from __future__ import annotations
 
 import ast
+import difflib
+from collections.abc import Iterable
 from pathlib import Path
 
 _PACKAGE = Path(__file__).parents[1]
@@ -23,3 +25,10 @@ def declared_names(module: str, variable: str) -> list[str]:
                 names = node.value.keys if isinstance(node.value, ast.Dict) else node.value.elts
                 return [ast.literal_eval(name) for name in names if name is not None]
     raise KeyError(f"{module} has no {variable}")
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Returns " (did you mean ...?)" with the known names most like this one, or nothing."""
+    names = {text.lower(): text for text in known}
+    close = difflib.get_close_matches(name.lower(), names, n=3)
+    return f" (did you mean {' or '.join(names[text] for text in close)}?)" if close else ""

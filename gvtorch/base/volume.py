@@ -160,8 +160,12 @@ class Volume:
         check.whole("Volume.describe", "bins", bins, low=1)
         low, high = self.value_range
         values = (self.data.float() if self.data.dtype == torch.bfloat16 else self.data).numpy()
-        limits = (low, high) if high > low else (low, low + 1)
-        counts, _ = np.histogram(values, bins=bins, range=limits)
+        limits = (low, high) if high > low else (low, low + max(1.0, abs(low)))
+        counts, total = np.zeros(bins, np.int64), 0.0
+        for part in values:  # by z: float16 and float32 can't tell the bins of their full range
+            wide = part.astype(np.float64)
+            counts += np.histogram(wide, bins=bins, range=limits)[0]
+            total += float(wide.sum())
         return {
             "name": self.name,
             "extent": list(self.extent),
@@ -171,7 +175,7 @@ class Volume:
             "origin": list(self.origin),
             **self.info.describe(),
             "range": [low, high],
-            "mean": float(values.mean(dtype=np.float64)),
+            "mean": total / values.size,
             "histogram": [int(count) for count in counts],
             "bytes": self.data.nbytes,
         }

@@ -8,6 +8,7 @@ centres at integers, and `from_kornia` and `to_kornia` shift the principal point
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from enum import Enum
@@ -18,6 +19,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.records import Rays
+from ..base.volume import DIRECTIONS
 from ..pool.staging import upload
 from .models import MODELS, CameraModel, Plane, last_rising_angle, model_of
 
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
 Numbers = float | Sequence[float] | Tensor
+Up = str | Sequence[float] | Tensor  # a name of `DIRECTIONS` such as "+z", or (3,) world
+_FILLED = 0.98  # of half the picture's width or height, which a box that fits takes
 
 
 class Frame(Enum):
@@ -55,9 +59,12 @@ class Camera:
             whole picture.
         sample: Which of the samples of its pixels this is; see `Rays.sample`.
         batched: False for one camera whose pictures have no batch dimension.
+        fitted: Half width and height of the whole picture at distance 1 where the distance follows
+            from the box's proportions, once the camera is `placed`; else None.
     """
 
     sample = 0
+    fitted: tuple[float, float] | None = None
 
     def __init__(
         self,
@@ -118,27 +125,39 @@ class Camera:
         cls,
         azimuth: Numbers = 30.0,
         elevation: Numbers = 20.0,
-        distance: Numbers = 2.4,
+        distance: Numbers | None = None,
         fov: float | None = None,
         width: int = 512,
         height: int = 512,
         model: CameraModel = "pinhole",
+        *,
+        up: Up = "+y",
+        fit: bool = False,
     ) -> Camera:
-        """Looks at the centre of the scene's box from a sphere around it; up is +y.
+        """Looks at the centre of the scene's box from a sphere around it.
 
         position = centre + distance * L * (sin az cos el, sin el, cos az cos el), L the box's
-        largest side.
+        largest side, where +y is up. Else that is turned: +x still runs to the right at azimuth 0
+        (+y, where up is nearly x), so with +z up the eye stands at -y.
 
         Args:
             azimuth: Degrees; a number, or (n,) for a batch.
             elevation: Degrees, likewise.
-            distance: In largest sides of the box, likewise, > 0.
+            distance: In largest sides of the box, likewise, > 0; 2.4 if left out.
             fov, width, height, model: See `look_at`.
+            up: +x, -x, +y, -y, +z, -z, or (3,) world.
+            fit: The distance is that from which the whole box just is in the picture, found when
+                the camera is `placed`. A fisheye or a panorama comes no nearer than where the box
+                spans 90 degrees.
 
         Raises:
-            ValueError: A number is not finite or out of its range.
+            ValueError: A number is not finite or out of its range, or `fit` and a distance are
+                both given.
         """
         where = "Camera.orbit"
+        if fit and distance is not None:
+            raise ValueError(f"{where}: fit finds the distance: leave it out, got {distance!r}")
+        distance = (1.0 if fit else 2.4) if distance is None else distance
         turn, lift, far = _batch(
             where, azimuth=(azimuth, ()), elevation=(elevation, ()), distance=(distance, ())
         )
@@ -147,17 +166,47 @@ class Camera:
         turn, lift = turn.deg2rad(), lift.deg2rad()
         zero = torch.zeros_like(turn)
         outward = torch.stack((turn.sin() * lift.cos(), lift.sin(), turn.cos() * lift.cos()), -1)
-        sign = torch.where(lift.cos() < -1e-12, -1.0, 1.0)  # beyond a pole up is still +y
+        sign = torch.where(lift.cos() < -1e-12, -1.0, 1.0)  # beyond a pole up is still up
         right = torch.stack((sign * turn.cos(), zero, -sign * turn.sin()), -1)
+        if not (isinstance(up, str) and up == "+y"):  # whose numbers are as they are
+            axes = _axes_around(upward(where, up))
+            outward, right = outward @ axes, right @ axes
         view = _viewmat(outward * far[..., None], -outward, right)
-        return _aimed(where, view, far, fov, width, height, model, Frame.BOX)
+        camera = _aimed(where, view, far, fov, width, height, model, Frame.BOX)
+        if fit:
+            focal = camera.Ks[0, (0, 1), (0, 1)].tolist()
+            camera.fitted = (0.5 * width / focal[0], 0.5 * height / focal[1])
+        return camera
+
+    @classmethod
+    def fit(
+        cls,
+        box: Sequence[Sequence[float]] | Tensor,
+        azimuth: Numbers = 30.0,
+        elevation: Numbers = 20.0,
+        fov: float | None = None,
+        width: int = 512,
+        height: int = 512,
+        model: CameraModel = "pinhole",
+        *,
+        up: Up = "+y",
+    ) -> Camera:
+        """Looks at a box, (2, 3) world, from where all of it just is in the picture, as `orbit`
+        with `fit` does; the camera stands in the world.
+        """
+        corners = check.reals("Camera.fit", "box", box, (2, 3))
+        if not bool((corners[1] > corners[0]).all()):
+            got = corners.tolist()
+            raise ValueError(f"Camera.fit: box must have its low corner below, got {got}")
+        camera = cls.orbit(azimuth, elevation, None, fov, width, height, model, up=up, fit=True)
+        return camera.placed(corners)
 
     @classmethod
     def look_at(
         cls,
         eye: Sequence[float] | Tensor,
         target: Sequence[float] | Tensor,
-        up: Sequence[float] | Tensor = (0.0, 1.0, 0.0),
+        up: Up = (0.0, 1.0, 0.0),
         fov: float | None = None,
         width: int = 512,
         height: int = 512,
@@ -168,8 +217,8 @@ class Camera:
         Args:
             eye: (3,) or (n, 3).
             target: (3,) or (n, 3).
-            up: (3,) or (n, 3); where it is parallel to the view, -z takes its place (or +y, if up
-                is z).
+            up: (3,) or (n, 3), or a name such as "+z"; where it is parallel to the view, -z takes
+                its place (or +y, if up is z).
             fov: Vertical field of view, degrees; left out, 30 of a pinhole and an orthographic
                 camera, which shows what a pinhole would at the target's distance, and 180 of a
                 fisheye, whose circle is as high as the picture, and of a panorama, which is twice
@@ -182,6 +231,7 @@ class Camera:
             ValueError: A place is not finite, up is zero, or eye and target are the same.
         """
         where = "Camera.look_at"
+        up = upward(where, up) if isinstance(up, str) else up
         eye_, target_, up_ = _batch(where, eye=(eye, (3,)), target=(target, (3,)), up=(up, (3,)))
         if bool((up_ == 0).all(-1).any()):
             raise ValueError(f"{where}: up must not be zero")
@@ -277,7 +327,8 @@ class Camera:
 
     def same(self, other: Camera) -> bool:
         """Whether another camera has the same rays; does not wait for a device."""
-        return (self.form, self.frame) == (other.form, other.frame) and all(
+        mine, others = ((one.form, one.frame, one.fitted) for one in (self, other))
+        return mine == others and all(
             torch.equal(getattr(self, name), getattr(other, name)) for name in _ROWS
         )
 
@@ -288,11 +339,20 @@ class Camera:
         centre, side = (box[0] + box[1]) / 2, (box[1] - box[0]).max()
         view, Ks = self.viewmats.clone(), self.Ks
         rotation = view[:, :3, :3]
-        view[:, :3, 3] = view[:, :3, 3] * side - rotation @ centre
+        scale = side.expand(len(self), 1)
+        if self.fitted is None:
+            view[:, :3, 3] = view[:, :3, 3] * side - rotation @ centre
+        else:
+            corners = torch.stack([box[at, (0, 1, 2)] for at in _CORNERS]) - centre
+            halves = [_FILLED * half for half in self.fitted]
+            away, scale = MODELS[self.model].fit(corners @ rotation.mT, *halves)  # (n,) each
+            view[:, :3, 3] = -(rotation @ centre)
+            view[:, 2, 3] += away
+            scale = scale[:, None]
         if MODELS[self.model].parallel:
             Ks = Ks.clone()
-            Ks[:, (0, 1), (0, 1)] /= side
-        return self._changed(viewmats=view, Ks=Ks, frame=Frame.WORLD)
+            Ks[:, (0, 1), (0, 1)] /= scale
+        return self._changed(viewmats=view, Ks=Ks, frame=Frame.WORLD, fitted=None)
 
     def shifted(self, dx: float, dy: float, sample: int | None = None) -> Camera:
         """Returns the camera whose rays go through (dx, dy) pixels right of and below the centres
@@ -375,6 +435,33 @@ class Camera:
 
 
 _ROWS = ("viewmats", "Ks", "radial_coeffs", "max_angle")  # a row a camera
+_CORNERS = list(itertools.product((0, 1), repeat=3))
+
+
+def upward(where: str, up: Up) -> Tensor:
+    """Returns the direction that is up, (3,) float64, of a name such as "+z" or of three numbers;
+    raises ValueError where it is neither, or zero.
+    """
+    if isinstance(up, str):
+        if up not in DIRECTIONS:
+            known = ", ".join(DIRECTIONS)
+            raise ValueError(f"{where}: up must be one of {known} or three numbers, got {up!r}")
+        at, sign = divmod(DIRECTIONS.index(up), 2)
+        return torch.eye(3, dtype=torch.float64)[at] * (1 - 2 * sign)
+    direction = torch.tensor(check.triple(where, "up", up), dtype=torch.float64)
+    if not bool(direction.any()):
+        raise ValueError(f"{where}: up must not be zero")
+    return direction
+
+
+def _axes_around(up: Tensor) -> Tensor:
+    """(3, 3): where x, y and z of an orbit around +y point to if another direction is up."""
+    up = up / up.norm()
+    right = torch.zeros_like(up)
+    right[int(up[0].abs() > 0.9)] = 1
+    right = right - (right @ up) * up
+    right = right / right.norm()
+    return torch.stack((right, up, torch.linalg.cross(right, up)))
 
 
 def _batch(where: str, **values: tuple[Any, tuple[int, ...]]) -> list[Tensor]:

@@ -17,6 +17,8 @@ from ..base.records import Rays
 CameraModel = Literal["pinhole", "ortho", "fisheye", "panorama"]
 _NEWTON = 20  # steps; each halves the bracket where Newton's leaves it
 _ROUNDING = 1 + 1e-12  # of the edges of fisheye and panorama
+_NEAREST = math.radians(45)  # half the angle that a box spans from where a wide view shows it
+_CLEAR = 1.02  # of the distance of a parallel camera's eye from the nearest corner
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,24 @@ class Model(ABC):
         length = 0.5 * height / math.tan(0.5 * fov)
         return length, length
 
+    def fit(self, corners: Tensor, half_x: float, half_y: float) -> tuple[Tensor, Tensor]:
+        """Returns from how far the corners of a box are in the picture, and the distance that a
+        parallel camera's focal lengths are divided by, (n,) each.
+
+        Args:
+            corners: (n, 8, 3) from the box's centre, along the camera's axes.
+            half_x: Half of the width that they may take, on the image plane at distance 1.
+            half_y: Half of the height.
+        """
+        across, depth = self.reach(corners, half_x, half_y), corners[..., 2]
+        away = (across - depth).amax(1)
+        return away, away
+
+    def reach(self, corners: Tensor, half_x: float, half_y: float) -> Tensor:
+        """Returns the depth (n, 8) at which corners lie on the edge of what they may take."""
+        x, y, _ = corners.abs().unbind(-1)
+        return torch.maximum(x / half_x, y / half_y)
+
     @abstractmethod
     def rays(self, plane: Plane) -> Rays:
         """Returns the rays through places of the image plane."""
@@ -117,6 +137,11 @@ class Ortho(Model):
 
     parallel = True
 
+    def fit(self, corners: Tensor, half_x: float, half_y: float) -> tuple[Tensor, Tensor]:
+        """The eye stands in front of the box, however small the scale is."""
+        scale = self.reach(corners, half_x, half_y).amax(1)
+        return torch.maximum(scale, _CLEAR * corners[..., 2].abs().amax(1)), scale
+
     def rays(self, plane: Plane) -> Rays:
         rotation = plane.rotation
         across = plane.x[..., None] * rotation[:, None, 0]
@@ -137,6 +162,10 @@ class Fisheye(Model):
     def focal(self, fov: float, width: int, height: int) -> tuple[float, float]:
         """A unit of the image plane is a radian."""
         return height / fov, height / fov
+
+    def reach(self, corners: Tensor, half_x: float, half_y: float) -> Tensor:
+        """All within a cone: a straight edge between two places of it does not leave it."""
+        return corners[..., :2].norm(dim=-1) / math.tan(min(half_x, half_y, _NEAREST))
 
     def rays(self, plane: Plane) -> Rays:
         x, y = plane.x, plane.y[:, None]
@@ -163,6 +192,11 @@ class Panorama(Model):
     def focal(self, fov: float, width: int, height: int) -> tuple[float, float]:
         """A unit of the image plane is a radian; a picture shows twice the angle across."""
         return width / (2 * fov), height / fov
+
+    def reach(self, corners: Tensor, half_x: float, half_y: float) -> Tensor:
+        """Within a frustum, from which a straight edge does not bulge as from a band of angles."""
+        slopes = (math.tan(min(half, _NEAREST)) for half in (half_x, half_y))
+        return super().reach(corners, *slopes)
 
     def rays(self, plane: Plane) -> Rays:
         latitude = plane.y[:, None].expand(-1, plane.x.shape[-1])

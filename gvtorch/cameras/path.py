@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from .camera import Camera
+from .camera import Camera, Up, upward
 from .models import CameraModel, model_of
 
 _UP, _FOV = (0.0, 1.0, 0.0), 30.0  # of keys that have none
@@ -68,26 +68,49 @@ class CameraPath:
         *,
         azimuth: float = 30.0,
         elevation: float = 20.0,
-        distance: float = 2.4,
+        distance: float | None = None,
+        up: Up = "+y",
+        fit: tuple[int, int] | None = None,
     ) -> CameraPath:
-        """Goes once around a box (2, 3); see `Camera.orbit` for the numbers. If left out, the field
-        of view is the model's own.
+        """Goes once around a box (2, 3); see `Camera.orbit` for the numbers.
+
+        Args:
+            box: World.
+            model: Name of the camera model.
+            fov: Degrees; the model's own if left out.
+            azimuth, elevation, distance, up: Of the start.
+            fit: (width, height) of pictures in which the whole box is all the way around: finds
+                the distance, which stays the same.
+
+        Raises:
+            ValueError: As `Camera.orbit`.
         """
-        fov = model_of("CameraPath.orbit", model).fov if fov is None else fov
+        where = "CameraPath.orbit"
+        fov = model_of(where, model).fov if fov is None else fov
         turn = azimuth + torch.linspace(0, 360, 37)
-        cameras = Camera.orbit(turn, elevation, distance, width=1, height=1).placed(box)
-        rotation, move = cameras.viewmats[:, :3, :3], cameras.viewmats[:, :3, 3:]
-        eye = -(rotation.mT @ move)[..., 0]
+        if fit is not None:
+            if distance is not None:
+                raise ValueError(f"{where}: fit finds the distance: leave it out, got {distance}")
+            seen = Camera.orbit(turn, elevation, None, fov, *fit, model, up=up, fit=True)
+            farthest = (box.mean(0) - _places(seen.placed(box))).norm(dim=1).amax()
+            distance = float(farthest / (box[1] - box[0]).max())
+        cameras = Camera.orbit(turn, elevation, distance, width=1, height=1, up=up).placed(box)
+        eye = _places(cameras)
         center = box.mean(0).expand_as(eye)
-        return cls(eye.tolist(), center.tolist(), fov=[fov] * len(eye))
+        ups = [upward(where, up).tolist()] * len(eye)
+        return cls(eye.tolist(), center.tolist(), ups, [fov] * len(eye))
 
     @classmethod
-    def from_json(cls, path: str | Path) -> CameraPath:
+    def from_json(
+        cls, path: str | Path, *, up: Up | None = None, fov: float | None = None
+    ) -> CameraPath:
         """Reads a list of keys: [{"eye": [x, y, z], "target": [x, y, z], "up": ..., "fov": ...}].
+        `up` and `fov` are of keys that have none; +y and 30 degrees if left out.
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: The file holds something else; the message names the file.
+            ValueError: The file holds something else, or every key has its own up, or fov, and one
+                is given; the message names the file.
         """
         keys = check.json_file("camera path", path)
         if not isinstance(keys, list) or not all(isinstance(key, Mapping) for key in keys):
@@ -98,7 +121,14 @@ class CameraPath:
             if unknown or missing:
                 what = f"unknown {unknown[0]!r}" if unknown else f"{missing[0]!r} is missing"
                 raise ValueError(f"{path}: key {number}: {what}")
-        full = [{"up": _UP, "fov": _FOV, **key} for key in keys]
+        for name, value in (("up", up), ("fov", fov)):
+            if value is not None and all(name in key for key in keys):
+                raise ValueError(f"{path}: each key has its own {name}: leave out {name}={value}")
+        others = {
+            "up": _UP if up is None else upward("CameraPath", up).tolist(),
+            "fov": _FOV if fov is None else fov,
+        }
+        full = [{**others, **key} for key in keys]
         try:
             return cls(*([key[name] for key in full] for name in ("eye", "target", "up", "fov")))
         except ValueError as error:
@@ -127,3 +157,9 @@ class CameraPath:
         line = b + 0.5 * t * (c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a)))
         eye, target, up, fov = line[:3], line[3:6], line[6:9], float(line[9])
         return Camera.look_at(eye, target, up, fov, width, height, model)
+
+
+def _places(cameras: Camera) -> Tensor:
+    """(n, 3) world places of cameras."""
+    rotation, move = cameras.viewmats[:, :3, :3], cameras.viewmats[:, :3, 3:]
+    return -(rotation.mT @ move)[..., 0]

@@ -167,6 +167,11 @@ class LevelReader:
         data = self._inside(level, start, stop, deadline)
         return np.ascontiguousarray(boxes.repeat_edges(data, start, low, high))
 
+    def stored(self, level: int) -> int:
+        """Returns the coarsest level up to `level` that is read without averaging finer ones."""
+        plain = [n for n, plan in enumerate(self._plans[: level + 1]) if plan and max(plan[1]) == 1]
+        return plain[-1]
+
     def _inside(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         plan = self._plans[level]
         if plan is None:

@@ -210,6 +210,10 @@ class Store:
         """(x, y, z) voxels of a level, 0 the finest."""
         return self.layout.shape(self._checked(level))[::-1]
 
+    def stored_level(self, level: int) -> int:
+        """Coarsest level up to this one that lies on disk, and is not averaged when it is read."""
+        return self._levels.stored(self._checked(level))
+
     def block_grid(self, level: int) -> tuple[int, int, int]:
         """(z, y, x) number of blocks of a level."""
         return self.layout.grid(self._checked(level), self.block)

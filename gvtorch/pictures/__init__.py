@@ -4,6 +4,7 @@ from .background import Backdrop, Environment, Gradient
 from .files import read_image
 from .picture import Picture
 from .progressive import Progressive, render_tiles
+from .video import Video
 
 __all__ = [
     "Backdrop",
@@ -11,6 +12,7 @@ __all__ = [
     "Gradient",
     "Picture",
     "Progressive",
+    "Video",
     "read_image",
     "render_tiles",
 ]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -17,31 +17,9 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..base import check
+from .preset_files import read_points
+from .presets import CT_PRESETS, Points, named
 from .shader import ColorTable, Sampling, Shader
-
-Points = Sequence[Sequence[float]]
-
-#: Presets over [0, 1], which stands for the range of the data: opacity (v, a) and colour (v, r, g,
-#: b).
-PRESETS: dict[str, tuple[Points, Points]] = {
-    "gray": ([(0, 0), (0.05, 0), (1, 0.5)], [(0, 0, 0, 0), (1, 1, 1, 1)]),
-    "hot": (
-        [(0, 0), (0.1, 0), (0.4, 0.05), (1, 0.6)],
-        [(0, 0.1, 0, 0), (0.35, 0.9, 0.1, 0), (0.7, 1, 0.6, 0.05), (1, 1, 1, 0.8)],
-    ),
-    "vessels": (
-        [(0, 0), (0.15, 0), (0.3, 0.25), (0.6, 0.9), (1, 0.95)],
-        [(0, 0.3, 0.02, 0.02), (0.3, 0.55, 0.05, 0.03), (0.6, 0.9, 0.45, 0.25), (1, 1, 0.95, 0.8)],
-    ),
-    "bone": (
-        [(0, 0), (0.45, 0), (0.55, 0.02), (0.65, 0.4), (1, 0.9)],
-        [(0, 0.3, 0.1, 0.05), (0.5, 0.6, 0.25, 0.15), (0.65, 0.9, 0.8, 0.6), (1, 1, 1, 0.95)],
-    ),
-    "tissue": (
-        [(0, 0), (0.3, 0), (0.45, 0.03), (0.6, 0.2), (0.8, 0.8), (1, 0.9)],
-        [(0, 0.4, 0.15, 0.1), (0.3, 0.8, 0.4, 0.25), (0.6, 0.95, 0.75, 0.5), (1, 1, 1, 0.95)],
-    ),
-}
 
 _KEPT = 8  # tables of a function
 # Cells of a table.
@@ -63,7 +41,10 @@ class TransferFunction(Shader):
         opacity: (k, 2) float64 points (value, alpha per reference length).
         color: (k, 4) float64 points (value, linear r, g, b).
         reference: World units, or None for the smallest spacing of what is rendered.
+        relative: Whether values have no meaning before the function is `stretched` over data.
     """
+
+    relative = False
 
     def __init__(
         self, opacity: Points, color: Points = ((0, 1, 1, 1),), reference: float | None = None
@@ -117,19 +98,74 @@ class TransferFunction(Shader):
             raise ValueError(f"{path}: {error}") from None
 
     @classmethod
-    def preset(cls, name: str, low: float, high: float) -> TransferFunction:
-        """Stretches a named preset over the data range [low, high]; raises ValueError where the
-        name is unknown.
+    def from_file(cls, path: str | Path, name: str | None = None) -> TransferFunction:
+        """Reads what `save` wrote, or a preset of another program: ParaView's .json, 3D Slicer's
+        .vp, .vp.json or presets.xml. Their colours are sRGB and become linear; what is not kept
+        (shading, opacity by gradient) is told in a warning. ParaView's values are often only
+        relative: `stretched` fits them to data.
+
+        Args:
+            path: The file.
+            name: Which preset, where the file has several.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: It is no such file, has no such preset, or its points are refused.
         """
-        if name not in PRESETS:
-            raise ValueError(f"unknown preset {name!r}; known: {', '.join(sorted(PRESETS))}")
+        if str(path).endswith(".json") and Path(path).is_file():
+            content = check.json_file("transfer function file", path)
+            if not isinstance(content, list) and _is_own(content):
+                if name is not None:
+                    raise ValueError(f"{path}: holds one function, without a name: leave it out")
+                return cls.from_json(path)
+        (opacity, color), reference, relative = read_points(path, name)
+        try:
+            function = cls(opacity, color, reference)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+        function.relative = relative
+        return function
+
+    @classmethod
+    def preset(
+        cls, name: str, low: float | None = None, high: float | None = None
+    ) -> TransferFunction:
+        """Returns a named function, stretched over the values [low, high], as `gv.window` finds
+        them: gray, hot, vessels, bone, tissue, or any colour map of matplotlib. Those in Hounsfield
+        units, ct-bone, ct-soft, ct-lung, ct-vessels, keep their own values if none are given.
+
+        Raises:
+            ValueError: The name is unknown, or the preset needs values.
+        """
+        function = cls(*named(name))
+        if (low is None) != (high is None) or (low is None and name not in CT_PRESETS):
+            raise ValueError(f"preset {name!r} is stretched over values: give low and high")
+        if low is None or high is None:
+            return function
+        return function.stretched(low, high)
+
+    def stretched(self, low: float, high: float) -> TransferFunction:
+        """Returns the function with its first corner point moved to `low` and its last to `high`;
+        where these are equal, a little is added to `high`.
+        """
+        where = "TransferFunction.stretched"
+        low, high = (check.number(where, n, v) for n, v in (("low", low), ("high", high)))
         if not high > low:
             high = low + max(1.0, 1e-6 * abs(low))
-        opacity, color = PRESETS[name]
-        return cls(
-            [(low + v * (high - low), a) for v, a in opacity],
-            [(low + point[0] * (high - low), *point[1:]) for point in color],
-        )
+        first, last, _ = self.corners()
+        parts = []
+        for points in (self.opacity, self.color):
+            values = low + (points[:, :1] - first) / (last - first) * (high - low)
+            parts.append(np.concatenate((values, points[:, 1:]), 1))
+        return type(self)(parts[0].tolist(), parts[1].tolist(), self.reference)
+
+    def save(self, path: str | Path) -> None:
+        """Writes the .json that `from_file` reads; raises ValueError where the path ends in
+        something else.
+        """
+        if Path(path).suffix != ".json":
+            raise ValueError(f"TransferFunction.save: path must end in .json, got {str(path)!r}")
+        Path(path).write_text(self.to_json() + "\n", encoding="utf-8")
 
     def to_json(self) -> str:
         """Returns the text that `from_json` reads."""
@@ -283,6 +319,11 @@ def _common_cells(places: Iterable[float], most: int, tolerance: float = math.in
         if cells > most or abs(float(fraction) - place) > tolerance:
             return None
     return cells
+
+
+def _is_own(content: Any) -> bool:
+    """Tells our JSON, also a broken one, from other programs'."""
+    return not isinstance(content, dict) or not {"RGBPoints", "volumeProperties"} & set(content)
 
 
 def _points(name: str, points: Points, width: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The command line: `gvtorch info`, `render`, `fly`, `convert`, `filter` and `bench`.
+"""The command line: `gvtorch info`, `render`, `fly`, `slice`, `convert`, `filter` and `bench`.
 
 torch is imported inside the commands, so that `--help` answers at once. A mistake of the user ends
 in one line on standard error and status 2.
@@ -21,11 +21,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg
 
+from ..base.declared import did_you_mean
 from ..io.ngff import is_zarr
 from .bench import Bench
-from .common import Bar, ReadOptions, refuse_for_store, volume_formats
+from .common import Bar, ReadOptions, given, refuse_for_store, volume_formats
 from .fly import Fly
 from .render import Render
+from .slice import Slice
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -44,6 +46,9 @@ class Info:
     def run(self) -> None:
         """Prints the answer."""
         if self.path is None:
+            flags = given(self.source)
+            if flags:
+                raise ValueError(f"{flags[0]} is for volume files: name one")
             content = installation()
         elif is_zarr(self.path):
             from ..io.store import Store
@@ -140,9 +145,10 @@ class Filter:
 
     store: Positional[Annotated[Path, arg(metavar="STORE.zarr")]]
     """a store that gvtorch convert made; its voxels are read and stay as they are"""
-    tf: Annotated[str, arg(metavar="FILE|PRESET")] = "gray"
-    """transfer function that the colours are made with: a JSON file, or a preset over the data's
-    range: gray, hot, vessels, bone, tissue"""
+    tf: Annotated[str | None, arg(metavar="FILE|PRESET")] = None
+    """transfer function that the colours are made with, as of gvtorch render; gray if left out"""
+    window: Annotated[str | None, arg(metavar="LO,HI")] = None
+    """values that it is stretched over, as of gvtorch render"""
     component: Annotated[int, arg(metavar="N")] = 0
     """which number of a voxel is shown"""
     directions: Literal["auto", "six", "one"] = "auto"
@@ -157,17 +163,17 @@ class Filter:
         from ..io.store import Store
         from ..ops import available
         from ..shaders import Filtered
-        from .look import parse_transfer
-        from .streaming import value_range
+        from .colors import chosen_transfer
 
         on_cuda = self.backend == "cuda" or (self.backend is None and not available()["cuda"])
         start, store = time.perf_counter(), Store.open(self.store)
         before = store.describe()["disk bytes"]
         with Bar() as bar:
+            transfer = chosen_transfer(self.tf, self.window, store, self.component)
             for moment in range(store.times):
                 Filtered.add_to(
                     store if moment == 0 else Store.open(self.store, time=moment),
-                    parse_transfer(self.tf, *value_range(store)),
+                    transfer,
                     component=self.component,
                     directions={"auto": None, "six": True, "one": False}[self.directions],
                     device="cuda" if on_cuda else "cpu",
@@ -243,21 +249,55 @@ def _sparkline(counts: list[int]) -> str:
     return "".join(" ▁▂▃▄▅▆▇█"[math.ceil(8 * math.log1p(count) / most)] for count in counts)
 
 
+_COMMANDS: dict[str, Any] = {
+    **{"info": Info, "render": Render, "fly": Fly, "slice": Slice, "convert": Convert},
+    **{"filter": Filter, "bench": Bench},
+}
+
+
+def _told(said: str) -> str:
+    """The parser's box on a mistake as one line; what an unknown flag may mean goes in brackets."""
+    box = re.sub(r"╭.*╮|[^\x20-\x7e]+|[-+|]{3,}", " ", said)  # and its title
+    words = " ".join(box.split())
+    unknown = re.match(r"Unrecognized options: (--[\w-]+)", words)
+    if unknown is None:
+        return words
+    close = did_you_mean(unknown[1], set(re.findall(r"--[\w-]+", words)) - {unknown[1], "--help"})
+    first = re.split(r" Perhaps you meant| Available subcommands| For full helptext", words)[0]
+    return f"{first}{close}; gvtorch COMMAND --help tells all"
+
+
+def _joined(args: list[str]) -> list[str]:
+    """The arguments with values that begin with a minus joined to their flags, as in `--up -z` and
+    `--at -4mm`, which the parser would take for flags.
+    """
+    joined: list[str] = []
+    for word in args:
+        value = re.fullmatch(r"-([xyz]|\.?\d.*)", word)
+        if value and joined and re.fullmatch(r"--[a-z][\w-]*", joined[-1]):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
+
+
 def main(args: list[str] | None = None) -> None:
     """Runs the command line and ends the process."""
-    if (sys.argv[1:] if args is None else args) == ["--version"]:
+    args = _joined(sys.argv[1:] if args is None else args)
+    if args == ["--version"]:
         from .. import __version__
 
         print(f"gvtorch {__version__}")
         return
+    if args and not args[0].startswith("-") and args[0] not in _COMMANDS:
+        known = f"{', '.join(_COMMANDS)}{did_you_mean(args[0], _COMMANDS)}"
+        print(f"gvtorch: error: unknown command {args[0]!r}; known: {known}", file=sys.stderr)
+        sys.exit(2)
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
             command = tyro.extras.subcommand_cli_from_dict(
-                {
-                    **{"info": Info, "render": Render, "fly": Fly, "convert": Convert},
-                    **{"filter": Filter, "bench": Bench},
-                },
+                _COMMANDS,
                 args=args,
                 prog="gvtorch",
                 description="GigaVoxels on PyTorch tensors.",
@@ -265,9 +305,7 @@ def main(args: list[str] | None = None) -> None:
             )
     except SystemExit as end:
         if end.code:
-            box = re.sub(r"╭.*╮|[^\x20-\x7e]+|[-+|]{3,}", " ", said.getvalue())  # and its title
-            words = " ".join(box.split())
-            print(f"gvtorch: error: {words}", file=sys.stderr)
+            print(f"gvtorch: error: {_told(said.getvalue())}", file=sys.stderr)
         raise
     warnings.showwarning = lambda message, *_rest, **_more: print(
         f"gvtorch: {message}", file=sys.stderr

@@ -1,4 +1,4 @@
-"""`gvtorch fly`: a picture a frame along a path through a store, or a video."""
+"""`gvtorch fly`: a picture a frame along a path through a volume or a store, or a film."""
 
 from __future__ import annotations
 
@@ -11,101 +11,138 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from tyro.conf import Positional, arg
 
-from .common import Bar, ReadOptions, numbers, refuse_for_store, size
-from .look import Look
-from .streaming import Streaming, tell_failures
+from ..base.declared import declared_names
+from .common import Bar, size, volume_formats
+from .look import parse_orbit
+from .scene import SceneFlags
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from ..cameras.path import CameraPath
-    from ..engine.engine import Engine
+
+_FILMS = tuple(declared_names("pictures.video", "FILMS"))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fly:
-    """Fly through a store: a picture a frame, and what each cost."""
+    """Fly around or through a volume or a store: a picture a frame, or a film."""
 
-    path: Positional[Annotated[str, arg(metavar="STORE.zarr")]]
-    """the store, a folder or a URL"""
+    path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {volume_formats()}")]]
     output: Annotated[Path, arg(aliases=["-o"], metavar="DIR|OUT.mp4")]
-    """a folder for 0000.png, 0001.png, ..., or a video"""
+    """a film, .mp4, or .gif or .webp, which loop; or a folder for 0000.png, 0001.png, ..."""
     flight: Annotated[str, arg(name="path", metavar="orbit|FILE.json")] = "orbit"
     """once around, or keys [{"eye": [x, y, z], "target": [x, y, z], "up": ..., "fov": ...}]"""
-    frames: Annotated[int, arg(metavar="N")] = 100
-    """number of pictures"""
-    fps: Annotated[int, arg(metavar="N")] = 25
-    """pictures a second of a video"""
-    orbit: Annotated[str, arg(metavar="AZ,EL,DIST")] = "30,20,2.4"
-    """where an orbit starts: degrees, and largest sides of the box"""
+    turntable: Annotated[float | None, arg(metavar="SECONDS")] = None
+    """an orbit that takes so long: instead of --frames"""
+    frames: Annotated[int | None, arg(metavar="N")] = None
+    """number of pictures; 100 if left out"""
+    fps: Annotated[int | None, arg(metavar="N")] = None
+    """pictures a second of a film or a turntable; 25 if left out"""
+    orbit: Annotated[str | None, arg(metavar="AZ,EL[,DIST]")] = None
+    """where an orbit starts: degrees, and largest sides of the box; 30,20 if left out, and all of
+    the box in each picture"""
     stats: Annotated[Path | None, arg(metavar="FILE.jsonl")] = None
     """one JSON line a frame; stats.jsonl beside the pictures if left out"""
-    look: tyro.conf.OmitArgPrefixes[Look] = Look()
-    streaming: tyro.conf.OmitArgPrefixes[Streaming] = Streaming()
-    source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
+    scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()
 
     def run(self) -> None:
         """Renders frame after frame."""
-        from ..base import check
-        from .video import Video
+        from ..pictures import Video
 
-        width, height = size(self.look.size)
-        check.whole("fly", "--frames", self.frames, low=1)
-        check.whole("fly", "--fps", self.fps, low=1, high=1000)
-        options, is_video = self.look.options(), self.output.suffix == ".mp4"
+        look = self.scene.look
+        width, height = size(look.size)
+        frames, fps = self._length()
+        options, is_film = look.options(), self.output.suffix in _FILMS
         if not self.output.parent.is_dir():
             raise FileNotFoundError(f"folder not found: {self.output.parent}")
-        if self.output.suffix and not is_video:
-            raise ValueError(f"--output must be a folder or end in .mp4, got {str(self.output)!r}")
-        start = numbers("--orbit", self.orbit, 3, float)
+        if self.output.suffix and not is_film:
+            kinds = ", ".join(_FILMS)
+            raise ValueError(
+                f"--output must be a folder or end in {kinds}, got {str(self.output)!r}"
+            )
+        if is_film and options["background"] is None:
+            raise ValueError(f"--background transparent is for pictures, not {self.output.suffix}")
+        self._check_path()
         with ExitStack() as stack:
             bar = stack.enter_context(Bar())
-            bar("reading", 0, 0)
-            refuse_for_store(self.source)
-            opened = self.streaming.open(self.path, self.look, self.source.time or 0)
-            engine, shader = stack.enter_context(opened)
-            path = self._path(engine, start)
-            video = None
-            if is_video:
-                video = stack.enter_context(Video(self.output, width, height, fps=self.fps))
+            film = Video(self.output, width, height, fps=fps) if is_film else None
+            scene = stack.enter_context(self.scene.open(self.path, options, bar))
+            path = self._path(scene.box, width, height)
+            if film is not None:
+                stack.enter_context(film)
             else:
                 self.output.mkdir(exist_ok=True)
             lines = stack.enter_context(self._stats_file().open("w", encoding="utf-8"))
-            for number in range(self.frames):
-                place = number / max(1, self.frames - 1 + (self.flight == "orbit"))
-                picture = engine.render(
-                    *(path.camera(place, width, height, self.look.camera_model), shader),
-                    self.streaming.mode or "balanced",
-                    max_frames=self.streaming.max_frames,
-                    **options,
-                )
+            for number in range(frames):
+                bar("frames", number, frames)
+                place = number / max(1, frames - 1 + (self.flight == "orbit"))
+                picture = scene.render(path.camera(place, width, height, look.camera_model))
                 lines.write(json.dumps({"picture": number, **picture.stats.as_dict()}) + "\n")
-                if video is not None:
-                    video.add(picture)
+                if film is not None:
+                    film.add(picture)
                 else:
                     picture.save(self.output / f"{number:04d}.png")
-                bar("frames", number + 1, self.frames)
-            tell_failures(engine)
-            report = engine.report()
-        from rich.console import Console
+            bar("frames", frames, frames)
+            report = scene.engine.report() if scene.engine is not None else None
+        if report is not None:
+            from rich.console import Console
 
-        Console().print(report)
-        print(f"{self.output}: {self.frames} pictures; what each cost: {self._stats_file()}")
+            Console().print(report)
+        print(f"{self.output}: {frames} pictures; what each cost: {self._stats_file()}")
+
+    def _length(self) -> tuple[int, int]:
+        """Number of pictures, and pictures a second."""
+        from ..base import check
+
+        fps = check.whole("fly", "--fps", 25 if self.fps is None else self.fps, low=1, high=1000)
+        if self.turntable is None:
+            if self.fps is not None and self.output.suffix not in _FILMS:
+                raise ValueError("--fps is for a film or --turntable: pictures have no speed")
+            return check.whole(
+                "fly", "--frames", self.frames or 100 * (self.frames is None), low=1
+            ), fps
+        if self.frames is not None:
+            raise ValueError("--turntable and --frames both tell how many pictures: leave one out")
+        if self.flight != "orbit":
+            raise ValueError("--turntable goes once around: not with --path FILE.json")
+        seconds = check.number("fly", "--turntable", self.turntable, low=0, open_low=True)
+        return max(1, round(seconds * fps)), fps
 
     def _stats_file(self) -> Path:
         if self.stats is not None:
             return self.stats
-        if self.output.suffix == ".mp4":
+        if self.output.suffix in _FILMS:
             return self.output.with_suffix(".jsonl")
         return self.output / "stats.jsonl"
 
-    def _path(self, engine: Engine, start: list[float]) -> CameraPath:
+    def _check_path(self) -> None:
+        """Raises what is wrong with the path before the volume is read."""
+        if self.flight != "orbit":
+            if self.orbit is not None:
+                raise ValueError("--orbit is for --path orbit, not for keys")
+            self._keys()
+        elif self.orbit is not None:
+            parse_orbit("--orbit", self.orbit)
+
+    def _keys(self) -> CameraPath:
+        from ..cameras.path import CameraPath
+
+        look = self.scene.look
+        return CameraPath.from_json(self.flight, up=look.upward(), fov=look.fov)
+
+    def _path(self, box: Tensor, width: int, height: int) -> CameraPath:
         from ..cameras.path import CameraPath
 
         if self.flight != "orbit":
-            return CameraPath.from_json(self.flight)
-        azimuth, elevation, distance = start
+            return self._keys()
+        azimuth, elevation, distance = parse_orbit("--orbit", self.orbit or "30,20")
+        look = self.scene.look
         return CameraPath.orbit(
-            *(engine.box, self.look.camera_model, self.look.fov),
+            *(box, look.camera_model, look.fov),
             azimuth=azimuth,
             elevation=elevation,
             distance=distance,
+            up=look.upward() or "+y",
+            fit=(width, height) if distance is None else None,
         )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
-from .common import numbers
+from .common import given, numbers
 
 if TYPE_CHECKING:
     from ..cameras import Camera
@@ -29,6 +29,10 @@ class Develop:
     """curve from scene light to the display"""
     exposure: Annotated[float, arg(metavar="STOPS")] = 0.0
     """the light is multiplied by 2^STOPS"""
+
+    def given(self) -> list[str]:
+        """Flags that differ from what they are if left out."""
+        return given(self)
 
     def wrap(self, render: Callable[[Camera], Picture]) -> Callable[[Camera], Picture]:
         """Returns what renders a camera with all samples, tone-mapped."""

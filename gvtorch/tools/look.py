@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
 from ..base.declared import declared_names
+from .colors import check_component, chosen_transfer
 from .common import numbers
 from .image import parse_background
 from .light import parse_lighting
@@ -16,15 +16,20 @@ from .light import parse_lighting
 if TYPE_CHECKING:
     import torch
 
+    from ..base.volume import Volume
     from ..cameras import Camera
+    from ..cameras.camera import Up
     from ..cameras.models import CameraModel
-    from ..shaders import Shader, TransferFunction
+    from ..io.store import Store
+    from ..shaders import Shader
     from ..tracing import Clip, ThinLens
 
     ShaderName = str
 else:
     CameraModel = str  # checked by the camera, since its module would load torch
     ShaderName = Literal[(*declared_names("shaders.built_in", "BY_NAME"), "filtered")]
+
+_WHOLE = ("isosurface", "maximum", "minimum", "mean")  # see one value, or a whole ray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,9 +42,16 @@ class Look:
     """vertical field of view; 30, or 180 of a fisheye or panorama, if left out"""
     size: Annotated[str, arg(metavar="WxH")] = "512x512"
     """pixels"""
+    up: Annotated[str | None, arg(metavar="+z|X,Y,Z")] = None
+    """direction that is up in the picture; +y if left out"""
     tf: Annotated[str | None, arg(metavar="FILE|PRESET")] = None
-    """transfer function: a JSON file, or a preset over the data's range: gray, hot, vessels, bone,
-    tissue; gray if left out, or the function of a store's filtered colours"""
+    """transfer function: gray, hot, vessels, bone or tissue; ct-bone, ct-soft, ct-lung or
+    ct-vessels (Hounsfield units); a colour map of matplotlib; a file of gvtorch, ParaView or 3D
+    Slicer (.json, .vp, .xml), or one preset of it, FILE:NAME; gray if left out, or the function of
+    a store's filtered colours"""
+    window: Annotated[str | None, arg(metavar="LO,HI")] = None
+    """values that it is stretched over: LO,HI; P%,P%, percentiles; full, the range; or auto, by the
+    histogram without its background, as for presets and colour maps if left out"""
     shader: ShaderName = "plain"
     """what is made of the values; filtered: plain, but right from afar (stores: gvtorch filter)"""
     value: Annotated[float | None, arg(metavar="VALUE")] = None
@@ -75,6 +87,8 @@ class Look:
 
     def options(self) -> dict[str, Any]:
         """Fields of `RenderOptions`."""
+        if self.shader in _WHOLE and self.stop_alpha != Look().stop_alpha:
+            raise ValueError(f"--stop-alpha is for what adds up along a ray, not for {self.shader}")
         return {
             "step": self.step,
             "lod": self.lod,
@@ -99,52 +113,62 @@ class Look:
         choose_backend(self.backend, device)
         return device
 
-    def chosen(self, low: float, high: float) -> Shader:
-        """Returns the shader asked for, its transfer function read or spanned over the range."""
-        from ..shaders import Filtered
+    def upward(self) -> Up | None:
+        """What `--up` tells."""
+        if self.up is None or (self.up[:1] in ("+", "-") and self.up[1:].isalpha()):
+            return self.up
+        return numbers("--up", self.up, 3, float)
+
+    def chosen(self, data: Volume | Store) -> Shader:
+        """Returns the shader asked for, its transfer function read, or spanned over the data."""
+        from ..shaders import Filtered, TransferFunction
         from ..shaders.built_in import BY_NAME
 
-        transfer = parse_transfer(self.tf or "gray", low, high)
         if (self.value is None) == (self.shader == "isosurface"):
             raise ValueError("--value and --shader isosurface belong together")
+        if self.shader == "isosurface":
+            for flag, given in (("--tf", self.tf), ("--window", self.window)):
+                if given is not None:
+                    raise ValueError(f"{flag} is for values: an isosurface has one")
+            check_component(data, self.component)
+            return BY_NAME[self.shader](TransferFunction([(0, 1)]), self.value or 0.0)
+        transfer = chosen_transfer(self.tf, self.window, data, self.component)
         if self.shader == "filtered":  # its colours are made with the tree
             return Filtered(transfer, component=self.component)
-        return BY_NAME[self.shader](transfer, self.value or 0.0)
+        return BY_NAME[self.shader](transfer, 0.0)
 
 
-def parse_transfer(text: str, low: float, high: float) -> TransferFunction:
-    """Reads a transfer function from a JSON file, or spans a preset over the range."""
-    from ..shaders import TransferFunction
+def parse_orbit(flag: str, text: str) -> tuple[float, float, float | None]:
+    """Returns azimuth, elevation and distance of AZ,EL, AZ,EL,fit or AZ,EL,DIST; the distance is
+    None where the box is to fit; raises ValueError if the text is something else.
+    """
+    if text.count(",") == 1 or text.endswith(",fit"):
+        azimuth, elevation = numbers(flag, text.removesuffix(",fit"), 2, float)
+        return azimuth, elevation, None
+    azimuth, elevation, distance = numbers(flag, text, 3, float)
+    return azimuth, elevation, distance
 
-    if text.endswith(".json") or Path(text).is_file():
-        return TransferFunction.from_json(text)
-    return TransferFunction.preset(text, low, high)
 
-
-def parse_camera(
-    text: str,
-    up: str,
-    fov: float | None,
-    width: int,
-    height: int,
-    model: CameraModel = "pinhole",
-) -> Camera:
-    """Makes a camera from `orbit:AZ,EL,DIST` or `look:ex,ey,ez,tx,ty,tz`.
+def parse_camera(text: str, look: Look, width: int, height: int) -> Camera:
+    """Makes a camera from `orbit:AZ,EL`, `orbit:AZ,EL,DIST` or `look:ex,ey,ez,tx,ty,tz`.
 
     Raises:
-        ValueError: The text is neither, or a number is out of its range.
+        ValueError: The text is none of these, or a number is out of its range.
     """
     from ..cameras import Camera
 
+    up, shape = look.upward() or "+y", (look.fov, width, height, look.camera_model)
     kind, _, rest = text.partition(":")
     if kind == "orbit":
-        azimuth, elevation, distance = numbers("--camera orbit", rest, 3, float)
-        return Camera.orbit(azimuth, elevation, distance, fov, width, height, model)
+        azimuth, elevation, distance = parse_orbit("--camera orbit", rest)
+        fit = distance is None
+        return Camera.orbit(azimuth, elevation, distance, *shape, up=up, fit=fit)
     if kind == "look":
         values = numbers("--camera look", rest, 6, float)
-        upward = numbers("--up", up, 3, float)
-        return Camera.look_at(values[:3], values[3:], upward, fov, width, height, model)
-    raise ValueError(f"--camera must be orbit:AZ,EL,DIST or look:ex,ey,ez,tx,ty,tz, got {text!r}")
+        return Camera.look_at(values[:3], values[3:], up, *shape)
+    raise ValueError(
+        f"--camera must be orbit:AZ,EL, orbit:AZ,EL,DIST or look:ex,ey,ez,tx,ty,tz, got {text!r}"
+    )
 
 
 def parse_clip(text: str) -> Clip:

@@ -6,20 +6,17 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from tyro.conf import arg
 
-from .common import check_component
 from .look import Look
 
 if TYPE_CHECKING:
     from ..base.records import RenderStats
     from ..engine import Engine, FrameStats
     from ..shaders import Shader
-
-_RANGE_VOXELS = 128**3  # of a foreign image that are read to learn its range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +30,7 @@ class Streaming:
     host_cache: Annotated[str, arg(metavar="BYTES")] = "512 MB"
     """memory of decoded blocks"""
     mode: Literal["interactive", "balanced", "converge"] | None = None
-    """one frame, a few, or until nothing is missing"""
+    """one frame, a few, or until nothing is missing, as if left out"""
     max_frames: Annotated[int, arg(metavar="N")] = 1000
     """most frames of a picture that converges"""
     loading: Literal["straight", "levels"] = "straight"
@@ -51,9 +48,10 @@ class Streaming:
         from ..producers import StoredProducer
         from ..shaders import Filtered
 
+        if self.mode not in (None, "converge") and self.max_frames != type(self)().max_frames:
+            raise ValueError(f"--max-frames is for --mode converge, not {self.mode}")
         store = Store.open(path, image=self.image, time=time)
-        check_component(look.component, store.width, store.info)
-        shader = look.chosen(*value_range(store))
+        shader = look.chosen(store)
         filtered = shader if isinstance(shader, Filtered) else None
         if filtered is not None and look.tf is None:
             shader = filtered = Filtered.stored(store)
@@ -71,25 +69,6 @@ class Streaming:
             device=look.device(),
         ) as engine:
             yield engine, shader
-
-
-def value_range(store: Any) -> tuple[float, float]:
-    """Smallest and largest value of a store. Other people's images do not tell: of them the finest
-    level of at most 128^3 voxels is read, which blurs the extremes a little.
-    """
-    if store.value_range is not None:
-        return (
-            min(low for low, _ in store.value_range),
-            max(high for _, high in store.value_range),
-        )
-    level = 0
-    while level + 1 < store.levels:
-        x, y, z = store.level_extent(level)
-        if x * y * z <= _RANGE_VOXELS:
-            break
-        level += 1
-    data = store.read_region(level, (0, 0, 0), store.level_extent(level)[::-1])
-    return (float(data.min()), float(data.max()))
 
 
 def told(stats: RenderStats) -> str:

@@ -9,5 +9,6 @@ from .options import RenderOptions as RenderOptions
 from .options import RenderSettings as RenderSettings
 from .pixels import render as render
 from .pixels import trace as trace
+from .slices import slice_picture as slice_picture
 from .thin_lens import ThinLens as ThinLens
 from .tree_tracer import TreeTracer as TreeTracer

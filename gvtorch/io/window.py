@@ -1,0 +1,136 @@
+"""`window`: the values that a picture shows dark and bright, from percentiles of the data.
+
+The range of the data seldom serves: one hot voxel pushes all else into the dark, and most of a scan
+is the air around it. Background, where there is any, is the highest peak of the histogram.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import torch
+
+from ..base import check
+from ..base.volume import Volume
+from ..pool.downsample import pool_mean
+from .boxes import Zyx
+from .store import Store
+
+_MOST = 2**22  # voxels that are looked at
+_BOXES = 4  # along each axis, of voxels that stand for all
+_BINS = 64  # of the histogram, at most: values of a scan may have gaps
+_DOMINATES = 0.25  # share of all values that makes the highest peak the background
+_TAIL = 1.0  # percent of the values, at either end of the window, that lie beyond
+
+
+def window(
+    data: Volume | Store,
+    percent: tuple[float, float] | None = None,
+    *,
+    component: int = 0,
+    background: bool = False,
+) -> tuple[float, float]:
+    """Returns the values to show dark and bright: of `TransferFunction.preset`, for one.
+
+    Of large data a coarse level is looked at, of at most 4 million voxels, or boxes of as many in
+    all; a volume and a store made of it have the same window.
+
+    Args:
+        data: A volume, or a store, of which no more than that is read.
+        percent: Percentiles, as in (1, 99), of all values. If left out: from the end of the
+            background, where a quarter of the values or more are around one in the lower half, to
+            the 99th percentile of what lies above; else from the 1st to the 99th of all.
+        component: Which number of a voxel.
+        background: The low end is not that of the background but the 1st percentile of all, as
+            pictures of slices need it.
+
+    Raises:
+        ValueError: There is no such component, or the percentiles are none, or out of order.
+    """
+    if percent is not None:
+        low, high = (check.number("window", "percent", p, low=0, high=100) for p in percent)
+        if low >= high:
+            raise ValueError(f"window: percent must be a low and a high one, got {percent}")
+    width = data.width if isinstance(data, Store) else data.data.shape[3]
+    check.whole("window", "component", component, low=0, high=width - 1)
+    values = _looked_at(data)[..., component].ravel()
+    if percent is not None:
+        return _span(*np.percentile(values, percent))
+    low, high = np.percentile(values, (_TAIL, 100 - _TAIL))
+    edge = _background(values)
+    if edge is not None:
+        low = low if background else edge
+        high = np.percentile(values[values > edge], 100 - _TAIL)
+    return _span(low, high)
+
+
+def value_range(data: Volume | Store) -> tuple[float, float]:
+    """Returns the smallest and the largest value. Other people's images do not tell: of them as
+    much is read as for `window`, which blurs the extremes a little.
+    """
+    if isinstance(data, Volume):
+        return data.value_range
+    if data.value_range is not None:
+        return min(low for low, _ in data.value_range), max(high for _, high in data.value_range)
+    values = _looked_at(data)
+    return float(values.min()), float(values.max())
+
+
+def _span(low: float, high: float) -> tuple[float, float]:
+    """A window that is wider than nothing."""
+    low, high = float(low), float(high)
+    return (low, high) if high > low else (low, low + max(1.0, 1e-6 * abs(low)))
+
+
+def _looked_at(data: Volume | Store) -> np.ndarray:
+    """Values (..., c) that stand for all."""
+    if isinstance(data, Volume):
+        bfloat = data.data.dtype == torch.bfloat16  # which NumPy has not
+        values = (data.data.float() if bfloat else data.data).numpy()
+        while values[..., 0].size > _MOST:
+            values = pool_mean(values, 2)
+        return values
+    sizes = [data.level_extent(level)[::-1] for level in range(data.levels)]
+    level = next((n for n, size in enumerate(sizes) if np.prod(size) <= _MOST), data.levels - 1)
+    level = data.stored_level(level)  # none that would be averaged from all of a finer one
+    parts = [data.read_region(level, *box) for box in _boxes(sizes[level])]
+    return np.concatenate([part.reshape(-1, data.width) for part in parts])
+
+
+def _boxes(size: Zyx) -> list[tuple[Zyx, Zyx]]:
+    """All of a level, or as many voxels of it as are looked at in evenly spaced boxes."""
+    if np.prod(size) <= _MOST:
+        return [((0, 0, 0), size)]
+    share = (_MOST / np.prod(size)) ** (1 / 3)
+    spans = []
+    for n in size:
+        side = max(1, int(n * share / _BOXES))
+        middles = [(2 * at + 1) * n // (2 * _BOXES) for at in range(_BOXES)]
+        spans.append([(max(0, m - side // 2), max(0, m - side // 2) + side) for m in middles])
+    return [
+        (tuple(a for a, _ in box), tuple(b for _, b in box)) for box in itertools.product(*spans)
+    ]
+
+
+def _background(values: np.ndarray) -> float | None:
+    """Where the background ends: beyond the highest peak of the histogram by as much again as it
+    is wide at half its height; None where there is none, or nothing else.
+    """
+    low, high = (float(end) for end in np.percentile(values, (0.01, 99.99)))
+    step = (high - low) / int(np.clip(values.size**0.5 / 2, 16, _BINS))
+    if values.dtype.kind in "iu":
+        step = max(1.0, np.ceil(step))
+    if high > low:
+        bins = int((high - low) / step) + 1
+        counts = np.bincount(np.clip((values - low) / step, 0, bins - 1).astype(np.int64))
+        top = int(counts.argmax())
+        if top > bins / 2:
+            return None
+        beyond = np.flatnonzero(counts[top:] < counts[top] / 2)
+        half = int(beyond[0]) if len(beyond) else bins
+        edge = low + (top + 2 * half - 1) * step
+    else:
+        edge = low
+    share = np.count_nonzero(values <= edge) / values.size
+    return edge if _DOMINATES <= share < 1 else None

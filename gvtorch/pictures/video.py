@@ -1,0 +1,168 @@
+"""`Video`: pictures to a film: H.264 through PyAV, or a GIF or WebP that loops, through Pillow."""
+
+from __future__ import annotations
+
+import itertools
+from abc import ABC, abstractmethod
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from ..base import check
+from .files import whole_file
+from .picture import Picture
+
+FILMS = [".mp4", ".gif", ".webp"]
+_FASTEST_GIF = 50  # pictures a second; viewers slow down what is faster
+_OF_PALETTE = 16  # pictures from which the colours of a GIF are taken
+
+
+class Video:
+    """A film of pictures of one size that appears when it is whole:
+
+    with gv.Video("turn.mp4", 640, 480, fps=25) as video:
+        video.add(picture)
+    """
+
+    def __init__(self, path: str | Path, width: int, height: int, *, fps: int = 25) -> None:
+        """Opens it; .gif and .webp loop, and are in memory until they are written.
+
+        Args:
+            path: The file: .mp4, .gif or .webp.
+            width: Pixels; even for .mp4.
+            height: Pixels, likewise.
+            fps: Pictures a second; at most 50 of .gif.
+
+        Raises:
+            ValueError: The ending is unknown, or does not go with the size or the speed.
+            FileNotFoundError: The folder does not exist.
+            ImportError: The library for this kind of film is missing.
+        """
+        self._path, self._size = Path(path), (width, height)
+        suffix = self._path.suffix
+        if suffix not in FILMS:
+            raise ValueError(f"Video: path must end in {', '.join(FILMS)}, got {str(path)!r}")
+        if not self._path.parent.is_dir():
+            raise FileNotFoundError(f"folder not found: {self._path.parent}")
+        check.whole("Video", "fps", fps, low=1, high=_FASTEST_GIF if suffix == ".gif" else 1000)
+        if suffix == ".mp4" and (width % 2 or height % 2):
+            raise ValueError(f"Video: size must be even for .mp4, got {width}x{height}")
+        kind = _Mp4 if suffix == ".mp4" else _Loop
+        self._stack = ExitStack()
+        self._film: _Film = kind(suffix, width, height, fps)
+
+    def add(self, picture: Picture) -> None:
+        """Appends a picture; raises ValueError if it is of another size, or a batch."""
+        pixels = picture.to_srgb8().numpy()
+        width, height = self._size
+        if pixels.shape != (height, width, 3):
+            raise ValueError(f"Video: picture must be ({height}, {width}, 3), got {pixels.shape}")
+        self._film.add(pixels)
+
+    def __enter__(self) -> Video:
+        """Returns itself."""
+        self._film.open(self._stack.enter_context(whole_file(self._path)))
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Finishes the file, or takes it away after a mistake."""
+        with self._stack:
+            self._film.close(whole=kind is None)
+            if error is not None:
+                raise error
+
+    def __repr__(self) -> str:
+        return f"Video({str(self._path)!r}, {self._size[0]}x{self._size[1]})"
+
+
+class _Film(ABC):
+    """A kind of file."""
+
+    @abstractmethod
+    def __init__(self, suffix: str, width: int, height: int, fps: int) -> None:
+        """Loads its library."""
+
+    @abstractmethod
+    def open(self, part: Path) -> None:
+        """Takes the file to write."""
+
+    @abstractmethod
+    def add(self, pixels: np.ndarray) -> None:
+        """Appends (h, w, 3) sRGB uint8."""
+
+    @abstractmethod
+    def close(self, *, whole: bool) -> None:
+        """Writes what is left, if the film is whole."""
+
+
+class _Mp4(_Film):
+    def __init__(self, suffix: str, width: int, height: int, fps: int) -> None:
+        try:
+            import av
+        except ImportError:
+            raise ImportError(f"{suffix} needs PyAV: pip install 'gvtorch[video]'") from None
+        self._av, self._size, self._fps = av, (width, height), fps
+
+    def open(self, part: Path) -> None:
+        self._file = self._av.open(str(part), "w")
+        self._stream: Any = self._file.add_stream("libx264", rate=self._fps)
+        self._stream.width, self._stream.height = self._size
+        self._stream.pix_fmt = "yuv420p"
+        self._stream.options = {"crf": "18"}
+
+    def add(self, pixels: np.ndarray) -> None:
+        frame = self._av.VideoFrame.from_ndarray(pixels, format="rgb24")
+        self._file.mux(self._stream.encode(frame))
+
+    def close(self, *, whole: bool) -> None:
+        try:
+            if whole:
+                self._file.mux(self._stream.encode())
+        finally:
+            self._file.close()
+
+
+class _Loop(_Film):
+    def __init__(self, suffix: str, width: int, height: int, fps: int) -> None:
+        del width, height
+        try:
+            from PIL import Image
+        except ImportError:
+            raise ImportError(f"{suffix} needs Pillow: pip install 'gvtorch[video]'") from None
+        self._image, self._suffix, self._fps = Image, suffix, fps
+        self._frames: list[Any] = []
+
+    def open(self, part: Path) -> None:
+        self._part = part
+
+    def add(self, pixels: np.ndarray) -> None:
+        self._frames.append(self._image.fromarray(pixels))
+
+    def close(self, *, whole: bool) -> None:
+        if not whole or not self._frames:
+            return
+        unit = 10 if self._suffix == ".gif" else 1  # a GIF counts in hundredths of a second
+        ends = [round(1000 * n / self._fps / unit) * unit for n in range(len(self._frames) + 1)]
+        lasts = [b - a for a, b in itertools.pairwise(ends)]
+        frames = self._frames
+        options: dict[str, Any] = {"quality": 90, "method": 4}
+        if self._suffix == ".gif":
+            frames, options = self._in_palette(), {"optimize": False, "disposal": 1}
+        first, *rest = frames
+        first.save(self._part, save_all=True, append_images=rest, duration=lasts, loop=0, **options)
+
+    def _in_palette(self) -> list[Any]:
+        """The frames in 256 colours of all, so that still parts do not flicker."""
+        step = -(-len(self._frames) // _OF_PALETTE)
+        some = [np.asarray(frame) for frame in self._frames[::step]]
+        colors = self._image.fromarray(np.concatenate(some)).quantize(256, kmeans=1)
+        dither = self._image.Dither.FLOYDSTEINBERG
+        return [frame.quantize(palette=colors, dither=dither) for frame in self._frames]

@@ -1,0 +1,280 @@
+"""Transfer functions of other programs: presets of ParaView and 3D Slicer as opacity (v, a) and
+colour (v, r, g, b), linear light.
+
+Theirs is sRGB, and ParaView's runs through other colour spaces between its points: it is sampled
+finely enough that straight lines follow.
+
+Source: Moreland, "Diverging color maps for scientific visualization", ISVC 2009 (Msh).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from ..base import check
+from ..base.declared import did_you_mean
+from .presets import RAMP, SAMPLES, Pair, Points, converted, linear
+
+_GRID = 2**14  # cells of the grid on which the points of files lie, which makes short tables
+_PARTS = 16  # of the way between two colours, at least
+_BENT = 128  # parts of a curve of opacities
+_UNSATURATED = 0.05  # radians of Msh
+
+
+def read_points(path: str | Path, name: str | None) -> tuple[Pair, float | None, bool]:
+    """Reads a preset of ParaView (.json) or 3D Slicer (.vp, .vp.json, or one by its name of an .xml
+    such as its presets.xml).
+
+    Returns:
+        The points, the length that opacities are given for if the file tells it, and whether the
+        values are only relative, as ParaView's are.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file holds something else, or has no such preset, or several and no name was
+            given.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise FileNotFoundError(f"transfer function file not found: {file}")
+    try:
+        if file.suffix == ".vp":
+            _only(file, name)
+            return _slicer(file, _of_vp(file.read_text("utf-8"))), None, False
+        if file.suffix == ".xml":
+            nodes = ElementTree.parse(file).iter("VolumeProperty")
+            found = {node.get("name") or node.get("id") or "": node.attrib for node in nodes}
+            return _slicer(file, _chosen(file, found, name)), None, False
+        content = check.json_file("transfer function file", file)
+        if isinstance(content, dict) and "volumeProperties" in content:
+            _only(file, name)
+            return *_of_vp_json(file, content), False
+        items = content if isinstance(content, list) else [content]
+        if not all(isinstance(item, dict) and "RGBPoints" in item for item in items):
+            raise ValueError(
+                'expected {"opacity": ..., "color": ...}, a list of ParaView presets '
+                '({"Name": ..., "RGBPoints": ...}) or "volumeProperties" of 3D Slicer'
+            )
+        found = {str(item.get("Name", number)): item for number, item in enumerate(items)}
+        return _of_paraview(file, _chosen(file, found, name)), None, True
+    except (KeyError, TypeError, IndexError, ElementTree.ParseError, UnicodeDecodeError) as error:
+        raise ValueError(f"{file}: no such file as its ending tells: {error!r}") from None
+    except ValueError as error:
+        told = str(error)
+        raise ValueError(told if told.startswith(str(file)) else f"{file}: {told}") from None
+
+
+def _only(file: Path, name: str | None) -> None:
+    if name is not None:
+        raise ValueError(f"holds one preset, without a name: leave {name!r} out")
+
+
+def _chosen(file: Path, found: Mapping[str, Any], name: str | None) -> Any:
+    if name is None and len(found) == 1:
+        return next(iter(found.values()))
+    if name in found:
+        return found[str(name)]
+    what = f"has no preset {name!r}" if name else "has several presets, name one as in FILE:NAME"
+    close = did_you_mean(name or "", found)
+    raise ValueError(f"{what}; it has {', '.join(found) or 'none'}{close}")
+
+
+def _of_vp(text: str) -> Mapping[str, Any]:
+    """Nine lines: interpolation, shade, diffuse, ambient, specular, its power, and three lists."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    if len(lines) < 9:
+        raise ValueError(f"a .vp file has 9 lines, this one {len(lines)}")
+    names = ("scalarOpacity", "gradientOpacity", "colorTransfer")
+    return {"shade": lines[1].strip(), **dict(zip(names, lines[6:9], strict=True))}
+
+
+def _slicer(file: Path, told: Mapping[str, Any]) -> Pair:
+    """Points of texts that hold how many numbers follow, and these."""
+    opacity = _counted(told["scalarOpacity"], 2)
+    gradient = _counted(told.get("gradientOpacity", "4 0 1 255 1"), 2)
+    _tell_lost(file, gradient, shaded=str(told.get("shade", "0")) not in ("0", "false"))
+    return _points(_opacities(opacity), _counted(told["colorTransfer"], 4))
+
+
+def _counted(text: str, width: int) -> np.ndarray:
+    count, *numbers = [float(part) for part in text.split()]
+    if count != len(numbers) or len(numbers) % width or not numbers:
+        raise ValueError(f"{text[:40]!r} must be a count and as many numbers, {width} a point")
+    return np.array(numbers).reshape(-1, width)
+
+
+def _of_vp_json(file: Path, content: Mapping[str, Any]) -> tuple[Pair, float | None]:
+    part = content["volumeProperties"][0]["components"][0]
+    color = [(p["x"], *p["color"]) for p in part["rgbTransferFunction"]["points"]]
+    gradient = [(p["x"], p["y"]) for p in part.get("gradientOpacity", {}).get("points", ())]
+    bent = [_bent(p) for p in part["scalarOpacity"]["points"]]
+    _tell_lost(file, np.array(gradient or [(0, 1)]), shaded=bool(part.get("shade")))
+    reference = part.get("scalarOpacityUnitDistance")
+    return _points(_opacities(np.array(bent, float)), np.array(color, float)), reference
+
+
+def _bent(point: Mapping[str, float]) -> tuple[float, ...]:
+    return point["x"], point["y"], point.get("midpoint", 0.5), point.get("sharpness", 0.0)
+
+
+def _tell_lost(file: Path, gradient: np.ndarray, shaded: bool) -> None:
+    lost = ["opacity by gradient"] if (gradient[:, 1] != 1).any() else []
+    lost += ["shading, which --shader lit has (gv.Lit)"] if shaded else []
+    if lost:
+        warnings.warn(f"{file}: not kept: {'; '.join(lost)}", stacklevel=5)
+
+
+def _of_paraview(file: Path, item: Mapping[str, Any]) -> Pair:
+    nodes = np.array(item["RGBPoints"], float).reshape(-1, 4)
+    space = str(item.get("ColorSpace", "RGB"))
+    if space in ("Lab/CIEDE2000", "LabCIEDE2000"):
+        warnings.warn(f"{file}: not kept: ColorSpace {space!r}, taken as 'Lab'", stacklevel=4)
+        space = "Lab"
+    known = ("RGB", "HSV", "Lab", "Diverging", "Step")
+    if space not in known:
+        raise ValueError(f"ColorSpace must be one of {', '.join(known)}, got {space!r}")
+    if item.get("Points"):
+        opacity = _opacities(np.array(item["Points"], float).reshape(-1, 4))
+    else:
+        low, high = nodes[0, 0], nodes[-1, 0]
+        opacity = np.array([(low + v * (high - low), a) for v, a in RAMP])
+    return _points(opacity, nodes, space, wrap=bool(item.get("HSVWrap", False)))
+
+
+def _opacities(nodes: np.ndarray) -> np.ndarray:
+    """(k, 2) of nodes (v, a), or (v, a, midpoint, sharpness) as VTK's vtkPiecewiseFunction has
+    them: between two nodes half the way is done at the midpoint, at sharpness 0 along straight
+    lines, else along a curve, which at 1 is nearly a step.
+    """
+    nodes = nodes[np.argsort(nodes[:, 0], kind="stable")]
+    if nodes.shape[1] == 2:
+        return nodes
+    points = []
+    for (v, a, midpoint, sharp), (w, b, *_) in itertools.pairwise(nodes):
+        middle = min(max(midpoint, 1e-5), 1 - 1e-5)
+        if sharp < 0.01:
+            places, shares = np.array([0, middle]), np.array([0, 0.5])
+        else:
+            places = np.arange(_BENT) / _BENT
+            shares = _hermite(places, middle, sharp)
+        points += list(zip(v + places * (w - v), a + shares * (b - a), strict=True))
+    return np.array([*points, nodes[-1, :2]])
+
+
+def _hermite(place: np.ndarray, middle: float, sharp: float) -> np.ndarray:
+    """Share of the way, by VTK's definition: time is bent towards the midpoint, then a cubic with
+    slopes that fall as it gets sharper.
+    """
+    s = np.where(place < middle, 0.5 * place / middle, 0.5 + 0.5 * (place - middle) / (1 - middle))
+    power = 1 + 10 * sharp
+    low = 0.5 * (2 * s.clip(max=0.5)) ** power
+    s = np.where(s < 0.5, low, 1 - 0.5 * (2 * (1 - s.clip(min=0.5))) ** power)
+    slope = 1 - sharp
+    s2, s3 = s * s, s * s * s
+    return (-2 * s3 + 3 * s2 + (s3 - 2 * s2 + s + s3 - s2) * slope).clip(0, 1)
+
+
+def _points(
+    opacity: np.ndarray, nodes: np.ndarray, space: str = "RGB", *, wrap: bool = False
+) -> Pair:
+    """Opacity and linear colour on one grid, from sRGB nodes."""
+    nodes = nodes[np.argsort(nodes[:, 0], kind="stable")]
+    if not (np.isfinite(opacity).all() and np.isfinite(nodes).all()):
+        raise ValueError("its numbers must be finite")
+    ends = np.concatenate((opacity[:, 0], nodes[:, 0]))
+    low, high = float(ends.min()), float(ends.max())
+    step = ((high - low) or 1.0) / _GRID
+    values, colors = [nodes[:1, 0]], [nodes[:1, 1:]]
+    for first, last in itertools.pairwise(nodes):
+        cells = (last[0] - first[0]) / step
+        count = max(1, math.ceil(SAMPLES * cells / _GRID), min(_PARTS, int(cells)))
+        share = np.arange(1, count + 1) / count
+        values.append(first[0] + share * (last[0] - first[0]))
+        if space == "Step":  # the upper node's colour, from the lower on
+            values[-1], share = np.array([first[0], last[0]]), np.ones(2)
+        colors.append(_between(first[1:], last[1:], share, space, wrap))
+    light = linear(np.concatenate(colors).clip(0, 1))
+    colored = np.column_stack((np.concatenate(values), light))
+    return _on_grid(opacity, low, step), _on_grid(colored, low, step)
+
+
+def _on_grid(points: np.ndarray, low: float, step: float) -> Points:
+    """Points moved to the grid; where several meet, the first and last make a ramp."""
+    kept: list[tuple[float, ...]] = []
+    last = -1
+    places = np.rint((points[:, 0] - low) / step).astype(int)
+    for at, run in itertools.groupby(
+        zip(places, points[:, 1:].tolist(), strict=True), lambda p: p[0]
+    ):
+        rows = [row for _, row in run]
+        for row in (rows[0], rows[-1]) if rows[0] != rows[-1] else rows[:1]:
+            last = max(int(at), last + 1)
+            kept.append((low + last * step, *row))
+    return kept
+
+
+def _between(
+    first: np.ndarray, last: np.ndarray, share: np.ndarray, space: str, wrap: bool
+) -> np.ndarray:
+    """(k, 3) sRGB on the way from one colour to another."""
+    t = share[:, None]
+    if space in ("RGB", "Step"):
+        return first + t * (last - first)
+    if space == "HSV":
+        a, b = (converted("rgb_to_hsv", color) for color in (first, last))
+        a[0], b[0] = a[0] / (2 * math.pi), b[0] / (2 * math.pi)
+        if wrap and abs(a[0] - b[0]) > 0.5:
+            (a if a[0] < b[0] else b)[0] += 1
+        mixed = a + t * (b - a)
+        mixed[:, 0] = mixed[:, 0] % 1 * 2 * math.pi
+        return converted("hsv_to_rgb", mixed)
+    a, b = (converted("rgb_to_lab", color) for color in (first, last))
+    mixed = a + t * (b - a) if space == "Lab" else _diverging(a, b, share)
+    light = converted("lab_to_rgb", mixed, clip=False)
+    return light / light.max(1, keepdims=True).clip(1)  # as VTK brings back what is too bright
+
+
+def _diverging(first: np.ndarray, last: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """(k, 3) Lab on Moreland's way between two colours: through white, if their hues differ."""
+    ends = [_msh(first), _msh(last)]
+    (m1, s1, h1), (m2, s2, h2) = ends
+    apart = abs(h1 - h2)
+    white = np.array([max(m1, m2, 88.0), 0.0, 0.0])
+    if min(s1, s2) > _UNSATURATED and min(apart, 2 * math.pi - apart) > math.pi / 3:
+        halves = [(ends[0], white, share[share <= 0.5] * 2)]
+        halves += [(white, ends[1], share[share > 0.5] * 2 - 1)]
+    else:
+        halves = [(ends[0], ends[1], share)]
+    mixed = np.concatenate([_msh_mix(*half) for half in halves])
+    m, s, h = mixed.T
+    return np.column_stack((m * np.cos(s), m * np.sin(s) * np.cos(h), m * np.sin(s) * np.sin(h)))
+
+
+def _msh(lab: np.ndarray) -> np.ndarray:
+    """Polar Lab: magnitude, saturation and hue, which are angles."""
+    m = float(np.linalg.norm(lab))
+    s = math.acos(float(lab[0]) / m) if m > 1e-3 else 0.0
+    return np.array([m, s, math.atan2(lab[2], lab[1]) if s > 1e-3 else 0.0])
+
+
+def _msh_mix(first: np.ndarray, last: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Straight in Msh; an unsaturated end takes a hue that turns away from the other's."""
+    a, b = first.copy(), last.copy()
+    for gray, other in ((a, b), (b, a)):
+        if gray[1] < _UNSATURATED < other[1]:
+            m, s, h = other
+            gray[2] = h
+            if m < gray[0] - 0.1:
+                spin = s * math.sqrt(gray[0] ** 2 - m**2) / (m * math.sin(s))
+                gray[2] = h + spin if h > -0.3 * math.pi else h - spin
+    way = b - a
+    way[2] = (way[2] + math.pi) % (2 * math.pi) - math.pi  # the shorter one around
+    return a + share[:, None] * way

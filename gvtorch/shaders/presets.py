@@ -1,0 +1,126 @@
+"""Points of transfer functions by name: opacity (v, a) and colour (v, r, g, b), linear light."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..base.declared import did_you_mean
+
+Points = Sequence[Sequence[float]]
+Pair = tuple[Points, Points]  # opacity and colour
+
+#: Over [0, 1], which stands for a window of the data.
+PRESETS: dict[str, Pair] = {
+    "gray": ([(0, 0), (0.05, 0), (1, 0.5)], [(0, 0, 0, 0), (1, 1, 1, 1)]),
+    "hot": (
+        [(0, 0), (0.1, 0), (0.4, 0.05), (1, 0.6)],
+        [(0, 0.1, 0, 0), (0.35, 0.9, 0.1, 0), (0.7, 1, 0.6, 0.05), (1, 1, 1, 0.8)],
+    ),
+    "vessels": (
+        [(0, 0), (0.15, 0), (0.3, 0.25), (0.6, 0.9), (1, 0.95)],
+        [(0, 0.3, 0.02, 0.02), (0.3, 0.55, 0.05, 0.03), (0.6, 0.9, 0.45, 0.25), (1, 1, 0.95, 0.8)],
+    ),
+    "bone": (
+        [(0, 0), (0.45, 0), (0.55, 0.02), (0.65, 0.4), (1, 0.9)],
+        [(0, 0.3, 0.1, 0.05), (0.5, 0.6, 0.25, 0.15), (0.65, 0.9, 0.8, 0.6), (1, 1, 1, 0.95)],
+    ),
+    "tissue": (
+        [(0, 0), (0.3, 0), (0.45, 0.03), (0.6, 0.2), (0.8, 0.8), (1, 0.9)],
+        [(0, 0.4, 0.15, 0.1), (0.3, 0.8, 0.4, 0.25), (0.6, 0.95, 0.75, 0.5), (1, 1, 1, 0.95)],
+    ),
+}
+RAMP = PRESETS["gray"][0]  # of colour maps
+
+#: In Hounsfield units: air is -1000, lung -900 to -500, fat -100, water 0, muscle 50, vessels with
+#: contrast agent 150 to 500, bone 300 to 2000.
+CT_PRESETS: dict[str, Pair] = {
+    "ct-bone": (
+        [(150, 0), (250, 0.03), (400, 0.35), (700, 0.8), (1500, 0.95)],
+        [
+            (150, 0.35, 0.1, 0.06),
+            (300, 0.75, 0.5, 0.3),
+            (600, 0.95, 0.85, 0.66),
+            (1500, 1, 1, 0.95),
+        ],
+    ),
+    "ct-soft": (
+        [(-200, 0), (-150, 0.02), (-50, 0.04), (10, 0.08), (80, 0.3), (200, 0.5), (1000, 0.9)],
+        [
+            *[(-200, 0.75, 0.45, 0.3), (-80, 0.85, 0.6, 0.3), (20, 0.55, 0.12, 0.09)],
+            *[(90, 0.75, 0.25, 0.17), (250, 0.95, 0.8, 0.6), (1000, 1, 1, 0.95)],
+        ],
+    ),
+    "ct-lung": (
+        [(-950, 0), (-850, 0.006), (-650, 0.02), (-500, 0.06), (-300, 0.12), (-200, 0)],
+        [
+            (-950, 0.1, 0.25, 0.5),
+            (-750, 0.35, 0.6, 0.9),
+            (-500, 0.9, 0.75, 0.6),
+            (-200, 1, 0.4, 0.3),
+        ],
+    ),
+    "ct-vessels": (
+        [(110, 0), (150, 0.08), (250, 0.4), (400, 0.8), (1500, 0.95)],
+        [
+            *[(110, 0.35, 0.02, 0.02), (200, 0.6, 0.06, 0.04), (320, 0.9, 0.4, 0.22)],
+            *[(500, 1, 0.9, 0.75), (1500, 1, 1, 0.95)],
+        ],
+    ),
+}
+#: The preset in Hounsfield units that shows the same as one over a window.
+IN_HU = {"bone": "ct-bone", "tissue": "ct-soft", "vessels": "ct-vessels"}
+
+SAMPLES = 256  # of a colour map
+
+
+def named(name: str) -> Pair:
+    """Returns a preset's points: of one over a window over [0, 1], as are matplotlib's colour maps,
+    whose opacity is that of gray; raises ValueError where there is none.
+    """
+    known = {**PRESETS, **CT_PRESETS}
+    if name in known:
+        return known[name]
+    maps, hint = _colormaps()
+    plain = name.removeprefix("matplotlib:")
+    if plain in maps:
+        places = np.arange(SAMPLES) / (SAMPLES - 1)
+        colors = linear(np.asarray(maps[plain](places))[:, :3])
+        return RAMP, np.column_stack((places, colors)).tolist()
+    raise ValueError(
+        f"unknown preset {name!r}; known: {', '.join(sorted(known))}, {hint}"
+        f"{did_you_mean(plain, (*known, *maps))}"
+    )
+
+
+def display_grays() -> Pair:
+    """Returns grays over [0, 1] whose sRGB number is the value."""
+    places = np.arange(SAMPLES) / (SAMPLES - 1)
+    return RAMP, np.column_stack((places, linear(np.repeat(places[:, None], 3, 1)))).tolist()
+
+
+def _colormaps() -> tuple[Mapping[str, Callable[..., Any]], str]:
+    """Matplotlib's colour maps, and what a message tells of them."""
+    try:
+        from matplotlib import colormaps
+    except ImportError:
+        return {}, "and with matplotlib (pip install 'gvtorch[color]') its colour maps"
+    return colormaps, "and matplotlib's colour maps"
+
+
+def converted(name: str, colors: np.ndarray, **options: bool) -> np.ndarray:
+    """Colours (..., 3) through a conversion of kornia, in float64."""
+    import kornia.color
+
+    planes = torch.from_numpy(np.array(colors, np.float64)).reshape(-1, 3).T[None, :, :, None]
+    return (
+        getattr(kornia.color, name)(planes, **options)[0, :, :, 0].T.reshape(colors.shape).numpy()
+    )
+
+
+def linear(colors: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB (k, 3)."""
+    return converted("rgb_to_linear_rgb", colors).clip(0, 1)

@@ -1,0 +1,112 @@
+"""`Scene`: what `gvtorch render` and `gvtorch fly` look at: a volume, built into a tree in memory,
+or a store, streamed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from tyro.conf import arg
+
+from ..io.ngff import is_zarr
+from .common import Bar, ReadOptions, given, refuse_for_store
+from .look import Look
+from .streaming import Streaming, tell_failures
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ..cameras import Camera
+    from ..engine import Engine
+    from ..pictures import Picture
+    from ..tracing import Cost
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is there."""
+
+    render: Callable[..., Picture]  # of a camera
+    cost: Callable[[Camera], Cost]
+    box: Tensor  # (2, 3) float64 world
+    extent: tuple[int, ...]  # (x, y, z) voxels
+    engine: Engine | None = None  # of a store
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneFlags:
+    """What is shown, and how."""
+
+    threshold: Annotated[float | None, arg(metavar="VALUE")] = None
+    """volumes: regions with no value above it are never drawn"""
+    look: tyro.conf.OmitArgPrefixes[Look] = Look()
+    streaming: tyro.conf.OmitArgPrefixes[Streaming] = Streaming()
+    source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
+
+    @contextmanager
+    def open(self, path: str, options: dict[str, Any], bar: Bar) -> Iterator[Scene]:
+        """Opens a volume or a store, to be rendered with these options.
+
+        Raises:
+            ValueError: A flag is for the other of both.
+        """
+        bar("reading", 0, 0)
+        if is_zarr(path):
+            with self._stream(path, options) as scene:
+                yield scene
+            return
+        flags = given(self.streaming)
+        if flags:
+            raise ValueError(
+                f"{flags[0]} is for stores; make one: gvtorch convert {path} STORE.zarr"
+            )
+        yield self._resident(path, options, bar)
+
+    def _resident(self, path: str, options: dict[str, Any], bar: Bar) -> Scene:
+        """Builds the whole tree of a volume file."""
+        from ..pool import N3Tree
+        from ..shaders import Filtered
+        from ..tracing import cost, render
+
+        volume, look = self.source.read(path), self.look
+        shader = look.chosen(volume)
+        tree = N3Tree.from_volume(
+            *(volume, look.brick_size, look.border),
+            threshold=self.threshold,
+            device=look.device(),
+            progress=bar,
+        )
+        if isinstance(shader, Filtered):
+            shader = Filtered.of(
+                tree, volume, shader.transfer, component=look.component, progress=bar
+            )
+        return Scene(
+            partial(render, tree, shader=shader, **options),
+            partial(cost, tree, shader=shader, **options),
+            tree.box,
+            volume.extent,
+        )
+
+    @contextmanager
+    def _stream(self, path: str, options: dict[str, Any]) -> Iterator[Scene]:
+        """Streams a store, and tells at last what failed."""
+        from ..tracing import cost
+
+        if self.threshold is not None:
+            raise ValueError("--threshold is for volumes; a store's is set by gvtorch convert")
+        refuse_for_store(self.source)
+        streaming = self.streaming
+        with streaming.open(path, self.look, self.source.time or 0) as (engine, shader):
+            (tree,) = (source.tree for source in engine.trees.values())
+            mode, most = streaming.mode or "converge", streaming.max_frames
+            yield Scene(
+                partial(engine.render, shader=shader, mode=mode, max_frames=most, **options),
+                partial(cost, tree, shader=shader, **options),
+                *(tree.box, tree.extent, engine),
+            )
+            tell_failures(engine)

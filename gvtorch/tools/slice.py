@@ -1,0 +1,96 @@
+"""`gvtorch slice`: planes of voxels as a picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from tyro.conf import Positional, arg
+
+from ..io.ngff import is_zarr
+from .colors import chosen_transfer, parse_window
+from .common import Bar, ReadOptions, refuse_for_store, volume_formats
+from .image import KINDS
+
+if TYPE_CHECKING:
+    from ..base.volume import Volume
+    from ..io.store import Store
+
+
+@dataclass(frozen=True, kw_only=True)
+class Slice:
+    """Show planes of voxels of a volume or a store, exact to the voxel."""
+
+    path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {volume_formats()}")]]
+    output: Annotated[Path, arg(aliases=["-o"], metavar="OUT.png")]
+    """the picture: .png, .exr, .tif, .npy or .npz"""
+    bits: Annotated[int | None, arg(metavar="N")] = None
+    """of a number in the file, as of gvtorch render"""
+    axis: Literal["x", "y", "z", "all"] = "z"
+    """which way the plane is cut; all: three planes in one picture"""
+    at: Annotated[str, arg(metavar="PLACE")] = "50%"
+    """where: 50%, the index of a voxel, or a place such as 12.5mm; for all axes also three, as in
+    50%,40%,12"""
+    up: Annotated[str | None, arg(metavar="+z")] = None
+    """which axis is up in the picture; if left out -y (rows run down) across z, else +z"""
+    scale: Annotated[float, arg(metavar="PIXELS")] = 1.0
+    """pixels along the shortest side of a voxel"""
+    level: Annotated[int, arg(metavar="N")] = 0
+    """stores: level of detail, 0 is the finest"""
+    tf: Annotated[str | None, arg(metavar="FILE|PRESET")] = None
+    """the colours, as of gvtorch render; grays as bright on the display as their values if left
+    out"""
+    window: Annotated[str | None, arg(metavar="LO,HI")] = None
+    """values that these are stretched over, as of gvtorch render; auto keeps the background"""
+    component: Annotated[int, arg(metavar="N")] = 0
+    """which number of a voxel is shown"""
+    image: Annotated[str | None, arg(metavar="NAME")] = None
+    """stores: which image, where there are several"""
+    source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
+
+    def run(self) -> None:
+        """Reads, colours, writes."""
+        from ..pictures.files import checked_path
+        from ..tracing import slice_picture
+
+        checked_path("--output", self.output, self.bits, KINDS)
+        places: Any = tuple(self.at.split(","))
+        if len(places) not in ((1, 3) if self.axis == "all" else (1,)):
+            raise ValueError(f"--at must be one place, or three for --axis all, got {self.at!r}")
+        with Bar() as bar:
+            bar("reading", 0, 0)
+            data = self._open()
+            span, colors = None, None
+            if self.tf is None:
+                text = self.window or "auto"
+                span = parse_window(text, data, self.component, background=True)
+            else:
+                given = self.tf, self.window, data, self.component
+                colors = chosen_transfer(*given, background=True)
+            picture = slice_picture(
+                *(data, self.axis, places if len(places) == 3 else places[0]),
+                span=span,
+                colors=colors,
+                component=self.component,
+                level=self.level,
+                scale=self.scale,
+                up=self.up,
+            )
+        picture.save(self.output, bits=self.bits)
+        height, width, _ = picture.color.shape
+        print(f"{self.output}: {width}x{height}")
+
+    def _open(self) -> Volume | Store:
+        from ..io.store import Store
+
+        if is_zarr(self.path):
+            refuse_for_store(self.source)
+            return Store.open(self.path, image=self.image, time=self.source.time or 0)
+        for flag, value in (("image", self.image), ("level", self.level)):
+            if value:
+                raise ValueError(
+                    f"--{flag} is for stores; make one: gvtorch convert {self.path} STORE.zarr"
+                )
+        return self.source.read(self.path)

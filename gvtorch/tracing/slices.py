@@ -1,0 +1,216 @@
+"""`slice_picture`: a plane of voxels as a picture, exact to the voxel.
+
+Nothing is interpolated: a voxel is a rectangle of pixels of one colour. Of a store only the voxels
+of the plane are read.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import torch
+
+from ..base import check
+from ..base.records import RenderStats
+from ..base.volume import Volume
+from ..io.store import Store
+from ..io.window import window
+from ..pictures.picture import Picture
+from ..shaders.presets import display_grays
+from ..shaders.transfer_function import TransferFunction
+
+At = float | int | str
+#: What is up in the picture of a plane across an axis: rows of a file run down, heads are up.
+UP = {"x": "+z", "y": "+z", "z": "-y"}
+_GAP = 4  # pixels between the three planes
+_MOST = 65536  # pixels along a side
+_UNITS = {
+    "nm": "nanometer",
+    "um": "micrometer",
+    "µm": "micrometer",
+    "mm": "millimeter",
+    "cm": "centimeter",
+    "m": "meter",
+}
+_METERS = {
+    **{"nanometer": 1e-9, "micrometer": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2},
+    **{"meter": 1.0, "angstrom": 1e-10},
+}
+
+
+def slice_picture(
+    data: Volume | Store,
+    axis: str = "z",
+    at: At | tuple[At, At, At] = 0.5,
+    *,
+    span: tuple[float, float] | None = None,
+    colors: TransferFunction | None = None,
+    component: int = 0,
+    level: int = 0,
+    scale: float = 1.0,
+    up: str | None = None,
+) -> Picture:
+    """Returns a plane of voxels across an axis as a picture; of voxels that are not cubes, pixels
+    keep the proportions.
+
+    Args:
+        data: A volume, or a store, of which no more than the plane is read.
+        axis: x, y, z, or all: the planes across y and x above the one across z, side by side so
+            that what is in line is the same place.
+        at: Where: a share of the extent, 0 to 1 or "50%"; an int, the index of a voxel of the
+            finest level; or a place in the world, "12.5mm". For all axes one, or three (x, y, z).
+        span: The values that are black and white, in steps that look even on a display: a voxel of
+            8 bits has the sRGB number of its value if that is (0, 255). What `window` finds, with
+            the background, if left out.
+        colors: Instead of grays, the colours of values (not their opacity).
+        component: Which number of a voxel.
+        level: Of a store: 0 is the finest.
+        scale: Pixels along the shortest side of a voxel.
+        up: Which axis is up in the picture of one plane, as in "+y"; -y (rows run down, as in
+            files) across z, else +z. The other runs to the right.
+
+    Raises:
+        ValueError: An argument is unknown, or out of its range.
+        OSError: The store can't be read.
+    """
+    where = "slice_picture"
+    if axis not in ("x", "y", "z", "all"):
+        raise ValueError(f"{where}: axis must be x, y, z or all, got {axis!r}")
+    scale = check.number(where, "scale", scale, low=0, open_low=True)
+    plane = _Plane(data, component, level)
+    if colors is None:
+        ends = window(data, component=component, background=True) if span is None else span
+        colors = TransferFunction(*display_grays()).stretched(*ends)
+    elif span is not None:
+        raise ValueError(f"{where}: span is for grays; colors have values of their own")
+    if axis != "all":
+        if isinstance(at, tuple):
+            raise ValueError(f"{where}: at must be one place for axis {axis}, got {at!r}")
+        pixel = min(plane.spacing[n] for n in "xyz" if n != axis) / scale
+        return _picture(plane.colored(axis, at, UP[axis] if up is None else up, pixel, colors))
+    if up is not None:
+        raise ValueError(f"{where}: up is for one plane, not for axis 'all'")
+    places = at if isinstance(at, tuple) else (at, at, at)
+    pixel = min(plane.spacing.values()) / scale
+    x, y, z = (
+        plane.colored(n, place, UP[n], pixel, colors)
+        for n, place in zip("xyz", places, strict=True)
+    )
+    (top, left), (bottom, right) = y.shape[:2], (z.shape[0], x.shape[1])
+    image = np.zeros((top + _GAP + bottom, left + _GAP + right, 3), np.float32)
+    image[:top, :left], image[:top, left + _GAP :], image[top + _GAP :, :left] = y, x, z
+    return _picture(image)
+
+
+class _Plane:
+    """Planes of voxels of one component and level."""
+
+    def __init__(self, data: Volume | Store, component: int, level: int) -> None:
+        where = "slice_picture"
+        self.data, self.component = data, component
+        stored = isinstance(data, Store)
+        width = data.width if isinstance(data, Store) else data.data.shape[3]
+        check.whole(where, "component", component, low=0, high=width - 1)
+        self.level = check.whole(where, "level", level, low=0)
+        if level and not stored:
+            raise ValueError(f"{where}: level is for stores, a volume has one, got {level}")
+        extent = data.level_extent(level) if isinstance(data, Store) else data.extent
+        self.extent = dict(zip("xyz", extent, strict=True))
+        self.finest = dict(zip("xyz", data.extent, strict=True))
+        self.step = dict(zip("xyz", data.spacing, strict=True))
+        self.spacing = {axis: step * 2**level for axis, step in self.step.items()}
+        self.origin = dict(zip("xyz", data.origin, strict=True))
+        self.unit = data.info.unit
+
+    def index(self, axis: str, at: At) -> int:
+        """Index of a voxel of the finest level along an axis."""
+        where, count = "slice_picture", self.finest[axis]
+        if isinstance(at, str):
+            text = at.strip()
+            if text.endswith("%"):
+                at = check.number(where, "at", text[:-1], low=0, high=100) / 100
+            elif re.fullmatch(r"[+-]?\d+", text):
+                at = int(text)
+            else:
+                return self._place(axis, text)
+        if isinstance(at, float):
+            share = check.number(where, "at", at, low=0, high=1)
+            return min(int(share * count), count - 1)
+        return check.whole(where, f"at along {axis}", at, low=0, high=count - 1)
+
+    def _place(self, axis: str, text: str) -> int:
+        """Index of the voxel in which a place of the world lies, as in "12.5mm"."""
+        found = re.fullmatch(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-zµ]+)", text)
+        if found is None or found[2] not in _UNITS:
+            raise ValueError(
+                f"slice_picture: at must be a share such as 50%, the index of a voxel, or a place "
+                f"such as 12.5mm, got {text!r}"
+            )
+        place, unit = float(found[1]), _UNITS[found[2]]
+        if self.unit is not None and unit != self.unit:
+            if self.unit not in _METERS:
+                raise ValueError(f"slice_picture: the unit of the data is {self.unit}, got {text}")
+            place *= _METERS[unit] / _METERS[self.unit]
+        index = int(np.floor((place - self.origin[axis]) / self.step[axis] + 0.5))
+        low, high = (
+            self.origin[axis] + (n - 0.5) * self.step[axis] for n in (0, self.finest[axis])
+        )
+        if not 0 <= index < self.finest[axis]:
+            ends = f"{low:g} to {high:g} {self.unit or ''}".rstrip()
+            raise ValueError(f"slice_picture: at {text} lies beyond the data, {axis} is {ends}")
+        return index
+
+    def values(self, axis: str, at: At) -> np.ndarray:
+        """The plane across an axis, in the order z, y, x of the other two."""
+        index = self.index(axis, at) >> self.level
+        low, high = [0, 0, 0], [self.extent[n] for n in "zyx"]
+        number = "zyx".index(axis)
+        low[number], high[number] = index, index + 1
+        if isinstance(self.data, Store):
+            part = self.data.read_region(self.level, low, high)
+        else:
+            box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+            found = self.data.data[box]
+            part = (found.float() if found.dtype == torch.bfloat16 else found).numpy()
+        return part[..., self.component].squeeze(number)
+
+    def colored(
+        self, axis: str, at: At, up: str, pixel: float, colors: TransferFunction
+    ) -> np.ndarray:
+        """(h, w, 3) float32 linear light of the plane, of pixels so wide in world units."""
+        others = [n for n in "zyx" if n != axis]  # of the rows and columns
+        if up not in [sign + n for n in others for sign in "+-"]:
+            raise ValueError(
+                f"slice_picture: up must be +{others[0]}, -{others[0]}, +{others[1]} or "
+                f"-{others[1]} across {axis}, got {up!r}"
+            )
+        values = self.values(axis, at)
+        if up[1] != others[0]:
+            values, others = values.T, others[::-1]
+        rows, columns = (_pixels(self.extent[n], self.spacing[n] / pixel) for n in others)
+        rows = rows[::-1] if up[0] == "+" else rows
+        return colors(values)[..., :3].astype(np.float32)[np.ix_(rows, columns)]
+
+
+def _pixels(count: int, size: float) -> np.ndarray:
+    """The voxel of each pixel along an axis; voxels are so many pixels long."""
+    pixels = max(1, round(count * size))
+    if pixels > _MOST:
+        raise ValueError(
+            f"slice_picture: {pixels} pixels are more than {_MOST}: take a smaller scale"
+        )
+    return ((np.arange(pixels) + 0.5) * (count / pixels)).astype(np.int64)
+
+
+def _picture(image: np.ndarray) -> Picture:
+    color = torch.from_numpy(np.ascontiguousarray(image))
+    one = torch.ones_like(color[..., :1])
+    return Picture(
+        color=color,
+        alpha=one,
+        depth=0 * one,
+        nearest=0 * one,
+        samples=one.int(),
+        stats=RenderStats(),
+    )

@@ -1,0 +1,45 @@
+"""What `gvtorch info` tells of a volume is never an error."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from helpers import gvtorch
+
+import gvtorch as gv
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
+def test_the_whole_range_of_a_dtype(dtype):
+    data = torch.zeros(3, 4, 5, dtype=dtype)
+    info = torch.finfo(dtype)
+    data[0, 0, 0], data[1, 1, 1] = info.min, info.max
+    told = gv.Volume(data).describe(bins=7)
+    assert told["histogram"] == [1, 0, 0, 58, 0, 0, 1] and told["mean"] == 0
+    assert told["range"] == [info.min, info.max]
+
+
+@pytest.mark.parametrize("value", [0.0, 7.0, -3e30, 1e-30, 65504.0])
+def test_flat_data(value):
+    told = gv.Volume(np.full((3, 4, 5), value, np.float32)).describe()
+    assert sum(told["histogram"]) == told["histogram"][0] == 60
+    assert told["mean"] == pytest.approx(value)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "float16", "float32"])
+def test_one_label_and_neighbours(dtype):
+    data = np.zeros((3, 4, 5), dtype)
+    data[1, 2, 3] = 1
+    told = gv.Volume(data).describe()
+    assert told["histogram"][0] == 59 and told["histogram"][-1] == 1
+
+
+def test_the_command_tells_it(tmp_path):
+    data = np.zeros((3, 4, 5), np.float32)
+    data[0, 0, 0], data[1, 1, 1] = -3e38, 3e38
+    np.save(tmp_path / "a.npy", data)
+    run = gvtorch("info", tmp_path / "a.npy", "--json")
+    assert run.returncode == 0 and sum(json.loads(run.stdout)["histogram"]) == 60, run.stderr

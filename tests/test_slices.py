@@ -1,0 +1,156 @@
+"""Planes of voxels as pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from helpers import gvtorch
+
+import gvtorch as gv
+
+
+@pytest.fixture(scope="module")
+def volume() -> gv.Volume:
+    values = np.random.default_rng(1).integers(0, 256, (14, 12, 10)).astype(np.uint8)
+    info = gv.ImageInfo(unit="millimeter")
+    return gv.Volume(values, (1, 1, 2), (5, 0, -4), info=info)
+
+
+@pytest.fixture(scope="module")
+def store(volume, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("slices")
+    np.save(folder / "a.npy", volume.data[..., 0].numpy())
+    place = {"spacing": volume.spacing, "origin": volume.origin}
+    return gv.convert(folder / "a.npy", folder / "a.zarr", **place, workers=1)
+
+
+def numbers(picture: gv.Picture) -> np.ndarray:
+    """sRGB numbers of a gray picture."""
+    pixels = picture.to_srgb8().numpy()
+    assert (pixels[..., :1] == pixels).all()
+    return pixels[..., 0]
+
+
+def test_a_voxel_is_its_own_number(volume, store):
+    """Across each axis; across z rows run down, else z is up, in pixels as long as voxels."""
+    zyx = volume.data[..., 0].numpy()
+    for data in (volume, store):
+        cut = {a: numbers(gv.slice_picture(data, a, 3, span=(0, 255))) for a in "xyz"}
+        assert np.array_equal(cut["z"], zyx[3])
+        assert np.array_equal(cut["y"], zyx[::-1, 3].repeat(2, 0))
+        assert np.array_equal(cut["x"], zyx[::-1, :, 3].repeat(2, 0))
+        turned = gv.slice_picture(data, "x", 3, span=(0, 255), up="-y", scale=2)
+        assert np.array_equal(numbers(turned), zyx[:, :, 3].T.repeat(2, 0).repeat(4, 1))
+
+
+def test_three_planes_in_line(volume):
+    zyx = volume.data[..., 0].numpy()
+    picture = numbers(gv.slice_picture(volume, "all", (1, "50%", 13), span=(0, 255)))
+    assert picture.shape == (28 + 4 + 12, 10 + 4 + 12)
+    assert np.array_equal(picture[:28, :10], zyx[::-1, 6].repeat(2, 0))
+    assert np.array_equal(picture[:28, 14:], zyx[::-1, :, 1].repeat(2, 0))
+    assert np.array_equal(picture[32:, :10], zyx[13])
+    assert not picture[28:32].any() and not picture[32:, 10:].any()
+
+
+@pytest.mark.parametrize(
+    ("at", "index"),
+    [
+        *[(0.0, 0), (0.5, 7), (1.0, 13), (5, 5), ("50%", 7), ("13", 13), ("-4mm", 0)],
+        *[("-3.1mm", 0), ("-2.9 mm", 1), ("0.2cm", 3), ("-2000um", 1)],
+    ],
+)
+def test_places(volume, at, index):
+    picture = gv.slice_picture(volume, "z", at, span=(0, 255))
+    assert np.array_equal(numbers(picture), volume.data[index, ..., 0].numpy())
+
+
+def test_a_coarse_level_is_that_of_the_store(store):
+    level = store.read_region(1, (0, 0, 0), store.level_extent(1)[::-1])[..., 0]
+    picture = gv.slice_picture(store, "z", 7, level=1, span=(0, 255))
+    assert np.array_equal(numbers(picture), level[3])
+
+
+def test_a_store_is_read_in_the_plane_alone(store, monkeypatch):
+    read = []
+    plain = gv.Store.read_region
+    monkeypatch.setattr(
+        gv.Store, "read_region", lambda s, *a, **k: read.append(a) or plain(s, *a, **k)
+    )
+    gv.slice_picture(store, "y", 5, span=(0, 255))
+    assert read == [(0, [0, 5, 0], [14, 6, 10])]
+
+
+def test_colours_and_components():
+    data = torch.zeros(2, 3, 4, 2)
+    data[0, 1, 2, 1] = 1
+    volume = gv.Volume(data)
+    colors = gv.TransferFunction([(0, 0)], [(0, 0, 0, 1), (1, 1, 0.5, 0)])
+    picture = gv.slice_picture(volume, "z", 0, colors=colors, component=1)
+    assert picture.color[1, 2].tolist() == [1, 0.5, 0] and picture.alpha.min() == 1
+    assert (picture.color.sum((0, 1)) == torch.tensor([1, 0.5, 11])).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"axis": "w"}, "axis must be x, y, z or all"),
+        ({"at": 1.5}, "at must be finite and >= 0 and <= 1"),
+        ({"at": 14}, "at along z must be an int >= 0 and <= 13"),
+        ({"at": "here"}, "at must be a share such as 50%"),
+        ({"at": "99mm"}, "at 99mm lies beyond the data, z is -5 to 23 millimeter"),
+        ({"at": ("1", "2", "3")}, "at must be one place"),
+        ({"up": "+z"}, r"up must be \+y, -y, \+x or -x across z"),
+        ({"axis": "all", "up": "+z"}, "up is for one plane"),
+        ({"level": 1}, "level is for stores"),
+        ({"component": 1}, "component must be an int >= 0 and <= 0"),
+        ({"scale": 0}, "scale must be finite and > 0"),
+        ({"scale": 1e5}, "pixels are more than 65536"),
+        ({"span": (0, 1), "colors": gv.TransferFunction([(0, 1)])}, "span is for grays"),
+    ],
+)
+def test_mistakes(volume, options, message):
+    with pytest.raises(ValueError, match=message):
+        gv.slice_picture(volume, **options)
+
+
+def test_the_command(volume, store, tmp_path):
+    file = tmp_path / "a.npy"
+    np.save(file, volume.data[..., 0].numpy())
+    for path, flags in ((file, ("--spacing", "1,1,2")), (store.location, ())):
+        out = tmp_path / "s.png"
+        run = gvtorch(
+            "slice", path, *flags, "--axis", "y", "--at", "3", "--window", "0,255", "-o", out
+        )
+        assert run.returncode == 0, run.stderr
+        assert "10x28" in run.stdout
+        found = gv.pictures.files._read_png(out)[..., 0]
+        assert np.array_equal(found, volume.data.numpy()[::-1, 3, :, 0].repeat(2, 0))
+        run = gvtorch("slice", path, *flags, "--axis", "all", "--at", "1,50%,2", "-o", out)
+        assert run.returncode == 0, run.stderr
+        viridis = gvtorch("slice", path, *flags, "--tf", "viridis", "-o", tmp_path / "v.png")
+        assert viridis.returncode == 0, viridis.stderr
+        colors = gv.pictures.files._read_png(tmp_path / "v.png")
+        assert (colors.max((0, 1)) > 100).all() and (colors[..., 0] != colors[..., 1]).any()
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--at", "1,2"], "--at must be one place, or three"),
+        (["--axis", "all", "--at", "1,2"], "--at must be one place, or three"),
+        (["--level", "1"], "--level is for stores; make one"),
+        (["--image", "a"], "--image is for stores"),
+        (["--window", "3,2"], "--window must be LO,HI with LO < HI"),
+        (["--window", "3%,2"], "--window must be LO,HI with LO < HI"),
+        (["--window", "wide"], "--window must be LO,HI, P%,P%, auto or full"),
+        (["--window", "9%,2%"], "percent must be a low and a high one"),
+        (["--axis", "w"], "invalid choice"),
+    ],
+)
+def test_flags_that_do_nothing_or_are_wrong(volume, tmp_path, flags, message):
+    np.save(tmp_path / "a.npy", volume.data[..., 0].numpy())
+    run = gvtorch("slice", tmp_path / "a.npy", "-o", tmp_path / "a.png", *flags)
+    assert run.returncode == 2 and len(run.stderr.splitlines()) == 1, run.stderr
+    assert message in run.stderr and not (tmp_path / "a.png").exists()

@@ -1,0 +1,107 @@
+"""Films: what is written comes back."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+import gvtorch as gv
+from gvtorch.base.records import RenderStats
+from gvtorch.pictures.tone import from_srgb
+
+WIDTH, HEIGHT = 48, 32
+
+
+def picture(number: int, height: int = HEIGHT) -> gv.Picture:
+    """A gradient, and a bright square that moves."""
+    y, x = torch.meshgrid(torch.linspace(0, 1, height), torch.linspace(0, 1, WIDTH), indexing="ij")
+    color = torch.stack((x, y, 0.3 * torch.ones_like(x)), -1)
+    color[4:12, 6 * number : 6 * number + 8] = 0.95
+    one = torch.ones_like(x)[..., None]
+    return gv.Picture(
+        color=from_srgb(color),
+        alpha=one,
+        depth=one,
+        nearest=one,
+        samples=one.int(),
+        stats=RenderStats(),
+    )
+
+
+def written(path, fps: int, count: int = 6) -> list[np.ndarray]:
+    with gv.Video(path, WIDTH, HEIGHT, fps=fps) as video:
+        assert not path.exists(), "a film appears when it is whole"
+        for number in range(count):
+            video.add(picture(number))
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
+    return [picture(number).to_srgb8().numpy().astype(int) for number in range(count)]
+
+
+@pytest.mark.parametrize(("suffix", "tolerance"), [(".gif", 6), (".webp", 5)])
+@pytest.mark.parametrize("fps", [7, 30])
+def test_gif_and_webp_loop_at_their_speed(tmp_path, suffix, tolerance, fps):
+    Image = pytest.importorskip("PIL.Image")
+    expected = written(tmp_path / f"a{suffix}", fps)
+    shown = 0.0
+    with Image.open(tmp_path / f"a{suffix}") as film:
+        assert film.n_frames == 6 and film.info["loop"] == 0
+        for number, frame in enumerate(expected):
+            film.seek(number)
+            found = np.array(film.convert("RGB")).astype(int)
+            shown += film.info.get("duration") or 0
+            assert np.abs(found - frame).mean() < tolerance
+    if suffix == ".gif":
+        assert abs(shown - 6000 / fps) <= 5, "rounding to hundredths does not add up"
+
+
+def test_mp4(tmp_path):
+    av = pytest.importorskip("av")
+    expected = written(tmp_path / "a.mp4", 12)
+    with av.open(str(tmp_path / "a.mp4")) as file:
+        found = [frame.to_ndarray(format="rgb24").astype(int) for frame in file.decode(video=0)]
+        assert file.streams.video[0].average_rate == 12
+    assert len(found) == 6
+    for frame, other in zip(found, expected, strict=True):
+        assert np.abs(frame - other).mean() < 12
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.gif", "a.webp"])
+def test_a_mistake_leaves_nothing(tmp_path, name):
+    with pytest.raises(ZeroDivisionError), gv.Video(tmp_path / name, WIDTH, HEIGHT) as video:
+        video.add(picture(0))
+        raise ZeroDivisionError
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda t: gv.Video(t / "a.avi", 8, 8), r"path must end in \.mp4, \.gif, \.webp"),
+        (lambda t: gv.Video(t / "a.mp4", 7, 8), "size must be even for .mp4, got 7x8"),
+        (lambda t: gv.Video(t / "a.gif", 8, 8, fps=51), "fps must be an int >= 1 and <= 50"),
+        (lambda t: gv.Video(t / "a.webp", 8, 8, fps=0), "fps must be an int >= 1 and <= 1000"),
+        (lambda t: gv.Video(t / "x" / "a.gif", 8, 8), "folder not found"),
+    ],
+)
+def test_bad_films_are_named(tmp_path, make, message):
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        make(tmp_path)
+
+
+def test_pictures_of_another_size_are_refused(tmp_path):
+    with (
+        pytest.raises(ValueError, match=r"picture must be \(32, 48, 3\), got \(30, 48, 3\)"),
+        gv.Video(tmp_path / "a.gif", WIDTH, HEIGHT) as video,
+    ):
+        video.add(picture(0, height=30))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("name", "library"), [("a.gif", "PIL"), ("a.mp4", "av")])
+def test_a_missing_library_tells_the_command(tmp_path, monkeypatch, name, library):
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ImportError, match=r"pip install 'gvtorch\[video\]'"):
+        gv.Video(tmp_path / name, 8, 8)
