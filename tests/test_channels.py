@@ -322,6 +322,19 @@ def test_a_store_tells_windows_by_a_coarse_level(tmp_path):
         assert one.window == pytest.approx(other.window, abs=1)
 
 
+@pytest.mark.backend("cpp")
+def test_any_window_has_a_table():
+    """Its corner points lie on rows, however their numbers round."""
+    tree = gv.N3Tree.from_volume(gv.Volume(blobs(1, (5, 5, 5))), 4)
+    numbers = np.random.default_rng(4).uniform(-3, 3, (40, 2))
+    for low, length in numbers.tolist():
+        look = gv.ChannelLook(window=(low, low + 10**length), color="white")
+        assert look.function(0, 1).opacity[-1].tolist() == [low + 10**length, 0.5]
+        rows = look.function(0, 1).rows()[2]
+        assert len(rows) == 1025 and (np.diff(rows[:, 3]) > 0).all()
+    gv.render(tree, gv.Camera.orbit(width=4, height=4), gv.Channels([look]))
+
+
 @pytest.mark.parametrize(
     ("color", "linear"),
     [

@@ -92,11 +92,9 @@ class ChannelLook:
         color = linear_color(where, default if self.color is None else self.color)
         opacity = _OPACITY if self.opacity is None else self.opacity
         opacity = check.number(where, "opacity", opacity, low=0, high=1)
-        parts = [part / _RAMP for part in range(_RAMP + 1)]
-        return TransferFunction(
-            [(low + part * (high - low), opacity * part * part) for part in parts],
-            [(low, 0, 0, 0), (high, *color)],
-        )
+        parts = [part / _RAMP for part in range(_RAMP)]
+        rising = [(low + part * (high - low), opacity * part * part) for part in parts]
+        return TransferFunction([*rising, (high, opacity)], [(low, 0, 0, 0), (high, *color)])
 
 
 class Channels(Shader):
