@@ -11,12 +11,16 @@ from helpers.rays import camera_rays
 from helpers.traces import assert_equal, run
 
 import gvtorch as gv
-from gvtorch.shaders.channels import NAMED, linear_color
+from gvtorch.shaders.channels import DISTINCT, NAMED, linear_color
 
 SPACING, ORIGIN = (1.0, 0.8, 1.3), (3.0, -2.0, 5.0)
 MODES = ["additive", "opacity"]
 FUNCTIONS = [  # component, reference length, function
-    (2, 1.1, gv.TransferFunction([(50, 0), (90, 0.3), (200, 0.6)], [(50, 1, 0, 0), (200, 1, 1, 0)])),
+    (
+        2,
+        1.1,
+        gv.TransferFunction([(50, 0), (90, 0.3), (200, 0.6)], [(50, 1, 0, 0), (200, 1, 1, 0)]),
+    ),
     (0, None, gv.TransferFunction([(20, 0), (120, 0.5)], [(0, 0, 1, 0)])),
     (1, 3.0, gv.TransferFunction([(100, 0), (130, 0.8), (160, 0)], [(0, 0.1, 0.2, 1)])),
 ]
@@ -52,7 +56,9 @@ def dense(data, rays, mode, step):
         shown = []
         for component, reference, function in FUNCTIONS:
             value = trilinear(data[..., component].astype(np.float64), place)
-            rgb = np.stack([np.interp(value, function.color[:, 0], c) for c in function.color.T[1:]])
+            rgb = np.stack(
+                [np.interp(value, function.color[:, 0], c) for c in function.color.T[1:]]
+            )
             alpha = np.interp(value, *function.opacity.T)
             shown.append((rgb.T, -np.log2(1 - alpha) * length / (reference or min(SPACING))))
         each = np.array([halvings for _, halvings in shown])
@@ -157,7 +163,7 @@ def test_every_dtype_and_width(compiled, dtype, width):
     tree = gv.N3Tree.from_volume(gv.Volume(data), 4)
     order = torch.randperm(width, generator=torch.Generator().manual_seed(3)).tolist()
     mixed = [
-        gv.ChannelLook(window=(20 + c, 110 + c), component=c, color=tuple(NAMED)[c]) for c in order
+        gv.ChannelLook(window=(20 + c, 110 + c), component=c, color=DISTINCT[c]) for c in order
     ]
     for distance in (0.9, 4.0):
         rays = camera_rays(tree, 10, distance=distance)
@@ -410,3 +416,56 @@ def test_a_table_that_leads_nowhere_reads_nothing_else():
             table[:, row, column] = number
             tracer.arguments = tracer.arguments._replace(table_lm4=table)
             assert tracer(rays).samples.shape == (64,)
+
+
+@pytest.fixture(scope="module")
+def two_channels(tmp_path_factory):
+    """Two balls, each in a channel of its own, as a file and as a store."""
+    folder = tmp_path_factory.mktemp("channels")
+    z, y, x = np.mgrid[0:20, 0:20, 0:32]
+    balls = [4000 * (np.hypot(np.hypot(x - c, y - 10), z - 10) < 7) for c in (8, 23)]
+    np.save(folder / "v.npy", np.stack(balls, -1).astype(np.uint16))
+    assert gvtorch("convert", folder / "v.npy", folder / "v.zarr").returncode == 0
+    return folder
+
+
+@pytest.mark.parametrize("name", ["v.npy", "v.zarr"])
+def test_the_command_line_shows_channels(two_channels, tmp_path, name):
+    def picture(*flags: str) -> np.ndarray:
+        out = tmp_path / "out.npy"
+        where = ("--camera", "orbit:0,0,1.6", "--size", "32x32", "-o", out, "--shader", "channels")
+        done = gvtorch("render", two_channels / name, *where, *flags)
+        assert done.returncode == 0, done.stderr
+        return np.load(out)[..., :3]
+
+    left, right = np.s_[14:18, 8:11], np.s_[14:18, 21:24]
+    auto = picture()
+    assert auto[left].mean((0, 1)).argmax() == 2 and auto[right].mean((0, 1)).argmax() == 1
+    told = picture("--channel", "1:#ff0000:100,4000;0:yellow:auto")
+    assert told[left].min((0, 1))[:2].min() > 0.3 and told[left].max((0, 1))[2] < 0.01
+    assert told[right][..., 0].min() > 0.3 and told[right][..., 1:].max() < 0.01
+    alone = picture("--channel", "1")
+    assert alone[right].min() > 0.3 and alone[left].max() < 0.01
+    half, whole = (picture("--channel", f"0:red:0,{high};opacity") for high in (8000, 4000))
+    assert 0.2 * whole[left].max() < half[left].max() < 0.8 * whole[left].max()
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--channel", "0"], "--channel is for --shader channels"),
+        (["--shader", "channels", "--tf", "bone"], "--tf is not for --shader channels"),
+        (["--shader", "channels", "--component", "1"], "--component is not for --shader"),
+        (["--shader", "channels", "--channel", "x:red"], "must hold NUMBER:COLOR:LO,HI"),
+        (["--shader", "channels", "--channel", "0;0"], "names channel 0 twice"),
+        (["--shader", "channels", "--channel", "opacity"], "name channels, too"),
+        (["--shader", "channels", "--channel", "2"], "component must be an int >= 0 and <= 1"),
+        (["--shader", "channels", "--channel", "0:nocolor"], "--channel 0: color must be"),
+        (["--shader", "channels", "--channel", "0:red:5"], "window must be 2 numbers"),
+        (["--shader", "channels", "--channel", "0:red:5,5"], "--channel 0: window must rise"),
+    ],
+)
+def test_a_mistake_on_the_command_line_is_one_line(two_channels, tmp_path, flags, message):
+    done = gvtorch("render", two_channels / "v.npy", "-o", tmp_path / "out.png", *flags)
+    assert done.returncode == 2 and message in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1

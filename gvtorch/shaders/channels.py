@@ -20,17 +20,19 @@ from .transfer_function import TransferFunction
 
 Mode = Literal["additive", "opacity"]
 
-MOST = 16  # channels of a picture
-#: Colours by name, as sRGB.
+#: Colours of microscopists' usual lookup tables, as sRGB.
 NAMED = {
-    **{"blue": "#2850ff", "green": "#00ff00", "red": "#ff0000", "magenta": "#ff00ff"},
-    **{"cyan": "#00ffff", "yellow": "#ffff00", "orange": "#ff8000", "violet": "#8000ff"},
-    **{"lime": "#80ff00", "pink": "#ff0080", "azure": "#0080ff", "mint": "#00ff80"},
-    **{"salmon": "#ff8080", "sky": "#80c0ff", "sand": "#ffd080", "gray": "#ffffff"},
-    **{"grey": "#ffffff", "white": "#ffffff"},
+    **{"blue": "#0000ff", "green": "#00ff00", "red": "#ff0000", "magenta": "#ff00ff"},
+    **{"cyan": "#00ffff", "yellow": "#ffff00", "orange": "#ff8000", "white": "#ffffff"},
+    **{"gray": "#ffffff", "grey": "#ffffff"},
 }
-_DISTINCT = tuple(NAMED)[:MOST]  # of channels whose colour is not told, by their place
+#: Of channels whose colour is not told, by their place; the first is blue, and light enough to see.
+DISTINCT = (
+    *("#2850ff", "#00ff00", "#ff0000", "#ff00ff", "#00ffff", "#ffff00", "#ff8000", "#ffffff"),
+    *("#8000ff", "#80ff00", "#ff0080", "#0080ff", "#00ff80", "#ff8080", "#80c0ff", "#ffd080"),
+)
 
+MOST = len(DISTINCT)  # channels of a picture
 _LINEAR = 0.04045  # sRGB: up to here it is linear
 _RAMP = 16  # straight parts in which opacity rises
 _OPACITY = 0.5
@@ -88,7 +90,7 @@ class ChannelLook:
                 "Channels.of(volume) finds windows"
             )
         low, high = window_of(where, self.window)
-        default = _DISTINCT[place % MOST] if count > 1 else "white"
+        default = DISTINCT[place] if count > 1 else "white"
         color = linear_color(where, default if self.color is None else self.color)
         opacity = _OPACITY if self.opacity is None else self.opacity
         opacity = check.number(where, "opacity", opacity, low=0, high=1)

@@ -16,15 +16,17 @@ from .light import parse_lighting
 if TYPE_CHECKING:
     import torch
 
+    from ..base.volume import Volume
     from ..cameras import Camera
     from ..cameras.models import CameraModel
-    from ..shaders import Shader, TransferFunction
+    from ..io.store import Store
+    from ..shaders import Channels, Shader, TransferFunction
     from ..tracing import Clip, ThinLens
 
     ShaderName = str
 else:
     CameraModel = str  # checked by the camera, since its module would load torch
-    ShaderName = Literal[(*declared_names("shaders.built_in", "BY_NAME"), "filtered")]
+    ShaderName = Literal[(*declared_names("shaders.built_in", "BY_NAME"), "filtered", "channels")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +43,11 @@ class Look:
     """transfer function: a JSON file, or a preset over the data's range: gray, hot, vessels, bone,
     tissue; gray if left out, or the function of a store's filtered colours"""
     shader: ShaderName = "plain"
-    """what is made of the values; filtered: plain, but right from afar (stores: gvtorch filter)"""
+    """what is made of the values; filtered: plain, but right from afar (stores: gvtorch filter);
+    channels: all numbers of a voxel, each in its colour and window as the file tells, else found"""
+    channel: Annotated[str | None, arg(metavar="N:COLOR:LO,HI;...")] = None
+    """of --shader channels: which ones; colour is a name or #RRGGBB, and what is left out or auto
+    is the file's; opacity as an item: they hide each other, else they are added"""
     value: Annotated[float | None, arg(metavar="VALUE")] = None
     """of the isosurface"""
     step: Annotated[float, arg(metavar="VOXELS")] = 0.5
@@ -98,6 +104,21 @@ class Look:
         device = torch.device("cuda" if wants_cuda else "cpu")
         choose_backend(self.backend, device)
         return device
+
+    def channels(self, image: Volume | Store) -> Channels | None:
+        """Returns the shader of an image's channels, if that was asked for."""
+        from .channels import parse_channels
+
+        if self.shader == "channels":
+            for flag, given in (("--tf", self.tf), ("--value", self.value)):
+                if given is not None:
+                    raise ValueError(f"{flag} is not for --shader channels; it takes --channel")
+            if self.component:
+                raise ValueError("--component is not for --shader channels; it takes --channel")
+            return parse_channels(self.channel, image)
+        if self.channel is not None:
+            raise ValueError("--channel is for --shader channels")
+        return None
 
     def chosen(self, low: float, high: float) -> Shader:
         """Returns the shader asked for, its transfer function read or spanned over the range."""

@@ -115,7 +115,8 @@ class Render:
                 f"{flags[0]} is for stores; make one: gvtorch convert {self.path} STORE.zarr"
             )
         volume = self.source.read(Path(self.path))
-        shader, look = self.look.chosen(*volume.value_range), self.look
+        look = self.look
+        shader = look.channels(volume) or look.chosen(*volume.value_range)
         tree = N3Tree.from_volume(
             *(volume, look.brick_size, look.border),
             threshold=self.threshold,

@@ -53,7 +53,7 @@ class Streaming:
         from ..shaders import Filtered
 
         store = Store.open(path, image=self.image, time=self.time)
-        shader = look.chosen(*value_range(store))
+        shader = look.channels(store) or look.chosen(*value_range(store))
         filtered = shader if isinstance(shader, Filtered) else None
         if filtered is not None and look.tf is None:
             shader = filtered = Filtered.stored(store)
