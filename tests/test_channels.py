@@ -291,7 +291,9 @@ def test_what_an_image_tells_of_its_channels_is_how_they_look():
     assert [look.component for look in shader.looks] == [0, 1, 2, 3] and first.opacity == 0.3
     some = gv.Channels.of(gv.Volume(data, info=told), "opacity", components=(2, 1))
     assert [look.name for look in some.looks] == ["actin", "GFP"] and some.looks[1].visible
-    assert repr(some) == "Channels(2 of actin, GFP, opacity)"
+    assert repr(some) == "Channels([actin, GFP], 'opacity')"
+    look = gv.ChannelLook(window=(0, 1), name="GFP")
+    assert repr(look) == "ChannelLook(window=(0, 1), name='GFP')"
 
 
 def test_channels_that_are_not_told_are_told_apart():

@@ -14,7 +14,6 @@ from torch import Tensor
 import gvtorch as gv
 
 
-
 def looks(*components: int) -> list[gv.ChannelLook]:
     """Windows of channels of 8 bits, with or without a sign."""
     return [gv.ChannelLook(window=(9.0 * c + 2, 120 - c), component=c) for c in components]

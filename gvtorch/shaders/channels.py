@@ -71,6 +71,8 @@ class ChannelLook:
     opacity: float | None = None
     name: str = ""
 
+    __repr__ = check.brief
+
     def function(self, place: int, count: int) -> TransferFunction:
         """Returns its transfer function, where it is the channel at a place of so many.
 
@@ -241,7 +243,7 @@ class Channels(Shader):
             look.name or f"{place if look.component is None else look.component}"
             for place, look in enumerate(self.looks)
         )
-        return f"Channels({len(self.looks)} of {looks}, {self.mode})"
+        return f"Channels([{looks}], {self.mode!r})"
 
 
 def _make_table(

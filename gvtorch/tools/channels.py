@@ -42,9 +42,9 @@ def parse_channels(text: str | None, image: Volume | Store) -> Channels:
         raise ValueError("--channel opacity: name channels, too, as in 0;1;opacity")
     mode: Any = "opacity" if "opacity" in items else "additive"
     shader = Channels.of(image, mode, components=list(wanted))
-    for look, (number, rest) in zip(shader.looks, wanted.items(), strict=True):
-        color, window = (*rest, "auto", "auto")[:2]
-        where = f"--channel {number}"
+    for look, (component, told) in zip(shader.looks, wanted.items(), strict=True):
+        color, window = (*told, "auto", "auto")[:2]
+        where = f"--channel {component}"
         if color not in ("", "auto"):
             look.color = linear_color(where, color)
         if window not in ("", "auto"):

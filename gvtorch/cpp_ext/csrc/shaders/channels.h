@@ -92,7 +92,8 @@ struct ChannelMix : ShaderFacts {
   GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
     probe.narrow(which);
     V values[kMostNumbers];
-    probe.numbers_at(probe.channels.value, Components<T>{&view.table_lm[1].red, 4, width}, count(), piece.middle, values);
+    probe.numbers_at(probe.channels.value, Components<T>{&view.table_lm[1].red, 4, width}, count(), piece.middle,
+                     values);
     V red{}, green{}, blue{}, total{};
     const bool added = view.table_lm[0].green > 0;
     each([&](int32_t i, const ChannelRows<T>& rows) {
