@@ -33,6 +33,8 @@ from .cameras import Camera as Camera, CameraPath as CameraPath, CustomCamera as
 # Shaders and lights.
 from .cpp_ext.user import CompileError as CompileError
 from .shaders import (
+    ChannelLook as ChannelLook,
+    Channels as Channels,
     CompiledShader as CompiledShader,
     DirectionalLight as DirectionalLight,
     Filtered as Filtered,

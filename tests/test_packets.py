@@ -13,6 +13,12 @@ from torch import Tensor
 
 import gvtorch as gv
 
+
+def looks(*components: int) -> list[gv.ChannelLook]:
+    """Windows of channels of 8 bits, with or without a sign."""
+    return [gv.ChannelLook(window=(9.0 * c + 2, 120 - c), component=c) for c in components]
+
+
 SUN = gv.DirectionalLight((1.0, -1.0, 0.0), (1.0, 0.9, 0.8))
 SHADERS = {
     "plain": TRANSFER,
@@ -31,6 +37,9 @@ SHADERS = {
     "minimum": gv.Projection("minimum", TRANSFER),
     "mean": gv.Projection("mean", TRANSFER),
     "features": gv.Features(TRANSFER, "rgba"),
+    "channels": gv.Channels(looks(3, 0, 2, 1), channel="rgba"),
+    "channels by opacity": gv.Channels(looks(2, 0), "opacity", channel="normal"),
+    "one channel": gv.Channels([TRANSFER]),
 }
 
 

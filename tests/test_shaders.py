@@ -24,7 +24,11 @@ from gvtorch.ops.shading import SHADER_KINDS, shader_number
 from gvtorch.shaders import built_in
 from gvtorch.tracing.tracer import Tracer
 
-GOLDEN = ROOT / "tests" / "golden_shaders.npz"
+GOLDEN = {
+    name: image
+    for file in sorted((ROOT / "tests").glob("golden_shaders*.npz"))
+    for name, image in np.load(file).items()
+}
 
 
 @pytest.fixture(scope="module")
@@ -231,7 +235,7 @@ def test_golden_image(tree, name):
     """64 x 64 of colour and alpha; the largest error is printed."""
     camera = gv.Camera.orbit(width=64, height=64, distance=1.4)
     picture = gv.render(tree, camera, SHADERS[name])
-    expected = torch.from_numpy(np.load(GOLDEN)[name].astype(np.float32))
+    expected = torch.from_numpy(GOLDEN[name].astype(np.float32))
     actual = torch.cat((picture.color, picture.alpha), -1)
     error = float((actual - expected).abs().max())
     print(f"{name}: {error:.2e}")
@@ -360,7 +364,7 @@ def test_a_kind_has_a_struct_a_twin_and_a_class():
     listed = (folder / "shaders.h").read_text().partition("#define GV_SHADERS(X)")[2]
     listed = listed.partition("#define GV_KIND")[0]
     assert re.findall(r"X\((\w+), \w+, \w+\)", listed) == [*SHADER_KINDS]
-    classes = [gv.Filtered, *(getattr(gv, name) for name in built_in.__all__)]
+    classes = [gv.Filtered, gv.Channels, *(getattr(gv, name) for name in built_in.__all__)]
     for kind in SHADER_KINDS:
         assert f"struct {kind} " in structs or kind.startswith("Shadowed"), kind
         assert any(kind in (one.kind, getattr(one, "shadowed_kind", "")) for one in classes), kind

@@ -7,6 +7,7 @@ is the air around it. Background, where there is any, is the highest peak of the
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -63,6 +64,19 @@ def window(
         low = low if background else edge
         high = np.percentile(values[values > edge], 100 - _TAIL)
     return _span(low, high)
+
+
+def windows(
+    data: Volume | Store, percent: tuple[float, float], components: Sequence[int]
+) -> list[tuple[float, float]]:
+    """Returns what `window` returns of several components between the same percentiles, which are
+    right; up to the largest value where what is bright is rarer than that.
+    """
+    values, spans = _looked_at(data), []
+    for component in components:
+        low, high = np.percentile(values[..., component], percent)
+        spans.append(_span(low, high if high > low else values[..., component].max()))
+    return spans
 
 
 def value_range(data: Volume | Store) -> tuple[float, float]:

@@ -29,6 +29,7 @@ SHADER_KINDS = (
     "ShadowedColor",
     "GradientMagnitude",
     "Filtered",
+    "ChannelMix",
 )
 
 

@@ -2,6 +2,7 @@
 
 from .built_in import *  # noqa: F403
 from .built_in import __all__ as _built_in
+from .channels import ChannelLook, Channels
 from .compiled import CompiledShader
 from .filtered import Filtered
 from .lights import DirectionalLight, Headlight, PointLight
@@ -10,6 +11,8 @@ from .shader import Shader
 from .transfer_function import TransferFunction
 
 __all__ = [  # noqa: PLE0604
+    "ChannelLook",
+    "Channels",
     "CompiledShader",
     "DirectionalLight",
     "Filtered",

@@ -222,7 +222,10 @@ class TransferFunction(Shader):
             self._tables[key] = table
         return self._tables[key]
 
-    def _make_table(self, sampling: Sampling) -> ColorTable:
+    def rows(self) -> tuple[float, float, np.ndarray]:
+        """Returns the first and last value of a table, and its rows (m, 4): linear RGB and opacity
+        per reference length, in float64. See `table`.
+        """
         low, high, places = self.corners()
         cells = _cells(places)
         if cells is None:
@@ -232,7 +235,10 @@ class TransferFunction(Shader):
                 f"TransferFunction: values {first:g} and {second:g} are too close "
                 f"for a table of {_MOST_CELLS + 1} rows from {low:g} to {high:g}"
             )
-        rows = self(low + (high - low) * np.arange(cells + 1) / cells)
+        return low, high, self(low + (high - low) * np.arange(cells + 1) / cells)
+
+    def _make_table(self, sampling: Sampling) -> ColorTable:
+        low, high, rows = self.rows()
         levels = sampling.fitting(len(rows))
         lengths = self.length(sampling) * 2.0 ** np.arange(levels)
         with np.errstate(divide="ignore"):

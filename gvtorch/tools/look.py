@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from ..cameras.camera import Up
     from ..cameras.models import CameraModel
     from ..io.store import Store
-    from ..shaders import Shader
+    from ..shaders import Channels, Shader
     from ..tracing import Clip, ThinLens
 
     ShaderName = str
 else:
     CameraModel = str  # checked by the camera, since its module would load torch
-    ShaderName = Literal[(*declared_names("shaders.built_in", "BY_NAME"), "filtered")]
+    ShaderName = Literal[(*declared_names("shaders.built_in", "BY_NAME"), "filtered", "channels")]
 
 _WHOLE = ("isosurface", "maximum", "minimum", "mean")  # see one value, or a whole ray
 
@@ -53,7 +53,11 @@ class Look:
     """values that it is stretched over: LO,HI; P%,P%, percentiles; full, the range; or auto, by the
     histogram without its background, as for presets and colour maps if left out"""
     shader: ShaderName = "plain"
-    """what is made of the values; filtered: plain, but right from afar (stores: gvtorch filter)"""
+    """what is made of the values; filtered: plain, but right from afar (stores: gvtorch filter);
+    channels: all numbers of a voxel, each in its colour and window as the file tells, else found"""
+    channel: Annotated[str | None, arg(metavar="N:COLOR:LO,HI;...")] = None
+    """of --shader channels: which ones; colour is a name or #RRGGBB, and what is left out or auto
+    is the file's; opacity as an item: they hide each other, else they are added"""
     value: Annotated[float | None, arg(metavar="VALUE")] = None
     """of the isosurface"""
     step: Annotated[float, arg(metavar="VOXELS")] = 0.5
@@ -119,11 +123,25 @@ class Look:
             return self.up
         return numbers("--up", self.up, 3, float)
 
+    def _channels(self, data: Volume | Store) -> Channels:
+        """Returns the shader of an image's channels."""
+        from .channels import parse_channels
+
+        told = {"--tf": self.tf, "--window": self.window, "--value": self.value}
+        for flag, given in {**told, "--component": self.component or None}.items():
+            if given is not None:
+                raise ValueError(f"{flag} is not for --shader channels; it takes --channel")
+        return parse_channels(self.channel, data)
+
     def chosen(self, data: Volume | Store) -> Shader:
         """Returns the shader asked for, its transfer function read, or spanned over the data."""
         from ..shaders import Filtered, TransferFunction
         from ..shaders.built_in import BY_NAME
 
+        if self.shader == "channels":
+            return self._channels(data)
+        if self.channel is not None:
+            raise ValueError("--channel is for --shader channels")
         if (self.value is None) == (self.shader == "isosurface"):
             raise ValueError("--value and --shader isosurface belong together")
         if self.shader == "isosurface":

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from ..base.records import Hits, Rays
 
@@ -31,7 +32,7 @@ def over(front: Hits, back: Hits, *, dimmed: bool = False) -> Hits:
         taken = None if back.normal is None else transmittance * (back.normal * back.alpha)
     normal = front.normal if back.normal is None else back.normal
     if front.normal is not None and taken is not None:
-        normal = unit(front.normal * front.alpha + taken)
+        normal = normalize(front.normal * front.alpha + taken, dim=1)
     if front.features is not None:
         features = front.features if features is None else front.features + features
     return Hits(
@@ -43,13 +44,6 @@ def over(front: Hits, back: Hits, *, dimmed: bool = False) -> Hits:
         normal=normal,
         features=features,
     )
-
-
-def unit(vectors: Tensor) -> Tensor:
-    """Returns vectors (r, 3) of unit length, zeros as they are; the bits do not depend on r."""
-    x, y, z = vectors.unbind(1)
-    length = (x * x + y * y + z * z).sqrt()
-    return vectors / torch.where(length > 0, length, 1)[:, None]
 
 
 def behind(rays: Rays, front: Hits) -> Rays:

@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.camera import Camera
-from .composite import Trace, over, unit
+from .composite import Trace, over
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,5 +158,5 @@ class LayerPixels:
         if front.normal is None or back.normal is None:
             return total
         taken = (1 - mixed.alpha) * back.alpha  # of the light; the layer has no part in the normal
-        normal = unit(front.normal * front.alpha + back.normal * taken)
+        normal = normalize(front.normal * front.alpha + back.normal * taken, dim=1)
         return replace(total, normal=torch.where(taken > 0, normal, front.normal))

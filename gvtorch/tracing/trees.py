@@ -18,6 +18,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from .. import ops
 from ..base.records import Hits, Rays
@@ -25,7 +26,7 @@ from ..ops.shading import pack
 from ..pool import N3Tree
 from ..shaders.shader import Shader, check_shader
 from .around import around
-from .composite import Trace, box_span, over, unit
+from .composite import Trace, box_span, over
 from .options import RenderOptions
 from .tracer import Batch, Tracer
 
@@ -148,7 +149,7 @@ def _mean_normal(ranked: Sequence[Hits]) -> Tensor | None:
     for more, one in zip(taken[1:], ranked[1:], strict=True):
         total = total + (1 - alpha) * more
         alpha = alpha + (1 - alpha) * one.alpha
-    return unit(total)
+    return normalize(total, dim=1)
 
 
 def _ranked(fields: list[Tensor | None], order: Tensor) -> Sequence[Any]:
@@ -234,7 +235,7 @@ def _media(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
             low, high = (near + (far - near) * (at / _PARTS) for at in (part, part + 1))
             high = far if part == _PARTS - 1 else high
             hits = _further(hits, rays, several, (low, high), stop, lambda r: _together(trees, r))
-    return hits if hits.normal is None else replace(hits, normal=unit(hits.normal))
+    return hits if hits.normal is None else replace(hits, normal=_unit(hits.normal))
 
 
 def _further(
@@ -349,7 +350,7 @@ class _Shown:
             depth=depth[:, None].to(self.dtype),
             samples=samples,
             missed=missed,
-            normal=unit(given["normal"]) if "normal" in given else None,
+            normal=_unit(given["normal"]) if "normal" in given else None,
             features=given.get("features"),
         )
 
@@ -471,3 +472,10 @@ def _scattered(found: Sequence[Hits], places: Sequence[Tensor]) -> Hits:
 
 def _zeros_if_none(field: Tensor | None, like: Tensor) -> Tensor:
     return torch.zeros_like(like) if field is None else field
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    """Returns vectors (r, 3) of unit length, zeros as they are; the bits do not depend on r."""
+    x, y, z = vectors.unbind(1)
+    length = (x * x + y * y + z * z).sqrt()
+    return vectors / torch.where(length > 0, length, 1)[:, None]

@@ -1,4 +1,4 @@
-"""200 random scenes, each made from its seed, through the public interface alone.
+"""Random scenes, each made from its seed, through the public interface alone.
 
 `settings` draws all that a scene is, as plain values; the functions after it make the objects. What
 it draws is the same on every machine, and so is what it makes, but for what gvtorch computes.
@@ -17,7 +17,6 @@ from torch import Tensor
 
 import gvtorch as gv
 
-SCENES = 200
 Settings = dict[str, Any]
 
 LOOKS = (
@@ -26,6 +25,8 @@ LOOKS = (
     *("isosurface", "coloured isosurface", "distance field", "maximum", "minimum", "mean"),
     *("features", "module", "transfer module", "plain"),
 )
+LATER = ("channels",) * 10  # of the scenes from number 200 on
+SCENES = 200 + len(LATER)
 WAYS = (
     *("render", "render", "render", "holes", "holes"),
     *("engine", "engine", "levels", "tracer", "cost"),
@@ -81,6 +82,8 @@ def settings(seed: int) -> Settings:
     """All that a scene is made of, as plain values."""
     dice = Dice(seed)
     look, way = LOOKS[seed % len(LOOKS)], WAYS[seed // len(LOOKS) % len(WAYS)]
+    if seed >= SCENES - len(LATER):
+        look, way = LATER[seed - SCENES], WAYS[seed % len(WAYS)]
     if way == "cost" and look != "transfer":  # what it takes: transfer functions
         look, way = ("plain", way) if seed % 3 == 0 else (look, "render")
     if way == "tracer" and look in MODULES:
@@ -134,6 +137,11 @@ def _volume(dice: Dice, look: str, way: str) -> Settings:
     }
     if look == "six":
         found["color"] = dice.pick("float16", "bfloat16", "float32")
+    if look == "channels":
+        found["width"] = dice.whole(2, 5)
+        spans = [(dice.number(0, 0.5), dice.number(0.1, 0.6)) for _ in range(found["width"])]
+        found["windows"] = [(low, low + length) for low, length in spans]
+        found["mode"] = dice.pick("additive", "opacity")
     found["component"] = dice.whole(0, found["width"] - 1)
     return found
 
@@ -341,6 +349,11 @@ def shader_of(s: Settings) -> Any:
         lit |= {"normals": "normal"} if "normals" in look else {}
         lit |= {} if look == "six" else {"reference": s["reference"]}
         return gv.StoredColor("color", **lit)
+    if look == "channels":
+        windows = [tuple(low + (high - low) * end for end in one) for one in s["windows"]]
+        looks = [gv.ChannelLook(component=c, window=one) for c, one in enumerate(windows)]
+        more = gv.ChannelLook(component=0, transfer=transfer)
+        return gv.Channels([*looks[::-1], more], s["mode"])
     colored = gv.TransferFunction.from_points([(0, 1)], [(0, 0.2, 0.1, 0.9), (200, 1, 0.8, 0)])
     surface = lit | {"filled": s["seed"] % 2 == 0}
     return {

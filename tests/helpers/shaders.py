@@ -9,6 +9,12 @@ from helpers.traces import SHADER
 
 POINT = gv.PointLight((0.0, 40.0, 60.0), (1.0, 0.9, 0.8))
 
+LOOKS = [
+    gv.ChannelLook(window=(60, 200), component=3),
+    gv.TransferFunction.from_points([(90, 0), (130, 0.4), (170, 0)], [(90, 1, 1, 0)], 2.0),
+    gv.ChannelLook(window=(120, 255), color="magenta", component=0, opacity=0.9),
+]
+
 
 SHADERS = {
     "lit": gv.Lit(SHADER),
@@ -31,4 +37,6 @@ SHADERS = {
     "mean": gv.Projection("mean", SHADER),
     "features": gv.Features(SHADER, "rgba"),
     "gradient magnitude": gv.GradientMagnitude(SHADER, 0.1),
+    "channels": gv.Channels(LOOKS, channel="rgba"),
+    "channels by opacity": gv.Channels(LOOKS, "opacity", channel="rgba"),
 }

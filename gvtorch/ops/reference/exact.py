@@ -61,6 +61,12 @@ def log2_exact(value: Tensor) -> Tensor:
     return exponent + series * s
 
 
+def _exp2_slope(f: Tensor) -> Tensor:
+    """(2^f - 1) / f for f in [-0.5, 0.5]."""
+    low = (1.52527338e-5, 1.54035304e-4, 1.33335581e-3, 9.61812911e-3)
+    return _polynomial(f, *low, 5.55041087e-2, 2.40226507e-1, 6.93147181e-1)
+
+
 def exp2_exact(value: Tensor) -> Tensor:
     """2 to the power of a float below 127, from + - * alone; 0 below -126 (float64: torch.exp2).
 
@@ -72,10 +78,20 @@ def exp2_exact(value: Tensor) -> Tensor:
     x = torch.where(tiny, 0.0, smaller(value, torch.full_like(value, 126.0)))
     whole = torch.floor(x + 0.5)
     f = x - whole
-    low = (1.52527338e-5, 1.54035304e-4, 1.33335581e-3, 9.61812911e-3)
-    series = _polynomial(f, *low, 5.55041087e-2, 2.40226507e-1, 6.93147181e-1, 1.0)
+    series = _exp2_slope(f) * f + 1.0
     power = ((whole.to(torch.int32) + 127) << 23).view(torch.float32)
     return torch.where(tiny, 0.0, series * power)
+
+
+def taken_by(halvings: Tensor) -> Tensor:
+    """What is taken from light that is halved so often: 1 - 2^-halvings, as exact where that is
+    little.
+    """
+    if halvings.dtype == torch.float64:
+        return -torch.expm1(halvings * -0.69314718055994531)
+    thin = halvings < 0.5
+    near = torch.where(thin, halvings, 0.0)
+    return torch.where(thin, _exp2_slope(-near) * near, 1 - exp2_exact(-halvings))
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:

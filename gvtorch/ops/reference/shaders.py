@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -27,6 +28,7 @@ from ..shading import (
     ShadeParameters,
     StoredColorNumbers,
 )
+from .channels import AllNumbers, ChannelTable
 from .exact import clamp, dot, larger, power, sqrt_exact, stretch, unit
 from .march import Piece, Plain, Probe, Visitor, Walk, above, below, mix
 from .rays import INF, Intervals, split
@@ -166,6 +168,7 @@ class Shade(Plain):
     other_component: int
     features: Tensor  # (r, c) sums
     shadows: Shadows | None
+    bricks: ClassVar[type[Bricks]] = Bricks  # what it reads of its channel
 
     def __post_init__(self) -> None:
         self.normal = torch.zeros_like(self.light.along)  # (r, 3) sum
@@ -220,6 +223,8 @@ class Sided(Bricks):
 
 class StoredColor(Shade):
     """Colour and opacity of each voxel."""
+
+    bricks = Sided
 
     @property
     def own(self) -> StoredColorNumbers:
@@ -466,6 +471,24 @@ class Filtered(Shade):
         return torch.where(stored[:, None], colors, row)
 
 
+class ChannelMix(Shade):
+    """Several numbers of a voxel, each with its function."""
+
+    bricks = AllNumbers
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.table = ChannelTable(self.transfer)
+
+    def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        return self.table.transparent(low, high)
+
+    def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
+        rgba = self.table.interval(piece, probe)
+        self.sum.add_light(self.sum.clear[:, None] * rgba[:, :3], where)
+        self.sum.absorb(rgba[:, 3], piece, where)
+
+
 def _by_direction(along: Tensor, width: int, number: int, read: Callable[[int], Tensor]) -> Tensor:
     """(r,) one of the four numbers of a voxel, as it is seen along rays (r, 3): of three
     directions, where a channel holds 24 numbers; `read` gives one of them.
@@ -492,6 +515,7 @@ TWINS: dict[str, type[Shade]] = {
     "ShadowedColor": StoredColor,
     "GradientMagnitude": GradientMagnitude,
     "Filtered": Filtered,
+    "ChannelMix": ChannelMix,
 }
 
 
@@ -501,7 +525,7 @@ def shade_rays(
     """Twin of `ops.shade_rays`."""
     kind = SHADER_KINDS[shading.shader]
     twin = TWINS[kind]
-    walk = Walk.enter(rays, arguments, Sided if twin is StoredColor else Bricks)
+    walk = Walk.enter(rays, arguments, twin.bricks)
     beam, channel = walk.at.beam, walk.channel
     columns = (rays.origin_r3, rays.direction_r3, beam.moved, arguments.place_33[1])
     light = Light(

@@ -182,6 +182,18 @@ GV_HD T log2_exact(T value) {
   return exponent + series * s;
 }
 
+// (2^f - 1) / f for f in [-0.5, 0.5].
+template <class T>
+GV_HD T exp2_slope(T f) {
+  T series = splat<T>(1.52527338e-5f);
+  series = series * f + 1.54035304e-4f;
+  series = series * f + 1.33335581e-3f;
+  series = series * f + 9.61812911e-3f;
+  series = series * f + 5.55041087e-2f;
+  series = series * f + 2.40226507e-1f;
+  return series * f + 6.93147181e-1f;
+}
+
 // 2 to the power of `value`; 0 below -126, the largest power below 127 above it.
 template <class T>
 GV_HD T exp2_exact(T value) {
@@ -190,19 +202,20 @@ GV_HD T exp2_exact(T value) {
   const T x = smaller(value, splat<T>(126.0f));
   const auto whole = floor_int(x + 0.5f);
   const T f = x - to_real<T>(whole);
-  T series = splat<T>(1.52527338e-5f);
-  series = series * f + 1.54035304e-4f;
-  series = series * f + 1.33335581e-3f;
-  series = series * f + 9.61812911e-3f;
-  series = series * f + 5.55041087e-2f;
-  series = series * f + 2.40226507e-1f;
-  series = series * f + 6.93147181e-1f;
-  series = series * f + 1.0f;
+  const T series = exp2_slope(f) * f + 1.0f;
   return select(normal, series * bit_cast<T>((whole + 127) << 23), T{});
 }
 
 GV_HD double log2_exact(double value) { return ::log2(value); }
 GV_HD double exp2_exact(double value) { return ::exp2(value); }
+
+// What is taken from light that is halved so often: 1 - 2^-halvings, as exact where that is little.
+template <class T>
+GV_HD T taken_by(T halvings) {
+  const auto thin = halvings < 0.5f;
+  return select(thin, exp2_slope(-halvings) * halvings, 1 - exp2_exact(-halvings));
+}
+GV_HD double taken_by(double halvings) { return -::expm1(halvings * -0.69314718055994531); }
 
 }  // namespace GV_NAMESPACE
 }  // namespace gvtorch

@@ -101,6 +101,37 @@ GV_CALL Row<Floats> read_packet_four(const PacketPool& any, int64_t shift, Ints 
   return {blend(0), blend(1), blend(2), blend(3)};
 }
 
+// Several numbers of each voxel. A word holds up to four of them, and of narrow voxels those of the next one along x.
+template <class Voxel, bool kFar>
+GV_CALL void read_packet_numbers(const PacketPool& pool, Components<float> components, int32_t count, Ints brick,
+                                 Floats x, Floats y, Floats z, Floats* out) {
+  constexpr int32_t kBytes = sizeof(Voxel);
+  const int32_t step_x = pool.channels * kBytes, step_y = step_x * pool.side, step_z = step_y * pool.side;
+  const Eight<Floats> eight(Vec3<Floats>{x, y, z}, pool.side);
+  const Ints corner =
+      truncated(eight.cell[2] * static_cast<float>(step_z) + eight.cell[1] * static_cast<float>(step_y) +
+                eight.cell[0] * static_cast<float>(step_x));
+  const Ints slot = kFar ? brick : brick * static_cast<int32_t>(pool.stride);
+  Ints words[8]{};
+  int32_t loaded = -1;  // bytes behind the voxel's first
+  for (int32_t i = 0; i < count; ++i) {
+    const int32_t byte = components[i] * kBytes, word = byte / 4 * 4, shift = 8 * (byte - word);
+    if (word != loaded) {
+      for (int which = 0; which < 8; which += 2) {
+        const Ints first = corner + ((which >> 1 & 1) * step_y + (which >> 2) * step_z + word);
+        words[which] = load_words<kFar>(pool, slot, first);
+        words[which + 1] =
+            2 * step_x <= 4 ? words[which] >> (8 * step_x) : load_words<kFar>(pool, slot, first + step_x);
+      }
+      loaded = word;
+    }
+    out[i] = eight.blend([&](int y, int z, Floats& left, Floats& right) {
+      left = Unpack<Voxel>::low(words[2 * y + 4 * z] >> shift);
+      right = Unpack<Voxel>::low(words[1 + 2 * y + 4 * z] >> shift);
+    });
+  }
+}
+
 // One component, `shift` bytes behind the first, of bricks that are told by their numbers.
 template <class Voxel, bool kFar>
 GV_HD Floats read_shifted(PacketPool pool, int64_t shift, Ints brick, const Vec3<Floats>& at) {
@@ -133,6 +164,7 @@ struct PacketChannel : ChannelView {
   decltype(&read_packet<float, false>) reader;
   decltype(&read_rise<float, false>) rise_reader;
   decltype(&read_packet_four<float, false>) four_reader;
+  decltype(&read_packet_numbers<float, false>) numbers_reader;
 
   PacketChannel(const ChannelView& channel, int32_t side, int64_t bricks)
       : ChannelView(channel), pool(bricks_bzyxc, type, side, width, 0) {
@@ -142,6 +174,7 @@ struct PacketChannel : ChannelView {
       reader = pool.far(bricks) ? &read_packet<Voxel, true> : &read_packet<Voxel, false>;
       rise_reader = pool.far(bricks) ? &read_rise<Voxel, true> : &read_rise<Voxel, false>;
       four_reader = pool.far(bricks) ? &read_packet_four<Voxel, true> : &read_packet_four<Voxel, false>;
+      numbers_reader = pool.far(bricks) ? &read_packet_numbers<Voxel, true> : &read_packet_numbers<Voxel, false>;
     });
   }
   GV_HD Floats read(int32_t component, Ints brick, const Vec3<Floats>& at) const {
@@ -149,6 +182,10 @@ struct PacketChannel : ChannelView {
   }
   GV_HD Row<Floats> four(int32_t component, Ints brick, const Vec3<Floats>& at) const {
     return four_reader(pool, component * bytes, brick, at.x, at.y, at.z);
+  }
+  GV_HD void numbers(Components<float> components, int32_t count, Ints brick, const Vec3<Floats>& at,
+                     Floats* out) const {
+    numbers_reader(pool, components, count, brick, at.x, at.y, at.z, out);
   }
   GV_HD Vec3<Floats> rise(int32_t component, Ints brick, const Vec3<Floats>& at) const {
     return rise_reader(pool, component * bytes, brick, at.x, at.y, at.z);

@@ -130,6 +130,15 @@ struct PacketWalk {
     const Floats other = number_in(channel, component, coarse, coarse_depth, t);
     return mixed ? number + weight(t) * (other - number) : number;
   }
+  GV_HD void numbers_at(const PacketChannel& channel, Components<float> components, int32_t count, Floats t,
+                        Floats* out) const {
+    numbers_in(channel, components, count, fine, fine_depth, t, out);
+    if (!any(mixed & marching)) return;
+    Floats other[kMostNumbers];
+    numbers_in(channel, components, count, coarse, coarse_depth, t, other);
+    const Floats part = weight(t);
+    for (int32_t i = 0; i < count; ++i) out[i] = mixed ? out[i] + part * (other[i] - out[i]) : out[i];
+  }
   GV_HD Vec3<Floats> gradient(Floats t) const {
     Vec3<Floats> slope = differences(fine, fine_depth, t);
     if (!any(mixed & marching)) return slope;
@@ -486,7 +495,7 @@ struct PacketWalk {
     if constexpr (kEnds) {
       piece.front = back;
       piece.back = back = value(piece.end);
-    } else {
+    } else if constexpr (!ReadsAll<Shader>::value) {
       piece.value = value(piece.middle);
     }
     const Mask seeing = which & (sum.clear > stop_clear);
@@ -519,6 +528,13 @@ struct PacketWalk {
     for_lanes(marching & ~brick.stored,
               [&](int lane) { number[lane] = channel.constant(component, node_of(lane, depth)); });
     return number;
+  }
+  GV_HD void numbers_in(const PacketChannel& channel, Components<float> components, int32_t count,
+                        const PacketBrick& brick, Ints depth, Floats t, Floats* out) const {
+    channel.numbers(components, count, brick.brick, brick.at(t), out);
+    for_lanes(marching & ~brick.stored, [&](int lane) {
+      for (int32_t i = 0; i < count; ++i) out[i][lane] = channel.constant(components[i], node_of(lane, depth));
+    });
   }
   GV_HD Vec3<Floats> differences(const PacketBrick& brick, Ints depth, Floats t) const {
     const Floats scale = pick(walk.levels.scale, depth);

@@ -11,6 +11,8 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
+constexpr int32_t kMostNumbers = 16;  // that are read at once
+
 struct ChannelView {
   const void* bricks_bzyxc;  // null where there is no brick
   const void* constant_tnc;  // null: there is no such channel
@@ -56,6 +58,37 @@ GV_CALL Row<T> read_four(const void* voxels, VoxelType type, int32_t width, int6
     row = {blend(0), blend(1), blend(2), blend(3)};
   });
   return row;
+}
+
+// Which numbers of a voxel are asked for: whole numbers, `stride` apart in memory.
+template <class T>
+struct Components {
+  const T* first;
+  int32_t stride, width;
+
+  GV_HD int32_t operator[](int32_t i) const {
+    return static_cast<int32_t>(clamp(first[i * stride], static_cast<T>(0), static_cast<T>(width - 1)));
+  }
+};
+
+// Several numbers of each voxel: the eight voxels are found once.
+template <class T>
+GV_CALL void read_numbers(const void* voxels, VoxelType type, Components<T> components, int32_t count, int64_t first,
+                          int32_t side, Vec3<T> at, T* out) {
+  with_voxel(type, [&](auto voxel) {
+    const Eight<T> eight(at, side);
+    const int32_t width = components.width, step_y = width * side, step_z = step_y * side;
+    const auto* corner = static_cast<const decltype(voxel)*>(voxels) + first +
+                         (eight.cell[2] * step_z + eight.cell[1] * step_y + eight.cell[0] * width);
+    for (int32_t i = 0; i < count; ++i) {
+      const int32_t component = components[i];
+      out[i] = eight.blend([&](int y, int z, T& left, T& right) {
+        const auto* pair = corner + (z * step_z + y * step_y) + component;
+        left = number<T>(pair[0]);
+        right = number<T>(pair[width]);
+      });
+    }
+  });
 }
 
 template <class T>
@@ -182,6 +215,16 @@ struct Probe {
     return blended(t, [&](const Spot<T>& spot) { return read(channel, component, spot, spot.at(t)); });
   }
 
+  // Several numbers of a channel at distance t, at most kMostNumbers.
+  GV_HD void numbers_at(const ChannelView& channel, Components<T> components, int32_t count, T t, T* out) const {
+    read(channel, components, count, fine, t, out);
+    if (!mixed) return;
+    T other[kMostNumbers];
+    read(channel, components, count, coarse, t, other);
+    const T part = weight(t);
+    for (int32_t i = 0; i < count; ++i) out[i] = out[i] + part * (other[i] - out[i]);
+  }
+
   // Gradient of the value at distance t, per world unit: differences over one voxel, half a voxel to each side, which a
   // border of 1 just holds. Neighbours read the same voxels at the face they share, so no seam shows.
   GV_HD Vec3<T> gradient(T t) const {
@@ -238,6 +281,17 @@ struct Probe {
     }
     const int64_t first = first_of(channel, component, spot);
     return read_brick(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, at);
+  }
+  GV_HD void read(const ChannelView& channel, Components<T> components, int32_t count, const Spot<T>& spot, T t,
+                  T* out) const {
+    if (spot.brick >= 0) {
+      const int64_t first = first_of(channel, 0, spot);
+      return read_numbers(channel.bricks_bzyxc, channel.type, components, count, first, channels.side, spot.at(t), out);
+    }
+    const int64_t row = static_cast<int64_t>(spot.node) * channel.width;
+    for (int32_t i = 0; i < count; ++i) {
+      out[i] = read_number<T>(channel.constant_tnc, channel.type, row + components[i]);
+    }
   }
   GV_HD Vec3<T> differences(const Spot<T>& spot, T t) const {
     Vec3<T> slope{0, 0, 0};

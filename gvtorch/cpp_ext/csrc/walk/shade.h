@@ -75,6 +75,16 @@ struct Transfer {
   T low, high, scale, last;
   int32_t rows;
 
+  Transfer() = default;
+  // Rows that begin at the value `low`, `scale` of them a unit of the value.
+  GV_HD Transfer(const Row<T>* table_lm, const int32_t* opaque_m, T low, T scale, int32_t rows)
+      : table_lm(table_lm),
+        opaque_m(opaque_m),
+        low(low),
+        high(low + static_cast<T>(rows - 1) / scale),
+        scale(scale),
+        last(static_cast<T>(rows - 1)),
+        rows(rows) {}
   GV_HD explicit Transfer(const TransferView<T>& view)
       : table_lm(view.table_lm),
         opaque_m(view.opaque_m),

@@ -1,0 +1,147 @@
+// Several numbers of a voxel, each with a transfer function of its own, composited together at each sample.
+//
+// An interval of length l through values v_i: channel i has the colour c_i and the opacity a_i of its reference length
+// r_i, so it halves the light h_i = -log2(1 - a_i) l / r_i times. Together they halve it
+//
+//   opacity:   H = h_1 + h_2 + ...        what each takes from the light multiplies
+//   additive:  H = max(h_1, h_2, ...)     they hide no more than the densest of them does alone
+//
+// times, so alpha = 1 - 2^-H, and the light that comes out is alpha (h_1 c_1 + h_2 c_2 + ...) / H, premultiplied. Both
+// solve emission and absorption for matter of one kind (each channel glows h_i c_i), so an interval in two halves shows
+// what it shows in one. A channel alone is what its function shows in either way; channels of equal h have the mean of
+// their colours by opacity, and the sum, which may be above 1, if they are added.
+//
+// The table holds, before the rows, a head: (channels, 1 if they are added, 0, 0), and for each channel (component,
+// value of the first row, rows a unit of the value, rows). Then come their rows, one channel after the other: colour,
+// and h of an interval of step * 2^l.
+//
+// Equal to ops/reference/shaders.py. Source: Max, "Optical models for direct volume rendering", IEEE TVCG 1995.
+#pragma once
+
+#include "shaders/plain.h"
+
+namespace gvtorch {
+inline namespace GV_NAMESPACE {
+
+// A whole number that a table holds, up to a bound.
+template <class T>
+GV_HD int32_t whole_up_to(T number, int32_t most) {
+  return static_cast<int32_t>(clamp(number, static_cast<T>(0), static_cast<T>(most)));
+}
+
+// The rows of one channel, as those of a transfer function.
+template <class T>
+struct ChannelRows : Transfer<T> {
+  int32_t component;
+  int32_t stride;  // rows of the whole table
+
+  ChannelRows() = default;
+  GV_HD ChannelRows(const TransferView<T>& all, const Row<T>& head, int32_t first, int32_t width)
+      : Transfer<T>(all.table_lm + first, all.opaque_m + first, head.green, head.blue,
+                    whole_up_to(head.alpha, all.rows - first)),
+        component(whole_up_to(head.red, width - 1)),
+        stride(all.rows) {}
+
+  // Colour, and how often an interval halves the light. Lanes that are not asked for may get anything.
+  template <class V>
+  GV_HD Row<V> look_up(V value, IntOf<V> level, MaskOf<V> which) const {
+    const Cell<V> cell = this->find(value);
+    const auto index = static_cast<typename LanesOf<V>::Index>(level) * stride + cell.row;
+    const auto a = this->row_at(index, 0), b = this->row_at(index, 1);
+    return make_row<V>(which, [&](int column) { return a[column] + cell.weight * (b[column] - a[column]); });
+  }
+};
+
+template <class T>
+struct ChannelMix : ShaderFacts {
+  static constexpr bool kReadsAll = true;
+  static bool packs(const ShadeArgs& args) {  // which count the bytes of the table in 32 bits
+    return int64_t{args.levels} * args.rows * int64_t{sizeof(Row<float>)} <= INT32_MAX;
+  }
+  template <class V>
+  using SumOf = ShadeSum<V>;
+  using Sum = SumOf<T>;
+  TransferView<T> view;
+  T step;
+  int32_t width;
+#ifndef __CUDACC__
+  int32_t known = 0;
+  ChannelRows<T> known_rows[kMostNumbers];  // read once; what lies on a GPU is read where it is needed
+#endif
+
+  explicit ChannelMix(const ShadeArgs& args) : view(args), step(static_cast<T>(args.step)), width(args.channels) {
+#ifndef __CUDACC__
+    read([&](int32_t i, const ChannelRows<T>& rows) {
+      known_rows[i] = rows;
+      known = i + 1;
+    });
+#endif
+  }
+
+  // range_of(component): between which two values a number of the voxels lies. None of them is seen.
+  template <class RangeOf>
+  GV_HD bool hides_ranges(const RangeOf& range_of) const {
+    bool hides = true;
+    each([&](int32_t, const ChannelRows<T>& rows) {
+      const auto range = range_of(rows.component);
+      hides = hides && rows.transparent(range.low, range.high);
+    });
+    return hides;
+  }
+  template <class V, class Eye>
+  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
+    probe.narrow(which);
+    V values[kMostNumbers];
+    probe.numbers_at(probe.channels.value, Components<T>{&view.table_lm[1].red, 4, width}, count(), piece.middle,
+                     values);
+    V red{}, green{}, blue{}, total{};
+    const bool added = view.table_lm[0].green > 0;
+    each([&](int32_t i, const ChannelRows<T>& rows) {
+      const Row<V> row = rows.look_up(values[i], piece.level, which);
+      red = red + row.alpha * row.red;
+      green = green + row.alpha * row.green;
+      blue = blue + row.alpha * row.blue;
+      total = added ? larger(total, row.alpha) : total + row.alpha;
+    });
+    const MaskOf<V> shown = which && total > 0;
+    if (!any(shown)) return;
+    V halvings = total;
+    if (piece.odd) halvings = total * (piece.length / step);
+    const V alpha = taken_by(halvings), part = alpha / total;
+    sum.add_light({red * part, green * part, blue * part, alpha}, sum.clear, shown);
+    sum.absorb(alpha, piece.start, piece.length, sum.hit_clear, shown);
+  }
+  GV_HD void done(Sum&) const {}
+
+ private:
+  // body(i, rows) for each channel. No head leads out of the table.
+  template <class Body>
+  GV_HD void each(const Body& body) const {
+#ifdef __CUDACC__
+    read(body);
+#else
+    for (int32_t i = 0; i < known; ++i) body(i, known_rows[i]);
+#endif
+  }
+  template <class Body>
+  GV_HD void read(const Body& body) const {
+    int32_t first = 1 + asked();
+    for (int32_t i = 0; i < asked() && first + 2 <= view.rows; ++i) {
+      const ChannelRows<T> rows(view, view.table_lm[1 + i], first, width);
+      if (rows.rows < 2) return;
+      body(i, rows);
+      first += rows.rows;
+    }
+  }
+  GV_HD int32_t asked() const { return whole_up_to(view.table_lm[0].red, smaller(kMostNumbers, view.rows - 1)); }
+  GV_HD int32_t count() const {
+#ifdef __CUDACC__
+    return asked();
+#else
+    return known;
+#endif
+  }
+};
+
+}  // namespace GV_NAMESPACE
+}  // namespace gvtorch

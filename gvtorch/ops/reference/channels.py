@@ -1,0 +1,70 @@
+"""Part of the torch twin: several numbers of a voxel, each with a transfer function of its own, as
+csrc/shaders/channels.h, which tells the formula and how the table is laid out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from .exact import clamp, larger, taken_by
+from .march import Piece, Probe, Transfer
+from .tree import Bricks
+
+
+class AllNumbers(Bricks):
+    """All numbers of a channel, whose smallest and largest values are (r, c)."""
+
+    def ends(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
+        low, high = self.range_n2c[node].to(real).unbind(1)
+        return low, high
+
+
+class ChannelRows(Transfer):
+    """The rows of one channel in the table of all."""
+
+    def __init__(self, every: Transfer, head: Sequence[float], first: int) -> None:
+        component, self.low, self.scale, rows = head
+        self.component, self.rows = int(component), int(rows)
+        mine = slice(first, first + self.rows)
+        self.table_lm4, self.opaque_m = every.table_lm4[:, mine], every.opaque_m[mine]
+
+    def place(self, value: Tensor) -> Tensor:
+        return clamp((value - self.low) * self.scale, 0, self.rows - 1)
+
+
+class ChannelTable:
+    """The rows of all channels."""
+
+    def __init__(self, every: Transfer) -> None:
+        heads = every.table_lm4[0]
+        count, self.added = int(heads[0, 0]), bool(heads[0, 1] > 0)
+        self.channels, first = [], 1 + count
+        for head in heads[1:first].tolist():
+            self.channels.append(ChannelRows(every, head, first))
+            first += self.channels[-1].rows
+
+    def transparent(self, low: Tensor, high: Tensor) -> Tensor:
+        """(r,) bool: no channel is seen between low and high (r, c)."""
+        unseen = torch.ones_like(low[:, 0], dtype=torch.bool)
+        for rows in self.channels:
+            unseen = unseen & rows.transparent(low[:, rows.component], high[:, rows.component])
+        return unseen
+
+    def interval(self, piece: Piece, probe: Probe) -> Tensor:
+        """(r, 4) premultiplied colours and alphas of intervals."""
+        total = torch.zeros_like(piece.middle)
+        color = total[:, None].expand(-1, 3)
+        level = torch.where(piece.odd, 0, piece.level)
+        for rows in self.channels:
+            numbers = replace(probe.channel, component=rows.component)
+            row = rows.look_up(probe.number(numbers, piece.middle), level)
+            halvings = row[:, 3]
+            color = color + halvings[:, None] * row[:, :3]
+            total = larger(total, halvings) if self.added else total + halvings
+        alpha = taken_by(torch.where(piece.odd, total * piece.lengths, total))
+        part = alpha / torch.where(total > 0, total, 1.0)
+        return torch.cat((color * part[:, None], alpha[:, None]), 1)
