@@ -16,7 +16,7 @@ import numpy as np
 from ..base import check
 from ..base.constants import MAX_VOXELS
 from ..base.volume import Volume, check_extent
-from .formats import FORMATS, find_format
+from .formats import check_options, find_format
 from .ngff import is_zarr
 from .source import VolumeSource, told_as
 from .store_layout import DTYPES, MOST_VOXELS, StoreError
@@ -89,12 +89,9 @@ def open_source(
     check.known("read_volume", options, FormatSettings)
     if not is_zarr(text) and not Path(text).exists():
         raise FileNotFoundError(f"volume not found: {path}")
-    found = find_format(text)
     given = {name: value for name, value in options.items() if value is not None}
-    for name in set(given).difference(found.options):
-        owner = next(other for other in FORMATS if name in other.options)
-        those = " and ".join(owner.options) + (" are" if len(owner.options) > 1 else " is")
-        raise ValueError(f"{path}: {those} for {owner.name} files, this is {found.name}")
+    found = find_format(text, raw="shape" in given)
+    check_options(text, found, given)
     found.need_library(text)
     with told_as(ValueError, text, f"can't be read as {found.name}", StoreError, TimeoutError):
         source = found.open(text, **given)
@@ -126,6 +123,6 @@ def placed(
 
 def read_whole(source: VolumeSource) -> np.ndarray:
     """Reads all of a source, (z, y, x, c); raises ValueError if the file is damaged."""
-    text = f"can't be read as {find_format(source.path).name}"
+    text = f"can't be read as {find_format(source.path, raw=True).name}"
     with told_as(ValueError, source.path, text, StoreError, TimeoutError):
         return source.read_whole()
