@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-
 from ...base.volume import check_extent
 from ..dicom_codecs import plugin_of
 from ..dicom_frames import Frame, frames_of, image_info, order_frames
