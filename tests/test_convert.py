@@ -27,7 +27,18 @@ from gvtorch.io.store import Store
 from gvtorch.io.store_layout import WORK
 from gvtorch.tools.cli import main
 
-ELSEWHERE = {"DICOM"}  # formats that tests of their own convert
+ELSEWHERE = {
+    "DICOM",
+    "HDF5",
+    "MetaImage",
+    "MRC",
+    "VTK",
+    "Zarr",
+    "N5",
+    "CZI",
+    "ND2",
+    "LIF",
+}  # formats that tests of their own convert
 SHAPE = (9, 20, 300)  # z y x: two shards along x
 
 
@@ -171,7 +182,7 @@ def test_arguments_are_checked_before_the_work(tmp_path, raw):
         ({"spacing": (1, 0, 1)}, "spacing must be positive"),
         ({"shape": (300, 20, 10), "dtype": "uint8"}, "takes 60000 bytes, the file has 54000"),
         ({"dtype": "text"}, "dtype must be a NumPy dtype"),
-        ({"key": "a"}, "key is for .* NPZ, .* files, this is RAW"),
+        ({"key": "a"}, "key is for .*NPZ, OME-Zarr.* files, this is RAW"),
     ):
         with pytest.raises(ValueError, match=message):
             convert(raw, target, **options)

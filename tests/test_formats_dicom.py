@@ -158,14 +158,14 @@ def test_images_of_one_place_are_times(tmp_path, data):
     source = open_source(tmp_path / "ct")
     assert source.times == 3 and source.extent == (12, 9, 6)
     assert (source.info.time_step, source.info.time_unit) == (40, "millisecond")
-    assert np.array_equal(source.read_whole()[..., 0], data[:, ::-1, ::-1])
+    assert np.array_equal(source.read_times(0, 1)[0][..., 0], data[:, ::-1, ::-1])
 
 
 def test_a_series_converts(tmp_path, data):
     folder = write_series(tmp_path / "ct", data)
     store = convert(folder, tmp_path / "a.zarr")
     volume = gv.read_volume(folder)
-    assert store.spacing == pytest.approx(SPACING) and store.unit == "millimeter"
+    assert store.spacing == pytest.approx(SPACING) and store.info.unit == "millimeter"
     assert np.array_equal(store.read_region(0, (0, 0, 0), SHAPE), volume.data.numpy())
 
 

@@ -60,7 +60,7 @@ def test_ome_tiff(tmp_path, options):
     assert [c.name for c in source.info.channels] == ["DAPI", "GFP", "Cy5"]
     assert [c.color for c in source.info.channels] == [(0, 0, 1), (0, 1, 0), (1, 0, 0)]
     whole = np.moveaxis(data[0], 0, -1)
-    assert np.array_equal(source.read_whole(), whole)
+    assert np.array_equal(source.read_times(0, 1)[0], whole)
     part = source.read_region((1, 5, 20), (3, 33, 45))
     assert np.array_equal(part, whole[1:3, 5:33, 20:45])
 
@@ -71,7 +71,7 @@ def test_times_without_slices_and_a_store(tmp_path):
     source = open_source(file)
     assert source.extent == (50, 40, 1) and source.times == 3
     store = convert(file, tmp_path / "a.zarr")
-    assert store.unit == "nanometer" and store.width == 2
+    assert store.info.unit == "nanometer" and store.width == 2
 
 
 def test_several_series_and_pyramids(tmp_path):
@@ -122,7 +122,7 @@ def test_imagej(tmp_path, compression):
     assert (source.info.time_step, source.info.time_unit) == (2.5, "second")
     assert [c.window for c in source.info.channels] == [(0, 100), (5, 200)]
     assert [c.color for c in source.info.channels] == [(1, 0, 0), (0, 1, 1)]
-    assert np.array_equal(source.read_whole(), np.moveaxis(data[0], 1, -1))
+    assert np.array_equal(source.read_times(0, 1)[0], np.moveaxis(data[0], 1, -1))
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -167,7 +167,7 @@ def test_folders_of_pillow(tmp_path, ending, shape):
     for number, image in enumerate(data):
         Image.fromarray(image).save(folder / f"s{number}.{ending}")  # s10 comes after s9
     source = open_source(folder)
-    found = source.read_whole()
+    found = source.read_times(0, 1)[0]
     assert not source.whole and found.shape == (12, 40, 50, data[0, 0, 0].size)
     wanted = data.reshape(found.shape).astype(int)
     assert np.abs(found - wanted).max() <= (8 if ending == "jpg" else 0)

@@ -214,7 +214,10 @@ def test_a_corrupt_chunk_is_an_error_of_its_block_alone(damaged, data):
     ("change", "message"),
     [
         ({"complete": False}, "half-written or damaged"),
-        ({"version": 2}, "store version 2, this reads 1"),
+        ({"version": 3}, "store version 3, this reads 1 and 2"),
+        ({"version": 2}, "damaged: gvtorch.times"),
+        ({"times": 2}, "damaged: gvtorch.times"),
+        ({"version": 2, "times": 2}, "metadata and level 0 differ"),
         ({"extent": [2**41, 1, 1]}, "damaged: gvtorch.extent"),
         ({"extent": [90, 45, 71]}, "metadata and level 0 differ"),
         ({"block": 33}, "damaged: gvtorch.block"),

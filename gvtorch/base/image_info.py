@@ -6,6 +6,7 @@ torch is not imported here, since readers of headers need it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 Rgb = tuple[float, float, float]
 
@@ -19,6 +20,20 @@ class ChannelInfo:
     window: tuple[float, float] | None = None  # the values that are shown dark and bright
     active: bool = True  # whether it is shown at first
 
+    def describe(self) -> str:
+        """Returns name, colour and window in a few words."""
+        words = [self.name] if self.name else []
+        if self.color is not None:
+            words.append("#" + to_hex(self.color))
+        if self.window is not None:
+            words.append(f"{self.window[0]:g} to {self.window[1]:g}")
+        return ", ".join(words + ["not shown at first"] * (not self.active)) or "nothing told"
+
+
+def to_hex(color: Rgb) -> str:
+    """Returns a colour as RRGGBB."""
+    return "".join(f"{round(255 * min(max(part, 0.0), 1.0)):02x}" for part in color)
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImageInfo:
@@ -28,8 +43,21 @@ class ImageInfo:
     channels: tuple[ChannelInfo, ...] = ()  # one for each channel, or none
     quantity: str | None = None  # what the values measure, as in "HU"
     labels: bool = False  # values are numbers of things, which must not be blended
+    space: str | None = None  # where x, y, z point: "right-anterior-superior", ...
     time_step: float | None = None  # from one time point to the next
+    time_origin: float = 0.0  # of the first time point
     time_unit: str | None = None  # as OME-NGFF spells it: "second", ...
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "channels", tuple(self.channels))
+
+    def describe(self) -> dict[str, Any]:
+        """Returns what is known as plain values."""
+        found: dict[str, Any] = {"unit": self.unit, "quantity": self.quantity, "space": self.space}
+        found["labels"] = self.labels or None
+        if self.time_step is not None:
+            found["time step"] = f"{self.time_step:g} {self.time_unit or ''}".strip()
+        found["channel info"] = {
+            str(number): channel.describe() for number, channel in enumerate(self.channels)
+        }
+        return {name: value for name, value in found.items() if value}

@@ -169,6 +169,7 @@ class Volume:
             "dtype": str(self.data.dtype).removeprefix("torch."),
             "spacing": list(self.spacing),
             "origin": list(self.origin),
+            **self.info.describe(),
             "range": [low, high],
             "mean": float(values.mean(dtype=np.float64)),
             "histogram": [int(count) for count in counts],

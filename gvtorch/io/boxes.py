@@ -31,8 +31,10 @@ def repeat_edges(data: np.ndarray, start: Zyx, low: Zyx, high: Zyx) -> np.ndarra
     return data
 
 
-def to_zyxc(data: np.ndarray, axes: str) -> np.ndarray:
-    """Returns an array whose axes are `axes` as (z, y, x, c); those that it lacks have size 1."""
-    missing = "".join(axis for axis in "zyxc" if axis not in axes)
+def to_zyxc(data: np.ndarray, axes: str, order: str = "zyxc") -> np.ndarray:
+    """Returns an array whose axes are `axes` as (z, y, x, c), or as another order of the same and
+    more; those that it lacks have size 1.
+    """
+    missing = "".join(axis for axis in order if axis not in axes)
     letters = missing + axes
-    return data[(None,) * len(missing)].transpose([letters.index(axis) for axis in "zyxc"])
+    return data[(None,) * len(missing)].transpose([letters.index(axis) for axis in order])

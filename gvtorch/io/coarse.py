@@ -75,8 +75,10 @@ def make_channel(
         json.dumps(channel.attributes(), allow_nan=False)
     except ValueError:
         raise ValueError(f"{store.location}: what {name!r} is made of is not finite") from None
-    folder = target / "gvtorch" / "coarse"
-    folder.mkdir(exist_ok=True)
+    folder = target / store.coarse_folder
+    folder.mkdir(parents=True, exist_ok=True)
+    if store.times > 1 and not (folder.parent / "zarr.json").exists():
+        write_json(folder.parent / "zarr.json", group({}))
     with _alone(folder), _levels_in_files(store, wide) as levels:
         fill(levels)
         known = _known(folder)
@@ -145,12 +147,12 @@ def _write_blocks(
     keep: Callable[[np.ndarray], np.ndarray],
     progress: Progress,
 ) -> None:
-    place = Path(store.location) / "gvtorch" / "coarse" / folder
+    place = Path(store.location) / store.coarse_folder / folder
     shutil.rmtree(place, ignore_errors=True)  # of work that was broken off
     place.mkdir()
     done, total = 0, sum(_voxels(values.shape[:3]) for values in levels)
     for level, values in enumerate(levels, 1):
-        spec = store.layout.coarse(level, folder, width)
+        spec = store.layout.coarse(level, f"{store.coarse_folder}/{folder}", width)
         Deadline(_OPEN_TIMEOUT).wait(opened(store.root, spec, "create"), spec["path"])
         for low in itertools.product(*(range(0, n, _CUBE) for n in values.shape[:3])):
             size = [min(_CUBE, n - a) for a, n in zip(low, values.shape, strict=False)]

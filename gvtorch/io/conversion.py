@@ -9,9 +9,9 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-import multiprocessing
+import shlex
 import shutil
-import time
+import zlib
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -25,6 +25,7 @@ from concurrent.futures import (
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from time import perf_counter
 from typing import Any, Unpack
 
 import numpy as np
@@ -33,6 +34,8 @@ from ..base import check
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume
 from . import resources, shard, unfinished
+from .level_reader import no_time
+from .oblique import Oblique
 from .reading import FormatSettings, open_source, placed, read_whole
 from .source import MemorySource, VolumeSource
 from .store import Store
@@ -99,7 +102,7 @@ class _Plan:
 
 
 def convert(
-    source: str | Path | Volume,
+    source: str | Path | Volume | Any,
     store: str | Path,
     *,
     block: int = 32,
@@ -107,31 +110,37 @@ def convert(
     spacing: Sequence[float] | None = None,
     origin: Sequence[float] | None = None,
     nan: float | None = None,
+    time: int | None = None,
+    oblique: Oblique | None = None,
     executor: Executor | None = None,
     workers: int | None = None,
     resume: bool = False,
     progress: Progress = no_progress,
     **options: Unpack[FormatSettings],
 ) -> Store:
-    """Writes a store: a mean pyramid, blocks with borders, and the range of every cell.
+    """Writes a store: a mean pyramid, blocks with borders, and the range of every cell; of all
+    time points, with what the file tells of its channels and units.
 
     Larger conversions start worker processes; a script that calls this needs the usual
     `if __name__ == "__main__":` around its work.
 
     Args:
-        source: A file or folder that `read_volume` knows, an OME-Zarr image, or a volume.
+        source: A file or folder that `read_volume` knows, an OME-Zarr image, a volume, or an array
+            as of `as_volume`; one of dask, zarr or h5py is computed or read part by part.
         store: The folder to make.
         block: Voxels along a side of a block, 32 or 64.
         threshold: Blocks with no value above it are not written; see `N3Tree.from_volume`.
         spacing: (x, y, z) world units; overrides the file's.
         origin: (x, y, z) world units; overrides the file's.
         nan: Value for voxels that are NaN or infinite; they are refused if left out.
+        time: The one time point to write; all if left out.
+        oblique: As of `read_volume`.
         executor: Runs the tasks, such as a dask client's `get_executor()`; the store's folder must
             be the same for all of its workers. A pool of processes if left out.
         workers: Number of processes of that pool; one a core if left out.
         resume: Go on with a half-written store.
         progress: Told ("converting", bytes done, bytes in all).
-        **options: shape, dtype and key, as of `read_volume`.
+        **options: shape, dtype, key and axes, as of `read_volume`.
 
     Returns:
         The store, open.
@@ -142,35 +151,45 @@ def convert(
             a store of other settings or of a source that has changed.
         OSError: The disk is full, or source or store can't be read or written; `resume` goes on
             from there.
+        KeyboardInterrupt: It was interrupted; `resume` goes on, as the message says.
     """
     target = Path(store)
     begun = unfinished.is_begun(target, resume=resume)
-    opened_source = _source(source, spacing, origin, options)
-    plan = _plan(source, opened_source, target, block, threshold, nan, workers)
+    opened_source = _source(source, spacing, origin, time, oblique, options)
+    plan = _plan(source, opened_source, target, block, threshold, nan, time, workers)
     if not begun:
         _check_room(target, _estimate(plan))
     with unfinished.claimed(target, plan.settings, resume=begun) as work:
         with _executor(executor, plan) as pool:
+            names = shlex.join((plan.settings["source"], str(target)))
+            goes_on = f"gvtorch convert {names} --resume goes on"
             try:
                 _write_levels(_staged(plan, pool), work, pool, progress)
             except BrokenExecutor:
                 raise OSError(
                     f"{target}: a worker process ended (killed, out of memory, or started by a "
                     'script that converts outside of `if __name__ == "__main__":`); '
-                    f"gvtorch convert {plan.settings['source']} {target} --resume goes on"
+                    f"{goes_on}"
+                ) from None
+            except KeyboardInterrupt:
+                tasks = plan.settings["tasks"]
+                raise KeyboardInterrupt(
+                    f"{target}: interrupted, {len(work.done)} of {tasks} shards are done; {goes_on}"
                 ) from None
         layout = dataclasses.replace(plan.task.layout, value_range=_value_range(plan.task))
-        work.finish(layout, plan.settings)
+        work.finish(layout, plan.task.source.info, plan.settings)
     return Store.open(target)
 
 
 def estimate(
-    source: str | Path | Volume,
+    source: str | Path | Volume | Any,
     store: str | Path,
     *,
     block: int = 32,
     threshold: float | None = None,
     nan: float | None = None,
+    time: int | None = None,
+    oblique: Oblique | None = None,
     workers: int | None = None,
     **options: Unpack[FormatSettings],
 ) -> Estimate:
@@ -178,22 +197,29 @@ def estimate(
 
     Args, Raises: as `convert`.
     """
-    opened_source = _source(source, None, None, options)
-    return _estimate(_plan(source, opened_source, Path(store), block, threshold, nan, workers))
+    opened_source = _source(source, None, None, time, oblique, options)
+    target = Path(store)
+    return _estimate(_plan(source, opened_source, target, block, threshold, nan, time, workers))
 
 
 # --- before the work
 
 
 def _source(
-    source: str | Path | Volume,
+    source: str | Path | Volume | Any,
     spacing: Sequence[float] | None,
     origin: Sequence[float] | None,
+    time: int | None,
+    oblique: Oblique | None,
     options: FormatSettings,
 ) -> VolumeSource:
-    """Opens the source; one that can only be read whole is read, once."""
+    """Opens the source; one that can only be read whole is read, once. Its time points are those
+    that are written.
+    """
     check.known("convert", options, FormatSettings)
     if isinstance(source, Volume):
+        if time not in (None, 0):
+            raise ValueError(no_time(source.name, time, 1))
         if source.filter != "mean":
             raise ValueError(
                 "convert: a store's levels are means: a volume seen from six directions "
@@ -204,27 +230,30 @@ def _source(
         told = {"path": source.name, "info": source.info}
         told |= {"spacing": source.spacing, "origin": source.origin}
         return placed("convert", MemorySource.of(source.data.numpy(), **told), spacing, origin)
-    found = open_source(source, spacing=spacing, origin=origin, **options)
+    found = open_source(
+        source, spacing=spacing, origin=origin, time=time, oblique=oblique, **options
+    )
     if not found.whole:
         return found
-    free = resources.memory_free()
-    if found.peak_bytes > free:
+    first, times = (0, found.times) if time is None else (time, 1)
+    free, needed = resources.memory_free(), found.peak_bytes + (times - 1) * found.nbytes
+    if needed > free:
         raise ValueError(
-            f"{source}: can only be read as a whole, which takes "
-            f"{resources.amount(found.peak_bytes)}, and {resources.amount(free)} of memory are "
-            "free: unpack it first"
+            f"{source}: can only be read as a whole, which takes {resources.amount(needed)}, and "
+            f"{resources.amount(free)} of memory are free: unpack it first"
         )
     told = {name: getattr(found, name) for name in ("path", "spacing", "origin", "info")}
-    return MemorySource.of(read_whole(found), **told)
+    return MemorySource.of(read_whole(found, first, times), **told)
 
 
 def _plan(
-    given: str | Path | Volume,
+    given: str | Path | Volume | Any,
     source: VolumeSource,
     target: Path,
     block: int,
     threshold: float | None,
     nan: float | None,
+    time: int | None,
     workers: int | None,
 ) -> _Plan:
     if block not in BLOCKS:
@@ -240,16 +269,24 @@ def _plan(
         width=source.width,
         block=block,
         threshold=threshold,
+        times=source.times if time is None else 1,
     )
+    told_channels = len(source.info.channels)
+    if told_channels not in (0, source.width):
+        raise ValueError(
+            f"{source.path}: its info names {told_channels} channels, it has {source.width}"
+        )
     workers = resources.cores() if workers is None else workers
     workers = check.whole("convert", "workers", workers, low=1)
-    tasks = [math.prod(layout.shards(level)) for level in range(layout.levels)]
+    tasks = [layout.times * math.prod(layout.shards(level)) for level in range(layout.levels)]
     told = ("extent", "dtype", "spacing", "origin")
     settings = {
         "source": source.path,
-        "fingerprint": unfinished.fingerprint(given),
+        "fingerprint": _fingerprint(given, source),
         **{name: getattr(source, name) for name in told},
         "unit": source.info.unit,
+        "times": layout.times,
+        "time": source.time,
         "channels": source.width,
         "block": block,
         "threshold": threshold,
@@ -265,20 +302,21 @@ def _plan(
     )
 
 
-def _places(layout: StoreLayout, level: int) -> Iterator[shard.Zyx]:
-    return itertools.product(*map(range, layout.shards(level)))  # type: ignore[return-value]
+def _places(layout: StoreLayout, level: int) -> Iterator[shard.Place]:
+    times = [layout.times] if layout.times > 1 else []
+    return itertools.product(*map(range, (*times, *layout.shards(level))))
 
 
 def _estimate(plan: _Plan) -> Estimate:
     layout, source = plan.task.layout, plan.task.source
-    voxels = math.prod(layout.extent)
-    below = sum(math.prod(layout.shape(level)) for level in range(1, layout.levels))
+    voxels = layout.times * math.prod(layout.extent)
+    below = _voxels(layout) - voxels
     plain, beside, seen, seconds = _sample(plan.task)
     share = (voxels + below) / seen
     copies = _COPIES * (layout.shard + 2) ** 3 * layout.voxel_bytes
-    cube = min(1.0, voxels / layout.shard**3)
+    cube = min(1.0, math.prod(layout.extent) / layout.shard**3)
     each = (_PROCESS if plan.uses_processes else 0) + int(copies * cube)
-    held = source.nbytes if isinstance(source, MemorySource) else 0
+    held = source.data.nbytes if isinstance(source, MemorySource) else 0
     staged = held if plan.uses_processes else 0
     start = 3.0 * plan.uses_processes
     target = plan.target.absolute()
@@ -289,7 +327,7 @@ def _estimate(plan: _Plan) -> Estimate:
         channels=layout.width,
         levels=layout.levels,
         tasks=plan.settings["tasks"],
-        source_bytes=source.nbytes,
+        source_bytes=layout.times * source.nbytes,
         disk_bytes=int((plain + beside) * share),
         temporary_bytes=int(2 * plain * below / seen) + staged,
         memory_bytes=_PROCESS + plan.workers * each + held,
@@ -305,18 +343,18 @@ def _sample(task: shard.Conversion) -> tuple[int, int, int, float]:
     import tensorstore as ts
 
     layout = task.layout
-    places = list(_places(layout, 0))
+    places = list(_places(layout, 0))  # spread over space, and over time
     picked = [places[(2 * i + 1) * len(places) // (2 * _SAMPLES)] for i in range(_SAMPLES)]
     root = {"driver": "memory", "path": f"gvtorch-estimate-{id(task)}/"}
     store = ts.KvStore.open(root, context=context()).result()
     trial = dataclasses.replace(task, root=root, nan=0.0 if task.nan is None else task.nan)
     _create_arrays(trial, 0)
-    start, seen = time.perf_counter(), 0
+    start, seen = perf_counter(), 0
     for place in dict.fromkeys(picked):
         seen += shard.write_shard(trial, 0, place).voxels
-        if time.perf_counter() - start > _SAMPLE_TIME:
+        if perf_counter() - start > _SAMPLE_TIME:
             break
-    seconds = time.perf_counter() - start
+    seconds = perf_counter() - start
     sizes = {name: len(store.read(name).result().value) for name in store.list().result()}
     store.delete_range(ts.KvStore.KeyRange()).result()
     plain = sum(size for name, size in sizes.items() if name.startswith(b"0/"))
@@ -346,9 +384,17 @@ def _executor(given: Executor | None, plan: _Plan) -> AbstractContextManager[Exe
     if given is not None:
         return nullcontext(given)
     if plan.uses_processes and plan.workers > 1:
-        spawn = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(plan.workers, spawn, resources.begin_worker)
+        return resources.worker_processes(plan.workers)
     return ThreadPoolExecutor(plan.workers)
+
+
+def _fingerprint(given: Any, source: VolumeSource) -> list[Any]:
+    if isinstance(given, Volume):
+        return unfinished.fingerprint(given)
+    if isinstance(given, (str, Path)):
+        return unfinished.fingerprint(source.path)
+    told: list[Any] = [list(source.shape), source.stored]
+    return told + ([zlib.crc32(source.data.tobytes())] if isinstance(source, MemorySource) else [])
 
 
 def _staged(plan: _Plan, pool: Executor) -> _Plan:
@@ -356,8 +402,9 @@ def _staged(plan: _Plan, pool: Executor) -> _Plan:
     if not isinstance(plan.task.source, MemorySource) or isinstance(pool, ThreadPoolExecutor):
         return plan
     file = plan.target / WORK / "source.npy"
-    np.save(file, plan.task.source.data)
-    task = dataclasses.replace(plan.task, source=open_source(file))
+    data = plan.task.source.data
+    np.save(file, data)
+    task = dataclasses.replace(plan.task, source=open_source(file, axes="tzyxc"[-data.ndim :]))
     return dataclasses.replace(plan, task=task)
 
 
@@ -365,9 +412,7 @@ def _write_levels(
     plan: _Plan, work: unfinished.UnfinishedStore, pool: Executor, progress: Progress
 ) -> None:
     layout = plan.task.layout
-    total = sum(math.prod(layout.shape(level)) for level in range(layout.levels))
-
-    total *= layout.voxel_bytes
+    total = _voxels(layout) * layout.voxel_bytes
     done = sum(work.done.values()) * layout.voxel_bytes
     progress("converting", done, total)
     counted = isinstance(pool, (ProcessPoolExecutor, ThreadPoolExecutor))
@@ -389,7 +434,8 @@ def _write_levels(
             shutil.rmtree(plan.target, ignore_errors=True)
             raise ValueError(
                 f"{plan.settings['source']}: {bad} values are NaN or infinite (of "
-                f"{math.prod(layout.extent) * layout.width}); pass nan=VALUE (--nan VALUE) to "
+                f"{layout.times * math.prod(layout.extent) * layout.width}); pass nan=VALUE "
+                "(--nan VALUE) to "
                 "replace them"
             )
         for which in ("low", "high"):  # the bounds below are not needed any more
@@ -426,8 +472,17 @@ def _run(
 
 
 def _value_range(task: shard.Conversion) -> list[list[float]]:
-    """Smallest and largest value of each channel: those of the one cell of the last level."""
+    """Smallest and largest value of each channel, of all times: those of the one cell of the last
+    level.
+    """
     deadline = Deadline(_OPEN_TIMEOUT)
     spec = task.layout.cells(task.layout.levels - 1)
-    cell = deadline.wait(deadline.wait(opened(task.root, spec), "cells").read(), "cells")[0, 0, 0]
-    return [[low.item(), high.item()] for low, high in cell[:2].T]
+    cells = deadline.wait(deadline.wait(opened(task.root, spec), "cells").read(), "cells")
+    cells = cells.reshape(-1, 3, task.layout.width)
+    lows, highs = cells[:, 0].min(0), cells[:, 1].max(0)
+    return [[low.item(), high.item()] for low, high in zip(lows, highs, strict=True)]
+
+
+def _voxels(layout: StoreLayout) -> int:
+    """Voxels of all levels and times."""
+    return layout.times * sum(math.prod(layout.shape(level)) for level in range(layout.levels))

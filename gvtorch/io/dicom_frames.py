@@ -292,6 +292,7 @@ def image_info(header: Any, samples: int, times: Times) -> tuple[ImageInfo, list
         unit="millimeter",
         channels=channels,
         quantity=quantity or None,
+        space="right-anterior-superior",
         time_step=times.step,
         time_unit=times.unit,
     )

@@ -57,9 +57,10 @@ def open_arrays(
     moment: int,
     channels: Sequence[int] | None,
     deadline: Deadline,
-) -> tuple[list[StoredArray], slice | list[int]]:
+) -> tuple[list[StoredArray], slice | list[int], dict[str, int]]:
     """Opens the image's arrays that fit the tree, the finest first, at one time point; returns
-    them and the index of their channels. What they say is checked before memory is taken.
+    them, the index of their channels, and how many times, channels, ... the image has. What they
+    say is checked before memory is taken.
     """
     finest = image.scales[0]
     at = child(root, finest.path)
@@ -76,14 +77,16 @@ def open_arrays(
         _check_array(name, array, image.axes)
         if not stored:
             chosen = _choose(where, array, image.axes, moment, channels)
-        picked: dict[str, Any] = {"t": moment, "c": chosen}
+            sizes = dict(zip(image.axes, map(int, array.shape), strict=True))
+        picked: dict[str, Any] = {"t": moment, "c": chosen, "-": 0}
         # Singleton axes of an index array would move: oindex leaves every axis where it is.
         array = array.oindex[tuple(picked.get(axis, slice(None)) for axis in image.axes)]
-        found = StoredArray(array, image.axes.replace("t", ""), (1, 1, 1), name)
+        axes = image.axes.replace("t", "").replace("-", "")
+        found = StoredArray(array, axes, (1, 1, 1), name)
         factors = _factors(stored[0], found, finest, scale) if stored else found.factors
         if factors is not None:
             stored.append(replace(found, factors=factors))
-    return stored, chosen
+    return stored, chosen, sizes
 
 
 def _check_array(where: str, array: Any, axes: str) -> None:
@@ -106,13 +109,19 @@ def _choose(
     size = {axis: int(n) for axis, n in zip(axes, array.shape, strict=True)}
     moments, width = size.get("t", 1), size.get("c", 1)
     if isinstance(moment, bool) or not isinstance(moment, int) or not 0 <= moment < moments:
-        raise ValueError(f"{where}: has no time {moment!r}; it has {moments}, from 0")
+        raise ValueError(no_time(where, moment, moments))
     if channels is None:
         return slice(None)
     picked = list(channels)
     if not picked or not all(isinstance(c, int) and 0 <= c < width for c in picked):
         raise ValueError(f"{where}: has no channels {picked!r}; it has {width}, from 0")
     return picked if "c" in axes else slice(None)
+
+
+def no_time(where: str, time: object, times: int) -> str:
+    """The message about a time point that is not there."""
+    one = "1 time point, which is 0" if times == 1 else f"{times} time points, 0 to {times - 1}"
+    return f"{where}: has no time {time!r}; it has {one}"
 
 
 def _factors(

@@ -8,16 +8,25 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from .store_layout import WORK, Deadline, StoreLayout, child, read_key
+from ..base.image_info import ImageInfo
+from .omero import forget_assumed, read_channels, write_channels
+from .store_layout import WORK, Deadline, StoreError, StoreLayout, child, read_key
 
 _MOST_LEVELS = 64
 _MOST_JSON = 1 << 24  # bytes
 _DEFAULT_AXES = "tczyx"  # of versions 0.1 and 0.2
+#: Lengths of a metre, to compare axes of different units.
+_METRES = {
+    **{"angstrom": 1e-10, "nanometer": 1e-9, "micrometer": 1e-6, "millimeter": 1e-3},
+    **{"centimeter": 1e-2, "decimeter": 1e-1, "meter": 1.0, "kilometer": 1e3},
+    **{"inch": 0.0254, "foot": 0.3048, "picometer": 1e-12},
+}
 
 
 @dataclass(frozen=True)
@@ -33,10 +42,11 @@ class ImageArray:
 class MultiscaleImage:
     """A multiscale image."""
 
-    axes: str  # in stored order, a letter each
+    axes: str  # in stored order, a letter each: t, c, z, y, x, or - for another
     scales: tuple[ImageArray, ...]  # finest first
     name: str
-    unit: str | None
+    info: ImageInfo = field(default_factory=ImageInfo)
+    lost: tuple[str, ...] = ()  # what is told beside, a few words each
 
 
 def is_zarr(path: str | Path) -> bool:
@@ -64,15 +74,24 @@ def find_image(
     own = attributes.get("gvtorch")
     layout = None if own is None else StoreLayout.parse(where, own)
     found = _parse_image(where, attributes, image)
+    series = _member(attributes, "bioformats2raw.layout")
     if found is None and layout is None:
         inner = "0" if image is None else image  # where converters of microscopy files put it
         if ".." not in inner and not inner.startswith("/"):
-            root = child(root, inner)
+            top, root = root, child(root, inner)
             deeper = _attributes(f"{where}/{inner}", root, deadline)
             found = _parse_image(where, deeper, None) if deeper else None
+            if found is not None and image is None and series is not None:
+                found = _with_series(where, top, found, deadline)
     if found is None:
         asked = "no multiscale image" if image is None else f"no image {image!r}"
-        raise ValueError(f"{where}: has {asked} (NGFF multiscales)")
+        plate = "; it is a plate: name a field of view, as in 'A/1/0'"
+        of = plate if _member(attributes, "plate") is not None else ""
+        raise ValueError(f"{where}: has {asked} (NGFF multiscales){of}")
+    if layout is not None and isinstance(own, dict):
+        found = replace(found, info=_own_info(own.get("info"), found.info))
+    else:
+        found = _with_labels(where, root, found, deadline)
     return root, found, layout
 
 
@@ -107,7 +126,7 @@ def _attributes(where: str, root: Any, deadline: Deadline) -> dict[str, Any] | N
 
 
 def _no_store(where: str, root: Any, deadline: Deadline) -> Exception:
-    if isinstance(root, dict) and not Path(where).exists():
+    if isinstance(root, dict) and not Path(root["path"]).exists():
         return FileNotFoundError(f"store not found: {where}")
     work = child(root, WORK)
     manifest = read_json(where, work, "manifest.json", deadline)
@@ -116,67 +135,169 @@ def _no_store(where: str, root: Any, deadline: Deadline) -> Exception:
     done = (read_key(where, work, "journal.jsonl", deadline) or b"").count(b"\n")
     return ValueError(
         f"{where}: half-written: {done} of {manifest.get('tasks', '?')} shards are done; "
-        f"gvtorch convert {manifest.get('source', 'SOURCE')} {where} --resume goes on"
+        f"gvtorch convert {shlex.join((str(manifest.get('source', 'SOURCE')), where))} --resume "
+        "goes on"
     )
 
 
 def _parse_image(
     where: str, attributes: dict[str, Any], image: str | None
 ) -> MultiscaleImage | None:
-    """Reads an image out of a group's attributes (of 0.5 those in `ome`), if it is there."""
-    ome = attributes.get("ome")
-    images = (ome if isinstance(ome, dict) else attributes).get("multiscales")
+    """Reads an image out of a group's attributes, if it is there."""
+    images = _member(attributes, "multiscales")
     if not isinstance(images, list) or not images:
         return None
     if not all(isinstance(item, dict) for item in images):
         raise ValueError(f"{where}: multiscales must be objects")
     for number, item in enumerate(images):
         if image in (None, item.get("name"), str(number)):
-            return _image(where, item)
+            found = _image(where, item, _member(attributes, "omero"))
+            others = [str(one.get("name", at)) for at, one in enumerate(images) if at != number]
+            return _told_beside(found, others if image is None else [])
     return None
 
 
-def _image(where: str, item: dict[str, Any]) -> MultiscaleImage:
-    axes, unit = _axes(where, item.get("axes"))
+def _member(attributes: dict[str, Any], name: str) -> Any:
+    """What is told of a name: of 0.5 in `ome`."""
+    ome = attributes.get("ome")
+    return (ome if isinstance(ome, dict) else attributes).get(name)
+
+
+def _told_beside(found: MultiscaleImage, others: list[str]) -> MultiscaleImage:
+    if not others:
+        return found
+    named = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
+    text = f"the images {named} beside {found.name!r} (key= or image= names one)"
+    return replace(found, lost=(*found.lost, text))
+
+
+def _with_series(
+    where: str, root: Any, found: MultiscaleImage, deadline: Deadline
+) -> MultiscaleImage:
+    """Names the other images that converters of microscopy files lay side by side."""
+    others: list[str] = []
+    try:
+        listed = _attributes(f"{where}/OME", child(root, "OME"), deadline) or {}
+        series = _member(listed, "series")
+        if isinstance(series, list):
+            others = [str(path) for path in series if path != "0"]
+        elif _attributes(f"{where}/1", child(root, "1"), deadline) is not None:
+            others = ["1"]
+    except (StoreError, ValueError):  # what is beside the image does not keep it from opening
+        pass
+    return _told_beside(found, others)
+
+
+def _with_labels(
+    where: str, root: Any, found: MultiscaleImage, deadline: Deadline
+) -> MultiscaleImage:
+    """Names the label images in the group beside the image."""
+    try:
+        group = _attributes(f"{where}/labels", child(root, "labels"), deadline) or {}
+    except (StoreError, ValueError):
+        return found
+    labels = _member(group, "labels")
+    if not isinstance(labels, list) or not labels:
+        return found
+    named = ", ".join(f"labels/{name}" for name in labels[:5])
+    return replace(found, lost=(*found.lost, f"the labels {named}"))
+
+
+def _own_info(told: Any, info: ImageInfo) -> ImageInfo:
+    """Adds what a store of ours tells beside NGFF."""
+    told = told if isinstance(told, dict) else {}
+    quantity, space = (told.get(name) for name in ("quantity", "space"))
+    return replace(
+        info,
+        channels=forget_assumed(info.channels, told.get("assumed")),
+        quantity=quantity if isinstance(quantity, str) else None,
+        space=space if isinstance(space, str) else None,
+        labels=told.get("labels") is True,
+    )
+
+
+def _image(where: str, item: dict[str, Any], omero: Any) -> MultiscaleImage:
+    axes, units, lost = _axes(where, item.get("axes"))
     datasets = item.get("datasets")
     if not isinstance(datasets, list) or not 1 <= len(datasets) <= _MOST_LEVELS:
         raise ValueError(f"{where}: multiscales must have 1 to {_MOST_LEVELS} datasets")
-    outer = _transform(where, item.get("coordinateTransformations"), axes)
-    scales = []
+    outer = _transform(where, item.get("coordinateTransformations"), axes, lost)
+    scales, times = [], []
     for dataset in datasets:
         path = dataset.get("path") if isinstance(dataset, dict) else None
         if not isinstance(path, str) or not path or path.startswith("/") or ".." in path:
             raise ValueError(f"{where}: a dataset needs a path inside the store, got {path!r}")
-        scale, move = _transform(where, dataset.get("coordinateTransformations"), axes)
-        z, y, x = (a * b for a, b in zip(scale, outer[0], strict=True))
-        mz, my, mx = (m * s + o for m, s, o in zip(move, *outer, strict=True))
-        scales.append(ImageArray(path.strip("/"), (z, y, x), (mz, my, mx)))
+        scale, move = _transform(where, dataset.get("coordinateTransformations"), axes, lost)
+        t, *zyx = (a * b for a, b in zip(scale, outer[0], strict=True))
+        mt, *moves = (m * s + o for m, s, o in zip(move, *outer, strict=True))
+        factors = _in_one_unit(units, lost)
+        sides, places = ([a * f for a, f in zip(one, factors, strict=True)] for one in (zyx, moves))
+        scales.append(ImageArray(path.strip("/"), _triple(sides), _triple(places)))
+        times.append((t, mt))
     name = item.get("name")
-    return MultiscaleImage(axes, tuple(scales), name if isinstance(name, str) else "image", unit)
+    channels, damaged = read_channels(omero) if omero is not None else ((), [])
+    (step, origin), period = times[0], units.get("t")
+    told = "t" in axes and (period is not None or step != 1)
+    info = ImageInfo(
+        unit=units.get("x"),
+        channels=channels,
+        time_step=step if told else None,
+        time_origin=origin if "t" in axes else 0.0,
+        time_unit=period,
+    )
+    text = name if isinstance(name, str) else "image"
+    return MultiscaleImage(axes, tuple(scales), text, info, tuple(dict.fromkeys(lost + damaged)))
 
 
-def _axes(where: str, axes: Any) -> tuple[str, str | None]:
+def _triple(values: Sequence[float]) -> tuple[float, float, float]:
+    z, y, x = values
+    return (z, y, x)
+
+
+def _in_one_unit(units: dict[str, str], lost: list[str]) -> list[float]:
+    """Factors along z, y, x that bring lengths into the unit of x."""
+    one, factors = units.get("x"), []
+    for axis in "zyx":
+        other = units.get(axis)
+        known = one in _METRES and other in _METRES
+        factors.append(_METRES[other] / _METRES[one] if known and other != one else 1.0)  # type: ignore[index]
+        if not known and other is not None and other != one:
+            lost.append(f"unit {other!r} of {axis}, where that of x is {one!r}")
+    return factors
+
+
+def _axes(where: str, axes: Any) -> tuple[str, dict[str, str], list[str]]:
+    """Letters of the axes, their units by letter, and what is not kept of them."""
     if axes is None:
-        return _DEFAULT_AXES, None
-    names, unit = "", None
+        return _DEFAULT_AXES, {}, []
+    letters, units, lost = "", dict[str, str](), list[str]()
     for axis in axes if isinstance(axes, list) else [None]:
-        name = axis.get("name") if isinstance(axis, dict) else axis
-        if not isinstance(name, str) or name.lower() not in ("t", "c", "z", "y", "x"):
-            raise ValueError(f"{where}: axes must be among t, c, z, y, x, got {name!r}")
-        names += name.lower()
-        if isinstance(axis, dict) and name.lower() == "x" and isinstance(axis.get("unit"), str):
-            unit = axis["unit"]
-    if len(set(names)) != len(names) or not {"y", "x"} <= set(names):
-        raise ValueError(f"{where}: axes must have y and x, each once, got {', '.join(names)}")
-    return names, unit
+        told = axis if isinstance(axis, dict) else {"name": axis}
+        name, kind, unit = (told.get(key) for key in ("name", "type", "unit"))
+        if not isinstance(name, str):
+            raise ValueError(f"{where}: axes must have names, got {name!r}")
+        letter = name.lower() if name.lower() in ("t", "c", "z", "y", "x") else None
+        letter = letter or {"time": "t", "channel": "c"}.get(str(kind), "-")
+        letters += letter
+        if isinstance(unit, str):
+            units[letter] = unit
+    solid = letters.replace("-", "")
+    if len(set(solid)) != len(solid) or not {"y", "x"} <= set(solid):
+        names = ", ".join(str(a.get("name") if isinstance(a, dict) else a) for a in axes)
+        raise ValueError(f"{where}: axes must have y and x, each of them once, got {names}")
+    return letters, units, lost
 
 
-def _transform(where: str, items: Any, axes: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Scale and translation along z, y, x; 1 and 0 where they are not told."""
-    told = {"scale": dict.fromkeys("zyx", 1.0), "translation": dict.fromkeys("zyx", 0.0)}
+def _transform(
+    where: str, items: Any, axes: str, lost: list[str]
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Scale and translation along t, z, y, x; 1 and 0 where they are not told."""
+    told = {"scale": dict.fromkeys("tzyx", 1.0), "translation": dict.fromkeys("tzyx", 0.0)}
     for item in items if isinstance(items, list) else []:
         kind = item.get("type") if isinstance(item, dict) else None
         if kind not in ("scale", "translation"):
+            if kind != "identity":
+                lost.append(f"a transformation of type {kind!r}")
             continue
         values = item.get(kind)
         plain = isinstance(values, list) and all(
@@ -185,39 +306,60 @@ def _transform(where: str, items: Any, axes: str) -> tuple[tuple[float, ...], tu
         if not plain or len(values) != len(axes):
             raise ValueError(f"{where}: {kind} must be {len(axes)} numbers, got {values!r}")
         told[kind].update(zip(axes, map(float, values), strict=True))
-    scale, move = (tuple(told[kind][axis] for axis in "zyx") for kind in told)
-    if min(scale) <= 0:
-        raise ValueError(f"{where}: scale must be positive, got {scale} (z, y, x)")
+    scale, move = (tuple(told[kind][axis] for axis in "tzyx") for kind in told)
+    if min(scale[1:]) <= 0:
+        raise ValueError(f"{where}: scale must be positive, got {scale[1:]} (z, y, x)")
     return scale, move
 
 
 def image_metadata(
     name: str,
-    levels: int,
+    layout: StoreLayout,
+    info: ImageInfo,
     *,
     spacing: Sequence[float],
     origin: Sequence[float],
-    width: int,
-    unit: str | None,
-) -> dict[str, Any]:
-    """Returns the `ome` attribute (0.5) of a pyramid of factor 2 in the arrays "0", "1", ...
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Returns the `ome` attribute (0.5) of a pyramid of factor 2 in the arrays "0", "1", ..., and
+    what `find_image` needs to know beside it.
 
-    `spacing` and `origin` are (x, y, z) of level 0; an axis c comes first where `width` is not 1.
+    `spacing` and `origin` are (x, y, z) of level 0; axes t and c come first where there are such.
     """
-    axes: list[dict[str, str]] = [{"name": "c", "type": "channel"}] if width > 1 else []
-    axes += [{"name": axis, "type": "space"} | ({"unit": unit} if unit else {}) for axis in "zyx"]
+    axes: list[dict[str, str]] = []
+    first_scale, first_move = [], []
+    if layout.times > 1:
+        unit = {"unit": info.time_unit} if info.time_unit else {}
+        axes.append({"name": "t", "type": "time"} | unit)
+        first_scale.append(1.0 if info.time_step is None else info.time_step)
+        first_move.append(info.time_origin)
+    if "c" in layout.axes:
+        axes.append({"name": "c", "type": "channel"})
+        first_scale.append(1.0)
+        first_move.append(0.0)
+    unit = {"unit": info.unit} if info.unit else {}
+    axes += [{"name": axis, "type": "space"} | unit for axis in "zyx"]
     datasets = []
-    for level in range(levels):
+    for level in range(layout.levels):
         factor = 2**level
         zyx = list(zip(spacing, origin, strict=True))[::-1]
-        scale = [1.0] * (len(axes) - 3) + [s * factor for s, _ in zyx]
-        move = [0.0] * (len(axes) - 3) + [o + (factor - 1) / 2 * s for s, o in zyx]
+        scale = first_scale + [s * factor for s, _ in zyx]
+        move = first_move + [o + (factor - 1) / 2 * s for s, o in zyx]
         transforms = [
             {"type": "scale", "scale": scale},
             {"type": "translation", "translation": move},
         ]
         datasets.append({"path": str(level), "coordinateTransformations": transforms})
-    return {
+    how = "mode" if info.labels else "mean"  # coarse levels are made
+    ome: dict[str, Any] = {
         "version": "0.5",
-        "multiscales": [{"name": name, "type": "mean", "axes": axes, "datasets": datasets}],
+        "multiscales": [{"name": name, "type": how, "axes": axes, "datasets": datasets}],
     }
+    beside: dict[str, Any] = {
+        "quantity": info.quantity,
+        "space": info.space,
+        "labels": info.labels or None,
+    }
+    if info.channels:
+        ome["omero"], assumed = write_channels(info.channels, layout.value_range or ())
+        beside["assumed"] = assumed or None
+    return ome, {key: value for key, value in beside.items() if value}

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 
@@ -28,6 +29,17 @@ def memory_free() -> int:
     except OSError:
         pass
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+
+
+def worker_processes(count: int) -> ProcessPoolExecutor:
+    """Starts worker processes, which leave Ctrl-C to this one from their first moment on."""
+    pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), begin_worker)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        pool.submit(int)  # the first task starts all processes, which inherit what is blocked
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    return pool
 
 
 def begin_worker() -> None:

@@ -24,7 +24,7 @@ from .store_layout import BORDER, CELL, Deadline, StoreError, StoreLayout, opene
 _TIMEOUT = 3600.0  # seconds for one read of local data
 _SLAB = 32  # planes of a level made at a time: two chunks of the level below
 
-Zyx = tuple[int, int, int]
+Place = tuple[int, ...]  # z, y, x, or t, z, y, x where a store has several time points
 _POOLS = (pool_mean, pool_min, pool_max)
 
 
@@ -42,52 +42,58 @@ class Conversion:
 class ShardResult:
     """What a task reports back."""
 
-    place: Zyx
+    place: Place
     voxels: int
     bad: int  # values that are not finite; the shard is not written then
 
 
-def write_shard(conversion: Conversion, level: int, place: Zyx) -> ShardResult:
-    """Writes the shards of one cube of a level, `place` (z, y, x) in shards; level 0 is the finest.
+def write_shard(conversion: Conversion, level: int, place: Place) -> ShardResult:
+    """Writes the shards of one cube of a level, `place` (z, y, x), or (t, z, y, x), in shards;
+    level 0 is the finest.
 
     Raises:
         OSError: The source can't be read, or the store can't be written (ENOSPC: the disk is full).
     """
     layout = conversion.layout
     shape = layout.shape(level)
-    low = [at * layout.shard for at in place]
+    low = [at * layout.shard for at in place[-3:]]
+    time = place[0] if len(place) > 3 else None
     stop = [min(a + layout.shard, n) for a, n in zip(low, shape, strict=True)]
     size = [b - a for a, b in zip(low, stop, strict=True)]
     padded = [-(-n // layout.block) * layout.block for n in size]
     box = [a - BORDER for a in low], [a + n + BORDER for a, n in zip(low, padded, strict=True)]
     inner = tuple(slice(BORDER, BORDER + n) for n in size)
     if level == 0:
-        values, bad = _from_source(conversion, *box, inner)
+        values, bad = _from_source(conversion, time or 0, *box, inner)
         if bad:
             return ShardResult(place, 0, bad)
         least = most = values
     else:
-        values, least, most = _from_below(conversion, level, *box)
-    writes = [write(conversion.root, layout.plain(level), low, _plain(values[inner]))]
+        values, least, most = _from_below(conversion, level, time or 0, *box)
+    axes = layout.axes.removeprefix("t")
+    plain = _plain(values[inner], axes)
+    writes = [write(conversion.root, layout.plain(level), low, plain, time)]
     for spec, bound in zip(layout.bounds(level), (least, most), strict=False):
-        writes.append(write(conversion.root, spec, low, _plain(bound[inner])))
+        writes.append(write(conversion.root, spec, low, _plain(bound[inner], axes), time))
     cells = _cells(values, least, most, [-(-n // CELL) for n in size])
-    writes.append(write(conversion.root, layout.cells(level), [a // CELL for a in low], cells))
+    first = [a // CELL for a in low]
+    writes.append(write(conversion.root, layout.cells(level), first, cells, time))
     blocks = _blocks(layout, values, needed_cells(cells, layout.threshold))
     if blocks is not None:
         at = [a // layout.block for a in low]
-        writes.append(write(conversion.root, layout.blocks(level), at, blocks))
+        writes.append(write(conversion.root, layout.blocks(level), at, blocks, time))
     for begun in writes:
         finish(begun, conversion.root.get("path", "store"))
     return ShardResult(place, int(np.prod(size)), 0)
 
 
 def _from_source(
-    conversion: Conversion, low: list[int], high: list[int], inner: tuple[slice, ...]
+    conversion: Conversion, time: int, low: list[int], high: list[int], inner: tuple[slice, ...]
 ) -> tuple[np.ndarray, int]:
     """Reads a box; returns also how many of its `inner` values are not finite."""
     start, stop = boxes.clamp(low, high, conversion.layout.shape(0))
-    values, bad = conversion.source.read_region(start, stop), 0
+    source = conversion.source.at_time(conversion.source.time + time)
+    values, bad = source.read_region(start, stop), 0
     if values.dtype.kind == "f" and (wrong := ~np.isfinite(values)).any():
         if conversion.nan is None:
             bad = int(boxes.repeat_edges(wrong, start, low, high)[inner].sum())
@@ -97,7 +103,7 @@ def _from_source(
 
 
 def _from_below(
-    conversion: Conversion, level: int, low: list[int], high: list[int]
+    conversion: Conversion, level: int, time: int, low: list[int], high: list[int]
 ) -> list[np.ndarray]:
     """Makes a box of a level, voxels around it included, from the level below: means, smallest and
     largest finest values.
@@ -107,6 +113,7 @@ def _from_below(
     # The finest values are their own smallest and largest.
     for spec in (layout.plain(level - 1), *layout.bounds(level - 1)):
         array = deadline.wait(opened(conversion.root, spec), spec["path"])
+        array = layout.at_time(array, time)
         arrays.append(StoredArray(array, "czyx"[-array.rank :], (1, 1, 1), spec["path"]))
     start, stop = boxes.clamp(low, high, layout.shape(level))
     size = (*[b - a for a, b in zip(start, stop, strict=True)], layout.width)
@@ -121,9 +128,9 @@ def _from_below(
     return [boxes.repeat_edges(values, start, low, high) for values in made]
 
 
-def _plain(values: np.ndarray) -> np.ndarray:
-    """(z, y, x, c) as the pyramid stores it."""
-    return values[..., 0] if values.shape[3] == 1 else np.moveaxis(values, 3, 0)
+def _plain(values: np.ndarray, axes: str) -> np.ndarray:
+    """(z, y, x, c) as the pyramid stores it, whose axes are czyx or zyx."""
+    return np.moveaxis(values, 3, 0) if "c" in axes else values[..., 0]
 
 
 def _cells(values: np.ndarray, least: np.ndarray, most: np.ndarray, count: list[int]) -> np.ndarray:
@@ -151,9 +158,16 @@ def _blocks(layout: StoreLayout, values: np.ndarray, needed: np.ndarray) -> np.n
     return blocks
 
 
-def write(root: dict[str, Any], spec: dict[str, Any], low: list[int], data: np.ndarray) -> Any:
-    """Begins to write a box into an array of the store."""
+def write(
+    root: dict[str, Any],
+    spec: dict[str, Any],
+    low: list[int],
+    data: np.ndarray,
+    time: int | None = None,
+) -> Any:
+    """Begins to write a box into an array of the store, at a time if it has an axis for that."""
     array = Deadline(_TIMEOUT).wait(opened(root, spec, "write"), spec["path"])
+    array = array if time is None else array[time]
     low = [0, *low] if data.ndim == 4 else low  # (c, z, y, x)
     low = [*low, *[0] * (data.ndim - len(low))]
     return array[boxes.index(low, np.add(low, data.shape).tolist())].write(data)

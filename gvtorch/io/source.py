@@ -13,15 +13,13 @@ import dataclasses
 import gzip
 import math
 import os
-import warnings
 import zipfile
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from time import time_ns
-from typing import IO, Any
+from typing import IO, Any, Self
 
 import numpy as np
 
@@ -43,6 +41,8 @@ class VolumeSource(ABC):
     flips: str = ""  # letters of axes that run backwards
     spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)  # x y z, world units
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x y z, centre of voxel 0
+    # Where the axes x, y, z do not lie along the world's: (3, 4), from voxels to the world.
+    oblique: tuple[tuple[float, ...], ...] | None = None
     info: ImageInfo = dataclasses.field(default_factory=ImageInfo)  # unit, channels, ...
     lost: tuple[str, ...] = ()  # what the file tells and this can't keep, a few words each
     time: int = 0  # the time point that is read
@@ -72,12 +72,12 @@ class VolumeSource(ABC):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all values as they are read."""
+        """Bytes of all values of a time point as they are read."""
         return math.prod(self.shape) // self.times * np.dtype(self.dtype).itemsize
 
     @property
     def peak_bytes(self) -> int:
-        """Bytes of memory that reading all at once takes: as it is stored, and as it is read."""
+        """Bytes of memory that reading a time point takes: as it is stored, and as it is read."""
         unpacked = self.times if self.whole else 1  # a file that is packed is unpacked whole
         return self.nbytes + self.nbytes // np.dtype(self.dtype).itemsize * unpacked * (
             np.dtype(self.stored).itemsize
@@ -86,6 +86,10 @@ class VolumeSource(ABC):
     def size(self, axis: str) -> int:
         """Voxels along an axis, 1 where it has none."""
         return self.shape[self.axes.index(axis)] if axis in self.axes else 1
+
+    def at_time(self, time: int) -> Self:
+        """Returns the source of another time point."""
+        return self if time == self.time else dataclasses.replace(self, time=time)
 
     def covers(self, index: Index) -> bool:
         """Whether an index takes the whole array."""
@@ -108,26 +112,31 @@ class VolumeSource(ABC):
             OSError: The file can't be read any more, or is damaged.
         """
         with told_as(OSError, self.path, "can't be read", OSError):
-            data = self._read(low, high)
+            data = self.read_box(low, high, (self.time, self.time + 1))[0]
             # Pages of a mapping that stays would count as this process's memory.
             return data.copy() if isinstance(data.base, np.memmap) else data
 
-    def read_whole(self) -> np.ndarray:
-        """Reads or maps all, (z, y, x, c) of `dtype`; damaged files may raise anything."""
-        return self._read((0, 0, 0), self.extent[::-1])
+    def read_times(self, start: int, stop: int) -> np.ndarray:
+        """Reads or maps whole time points; see `read_box`."""
+        return self.read_box((0, 0, 0), self.extent[::-1], (start, stop))
 
-    def _read(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
+    def read_box(
+        self, low: Sequence[int], high: Sequence[int], times: tuple[int, int]
+    ) -> np.ndarray:
+        """Reads or maps a box of time points, (t, z, y, x, c) of `dtype`; damaged files may raise
+        anything.
+        """
         spans = dict(zip("zyx", zip(low, high, strict=True), strict=True))
         index = []
-        spans["t"] = (self.time, self.time + 1)
+        spans["t"] = times
         for axis, size in zip(self.axes, self.shape, strict=True):
             start, stop = spans.get(axis, (0, size))
             backwards = axis in self.flips
             index.append(slice(size - stop, size - start) if backwards else slice(start, stop))
         data = self.read_stored(tuple(index))
-        data = data.squeeze(tuple(i for i, axis in enumerate(self.axes) if axis in "-t"))
-        data = boxes.to_zyxc(data, self.axes.replace("-", "").replace("t", ""))
-        data = np.flip(data, tuple("zyx".index(axis) for axis in self.flips))
+        data = data.squeeze(tuple(i for i, axis in enumerate(self.axes) if axis == "-"))
+        data = boxes.to_zyxc(data, self.axes.replace("-", ""), "tzyxc")
+        data = np.flip(data, tuple("tzyx".index(axis) for axis in self.flips))
         with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite
             return np.asarray(data).astype(self.dtype, order="C", copy=False)
 
@@ -178,57 +187,74 @@ class ArraySource(VolumeSource):
 class MemorySource(VolumeSource):
     """A volume that lies in memory."""
 
-    data: np.ndarray = dataclasses.field(repr=False)  # (z, y, x, c)
+    data: np.ndarray = dataclasses.field(repr=False)  # (z, y, x, c) or (t, z, y, x, c)
 
     @classmethod
     def of(cls, data: np.ndarray, **told: Any) -> MemorySource:
-        """Takes (z, y, x, c) values; `told` are path, spacing, origin and info."""
-        return cls(data=data, shape=data.shape, axes="zyxc", stored=data.dtype.str, **told)
+        """Takes (z, y, x, c) values, or (t, z, y, x, c); `told` are path, spacing, origin, info."""
+        axes = "tzyxc"[-data.ndim :]
+        return cls(data=data, shape=data.shape, axes=axes, stored=data.dtype.str, **told)
 
     def read_stored(self, index: Index) -> np.ndarray:
         return self.data[index]
 
     def read_region(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
         """Returns the box `low` to `high`, (z, y, x), as a view."""
-        return self.data[boxes.index(low, high)]
+        data = self.data[self.time] if self.data.ndim == 5 else self.data
+        return data[boxes.index(low, high)]
 
 
 def place_axes(
-    path: str, affine: np.ndarray, shape: Sequence[int], component: int | None = None
+    path: str,
+    affine: np.ndarray,
+    shape: Sequence[int],
+    component: int | None = None,
+    time: int | None = None,
 ) -> dict[str, Any]:
-    """Lays voxel axes along the world's, by `affine` (4, 4) from voxel indices to the world;
-    oblique ones stay as they are. The axis `component` of the array counts components.
+    """Lays voxel axes along the world's, by `affine` (4, 4) from voxel indices to the world.
+
+    Axes lie along the world's if no voxel comes to lie more than half a voxel beside its place.
+    Others are called x, y, z in their order, and `oblique` tells where they lie (oblique.py).
+
+    Args:
+        path: For messages.
+        affine: Of the three axes of space, in their order.
+        shape: Of the array as it is stored.
+        component: The axis of the array that counts components, if any.
+        time: The axis that counts time points, if any.
 
     Returns:
-        The fields axes, flips, spacing and origin of a `VolumeSource`.
+        The fields axes, flips, spacing, origin and oblique of a `VolumeSource`.
     """
-    matrix, origin = affine[:3, :3], affine[:3, 3].astype(np.float64)
+    matrix, origin = affine[:3, :3].astype(np.float64), affine[:3, 3].astype(np.float64)
     lengths = np.linalg.norm(matrix, axis=0)
-    if not np.isfinite(affine).all() or (lengths == 0).any():
+    volume = np.linalg.det(matrix / np.where(lengths > 0, lengths, 1))
+    if not np.isfinite(affine).all() or (lengths == 0).any() or abs(volume) < 1e-6:
         raise ValueError(f"{path}: the header's voxel axes are degenerate: {matrix.tolist()}")
-    spatial = [axis for axis in range(len(shape)) if axis != component]
+    letters = ["t" if axis == time else "c" for axis in range(len(shape))]
+    spatial = [axis for axis in range(len(shape)) if axis not in (component, time)]
     world_axis = np.abs(matrix).argmax(axis=0)  # of each voxel axis
-    along = np.abs(matrix[world_axis, [0, 1, 2]]) / lengths
-    if sorted(world_axis.tolist()) != [0, 1, 2] or (along < 1 - 1e-4).any():
-        warnings.warn(
-            f"{Path(path).name}: voxel axes are oblique; the world's axes are taken along them",
-            stacklevel=2,
-        )
-        order, spacing = np.arange(3), lengths
+    straight = np.zeros((3, 3))
+    straight[world_axis, [0, 1, 2]] = matrix[world_axis, [0, 1, 2]]
+    most = np.array([shape[axis] - 1 for axis in spatial])
+    beside = np.abs((matrix - straight) * most).sum(1)  # of the voxel that lies farthest off
+    is_oblique = len(set(world_axis.tolist())) != 3 or (beside > lengths.min() / 2).any()
+    if is_oblique:
+        order, steps = np.arange(3), lengths
     else:
         order = np.argsort(world_axis)
-        spacing = matrix[[0, 1, 2], order]
-    letters = ["c"] * len(shape)
+        steps = straight[[0, 1, 2], order]
     for axis, letter in enumerate("xyz"):
         voxel_axis = spatial[order[axis]]
         letters[voxel_axis] = letter
-        if spacing[axis] < 0:
-            origin[axis] += spacing[axis] * (shape[voxel_axis] - 1)
+        if steps[axis] < 0:
+            origin[axis] += steps[axis] * (shape[voxel_axis] - 1)
     return {
         "axes": "".join(letters),
-        "flips": "".join(letter for letter, step in zip("xyz", spacing, strict=True) if step < 0),
-        "spacing": tuple(np.abs(spacing).tolist()),
+        "flips": "".join(letter for letter, step in zip("xyz", steps, strict=True) if step < 0),
+        "spacing": tuple(np.abs(steps).tolist()),
         "origin": tuple(origin.tolist()),
+        "oblique": tuple(map(tuple, affine[:3].tolist())) if is_oblique else None,
     }
 
 

@@ -12,6 +12,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,6 @@ from .store_layout import (
 )
 
 _OPEN_TIMEOUT = 20.0  # seconds
-_COARSE = "gvtorch/coarse"
 _BATCH = 256  # blocks read at once; more only makes memory travel
 _AHEAD = 2 * _BATCH  # blocks on their way
 _GROUP = 4  # blocks along a side of a group that may be read as one region
@@ -55,7 +55,10 @@ class Store:
         extent: (x, y, z) voxels of the finest level.
         spacing: (x, y, z) world size of a finest voxel.
         origin: (x, y, z) world place of the centre of voxel 0.
-        unit: Unit of length, or None.
+        info: Unit, names and colours of channels, time step, ...
+        lost: What the metadata tells beside, and this does not keep; a few words each.
+        times: Number of time points.
+        time: The one that is read.
         dtype: torch dtype of the values.
         width: Number of channels.
         levels: Number of tree levels; the last one is at most 8 voxels wide.
@@ -79,10 +82,13 @@ class Store:
         levels: LevelReader,
         channels: slice | list[int],
         *,
+        time: int,
+        times: int,
         has_blocks: bool,
     ) -> None:
         """Takes what `open` found."""
-        self.location, self.name, self.unit = location, image.name, image.unit
+        self.location, self.name = location, image.name
+        self.info, self.lost, self.time, self.times = image.info, image.lost, time, times
         self.spacing = image.scales[0].scale[::-1]
         self.origin = image.scales[0].translation[::-1]
         self.extent, self.levels, self.block = layout.extent, layout.levels, layout.block
@@ -126,16 +132,21 @@ class Store:
         """
         where, root, deadline = str(location), kvstore(location), Deadline(_OPEN_TIMEOUT)
         root, found, own = find_image(where, root, image, deadline)
-        stored, chosen = open_arrays(where, root, found, time, channels, deadline)
+        stored, chosen, sizes = open_arrays(where, root, found, time, channels, deadline)
         dtype = value_dtype(stored[0].array.dtype.numpy_dtype)
         if dtype not in DTYPES:
             raise ValueError(f"{where}: dtype {dtype} is unknown; known: {', '.join(DTYPES)}")
         x, y, z, width = (stored[0].size(axis) for axis in "xyzc")
+        times = sizes.get("t", 1)
         layout = own or StoreLayout(extent=(x, y, z), dtype=dtype, width=width)
-        if (layout.extent, layout.dtype) != ((x, y, z), dtype):
+        if (layout.extent, layout.dtype) != ((x, y, z), dtype) or (own and own.times != times):
             raise ValueError(f"{where}: damaged: metadata and level 0 differ in extent or dtype")
         levels = LevelReader(stored, layout)
-        self = cls(where, found, layout, levels, chosen, has_blocks=own is not None)
+        found = _fitted(found, sizes, chosen)
+        own_blocks = own is not None
+        self = cls(
+            *(where, found, layout, levels, chosen), time=time, times=times, has_blocks=own_blocks
+        )
         if own:
             self._open_own(deadline)
         return self
@@ -150,8 +161,9 @@ class Store:
             wanted = spec["metadata"]
             if list(array.shape) != wanted["shape"] or array.dtype.name != wanted["data_type"]:
                 raise ValueError(f"{where}: damaged: {array.shape} {array.dtype.name}")
-            arrays.append(array)
-        told = read_json(self.location, child(self.root, _COARSE), "zarr.json", deadline)
+            arrays.append(self.layout.at_time(array, self.time))
+        folder = child(self.root, self.coarse_folder)
+        told = read_json(self.location, folder, "zarr.json", deadline)
         if told is not None:
             self.coarse = CoarseChannel.parse(self.location, told.get("attributes"))
 
@@ -164,8 +176,14 @@ class Store:
             f"{self.levels} levels, {kind})"
         )
 
+    @property
+    def coarse_folder(self) -> str:
+        """Where its coarse channels lie, inside it."""
+        return self.layout.coarse_folder(self.time)
+
     def describe(self) -> dict[str, Any]:
         """Returns extent, dtype, place, levels, range and size on disk as plain values."""
+        times = {"times": self.times, "time": self.time} if self.times > 1 else {}
         folder = Path(self.location)
         files = (file for file in folder.rglob("*") if file.is_file()) if folder.is_dir() else ()
         return {
@@ -175,7 +193,9 @@ class Store:
             "dtype": str(self.dtype).removeprefix("torch."),
             "spacing": list(self.spacing),
             "origin": list(self.origin),
-            "unit": self.unit,
+            "unit": None,
+            **self.info.describe(),
+            **times,
             "levels": self.levels,
             "level extents": [list(self.level_extent(level)) for level in range(self.levels)],
             "blocks": f"{self.block}^3+{self.border}" if self.has_blocks else "none",
@@ -183,6 +203,7 @@ class Store:
             "range": [list(pair) for pair in self.value_range] if self.value_range else None,
             "coarse channels": ", ".join(self.coarse) or "none",
             "disk bytes": sum(file.stat().st_size for file in files),
+            **({"not kept": list(self.lost)} if self.lost else {}),
         }
 
     def level_extent(self, level: int) -> tuple[int, int, int]:
@@ -299,7 +320,8 @@ class Store:
         if level == 0 or (zyx.size and (zyx.min() < 0 or (zyx >= grid).any())):
             raise ValueError(f"read_coarse: a place leaves the grid {grid} of level {level}")
         deadline = Deadline(timeout)
-        spec = self.layout.coarse(level, channel.folder(name), channel.width)
+        place = f"{self.coarse_folder}/{channel.folder(name)}"
+        spec = self.layout.coarse(level, place, channel.width)
         where = f"{self.location}/{spec['path']}"
         array = deadline.wait(opened(self.root, spec), where)
         if list(array.shape) != spec["metadata"]["shape"] or array.dtype.name != "float16":
@@ -389,6 +411,8 @@ class Store:
         """
         where, metadata = f"{self.location}/{spec['path']}", spec["metadata"]
         shape = metadata["chunk_grid"]["configuration"]["chunk_shape"]
+        moment = (self.time,) if self.times > 1 and "coarse" not in spec["path"] else ()
+        shape = shape[len(moment) :]
         first = len(shape) == 4  # c, z, y, x
         per = shape[first]
         spans = [range(a // per, (b - 1) // per + 1) for a, b in zip(low, high, strict=True)]
@@ -398,7 +422,7 @@ class Store:
             if key in self._seen or data[boxes.index(corner.clip(0), corner + per)].any():
                 continue
             chunk = (0, *place) if first else (*place, *[0] * (len(shape) - 3))
-            name = "/".join(map(str, ("c", *chunk)))
+            name = "/".join(map(str, ("c", *moment, *chunk)))
             if read_key(where, child(self.root, spec["path"]), name, deadline, 1) is None:
                 raise StoreError(f"{where}: shard {place} z y x: missing chunk")
             self._seen.add(key)
@@ -438,6 +462,21 @@ class Store:
 
     def _checked(self, level: int) -> int:
         return check.whole(self.location, "level", level, low=0, high=self.levels - 1)
+
+
+def _fitted(
+    image: MultiscaleImage, sizes: dict[str, int], chosen: slice | list[int]
+) -> MultiscaleImage:
+    """What the metadata tells of the channels that were chosen, if it fits the array."""
+    told, width, lost = image.info.channels, sizes.get("c", 1), list(image.lost)
+    if told and len(told) != width:
+        lost.append(f"what is told of {len(told)} channels, where there are {width}")
+        told = ()
+    if sizes.get("-", 1) > 1:
+        lost.append(f"an axis that is none of t, c, z, y, x: the first of {sizes['-']} is read")
+    if told and not isinstance(chosen, slice):
+        told = tuple(told[number] for number in chosen)
+    return replace(image, info=replace(image.info, channels=told), lost=tuple(lost))
 
 
 def needed_cells(cells: np.ndarray, threshold: float | None) -> np.ndarray:

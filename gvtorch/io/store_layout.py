@@ -1,7 +1,9 @@
 """What a store is and how it lies on disk; and tensorstore: its settings, and waiting for it.
 
     STORE.zarr/zarr.json             metadata; written last, so a store that has it is whole
-    STORE.zarr/0, 1, ...             (z, y, x) or (c, z, y, x), the mean pyramid, 0 the finest
+    STORE.zarr/0, 1, ...             (z, y, x) or (c, z, y, x), the mean pyramid, 0 the finest;
+                                     (t, c, z, y, x) of several time points, and t comes first in
+                                     all other arrays; coarse/TIME/ takes the place of coarse/
     STORE.zarr/gvtorch/blocks/0 ...  (gz, gy, gx, s, s, s, c), s = block + 2 border, a chunk each,
                                      its border the true neighbours, repeated at the volume's faces;
                                      blocks of CONSTANT and EMPTY cells only are not written
@@ -17,24 +19,27 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import os
 import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote, urlsplit
 
 from .resources import cores
 
 if TYPE_CHECKING:
     import numpy as np  # not when the program starts: `gvtorch --help` comes this way
 
-VERSION = 1
+VERSION = 1  # of stores of one time point; of more: 2
 CELL = 8  # voxels along a side of a cell
 BORDER = 1  # voxels around a block, and around a cell for its low and high
 BLOCKS = (32, 64)  # voxels along a side of a block
 WORK = ".gvtorch-work"
 MOST_VOXELS = 2**40
+MOST_TIMES = 2**20
 DTYPES = {"uint8": 1, "int8": 1, "uint16": 2, "int16": 2, "float16": 2, "float32": 4}  # bytes
 GROUPS = ("gvtorch", "gvtorch/blocks", "gvtorch/cells")
 _PLAIN_CHUNK = 64  # voxels
@@ -60,6 +65,12 @@ class StoreLayout:
     block: int = BLOCKS[0]
     threshold: float | None = None  # what EMPTY was decided by
     value_range: Sequence[Sequence[float]] | None = None  # [low, high] of each channel
+    times: int = 1  # time points
+
+    @property
+    def axes(self) -> str:
+        """Axes of the pyramid's arrays."""
+        return "tczyx" if self.times > 1 else "czyx" if self.width > 1 else "zyx"
 
     @property
     def levels(self) -> int:
@@ -95,15 +106,20 @@ class StoreLayout:
         """(z, y, x) number of shards of a level: one a task of the converter."""
         return self.grid(level, self.shard)
 
+    def at_time(self, array: Any, time: int) -> Any:
+        """One time point of an array of the store, without its axis of time."""
+        return array[time] if self.times > 1 else array
+
     def plain(self, level: int, *, path: str = "") -> dict[str, Any]:
         """Spec of the pyramid's array of a level."""
-        first = [self.width] if self.width > 1 else []
+        first = [self.width] if "c" in self.axes else []
         return self._array(
             path or str(level),
             shape=[*first, *self.shape(level)],
             shard=[*first, *[self.shard] * 3],
             chunk=[1] * len(first) + [_PLAIN_CHUNK] * 3,
-            names="czyx"[-3 - len(first) :],
+            names=self.axes,
+            times=self.times,
         )
 
     def blocks(self, level: int) -> dict[str, Any]:
@@ -115,6 +131,7 @@ class StoreLayout:
             shard=[*[self.shard // self.block] * 3, *inside],
             chunk=[1, 1, 1, *inside],
             keep=False,
+            times=self.times,
         )
 
     def cells(self, level: int) -> dict[str, Any]:
@@ -125,13 +142,20 @@ class StoreLayout:
             shape=[*self.grid(level, CELL), *inside],
             shard=[*[self.shard // CELL] * 3, *inside],
             chunk=[*[_CELL_CHUNK] * 3, *inside],
+            times=self.times,
         )
 
+    def coarse_folder(self, time: int) -> str:
+        """Where the coarse channels of a time point lie."""
+        return "gvtorch/coarse" if self.times == 1 else f"gvtorch/coarse/{time}"
+
     def coarse(self, level: int, folder: str, width: int) -> dict[str, Any]:
-        """Spec of the array of bordered blocks of a coarse channel, from level 1 on."""
+        """Spec of the array of bordered blocks of a coarse channel, from level 1 on; `folder` is
+        that of the channel.
+        """
         inside = [self.stored] * 3 + [width]
         return dataclasses.replace(self, dtype="float16")._array(
-            f"gvtorch/coarse/{folder}/{level}",
+            f"{folder}/{level}",
             shape=[*self.grid(level, self.block), *inside],
             shard=[*[_COARSE_SHARD // self.block] * 3, *inside],
             chunk=[1, 1, 1, *inside],
@@ -154,7 +178,10 @@ class StoreLayout:
         chunk: list[int],
         names: str = "",
         keep: bool = True,
+        times: int = 1,
     ) -> dict[str, Any]:
+        if times > 1:  # each time point has shards of its own
+            shape, shard, chunk = [times, *shape], [1, *shard], [1, *chunk]
         size = DTYPES[self.dtype]
         wide = size > 1
         little = {"name": "bytes", "configuration": {"endian": "little"}}
@@ -188,9 +215,11 @@ class StoreLayout:
 
     def attributes(self, place: dict[str, Any]) -> dict[str, Any]:
         """What the metadata says of a whole store; `place` is its spacing and origin."""
+        several = {"times": self.times} if self.times > 1 else {}
         return {
-            "version": VERSION,
+            "version": VERSION + (self.times > 1),
             "extent": list(self.extent),
+            **several,
             **place,
             "dtype": self.dtype,
             "channels": self.width,
@@ -209,12 +238,17 @@ class StoreLayout:
         """Reads `attributes`; raises ValueError unless they are what `convert` writes."""
         if not isinstance(own, dict) or own.get("complete") is not True:
             raise ValueError(f"{where}: half-written or damaged: zarr.json does not say complete")
-        if own.get("version") != VERSION:
-            raise ValueError(f"{where}: store version {own.get('version')!r}, this reads {VERSION}")
+        if own.get("version") not in (VERSION, VERSION + 1):
+            raise ValueError(
+                f"{where}: store version {own.get('version')!r}, this reads {VERSION} and "
+                f"{VERSION + 1}"
+            )
+        times = own.get("times", 1)
         extent: Any = own.get("extent")
         ranges: Any = own.get("value_range")
         fits = {
             "extent": _is_list(extent, 3) and all(_is_whole(n, 1, MOST_VOXELS) for n in extent),
+            "times": _is_whole(times, own["version"], MOST_TIMES if own["version"] > 1 else 1),
             "dtype": own.get("dtype") in DTYPES,
             "channels": _is_whole(own.get("channels"), 1, 2**16),
             "block": own.get("block") in BLOCKS,
@@ -229,7 +263,7 @@ class StoreLayout:
         for key, good in fits.items():
             if not good:
                 raise ValueError(f"{where}: damaged: gvtorch.{key} is {own.get(key)!r}")
-        told = {key: own[key] for key in ("dtype", "block", "value_range")}
+        told = {key: own[key] for key in ("dtype", "block", "value_range")} | {"times": times}
         return cls(
             extent=tuple(extent), width=own["channels"], threshold=own.get("threshold"), **told
         )
@@ -331,11 +365,26 @@ def context() -> Any:
 
 
 def kvstore(location: str | Path) -> Any:
-    """Returns tensorstore's spec of a folder: a path, or a URL that it knows."""
+    """Returns tensorstore's spec of a folder: a path, or a URL that it knows. Whatever a path is
+    made of, links and ".." too, stands for the folder that the system finds there.
+
+    Raises:
+        ValueError: The path can't be written as UTF-8.
+    """
     text = str(location)
+    if text.startswith("file://"):
+        text = unquote(urlsplit(text).path)
     if re.match(r"[a-z0-9+]{2,}://", text):
         return text if text.endswith("/") or "?" in text else text + "/"
-    return {"driver": "file", "path": f"{Path(text).absolute()}/"}
+    path = os.path.realpath(text)
+    try:
+        path.encode()
+    except UnicodeEncodeError:
+        raise ValueError(
+            f"{path.encode(errors='backslashreplace').decode()}: a store's path must be UTF-8; "
+            "rename it"
+        ) from None
+    return {"driver": "file", "path": f"{path.rstrip('/')}/"}
 
 
 def child(root: Any, path: str) -> Any:

@@ -5,14 +5,18 @@ Source: OME model 2016-06 (Pixels, Channel, Plane); ImageJ, class TiffEncoder (m
 
 from __future__ import annotations
 
+import logging
 import math
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
 from ..base.image_info import ChannelInfo, ImageInfo, Rgb
-from .units import spacing_of, time_unit
+from ..base.units import spacing_of, time_unit
 
 Told = tuple[ImageInfo, tuple[float, float, float], list[str]]  # info, spacing, what is not kept
 _MOST_XML = 1 << 28  # characters

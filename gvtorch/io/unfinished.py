@@ -14,11 +14,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
+from ..base.image_info import ImageInfo
 from ..base.volume import Volume, movable
 from .ngff import image_metadata, parse_json
 from .store_layout import GROUPS, WORK, StoreLayout
 
-Task = tuple[int, ...]  # level, z, y, x
+Task = tuple[int, ...]  # level, z, y, x, or level, t, z, y, x
 
 
 class UnfinishedStore:
@@ -37,15 +38,15 @@ class UnfinishedStore:
         self._journal.flush()
         os.fsync(self._journal.fileno())
 
-    def finish(self, layout: StoreLayout, settings: Mapping[str, Any]) -> None:
+    def finish(self, layout: StoreLayout, info: ImageInfo, settings: Mapping[str, Any]) -> None:
         """Writes the metadata, the root's last of all, and removes the hidden folder."""
         for name in GROUPS:
             write_json(self._target / name / "zarr.json", group({}))
         place = {"spacing": settings["spacing"], "origin": settings["origin"]}
         name = self._target.name.removesuffix(".zarr")
-        told = {"width": layout.width, "unit": settings["unit"]}
-        image = image_metadata(name, layout.levels, **place, **told)
-        attributes = {"ome": image, "gvtorch": layout.attributes(place)}
+        image, beside = image_metadata(name, layout, info, **place)
+        own = layout.attributes(place) | ({"info": beside} if beside else {})
+        attributes = {"ome": image, "gvtorch": own}
         write_json(self._target / "zarr.json", group(attributes))
         shutil.rmtree(self._target / WORK, ignore_errors=True)
 

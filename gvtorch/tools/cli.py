@@ -48,8 +48,9 @@ class Info:
         elif is_zarr(self.path):
             from ..io.store import Store
 
-            refuse_for_store(self.source)
-            content = Store.open(self.path).describe()
+            refuse_for_store(self.source, "--key")
+            store = Store.open(self.path, image=self.source.key, time=self.source.time or 0)
+            content = store.describe()
         else:
             with Bar() as bar:
                 bar("reading", 0, 0)
@@ -155,14 +156,15 @@ class Filter:
         start, store = time.perf_counter(), Store.open(self.store)
         before = store.describe()["disk bytes"]
         with Bar() as bar:
-            Filtered.add_to(
-                store,
-                parse_transfer(self.tf, *value_range(store)),
-                component=self.component,
-                directions={"auto": None, "six": True, "one": False}[self.directions],
-                device="cuda" if on_cuda else "cpu",
-                progress=bar,
-            )
+            for moment in range(store.times):
+                Filtered.add_to(
+                    store if moment == 0 else Store.open(self.store, time=moment),
+                    parse_transfer(self.tf, *value_range(store)),
+                    component=self.component,
+                    directions={"auto": None, "six": True, "one": False}[self.directions],
+                    device="cuda" if on_cuda else "cpu",
+                    progress=bar,
+                )
         added = amount(max(0, store.describe()["disk bytes"] - before))
         print(f"{self.store}: {added} of colours in {time.perf_counter() - start:.1f} s")
 
@@ -277,7 +279,9 @@ def main(args: list[str] | None = None) -> None:
         text = " ".join(str(error).split())
         print(f"gvtorch: error: not enough memory: {text}", file=sys.stderr)
         sys.exit(2)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
+        if str(stop):
+            print(f"gvtorch: {stop}", file=sys.stderr)
         sys.exit(130)
 
 

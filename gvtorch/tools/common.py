@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
@@ -31,7 +31,13 @@ class ReadOptions:
     spacing: Annotated[str | None, arg(metavar="X,Y,Z")] = None
     """voxel size in world units"""
     key: Annotated[str | None, arg(metavar="NAME")] = None
-    """NPZ: which array"""
+    """NPZ: which array; OME-Zarr: which image"""
+    axes: Annotated[str | None, arg(metavar="LETTERS")] = None
+    """NPY, NPZ, NRRD: what the axes are, the slowest first, as in tzyx or czyx"""
+    time: Annotated[int | None, arg(metavar="N")] = None
+    """time point, from 0"""
+    oblique: Literal["resample", "keep"] | None = None
+    """voxel axes that do not lie along the world's: resample along these, or keep the voxels"""
     nan: Annotated[float | None, arg(metavar="VALUE")] = None
     """value for voxels that are NaN or infinite"""
 
@@ -48,6 +54,9 @@ class ReadOptions:
             "dtype": self.dtype,
             "spacing": numbers("--spacing", self.spacing, 3, float) if self.spacing else None,
             "key": self.key,
+            "axes": self.axes,
+            "time": self.time,
+            "oblique": self.oblique,
             "nan": self.nan,
         }
 
@@ -104,9 +113,11 @@ def given(options: Any) -> list[str]:
     return [f"--{n.replace('_', '-')}" for n, v in vars(options).items() if v != plain[n]]
 
 
-def refuse_for_store(source: ReadOptions) -> None:
-    """Raises ValueError where flags tell how to read a volume file, but a store was named."""
-    flags = given(source)
+def refuse_for_store(source: ReadOptions, *known: str) -> None:
+    """Raises ValueError where flags tell how to read a volume file, but a store was named; --time
+    and those `known` are for stores too.
+    """
+    flags = [flag for flag in given(source) if flag not in ("--time", *known)]
     if flags:
         raise ValueError(f"{flags[0]} is for volume files; a store tells it itself")
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from tyro.conf import Positional, arg
 
-from .common import Bar, numbers, size
+from .common import Bar, ReadOptions, numbers, refuse_for_store, size
 from .look import Look
 from .streaming import Streaming, tell_failures
 
@@ -40,6 +40,7 @@ class Fly:
     """one JSON line a frame; stats.jsonl beside the pictures if left out"""
     look: tyro.conf.OmitArgPrefixes[Look] = Look()
     streaming: tyro.conf.OmitArgPrefixes[Streaming] = Streaming()
+    source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     def run(self) -> None:
         """Renders frame after frame."""
@@ -58,7 +59,9 @@ class Fly:
         with ExitStack() as stack:
             bar = stack.enter_context(Bar())
             bar("reading", 0, 0)
-            engine, shader = stack.enter_context(self.streaming.open(self.path, self.look))
+            refuse_for_store(self.source)
+            opened = self.streaming.open(self.path, self.look, self.source.time or 0)
+            engine, shader = stack.enter_context(opened)
             path = self._path(engine, start)
             video = None
             if is_video:

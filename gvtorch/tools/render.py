@@ -143,7 +143,7 @@ class Render:
             raise ValueError("--threshold is for volumes; a store's is set by gvtorch convert")
         refuse_for_store(self.source)
         streaming = self.streaming
-        with streaming.open(self.path, self.look) as (engine, shader):
+        with streaming.open(self.path, self.look, self.source.time or 0) as (engine, shader):
             (source,) = engine.trees.values()
             mode, most = streaming.mode or "converge", streaming.max_frames
             stats = self._take(

@@ -37,22 +37,20 @@ class Streaming:
     """most frames of a picture that converges"""
     loading: Literal["straight", "levels"] = "straight"
     """to the wanted level at once, or level by level"""
-    time: Annotated[int, arg(metavar="N")] = 0
-    """time point"""
     image: Annotated[str | None, arg(metavar="NAME")] = None
     """which image, where a store has several"""
     strict: tyro.conf.FlagCreatePairsOff[bool] = False
     """a block that can't be read ends the work"""
 
     @contextmanager
-    def open(self, path: str, look: Look) -> Iterator[tuple[Engine, Shader]]:
-        """Opens a store: the engine over it, and the transfer function."""
+    def open(self, path: str, look: Look, time: int = 0) -> Iterator[tuple[Engine, Shader]]:
+        """Opens a store at a time point: the engine over it, and the transfer function."""
         from ..engine.engine import Engine
         from ..io.store import Store
         from ..producers import StoredProducer
         from ..shaders import Filtered
 
-        store = Store.open(path, image=self.image, time=self.time)
+        store = Store.open(path, image=self.image, time=time)
         shader = look.chosen(*value_range(store))
         filtered = shader if isinstance(shader, Filtered) else None
         if filtered is not None and look.tf is None:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.arrays import as_volume
 from ..base.records import Hits, Rays, RenderStats
 from ..base.stage import Progress, collect_timings, no_progress, stage
 from ..cameras.camera import Camera
@@ -35,7 +36,7 @@ _RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that p
 
 
 def render(
-    tree: N3Tree,
+    tree: N3Tree | Any,
     camera: Camera | Rays,
     shader: Shader,
     *,
@@ -46,7 +47,8 @@ def render(
 
     Args:
         tree: What to render, on the device that renders it; its stamps and request words are
-            written.
+            written. A volume or an array (see `as_volume`) becomes a tree on the CPU, anew in each
+            call: make one where there are more pictures.
         camera: One camera or a batch; an orbit camera stands around the tree's box. Or rays in
             world units, which make a picture as wide as `Rays.width`, or of one row.
         shader: The transfer function, in data units, or another shader.
@@ -61,7 +63,8 @@ def render(
     """
     camera = as_camera("render", camera)
     chosen = render_options("render", options, camera)
-    check.instance("render", "tree", tree, N3Tree)
+    if not isinstance(tree, N3Tree):
+        tree = N3Tree.from_volume(as_volume(tree, where="render"))
     start = time.perf_counter()
     with collect_timings(tree.device) as timings:
         with stage("prepare"):

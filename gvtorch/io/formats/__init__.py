@@ -5,7 +5,6 @@ torch is not imported here, so that the command line can name the formats at onc
 
 import importlib
 import pkgutil
-from collections.abc import Collection
 from pathlib import Path
 
 from .format import FORMATS, Format
@@ -37,18 +36,12 @@ def find_format(path: str, *, raw: bool = False) -> Format:
     )
 
 
-def check_options(path: str, found: Format, given: Collection[str]) -> None:
-    """Raises ValueError, with the formats that take it, for an option that a format doesn't."""
-    for name in given:
-        if name not in found.options:
-            owners = [candidate for candidate in FORMATS if name in candidate.options]
-            names, those = " and ".join(owners[0].options), len(owners[0].options) > 1
-            if len(owners) > 1:
-                names, those = name, False
-            raise ValueError(
-                f"{path}: {names} {'are' if those else 'is'} for "
-                f"{', '.join(owner.name for owner in owners)} files, this is {found.name}"
-            )
+def split_path(text: str) -> tuple[str, str | None]:
+    """Splits `file.h5:/group/data` into the file and what is named of it; other paths stay."""
+    file, mark, inner = text.rpartition(":/")
+    if mark and "://" not in text and not Path(text).exists() and Path(file).is_file():
+        return file, f"/{inner}"
+    return text, None
 
 
 def format_names() -> str:
@@ -57,4 +50,4 @@ def format_names() -> str:
     return f"{', '.join(names)} or {last}"
 
 
-__all__ = ["FORMATS", "Format", "check_options", "find_format", "format_names"]
+__all__ = ["FORMATS", "Format", "find_format", "format_names", "split_path"]

@@ -80,6 +80,8 @@ class DicomSource(VolumeSource):
 
 def _has_magic(path: str | os.PathLike[str]) -> bool:
     try:
+        if not os.path.isfile(path):  # a pipe would be waited for
+            return False
         with open(path, "rb") as file:
             return file.read(132)[128:] == b"DICM"
     except OSError:

@@ -1,14 +1,25 @@
-"""NIfTI, through nibabel. Axes along the world's are turned to x, y, z."""
+"""NIfTI, through nibabel: (x, y, z), then time, then components. Axes along the world's, which are
+x right, y anterior, z superior, are turned to x, y, z.
+
+Source: "NIfTI-1 data format", nifti1.h (nifti.nimh.nih.gov), dim, xyzt_units, intent_code, cal_max.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from ...base.image_info import ChannelInfo, ImageInfo
 from ..source import Index, VolumeSource, place_axes
 from .format import Format
+
+_LENGTHS = {"meter": "meter", "mm": "millimeter", "micron": "micrometer"}
+_TIMES = {"sec": "second", "msec": "millisecond", "usec": "microsecond"}
+_LABEL_INTENT = 1002
+_RGB = (("red", (1.0, 0.0, 0.0)), ("green", (0.0, 1.0, 0.0)), ("blue", (0.0, 0.0, 1.0)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,7 +27,10 @@ class NiftiSource(VolumeSource):
     """A NIfTI image, its values scaled as the header tells."""
 
     def read_stored(self, index: Index) -> np.ndarray:
-        return np.asanyarray(_load(self.path).dataobj[index])
+        data = _load(self.path).dataobj
+        if data.dtype.fields is None:
+            return np.asanyarray(data[index])
+        return _components(np.asanyarray(data[index[: len(data.shape)]]))[..., index[-1]]
 
 
 @Format("NIfTI", ".nii", ".nii.gz", library="nibabel")
@@ -24,16 +38,76 @@ def open_nifti(path: str) -> NiftiSource:
     """Opens an image; its first voxel tells the dtype after scaling."""
     image = _load(path)
     shape = tuple(int(n) for n in image.shape)
-    if len(shape) not in (3, 4):
-        raise ValueError(f"{path}: expected 3 or 4 dimensions, got {shape}")
     first = np.asanyarray(image.dataobj[(slice(0, 1),) * len(shape)])
+    if first.dtype.fields is not None:  # colours, the numbers of a voxel side by side
+        first = _components(first)
+        shape = (*shape, *[1] * (4 - len(shape)), first.shape[-1])
+    if len(shape) < 3 or math.prod(shape[5:]) != 1:
+        raise ValueError(f"{path}: expected 3 to 5 dimensions, got {shape}")
+    told = place_axes(
+        path,
+        np.asarray(image.affine),
+        shape[:5],
+        4 if len(shape) > 4 else None,
+        3 if len(shape) > 3 else None,
+    )
+    info, lost = _info(image, shape)
     return NiftiSource(
         path=path,
         shape=shape,
         stored=first.dtype.str,
         whole=path.lower().endswith(".gz"),
-        **place_axes(path, np.asarray(image.affine), shape, 3 if len(shape) == 4 else None),
+        info=info,
+        lost=tuple(lost),
+        **told | {"axes": told["axes"] + "-" * len(shape[5:])},
     )
+
+
+def _info(image: Any, shape: tuple[int, ...]) -> tuple[ImageInfo, list[str]]:
+    """What the header tells of the values, and what of it is not kept."""
+    header, lost = image.header, []
+    try:
+        length, period = header.get_xyzt_units()
+    except KeyError:
+        length = period = "unknown"
+        lost.append(f"xyzt_units {int(header['xyzt_units'])}, which are none")
+    step: float | None = None
+    origin = 0.0
+    if len(shape) > 3 and shape[3] > 1:
+        step, origin = float(header["pixdim"][4]), float(header["toffset"])
+        if period not in (*_TIMES, "unknown"):
+            lost.append(f"the fourth axis counts {period}, and is taken for time")
+        step = step if math.isfinite(step) and step > 0 else None
+        origin = origin if math.isfinite(origin) else 0.0
+    if int(header["qform_code"]) > 0 and int(header["sform_code"]) > 0:
+        forms = header.get_qform(), header.get_sform()
+        if not np.allclose(*forms, rtol=1e-3, atol=1e-2 * float(header["pixdim"][1:4].min())):
+            lost.append("the qform, which differs from the sform")
+    if len(header.extensions):
+        lost.append(f"{len(header.extensions)} header extensions")
+    window = (float(header["cal_min"]), float(header["cal_max"]))
+    plain = ChannelInfo(window=window if all(map(math.isfinite, window)) else None)
+    channels = [plain] * (shape[4] if len(shape) > 4 else 1) if window[0] < window[1] else []
+    if image.dataobj.dtype.fields is not None:
+        channels = [ChannelInfo(name=name, color=color) for name, color in _RGB]
+        channels += [ChannelInfo(name="alpha")] * (shape[4] - 3)
+    info = ImageInfo(
+        unit=_LENGTHS.get(length),
+        channels=tuple(channels),
+        labels=int(header["intent_code"]) == _LABEL_INTENT,
+        space="right-anterior-superior",
+        time_step=step,
+        time_origin=origin,
+        time_unit=_TIMES.get(period) if step is not None else None,
+    )
+    return info, lost
+
+
+def _components(data: np.ndarray) -> np.ndarray:
+    """(x, y, z[, t]) colours of named parts -> (x, y, z, t, c)."""
+    names = data.dtype.names or ()
+    parts = np.stack([data[name] for name in names], -1)
+    return parts[..., None, :] if parts.ndim == 4 else parts
 
 
 def _load(path: str) -> Any:

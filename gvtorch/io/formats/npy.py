@@ -1,4 +1,4 @@
-"""NumPy arrays, (z, y, x) or (z, y, x, c): NPY, packed NPY, and NPZ. Nothing is unpickled."""
+"""NumPy arrays: NPY, packed NPY, and NPZ. Nothing is unpickled."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import zipfile
 
 import numpy as np
 
+from ...base.named_axes import ask_axes
 from ..source import ArraySource, open_unpacked
 from .format import Format
 
 
-@Format("NPY", ".npy", ".npy.gz", ".npy.bz2")
-def open_npy(path: str, member: str = "") -> ArraySource:
-    """Opens an array file, or a member of an archive of them."""
+@Format("NPY", ".npy", ".npy.gz", ".npy.bz2", options=("axes",))
+def open_npy(path: str, axes: str | None = None, member: str = "") -> ArraySource:
+    """Opens an array file, or a member of an archive of them; `axes` as of `ask_axes`."""
     with open_unpacked(path, member) as stream:
         version = np.lib.format.read_magic(stream)
         read_header = {
@@ -25,14 +26,12 @@ def open_npy(path: str, member: str = "") -> ArraySource:
         offset = stream.tell()
     if dtype.hasobject:
         raise ValueError(f"{path}: holds Python objects, not numbers")
-    if len(shape) not in (3, 4):
-        raise ValueError(f"{path}: data must be (z, y, x) or (z, y, x, c), got shape {shape}")
     return ArraySource(
         path=path,
         file=path,
         member=member,
         shape=tuple(int(n) for n in shape),
-        axes="zyxc"[: len(shape)],
+        axes=ask_axes(path, shape, axes),
         stored=dtype.str,
         offset=offset,
         fortran=fortran,
@@ -40,9 +39,9 @@ def open_npy(path: str, member: str = "") -> ArraySource:
     )
 
 
-@Format("NPZ", ".npz", options=("key",))
-def open_npz(path: str, key: str | None = None) -> ArraySource:
-    """Opens the array `key` of an archive; without it, the only one."""
+@Format("NPZ", ".npz", options=("key", "axes"))
+def open_npz(path: str, key: str | None = None, axes: str | None = None) -> ArraySource:
+    """Opens the array `key` of an archive; without it, the only one. `axes` as of `ask_axes`."""
     with zipfile.ZipFile(path) as archive:
         names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
     if key is None and len(names) != 1:
@@ -52,4 +51,4 @@ def open_npz(path: str, key: str | None = None) -> ArraySource:
     chosen = names[0] if key is None else key
     if chosen not in names:
         raise ValueError(f"{path}: has no array {chosen!r}; it holds {', '.join(names)}")
-    return open_npy(path, f"{chosen}.npy")
+    return open_npy(path, axes, f"{chosen}.npy")

@@ -1,5 +1,5 @@
 """NRRD, attached or detached; the header through pynrrd. Axes along the world's are turned to
-x, y, z.
+x, y, z; which way these point is told (`ImageInfo.space`), they are not turned to another space.
 
 Source: "Definition of NRRD File Format" (teem.sourceforge.net/nrrd/format.html).
 """
@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from ...base.image_info import ChannelInfo, ImageInfo
+from ...base.named_axes import ask_axes
 from ..source import ArraySource, Index, VolumeSource, place_axes
 from .format import Format
 
@@ -26,6 +28,32 @@ _TYPES = {
     **dict.fromkeys(("ulonglong", "unsigned long long", "uint64"), "u8"),
     **{"float": "f4", "double": "f8"},
 }
+_LENGTHS = {
+    **dict.fromkeys(("m", "meter", "metre"), "meter"),
+    **dict.fromkeys(("cm", "centimeter"), "centimeter"),
+    **dict.fromkeys(("mm", "millimeter", "millimetre"), "millimeter"),
+    **dict.fromkeys(("um", "µm", "μm", "micron", "microns", "micrometer"), "micrometer"),
+    **dict.fromkeys(("nm", "nanometer", "nanometre"), "nanometer"),
+}
+_TIMES = {
+    **dict.fromkeys(("s", "sec", "second", "seconds"), "second"),
+    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), "millisecond"),
+    **dict.fromkeys(("us", "µs", "usec", "microsecond"), "microsecond"),
+}
+_SPACES = {"ras": "right-anterior-superior", "las": "left-anterior-superior"}
+_SPACES["lps"] = "left-posterior-superior"
+_SPATIAL = ("domain", "space")
+_COLORS = (("red", (1.0, 0.0, 0.0)), ("green", (0.0, 1.0, 0.0)), ("blue", (0.0, 0.0, 1.0)))
+#: Fields of the format; others are key/value pairs of the file's writer.
+_FIELDS = {
+    *("type", "dimension", "sizes", "encoding", "endian", "data file", "datafile", "block size"),
+    *("byte skip", "byteskip", "line skip", "lineskip", "content", "sample units", "number"),
+    *("space", "space dimension", "space units", "space origin", "space directions", "spacings"),
+    *("kinds", "units", "labels", "centers", "centerings", "thicknesses", "axis mins", "axismins"),
+    *("axis maxs", "axismaxs", "sampleunits", "blocksize", "measurement frame", "min", "max"),
+    *("old min", "oldmin", "old max", "oldmax"),
+}
+_UNKEPT = ("measurement frame", "old min", "oldmin", "old max", "oldmax")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,26 +67,30 @@ class NrrdSource(VolumeSource):
         return nrrd.read(self.path, index_order="F")[0][index]
 
 
-@Format("NRRD", ".nrrd", ".nhdr", library="nrrd", package="pynrrd")
-def open_nrrd(path: str) -> VolumeSource:
-    """Opens a file."""
+@Format("NRRD", ".nrrd", ".nhdr", options=("axes",), library="nrrd", package="pynrrd")
+def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
+    """Opens a file; `axes` as of `ask_axes`, the slowest first."""
     import nrrd
 
     with open(path, "rb") as file:
         header = nrrd.read_header(file)
         offset = file.tell()
     shape = tuple(int(n) for n in header["sizes"])
-    if len(shape) not in (3, 4):
-        raise ValueError(f"{path}: expected 3 or 4 dimensions, got {shape}")
     kind = _TYPES.get(str(header["type"]).lower().removesuffix("_t"))
     if kind is None:
         raise ValueError(f"{path}: type {header['type']!r} is unknown")
-    component, affine = _place(header, len(shape))
+    letters = _letters(path, header, shape, axes)
+    info, lost = _info(header, letters, shape)
     told: dict[str, Any] = {
         "path": path,
         "shape": shape,
         "stored": np.dtype((">" if header.get("endian") == "big" else "<") + kind).str,
-        **place_axes(path, affine, shape, component),
+        "info": info,
+        "lost": tuple(lost),
+        **place_axes(
+            *(path, _affine(header, letters), shape),
+            *(letters.index(letter) if letter in letters else None for letter in "ct"),
+        ),
     }
     data = header.get("data file", header.get("datafile"))
     skip = int(header.get("byte skip", header.get("byteskip", 0)))
@@ -73,27 +105,102 @@ def open_nrrd(path: str) -> VolumeSource:
     return ArraySource(file=file_path, offset=offset, fortran=True, **told)
 
 
-def _place(header: dict[str, Any], rank: int) -> tuple[int | None, np.ndarray]:
-    """Returns the axis that counts components, if any, and the (4, 4) place of the others."""
-    directions = np.asarray(header.get("space directions", np.zeros((0, 3))), dtype=np.float64)
-    spacings = np.asarray(header.get("spacings", np.zeros(0)), dtype=np.float64)
-    kinds = list(header.get("kinds", ()))
-    component = None
-    if rank == 4:  # one axis counts components: the one that has no place, else the first
-        placed = [np.isfinite(row).all() for row in directions] or list(np.isfinite(spacings))
-        component = placed.index(False) if False in placed else 0
-        component = next(
-            (i for i, kind in enumerate(kinds) if kind not in ("domain", "space")), component
-        )
-        directions, spacings = (
-            np.delete(a, component, 0) if len(a) == 4 else a for a in (directions, spacings)
-        )
+def _letters(path: str, header: dict[str, Any], shape: tuple[int, ...], axes: str | None) -> str:
+    """What each axis is: "s" of space, "t" times, "c" components."""
+    rank, kinds = len(shape), [str(kind).lower() for kind in header.get("kinds", ())]
+    if rank < 3:
+        raise ValueError(f"{path}: expected 3 axes of space, got {rank} axes")
+    if axes is None:
+        if len(kinds) == rank and set(kinds) - {"???", "none"}:
+            found = ["s" if k in _SPATIAL else "t" if k == "time" else "c" for k in kinds]
+        else:  # the axes that have no place, if the header tells of one
+            places = _directions(header, rank), _spacings(header, rank)[:, None]
+            table = next((one for one in places if np.isfinite(one).any()), np.zeros((rank, 1)))
+            found = ["s" if np.isfinite(row[:3]).all() else "c" for row in table]
+        if found.count("s") == 3 and found.count("t") <= 1 and found.count("c") <= 1:
+            return "".join(found)
+    letters = ask_axes(path, shape[::-1], axes)[::-1]
+    if sum(letter in "zyx" for letter in letters) != 3:
+        raise ValueError(f"{path}: expected three axes of space, got {letters[::-1]}")
+    return "".join("s" if letter in "zyx" else letter for letter in letters)
+
+
+def _directions(header: dict[str, Any], rank: int) -> np.ndarray:
+    """(axes, 3 or 4) steps along each axis, in space and, if told, in time; NaN for none."""
+    told = np.asarray(header.get("space directions", np.zeros((0, 3))), dtype=np.float64)
+    fits = told.ndim == 2 and len(told) == rank and told.shape[1] in (3, 4)
+    return told if fits else np.full((rank, 3), np.nan)
+
+
+def _spacings(header: dict[str, Any], rank: int) -> np.ndarray:
+    """(axes,) widths of a step along each axis; NaN for none."""
+    told = np.asarray(header.get("spacings", np.zeros(0)), dtype=np.float64)
+    return told if told.shape == (rank,) else np.full(rank, np.nan)
+
+
+def _affine(header: dict[str, Any], letters: str) -> np.ndarray:
+    """(4, 4) place of the three axes of space."""
+    spatial = [axis for axis, letter in enumerate(letters) if letter == "s"]
+    directions = _directions(header, len(letters))[spatial, :3]
+    spacings = _spacings(header, len(letters))[spatial]
     affine = np.eye(4)
-    if directions.shape == (3, 3) and np.isfinite(directions).all():
+    if np.isfinite(directions).all():
         affine[:3, :3] = directions.T
-    elif spacings.shape == (3,) and np.isfinite(spacings).all():
+    elif np.isfinite(spacings).all():
         affine[:3, :3] = np.diag(spacings)
     origin = np.asarray(header.get("space origin", np.zeros(3)), dtype=np.float64)
-    if origin.shape == (3,) and np.isfinite(origin).all():
-        affine[:3, 3] = origin
-    return component, affine
+    if origin.shape in ((3,), (4,)) and np.isfinite(origin[:3]).all():
+        affine[:3, 3] = origin[:3]
+    return affine
+
+
+def _info(
+    header: dict[str, Any], letters: str, shape: tuple[int, ...]
+) -> tuple[ImageInfo, list[str]]:
+    """What the header tells of the values, and what of it is not kept."""
+    own = [str(name) for name in header if str(name).lower() not in _FIELDS]
+    lost = [f"the field {name!r}" for name in header if str(name).lower() in _UNKEPT]
+    if own:
+        more = f" and {len(own) - 3} more" if len(own) > 3 else ""
+        lost.append(f"key/value pairs {', '.join(own[:3])}{more}")
+    units = [str(unit) for unit in header.get("units", ())]
+    units = units if len(units) == len(letters) else [""] * len(letters)
+    spatial = [str(unit) for unit in header.get("space units", ())][:3]
+    spatial = spatial or [u for u, letter in zip(units, letters, strict=True) if letter == "s"]
+    known = {_LENGTHS.get(unit.lower().strip()) for unit in spatial}
+    unit = known.pop() if len(known) == 1 else None
+    if unit is None and any(spatial):
+        lost.append(f"units of space {', '.join(spatial)}")
+    step: float | None = None
+    period = None
+    if "t" in letters:
+        at = letters.index("t")
+        steps = (*_directions(header, len(letters))[at, 3:], _spacings(header, len(letters))[at])
+        step = next((float(one) for one in steps if np.isfinite(one) and one > 0), None)
+        period = _TIMES.get(units[at].lower().strip()) if step else None
+    space = str(header.get("space", "")).lower().removesuffix("-time")
+    info = ImageInfo(
+        unit=unit,
+        channels=_channels(header, letters, shape),
+        quantity=str(header.get("sample units", header.get("sampleunits", ""))) or None,
+        labels=any(str(name).startswith("Segment0_") for name in header),
+        space=_SPACES.get(space, space) or None,
+        time_step=step,
+        time_unit=period,
+    )
+    return info, lost
+
+
+def _channels(
+    header: dict[str, Any], letters: str, shape: tuple[int, ...]
+) -> tuple[ChannelInfo, ...]:
+    """Names of the components of kinds that have some."""
+    kinds = [str(kind).lower() for kind in header.get("kinds", ())]
+    at = letters.find("c")
+    kind = kinds[at] if 0 <= at < len(kinds) else ""
+    if kind in ("rgb-color", "rgba-color") and shape[at] == len(kind) - 6:
+        found = [ChannelInfo(name=name, color=color) for name, color in _COLORS]
+        return (*found, ChannelInfo(name="alpha"))[: shape[at]]
+    if kind == "complex" and shape[at] == 2:
+        return (ChannelInfo(name="real"), ChannelInfo(name="imaginary"))
+    return ()

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from ...base.image_info import ImageInfo
 from ..ngff import is_zarr
 from ..source import Index, VolumeSource
 from .format import Format
@@ -18,33 +17,41 @@ _TIMEOUT = 600.0  # seconds for one read
 
 @dataclass(frozen=True, kw_only=True)
 class OmeZarrSource(VolumeSource):
-    """The finest level of an image."""
+    """The finest level of an image, (t, z, y, x, c)."""
+
+    key: str | None
 
     def read_stored(self, index: Index) -> np.ndarray:
-        low, high = [s.start for s in index[:3]], [s.stop for s in index[:3]]
-        return _store(self).read_region(0, low, high, timeout=_TIMEOUT)
+        low, high = [s.start for s in index[1:4]], [s.stop for s in index[1:4]]
+        stores = [
+            _store(self.path, self.key, self.opened, time)
+            for time in range(index[0].start, index[0].stop)
+        ]
+        return np.stack([store.read_region(0, low, high, timeout=_TIMEOUT) for store in stores])
 
 
 @functools.lru_cache(maxsize=4)
-def _store(source: OmeZarrSource) -> Any:
+def _store(path: str, key: str | None, _opened: int, time: int) -> Any:
     from ..store import Store
 
-    return Store.open(source.path)
+    return Store.open(path, image=key, time=time)
 
 
-@Format("OME-Zarr", ".zarr", matches=is_zarr)
-def open_ome_zarr(path: str) -> OmeZarrSource:
-    """Opens the first image, its first time point and all channels."""
+@Format("OME-Zarr", ".zarr", matches=is_zarr, options=("key",))
+def open_ome_zarr(path: str, key: str | None = None) -> OmeZarrSource:
+    """Opens an image, the first one if `key` names none, with all times and channels."""
     from ..store import Store
 
-    store = Store.open(path)
+    store = Store.open(path, image=key)
     x, y, z = store.extent
     return OmeZarrSource(
         path=path,
-        shape=(z, y, x, store.width),
-        axes="zyxc",
+        shape=(store.times, z, y, x, store.width),
+        axes="tzyxc",
         stored=str(store.dtype).removeprefix("torch."),
         spacing=store.spacing,
         origin=store.origin,
-        info=ImageInfo(unit=store.unit),
+        info=store.info,
+        lost=store.lost,
+        key=key,
     )

@@ -1,0 +1,189 @@
+"""`straighten`: a source whose voxel axes do not lie along the world's, resampled along these.
+
+Voxels are interpolated (trilinear, float64); those of labels are the nearest ones. A region of the
+result reads only the voxels of the source that it lies over, and has the bits of the whole.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from ..pool.downsample import round_array
+from . import boxes
+from .source import Index, VolumeSource
+
+Oblique = Literal["resample", "keep"]
+
+_SLAB = 1 << 20  # voxels that are interpolated at a time
+_TIE = 2.0**-20  # voxels: what rounding may take a place beside where it belongs
+
+
+@dataclass(frozen=True, kw_only=True)
+class StraightSource(VolumeSource):
+    """A source on a grid along the world's axes, (t, z, y, x, c)."""
+
+    inner: VolumeSource
+    to_inner: tuple[tuple[float, ...], ...]  # (3, 4): from own x, y, z to those of `inner`
+    nearest: bool  # values are not to be blended
+    fill: float  # of voxels that lie beside `inner`
+
+    @property
+    def peak_bytes(self) -> int:
+        """As of any source: the inner one is held while it is resampled."""
+        return self.inner.peak_bytes + self.nbytes
+
+    def check_file(self) -> None:
+        self.inner.check_file()
+
+    def read_stored(self, index: Index) -> np.ndarray:
+        """Resamples a part."""
+        times, low, high = index[0], *zip(*((s.start, s.stop) for s in index[1:4]), strict=True)
+        size = [b - a for a, b in zip(low, high, strict=True)]
+        out = np.empty((times.stop - times.start, *size, self.width), self.stored)
+        out[...] = self.fill
+        start, stop = self._reach(low, high)
+        if any(a >= b for a, b in zip(start, stop, strict=True)):
+            return out[..., index[4]]
+        rows = max(1, _SLAB // math.prod(size[1:]))
+        found = self.inner.read_box(start, stop, (times.start, times.stop))
+        for values, made in zip(found, out, strict=True):
+            for z in range(low[0], high[0], rows):
+                box = (z, *low[1:]), (min(z + rows, high[0]), *high[1:])
+                self._resample(values, start, box, made[z - low[0] : box[1][0] - low[0]])
+        return out[..., index[4]]
+
+    def _places(self, low: Sequence[int], high: Sequence[int]) -> list[np.ndarray]:
+        """Places z, y, x in the inner source of a box of voxels; the same bits for any box."""
+        z, y, x = np.ogrid[boxes.index(low, high)]
+        found = [a * x + b * y + c * z + d for a, b, c, d in self.to_inner]
+        return found[::-1]
+
+    def _reach(self, low: Sequence[int], high: Sequence[int]) -> tuple[list[int], list[int]]:
+        """Voxels of the inner source, z y x, that a box lies over; none where stop <= start."""
+        ends = zip(low, np.subtract(high, 1), strict=True)
+        corners = np.array([(x, y, z, 1) for z, y, x in itertools.product(*ends)])
+        places = (corners @ np.array(self.to_inner).T)[:, ::-1]
+        shape = np.array(self.inner.extent[::-1])
+        first, last = np.floor(places.min(0) - _TIE), np.floor(places.max(0) + _TIE) + 2
+        start, stop = np.maximum(first, 0), np.minimum(last, shape)
+        return start.astype(int).tolist(), stop.astype(int).tolist()
+
+    def _resample(
+        self,
+        values: np.ndarray,
+        start: Sequence[int],
+        box: tuple[Sequence[int], Sequence[int]],
+        out: np.ndarray,
+    ) -> None:
+        """Writes a box (z, y, x, c) from inner values (z, y, x, c), which begin at `start`."""
+        places = np.broadcast_arrays(*self._places(*box))
+        shape = self.inner.extent[::-1]
+        inside = np.logical_and.reduce(
+            [
+                (at >= -0.5 - _TIE) & (at <= n - 0.5 + _TIE)
+                for at, n in zip(places, shape, strict=True)
+            ]
+        )
+        if not inside.any():
+            return
+        at = [place[inside].clip(0, n - 1) for place, n in zip(places, shape, strict=True)]
+        if self.nearest:
+            index = [np.floor(a + 0.5).astype(np.int64) - s for a, s in zip(at, start, strict=True)]
+            out[inside] = values[tuple(index)]
+            return
+        lows = [np.floor(a) for a in at]
+        total = np.zeros((len(at[0]), values.shape[3]))
+        for corner in itertools.product((0, 1), repeat=3):
+            weight, index = np.ones(len(at[0])), []
+            for a, first, upper, n, s in zip(at, lows, corner, shape, start, strict=True):
+                weight = weight * (a - first if upper else 1 - (a - first))
+                index.append((np.minimum(first + upper, n - 1)).astype(np.int64) - s)
+            found = values[tuple(index)].astype(np.float64)
+            total += np.where(weight[:, None] > 0, found * weight[:, None], 0)  # 0 * NaN is none
+        out[inside] = round_array(total, out.dtype)
+
+
+def straighten(
+    source: VolumeSource, oblique: Oblique | None = None, fill: float | None = None
+) -> VolumeSource:
+    """Returns a source whose axes lie along the world's, and tells in a line what it did.
+
+    A step along an axis of the world is as long as the voxels are in that direction, so as many
+    voxels come out as there were, and the whole turned box lies inside.
+
+    Args:
+        source: Returned as it is, if its axes lie along the world's.
+        oblique: "resample" (the default), or "keep": the voxels stay as they are, and their axes
+            are taken for the world's.
+        fill: The value beside the source's box; the smallest one (of the time point that is read
+            first), 0 of labels, if left out.
+
+    Raises:
+        ValueError: `oblique` is something else.
+        OSError: The smallest value can't be read.
+    """
+    if oblique is not None and oblique not in get_args(Oblique):
+        raise ValueError(f"{source.path}: oblique must be 'resample' or 'keep', got {oblique!r}")
+    if source.oblique is None:
+        return source
+    affine = np.array(source.oblique)
+    lengths = np.linalg.norm(affine[:, :3], axis=0)
+    turned = math.degrees(math.acos(min(1.0, (np.abs(affine[:, :3]).max(0) / lengths).min())))
+    name = f"{Path(source.path).name}: voxel axes are turned by {turned:.3g} degrees"
+    if oblique == "keep":
+        warnings.warn(f"{name}: kept, and taken for the world's axes", stacklevel=3)
+        return dataclasses.replace(source, oblique=None)
+    inverse = np.linalg.inv(affine[:, :3])
+    spacing = 1 / np.linalg.norm(inverse, axis=0)
+    ends = [(-0.5, n - 0.5) for n in source.extent]
+    corners = np.array(list(itertools.product(*ends))) @ affine[:, :3].T + affine[:, 3]
+    low, high = corners.min(0), corners.max(0)
+    extent = np.ceil((high - low) / spacing - 1e-6).astype(int).clip(1)
+    origin = (low + high - (extent - 1) * spacing) / 2
+    to_inner = np.column_stack((inverse * spacing, inverse @ (origin - affine[:, 3])))
+    if fill is None:
+        fill = 0.0 if source.info.labels else _smallest(source)
+    x, y, z = extent.tolist()
+    warnings.warn(
+        f"{name}: resampled along the world's axes, {x}x{y}x{z} voxels of "
+        f"{' x '.join(f'{s:.4g}' for s in spacing)}; oblique='keep' (--oblique keep) keeps the "
+        "voxels as they are",
+        stacklevel=3,
+    )
+    return StraightSource(
+        path=source.path,
+        shape=(source.times, z, y, x, source.width),
+        axes="tzyxc",
+        stored=source.dtype,
+        spacing=tuple(spacing.tolist()),
+        origin=tuple(origin.tolist()),
+        info=source.info,
+        lost=source.lost,
+        time=source.time,
+        whole=source.whole,
+        inner=dataclasses.replace(source, oblique=None),
+        to_inner=tuple(map(tuple, to_inner.tolist())),
+        nearest=source.info.labels,
+        fill=fill,
+    )
+
+
+def _smallest(source: VolumeSource) -> float:
+    """The smallest finite value, read part by part where that is possible."""
+    x, y, z = source.extent
+    rows = z if source.whole else max(1, _SLAB // (y * x * source.width))
+    smallest = math.inf
+    for low in range(0, z, rows):
+        part = source.read_region((low, 0, 0), (min(low + rows, z), y, x))
+        finite = part[np.isfinite(part)] if part.dtype.kind == "f" else part
+        smallest = min(smallest, float(finite.min()) if finite.size else math.inf)
+    return smallest if smallest < math.inf else 0.0
