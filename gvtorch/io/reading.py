@@ -34,6 +34,7 @@ class FormatSettings(TypedDict, total=False):
 
     shape: Sequence[int] | None
     dtype: str | np.dtype | None
+    offset: int | None
     key: str | None
     axes: str | None
 
@@ -66,11 +67,11 @@ def read_volume(
         time: Which time point, from 0; the first, with a warning, if left out where there are more.
         oblique: Of voxel axes that do not lie along the world's: "resample" (the default), or
             "keep", which keeps the voxels and takes their axes for the world's.
-        **options: RAW only: shape, (x, y, z) voxels, and dtype, a NumPy dtype as in "int16" or
-            ">i2"; the name's `_XxYxZ_dtype` if left out. `.npz`: key, which array; needed where
-            there are several. OME-Zarr: key, name, number or folder of the image. Formats without
-            names of axes (NPY, NPZ, NRRD): axes, a letter among t c z y x for each axis of the
-            array, the slowest first.
+        **options: RAW, and files of any ending: shape, (x, y, z) voxels, dtype, a NumPy dtype as in
+            "int16" or ">i2" (the name's `_XxYxZ_dtype` if left out), and offset, bytes of a header
+            to skip. key: which of several arrays, series, scenes or images. Formats without names
+            of axes (NPY, NPZ, NRRD, HDF5, Zarr): axes, a letter among t c z y x for each axis of
+            the array, the slowest first. docs/formats.md has all formats.
 
     Returns:
         The volume, dtype kept (64 and 32 bit integers and float64 become float32).
