@@ -1,4 +1,4 @@
-"""Plain Zarr arrays of zarr-python and xarray, N5 arrays of tensorstore; raw files of any ending."""
+"""Plain Zarr of zarr-python and xarray, N5 of tensorstore; raw files of any ending."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_hostile_chunks_take_no_memory(tmp_path):
 
 def test_a_folder_of_nothing_is_named(tmp_path):
     (tmp_path / "a.n5").mkdir()
-    with pytest.raises(ValueError, match="holds 0 arrays.*none of three or more axes"):
+    with pytest.raises(ValueError, match=r"holds 0 arrays.*none of three or more axes"):
         gv.read_volume(tmp_path / "a.n5")
 
 

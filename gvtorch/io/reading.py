@@ -23,6 +23,7 @@ from .formats import FORMATS, find_format, split_path
 from .level_reader import no_time
 from .ngff import is_zarr
 from .oblique import Oblique, straighten
+from .remote import fetch, is_file_url, split_url
 from .source import MemorySource, VolumeSource, told_as
 from .store_layout import DTYPES, MOST_TIMES, MOST_VOXELS, StoreError
 
@@ -59,7 +60,8 @@ def read_volume(
     and what of the file is not kept, is told in a warning.
 
     Args:
-        path: The file, a folder of slices, `file.h5:/dataset`, or an array as of `as_volume`.
+        path: The file, a folder of slices, `file.h5:/dataset`, a URL (a file is downloaded once, see
+            docs/formats.md), or an array as of `as_volume`.
         spacing: (x, y, z) world units; overrides the file's. 1 where neither tells.
         origin: (x, y, z) world place of the first voxel's centre; overrides the file's. 0 where
             neither tells.
@@ -90,8 +92,7 @@ def read_volume(
             f"time=N (--time N) reads another, up to {source.times - 1}",
             stacklevel=2,
         )
-    data = read_whole(source, source.time)[0]
-    name = Path(path if isinstance(path, (str, PathLike)) else source.path).name
+    data, name = read_whole(source, source.time)[0], Path(source.path).name
     return Volume(data, source.spacing, source.origin, name=name, nan=nan, info=source.info)
 
 
@@ -149,7 +150,11 @@ def _find(path: Any, given: dict[str, Any]) -> tuple[str, str, Callable[..., Vol
             ("axes",),
         )
     else:
-        text, inner = split_path(str(path))
+        text, inner = split_url(str(path))
+        if is_file_url(text):
+            text = str(fetch(text))
+        else:
+            text, inner = split_path(text)
         if inner is not None:
             given["key"] = inner
         if not is_zarr(text) and not Path(text).exists():
