@@ -60,7 +60,7 @@ def read_volume(
     and what of the file is not kept, is told in a warning.
 
     Args:
-        path: The file, a folder of slices, `file.h5:/dataset`, a URL (a file is downloaded once, see
+        path: The file, a folder of slices, `file.h5:/dataset`, a URL (a file is downloaded, see
             docs/formats.md), or an array as of `as_volume`.
         spacing: (x, y, z) world units; overrides the file's. 1 where neither tells.
         origin: (x, y, z) world place of the first voxel's centre; overrides the file's. 0 where

@@ -5,7 +5,7 @@ ranges; s3, gs and others go through fsspec.
     CACHE/KEY/VERSION/NAME    the file; a folder appears when it is whole
 
 The cache is bounded, and what was not used for longest goes first. GVTORCH_CACHE names another
-folder, GVTORCH_CACHE_GB another bound (50), of one file too.
+folder (that of compiled shaders too), GVTORCH_CACHE_GB another bound (50), of one file too.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def cache_folder() -> Path:
     """Where downloads are kept."""
     own = os.environ.get("GVTORCH_CACHE")
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(own) if own else Path(base) / "gvtorch" / "downloads"
+    return (Path(own) if own else Path(base) / "gvtorch") / "downloads"
 
 
 def cache_limit() -> int:
