@@ -70,8 +70,8 @@ class ArrayLike:
         """
         where = f"{where} ({type(given).__name__})"
         if hasattr(given, "data_vars"):
-            names = ", ".join(map(str, given.data_vars))
-            raise ValueError(f"{where}: is a set of arrays, take one of them: {names}")
+            held = ", ".join(map(str, given.data_vars))
+            raise ValueError(f"{where}: is a set of arrays, take one of them: {held}")
         if not hasattr(given, "shape") or not hasattr(given, "dtype"):
             given = _plain(where, given)
         shape = tuple(int(n) for n in given.shape)
@@ -184,7 +184,7 @@ def _is_lazy(given: Any) -> bool:
 
 def _attributes(given: Any) -> dict[str, Any]:
     attrs = getattr(given, "attrs", None)
-    return dict(attrs) if hasattr(attrs, "keys") else {}
+    return dict(attrs) if attrs is not None and hasattr(attrs, "keys") else {}
 
 
 def _described(
@@ -192,8 +192,8 @@ def _described(
 ) -> tuple[list[str], list[tuple[float, float] | None], list[str | None], list[str]]:
     """Names, places and units of axes, and what is not kept."""
     metadata = getattr(given, "metadata", None)  # of zarr
-    dims: Sequence[Any] = getattr(given, "dims", None) or getattr(metadata, "dimension_names", ())
-    names = [str(name or "") for name in dims or ()]
+    dims: Any = getattr(given, "dims", None) or getattr(metadata, "dimension_names", None) or ()
+    names = [str(name or "") for name in dims]
     if len(names) != rank or any("<" in name for name in names):  # h5py's dims are objects
         names = [""] * rank
     steps: list[tuple[float, float] | None] = [None] * rank

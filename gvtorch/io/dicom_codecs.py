@@ -63,7 +63,9 @@ def decode_frame(packed: bytes, runner: Any) -> bytes:
     if size != wanted:
         raise ValueError(f"a frame is of {size} (columns, rows, samples), not of {wanted}")
     if codec == "jpeg":  # colours stay as they are stored: pydicom turns them
-        kind = {"colorspace": "YCBCR", "outcolorspace": "YCBCR"} if size[2] == 3 else {}
+        kind: dict[str, Any] = (
+            {"colorspace": "YCBCR", "outcolorspace": "YCBCR"} if size[2] == 3 else {}
+        )
         data = imagecodecs.jpeg_decode(packed, **kind)
     else:
         data = getattr(imagecodecs, f"{codec}_decode")(packed)

@@ -92,6 +92,11 @@ def read_volume(
             f"time=N (--time N) reads another, up to {source.times - 1}",
             stacklevel=2,
         )
+    return volume_of(source, nan)
+
+
+def volume_of(source: VolumeSource, nan: float | None = None) -> Volume:
+    """Reads a source's time point; `nan` and errors as of `read_volume`."""
     data, name = read_whole(source, source.time)[0], Path(source.path).name
     return Volume(data, source.spacing, source.origin, name=name, nan=nan, info=source.info)
 
@@ -136,19 +141,17 @@ def open_source(
             )
         source = straighten(source, oblique)
     if source.lost:
-        warnings.warn(f"{text}: not kept: {'; '.join(source.lost)}", stacklevel=2)
+        told = " ".join("; ".join(source.lost).split())  # in one line, whatever the file says
+        warnings.warn(f"{text}: not kept: {told}", stacklevel=2)
     return placed(text, source, spacing, origin)
 
 
 def _find(path: Any, given: dict[str, Any]) -> tuple[str, str, Callable[..., VolumeSource]]:
     """Returns what to call a volume, its kind, and what opens it, which takes `given`."""
     if not isinstance(path, (str, PathLike)):
-        text, kind, opener, known = (
-            "array",
-            "an array",
-            partial(as_source, "read_volume", path),
-            ("axes",),
-        )
+        text, kind = "array", "an array"
+        opener: Callable[..., VolumeSource] = partial(as_source, "read_volume", path)
+        known: tuple[str, ...] = ("axes",)
     else:
         text, inner = split_url(str(path))
         if is_file_url(text):

@@ -77,7 +77,7 @@ def ome_info(xml: str, number: int, name: str, width: int) -> Told:
     if image is None or pixels is None:
         return ImageInfo(), (1.0, 1.0, 1.0), ["OME-XML, which tells nothing of this image"]
     sizes = [_number(pixels.get(f"PhysicalSize{axis}")) for axis in "XYZ"]
-    units = [pixels.get(f"PhysicalSize{axis}Unit", "µm") for axis in "XYZ"]
+    units = [pixels.get(f"PhysicalSize{axis}Unit", "\u00b5m") for axis in "XYZ"]
     spacing, unit = spacing_of(sizes, units)
     lost = []
     if unit and sizes[2] is None and int(_number(pixels.get("SizeZ")) or 1) > 1:
@@ -126,7 +126,7 @@ def _step_of_planes(pixels: Any) -> tuple[float | None, str]:
 
 def imagej_info(described: dict[str, Any], resolution: list[float | None], width: int) -> Told:
     """Reads ImageJ's metadata; `resolution` is the width and height of a pixel."""
-    unit = str(described.get("unit", "")).replace("\\u00B5", "µ").replace("\\u00b5", "µ")
+    unit = str(described.get("unit", "")).replace("\\u00B5", "\u00b5").replace("\\u00b5", "\u00b5")
     distance = _number(described.get("spacing"))
     known = bool(unit) or distance is not None
     sizes = [*(resolution if known else (None, None)), None if distance is None else abs(distance)]

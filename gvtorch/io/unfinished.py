@@ -43,7 +43,7 @@ class UnfinishedStore:
         for name in GROUPS:
             write_json(self._target / name / "zarr.json", group({}))
         place = {"spacing": settings["spacing"], "origin": settings["origin"]}
-        name = self._target.name.removesuffix(".zarr")
+        name = Path(os.path.realpath(self._target)).name.removesuffix(".zarr")
         image, beside = image_metadata(name, layout, info, **place)
         own = layout.attributes(place) | ({"info": beside} if beside else {})
         attributes = {"ome": image, "gvtorch": own}

@@ -52,9 +52,16 @@ class Info:
             store = Store.open(self.path, image=self.source.key, time=self.source.time or 0)
             content = store.describe()
         else:
+            from ..io.reading import MAX_VOXELS, open_source, volume_of
+
+            options = self.source.options()
+            nan = options.pop("nan")
             with Bar() as bar:
                 bar("reading", 0, 0)
-                content = self.source.read(self.path).describe()
+                source = open_source(self.path, most=MAX_VOXELS, **options)
+                content = volume_of(source, nan).describe()
+            if source.times > 1:
+                content |= {"times": source.times, "time": source.time}
         if self.json:
             print(json.dumps(content))
         else:
@@ -111,7 +118,8 @@ class Convert:
         seconds = time.perf_counter() - start
         size = amount(store.describe()["disk bytes"])
         extent = "x".join(str(n) for n in store.extent)
-        print(f"{self.store}: {extent}, {store.levels} levels, {size} in {seconds:.1f} s")
+        times = f" at {store.times} times" if store.times > 1 else ""
+        print(f"{self.store}: {extent}{times}, {store.levels} levels, {size} in {seconds:.1f} s")
 
     @contextlib.contextmanager
     def _cluster(self) -> Iterator[Executor | None]:
@@ -232,7 +240,10 @@ def _sparkline(counts: list[int]) -> str:
     most = math.log1p(max(counts))
     if not (sys.stdout.encoding or "ascii").lower().startswith("utf"):
         return ", ".join(str(count) for count in counts)
-    return "".join(" ▁▂▃▄▅▆▇█"[math.ceil(8 * math.log1p(count) / most)] for count in counts)
+    return "".join(
+        " \u2581\u2582\u2583\u2584\u2585\u2586\u2587\u2588"[math.ceil(8 * math.log1p(count) / most)]
+        for count in counts
+    )
 
 
 def main(args: list[str] | None = None) -> None:
@@ -257,7 +268,9 @@ def main(args: list[str] | None = None) -> None:
             )
     except SystemExit as end:
         if end.code:
-            box = re.sub(r"╭.*╮|[^\x20-\x7e]+|[-+|]{3,}", " ", said.getvalue())  # and its title
+            box = re.sub(
+                r"\u256d.*\u256e|[^\x20-\x7e]+|[-+|]{3,}", " ", said.getvalue()
+            )  # and its title
             words = " ".join(box.split())
             print(f"gvtorch: error: {words}", file=sys.stderr)
         raise

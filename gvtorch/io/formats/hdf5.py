@@ -99,8 +99,8 @@ def _choose(path: str, file: Any, key: str | None) -> str:
         if isinstance(file.get(key), h5py.Dataset):
             return key
         if not isinstance(file.get(key), h5py.Group):
-            names = ", ".join(_volumes(file)) or "none of three or more axes"
-            raise ValueError(f"{path}: has no data set {key!r}; it holds {names}")
+            held = ", ".join(_volumes(file)) or "none of three or more axes"
+            raise ValueError(f"{path}: has no data set {key!r}; it holds {held}")
         names = {f"{key.rstrip('/')}/{name}": text for name, text in _volumes(file[key]).items()}
     else:
         names = _volumes(file)

@@ -77,9 +77,8 @@ def _image(
     channels = element.findall("./Data/Image/ImageDescription/Channels/ChannelDescription")
     axes = element.findall("./Data/Image/ImageDescription/Dimensions/DimensionDescription")
     kinds = {(int(c.get("DataType", 0)), -(-int(c.get("Resolution", 8)) // 8)) for c in channels}
-    stored = {(0, 1): "<u1", (0, 2): "<u2", (1, 4): "<f4"}.get(
-        kinds.pop() if len(kinds) == 1 else ()
-    )
+    known = {(0, 1): "<u1", (0, 2): "<u2", (1, 4): "<f4"}
+    stored = known.get(next(iter(kinds))) if len(kinds) == 1 else None
     if stored is None:
         raise ValueError(f"{path}: channels of several or unknown kinds of numbers")
     shape, strides, letters = [], [], ""

@@ -251,7 +251,7 @@ def _read_all(path: str, size: int) -> bytes:
 
 def _xml_arrays(piece: Any) -> list[dict[str, Any]]:
     """The arrays of a piece: at points, then in cells; those that are marked as scalars first."""
-    found = []
+    found: list[dict[str, Any]] = []
     numbers = {id(item): at for at, item in enumerate(piece.iter("DataArray"))}
     for kind in ("PointData", "CellData"):
         group = piece.find(kind)
@@ -318,7 +318,8 @@ def _legacy_parts(
     """Affine, number of points, and the arrays: of text the first, since where it ends is not
     known.
     """
-    affine, points, arrays = np.eye(4), [1, 1, 1], []
+    affine, points = np.eye(4), [1, 1, 1]
+    arrays: list[dict[str, Any]] = []
     cells, in_field = False, 0
     while (end := content.find(b"\n", at)) >= 0 and len(arrays) < _MOST_ARRAYS:
         words = content[at:end].decode("latin-1").split()
