@@ -6,7 +6,7 @@ along the axes: for each column of them its colour and alpha, and of the columns
 with the light that came through the voxel before. Cracks stay open, and walls closed.
 
 Source: Crassin et al., "Interactive indirect illumination using voxel cone tracing", CGF 2011
-(voxels by direction); Younesy, M\u00f6ller, Carr, "Improving the quality of multi-resolution volume
+(voxels by direction); Younesy, Möller, Carr, "Improving the quality of multi-resolution volume
 rendering", EuroVis 2006 (why). The weight is ours; docs/picture.md measures what it gives.
 """
 

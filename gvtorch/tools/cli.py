@@ -240,10 +240,7 @@ def _sparkline(counts: list[int]) -> str:
     most = math.log1p(max(counts))
     if not (sys.stdout.encoding or "ascii").lower().startswith("utf"):
         return ", ".join(str(count) for count in counts)
-    return "".join(
-        " \u2581\u2582\u2583\u2584\u2585\u2586\u2587\u2588"[math.ceil(8 * math.log1p(count) / most)]
-        for count in counts
-    )
+    return "".join(" ▁▂▃▄▅▆▇█"[math.ceil(8 * math.log1p(count) / most)] for count in counts)
 
 
 def main(args: list[str] | None = None) -> None:
@@ -268,9 +265,7 @@ def main(args: list[str] | None = None) -> None:
             )
     except SystemExit as end:
         if end.code:
-            box = re.sub(
-                r"\u256d.*\u256e|[^\x20-\x7e]+|[-+|]{3,}", " ", said.getvalue()
-            )  # and its title
+            box = re.sub(r"╭.*╮|[^\x20-\x7e]+|[-+|]{3,}", " ", said.getvalue())  # and its title
             words = " ".join(box.split())
             print(f"gvtorch: error: {words}", file=sys.stderr)
         raise

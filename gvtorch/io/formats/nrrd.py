@@ -32,13 +32,13 @@ _LENGTHS = {
     **dict.fromkeys(("m", "meter", "metre"), "meter"),
     **dict.fromkeys(("cm", "centimeter"), "centimeter"),
     **dict.fromkeys(("mm", "millimeter", "millimetre"), "millimeter"),
-    **dict.fromkeys(("um", "\u00b5m", "\u03bcm", "micron", "microns", "micrometer"), "micrometer"),
+    **dict.fromkeys(("um", "µm", "μm", "micron", "microns", "micrometer"), "micrometer"),
     **dict.fromkeys(("nm", "nanometer", "nanometre"), "nanometer"),
 }
 _TIMES = {
     **dict.fromkeys(("s", "sec", "second", "seconds"), "second"),
     **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), "millisecond"),
-    **dict.fromkeys(("us", "\u00b5s", "usec", "microsecond"), "microsecond"),
+    **dict.fromkeys(("us", "µs", "usec", "microsecond"), "microsecond"),
 }
 _SPACES = {"ras": "right-anterior-superior", "las": "left-anterior-superior"}
 _SPACES["lps"] = "left-posterior-superior"
