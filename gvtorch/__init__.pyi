@@ -1,6 +1,7 @@
 """The public names of gvtorch, in groups: `import gvtorch as gv` offers all of them."""
 
 # Data, and the tree it becomes.
+from .base.arrays import as_volume as as_volume
 from .base.image_info import ChannelInfo as ChannelInfo, ImageInfo as ImageInfo
 from .base.volume import Volume as Volume
 from .io.conversion import convert as convert, estimate as estimate

@@ -27,6 +27,18 @@ from gvtorch.io.store import Store
 from gvtorch.io.store_layout import WORK
 from gvtorch.tools.cli import main
 
+ELSEWHERE = {
+    "DICOM",
+    "HDF5",
+    "MetaImage",
+    "MRC",
+    "VTK",
+    "Zarr",
+    "N5",
+    "CZI",
+    "ND2",
+    "LIF",
+}  # formats that tests of their own convert
 SHAPE = (9, 20, 300)  # z y x: two shards along x
 
 
@@ -102,12 +114,13 @@ def source_files(folder: Path) -> dict[str, Path]:
 
 
 def test_every_format_converts_to_what_read_volume_reads(tmp_path):
-    whole = {"a.nii.gz", "gzip.nrrd", "a.npz", "b_12x9x7_int16.raw.gz", "planes.tif"}
+    whole = {"a.nii.gz", "gzip.nrrd", "a.npz", "b_12x9x7_int16.raw.gz"}
     whole |= {"a.fits.gz", "c.npy.gz", "f.npy.bz2"}
     files = source_files(tmp_path / "files")
     detached = files.pop("raw.raw", None)
     assert detached is not None and len(files) == 25
-    assert {find_format(str(file)).name for file in files.values()} == {f.name for f in FORMATS}
+    found = {find_format(str(file)).name for file in files.values()}
+    assert found == {f.name for f in FORMATS} - ELSEWHERE
     for name, file in files.items():
         volume = gv.read_volume(file)
         source = open_source(file)
@@ -169,7 +182,7 @@ def test_arguments_are_checked_before_the_work(tmp_path, raw):
         ({"spacing": (1, 0, 1)}, "spacing must be positive"),
         ({"shape": (300, 20, 10), "dtype": "uint8"}, "takes 60000 bytes, the file has 54000"),
         ({"dtype": "text"}, "dtype must be a NumPy dtype"),
-        ({"key": "a"}, "key is for NPZ, OME-Zarr files, this is RAW"),
+        ({"key": "a"}, "key is for .*NPZ, OME-Zarr.* files, this is RAW"),
     ):
         with pytest.raises(ValueError, match=message):
             convert(raw, target, **options)

@@ -163,7 +163,7 @@ def test_channels_keep_dtype_and_width(blobs):
         (lambda v: gv.N3Tree.from_volume(v, 8, -1), "border must be an int >= 0"),
         (lambda v: gv.N3Tree.from_volume(v, branching=1), "branching must be an int >= 2"),
         (lambda v: gv.N3Tree.from_volume(v, threshold=float("nan")), "threshold must be finite"),
-        (lambda v: gv.N3Tree.from_volume(v.data), "volume must be a Volume"),
+        (lambda v: gv.N3Tree.from_volume("v"), "expected a volume or an array"),
         (lambda v: gv.N3Tree.from_volume({}), "at least one channel"),
         (lambda v: gv.NodePool(0), "capacity must be an int >= 1"),
         (lambda v: gv.NodePool(2**30), "more than int32 can name"),

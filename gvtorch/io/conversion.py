@@ -11,6 +11,7 @@ import itertools
 import math
 import shlex
 import shutil
+import zlib
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -101,7 +102,7 @@ class _Plan:
 
 
 def convert(
-    source: str | Path | Volume,
+    source: str | Path | Volume | Any,
     store: str | Path,
     *,
     block: int = 32,
@@ -124,7 +125,8 @@ def convert(
     `if __name__ == "__main__":` around its work.
 
     Args:
-        source: A file or folder that `read_volume` knows, an OME-Zarr image, or a volume.
+        source: A file or folder that `read_volume` knows, an OME-Zarr image, a volume, or an array
+            as of `as_volume`; one of dask, zarr or h5py is computed or read part by part.
         store: The folder to make.
         block: Voxels along a side of a block, 32 or 64.
         threshold: Blocks with no value above it are not written; see `N3Tree.from_volume`.
@@ -166,7 +168,7 @@ def convert(
 
 
 def estimate(
-    source: str | Path | Volume,
+    source: str | Path | Volume | Any,
     store: str | Path,
     *,
     block: int = 32,
@@ -190,7 +192,7 @@ def estimate(
 
 
 def _source(
-    source: str | Path | Volume,
+    source: str | Path | Volume | Any,
     spacing: Sequence[float] | None,
     origin: Sequence[float] | None,
     time: int | None,
@@ -231,7 +233,7 @@ def _source(
 
 
 def _plan(
-    given: str | Path | Volume,
+    given: str | Path | Volume | Any,
     source: VolumeSource,
     target: Path,
     block: int,
@@ -266,7 +268,7 @@ def _plan(
     told = ("extent", "dtype", "spacing", "origin")
     settings = {
         "source": source.path,
-        "fingerprint": unfinished.fingerprint(given),
+        "fingerprint": _fingerprint(given, source),
         **{name: getattr(source, name) for name in told},
         "unit": source.info.unit,
         "times": layout.times,
@@ -370,6 +372,15 @@ def _executor(given: Executor | None, plan: _Plan) -> AbstractContextManager[Exe
     if plan.uses_processes and plan.workers > 1:
         return resources.worker_processes(plan.workers)
     return ThreadPoolExecutor(plan.workers)
+
+
+def _fingerprint(given: Any, source: VolumeSource) -> list[Any]:
+    if isinstance(given, Volume):
+        return unfinished.fingerprint(given)
+    if isinstance(given, (str, Path)):
+        return unfinished.fingerprint(source.path)
+    told: list[Any] = [list(source.shape), source.stored]
+    return told + ([zlib.crc32(source.data.tobytes())] if isinstance(source, MemorySource) else [])
 
 
 @contextmanager

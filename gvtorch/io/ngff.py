@@ -16,6 +16,7 @@ from typing import Any
 
 from ..base.image_info import ImageInfo
 from .omero import forget_assumed, read_channels, write_channels
+from .remote import is_file_url
 from .store_layout import WORK, Deadline, StoreLayout, child, read_key
 
 _MOST_LEVELS = 64
@@ -52,6 +53,8 @@ class MultiscaleImage:
 def is_zarr(path: str | Path) -> bool:
     """Tells a Zarr group, or what is named like one (a URL, `NAME.zarr`), from any other file."""
     text = str(path)
+    if is_file_url(text):
+        return False
     if "://" in text or text.rstrip("/").endswith(".zarr"):
         return True
     return any((Path(text) / name).is_file() for name in ("zarr.json", ".zattrs", ".zgroup"))

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from os import PathLike
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
@@ -16,11 +18,13 @@ import numpy as np
 from ..base import check
 from ..base.constants import MAX_VOXELS
 from ..base.volume import Volume, check_extent
-from .formats import FORMATS, find_format
+from .arrays import ObjectSource, as_source
+from .formats import FORMATS, find_format, split_path
 from .level_reader import no_time
 from .ngff import is_zarr
 from .oblique import Oblique, straighten
-from .source import VolumeSource, told_as
+from .remote import fetch, is_file_url, split_url
+from .source import MemorySource, VolumeSource, told_as
 from .store_layout import DTYPES, MOST_TIMES, MOST_VOXELS, StoreError
 
 _MOST_CHANNELS = 2**10
@@ -31,12 +35,13 @@ class FormatSettings(TypedDict, total=False):
 
     shape: Sequence[int] | None
     dtype: str | np.dtype | None
+    offset: int | None
     key: str | None
     axes: str | None
 
 
 def read_volume(
-    path: str | Path,
+    path: str | Path | Any,
     *,
     spacing: Sequence[float] | None = None,
     origin: Sequence[float] | None = None,
@@ -55,7 +60,8 @@ def read_volume(
     and what of the file is not kept, is told in a warning.
 
     Args:
-        path: The file, or a folder of TIFF slices.
+        path: The file, a folder of slices, `file.h5:/dataset`, a URL (a file is downloaded, see
+            docs/formats.md), or an array as of `as_volume`.
         spacing: (x, y, z) world units; overrides the file's. 1 where neither tells.
         origin: (x, y, z) world place of the first voxel's centre; overrides the file's. 0 where
             neither tells.
@@ -63,11 +69,11 @@ def read_volume(
         time: Which time point, from 0; the first, with a warning, if left out where there are more.
         oblique: Of voxel axes that do not lie along the world's: "resample" (the default), or
             "keep", which keeps the voxels and takes their axes for the world's.
-        **options: RAW only: shape, (x, y, z) voxels, and dtype, a NumPy dtype as in "int16" or
-            ">i2"; the name's `_XxYxZ_dtype` if left out. `.npz`: key, which array; needed where
-            there are several. OME-Zarr: key, name, number or folder of the image. Formats without
-            names of axes (NPY, NPZ, NRRD): axes, a letter among t c z y x for each axis of the
-            array, the slowest first.
+        **options: RAW, and files of any ending: shape, (x, y, z) voxels, dtype, a NumPy dtype as in
+            "int16" or ">i2" (the name's `_XxYxZ_dtype` if left out), and offset, bytes of a header
+            to skip. key: which of several arrays, series, scenes or images. Formats without names
+            of axes (NPY, NPZ, NRRD, HDF5, Zarr): axes, a letter among t c z y x for each axis of
+            the array, the slowest first. docs/formats.md has all formats.
 
     Returns:
         The volume, dtype kept (64 and 32 bit integers and float64 become float32).
@@ -82,8 +88,8 @@ def read_volume(
     source = open_source(path, most=MAX_VOXELS, **told, **options)
     if time is None and source.times > 1:
         warnings.warn(
-            f"{path}: has {source.times} time points, this is the first; time=N (--time N) reads "
-            f"another, up to {source.times - 1}",
+            f"{source.path}: has {source.times} time points, this is the first; "
+            f"time=N (--time N) reads another, up to {source.times - 1}",
             stacklevel=2,
         )
     return volume_of(source, nan)
@@ -96,7 +102,7 @@ def volume_of(source: VolumeSource, nan: float | None = None) -> Volume:
 
 
 def open_source(
-    path: str | Path,
+    path: str | Path | Any,
     *,
     spacing: Sequence[float] | None = None,
     origin: Sequence[float] | None = None,
@@ -113,38 +119,58 @@ def open_source(
     Returns:
         The source, its `time` as asked for, or 0.
     """
-    text = str(path)
     check.known("read_volume", options, FormatSettings)
-    if not is_zarr(text) and not Path(text).exists():
-        raise FileNotFoundError(f"volume not found: {path}")
-    found = find_format(text)
-    given = {name: value for name, value in options.items() if value is not None}
-    for name in sorted(set(given).difference(found.options)):
-        owners = ", ".join(other.name for other in FORMATS if name in other.options)
-        raise ValueError(f"{path}: {name} is for {owners} files, this is {found.name}")
-    found.need_library(text)
-    with told_as(ValueError, text, f"can't be read as {found.name}", StoreError, TimeoutError):
-        source = found.open(text, **given)
+    given: dict[str, Any] = {name: v for name, v in options.items() if v is not None}
+    text, kind, opener = _find(path, given)
+    with told_as(ValueError, text, f"can't be read as {kind}", StoreError, TimeoutError):
+        source = opener(**given)
         check_extent(text, (*source.extent, source.width), most=most)
         check_extent(text, source.extent, most=MOST_VOXELS)
         if not 1 <= source.times <= MOST_TIMES or min(source.shape) < 1:
-            raise ValueError(f"{path}: expected 1 to {MOST_TIMES} time points, got {source.times}")
+            raise ValueError(f"{text}: expected 1 to {MOST_TIMES} time points, got {source.times}")
         if time is not None and (type(time) is not int or not 0 <= time < source.times):
             raise ValueError(no_time(text, time, source.times))
         source = source.at_time(time or 0)
         if source.dtype not in DTYPES:
-            raise ValueError(f"{path}: values must be real numbers, got dtype {source.dtype}")
+            raise ValueError(f"{text}: values must be real numbers, got dtype {source.dtype}")
         source.check_file()
         if source.oblique is not None and spacing is not None and oblique != "keep":
             raise ValueError(
-                f"{path}: voxel axes are oblique, resampling finds their spacing: leave spacing "
+                f"{text}: voxel axes are oblique, resampling finds their spacing: leave spacing "
                 "out, or keep the voxels as they are with oblique='keep' (--oblique keep)"
             )
         source = straighten(source, oblique)
     if source.lost:
         told = " ".join("; ".join(source.lost).split())  # in one line, whatever the file says
-        warnings.warn(f"{path}: not kept: {told}", stacklevel=2)
+        warnings.warn(f"{text}: not kept: {told}", stacklevel=2)
     return placed(text, source, spacing, origin)
+
+
+def _find(path: Any, given: dict[str, Any]) -> tuple[str, str, Callable[..., VolumeSource]]:
+    """Returns what to call a volume, its kind, and what opens it, which takes `given`."""
+    if not isinstance(path, (str, PathLike)):
+        text, kind = "array", "an array"
+        opener: Callable[..., VolumeSource] = partial(as_source, "read_volume", path)
+        known: tuple[str, ...] = ("axes",)
+    else:
+        text, inner = split_url(str(path))
+        if is_file_url(text):
+            text = str(fetch(text))
+        else:
+            text, inner = split_path(text)
+        if inner is not None:
+            given["key"] = inner
+        if not is_zarr(text) and not Path(text).exists():
+            raise FileNotFoundError(f"volume not found: {path}")
+        found = find_format(text, raw="shape" in given)
+        kind, known = found.name, found.options
+        opener = partial(found.open, text)
+    for name in sorted(set(given).difference(known)):
+        owners = ", ".join(other.name for other in FORMATS if name in other.options)
+        raise ValueError(f"{text}: {name} is for {owners} files, this is {kind}")
+    if isinstance(path, (str, PathLike)):
+        found.need_library(text)
+    return text, kind, opener
 
 
 def placed(
@@ -165,6 +191,7 @@ def placed(
 
 def read_whole(source: VolumeSource, first: int = 0, times: int = 1) -> np.ndarray:
     """Reads whole time points, (t, z, y, x, c); raises ValueError if the file is damaged."""
-    text = f"can't be read as {find_format(source.path).name}"
-    with told_as(ValueError, source.path, text, StoreError, TimeoutError):
+    is_array = isinstance(source, (ObjectSource, MemorySource))
+    kind = "an array" if is_array else find_format(source.path, raw=True).name
+    with told_as(ValueError, source.path, f"can't be read as {kind}", StoreError, TimeoutError):
         return source.read_times(first, first + times)

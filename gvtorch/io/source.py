@@ -28,7 +28,6 @@ from . import boxes
 from .store_layout import value_dtype
 
 Index = tuple[slice, ...]
-FEW = 4  # a last axis of so many counts channels if nothing else is told
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,36 +256,6 @@ def place_axes(
         "origin": tuple(origin.tolist()),
         "oblique": tuple(map(tuple, affine[:3].tolist())) if is_oblique else None,
     }
-
-
-def ask_axes(path: str, shape: Sequence[int], axes: str | None = None) -> str:
-    """Returns what the axes of an array without names are, a letter each: as the user told, else
-    (z, y, x), or (z, y, x, c) where the last axis counts at most 4 and the first one more.
-
-    Raises:
-        ValueError: They could be something else as well; the message asks. Or what was told does
-            not fit.
-    """
-    sizes = "(" + ", ".join(map(str, shape)) + ")"
-    if axes is not None:
-        known = isinstance(axes, str) and set(axes) <= set("tczyx") and {"y", "x"} <= set(axes)
-        if not known or len(set(axes)) != len(axes) or len(axes) != len(shape):
-            raise ValueError(
-                f"{path}: axes must be {len(shape)} letters among t, c, z, y, x for the shape "
-                f"{sizes}, each once, y and x among them, got {axes!r}"
-            )
-        return axes
-    if len(shape) == 3:
-        return "zyx"
-    if len(shape) == 4 and shape[3] <= FEW < shape[0]:
-        return "zyxc"
-    which = {2: "'yx'", 4: "'zyxc', 'czyx' or 'tzyx'", 5: "'tczyx'"}.get(len(shape))
-    if which is None:
-        raise ValueError(f"{path}: expected 2 to 5 axes, got shape {sizes}")
-    raise ValueError(
-        f"{path}: what are the axes of shape {sizes}? Tell with axes (--axes), a letter each: "
-        f"{which}"
-    )
 
 
 def open_unpacked(file: str, member: str = "") -> IO[bytes]:

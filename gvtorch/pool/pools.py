@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.arrays import as_volume
 from ..base.constants import ABSENT
 from ..base.volume import CHANNEL_DTYPES, Volume, movable
 
@@ -63,17 +64,16 @@ def phrase(channels: Mapping[str, Channel]) -> str:
 def volumes_by_channel(where: str, volume: Volume | Mapping[str, Volume]) -> dict[str, Volume]:
     """Returns volumes by channel name; one volume alone becomes channel "value".
 
-    Raises ValueError if there is none, one is no `Volume`, or they differ in place or extent.
+    Arrays become volumes, see `as_volume`.
+
+    Raises ValueError if there is none, one is no volume, or they differ in place or extent.
     """
-    volumes = dict(volume) if isinstance(volume, Mapping) else {"value": volume}
+    given = dict(volume) if isinstance(volume, Mapping) else {"value": volume}
+    volumes = {
+        name: as_volume(one, where=f"{where}: channel {name!r}") for name, one in given.items()
+    }
     if not volumes:
         raise ValueError(f"{where}: volume must name at least one channel")
-    for name, one in volumes.items():
-        if not isinstance(one, Volume):
-            raise ValueError(
-                f"{where}: volume must be a Volume (gv.Volume(data, spacing)), "
-                f"got {type(one).__name__} for channel {name!r}"
-            )
     first, *others = volumes.values()
     for other in others:
         if any(getattr(other, name) != getattr(first, name) for name in _COMMON):

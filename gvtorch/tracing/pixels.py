@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.arrays import as_volume
 from ..base.records import Hits, Rays, RenderStats
 from ..base.stage import Progress, collect_timings, no_progress, stage
 from ..cameras.camera import Camera
@@ -38,7 +39,7 @@ _RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that p
 
 
 def render(
-    tree: Scene,
+    tree: Scene | Any,
     camera: Camera | Rays,
     shader: Shaders,
     *,
@@ -50,7 +51,8 @@ def render(
     Args:
         tree: What to render, on the device that renders it; its stamps and request words are
             written. Or trees by name, on one device: where they overlap, they are composited by
-            sample.
+            sample. A volume or an array (see `as_volume`) in a tree's place becomes one on the CPU,
+            anew in each call: make one where there are more pictures.
         camera: One camera or a batch; an orbit camera stands around the scene's box. Or rays in
             world units, which make a picture as wide as `Rays.width`, or of one row.
         shader: The transfer function, in data units, or another shader; or one for each tree by
@@ -66,11 +68,12 @@ def render(
     """
     camera = as_camera("render", camera)
     chosen = render_options("render", options, camera)
-    trees = _trees("render", tree)
+    scene = _resident("render", tree)
+    trees = _trees("render", scene)
     device, start = trees[0].device, time.perf_counter()
     with collect_timings(device) as timings:
         with stage("prepare"):
-            traced, box = _traced("render", tree, shader, chosen)
+            traced, box = _traced("render", scene, shader, chosen)
         placed = camera.placed(box)
         view = View(placed, placed.numbers(device), traced, chosen)
         hits = view.hits(progress)
@@ -105,6 +108,20 @@ def trace(tree: Scene, rays: Rays, shader: Shaders, **options: Unpack[RenderSett
     chosen = render_options("trace", options)
     check.instance("trace", "rays", rays, Rays)
     return _traced("trace", tree, shader, chosen)[0](rays)
+
+
+def _resident(where: str, scene: Any) -> Scene:
+    """The trees of a scene; what is a volume becomes one."""
+    if isinstance(scene, N3Tree):
+        return scene
+    if isinstance(scene, Mapping):
+        return {
+            name: one
+            if isinstance(one, N3Tree)
+            else N3Tree.from_volume(as_volume(one, where=where))
+            for name, one in scene.items()
+        }
+    return N3Tree.from_volume(as_volume(scene, where=where))
 
 
 def _trees(where: str, scene: Scene) -> list[N3Tree]:

@@ -5,6 +5,7 @@ torch is not imported here, so that the command line can name the formats at onc
 
 import importlib
 import pkgutil
+from pathlib import Path
 
 from .format import FORMATS, Format
 
@@ -12,15 +13,35 @@ for _module in sorted(module.name for module in pkgutil.iter_modules(__path__)):
     importlib.import_module(f".{_module}", __name__)
 
 
-def find_format(path: str) -> Format:
-    """Returns the format of a file, folder or URL, by its name and kind; ValueError if none."""
+def find_format(path: str, *, raw: bool = False) -> Format:
+    """Returns the format of a file, folder or URL, by its name and kind. With `raw` a file of
+    unknown kind is RAW, since its extent is known.
+
+    Raises:
+        ValueError: There is none.
+    """
     for candidate in FORMATS:
         if candidate.matches(path):
             return candidate
+    if raw and not Path(path).is_dir():
+        return next(candidate for candidate in FORMATS if candidate.name == "RAW")
+    if Path(path).is_dir():
+        raise ValueError(
+            f"{path}: holds neither a DICOM series, nor images, nor a Zarr or N5 array"
+        )
     endings = ", ".join(ending for candidate in FORMATS for ending in candidate.endings)
     raise ValueError(
-        f"{path}: unknown volume format; known endings: {endings}, or a folder of TIFF slices"
+        f"{path}: unknown volume format; known endings: {endings}, or a folder of DICOM files or "
+        "of images; numbers alone are read if shape and dtype (--shape, --dtype) tell their extent"
     )
+
+
+def split_path(text: str) -> tuple[str, str | None]:
+    """Splits `file.h5:/group/data` into the file and what is named of it; other paths stay."""
+    file, mark, inner = text.rpartition(":/")
+    if mark and "://" not in text and not Path(text).exists() and Path(file).is_file():
+        return file, f"/{inner}"
+    return text, None
 
 
 def format_names() -> str:
@@ -29,4 +50,4 @@ def format_names() -> str:
     return f"{', '.join(names)} or {last}"
 
 
-__all__ = ["FORMATS", "Format", "find_format", "format_names"]
+__all__ = ["FORMATS", "Format", "find_format", "format_names", "split_path"]

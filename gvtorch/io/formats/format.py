@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from ..source import VolumeSource
 
@@ -32,6 +32,7 @@ class Format:
         options: tuple[str, ...] = (),
         library: str = "",
         package: str = "",
+        extra: str = "io",
     ) -> None:
         """Describes a format.
 
@@ -42,10 +43,11 @@ class Format:
             options: Arguments of `read_volume` that this format takes.
             library: The module that reading needs; it is there when files are opened.
             package: What pip installs it as, if that is another name.
+            extra: The extra of gvtorch that brings it.
         """
         self.name, self.endings, self.options = name, endings, options
         self.matches = matches or (lambda path: path.lower().endswith(endings))
-        self.library, self.package = library, package or library
+        self.library, self.package, self.extra = library, package or library, extra
 
     def __call__(self, opener: Opener) -> Opener:
         """Takes the function that opens files."""
@@ -61,14 +63,20 @@ class Format:
         """The word "ready", or what to install."""
         if not self.library or importlib.util.find_spec(self.library):
             return "ready"
-        return f"needs {self.package}: pip install 'gvtorch[io]'"
+        return f"needs {self.package}: pip install 'gvtorch[{self.extra}]'"
 
     def need_library(self, path: str) -> None:
         """Raises ImportError, with the pip command, if the library is missing."""
-        try:
-            importlib.import_module(self.library or __name__)
-        except ImportError as error:
-            raise ImportError(
-                f"{path}: reading this format needs {self.package}: "
-                f"pip install 'gvtorch[io]' ({error})"
-            ) from None
+        need_library(
+            f"{path}: reading this format", self.library or __name__, self.package, self.extra
+        )
+
+
+def need_library(what: str, library: str, package: str = "", extra: str = "io") -> Any:
+    """Returns a module; raises ImportError, with the pip command, if it is missing."""
+    try:
+        return importlib.import_module(library)
+    except ImportError as error:
+        raise ImportError(
+            f"{what} needs {package or library}: pip install 'gvtorch[{extra}]' ({error})"
+        ) from None

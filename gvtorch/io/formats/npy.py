@@ -6,7 +6,8 @@ import zipfile
 
 import numpy as np
 
-from ..source import ArraySource, ask_axes, open_unpacked
+from ...base.named_axes import ask_axes
+from ..source import ArraySource, open_unpacked
 from .format import Format
 
 

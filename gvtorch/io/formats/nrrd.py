@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo
-from ..source import ArraySource, Index, VolumeSource, ask_axes, place_axes
+from ...base.named_axes import ask_axes
+from ..source import ArraySource, Index, VolumeSource, place_axes
 from .format import Format
 
 _TYPES = {

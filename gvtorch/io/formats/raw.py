@@ -1,4 +1,6 @@
-"""RAW: numbers alone, x fastest; the file's name or the user tells extent and dtype."""
+"""RAW: numbers alone, x fastest; the file's name or the user tells extent and dtype. A file of any
+ending is one if the user tells its shape.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +17,16 @@ _NAME = re.compile(r"_(\d+)x(\d+)x(\d+)_([a-z]+\d+)(?:_?(le|be))?(?=[._]|$)")
 _HINT = "name it *_XxYxZ_dtype.raw or pass"
 
 
-@Format("RAW", ".raw", ".raw.gz", options=("shape", "dtype"))
+@Format("RAW", ".raw", ".raw.gz", options=("shape", "dtype", "offset"))
 def open_raw(
-    path: str, shape: Sequence[int] | None = None, dtype: str | np.dtype | None = None
+    path: str,
+    shape: Sequence[int] | None = None,
+    dtype: str | np.dtype | None = None,
+    offset: int | None = None,
 ) -> ArraySource:
     """Opens a RAW file of (x, y, z) voxels. What is not given is read from its name, as in
-    `scan_512x512x300_int16.raw`, little endian unless that says "be".
+    `scan_512x512x300_int16.raw`, little endian unless that says "be". Where `offset` bytes of a
+    header come first, something may also follow the numbers.
     """
     named = _NAME.search(Path(path).name.lower())
     if shape is None:
@@ -40,6 +46,8 @@ def open_raw(
         raise ValueError(f"{path}: dtype must be an integer or a float, got {told!r}")
     if dtype is None and named:
         kind = kind.newbyteorder(">" if named[5] == "be" else "<")
+    if offset is not None and (type(offset) is not int or offset < 0):
+        raise ValueError(f"{path}: offset must be bytes, an int >= 0, got {offset!r}")
     return ArraySource(
         path=path,
         file=path,
@@ -47,6 +55,7 @@ def open_raw(
         axes="xyz",
         fortran=True,
         stored=kind.str,
-        exact=True,
-        whole=path.lower().endswith(".gz"),
+        offset=offset or 0,
+        exact=offset is None,
+        whole=path.lower().endswith((".gz", ".bz2")),
     )

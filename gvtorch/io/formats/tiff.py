@@ -1,150 +1,189 @@
-"""TIFF, through tifffile: a stack in a file, or a folder of slices."""
+"""TIFF, through tifffile: plain, BigTIFF, OME-TIFF and ImageJ's, with times and channels."""
 
 from __future__ import annotations
 
-import functools
-import re
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..ngff import is_zarr
+from ...base.image_info import ChannelInfo, ImageInfo
 from ..source import ArraySource, Index, VolumeSource
+from ..tiff_info import RGB, Told, imagej_info, ome_info, opened
 from .format import Format
+
+_JPEG = (6, 7, 34892, 33007)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TiffSource(VolumeSource):
-    """A stack of packed pages. Where a page is no slice, all is read at once (`whole`)."""
+    """A series of packed pages, of which the tiles and strips of a part are unpacked."""
+
+    series: int = 0
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Decodes the pages of a part."""
-        if self.whole or self.covers(index):
-            import tifffile
-
-            with tifffile.TiffFile(self.path) as file:
-                return file.series[0].asarray()[index]
-        pages = _series(self).pages
-        first = len(self.shape) - (3 if self.axes.endswith("c") else 2)
-        spans = [range(*span.indices(n)) for span, n in zip(index, self.shape, strict=True)][:first]
-        slices = next(
-            (span for span, axis in zip(spans, self.axes, strict=False) if axis == "z"), range(1)
-        )
-        data = np.stack([pages[i].asarray()[index[first:]] for i in slices])
-        return data.reshape([*map(len, spans), *data.shape[1:]])
-
-
-@dataclass(frozen=True, kw_only=True)
-class SlicesSource(VolumeSource):
-    """A folder of slices."""
-
-    files: tuple[str, ...]  # one a slice
-
-    def read_stored(self, index: Index) -> np.ndarray:
-        """Reads the files of a part."""
-        import tifffile
-
-        files = self.files[index[0]]
-        data = np.empty((len(files), *[s.stop - s.start for s in index[1:]]), self.stored)
-        for at, file in enumerate(files):
-            image = tifffile.imread(file)
-            if image.shape != self.shape[1:] or image.dtype != data.dtype:
-                raise ValueError(
-                    f"{file}: {image.shape} {image.dtype} differs from "
-                    f"{self.shape[1:]} {data.dtype} of {Path(self.files[0]).name}"
-                )
-            data[at] = image[index[1:]]
+        """Unpacks the pages of a part."""
+        with opened(self.path) as (file, _):
+            series = file.series[self.series]
+            if self.whole:
+                return series.asarray()[index]
+            first = len(self.shape) - len(_page_shape(series))
+            data = np.empty([s.stop - s.start for s in index], self.stored)
+            spans = [range(s.start, s.stop) for s in index[:first]]
+            for place in itertools.product(*spans):
+                number = int(np.ravel_multi_index(place, self.shape[:first])) if first else 0
+                at = tuple(p - span.start for p, span in zip(place, spans, strict=True))
+                if (page := series.pages[number]) is None:
+                    raise ValueError(f"{self.path}: page {number} is missing")
+                data[at] = read_page(page, series.keyframe, index[first:])
         return data
 
 
-@functools.lru_cache(maxsize=4)
-def _series(source: TiffSource) -> Any:
-    import tifffile
+def read_page(page: Any, keyframe: Any, index: Index) -> np.ndarray:
+    """Unpacks a part (rows, columns) or (rows, columns, c) of a page.
 
-    return tifffile.TiffFile(source.path).series[0]
+    Raises:
+        ValueError: The file ends before.
+    """
+    planes, depth, length, width, samples = keyframe.shaped
+    if planes != 1 or depth != 1 or len(page.dataoffsets) != math.prod(keyframe.chunked):
+        return page.asarray()[index]
+    rows, columns = index[0], index[1]
+    tall, wide = (keyframe.tilelength, keyframe.tilewidth) if keyframe.is_tiled else (
+        keyframe.rowsperstrip, width,
+    )  # fmt: skip
+    tall, across = min(tall, length) if not keyframe.is_tiled else tall, -(-width // wide)
+    out = np.zeros((rows.stop - rows.start, columns.stop - columns.start, samples), keyframe.dtype)
+    places = itertools.product(
+        range(rows.start // tall, -(-rows.stop // tall)),
+        range(columns.start // wide, -(-columns.stop // wide)),
+    )
+    for down, right in places:
+        tile = _unpacked(page, keyframe, down * across + right)
+        if tile is None:
+            continue
+        top, left = down * tall, right * wide
+        tile = tile[: length - top, : width - left]
+        low = max(rows.start, top), max(columns.start, left)
+        high = min(rows.stop, top + tile.shape[0]), min(columns.stop, left + tile.shape[1])
+        out[
+            low[0] - rows.start : high[0] - rows.start,
+            low[1] - columns.start : high[1] - columns.start,
+        ] = tile[low[0] - top : high[0] - top, low[1] - left : high[1] - left]
+    return out[..., index[2]] if len(index) == 3 else out[..., 0]
 
 
-@Format("TIFF", ".tif", ".tiff", library="tifffile")
-def open_tiff(path: str) -> VolumeSource:
-    """Opens a stack: the first series of a file."""
-    import tifffile
+def _unpacked(page: Any, keyframe: Any, number: int) -> np.ndarray | None:
+    """(rows, columns, c) of a tile or strip; None if it is not written, which stands for zeros."""
+    offset, size = page.dataoffsets[number], page.databytecounts[number]
+    if not size:
+        return None
+    file = page.parent.filehandle
+    file.seek(offset)
+    packed = file.read(size)
+    if len(packed) != size:
+        raise ValueError(f"{file.path}: ends before its tile {number}")
+    more = {}
+    if keyframe.compression in _JPEG:
+        more = {"jpegtables": page.jpegtables, "jpegheader": keyframe.jpegheader}
+    found = keyframe.decode(packed, number, **more)[0]
+    return None if found is None else found[0]
 
-    with tifffile.TiffFile(path) as file:
-        series = file.series[0]
-        axes = _axes(path, series.shape, series.axes)
+
+def _page_shape(series: Any) -> tuple[int, ...]:
+    return tuple(int(n) for n in series.keyframe.shape)
+
+
+@Format(
+    "TIFF", ".tif", ".tiff", ".btf", ".tf8", options=("key",), library="tifffile"
+)  # pyramids: a series is its finest level
+def open_tiff(path: str, key: str | None = None) -> VolumeSource:
+    """Opens a stack: the series `key` (its number or name) of a file, the first if left out."""
+    with opened(path) as (file, warned):
+        number = _choose(path, file.series, key)
+        series = file.series[number]
+        shape = tuple(int(n) for n in series.shape)
+        axes = _axes(path, shape, series.axes)
+        info, spacing, lost = _told(file, series, number, axes, shape)
+        if key is None and len(file.series) > 1:
+            names = ", ".join(f"{at} {one.name!r}" for at, one in enumerate(file.series))
+            lost.append(f"{len(file.series) - 1} other series; key (--key) chooses among {names}")
+        lost += [f"what tifffile warns of ({text})" for text in dict.fromkeys(warned)]
         told: dict[str, Any] = {
             "path": path,
-            "shape": tuple(int(n) for n in series.shape),
+            "shape": shape,
             "axes": axes,
-            "spacing": _spacing(file),
+            "spacing": spacing,
+            "info": info,
         }
         if series.dataoffset is not None:
             stored = series.dtype.newbyteorder(file.byteorder).str
-            return ArraySource(file=path, stored=stored, offset=int(series.dataoffset), **told)
-    pages = re.fullmatch("-*z?-*yxc?", axes) is not None
-    return TiffSource(stored=series.dtype.str, whole=not pages, **told)
-
-
-def _is_folder(path: str) -> bool:
-    return Path(path).is_dir() and not is_zarr(path)
-
-
-@Format("a folder of TIFF slices", matches=_is_folder, library="tifffile")
-def open_folder(path: str) -> SlicesSource:
-    """Opens a folder of slices, in natural order of their names."""
-    import tifffile
-
-    files = [file for file in Path(path).iterdir() if file.suffix.lower() in (".tif", ".tiff")]
-    if not files:
-        raise ValueError(f"{path}: no .tif or .tiff slices in this folder")
-    files.sort(key=lambda file: _natural(file.name))
-    first = tifffile.imread(files[0])
-    if first.ndim not in (2, 3):
-        raise ValueError(f"{files[0]}: expected one slice (y, x) or (y, x, c), got {first.shape}")
-    return SlicesSource(
-        path=path,
-        shape=(len(files), *first.shape),
-        axes="zyxc"[: 1 + first.ndim],
-        stored=first.dtype.str,
-        files=tuple(str(file) for file in files),
+            offset = int(series.dataoffset)
+            return ArraySource(file=path, stored=stored, offset=offset, lost=tuple(lost), **told)
+        inside = _page_shape(series)
+        first = len(shape) - len(inside)
+        by_page = shape[first:] == inside and len(series.pages) == math.prod(shape[:first])
+        by_page &= axes[first:].replace("-", "") in ("yx", "yxc") and "-" not in axes[first:]
+        missing = sum(page is None for page in series.pages)
+        if missing:
+            lost.append(f"{missing} of {len(series.pages)} pages, which are not there")
+    return TiffSource(
+        stored=series.dtype.str, whole=not by_page, series=number, lost=tuple(lost), **told
     )
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Sorts s9 before s10."""
-    return [
-        (int(part), part) if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)
-    ]
+def _choose(path: str, series: Sequence[Any], key: str | None) -> int:
+    if not series:
+        raise ValueError("it holds no images")
+    if key is None:
+        return 0
+    found = [at for at, one in enumerate(series) if key == one.name]
+    if not found and key.isdigit() and int(key) < len(series):
+        found = [int(key)]
+    if not found:
+        names = ", ".join(f"{at} {one.name!r}" for at, one in enumerate(series))
+        raise ValueError(f"{path}: has no series {key!r}; it holds {names}")
+    return found[0]
 
 
 def _axes(path: str, shape: Sequence[int], axes: str) -> str:
-    """Returns what each axis of a series is: z, y, x, c, or - for one of size 1 to drop."""
+    """Returns what each axis of a series is: t, z, y, x, c, or - for one of size 1 to drop."""
     letters = "".join(
         "-" if size == 1 and letter not in "ZYX" else letter
         for size, letter in zip(shape, axes, strict=True)
     )
-    others = [letter for letter in letters if letter not in "ZYXCS-"]
+    others = [letter for letter in letters if letter not in "TZYXCS-"]
     if "Z" not in letters and len(others) == 1 and others[0] in "QI":
         letters, others = letters.replace(others[0], "Z"), []  # pages without a meaning: slices
     channels = [letter for letter in letters if letter in "CS"]
     if others or len(channels) > 1 or letters.count("Y") != 1 or letters.count("X") != 1:
         raise ValueError(
-            f"{path}: axes {axes} {tuple(shape)}; expected Z, Y, X and at most one of C, S"
+            f"{path}: axes {axes} {tuple(shape)}; expected T, Z, Y, X and at most one of C, S"
         )
     return letters.replace("S", "C").lower()
 
 
-def _spacing(file: Any) -> tuple[float, float, float]:
-    """Voxel size as ImageJ writes it: slices apart in the description, pixels per unit in tags."""
-    described = file.imagej_metadata
-    if not described or "spacing" not in described:
-        return (1.0, 1.0, 1.0)
-    tags = file.pages[0].tags
-    sides = []
+def _told(file: Any, series: Any, number: int, axes: str, shape: Sequence[int]) -> Told:
+    """What the file tells of a series beside its numbers."""
+    width = shape[axes.index("c")] if "c" in axes else 1
+    if series.kind == "ome":
+        return ome_info(file.ome_metadata, number, series.name, width)
+    if series.kind == "imagej":
+        return imagej_info(file.imagej_metadata, _resolution(file), width)
+    colors = width in (3, 4) and series.keyframe.photometric in (2, 6)  # RGB, YCbCr
+    names = [ChannelInfo(name=name, color=color) for name, color in RGB] if colors else []
+    names += [ChannelInfo(name="alpha")] * (width - 3) if colors else []
+    lost = ["its palette: values are its numbers"] if series.keyframe.photometric == 3 else []
+    return ImageInfo(channels=tuple(names)), (1.0, 1.0, 1.0), lost
+
+
+def _resolution(file: Any) -> list[float | None]:
+    """Width and height of a pixel, as ImageJ writes them: pixels per unit, in tags."""
+    tags, sides = file.pages[0].tags, []
     for name in ("XResolution", "YResolution"):
         pixels, units = tags[name].value if name in tags else (1, 1)
-        sides.append(units / pixels if pixels > 0 else 1.0)
-    return (sides[0], sides[1], float(described["spacing"]))
+        sides.append(units / pixels if pixels > 0 and units > 0 else None)
+    return sides

@@ -1,0 +1,102 @@
+"""Packed DICOM frames through imagecodecs, as a decoding plugin of pydicom: JPEG (8, 12 bits and
+lossless), JPEG-LS, JPEG 2000 and its high-throughput kind. pydicom itself unpacks RLE.
+
+A frame's own header is compared with the file's before it is unpacked.
+Source: ISO/IEC 10918-1 (JPEG) and 15444-1 (JPEG 2000), markers SOF and SIZ; DICOM PS3.5, annex A.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+_JPEG_FRAMES = {*range(0xC0, 0xD0), 0xF7} - {0xC4, 0xC8, 0xCC}  # of JPEG and of JPEG-LS
+_BARE = {0x01, *range(0xD0, 0xD9)}  # markers without a length
+_CODECS = {
+    "1.2.840.10008.1.2.4.50": "jpeg",
+    "1.2.840.10008.1.2.4.51": "jpeg",
+    "1.2.840.10008.1.2.4.57": "ljpeg",
+    "1.2.840.10008.1.2.4.70": "ljpeg",
+    "1.2.840.10008.1.2.4.80": "jpegls",
+    "1.2.840.10008.1.2.4.81": "jpegls",
+    "1.2.840.10008.1.2.4.90": "jpeg2k",
+    "1.2.840.10008.1.2.4.91": "jpeg2k",
+    "1.2.840.10008.1.2.4.201": "jpeg2k",
+    "1.2.840.10008.1.2.4.202": "jpeg2k",
+    "1.2.840.10008.1.2.4.203": "jpeg2k",
+}
+DECODER_DEPENDENCIES = dict.fromkeys(_CODECS, ("imagecodecs",))
+_NAME = "gvtorch-imagecodecs"
+
+
+def plugin_of(syntax: str) -> str:
+    """Returns the plugin's name, made known to pydicom, if it unpacks a transfer syntax."""
+    if syntax not in _CODECS:
+        return ""
+    from pydicom.pixels import get_decoder
+
+    decoder = get_decoder(syntax)
+    if _NAME not in (*decoder.available_plugins, *decoder.missing_dependencies):
+        decoder.add_plugin(_NAME, (__name__, "decode_frame"))
+    return _NAME
+
+
+def is_available(uid: str) -> bool:
+    """Whether imagecodecs is here; pydicom asks."""
+    import importlib.util
+
+    return uid in _CODECS and importlib.util.find_spec("imagecodecs") is not None
+
+
+def decode_frame(packed: bytes, runner: Any) -> bytes:
+    """Unpacks a frame; pydicom calls it.
+
+    Raises:
+        ValueError: The frame is damaged, or of another extent than the file tells.
+    """
+    import imagecodecs
+    import numpy as np
+
+    codec = _CODECS[str(runner.transfer_syntax)]
+    wanted = (runner.columns, runner.rows, runner.samples_per_pixel)
+    size = jpeg2k_size(packed) if codec == "jpeg2k" else jpeg_size(packed)
+    if size != wanted:
+        raise ValueError(f"a frame is of {size} (columns, rows, samples), not of {wanted}")
+    if codec == "jpeg":  # colours stay as they are stored: pydicom turns them
+        kind: dict[str, Any] = (
+            {"colorspace": "YCBCR", "outcolorspace": "YCBCR"} if size[2] == 3 else {}
+        )
+        data = imagecodecs.jpeg_decode(packed, **kind)
+    else:
+        data = getattr(imagecodecs, f"{codec}_decode")(packed)
+    data = np.asarray(data)
+    if data.size != size[0] * size[1] * size[2] or data.dtype.kind not in "iu":
+        raise ValueError(f"a frame holds {data.shape} {data.dtype}")
+    if codec == "jpeg2k" and size[2] == 3:
+        runner.set_option("photometric_interpretation", "RGB")
+    runner.set_option("bits_allocated", 8 * data.dtype.itemsize)
+    if size[2] > 1:
+        runner.set_option("planar_configuration", 0)
+    return np.ascontiguousarray(data).tobytes()
+
+
+def jpeg_size(packed: bytes) -> tuple[int, int, int] | None:
+    """(columns, rows, samples) that the header of a JPEG or JPEG-LS image tells."""
+    at = 2
+    while packed[:2] == b"\xff\xd8" and at + 9 < len(packed) and packed[at] == 0xFF:
+        marker = packed[at + 1]
+        if marker in _JPEG_FRAMES:
+            rows, columns, samples = struct.unpack_from(">HHB", packed, at + 5)
+            return (columns, rows, samples)
+        bare = marker in _BARE or marker == 0xFF
+        at += (1 if marker == 0xFF else 2) if bare else 2 + int.from_bytes(packed[at + 2 : at + 4])
+    return None
+
+
+def jpeg2k_size(packed: bytes) -> tuple[int, int, int] | None:
+    """(columns, rows, samples) that the header of a JPEG 2000 codestream tells."""
+    at = packed.find(b"\xff\x4f\xff\x51", 0, 4096)
+    if at < 0 or len(packed) < at + 42:
+        return None
+    right, low, left, high = struct.unpack_from(">4I", packed, at + 8)
+    return (right - left, low - high, int.from_bytes(packed[at + 40 : at + 42]))

@@ -1,0 +1,318 @@
+"""The frames of a DICOM series: where each lies, how its values are scaled, and their order.
+
+A frame is an image of a file, be it the only one (classic) or one of many (enhanced: what is told
+of it stands in the functional groups; others: in vectors beside the pixels).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..base.image_info import ChannelInfo, ImageInfo
+
+Triple = tuple[float, float, float]
+_EVEN = 0.01  # of a step: how far slices may lie beside an even grid
+_RGB = (("red", (1.0, 0.0, 0.0)), ("green", (0.0, 1.0, 0.0)), ("blue", (0.0, 0.0, 1.0)))
+#: What may tell images of one place apart, the best first.
+_APART = (
+    "TemporalPositionIndex",
+    "TemporalPositionIdentifier",
+    "TriggerTime",
+    "FrameReferenceTime",
+    "AcquisitionTime",
+    "DiffusionBValue",
+    "EchoTime",
+    "AcquisitionNumber",
+    "InstanceNumber",
+)
+_IN_TIME = {"TriggerTime": "millisecond", "FrameReferenceTime": "millisecond"}
+_IN_TIME["AcquisitionTime"] = "second"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """An image of a file."""
+
+    file: str
+    number: int  # in its file
+    slope: float
+    intercept: float
+    position: Triple | None  # of the first voxel's centre, LPS millimetres
+    orientation: tuple[float, ...] | None  # of rows, then of columns
+    spacing: tuple[float, float]  # between rows, between columns
+    between: float | None  # slices, where they have no place
+    moments: dict[str, float] = field(default_factory=dict)  # what may tell it from others
+
+
+@dataclass(frozen=True, kw_only=True)
+class Times:
+    """Time points of a series."""
+
+    count: int = 1
+    step: float | None = None
+    unit: str | None = None
+
+
+def frames_of(header: Any, count: int) -> list[Frame]:
+    """Returns the frames of a file, from its header without pixels."""
+    shared = _first(header.get("SharedFunctionalGroupsSequence"))
+    each = header.get("PerFrameFunctionalGroupsSequence") or ()
+    if each and len(each) != count:
+        raise ValueError(f"{header.filename}: tells of {len(each)} frames and holds {count}")
+    offsets = [float(v) for v in _list(header.get("GridFrameOffsetVector"))]
+    found = []
+    for number in range(count):
+        groups = [g for g in (each[number] if each else None, shared) if g is not None]
+        frame = _frame(header, groups, number)
+        if len(offsets) == count > 1 and frame.position and frame.orientation:  # of doses
+            normal = np.cross(frame.orientation[:3], frame.orientation[3:])
+            moved = np.add(frame.position, normal * (offsets[number] - offsets[0]))
+            frame = Frame(**{**vars(frame), "position": tuple(moved.tolist())})
+        elif count > 1 and not each:  # one place is told of all of them
+            frame = Frame(**{**vars(frame), "position": None})
+        found.append(frame)
+    return found
+
+
+def _frame(header: Any, groups: list[Any], number: int) -> Frame:
+    def told(sequence: str, name: str) -> Any:
+        for group in groups:
+            item = _first(group.get(sequence))
+            if item is not None and item.get(name) is not None:
+                return item.get(name)
+        return header.get(name)
+
+    spacing = _list(told("PixelMeasuresSequence", "PixelSpacing"))
+    if not spacing:
+        spacing = _list(header.get("ImagerPixelSpacing")) or [1.0, 1.0]
+    position = _list(told("PlanePositionSequence", "ImagePositionPatient"))
+    orientation = _list(told("PlaneOrientationSequence", "ImageOrientationPatient"))
+    slope = told("PixelValueTransformationSequence", "RescaleSlope")
+    slope = header.get("DoseGridScaling") if slope is None else slope
+    intercept = told("PixelValueTransformationSequence", "RescaleIntercept")
+    between = told("PixelMeasuresSequence", "SpacingBetweenSlices")
+    moments: dict[str, float] = {}
+    for name in _APART:
+        value = told("FrameContentSequence", name)
+        if name == "DiffusionBValue":
+            value = told("MRDiffusionSequence", name)
+        if value not in (None, ""):
+            moments[name] = _seconds(str(value)) if name == "AcquisitionTime" else float(value)
+    if groups:
+        moments["InstanceNumber"] = number
+    numbers = [*spacing, *position, *orientation, *(v for v in (slope, intercept) if v is not None)]
+    if not all(math.isfinite(v) for v in numbers) or len(spacing) != 2:
+        raise ValueError(f"{header.filename}: place, spacing or rescaling is no number")
+    return Frame(
+        file=header.filename,
+        number=number,
+        slope=1.0 if slope is None else float(slope),
+        intercept=0.0 if intercept is None else float(intercept),
+        position=tuple(position) if len(position) == 3 else None,  # type: ignore[arg-type]
+        orientation=tuple(orientation) if len(orientation) == 6 else None,
+        spacing=(spacing[0], spacing[1]),
+        between=None if between is None else abs(float(between)),
+        moments=moments,
+    )
+
+
+def order_frames(
+    where: str, frames: Sequence[Frame]
+) -> tuple[list[Frame], np.ndarray, list[str], Times]:
+    """Sorts frames by time and place.
+
+    Returns:
+        The frames, time by time and slice by slice; the (4, 4) affine from (slice, row, column) to
+        LPS millimetres; what is not kept; and the time points.
+
+    Raises:
+        ValueError: Slices are missing, are not evenly apart, lie askew or are there twice.
+    """
+    first = frames[0]
+    for frame in frames:
+        same = np.allclose(frame.spacing, first.spacing, rtol=1e-3)
+        if frame.orientation is not None and first.orientation is not None:
+            same &= np.allclose(frame.orientation, first.orientation, atol=1e-3)
+        if not same:
+            raise ValueError(
+                f"{where}: a series of slices of different orientation or spacing: "
+                f"{first.orientation} {first.spacing} and {frame.orientation} {frame.spacing}; "
+                "put those of one kind into a folder of their own"
+            )
+    rows, columns = _directions(where, first)
+    affine = np.eye(4)
+    affine[:3, 1], affine[:3, 2] = columns * first.spacing[0], rows * first.spacing[1]
+    if any(frame.position is None for frame in frames):
+        return _without_place(frames, affine, np.cross(rows, columns))
+    slices = _by_place(where, frames, np.cross(rows, columns))
+    count, apart = _times(where, slices)
+    ordered = [one[t] for t in range(count) for one in slices]
+    places = np.array([one[0].position for one in slices])
+    affine[:3, 3] = places[0]
+    affine[:3, 0] = np.cross(rows, columns) * (first.between or 1.0)
+    lost = []
+    if len(slices) > 1:
+        affine[:3, 0] = _step(where, places, np.cross(rows, columns))
+    elif first.between is None:
+        lost.append("how thick its only slice is: it is 1 thick here")
+    if apart is not None and apart not in (*_IN_TIME, *_APART[:2]):
+        lost.append(f"{count} images of each slice differ in {apart}: they are taken for times")
+    return ordered, affine, lost, _moments(ordered, count, apart)
+
+
+def _directions(where: str, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors along a row and along a column."""
+    told = np.array(frame.orientation or (1, 0, 0, 0, 1, 0), dtype=np.float64)
+    rows, columns = told[:3], told[3:]
+    lengths = np.linalg.norm(rows), np.linalg.norm(columns)
+    if not np.allclose(lengths, 1, atol=1e-2) or abs(rows @ columns) > 1e-2:
+        raise ValueError(f"{where}: Image Orientation {told.tolist()} is no pair of directions")
+    return rows / lengths[0], columns / lengths[1]
+
+
+def _without_place(
+    frames: Sequence[Frame], affine: np.ndarray, normal: np.ndarray
+) -> tuple[list[Frame], np.ndarray, list[str], Times]:
+    """Frames of one place, or of none that is told: in the order of their numbers."""
+    ordered = sorted(frames, key=lambda f: (f.moments.get("InstanceNumber", 0), f.file, f.number))
+    between = ordered[0].between
+    affine[:3, 0] = normal * (between or 1.0)
+    lost = ["slices have no place: they follow their numbers, from 0"]
+    if between is None:
+        lost[0] += ", 1 apart"
+    return ordered, affine, lost if len(ordered) > 1 else [], Times()
+
+
+def _by_place(where: str, frames: Sequence[Frame], normal: np.ndarray) -> list[list[Frame]]:
+    """Groups frames whose places are the same, along the normal of their plane."""
+    depths = np.array([frame.position for frame in frames]) @ normal
+    order = np.argsort(depths, kind="stable")
+    slices: list[list[Frame]] = []
+    last = -math.inf
+    for at in order:
+        if depths[at] - last > 1e-3:
+            slices.append([])
+            last = depths[at]
+        slices[-1].append(frames[at])
+    return slices
+
+
+def _times(where: str, slices: list[list[Frame]]) -> tuple[int, str | None]:
+    """Sorts the frames of each slice by what tells them apart; returns how many they are and it."""
+    counts = sorted({len(one) for one in slices})
+    if counts == [1]:
+        return 1, None
+    if len(counts) > 1:
+        raise ValueError(
+            f"{where}: slices are there {counts[0]} to {counts[-1]} times; expected each of "
+            f"{len(slices)} places equally often"
+        )
+
+    def differs(name: str) -> bool:
+        return all(len({f.moments.get(name, 0.0) for f in one}) == counts[0] for one in slices)
+
+    name = next(filter(differs, _APART), None)
+    if name is None:
+        raise ValueError(f"{where}: {counts[0]} images of each slice, which nothing tells apart")
+    for one in slices:
+        one.sort(key=lambda frame: frame.moments.get(name, 0.0))
+    return counts[0], name
+
+
+def _moments(ordered: Sequence[Frame], count: int, apart: str | None) -> Times:
+    if count == 1:
+        return Times()
+    name = (
+        apart if apart in _IN_TIME else next((n for n in _IN_TIME if n in ordered[0].moments), None)
+    )
+    if name is None:
+        return Times(count=count)
+    each = len(ordered) // count
+    first = [ordered[t * each].moments.get(name, 0.0) for t in range(count)]
+    step = (first[-1] - first[0]) / (count - 1)
+    return Times(count=count, step=step, unit=_IN_TIME[name]) if step > 0 else Times(count=count)
+
+
+def _step(where: str, places: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """From one slice to the next; raises ValueError unless all are evenly apart, on a line."""
+    gaps = np.diff(places @ normal)
+    usual = float(np.median(gaps))
+    odd = np.abs(gaps - usual) > max(_EVEN * usual, 2e-3)
+    if odd.any():
+        at = int(odd.argmax())
+        times = gaps[at] / usual
+        missing = round(times) - 1
+        if missing > 0 and abs(times - round(times)) < 0.1:
+            raise ValueError(
+                f"{where}: {missing} slices are missing after slice {at + 1} of {len(places)}: "
+                f"the next lies {gaps[at]:.4g} mm further, others {usual:.4g} mm"
+            )
+        raise ValueError(
+            f"{where}: slices are not evenly apart: {gaps.min():.4g} to {gaps.max():.4g} mm; "
+            "resample them, or put those that are into a folder of their own"
+        )
+    step: np.ndarray = (places[-1] - places[0]) / (len(places) - 1)
+    beside = places - (places[0] + np.arange(len(places))[:, None] * step)
+    if np.abs(beside).max() > max(0.05 * usual, 1e-2):
+        raise ValueError(f"{where}: slices do not lie on a line, by {np.abs(beside).max():.4g} mm")
+    return step
+
+
+def image_info(header: Any, samples: int, times: Times) -> tuple[ImageInfo, list[str]]:
+    """What the header tells of the values, and what of it is not kept."""
+    lost = []
+    kind = str(header.get("PhotometricInterpretation", ""))
+    if kind == "PALETTE COLOR":
+        lost.append("the palette: values are its numbers")
+    if kind == "MONOCHROME1":
+        lost.append("that high values are meant to be dark (MONOCHROME1)")
+    quantity = str(
+        header.get("RescaleType") or header.get("Units") or header.get("DoseUnits") or ""
+    )
+    if header.get("Modality") == "CT" and quantity in ("", "US"):
+        quantity = "HU"
+    shared = _first(header.get("SharedFunctionalGroupsSequence"))
+    voi = _first(shared.get("FrameVOILUTSequence")) if shared is not None else None
+    center, width = (
+        _list((voi if voi is not None else header).get(name))
+        for name in ("WindowCenter", "WindowWidth")
+    )
+    channels: tuple[ChannelInfo, ...] = ()
+    if samples == 3:
+        channels = tuple(ChannelInfo(name=name, color=color) for name, color in _RGB)
+    elif center and width and math.isfinite(center[0]) and width[0] >= 1:
+        low = center[0] - 0.5 - (width[0] - 1) / 2
+        channels = (ChannelInfo(window=(low, low + width[0] - 1)),) if width[0] > 1 else ()
+    info = ImageInfo(
+        unit="millimeter",
+        channels=channels,
+        quantity=quantity or None,
+        space="right-anterior-superior",
+        time_step=times.step,
+        time_unit=times.unit,
+    )
+    return info, lost
+
+
+def _first(sequence: Any) -> Any:
+    return sequence[0] if sequence else None
+
+
+def _list(value: Any) -> list[float]:
+    if value is None or value == "":
+        return []
+    several = hasattr(value, "__iter__") and not isinstance(value, str)
+    return [float(part) for part in (value if several else [value])]
+
+
+def _seconds(text: str) -> float:
+    """Seconds since midnight of HHMMSS.FFF."""
+    clock = text.replace(":", "").partition(".")
+    digits = clock[0].ljust(6, "0")
+    rest = float(f"0.{clock[2]}") if clock[2] else 0.0
+    return int(digits[:2]) * 3600 + int(digits[2:4]) * 60 + int(digits[4:6]) + rest

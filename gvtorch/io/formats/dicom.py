@@ -1,0 +1,285 @@
+"""DICOM, through pydicom: the images of a series in a folder, or the frames of one file.
+
+World axes are NIfTI's, x to the right, y to the front, z upwards (RAS), millimetres: DICOM's own x
+and y (LPS) are turned round. So a scan lies where it lies as NIfTI. Slices are told apart by their
+place (Image Position), never by their thickness.
+Source: DICOM PS3.3, C.7.6.2 (image plane), C.7.6.16 (functional groups), C.11.1 (rescale).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import zlib
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...base.volume import check_extent
+from ..dicom_codecs import plugin_of
+from ..dicom_frames import Frame, frames_of, image_info, order_frames
+from ..ngff import is_zarr
+from ..source import Index, VolumeSource, place_axes
+from .format import Format
+
+_MOST_FILES = 200_000
+_MOST_UNPACKED = 1 << 32  # bytes
+_ENDINGS = (".dcm", ".dicom", ".ima")
+_OTHERS = (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".bmp", ".txt", ".json")  # not looked into
+_DEFLATED = "1.2.840.10008.1.2.1.99"
+_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class DicomSource(VolumeSource):
+    """Images (t, z, rows, columns) or (t, z, rows, columns, c)."""
+
+    frames: tuple[tuple[str, int, float, float], ...]  # file, number, slope, intercept; time, place
+
+    def check_file(self) -> None:
+        """Compares the size of files that are not packed with what their images take."""
+        for file, number, *_ in dict((frame[0], frame) for frame in self.frames).values():
+            need = _bytes_unpacked(file, number + 1)
+            size = os.stat(file).st_size
+            if size < need:
+                raise ValueError(f"{file}: its images take {need} bytes, the file has {size}")
+
+    def read_stored(self, index: Index) -> np.ndarray:
+        """Unpacks the images of a part."""
+        times, places, *inside = index
+        depth = self.shape[1]
+        wanted = [
+            self.frames[t * depth + z]
+            for t in range(times.start, times.stop)
+            for z in range(places.start, places.stop)
+        ]
+        data = np.empty((len(wanted), *(s.stop - s.start for s in inside)), self.stored)
+        at = 0
+        for file, group in groupby(wanted, key=lambda frame: frame[0]):
+            same = list(group)
+            images = _images(file, [number for _, number, _, _ in same])
+            for (_, _, slope, intercept), image in zip(same, images, strict=True):
+                if image.shape != self.shape[2:]:
+                    raise ValueError(f"{file}: {image.shape} differs from {self.shape[2:]}")
+                part = image[tuple(inside)]
+                if (slope, intercept) != (1, 0):
+                    part = part * np.float64(slope) + intercept
+                data[at] = part
+                at += 1
+        if at != len(wanted):
+            raise ValueError(f"{self.path}: {len(wanted) - at} images are missing")
+        sizes = (times.stop - times.start, places.stop - places.start)
+        return data.reshape((*sizes, *data.shape[1:]))
+
+
+def _has_magic(path: str | os.PathLike[str]) -> bool:
+    try:
+        if not os.path.isfile(path):  # a pipe would be waited for
+            return False
+        with open(path, "rb") as file:
+            return file.read(132)[128:] == b"DICM"
+    except OSError:
+        return False
+
+
+def _files(folder: str) -> Iterator[str]:
+    """DICOM files in a folder and those below, in order of their names."""
+    seen = 0
+    for place, folders, names in os.walk(folder):
+        folders.sort()
+        for name in sorted(names):
+            seen += 1
+            if seen > _MOST_FILES:
+                raise ValueError(f"{folder}: more than {_MOST_FILES} files")
+            file = os.path.join(place, name)
+            if (
+                not name.lower().endswith(_OTHERS)
+                and name.upper() != "DICOMDIR"
+                and _has_magic(file)
+            ):
+                yield file
+
+
+def _is_dicom(path: str) -> bool:
+    if "://" in path or is_zarr(path):
+        return False
+    if Path(path).is_dir():
+        return next(_files(path), None) is not None
+    bare = re.fullmatch(r"|\.\d+", Path(path).suffix) is not None  # as in IM0001, 1.2.840.113619.5
+    return path.lower().endswith(_ENDINGS) or (bare and _has_magic(path))
+
+
+@Format("DICOM", *_ENDINGS, matches=_is_dicom, options=("key",), library="pydicom")
+def open_dicom(path: str, key: str | None = None) -> DicomSource:
+    """Opens a series: the only one of a folder, or `key` (its number, UID or description); or the
+    series that a file belongs to, or the frames of a file that has several.
+    """
+    series: dict[str, list[Any]] = defaultdict(list)
+    if Path(path).is_dir():
+        for file in _files(path):
+            header = _header(file)
+            if header.get("Rows") and header.get("Columns"):  # else a report, a plan, ...
+                series[str(header.get("SeriesInstanceUID", ""))].append(header)
+        headers = _choose(path, series, key)
+    else:
+        headers = [_header(path)]
+        if _frame_count(headers[0]) == 1:
+            headers += _siblings(path, headers[0])
+    return _source(path, _without_copies(headers))
+
+
+def _siblings(path: str, first: Any) -> Iterator[Any]:
+    """Headers of the other files of a folder that belong to the same series."""
+    for entry in sorted(Path(path).absolute().parent.iterdir()):
+        if entry.is_file() and not os.path.samefile(entry, path) and _has_magic(entry):
+            header = _header(str(entry))
+            if header.get("SeriesInstanceUID") == first.get("SeriesInstanceUID") is not None:
+                if header.get("Rows"):
+                    yield header
+
+
+def _header(file: str) -> Any:
+    """Reads all but the pixels; what unpacks to far too much is refused before it is unpacked."""
+    import pydicom
+
+    _check_deflated(file)
+    header = pydicom.dcmread(file, stop_before_pixels=True, force=not _has_magic(file))
+    header.filename = file
+    return header
+
+
+def _check_deflated(file: str) -> None:
+    from pydicom.filereader import read_file_meta_info
+
+    if not _has_magic(file):
+        return
+    meta = read_file_meta_info(file)
+    if str(meta.get("TransferSyntaxUID", "")) != _DEFLATED:
+        return
+    size, unpack = 0, zlib.decompressobj(-zlib.MAX_WBITS)
+    with open(file, "rb") as stream:
+        stream.seek(144 + int(meta.get("FileMetaInformationGroupLength", 0)))
+        while size <= _MOST_UNPACKED and (packed := stream.read(1 << 16)):
+            while packed and size <= _MOST_UNPACKED:
+                size += len(unpack.decompress(packed, 1 << 20))
+                packed = unpack.unconsumed_tail
+    if size > _MOST_UNPACKED:
+        raise ValueError(f"{file}: unpacks to more than {_MOST_UNPACKED} bytes")
+
+
+def _choose(path: str, series: dict[str, list[Any]], key: str | None) -> list[Any]:
+    if not series:
+        raise ValueError(f"{path}: no DICOM file in this folder holds an image")
+    if key is None and len(series) == 1:
+        return next(iter(series.values()))
+    names = {uid: _names(uid, headers[0]) for uid, headers in series.items()}
+    found = [uid for uid, words in names.items() if key is not None and key in words]
+    if len(found) == 1:
+        return series[found[0]]
+    numbers = [words[0] for words in names.values()]
+    listed = ", ".join(
+        f"{words[0] if numbers.count(words[0]) == 1 else uid} ({words[1] or 'without a name'}, "
+        f"{len(series[uid])} files)"
+        for uid, words in names.items()
+    )
+    what = f"holds {len(series)} series" if key is None else f"has no series {key!r}"
+    raise ValueError(f"{path}: {what}, choose one with key (--key): {listed}")
+
+
+def _names(uid: str, header: Any) -> list[str]:
+    return [str(header.get("SeriesNumber", uid)), str(header.get("SeriesDescription", "")), uid]
+
+
+def _without_copies(headers: Sequence[Any]) -> list[Any]:
+    """Leaves out a file that is there twice."""
+    found = {str(h.get("SOPInstanceUID", h.filename)): h for h in reversed(headers)}
+    return list(reversed(found.values()))
+
+
+def _frame_count(header: Any) -> int:
+    count = int(header.get("NumberOfFrames") or 1)
+    if not 1 <= count <= os.stat(header.filename).st_size:
+        raise ValueError(f"{header.filename}: {count} frames in a file that is too short for them")
+    return count
+
+
+def _source(path: str, headers: list[Any]) -> DicomSource:
+    first = headers[0]
+    rows, columns, samples = _image_shape(first)
+    frames: list[Frame] = []
+    for header in headers:
+        count = _frame_count(header)
+        check_extent(header.filename, (count, rows, columns), most=1 << 40)
+        if _image_shape(header) != (rows, columns, samples):
+            raise ValueError(
+                f"{path}: a series of images of different sizes: {(rows, columns, samples)} and "
+                f"{_image_shape(header)} (rows, columns, samples, {Path(header.filename).name})"
+            )
+        frames += frames_of(header, count)
+    ordered, affine, lost, times = order_frames(path, frames)
+    depth = len(ordered) // times.count
+    told = place_axes(path, _TO_RAS @ affine, (depth, rows, columns))
+    color = (samples,) if samples > 1 else ()
+    told["axes"] = "t" + told["axes"] + "c" * len(color)
+    info, more = image_info(first, samples, times)
+    if any(frame.position is None for frame in ordered):
+        info = replace(info, unit=info.unit if first.get("PixelSpacing") else None)
+    return DicomSource(
+        path=path,
+        shape=(times.count, depth, rows, columns, *color),
+        stored=_dtype(first, ordered),
+        frames=tuple((f.file, f.number, f.slope, f.intercept) for f in ordered),
+        info=info,
+        lost=(*lost, *more),
+        **told,
+    )
+
+
+def _image_shape(header: Any) -> tuple[int, int, int]:
+    samples = int(header.get("SamplesPerPixel") or 1)
+    return (int(header.get("Rows") or 0), int(header.get("Columns") or 0), samples)
+
+
+def _dtype(header: Any, frames: Sequence[Frame]) -> str:
+    """The smallest dtype that holds every value after rescaling."""
+    for tag, kind in (("FloatPixelData", "float32"), ("DoubleFloatPixelData", "float64")):
+        if tag in header:
+            return kind
+    bits, signed = int(header.get("BitsStored") or 0), int(header.get("PixelRepresentation") or 0)
+    if not 1 <= bits <= 32:
+        raise ValueError(f"{header.filename}: {bits} bits stored; expected 1 to 32")
+    low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
+    ends: list[float] = []
+    for slope, intercept in {(frame.slope, frame.intercept) for frame in frames}:
+        if not (slope.is_integer() and intercept.is_integer()):
+            return "float32"
+        ends += [low * slope + intercept, high * slope + intercept]
+    for kind in ("uint8", "int8", "int16", "uint16"):
+        if np.iinfo(kind).min <= min(ends) and max(ends) <= np.iinfo(kind).max:
+            return kind
+    return "int32" if max(map(abs, ends)) < 2**31 and bits > 16 else "float32"
+
+
+def _bytes_unpacked(file: str, images: int) -> int:
+    """Bytes that the images of a file take if they are not packed, else 0."""
+    header = _header(file)
+    syntax = header.file_meta.get("TransferSyntaxUID") if "file_meta" in vars(header) else None
+    if syntax is None or syntax.is_compressed:
+        return 0
+    bits = int(header.get("BitsAllocated") or 0)
+    return math.prod(_image_shape(header)) * images * bits // 8
+
+
+def _images(file: str, numbers: list[int]) -> Iterator[np.ndarray]:
+    """Unpacks some of the images of a file."""
+    from pydicom.filereader import read_file_meta_info
+    from pydicom.pixels import iter_pixels
+
+    syntax = read_file_meta_info(file).get("TransferSyntaxUID", "") if _has_magic(file) else ""
+    return iter_pixels(file, indices=numbers, decoding_plugin=plugin_of(str(syntax)))

@@ -1,0 +1,222 @@
+"""HDF5 and NetCDF 4, through h5py: a data set of a file, `file.h5:/group/data`, by region.
+
+What axes are and how far apart is read from dimension scales and CF attributes (NetCDF), `axistags`
+(ilastik), `element_size_um` (ImageJ, ilastik) and `spacing`; else asked, as of arrays.
+Source: HDF5 dimension scales; CF conventions 1.11, 4 (axes) and 8.1 (packed data).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ...base.image_info import ChannelInfo, ImageInfo
+from ...base.named_axes import ask_axes, even_steps, letter_of, named_axes, place_named
+from ...base.units import spacing_of
+from ..source import Index, VolumeSource
+from .format import Format
+
+_ENDINGS = (".h5", ".hdf5", ".hdf", ".he5", ".h5ad", ".ilp", ".nc", ".nc4", ".cdf")
+_MOST_CHUNK = 1 << 31  # bytes
+_MOST_SETS = 100_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hdf5Source(VolumeSource):
+    """A data set."""
+
+    name: str
+    scale: tuple[float, float] | None = None  # factor and offset of packed values
+    missing: tuple[float, ...] = ()  # stored values that stand for none
+
+    def read_stored(self, index: Index) -> np.ndarray:
+        """Reads a part; packed values are unpacked, missing ones become NaN."""
+        import h5py
+
+        with h5py.File(self.path, "r") as file:
+            data = file[self.name][index]
+        if self.scale is None and not self.missing:
+            return data
+        found = data * np.float64(self.scale[0]) + self.scale[1] if self.scale else data
+        found = np.asarray(found).astype(self.stored)
+        for value in self.missing:
+            found[data == value] = np.nan
+        return found
+
+
+@Format("HDF5", *_ENDINGS, options=("key", "axes"), library="h5py")
+def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf5Source:
+    """Opens the data set `key` of a file, the only one of three or more axes if left out. `axes` as
+    of `ask_axes`.
+    """
+    import h5py
+
+    _check_kind(path)
+    with h5py.File(path, "r") as file:
+        name = _choose(path, file, key)
+        data = file[name]
+        _check(path, name, data)
+        shape = tuple(int(n) for n in data.shape)
+        letters, steps, units, lost = _axes(f"{path}:/{name.strip('/')}", data, shape, axes)
+        info, scale, missing, stored = _values(data, letters, shape)
+        place, moments = place_named(letters, shape, steps, units)
+        sizes = np.ravel(data.attrs.get("element_size_um", ())).tolist()
+        if moments["unit"] is None and len(sizes) == 3:
+            place["spacing"], moments["unit"] = spacing_of(sizes[::-1], ["um"] * 3)
+    info = replace(info, **moments)
+    return Hdf5Source(
+        path=path,
+        shape=shape,
+        axes=letters,
+        stored=stored,
+        name=name,
+        scale=scale,
+        missing=missing,
+        info=info,
+        lost=tuple(lost),
+        **place,
+    )
+
+
+def _check_kind(path: str) -> None:
+    with open(path, "rb") as file:
+        if re.match(rb"CDF[\1\2\5]", file.read(4)):
+            raise ValueError(
+                f"{path}: is a NetCDF file of the classic kind; nccopy -k nc4 {path} NEW.nc makes "
+                "one of NetCDF 4, which can be read"
+            )
+
+
+def _choose(path: str, file: Any, key: str | None) -> str:
+    import h5py
+
+    if key is not None:
+        if isinstance(file.get(key), h5py.Dataset):
+            return key
+        if not isinstance(file.get(key), h5py.Group):
+            held = ", ".join(_volumes(file)) or "none of three or more axes"
+            raise ValueError(f"{path}: has no data set {key!r}; it holds {held}")
+        names = {f"{key.rstrip('/')}/{name}": text for name, text in _volumes(file[key]).items()}
+    else:
+        names = _volumes(file)
+    if len(names) == 1:
+        return next(iter(names))
+    if not names:
+        raise ValueError(f"{path}: holds no data set of three or more axes")
+    listed = ", ".join(f"{path}:/{name.strip('/')} {text}" for name, text in names.items())
+    raise ValueError(f"{path}: holds {len(names)} data sets, choose one: {listed}")
+
+
+def _volumes(group: Any) -> dict[str, str]:
+    """Data sets of numbers that have three or more axes."""
+    import h5py
+
+    found: dict[str, str] = {}
+
+    def visit(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and item.ndim >= 3 and item.dtype.kind in "biuf":
+            if len(found) < _MOST_SETS:
+                found[name] = f"({', '.join(map(str, item.shape))}) {item.dtype}"
+
+    group.visititems(visit)
+    return found
+
+
+def _check(path: str, name: str, data: Any) -> None:
+    if data.dtype.kind not in "biuf":
+        raise ValueError(f"{path}: {name} must hold real numbers, got dtype {data.dtype}")
+    if data.ndim < 2:
+        raise ValueError(f"{path}: {name} must have 2 to 5 axes, got shape {data.shape}")
+    chunk = math.prod(data.chunks or (1,)) * data.dtype.itemsize
+    if chunk > _MOST_CHUNK:
+        raise ValueError(f"{path}: a chunk of {name} takes {chunk} bytes, more than {_MOST_CHUNK}")
+    if data.chunks is None and data.external is None and not data.is_virtual:
+        held = data.id.get_storage_size()
+        need = math.prod(data.shape) * data.dtype.itemsize
+        if held and held < need:
+            raise ValueError(f"{path}: {name} takes {need} bytes, the file has {held}")
+
+
+def _axes(
+    where: str, data: Any, shape: tuple[int, ...], axes: str | None
+) -> tuple[str, list[tuple[float, float] | None], list[str | None], list[str]]:
+    """Returns a letter, (step, first place) and the unit of each axis, and what is not kept."""
+    rank = len(shape)
+    names: list[str] = [""] * rank
+    steps: list[tuple[float, float] | None] = [None] * rank
+    units: list[str | None] = [None] * rank
+    lost: list[str] = []
+    for at, dimension in enumerate(data.dims):
+        scale = dimension[0] if len(dimension) else None
+        told = dict(scale.attrs) if scale is not None else {}
+        names[at] = str(dimension.label or (scale.name.rpartition("/")[2] if scale else ""))
+        kind = _text(told.get("axis")).lower() or _text(told.get("standard_name")).lower()
+        names[at] = kind if letter_of(kind) != "?" else names[at]
+        units[at] = _text(told.get("units")) or None
+        if _text(told.get("NAME")).startswith("This is a netCDF dimension but not"):
+            continue
+        if scale is not None and scale.shape == shape[at : at + 1] and scale.dtype.kind in "iuf":
+            steps[at], even = even_steps(scale[()])
+            if not even:
+                lost.append(f"that places along {names[at]} are not evenly apart")
+    tags = _tags(data)
+    if len(tags) == rank:
+        names = [str(tag.get("key", "")) for tag in tags]
+        for at, tag in enumerate(tags):
+            size = tag.get("resolution")
+            steps[at] = (float(size), 0.0) if isinstance(size, (int, float)) and size > 0 else None
+    letters = named_axes(names, shape) if axes is None else None
+    if letters is None and axes is None and rank > 3 and set(shape[:-3]) == {1}:
+        letters = "-" * (rank - 3) + "zyx"
+    return letters or ask_axes(where, shape, axes), steps, units, lost
+
+
+def _tags(data: Any) -> list[Any]:
+    """ilastik's `axistags`."""
+    try:
+        found = json.loads(_text(data.attrs.get("axistags")) or "{}")
+    except ValueError:
+        return []
+    tags = found.get("axes") if isinstance(found, dict) else None
+    return tags if isinstance(tags, list) and all(isinstance(tag, dict) for tag in tags) else []
+
+
+def _values(
+    data: Any, letters: str, shape: tuple[int, ...]
+) -> tuple[ImageInfo, tuple[float, float] | None, tuple[float, ...], str]:
+    """What the attributes tell of values: info, scale, missing ones, and the dtype they become."""
+    attrs = data.attrs
+    factor, offset = (_number(attrs.get(name)) for name in ("scale_factor", "add_offset"))
+    scale = None
+    if factor is not None or offset is not None:
+        scale = (1.0 if factor is None else factor, 0.0 if offset is None else offset)
+    missing = {_number(attrs.get(name)) for name in ("_FillValue", "missing_value")}
+    gaps = tuple(sorted(v for v in missing if v is not None and not math.isnan(v)))
+    quantity = _text(attrs.get("units"))
+    name = _text(attrs.get("long_name"))
+    width = shape[letters.index("c")] if "c" in letters else 1
+    names = np.ravel(attrs.get("channel_names", ())).tolist()
+    channels = tuple(ChannelInfo(name=_text(n)) for n in names) if len(names) == width else ()
+    if not channels and width == 1 and name:
+        channels = (ChannelInfo(name=name),)
+    stored = data.dtype.str
+    if scale or gaps:
+        wide = data.dtype.kind == "f" and data.dtype.itemsize > 4
+        stored = "float64" if wide else "float32"
+    return ImageInfo(quantity=quantity or None, channels=channels), scale, gaps, stored
+
+
+def _number(value: Any) -> float | None:
+    found = np.ravel(value) if value is not None else np.zeros(0)
+    return float(found[0]) if found.size == 1 and found.dtype.kind in "iuf" else None
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        value = value.ravel()[0] if value.size == 1 else ""
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value or "")

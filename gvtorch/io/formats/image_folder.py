@@ -1,0 +1,134 @@
+"""A folder of images: TIFF (through tifffile), PNG, JPEG or BMP (through imagecodecs) slices in the
+natural order of their names.
+
+What an image's header tells is compared with the first one's before it is unpacked.
+Source: ISO/IEC 15948 (PNG), IHDR; ISO/IEC 10918-1 (JPEG), SOF; Microsoft, BITMAPINFOHEADER.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...base.image_info import ChannelInfo, ImageInfo
+from ...base.volume import check_extent
+from ..dicom_codecs import jpeg_size
+from ..ngff import is_zarr
+from ..source import Index, VolumeSource
+from ..tiff_info import RGB, opened
+from .format import Format
+
+_TIFF = (".tif", ".tiff")
+_CODECS = {".png": "png", ".jpg": "jpeg8", ".jpeg": "jpeg8", ".bmp": "bmp"}
+_HEAD = 1 << 20  # bytes of an image that hold its header
+_MOST_PIXELS = 2**31
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlicesSource(VolumeSource):
+    """A folder of slices."""
+
+    files: tuple[str, ...]  # one a slice
+
+    def read_stored(self, index: Index) -> np.ndarray:
+        """Reads the files of a part."""
+        files = self.files[index[0]]
+        data = np.empty((len(files), *[s.stop - s.start for s in index[1:]]), self.stored)
+        for at, file in enumerate(files):
+            shape = _shape(file)
+            image = _image(file) if shape[:2] == self.shape[1:3] else np.empty(shape, np.void)
+            if image.shape != self.shape[1:] or image.dtype != data.dtype:
+                raise ValueError(
+                    f"{file}: {image.shape} {image.dtype} differs from "
+                    f"{self.shape[1:]} {data.dtype} of {Path(self.files[0]).name}"
+                )
+            data[at] = image[index[1:]]
+        return data
+
+
+def _slices(path: str) -> list[Path]:
+    """The images in a folder, those of the kind that is there most."""
+    files: dict[str, list[Path]] = {}
+    for file in Path(path).iterdir():
+        kind = file.suffix.lower()
+        if kind in (*_TIFF, *_CODECS) and not file.name.startswith("."):
+            files.setdefault(_CODECS.get(kind, "tiff"), []).append(file)
+    if len(files) > 1:
+        kinds = " and ".join(f"{len(of)} {kind}" for kind, of in sorted(files.items()))
+        raise ValueError(f"{path}: images of several kinds: {kinds}; expected those of one stack")
+    return next(iter(files.values()), [])
+
+
+def _is_folder(path: str) -> bool:
+    return Path(path).is_dir() and not is_zarr(path)
+
+
+@Format("a folder of images", matches=_is_folder, library="imagecodecs")
+def open_folder(path: str) -> SlicesSource:
+    """Opens a folder of slices, in natural order of their names."""
+    files = _slices(path)
+    if not files:
+        raise ValueError(
+            f"{path}: no .tif, .tiff, .png, .jpg, .jpeg or .bmp slices in this folder, and no "
+            "DICOM files"
+        )
+    files.sort(key=lambda file: _natural(file.name))
+    check_extent(str(files[0]), _shape(str(files[0])), most=_MOST_PIXELS)
+    first = _image(str(files[0]))
+    if first.ndim not in (2, 3):
+        raise ValueError(f"{files[0]}: expected one slice (y, x) or (y, x, c), got {first.shape}")
+    info = ImageInfo()
+    if first.ndim == 3 and first.shape[2] in (3, 4):
+        channels = [ChannelInfo(name=name, color=color) for name, color in RGB]
+        channels += [ChannelInfo(name="alpha")] * (first.shape[2] - 3)
+        info = ImageInfo(channels=tuple(channels))
+    return SlicesSource(
+        path=path,
+        shape=(len(files), *first.shape),
+        axes="zyxc"[: 1 + first.ndim],
+        stored=first.dtype.str,
+        files=tuple(str(file) for file in files),
+        info=info,
+    )
+
+
+def _image(file: str) -> np.ndarray:
+    """Unpacks an image."""
+    codec = _CODECS.get(Path(file).suffix.lower())
+    if codec is None:
+        with opened(file) as (tiff, _):
+            return tiff.asarray()
+    import imagecodecs
+
+    found = np.asarray(getattr(imagecodecs, f"{codec}_decode")(Path(file).read_bytes()))
+    return found[..., 0] if found.ndim == 3 and found.shape[2] == 1 else found
+
+
+def _shape(file: str) -> tuple[Any, ...]:
+    """What the header of an image tells: rows and columns first."""
+    if Path(file).suffix.lower() in _TIFF:
+        with opened(file) as (tiff, _):
+            return tuple(tiff.series[0].shape)
+    with open(file, "rb") as stream:
+        head = stream.read(_HEAD)
+    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) >= 24:
+        columns, rows = struct.unpack_from(">II", head, 16)
+    elif head[:2] == b"BM" and len(head) >= 26:
+        columns, rows = map(abs, struct.unpack_from("<ii", head, 18))
+    elif (size := jpeg_size(head)) is not None:
+        columns, rows, _ = size
+    else:
+        raise ValueError(f"{file}: is no PNG, JPEG or BMP image")
+    return (rows, columns)
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sorts s9 before s10."""
+    return [
+        (int(part), part) if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)
+    ]

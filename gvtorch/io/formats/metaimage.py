@@ -1,0 +1,157 @@
+"""MetaImage, `.mha` and `.mhd`: a header of text lines, and numbers, packed by zlib or not.
+
+World axes are turned to x right, y anterior, z superior (RAS), as of NIfTI: the file's own (LPS)
+are x left, y posterior.
+Source: "MetaIO documentation" (Insight Software Consortium), tags of images; ITK's MetaImageIO.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...base.image_info import ChannelInfo, ImageInfo
+from ..packed import PackedSource
+from ..source import ArraySource, VolumeSource, place_axes
+from ..tiff_info import RGB
+from .format import Format
+
+_TYPES = {
+    "MET_CHAR": "i1",
+    "MET_UCHAR": "u1",
+    "MET_SHORT": "i2",
+    "MET_USHORT": "u2",
+    "MET_INT": "i4",
+    "MET_UINT": "u4",
+    "MET_LONG": "i4",
+    "MET_ULONG": "u4",
+    "MET_LONG_LONG": "i8",
+    "MET_ULONG_LONG": "u8",
+    "MET_FLOAT": "f4",
+    "MET_DOUBLE": "f8",
+}
+_MOST_HEADER = 1 << 20  # bytes
+_KEPT = {
+    *("ObjectType", "NDims", "BinaryData", "BinaryDataByteOrderMSB", "ElementByteOrderMSB"),
+    *("CompressedData", "CompressedDataSize", "TransformMatrix", "Rotation", "Orientation"),
+    *("Offset", "Position", "Origin", "CenterOfRotation", "AnatomicalOrientation", "DimSize"),
+    *("ElementSpacing", "ElementSize", "ElementType", "ElementNumberOfChannels", "HeaderSize"),
+    *("ElementDataFile", "Modality", "DistanceUnits", "ObjectSubType", "ElementMin", "ElementMax"),
+    *("ITK_InputFilterName", "CompressionLevel", "AcquisitionDate", "Name", "Comment", "ID"),
+}
+
+
+@Format("MetaImage", ".mha", ".mhd")
+def open_metaimage(path: str) -> VolumeSource:
+    """Opens an image: 3 axes, or 4, the last of which counts times."""
+    header, end = _header(path)
+    rank = int(header.get("NDims", 3))
+    shape = tuple(int(n) for n in header["DimSize"].split())
+    if rank not in (2, 3, 4) or len(shape) != rank:
+        raise ValueError(f"{path}: expected 2 to 4 dimensions, got {shape} of {rank}")
+    kind = _TYPES.get(header["ElementType"].removesuffix("_ARRAY"))
+    if kind is None:
+        raise ValueError(f"{path}: ElementType {header['ElementType']!r} is unknown")
+    width = int(header.get("ElementNumberOfChannels", 1))
+    if width < 1:
+        raise ValueError(f"{path}: {width} channels")
+    is_big = header.get("ElementByteOrderMSB", header.get("BinaryDataByteOrderMSB", "False"))
+    lost = [f"{name} of the header" for name in sorted(set(header) - _KEPT)][:8]
+    told: dict[str, Any] = {
+        "path": path,
+        "stored": np.dtype((">" if is_big.lower() == "true" else "<") + kind).str,
+        "shape": ((width,) if width > 1 else ()) + shape,
+        "info": _info(header, width, rank),
+        "lost": tuple(lost),
+        **_placed(path, header, shape, width),
+    }
+    file = header["ElementDataFile"].strip()
+    if file.upper() == "LIST" or "%" in file:
+        raise ValueError(f"{path}: its slices lie in files of their own (ElementDataFile = {file})")
+    is_here = file.upper() == "LOCAL"
+    data = path if is_here else str(Path(path).parent / file)
+    offset = end if is_here else int(header.get("HeaderSize", 0))
+    if header.get("BinaryData", "True").lower() != "true":
+        return PackedSource(file=data, offset=offset, codec="text", fortran=True, **told)
+    if header.get("CompressedData", "False").lower() == "true":
+        return PackedSource(file=data, offset=max(offset, 0), codec="zlib", fortran=True, **told)
+    source = ArraySource(file=data, offset=max(offset, 0), fortran=True, **told)
+    if offset < 0:  # the numbers are the last of the file
+        need = int(np.prod(source.shape)) * np.dtype(source.stored).itemsize
+        told_end = os.stat(data).st_size - need
+        if told_end < 0:
+            raise ValueError(f"{path}: takes {need} bytes, the file has {need + told_end}")
+        source = ArraySource(file=data, offset=told_end, fortran=True, **told)
+    return source
+
+
+def _header(path: str) -> tuple[dict[str, str], int]:
+    """The header's lines by name, up to ElementDataFile, and where they end."""
+    with open(path, "rb") as file:
+        text = file.read(_MOST_HEADER)
+    found: dict[str, str] = {}
+    at = 0
+    while at < len(text):
+        end = text.find(b"\n", at)
+        end = len(text) if end < 0 else end
+        match = re.fullmatch(r"\s*(\w+)\s*[=:]\s*(.*?)\s*", text[at:end].decode("latin-1"))
+        at = end + 1
+        if match is None:
+            break
+        found[match[1]] = match[2]
+        if match[1] == "ElementDataFile":
+            for name in ("DimSize", "ElementType"):
+                if name not in found:
+                    raise ValueError(f"the header tells no {name}")
+            return found, at
+    raise ValueError("no MetaImage: the header has no ElementDataFile")
+
+
+def _placed(
+    path: str, header: dict[str, str], shape: tuple[int, ...], width: int
+) -> dict[str, Any]:
+    """Axes and place of the array, whose first axis counts channels if there are several."""
+    rank = len(shape)
+
+    def numbers(count: int, *names: str) -> np.ndarray | None:
+        text = next((header[name] for name in names if name in header), None)
+        values = np.array([float(v) for v in text.split()]) if text else None
+        if values is not None and len(values) != count:
+            raise ValueError(f"{path}: {names[0]} must be {count} numbers, got {text!r}")
+        return values
+
+    steps = numbers(rank, "ElementSpacing", "ElementSize")
+    steps = np.ones(rank) if steps is None else steps
+    matrix = numbers(rank * rank, "TransformMatrix", "Rotation", "Orientation")
+    matrix = np.eye(rank) if matrix is None else matrix.reshape(rank, rank).T
+    offset = numbers(rank, "Offset", "Position", "Origin")
+    affine, space = np.eye(4), min(rank, 3)
+    affine[:space, :space] = (matrix * steps)[:space, :space]
+    affine[:space, 3] = 0.0 if offset is None else offset[:space]
+    spatial = (*shape[:3], 1)[:3]
+    place = place_axes(path, np.diag([-1.0, -1.0, 1.0, 1.0]) @ affine, spatial)
+    place["axes"] = "c" * (width > 1) + place["axes"][:space] + "t" * (rank == 4)
+    return place
+
+
+def _info(header: dict[str, str], width: int, rank: int) -> ImageInfo:
+    """What the header tells of the values."""
+    units = {"mm": "millimeter", "um": "micrometer", "cm": "centimeter", "m": "meter"}
+    modality = header.get("Modality", "")
+    color = width == 3 and header["ElementType"].startswith("MET_UCHAR")
+    return ImageInfo(
+        unit=units.get(header.get("DistanceUnits", "mm").lower()),
+        quantity="HU" if modality == "MET_MOD_CT" else None,
+        channels=tuple(ChannelInfo(name=n, color=c) for n, c in RGB) if color else (),
+        space="right-anterior-superior",
+        time_step=_time_step(header) if rank == 4 else None,
+    )
+
+
+def _time_step(header: dict[str, str]) -> float | None:
+    words = header.get("ElementSpacing", "").split()
+    return float(words[3]) if len(words) == 4 and float(words[3]) > 0 else None

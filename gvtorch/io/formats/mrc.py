@@ -1,0 +1,110 @@
+"""MRC and CCP4 maps, through mrcfile: by region, or whole where the file is packed.
+
+Source: Cheng et al., "MRC2014: extensions to the MRC format header", J. Struct. Biol. 2015.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...base.image_info import ImageInfo
+from ..source import ArraySource, Index, VolumeSource
+from .format import Format
+
+_PACKED = (".gz", ".bz2")
+_DTYPES = {0: "i1", 1: "i2", 2: "f4", 6: "u2", 12: "f2"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class MrcSource(VolumeSource):
+    """A packed map."""
+
+    offset: int
+    whole: bool = True
+
+    def read_stored(self, index: Index) -> np.ndarray:
+        """Unpacks all, no further than the header tells, and returns a part."""
+        import bz2
+        import gzip
+
+        opener: Any = gzip.open if self.path.lower().endswith(".gz") else bz2.open
+        need = int(np.prod(self.shape)) * np.dtype(self.stored).itemsize
+        with opener(self.path, "rb") as stream:
+            stream.seek(self.offset)
+            data = stream.read(need)
+        if len(data) != need:
+            raise ValueError(f"{self.path}: {need} bytes expected, {len(data)} found")
+        return np.frombuffer(data, self.stored).reshape(self.shape)[index]
+
+
+@Format("MRC", ".mrc", ".map", ".rec", ".ccp4", ".mrcs", ".st", ".mrc.gz", ".map.gz", ".mrc.bz2",
+        ".map.bz2", library="mrcfile")  # fmt: skip
+def open_mrc(path: str) -> VolumeSource:
+    """Opens a map, in angstroms. A stack of maps is taken for times."""
+    import mrcfile
+
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        with mrcfile.open(path, mode="r", header_only=True, permissive=True) as file:
+            header = file.header
+            if header is None:
+                raise ValueError("the header can't be read")
+            found, order = header.copy(), header.mode.dtype.byteorder
+    lost = [" ".join(str(one.message).split()) for one in heard]
+    serious = [text for text in lost if "machine stamp" not in text and "Map ID" not in text]
+    if serious:
+        raise ValueError(serious[0])
+    sizes = [int(found[name]) for name in ("nz", "ny", "nx")]
+    kind = _DTYPES.get(int(found["mode"]))
+    if kind is None:
+        raise ValueError(f"{path}: mode {int(found['mode'])}; expected one of {sorted(_DTYPES)}")
+    if int(found["nsymbt"]) < 0:
+        raise ValueError(f"{path}: an extended header of {int(found['nsymbt'])} bytes")
+    axes = [int(found[name]) for name in ("maps", "mapr", "mapc")]
+    letters = "zyx" if sorted(axes) != [1, 2, 3] else "".join("xyz"[axis - 1] for axis in axes)
+    spacing, origin, unit = _place(found, dict(zip(letters, sizes, strict=True)))
+    stack = int(found["ispg"]) > 400 and int(found["mz"]) > 0
+    if stack:
+        each = int(found["mz"])
+        if sizes[0] % each:
+            raise ValueError(f"{path}: a stack of {sizes[0]} slices is no whole number of maps")
+        sizes, letters = [sizes[0] // each, each, *sizes[1:]], "t" + letters
+        lost.append(f"that its {sizes[0]} maps are no times")
+    told: dict[str, Any] = {
+        "path": path,
+        "shape": tuple(sizes),
+        "axes": letters,
+        "stored": np.dtype(("<" if order in "<=|" else ">") + kind).str,
+        "offset": 1024 + int(found["nsymbt"]),
+        "spacing": spacing,
+        "origin": origin,
+        "info": ImageInfo(unit=unit),
+        "lost": tuple(lost),
+    }
+    if path.lower().endswith(_PACKED):
+        return MrcSource(**told)
+    return ArraySource(file=path, **told)
+
+
+def _place(
+    header: Any, sizes: dict[str, int]
+) -> tuple[tuple[float, float, float], tuple[float, float, float], str | None]:
+    """Voxel size and place of the first voxel, angstroms, x y z."""
+    steps, starts = [], []
+    names = ("nxstart", "nystart", "nzstart")  # of columns, rows, sections
+    order = [int(header[name]) for name in ("mapc", "mapr", "maps")]
+    order = order if sorted(order) == [1, 2, 3] else [1, 2, 3]
+    for axis, letter in enumerate("xyz"):
+        cell, count = float(header["cella"][letter]), int(header[f"m{letter}"])
+        steps.append(cell / count if cell > 0 and count > 0 and np.isfinite(cell) else 0.0)
+        starts.append(int(header[names[order.index(axis + 1)]]))
+    known = all(step > 0 for step in steps)
+    x, y, z = steps if known else (1.0, 1.0, 1.0)
+    place = [float(header["origin"][letter]) for letter in "xyz"]
+    if not any(place) or not np.isfinite(place).all():
+        place = [start * step for start, step in zip(starts, (x, y, z), strict=True)]
+    return (x, y, z), (place[0], place[1], place[2]), "angstrom" if known else None

@@ -1,0 +1,373 @@
+"""VTK images without VTK: XML (`.vti`) and legacy files (`.vtk`, STRUCTURED_POINTS).
+
+Raw numbers are read by region; packed ones block by block, each bounded by what the header tells.
+Point data, or cell data (voxels between the points). Axes may be turned (Direction).
+Source: "VTK File Formats" (VTK User's Guide, Kitware), simple legacy and XML formats.
+"""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import math
+import mmap
+import re
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from ...base.image_info import ChannelInfo, ImageInfo
+from ...base.volume import check_extent
+from ..packed import PackedSource
+from ..source import ArraySource, Index, VolumeSource, place_axes
+from .format import Format
+
+_LEGACY = {
+    "unsigned_char": "u1",
+    "char": "i1",
+    "unsigned_short": "u2",
+    "short": "i2",
+    "unsigned_int": "u4",
+    "int": "i4",
+    "unsigned_long": "u8",
+    "long": "i8",
+    "vtktypeint64": "i8",
+    "vtktypeuint64": "u8",
+    "vtkidtype": "i8",
+    "float": "f4",
+    "double": "f8",
+}
+_XML = {
+    **{f"Int{bits}": f"i{bits // 8}" for bits in (8, 16, 32, 64)},
+    **{f"UInt{bits}": f"u{bits // 8}" for bits in (8, 16, 32, 64)},
+    **{"Float32": "f4", "Float64": "f8"},
+}
+_MOST_HEADER = 1 << 22  # bytes
+_MOST_VALUES = 1 << 33
+_MOST_ARRAYS = 64
+_ARRAYS = ("SCALARS", "VECTORS", "COLOR_SCALARS")
+
+
+@dataclass(frozen=True, kw_only=True)
+class VtkSource(VolumeSource):
+    """An array of an XML file that is packed or written as text."""
+
+    encoding: str  # "raw", "base64" or "ascii"
+    compressor: str  # "zlib", "lzma", "lz4", or none
+    header: str  # dtype of the sizes before the data
+    offset: int
+    length: int  # bytes of the file that may belong to it
+    whole: bool = True
+
+    def read_stored(self, index: Index) -> np.ndarray:
+        """Unpacks all, and returns a part."""
+        count, dtype = math.prod(self.shape), np.dtype(self.stored)
+        with open(self.path, "rb") as file:
+            file.seek(self.offset)
+            content = file.read(self.length)
+        if self.encoding == "ascii":
+            words = content.split()
+            if len(words) != count:
+                raise ValueError(f"{self.path}: {count} numbers expected, got {len(words)}")
+            numbers = [float(w) if dtype.kind == "f" else int(w) for w in words]
+            return np.array(numbers).astype(dtype).reshape(self.shape)[index]
+        data = self._unpacked(content, count * dtype.itemsize)
+        return np.frombuffer(data, dtype).reshape(self.shape)[index]
+
+    def _unpacked(self, content: bytes, need: int) -> bytes:
+        size = np.dtype(self.header).itemsize
+        if self.encoding == "base64":
+            content = re.split(rb"[<\s]", content.strip(), maxsplit=1)[0]
+        if not self.compressor:
+            first = _bytes(content, self.encoding, 0, size + need)
+            told = int(np.frombuffer(first[:size], self.header)[0])
+            if told != need or len(first) < size + need:
+                raise ValueError(f"{self.path}: {need} bytes expected, {told} found")
+            return first[size : size + need]
+        blocks = int(np.frombuffer(_bytes(content, self.encoding, 0, size), self.header)[0])
+        if not 1 <= blocks <= len(content):
+            raise ValueError(f"{self.path}: {blocks} blocks in {len(content)} bytes")
+        heads = (3 + blocks) * size
+        table = np.frombuffer(_bytes(content, self.encoding, 0, heads), self.header).tolist()
+        block, last, packed = table[1], table[2], table[3:]
+        sizes = [block] * (blocks - 1) + [last or block]
+        if sum(sizes) != need or sum(packed) > len(content):
+            raise ValueError(f"{self.path}: {need} bytes expected, {sum(sizes)} found")
+        # The head and the blocks are of one stretch of base64 each.
+        begin = heads if self.encoding == "raw" else -(-heads // 3) * 4
+        data, parts, at = _bytes(content[begin:], self.encoding, 0, sum(packed)), [], 0
+        for here, unpacked in zip(packed, sizes, strict=True):
+            parts.append(_unpack(self.compressor, data[at : at + here], unpacked))
+            at += here
+        return b"".join(parts)
+
+
+def _bytes(content: bytes, encoding: str, start: int, count: int) -> bytes:
+    if encoding == "raw":
+        return content[start : start + count]
+    return base64.b64decode(content[: -(-count // 3) * 4])[:count]
+
+
+def _unpack(compressor: str, packed: bytes, need: int) -> bytes:
+    """Unpacks a block that must be of `need` bytes."""
+    if compressor == "zlib":
+        found = zlib.decompressobj().decompress(packed, need + 1)
+    elif compressor == "lzma":
+        import lzma
+
+        found = lzma.LZMADecompressor().decompress(packed, need + 1)
+    else:
+        import imagecodecs
+
+        found = bytes(imagecodecs.lz4_decode(packed, out=need))
+    if len(found) != need:
+        raise ValueError(f"a block of {need} bytes expected, {len(found)} found")
+    return found
+
+
+@Format("VTK", ".vti", ".vtk", options=("key",))
+def open_vtk(path: str, key: str | None = None) -> VolumeSource:
+    """Opens an image; `key` is the name of an array, the first if left out."""
+    return _open_legacy(path, key) if path.lower().endswith(".vtk") else _open_xml(path, key)
+
+
+def _choose(path: str, names: Sequence[str], key: str | None) -> int:
+    if not names:
+        raise ValueError(f"{path}: holds no array of numbers")
+    if key is not None and key not in names:
+        raise ValueError(f"{path}: has no array {key!r}; it holds {', '.join(names)}")
+    return 0 if key is None else names.index(key)
+
+
+def _told(
+    path: str,
+    points: Sequence[int],
+    affine: np.ndarray,
+    array: dict[str, Any],
+    others: Sequence[str],
+) -> dict[str, Any]:
+    """Fields of a source of (z, y, x) or (z, y, x, c) values at points, or in cells."""
+    size = [max(n - 1, 1) for n in points] if array["cells"] else list(points)
+    check_extent(path, size, most=_MOST_VALUES)
+    if array["cells"]:
+        affine = affine.copy()
+        half = [0.5 * (n > 1) for n in points]
+        affine[:3, 3] += affine[:3, :3] @ half
+    width = array["width"]
+    place = place_axes(path, affine, size)
+    place["axes"] = place["axes"][::-1] + "c" * (width > 1)
+    lost = [f"other arrays; key (--key) chooses among {', '.join(others)}"] if others[1:] else []
+    return {
+        "path": path,
+        "shape": (*size[::-1], *((width,) if width > 1 else ())),
+        "info": ImageInfo(channels=(ChannelInfo(name=array["name"]),) if width == 1 else ()),
+        "lost": tuple(lost),
+        **place,
+    }
+
+
+# --- XML
+
+
+def _open_xml(path: str, key: str | None) -> VolumeSource:
+    with open(path, "rb") as file:
+        content = file.read(_MOST_HEADER)
+        file.seek(0, 2)
+        end = file.tell()
+    appended = re.search(rb"<AppendedData\b[^>]*>\s*_", content)
+    inline = appended is None
+    if inline and end > _MOST_HEADER:
+        content = _read_all(path, end)
+    text = content if inline else content[: appended.start()] + b"</VTKFile>"  # type: ignore[union-attr]
+    root = ElementTree.fromstring(text)
+    image = root.find("ImageData")
+    if root.tag != "VTKFile" or image is None:
+        raise ValueError(f"{path}: is no ImageData, but {root.get('type', root.tag)!r}")
+    pieces = image.findall("Piece")
+    if len(pieces) != 1:
+        raise ValueError(f"{path}: has {len(pieces)} pieces; expected one")
+    extent = [int(n) for n in pieces[0].get("Extent", image.get("WholeExtent", "")).split()]
+    if len(extent) != 6:
+        raise ValueError(f"{path}: has no extent")
+    low, high = extent[::2], extent[1::2]
+    arrays = _xml_arrays(pieces[0])
+    names = [array["name"] for array in arrays]
+    array = arrays[_choose(path, names, key)]
+    if array["kind"] not in _XML:
+        raise ValueError(f"{path}: {array['name']} is of {array['kind']}; expected numbers")
+    numbers = {
+        name: np.array([float(v) for v in image.get(name, plain).split()])
+        for name, plain in (
+            ("Origin", "0 0 0"), ("Spacing", "1 1 1"), ("Direction", "1 0 0 0 1 0 0 0 1"),
+        )
+    }  # fmt: skip
+    affine = np.eye(4)
+    affine[:3, :3] = numbers["Direction"].reshape(3, 3) * numbers["Spacing"]
+    affine[:3, 3] = numbers["Origin"] + affine[:3, :3] @ low
+    told = _told(path, [b - a + 1 for a, b in zip(low, high, strict=True)], affine, array,
+                 names if key is None else names[:1])  # fmt: skip
+    order = "<" if root.get("byte_order", "LittleEndian") == "LittleEndian" else ">"
+    header = order + {"UInt32": "u4", "UInt64": "u8"}[root.get("header_type", "UInt32")]
+    packer = {"": "", "vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma",
+              "vtkLZ4DataCompressor": "lz4"}[root.get("compressor", "")]  # fmt: skip
+    stored = order + _XML[array["kind"]]
+    if array["format"] == "appended":
+        if appended is None:
+            raise ValueError(f"{path}: has no appended data")
+        encoding = "base64" if b"base64" in appended.group() else "raw"
+        offset = appended.end() + array["offset"]
+        if not packer and encoding == "raw":
+            data = ArraySource(
+                file=path, offset=offset + np.dtype(header).itemsize, stored=stored, **told
+            )
+            data.check_file()
+            return data
+        length = end - offset
+    else:
+        encoding = "ascii" if array["format"] == "ascii" else "base64"
+        offset, length = _inline(path, content, array["number"])
+    return VtkSource(
+        stored=stored,
+        encoding=encoding,
+        compressor=packer,
+        header=header,
+        offset=offset,
+        length=length,
+        **told,
+    )
+
+
+def _read_all(path: str, size: int) -> bytes:
+    """A file whose numbers stand among its XML."""
+    if size > 1 << 31:
+        raise ValueError(f"{path}: {size} bytes of XML are too many; write it with appended data")
+    with open(path, "rb") as file:
+        return file.read()
+
+
+def _xml_arrays(piece: Any) -> list[dict[str, Any]]:
+    """The arrays of a piece: at points, then in cells; those that are marked as scalars first."""
+    found: list[dict[str, Any]] = []
+    numbers = {id(item): at for at, item in enumerate(piece.iter("DataArray"))}
+    for kind in ("PointData", "CellData"):
+        group = piece.find(kind)
+        for item in [] if group is None else group.findall("DataArray"):
+            width = int(item.get("NumberOfComponents", 1))
+            if not 1 <= width <= 1 << 16 or int(item.get("offset", 0)) < 0:
+                raise ValueError(f"{width} components at {item.get('offset')}")
+            found.append(
+                {
+                    "name": item.get("Name", f"array {len(found)}"),
+                    "kind": item.get("type", ""),
+                    "width": width,
+                    "format": item.get("format", "ascii"),
+                    "offset": int(item.get("offset", 0)),
+                    "cells": kind == "CellData",
+                    "number": numbers[id(item)],
+                    "first": item.get("Name") == group.get("Scalars"),
+                }
+            )
+    return sorted(found, key=lambda array: not array["first"])
+
+
+def _inline(path: str, content: bytes, number: int) -> tuple[int, int]:
+    """Where the content of a DataArray begins, and its length."""
+    tags = re.finditer(rb"<DataArray\b[^>]*[^/]>", content)
+    tag = next(itertools.islice(tags, number, None), None)
+    stop = -1 if tag is None else content.find(b"<", tag.end())
+    if tag is None or stop < 0:
+        raise ValueError(f"{path}: ends within its numbers")
+    return tag.end(), stop - tag.end()
+
+
+# --- legacy
+
+
+def _open_legacy(path: str, key: str | None) -> VolumeSource:
+    with (
+        open(path, "rb") as file,
+        mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
+    ):
+        return _open_mapped(path, content, key)
+
+
+def _open_mapped(path: str, content: mmap.mmap, key: str | None) -> VolumeSource:
+    lines = content[:4096].split(b"\n", 4)
+    if len(lines) < 5 or not lines[0].startswith(b"# vtk DataFile"):
+        raise ValueError(f"{path}: is no legacy VTK file")
+    if lines[3].split() != [b"DATASET", b"STRUCTURED_POINTS"]:
+        raise ValueError(f"{path}: {lines[3][:60].decode('latin-1')!r}; expected STRUCTURED_POINTS")
+    binary = lines[2].strip().upper() == b"BINARY"
+    affine, points, arrays = _legacy_parts(
+        path, content, sum(len(line) + 1 for line in lines[:4]), binary
+    )
+    names = [array["name"] for array in arrays]
+    found = arrays[_choose(path, names, key)]
+    told = _told(path, points, affine, found, names if key is None else names[:1])
+    told |= {"file": path, "offset": found["offset"], "stored": found["stored"]}
+    return ArraySource(**told) if binary else PackedSource(codec="text", **told)
+
+
+def _legacy_parts(
+    path: str, content: mmap.mmap, at: int, binary: bool
+) -> tuple[np.ndarray, list[int], list[dict[str, Any]]]:
+    """Affine, number of points, and the arrays: of text the first, since where it ends is not
+    known.
+    """
+    affine, points = np.eye(4), [1, 1, 1]
+    arrays: list[dict[str, Any]] = []
+    cells, in_field = False, 0
+    while (end := content.find(b"\n", at)) >= 0 and len(arrays) < _MOST_ARRAYS:
+        words = content[at:end].decode("latin-1").split()
+        at = end + 1
+        name = words[0].upper() if words else ""
+        if name == "DIMENSIONS":
+            points = [int(n) for n in words[1:4]]
+        elif name in ("SPACING", "ASPECT_RATIO"):
+            affine[:3, :3] = np.diag([float(n) for n in words[1:4]])
+        elif name == "ORIGIN":
+            affine[:3, 3] = [float(n) for n in words[1:4]]
+        elif name in ("POINT_DATA", "CELL_DATA"):
+            cells = name == "CELL_DATA"
+        elif name == "FIELD":
+            in_field = int(words[2])
+        elif name in _ARRAYS or (len(words) == 4 and words[3].lower() in _LEGACY and in_field > 0):
+            array = _legacy_array(path, words, points, cells)
+            table = re.match(rb"LOOKUP_TABLE[^\n]*\n", content[at : at + 200])
+            at += table.end() if table and name == "SCALARS" else 0
+            arrays.append({**array, "offset": at})
+            in_field -= name not in _ARRAYS
+            at += array["bytes"]
+            if not binary:
+                break
+    return affine, points, arrays
+
+
+def _legacy_array(
+    path: str, words: list[str], points: Sequence[int], cells: bool
+) -> dict[str, Any]:
+    """An array by the line that announces it."""
+    kind = words[0].upper()
+    if kind == "COLOR_SCALARS":
+        name, dtype, width = words[1], "u1", int(words[2])
+    elif kind not in _ARRAYS:  # of a field
+        name, width, dtype = words[0], int(words[1]), _LEGACY.get(words[3].lower(), "")
+    else:
+        name, dtype = words[1], _LEGACY.get(words[2].lower(), "")
+        width = 3 if kind == "VECTORS" else int(words[3]) if len(words) > 3 else 1
+    if not dtype:
+        raise ValueError(f"{path}: {' '.join(words)[:80]!r} is no array of numbers")
+    check_extent(path, (*points, width), most=_MOST_VALUES)
+    count = math.prod(max(n - 1, 1) if cells else n for n in points) * width
+    size = np.dtype(dtype).itemsize
+    return {
+        "name": name.replace("%20", " "),
+        "width": width,
+        "stored": ">" + dtype,
+        "cells": cells,
+        "bytes": count * size,
+    }

@@ -1,0 +1,247 @@
+"""`fetch`: a file behind a URL, downloaded into a cache on disk: http and https need not know byte
+ranges; s3, gs and others go through fsspec.
+
+    CACHE/KEY/about.json      the URL, and by what the server tells its versions apart
+    CACHE/KEY/VERSION/NAME    the file; a folder appears when it is whole
+
+The cache is bounded, and what was not used for longest goes first. GVTORCH_CACHE names another
+folder (that of compiled shaders too), GVTORCH_CACHE_GB another bound (50), of one file too.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import tempfile
+import urllib.error
+import urllib.request
+import warnings
+from contextlib import closing
+from pathlib import Path
+from typing import IO, Any
+from urllib.parse import unquote, urlsplit
+
+from .resources import amount
+
+_TIMEOUT = 30.0  # seconds without a byte
+_PART = 1 << 20  # bytes
+_FOLDERS = ("zarr", "n5")  # what is read in parts where it lies
+_DETACHED = (".mhd", ".nhdr")
+
+Version = dict[str, str]  # by what a server tells versions of a file apart
+
+
+def is_file_url(text: str) -> bool:
+    """Tells a URL of a file, which ends in a file's ending, from that of a Zarr or N5 folder."""
+    if not re.match(r"[a-z0-9+]{2,}://", text) or text.startswith("file://"):
+        return False
+    name = _name(text)
+    ending = re.search(r"\.([A-Za-z]\w*)$", name)
+    return ending is not None and ending[1].lower() not in _FOLDERS and not text.endswith("/")
+
+
+def split_url(text: str) -> tuple[str, str | None]:
+    """Splits `https://host/file.h5:/group/data` into the URL and what is named of the file."""
+    match = re.fullmatch(r"(\w+://.+\.\w+):(/.+)", text)
+    return (match[1], match[2]) if match else (text, None)
+
+
+def cache_folder() -> Path:
+    """Where downloads are kept."""
+    own = os.environ.get("GVTORCH_CACHE")
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return (Path(own) if own else Path(base) / "gvtorch") / "downloads"
+
+
+def cache_limit() -> int:
+    """Bytes of the cache, at most."""
+    text = os.environ.get("GVTORCH_CACHE_GB", "50")
+    try:
+        limit = float(text)
+    except ValueError:
+        limit = -1.0
+    if not 0 < limit < 1e6:
+        raise ValueError(f"GVTORCH_CACHE_GB must be gigabytes, got {text!r}")
+    return int(limit * 1e9)
+
+
+def fetch(url: str) -> Path:
+    """Returns a copy of the file, downloaded unless the one that is kept is the server's.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        OSError: It can't be downloaded, is cut off, or is larger than the cache or the disk.
+        ImportError: A library is missing.
+    """
+    if url.lower().split("?")[0].endswith(_DETACHED):
+        raise ValueError(f"{url}: its numbers lie in a file beside it: download both")
+    folder = cache_folder() / hashlib.sha256(url.encode()).hexdigest()[:32]
+    kept = _kept(folder)
+    opener = _open_http if urlsplit(url).scheme in ("http", "https") else _open_fsspec
+    try:
+        answer = opener(url, kept[1] if kept else {})
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        if kept is None:
+            raise OSError(f"{url}: can't be downloaded: {_reason(error)}") from None
+        warnings.warn(f"{url}: no answer ({_reason(error)}); the copy of before", stacklevel=3)
+        answer = None
+    if answer is None:
+        assert kept is not None
+        os.utime(kept[0].parent)
+        return kept[0]
+    stream, size, version = answer
+    folder.mkdir(parents=True, exist_ok=True)
+    with closing(stream):
+        file = _download(url, folder, stream, size)
+    place = folder / (_key(version) if version else file.parent.name.strip(".").split("-")[1])
+    try:
+        file.parent.rename(place)
+    except OSError:  # it is there already, by another process
+        shutil.rmtree(file.parent, ignore_errors=True)
+    about = {"url": url, "name": file.name, "place": place.name, "version": version}
+    draft = folder / f".about-{os.getpid()}"
+    draft.write_text(json.dumps(about), encoding="utf-8")
+    draft.replace(folder / "about.json")
+    _evict(place)
+    return place / file.name
+
+
+def _name(url: str) -> str:
+    """A file name for a URL, of harmless characters."""
+    name = unquote(urlsplit(url).path.rpartition("/")[2])
+    return re.sub(r"[^\w.+-]", "_", name).lstrip(".")[-120:] or "file"
+
+
+def _key(version: Version) -> str:
+    text = json.dumps(version, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _kept(folder: Path) -> tuple[Path, Version] | None:
+    """The copy that is there, and which version it is."""
+    try:
+        about = json.loads((folder / "about.json").read_text(encoding="utf-8"))
+        file = folder / Path(about["place"]).name / Path(about["name"]).name
+        version = {str(name): str(value) for name, value in dict(about["version"]).items()}
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return (file, version) if file.is_file() else None
+
+
+Answer = tuple[IO[bytes], int | None, Version]
+
+
+def _open_http(url: str, known: Version) -> Answer | None:
+    """Begins a download; None if the version that is known is the server's."""
+    request = urllib.request.Request(url, headers={"Accept-Encoding": "identity"})
+    for name, header in (("ETag", "If-None-Match"), ("Last-Modified", "If-Modified-Since")):
+        if known.get(name):
+            request.add_header(header, known[name])
+    try:
+        answer = urllib.request.urlopen(request, timeout=_TIMEOUT)
+    except urllib.error.HTTPError as error:
+        error.close()
+        if error.code == 304 and known:
+            return None
+        if error.code in (404, 410):
+            raise FileNotFoundError(f"volume not found: {url}") from None
+        raise OSError(f"{error.code} {error.reason}") from None
+    length = answer.headers.get("Content-Length", "")
+    version = {n: answer.headers[n] for n in ("ETag", "Last-Modified") if answer.headers.get(n)}
+    return answer, int(length) if length.isdigit() else None, version
+
+
+def _open_fsspec(url: str, known: Version) -> Answer | None:
+    """The same for other schemes; what is public is read without credentials."""
+    from .formats.format import need_library
+
+    scheme = urlsplit(url).scheme
+    fsspec = need_library(f"{url}: reading {scheme}://", "fsspec", extra="remote")
+    try:
+        system, path = fsspec.core.url_to_fs(url)
+    except ImportError as error:
+        raise ImportError(
+            f"{url}: reading {scheme}:// needs a library: pip install 'gvtorch[remote]' ({error})"
+        ) from None
+    except ValueError as error:
+        raise ValueError(f"{url}: {_reason(error)}") from None
+    try:
+        info = system.info(path)
+    except FileNotFoundError:
+        raise FileNotFoundError(f"volume not found: {url}") from None
+    except Exception as error:
+        if scheme not in ("s3", "gs", "gcs"):
+            raise OSError(_reason(error)) from None
+        anonymous = {"anon": True} if scheme == "s3" else {"token": "anon"}
+        system, path = fsspec.core.url_to_fs(url, **anonymous)
+        try:
+            info = system.info(path)
+        except Exception as other:
+            raise OSError(f"{_reason(error)}; without credentials: {_reason(other)}") from None
+    names = ("ETag", "etag", "LastModified", "updated", "mtime", "created", "size")
+    version = {name: str(info[name]) for name in names if info.get(name) is not None}
+    size = info.get("size")
+    if version == known and len(version) > 1:
+        return None
+    return system.open(path, "rb"), size if isinstance(size, int) else None, version
+
+
+def _download(url: str, folder: Path, stream: IO[bytes], size: int | None) -> Path:
+    """Writes a stream into a folder of its own, which is removed again if it can't be."""
+    limit = cache_limit()
+    free = shutil.disk_usage(folder).free
+    most = min(limit, free)
+    what = "the cache (GVTORCH_CACHE_GB)" if limit < free else "the disk"
+    if size is not None and size > most:
+        raise OSError(f"{url}: is {amount(size)}, {what} has room for {amount(most)}")
+    target = Path(tempfile.mkdtemp(prefix=".part-", dir=folder))
+    try:
+        file, done = target / _name(url), 0
+        with file.open("wb") as out:
+            while part := _read(url, stream):
+                done += len(part)
+                if done > most:
+                    raise OSError(f"{url}: is more than {amount(most)}, the room in {what}")
+                out.write(part)
+        if size is not None and done != size:
+            raise OSError(f"{url}: is cut off: {done} of {size} bytes came")
+    except BaseException:
+        shutil.rmtree(target, ignore_errors=True)
+        raise
+    return file
+
+
+def _read(url: str, stream: IO[bytes]) -> bytes:
+    try:
+        return stream.read(_PART)
+    except Exception as error:  # of http.client, of fsspec's file systems
+        raise OSError(f"{url}: is cut off: {_reason(error)}") from None
+
+
+def _evict(newest: Path) -> None:
+    """Removes versions, those first that were not used for longest, until the rest fits."""
+    found: list[tuple[float, int, Path]] = []
+    for place in newest.parent.parent.glob("*/*"):
+        if place.is_dir():
+            try:
+                size = sum(file.stat().st_size for file in place.iterdir())
+                found.append((place.stat().st_mtime, size, place))
+            except OSError:
+                continue  # another process removes it
+    total, limit = sum(size for _, size, _ in found), cache_limit()
+    for _, size, place in sorted(found):
+        if total <= limit:
+            break
+        if place != newest:
+            shutil.rmtree(place, ignore_errors=True)
+            total -= size
+
+
+def _reason(error: Any) -> str:
+    reason: Any = getattr(error, "reason", None) or error
+    return " ".join(str(reason).split())[:300] or type(error).__name__

@@ -1,0 +1,178 @@
+"""What TIFF files of microscopes tell of their numbers: OME-XML, and ImageJ's description and tags.
+
+Source: OME model 2016-06 (Pixels, Channel, Plane); ImageJ, class TiffEncoder (metadata of stacks).
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from ..base.image_info import ChannelInfo, ImageInfo, Rgb
+from ..base.units import spacing_of, time_unit
+
+Told = tuple[ImageInfo, tuple[float, float, float], list[str]]  # info, spacing, what is not kept
+_MOST_XML = 1 << 28  # characters
+_MOST_PLANES = 1 << 16
+RGB = (("red", (1.0, 0.0, 0.0)), ("green", (0.0, 1.0, 0.0)), ("blue", (0.0, 0.0, 1.0)))
+
+
+@contextmanager
+def opened(path: str) -> Iterator[tuple[Any, list[str]]]:
+    """Opens a file through tifffile, which logs damage and reads on.
+
+    Yields:
+        The `TiffFile`, and what it has warned of, in a list that grows.
+
+    Raises:
+        ValueError: The file is damaged.
+    """
+    import tifffile
+
+    heard = _Heard()
+    log = logging.getLogger("tifffile")
+    log.addHandler(heard)
+    try:
+        with tifffile.TiffFile(path) as file:
+            len(file.pages)  # finds out where the chain of pages ends
+            yield file, heard.warned
+            if heard.damage:
+                raise ValueError(f"{path}: damaged: {heard.damage[0]}")
+    finally:
+        log.removeHandler(heard)
+
+
+class _Heard(logging.Handler):
+    """Keeps what tifffile logs in this thread."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.thread = threading.get_ident()
+        self.damage: list[str] = []
+        self.warned: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.thread == self.thread:
+            text = " ".join(record.getMessage().split())[:200]
+            wrong = record.levelno >= logging.ERROR or "invalid page offset" in text
+            (self.damage if wrong else self.warned).append(text)
+
+
+def ome_info(xml: str, number: int, name: str, width: int) -> Told:
+    """Reads what OME-XML tells of an image, by its number among the images, or its name."""
+    if len(xml) > _MOST_XML:
+        raise ValueError(f"{len(xml)} characters of OME-XML are too many")
+    root = ElementTree.fromstring(xml)
+    images = [child for child in root.iter() if _tag(child) == "Image"]
+    named = [image for image in images if image.get("Name") == name]
+    image = named[0] if len(named) == 1 else images[number] if number < len(images) else None
+    pixels = None if image is None else _child(image, "Pixels")
+    if image is None or pixels is None:
+        return ImageInfo(), (1.0, 1.0, 1.0), ["OME-XML, which tells nothing of this image"]
+    sizes = [_number(pixels.get(f"PhysicalSize{axis}")) for axis in "XYZ"]
+    units = [pixels.get(f"PhysicalSize{axis}Unit", "\u00b5m") for axis in "XYZ"]
+    spacing, unit = spacing_of(sizes, units)
+    lost = []
+    if unit and sizes[2] is None and int(_number(pixels.get("SizeZ")) or 1) > 1:
+        lost.append("how far slices are apart, which is not told: as far as pixels")
+    step, of_time = _number(pixels.get("TimeIncrement")), pixels.get("TimeIncrementUnit", "s")
+    if step is None and int(_number(pixels.get("SizeT")) or 1) > 1:
+        step, of_time = _step_of_planes(pixels)
+    channels = [_ome_channel(child) for child in pixels if _tag(child) == "Channel"]
+    samples = [int(c.get("SamplesPerPixel", 1)) for c in pixels if _tag(c) == "Channel"]
+    if samples == [3] and width == 3:
+        channels = [ChannelInfo(name=name, color=color) for name, color in RGB]
+    if any(_tag(child) == "ROI" for child in root):
+        lost.append("regions of interest (ROI)")
+    info = ImageInfo(
+        unit=unit,
+        channels=tuple(channels) if len(channels) == width else (),
+        time_step=step if step else None,
+        time_unit=time_unit(of_time) if step else None,
+    )
+    return info, spacing, lost
+
+
+def _ome_channel(element: Any) -> ChannelInfo:
+    code, color = _number(element.get("Color")), None
+    if code is not None:
+        red, green, blue, _ = (int(code) % 2**32).to_bytes(4)
+        color = (red / 255, green / 255, blue / 255)
+    return ChannelInfo(name=element.get("Name", ""), color=color)
+
+
+def _step_of_planes(pixels: Any) -> tuple[float | None, str]:
+    """The mean step between the times of the first channel's first slices."""
+    times: dict[int, float] = {}
+    unit = "s"
+    for plane in [child for child in pixels if _tag(child) == "Plane"][:_MOST_PLANES]:
+        at = _number(plane.get("DeltaT"))
+        if at is not None and plane.get("TheZ", "0") == plane.get("TheC", "0") == "0":
+            times[int(plane.get("TheT", 0))] = at
+            unit = plane.get("DeltaTUnit", "s")
+    if len(times) < 2:
+        return None, unit
+    first, last = min(times), max(times)
+    step = (times[last] - times[first]) / (last - first)
+    return (step if step > 0 else None), unit
+
+
+def imagej_info(described: dict[str, Any], resolution: list[float | None], width: int) -> Told:
+    """Reads ImageJ's metadata; `resolution` is the width and height of a pixel."""
+    unit = str(described.get("unit", "")).replace("\\u00B5", "\u00b5").replace("\\u00b5", "\u00b5")
+    distance = _number(described.get("spacing"))
+    known = bool(unit) or distance is not None
+    sizes = [*(resolution if known else (None, None)), None if distance is None else abs(distance)]
+    spacing, named = spacing_of(sizes, [unit] * 3)
+    lost = []
+    if unit and named is None and unit.lower() not in ("pixel", "pixels", "inch"):
+        lost.append(f"the unit {unit!r}, which is unknown")
+    step = _number(described.get("finterval")) or None
+    ranges = [float(v) for v in described.get("Ranges", ())]
+    if not ranges and {"min", "max"} <= set(described):
+        ranges = [float(described["min"]), float(described["max"])] * width
+    tables = described.get("LUTs", [])
+    channels = []
+    for at in range(width):
+        low, high = ranges[2 * at : 2 * at + 2] if len(ranges) >= 2 * at + 2 else (0.0, 0.0)
+        color = _color(tables[at]) if width > 1 and at < len(tables) else None
+        channels.append(ChannelInfo(color=color, window=(low, high) if low < high else None))
+    if any(name in described for name in ("Overlays", "ROI")):
+        lost.append("overlays and regions of interest")
+    told = [c for c in channels if c.color or c.window]
+    info = ImageInfo(
+        unit=named,
+        channels=tuple(channels) if told else (),
+        time_step=step,
+        time_unit=time_unit(described.get("tunit", "sec")) if step else None,
+    )
+    return info, spacing, lost
+
+
+def _color(table: Any) -> Rgb | None:
+    """The colour that a look-up table ends with."""
+    last = np.asarray(table).reshape(3, -1)[:, -1] / 255
+    return (float(last[0]), float(last[1]), float(last[2])) if last.any() else None
+
+
+def _tag(element: Any) -> str:
+    return str(element.tag).rpartition("}")[2]
+
+
+def _child(element: Any, tag: str) -> Any:
+    return next((child for child in element if _tag(child) == tag), None)
+
+
+def _number(text: Any) -> float | None:
+    try:
+        value = float(text)
+    except (TypeError, ValueError):
+        return None
+    return value if math.isfinite(value) else None

@@ -1,0 +1,97 @@
+"""Breaks files in many ways, and reads the pieces in a process that may crash."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+WAYS = 50
+_SECONDS = 240
+_MEMORY = 3 << 30  # bytes of address space beyond what the libraries take
+
+_READER = """
+import json, resource, sys, warnings
+import gvtorch as gv
+from gvtorch.io.reading import open_source
+warnings.simplefilter("ignore")
+paths, options, memory = json.loads(sys.stdin.read())
+gv.read_volume(paths[0], **options)  # the libraries are there from now on
+used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + memory, -1))
+for path in paths:
+    try:
+        source = open_source(path, **options)
+        x, y, z = source.extent
+        source.read_region((0, 0, 0), (min(2, z), min(3, y), min(4, x)))
+        gv.read_volume(path, nan=0, **options)
+        told = ["read", ""]
+    except (ValueError, OSError) as error:
+        told = ["refused", str(error)]
+    except BaseException as error:
+        told = [type(error).__name__, str(error)]
+    print(json.dumps(told), flush=True)
+"""
+
+
+def break_file(content: bytes, number: int) -> bytes:
+    """Cuts a file (even numbers) or changes some of its bytes, most of them near its begin."""
+    chance = random.Random(number)
+    if number % 2 == 0:
+        return content[: chance.randrange(len(content))]
+    broken = bytearray(content)
+    reach = len(content) if number % 4 == 1 else min(len(content), 600)
+    for _ in range(chance.choice((1, 4, 32))):
+        broken[chance.randrange(reach)] = chance.randrange(256)
+    return bytes(broken)
+
+
+def outcomes(path: Path, folder: Path, **options: Any) -> list[tuple[str, str]]:
+    """Breaks a file, or one file of a folder, in 50 ways; returns "read" or "refused" and the
+    message of each, the first of them that of the whole file.
+
+    Raises:
+        AssertionError: The process crashed or did not end.
+    """
+    paths = [path]
+    for number in range(WAYS):
+        copy = folder / f"{number}" / path.name
+        copy.parent.mkdir(parents=True)
+        if path.is_dir():
+            shutil.copytree(path, copy)
+            files = sorted(file for file in copy.rglob("*") if file.is_file())
+            victim = files[number % len(files)]
+            victim.write_bytes(break_file(victim.read_bytes(), number))
+        else:
+            copy.write_bytes(break_file(path.read_bytes(), number))
+        paths.append(copy)
+    told = json.dumps([[str(path) for path in paths], options, _MEMORY])
+    run = subprocess.run(
+        [sys.executable, "-X", "faulthandler", "-c", _READER],
+        input=told,
+        capture_output=True,
+        text=True,
+        timeout=_SECONDS,
+        check=False,
+    )
+    lines = [tuple(json.loads(line)) for line in run.stdout.splitlines() if line.startswith("[")]
+    at = paths[len(lines)] if len(lines) < len(paths) else "the end"
+    assert run.returncode == 0, f"crashed ({run.returncode}) at {at}: {run.stderr[-3000:]}"
+    return lines
+
+
+def assert_told(path: Path, folder: Path, least: int = 15, **options: Any) -> None:
+    """Asserts that the whole file is read, and that every broken one is read or refused in a line
+    that names it; at least so many are refused.
+    """
+    (first, message), *rest = outcomes(path, folder, **options)
+    assert first == "read", message
+    assert len(rest) == WAYS
+    for kind, message in rest:
+        assert kind in ("read", "refused"), f"{kind}: {message}"
+        assert kind == "read" or ("\n" not in message and str(folder) in message), message
+    assert sum(kind == "refused" for kind, _ in rest) >= least, rest

@@ -1,0 +1,164 @@
+"""Arrays of other libraries: read, converted part by part, built into trees, rendered."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from helpers.stores import noise
+
+import gvtorch as gv
+from gvtorch.io import conversion
+from gvtorch.io.arrays import ObjectSource
+from gvtorch.io.conversion import convert
+from gvtorch.io.reading import open_source
+
+xarray = pytest.importorskip("xarray")
+dask = pytest.importorskip("dask.array")
+zarr = pytest.importorskip("zarr")
+
+
+@pytest.fixture
+def grid() -> np.ndarray:
+    return noise((7, 9, 12), "int16")
+
+
+class Own:
+    """Any object that offers `__array__`."""
+
+    def __init__(self, data: np.ndarray) -> None:
+        self.data = data
+
+    def __array__(self, dtype=None, copy=None) -> np.ndarray:
+        return self.data
+
+
+class Interface:
+    def __init__(self, data: np.ndarray) -> None:
+        self.__array_interface__ = data.__array_interface__
+        self.kept = data
+
+
+def labelled(grid) -> xarray.DataArray:
+    coords = {
+        "z": ("z", 5 + 2.0 * np.arange(7), {"units": "um"}),
+        "y": ("y", -3.0 * np.arange(9), {"units": "um"}),
+        "x": ("x", 500.0 * np.arange(12), {"units": "nm"}),
+        "channel": ["a", "b"],
+    }
+    data = np.stack((grid, grid + 1))
+    return xarray.DataArray(data, coords, ("channel", "z", "y", "x"), "cells", {"units": "HU"})
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        Own,
+        Interface,
+        np.asfortranarray,
+        torch.from_numpy,
+        lambda grid: dask.from_array(grid, chunks=(4, 4, 4)),
+        lambda grid: zarr.array(grid, chunks=(4, 4, 4)),
+        xarray.DataArray,
+        lambda grid: grid.astype(">i2"),
+    ],
+    ids=["array", "interface", "fortran", "torch", "dask", "zarr", "xarray", "swapped"],
+)
+def test_any_array_is_a_volume(tmp_path, grid, make):
+    given = make(grid)
+    for volume in (gv.as_volume(given), gv.read_volume(given)):
+        assert np.array_equal(volume.data[..., 0].numpy(), grid)
+    store = convert(given, tmp_path / "a.zarr", spacing=(1, 2, 3))
+    assert store.spacing == (1, 2, 3)
+    assert np.array_equal(store.read_region(0, (0, 0, 0), grid.shape)[..., 0], grid)
+
+
+def test_names_places_and_units_of_xarray(grid):
+    for volume in (gv.as_volume(labelled(grid)), gv.read_volume(labelled(grid))):
+        assert volume.data.shape == (7, 9, 12, 2) and volume.name == "cells"
+        assert (
+            volume.spacing == pytest.approx((500, 3000, 2000)) and volume.info.unit == "nanometer"
+        )
+        assert volume.origin == pytest.approx((0, -24000, 5000))
+        assert np.array_equal(volume.data[..., 1].numpy(), grid[:, ::-1] + 1)
+        assert [c.name for c in volume.info.channels] == ["a", "b"]
+        assert volume.info.quantity == "HU"
+    with pytest.raises(ValueError, match="is a set of arrays, take one of them: cells"):
+        gv.as_volume(labelled(grid).to_dataset())
+
+
+def test_dask_computes_what_is_asked_for(tmp_path):
+    asked: list[tuple[int, ...]] = []
+
+    def block(block_info=None):
+        low = [start for start, _ in block_info[None]["array-location"]]
+        asked.append(tuple(low))
+        return np.full((16, 16, 16), sum(low), "int16")
+
+    lazy = dask.map_blocks(block, chunks=((16,) * 4,) * 3, dtype="int16")
+    source = open_source(lazy)
+    assert isinstance(source, ObjectSource) and not asked
+    part = source.read_region((0, 17, 33), (16, 20, 40))
+    assert asked == [(0, 16, 32)] and (part == 48).all()
+    assert pickle.loads(pickle.dumps(open_source(zarr.zeros((3, 4, 5))))).extent == (5, 4, 3)
+
+
+def test_lazy_arrays_convert_part_by_part(tmp_path, monkeypatch):
+    data = noise((4, 150, 270), "uint16")
+    lazy = xarray.DataArray(dask.from_array(data, chunks=64), dims=("z", "y", "x"))
+    assert isinstance(open_source(lazy), ObjectSource)
+    store = convert(lazy, tmp_path / "a.zarr", workers=1)
+    assert np.array_equal(store.read_region(0, (0, 0, 0), data.shape)[..., 0], data)
+    monkeypatch.setattr(conversion, "_FEW", 1)  # in processes
+    store = convert(zarr.array(data), tmp_path / "b.zarr", workers=2)
+    assert np.array_equal(store.read_region(0, (0, 0, 0), data.shape)[..., 0], data)
+
+
+def test_memory_maps_are_mapped_again(tmp_path, grid):
+    np.save(tmp_path / "a.npy", grid)
+    mapped = np.load(tmp_path / "a.npy", mmap_mode="r")
+    source = pickle.loads(pickle.dumps(open_source(mapped)))
+    assert len(pickle.dumps(source)) < 2000 and source.file == str(tmp_path / "a.npy")
+    assert np.array_equal(source.read_region((1, 2, 3), (4, 5, 6))[..., 0], grid[1:4, 2:5, 3:6])
+    view = mapped[2:]
+    assert np.array_equal(gv.read_volume(view).data[..., 0].numpy(), grid[2:])
+
+
+def test_times_and_axes_are_asked_about(grid):
+    four = np.stack([grid] * 3)
+    with pytest.raises(ValueError, match=r"what are the axes of shape \(3, 7, 9, 12\)"):
+        gv.as_volume(four)
+    with pytest.warns(UserWarning, match="3 time points, this is the first"):
+        gv.as_volume(four, axes="tzyx")
+    assert gv.as_volume(four, axes="czyx").data.shape == (7, 9, 12, 3)
+    assert gv.as_volume(grid[0], axes="yx").extent == (12, 9, 1)
+    named = xarray.DataArray(four, dims=("time", "z", "y", "x"))
+    assert np.array_equal(gv.as_volume(named, time=2).data[..., 0].numpy(), grid)
+
+
+@pytest.mark.parametrize("given", [None, "words", [1, 2], object(), {"a": 1}])
+def test_what_is_no_array_is_named(given):
+    with pytest.raises(ValueError, match=r"as_volume \(\w+\): expected a volume"):
+        gv.as_volume(given)
+
+
+def test_objects_and_words_are_refused():
+    for data in (np.array([[["a"]]]), np.array([[[{}]]]), np.zeros((2, 2, 2), complex)):
+        with pytest.raises(ValueError, match="must hold real numbers"):
+            gv.as_volume(data)
+
+
+def test_arrays_are_rendered(grid):
+    camera = gv.Camera.orbit(30, 20, width=24, height=16)
+    shader = gv.TransferFunction.preset("gray", *map(float, (grid.min(), grid.max())))
+    tree = gv.N3Tree.from_volume(gv.Volume(grid))
+    expected = gv.render(tree, camera, shader)
+    for given in (grid, gv.Volume(grid), Own(grid), dask.from_array(grid)):
+        picture = gv.render(given, camera, shader)
+        assert torch.equal(picture.color, expected.color) and picture.alpha.max() > 0
+    assert gv.N3Tree.from_volume({"a": grid, "b": gv.Volume(grid)}).bricks.channels.keys() == {
+        "a",
+        "b",
+    }

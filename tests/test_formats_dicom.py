@@ -1,0 +1,285 @@
+"""DICOM: series written by SimpleITK (GDCM), and files written by pydicom."""
+
+from __future__ import annotations
+
+import locale
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.damage import assert_told
+from helpers.stores import noise
+
+import gvtorch as gv
+from gvtorch.io.conversion import convert
+from gvtorch.io.reading import open_source
+
+pydicom = pytest.importorskip("pydicom")
+itk = pytest.importorskip("SimpleITK")
+
+SHAPE = (6, 9, 12)  # z y x
+SPACING = (0.5, 0.75, 2.5)
+ORIGIN = (-10.0, 20.0, 5.0)  # LPS
+CT = "1.2.840.10008.5.1.4.1.1.2"
+
+
+@pytest.fixture(autouse=True)
+def same_locale() -> Iterator[None]:
+    """GDCM leaves the C locale behind, in which Python opens text as ASCII."""
+    before = locale.setlocale(locale.LC_ALL)
+    yield
+    locale.setlocale(locale.LC_ALL, before)
+
+
+def write_series(
+    folder: Path,
+    data: np.ndarray,
+    *,
+    series: int = 1,
+    packed: str = "",
+    tags: dict[str, str] | None = None,
+    direction: tuple[float, ...] = (1, 0, 0, 0, 1, 0, 0, 0, 1),
+    depths: list[float] | None = None,
+) -> Path:
+    """Writes (z, y, x) slices through SimpleITK, named so that names say nothing of their order."""
+    folder.mkdir(parents=True, exist_ok=True)
+    image = itk.GetImageFromArray(data)
+    image.SetSpacing(SPACING)
+    image.SetOrigin(ORIGIN)
+    image.SetDirection(direction)
+    writer = itk.ImageFileWriter()
+    writer.KeepOriginalImageUIDOn()
+    if packed:
+        writer.UseCompressionOn()
+        writer.SetCompressor(packed)
+    axes = np.array(direction).reshape(3, 3)
+    for z in range(len(data)):
+        depth = z * SPACING[2] if depths is None else depths[z]
+        place = np.array(ORIGIN) + axes[:, 2] * depth
+        told = {
+            "0008|0060": "CT",
+            "0008|0016": CT,
+            "0008|0018": f"1.2.3.{series}.{z + 1}",
+            "0020|000d": "1.2.3",
+            "0020|000e": f"1.2.3.{series}",
+            "0020|0011": str(series),
+            "0008|103e": f"scan {series}",
+            "0020|0013": str(z + 1),
+            "0020|0032": "\\".join(f"{v:.6f}" for v in place),
+            "0020|0037": "\\".join(f"{v:.6f}" for v in (*axes[:, 0], *axes[:, 1])),
+            "0018|0050": "9",  # thickness is not how far slices are apart
+            **(tags or {}),
+        }
+        one = image[:, :, z]
+        for tag, value in told.items():
+            one.SetMetaData(tag, value)
+        writer.SetFileName(str(folder / f"i{(7 * z + 3) % 101:03d}_{series}.dcm"))
+        writer.Execute(one)
+    return folder
+
+
+@pytest.fixture
+def data() -> np.ndarray:
+    return noise((*SHAPE, 1), "int16")[..., 0] // 16
+
+
+RESCALED = {"0028|1052": "-1024", "0028|1053": "1", "0028|1050": "40", "0028|1051": "400"}
+
+
+@pytest.mark.parametrize("packed", ["", "JPEG", "JPEGLS", "JPEG2000", "RLE"])
+def test_a_series_of_gdcm(tmp_path, data, packed):
+    stored = data - 1024
+    folder = write_series(tmp_path / "ct", stored, packed=packed, tags=RESCALED)
+    syntax = pydicom.dcmread(next(folder.iterdir())).file_meta.TransferSyntaxUID
+    assert syntax.is_compressed == bool(packed), syntax.name
+    for path in (folder, next(folder.iterdir())):
+        volume = gv.read_volume(path)
+        assert volume.extent == SHAPE[::-1]
+        # x and y of RAS run against those of LPS.
+        assert np.array_equal(volume.data[..., 0].numpy(), stored[:, ::-1, ::-1])
+        assert volume.spacing == pytest.approx(SPACING)
+        low = (10 - 11 * SPACING[0], -20 - 8 * SPACING[1], 5)
+        assert volume.origin == pytest.approx(low)
+        assert volume.info.unit == "millimeter" and volume.info.quantity == "HU"
+        low, high = volume.info.channels[0].window
+        assert (low, high) == pytest.approx((-160, 239))
+    source = open_source(folder)
+    assert not source.whole
+    assert np.array_equal(
+        source.read_region((2, 1, 3), (5, 4, 9)), volume.data[2:5, 1:4, 3:9].numpy()
+    )
+
+
+def test_the_same_scan_as_nifti_lies_at_the_same_place(tmp_path, data):
+    turned = (0, 0, 1, -1, 0, 0, 0, -1, 0)  # sagittal
+    folder = write_series(tmp_path / "ct", data, direction=turned)
+    reader = itk.ImageSeriesReader()
+    reader.SetFileNames(reader.GetGDCMSeriesFileNames(str(folder)))
+    itk.WriteImage(reader.Execute(), str(tmp_path / "a.nii"))
+    one, other = gv.read_volume(folder), gv.read_volume(tmp_path / "a.nii")
+    assert one.extent == other.extent != SHAPE[::-1]
+    assert one.spacing == pytest.approx(other.spacing)
+    assert one.origin == pytest.approx(other.origin, abs=1e-4)
+    assert np.array_equal(one.data.numpy(), other.data.numpy())
+
+
+def test_several_series_are_asked_about(tmp_path, data):
+    write_series(tmp_path / "study" / "a", data, series=2)
+    write_series(tmp_path / "study" / "b", data[:3] + 1, series=5)
+    with pytest.raises(ValueError, match=r"holds 2 series.*key.*2 \(scan 2, 6 files\), 5 \(scan 5"):
+        gv.read_volume(tmp_path / "study")
+    for key in ("5", "scan 5", "1.2.3.5"):
+        assert gv.read_volume(tmp_path / "study", key=key).extent == (12, 9, 3)
+    with pytest.raises(ValueError, match="has no series '7'"):
+        gv.read_volume(tmp_path / "study", key="7")
+    one = next((tmp_path / "study" / "a").iterdir())
+    assert gv.read_volume(one).extent == (12, 9, 6)  # its series
+
+
+@pytest.mark.parametrize(
+    ("depths", "message"),
+    [
+        ([0, 1, 2, 4, 5, 6], r"1 slices are missing after slice 3 of 6: the next lies 2 mm"),
+        ([0, 1, 2.5, 4, 4.5, 6], "not evenly apart: 0.5 to 1.5 mm"),
+        ([0, 1, 2, 2, 3, 4], "slices are there 1 to 2 times"),
+    ],
+)
+def test_slices_that_are_not_even_are_refused(tmp_path, data, depths, message):
+    write_series(tmp_path / "ct", data, depths=depths)
+    with pytest.raises(ValueError, match=message):
+        gv.read_volume(tmp_path / "ct")
+
+
+def test_slices_may_run_downwards_and_lie_over_each_other(tmp_path, data):
+    write_series(tmp_path / "ct", data, depths=[-1.25 * z for z in range(6)])
+    volume = gv.read_volume(tmp_path / "ct")
+    assert volume.spacing == pytest.approx((0.5, 0.75, 1.25))
+    assert np.array_equal(volume.data[..., 0].numpy(), data[::-1, ::-1, ::-1])
+    assert volume.origin[2] == pytest.approx(5 - 5 * 1.25)
+
+
+def test_images_of_one_place_are_times(tmp_path, data):
+    for t in range(3):
+        tags = {"0008|0018": "", "0020|0100": str(t + 1), "0018|1060": str(40.0 * t)}
+        del tags["0008|0018"]
+        tags["0020|000e"] = "1.2.3.9"
+        write_series(tmp_path / "ct", data + t, series=20 + t, tags=tags)
+    source = open_source(tmp_path / "ct")
+    assert source.times == 3 and source.extent == (12, 9, 6)
+    assert (source.info.time_step, source.info.time_unit) == (40, "millisecond")
+    assert np.array_equal(source.read_times(0, 1)[0][..., 0], data[:, ::-1, ::-1])
+
+
+def test_a_series_converts(tmp_path, data):
+    folder = write_series(tmp_path / "ct", data)
+    store = convert(folder, tmp_path / "a.zarr")
+    volume = gv.read_volume(folder)
+    assert store.spacing == pytest.approx(SPACING) and store.info.unit == "millimeter"
+    assert np.array_equal(store.read_region(0, (0, 0, 0), SHAPE), volume.data.numpy())
+
+
+# --- files of pydicom
+
+
+def dataset(**told: object):
+    from pydicom.dataset import FileMetaDataset
+    from pydicom.uid import ExplicitVRLittleEndian
+
+    found = pydicom.Dataset()
+    found.file_meta = FileMetaDataset()
+    found.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    found.file_meta.MediaStorageSOPClassUID = found.SOPClassUID = CT
+    found.file_meta.MediaStorageSOPInstanceUID = found.SOPInstanceUID = "1.2.3.4"
+    found.SeriesInstanceUID, found.Modality = "1.2.3", "MR"
+    found.SamplesPerPixel, found.PhotometricInterpretation = 1, "MONOCHROME2"
+    found.BitsAllocated, found.BitsStored, found.HighBit, found.PixelRepresentation = 16, 12, 11, 0
+    for name, value in told.items():
+        setattr(found, name, value)
+    return found
+
+
+def enhanced(data: np.ndarray):
+    """A multi-frame image whose frames lie in the file from the last to the first."""
+    found = dataset(NumberOfFrames=len(data), Rows=data.shape[1], Columns=data.shape[2])
+    shared, measures, place = pydicom.Dataset(), pydicom.Dataset(), pydicom.Dataset()
+    measures.PixelSpacing = [0.75, 0.5]
+    place.ImageOrientationPatient = [1, 0, 0, 0, 1, 0]
+    shared.PixelMeasuresSequence, shared.PlaneOrientationSequence = [measures], [place]
+    found.SharedFunctionalGroupsSequence = [shared]
+    each = []
+    for z in reversed(range(len(data))):
+        frame, position, value = pydicom.Dataset(), pydicom.Dataset(), pydicom.Dataset()
+        position.ImagePositionPatient = [0, 0, 2 * z]
+        value.RescaleSlope, value.RescaleIntercept, value.RescaleType = 0.5, z, "US"
+        frame.PlanePositionSequence = [position]
+        frame.PixelValueTransformationSequence = [value]
+        each.append(frame)
+    found.PerFrameFunctionalGroupsSequence = each
+    found.PixelData = data[::-1].astype("<u2").tobytes()
+    return found
+
+
+def test_enhanced_images(tmp_path, data):
+    data = np.abs(data)
+    file = tmp_path / "enhanced.dcm"
+    enhanced(data).save_as(file, enforce_file_format=True)
+    volume = gv.read_volume(file)
+    assert volume.spacing == (0.5, 0.75, 2)
+    expected = data * 0.5 + np.arange(len(data))[:, None, None]
+    assert np.array_equal(volume.data[..., 0].numpy(), expected[:, ::-1, ::-1].astype("f4"))
+
+
+def test_color_and_images_without_a_place(tmp_path):
+    rgb = noise((2, 5, 7, 3))
+    for z, image in enumerate(rgb):
+        one = dataset(Rows=5, Columns=7, InstanceNumber=2 - z, PlanarConfiguration=0)
+        one.SamplesPerPixel, one.PhotometricInterpretation = 3, "RGB"
+        one.BitsAllocated, one.BitsStored, one.HighBit = 8, 8, 7
+        one.PixelData, one.SOPInstanceUID = image.tobytes() + b"\0", f"1.2.{z}"
+        one.save_as(tmp_path / f"{z}", enforce_file_format=True)
+    with pytest.warns(UserWarning, match="not kept: slices have no place"):
+        volume = gv.read_volume(tmp_path)
+    assert np.array_equal(volume.data.numpy(), rgb[::-1, ::-1, ::-1])
+    assert [channel.name for channel in volume.info.channels] == ["red", "green", "blue"]
+
+
+@pytest.mark.parametrize("codec", ["jpeg", "ljpeg"])
+def test_frames_through_imagecodecs(tmp_path, codec):
+    import imagecodecs
+    from pydicom.encaps import encapsulate
+
+    image = np.linspace(0, 200, 32 * 40).reshape(32, 40).astype("u1")
+    encode = imagecodecs.jpeg8_encode if codec == "jpeg" else imagecodecs.ljpeg_encode
+    one = dataset(Rows=32, Columns=40, ImagePositionPatient=[0, 0, 0], SpacingBetweenSlices=3)
+    one.BitsAllocated, one.BitsStored, one.HighBit = 8, 8, 7
+    one.file_meta.TransferSyntaxUID = f"1.2.840.10008.1.2.4.{50 if codec == 'jpeg' else 70}"
+    one.PixelData = encapsulate([encode(image)])
+    one["PixelData"].is_undefined_length = True
+    one.save_as(tmp_path / "a.dcm", enforce_file_format=True)
+    volume = gv.read_volume(tmp_path / "a.dcm")
+    assert np.abs(volume.data[0, ..., 0].numpy().astype(int) - image[::-1, ::-1]).max() <= (
+        3 if codec == "jpeg" else 0
+    )
+    one.Rows = 4000  # the frame's own header says something else
+    one.save_as(tmp_path / "b.dcm", enforce_file_format=True)
+    with pytest.raises(ValueError, match="a frame is of"):
+        gv.read_volume(tmp_path / "b.dcm")
+
+
+def test_hostile_files_take_no_memory(tmp_path, data):
+    one = dataset(Rows=65535, Columns=30000, PixelData=b"\0" * 64)
+    one.save_as(tmp_path / "a.dcm", enforce_file_format=True)
+    with pytest.raises(ValueError, match="its images take 3932100000 bytes, the file has"):
+        gv.read_volume(tmp_path / "a.dcm")
+    one = dataset(Rows=10, Columns=10, NumberOfFrames=10**9, PixelData=b"\0" * 64)
+    one.save_as(tmp_path / "b.dcm", enforce_file_format=True)
+    with pytest.raises(ValueError, match="1000000000 frames in a file that is too short"):
+        gv.read_volume(tmp_path / "b.dcm")
+
+
+def test_broken_files_give_one_line(tmp_path, data):
+    enhanced(np.abs(data)).save_as(tmp_path / "e.dcm", enforce_file_format=True)
+    assert_told(tmp_path / "e.dcm", tmp_path / "one")
+    folder = write_series(tmp_path / "ct", data, packed="JPEGLS")
+    assert_told(folder, tmp_path / "many", least=10)

@@ -1,0 +1,147 @@
+"""HDF5 of h5py, NetCDF of xarray (h5netcdf)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.damage import assert_told
+from helpers.stores import noise
+
+import gvtorch as gv
+from gvtorch.io.conversion import convert
+from gvtorch.io.reading import open_source
+
+h5py = pytest.importorskip("h5py")
+xarray = pytest.importorskip("xarray")
+pytest.importorskip("h5netcdf")
+
+
+@pytest.fixture
+def grid() -> np.ndarray:
+    return noise((7, 9, 12), "int16")
+
+
+def netcdf(file: Path, grid: np.ndarray, **encoding: object) -> Path:
+    places = {
+        "depth": ("depth", 10.0 - 2.5 * np.arange(7), {"units": "mm"}),
+        "y": ("y", 100 + 3.0 * np.arange(9), {"units": "mm"}),
+        "x": ("x", 0.5 * np.arange(12), {"units": "cm"}),
+    }
+    told = {"long_name": "temperature", "units": "K"}
+    data = xarray.Dataset({"T": (("depth", "y", "x"), grid, told)}, places)
+    data.to_netcdf(file, engine="h5netcdf", encoding={"T": encoding})
+    return file
+
+
+def test_hdf5_is_read_by_region(tmp_path, grid):
+    file = tmp_path / "a.h5"
+    with h5py.File(file, "w") as out:
+        out.create_dataset("raw/image", data=grid, chunks=(4, 4, 4), compression="gzip")
+        out.create_dataset("table", data=np.zeros((3, 4)))
+    for path in (file, f"{file}:/raw/image", f"{file}:/raw"):
+        source = open_source(path)
+        assert not source.whole
+        assert np.array_equal(source.read_times(0, 1)[0, ..., 0], grid)
+        part = source.read_region((1, 2, 3), (5, 4, 11))
+        assert np.array_equal(part[..., 0], grid[1:5, 2:4, 3:11])
+    store = convert(f"{file}:/raw/image", tmp_path / "a.zarr")
+    assert np.array_equal(store.read_region(0, (0, 0, 0), grid.shape)[..., 0], grid)
+
+
+def test_several_sets_are_asked_about(tmp_path, grid):
+    file = tmp_path / "a.h5"
+    with h5py.File(file, "w") as out:
+        out["a"], out["g/b"], out["words"] = grid, grid + 1, "text"
+    with pytest.raises(ValueError, match=r"2 data sets, choose one: .*a\.h5:/a .*a\.h5:/g/b \(7"):
+        gv.read_volume(file)
+    assert np.array_equal(gv.read_volume(file, key="g/b").data[..., 0].numpy(), grid + 1)
+    with pytest.raises(ValueError, match="no data set '/c'; it holds a, g/b"):
+        gv.read_volume(f"{file}:/c")
+    with pytest.raises(ValueError, match="words must hold real numbers"):
+        gv.read_volume(f"{file}:/words")
+    with pytest.raises(FileNotFoundError):
+        gv.read_volume(tmp_path / "none.h5:/a")
+
+
+def test_axes_of_ilastik_and_imagej(tmp_path):
+    data = noise((2, 7, 9, 12, 3), "uint8")
+    tags = {"axes": [{"key": k, "resolution": r} for k, r in zip("tzyxc", (0, 2, 3, 4, 0))]}  # noqa: B905
+    with h5py.File(tmp_path / "a.h5", "w") as out:
+        out["exported_data"] = data
+        out["exported_data"].attrs["axistags"] = json.dumps(tags)
+        out["exported_data"].attrs["channel_names"] = ["a", "b", "c"]
+    source = open_source(tmp_path / "a.h5")
+    assert (source.axes, source.times, source.spacing) == ("tzyxc", 2, (4, 3, 2))
+    assert [c.name for c in source.info.channels] == ["a", "b", "c"]
+    with h5py.File(tmp_path / "b.h5", "w") as out:
+        out["t0/channel0"] = data[0, ..., 0]
+        out["t0/channel0"].attrs["element_size_um"] = [2.0, 0.5, 0.25]
+        out["t0/channel0"].attrs["DIMENSION_LABELS"] = ["z", "y", "x"]
+    source = open_source(tmp_path / "b.h5")
+    assert source.spacing == (0.25, 0.5, 2) and source.info.unit == "micrometer"
+    with h5py.File(tmp_path / "c.h5", "w") as out:
+        out["d"] = data[0]
+        out["e"] = data
+    with pytest.raises(ValueError, match=r"what are the axes of shape \(2, 7, 9, 12, 3\)"):
+        gv.read_volume(tmp_path / "c.h5", key="e")
+    assert open_source(tmp_path / "c.h5", key="e", axes="tzyxc").times == 2
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_netcdf_of_xarray(tmp_path, grid, packed):
+    encoding = {"zlib": True, "chunksizes": (3, 4, 5)} if packed else {}
+    volume = gv.read_volume(netcdf(tmp_path / "a.nc", grid, **encoding))
+    assert volume.spacing == pytest.approx((0.5, 0.3, 0.25)) and volume.info.unit == "centimeter"
+    assert volume.origin == pytest.approx((0, 10, -0.5))  # depths fall: the last is the lowest
+    assert np.array_equal(volume.data[..., 0].numpy(), grid[::-1])
+    assert volume.info.quantity == "K" and volume.info.channels[0].name == "temperature"
+
+
+def test_packed_values_and_missing_ones(tmp_path, grid):
+    values = grid.astype("f8") / 4
+    values[0, 0, 0] = np.nan
+    encoding = {"dtype": "int32", "scale_factor": 0.25, "add_offset": 3.0, "_FillValue": -99999}
+    file = netcdf(tmp_path / "a.nc", values, **encoding)
+    with pytest.raises(ValueError, match="1 values that are NaN"):
+        gv.read_volume(file)
+    volume = gv.read_volume(file, nan=-1)
+    expected = np.where(np.isnan(values), -1, values)[::-1]
+    assert np.array_equal(volume.data[..., 0].numpy(), expected.astype("f4"))
+
+
+def test_times_of_netcdf(tmp_path):
+    data = noise((4, 3, 5, 6), "float32")
+    cube = xarray.DataArray(data, dims=("time", "z", "lat", "lon"), name="v")
+    cube["time"] = ("time", np.arange(4) * 6.0, {"units": "hours since 2000-01-01"})
+    cube["lat"] = ("lat", 50 - 0.25 * np.arange(5), {"units": "degrees_north"})
+    cube.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    source = open_source(tmp_path / "a.nc", time=2)
+    assert (source.info.time_step, source.info.time_unit) == (6, "hour")
+    assert source.info.unit is None and source.spacing == (1, 0.25, 1)
+    assert np.array_equal(source.read_region((0, 0, 0), (3, 5, 6))[..., 0], data[2, :, ::-1])
+
+
+def test_classic_netcdf_is_told(tmp_path):
+    (tmp_path / "a.nc").write_bytes(b"CDF\1" + bytes(100))
+    with pytest.raises(ValueError, match="classic kind; nccopy -k nc4"):
+        gv.read_volume(tmp_path / "a.nc")
+
+
+def test_hostile_chunks_take_no_memory(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as out:
+        out.create_dataset("a", (2000, 2000, 2000), "u1", chunks=(1500, 1500, 1500))
+    with pytest.raises(ValueError, match="a chunk of a takes 3375000000 bytes"):
+        open_source(tmp_path / "a.h5")
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_broken_files_give_one_line(tmp_path, grid, packed):
+    file = tmp_path / "a.h5"
+    with h5py.File(file, "w") as out:
+        more = {"chunks": (4, 4, 4), "compression": "gzip", "fletcher32": True} if packed else {}
+        out.create_dataset("a", data=grid, **more)
+    assert_told(file, tmp_path / "broken")
+    assert_told(netcdf(tmp_path / "a.nc", grid), tmp_path / "broken2")

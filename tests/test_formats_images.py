@@ -1,0 +1,239 @@
+"""MetaImage of SimpleITK, MRC of mrcfile, VTK images of VTK."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.damage import assert_told
+from helpers.stores import noise
+
+import gvtorch as gv
+from gvtorch.io.conversion import convert
+from gvtorch.io.reading import open_source
+
+itk = pytest.importorskip("SimpleITK")
+mrcfile = pytest.importorskip("mrcfile")
+vtk = pytest.importorskip("vtkmodules.all")
+numpy_support = pytest.importorskip("vtkmodules.util.numpy_support")
+
+
+@pytest.fixture
+def grid() -> np.ndarray:
+    return noise((7, 9, 12), "int16")
+
+
+def assert_parts(path: str | Path, **options) -> gv.Volume:
+    """Asserts that regions are those of the whole, which it returns."""
+    volume, source = gv.read_volume(path, **options), open_source(path, **options)
+    z, y, x = volume.data.shape[:3]
+    part = source.read_region((1, 2, 3), (z - 2, y - 1, x))
+    assert np.array_equal(part, volume.data[1 : z - 2, 2 : y - 1, 3:].numpy())
+    return volume
+
+
+# --- MetaImage
+
+
+def image(grid: np.ndarray, direction=(1, 0, 0, 0, 1, 0, 0, 0, 1), vector=False):
+    found = itk.GetImageFromArray(grid, isVector=vector)
+    found.SetSpacing((0.5, 2.0, 3.0))
+    found.SetOrigin((10.0, -20.0, 30.0))
+    found.SetDirection(direction)
+    return found
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("ending", ["mha", "mhd"])
+@pytest.mark.parametrize(
+    "direction", [(1, 0, 0, 0, 1, 0, 0, 0, 1), (0, 0, 1, -1, 0, 0, 0, -1, 0)], ids=str
+)
+def test_metaimage_lies_where_nifti_does(tmp_path, grid, ending, packed, direction):
+    for name in (f"a.{ending}", "a.nii"):
+        itk.WriteImage(image(grid, direction), str(tmp_path / name), packed)
+    one, other = assert_parts(tmp_path / f"a.{ending}"), gv.read_volume(tmp_path / "a.nii")
+    assert one.spacing == pytest.approx(other.spacing) and one.extent == other.extent
+    assert one.origin == pytest.approx(other.origin)
+    assert np.array_equal(one.data.numpy(), other.data.numpy())
+    assert one.info.unit == "millimeter" and one.info.space == "right-anterior-superior"
+    assert open_source(tmp_path / f"a.{ending}").whole == packed
+
+
+def test_metaimage_with_colors_times_and_other_types(tmp_path, grid):
+    rgb = noise((7, 9, 12, 3))
+    itk.WriteImage(image(rgb, vector=True), str(tmp_path / "rgb.mha"))
+    volume = gv.read_volume(tmp_path / "rgb.mha")
+    assert np.array_equal(volume.data.numpy(), rgb[:, ::-1, ::-1])
+    four = np.stack([grid, grid + 1, grid + 2]).astype("float64")
+    itk.WriteImage(itk.GetImageFromArray(four, isVector=False), str(tmp_path / "t.mha"))
+    source = open_source(tmp_path / "t.mha", time=2)
+    assert source.times == 3
+    found = source.read_region((0, 0, 0), (7, 9, 12))[..., 0]
+    assert np.array_equal(found, four[2, :, ::-1, ::-1].astype("float32"))
+
+
+def test_metaimage_without_its_numbers(tmp_path, grid):
+    itk.WriteImage(image(grid), str(tmp_path / "a.mhd"))
+    (tmp_path / "a.raw").unlink()
+    with pytest.raises((ValueError, OSError), match=r"a\.raw"):
+        gv.read_volume(tmp_path / "a.mhd")
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_broken_metaimages_give_one_line(tmp_path, grid, packed):
+    itk.WriteImage(image(grid), str(tmp_path / "a.mha"), packed)
+    assert_told(tmp_path / "a.mha", tmp_path / "broken")
+
+
+# --- MRC
+
+
+@pytest.mark.parametrize("dtype", ["int8", "int16", "float32", "uint16", "float16"])
+@pytest.mark.parametrize("ending", ["mrc", "map.gz", "mrc.bz2"])
+def test_mrc(tmp_path, grid, dtype, ending):
+    kind = {"gz": "gzip", "z2": "bzip2"}.get(ending[-2:])
+    grid = np.abs(grid)
+    file = tmp_path / f"a.{ending}"
+    with mrcfile.new(file, data=(grid // 300).astype(dtype), compression=kind) as out:
+        out.voxel_size = (1.5, 2.5, 4.0)
+        out.header.origin = (10, 20, 30)
+    volume = assert_parts(file)
+    assert np.array_equal(volume.data[..., 0].float().numpy(), (grid // 300).astype("f4"))
+    assert volume.spacing == pytest.approx((1.5, 2.5, 4)) and volume.info.unit == "angstrom"
+    assert volume.origin == (10, 20, 30)
+    assert open_source(file).whole == (kind is not None)
+
+
+def test_mrc_axes_and_starts(tmp_path, grid):
+    with mrcfile.new(tmp_path / "a.mrc", data=grid) as out:
+        out.voxel_size = 2.0
+        out.header.mapc, out.header.mapr, out.header.maps = 3, 2, 1  # z fastest
+        out.header.nxstart, out.header.nzstart = 5, -7  # of columns, which are z
+        out.set_extended_header(np.zeros(80, "V1"))
+    volume = gv.read_volume(tmp_path / "a.mrc")
+    assert np.array_equal(volume.data[..., 0].numpy(), grid.transpose(2, 1, 0))
+    assert volume.origin[2] == 5 * volume.spacing[2] and volume.origin[0] == -7 * volume.spacing[0]
+    store = convert(tmp_path / "a.mrc", tmp_path / "a.zarr")
+    assert store.info.unit == "angstrom"
+
+
+def test_broken_maps_give_one_line(tmp_path, grid):
+    mrcfile.write(tmp_path / "a.mrc", grid)
+    assert_told(tmp_path / "a.mrc", tmp_path / "broken")
+
+
+# --- VTK
+
+
+def vtk_image(grid: np.ndarray, name: str = "density", cells: bool = False):
+    """An image of VTK of (z, y, x) or (z, y, x, c) values, and another array beside."""
+    found = vtk.vtkImageData()
+    size = [n + cells for n in grid.shape[2::-1]]
+    found.SetExtent(2, size[0] + 1, 0, size[1] - 1, 0, size[2] - 1)
+    found.SetSpacing(0.5, 2, 3)
+    found.SetOrigin(10, 20, 30)
+    data = found.GetCellData() if cells else found.GetPointData()
+    width = grid.shape[3] if grid.ndim == 4 else 1
+    for add, called in ((0, name), (1, "other")):
+        array = numpy_support.numpy_to_vtk((grid + add).reshape(-1, width), deep=True)
+        array.SetName(called)
+        (data.SetScalars if called == name else data.AddArray)(array)
+    return found
+
+
+def write_vti(file: Path, data, mode: str = "Appended", packer: str = "ZLib") -> Path:
+    writer = vtk.vtkXMLImageDataWriter()
+    writer.SetFileName(str(file))
+    writer.SetInputData(data)
+    getattr(writer, f"SetDataModeTo{mode}")()
+    getattr(writer, f"SetCompressorTypeTo{packer}")()
+    writer.SetEncodeAppendedData(mode == "Appended" and packer == "LZMA")
+    writer.Write()
+    return file
+
+
+@pytest.mark.parametrize(
+    ("mode", "packer"),
+    [
+        ("Appended", "None"),
+        ("Appended", "ZLib"),
+        ("Appended", "LZ4"),
+        ("Appended", "LZMA"),
+        ("Binary", "None"),
+        ("Binary", "ZLib"),
+        ("Ascii", "None"),
+    ],
+)
+@pytest.mark.parametrize("dtype", ["int16", "float64", "uint8"])
+@pytest.mark.filterwarnings("ignore:.*other arrays.*")
+def test_vti(tmp_path, grid, mode, packer, dtype):
+    values = (grid // 300).astype(dtype)
+    file = write_vti(tmp_path / "a.vti", vtk_image(values), mode, packer)
+    volume = assert_parts(file)
+    assert np.array_equal(volume.data[..., 0].float().numpy(), values.astype("f4"))
+    assert volume.spacing == (0.5, 2, 3) and volume.origin == (11, 20, 30)
+    assert volume.info.channels[0].name == "density"
+    other = gv.read_volume(file, key="other")
+    assert np.array_equal(other.data.float(), (volume.data + 1).float())
+    assert open_source(file).whole == ((mode, packer) != ("Appended", "None"))
+    with pytest.raises(ValueError, match="has no array 'x'; it holds density, other"):
+        gv.read_volume(file, key="x")
+
+
+@pytest.mark.filterwarnings("ignore:.*other arrays.*")
+def test_vti_of_cells_vectors_and_turned_axes(tmp_path, grid):
+    volume = gv.read_volume(write_vti(tmp_path / "c.vti", vtk_image(grid, cells=True)))
+    assert np.array_equal(volume.data[..., 0].numpy(), grid)
+    assert volume.origin == (11.25, 21, 31.5)
+    rgb = noise((7, 9, 12, 3))
+    volume = gv.read_volume(write_vti(tmp_path / "v.vti", vtk_image(rgb)))
+    assert np.array_equal(volume.data.numpy(), rgb)
+    turned = vtk_image(grid)
+    turned.SetDirectionMatrix(0, 1, 0, -1, 0, 0, 0, 0, 1)
+    volume = gv.read_volume(write_vti(tmp_path / "t.vti", turned))
+    place = [0.0, 0.0, 0.0]
+    turned.TransformIndexToPhysicalPoint((2 + 11, 0, 0), place)  # the lowest world y, x
+    assert volume.origin == tuple(place) and volume.spacing == (2, 0.5, 3)
+    assert np.array_equal(volume.data[..., 0].numpy(), grid[:, :, ::-1].transpose(0, 2, 1))
+
+
+@pytest.mark.parametrize("kind", ["Binary", "ASCII"])
+@pytest.mark.parametrize("cells", [False, True])
+@pytest.mark.filterwarnings("ignore:.*other arrays.*")
+def test_legacy_vtk(tmp_path, grid, kind, cells):
+    writer = vtk.vtkStructuredPointsWriter()
+    writer.SetFileName(str(tmp_path / "a.vtk"))
+    writer.SetInputData(vtk_image(grid, cells=cells))
+    getattr(writer, f"SetFileTypeTo{kind}")()
+    writer.Write()
+    volume = assert_parts(tmp_path / "a.vtk")
+    assert np.array_equal(volume.data[..., 0].numpy(), grid)
+    assert volume.spacing == (0.5, 2, 3)
+    assert volume.origin == ((11.25, 21, 31.5) if cells else (11, 20, 30))
+    if kind == "Binary":
+        other = gv.read_volume(tmp_path / "a.vtk", key="other")
+        assert np.array_equal(other.data[..., 0].numpy(), grid + 1)
+
+
+def test_other_vtk_files_are_named(tmp_path):
+    (tmp_path / "a.vtk").write_bytes(b"# vtk DataFile Version 3.0\nt\nASCII\nDATASET POLYDATA\n\n")
+    with pytest.raises(ValueError, match=r"POLYDATA.*expected STRUCTURED_POINTS"):
+        gv.read_volume(tmp_path / "a.vtk")
+
+
+@pytest.mark.parametrize(
+    ("mode", "packer"), [("Appended", "None"), ("Appended", "ZLib"), ("Binary", "ZLib")]
+)
+def test_broken_vti_gives_one_line(tmp_path, grid, mode, packer):
+    assert_told(write_vti(tmp_path / "a.vti", vtk_image(grid), mode, packer), tmp_path / "broken")
+
+
+@pytest.mark.parametrize("kind", ["Binary", "ASCII"])
+def test_broken_vtk_gives_one_line(tmp_path, grid, kind):
+    writer = vtk.vtkStructuredPointsWriter()
+    writer.SetFileName(str(tmp_path / "a.vtk"))
+    writer.SetInputData(vtk_image(grid))
+    getattr(writer, f"SetFileTypeTo{kind}")()
+    writer.Write()
+    assert_told(tmp_path / "a.vtk", tmp_path / "broken", least=8)

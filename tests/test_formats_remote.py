@@ -1,0 +1,205 @@
+"""Files behind URLs: servers with and without validators, what is kept, and what goes wrong."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.stores import noise
+
+import gvtorch as gv
+from gvtorch.io import remote
+from gvtorch.io.conversion import convert
+
+
+class Server(ThreadingHTTPServer):
+    """Serves a few files, without byte ranges, and counts what it sent."""
+
+    files: dict[str, bytes]
+    tag: str | None = '"one"'
+    modified: str | None = None
+    sized = True
+    cut = 0
+    sent: list[str]
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.files, self.sent = {}, []
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server_address[1]}"
+
+
+class Handler(BaseHTTPRequestHandler):
+    server: Server
+
+    def do_GET(self) -> None:
+        server, name = self.server, self.path.partition("?")[0]
+        content = server.files.get(name)
+        if content is None:
+            self.send_error(404)
+            return
+        if (server.tag and self.headers.get("If-None-Match") == server.tag) or (
+            server.modified and self.headers.get("If-Modified-Since") == server.modified
+        ):
+            self.send_response(304)
+            self.end_headers()
+            return
+        server.sent.append(self.path)
+        self.send_response(200)
+        for header, value in (("ETag", server.tag), ("Last-Modified", server.modified)):
+            if value:
+                self.send_header(header, value)
+        if server.sized:
+            self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content[: len(content) - server.cut])
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def server(tmp_path, monkeypatch) -> Iterator[Server]:
+    monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path / "cache"))
+    with Server() as found:
+        thread = threading.Thread(target=found.serve_forever)
+        thread.start()
+        yield found
+        found.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def grid(tmp_path, server) -> np.ndarray:
+    data = noise((7, 9, 12), "int16")
+    np.save(tmp_path / "a.npy", data)
+    server.files["/x/a.npy"] = (tmp_path / "a.npy").read_bytes()
+    return data
+
+
+def kept(tmp_path: Path) -> list[Path]:
+    return [p for p in (tmp_path / "cache").rglob("*") if p.is_file() and p.suffix != ".json"]
+
+
+@pytest.mark.parametrize("sized", [True, False])
+def test_a_file_is_downloaded_once(tmp_path, server, grid, sized):
+    server.sized = sized
+    for _ in range(2):
+        volume = gv.read_volume(f"{server.url}/x/a.npy?token=1")
+        assert np.array_equal(volume.data[..., 0].numpy(), grid) and volume.name == "a.npy"
+    store = convert(f"{server.url}/x/a.npy?token=1", tmp_path / "a.zarr")
+    assert np.array_equal(store.read_region(0, (0, 0, 0), grid.shape)[..., 0], grid)
+    assert len(server.sent) == 1 and len(kept(tmp_path)) == 1
+
+
+@pytest.mark.parametrize("by", ["tag", "modified"])
+def test_a_new_version_is_downloaded(tmp_path, server, grid, by):
+    server.tag = server.modified = None
+    setattr(server, by, "Sun, 22 Nov 2026 10:00:00 GMT")
+    url = f"{server.url}/x/a.npy"
+    assert gv.read_volume(url).extent == (12, 9, 7)
+    np.save(tmp_path / "b.npy", grid[:3])
+    server.files["/x/a.npy"] = (tmp_path / "b.npy").read_bytes()
+    assert gv.read_volume(url).extent == (12, 9, 7)  # as the server says
+    setattr(server, by, "Sun, 22 Nov 2026 11:00:00 GMT")
+    assert gv.read_volume(url).extent == (12, 9, 3)
+    assert len(server.sent) == 2
+
+
+def test_without_validators_it_is_downloaded_each_time(server, grid):
+    server.tag = None
+    for _ in range(2):
+        gv.read_volume(f"{server.url}/x/a.npy")
+    assert len(server.sent) == 2
+
+
+def test_the_cache_is_bounded_and_the_oldest_goes(tmp_path, server, grid, monkeypatch):
+    size = len(server.files["/x/a.npy"])
+    monkeypatch.setenv("GVTORCH_CACHE_GB", str(2.5 * size / 1e9))
+    for name in "abcd":
+        server.files[f"/{name}.npy"] = server.files["/x/a.npy"]
+        gv.read_volume(f"{server.url}/{name}.npy")
+    assert sorted(file.name for file in kept(tmp_path)) == ["c.npy", "d.npy"]
+
+
+def test_what_is_too_large_is_refused(tmp_path, server, grid, monkeypatch):
+    monkeypatch.setenv("GVTORCH_CACHE_GB", "1e-6")
+    for server.sized, message in ((True, "is 0.0 MB, the cache"), (False, "is more than 0.0 MB")):
+        with pytest.raises(OSError, match=message):
+            gv.read_volume(f"{server.url}/x/a.npy")
+    assert not kept(tmp_path)
+    monkeypatch.setenv("GVTORCH_CACHE_GB", "much")
+    with pytest.raises(ValueError, match="GVTORCH_CACHE_GB must be gigabytes, got 'much'"):
+        gv.read_volume(f"{server.url}/x/a.npy")
+
+
+def test_a_broken_download_leaves_nothing(tmp_path, server, grid):
+    server.cut = 100
+    with pytest.raises(OSError, match=r"is cut off"):
+        gv.read_volume(f"{server.url}/x/a.npy")
+    assert not kept(tmp_path)
+    with pytest.raises(FileNotFoundError, match="volume not found: http"):
+        gv.read_volume(f"{server.url}/none.npy")
+
+
+def test_without_a_network_the_copy_is_used(server, grid, monkeypatch):
+    url = f"{server.url}/x/a.npy"
+    gv.read_volume(url)
+
+    def fail(*_: object, **__: object) -> None:
+        raise OSError("no route to host")
+
+    monkeypatch.setattr(remote.urllib.request, "urlopen", fail)
+    with pytest.warns(UserWarning, match=r"no answer \(no route to host\); the copy of before"):
+        gv.read_volume(url)
+    with pytest.raises(OSError, match="can't be downloaded: no route to host"):
+        gv.read_volume(f"{server.url}/other.npy")
+
+
+def test_a_data_set_of_a_file_behind_a_url(tmp_path, server, grid):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "a.h5", "w") as out:
+        out["g/a"], out["b"] = grid, grid + 1
+    server.files["/a.h5"] = (tmp_path / "a.h5").read_bytes()
+    volume = gv.read_volume(f"{server.url}/a.h5:/g/a")
+    assert np.array_equal(volume.data[..., 0].numpy(), grid)
+    with pytest.raises(ValueError, match="its numbers lie in a file beside it"):
+        gv.read_volume(f"{server.url}/a.mhd")
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_other_schemes_through_fsspec(tmp_path, server, grid):
+    fsspec = pytest.importorskip("fsspec")
+    fsspec.filesystem("memory").pipe("/bucket/a.npy", server.files["/x/a.npy"])
+    for _ in range(2):
+        volume = gv.read_volume("memory://bucket/a.npy")
+        assert np.array_equal(volume.data[..., 0].numpy(), grid)
+    assert len(kept(tmp_path)) == 1
+    with pytest.raises(FileNotFoundError, match="volume not found: memory://"):
+        gv.read_volume("memory://bucket/none.npy")
+    with pytest.raises((OSError, ValueError), match="nothing://"):
+        gv.read_volume("nothing://bucket/none.npy")
+
+
+@pytest.mark.parametrize(
+    ("url", "is_file"),
+    [
+        ("https://host/a/scan.nii.gz", True),
+        ("https://host/a/scan.tif?key=a.zarr", True),
+        ("s3://bucket/scan.nrrd", True),
+        ("https://host/a.zarr", False),
+        ("https://host/a.zarr/0", False),
+        ("https://host/v0.4/6001240.zarr/", False),
+        ("s3://bucket/a.n5", False),
+        ("file:///a/b.tif", False),
+        ("/a/b.tif", False),
+    ],
+)
+def test_what_is_the_url_of_a_file(url, is_file):
+    assert remote.is_file_url(url) == is_file
