@@ -25,15 +25,17 @@ class ReadOptions:
     """How to read the volume where the file does not tell."""
 
     shape: Annotated[str | None, arg(metavar="X,Y,Z")] = None
-    """RAW: voxels; else taken from the name *_XxYxZ_dtype.raw"""
+    """RAW, or a file of any ending: voxels; else taken from the name *_XxYxZ_dtype.raw"""
     dtype: Annotated[str | None, arg(metavar="TYPE")] = None
-    """RAW: a NumPy dtype, as in int16 or >i2"""
+    """RAW, or a file of any ending: a NumPy dtype, as in int16 or >i2"""
+    offset: Annotated[int | None, arg(metavar="BYTES")] = None
+    """RAW, or a file of any ending: bytes before the numbers"""
     spacing: Annotated[str | None, arg(metavar="X,Y,Z")] = None
     """voxel size in world units"""
     key: Annotated[str | None, arg(metavar="NAME")] = None
-    """NPZ: which array; OME-Zarr: which image"""
+    """which of several arrays, series, images or scenes"""
     axes: Annotated[str | None, arg(metavar="LETTERS")] = None
-    """NPY, NPZ, NRRD: what the axes are, the slowest first, as in tzyx or czyx"""
+    """what the axes of an array are, the slowest first, as in tzyx or czyx"""
     time: Annotated[int | None, arg(metavar="N")] = None
     """time point, from 0"""
     oblique: Literal["resample", "keep"] | None = None
@@ -52,6 +54,7 @@ class ReadOptions:
         return {
             "shape": numbers("--shape", self.shape, 3, int) if self.shape else None,
             "dtype": self.dtype,
+            "offset": self.offset,
             "spacing": numbers("--spacing", self.spacing, 3, float) if self.spacing else None,
             "key": self.key,
             "axes": self.axes,

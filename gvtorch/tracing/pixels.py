@@ -112,16 +112,13 @@ def trace(tree: Scene, rays: Rays, shader: Shaders, **options: Unpack[RenderSett
 
 def _resident(where: str, scene: Any) -> Scene:
     """The trees of a scene; what is a volume becomes one."""
-    if isinstance(scene, N3Tree):
-        return scene
+
+    def tree_of(one: Any) -> N3Tree:
+        return one if isinstance(one, N3Tree) else N3Tree.from_volume(as_volume(one, where=where))
+
     if isinstance(scene, Mapping):
-        return {
-            name: one
-            if isinstance(one, N3Tree)
-            else N3Tree.from_volume(as_volume(one, where=where))
-            for name, one in scene.items()
-        }
-    return N3Tree.from_volume(as_volume(scene, where=where))
+        return {name: tree_of(one) for name, one in scene.items()}
+    return tree_of(scene)
 
 
 def _trees(where: str, scene: Scene) -> list[N3Tree]:
