@@ -6,12 +6,14 @@ how rays are walked for it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.checked import Check, instance_of, or_none, whole
 from .shader import ColorTable, Sampling, Shader
 from .transfer_function import TransferFunction
 
@@ -44,6 +46,14 @@ class ModuleShader(Shader, torch.nn.Module):
 
     uses_torch = True
     channels: tuple[str, ...] = ()
+    hidden_by: TransferFunction | None
+    samples: int | None
+    checks: ClassVar[Mapping[str, Check]] = {
+        "module": lambda owner, name, value: _callable(value),
+        "channels": lambda owner, name, value: _names(value),
+        "hidden_by": or_none(instance_of(TransferFunction)),
+        "samples": or_none(whole(PART_SAMPLES)),
+    }
 
     def __init__(
         self,
@@ -57,16 +67,10 @@ class ModuleShader(Shader, torch.nn.Module):
         its range.
         """
         super().__init__()
-        if not callable(module):
-            raise ValueError(f"ModuleShader: module must be callable, got {type(module).__name__}")
-        if isinstance(channels, str) or (channels is not None and not len(channels)):
+        if channels is not None and not len(channels):
             raise ValueError(f"ModuleShader: channels must be names, got {channels!r}")
-        if hidden_by is not None:
-            check.instance("ModuleShader", "hidden_by", hidden_by, TransferFunction)
-        if samples is not None:
-            check.whole("ModuleShader", "samples", samples, low=PART_SAMPLES)
         self.module, self.hidden_by, self.samples = module, hidden_by, samples
-        self.channels = tuple(channels or ())
+        self.channels = () if channels is None else channels  # type: ignore[assignment]
 
     def __repr__(self) -> str:
         name = getattr(self.module, "__name__", type(self.module).__name__)
@@ -98,6 +102,18 @@ class ModuleShader(Shader, torch.nn.Module):
         if not bool(torch.isfinite(color).all()):
             raise ValueError("ModuleShader: the module's colour must be finite")
         return color, alpha
+
+
+def _callable(module: Any) -> Any:
+    if not callable(module):
+        raise ValueError(f"ModuleShader: module must be callable, got {type(module).__name__}")
+    return module
+
+
+def _names(channels: Any) -> tuple[str, ...]:
+    if not isinstance(channels, Sequence) or isinstance(channels, str):
+        raise ValueError(f"ModuleShader: channels must be names, got {channels!r}")
+    return tuple(channels)
 
 
 class TransferModule(torch.nn.Module):

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..base import check
+from ..base.checked import Check, above, kind_of, or_none
 from .shader import ColorTable, Sampling, Shader
 
 Points = Sequence[Sequence[float]]
@@ -65,6 +66,15 @@ class TransferFunction(Shader):
         reference: World units, or None for the smallest spacing of what is rendered.
     """
 
+    opacity: np.ndarray
+    color: np.ndarray
+    reference: float | None
+    checks: ClassVar[Mapping[str, Check]] = {
+        "opacity": lambda owner, name, points: _points(kind_of(owner), name, points, 2),
+        "color": lambda owner, name, points: _points(kind_of(owner), name, points, 4),
+        "reference": or_none(above(0)),
+    }
+
     def __init__(
         self, opacity: Points, color: Points = ((0, 1, 1, 1),), reference: float | None = None
     ) -> None:
@@ -79,13 +89,7 @@ class TransferFunction(Shader):
         Raises:
             ValueError: No points, values that do not increase, numbers out of [0, 1] or not finite.
         """
-        self.opacity = _points("opacity", opacity, 2)
-        self.color = _points("color", color, 4)
-        if reference is not None:
-            reference = check.number(
-                "TransferFunction", "reference", reference, low=0, open_low=True
-            )
-        self.reference = reference
+        self.opacity, self.color, self.reference = opacity, color, reference  # type: ignore[assignment]
         self._tables: dict[Any, ColorTable] = {}
 
     @classmethod
@@ -180,6 +184,7 @@ class TransferFunction(Shader):
         """Returns a table of the function as it is now; the last few are kept."""
         key = make, self.opacity.tobytes(), self.color.tobytes(), self.reference, sampling
         if key not in self._tables:
+            self.check_again()  # points may have been edited in place
             table = make(self, sampling)
             if len(self._tables) == _KEPT:
                 self._tables.pop(next(iter(self._tables)))
@@ -285,8 +290,7 @@ def _common_cells(places: Iterable[float], most: int, tolerance: float = math.in
     return cells
 
 
-def _points(name: str, points: Points, width: int) -> np.ndarray:
-    where = "TransferFunction"
+def _points(where: str, name: str, points: Points, width: int) -> np.ndarray:
     names = "(value, alpha)" if width == 2 else "(value, red, green, blue)"
     try:
         array = np.array([[float(number) for number in point] for point in points])
@@ -294,6 +298,7 @@ def _points(name: str, points: Points, width: int) -> np.ndarray:
         raise ValueError(f"{where}: {name} must be a list of points {names}") from None
     if array.ndim != 2 or array.shape[0] == 0 or array.shape[1] != width:
         raise ValueError(f"{where}: {name} must be a list of points {names}, got {points!r}")
+    points = array.tolist()
     if not np.isfinite(array).all():
         raise ValueError(f"{where}: {name} must be finite, got {points!r}")
     steps = np.diff(array[:, 0])
