@@ -196,6 +196,7 @@ def check_number(
     """Raises ValueError unless it is a finite number in [low, high], or a tensor of one. A tensor
     on CUDA is not looked at, since that would block.
     """
+    check.no_gradient(where, name, value)
     if isinstance(value, Tensor):
         if value.numel() != 1:
             got = check.describe(value)
@@ -212,6 +213,7 @@ def check_triple(
     """Raises ValueError unless these are three finite numbers in [low, high], or a tensor of them,
     as for `check_number`; `zero` tells whether all may be 0.
     """
+    check.no_gradient(where, name, value)
     if isinstance(value, Tensor) and value.is_cuda:
         if value.shape != (3,):
             raise ValueError(f"{where}: {name} must be (3,), got {check.describe(value)}")

@@ -293,7 +293,10 @@ def _common_cells(places: Iterable[float], most: int, tolerance: float = math.in
 def _points(where: str, name: str, points: Points, width: int) -> np.ndarray:
     names = "(value, alpha)" if width == 2 else "(value, red, green, blue)"
     try:
-        array = np.array([[float(number) for number in point] for point in points])
+        rows = [list(point) for point in points]
+        for number in (number for row in rows for number in row):
+            check.no_gradient(where, name, number)
+        array = np.array([[float(number) for number in row] for row in rows])
     except (TypeError, ValueError):
         raise ValueError(f"{where}: {name} must be a list of points {names}") from None
     if array.ndim != 2 or array.shape[0] == 0 or array.shape[1] != width:
