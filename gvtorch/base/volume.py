@@ -116,6 +116,12 @@ class Volume:
         return (x, y, z)
 
     @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Of the data: (z, y, x, c)."""
+        z, y, x, c = self.data.shape
+        return (z, y, x, c)
+
+    @property
     def value_range(self) -> tuple[float, float]:
         """Smallest and largest value over all channels."""
         unordered = self.data.dtype == torch.uint16  # torch does not compare them

@@ -141,6 +141,9 @@ class TransferModule(torch.nn.Module):
         self.scale = (len(table.opaque_m) - 1) / (high - self.low)
         self.rows = torch.nn.Parameter(table.table_lm4[0].clone())
 
+    def __repr__(self) -> str:
+        return f"TransferModule(rows={check.shown(self.rows)}, from {self.low:g})"
+
     def shows(self, values: Tensor) -> Tensor:
         """Bool of the same shape: a value has an opacity."""
         place = ((values - self.low) * self.scale).clamp(0, len(self.rows) - 1)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.explicit import explicit
 from ..base.records import Hits, Rays, RenderStats
 from ..base.stage import Progress, collect_timings, no_progress, stage
 from ..cameras.camera import Camera
@@ -34,6 +35,7 @@ Again = tuple[Hits, Tensor]
 _RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that progress shows
 
 
+@explicit(RenderOptions)
 def render(
     tree: N3Tree,
     camera: Camera | Rays,
@@ -80,15 +82,16 @@ def render(
     return picture
 
 
+@explicit(RenderOptions)
 def trace(tree: N3Tree, rays: Rays, shader: Shader, **options: Unpack[RenderSettings]) -> Hits:
-    """Traces any world rays through a resident tree, as one frame.
+    """Traces any world rays through a resident tree, as one frame. Background and layer belong to
+    pictures and have no part in it.
 
     Args:
         tree: The tree; its stamps and request words are written.
         rays: Rays in world units, on the tree's device.
         shader: The transfer function, or another shader.
-        **options: Fields of `RenderOptions`; background and layer belong to pictures and have no
-            part in it.
+        **options: Fields of `RenderOptions`.
 
     Returns:
         Colour, alpha, depth and samples of each ray, in the options' dtype.
