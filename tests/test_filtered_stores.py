@@ -121,7 +121,7 @@ def test_broken_off_work_leaves_the_store_as_it_was(store):
         check_streamed(store, matter(), gv.Filtered(MISTY))
     bad = gv.TransferFunction([(30, 0), (250, 0.08)])
     bad.opacity[1, 1] = float("nan")
-    with pytest.raises(ValueError, match="what 'filtered' is made of is not finite"):
+    with pytest.raises(ValueError, match="opacity must be finite"):
         gv.Filtered.add_to(store, bad)
     shader = gv.Filtered.add_to(store, OPAQUE)
     check_streamed(store, matter(), shader)

@@ -87,6 +87,7 @@ def test_bricks_beyond_2_gib_are_read_as_others_are(name, dtype):
     bricks.bricks["value"] = torch.from_numpy(far)
     bricks.stamp_b = torch.full((first + used,), -1, dtype=torch.int32)
     tree.nodes.brick_tn[tree.nodes.brick_tn >= 0] += first
+    bricks.in_order()
     hits = gv.trace(tree, rays, SHADERS[name])
     assert near.alpha.max() > 0.3 and (bricks.stamp_b[first:] == tree.frame).any()
     for field, there in vars(near).items():

@@ -45,6 +45,10 @@ def test_objects_tell_of_themselves_in_one_line(tree):
         (gv.Isosurface(torch.tensor(2.0)), "Isosurface(value=() float32, color=(0.8"),
         (gv.Projection("mean", GRAY), "Projection(transfer=TransferFunction("),
         (gv.ModuleShader(torch.nn.Identity()), "ModuleShader(Identity, channels=())"),
+        (gv.TransferModule(GRAY, 1.0), "TransferModule(rows=(1041, 4) float32, from 0)"),
+        (gv.TreeTracer(tree, GRAY), "TreeTracer(N3Tree(8x8x8 (x, y, z), N=2"),
+        (gv.EngineOptions(brick_size=4), "EngineOptions(brick_size=4)"),
+        (gv.PointLight((1, 2, 3)), "PointLight(position=(1, 2, 3), color=(1.0, "),
     ):
         text = repr(thing)
         assert text.startswith(begin), text

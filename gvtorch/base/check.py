@@ -130,6 +130,24 @@ def known(where: str, options: Mapping[str, Any], kind: type) -> None:
         raise ValueError(f"{where}: unknown option {unknown[0]!r}; known: {', '.join(names)}")
 
 
+def no_gradient(where: str, name: str, value: Any) -> None:
+    """Raises RuntimeError if a tensor requires gradients, which are recorded and would be lost.
+
+    The same in eager, scripted, compiled and exported programs: ops/registry.py calls it for the
+    arguments of ops, others where numbers leave torch.
+    """
+    if torch.is_grad_enabled() and isinstance(value, Tensor) and value.requires_grad:
+        raise lost_gradient(where, name)
+
+
+def lost_gradient(where: str, name: str) -> RuntimeError:
+    """Returns the error for a gradient that would be lost."""
+    return RuntimeError(
+        f"{where}: gradients by {name} would be lost: only gv.ModuleShader gives gradients, by its "
+        "parameters and by bricks that require them; else take detach() or torch.no_grad()"
+    )
+
+
 def images(where: str, name: str, value: Any, channels: int, *, batch: bool = True) -> None:
     """Raises ValueError unless `value` is a picture (h, w, channels) of floats, not empty, or, if
     `batch`, several (n, h, w, channels).
@@ -206,6 +224,7 @@ def number(
     """Returns `value` as a float; raises ValueError unless it is finite and inside [low, high] (or
     (low, high]).
     """
+    no_gradient(where, name, value)
     try:
         result = float(value)
     except (TypeError, ValueError):
@@ -231,6 +250,7 @@ def triple(
     where: str, name: str, value: Any, *, positive: bool = False
 ) -> tuple[float, float, float]:
     """Returns (x, y, z); raises ValueError unless they are finite and, if asked, positive."""
+    no_gradient(where, name, value)
     if isinstance(value, Tensor):
         value = value.tolist()
     try:
@@ -260,6 +280,7 @@ def reals(where: str, name: str, value: Any, shape: tuple[int, ...] | None = Non
     """Returns numbers, of any shape if none is given, as a float64 tensor on the CPU; raises
     ValueError unless they have the shape and are finite.
     """
+    no_gradient(where, name, value)
     try:
         numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
     except (TypeError, ValueError, RuntimeError):

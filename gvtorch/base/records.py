@@ -12,6 +12,13 @@ from torch import Tensor
 from . import check
 
 
+def moved(value: Any, device: torch.device | str | None, dtype: torch.dtype | None = None) -> Any:
+    """Returns a tensor on a device, in another dtype if it holds floats; anything else as it is."""
+    if not isinstance(value, Tensor):
+        return value
+    return value.to(device, dtype if value.is_floating_point() else None)
+
+
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Rays:
     """Rays in world units, all float32 or all float64 on one device."""
@@ -30,9 +37,11 @@ class Rays:
         """Some of the rays, which are no rows any more."""
         return self._each(lambda column: column[index], 0)
 
-    def to(self, device: torch.device | str) -> Rays:
-        """The rays on a device."""
-        return self._each(lambda column: column.to(device), self.width)
+    def to(
+        self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> Rays:
+        """The rays on a device, in float32 or float64; None leaves each as it is."""
+        return self._each(lambda column: moved(column, device, dtype), self.width)
 
     def light(self) -> Tensor:
         """Returns (r, 1) float64 transmittance at the first distance."""
@@ -62,6 +71,12 @@ class Hits:
     # What only some shaders give, else None:
     normal: Tensor | None = None  # (r, 3) world, towards the eye, of unit length or 0
     features: Tensor | None = None  # (r, c)
+
+    def to(
+        self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> Hits:
+        """The hits on a device; its floats in another dtype. None leaves each as it is."""
+        return replace(self, **{name: moved(v, device, dtype) for name, v in vars(self).items()})
 
     def __repr__(self) -> str:
         extra = [name for name in ("normal", "features") if getattr(self, name) is not None]

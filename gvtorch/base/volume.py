@@ -86,8 +86,15 @@ class Volume:
         Raises:
             ValueError: data is empty, of another shape or dtype, has more than 2^31 voxels or
                 holds values that are not finite; spacing is not positive.
+            RuntimeError: data requires gradients, and they are recorded.
         """
         where = f"Volume {name!r}" if name != "volume" else "Volume"
+        if isinstance(data, Tensor) and data.requires_grad and torch.is_grad_enabled():
+            raise RuntimeError(
+                f"{where}: data requires gradients, which a volume does not keep: take detach(); "
+                'to learn voxels, let tree.bricks["value"] require gradients and render with a '
+                "gv.ModuleShader"
+            )
         tensor = _as_tensor(where, data)
         if tensor.dim() not in (3, 4):
             got = check.shown(data)
@@ -107,6 +114,12 @@ class Volume:
         """Voxels in (x, y, z)."""
         z, y, x, _ = self.data.shape
         return (x, y, z)
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Of the data: (z, y, x, c)."""
+        z, y, x, c = self.data.shape
+        return (z, y, x, c)
 
     @property
     def value_range(self) -> tuple[float, float]:

@@ -70,6 +70,7 @@ class Cache:
     def __init__(self, nodes: NodePool, bricks: BrickPool, roots: int) -> None:
         """Locks the first `roots` tiles and bricks."""
         self.nodes, self.bricks, self.frame = nodes, bricks, 0
+        bricks.in_order()
         device = nodes.child_tn.device
         loads = [LRU(bricks.capacity, max(roots, bricks.coarse), device)]
         if bricks.coarse:

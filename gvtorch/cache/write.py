@@ -162,14 +162,15 @@ def put_bricks(cache: Cache, slot_k: Tensor, node: Tensor, data: Voxels | Sequen
     """
     nodes, pool, slot = cache.nodes, cache.bricks, slot_k.to(torch.int64)
     unlink(nodes.brick_tn, slot_k, pool.capacity)
-    if isinstance(data, Mapping):
-        there = {name: on_device(rows, slot.device) for name, rows in data.items()}
-        nbytes = _fill_slots(cache, slot, there)
-    else:
-        nbytes = 0
-        for chunk in data:
-            with chunk as arrived:
-                nbytes += _fill_slots(cache, slot[chunk.begin : chunk.end], arrived)
+    with pool.writing():
+        if isinstance(data, Mapping):
+            there = {name: on_device(rows, slot.device) for name, rows in data.items()}
+            nbytes = _fill_slots(cache, slot, there)
+        else:
+            nbytes = 0
+            for chunk in data:
+                with chunk as arrived:
+                    nbytes += _fill_slots(cache, slot[chunk.begin : chunk.end], arrived)
     slots = (pool.owner_b, pool.stamp_b, pool.born_b, pool.shared_b)
     link_bricks(nodes.brick_tn, nodes.request_tn, *slots, node, slot_k, cache.frame)
     return nbytes

@@ -276,9 +276,9 @@ class Camera:
         sizes = torch.stack((camera.height, camera.width)).long().unique(dim=1)
         if sizes.shape[1] != 1:
             raise ValueError("Camera.from_kornia: all cameras must have one height and width")
-        Ks = camera.intrinsics[:, :3, :3].detach().to("cpu", torch.float64).clone()
+        Ks = camera.intrinsics[:, :3, :3].to("cpu", torch.float64).clone()
         Ks[:, :2, 2] += 0.5
-        view = camera.extrinsics.detach().to("cpu", torch.float64)
+        view = camera.extrinsics.to("cpu", torch.float64)
         return Camera(view, Ks, int(sizes[1, 0]), int(sizes[0, 0]))
 
     def to_kornia(self) -> Any:

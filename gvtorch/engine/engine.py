@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.explicit import explicit
 from ..base.records import Hits, Rays, add
 from ..base.stage import Progress, collect_timings, mark, milliseconds, no_progress, stage
 from ..cache import Cache, RequestList, Scheduler
@@ -65,6 +66,7 @@ class Engine:
         frames: Number of the last picture.
     """
 
+    @explicit(EngineOptions)
     def __init__(self, scene: Scene, **options: Unpack[EngineSettings]) -> None:
         """Takes the memory and makes the root of every tree.
 
@@ -106,6 +108,7 @@ class Engine:
             self.close()
             raise
 
+    @explicit(RenderOptions)
     def frame(
         self,
         camera: Camera | Rays,
@@ -291,6 +294,7 @@ class Engine:
         self.cache.make_room(0, 0)
         self.readbacks.append(Readback(stats, collected))
 
+    @explicit(RenderOptions)
     def render(
         self,
         camera: Camera | Rays,
@@ -385,6 +389,7 @@ class Engine:
             self.serve_last_frame(stats, wait=True)
         return hits, stats
 
+    @explicit(RenderOptions)
     def capture(
         self, camera: Camera | Rays, shader: Shaders, **options: Unpack[RenderSettings]
     ) -> FrameGraph:
@@ -392,6 +397,11 @@ class Engine:
 
         Renders a frame first, as `frame` does with the same arguments. A replay reads the layer's
         tensors where they lie.
+
+        Args:
+            camera: Cameras as those of the replays.
+            shader: For all trees, or one for each; no `ModuleShader`.
+            **options: Fields of `RenderOptions`.
 
         Raises:
             ValueError: The engine is on no CUDA device, the layer is on another, a shader is a

@@ -22,23 +22,43 @@ from .request_batch import ProducedTree
 
 @dataclass(frozen=True, kw_only=True)
 class EngineOptions:
-    """How the engine keeps its scene."""
+    """How the engine keeps its scene. `help(gv.Engine)` shows these texts.
 
-    node_pool: int | str = "8 MB"  # bytes of node words, constants and ranges
-    brick_pool: int | str = "256 MB"  # bytes of voxels
+    Attributes:
+        node_pool: Bytes of node words, constants and ranges; a number or a text as in "8 MB".
+        brick_pool: Bytes of voxels, likewise.
+        device: Where the pools lie and rays are traced.
+        brick_size: Voxels along a side of a brick, without the border.
+        border: Voxels around a brick; from 1 on no seam shows.
+        loading: straight: to the wanted level; levels: one by one.
+        order: coarse or fine: which levels are served first.
+        load_budget: Most bricks a frame.
+        subdivide_budget: Most node tiles a frame.
+        time_budget: Most milliseconds of production a frame; None: no limit.
+        scout_rounds: Rounds of a sixteenth of the rays before a frame that missed something.
+        patience: Seconds until an answer that does not come is given up.
+        coarse_share: Share of the brick slots that hold coarse channels, if there are any.
+        strict: Whether to raise when something can't be produced.
+        monitor: Whether to time the stages and remember the last frames, for `report`.
+    """
+
+    node_pool: int | str = "8 MB"
+    brick_pool: int | str = "256 MB"
     device: torch.device | str = "cpu"
-    brick_size: int = 8  # voxels along a side, without the border
-    border: int = 1  # voxels around a brick; from 1 on no seam shows
-    loading: Literal["straight", "levels"] = "straight"  # to the wanted level, or one by one
-    order: Literal["coarse", "fine"] = "coarse"  # which levels are served first
-    load_budget: int = 4096  # most bricks a frame
-    subdivide_budget: int = 4096  # most node tiles a frame
-    time_budget: float | None = None  # most milliseconds of production a frame
-    scout_rounds: int = 2  # rounds of a sixteenth of the rays before a frame that missed something
-    patience: float = 120.0  # seconds until an answer that does not come is given up
-    coarse_share: float = 0.25  # of brick slots: those that hold coarse channels, if there are any
-    strict: bool = False  # raise when something can't be produced
-    monitor: bool = True  # time the stages and remember the last frames, for `report`
+    brick_size: int = 8
+    border: int = 1
+    loading: Literal["straight", "levels"] = "straight"
+    order: Literal["coarse", "fine"] = "coarse"
+    load_budget: int = 4096
+    subdivide_budget: int = 4096
+    time_budget: float | None = None
+    scout_rounds: int = 2
+    patience: float = 120.0
+    coarse_share: float = 0.25
+    strict: bool = False
+    monitor: bool = True
+
+    __repr__ = check.brief
 
     def __post_init__(self) -> None:
         names = {"loading": ("straight", "levels"), "order": ("coarse", "fine")}
@@ -58,7 +78,7 @@ class EngineOptions:
 
 
 class EngineSettings(TypedDict, total=False):
-    """The fields of `EngineOptions` as keyword arguments of `Engine`, for editors."""
+    """The fields of `EngineOptions` as keyword arguments of `Engine`, for type checkers."""
 
     node_pool: int | str
     brick_pool: int | str

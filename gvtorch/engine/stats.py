@@ -158,6 +158,9 @@ class Readback:
             self._event.record(torch.cuda.current_stream(numbers.device))
         stats.later(self._complete)
 
+    def __repr__(self) -> str:
+        return f"Readback({self.stats!r})"
+
     @property
     def arrived(self) -> bool:
         """Whether the counts are here."""

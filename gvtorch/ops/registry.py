@@ -197,13 +197,39 @@ FAKES: dict[str, Callable[..., Any]] = {
 }
 
 
+_libraries: dict[str, torch.library.Library] = {}  # kernels last as long as these
+
+
+def _refuse_gradients(op: Any) -> None:
+    """Lets an op that has no gradients raise where some would be lost: its outputs would require
+    them, and give None. Autograd calls this in every mode: eager, script, compile and export.
+    """
+    names = _names(op)
+    namespace, _, where = op.default.name().partition("::")
+    if namespace not in _libraries:
+        _libraries[namespace] = torch.library.Library(namespace, "IMPL")
+
+    def kernel(keys: Any, *given: Any) -> Any:
+        if torch.is_grad_enabled():
+            for name, value in zip(names, given, strict=False):
+                check.no_gradient(where, name, value)
+        return op.default.redispatch(keys & torch._C._after_autograd_keyset, *given)
+
+    _libraries[namespace].impl(where, kernel, "Autograd", with_keyset=True)
+
+
 @functools.cache
 def add_user_op(name: str) -> None:
-    """Gives the op of a user's shader, which is loaded, its fake."""
-    _register_fake(getattr(torch.ops.gvtorch_user, name), _shade_rays)
+    """Gives the op of a user's shader, which is loaded, its fake, and lets it refuse gradients."""
+    op = getattr(torch.ops.gvtorch_user, name)
+    _register_fake(op, _shade_rays)
+    _refuse_gradients(op)
 
 
 def _save_samples(ctx: Any, inputs: tuple, output: Tensor) -> None:
+    for name, value in zip(_names(torch.ops.gvtorch.sample_bricks), inputs, strict=True):
+        if name not in _LEARNED and isinstance(value, Tensor) and value.requires_grad:
+            raise check.lost_gradient("sample_bricks", name)
     ctx.save_for_backward(*(one if isinstance(one, Tensor) else None for one in inputs))
     ctx.numbers = [None if isinstance(one, Tensor) else one for one in inputs]
 
@@ -234,10 +260,15 @@ def _composite_gradient(
     return alpha, feature, None, clear, None
 
 
+#: Arguments of `sample_bricks` by which it has gradients.
+_LEARNED = ("bricks_bzyxc", "constant_tnc")
+
 _reasons = cpp_ext.load()
 if not _reasons["cpp"]:
     for _name, _fake in FAKES.items():
         _register_fake(getattr(torch.ops.gvtorch, _name), _fake)
+    _refuse_gradients(torch.ops.gvtorch.trace_rays)
+    _refuse_gradients(torch.ops.gvtorch.shade_rays)
     torch.library.register_autograd(
         "gvtorch::sample_bricks", _sample_gradient, setup_context=_save_samples
     )

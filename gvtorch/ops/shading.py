@@ -13,6 +13,8 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
+from ..base import check
+
 Number = float | Tensor
 Triple = Sequence[float] | Tensor
 
@@ -131,10 +133,12 @@ class ShadeParameters(NamedTuple):
 def pack(parts: Sequence[Any], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Joins numbers, triples and tensors to one (k,) tensor on the device. Numbers go as arguments
     of kernels and tensors of the device stay there: it does not block, and a CUDA graph reads them
-    anew. Raises ValueError if a number is beyond what the dtype holds.
+    anew. Raises ValueError if a number is beyond what the dtype holds, RuntimeError if its
+    gradient would be lost.
     """
     out: list[Tensor] = []
     for part in parts:
+        check.no_gradient("shader", "its numbers", part)
         if isinstance(part, Tensor) and part.device == device:
             out.append(part.detach().reshape(-1).to(dtype))
             continue

@@ -151,6 +151,13 @@ def check_shade(
     check.whole(where, "other_component", shading.other_component, low=0, high=high)
 
 
+def _refuse_gradients(where: str, *records: Any) -> None:
+    """Lets twins refuse what the ops refuse, see `registry.py`."""
+    for record in records:
+        for name, value in record._asdict().items():
+            check.no_gradient(where, name, value)
+
+
 def trace_rays(
     rays: RayArguments, arguments: TraceArguments, *, backend: Backend = "auto"
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -170,6 +177,7 @@ def trace_rays(
     """
     check_trace("trace_rays", rays, arguments)
     if choose_backend(backend, rays.origin_r3.device) == "reference":
+        _refuse_gradients("trace_rays", rays, arguments)
         return march.trace_rays(rays, arguments)
     return torch.ops.gvtorch.trace_rays(*rays, *arguments)
 
@@ -204,6 +212,8 @@ def shade_rays(
         return op_of(op)(*rays, *arguments, *shading, parameter_54)
     if op is not None:
         raise ValueError("shade_rays: a shader in C++ has no reference: write a ModuleShader")
+    _refuse_gradients("shade_rays", rays, arguments, shading)
+    check.no_gradient("shade_rays", "parameter_54", parameter_54)
     return shaders.shade_rays(rays, arguments, shading, parameter_54)
 
 

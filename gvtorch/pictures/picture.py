@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import sys
 import tempfile
+import webbrowser
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from ..base.records import RenderStats
+from ..base.records import RenderStats, moved
 from .files import display_pixels, write_image, write_png
 from .tone import ToneCurve, tone_map
-
-if TYPE_CHECKING:
-    import numpy as np
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +62,41 @@ class Picture:
         transparent picture is shown over black, NaN as black.
         """
         return torch.from_numpy(display_pixels(self.color, None, 8))
+
+    def numpy(self) -> np.ndarray:
+        """Returns linear light, (h, w, 4) float32: colour (premultiplied if transparent), alpha."""
+        layers = self.layers()
+        return np.concatenate((layers["color"], layers["alpha"]), -1)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """Returns what a display shows, as `np.asarray(picture)`, Pillow and matplotlib take it:
+        sRGB uint8, (h, w, 3), or (h, w, 4) with straight alpha if the picture is transparent.
+        """
+        if copy is False:
+            raise ValueError("Picture: an array of it is always made anew: copy must not be False")
+        pixels = display_pixels(self.color, self.alpha if self.transparent else None, 8)
+        return pixels if dtype is None else pixels.astype(dtype)
+
+    def to(
+        self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> Picture:
+        """Returns the picture on a device; its floats in another dtype. None leaves each as is."""
+        return replace(self, **{name: moved(v, device, dtype) for name, v in vars(self).items()})
+
+    def show(self) -> None:
+        """Shows the picture: in a notebook below the cell, else as a PNG in the system's viewer.
+
+        Raises:
+            RuntimeError: There is no viewer; the message tells where the PNG lies.
+        """
+        shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+        if shell is not None and hasattr(shell, "kernel"):
+            sys.modules["IPython"].display.display(self)
+            return
+        path = Path(tempfile.mkdtemp(prefix="gvtorch-")) / "picture.png"
+        self.save(path)
+        if not webbrowser.open(path.as_uri()):
+            raise RuntimeError(f"Picture.show: no viewer can be opened here; the PNG is {path}")
 
     def layers(self) -> dict[str, np.ndarray]:
         """Returns color, alpha, depth, and normal and features where they are (float32), and

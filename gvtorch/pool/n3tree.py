@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+import math
+import warnings
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -10,11 +13,13 @@ from torch import Tensor
 
 from ..base import check
 from ..base.constants import CONSTANT, TERMINAL
+from ..base.image_info import ImageInfo
 from ..base.stage import Progress, no_progress
-from ..base.volume import Volume
+from ..base.volume import Volume, movable
 from ..ops import locate
 from .pools import BrickPool, Channel, NodePool, volumes_by_channel
 from .pyramid import TreePlan, levels_by_depth, tree_depth
+from .refresh import BrickLevels
 
 
 class N3Tree:
@@ -33,9 +38,13 @@ class N3Tree:
         extent: Voxels of the finest level along x, y, z.
         box: (2, 3) float64 world corners of the scene, x y z.
         spacing: (x, y, z) world size of a finest voxel.
+        origin: (x, y, z) world place of the centre of voxel 0.
         value_range: For each channel, the smallest and largest value of the finest level.
         frame: Number of the last frame traced; usage stamps hold it.
         made_of: For coarse channels, what they were made of, as plain values.
+        filters: For channels whose coarse levels are no means, their `Volume.filter`.
+        infos: For channels that a volume told more of, its `Volume.info`.
+        threshold: See `from_volume`.
     """
 
     def __init__(
@@ -60,12 +69,16 @@ class N3Tree:
         self.branching = nodes.branching if branching is None else branching
         check.whole("N3Tree", "branching", self.branching, low=2, high=nodes.branching)
         self.root, self.depth, self.extent, self.spacing = root, depth, extent, spacing
+        self.origin = origin
         low = [o - 0.5 * s for o, s in zip(origin, spacing, strict=True)]
         high = [a + n * s for a, n, s in zip(low, extent, spacing, strict=True)]
         self.box = torch.tensor([low, high], dtype=torch.float64)
         self.value_range = dict(value_range or {})
         self.frame = 0
         self.made_of: dict[str, Any] = {}
+        self.filters: dict[str, Any] = {}
+        self.infos: dict[str, ImageInfo] = {}
+        self.threshold: float | None = None
         self._place: Tensor | None = None
 
     @property
@@ -219,9 +232,106 @@ class N3Tree:
             origin=first.origin,
             value_range={name: volume.value_range for name, volume in volumes.items()},
         )
+        tree.filters = {name: one.filter for name, one in volumes.items() if one.filter != "mean"}
+        tree.infos = {name: one.info for name, one in volumes.items()}
+        tree.threshold = threshold
         plan.write_nodes(tree.nodes, tree.bricks)
         for name in channels:
             for at in range(depth + 1):
                 plan.write_bricks(tree.bricks, name, at)
                 progress("bricks", at + 1, depth + 1)
+        tree.bricks.in_order()
         return tree
+
+    def to(self, device: torch.device | str) -> N3Tree:
+        """Returns the tree with its pools on a device; what lies there already is shared."""
+        other = copy.copy(self)
+        other.nodes, other.bricks = self.nodes.to(device), self.bricks.to(device)
+        return other
+
+    def to_volume(self, channel: str | None = None) -> Volume:
+        """Returns the finest voxels of a channel, the first if none is named, as they are in the
+        bricks now: of a tree that `from_volume` made and nobody edited, the volume that it took.
+
+        Regions that a threshold made EMPTY have the mean of each.
+
+        Raises:
+            ValueError: There is no such channel, it is a coarse one, or not all of the tree is in
+                memory, as in an engine.
+        """
+        name = self.channel_names[0] if channel is None else channel
+        if name not in self.bricks.channels or self.bricks.channels[name].coarse:
+            raise ValueError(
+                f"N3Tree.to_volume: the finest bricks have no channel {name!r}; "
+                f"the tree has {', '.join(self.channel_names)}"
+            )
+        z, y, x = reversed(self.extent)
+        data = self._levels().read(name, 0, (0, 0, 0), (z, y, x))
+        volume = Volume(data, self.spacing, self.origin, info=self.infos.get(name))
+        volume.filter = self.filters.get(name, "mean")
+        return volume
+
+    @torch.no_grad()
+    def refresh(self, box: Sequence[Sequence[float]] | Tensor | None = None) -> None:
+        """Makes borders, coarse levels, regions and ranges right after the finest bricks were
+        edited or trained: then bricks, ranges and pictures are those of a tree that `from_volume`
+        makes of `to_volume()`, in every bit.
+
+        What counts are the voxels of finest bricks inside their borders; all else is overwritten.
+        A region that has no brick, since it was CONSTANT or EMPTY when the tree was built, stays as
+        it is. One that has a brick becomes CONSTANT or EMPTY where its voxels are, and comes back
+        with its brick when they change; bricks that require gradients stay bricks. Coarse
+        channels, such as `Filtered` colours, have to be made anew. It runs on the host.
+
+        Args:
+            box: (2, 3) world corners, low and high: only voxels that it touches were edited. None:
+                any were.
+
+        Raises:
+            ValueError: The box is none, or not all of the tree is in memory, as in an engine.
+        """
+        low, high = (0, 0, 0), self.extent
+        if box is not None:
+            corners = check.reals("N3Tree.refresh", "box", box, (2, 3))
+            if not bool((corners[0] <= corners[1]).all()):
+                raise ValueError(f"N3Tree.refresh: box must be low and high corner, got {box!r}")
+            ends = ((corners - self.box[0]) / torch.tensor(self.spacing)).tolist()
+            sizes = zip(*ends, self.extent, strict=True)
+            spans = [(max(0, math.floor(a)), min(n, math.floor(b) + 1)) for a, b, n in sizes]
+            low, high = (tuple(end) for end in zip(*spans, strict=True))
+            if any(a >= b for a, b in spans):
+                return  # beside the tree
+        fine = [name for name, one in self.bricks.channels.items() if not one.coarse]
+        filters = {name: self.filters.get(name, "mean") for name in fine}
+        self._levels().refresh(low[::-1], high[::-1], filters, self.spacing, self.threshold)
+        tile, child = divmod(self.root, self.nodes.nodes_per_tile)
+        for name in fine:
+            held = self.nodes.ranges[name]
+            two = movable(held)[tile, child].view(held.dtype).float()  # (2, c)
+            self.value_range[name] = (float(two[0].min()), float(two[1].max()))
+        for name in self.made_of:
+            self.made_of[name] = {}
+        self.bricks.in_order()
+
+    def _levels(self) -> BrickLevels:
+        return BrickLevels(
+            nodes=self.nodes,
+            bricks=self.bricks,
+            root=self.root,
+            depth=self.depth,
+            branching=self.branching,
+            extent=self.extent[::-1],
+            number=self.number,
+        )
+
+    def warn_if_edited(self, where: str, *, learned: bool = False) -> None:
+        """Warns, once for each edit, if bricks were edited and not refreshed since. `learned`: who
+        asks reads bricks that require gradients as they are being trained.
+        """
+        edited = self.bricks.new_edits(learned)
+        if edited:
+            warnings.warn(
+                f"{where}: bricks of {', '.join(edited)} were edited, and ranges and coarse levels "
+                "were made before: call tree.refresh()",
+                stacklevel=4,
+            )

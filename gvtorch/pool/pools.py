@@ -4,8 +4,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -93,7 +96,7 @@ class _Pool:
         for name, value in vars(self).items():
             if isinstance(value, Tensor):
                 found[name] = value
-            elif isinstance(value, dict) and name != "channels":
+            elif isinstance(value, dict) and name != "channels" and name[0] != "_":
                 found |= {f"{name}.{channel}": tensor for channel, tensor in value.items()}
         return found
 
@@ -107,12 +110,41 @@ class _Pool:
         """Bytes of all fields."""
         return sum(field.nbytes for field in self.fields.values())
 
+    def to(self, device: torch.device | str) -> Self:
+        """Returns the pool with its fields on a device; those that lie there are shared."""
+        other = copy.copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                setattr(other, name, value.to(device))
+            elif isinstance(value, dict):
+                setattr(other, name, {key: _moved(one, device) for key, one in value.items()})
+        return other
+
     def _shown(self, slots: str) -> str:
         device = next(iter(self.fields.values())).device
         return (
             f"{type(self).__name__}({self.capacity} {slots}, "
             f"{phrase(self.channels) or 'no channels'}, {self.nbytes / 1e6:.1f} MB on {device})"
         )
+
+
+def _moved(value: Any, device: torch.device | str) -> Any:
+    """A tensor on a device, a leaf that requires gradients if it did; anything else as it is."""
+    if not isinstance(value, Tensor):
+        return value
+    there = value.detach().to(device)
+    same = there.data_ptr() == value.data_ptr()
+    return value if same else there.requires_grad_(value.requires_grad)
+
+
+_State = tuple[int, int]
+
+
+def _state(voxels: Tensor) -> _State:
+    """Where a tensor lies, and how often it was written in place; of an inference tensor torch does
+    not count that.
+    """
+    return (voxels.data_ptr(), -1 if voxels.is_inference() else voxels._version)
 
 
 class NodePool(_Pool):
@@ -248,6 +280,66 @@ class BrickPool(_Pool):
 
         self.stamp_b, self.born_b, self.owner_b = words(-1), words(0), words(-1)
         self.shared_b = torch.zeros((capacity,), dtype=torch.bool, device=device)
+        self._known: dict[str, _State] = {}  # of channels, when they were looked at last
+        self._edited: set[str] = set()
+        self._told: set[str] = set()
+
+    def __getitem__(self, channel: str) -> Tensor:
+        """Returns the voxels of a channel, (b, z, y, x, c) with borders, to read or to edit."""
+        if channel not in self.bricks:
+            known = ", ".join(self.bricks)
+            raise ValueError(f"BrickPool: unknown channel {channel!r}; it has {known}")
+        return self.bricks[channel]
+
+    def __setitem__(self, channel: str, voxels: Tensor) -> None:
+        """Puts another tensor in the place of a channel's voxels, such as a parameter."""
+        held = self[channel]
+        check.tensor("BrickPool", channel, voxels, held.shape, held.dtype, held.device)
+        if not voxels.is_contiguous():
+            raise ValueError(f"BrickPool: {channel} must be contiguous")
+        self.bricks[channel] = voxels
+
+    def to(self, device: torch.device | str) -> Self:
+        """See `NodePool`; whether it was edited is known of the other pool as well."""
+        other = super().to(device)
+        other._edited, other._told = set(self.edited()), set(self._told)
+        other._known = {name: _state(other.bricks[name]) for name in self._known}
+        return other
+
+    def in_order(self) -> None:
+        """Notes that ranges, borders and coarse levels are those of the voxels as they are now."""
+        fine = (name for name, channel in self.channels.items() if not channel.coarse)
+        self._known = {name: _state(self.bricks[name]) for name in fine}
+        self._edited.clear()
+
+    def edited(self) -> list[str]:
+        """Returns the channels that were written or replaced since they were known to be in order
+        (`in_order`), as far as torch counts it: a write in place through the tensor, a view or a
+        parameter is counted, one through `.data`, NumPy or a pointer is not.
+        """
+        for name, known in self._known.items():
+            state = _state(self.bricks[name])
+            if state != known:
+                self._known[name] = state
+                self._edited.add(name)
+                self._told.discard(name)
+        return sorted(self._edited)
+
+    def new_edits(self, learned: bool = False) -> list[str]:
+        """Returns the edited channels that were not told of before: each edit once. `learned`:
+        without those that require gradients.
+        """
+        new = [name for name in self.edited() if name not in self._told]
+        new = [name for name in new if not (learned and self.bricks[name].requires_grad)]
+        self._told.update(new)
+        return new
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Lets the block write voxels that come with their ranges: that is no edit."""
+        self.edited()
+        yield
+        self._known = {name: _state(self.bricks[name]) for name in self._known}
 
     def __repr__(self) -> str:
         return self._shown(f"bricks of {self.brick_size}^3+{self.border}")

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -74,27 +75,55 @@ def volume_levels(
     mean, rounded to the dtype (ties to even), or what is seen of it along six directions.
     """
     dtype = volume.data.dtype
-    # NumPy has no bfloat16: float32 holds its values, rounded again after every mean.
-    data = volume.data.float() if dtype == torch.bfloat16 else volume.data
-    z, y, x = (side / min(volume.spacing) for side in reversed(volume.spacing))
-    values = low = high = data.numpy()
+    values = low = high = to_numpy(volume.data)
     for level in range(count):
         if level > 0:
-            if volume.filter == "directional":
-                scale = branching ** (level - 1)
-                values = pool_directional(values, branching, (z * scale, y * scale, x * scale))
-            else:
-                values = pool_mean(values, branching)
-            if dtype == torch.bfloat16:
-                values = torch.from_numpy(values).to(dtype).float().numpy()
+            values = coarser(values, volume.filter, branching, dtype, volume.spacing, level)
             low, high = pool_min(low, branching), pool_max(high, branching)
         summary = NodeSummary(
             low=torch.from_numpy(by_node(low, "min", brick_size, border)),
             high=torch.from_numpy(by_node(high, "max", brick_size, border)),
             mean=torch.from_numpy(by_node(values, "mean", brick_size, 0)),
         )
-        stored = volume.data if level == 0 else torch.from_numpy(values).to(dtype)
+        stored = volume.data if level == 0 else from_numpy(values, dtype)
         yield Level(values=stored, nodes=summary)
+
+
+def coarser(
+    values: np.ndarray,
+    how: str,
+    branching: int,
+    dtype: torch.dtype,
+    spacing: tuple[float, float, float],
+    level: int,
+) -> np.ndarray:
+    """Returns a level made of the one before.
+
+    Args:
+        values: That level, (z, y, x, c), or a part of it that begins at a multiple of `branching`.
+        how: The volume's filter.
+        branching: N.
+        dtype: Of the channel.
+        spacing: Of the volume.
+        level: Number of the level that is made, from 1.
+    """
+    if how == "directional":
+        scale = branching ** (level - 1)
+        x, y, z = (side / min(spacing) * scale for side in spacing)
+        values = pool_directional(values, branching, (z, y, x))
+    else:
+        values = pool_mean(values, branching)
+    return to_numpy(from_numpy(values, dtype)) if dtype == torch.bfloat16 else values
+
+
+def to_numpy(values: Tensor) -> np.ndarray:
+    """Returns voxels as an array. NumPy has no bfloat16: float32 holds its values."""
+    return (values.float() if values.dtype == torch.bfloat16 else values).numpy()
+
+
+def from_numpy(values: np.ndarray, dtype: torch.dtype) -> Tensor:
+    """Returns what `to_numpy` took, in its dtype again."""
+    return torch.from_numpy(values).to(dtype)
 
 
 def levels_by_depth(

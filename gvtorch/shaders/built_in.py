@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from copy import copy
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import torch
 
-from ..base import check
+from ..base.checked import Check, above, flag, instance_of, kind_of, or_none, text
 from ..ops import ShadeArguments
 from ..ops.shading import (
     GradientMagnitudeNumbers,
@@ -25,7 +25,7 @@ from ..ops.shading import (
     pack,
 )
 from ..pool import Channel, N3Tree
-from .lights import LitShader, check_number, check_triple
+from .lights import LitShader, a_number, a_triple
 from .shader import ColorTable, CutSurface, Sampling, Shader, number_of_one, one_color
 from .transfer_function import TransferFunction, integrated_table
 
@@ -40,7 +40,11 @@ __all__ = [
     "StoredColor",
 ]
 
+_TRANSFER = instance_of(TransferFunction)
 _WHITE = TransferFunction.from_points([(0, 1)])
+_COLOR = a_triple(low=0, high=1)
+_PROJECTIONS = {name: name for name in ("maximum", "minimum", "mean")}
+_PROJECTIONS |= {"max": "maximum", "min": "minimum"}
 # Of a `Solid`: rows of its table; width of its ramp in intervals, at which penumbras agree best;
 # and of a distance field's ramp in voxels at most.
 _ROWS, _RAMP, _WIDEST = 1025, 3.0, 16
@@ -56,6 +60,10 @@ class Lit(LitShader):
     kind = "Lit"
     shadowed_kind = "ShadowedLit"
     transfer: TransferFunction
+    checks: ClassVar[Mapping[str, Check]] = {
+        "transfer": _TRANSFER,
+        "in_the_way": or_none(instance_of(Shader)),
+    }
 
     def __init__(
         self,
@@ -77,11 +85,7 @@ class Lit(LitShader):
                 `LitShader`.
         """
         super().__init__(**light)
-        self.transfer = check.instance("Lit", "transfer", transfer, TransferFunction)
-        self.shadows = shadows
-        self.in_the_way = in_the_way
-        if in_the_way is not None:
-            check.instance("Lit", "in_the_way", in_the_way, Shader)
+        self.transfer, self.shadows, self.in_the_way = transfer, shadows, in_the_way
 
     def blocker(self) -> Shader:
         return self.in_the_way or self.transfer
@@ -94,9 +98,10 @@ class PreIntegrated(Shader):
 
     kind = "PreIntegrated"
     transfer: TransferFunction
+    checks: ClassVar[Mapping[str, Check]] = {"transfer": _TRANSFER}
 
     def __init__(self, transfer: TransferFunction) -> None:
-        self.transfer = check.instance("PreIntegrated", "transfer", transfer, TransferFunction)
+        self.transfer = transfer
 
     def table(self, sampling: Sampling) -> ColorTable:
         return self.transfer.kept(integrated_table, sampling)
@@ -111,6 +116,12 @@ class StoredColor(LitShader):
     kind = "StoredColor"
     shadowed_kind = "ShadowedColor"
     component = 3
+    checks: ClassVar[Mapping[str, Check]] = {
+        "channel": text,
+        "reference": or_none(above(0)),
+        "premultiplied": flag,
+        "lit": flag,
+    }
 
     def __init__(
         self,
@@ -138,9 +149,7 @@ class StoredColor(LitShader):
             ValueError: A number is out of its range.
         """
         super().__init__(**light)
-        if reference is not None:
-            check.number("StoredColor", "reference", reference, low=0, open_low=True)
-        self.channel = _name("StoredColor", channel)
+        self.channel = channel
         self.reference, self.premultiplied = reference, premultiplied
         self.lit, self.shadows = lit or self.normals is not None, shadows
 
@@ -187,6 +196,14 @@ class Isosurface(LitShader):
 
     kind = "Isosurface"
     distance = False  # the value is a distance in world units, negative inside
+    color: Triple | TransferFunction
+    checks: ClassVar[Mapping[str, Check]] = {
+        "value": a_number(),
+        "color": lambda owner, name, value: (
+            value if isinstance(value, TransferFunction) else _COLOR(owner, name, value)
+        ),
+        "filled": flag,
+    }
 
     def __init__(
         self,
@@ -213,13 +230,18 @@ class Isosurface(LitShader):
             ValueError: A number is out of its range, or channel and colour do not fit.
         """
         super().__init__(**light)
-        check_number("Isosurface", "value", value)
-        if isinstance(color, TransferFunction) != (color_channel is not None):
-            raise ValueError("Isosurface: a transfer function and color_channel belong together")
-        if not isinstance(color, TransferFunction):
-            check_triple("Isosurface", "color", color, low=0, high=1)
         self.value, self.color, self.filled = value, color, filled
         self.other, self.other_component = color_channel, color_component
+        self._check_color()
+
+    def _check_color(self) -> None:
+        if isinstance(self.color, TransferFunction) != (self.other is not None):
+            kind = kind_of(self)
+            raise ValueError(f"{kind}: a transfer function and color_channel belong together")
+
+    def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
+        self._check_color()
+        return super().shading(where, tree)
 
     def table(self, sampling: Sampling) -> ColorTable:
         if isinstance(self.color, TransferFunction):
@@ -327,21 +349,24 @@ class Projection(Shader):
 
     kind = "Projection"
     whole_ray = True
+    which: Literal["maximum", "minimum", "mean"]
+    checks: ClassVar[Mapping[str, Check]] = {
+        "which": lambda owner, name, value: _projection(value),
+        "transfer": _TRANSFER,
+    }
 
     def __init__(
-        self, which: Literal["maximum", "minimum", "mean"], transfer: TransferFunction
+        self,
+        which: Literal["maximum", "minimum", "mean", "max", "min"],
+        transfer: TransferFunction,
     ) -> None:
         """Takes which one, and the colours.
 
         Raises:
             ValueError: There is no such projection.
         """
-        if which not in ("maximum", "minimum", "mean"):
-            raise ValueError(
-                f"Projection: which must be 'maximum', 'minimum' or 'mean', got {which!r}"
-            )
-        self.which = which
-        self.transfer = check.instance("Projection", "transfer", transfer, TransferFunction)
+        self.which = which  # type: ignore[assignment]
+        self.transfer = transfer
 
     @property
     def projection(self) -> Literal["maximum", "minimum", "mean"]:
@@ -360,11 +385,14 @@ class Features(Shader):
     """
 
     kind = "Features"
+    checks: ClassVar[Mapping[str, Check]] = {
+        "transfer": _TRANSFER,
+        "other": lambda owner, _, value: text(owner, "channel", value),
+    }
 
     def __init__(self, transfer: TransferFunction, channel: str) -> None:
         """Takes the transfer function of the density, and the name of the features' channel."""
-        self.transfer = check.instance("Features", "transfer", transfer, TransferFunction)
-        self.other = _name("Features", channel)
+        self.transfer, self.other = transfer, channel
 
     def feature_count(self, tree: N3Tree) -> int:
         return tree.bricks.channels[str(self.other)].width
@@ -379,6 +407,10 @@ class GradientMagnitude(Shader):
 
     kind = "GradientMagnitude"
     transfer: TransferFunction
+    checks: ClassVar[Mapping[str, Check]] = {
+        "transfer": _TRANSFER,
+        "full": or_none(a_number(low=1e-30)),
+    }
 
     def __init__(self, transfer: TransferFunction, full: Number | None = None) -> None:
         """Takes the transfer function, and the gradient at which its opacity is whole.
@@ -391,10 +423,7 @@ class GradientMagnitude(Shader):
         Raises:
             ValueError: `full` is not positive.
         """
-        self.transfer = check.instance("GradientMagnitude", "transfer", transfer, TransferFunction)
-        if full is not None:
-            check_number("GradientMagnitude", "full", full, low=1e-30)
-        self.full = full
+        self.transfer, self.full = transfer, full
 
     def own_numbers(self, tree: N3Tree) -> GradientMagnitudeNumbers:
         low, high, _ = self.transfer.corners()
@@ -416,7 +445,8 @@ BY_NAME: Mapping[str, Callable[[TransferFunction, float], Shader]] = {
 }
 
 
-def _name(where: str, channel: Any) -> str:
-    if not isinstance(channel, str):
-        raise ValueError(f"{where}: channel must be a name, got {channel!r}")
-    return channel
+def _projection(which: Any) -> str:
+    found = _PROJECTIONS.get(which) if isinstance(which, str) else None
+    if found is None:
+        raise ValueError(f"Projection: which must be 'maximum', 'minimum' or 'mean', got {which!r}")
+    return found

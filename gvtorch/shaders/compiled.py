@@ -9,12 +9,13 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, MutableMapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.checked import Check, instance_of, or_none
 from ..cpp_ext import user
 from ..ops import ShadeArguments
 from ..ops.registry import add_user_op
@@ -38,6 +39,7 @@ class CompiledShader(LitShader):
     """
 
     op: str
+    checks: ClassVar[Mapping[str, Check]] = {"transfer": or_none(instance_of(TransferFunction))}
 
     def __init__(
         self,
@@ -71,8 +73,6 @@ class CompiledShader(LitShader):
             ValueError: There is no such file, or uniforms are not those that the struct names.
         """
         super().__init__(**light)
-        if transfer is not None:
-            check.instance("CompiledShader", "transfer", transfer, TransferFunction)
         self.name = name
         self._take(user.load(header, name))
         self.transfer, self.channel, self.component = transfer, channel, component

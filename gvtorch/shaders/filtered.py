@@ -12,15 +12,16 @@ rendering", EuroVis 2006 (why). The weight is ours; docs/picture.md measures wha
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.checked import Check, instance_of, whole
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume
 from ..io.coarse import make_channel
@@ -50,6 +51,10 @@ class Filtered(Shader):
     reads_coarse = True
     finer = 1.6  # a fine voxel is at least five eighths of an interval
     transfer: TransferFunction
+    checks: ClassVar[Mapping[str, Check]] = {
+        "transfer": instance_of(TransferFunction),
+        "component": whole(0),
+    }
 
     def __init__(
         self,
@@ -69,8 +74,8 @@ class Filtered(Shader):
             directions: Whether colours are made for each of six directions, or their mean, which
                 takes a sixth of the memory. None: where a voxel may hide a fifth of what is behind.
         """
-        self.transfer = check.instance("Filtered", "transfer", transfer, TransferFunction)
-        self.other, self.component, self._directions = channel, component, directions
+        self.transfer, self.other = transfer, channel
+        self.component, self._directions = component, directions
 
     @classmethod
     def of(

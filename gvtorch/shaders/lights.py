@@ -1,21 +1,23 @@
 """Lights, and the base of the shaders that are lit.
 
-Each number may be a float or a tensor, and may be edited between frames; tensors are read when a
-frame is traced, so nothing is built again.
+Each number may be a float or a tensor, and may be edited between frames, which checks it; tensors
+are read when a frame is traced, so nothing is built again.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
 from math import inf
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.checked import Check, Checked, kind_of
 from ..ops import ShadeArguments
 from ..ops.shading import LightKind, Number, ShadeParameters, Triple, shader_number
 from ..pool import N3Tree
@@ -26,35 +28,57 @@ from .shader import Shader
 CONE_OF_DISC = 0.35
 
 
+def a_number(low: float = -inf, high: float = inf) -> Check:
+    """A check for a number, or a tensor of one; see `check_number`."""
+
+    def checked(owner: Any, name: str, value: Any) -> Any:
+        check_number(kind_of(owner), name, value, low=low, high=high)
+        return value
+
+    return checked
+
+
+def a_triple(low: float = -inf, high: float = inf, zero: bool = True) -> Check:
+    """A check for three numbers, or a tensor of them; see `check_triple`."""
+
+    def checked(owner: Any, name: str, value: Any) -> Any:
+        check_triple(kind_of(owner), name, value, low=low, high=high, zero=zero)
+        return value
+
+    return checked
+
+
 @dataclass
-class Headlight:
+class Headlight(Checked):
     """A light at the eye of each ray."""
 
     color: Triple = (1.0, 1.0, 1.0)  # linear RGB
 
-    def __post_init__(self) -> None:
-        check_triple("Headlight", "color", self.color, low=0.0)
+    checks: ClassVar[Mapping[str, Check]] = {"color": a_triple(low=0)}
 
     def parameters(self) -> ShadeParameters:
         """Returns what the kernel is told of the light; its material is to be added."""
+        self.check_again()
         return ShadeParameters(light_color=self.color)
 
 
 @dataclass
-class DirectionalLight:
+class DirectionalLight(Checked):
     """A light far away."""
 
     direction: Triple  # the way it shines, world; of any length but 0
     color: Triple = (1.0, 1.0, 1.0)  # linear RGB
     angle: Number = 0.0  # how wide it looks, degrees, for soft shadows; the sun: 0.53
 
-    def __post_init__(self) -> None:
-        check_triple("DirectionalLight", "direction", self.direction, zero=False)
-        check_triple("DirectionalLight", "color", self.color, low=0.0)
-        check_number("DirectionalLight", "angle", self.angle, low=0, high=120.0)
+    checks: ClassVar[Mapping[str, Check]] = {
+        "direction": a_triple(zero=False),
+        "color": a_triple(low=0),
+        "angle": a_number(low=0, high=120),
+    }
 
     def parameters(self) -> ShadeParameters:
         """See `Headlight`."""
+        self.check_again()
         if isinstance(self.angle, Tensor):
             growth: Number = 2 * CONE_OF_DISC * torch.tan(torch.deg2rad(self.angle) / 2)
         else:
@@ -65,25 +89,30 @@ class DirectionalLight:
 
 
 @dataclass
-class PointLight:
+class PointLight(Checked):
     """A light at a place. Its strength does not fall with the distance."""
 
     position: Triple  # world
     color: Triple = (1.0, 1.0, 1.0)  # linear RGB
     radius: Number = 0.0  # of the ball that shines, world units, for soft shadows
 
-    def __post_init__(self) -> None:
-        check_triple("PointLight", "position", self.position)
-        check_triple("PointLight", "color", self.color, low=0.0)
-        check_number("PointLight", "radius", self.radius, low=0)
+    checks: ClassVar[Mapping[str, Check]] = {
+        "position": a_triple(),
+        "color": a_triple(low=0),
+        "radius": a_number(low=0),
+    }
 
     def parameters(self) -> ShadeParameters:
         """See `Headlight`."""
+        self.check_again()
         width = 2 * CONE_OF_DISC * self.radius
         return ShadeParameters(self.position, LightKind.POINT, self.color, light_growth=width)
 
 
 Light = Headlight | DirectionalLight | PointLight
+
+
+_MATERIAL = ("ambient", "diffuse", "specular", "shininess")
 
 
 class LitShader(Shader):
@@ -98,6 +127,10 @@ class LitShader(Shader):
 
     shadows = False
     shadowed_kind: str | None = None
+    checks: ClassVar[Mapping[str, Check]] = {
+        "light": lambda owner, name, value: check_light(f"{kind_of(owner)}: {name}", value),
+        **dict.fromkeys(_MATERIAL, a_number(low=0)),
+    }
 
     def __init__(
         self,
@@ -126,15 +159,10 @@ class LitShader(Shader):
         self.normals, self.light = normals, light or Headlight()
         self.ambient, self.diffuse = ambient, diffuse
         self.specular, self.shininess = specular, shininess
-        self.material()
 
     def material(self) -> ShadeParameters:
-        """See `Shader`; every number that the host can see is checked."""
-        check_light("shader: light", self.light)
-        names = ("ambient", "diffuse", "specular", "shininess")
-        for name in names:
-            check_number("shader", name, getattr(self, name), low=0)
-        return self.light.parameters()._replace(**{name: getattr(self, name) for name in names})
+        """See `Shader`."""
+        return self.light.parameters()._replace(**{name: getattr(self, name) for name in _MATERIAL})
 
     def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
         """See `Shader`."""
@@ -152,13 +180,14 @@ class LitShader(Shader):
         return bare
 
 
-def check_light(what: str, value: Any) -> None:
-    """Raises ValueError unless it is a light."""
+def check_light(what: str, value: Any) -> Light:
+    """Returns a light; raises ValueError unless it is one."""
     if not isinstance(value, Light):
         raise ValueError(
             f"{what} must be a Headlight, DirectionalLight or PointLight, "
             f"got {type(value).__name__}"
         )
+    return value
 
 
 def check_number(
@@ -167,6 +196,7 @@ def check_number(
     """Raises ValueError unless it is a finite number in [low, high], or a tensor of one. A tensor
     on CUDA is not looked at, since that would block.
     """
+    check.no_gradient(where, name, value)
     if isinstance(value, Tensor):
         if value.numel() != 1:
             got = check.describe(value)
@@ -183,6 +213,7 @@ def check_triple(
     """Raises ValueError unless these are three finite numbers in [low, high], or a tensor of them,
     as for `check_number`; `zero` tells whether all may be 0.
     """
+    check.no_gradient(where, name, value)
     if isinstance(value, Tensor) and value.is_cuda:
         if value.shape != (3,):
             raise ValueError(f"{where}: {name} must be (3,), got {check.describe(value)}")

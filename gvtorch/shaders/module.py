@@ -6,12 +6,14 @@ how rays are walked for it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.checked import Check, instance_of, or_none, whole
 from .shader import ColorTable, Sampling, Shader
 from .transfer_function import TransferFunction
 
@@ -44,6 +46,14 @@ class ModuleShader(Shader, torch.nn.Module):
 
     uses_torch = True
     channels: tuple[str, ...] = ()
+    hidden_by: TransferFunction | None
+    samples: int | None
+    checks: ClassVar[Mapping[str, Check]] = {
+        "module": lambda owner, name, value: _callable(value),
+        "channels": lambda owner, name, value: _names(value),
+        "hidden_by": or_none(instance_of(TransferFunction)),
+        "samples": or_none(whole(PART_SAMPLES)),
+    }
 
     def __init__(
         self,
@@ -57,16 +67,10 @@ class ModuleShader(Shader, torch.nn.Module):
         its range.
         """
         super().__init__()
-        if not callable(module):
-            raise ValueError(f"ModuleShader: module must be callable, got {type(module).__name__}")
-        if isinstance(channels, str) or (channels is not None and not len(channels)):
+        if channels is not None and not len(channels):
             raise ValueError(f"ModuleShader: channels must be names, got {channels!r}")
-        if hidden_by is not None:
-            check.instance("ModuleShader", "hidden_by", hidden_by, TransferFunction)
-        if samples is not None:
-            check.whole("ModuleShader", "samples", samples, low=PART_SAMPLES)
         self.module, self.hidden_by, self.samples = module, hidden_by, samples
-        self.channels = tuple(channels or ())
+        self.channels = () if channels is None else channels  # type: ignore[assignment]
 
     def __repr__(self) -> str:
         name = getattr(self.module, "__name__", type(self.module).__name__)
@@ -100,6 +104,18 @@ class ModuleShader(Shader, torch.nn.Module):
         return color, alpha
 
 
+def _callable(module: Any) -> Any:
+    if not callable(module):
+        raise ValueError(f"ModuleShader: module must be callable, got {type(module).__name__}")
+    return module
+
+
+def _names(channels: Any) -> tuple[str, ...]:
+    if not isinstance(channels, Sequence) or isinstance(channels, str):
+        raise ValueError(f"ModuleShader: channels must be names, got {channels!r}")
+    return tuple(channels)
+
+
 class TransferModule(torch.nn.Module):
     """A transfer function as a module, whose rows are parameters: the twin of the kernel's.
 
@@ -124,6 +140,9 @@ class TransferModule(torch.nn.Module):
         self.low, high = table.domain_2.tolist()
         self.scale = (len(table.opaque_m) - 1) / (high - self.low)
         self.rows = torch.nn.Parameter(table.table_lm4[0].clone())
+
+    def __repr__(self) -> str:
+        return f"TransferModule(rows={check.shown(self.rows)}, from {self.low:g})"
 
     def shows(self, values: Tensor) -> Tensor:
         """Bool of the same shape: a value has an opacity."""

@@ -5,15 +5,16 @@ kernels read, rows of colour and alpha at even distances of the value.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.checked import Check, Checked, flag, or_none, text, whole
 from ..ops import ShadeArguments
 from ..ops.shading import Number, ShadeParameters, Triple, pack, shader_number
 from ..pool import N3Tree
@@ -72,9 +73,9 @@ class CutSurface:
     colors: Shader | None  # shows the colour of another channel's value; None: that is white
 
 
-class Shader:
-    """What turns the values along a ray into colour. Attributes may be edited: the next picture is
-    made with them, and nothing is compiled.
+class Shader(Checked):
+    """What turns the values along a ray into colour. Attributes may be edited: they are checked and
+    converted as by the constructor, the next picture is made with them, and nothing is compiled.
 
     Attributes:
         kind: Name of its C++ struct, which the op `shade_rays` runs; None: its table is all, and
@@ -105,6 +106,14 @@ class Shader:
     finer: float = 1.0
     whole_ray: bool = False
     uses_torch: bool = False
+    checks: ClassVar[Mapping[str, Check]] = {
+        "channel": or_none(text),
+        "component": or_none(whole(0)),
+        "normals": or_none(text),
+        "other": or_none(text),
+        "other_component": whole(0),
+        "shadows": flag,
+    }
 
     def __repr__(self) -> str:
         """Tells its channels, and what it is made of."""
@@ -139,7 +148,10 @@ class Shader:
         return 0
 
     def parameter_tensor(self, tree: N3Tree, dtype: torch.dtype) -> Tensor:
-        """Returns `parameter_54` of `shade_rays`, with lights and materials as they are now."""
+        """Returns `parameter_54` of `shade_rays`, with lights and materials as they are now; what
+        the host sees of them is checked.
+        """
+        self.check_again()
         scale, offset = 1.0, 0.0
         if self.normals is not None:
             kind = tree.bricks.channels[self.normals].dtype

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..base import check
+from ..base.checked import Check, above, kind_of, or_none
 from .preset_files import read_points
 from .presets import CT_PRESETS, Points, named
 from .shader import ColorTable, Sampling, Shader
@@ -44,7 +45,15 @@ class TransferFunction(Shader):
         relative: Whether values have no meaning before the function is `stretched` over data.
     """
 
+    opacity: np.ndarray
+    color: np.ndarray
+    reference: float | None
     relative = False
+    checks: ClassVar[Mapping[str, Check]] = {
+        "opacity": lambda owner, name, points: _points(kind_of(owner), name, points, 2),
+        "color": lambda owner, name, points: _points(kind_of(owner), name, points, 4),
+        "reference": or_none(above(0)),
+    }
 
     def __init__(
         self, opacity: Points, color: Points = ((0, 1, 1, 1),), reference: float | None = None
@@ -60,13 +69,7 @@ class TransferFunction(Shader):
         Raises:
             ValueError: No points, values that do not increase, numbers out of [0, 1] or not finite.
         """
-        self.opacity = _points("opacity", opacity, 2)
-        self.color = _points("color", color, 4)
-        if reference is not None:
-            reference = check.number(
-                "TransferFunction", "reference", reference, low=0, open_low=True
-            )
-        self.reference = reference
+        self.opacity, self.color, self.reference = opacity, color, reference  # type: ignore[assignment]
         self._tables: dict[Any, ColorTable] = {}
 
     @classmethod
@@ -216,6 +219,7 @@ class TransferFunction(Shader):
         """Returns a table of the function as it is now; the last few are kept."""
         key = make, self.opacity.tobytes(), self.color.tobytes(), self.reference, sampling
         if key not in self._tables:
+            self.check_again()  # points may have been edited in place
             table = make(self, sampling)
             if len(self._tables) == _KEPT:
                 self._tables.pop(next(iter(self._tables)))
@@ -332,15 +336,18 @@ def _is_own(content: Any) -> bool:
     return not isinstance(content, dict) or not {"RGBPoints", "volumeProperties"} & set(content)
 
 
-def _points(name: str, points: Points, width: int) -> np.ndarray:
-    where = "TransferFunction"
+def _points(where: str, name: str, points: Points, width: int) -> np.ndarray:
     names = "(value, alpha)" if width == 2 else "(value, red, green, blue)"
     try:
-        array = np.array([[float(number) for number in point] for point in points])
+        rows = [list(point) for point in points]
+        for number in (number for row in rows for number in row):
+            check.no_gradient(where, name, number)
+        array = np.array([[float(number) for number in row] for row in rows])
     except (TypeError, ValueError):
         raise ValueError(f"{where}: {name} must be a list of points {names}") from None
     if array.ndim != 2 or array.shape[0] == 0 or array.shape[1] != width:
         raise ValueError(f"{where}: {name} must be a list of points {names}, got {points!r}")
+    points = array.tolist()
     if not np.isfinite(array).all():
         raise ValueError(f"{where}: {name} must be finite, got {points!r}")
     steps = np.diff(array[:, 0])

@@ -200,7 +200,7 @@ class Clipped:
 
 
 def _face(name: str, numbers: Any) -> Face:
-    a, b, c, d = check.reals("Clip", name, [numbers], (1, 4))[0].tolist()
+    a, b, c, d = check.reals("Clip", name, numbers, (4,)).tolist()
     length = math.hypot(a, b, c)
     if length == 0:
         raise ValueError(f"Clip: {name} has a normal of length 0: {numbers!r}")

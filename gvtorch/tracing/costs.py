@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.explicit import explicit
 from ..base.records import Hits, Rays, RenderStats
 from ..base.stage import Progress, no_progress
 from ..base.volume import movable
@@ -92,6 +93,7 @@ class Cost:
         )
 
 
+@explicit(RenderOptions)
 @torch.no_grad()
 def cost(
     tree: N3Tree,
@@ -104,14 +106,15 @@ def cost(
     """Counts what the rays of a picture do; writes neither stamps nor requests.
 
     Of an engine's tree (`engine.trees[NAME].tree`) it shows the last frame. Rays are walked node
-    by node outside the kernel, which takes many times as long as the picture itself.
+    by node outside the kernel, which takes many times as long as the picture itself. There is no
+    lighting, since transfer functions have no normals.
 
     Args:
         tree: The tree.
         camera: See `render`.
         shader: The transfer function.
         progress: Told how many rays are done.
-        **options: Fields of `RenderOptions`; no lighting, since transfer functions have no normals.
+        **options: Fields of `RenderOptions`.
 
     Raises:
         ValueError: See `render`.

@@ -1,5 +1,5 @@
-"""`RenderOptions`: how a picture is made, checked once. `RenderSettings` tells editors and type
-checkers the same options as keyword arguments.
+"""`RenderOptions`: how a picture is made, checked once; what renders shows them as its keyword
+arguments (base/explicit.py). `RenderSettings` tells type checkers the same.
 """
 
 from __future__ import annotations
@@ -24,23 +24,40 @@ from .thin_lens import ThinLens
 
 @dataclass(frozen=True, kw_only=True)
 class RenderOptions:
-    """How a picture is made."""
+    """How a picture is made. `help` of what renders shows these texts.
 
-    step: float = config.STEP  # shortest interval, in voxels of the finest level
-    lod: Literal["auto", "finest"] = "auto"  # auto: voxels as wide as the pixel cone
-    # A colour (linear RGB), an object of `background.py`, an image (h, w, 3) or None: transparent.
+    Attributes:
+        step: Shortest interval, in voxels of the finest level, > 0.
+        lod: auto: voxels as wide as the pixel cone; finest: the finest level everywhere.
+        background: A colour (linear RGB, 0 to 1), a `Gradient`, `Backdrop` or `Environment`, an
+            image (h, w, 3) of the picture's size, or None: transparent.
+        stop_alpha: A ray ends at this alpha, 0 to 1; 1 integrates to the end.
+        depth_alpha: Depth is where alpha passes this, below `stop_alpha`.
+        cone_scale: Widens the pixel cone by this factor, > 0; larger takes coarser voxels.
+        channel: Name of the channel that the shader reads; None: the first.
+        component: Which number of the channel, from 0.
+        layer: What another renderer drew, composited with the voxels.
+        clip: The region of interest; None: everything.
+        lens: Depth of field; None: all is sharp.
+        lighting: Shadows and light from all around; None: the shader's own.
+        backend: auto, reference, cpp or cuda; all give the same bits.
+        dtype: Of rays and picture: float32, or float64 for very thin media and narrow cones.
+    """
+
+    step: float = config.STEP
+    lod: Literal["auto", "finest"] = "auto"
     background: tuple[float, float, float] | Background | Tensor | None = (0.0, 0.0, 0.0)
-    stop_alpha: float = config.STOP_ALPHA  # a ray ends here; 1 integrates to the end
-    depth_alpha: float = config.DEPTH_ALPHA  # depth is where alpha passes this
-    cone_scale: float = config.CONE_OVERESTIMATE  # widens the pixel cone
-    channel: str | None = None  # name of the channel the shader reads; None: the first
-    component: int = 0  # which number of the channel
-    layer: Layer | None = None  # what another renderer drew, composited with the voxels
-    clip: Clip | None = None  # the region of interest; None: everything
-    lens: ThinLens | None = None  # depth of field; None: all is sharp
-    lighting: Lighting | None = None  # shadows and light from all around; None: the shader's own
+    stop_alpha: float = config.STOP_ALPHA
+    depth_alpha: float = config.DEPTH_ALPHA
+    cone_scale: float = config.CONE_OVERESTIMATE
+    channel: str | None = None
+    component: int = 0
+    layer: Layer | None = None
+    clip: Clip | None = None
+    lens: ThinLens | None = None
+    lighting: Lighting | None = None
     backend: Backend = "auto"
-    dtype: torch.dtype = torch.float32  # float64 for very thin media, very narrow cones
+    dtype: torch.dtype = torch.float32
 
     def __post_init__(self) -> None:
         where = "render"

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.arrays import as_volume
+from ..base.explicit import explicit
 from ..base.records import Hits, Rays, RenderStats
 from ..base.stage import Progress, collect_timings, no_progress, stage
 from ..cameras.camera import Camera
@@ -38,6 +39,7 @@ Again = tuple[Hits, Tensor]
 _RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that progress shows
 
 
+@explicit(RenderOptions)
 def render(
     tree: Scene | Any,
     camera: Camera | Rays,
@@ -88,15 +90,16 @@ def render(
     return picture
 
 
+@explicit(RenderOptions)
 def trace(tree: Scene, rays: Rays, shader: Shaders, **options: Unpack[RenderSettings]) -> Hits:
-    """Traces any world rays through a resident tree, or several, as one frame.
+    """Traces any world rays through a resident tree, or several, as one frame. Background and layer
+    belong to pictures and have no part in it.
 
     Args:
         tree: The tree, or trees by name; stamps and request words are written.
         rays: Rays in world units, on the tree's device.
         shader: The transfer function, or another shader; or one for each tree by name.
-        **options: Fields of `RenderOptions`; background and layer belong to pictures and have no
-            part in it.
+        **options: Fields of `RenderOptions`.
 
     Returns:
         Colour, alpha, depth and samples of each ray, in the options' dtype.

@@ -61,6 +61,7 @@ class Tracer:
             )
         step = options.step * min(tree.spacing)
         _check_step(tree, step, options)
+        tree.warn_if_edited("render", learned=isinstance(shader, ModuleShader))
         self.tree, self.shader, self.channel = tree, shader, channel
         if frame_1 is None:
             frame_1 = torch.full((1,), tree.frame, dtype=torch.int32, device=tree.device)

@@ -6,13 +6,17 @@ archive import `gvtorch.ops` first; C++ programs open `libgvtorch_cpu.so`.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor
 
 from ..base import check
 from ..base import constants as config
+from ..base.records import Rays
+from ..cameras.camera import Camera
+from ..cameras.custom import as_camera
 from ..ops import RayArguments, ShadeArguments, TraceArguments, available
 from ..ops.trace import op_of
 from ..pool import N3Tree
@@ -23,7 +27,8 @@ from .tracer import Tracer
 
 class TreeTracer(torch.nn.Module):
     """Traces world rays through a resident tree, as `render` does. Pools are buffers: `.to(device)`
-    moves them.
+    moves them. Their dtypes stay as kernels need them, also where `half()`, `bfloat16()` or
+    `double()` of a net that holds the module changes those of others.
 
     Buffers and numbers have the names of the ops' arguments. Light and material of a lit shader are
     the buffer `parameter_54`, see `ops.shade_rays`; it may be edited.
@@ -58,7 +63,10 @@ class TreeTracer(torch.nn.Module):
         check_shader("TreeTracer", "shader", shader)
         if shader.uses_torch:
             kind = type(shader).__name__
-            raise ValueError(f"TreeTracer: shader must be one of the kernels', got {kind}")
+            raise ValueError(
+                f"TreeTracer: shader must be one of the kernels', got {kind}: hold that in the net "
+                "instead, and trace with gv.trace"
+            )
         options = RenderOptions(
             step=step,
             stop_alpha=stop_alpha,
@@ -87,6 +95,33 @@ class TreeTracer(torch.nn.Module):
             else:
                 self.register_buffer(name, nothing if value is None else value)
         self.register_buffer("parameter_54", parameters)
+        self.box = tree.box  # (2, 3) on the CPU, where `rays` places cameras
+        self.about = f"{tree!r}, {shader!r}"
+
+    def __repr__(self) -> str:
+        return f"TreeTracer({self.about})"
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Moves the buffers, and leaves their dtypes."""
+
+        def moved(tensor: Tensor) -> Tensor:
+            made = fn(tensor)
+            return made if made.dtype == tensor.dtype else tensor.to(made.device)
+
+        return super()._apply(moved, recurse)
+
+    @torch.jit.unused
+    def rays(self, camera: Camera | Rays) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Returns the rays of a camera's pixels as `forward` takes them, in the shape of its
+        picture: origin and direction (h, w, 3), cone and range (h, w, 2), or (n, h, w, ...) for a
+        batch. An orbit camera stands around the tree's box.
+        """
+        placed = as_camera("TreeTracer.rays", camera).placed(self.box)
+        rays = placed.rays(self.place_33.device)
+        origin, direction, cone, limits = (
+            placed.image(column) for column in (rays.origin, rays.direction, rays.cone, rays.range)
+        )
+        return origin, direction, cone, limits
 
     def __getstate__(self) -> dict[str, Any]:
         """Names its op, which can't be pickled."""
@@ -110,17 +145,18 @@ class TreeTracer(torch.nn.Module):
     def forward(
         self, origin: Tensor, direction: Tensor, cone: Tensor, range: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Traces rays in world units.
+        """Traces rays in world units, of any leading shape `...`, the same for all four.
 
         Args:
-            origin: (r, 3) float32 or float64, as the others: rays enter the tree in float64.
-            direction: (r, 3) unit length.
-            cone: (r, 2) width at the origin and growth per unit distance; zeros for the finest
+            origin: (..., 3) float32 or float64, as the others: rays enter the tree in float64.
+            direction: (..., 3) unit length.
+            cone: (..., 2) width at the origin and growth per unit distance; zeros for the finest
                 level.
-            range: (r, 2) first and last distance.
+            range: (..., 2) first and last distance.
 
         Returns:
-            color (r, 3) premultiplied, alpha (r, 1), depth (r, 1), all float32; samples (r,) int32.
+            color (..., 3) premultiplied, alpha (..., 1), depth (..., 1), all float32; samples (...)
+            int32.
         """
         color, alpha, depth, samples, _, _ = self.hits(origin, direction, cone, range)
         return color, alpha, depth, samples
@@ -129,19 +165,26 @@ class TreeTracer(torch.nn.Module):
     def hits(
         self, origin: Tensor, direction: Tensor, cone: Tensor, range: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """As `forward`; also returns normal (r, 3) and features (r, c), which are (0, 3) and (0, 0)
-        where the shader gives none.
+        """As `forward`; also returns normal (..., 3) and features (..., c), which are (0, 3) and
+        (0, 0) where the shader gives none.
         """
-        columns = [c.to(torch.float64).contiguous() for c in (origin, direction, cone, range)]
+        lead = list(origin.shape[:-1])
+        columns = [
+            c.to(torch.float64).reshape(-1, c.shape[-1]).contiguous()
+            for c in (origin, direction, cone, range)
+        ]
         rays = RayArguments(columns[0], columns[1], columns[2], columns[3], 0, None)
         arguments = self.arguments()
         if self.plain:
             color, alpha, depth, samples, _ = torch.ops.gvtorch.trace_rays(*rays, *arguments)
-            return color, alpha, depth, samples, color.new_zeros((0, 3)), color.new_zeros((0, 0))
-        color, alpha, depth, samples, _, normal, features = self.shade_rays(
-            *rays, *arguments, *self.shading(), self.parameter_54
-        )
-        return color, alpha, depth, samples, normal, features
+            normal, features = color.new_zeros((0, 3)), color.new_zeros((0, 0))
+        else:
+            color, alpha, depth, samples, _, normal, features = self.shade_rays(
+                *rays, *arguments, *self.shading(), self.parameter_54
+            )
+            normal, features = _led(normal, lead), _led(features, lead)
+        color, alpha, depth = _led(color, lead), _led(alpha, lead), _led(depth, lead)
+        return color, alpha, depth, samples.reshape(lead), normal, features
 
     def arguments(self) -> TraceArguments:
         """What rays go through."""
@@ -183,6 +226,11 @@ class TreeTracer(torch.nn.Module):
             other_tnc=_given(self.other_tnc),
             other_component=self.other_component,
         )
+
+
+def _led(rows: Tensor, lead: list[int]) -> Tensor:
+    """Returns rows (r, c) as (..., c)."""
+    return rows.reshape(lead + [rows.shape[1]])  # noqa: RUF005  (TorchScript has no stars here)
 
 
 def _given(buffer: Tensor) -> Tensor | None:

@@ -1,0 +1,149 @@
+"""Gradients that would be lost raise, by one rule, in eager, scripted, compiled and exported
+programs; nothing raises where none are recorded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import DEVICES
+from helpers.compiled import HEADER
+from helpers.pictures import GRAY, camera
+
+import gvtorch as gv
+
+SHADERS = {"plain": GRAY, "lit": gv.Lit(GRAY)}
+COLUMNS = ("origin_r3", "direction_r3", "cone_r2", "range_r2")
+
+
+def lost(by: str) -> str:
+    return f"gradients by {by} would be lost: only gv.ModuleShader gives gradients, by its param"
+
+
+@pytest.fixture
+def tree(blobs):
+    return gv.N3Tree.from_volume(blobs, 8)
+
+
+def rays_of(tree: gv.N3Tree) -> gv.Rays:
+    return camera(4, distance=1.3).placed(tree.box).rays()
+
+
+def columns(rays: gv.Rays) -> list[torch.Tensor]:
+    return [rays.origin, rays.direction, rays.cone, rays.range]
+
+
+def scripted(tracer: gv.TreeTracer) -> Callable:
+    return torch.jit.script(tracer)
+
+
+def compiled(tracer: gv.TreeTracer) -> Callable:
+    torch._dynamo.reset()
+    return torch.compile(tracer, fullgraph=True, backend="aot_eager")
+
+
+MODES = {"eager": lambda tracer: tracer, "script": scripted, "compile": compiled}
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("name", SHADERS)
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("what", [*COLUMNS, "bricks_bzyxc", "table_lm4", "parameter_54"])
+def test_one_rule_in_every_mode(tree, name, mode, what):
+    """Rays, voxels, tables and the shader's numbers."""
+    if what == "parameter_54" and name == "plain":
+        pytest.skip("the plain shader has no numbers")
+    tracer, given = gv.TreeTracer(tree, SHADERS[name]), columns(rays_of(tree))
+    if what in COLUMNS:
+        at = COLUMNS.index(what)
+        given[at] = given[at].clone().requires_grad_()
+    else:
+        setattr(tracer, what, getattr(tracer, what).clone().requires_grad_())
+    run = MODES[mode](tracer)
+    with pytest.raises(RuntimeError) as caught:
+        run(*given)
+    assert lost(what) in str(caught.value)
+    with torch.no_grad():
+        assert not run(*given)[0].requires_grad
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("name", SHADERS)
+def test_an_exported_program_raises_when_it_runs_and_when_it_is_made(tree, name):
+    tracer, given = gv.TreeTracer(tree, SHADERS[name]), columns(rays_of(tree))
+    program = torch.export.export(tracer, tuple(given)).module()
+    program(*given)
+    given[0] = given[0].clone().requires_grad_()
+    for run in (program, lambda *rays: torch.export.export(tracer, rays)):
+        with pytest.raises(RuntimeError) as caught:
+            run(*given)
+        assert lost("origin_r3") in str(caught.value)
+
+
+@pytest.mark.parametrize("name", SHADERS)
+def test_rays_and_voxels_of_a_fused_shader_raise(blobs, backend, name):
+    tree = gv.N3Tree.from_volume(blobs, 8, device=DEVICES[backend])
+    rays, options = rays_of(tree).to(tree.device), {"backend": backend}
+    bent = replace(rays, direction=rays.direction.clone().requires_grad_())
+    for trace in (gv.trace, gv.render):
+        with pytest.raises(RuntimeError, match=lost("(origin|direction)_r3")):  # rays may be moved
+            trace(tree, bent, SHADERS[name], **options)
+        with torch.no_grad():
+            trace(tree, bent, SHADERS[name], **options)
+    tree.bricks["value"].requires_grad_()
+    for trace in (gv.trace, gv.render):
+        with pytest.raises(RuntimeError, match=lost("bricks_bzyxc")):
+            trace(tree, rays, SHADERS[name], **options)
+        with torch.no_grad():
+            assert not trace(tree, rays, SHADERS[name], **options).color.requires_grad
+
+
+def test_a_module_shader_has_gradients_by_voxels_and_none_by_rays(tree):
+    rays, shader = rays_of(tree), gv.ModuleShader(lambda v, *_: (v.expand(-1, 3), v.clamp(0, 1)))
+    bent = replace(rays, origin=rays.origin.clone().requires_grad_())
+    with pytest.raises(RuntimeError, match=lost("origin_r3")):
+        gv.trace(tree, bent, shader)
+    pool = tree.bricks["value"].requires_grad_()
+    gv.trace(tree, rays, shader).color.sum().backward()
+    assert pool.grad is not None and pool.grad.abs().max() > 0
+
+
+def test_numbers_that_leave_torch_raise(tree, blobs):
+    view, number = camera(4, distance=1.3), torch.tensor(0.5, requires_grad=True)
+    three = torch.tensor([0.3, 0.2, 0.9], requires_grad=True)
+    pose = torch.eye(4, dtype=torch.float64, requires_grad=True)
+    for make, by in (
+        (lambda: gv.render(tree, view, gv.Isosurface(number)), "value"),
+        (lambda: gv.Lit(GRAY, light=gv.PointLight(three)), "position"),
+        (lambda: gv.TransferFunction([(0, 0), (1, number)]), "opacity"),
+        (lambda: gv.Camera(pose, torch.eye(3), 8, 8), "viewmats"),
+        (lambda: gv.Camera.look_at(three, (0, 0, 0)), "eye"),
+        (lambda: gv.Camera.look_at((1, 1, 1), (0, 0, 0), fov=number * 60), "fov"),
+        (lambda: gv.render(tree, view, GRAY, step=number), "step"),
+        (lambda: gv.Clip(planes=three.new_ones(1, 4) * number), "planes[0]"),
+    ):
+        with pytest.raises(RuntimeError) as caught:
+            make()
+        assert lost(by) in str(caught.value) and "\n" not in str(caught.value)
+        with torch.no_grad():
+            make()
+
+
+def test_a_volume_tells_how_voxels_are_learned(blobs):
+    data = blobs.data.clone().requires_grad_()
+    with pytest.raises(RuntimeError, match=r"take detach\(\); to learn voxels, .* gv.ModuleShader"):
+        gv.Volume(data)
+    assert torch.equal(gv.Volume(data.detach()).data, blobs.data)
+    with torch.no_grad():
+        assert not gv.Volume(data).data.requires_grad
+
+
+@pytest.mark.backend("cpp")
+def test_a_compiled_shader_raises_too(tree):
+    shader = gv.CompiledShader(HEADER, "mine::Plain", transfer=GRAY)
+    rays = rays_of(tree)
+    with pytest.raises(RuntimeError, match=lost("cone_r2")):
+        gv.trace(tree, replace(rays, cone=rays.cone.clone().requires_grad_()), shader)

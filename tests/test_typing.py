@@ -1,0 +1,48 @@
+"""Type checkers see gvtorch's types from another folder, in a strict project, where it is installed
+in place: its editable install is a path, not a finder that only Python can ask.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import sysconfig
+import tomllib
+
+import pytest
+from helpers import ROOT
+
+USE = """
+import gvtorch as gv
+import torch
+
+tree = gv.N3Tree.from_volume(gv.Volume(torch.rand(8, 8, 8)))
+shader = gv.TransferFunction([(0, 0), (1, 0.5)])
+reveal_type(gv.render(tree, gv.Camera.orbit(), shader, step=0.5, lod="finest").color)
+reveal_type(tree.to_volume())
+gv.render(tree, gv.Camera.orbit(), shader, stp=1)
+"""
+
+
+def test_a_strict_project_sees_the_types(tmp_path):
+    pytest.importorskip("mypy")
+    site = tmp_path / "venv" / "lib" / f"python3.{sys.version_info.minor}" / "site-packages"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path / "venv"], check=True)
+    (site / "gvtorch.pth").write_text(f"{ROOT}\n{sysconfig.get_path('purelib')}\n")
+    (tmp_path / "use.py").write_text(USE)
+    python = str(tmp_path / "venv" / "bin" / "python")
+    call = [sys.executable, "-m", "mypy", "--strict", "--python-executable", python, "use.py"]
+    done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, check=False)
+    lines = [line.partition(": ")[2] for line in done.stdout.splitlines()]
+    assert lines[:3] == [
+        'note: Revealed type is "torch._tensor.Tensor"',
+        'note: Revealed type is "gvtorch.base.volume.Volume"',
+        'error: Unexpected keyword argument "stp" for "render"; did you mean "step"?  [call-arg]',
+    ], done.stdout + done.stderr
+    assert "Found 1 error" in done.stdout
+
+
+def test_an_editable_install_is_a_path():
+    """setuptools writes a path where the folder of packages is named, and a finder elsewhere."""
+    tool = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    assert tool["package-dir"] == {"": "."} and (ROOT / "gvtorch" / "py.typed").is_file()
