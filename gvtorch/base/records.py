@@ -62,9 +62,10 @@ class Hits:
     # What only some shaders give, else None:
     normal: Tensor | None = None  # (r, 3) world, towards the eye, of unit length or 0
     features: Tensor | None = None  # (r, c)
+    label: Tensor | None = None  # (r, 1) int64, at the depth; -1 where nothing was hit
 
     def __repr__(self) -> str:
-        extra = [name for name in ("normal", "features") if getattr(self, name) is not None]
+        extra = [name for name in ("normal", "features", "label") if getattr(self, name) is not None]
         return f"Hits({', '.join([check.describe(self.color), *extra])})"
 
 

@@ -29,6 +29,7 @@ SHADER_KINDS = (
     "ShadowedColor",
     "GradientMagnitude",
     "Filtered",
+    "Labels",
 )
 
 
@@ -87,6 +88,12 @@ class FilteredNumbers(NamedTuple):
     """The own number of a transfer function with filtered colours."""
 
     side: Number  # of the root cube, its smallest, world length
+
+
+class LabelNumbers(NamedTuple):
+    """The own number of labels."""
+
+    lit: Number  # above 0: they are lit
 
 
 _Record = TypeVar("_Record")

@@ -13,7 +13,7 @@ from ..base.constants import CONSTANT, TERMINAL
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume
 from ..ops import locate
-from .pools import BrickPool, Channel, NodePool, volumes_by_channel
+from .pools import BrickPool, Channel, NodePool, labels_by_channel, volumes_by_channel
 from .pyramid import TreePlan, levels_by_depth, tree_depth
 
 
@@ -35,6 +35,8 @@ class N3Tree:
         spacing: (x, y, z) world size of a finest voxel.
         value_range: For each channel, the smallest and largest value of the finest level.
         frame: Number of the last frame traced; usage stamps hold it.
+        labels: For channels that hold labels, (k,) int64 the label that each value stands for, or
+            None: values stand for themselves.
         made_of: For coarse channels, what they were made of, as plain values.
     """
 
@@ -50,6 +52,7 @@ class N3Tree:
         root: int = 0,
         branching: int | None = None,
         value_range: Mapping[str, tuple[float, float]] | None = None,
+        labels: Mapping[str, Tensor | None] | None = None,
     ) -> None:
         """Makes a tree over two pools, which trees may share; it writes nothing into them.
 
@@ -63,7 +66,7 @@ class N3Tree:
         low = [o - 0.5 * s for o, s in zip(origin, spacing, strict=True)]
         high = [a + n * s for a, n, s in zip(low, extent, spacing, strict=True)]
         self.box = torch.tensor([low, high], dtype=torch.float64)
-        self.value_range = dict(value_range or {})
+        self.value_range, self.labels = dict(value_range or {}), dict(labels or {})
         self.frame = 0
         self.made_of: dict[str, Any] = {}
         self._place: Tensor | None = None
@@ -218,6 +221,7 @@ class N3Tree:
             spacing=first.spacing,
             origin=first.origin,
             value_range={name: volume.value_range for name, volume in volumes.items()},
+            labels=labels_by_channel(volumes),
         )
         plan.write_nodes(tree.nodes, tree.bricks)
         for name in channels:

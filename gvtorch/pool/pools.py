@@ -83,6 +83,11 @@ def volumes_by_channel(where: str, volume: Volume | Mapping[str, Volume]) -> dic
     return volumes
 
 
+def labels_by_channel(volumes: Mapping[str, Volume]) -> dict[str, Tensor | None]:
+    """Returns `N3Tree.labels` of the volumes that a tree is made of."""
+    return {name: one.label_values for name, one in volumes.items() if one.info.labels}
+
+
 class _Pool:
     channels: dict[str, Channel]
 

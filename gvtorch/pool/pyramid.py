@@ -14,10 +14,18 @@ import torch
 from torch import Tensor
 
 from ..base.constants import CONSTANT, EMPTY, TERMINAL
+from ..base.labels import background
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume, movable
 from ..ops import cut_bricks
-from .downsample import by_node, pool_directional, pool_max, pool_mean, pool_min
+from .downsample import (
+    by_node,
+    pool_directional,
+    pool_majority,
+    pool_max,
+    pool_mean,
+    pool_min,
+)
 from .pools import BrickPool, NodePool
 
 _BATCH = 4096  # bricks cut from a level at a time
@@ -29,7 +37,8 @@ class NodeSummary:
 
     low: Tensor  # (..., c) float32 smallest finest-level value in reach of the brick, with border
     high: Tensor  # (..., c) float32 largest
-    mean: Tensor  # (..., c) float32 mean of the node's own voxels, as its level stores them
+    mean: Tensor  # (..., c) float32 mean of the node's own voxels, as its level stores them; of
+    # labels the smallest
 
     @property
     def is_constant(self) -> Tensor:
@@ -71,18 +80,24 @@ def volume_levels(
     """Yields the first `count` levels of a volume, finest first.
 
     A level is what the volume's filter (`Volume.filter`) makes of the level below as stored: its
-    mean, rounded to the dtype (ties to even), or what is seen of it along six directions.
+    mean, rounded to the dtype (ties to even), its most frequent label, or what is seen of it along
+    six directions.
     """
     dtype = volume.data.dtype
     # NumPy has no bfloat16: float32 holds its values, rounded again after every mean.
     data = volume.data.float() if dtype == torch.bfloat16 else volume.data
     z, y, x = (side / min(volume.spacing) for side in reversed(volume.spacing))
+    known = volume.label_values
+    empty = background(None if known is None else known.numpy())
+    middle = "min" if volume.filter == "majority" else "mean"  # a label that is there
     values = low = high = data.numpy()
     for level in range(count):
         if level > 0:
             if volume.filter == "directional":
                 scale = branching ** (level - 1)
                 values = pool_directional(values, branching, (z * scale, y * scale, x * scale))
+            elif volume.filter == "majority":
+                values = pool_majority(values, branching, empty)
             else:
                 values = pool_mean(values, branching)
             if dtype == torch.bfloat16:
@@ -91,7 +106,7 @@ def volume_levels(
         summary = NodeSummary(
             low=torch.from_numpy(by_node(low, "min", brick_size, border)),
             high=torch.from_numpy(by_node(high, "max", brick_size, border)),
-            mean=torch.from_numpy(by_node(values, "mean", brick_size, 0)),
+            mean=torch.from_numpy(by_node(values, middle, brick_size, 0)),
         )
         stored = volume.data if level == 0 else torch.from_numpy(values).to(dtype)
         yield Level(values=stored, nodes=summary)

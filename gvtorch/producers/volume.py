@@ -12,7 +12,7 @@ from ..base import check
 from ..base.volume import Volume
 from ..ops import cut_bricks
 from ..pool import BrickTable, Channel
-from ..pool.pools import volumes_by_channel
+from ..pool.pools import labels_by_channel, volumes_by_channel
 from ..pool.pyramid import Level, NodeSummary, levels_by_depth
 from ..pool.staging import wide_rows
 from .answer import regions_of
@@ -65,6 +65,7 @@ class VolumeProducer(Producer):
             spacing=first.spacing,
             origin=first.origin,
             value_range={name: volume.value_range for name, volume in volumes.items()},
+            labels=labels_by_channel(volumes),
         )
         if threshold is not None:
             threshold = check.number("VolumeProducer", "threshold", threshold)

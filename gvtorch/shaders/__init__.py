@@ -4,6 +4,7 @@ from .built_in import *  # noqa: F403
 from .built_in import __all__ as _built_in
 from .compiled import CompiledShader
 from .filtered import Filtered
+from .labels import Labels
 from .lights import DirectionalLight, Headlight, PointLight
 from .module import ModuleShader, TransferModule
 from .shader import Shader
@@ -14,6 +15,7 @@ __all__ = [  # noqa: PLE0604
     "DirectionalLight",
     "Filtered",
     "Headlight",
+    "Labels",
     "ModuleShader",
     "PointLight",
     "Shader",

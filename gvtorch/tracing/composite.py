@@ -46,7 +46,18 @@ def over(front: Hits, back: Hits, *, dimmed: bool = False) -> Hits:
         missed=front.missed | back.missed,
         normal=normal,
         features=features,
+        label=_nearer_label(front, back),
     )
+
+
+def _nearer_label(front: Hits, back: Hits) -> Tensor | None:
+    """(r, 1) the label of whichever is hit first; None where neither has any."""
+    given = front.label if front.label is not None else back.label
+    if given is None:
+        return None
+    nothing = torch.full_like(given, -1)
+    labels = (nothing if one.label is None else one.label for one in (front, back))
+    return torch.where(front.depth <= back.depth, *labels)
 
 
 def behind(rays: Rays, front: Hits) -> Rays:
@@ -97,15 +108,15 @@ def _mean_normal(ranked: Sequence[Hits]) -> Tensor | None:
 
 
 def _ranked(fields: list[Tensor | None], order: Tensor) -> Sequence[Any]:
-    """The same field (r, ...) of m trees, in the order (m, r) of the trees along each ray; zeros
-    stand for a tree that does not give it.
+    """The same field (r, ...) of m trees, in the order (m, r) of the trees along each ray; zeros,
+    of labels -1, stand for a tree that does not give it.
     """
     given = [field for field in fields if field is not None]
     if not given:
         return fields
     if len({field.shape[1:] for field in given}) > 1:
         raise ValueError("render: trees must give as many features each")
-    nothing = torch.zeros_like(given[0])
+    nothing = torch.full_like(given[0], 0 if given[0].is_floating_point() else -1)
     stacked = torch.stack([nothing if field is None else field for field in fields])
     if stacked.dim() == 3:
         order = order[:, :, None].expand_as(stacked)

@@ -486,7 +486,7 @@ struct PacketWalk {
     if constexpr (kEnds) {
       piece.front = back;
       piece.back = back = value(piece.end);
-    } else {
+    } else if constexpr (!ReadsAll<Shader>::value) {
       piece.value = value(piece.middle);
     }
     const Mask seeing = which & (sum.clear > stop_clear);

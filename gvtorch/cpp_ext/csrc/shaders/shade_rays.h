@@ -20,6 +20,11 @@ template <class Shader>
 struct IsFiltered<Shader, std::void_t<decltype(Shader::kFiltered)>> : std::bool_constant<Shader::kFiltered> {};
 
 template <class Shader, class = void>
+struct ReadsAll : std::false_type {};
+template <class Shader>
+struct ReadsAll<Shader, std::void_t<decltype(Shader::kReadsAll)>> : std::bool_constant<Shader::kReadsAll> {};
+
+template <class Shader, class = void>
 struct HidesAlike : std::false_type {};
 template <class Shader>
 struct HidesAlike<Shader, std::void_t<decltype(Shader::kHidesAlike)>> : std::bool_constant<Shader::kHidesAlike> {};
@@ -84,8 +89,9 @@ struct ShadeRay : Walk<T> {
   struct Range {
     T low, high;
   };
-  GV_HD Range range_of(int32_t node) const {
-    const int64_t row = int64_t{2} * node * channels.value.width + channels.component;
+  GV_HD Range range_of(int32_t node) const { return range_of(node, channels.component); }
+  GV_HD Range range_of(int32_t node, int32_t component) const {
+    const int64_t row = int64_t{2} * node * channels.value.width + component;
     const auto read = [&](int64_t index) { return read_number<T>(range_tn2c, channels.value.type, index); };
     Range range{read(row), read(row + channels.value.width)};
     for (int32_t other = 1; other < directions; ++other) {
@@ -97,8 +103,12 @@ struct ShadeRay : Walk<T> {
   // Nothing between the ends of the node's range changes the sum.
   template <class Any>
   GV_HD bool hides(const Any& shader, int32_t node, const typename Any::Sum& sum) const {
-    const Range range = range_of(node);
-    return shader.hides(range.low, range.high, sum);
+    if constexpr (ReadsAll<Any>::value) {
+      return shader.hides_ranges([&](int32_t component) { return range_of(node, component); });
+    } else {
+      const Range range = range_of(node);
+      return shader.hides(range.low, range.high, sum);
+    }
   }
 
   // The same for all rays: looked at once.
@@ -178,6 +188,8 @@ struct ShadeRay : Walk<T> {
                                                // function's
         if (shader.stored(probe)) return take_by(shader, [](T) { return T{}; }, probe, at, alike, last);
         return take(ready_for_ray(shader.plain()), probe, at, alike, last);
+      } else if constexpr (ReadsAll<Any>::value) {
+        return take_by(shader, [](T) { return T{}; }, probe, at, alike, last);
       } else {
         return take(shader, probe, at, alike, last);
       }

@@ -10,6 +10,8 @@
 //   hides(low, high, sum)                         true: no value in [low, high] changes the sum. The node is left out;
 //                                                 without kHidesAlike, of V as `add`
 //   kHidesAlike                                   it does not look at the sum: nodes are hidden from all rays alike
+//   kReadsAll, hides_ranges(range_of)             it reads the voxels' numbers by itself, and no value comes with a piece;
+//                                                 range_of(component) tells the ends of any of them
 //   add(which, piece, probe, sum)                 adds an interval; `probe` reads any channel at any distance
 //   kSurface, surface(probe, sum)                 where depth was set: `probe` then stands in the node of that place
 //   done(sum)                                     after the last interval
@@ -34,6 +36,7 @@
 // shading", Graphics Hardware 2001; Levoy, "Display of surfaces from volume data", IEEE CG&A 1988.
 #pragma once
 
+#include "shaders/labels.h"
 #include "shaders/stored_color.h"
 
 namespace gvtorch {
@@ -387,7 +390,8 @@ struct GradientMagnitude : Plain<T> {
   X(ShadowedLit, Lit, true)                      \
   X(ShadowedColor, StoredColor, true)            \
   X(GradientMagnitude, GradientMagnitude, false) \
-  X(Filtered, Filtered, false)
+  X(Filtered, Filtered, false)                   \
+  X(Labels, Labels, false)
 
 #define GV_KIND(kind, Shader, shadows) k##kind,
 enum class ShaderKind : int32_t { GV_SHADERS(GV_KIND) kCount };
