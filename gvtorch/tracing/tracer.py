@@ -122,7 +122,8 @@ class Tracer:
         hits = Hits(**dict(zip(Hits.__annotations__, fields, strict=False)))
         if self.names is None or hits.features is None:
             return hits
-        return replace(hits, features=None, label=self.names[hits.features.to(torch.int64)])
+        label = self.names[hits.features.to(torch.int64)]
+        return replace(hits, features=hits.features[:, :0], label=label)
 
     def _march_module(self, shader: ModuleShader, rays: Rays) -> Hits:
         """Traces rays with a module, a block at a time."""

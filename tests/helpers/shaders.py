@@ -31,4 +31,6 @@ SHADERS = {
     "mean": gv.Projection("mean", SHADER),
     "features": gv.Features(SHADER, "rgba"),
     "gradient magnitude": gv.GradientMagnitude(SHADER, 0.1),
+    "labels": gv.Labels(channel="label", light=POINT),
+    "flat labels": gv.Labels(opacity={2000: 0.1, 3000: 0.4}, channel="label", lit=False),
 }
