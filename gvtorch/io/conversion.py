@@ -21,7 +21,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
-from contextlib import AbstractContextManager, closing, nullcontext
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -158,22 +158,8 @@ def convert(
     if not begun:
         _check_room(target, _estimate(plan))
     with unfinished.claimed(target, plan.settings, resume=begun) as work:
-        with _executor(executor, plan) as pool:
-            names = shlex.join((plan.settings["source"], str(target)))
-            goes_on = f"gvtorch convert {names} --resume goes on"
-            try:
-                _write_levels(_staged(plan, pool), work, pool, progress)
-            except BrokenExecutor:
-                raise OSError(
-                    f"{target}: a worker process ended (killed, out of memory, or started by a "
-                    'script that converts outside of `if __name__ == "__main__":`); '
-                    f"{goes_on}"
-                ) from None
-            except KeyboardInterrupt:
-                tasks = plan.settings["tasks"]
-                raise KeyboardInterrupt(
-                    f"{target}: interrupted, {len(work.done)} of {tasks} shards are done; {goes_on}"
-                ) from None
+        with _told_how_to_go_on(plan, work), _executor(executor, plan) as pool:
+            _write_levels(_staged(plan, pool), work, pool, progress)
         layout = dataclasses.replace(plan.task.layout, value_range=_value_range(plan.task))
         work.finish(layout, plan.task.source.info, plan.settings)
     return Store.open(target)
@@ -384,6 +370,25 @@ def _executor(given: Executor | None, plan: _Plan) -> AbstractContextManager[Exe
     if plan.uses_processes and plan.workers > 1:
         return resources.worker_processes(plan.workers)
     return ThreadPoolExecutor(plan.workers)
+
+
+@contextmanager
+def _told_how_to_go_on(plan: _Plan, work: unfinished.UnfinishedStore) -> Iterator[None]:
+    """Tells how to resume where the work is broken off from outside."""
+    target = plan.target
+    command = shlex.join(("gvtorch", "convert", plan.settings["source"], str(target), "--resume"))
+    try:
+        yield
+    except BrokenExecutor:
+        raise OSError(
+            f"{target}: a worker process ended (killed, out of memory, or started by a script "
+            f'that converts outside of `if __name__ == "__main__":`); {command} goes on'
+        ) from None
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"{target}: interrupted, {len(work.done)} of {plan.settings['tasks']} shards are done; "
+            f"{command} goes on"
+        ) from None
 
 
 def _staged(plan: _Plan, pool: Executor) -> _Plan:

@@ -16,7 +16,7 @@ from typing import Any
 
 from ..base.image_info import ImageInfo
 from .omero import forget_assumed, read_channels, write_channels
-from .store_layout import WORK, Deadline, StoreError, StoreLayout, child, read_key
+from .store_layout import WORK, Deadline, StoreLayout, child, read_key
 
 _MOST_LEVELS = 64
 _MOST_JSON = 1 << 24  # bytes
@@ -152,9 +152,19 @@ def _parse_image(
     for number, item in enumerate(images):
         if image in (None, item.get("name"), str(number)):
             found = _image(where, item, _member(attributes, "omero"))
+            found = _as_labels(found, _member(attributes, "image-label"))
             others = [str(one.get("name", at)) for at, one in enumerate(images) if at != number]
             return _told_beside(found, others if image is None else [])
     return None
+
+
+def _as_labels(found: MultiscaleImage, told: Any) -> MultiscaleImage:
+    """An image whose values are labels, if `image-label` says so."""
+    if not isinstance(told, dict):
+        return found
+    beside = [f"{name} of the labels" for name in ("colors", "properties") if told.get(name)]
+    info = replace(found.info, labels=True)
+    return replace(found, info=info, lost=(*found.lost, *beside))
 
 
 def _member(attributes: dict[str, Any], name: str) -> Any:
@@ -183,7 +193,7 @@ def _with_series(
             others = [str(path) for path in series if path != "0"]
         elif _attributes(f"{where}/1", child(root, "1"), deadline) is not None:
             others = ["1"]
-    except (StoreError, ValueError):  # what is beside the image does not keep it from opening
+    except (OSError, ValueError):  # what is beside the image does not keep it from opening
         pass
     return _told_beside(found, others)
 
@@ -194,7 +204,7 @@ def _with_labels(
     """Names the label images in the group beside the image."""
     try:
         group = _attributes(f"{where}/labels", child(root, "labels"), deadline) or {}
-    except (StoreError, ValueError):
+    except (OSError, ValueError):
         return found
     labels = _member(group, "labels")
     if not isinstance(labels, list) or not labels:
@@ -225,7 +235,8 @@ def _image(where: str, item: dict[str, Any], omero: Any) -> MultiscaleImage:
     scales, times = [], []
     for dataset in datasets:
         path = dataset.get("path") if isinstance(dataset, dict) else None
-        if not isinstance(path, str) or not path or path.startswith("/") or ".." in path:
+        plain = isinstance(path, str) and path.isprintable() and ".." not in path
+        if not isinstance(path, str) or not plain or not path or path.startswith("/"):
             raise ValueError(f"{where}: a dataset needs a path inside the store, got {path!r}")
         scale, move = _transform(where, dataset.get("coordinateTransformations"), axes, lost)
         t, *zyx = (a * b for a, b in zip(scale, outer[0], strict=True))
@@ -260,7 +271,8 @@ def _in_one_unit(units: dict[str, str], lost: list[str]) -> list[float]:
     for axis in "zyx":
         other = units.get(axis)
         known = one in _METRES and other in _METRES
-        factors.append(_METRES[other] / _METRES[one] if known and other != one else 1.0)  # type: ignore[index]
+        ratio = _METRES[other] / _METRES[one] if known else 1.0  # type: ignore[index]
+        factors.append(float(f"{ratio:.12g}"))
         if not known and other is not None and other != one:
             lost.append(f"unit {other!r} of {axis}, where that of x is {one!r}")
     return factors
@@ -283,7 +295,7 @@ def _axes(where: str, axes: Any) -> tuple[str, dict[str, str], list[str]]:
             units[letter] = unit
     solid = letters.replace("-", "")
     if len(set(solid)) != len(solid) or not {"y", "x"} <= set(solid):
-        names = ", ".join(str(a.get("name") if isinstance(a, dict) else a) for a in axes)
+        names = ", ".join(repr(a.get("name") if isinstance(a, dict) else a) for a in axes)
         raise ValueError(f"{where}: axes must have y and x, each of them once, got {names}")
     return letters, units, lost
 

@@ -23,7 +23,7 @@ from .source import Index, VolumeSource
 
 Oblique = Literal["resample", "keep"]
 
-_SLAB = 1 << 20  # voxels that are interpolated at a time
+_SLAB = 1 << 18  # voxels that are interpolated at a time
 _TIE = 2.0**-20  # voxels: what rounding may take a place beside where it belongs
 
 
@@ -104,9 +104,10 @@ class StraightSource(VolumeSource):
         total = np.zeros((len(at[0]), values.shape[3]))
         for corner in itertools.product((0, 1), repeat=3):
             weight, index = np.ones(len(at[0])), []
-            for a, first, upper, n, s in zip(at, lows, corner, shape, start, strict=True):
+            for a, first, upper, n, s in zip(at, lows, corner, values.shape, start, strict=False):
                 weight = weight * (a - first if upper else 1 - (a - first))
-                index.append((np.minimum(first + upper, n - 1)).astype(np.int64) - s)
+                place = (first + upper).astype(np.int64) - s
+                index.append(np.minimum(place, n - 1))  # what lies beyond weighs nothing
             found = values[tuple(index)].astype(np.float64)
             total += np.where(weight[:, None] > 0, found * weight[:, None], 0)  # 0 * NaN is none
         out[inside] = round_array(total, out.dtype)
@@ -142,14 +143,7 @@ def straighten(
     if oblique == "keep":
         warnings.warn(f"{name}: kept, and taken for the world's axes", stacklevel=3)
         return dataclasses.replace(source, oblique=None)
-    inverse = np.linalg.inv(affine[:, :3])
-    spacing = 1 / np.linalg.norm(inverse, axis=0)
-    ends = [(-0.5, n - 0.5) for n in source.extent]
-    corners = np.array(list(itertools.product(*ends))) @ affine[:, :3].T + affine[:, 3]
-    low, high = corners.min(0), corners.max(0)
-    extent = np.ceil((high - low) / spacing - 1e-6).astype(int).clip(1)
-    origin = (low + high - (extent - 1) * spacing) / 2
-    to_inner = np.column_stack((inverse * spacing, inverse @ (origin - affine[:, 3])))
+    extent, spacing, origin, to_inner = _grid(affine, source.extent)
     if fill is None:
         fill = 0.0 if source.info.labels else _smallest(source)
     x, y, z = extent.tolist()
@@ -177,10 +171,25 @@ def straighten(
     )
 
 
+def _grid(affine: np.ndarray, inner: Sequence[int]) -> tuple[np.ndarray, ...]:
+    """Extent, spacing and origin (x, y, z) of a grid along the world's axes that covers voxels, and
+    where its own lie among them, (3, 4).
+    """
+    inverse = np.linalg.inv(affine[:, :3])
+    spacing = 1 / np.linalg.norm(inverse, axis=0)
+    ends = [(-0.5, n - 0.5) for n in inner]
+    corners = np.array(list(itertools.product(*ends))) @ affine[:, :3].T + affine[:, 3]
+    low, high = corners.min(0), corners.max(0)
+    extent = np.ceil((high - low) / spacing - 1e-6).astype(int).clip(1)
+    origin = (low + high - (extent - 1) * spacing) / 2
+    to_inner = np.column_stack((inverse * spacing, inverse @ (origin - affine[:, 3])))
+    return extent, spacing, origin, to_inner
+
+
 def _smallest(source: VolumeSource) -> float:
     """The smallest finite value, read part by part where that is possible."""
     x, y, z = source.extent
-    rows = z if source.whole else max(1, _SLAB // (y * x * source.width))
+    rows = z if source.whole else max(1, 16 * _SLAB // (y * x * source.width))
     smallest = math.inf
     for low in range(0, z, rows):
         part = source.read_region((low, 0, 0), (min(low + rows, z), y, x))

@@ -86,7 +86,12 @@ def read_volume(
             f"another, up to {source.times - 1}",
             stacklevel=2,
         )
-    data, name = read_whole(source, source.time)[0], Path(path).name
+    return volume_of(source, nan)
+
+
+def volume_of(source: VolumeSource, nan: float | None = None) -> Volume:
+    """Reads a source's time point; `nan` and errors as of `read_volume`."""
+    data, name = read_whole(source, source.time)[0], Path(source.path).name
     return Volume(data, source.spacing, source.origin, name=name, nan=nan, info=source.info)
 
 
@@ -137,7 +142,8 @@ def open_source(
             )
         source = straighten(source, oblique)
     if source.lost:
-        warnings.warn(f"{path}: not kept: {'; '.join(source.lost)}", stacklevel=2)
+        told = " ".join("; ".join(source.lost).split())  # in one line, whatever the file says
+        warnings.warn(f"{path}: not kept: {told}", stacklevel=2)
     return placed(text, source, spacing, origin)
 
 

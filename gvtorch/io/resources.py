@@ -6,7 +6,9 @@ import multiprocessing
 import os
 import signal
 import threading
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -31,15 +33,18 @@ def memory_free() -> int:
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
 
 
-def worker_processes(count: int) -> ProcessPoolExecutor:
+@contextmanager
+def worker_processes(count: int) -> Iterator[Executor]:
     """Starts worker processes, which leave Ctrl-C to this one from their first moment on."""
-    pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), begin_worker)
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    try:
-        pool.submit(int)  # the first task starts all processes, which inherit what is blocked
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    return pool
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(count, spawn, begin_worker) as pool:
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        try:
+            for _ in range(count):  # each task starts a process, which inherits what is blocked
+                pool.submit(int)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        yield pool
 
 
 def begin_worker() -> None:

@@ -249,7 +249,7 @@ class StoreLayout:
         fits = {
             "extent": _is_list(extent, 3) and all(_is_whole(n, 1, MOST_VOXELS) for n in extent),
             "times": _is_whole(times, own["version"], MOST_TIMES if own["version"] > 1 else 1),
-            "dtype": own.get("dtype") in DTYPES,
+            "dtype": own.get("dtype") in list(DTYPES),
             "channels": _is_whole(own.get("channels"), 1, 2**16),
             "block": own.get("block") in BLOCKS,
             "border": own.get("border") == BORDER,

@@ -52,9 +52,16 @@ class Info:
             store = Store.open(self.path, image=self.source.key, time=self.source.time or 0)
             content = store.describe()
         else:
+            from ..io.reading import MAX_VOXELS, open_source, volume_of
+
+            options = self.source.options()
+            nan = options.pop("nan")
             with Bar() as bar:
                 bar("reading", 0, 0)
-                content = self.source.read(self.path).describe()
+                source = open_source(self.path, most=MAX_VOXELS, **options)
+                content = volume_of(source, nan).describe()
+            if source.times > 1:
+                content |= {"times": source.times, "time": source.time}
         if self.json:
             print(json.dumps(content))
         else:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import arg
 
 if TYPE_CHECKING:
+    from ..base.image_info import ImageInfo
     from ..base.volume import Volume
 
 
@@ -120,6 +121,14 @@ def refuse_for_store(source: ReadOptions, *known: str) -> None:
     flags = [flag for flag in given(source) if flag not in ("--time", *known)]
     if flags:
         raise ValueError(f"{flags[0]} is for volume files; a store tells it itself")
+
+
+def check_component(component: int, width: int, info: ImageInfo) -> None:
+    """Raises ValueError, which names what there is, where a voxel has no such number."""
+    if not 0 <= component < width:
+        names = [channel.name for channel in info.channels] or [""] * width
+        listed = ", ".join(f"{number} {name}".strip() for number, name in enumerate(names[:16]))
+        raise ValueError(f"--component {component}: a voxel has {width} numbers: {listed}")
 
 
 def numbers(name: str, text: str, count: int, kind: type) -> list[Any]:

@@ -13,7 +13,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from ..io.ngff import is_zarr
-from .common import Bar, ReadOptions, given, refuse_for_store, size, volume_formats
+from .common import Bar, ReadOptions, check_component, given, refuse_for_store, size, volume_formats
 from .image import KINDS, STRIPS, Develop
 from .look import Look, parse_camera
 from .streaming import Streaming, tell_failures, told
@@ -115,6 +115,7 @@ class Render:
                 f"{flags[0]} is for stores; make one: gvtorch convert {self.path} STORE.zarr"
             )
         volume = self.source.read(Path(self.path))
+        check_component(self.look.component, volume.data.shape[3], volume.info)
         shader, look = self.look.chosen(*volume.value_range), self.look
         tree = N3Tree.from_volume(
             *(volume, look.brick_size, look.border),

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import arg
 
+from .common import check_component
 from .look import Look
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ class Streaming:
         from ..shaders import Filtered
 
         store = Store.open(path, image=self.image, time=time)
+        check_component(look.component, store.width, store.info)
         shader = look.chosen(*value_range(store))
         filtered = shader if isinstance(shader, Filtered) else None
         if filtered is not None and look.tf is None:
