@@ -43,6 +43,7 @@ def read_volume(
     nan: float | None = None,
     time: int | None = None,
     oblique: Oblique | None = None,
+    labels: bool = False,
     **options: Unpack[FormatSettings],
 ) -> Volume:
     """Reads a volume, with what the file tells of it: `Volume.info`.
@@ -63,6 +64,7 @@ def read_volume(
         time: Which time point, from 0; the first, with a warning, if left out where there are more.
         oblique: Of voxel axes that do not lie along the world's: "resample" (the default), or
             "keep", which keeps the voxels and takes their axes for the world's.
+        labels: Values are numbers of things, see `Volume`; also where the file says so.
         **options: RAW only: shape, (x, y, z) voxels, and dtype, a NumPy dtype as in "int16" or
             ">i2"; the name's `_XxYxZ_dtype` if left out. `.npz`: key, which array; needed where
             there are several. OME-Zarr: key, name, number or folder of the image. Formats without
@@ -70,7 +72,8 @@ def read_volume(
             array, the slowest first.
 
     Returns:
-        The volume, dtype kept (64 and 32 bit integers and float64 become float32).
+        The volume, dtype kept (64 and 32 bit integers and float64 become float32, unless they are
+        labels).
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -79,7 +82,7 @@ def read_volume(
         ImportError: A library is missing; the message tells which pip command brings it.
     """
     told: dict[str, Any] = {"spacing": spacing, "origin": origin, "time": time, "oblique": oblique}
-    source = open_source(path, most=MAX_VOXELS, **told, **options)
+    source = open_source(path, most=MAX_VOXELS, labels=labels, **told, **options)
     if time is None and source.times > 1:
         warnings.warn(
             f"{path}: has {source.times} time points, this is the first; time=N (--time N) reads "
@@ -102,6 +105,7 @@ def open_source(
     origin: Sequence[float] | None = None,
     time: int | None = None,
     oblique: Oblique | None = None,
+    labels: bool = False,
     most: int = MOST_VOXELS * _MOST_CHANNELS,
     **options: Unpack[FormatSettings],
 ) -> VolumeSource:
@@ -125,6 +129,8 @@ def open_source(
     found.need_library(text)
     with told_as(ValueError, text, f"can't be read as {found.name}", StoreError, TimeoutError):
         source = found.open(text, **given)
+        if labels:
+            source = dataclasses.replace(source, info=dataclasses.replace(source.info, labels=True))
         check_extent(text, (*source.extent, source.width), most=most)
         check_extent(text, source.extent, most=MOST_VOXELS)
         if not 1 <= source.times <= MOST_TIMES or min(source.shape) < 1:
@@ -132,7 +138,8 @@ def open_source(
         if time is not None and (type(time) is not int or not 0 <= time < source.times):
             raise ValueError(no_time(text, time, source.times))
         source = source.at_time(time or 0)
-        if source.dtype not in DTYPES:
+        kind = np.dtype(source.dtype).kind
+        if source.dtype not in DTYPES and not (source.info.labels and kind in "iuf"):
             raise ValueError(f"{path}: values must be real numbers, got dtype {source.dtype}")
         source.check_file()
         if source.oblique is not None and spacing is not None and oblique != "keep":

@@ -13,7 +13,14 @@ from ..base.constants import CONSTANT, TERMINAL
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume
 from ..ops import locate
-from .pools import BrickPool, Channel, NodePool, labels_by_channel, volumes_by_channel
+from .pools import (
+    BrickPool,
+    Channel,
+    NodePool,
+    checked_threshold,
+    labels_by_channel,
+    volumes_by_channel,
+)
 from .pyramid import TreePlan, levels_by_depth, tree_depth
 
 
@@ -193,7 +200,7 @@ class N3Tree:
             border: Voxels around a brick; from 1 on no seam shows.
             branching: N >= 2.
             threshold: Regions with no value above it are EMPTY: they are never drawn, whatever the
-                transfer function. None keeps every value.
+                transfer function. None keeps every value. Not of labels alone.
             device: Device of the pools.
             progress: Called with what is made, how many levels of it are done, and of how many.
 
@@ -206,8 +213,7 @@ class N3Tree:
         volumes = volumes_by_channel("from_volume", volume)
         first = next(iter(volumes.values()))
         check.whole("from_volume", "branching", branching, low=2, high=16)
-        if threshold is not None:
-            threshold = check.number("from_volume", "threshold", threshold)
+        threshold = checked_threshold("from_volume", threshold, volumes)
         channels = {name: Channel.of(volume) for name, volume in volumes.items()}
         BrickPool(0, channels, brick_size=brick_size, border=border)  # its checks, before the work
         depth = tree_depth(first.extent, brick_size, branching)

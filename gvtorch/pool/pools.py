@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -81,6 +82,19 @@ def volumes_by_channel(where: str, volume: Volume | Mapping[str, Volume]) -> dic
                 f"{where}: channels must share extent, spacing and origin: {first} and {other}"
             )
     return volumes
+
+
+def checked_threshold(
+    where: str, threshold: Any, volumes: Mapping[str, Volume]
+) -> float | None:
+    """Returns a user's threshold; raises ValueError where it is no number, or there are no values
+    but labels, whose order means nothing.
+    """
+    if threshold is None:
+        return None
+    if all(one.info.labels for one in volumes.values()):
+        raise ValueError(f"{where}: threshold is for values; labels are hidden by the shader")
+    return check.number(where, "threshold", threshold)
 
 
 def labels_by_channel(volumes: Mapping[str, Volume]) -> dict[str, Tensor | None]:

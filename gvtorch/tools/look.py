@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     ShaderName = str
 else:
     CameraModel = str  # checked by the camera, since its module would load torch
-    ShaderName = Literal[(*declared_names("shaders.built_in", "BY_NAME"), "filtered")]
+    ShaderName = Literal[(*declared_names("shaders.built_in", "BY_NAME"), "filtered", "labels")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,8 @@ class Look:
     """transfer function: a JSON file, or a preset over the data's range: gray, hot, vessels, bone,
     tissue; gray if left out, or the function of a store's filtered colours"""
     shader: ShaderName = "plain"
-    """what is made of the values; filtered: plain, but right from afar (stores: gvtorch filter)"""
+    """what is made of the values; filtered: plain, but right from afar (stores: gvtorch filter);
+    labels: each in its colour, also if left out where there are labels"""
     value: Annotated[float | None, arg(metavar="VALUE")] = None
     """of the isosurface"""
     step: Annotated[float, arg(metavar="VOXELS")] = 0.5
@@ -99,11 +100,18 @@ class Look:
         choose_backend(self.backend, device)
         return device
 
-    def chosen(self, low: float, high: float) -> Shader:
-        """Returns the shader asked for, its transfer function read or spanned over the range."""
-        from ..shaders import Filtered
+    def chosen(self, low: float, high: float, labels: bool = False) -> Shader:
+        """Returns the shader asked for, its transfer function read or spanned over the range; of
+        labels, theirs.
+        """
+        from ..shaders import Filtered, Labels
         from ..shaders.built_in import BY_NAME
 
+        if self.shader == "labels" or (labels and self.shader == "plain"):
+            if self.tf is not None or self.value is not None:
+                flag = "--tf" if self.value is None else "--value"
+                raise ValueError(f"{flag} is for values; labels have colours of their own")
+            return Labels()
         transfer = parse_transfer(self.tf or "gray", low, high)
         if (self.value is None) == (self.shader == "isosurface"):
             raise ValueError("--value and --shader isosurface belong together")

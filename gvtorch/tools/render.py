@@ -116,7 +116,7 @@ class Render:
             )
         volume = self.source.read(Path(self.path))
         check_component(self.look.component, volume.data.shape[3], volume.info)
-        shader, look = self.look.chosen(*volume.value_range), self.look
+        shader, look = self.look.chosen(*volume.value_range, volume.info.labels), self.look
         tree = N3Tree.from_volume(
             *(volume, look.brick_size, look.border),
             threshold=self.threshold,

@@ -53,7 +53,7 @@ class Streaming:
 
         store = Store.open(path, image=self.image, time=time)
         check_component(look.component, store.width, store.info)
-        shader = look.chosen(*value_range(store))
+        shader = look.chosen(*value_range(store), store.info.labels)
         filtered = shader if isinstance(shader, Filtered) else None
         if filtered is not None and look.tf is None:
             shader = filtered = Filtered.stored(store)
