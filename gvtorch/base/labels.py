@@ -1,7 +1,7 @@
-"""Numbers of things: whole numbers of any width that must stay apart, in the dtypes that bricks have.
+"""Numbers of things: whole numbers of any width that must stay apart, in the dtypes of bricks.
 
-Numbers of 16 bits at most are kept as they are. Wider ones are counted off: voxels hold the index of
-their label among all that there are, and a table holds the labels.
+Numbers of 16 bits at most are kept as they are. Wider ones are counted off: voxels hold the index
+of their label among all that there are, and a table holds the labels.
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ def indices(values: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def counted_off(where: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Returns labels as bricks hold them, and (k,) int64 what each of their numbers stands for; None
-    where they are kept as they are. Raises ValueError as `as_whole` and `distinct`.
+    """Returns labels as bricks hold them, and (k,) int64 what each of their numbers stands for;
+    None where they are kept as they are. Raises ValueError as `as_whole` and `distinct`.
     """
     values = as_whole(where, values)
     if values.dtype.name in NARROW:

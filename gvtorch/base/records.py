@@ -65,7 +65,9 @@ class Hits:
     label: Tensor | None = None  # (r, 1) int64, at the depth; -1 where nothing was hit
 
     def __repr__(self) -> str:
-        extra = [name for name in ("normal", "features", "label") if getattr(self, name) is not None]
+        extra = [
+            name for name in ("normal", "features", "label") if getattr(self, name) is not None
+        ]
         return f"Hits({', '.join([check.describe(self.color), *extra])})"
 
 

@@ -331,10 +331,10 @@ def _plan(
     pool: Pool = pool_mean
     if source.info.labels:
         pool = partial(pool_majority, background=background(names))
-    told_all = {"layout": layout, "source": source, "nan": nan, "pool": pool}
+    root = kvstore(target)
     return _Plan(
         target=target,
-        task=shard.Conversion(root=kvstore(target), **told_all),
+        task=shard.Conversion(root=root, layout=layout, source=source, nan=nan, pool=pool),
         settings=settings,
         workers=min(workers, tasks[0]),
         uses_processes=tasks[0] > _FEW,

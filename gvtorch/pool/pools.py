@@ -84,9 +84,7 @@ def volumes_by_channel(where: str, volume: Volume | Mapping[str, Volume]) -> dic
     return volumes
 
 
-def checked_threshold(
-    where: str, threshold: Any, volumes: Mapping[str, Volume]
-) -> float | None:
+def checked_threshold(where: str, threshold: Any, volumes: Mapping[str, Volume]) -> float | None:
     """Returns a user's threshold; raises ValueError where it is no number, or there are no values
     but labels, whose order means nothing.
     """

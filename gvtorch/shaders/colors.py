@@ -20,7 +20,7 @@ NAMED = {
     **{"brown": "#8c5032", "tan": "#d2b48c", "bone": "#e8dcc5", "olive": "#808000"},
 }
 _GOLDEN = 0x9E3779B97F4A7C15  # 2^64 / the golden ratio
-_PLASTIC = 0xC13FA9A902A6328F  # 2^64 / the plastic number
+_APART = 0x57AE147AE147B001  # 2^64 * 0.3425: so the first 64 colours lie farthest apart
 
 
 def linear_color(where: str, value: Any) -> tuple[float, float, float]:
@@ -52,14 +52,13 @@ def distinct_colors(numbers: np.ndarray) -> np.ndarray:
     Hues of numbers that follow one another lie a golden ratio of the circle apart, so any few of
     them differ; lightness and chroma go around in another rhythm.
 
-    Source: Ottosson, "A perceptual color space for image processing", 2020 (OKLab); Roberts, "The
-        unreasonable effectiveness of quasirandom sequences", 2018.
+    Source: Ottosson, "A perceptual color space for image processing", 2020 (OKLab).
     """
     whole = numbers.astype(np.int64).view(np.uint64)
     hue, other = (
-        (whole * np.uint64(step) >> np.uint64(11)) * 2.0**-53 for step in (_GOLDEN, _PLASTIC)
+        (whole * np.uint64(step) >> np.uint64(11)) * 2.0**-53 for step in (_GOLDEN, _APART)
     )
-    lightness = 0.62 + 0.22 * other
+    lightness = 0.56 + 0.30 * other
     chroma = 0.165 - 0.05 * np.abs(2 * other - 1)
     angle = 2 * math.pi * (hue + 0.07)
     return _from_oklab(lightness, chroma * np.cos(angle), chroma * np.sin(angle))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from copy import copy
 from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
@@ -27,9 +28,10 @@ class Labels(LitShader):
     voxels meet, that of the upper one. Labels are never mixed; where two levels of detail blend,
     their colours do. `Hits.label` and `Picture.label` tell what is seen.
 
-    It reads a channel of labels (`Volume(..., labels=True)`). Lit, a label is bounded by the
-    smoothed surface between its voxels and those of others, which takes a border of 1; within it,
-    places are lit as if they faced the light.
+    It reads a channel of labels (`Volume(..., labels=True)`). Lit, the normal of a place is made of
+    the voxels around that are not of its label, as many to each side as bricks have for a border, 1
+    to 3: of a ball it is off by 11 degrees in the mean with a border of 1, by 4 with 2, by 2 with
+    3. Where there are none, a place is lit as if it faced the light.
 
     Attributes may be edited, also in place: the next picture is made with them.
 
@@ -73,8 +75,9 @@ class Labels(LitShader):
         if "normals" in light:
             raise ValueError("Labels: normals are those of the labels, got normals")
         super().__init__(**{"ambient": 0.3, "diffuse": 0.7, "specular": 0.15, **light})
-        again = visible is None or isinstance(visible, Collection)  # it can be gone through again
-        self.colors, self.opacity, self.visible = colors, opacity, visible if again else [*visible]
+        if isinstance(visible, Iterator):  # which could be gone through once
+            visible = [*visible]
+        self.colors, self.opacity, self.visible = colors, opacity, visible
         self.channel, self.reference, self.lit = channel, reference, lit
         self._kept: dict[Any, tuple[Any, Any]] = {}
         self._look()
@@ -96,6 +99,11 @@ class Labels(LitShader):
     def unlit(self) -> Self:
         bare = super().unlit()
         bare.lit = True
+        return bare
+
+    def blocker(self) -> Labels:
+        bare = copy(self)
+        bare.lit = False  # normals take their time
         return bare
 
     def table(self, sampling: Sampling) -> ColorTable:
@@ -200,12 +208,12 @@ class _Look:
             self.own_opacity = {_label(n): _alpha(where, alpha) for n, alpha in opacity.items()}
         else:
             self.opacity = _alpha(where, opacity)
-        if isinstance(visible, str) and visible != "all":
-            raise ValueError(f"{where}: visible must be labels, 'all' or None, got {visible!r}")
-        self.everything = visible == "all" if isinstance(visible, str) else False
-        self.visible = None
-        if visible is not None and not self.everything:
+        self.everything = isinstance(visible, str) and visible == "all"
+        self.visible: frozenset[int] | None = None
+        if isinstance(visible, Iterable) and not isinstance(visible, str):
             self.visible = frozenset(_label(number) for number in visible)
+        elif visible is not None and not self.everything:
+            raise ValueError(f"{where}: visible must be labels, 'all' or None, got {visible!r}")
         self.key = (
             *(self.first.tobytes(), tuple(self.colors.items())),
             *(self.opacity, tuple(self.own_opacity.items()), self.everything, self.visible),

@@ -56,8 +56,8 @@ def _nearer_label(front: Hits, back: Hits) -> Tensor | None:
     if given is None:
         return None
     nothing = torch.full_like(given, -1)
-    labels = (nothing if one.label is None else one.label for one in (front, back))
-    return torch.where(front.depth <= back.depth, *labels)
+    near, far = (nothing if one.label is None else one.label for one in (front, back))
+    return torch.where(front.depth <= back.depth, near, far)
 
 
 def behind(rays: Rays, front: Hits) -> Rays:

@@ -1,4 +1,4 @@
-"""Part of the torch twin: the nearest voxels of bricks that hold labels, as csrc/shaders/labels.h."""
+"""Part of the torch twin: voxels nearest to places, for labels, as csrc/shaders/labels.h."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .exact import clamp, smaller
-from .rays import Beam
+from .exact import clamp, larger, smaller
+from .rays import INF, Beam
 from .tree import Bricks, Holder
+
+_MOST_REACH = 3  # voxels
 
 
 @dataclass
@@ -37,44 +39,47 @@ class LabelBricks(Bricks):
         cell = cell.to(torch.int64)
         constant = self.constant_nc[holder.node.clamp(min=0), self.component].to(real)
         constant = torch.where(holder.node >= 0, constant, 0.0)
-        value = torch.where(holder.brick >= 0, self.voxel(holder, *cell.unbind(1), real), constant)
+        value = torch.where(holder.brick >= 0, self.voxel(holder, cell, real), constant)
         return Nearest(value, cell, beside)
 
-    def voxel(
-        self, holder: Holder, x: Tensor, y: Tensor, z: Tensor, real: torch.dtype
-    ) -> Tensor:
-        """(r,) values of voxels; anything where there is no brick."""
+    def voxel(self, holder: Holder, cell: Tensor, real: torch.dtype) -> Tensor:
+        """(r,) values of voxels (r, 3); anything where there is no brick."""
+        x, y, z = cell.unbind(1)
         if self.bricks_bzyxc.shape[0] == 0:
             return torch.zeros_like(x, dtype=real)
         brick = holder.brick.clamp(min=0)
         return self.bricks_bzyxc[brick, z, y, x, self.component].to(real)
 
-    def slope(self, holder: Holder, found: Nearest) -> Tensor:
-        """(r, 3) how "the same label as here" grows along x, y, z, a voxel: 1 in voxels of this
-        label and 0 in others, smoothed by a quadratic B-spline.
+    def away(self, holder: Holder, here: Nearest) -> Tensor:
+        """(r, 3) the mean way along x, y, z, in voxels, to those voxels around that are not of the
+        label here, of any length. Each is weighted by a tent around the place, which ends half a
+        voxel beyond as many voxels as bricks have for a border, 1 to 3.
         """
-        value, last = found.value, self.bricks_bzyxc.shape[1] - 1
-        below, above = 0.5 - found.place, 0.5 + found.place
-        middle = 0.75 - found.place * found.place
-        shares = (0.5 * (below * below), middle, 0.5 * (above * above))
-        slopes = (-below, -(found.place + found.place), above)
-        share, slope = ([one.unbind(1) for one in three] for three in (shares, slopes))
+        value, last = here.value, self.bricks_bzyxc.shape[1] - 1
+        reach = max(1, min(_MOST_REACH, self.border))
+        around = range(-reach, reach + 1)
+        offsets = [k - here.place for k in around]
+        shares = [clamp(reach + 0.5 - larger(one, -one), 0, INF).unbind(1) for one in offsets]
+        ways = [
+            tuple(weight * column for weight, column in zip(share, one.unbind(1), strict=True))
+            for share, one in zip(shares, offsets, strict=True)
+        ]
         zero = torch.zeros_like(value)
-        nx, ny, nz = zero, zero, zero
-        for k in range(3):
+        x, y, z = zero, zero, zero
+        for k in around:
             plane, along_x, along_y = zero, zero, zero
-            for j in range(3):
-                row, rise = zero, zero
-                for i in range(3):
-                    offset = torch.tensor((i - 1, j - 1, k - 1)).to(found.cell)
-                    other = (found.cell + offset).clamp(0, last)
-                    same = (self.voxel(holder, *other.unbind(1), value.dtype) == value).to(value)
-                    row = row + share[i][0] * same
-                    rise = rise + slope[i][0] * same
-                plane = plane + share[j][1] * row
-                along_x = along_x + share[j][1] * rise
-                along_y = along_y + slope[j][1] * row
-            nx = nx + share[k][2] * along_x
-            ny = ny + share[k][2] * along_y
-            nz = nz + slope[k][2] * plane
-        return torch.stack((nx, ny, nz), 1)
+            for j in around:
+                row, along = zero, zero
+                for i in around:
+                    other = (here.cell + torch.tensor((i, j, k)).to(here.cell)).clamp(0, last)
+                    found = self.voxel(holder, other, value.dtype)
+                    differs = (found != value).to(value)
+                    row = row + shares[i + reach][0] * differs
+                    along = along + ways[i + reach][0] * differs
+                plane = plane + shares[j + reach][1] * row
+                along_x = along_x + shares[j + reach][1] * along
+                along_y = along_y + ways[j + reach][1] * row
+            x = x + shares[k + reach][2] * along_x
+            y = y + shares[k + reach][2] * along_y
+            z = z + ways[k + reach][2] * plane
+        return torch.stack((x, y, z), 1)

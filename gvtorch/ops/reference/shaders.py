@@ -453,7 +453,9 @@ class Labels(Shade):
         hit = where & (left < at) & (clear >= at)
         self.features = torch.where(hit[:, None], (1 + label)[:, None].to(alpha), self.features)
         shown = where & (alpha[:, 0] > 0)
-        self.normal = torch.where(shown[:, None], self.normal + clear[:, None] * normal, self.normal)
+        self.normal = torch.where(
+            shown[:, None], self.normal + clear[:, None] * normal, self.normal
+        )
         self.sum.add_light(clear[:, None] * color, shown)
         self.sum.absorb(alpha[:, 0], piece, shown)
 
@@ -463,7 +465,7 @@ class Labels(Shade):
         return clamp(label - low, 0, last).to(torch.int64)
 
     def look(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
-        """(r, 7) what one of the nodes shows: premultiplied colours, alphas, normals times alpha."""
+        """(r, 7) what one of the nodes shows: premultiplied colours, alphas, normals by alpha."""
         t, table = piece.middle, self.transfer.table_lm4
         found = self.channel.nearest(holder, probe.beam, t)
         level = torch.where(piece.odd, 0, piece.level)
@@ -472,8 +474,8 @@ class Labels(Shade):
         alpha = torch.where((piece.odd & (alpha[:, 0] > 0))[:, None], stretched, alpha)
         normal = torch.zeros_like(color)
         if self.light.parameters.own_as(LabelNumbers).lit > 0:
-            slope = self.channel.slope(holder, found) * (holder.scale[:, None] / self.light.cube)
-            normal = unit(torch.where((holder.brick >= 0)[:, None], slope, 0.0))
+            way = self.channel.away(holder, found) * (holder.scale[:, None] / self.light.cube)
+            normal = unit(torch.where((holder.brick >= 0)[:, None], way, 0.0))
             away = dot(normal, self.light.along) > 0
             normal = torch.where(away[:, None], -normal, normal)
             color = self.light.shade(color, normal, t)

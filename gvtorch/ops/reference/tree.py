@@ -195,7 +195,7 @@ class Bricks:
         return constant[a] == constant[b]
 
     def places(self, holder: Holder, beam: Beam, t: Tensor) -> Tensor:
-        """(r, 3) places x, y, z in bricks at distances t (r,), in voxels from the first's centre."""
+        """(r, 3) places x, y, z in bricks at distances t (r,), in voxels from the first one's."""
         scale = holder.scale[:, None]
         offset = (beam.place - holder.corner).to(t.dtype) * scale + (self.border - 0.5)
         return offset + t[:, None] * (beam.direction * scale)

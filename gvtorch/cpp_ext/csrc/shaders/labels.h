@@ -1,4 +1,5 @@
-// Voxels that hold numbers of things: each place shows the label of its nearest voxel, and no two labels are ever mixed.
+// Voxels that hold numbers of things: each place shows the label of its nearest voxel, and no two labels are ever
+// mixed.
 //
 // Equal to ops/reference/shaders.py and labels.py.
 #pragma once
@@ -8,9 +9,11 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
+constexpr int32_t kMostReach = 3;  // voxels
+
 // A row of the table for each label, from the first row's value on, a whole number apart. Where two levels blend, their
-// colours do. Lit by the gradient of "the same label as here": 1 in voxels of this label and 0 in others, smoothed by a
-// quadratic B-spline, which the 27 voxels around a place just hold.
+// colours do. Lit by where the voxels around lie that are not of this label: the mean way to them, each weighted by a
+// tent around the place, which ends half a voxel beyond as many voxels as bricks have for a border, 1 to 3.
 template <class T>
 struct Labels : ShaderFacts {
   static constexpr bool kReadsAll = true;
@@ -51,8 +54,8 @@ struct Labels : ShaderFacts {
     Row<V> row{};
     Vec3<V> normal{};
     probe.each(which, [&](int lane, const auto& one) {
-      const Look look = blended(lane_of(piece.middle, lane), lane_of(piece.length, lane), lane_of(piece.level, lane),
-                                piece.odd, one);
+      const Look look =
+          blended(lane_of(piece.middle, lane), lane_of(piece.length, lane), lane_of(piece.level, lane), piece.odd, one);
       const T clear = lane_of(sum.clear, lane), left = clear * (1 - look.row.alpha);
       if (left < sum.hit_clear && clear >= sum.hit_clear) {
         lane_of(sum.feature_c, lane)[0] = static_cast<T>(1 + look.label);
@@ -130,45 +133,44 @@ struct Labels : ShaderFacts {
       from[axis] = clamp(at[axis] - static_cast<T>(cell[axis]), -half, half);
     }
   }
-  // The gradient's direction, towards the eye. Voxels beyond the brick repeat its outermost ones.
+  // Away from the voxels of this label, and towards the eye. Voxels beyond the brick repeat its outermost ones.
   GV_HD Vec3<T> normal(const Probe<T>& probe, const Spot<T>& spot, const int32_t (&cell)[3], const T (&from)[3],
                        T label) const {
-    T share[3][3], slope[3][3];  // of each axis: weights of the three voxels, and how they grow along it
+    const int32_t reach = larger(smaller(probe.channels.border, kMostReach), 1), last = probe.channels.side - 1;
+    T share[3][2 * kMostReach + 1], way[3][2 * kMostReach + 1];  // of each axis: weights, and these times offsets
     for (int axis = 0; axis < 3; ++axis) {
-      const T u = from[axis], below = static_cast<T>(0.5) - u, above = static_cast<T>(0.5) + u;
-      share[axis][0] = static_cast<T>(0.5) * (below * below);
-      share[axis][1] = static_cast<T>(0.75) - u * u;
-      share[axis][2] = static_cast<T>(0.5) * (above * above);
-      slope[axis][0] = -below;
-      slope[axis][1] = -(u + u);
-      slope[axis][2] = above;
+      for (int k = -reach; k <= reach; ++k) {
+        const T offset = static_cast<T>(k) - from[axis];
+        const T left = static_cast<T>(reach) + static_cast<T>(0.5) - larger(offset, -offset);
+        share[axis][k + reach] = larger(left, static_cast<T>(0));
+        way[axis][k + reach] = share[axis][k + reach] * offset;
+      }
     }
-    const int32_t last = probe.channels.side - 1;
-    const auto beside = [&](int axis, int k) { return smaller(larger(cell[axis] + k - 1, 0), last); };
+    const auto beside = [&](int axis, int k) { return smaller(larger(cell[axis] + k - reach, 0), last); };
     Vec3<T> n{0, 0, 0};
 #ifdef __CUDA_ARCH__
 #pragma unroll 1
 #endif
-    for (int k = 0; k < 3; ++k) {
+    for (int k = 0; k <= 2 * reach; ++k) {
       T plane = 0, along_x = 0, along_y = 0;
 #ifdef __CUDA_ARCH__
 #pragma unroll 1
 #endif
-      for (int j = 0; j < 3; ++j) {
-        T row = 0, rise = 0;
-        for (int i = 0; i < 3; ++i) {
+      for (int j = 0; j <= 2 * reach; ++j) {
+        T row = 0, along = 0;
+        for (int i = 0; i <= 2 * reach; ++i) {
           const T other = probe.value_in(spot, beside(0, i), beside(1, j), beside(2, k));
-          const T same = other == label ? static_cast<T>(1) : static_cast<T>(0);
-          row = row + share[0][i] * same;
-          rise = rise + slope[0][i] * same;
+          const T differs = other == label ? static_cast<T>(0) : static_cast<T>(1);
+          row = row + share[0][i] * differs;
+          along = along + way[0][i] * differs;
         }
         plane = plane + share[1][j] * row;
-        along_x = along_x + share[1][j] * rise;
-        along_y = along_y + slope[1][j] * row;
+        along_x = along_x + share[1][j] * along;
+        along_y = along_y + way[1][j] * row;
       }
       n.x = n.x + share[2][k] * along_x;
       n.y = n.y + share[2][k] * along_y;
-      n.z = n.z + slope[2][k] * plane;
+      n.z = n.z + way[2][k] * plane;
     }
     for (int axis = 0; axis < 3; ++axis) n[axis] = n[axis] * (spot.scale / probe.cube[axis]);
     n = unit(n);

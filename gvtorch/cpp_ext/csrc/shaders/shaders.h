@@ -10,7 +10,8 @@
 //   hides(low, high, sum)                         true: no value in [low, high] changes the sum. The node is left out;
 //                                                 without kHidesAlike, of V as `add`
 //   kHidesAlike                                   it does not look at the sum: nodes are hidden from all rays alike
-//   kReadsAll, hides_ranges(range_of)             it reads the voxels' numbers by itself, and no value comes with a piece;
+//   kReadsAll, hides_ranges(range_of)             it reads the voxels' numbers by itself, and no value comes with a
+//   piece;
 //                                                 range_of(component) tells the ends of any of them
 //   add(which, piece, probe, sum)                 adds an interval; `probe` reads any channel at any distance
 //   kSurface, surface(probe, sum)                 where depth was set: `probe` then stands in the node of that place
