@@ -794,3 +794,29 @@ def test_the_command_line_shows_labels(tmp_path):
 def test_replacing_a_label_volume_keeps_its_filter():
     volume = gv.Volume(numbers(4, 4, 4), labels=True, info=gv.ImageInfo(unit="micrometer"))
     assert volume.info == replace(gv.ImageInfo(unit="micrometer"), labels=True)
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("dtype", ["uint32", "uint8"])
+def test_label_images_that_another_library_wrote(tmp_path, dtype):
+    """By zarr, with one level: coarser ones are made by majority; wide ones are counted off."""
+    zarr = pytest.importorskip("zarr")
+    data = (cells((40, 36, 44), 12) * (2**28 - 1 if dtype == "uint32" else 21)).astype(dtype)
+    group = zarr.open_group(tmp_path / "cells.zarr", mode="w", zarr_format=3)
+    group.create_array("0", data=data, chunks=(16, 16, 16))
+    axes = [{"name": name, "type": "space", "unit": "micrometer"} for name in "zyx"]
+    scale = [{"type": "scale", "scale": [1.3, 0.8, 1.0]}]
+    datasets = [{"path": "0", "coordinateTransformations": scale}]
+    images = [{"name": "cells", "axes": axes, "datasets": datasets}]
+    group.attrs["ome"] = {"version": "0.5", "multiscales": images, "image-label": {}}
+    volume = gv.read_volume(tmp_path / "cells.zarr")
+    assert volume.info.labels and np.array_equal(kept(volume), data.astype(np.int64))
+    store = gv.Store.open(tmp_path / "cells.zarr")
+    if dtype == "uint8":
+        same_as_resident(store, volume)
+    else:
+        with pytest.raises(ValueError, match=r"labels of <u4 must be counted off first: gvtorch"):
+            gv.StoredProducer(store)
+    made = gv.convert(tmp_path / "cells.zarr", tmp_path / "own.zarr")
+    assert made.info.labels and made.spacing == SPACING
+    same_as_resident(made, volume)
