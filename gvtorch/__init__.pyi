@@ -40,6 +40,7 @@ from .shaders import (
     DirectionalLight as DirectionalLight,
     Filtered as Filtered,
     Headlight as Headlight,
+    Labels as Labels,
     ModuleShader as ModuleShader,
     PointLight as PointLight,
     Shader as Shader,

@@ -100,7 +100,7 @@ def blobs() -> gv.Volume:
 
 @pytest.fixture(scope="session")
 def channels(blobs) -> dict[str, gv.Volume]:
-    """The blobs with a colour and a normal in each voxel, both of 8 bits."""
+    """The blobs with a colour and a normal in each voxel, both of 8 bits, and a label."""
     value = blobs.data[..., 0]
     z, y, x = torch.meshgrid(*(torch.linspace(0, 1, n) for n in value.shape), indexing="ij")
     rgba = torch.stack((x, y, z, value), -1)
@@ -117,6 +117,7 @@ def channels(blobs) -> dict[str, gv.Volume]:
         ),
         "six": six,
         "normal": gv.Volume((normal * 255).round().to(torch.uint8), *place),
+        "label": gv.Volume((value * 6).to(torch.int64) * 1000, *place, labels=True),
     }
 
 

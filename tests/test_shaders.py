@@ -364,7 +364,8 @@ def test_a_kind_has_a_struct_a_twin_and_a_class():
     listed = (folder / "shaders.h").read_text().partition("#define GV_SHADERS(X)")[2]
     listed = listed.partition("#define GV_KIND")[0]
     assert re.findall(r"X\((\w+), \w+, \w+\)", listed) == [*SHADER_KINDS]
-    classes = [gv.Filtered, gv.Channels, *(getattr(gv, name) for name in built_in.__all__)]
+    own = (gv.Filtered, gv.Channels, gv.Labels)
+    classes = [*own, *(getattr(gv, name) for name in built_in.__all__)]
     for kind in SHADER_KINDS:
         assert f"struct {kind} " in structs or kind.startswith("Shadowed"), kind
         assert any(kind in (one.kind, getattr(one, "shadowed_kind", "")) for one in classes), kind

@@ -71,6 +71,7 @@ class Hits:
     # What only some shaders give, else None:
     normal: Tensor | None = None  # (r, 3) world, towards the eye, of unit length or 0
     features: Tensor | None = None  # (r, c)
+    label: Tensor | None = None  # (r, 1) int64, at the depth; -1 where nothing was hit
 
     def to(
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
@@ -79,7 +80,9 @@ class Hits:
         return replace(self, **{name: moved(v, device, dtype) for name, v in vars(self).items()})
 
     def __repr__(self) -> str:
-        extra = [name for name in ("normal", "features") if getattr(self, name) is not None]
+        extra = [
+            name for name in ("normal", "features", "label") if getattr(self, name) is not None
+        ]
         return f"Hits({', '.join([check.describe(self.color), *extra])})"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -13,6 +14,7 @@ from torch import Tensor
 from . import check
 from . import constants as config
 from .image_info import ImageInfo
+from .labels import check_narrowed, counted_off
 
 #: The dtypes that a brick channel can have. Wider ones are narrowed on the way in, see `Volume`.
 CHANNEL_DTYPES = (
@@ -56,11 +58,14 @@ class Volume:
     Attributes:
         data: (z, y, x, c) tensor on the CPU, one of `CHANNEL_DTYPES`.
         spacing, origin, name, info: See the constructor.
-        filter: How coarse levels are made: the mean, or what is seen along six directions, see
-            `directional`.
+        filter: How coarse levels are made: the mean; of labels the most frequent; or what is seen
+            along six directions, see `directional`.
+        label_values: (k,) int64, sorted: the label that each value of the data stands for, where
+            labels were counted off; None: values stand for themselves.
     """
 
-    filter: Literal["mean", "directional"] = "mean"
+    filter: Literal["mean", "majority", "directional"] = "mean"
+    label_values: Tensor | None = None
 
     def __init__(
         self,
@@ -71,21 +76,27 @@ class Volume:
         name: str = "volume",
         nan: float | None = None,
         info: ImageInfo | None = None,
+        labels: bool = False,
     ) -> None:
         """Checks and takes over a grid.
 
         Args:
             data: (z, y, x) or (z, y, x, c). Any byte order. bool becomes uint8; 32 and 64 bit
-                integers and float64 become float32.
+                integers and float64 become float32. Labels are whole numbers of any dtype, below
+                2^63; those of more than 16 bits are counted off, see `label_values`.
             spacing: (x, y, z) world units, distance of neighbouring voxel centres.
             origin: (x, y, z) world units, centre of voxel 0.
             name: Where it came from, for messages.
             nan: The value that voxels which are not finite get; None refuses them.
             info: Unit, names and colours of channels, ...; nothing is known if left out.
+            labels: Values are numbers of things: they are kept exactly and never blended, and the
+                shader is `Labels`. Also if `info` says so.
 
         Raises:
             ValueError: data is empty, of another shape or dtype, has more than 2^31 voxels or
-                holds values that are not finite; spacing is not positive.
+                holds values that are not finite, or integers beyond 2^24 that float32 does not
+                keep apart; spacing is not positive. Or labels are no whole numbers, or more than
+                2^24.
             RuntimeError: data requires gradients, and they are recorded.
         """
         where = f"Volume {name!r}" if name != "volume" else "Volume"
@@ -95,6 +106,10 @@ class Volume:
                 'to learn voxels, let tree.bricks["value"] require gradients and render with a '
                 "gv.ModuleShader"
             )
+        info = ImageInfo() if info is None else info
+        if labels or info.labels:
+            info, self.filter = replace(info, labels=True), "majority"
+            data, self.label_values = _as_labels(where, data, nan)
         tensor = _as_tensor(where, data)
         if tensor.dim() not in (3, 4):
             got = check.shown(data)
@@ -106,8 +121,7 @@ class Volume:
         self.data = _finite(where, tensor.contiguous(), nan)
         self.spacing = check.triple(where, "spacing", spacing, positive=True)
         self.origin = check.triple(where, "origin", origin)
-        self.name = name
-        self.info = ImageInfo() if info is None else info
+        self.name, self.info = name, info
 
     @property
     def extent(self) -> tuple[int, int, int]:
@@ -209,6 +223,21 @@ def movable(tensor: Tensor) -> Tensor:
     return tensor.view(torch.int16) if tensor.dtype == torch.uint16 else tensor
 
 
+def _as_labels(
+    where: str, data: Tensor | np.ndarray, nan: float | None
+) -> tuple[Tensor | np.ndarray, Tensor | None]:
+    """Labels as bricks hold them, and what they stand for."""
+    if isinstance(data, Tensor):
+        tensor = data.detach().cpu()
+        data = (tensor.float() if tensor.dtype == torch.bfloat16 else tensor).numpy()
+    if not isinstance(data, np.ndarray) or data.ndim not in (3, 4) or not data.size:
+        return data, None  # `_as_tensor` and `Volume` tell what is wrong
+    if data.dtype.kind == "f" and nan is not None:
+        data = np.where(np.isfinite(data), data, nan)
+    values, labels = counted_off(where, data)
+    return _as_tensor(where, values), None if labels is None else torch.from_numpy(labels)
+
+
 def _as_tensor(where: str, data: Tensor | np.ndarray) -> Tensor:
     if isinstance(data, Tensor):
         tensor = data.detach().cpu()
@@ -227,6 +256,7 @@ def _as_tensor(where: str, data: Tensor | np.ndarray) -> Tensor:
         return tensor
     if tensor.is_complex():
         raise ValueError(f"{where}: data must hold real numbers, got {check.describe(tensor)}")
+    check_narrowed(where, tensor.numpy())
     return tensor.to(torch.float32)
 
 

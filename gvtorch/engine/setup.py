@@ -185,6 +185,7 @@ def make_tree(
         root=number * nodes.nodes_per_tile,
         branching=producer.branching,
         value_range=producer.value_range,
+        labels=producer.labels,
     )
     tree.made_of = dict(producer.made_of)
     nodes.child_tn[number], nodes.brick_tn[number] = TERMINAL, EMPTY

@@ -24,6 +24,7 @@ from concurrent.futures import (
 )
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Unpack
@@ -31,10 +32,13 @@ from typing import Any, Unpack
 import numpy as np
 
 from ..base import check
+from ..base.labels import background
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume
+from ..pool.downsample import pool_majority, pool_mean
 from . import resources, shard, unfinished
-from .level_reader import no_time
+from .label_source import IndexSource, counted_source, write_labels
+from .level_reader import Pool, no_time
 from .oblique import Oblique
 from .reading import FormatSettings, open_source, placed, read_whole
 from .source import MemorySource, VolumeSource
@@ -59,6 +63,7 @@ _DISK = 2.0  # writing to disk takes so much longer than to memory
 _SAMPLES = 3  # cubes that are converted for an estimate
 _SAMPLE_TIME = 2.0  # seconds after which no more are
 _OPEN_TIMEOUT = 60.0  # seconds
+_LABELS = "labels.npy"  # beside the journal
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -100,6 +105,14 @@ class _Plan:
     workers: int
     uses_processes: bool
 
+    @property
+    def labels(self) -> np.ndarray | None:
+        """(k,) int64 labels that are counted off."""
+        source = self.task.source
+        if not isinstance(source, IndexSource) or isinstance(source.labels, str):
+            return None
+        return source.labels
+
 
 def convert(
     source: str | Path | Volume | Any,
@@ -112,6 +125,7 @@ def convert(
     nan: float | None = None,
     time: int | None = None,
     oblique: Oblique | None = None,
+    labels: bool = False,
     executor: Executor | None = None,
     workers: int | None = None,
     resume: bool = False,
@@ -135,6 +149,8 @@ def convert(
         nan: Value for voxels that are NaN or infinite; they are refused if left out.
         time: The one time point to write; all if left out.
         oblique: As of `read_volume`.
+        labels: Values are numbers of things, kept exactly; also where the file says so. Those wider
+            than 16 bits are counted off: all is read once before, to find which there are.
         executor: Runs the tasks, such as a dask client's `get_executor()`; the store's folder must
             be the same for all of its workers. A pool of processes if left out.
         workers: Number of processes of that pool; one a core if left out.
@@ -155,13 +171,18 @@ def convert(
     """
     target = Path(store)
     begun = unfinished.is_begun(target, resume=resume)
-    opened_source = _source(source, spacing, origin, time, oblique, options)
+    opened_source = _source(source, spacing, origin, time, oblique, labels, options)
+    opened_source = _counted(opened_source, target, time, workers, progress)
     plan = _plan(source, opened_source, target, block, threshold, nan, time, workers)
     if not begun:
         _check_room(target, _estimate(plan))
     with _told_how_to_go_on(plan), unfinished.claimed(target, plan.settings, resume=begun) as work:
+        if plan.labels is not None:
+            write_labels(target / WORK / _LABELS, plan.labels)
         with _executor(executor, plan) as pool:
             _write_levels(_staged(plan, pool), work, pool, progress)
+        if plan.labels is not None:
+            _write_label_array(plan.task, plan.labels)
         layout = dataclasses.replace(plan.task.layout, value_range=_value_range(plan.task))
         work.finish(layout, plan.task.source.info, plan.settings)
     return Store.open(target)
@@ -176,15 +197,18 @@ def estimate(
     nan: float | None = None,
     time: int | None = None,
     oblique: Oblique | None = None,
+    labels: bool = False,
     workers: int | None = None,
     **options: Unpack[FormatSettings],
 ) -> Estimate:
-    """Tells what `convert` would take, from a few cubes converted in memory. Writes nothing.
+    """Tells what `convert` would take, from a few cubes converted in memory. Writes nothing. Labels
+    wider than 16 bits are all read, to find which there are.
 
     Args, Raises: as `convert`.
     """
-    opened_source = _source(source, None, None, time, oblique, options)
+    opened_source = _source(source, None, None, time, oblique, labels, options)
     target = Path(store)
+    opened_source = _counted(opened_source, target, time, workers, no_progress)
     return _estimate(_plan(source, opened_source, target, block, threshold, nan, time, workers))
 
 
@@ -197,6 +221,7 @@ def _source(
     origin: Sequence[float] | None,
     time: int | None,
     oblique: Oblique | None,
+    labels: bool,
     options: FormatSettings,
 ) -> VolumeSource:
     """Opens the source; one that can only be read whole is read, once. Its time points are those
@@ -206,7 +231,9 @@ def _source(
     if isinstance(source, Volume):
         if time not in (None, 0):
             raise ValueError(no_time(source.name, time, 1))
-        if source.filter != "mean":
+        if labels and not source.info.labels:
+            raise ValueError("convert: the volume must hold labels: gv.Volume(data, labels=True)")
+        if source.filter == "directional":
             raise ValueError(
                 "convert: a store's levels are means: a volume seen from six directions "
                 "is rendered with N3Tree.from_volume or VolumeProducer"
@@ -215,10 +242,13 @@ def _source(
             raise ValueError(f"{source.name}: {source.data.dtype} has no place in a store")
         told = {"path": source.name, "info": source.info}
         told |= {"spacing": source.spacing, "origin": source.origin}
-        return placed("convert", MemorySource.of(source.data.numpy(), **told), spacing, origin)
-    found = open_source(
-        source, spacing=spacing, origin=origin, time=time, oblique=oblique, **options
-    )
+        found = placed("convert", MemorySource.of(source.data.numpy(), **told), spacing, origin)
+        if source.label_values is None:
+            return found
+        # They are counted off already.
+        return IndexSource.of(found, source.label_values.numpy(), indexed=True)
+    placement: dict[str, Any] = {"spacing": spacing, "origin": origin, "oblique": oblique}
+    found = open_source(source, time=time, labels=labels, **placement, **options)
     if not found.whole:
         return found
     first, times = (0, found.times) if time is None else (time, 1)
@@ -230,6 +260,21 @@ def _source(
         )
     told = {name: getattr(found, name) for name in ("path", "spacing", "origin", "info")}
     return MemorySource.of(read_whole(found, first, times), **told)
+
+
+def _counted(
+    source: VolumeSource,
+    target: Path,
+    time: int | None,
+    workers: int | None,
+    progress: Progress,
+) -> VolumeSource:
+    """Counts labels off that are wider than 16 bits."""
+    if not source.info.labels or isinstance(source, IndexSource):
+        return source
+    times = (0, source.times) if time is None else (source.time, source.time + 1)
+    threads = min(8, resources.cores() if workers is None else workers)
+    return counted_source(source, times, threads, target / WORK / _LABELS, progress)
 
 
 def _plan(
@@ -249,6 +294,10 @@ def _plan(
     if nan is not None:
         most = float(np.finfo(source.dtype).max) if np.dtype(source.dtype).kind == "f" else math.inf
         nan = check.number("convert", "nan", nan, low=-most, high=most)
+    if source.info.labels and threshold is not None:
+        raise ValueError("convert: threshold is for values; labels are hidden by the shader")
+    known = source.labels if isinstance(source, IndexSource) else None
+    names = None if isinstance(known, str) else known
     layout = StoreLayout(
         extent=source.extent,
         dtype=source.dtype,
@@ -256,6 +305,7 @@ def _plan(
         block=block,
         threshold=threshold,
         times=source.times if time is None else 1,
+        label_count=None if names is None else len(names),
     )
     told_channels = len(source.info.channels)
     if told_channels not in (0, source.width):
@@ -277,11 +327,16 @@ def _plan(
         "block": block,
         "threshold": threshold,
         "nan": nan,
+        "labels": source.info.labels,
         "tasks": sum(tasks),
     }
+    pool: Pool = pool_mean
+    if source.info.labels:
+        pool = partial(pool_majority, background=background(names))
+    root = kvstore(target)
     return _Plan(
         target=target,
-        task=shard.Conversion(root=kvstore(target), layout=layout, source=source, nan=nan),
+        task=shard.Conversion(root=root, layout=layout, source=source, nan=nan, pool=pool),
         settings=settings,
         workers=min(workers, tasks[0]),
         uses_processes=tasks[0] > _FEW,
@@ -302,7 +357,8 @@ def _estimate(plan: _Plan) -> Estimate:
     copies = _COPIES * (layout.shard + 2) ** 3 * layout.voxel_bytes
     cube = min(1.0, math.prod(layout.extent) / layout.shard**3)
     each = (_PROCESS if plan.uses_processes else 0) + int(copies * cube)
-    held = source.data.nbytes if isinstance(source, MemorySource) else 0
+    inner = source.inner if isinstance(source, IndexSource) else source
+    held = inner.data.nbytes if isinstance(inner, MemorySource) else 0
     staged = held if plan.uses_processes else 0
     start = 3.0 * plan.uses_processes
     target = plan.target.absolute()
@@ -404,14 +460,27 @@ def _told_how_to_go_on(plan: _Plan) -> Iterator[None]:
 
 
 def _staged(plan: _Plan, pool: Executor) -> _Plan:
-    """Writes a volume that lies in memory to a file, where other processes shall read it."""
-    if not isinstance(plan.task.source, MemorySource) or isinstance(pool, ThreadPoolExecutor):
+    """Writes what lies in memory, a volume or labels, to files, where other processes shall read
+    it.
+    """
+    if isinstance(pool, ThreadPoolExecutor):
         return plan
+    source = plan.task.source
+    if isinstance(source, IndexSource):
+        inner = _in_file(plan, source.inner)
+        source = dataclasses.replace(source, inner=inner).in_file(plan.target / WORK / _LABELS)
+    else:
+        source = _in_file(plan, source)
+    return dataclasses.replace(plan, task=dataclasses.replace(plan.task, source=source))
+
+
+def _in_file(plan: _Plan, source: VolumeSource) -> VolumeSource:
+    if not isinstance(source, MemorySource):
+        return source
     file = plan.target / WORK / "source.npy"
-    data = plan.task.source.data
-    np.save(file, data)
-    task = dataclasses.replace(plan.task, source=open_source(file, axes="tzyxc"[-data.ndim :]))
-    return dataclasses.replace(plan, task=task)
+    np.save(file, source.data)
+    axes = "tzyxc"[-source.data.ndim :]
+    return dataclasses.replace(open_source(file, axes=axes), info=source.info)
 
 
 def _write_levels(
@@ -455,6 +524,12 @@ def _create_arrays(task: shard.Conversion, level: int) -> None:
     for spec in (*arrays, *layout.bounds(level)):
         where = f"{task.root['path']}{spec['path']}"
         Deadline(_OPEN_TIMEOUT).wait(opened(task.root, spec, "create"), where)
+
+
+def _write_label_array(task: shard.Conversion, labels: np.ndarray) -> None:
+    spec = task.layout.labels()
+    Deadline(_OPEN_TIMEOUT).wait(opened(task.root, spec, "create"), spec["path"])
+    shard.finish(shard.write(task.root, spec, [0], labels), task.root.get("path", "store"))
 
 
 def _run(

@@ -11,18 +11,20 @@ import itertools
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from ..base.labels import check_narrowed
 from ..pool.downsample import pool_mean
 from . import boxes
 from .boxes import Zyx
 from .ngff import ImageArray, MultiscaleImage, read_json
 from .store_layout import MOST_VOXELS, Deadline, StoreError, StoreLayout, child, opened, short
 
+Pool = Callable[[np.ndarray, int | Sequence[int]], np.ndarray]
 _TILE = 64  # voxels along a side of a tile that is made on demand
 _KEPT = 128 << 20  # bytes of such tiles
 _MOST_CHUNK = 2**31  # bytes of one chunk of a foreign array
@@ -142,9 +144,13 @@ def _factors(
 class LevelReader:
     """Tree levels over stored arrays. Safe to use from several threads."""
 
-    def __init__(self, stored: Sequence[StoredArray], layout: StoreLayout) -> None:
-        """Plans how each level of the layout is read from arrays, the finest first."""
-        self._layout, self.width = layout, stored[0].size("c")
+    def __init__(
+        self, stored: Sequence[StoredArray], layout: StoreLayout, pool: Pool = pool_mean
+    ) -> None:
+        """Plans how each level of the layout is read from arrays, the finest first; `pool` makes
+        the voxels of a level that has none.
+        """
+        self._layout, self._pool, self.width = layout, pool, stored[0].size("c")
         self._plans: list[tuple[StoredArray, list[int]] | None] = []
         cost = 1.0
         for level in range(layout.levels):
@@ -167,10 +173,23 @@ class LevelReader:
         data = self._inside(level, start, stop, deadline)
         return np.ascontiguousarray(boxes.repeat_edges(data, start, low, high))
 
-    def stored(self, level: int) -> int:
+    def coarsest(self, level: int) -> int:
         """Returns the coarsest level up to `level` that is read without averaging finer ones."""
         plain = [n for n, plan in enumerate(self._plans[: level + 1]) if plan and max(plan[1]) == 1]
         return plain[-1]
+
+    @property
+    def stored(self) -> np.dtype:
+        """The dtype of the finest array."""
+        base, _ = self._plans[0] or (None, None)
+        assert base is not None
+        return base.array.dtype.numpy_dtype
+
+    def read_stored(self, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
+        """Reads (z, y, x, c) finest voxels of this dtype, a box inside the volume."""
+        base, _ = self._plans[0] or (None, None)
+        assert base is not None
+        return base.read(low, high, deadline)
 
     def _inside(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         plan = self._plans[level]
@@ -180,8 +199,11 @@ class LevelReader:
         ends = [-(-n // f) for n, f in zip(self._layout.shape(0), base.factors, strict=True)]
         start = [a * r for a, r in zip(low, rest, strict=True)]
         stop = [min(b * r, n) for b, r, n in zip(high, rest, ends, strict=True)]
-        data = base.read(start, stop, deadline).astype(self._layout.dtype, copy=False)
-        return data if math.prod(rest) == 1 else pool_mean(data, rest)
+        data = base.read(start, stop, deadline)
+        if self._layout.dtype == "float32":
+            check_narrowed(base.where, data)
+        data = data.astype(self._layout.dtype, copy=False)
+        return data if math.prod(rest) == 1 else self._pool(data, rest)
 
     def _from_tiles(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         size = [b - a for a, b in zip(low, high, strict=True)]
@@ -204,7 +226,7 @@ class LevelReader:
         below = self._layout.shape(level - 1)
         low = [2 * _TILE * at for at in place]
         high = [min(a + 2 * _TILE, n) for a, n in zip(low, below, strict=True)]
-        tile = pool_mean(self._inside(level - 1, low, high, deadline), 2)
+        tile = self._pool(self._inside(level - 1, low, high, deadline), 2)
         with self._lock:
             self._tiles[key] = tile
             size = sum(kept.nbytes for kept in self._tiles.values())

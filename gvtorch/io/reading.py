@@ -48,6 +48,7 @@ def read_volume(
     nan: float | None = None,
     time: int | None = None,
     oblique: Oblique | None = None,
+    labels: bool = False,
     **options: Unpack[FormatSettings],
 ) -> Volume:
     """Reads a volume, with what the file tells of it: `Volume.info`.
@@ -69,6 +70,7 @@ def read_volume(
         time: Which time point, from 0; the first, with a warning, if left out where there are more.
         oblique: Of voxel axes that do not lie along the world's: "resample" (the default), or
             "keep", which keeps the voxels and takes their axes for the world's.
+        labels: Values are numbers of things, see `Volume`; also where the file says so.
         **options: RAW, and files of any ending: shape, (x, y, z) voxels, dtype, a NumPy dtype as in
             "int16" or ">i2" (the name's `_XxYxZ_dtype` if left out), and offset, bytes of a header
             to skip. key: which of several arrays, series, scenes or images. Formats without names
@@ -76,7 +78,8 @@ def read_volume(
             the array, the slowest first. docs/formats.md has all formats.
 
     Returns:
-        The volume, dtype kept (64 and 32 bit integers and float64 become float32).
+        The volume, dtype kept (64 and 32 bit integers and float64 become float32, unless they are
+        labels).
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -85,7 +88,7 @@ def read_volume(
         ImportError: A library is missing; the message tells which pip command brings it.
     """
     told: dict[str, Any] = {"spacing": spacing, "origin": origin, "time": time, "oblique": oblique}
-    source = open_source(path, most=MAX_VOXELS, **told, **options)
+    source = open_source(path, most=MAX_VOXELS, labels=labels, **told, **options)
     if time is None and source.times > 1:
         warnings.warn(
             f"{source.path}: has {source.times} time points, this is the first; "
@@ -108,6 +111,7 @@ def open_source(
     origin: Sequence[float] | None = None,
     time: int | None = None,
     oblique: Oblique | None = None,
+    labels: bool = False,
     most: int = MOST_VOXELS * _MOST_CHANNELS,
     **options: Unpack[FormatSettings],
 ) -> VolumeSource:
@@ -124,6 +128,8 @@ def open_source(
     text, kind, opener = _find(path, given)
     with told_as(ValueError, text, f"can't be read as {kind}", StoreError, TimeoutError):
         source = opener(**given)
+        if labels:
+            source = dataclasses.replace(source, info=dataclasses.replace(source.info, labels=True))
         check_extent(text, (*source.extent, source.width), most=most)
         check_extent(text, source.extent, most=MOST_VOXELS)
         if not 1 <= source.times <= MOST_TIMES or min(source.shape) < 1:
@@ -131,7 +137,8 @@ def open_source(
         if time is not None and (type(time) is not int or not 0 <= time < source.times):
             raise ValueError(no_time(text, time, source.times))
         source = source.at_time(time or 0)
-        if source.dtype not in DTYPES:
+        known = source.info.labels and np.dtype(source.dtype).kind in "iuf"
+        if source.dtype not in DTYPES and not known:
             raise ValueError(f"{text}: values must be real numbers, got dtype {source.dtype}")
         source.check_file()
         if source.oblique is not None and spacing is not None and oblique != "keep":

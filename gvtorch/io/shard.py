@@ -16,7 +16,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ..pool.downsample import pool_max, pool_mean, pool_min, round_array, window
 from . import boxes
-from .level_reader import StoredArray
+from .level_reader import Pool, StoredArray
 from .source import VolumeSource
 from .store import needed_cells
 from .store_layout import BORDER, CELL, Deadline, StoreError, StoreLayout, opened, short
@@ -25,7 +25,6 @@ _TIMEOUT = 3600.0  # seconds for one read of local data
 _SLAB = 32  # planes of a level made at a time: two chunks of the level below
 
 Place = tuple[int, ...]  # z, y, x, or t, z, y, x where a store has several time points
-_POOLS = (pool_mean, pool_min, pool_max)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +35,7 @@ class Conversion:
     layout: StoreLayout
     source: VolumeSource
     nan: float | None
+    pool: Pool = pool_mean  # makes coarser voxels
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,8 @@ def write_shard(conversion: Conversion, level: int, place: Place) -> ShardResult
     writes = [write(conversion.root, layout.plain(level), low, plain, time)]
     for spec, bound in zip(layout.bounds(level), (least, most), strict=False):
         writes.append(write(conversion.root, spec, low, _plain(bound[inner], axes), time))
-    cells = _cells(values, least, most, [-(-n // CELL) for n in size])
+    middle = "min" if conversion.source.info.labels else "mean"  # a label that is there
+    cells = _cells(values, least, most, [-(-n // CELL) for n in size], middle)
     first = [a // CELL for a in low]
     writes.append(write(conversion.root, layout.cells(level), first, cells, time))
     blocks = _blocks(layout, values, needed_cells(cells, layout.threshold))
@@ -105,9 +106,10 @@ def _from_source(
 def _from_below(
     conversion: Conversion, level: int, time: int, low: list[int], high: list[int]
 ) -> list[np.ndarray]:
-    """Makes a box of a level, voxels around it included, from the level below: means, smallest and
-    largest finest values.
+    """Makes a box of a level, voxels around it included, from the level below: means (labels: the
+    most frequent), smallest and largest finest values.
     """
+    pools = (conversion.pool, pool_min, pool_max)
     layout, deadline = conversion.layout, Deadline(_TIMEOUT)
     arrays = []
     # The finest values are their own smallest and largest.
@@ -117,13 +119,13 @@ def _from_below(
         arrays.append(StoredArray(array, "czyx"[-array.rank :], (1, 1, 1), spec["path"]))
     start, stop = boxes.clamp(low, high, layout.shape(level))
     size = (*[b - a for a, b in zip(start, stop, strict=True)], layout.width)
-    made = [np.empty(size, layout.dtype) for _ in _POOLS]
+    made = [np.empty(size, layout.dtype) for _ in pools]
     for z in (start[0], *range((start[0] // _SLAB + 1) * _SLAB, stop[0], _SLAB)):
         end = min(stop[0], (z // _SLAB + 1) * _SLAB)
         first = [2 * z, 2 * start[1], 2 * start[2]]
         last = np.minimum([2 * end, 2 * stop[1], 2 * stop[2]], layout.shape(level - 1)).tolist()
         parts = [array.read(first, last, deadline) for array in arrays]
-        for out, part, pool in zip(made, parts * (len(_POOLS) // len(parts)), _POOLS, strict=True):
+        for out, part, pool in zip(made, parts * (len(pools) // len(parts)), pools, strict=True):
             out[z - start[0] : end - start[0]] = pool(part, 2)
     return [boxes.repeat_edges(values, start, low, high) for values in made]
 
@@ -133,14 +135,16 @@ def _plain(values: np.ndarray, axes: str) -> np.ndarray:
     return np.moveaxis(values, 3, 0) if "c" in axes else values[..., 0]
 
 
-def _cells(values: np.ndarray, least: np.ndarray, most: np.ndarray, count: list[int]) -> np.ndarray:
+def _cells(
+    values: np.ndarray, least: np.ndarray, most: np.ndarray, count: list[int], middle: str
+) -> np.ndarray:
     """(gz, gy, gx, 3, c) low, high, mean of the cells of a cube with its border."""
     reach = tuple(slice(0, n * CELL + 2 * BORDER) for n in count)
     own = tuple(slice(BORDER, BORDER + n * CELL) for n in count)
     size = CELL + 2 * BORDER
     low = window(least[reach], "min", size=size, step=CELL)
     high = window(most[reach], "max", size=size, step=CELL)
-    mean = window(values[own], "mean", size=CELL, step=CELL)
+    mean = window(values[own], middle, size=CELL, step=CELL)
     return np.stack((low, high, round_array(mean, values.dtype)), axis=3)
 
 

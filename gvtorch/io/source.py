@@ -24,6 +24,7 @@ from typing import IO, Any, Self
 import numpy as np
 
 from ..base.image_info import ImageInfo
+from ..base.labels import check_narrowed
 from . import boxes
 from .store_layout import value_dtype
 
@@ -67,8 +68,8 @@ class VolumeSource(ABC):
 
     @property
     def dtype(self) -> str:
-        """What values are read as: wide numbers become float32, as in `Volume`."""
-        return value_dtype(np.dtype(self.stored))
+        """What values are read as: wide numbers become float32, as in `Volume`; labels stay."""
+        return value_dtype(np.dtype(self.stored), labels=self.info.labels)
 
     @property
     def nbytes(self) -> int:
@@ -137,6 +138,8 @@ class VolumeSource(ABC):
         data = data.squeeze(tuple(i for i, axis in enumerate(self.axes) if axis == "-"))
         data = boxes.to_zyxc(data, self.axes.replace("-", ""), "tzyxc")
         data = np.flip(data, tuple("tzyx".index(axis) for axis in self.flips))
+        if not self.info.labels:
+            check_narrowed(self.path, data)
         with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite
             return np.asarray(data).astype(self.dtype, order="C", copy=False)
 

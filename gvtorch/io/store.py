@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,11 @@ import numpy as np
 import torch
 
 from ..base import check
+from ..base.labels import background
+from ..pool.downsample import pool_majority, pool_mean
 from . import boxes
 from .boxes import Zyx
-from .level_reader import LevelReader, open_arrays
+from .level_reader import LevelReader, Pool, open_arrays
 from .ngff import MultiscaleImage, find_image, read_json
 from .store_layout import (
     BORDER,
@@ -70,6 +73,9 @@ class Store:
         threshold: What EMPTY was decided by, or None.
         all_channels: Whether it was opened with all of its channels, as they are.
         coarse: Its coarse channels by name; see coarse.py.
+        label_values: (k,) int64 the label that each value stands for, where labels were counted
+            off; None: values stand for themselves.
+        pool: Makes coarser voxels: their mean, or the most frequent label.
         layout: What lies where on disk.
         root: tensorstore's spec of its folder.
     """
@@ -85,6 +91,8 @@ class Store:
         time: int,
         times: int,
         has_blocks: bool,
+        label_values: np.ndarray | None = None,
+        pool: Pool = pool_mean,
     ) -> None:
         """Takes what `open` found."""
         self.location, self.name = location, image.name
@@ -104,6 +112,8 @@ class Store:
         self.root = kvstore(location)
         self.all_channels = isinstance(channels, slice)
         self.coarse: dict[str, CoarseChannel] = {}
+        self.pool = pool
+        self.label_values = None if label_values is None else torch.from_numpy(label_values)
         self._blocks: list[Any] = []
         self._cells: list[Any] = []
         self._seen: set[tuple[Any, ...]] = set()
@@ -141,11 +151,19 @@ class Store:
         layout = own or StoreLayout(extent=(x, y, z), dtype=dtype, width=width)
         if (layout.extent, layout.dtype) != ((x, y, z), dtype) or (own and own.times != times):
             raise ValueError(f"{where}: damaged: metadata and level 0 differ in extent or dtype")
-        levels = LevelReader(stored, layout)
+        names = None if layout.label_count is None else _read_labels(where, root, layout, deadline)
+        pool: Pool = pool_mean
+        if found.info.labels:
+            pool = partial(pool_majority, background=background(names))
+        levels = LevelReader(stored, layout, pool)
         found = _fitted(found, sizes, chosen)
-        own_blocks = own is not None
         self = cls(
-            *(where, found, layout, levels, chosen), time=time, times=times, has_blocks=own_blocks
+            *(where, found, layout, levels, chosen),
+            time=time,
+            times=times,
+            has_blocks=own is not None,
+            label_values=names,
+            pool=pool,
         )
         if own:
             self._open_own(deadline)
@@ -212,7 +230,7 @@ class Store:
 
     def stored_level(self, level: int) -> int:
         """Coarsest level up to this one that lies on disk, and is not averaged when it is read."""
-        return self._levels.stored(self._checked(level))
+        return self._levels.coarsest(self._checked(level))
 
     def block_grid(self, level: int) -> tuple[int, int, int]:
         """(z, y, x) number of blocks of a level."""
@@ -246,6 +264,22 @@ class Store:
             inside = data[boxes.index(np.subtract(start, low).clip(0), data.shape[:3])]
             self._check_shards(self.layout.plain(level), inside, start, stop, deadline)
         return data
+
+    @property
+    def stored(self) -> str:
+        """NumPy dtype of what `read_stored` gives: that of the array, before it is narrowed."""
+        return "int64" if self.label_values is not None else self._levels.stored.str
+
+    def read_stored(self, low: Zyx, high: Zyx, *, timeout: float = 60.0) -> np.ndarray:
+        """Reads a box of finest voxels, (z, y, x, c), as they are stored; labels that were counted
+        off are given as labels. Box and errors as of `read_region`; it lies inside the volume.
+        """
+        if not self.has_blocks:
+            return self._levels.read_stored(low, high, Deadline(timeout))
+        data = self.read_region(0, low, high, timeout=timeout)
+        if self.label_values is None:
+            return data
+        return self.label_values.numpy()[data.astype(np.int64)]
 
     def read_cells(self, level: int, low: Zyx, high: Zyx, *, timeout: float = 60.0) -> np.ndarray:
         """Reads smallest, largest and mean value of a box of cells, of our own stores only.
@@ -466,6 +500,19 @@ class Store:
 
     def _checked(self, level: int) -> int:
         return check.whole(self.location, "level", level, low=0, high=self.levels - 1)
+
+
+def _read_labels(where: str, root: Any, layout: StoreLayout, deadline: Deadline) -> np.ndarray:
+    """(k,) int64 labels that were counted off."""
+    spec = layout.labels()
+    name = f"{where}/{spec['path']}"
+    array = deadline.wait(opened(root, spec), name)
+    if list(array.shape) != [layout.label_count] or array.dtype.name != "int64":
+        raise ValueError(f"{name}: damaged: {array.shape} {array.dtype.name}")
+    labels: np.ndarray = deadline.wait(array.read(order="C"), name)
+    if not (labels[1:] > labels[:-1]).all():
+        raise ValueError(f"{name}: damaged: labels must rise")
+    return labels
 
 
 def _fitted(

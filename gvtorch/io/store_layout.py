@@ -8,10 +8,13 @@
                                      its border the true neighbours, repeated at the volume's faces;
                                      blocks of CONSTANT and EMPTY cells only are not written
     STORE.zarr/gvtorch/cells/0 ...   (gz, gy, gx, 3, c) low, high, mean of every cell of 8^3 voxels
+    STORE.zarr/gvtorch/labels        (k,) int64, rising: of labels that were counted off, since they
+                                     are wider than 16 bits, the label that each value stands for
     STORE.zarr/gvtorch/coarse/ ...   what coarse voxels hold beside means; see coarse.py
     STORE.zarr/.gvtorch-work         only while it is made: manifest, journal, low and high pyramids
 
-A shard of any array covers the same cube of voxels, and one task of the converter writes it.
+A shard of any array covers the same cube of voxels, and one task of the converter writes it. Of
+labels, coarse voxels hold the most frequent, and cells the smallest in place of the mean.
 """
 
 from __future__ import annotations
@@ -44,14 +47,19 @@ DTYPES = {"uint8": 1, "int8": 1, "uint16": 2, "int16": 2, "float16": 2, "float32
 GROUPS = ("gvtorch", "gvtorch/blocks", "gvtorch/cells")
 _PLAIN_CHUNK = 64  # voxels
 _CELL_CHUNK = 16  # cells
+_LABEL_CHUNK = 2**16
 _COARSE_SHARD = 128  # voxels along a side of a shard of a coarse channel
 _KEEP = "store_data_equal_to_fill_value"  # zeros are written too: what is missing then shows
 
 
-def value_dtype(stored: np.dtype) -> str:
-    """Name of the dtype that values are read as: bool becomes uint8, wide numbers float32."""
+def value_dtype(stored: np.dtype, *, labels: bool = False) -> str:
+    """Name of the dtype that values are read as: bool becomes uint8, wide numbers float32, unless
+    they are labels.
+    """
     if stored.kind == "b":
         return "uint8"
+    if labels:
+        return stored.name
     return "float32" if stored.kind in "iuf" and stored.name not in DTYPES else stored.name
 
 
@@ -66,6 +74,7 @@ class StoreLayout:
     threshold: float | None = None  # what EMPTY was decided by
     value_range: Sequence[Sequence[float]] | None = None  # [low, high] of each channel
     times: int = 1  # time points
+    label_count: int | None = None  # of labels that were counted off
 
     @property
     def axes(self) -> str:
@@ -161,6 +170,14 @@ class StoreLayout:
             chunk=[1, 1, 1, *inside],
         )
 
+    def labels(self) -> dict[str, Any]:
+        """Spec of the array of labels that were counted off."""
+        count = self.label_count or 0
+        shard = -(-count // _LABEL_CHUNK) * _LABEL_CHUNK
+        return dataclasses.replace(self, dtype="int64")._array(
+            "gvtorch/labels", shape=[count], shard=[shard], chunk=[_LABEL_CHUNK]
+        )
+
     def bounds(self, level: int) -> list[dict[str, Any]]:
         """Specs of the temporary arrays of smallest and largest finest values, where a level needs
         them: the finest values are their own, and nothing is made of the last.
@@ -182,7 +199,7 @@ class StoreLayout:
     ) -> dict[str, Any]:
         if times > 1:  # each time point has shards of its own
             shape, shard, chunk = [times, *shape], [1, *shard], [1, *chunk]
-        size = DTYPES[self.dtype]
+        size = {**DTYPES, "int64": 8}[self.dtype]
         wide = size > 1
         little = {"name": "bytes", "configuration": {"endian": "little"}}
         crc = {"name": "crc32c"}
@@ -216,10 +233,12 @@ class StoreLayout:
     def attributes(self, place: dict[str, Any]) -> dict[str, Any]:
         """What the metadata says of a whole store; `place` is its spacing and origin."""
         several = {"times": self.times} if self.times > 1 else {}
+        counted = {"label_count": self.label_count} if self.label_count is not None else {}
         return {
             "version": VERSION + (self.times > 1),
             "extent": list(self.extent),
             **several,
+            **counted,
             **place,
             "dtype": self.dtype,
             "channels": self.width,
@@ -243,13 +262,14 @@ class StoreLayout:
                 f"{where}: store version {own.get('version')!r}, this reads {VERSION} and "
                 f"{VERSION + 1}"
             )
-        times = own.get("times", 1)
+        times, count = own.get("times", 1), own.get("label_count")
         extent: Any = own.get("extent")
         ranges: Any = own.get("value_range")
         fits = {
             "extent": _is_list(extent, 3) and all(_is_whole(n, 1, MOST_VOXELS) for n in extent),
             "times": _is_whole(times, own["version"], MOST_TIMES if own["version"] > 1 else 1),
             "dtype": own.get("dtype") in list(DTYPES),
+            "label_count": count is None or _is_whole(count, 1, 2**24),
             "channels": _is_whole(own.get("channels"), 1, 2**16),
             "block": own.get("block") in BLOCKS,
             "border": own.get("border") == BORDER,
@@ -263,7 +283,8 @@ class StoreLayout:
         for key, good in fits.items():
             if not good:
                 raise ValueError(f"{where}: damaged: gvtorch.{key} is {own.get(key)!r}")
-        told = {key: own[key] for key in ("dtype", "block", "value_range")} | {"times": times}
+        told = {key: own[key] for key in ("dtype", "block", "value_range")}
+        told |= {"times": times, "label_count": count}
         return cls(
             extent=tuple(extent), width=own["channels"], threshold=own.get("threshold"), **told
         )

@@ -32,6 +32,7 @@ SHADER_KINDS = (
     "GradientMagnitude",
     "Filtered",
     "ChannelMix",
+    "Labels",
 )
 
 
@@ -90,6 +91,12 @@ class FilteredNumbers(NamedTuple):
     """The own number of a transfer function with filtered colours."""
 
     side: Number  # of the root cube, its smallest, world length
+
+
+class LabelNumbers(NamedTuple):
+    """The own number of labels."""
+
+    lit: Number  # above 0: they are lit
 
 
 _Record = TypeVar("_Record")

@@ -142,7 +142,7 @@ def check_shade(
         raise ValueError(f"{where}: features need other_bzyxc")
     if kind == "Filtered" and others not in (4, 24):
         raise ValueError(f"{where}: filtered colours need an other_bzyxc of 4 or 24 numbers")
-    given = {"Features": others, "Projection": 1}.get(kind, 0)
+    given = {"Features": others, "Projection": 1, "Labels": 1}.get(kind, 0)
     if own:
         check.whole(where, "features", shading.features, low=0)
     else:

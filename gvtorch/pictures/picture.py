@@ -33,6 +33,7 @@ class Picture:
     # What only some shaders give, else None:
     normal: Tensor | None = None  # (h, w, 3) world, towards the eye, of unit length or 0
     features: Tensor | None = None  # (h, w, c)
+    label: Tensor | None = None  # (h, w, 1) int64, of the voxels at the depth; -1: nothing was hit
 
     def tone_map(
         self, curve: ToneCurve = "aces", *, exposure: float = 0.0, white: float = 4.0
@@ -99,13 +100,15 @@ class Picture:
             raise RuntimeError(f"Picture.show: no viewer can be opened here; the PNG is {path}")
 
     def layers(self) -> dict[str, np.ndarray]:
-        """Returns color, alpha, depth, and normal and features where they are (float32), and
-        samples (int32) as arrays.
+        """Returns color, alpha, depth, and normal and features where they are (float32), samples
+        (int32), and label where it is (int64) as arrays.
         """
         names = ("color", "alpha", "depth", "normal", "features")
         given = {name: getattr(self, name) for name in names}
         layers = {name: layer.float() for name, layer in given.items() if layer is not None}
         layers["samples"] = self.samples
+        if self.label is not None:
+            layers["label"] = self.label
         return {name: layer.detach().cpu().numpy() for name, layer in layers.items()}
 
     def save(self, path: str | Path, *, bits: int | None = None) -> None:
@@ -116,7 +119,8 @@ class Picture:
         - .tif: the same, or 32 bits: linear float, premultiplied (BigTIFF, Deflate).
         - .exr: linear, 32 or 16 bits float: R G B A (premultiplied), Z (depth), samples.
         - .npy: (h, w, 6) float32: color, alpha, depth, samples.
-        - .npz: float32 color, alpha and depth, int32 samples; normal and features where they are.
+        - .npz: float32 color, alpha and depth, int32 samples; normal, features and label where
+          they are.
 
         Args:
             path: The file; its ending chooses the format.

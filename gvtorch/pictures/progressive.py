@@ -28,7 +28,7 @@ from ..cameras.custom import as_camera
 from .files import checked_path, stacked, tiff_pixels, whole_file, write_tiff
 from .picture import Picture
 
-_OF_CENTRES = ("depth", "nearest", "normal", "features")  # the first frame's are kept
+_OF_CENTRES = ("depth", "nearest", "normal", "features", "label")  # the first frame's are kept
 _PLASTIC = 1.32471795724474602596  # the real root of x^3 = x + 1
 _PIXEL_BYTES = 400  # of a strip on its way: rays (80), hits twice, layers and their encoding
 _TILE = 4  # rows of the tiles in which rays are traced
@@ -84,10 +84,10 @@ class Progressive:
         """Renders one more frame, the first of a new mean if the camera moved.
 
         Returns:
-            The mean of colour and alpha so far, summed up in float64; depth, nearest, normal and
-            features are those of the pixels' centres where nothing was missing, `samples` and
-            `stats` those of this frame, and `missed` tells which pixels have seen no frame without
-            a miss. The first is the plain picture to the last bit.
+            The mean of colour and alpha so far, summed up in float64; depth, nearest, normal,
+            features and label are those of the pixels' centres where nothing was missing, `samples`
+            and `stats` those of this frame, and `missed` tells which pixels have seen no frame
+            without a miss. The first is the plain picture to the last bit.
         """
         if self._camera is None or camera is not self._given:
             own = as_camera("Progressive", camera)

@@ -1,7 +1,7 @@
 """Reductions of voxels in NumPy, of which coarse levels and summaries of nodes are made.
 
-`pool_mean` is the filter of a level (docs/design.md, section 2, tells why), `pool_directional` that
-of volumes with six directions, see `Volume.directional`.
+`pool_mean` is the filter of a level (docs/design.md, section 2, tells why), `pool_majority` that of
+labels, `pool_directional` that of volumes with six directions, see `Volume.directional`.
 
 All functions take (z, y, x, c) arrays. Each gives the same bits on any part of an array whose
 corner is a multiple of the factor as on the whole, so volumes are also converted part by part.
@@ -12,6 +12,7 @@ Source: Crassin et al., "GigaVoxels", I3D 2009, section 3 (mip-mapped bricks); W
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -56,6 +57,40 @@ def pool_min(values: np.ndarray, factor: int | Sequence[int]) -> np.ndarray:
 def pool_max(values: np.ndarray, factor: int | Sequence[int]) -> np.ndarray:
     """Returns the maximum of each block; arguments as for `pool_mean`."""
     return _pool(values, factor, partial(_reduced, combine=np.maximum))
+
+
+def pool_majority(
+    values: np.ndarray, factor: int | Sequence[int], background: float | None
+) -> np.ndarray:
+    """Returns the most frequent value of each block; of equally frequent ones the smallest, and the
+    background last, so that a sheet one voxel thick does not vanish. Arguments as for `pool_mean`.
+    """
+
+    def reduce(part: np.ndarray, factors: Factors) -> np.ndarray:
+        low, high = (_reduced(part, factors, one) for one in (np.minimum, np.maximum))
+        mixed = (low != high).nonzero()
+        if len(mixed[0]):
+            z, y, x = (n // f for n, f in zip(part.shape, factors, strict=False))
+            blocks = part.reshape(z, factors[0], y, factors[1], x, factors[2], part.shape[3])
+            rows = blocks.transpose(0, 2, 4, 6, 1, 3, 5)[mixed].reshape(len(mixed[0]), -1)
+            low[mixed] = _most_frequent(rows, background)
+        return low
+
+    return _pool(values, factor, reduce)
+
+
+def _most_frequent(rows: np.ndarray, background: float | None) -> np.ndarray:
+    """(k,) of rows (k, m), see `pool_majority`."""
+    columns = np.sort(rows, 1).T
+    run = np.ones(len(rows), np.int32)
+    best, most = columns[0].copy(), run.copy()
+    for before, value in itertools.pairwise(columns):
+        run = np.where(value == before, run + 1, 1)
+        better = run > most
+        if background is not None:
+            better |= (run == most) & (best == background)
+        best[better], most[better] = value[better], run[better]
+    return best
 
 
 def pool_directional(

@@ -14,10 +14,18 @@ from torch import Tensor
 from ..base import check
 from ..base.constants import CONSTANT, TERMINAL
 from ..base.image_info import ImageInfo
+from ..base.labels import background
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume, movable
 from ..ops import locate
-from .pools import BrickPool, Channel, NodePool, volumes_by_channel
+from .pools import (
+    BrickPool,
+    Channel,
+    NodePool,
+    checked_threshold,
+    labels_by_channel,
+    volumes_by_channel,
+)
 from .pyramid import TreePlan, levels_by_depth, tree_depth
 from .refresh import BrickLevels
 
@@ -41,6 +49,8 @@ class N3Tree:
         origin: (x, y, z) world place of the centre of voxel 0.
         value_range: For each channel, the smallest and largest value of the finest level.
         frame: Number of the last frame traced; usage stamps hold it.
+        labels: For channels that hold labels, (k,) int64 the label that each value stands for, or
+            None: values stand for themselves.
         made_of: For coarse channels, what they were made of, as plain values.
         filters: For channels whose coarse levels are no means, their `Volume.filter`.
         infos: For channels that a volume told more of, its `Volume.info`.
@@ -59,6 +69,7 @@ class N3Tree:
         root: int = 0,
         branching: int | None = None,
         value_range: Mapping[str, tuple[float, float]] | None = None,
+        labels: Mapping[str, Tensor | None] | None = None,
     ) -> None:
         """Makes a tree over two pools, which trees may share; it writes nothing into them.
 
@@ -73,7 +84,7 @@ class N3Tree:
         low = [o - 0.5 * s for o, s in zip(origin, spacing, strict=True)]
         high = [a + n * s for a, n, s in zip(low, extent, spacing, strict=True)]
         self.box = torch.tensor([low, high], dtype=torch.float64)
-        self.value_range = dict(value_range or {})
+        self.value_range, self.labels = dict(value_range or {}), dict(labels or {})
         self.frame = 0
         self.made_of: dict[str, Any] = {}
         self.filters: dict[str, Any] = {}
@@ -203,7 +214,7 @@ class N3Tree:
             border: Voxels around a brick; from 1 on no seam shows.
             branching: N >= 2.
             threshold: Regions with no value above it are EMPTY: they are never drawn, whatever the
-                transfer function. None keeps every value.
+                transfer function. None keeps every value. Not of labels alone.
             device: Device of the pools.
             progress: Called with what is made, how many levels of it are done, and of how many.
 
@@ -216,8 +227,7 @@ class N3Tree:
         volumes = volumes_by_channel("from_volume", volume)
         first = next(iter(volumes.values()))
         check.whole("from_volume", "branching", branching, low=2, high=16)
-        if threshold is not None:
-            threshold = check.number("from_volume", "threshold", threshold)
+        threshold = checked_threshold("from_volume", threshold, volumes)
         channels = {name: Channel.of(volume) for name, volume in volumes.items()}
         BrickPool(0, channels, brick_size=brick_size, border=border)  # its checks, before the work
         depth = tree_depth(first.extent, brick_size, branching)
@@ -231,6 +241,7 @@ class N3Tree:
             spacing=first.spacing,
             origin=first.origin,
             value_range={name: volume.value_range for name, volume in volumes.items()},
+            labels=labels_by_channel(volumes),
         )
         tree.filters = {name: one.filter for name, one in volumes.items() if one.filter != "mean"}
         tree.infos = {name: one.info for name, one in volumes.items()}
@@ -267,6 +278,9 @@ class N3Tree:
             )
         z, y, x = reversed(self.extent)
         data = self._levels().read(name, 0, (0, 0, 0), (z, y, x))
+        table = self.labels.get(name)
+        if table is not None:
+            data = table[data.to(torch.int64)]
         volume = Volume(data, self.spacing, self.origin, info=self.infos.get(name))
         volume.filter = self.filters.get(name, "mean")
         return volume
@@ -303,7 +317,10 @@ class N3Tree:
                 return  # beside the tree
         fine = [name for name, one in self.bricks.channels.items() if not one.coarse]
         filters = {name: self.filters.get(name, "mean") for name in fine}
-        self._levels().refresh(low[::-1], high[::-1], filters, self.spacing, self.threshold)
+        tables = {name: None if one is None else one.numpy() for name, one in self.labels.items()}
+        empty = {name: background(table) for name, table in tables.items()}
+        told = filters, empty, self.spacing, self.threshold
+        self._levels().refresh(low[::-1], high[::-1], *told)
         tile, child = divmod(self.root, self.nodes.nodes_per_tile)
         for name in fine:
             held = self.nodes.ranges[name]

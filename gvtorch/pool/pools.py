@@ -86,6 +86,22 @@ def volumes_by_channel(where: str, volume: Volume | Mapping[str, Volume]) -> dic
     return volumes
 
 
+def checked_threshold(where: str, threshold: Any, volumes: Mapping[str, Volume]) -> float | None:
+    """Returns a user's threshold; raises ValueError where it is no number, or there are no values
+    but labels, whose order means nothing.
+    """
+    if threshold is None:
+        return None
+    if all(one.info.labels for one in volumes.values()):
+        raise ValueError(f"{where}: threshold is for values; labels are hidden by the shader")
+    return check.number(where, "threshold", threshold)
+
+
+def labels_by_channel(volumes: Mapping[str, Volume]) -> dict[str, Tensor | None]:
+    """Returns `N3Tree.labels` of the volumes that a tree is made of."""
+    return {name: one.label_values for name, one in volumes.items() if one.info.labels}
+
+
 class _Pool:
     channels: dict[str, Channel]
 

@@ -9,16 +9,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..base.constants import CONSTANT, EMPTY, TERMINAL
+from ..base.labels import background
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume, movable
 from ..ops import cut_bricks
-from .downsample import by_node, pool_directional, pool_max, pool_mean, pool_min
+from .downsample import (
+    by_node,
+    pool_directional,
+    pool_majority,
+    pool_max,
+    pool_mean,
+    pool_min,
+)
 from .pools import BrickPool, NodePool
 
 _BATCH = 4096  # bricks cut from a level at a time
@@ -30,7 +39,8 @@ class NodeSummary:
 
     low: Tensor  # (..., c) float32 smallest finest-level value in reach of the brick, with border
     high: Tensor  # (..., c) float32 largest
-    mean: Tensor  # (..., c) float32 mean of the node's own voxels, as its level stores them
+    mean: Tensor  # (..., c) float32 mean of the node's own voxels, as its level stores them; of
+    # labels the smallest
 
     @property
     def is_constant(self) -> Tensor:
@@ -72,21 +82,31 @@ def volume_levels(
     """Yields the first `count` levels of a volume, finest first.
 
     A level is what the volume's filter (`Volume.filter`) makes of the level below as stored: its
-    mean, rounded to the dtype (ties to even), or what is seen of it along six directions.
+    mean, rounded to the dtype (ties to even), its most frequent label, or what is seen of it along
+    six directions.
     """
     dtype = volume.data.dtype
+    known = volume.label_values
+    empty = background(None if known is None else known.numpy())
     values = low = high = to_numpy(volume.data)
     for level in range(count):
         if level > 0:
-            values = coarser(values, volume.filter, branching, dtype, volume.spacing, level)
+            values = coarser(
+                values, volume.filter, branching, dtype, volume.spacing, level, empty=empty
+            )
             low, high = pool_min(low, branching), pool_max(high, branching)
         summary = NodeSummary(
             low=torch.from_numpy(by_node(low, "min", brick_size, border)),
             high=torch.from_numpy(by_node(high, "max", brick_size, border)),
-            mean=torch.from_numpy(by_node(values, "mean", brick_size, 0)),
+            mean=torch.from_numpy(by_node(values, middle_of(volume.filter), brick_size, 0)),
         )
         stored = volume.data if level == 0 else from_numpy(values, dtype)
         yield Level(values=stored, nodes=summary)
+
+
+def middle_of(how: str) -> Literal["mean", "min"]:
+    """Returns which value stands for a node: a label must be one that is there."""
+    return "min" if how == "majority" else "mean"
 
 
 def coarser(
@@ -96,6 +116,8 @@ def coarser(
     dtype: torch.dtype,
     spacing: tuple[float, float, float],
     level: int,
+    *,
+    empty: float | None = None,
 ) -> np.ndarray:
     """Returns a level made of the one before.
 
@@ -106,11 +128,14 @@ def coarser(
         dtype: Of the channel.
         spacing: Of the volume.
         level: Number of the level that is made, from 1.
+        empty: Of labels, the value of the background.
     """
     if how == "directional":
         scale = branching ** (level - 1)
         x, y, z = (side / min(spacing) * scale for side in spacing)
         values = pool_directional(values, branching, (z, y, x))
+    elif how == "majority":
+        values = pool_majority(values, branching, empty)
     else:
         values = pool_mean(values, branching)
     return to_numpy(from_numpy(values, dtype)) if dtype == torch.bfloat16 else values

@@ -18,7 +18,7 @@ from ..base.constants import ABSENT, CONSTANT, EMPTY, TERMINAL
 from ..base.volume import movable
 from .downsample import by_node, extend, pool_max, pool_min, window
 from .pools import BrickPool, NodePool
-from .pyramid import NodeSummary, coarser, from_numpy, to_numpy
+from .pyramid import NodeSummary, coarser, from_numpy, middle_of, to_numpy
 
 _BATCH = 4096  # bricks read or written at a time
 Place = tuple[int, ...]  # voxels or nodes of a level, z y x
@@ -113,6 +113,7 @@ class BrickLevels:
         low: Place,
         high: Place,
         filters: Mapping[str, str],
+        empty: Mapping[str, float | None],
         spacing: tuple[float, float, float],
         threshold: float | None,
     ) -> None:
@@ -122,10 +123,14 @@ class BrickLevels:
             low: First voxel.
             high: The one after the last.
             filters: Of each channel, see `Volume.filter`.
+            empty: Of channels of labels, the value of the background.
             spacing: (x, y, z) of the finest voxels.
             threshold: See `N3Tree.from_volume`.
         """
-        channels = [_ChannelLevels(self, name, how, spacing) for name, how in filters.items()]
+        channels = [
+            _ChannelLevels(self, name, how, spacing, empty.get(name))
+            for name, how in filters.items()
+        ]
         if any(how != "mean" for how in filters.values()):  # constants are no voxels of theirs
             low, high = (0, 0, 0), self.extent
         begin, end = low, high
@@ -186,9 +191,15 @@ class _ChannelLevels:
     """One channel while it is made anew, level after level, the finest first."""
 
     def __init__(
-        self, tree: BrickLevels, name: str, how: str, spacing: tuple[float, float, float]
+        self,
+        tree: BrickLevels,
+        name: str,
+        how: str,
+        spacing: tuple[float, float, float],
+        empty: float | None,
     ) -> None:
         self.tree, self.name, self.how, self.spacing = tree, name, how, spacing
+        self.empty = empty
         self.dtype = tree.bricks.bricks[name].dtype
         self._values: np.ndarray | None = None  # of the level before
         self._begin: Place = (0, 0, 0)  # their first voxel
@@ -247,7 +258,7 @@ class _ChannelLevels:
                 for one in self._pooled(level)
             )
         inner = padded[tuple(slice(border, s - border) for s in padded.shape[:3])]
-        mean = window(inner, "mean", size=size, step=size)
+        mean = window(inner, middle_of(self.how), size=size, step=size)
         if level < self._by_brick:
             both = {"size": size + 2 * border, "step": size}
             ranges = [window(smallest, "min", **both), window(largest, "max", **both)]
@@ -275,7 +286,8 @@ class _ChannelLevels:
             slice(a * n - at, min(b * n, most) - at)
             for a, (b, most, at) in zip(begin, ends, strict=True)
         )
-        made = coarser(self._values[cut], self.how, n, self.dtype, self.spacing, level)
+        told = self.how, n, self.dtype, self.spacing, level
+        made = coarser(self._values[cut], *told, empty=self.empty)
         if (low, high) == (begin, end):
             return made
         values = to_numpy(self.tree.read(self.name, level, low, high))

@@ -319,7 +319,7 @@ class Producer(torch.nn.Module):
             engine's.
         layout: Set by the engine that uses this producer; None while none does.
         made_of: For coarse channels, what they are made of: shaders compare it with what they need.
-        extent, spacing, origin, branching, channels, value_range: See `__init__`.
+        extent, spacing, origin, branching, channels, value_range, labels: See `__init__`.
     """
 
     patience: float | None = None
@@ -335,6 +335,7 @@ class Producer(torch.nn.Module):
         origin: Sequence[float] = (0.0, 0.0, 0.0),
         branching: int = 2,
         value_range: Mapping[str, tuple[float, float]] | None = None,
+        labels: Mapping[str, Tensor | None] | None = None,
     ) -> None:
         """Tells where the content lies.
 
@@ -347,6 +348,8 @@ class Producer(torch.nn.Module):
             origin: World place of the centre of voxel 0.
             branching: N >= 2.
             value_range: For each channel its smallest and largest value, where they are known.
+            labels: For channels that hold labels, (k,) int64 the label that each value stands for,
+                rising; None: values stand for themselves. Coarse voxels then hold a label, too.
 
         Raises:
             ValueError: A number is out of its range.
@@ -373,7 +376,7 @@ class Producer(torch.nn.Module):
         for name, channel in self.channels.items():
             if not isinstance(channel, Channel):
                 raise ValueError(f"{where}: channels[{name!r}] must be a Channel, got {channel!r}")
-        self.value_range = dict(value_range or {})
+        self.value_range, self.labels = dict(value_range or {}), dict(labels or {})
         self.made_of: dict[str, Any] = {}
 
     def prepare(self, layout: Layout) -> None:

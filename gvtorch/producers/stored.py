@@ -20,7 +20,6 @@ from numpy.lib.stride_tricks import as_strided
 from ..base import check
 from ..io.store import Store
 from ..pool import Channel
-from ..pool.downsample import pool_mean
 from ..pool.pyramid import NodeSummary
 from .answer import regions_of
 from .producer import (
@@ -156,6 +155,11 @@ class StoredProducer(Producer):
         if not isinstance(store, Store):
             store = Store.open(store, image=image, time=time, channels=channels)
         value_range = {}
+        if store.info.labels and store.dtype.is_floating_point and not store.has_blocks:
+            raise ValueError(
+                f"{store.location}: labels of {store.stored} must be counted off first: "
+                f"gvtorch convert {store.location} STORE.zarr"
+            )
         if store.value_range is not None:
             lows, highs = zip(*store.value_range, strict=True)
             value_range[_CHANNEL] = (min(lows), max(highs))
@@ -182,6 +186,7 @@ class StoredProducer(Producer):
             spacing=store.spacing,
             origin=store.origin,
             value_range=value_range,
+            labels={_CHANNEL: store.label_values} if store.info.labels else None,
         )
         self.store, self.timeout, self.made_of = store, seconds, made_of
         self._cache = HostCache(limit)
@@ -223,6 +228,8 @@ class StoredProducer(Producer):
         first = (zyx * layout.brick_size - beyond) // store.cell
         last = -(-((zyx + 1) * layout.brick_size + beyond) // store.cell)
         low, high, mean = np.zeros((3, len(loc), store.width), np.float32)
+        if store.info.labels:
+            mean[:] = np.inf  # the smallest label takes the place of the mean
         low[:], high[:] = self.channels[_CHANNEL].limits
         count = np.zeros((len(loc), 1), np.float32)
         errors: dict[int, str] = {}
@@ -239,9 +246,12 @@ class StoredProducer(Producer):
                 errors.update({int(to[index]): text for index, text in wrong.items()})
                 low[to] = np.minimum(low[to], cells[:, 0])
                 high[to] = np.maximum(high[to], cells[:, 1])
-                mean[to] += cells[:, 2]
-                count[to] += 1
-        mean /= np.maximum(count, 1)
+                if store.info.labels:
+                    mean[to] = np.minimum(mean[to], cells[:, 2])
+                else:
+                    mean[to] += cells[:, 2]
+                    count[to] += 1
+        mean = np.where(np.isfinite(mean), mean / np.maximum(count, 1), low)
         summary = NodeSummary(*(torch.from_numpy(values) for values in (low, high, mean)))
         found = regions_of({_CHANNEL: summary}, self.channels, store.threshold)
         return replace(found, errors=errors)
@@ -378,7 +388,7 @@ class StoredProducer(Producer):
         except (OSError, ValueError) as error:
             return dict.fromkeys(rows.tolist(), str(error))
         for _ in range(level - last):
-            values = pool_mean(values, 2)
+            values = self.store.pool(values, 2)
         reach = np.arange(layout.side) - layout.border
         corners = zyx[:, :, None] * layout.brick_size + reach
         z, y, x = (corners[:, axis].clip(0, values.shape[axis] - 1) for axis in range(3))

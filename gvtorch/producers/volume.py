@@ -12,7 +12,7 @@ from ..base import check
 from ..base.volume import Volume
 from ..ops import cut_bricks
 from ..pool import BrickTable, Channel
-from ..pool.pools import volumes_by_channel
+from ..pool.pools import checked_threshold, labels_by_channel, volumes_by_channel
 from ..pool.pyramid import Level, NodeSummary, levels_by_depth
 from ..pool.staging import wide_rows
 from .answer import regions_of
@@ -65,9 +65,9 @@ class VolumeProducer(Producer):
             spacing=first.spacing,
             origin=first.origin,
             value_range={name: volume.value_range for name, volume in volumes.items()},
+            labels=labels_by_channel(volumes),
         )
-        if threshold is not None:
-            threshold = check.number("VolumeProducer", "threshold", threshold)
+        threshold = checked_threshold("VolumeProducer", threshold, volumes)
         self._volumes, self._threshold, self._hold = volumes, threshold, hold
         self._filtered = filtered
         self._levels: dict[str, list[Level]] = {}  # by channel, the root's first

@@ -5,6 +5,7 @@ from .built_in import __all__ as _built_in
 from .channels import ChannelLook, Channels
 from .compiled import CompiledShader
 from .filtered import Filtered
+from .labels import Labels
 from .lights import DirectionalLight, Headlight, PointLight
 from .module import ModuleShader, TransferModule
 from .shader import Shader
@@ -17,6 +18,7 @@ __all__ = [  # noqa: PLE0604
     "DirectionalLight",
     "Filtered",
     "Headlight",
+    "Labels",
     "ModuleShader",
     "PointLight",
     "Shader",

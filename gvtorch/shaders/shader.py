@@ -89,6 +89,7 @@ class Shader(Checked):
         other_component: Which number of it colours a surface.
         reads_coarse: The second channel may be a coarse one, which only coarse bricks have.
         finer: Levels are chosen as if voxels were so many times as large as they are.
+        reads_labels: It reads a channel of labels; others would blend them.
         whole_ray: It must see a ray in one go: what cuts rays into pieces refuses it.
         uses_torch: Its colours are made in torch, outside of the kernel. The host waits for the
             device meanwhile, so it is not recorded as a CUDA graph.
@@ -103,6 +104,7 @@ class Shader(Checked):
     other: str | None = None
     other_component: int = 0
     reads_coarse: bool = False
+    reads_labels: bool = False
     finer: float = 1.0
     whole_ray: bool = False
     uses_torch: bool = False
@@ -127,6 +129,16 @@ class Shader(Checked):
         if self.transfer is None:
             return one_color((1.0, 1.0, 1.0), sampling)
         return self.transfer.table(sampling)
+
+    def table_of(self, tree: N3Tree, channel: str, sampling: Sampling) -> ColorTable:
+        """Returns `table`, as a channel of a tree needs it."""
+        return self.table(sampling)
+
+    def label_names(self, tree: N3Tree, channel: str) -> Tensor | None:
+        """Returns (1 + m,) int64: -1, and the label of each row of the table, on the tree's device;
+        its one feature then is a row of these. None: it shows no labels.
+        """
+        return None
 
     @property
     def channels(self) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from tyro.conf import arg
+from tyro.conf import FlagCreatePairsOff, arg
 
 if TYPE_CHECKING:
     from ..base.volume import Volume
@@ -42,6 +42,8 @@ class ReadOptions:
     """voxel axes that do not lie along the world's: resample along these, or keep the voxels"""
     nan: Annotated[float | None, arg(metavar="VALUE")] = None
     """value for voxels that are NaN or infinite"""
+    labels: FlagCreatePairsOff[bool] = False
+    """values are numbers of things: kept exactly, never blended, and shown by --shader labels"""
 
     def read(self, path: str | Path) -> Volume:
         """Reads the volume at `path`."""
@@ -61,6 +63,7 @@ class ReadOptions:
             "time": self.time,
             "oblique": self.oblique,
             "nan": self.nan,
+            "labels": self.labels,
         }
 
 

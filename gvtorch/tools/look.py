@@ -21,13 +21,15 @@ if TYPE_CHECKING:
     from ..cameras.camera import Up
     from ..cameras.models import CameraModel
     from ..io.store import Store
-    from ..shaders import Channels, Shader
+    from ..shaders import Channels, Labels, Shader
     from ..tracing import Clip, ThinLens
 
     ShaderName = str
 else:
     CameraModel = str  # checked by the camera, since its module would load torch
-    ShaderName = Literal[(*declared_names("shaders.built_in", "BY_NAME"), "filtered", "channels")]
+    ShaderName = Literal[
+        (*declared_names("shaders.built_in", "BY_NAME"), "filtered", "channels", "labels")
+    ]
 
 _WHOLE = ("isosurface", "maximum", "minimum", "mean")  # see one value, or a whole ray
 
@@ -54,7 +56,8 @@ class Look:
     histogram without its background, as for presets and colour maps if left out"""
     shader: ShaderName = "plain"
     """what is made of the values; filtered: plain, but right from afar (stores: gvtorch filter);
-    channels: all numbers of a voxel, each in its colour and window as the file tells, else found"""
+    channels: all numbers of a voxel, each in its colour and window as the file tells, else found;
+    labels: each in its colour, also if left out where there are labels"""
     channel: Annotated[str | None, arg(metavar="N:COLOR:LO,HI;...")] = None
     """of --shader channels: which ones; colour is a name or #RRGGBB, and what is left out or auto
     is the file's; opacity as an item: they hide each other, else they are added"""
@@ -127,14 +130,27 @@ class Look:
         """Returns the shader of an image's channels."""
         from .channels import parse_channels
 
-        told = {"--tf": self.tf, "--window": self.window, "--value": self.value}
-        for flag, given in {**told, "--component": self.component or None}.items():
-            if given is not None:
-                raise ValueError(f"{flag} is not for --shader channels; it takes --channel")
+        self._refuse("it takes --channel", "component")
         return parse_channels(self.channel, data)
 
+    def _labels(self, data: Volume | Store) -> Labels:
+        """Returns the shader of labels."""
+        from ..shaders import Labels
+
+        self._refuse("labels have colours of their own")
+        check_component(data, self.component)
+        return Labels()
+
+    def _refuse(self, why: str, *more: str) -> None:
+        """Raises ValueError where a flag of transfer functions is given."""
+        for name in ("tf", "window", "value", *more):
+            if getattr(self, name) != getattr(Look(), name):
+                raise ValueError(f"--{name} is not for --shader {self.shader}: {why}")
+
     def chosen(self, data: Volume | Store) -> Shader:
-        """Returns the shader asked for, its transfer function read, or spanned over the data."""
+        """Returns the shader asked for, its transfer function read, or spanned over the data; of
+        labels, theirs.
+        """
         from ..shaders import Filtered, TransferFunction
         from ..shaders.built_in import BY_NAME
 
@@ -142,6 +158,8 @@ class Look:
             return self._channels(data)
         if self.channel is not None:
             raise ValueError("--channel is for --shader channels")
+        if self.shader == "labels" or (self.shader == "plain" and data.info.labels):
+            return self._labels(data)
         if (self.value is None) == (self.shader == "isosurface"):
             raise ValueError("--value and --shader isosurface belong together")
         if self.shader == "isosurface":

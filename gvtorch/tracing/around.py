@@ -97,10 +97,27 @@ def _clipped(
         box,
         step=tracer.arguments.step,
         depth_alpha=options.depth_alpha,
-        slab=None if surface is None else _surface_slab(surface, tracer, options),
+        slab=_slab(surface, tracer, options, trace),
         unlit=options.lighting is not None,
         together=together,
     )
+
+
+def _slab(
+    surface: CutSurface | None, tracer: Tracer, options: RenderOptions, trace: Trace
+) -> Trace | None:
+    """What traces the intervals behind cuts; None: what traces all else."""
+    if surface is not None:
+        return _surface_slab(surface, tracer, options)
+    if tracer.names is None:
+        return None
+    # A cap hits whatever is seen behind it, be it as thin as it likes.
+    first = tracer.seeing(tracer.shader, replace(options, depth_alpha=0.0))
+
+    def slab(rays: Rays) -> Hits:
+        return replace(trace(rays), label=first(replace(rays, transmittance=None)).label)
+
+    return slab
 
 
 def _surface_slab(surface: CutSurface, tracer: Tracer, options: RenderOptions) -> Trace:

@@ -177,6 +177,7 @@ class Clipped:
             missed=slab.missed,
             normal=None if slab.normal is None else normal.to(before) * (alpha > 0)[:, None],
             features=None if slab.features is None else slab.features * part[:, None],
+            label=None if slab.label is None else torch.where(hit[:, None], slab.label, -1),
         )
 
     def _facing(self, rays: Rays, t: Tensor) -> tuple[Tensor, Tensor]:

@@ -43,7 +43,18 @@ def over(front: Hits, back: Hits, *, dimmed: bool = False) -> Hits:
         missed=front.missed | back.missed,
         normal=normal,
         features=features,
+        label=_nearer_label(front, back),
     )
+
+
+def _nearer_label(front: Hits, back: Hits) -> Tensor | None:
+    """(r, 1) the label of whichever is hit first; None where neither has any."""
+    given = front.label if front.label is not None else back.label
+    if given is None:
+        return None
+    nothing = torch.full_like(given, -1)
+    near, far = (nothing if one.label is None else one.label for one in (front, back))
+    return torch.where(front.depth <= back.depth, near, far)
 
 
 def behind(rays: Rays, front: Hits) -> Rays:

@@ -59,6 +59,7 @@ class Tracer:
             raise ValueError(
                 f"render: channel {shader.other!r} was made of {first!r}, not of {channel!r}"
             )
+        _check_labels(tree, shader, channel)
         step = options.step * min(tree.spacing)
         _check_step(tree, step, options)
         tree.warn_if_edited("render", learned=isinstance(shader, ModuleShader))
@@ -74,6 +75,7 @@ class Tracer:
             device=tree.device,
         )
         self.dtype, self.backend = options.dtype, options.backend
+        self.names = shader.label_names(tree, channel)
         self.shading = shader.shading("render", tree)
         self.arguments = ops.TraceArguments(
             place_33=tree.place,
@@ -94,7 +96,7 @@ class Tracer:
             stamp_b=tree.bricks.stamp_b,
             frame_1=frame_1,
             root=tree.root,
-            **vars(shader.table(sampling)),
+            **vars(shader.table_of(tree, channel, sampling)),
             stop_alpha=options.stop_alpha,
             depth_alpha=options.depth_alpha,
             by_level=by_level,
@@ -118,7 +120,11 @@ class Tracer:
             fields = ops.shade_rays(
                 given, self.arguments, *own, op=self.shader.op, backend=self.backend
             )
-        return Hits(**dict(zip(Hits.__annotations__, fields, strict=False)))
+        hits = Hits(**dict(zip(Hits.__annotations__, fields, strict=False)))
+        if self.names is None or hits.features is None:
+            return hits
+        label = self.names[hits.features.to(torch.int64)]
+        return replace(hits, features=hits.features[:, :0], label=label)
 
     def _march_module(self, shader: ModuleShader, rays: Rays) -> Hits:
         """Traces rays with a module, a block at a time."""
@@ -139,6 +145,24 @@ class Tracer:
         parts = [vars(block(rays[at : at + size])) for at in range(0, count, size)]
         given = [name for name, field in parts[0].items() if field is not None]
         return Hits(**{name: torch.cat([part[name] for part in parts]) for name in given})
+
+
+def _check_labels(tree: N3Tree, shader: Shader, channel: str) -> None:
+    """Raises ValueError where labels would be blended, or where there are none."""
+    if shader.reads_labels:
+        if channel not in tree.labels:
+            raise ValueError(
+                f"render: channel {channel!r} holds no labels but values, whose coarse levels are "
+                "means: gv.Volume(data, labels=True) (--labels) makes labels of them"
+            )
+        return
+    for name in (channel, *shader.channels):
+        if name in tree.labels:
+            kind = type(shader).__name__
+            raise ValueError(
+                f"render: channel {name!r} holds labels, which {kind} would blend: "
+                "gv.Labels() (--shader labels) shows them"
+            )
 
 
 def _check_step(tree: N3Tree, step: float, options: RenderOptions) -> None:

@@ -25,8 +25,8 @@ LOOKS = (
     *("isosurface", "coloured isosurface", "distance field", "maximum", "minimum", "mean"),
     *("features", "module", "transfer module", "plain"),
 )
-LATER = ("channels",) * 10  # of the scenes from number 200 on
-SCENES = 200 + len(LATER)
+FIRST, LATER = 200, ("channels",) * 10 + ("labels",) * 20  # of the scenes from that number on
+SCENES = FIRST + len(LATER)
 WAYS = (
     *("render", "render", "render", "holes", "holes"),
     *("engine", "engine", "levels", "tracer", "cost"),
@@ -48,7 +48,7 @@ LIGHTS = ("none", "head", "sun", "wide sun", "lamp", "wide lamp")
 SURFACES = ("isosurface", "coloured isosurface", "distance field")
 PROJECTIONS = ("maximum", "minimum", "mean")
 STORED = ("stored", "premultiplied", "six", "stored with shadows", "stored by normals")
-LIT = ("lit", "lit by normals", "lit with shadows", *STORED, *SURFACES)
+LIT = ("lit", "lit by normals", "lit with shadows", *STORED, *SURFACES, "labels")
 MODULES = ("module", "transfer module")
 
 
@@ -82,8 +82,9 @@ def settings(seed: int) -> Settings:
     """All that a scene is made of, as plain values."""
     dice = Dice(seed)
     look, way = LOOKS[seed % len(LOOKS)], WAYS[seed // len(LOOKS) % len(WAYS)]
-    if seed >= SCENES - len(LATER):
-        look, way = LATER[seed - SCENES], WAYS[seed % len(WAYS)]
+    if seed >= FIRST:
+        look = LATER[seed - FIRST]
+        way = WAYS[seed % (len(WAYS) - (look == "labels"))]  # which have no cost
     if way == "cost" and look != "transfer":  # what it takes: transfer functions
         look, way = ("plain", way) if seed % 3 == 0 else (look, "render")
     if way == "tracer" and look in MODULES:
@@ -120,6 +121,8 @@ def _volume(dice: Dice, look: str, way: str) -> Settings:
     dtype = dice.pick(*SPANS)
     if look == "distance field":
         dtype = dice.pick("float16", "float32")
+    if look == "labels":
+        dtype = dice.pick("uint8", "int8", "int16", "uint16")
     spacing = dice.pick((1.0, 1.0, 1.0), (0.5, 0.5, 0.5), dice.triple(0.4, 2.0))
     found: Settings = {
         "branching": dice.pick(2, 2, 3, 4),
@@ -135,6 +138,8 @@ def _volume(dice: Dice, look: str, way: str) -> Settings:
         "color": dice.pick("uint8", "uint16", "float16", "bfloat16", "float32"),
         "normal": dice.pick("uint8", "int8", "uint16", "int16", "float16", "float32"),
     }
+    if look == "labels":
+        found |= {"threshold": None, "wide": dice.chance(0.5), "most": dice.pick(3, 9, 40)}
     if look == "six":
         found["color"] = dice.pick("float16", "bfloat16", "float32")
     if look == "channels":
@@ -276,6 +281,11 @@ def volumes(s: Settings, shift: float = 0.0) -> dict[str, gv.Volume]:
                 colors[where], normal[where] = (0.2, 0.9, 0.4, number / 2), (0.0, 0.6, 0.8)
     spacing, (x, *rest) = s["spacing"], s["origin"]
     place = spacing, (x + shift, *rest)
+    if look == "labels":
+        parts = (value - low) / (high - low)
+        label = np.floor(parts * s["most"]) - (low < 0)
+        label = label.astype(np.int64) * 2**33 if s["wide"] else label.astype(s["value"])
+        return {"value": gv.Volume(torch.from_numpy(label), *place, labels=True)}
 
     def whole(dtype: str) -> float:
         return 1.0 if "float" in dtype else float(np.iinfo(dtype).max)
@@ -343,6 +353,12 @@ def shader_of(s: Settings) -> Any:
         return transfer
     if look in PROJECTIONS:
         return gv.Projection(look, transfer)
+    if look == "labels":
+        unit_ = 2**33 if s["wide"] else 1
+        thin = {label * unit_: s["level"] ** label for label in range(0, s["most"], 2)}
+        visible = None if s["level"] < 0.5 else "all"
+        lit |= {"lit": s["seed"] % 4 > 0, "reference": s["reference"]}
+        return gv.Labels({unit_: s["glow"]}, thin, visible, **lit)
     if look in STORED:
         lit |= {"lit": s["level"] > 0.5, "shadows": "shadows" in look}
         lit |= {"premultiplied": look == "premultiplied"}

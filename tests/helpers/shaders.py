@@ -39,4 +39,6 @@ SHADERS = {
     "gradient magnitude": gv.GradientMagnitude(SHADER, 0.1),
     "channels": gv.Channels(LOOKS, channel="rgba"),
     "channels by opacity": gv.Channels(LOOKS, "opacity", channel="rgba"),
+    "labels": gv.Labels(channel="label", light=POINT),
+    "flat labels": gv.Labels(opacity={2000: 0.1, 3000: 0.4}, channel="label", lit=False),
 }

@@ -42,6 +42,9 @@ def assert_equal(tree, backend, rays, shader=SHADER, **options):
     tolerance = 1e-5 if expected["color"].dtype == torch.float32 else 1e-12
     for name in ("color", "alpha", "depth"):
         torch.testing.assert_close(actual[name], expected[name], rtol=tolerance, atol=tolerance)
+    assert ("label" in actual) == shader.reads_labels
+    if shader.reads_labels:
+        assert torch.equal(actual["label"], expected["label"])
     return expected, expected_marks
 
 

@@ -27,6 +27,7 @@ def on(tree: gv.N3Tree, device: str) -> gv.N3Tree:
     copy = gv.N3Tree(
         *(nodes, bricks), depth=tree.depth, extent=tree.extent, spacing=tree.spacing, origin=origin
     )
+    copy.labels = tree.labels
     for old, new in ((tree.nodes.fields, nodes.fields), (tree.bricks.fields, bricks.fields)):
         for name, field in new.items():
             field.copy_(old[name])

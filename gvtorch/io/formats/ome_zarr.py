@@ -27,7 +27,7 @@ class OmeZarrSource(VolumeSource):
             _store(self.path, self.key, self.opened, time)
             for time in range(index[0].start, index[0].stop)
         ]
-        return np.stack([store.read_region(0, low, high, timeout=_TIMEOUT) for store in stores])
+        return np.stack([store.read_stored(low, high, timeout=_TIMEOUT) for store in stores])
 
 
 @functools.lru_cache(maxsize=4)
@@ -48,7 +48,7 @@ def open_ome_zarr(path: str, key: str | None = None) -> OmeZarrSource:
         path=path,
         shape=(store.times, z, y, x, store.width),
         axes="tzyxc",
-        stored=str(store.dtype).removeprefix("torch."),
+        stored=store.stored,
         spacing=store.spacing,
         origin=store.origin,
         info=store.info,

@@ -22,6 +22,7 @@ from ..shading import (
     FilteredNumbers,
     GradientMagnitudeNumbers,
     IsosurfaceNumbers,
+    LabelNumbers,
     LightKind,
     ProjectionKind,
     ProjectionNumbers,
@@ -30,6 +31,7 @@ from ..shading import (
 )
 from .channels import AllNumbers, ChannelTable
 from .exact import clamp, dot, larger, power, sqrt_exact, stretch, unit
+from .labels import LabelBricks
 from .march import Piece, Plain, Probe, Visitor, Walk, above, below, mix
 from .rays import INF, Intervals, split
 from .tree import Bricks, Holder
@@ -430,6 +432,59 @@ class GradientMagnitude(Shade):
         self.sum.add(torch.cat((rgba[:, :3], alpha[:, None]), 1), piece, where)
 
 
+class Labels(Shade):
+    """The label of the nearest voxel."""
+
+    bricks = LabelBricks
+    channel: LabelBricks
+
+    def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        first, last = self.row(low), self.row(high)
+        before = self.transfer.opaque_m[(first - 1).clamp(min=0)]
+        return self.transfer.opaque_m[last] == torch.where(first > 0, before, 0)
+
+    def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
+        fine, coarse = probe.answer.fine, probe.answer.coarse
+        looks = probe.blend(piece.middle, partial(self.look, piece, probe))
+        color, alpha, normal = looks.split((3, 1, 3), 1)
+        hidden = ~(self.look(piece, probe, fine)[:, 3] > 0)
+        holder = fine.index_put((hidden.nonzero()[:, 0],), coarse[hidden])
+        label = self.row(self.channel.nearest(holder, probe.beam, piece.middle).value)
+        left, clear, at = self.sum.clear * (1 - alpha[:, 0]), self.sum.clear, self.sum.hit_clear
+        hit = where & (left < at) & (clear >= at)
+        self.features = torch.where(hit[:, None], (1 + label)[:, None].to(alpha), self.features)
+        shown = where & (alpha[:, 0] > 0)
+        self.normal = torch.where(
+            shown[:, None], self.normal + clear[:, None] * normal, self.normal
+        )
+        self.sum.add_light(clear[:, None] * color, shown)
+        self.sum.absorb(alpha[:, 0], piece, shown)
+
+    def row(self, label: Tensor) -> Tensor:
+        """(r,) int64 rows of the table that stand for labels."""
+        low, last = self.transfer.domain_2[0], len(self.transfer.opaque_m) - 1
+        return clamp(label - low, 0, last).to(torch.int64)
+
+    def look(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
+        """(r, 7) what one of the nodes shows: premultiplied colours, alphas, normals by alpha."""
+        t, table = piece.middle, self.transfer.table_lm4
+        found = self.channel.nearest(holder, probe.beam, t)
+        level = torch.where(piece.odd, 0, piece.level)
+        color, alpha = table[level, self.row(found.value)].split((3, 1), 1)
+        stretched = stretch(alpha[:, 0], piece.lengths)[:, None]
+        alpha = torch.where((piece.odd & (alpha[:, 0] > 0))[:, None], stretched, alpha)
+        normal = torch.zeros_like(color)
+        if self.light.parameters.own_as(LabelNumbers).lit > 0:
+            way = self.channel.away(holder, found) * (holder.scale[:, None] / self.light.cube)
+            normal = unit(torch.where((holder.brick >= 0)[:, None], way, 0.0))
+            away = dot(normal, self.light.along) > 0
+            normal = torch.where(away[:, None], -normal, normal)
+            color = self.light.shade(color, normal, t)
+        seen = alpha > 0
+        parts = torch.cat((color * alpha, alpha, normal * alpha), 1)
+        return torch.where(seen, parts, 0.0)
+
+
 class Filtered(Shade):
     """The transfer function, and the colours that the pool's first bricks have."""
 
@@ -516,6 +571,7 @@ TWINS: dict[str, type[Shade]] = {
     "GradientMagnitude": GradientMagnitude,
     "Filtered": Filtered,
     "ChannelMix": ChannelMix,
+    "Labels": Labels,
 }
 
 

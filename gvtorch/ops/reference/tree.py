@@ -194,6 +194,12 @@ class Bricks:
         constant = self.constant_nc[:, self.component]
         return constant[a] == constant[b]
 
+    def places(self, holder: Holder, beam: Beam, t: Tensor) -> Tensor:
+        """(r, 3) places x, y, z in bricks at distances t (r,), in voxels from the first one's."""
+        scale = holder.scale[:, None]
+        offset = (beam.place - holder.corner).to(t.dtype) * scale + (self.border - 0.5)
+        return offset + t[:, None] * (beam.direction * scale)
+
     def sample(
         self, holder: Holder, beam: Beam, t: Tensor, shift: Sequence[float] = (0, 0, 0)
     ) -> Tensor:
@@ -205,10 +211,7 @@ class Bricks:
         constant = torch.where(holder.node >= 0, constant, 0.0)
         if self.bricks_bzyxc.shape[0] == 0:
             return constant
-        scale = holder.scale[:, None]
-        offset = (beam.place - holder.corner).to(real) * scale + (self.border - 0.5)
-        place = offset + t[:, None] * (beam.direction * scale)
-        columns = zip(place.unbind(1), shift, strict=True)
+        columns = zip(self.places(holder, beam, t).unbind(1), shift, strict=True)
         place = clamp(torch.stack([p + d if d else p for p, d in columns], 1), 0, side - 1)
         cell = smaller(torch.floor(place), torch.full_like(place, side - 2))
         wx, wy, wz = (place - cell).unbind(1)

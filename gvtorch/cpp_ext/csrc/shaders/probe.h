@@ -252,6 +252,13 @@ struct Probe {
     return read_four(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, spot.at(t));
   }
   GV_HD static T scale_of(const Spot<T>& spot) { return spot.scale; }
+  // The value of a voxel of a brick, counted with its border.
+  GV_HD T value_in(const Spot<T>& spot, int32_t x, int32_t y, int32_t z) const {
+    const ChannelView& channel = channels.value;
+    const int64_t voxel = (static_cast<int64_t>(z) * channels.side + y) * channels.side + x;
+    return read_number<T>(channel.bricks_bzyxc, channel.type,
+                          first_of(channel, channels.component, spot) + voxel * channel.width);
+  }
   GV_HD T weight(T t) const { return clamp((near + growth * t - voxel) * blend, static_cast<T>(0), static_cast<T>(1)); }
 
   // No node that answers has a brick, and all numbers of both are equal: one value all over the visit.

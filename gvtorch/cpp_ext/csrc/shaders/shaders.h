@@ -38,6 +38,7 @@
 #pragma once
 
 #include "shaders/channels.h"
+#include "shaders/labels.h"
 #include "shaders/stored_color.h"
 
 namespace gvtorch {
@@ -392,7 +393,8 @@ struct GradientMagnitude : Plain<T> {
   X(ShadowedColor, StoredColor, true)            \
   X(GradientMagnitude, GradientMagnitude, false) \
   X(Filtered, Filtered, false)                   \
-  X(ChannelMix, ChannelMix, false)
+  X(ChannelMix, ChannelMix, false)               \
+  X(Labels, Labels, false)
 
 #define GV_KIND(kind, Shader, shadows) k##kind,
 enum class ShaderKind : int32_t { GV_SHADERS(GV_KIND) kCount };

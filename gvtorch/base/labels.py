@@ -1,0 +1,118 @@
+"""Numbers of things: whole numbers of any width that must stay apart, in the dtypes of bricks.
+
+Numbers of 16 bits at most are kept as they are. Wider ones are counted off: voxels hold the index
+of their label among all that there are, and a table holds the labels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+#: Labels that are kept as they are.
+NARROW = ("uint8", "int8", "uint16", "int16")
+#: Up to this one float32 keeps whole numbers apart.
+MOST_WHOLE = 2**24
+_SPREAD = 2**22  # labels this close together are found by a table, others by bisection
+
+
+def as_whole(where: str, values: np.ndarray) -> np.ndarray:
+    """Returns labels as whole numbers: floats that are whole become int64, bool becomes uint8.
+
+    Raises:
+        ValueError: They are no whole numbers, or beyond int64.
+    """
+    if values.dtype.kind == "b":
+        return values.astype(np.uint8)
+    if values.dtype.kind == "f":
+        with np.errstate(invalid="ignore"):
+            whole = (np.rint(values) == values) & (np.abs(values) < 2.0**63)
+        if not whole.all():
+            bad = values[~whole].flat[0]
+            raise ValueError(f"{where}: labels must be whole numbers, got {bad:g}")
+        return values.astype(np.int64)
+    if values.dtype.kind not in "iu":
+        raise ValueError(f"{where}: labels must be whole numbers, got {values.dtype}")
+    if values.dtype == np.uint64 and values.size and int(values.max()) > np.iinfo(np.int64).max:
+        raise ValueError(
+            f"{where}: labels must be below 2^63, got {int(values.max())}: number them anew"
+        )
+    return values
+
+
+def distinct(where: str, parts: Iterable[np.ndarray]) -> np.ndarray:
+    """Returns (k,) int64 the labels of whole numbers that come part by part, sorted.
+
+    Raises:
+        ValueError: There are more than 2^24.
+    """
+    found, waiting, count = np.zeros(0, np.int64), [], 0
+    for part in parts:
+        waiting.append(np.unique(part).astype(np.int64))
+        count += len(waiting[-1])
+        if count > max(2**20, len(found)):
+            found, waiting, count = np.unique(np.concatenate((found, *waiting))), [], 0
+            check_count(where, len(found))
+    found = np.unique(np.concatenate((found, *waiting)))
+    check_count(where, len(found))
+    return found
+
+
+def check_count(where: str, count: int) -> None:
+    """Raises ValueError if there are more labels than bricks can hold."""
+    if count > MOST_WHOLE:
+        raise ValueError(
+            f"{where}: holds {count} labels or more, at most {MOST_WHOLE} fit: crop it, or join "
+            "some of them"
+        )
+
+
+def index_dtype(count: int) -> np.dtype:
+    """Returns the smallest dtype of bricks that holds so many indices."""
+    return np.dtype("uint8" if count <= 2**8 else "uint16" if count <= 2**16 else "float32")
+
+
+def indices(values: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Returns of whole numbers of any shape, all among `labels` (k,), which one they are."""
+    dtype = index_dtype(len(labels))
+    low, high = int(labels[0]), int(labels[-1])
+    if high - low < max(_SPREAD, values.size):
+        table = np.zeros(high - low + 1, dtype)
+        table[labels - low] = np.arange(len(labels), dtype=dtype)
+        # Also of uint64, where NumPy would go by way of float64.
+        return table[values.astype(np.int64, copy=False) - low]
+    return np.searchsorted(labels, values.astype(np.int64, copy=False)).astype(dtype)
+
+
+def counted_off(where: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Returns labels as bricks hold them, and (k,) int64 what each of their numbers stands for;
+    None where they are kept as they are. Raises ValueError as `as_whole` and `distinct`.
+    """
+    values = as_whole(where, values)
+    if values.dtype.name in NARROW:
+        return values, None
+    labels = distinct(where, values)  # plane by plane
+    return indices(values, labels), labels
+
+
+def background(labels: np.ndarray | None) -> int | None:
+    """Returns what stands for label 0, the background; None where there is none."""
+    if labels is None:
+        return 0
+    at = int(np.searchsorted(labels, 0))
+    return at if at < len(labels) and labels[at] == 0 else None
+
+
+def check_narrowed(where: str, values: np.ndarray) -> None:
+    """Raises ValueError where whole numbers would merge, since float32 does not keep them apart."""
+    if values.dtype.kind not in "iu" or values.dtype.itemsize < 4 or not values.size:
+        return
+    low, high = int(values.min()), int(values.max())
+    most = high if high > -low else low
+    if abs(most) > MOST_WHOLE:
+        raise ValueError(
+            f"{where}: {values.dtype.name} values reach {most}, and float32 keeps whole numbers "
+            f"apart up to {MOST_WHOLE}: labels=True (--labels) keeps labels exactly, and "
+            "measurements can be rounded before: data.astype('float32')"
+        )

@@ -1,0 +1,135 @@
+"""Labels on their way into a store: which there are, region by region, and sources that count them
+off.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..base.labels import NARROW, as_whole, distinct, index_dtype, indices
+from ..base.stage import Progress, no_progress
+from .source import Index, MemorySource, VolumeSource
+
+_CUBE = 128  # voxels along a side of what is read at once
+
+
+@dataclass(frozen=True, kw_only=True)
+class IndexSource(VolumeSource):
+    """A source of labels, (t, z, y, x, c): of each its index among all that there are."""
+
+    inner: VolumeSource
+    labels: np.ndarray | str  # (k,) int64, or the .npy file that holds them
+    indexed: bool  # the inner source holds indices already
+
+    @classmethod
+    def of(cls, inner: VolumeSource, labels: np.ndarray, *, indexed: bool = False) -> IndexSource:
+        """Counts the labels of a source off."""
+        x, y, z = inner.extent
+        told = ("path", "spacing", "origin", "info", "time")
+        return cls(
+            shape=(inner.times, z, y, x, inner.width),
+            axes="tzyxc",
+            stored=index_dtype(len(labels)).name,
+            inner=inner,
+            labels=labels,
+            indexed=indexed,
+            **{name: getattr(inner, name) for name in told},
+        )
+
+    def in_file(self, file: Path) -> IndexSource:
+        """Returns the same for other processes, whose labels lie in a file."""
+        return replace(self, labels=str(file))
+
+    def read_stored(self, index: Index) -> np.ndarray:
+        times, low, high = index[0], *zip(*((s.start, s.stop) for s in index[1:4]), strict=True)
+        found = self.inner.read_box(low, high, (times.start, times.stop))[..., index[4]]
+        if self.indexed:
+            return found
+        labels = _loaded(self.labels) if isinstance(self.labels, str) else self.labels
+        found = as_whole(self.path, found)
+        try:
+            counted = indices(found, labels)
+            same = labels[counted.astype(np.int64)] == found
+        except IndexError:
+            same = np.array(False)
+        if not same.all():
+            raise OSError(f"{self.path}: changed while it was read: a label is new")
+        return counted
+
+
+@functools.lru_cache(maxsize=2)
+def _loaded(file: str) -> np.ndarray:
+    return np.load(file)
+
+
+def counted_source(
+    source: VolumeSource,
+    times: tuple[int, int],
+    workers: int,
+    known: Path,
+    progress: Progress = no_progress,
+) -> VolumeSource:
+    """Returns a source of labels as stores hold them: as it is, where they are of 16 bits at most.
+
+    Args:
+        source: Of labels.
+        times: The first time point, and one past the last.
+        workers: Threads that read.
+        known: The .npy file of its labels, if it has been written before; else all is read once.
+        progress: Told ("labels", regions done, regions in all).
+
+    Raises:
+        ValueError: They are no whole numbers, or too many.
+        OSError: The source can't be read.
+    """
+    if source.dtype in NARROW:
+        return source
+    if isinstance(source, MemorySource):
+        source = replace(source, data=as_whole(source.path, source.data))
+        source = replace(source, stored=source.data.dtype.str)
+    if known.exists():
+        return IndexSource.of(source, np.load(known))
+    return IndexSource.of(source, _labels_of(source, times, workers, progress))
+
+
+def _labels_of(
+    source: VolumeSource, times: tuple[int, int], workers: int, progress: Progress
+) -> np.ndarray:
+    x, y, z = source.extent
+    spans = [range(*times), *(range(0, n, _CUBE) for n in (z, y, x))]
+    total = int(np.prod([len(span) for span in spans]))
+
+    def read(place: tuple[int, ...]) -> np.ndarray:
+        time, *low = place
+        high = [min(a + _CUBE, n) for a, n in zip(low, (z, y, x), strict=True)]
+        part = source.at_time(time).read_region(low, high)
+        return np.unique(as_whole(source.path, part))
+
+    def parts() -> Iterator[np.ndarray]:
+        places, done = itertools.product(*spans), 0
+        progress("labels", 0, total)
+        with ThreadPoolExecutor(workers) as pool:
+            while some := list(itertools.islice(places, 4 * workers)):
+                yield from pool.map(read, some)
+                done += len(some)
+                progress("labels", done, total)
+
+    return distinct(source.path, parts())
+
+
+def write_labels(file: Path, labels: np.ndarray) -> None:
+    """Writes labels to a .npy file that is either there as a whole or not at all."""
+    draft = file.with_name(f".{file.name}")
+    with draft.open("wb") as out:
+        np.save(out, labels)
+        out.flush()
+        os.fsync(out.fileno())
+    draft.replace(file)

@@ -1,0 +1,75 @@
+"""Colours by name and as #RRGGBB, and distinct colours for any numbers; as linear light."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any
+
+import numpy as np
+
+from ..base import check
+
+#: Colours by name, as sRGB.
+NAMED = {
+    **{"black": "#000000", "gray": "#808080", "grey": "#808080", "silver": "#c0c0c0"},
+    **{"white": "#ffffff", "red": "#e6332a", "orange": "#f39200", "gold": "#ffc800"},
+    **{"yellow": "#ffed00", "lime": "#a5d700", "green": "#2ca02c", "teal": "#008c8c"},
+    **{"cyan": "#00c8dc", "sky": "#78c8ff", "blue": "#2864dc", "navy": "#14286e"},
+    **{"violet": "#8246c8", "magenta": "#dc28b4", "pink": "#ff96be", "salmon": "#fa8072"},
+    **{"brown": "#8c5032", "tan": "#d2b48c", "bone": "#e8dcc5", "olive": "#808000"},
+}
+_GOLDEN = 0x9E3779B97F4A7C15  # 2^64 / the golden ratio
+_APART = 0x57AE147AE147B001  # 2^64 * 0.3425: so the first 64 colours lie farthest apart
+
+
+def linear_color(where: str, value: Any) -> tuple[float, float, float]:
+    """Returns a colour as linear red, green, blue: a name or #RRGGBB, which are sRGB, or three
+    numbers in [0, 1], which are linear; raises ValueError where it is neither.
+    """
+    if not isinstance(value, str):
+        color = check.triple(where, "colour", value)
+        for part in color:
+            check.number(where, "colour", part, low=0, high=1)
+        return color
+    text = NAMED.get(value.lower(), value)
+    if not re.fullmatch(r"#[0-9a-fA-F]{6}", text):
+        names = ", ".join(NAMED)
+        raise ValueError(f"{where}: {value!r} is no colour; known: #RRGGBB, {names}")
+    red, green, blue = (int(text[at : at + 2], 16) / 255 for at in (1, 3, 5))
+    red, green, blue = from_srgb(np.array((red, green, blue))).tolist()
+    return (red, green, blue)
+
+
+def from_srgb(color: np.ndarray) -> np.ndarray:
+    """Returns sRGB in [0, 1] as linear light (IEC 61966-2-1)."""
+    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+
+
+def distinct_colors(numbers: np.ndarray) -> np.ndarray:
+    """Returns (k, 3) float64 linear colours of numbers (k,) int64, always the same of a number.
+
+    Hues of numbers that follow one another lie a golden ratio of the circle apart, so any few of
+    them differ; lightness and chroma go around in another rhythm.
+
+    Source: Ottosson, "A perceptual color space for image processing", 2020 (OKLab).
+    """
+    whole = numbers.astype(np.int64).view(np.uint64)
+    hue, other = (
+        (whole * np.uint64(step) >> np.uint64(11)) * 2.0**-53 for step in (_GOLDEN, _APART)
+    )
+    lightness = 0.56 + 0.30 * other
+    chroma = 0.165 - 0.05 * np.abs(2 * other - 1)
+    angle = 2 * math.pi * (hue + 0.07)
+    return _from_oklab(lightness, chroma * np.cos(angle), chroma * np.sin(angle))
+
+
+def _from_oklab(lightness: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(k, 3) linear RGB, clipped to [0, 1]."""
+    long = (lightness + 0.3963377774 * a + 0.2158037573 * b) ** 3
+    medium = (lightness - 0.1055613458 * a - 0.0638541728 * b) ** 3
+    short = (lightness - 0.0894841775 * a - 1.2914855480 * b) ** 3
+    red = 4.0767416621 * long - 3.3077115913 * medium + 0.2309699292 * short
+    green = -1.2684380046 * long + 2.6097574011 * medium - 0.3413193965 * short
+    blue = -0.0041960863 * long - 0.7034186147 * medium + 1.7076147010 * short
+    return np.stack((red, green, blue), -1).clip(0, 1)
