@@ -2,7 +2,7 @@
 # make test   sets up .venv, runs every test
 # make lint   ruff, mypy, clang-format
 # make bench  every workload on this machine, beside peers: docs/performance (ARGS=--quick: tiny sizes)
-# make wheel  one wheel for every Python >= 3.11 and every torch >= 2.11, in dist/
+# make wheel  one wheel for every Python >= 3.11, every torch >= 2.11 and every card, with a manylinux tag, in dist/
 #
 # Torch is pinned in pyproject.toml ([build-system] requires) and nowhere else, the rest in .ci/constraints.txt.
 
@@ -17,6 +17,7 @@ NATIVE := $(shell nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/de
 # What must have run, or the tests have failed; OpenGL in software is the system's (Debian: libegl1, libgl1-mesa-dri).
 REQUIRE := reference,cpp,io$(if $(shell ldconfig -p 2>/dev/null | grep libEGL.so.1),$(COMMA)opengl)
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint .ci/constraints.txt
+ARCHS_GIVEN := $(GVTORCH_CUDA_ARCHS)
 export GVTORCH_CUDA_ARCHS ?= $(or $(NATIVE),90)
 
 .PHONY: demo test lint format bench wheel clean
@@ -50,8 +51,14 @@ bench: $(VENV)/bench
 	for device in cpu $(if $(NATIVE),cuda); do $(BIN)/gvtorch bench all --device $$device -o docs/performance $(ARGS) || exit; done
 	$(BIN)/python benchmarks/plots.py
 
+# Without GVTORCH_CUDA_ARCHS, for all architectures that build.py names. auditwheel finds the oldest glibc that has what
+# the libraries use, and names it in the tag; torch's own libraries are those of the torch that is installed.
+wheel: export GVTORCH_CUDA_ARCHS := $(ARCHS_GIVEN)
 wheel: $(VENV)/ready
-	$(BIN)/python -m build --wheel --no-isolation
+	rm -rf build/wheel
+	$(BIN)/python -m build --wheel --no-isolation --outdir build/wheel
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m auditwheel repair --exclude 'libtorch*' --exclude 'libc10*' \
+	  --wheel-dir dist build/wheel/*.whl
 
 clean:
 	rm -rf $(VENV) build dist out gvtorch/cpp_ext/lib *.egg-info

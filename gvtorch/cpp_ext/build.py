@@ -16,6 +16,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import re
 import runpy
 import shlex
 import shutil
@@ -46,6 +47,17 @@ def find_nvcc() -> str | None:
     return nvcc
 
 
+def compression(nvcc: str) -> str:
+    """Returns the flag by which the machine code of all architectures is compressed: to a twelfth
+    by CUDA 13, whose drivers all read it, and otherwise so that every driver does.
+    """
+    told = subprocess.run([nvcc, "--version"], capture_output=True, text=True, check=True).stdout
+    release = re.search(r"release (\d+)", told)
+    if release is not None and int(release[1]) >= 13:
+        return "--compress-mode=size"
+    return "-Xfatbin=-compress-all"
+
+
 def commands(output: Path) -> dict[Path, list[list[str]]]:
     """Returns the compiler calls of each library, by the library's path under `output`; all but the
     last, which links, may run side by side.
@@ -70,11 +82,11 @@ def commands(output: Path) -> dict[Path, list[list[str]]]:
     }
     nvcc = find_nvcc()
     if nvcc is not None:
-        archs = os.environ.get("GVTORCH_CUDA_ARCHS", ARCHS).split(";")
+        archs = (os.environ.get("GVTORCH_CUDA_ARCHS") or ARCHS).split(";")
         codes = compilers.machine_codes(archs)
         codes.append(f"-gencode=arch=compute_{archs[-1]},code=compute_{archs[-1]}")
         call = [nvcc, *compilers.NVCC_FLAGS, f"-I{source}", "--threads=0", *codes, *include]
-        call += [str(source / "cuda.cu"), "-Xlinker=--no-as-needed", *link]
+        call += [compression(nvcc), str(source / "cuda.cu"), "-Xlinker=--no-as-needed", *link]
         calls[output / "libgvtorch_cuda.so"] = [call]
     return calls
 
