@@ -130,7 +130,10 @@ def test_age_counts_frames_since_a_brick_was_written(blobs, compiled):
         assert seen.min() > 5 - 1e-4 and seen.max() < engine.frames
         other = gv.Camera.orbit(-150, 20, 1.3, width=24, height=24)
         assert sum(engine.frame(other, SHADER)[1].produced.values()) == 0
-        _, stats = engine.frame(other, SHADER)
+        for _ in range(4):  # the host may be ahead of the counts of the frame before
+            _, stats = engine.frame(other, SHADER)
+            if stats.produced["bricks"]:
+                break
         assert stats.produced["bricks"] > 0
         fresh = gv.cost(tree, other, SHADER).age
         assert fresh[~fresh.isnan()].min() < 3 < seen.min()
