@@ -249,7 +249,8 @@ def test_every_setting_is_drawn():
     """No option is left to chance: each is there a few times."""
     scenes = [settings(seed) for seed in range(SCENES)]
     known = {
-        **{"look": (*LOOKS, "labels"), "way": WAYS, "camera": CAMERAS, "light": LIGHTS, "value": SPANS},
+        **{"look": (*LOOKS, "labels"), "way": WAYS, "camera": CAMERAS},
+        **{"light": LIGHTS, "value": SPANS},
         **{"branching": (2, 3, 4), "brick": (4, 8, 16), "border": (0, 1, 2), "width": (1, 2, 3)},
         **{"lod": ("auto", "finest"), "hashed": ("raw", "float32"), "inside": (True, False)},
         "clip": ("planes", "box", "boxes", "matrix", "without"),
