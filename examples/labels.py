@@ -69,10 +69,8 @@ def main(settings: Settings) -> None:
     options = {"shader": shader, "lighting": LIGHT, "clip": CUT, "background": SKY}
     show = gv.Progressive(partial(gv.render, tree, **options))
     picture = show.refine(camera, settings.samples)
-    h, w, _ = picture.label.shape
-    print(
-        f"{len(volume.label_values) - 1} labels; in the middle: {picture.label[h // 2, w // 2, 0]}"
-    )
+    middle = picture.label[settings.size // 2, settings.size * 8 // 9, 0]
+    print(f"{len(volume.label_values) - 1} labels; in the middle: {middle}")
     picture.tone_map("aces", exposure=0.15).save(settings.output)
     print(settings.output)
 

@@ -1,45 +1,27 @@
-"""Labels: kept exactly, sampled by the nearest voxel, never blended, coarse by majority, picked;
-from arrays and files through stores to pictures, against a dense marcher that shares nothing.
+"""Pictures of labels: sampled by the nearest voxel, never blended, lit and picked; against a dense
+marcher that shares nothing with them.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from helpers import DEVICES, gvtorch
+from helpers import DEVICES
+from helpers.labels import SPACING, WIDE, cells, numbers
 from helpers.marcher import box_of, orbit_rays
 from helpers.rays import camera_rays, rays_along
 from helpers.traces import run
 from helpers.trees import on
 
 import gvtorch as gv
-from gvtorch.base import labels as base
-from gvtorch.io import label_source
-from gvtorch.pool.downsample import pool_majority
-from gvtorch.pool.pyramid import volume_levels
 from gvtorch.shaders.colors import distinct_colors, from_srgb, linear_color
 
-WIDE = 2**24 + 1
-SPACING, ORIGIN = (1.0, 0.8, 1.3), (2.0, -1.0, 0.5)
+ORIGIN = (2.0, -1.0, 0.5)
 RED, GREEN, BLUE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-
-
-def numbers(*shape: int, most: int = 5, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, most, shape)
-
-
-def cells(shape, count: int, seed: int = 0, dtype=np.int64) -> np.ndarray:
-    """The number of the nearest of some places: connected labels from 0 on."""
-    grid = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
-    places = np.random.default_rng(seed).random((count, 3)) * shape
-    return ((grid[..., None, :] - places) ** 2).sum(-1).argmin(-1).astype(dtype)
 
 
 def balls(a: int, b: int) -> gv.Volume:
@@ -48,148 +30,6 @@ def balls(a: int, b: int) -> gv.Volume:
     label = np.where((x - 11) ** 2 + (y - 12) ** 2 + (z - 12) ** 2 < 64, a, 0)
     label = np.where((x - 28) ** 2 + (y - 12) ** 2 + (z - 12) ** 2 < 64, b, label)
     return gv.Volume(label, labels=True)
-
-
-def kept(volume: gv.Volume) -> np.ndarray:
-    """The labels that a volume stands for."""
-    data = volume.data[..., 0].to(torch.int64)
-    return (data if volume.label_values is None else volume.label_values[data]).numpy()
-
-
-# --- what a volume keeps
-
-
-@pytest.mark.parametrize(
-    ("dtype", "low", "high"),
-    [
-        ("bool", 0, 1),
-        ("uint8", 0, 255),
-        ("int8", -128, 127),
-        ("uint16", 0, 65535),
-        ("int16", -32768, 32767),
-        ("int32", -(2**31), 2**31 - 1),
-        ("uint32", 0, 2**32 - 1),
-        ("int64", -(2**63), 2**63 - 1),
-        ("uint64", 0, 2**63 - 1),
-        (">i4", -(2**31), 2**31 - 1),
-        ("float64", -(2**53), 2**53),
-    ],
-)
-def test_labels_of_every_dtype_are_kept_exactly(dtype, low, high):
-    whole = np.array([low, high, high - 1, low + 1, 0, *range(min(20, high))]).astype(dtype)
-    data = np.resize(whole, (5, 6, 7))
-    volume = gv.Volume(data, labels=True)
-    assert np.array_equal(kept(volume), data.astype(np.int64)) and volume.filter == "majority"
-    narrow = np.dtype(dtype).itemsize <= 2
-    assert (volume.label_values is None) == narrow
-    assert volume.info.labels and volume.data.dtype.itemsize == (data.itemsize if narrow else 1)
-    if not narrow:
-        assert torch.equal(volume.label_values, torch.from_numpy(np.unique(data.astype(np.int64))))
-    if np.dtype(dtype).isnative:
-        again = gv.Volume(torch.from_numpy(data), info=gv.ImageInfo(labels=True))
-        assert torch.equal(again.data, volume.data)
-
-
-@pytest.mark.parametrize("count", [256, 257, 65536, 65537, 70000])
-def test_as_few_bits_as_the_labels_need(count):
-    data = np.arange(count).repeat(2)[: 2 * count].reshape(2, count, 1) * 7 + 2**40
-    volume = gv.Volume(data, labels=True)
-    assert volume.data.dtype == getattr(torch, base.index_dtype(count).name)
-    assert volume.data.dtype.itemsize == (1 if count <= 256 else 2 if count <= 65536 else 4)
-    assert np.array_equal(kept(volume), data)
-
-
-def test_whole_floats_are_labels_and_nan_can_be_replaced():
-    data = np.array([[[0.0, 3.0, np.nan, 2.0**60]]])
-    volume = gv.Volume(data, labels=True, nan=0)
-    assert kept(volume).tolist() == [[[0, 3, 0, 2**60]]]
-    with pytest.raises(ValueError, match="must be whole numbers, got nan"):
-        gv.Volume(data, labels=True)
-    with pytest.raises(ValueError, match=r"must be whole numbers, got 0\.5"):
-        gv.Volume(np.full((2, 2, 2), 0.5), labels=True)
-
-
-def test_what_does_not_fit_is_one_clear_error():
-    with pytest.raises(ValueError, match=r"below 2\^63, got 9223372036854775808: number them anew"):
-        gv.Volume(np.full((2, 2, 2), 2**63, np.uint64), labels=True)
-    with pytest.raises(ValueError, match="holds 16777217 labels or more, at most 16777216 fit"):
-        base.check_count("Volume", 2**24 + 1)
-    base.check_count("Volume", 2**24)
-    for what in (np.zeros((2, 2, 2), complex), np.zeros(3, int), "labels", np.zeros((0, 2, 2))):
-        with pytest.raises(ValueError, match="Volume: ") as caught:
-            gv.Volume(what, labels=True)
-        assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("dtype", ["int32", "uint32", "int64", "uint64"])
-def test_wide_integers_never_merge_in_silence(dtype):
-    data = np.full((3, 3, 3), WIDE, dtype)
-    for given in (data, torch.from_numpy(data)):
-        with pytest.raises(ValueError, match=r"16777217.*labels=True \(--labels\)") as caught:
-            gv.Volume(given)
-        assert "\n" not in str(caught.value)
-    assert gv.Volume(data - 1).data.unique().tolist() == [2**24]
-    if dtype.startswith("int"):
-        with pytest.raises(ValueError, match="-16777217"):
-            gv.Volume(-data)
-    assert gv.Volume(data.astype(np.float64)).data.unique().tolist() == [2**24]
-
-
-# --- coarse levels
-
-
-def brute_majority(values: np.ndarray, factor: int, background: float | None) -> np.ndarray:
-    shape = [-(-n // factor) for n in values.shape[:3]]
-    out = np.empty((*shape, values.shape[3]), values.dtype)
-    for z, y, x, c in np.ndindex(out.shape):
-        index = [
-            np.minimum(np.arange(factor) + factor * at, n - 1)
-            for at, n in zip((z, y, x), values.shape, strict=False)
-        ]
-        found, counts = np.unique(values[..., c][np.ix_(*index)], return_counts=True)
-        order = sorted(zip(-counts, found == background, found, strict=True))
-        out[z, y, x, c] = order[0][2]
-    return out
-
-
-@pytest.mark.parametrize("background", [None, 0, 2])
-@pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "float32"])
-@pytest.mark.parametrize("factor", [2, 3])
-def test_majority_is_that_of_every_block(factor, dtype, background):
-    for most, seed in ((2, 0), (4, 1), (40, 2)):
-        values = numbers(9, 8, 11, 2, most=most, seed=seed).astype(dtype)
-        values[:4] = values[0, 0, 0]  # blocks of one label
-        found = pool_majority(values, factor, background)
-        assert found.dtype == values.dtype
-        assert np.array_equal(found, brute_majority(values, factor, background))
-        assert np.array_equal(found[1:], pool_majority(values[factor:], factor, background))
-
-
-def test_a_sheet_one_voxel_thick_stays():
-    """Half of each block is background, at every level: ties go to what is there."""
-    data = np.zeros((32, 32, 32), np.int64)
-    data[13] = WIDE
-    volume = gv.Volume(data, labels=True)
-    for level in volume_levels(volume, 5, branching=2, brick_size=4, border=1):
-        assert (level.values == 1).any((1, 2, 3)).sum() == 1 and level.values.max() == 1
-
-
-def test_a_tree_holds_no_label_that_the_volume_has_not():
-    volume = gv.Volume(numbers(21, 18, 25, most=9).astype(np.int64) ** 20 + 3, SPACING, labels=True)
-    there = set(volume.data.unique().tolist())
-    for branching, threshold in itertools.product((2, 3), (None, 3.0)):
-        channels = {"label": volume, "value": gv.Volume(volume.data.float(), SPACING)}
-        tree = gv.N3Tree.from_volume(channels, 4, branching=branching, threshold=threshold)
-        assert set(tree.bricks.bricks["label"].unique().tolist()) <= there
-        brick = tree.nodes.brick_tn < 0
-        assert set(tree.nodes.constants["label"][brick].unique().tolist()) <= there
-
-
-def test_a_threshold_is_not_for_labels():
-    volume = gv.Volume(numbers(8, 8, 8), labels=True)
-    for make in (gv.N3Tree.from_volume, gv.VolumeProducer):
-        with pytest.raises(ValueError, match="threshold is for values; labels are hidden by"):
-            make(volume, threshold=0)
 
 
 # --- pictures: against a dense marcher
@@ -592,119 +432,7 @@ def test_streamed_is_resident_in_every_bit(scene, compiled, hold):
                 assert torch.equal(getattr(picture, name), getattr(resident, name)), name
 
 
-def same_as_resident(store: gv.Store, volume: gv.Volume) -> None:
-    shader, cameras = gv.Labels(), [gv.Camera.orbit(30, 20, d, width=24, height=20) for d in (1, 5)]
-    tree = gv.N3Tree.from_volume(volume, 8)
-    with gv.Engine(gv.StoredProducer(store), brick_size=8) as engine:
-        for camera in cameras:
-            resident, picture = gv.render(tree, camera, shader), engine.render(camera, shader)
-            assert picture.stats.converged and not engine.failures
-            for name in ("color", "alpha", "depth", "label", "normal"):
-                assert torch.equal(getattr(picture, name), getattr(resident, name)), name
-
-
-@pytest.mark.backend("cpp")
-@pytest.mark.parametrize("kind", ["int64 file", "packed file", "volume", "uint16 file"])
-def test_a_store_keeps_labels(tmp_path, kind):
-    data = cells((90, 70, 80), 40, dtype=np.uint16 if "uint16" in kind else np.int64)
-    data = data if "uint16" in kind else np.where(data % 4 == 0, 0, data * 2**33 - 9)
-    file = tmp_path / ("labels.npy" if "packed" not in kind else "labels.npz")
-    np.save(file, data) if file.suffix == ".npy" else np.savez_compressed(file, data)
-    volume = gv.read_volume(file, labels=True, spacing=SPACING)
-    assert np.array_equal(kept(volume), data)
-    source = volume if kind == "volume" else file
-    place = {} if kind == "volume" else {"spacing": SPACING}
-    store = gv.convert(source, tmp_path / "labels.zarr", labels=True, **place)
-    assert store.info.labels and (store.label_values is None) == ("uint16" in kind)
-    again = gv.read_volume(tmp_path / "labels.zarr")
-    assert again.info.labels and np.array_equal(kept(again), data)
-    levels = volume_levels(volume, store.levels, branching=2, brick_size=8, border=1)
-    for number, level in enumerate(levels):
-        z, y, x = level.values.shape[:3]
-        stored = store.read_region(number, (0, 0, 0), (z, y, x))
-        assert np.array_equal(stored, level.values.numpy()), number
-    same_as_resident(store, volume)
-
-
-@pytest.mark.backend("cpp")
-def test_a_store_of_more_labels_than_16_bits_count_by_processes(tmp_path):
-    data = np.random.default_rng(0).integers(0, 80_000, (150, 140, 130)) * 2**40 + 5
-    np.save(tmp_path / "many.npy", data)
-    store = gv.convert(tmp_path / "many.npy", tmp_path / "many.zarr", labels=True, workers=2)
-    assert store.dtype == torch.float32 and len(store.label_values) == len(np.unique(data))
-    assert np.array_equal(kept(gv.read_volume(tmp_path / "many.zarr")), data)
-
-
-def test_converting_labels_resumes_without_finding_them_again(tmp_path, monkeypatch):
-    data = cells((300, 40, 30), 20) * 2**35
-    np.save(tmp_path / "a.npy", data)
-    given = {"labels": True, "executor": ThreadPoolExecutor(1), "workers": 1}
-
-    def stop(what: str, done: int, total: int) -> None:
-        if what == "converting" and done:
-            raise RuntimeError("the power is gone")
-
-    with pytest.raises(RuntimeError, match="the power is gone"):
-        gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", progress=stop, **given)
-    with pytest.raises(FileExistsError, match="half-written"):
-        gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", **given)
-    with pytest.raises(ValueError, match="was begun with"):
-        gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", resume=True, nan=0, **given)
-    monkeypatch.setattr(label_source, "distinct", None)  # to call it would fail
-    store = gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", resume=True, **given)
-    assert np.array_equal(kept(gv.read_volume(tmp_path / "a.zarr")), data)
-    assert store.label_values.tolist() == np.unique(data).tolist()
-
-
-def test_a_label_that_comes_while_it_is_read_is_an_error(tmp_path):
-    np.save(tmp_path / "a.npy", cells((20, 20, 20), 5) * WIDE)
-    source = gv.convert.__globals__["open_source"](tmp_path / "a.npy", labels=True)
-    for known in ([0, WIDE, 2 * WIDE, 3 * WIDE], [0, 5 * WIDE], [7]):
-        counted = label_source.IndexSource.of(source, np.array(known))
-        with pytest.raises(OSError, match="changed while it was read: a label is new"):
-            counted.read_region((0, 0, 0), (20, 20, 20))
-
-
-def test_damaged_label_tables_are_told(tmp_path):
-    np.save(tmp_path / "a.npy", cells((20, 20, 20), 5) * WIDE)
-    gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", labels=True)
-    file = tmp_path / "a.zarr" / "zarr.json"
-    text = file.read_text()
-    for count, said in ((0, "damaged"), (6, "damaged"), ('"x"', "damaged"), (2**25, "damaged")):
-        file.write_text(text.replace('"label_count": 5', f'"label_count": {count}'))
-        with pytest.raises(ValueError, match=said):
-            gv.Store.open(tmp_path / "a.zarr")
-    file.write_text(text)
-    for part in (tmp_path / "a.zarr" / "gvtorch" / "labels").rglob("c/*"):
-        part.write_bytes(part.read_bytes()[:-3])
-    with pytest.raises((ValueError, OSError)):
-        gv.Store.open(tmp_path / "a.zarr")
-
-
-def test_files_of_wide_integers_never_merge_in_silence(tmp_path):
-    data = cells((40, 30, 20), 5) + WIDE
-    np.save(tmp_path / "a.npy", data)
-    np.savez(tmp_path / "a.npz", data)
-    for name in ("a.npy", "a.npz"):
-        for work in (gv.read_volume, lambda file: gv.convert(file, tmp_path / "a.zarr")):
-            with pytest.raises((ValueError, OSError), match=r"labels=True \(--labels\)") as caught:
-                work(tmp_path / name)
-            assert "\n" not in str(caught.value)
-
-
-def test_what_conversion_refuses(tmp_path):
-    volume = gv.Volume(numbers(8, 8, 8), labels=True)
-    with pytest.raises(ValueError, match="threshold is for values"):
-        gv.convert(volume, tmp_path / "a.zarr", threshold=1)
-    with pytest.raises(ValueError, match=r"must hold labels: gv\.Volume\(data, labels=True\)"):
-        gv.convert(gv.Volume(numbers(8, 8, 8)), tmp_path / "a.zarr", labels=True)
-    np.save(tmp_path / "half.npy", np.full((4, 4, 4), 0.5))
-    with pytest.raises((ValueError, OSError), match="labels must be whole numbers"):
-        gv.convert(tmp_path / "half.npy", tmp_path / "a.zarr", labels=True)
-    assert not (tmp_path / "a.zarr" / "zarr.json").exists()
-
-
-# --- what a shader is told, and the command line
+# --- what a shader is told
 
 
 def test_other_shaders_do_not_blend_labels(scene):
@@ -761,62 +489,3 @@ def test_a_producer_of_labels(compiled):
     with gv.Engine(Slabs(), brick_size=4, device=DEVICES[compiled]) as engine:
         picture = engine.render(gv.Camera.orbit(0, 0, 2.5, width=16, height=16), gv.Labels())
     assert set(picture.label.unique().tolist()) == {-1, 1, 7}
-
-
-@pytest.mark.backend("cpp")
-def test_the_command_line_shows_labels(tmp_path):
-    np.save(tmp_path / "a.npy", cells((24, 22, 26), 9) * WIDE)
-    size = ("--size", "24x20")
-    refused = gvtorch("render", "a.npy", "-o", "a.png", *size, cwd=tmp_path)
-    assert refused.returncode == 2 and "--labels" in refused.stderr
-    done = gvtorch(
-        *("render", "a.npy", "--labels", "-o", "a.png", "--npz", "a.npz", *size), cwd=tmp_path
-    )
-    assert done.returncode == 0, done.stderr
-    made = gvtorch("convert", "a.npy", "a.zarr", "--labels", cwd=tmp_path)
-    assert made.returncode == 0, made.stderr
-    for shader in ((), ("--shader", "labels")):
-        done = gvtorch(
-            *("render", "a.zarr", "-o", "b.png", "--npz", "b.npz", *size, *shader), cwd=tmp_path
-        )
-        assert done.returncode == 0, done.stderr
-        with np.load(tmp_path / "a.npz") as a, np.load(tmp_path / "b.npz") as b:
-            assert np.array_equal(a["label"], b["label"]) and a["label"].max() > WIDE
-            assert np.array_equal(a["color"], b["color"])
-    for flags in (("--tf", "bone"), ("--shader", "labels", "--tf", "bone"), ("--threshold", "0")):
-        done = gvtorch("render", "a.npy", "--labels", "-o", "a.png", *flags, cwd=tmp_path)
-        assert done.returncode == 2 and "labels" in done.stderr, flags
-        assert len(done.stderr.splitlines()) == 1
-    told = gvtorch("info", "a.zarr", cwd=tmp_path).stdout
-    assert "labels" in told
-
-
-def test_replacing_a_label_volume_keeps_its_filter():
-    volume = gv.Volume(numbers(4, 4, 4), labels=True, info=gv.ImageInfo(unit="micrometer"))
-    assert volume.info == replace(gv.ImageInfo(unit="micrometer"), labels=True)
-
-
-@pytest.mark.backend("cpp")
-@pytest.mark.parametrize("dtype", ["uint32", "uint8"])
-def test_label_images_that_another_library_wrote(tmp_path, dtype):
-    """By zarr, with one level: coarser ones are made by majority; wide ones are counted off."""
-    zarr = pytest.importorskip("zarr")
-    data = (cells((40, 36, 44), 12) * (2**28 - 1 if dtype == "uint32" else 21)).astype(dtype)
-    group = zarr.open_group(tmp_path / "cells.zarr", mode="w", zarr_format=3)
-    group.create_array("0", data=data, chunks=(16, 16, 16))
-    axes = [{"name": name, "type": "space", "unit": "micrometer"} for name in "zyx"]
-    scale = [{"type": "scale", "scale": [1.3, 0.8, 1.0]}]
-    datasets = [{"path": "0", "coordinateTransformations": scale}]
-    images = [{"name": "cells", "axes": axes, "datasets": datasets}]
-    group.attrs["ome"] = {"version": "0.5", "multiscales": images, "image-label": {}}
-    volume = gv.read_volume(tmp_path / "cells.zarr")
-    assert volume.info.labels and np.array_equal(kept(volume), data.astype(np.int64))
-    store = gv.Store.open(tmp_path / "cells.zarr")
-    if dtype == "uint8":
-        same_as_resident(store, volume)
-    else:
-        with pytest.raises(ValueError, match=r"labels of <u4 must be counted off first: gvtorch"):
-            gv.StoredProducer(store)
-    made = gv.convert(tmp_path / "cells.zarr", tmp_path / "own.zarr")
-    assert made.info.labels and made.spacing == SPACING
-    same_as_resident(made, volume)

@@ -259,3 +259,26 @@ def test_mistakes_are_told_in_a_line(volumes, make, told):
     with pytest.raises(ValueError, match=told) as error:
         make(tree)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.backend("cpp")
+def test_labels_are_told_among_media(volumes):
+    """A segmentation of the smooth ball in another volume: its labels, as without the other."""
+    values = volumes["ct"].data[..., 0]
+    numbers = (values > 0.3).long() * 700_000_000_001 + (values > 0.7).long()
+    labels = gv.Volume(numbers, volumes["ct"].spacing, volumes["ct"].origin, labels=True)
+    trees = {
+        "labels": gv.N3Tree.from_volume(labels, 8),
+        "pet": gv.N3Tree.from_volume(volumes["pet"], 8),
+    }
+    shaders = {"labels": gv.Labels(), "pet": COLD}
+    found = gv.render(trees, view(), shaders)
+    alone = gv.render(trees["labels"], view(), shaders["labels"])
+    faint = gv.TransferFunction([(0, 1e-9)])
+    through = gv.render(trees, view(), {**shaders, "pet": faint})
+    assert sorted(set(alone.label.unique().tolist())) == [-1, 700_000_000_001]
+    same = (through.label == alone.label).float().mean()
+    assert same > 0.99, "but for pixels at the edge"
+    hidden = (found.label == -1) & (alone.label > 0)
+    assert ((found.label == alone.label) | hidden).float().mean() > 0.99
+    assert (found.label > 0).float().mean() > 0.05

@@ -16,6 +16,8 @@ from ..base.volume import Volume
 from ..io.store import Store
 from ..io.window import windows
 from ..ops.shading import Triple
+from .colors import from_srgb
+from .colors import linear_color as named_color
 from .shader import ColorTable, Sampling, Shader
 from .transfer_function import TransferFunction
 
@@ -34,7 +36,6 @@ DISTINCT = (
 )
 
 MOST = len(DISTINCT)  # channels of a picture
-_LINEAR = 0.04045  # sRGB: up to here it is linear
 _RAMP = 16  # straight parts in which opacity rises
 _OPACITY = 0.5
 _OPAQUE = 1024.0  # halvings that stand for an opacity of 1
@@ -196,7 +197,7 @@ class Channels(Shader):
             one = told.get(component, ChannelInfo())
             looks.append(
                 ChannelLook(
-                    color=one.color and decoded(one.color),
+                    color=one.color and tuple(from_srgb(np.array(one.color)).tolist()),
                     window=one.window or found[component],
                     component=component,
                     visible=active or one.active,
@@ -288,28 +289,7 @@ def window_of(where: str, window: Sequence[float]) -> tuple[float, float]:
 
 
 def linear_color(where: str, color: Triple | str) -> Triple:
-    """Returns a colour as linear RGB: three numbers as they are, or a name or #RRGGBB in sRGB.
-
-    Raises:
-        ValueError: It is none of these.
+    """Returns a colour as linear RGB, as `colors.linear_color`, of which names are those of lookup
+    tables.
     """
-    if not isinstance(color, str):
-        triple = check.triple(where, "color", color)
-        for number in triple:
-            check.number(where, "color", number, low=0, high=1)
-        return triple
-    text = NAMED.get(color.lower(), color)
-    try:
-        if len(text) != 7 or text[0] != "#":
-            raise ValueError
-        return decoded([int(text[at : at + 2], 16) / 255 for at in (1, 3, 5)])
-    except ValueError:
-        names = ", ".join(NAMED)
-        raise ValueError(
-            f"{where}: color must be three numbers, #RRGGBB or one of {names}; got {color!r}"
-        ) from None
-
-
-def decoded(color: Sequence[float]) -> Triple:
-    """Returns linear RGB of an sRGB colour, 0 to 1 (IEC 61966-2-1:1999)."""
-    return tuple(c / 12.92 if c <= _LINEAR else ((c + 0.055) / 1.055) ** 2.4 for c in color)
+    return named_color(where, color, NAMED)

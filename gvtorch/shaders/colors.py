@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -23,18 +24,20 @@ _GOLDEN = 0x9E3779B97F4A7C15  # 2^64 / the golden ratio
 _APART = 0x57AE147AE147B001  # 2^64 * 0.3425: so the first 64 colours lie farthest apart
 
 
-def linear_color(where: str, value: Any) -> tuple[float, float, float]:
-    """Returns a colour as linear red, green, blue: a name or #RRGGBB, which are sRGB, or three
-    numbers in [0, 1], which are linear; raises ValueError where it is neither.
+def linear_color(
+    where: str, value: Any, named: Mapping[str, str] = NAMED
+) -> tuple[float, float, float]:
+    """Returns a colour as linear red, green, blue: one of the names or #RRGGBB, which are sRGB, or
+    three numbers in [0, 1], which are linear; raises ValueError where it is neither.
     """
     if not isinstance(value, str):
         color = check.triple(where, "colour", value)
         for part in color:
             check.number(where, "colour", part, low=0, high=1)
         return color
-    text = NAMED.get(value.lower(), value)
+    text = named.get(value.lower(), value)
     if not re.fullmatch(r"#[0-9a-fA-F]{6}", text):
-        names = ", ".join(NAMED)
+        names = ", ".join(named)
         raise ValueError(f"{where}: {value!r} is no colour; known: #RRGGBB, {names}")
     red, green, blue = (int(text[at : at + 2], 16) / 255 for at in (1, 3, 5))
     red, green, blue = from_srgb(np.array((red, green, blue))).tolist()

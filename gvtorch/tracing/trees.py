@@ -153,8 +153,8 @@ def _mean_normal(ranked: Sequence[Hits]) -> Tensor | None:
 
 
 def _ranked(fields: list[Tensor | None], order: Tensor) -> Sequence[Any]:
-    """The same field (r, ...) of m trees, in the order (m, r) of the trees along each ray; zeros
-    stand for a tree that does not give it.
+    """The same field (r, ...) of m trees, in the order (m, r) of the trees along each ray; zeros,
+    of labels -1, stand for a tree that does not give it.
     """
     filled = _filled(fields)
     if filled is None:
@@ -172,7 +172,8 @@ def _filled(fields: Sequence[Tensor | None]) -> list[Tensor] | None:
         return None
     if len({field.shape[1:] for field in given}) > 1:
         raise ValueError("render: trees must give as many features each")
-    return [_zeros_if_none(field, given[0]) for field in fields]
+    nothing = _nothing_like(given[0], len(given[0]))
+    return [nothing if field is None else field for field in fields]
 
 
 # --- several trees in the same space
@@ -254,14 +255,14 @@ def _further(
     if found["normal"] is not None:
         found["normal"] = found["normal"] * (found["alpha"] - before)
     join: dict[str, Any] = {"depth": torch.minimum, "missed": torch.logical_or}
-    join["alpha"] = lambda _, whole: whole
+    join |= {"alpha": lambda _, whole: whole, "label": torch.maximum}  # only one is hit
     fields: dict[str, Any] = vars(hits).copy()
     for name, more in found.items():
         if more is None:
             continue
         known = fields[name]
         if known is None:
-            known = more.new_zeros((len(which), *more.shape[1:]))
+            known = _nothing_like(more, len(which))
         fields[name] = known.index_copy(0, at, join.get(name, torch.add)(known[at], more))
     return Hits(**fields)
 
@@ -288,16 +289,27 @@ def _together(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     hit = ((before >= hit_clear) & (before * (1 - alpha) < hit_clear)).nonzero()[:, 0]
     near, far = pieces.span[hit].unbind(1)
     place = near + torch.log(before[hit] / hit_clear) / shown.extinction[hit, 0] * (far - near)
+    label, samples = None, torch.zeros(len(clear), dtype=torch.int32, device=clear.device)
+    if any(one.tracer.shader.reads_labels for one in trees):
+        label = samples.new_full((len(clear), 1), -1, dtype=torch.int64)
+    single = pieces.covered.sum(0)[hit] == 1
     for one, covered in zip(trees, pieces.covered, strict=True):
-        alone = (covered & (pieces.covered.sum(0) == 1))[hit].nonzero()[:, 0]
-        if len(alone):  # a run of samples: its tree finds the place
-            part = pieces.rays(rays, hit[alone], before[hit[alone]])
-            found = one.trace(part).depth[:, 0].to(place)
-            place[alone] = torch.where(found < torch.inf, found, place[alone])
+        mine, light = covered[hit], before[hit]
+        if label is not None and one.tracer.shader.reads_labels:
+            light = torch.where(single, light, hit_clear)  # among others: what it shows at all
+        else:
+            mine = mine & single  # a run of samples: its tree finds the place
+        at = mine.nonzero()[:, 0]
+        if not len(at):
+            continue
+        found = one.trace(pieces.rays(rays, hit[at], light[at]))
+        far = found.depth[:, 0].to(place)
+        place[at] = torch.where(single[at] & (far < torch.inf), far, place[at])
+        if found.label is not None and label is not None:
+            label[pieces.ray[hit[at]]] = found.label
     depth = left.new_full((len(clear),), torch.inf).index_put((pieces.ray[hit],), place)
-    samples = torch.zeros(len(clear), dtype=torch.int32, device=clear.device)
     samples.index_add_(0, pieces.ray, torch.where(before > 0, shown.samples, 0))
-    return shown.hits(total, left, depth, samples, missed)
+    return replace(shown.hits(total, left, depth, samples, missed), label=label)
 
 
 class _Shown:
@@ -463,15 +475,17 @@ def _scattered(found: Sequence[Hits], places: Sequence[Tensor]) -> Hits:
         like = next((field for field in filled if field is not None), None)
         if like is not None:
             parts = [
-                like.new_zeros((len(one.alpha), *like.shape[1:])) if field is None else field
+                _nothing_like(like, len(one.alpha)) if field is None else field
                 for one, field in zip(found, filled, strict=True)
             ]
             fields[name] = torch.cat(parts)[at]
     return Hits(**fields)
 
 
-def _zeros_if_none(field: Tensor | None, like: Tensor) -> Tensor:
-    return torch.zeros_like(like) if field is None else field
+def _nothing_like(field: Tensor, rays: int) -> Tensor:
+    """The field (r, ...) of rays that met nothing that gives it: zeros, of labels -1."""
+    shape = (rays, *field.shape[1:])
+    return field.new_full(shape, -1 if field.dtype == torch.int64 else 0)
 
 
 def _unit(vectors: Tensor) -> Tensor:

@@ -1,0 +1,141 @@
+"""Light of the fused shaders, and shadows, which are cones from samples to the light: the twin of
+csrc/shaders/light.h.
+
+Source: Blinn, "Models of light reflection for computer synthesized pictures", SIGGRAPH 1977.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ..shading import LightKind, ShadeParameters
+from .exact import dot, larger, power, sqrt_exact, unit
+from .march import Piece, Plain, Probe, Visitor, Walk
+from .rays import INF, Intervals, split
+from .tree import Bricks
+
+
+@dataclass
+class Light:
+    """A light, the material it falls on, and the eye that sees it. World units."""
+
+    parameters: ShadeParameters
+    normals: tuple[Bricks, ...]  # three components, or none
+    eye: Tensor  # (r, 3)
+    along: Tensor  # (r, 3)
+    moved: Tensor  # (r,) distance from the eye to where distances begin
+    cube: Tensor  # (3,) size of the root cube
+
+    def normal_at(self, probe: Probe, t: Tensor) -> Tensor:
+        """(r, 3) normals towards the eye, stored or the gradient's; 0 where there is none."""
+        if self.normals:
+            p, columns = self.parameters, [probe.number(c, t) for c in self.normals]
+            normal = torch.stack(columns, 1) * p.normal_scale + p.normal_offset
+        else:
+            normal = probe.gradient(t, self.cube)
+        normal = unit(normal)
+        return torch.where((dot(normal, self.along) > 0)[:, None], -normal, normal)
+
+    def towards(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(r, 3) ways from places to the light, (r,) lengths of these ways, and (r,) how much cones
+        to the light grow per unit of length.
+        """
+        back, place = -self.along, torch.as_tensor(self.parameters.light)
+        length = torch.full_like(t, INF)
+        growth = torch.zeros_like(t) + self.parameters.light_growth
+        if self.parameters.light_kind == LightKind.DIRECTIONAL:
+            return unit(-place.expand_as(back)), length, growth
+        if self.parameters.light_kind == LightKind.POINT:
+            way = place - (self.eye + (t + self.moved)[:, None] * self.along)
+            length = sqrt_exact(dot(way, way))
+            return unit(way), length, growth / length
+        return back, length, growth
+
+    def shade(
+        self,
+        base: Tensor,
+        normal: Tensor,
+        t: Tensor,
+        share: Callable[[Tensor], Tensor] = torch.ones_like,
+    ) -> Tensor:
+        """(r, 3) colours in the light of base colours (r, 3). `share` gives the share of light that
+        comes to those places that face the light, (r,) bool.
+        """
+        p, zero = self.parameters, torch.zeros_like(t)
+        to_light, _, _ = self.towards(t)
+        bare = ~(dot(normal, normal) > 0)
+        facing = torch.where(bare, 1.0, larger(zero, dot(normal, to_light)))
+        half = unit(to_light - self.along)
+        highlight = power(larger(zero, dot(normal, half)), p.shininess)
+        highlight = torch.where((facing > 0) & ~bare, highlight, zero)
+        comes = share(facing > 0)
+        facing, highlight = facing * comes, highlight * comes
+        diffuse = (p.diffuse * facing)[:, None]
+        specular = (p.specular * highlight)[:, None]
+        light = torch.as_tensor(p.light_color)
+        return base * (p.ambient + diffuse * light) + specular * light
+
+
+class Shadows:
+    """What cones from samples to the light go through, and what they cost."""
+
+    def __init__(self, walk: Walk, cube: Tensor, cone_scale: float) -> None:
+        self.walk, self.cube, self.cone_scale = walk, cube, cone_scale  # the eye's; see `Light`
+        self.samples, self.missed = torch.zeros_like(walk.samples), torch.zeros_like(walk.missed)
+
+    def share(
+        self, matter: Plain, t: Tensor, way: Tensor, length: Tensor, growth: Tensor, where: Tensor
+    ) -> Tensor:
+        """(r,) share of a light, `length` (r,) away, that comes to places t (r,), where `where` is
+        true. A cone is as wide there as the eye's; its first interval is left out, so that a place
+        does not stand in its own shadow.
+        """
+        which = where.nonzero()[:, 0]
+        t, way, eye = t[which], way[which], self.walk.at.beam[which]
+        origin, rest = split(eye.along(t), eye.deep, t.dtype)
+        beam = replace(
+            eye,
+            origin=origin,
+            rest=rest,
+            direction=way / self.cube,
+            cone_near=eye.cone(t),
+            cone_growth=growth[which] * self.cone_scale,
+            first=torch.zeros_like(t),
+            last=length[which],
+            moved=torch.zeros_like(t),
+        ).clipped()
+        length_l = self.walk.at.length_l
+        at = Intervals(beam, length_l[0], len(length_l))
+        at.next(torch.ones_like(where[which]))
+        veil = Veil(matter.transfer, matter.channel, matter, way, torch.ones_like(t))
+        walk = Walk(at, self.walk.tree, matter.channel)
+        walk.go(veil)
+        self.samples[which] += walk.samples
+        self.missed[which] |= walk.missed
+        return torch.ones_like(length).index_put((which,), veil.clear)
+
+
+@dataclass
+class Veil(Visitor):
+    """What matter takes from the light that goes through."""
+
+    matter: Plain
+    along: Tensor  # (r, 3) world
+    clear: Tensor  # (r,) transmittance
+
+    def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        return self.matter.hides(which, low, high)
+
+    def same(self, fine: Tensor, coarse: Tensor) -> Tensor:
+        return self.matter.same(fine, coarse)
+
+    def goes_on(self, leaves: Tensor) -> Tensor:
+        return self.clear > self.matter.stop_clear
+
+    def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
+        clear = self.clear * (1 - self.matter.alpha(piece, probe, self.along))
+        self.clear = torch.where(where, clear, self.clear)
