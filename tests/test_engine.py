@@ -412,7 +412,7 @@ def test_report_tells_stages_rates_and_occupancy(blobs):
         (lambda v: engine(v, scout_rounds=-1), "scout_rounds must be an int >= 0"),
         (lambda v: engine(v, device="gpu"), "device must name a device, got 'gpu'"),
         (lambda v: engine(v, strict="no"), "strict must be bool, got 'no'"),
-        (lambda v: gv.VolumeProducer(v.data), "VolumeProducer: volume must be a Volume"),
+        (lambda v: gv.VolumeProducer("scan"), "VolumeProducer: channel 'value'"),
         (lambda v: gv.VolumeProducer({}), "VolumeProducer: volume must name at least one"),
         (lambda v: gv.Producer(4, channels={"a": torch.uint8}), "channels['a'] must be a Channel"),
         (lambda v: gv.Engine(type("Lazy", (gv.Producer,), {"__init__": nothing})()), "super()"),

@@ -92,7 +92,8 @@ def test_a_name_that_is_no_text_is_one_line(tmp_path, data):
 
 
 INTERRUPTED = """
-import sys, time
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background ignore it
 from gvtorch.io import conversion, shard
 from gvtorch.tools.cli import main
 original = shard.write_shard

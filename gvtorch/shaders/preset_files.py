@@ -163,7 +163,8 @@ def _opacities(nodes: np.ndarray) -> np.ndarray:
         if sharp < 0.01:
             places, shares = np.array([0, middle]), np.array([0, 0.5])
         else:
-            places = np.arange(_BENT) / _BENT
+            half = np.arange(_BENT // 2) / (_BENT // 2)  # as many on either side of the midpoint
+            places = np.concatenate((half * middle, middle + half * (1 - middle)))
             shares = _hermite(places, middle, sharp)
         points += list(zip(v + places * (w - v), a + shares * (b - a), strict=True))
     return np.array([*points, nodes[-1, :2]])

@@ -25,6 +25,7 @@ from ..base.records import Hits, Rays
 from ..ops.shading import pack
 from ..pool import N3Tree
 from ..shaders.shader import Shader, check_shader
+from ..shaders.transfer_function import TransferFunction
 from .around import around
 from .composite import Trace, box_span, over
 from .options import RenderOptions
@@ -103,6 +104,9 @@ def trace_trees(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
         return trees[0].trace(rays)
     if not overlaps(trees):
         return _in_order(trees, rays)
+    trees = [one for one in trees if _shows(one)] or trees[:1]
+    if len(trees) == 1:
+        return trees[0].trace(rays)
     span = _spans(trees, rays)
     first, last = span.unbind(2)
     pairs = combinations(range(len(trees)), 2)
@@ -125,6 +129,12 @@ def overlaps(trees: Sequence[TreeTrace]) -> bool:
         bool((torch.maximum(a.box[0], b.box[0]) < torch.minimum(a.box[1], b.box[1])).all())
         for a, b in combinations(trees, 2)
     )
+
+
+def _shows(one: TreeTrace) -> bool:
+    """Whether a tree's transfer function shows anything at all."""
+    transfer = one.tracer.shader.transfer or one.tracer.shader
+    return not isinstance(transfer, TransferFunction) or bool(transfer.opacity[:, 1].any())
 
 
 # --- one tree behind the other
