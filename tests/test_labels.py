@@ -233,6 +233,9 @@ def test_colours_of_few_labels_differ():
     apart = np.linalg.norm(srgb[:, None] - srgb[None], axis=-1) + 9 * np.eye(12)
     assert apart.min() > 0.12 and (srgb.max(1) > 0.55).all()
     assert np.array_equal(distinct_colors(np.array([5])), colors[4:5])
+    for step in (100_003, 2**20, 10**9, 700_000_000_001):
+        many = distinct_colors(step * np.arange(1, 65))
+        assert len(np.unique(many.round(1), axis=0)) > 40, "multiples of a number differ, too"
 
 
 # --- light

@@ -21,6 +21,7 @@ NAMED = {
     **{"brown": "#8c5032", "tan": "#d2b48c", "bone": "#e8dcc5", "olive": "#808000"},
 }
 _GOLDEN = 0x9E3779B97F4A7C15  # 2^64 / the golden ratio
+_MIXED = np.uint64(2**16)
 _APART = 0x57AE147AE147B001  # 2^64 * 0.3425: so the first 64 colours lie farthest apart
 
 
@@ -53,11 +54,14 @@ def distinct_colors(numbers: np.ndarray) -> np.ndarray:
     """Returns (k, 3) float64 linear colours of numbers (k,) int64, always the same of a number.
 
     Hues of numbers that follow one another lie a golden ratio of the circle apart, so any few of
-    them differ; lightness and chroma go around in another rhythm.
+    them differ; lightness and chroma go around in another rhythm. Large numbers seldom follow one
+    another but may be multiples of one: from 2^16 on they are mixed first.
 
-    Source: Ottosson, "A perceptual color space for image processing", 2020 (OKLab).
+    Source: Ottosson, "A perceptual color space for image processing", 2020 (OKLab); Steele, Lea,
+        Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014 (the mixing).
     """
     whole = numbers.astype(np.int64).view(np.uint64)
+    whole = np.where(whole < _MIXED, whole, _mixed(whole))
     hue, other = (
         (whole * np.uint64(step) >> np.uint64(11)) * 2.0**-53 for step in (_GOLDEN, _APART)
     )
@@ -65,6 +69,13 @@ def distinct_colors(numbers: np.ndarray) -> np.ndarray:
     chroma = 0.165 - 0.05 * np.abs(2 * other - 1)
     angle = 2 * math.pi * (hue + 0.07)
     return _from_oklab(lightness, chroma * np.cos(angle), chroma * np.sin(angle))
+
+
+def _mixed(whole: np.ndarray) -> np.ndarray:
+    """(k,) uint64 of which every bit depends on all bits of a number."""
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        whole = (whole ^ (whole >> np.uint64(shift))) * np.uint64(factor)
+    return whole ^ (whole >> np.uint64(31))
 
 
 def _from_oklab(lightness: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
