@@ -401,3 +401,17 @@ def test_missing_file_and_preset():
         gv.TransferFunction.from_json("nowhere.json")
     with pytest.raises(ValueError, match="unknown preset 'lungs'; known: bone, ct-bone, ct-lung"):
         gv.TransferFunction.preset("lungs", 0, 1)
+
+
+def test_points_a_rounding_apart_are_drawn_or_told_in_a_line():
+    """An opacity's value and a colour's may differ in their last bit, and fall together."""
+    for value in (1.0, 1e6, 3.0000000000000004):
+        near = float(np.nextafter(value, 0))
+        transfer = gv.TransferFunction(
+            [(0, 0), (near, 0.5), (2e6, 1)], [(0, 0, 0, 0), (value, 1, 1, 1)]
+        )
+        try:
+            picture = gv.render(gv.Volume(torch.rand(8, 8, 8)), gv.Camera.orbit(), transfer)
+            assert picture.color.isfinite().all()
+        except ValueError as error:
+            assert "too close" in str(error) and "\n" not in str(error)

@@ -194,7 +194,7 @@ class TransferFunction(Shader):
         low, high = float(values[0]), float(values[-1])
         if high == low:
             high = low + max(1.0, abs(low))
-        return low, high, (values - low) / (high - low)
+        return low, high, np.unique((values - low) / (high - low))  # some fall together
 
     def length(self, sampling: Sampling) -> float:
         """Returns the length of the shortest interval in reference lengths."""

@@ -87,8 +87,8 @@ class Look:
     """which number of a voxel is shown"""
     brick_size: Annotated[int, arg(metavar="VOXELS")] = 8
     """side of a brick"""
-    border: Annotated[int, arg(metavar="VOXELS")] = 1
-    """voxels around a brick"""
+    border: Annotated[int | None, arg(metavar="VOXELS")] = None
+    """voxels around a brick; 1 if left out, 2 of labels, whose slanted faces it smooths"""
     backend: Literal["auto", "reference", "cpp", "cuda"] = "auto"
     """what traces the rays"""
 
@@ -119,6 +119,11 @@ class Look:
         device = torch.device("cuda" if wants_cuda else "cpu")
         choose_backend(self.backend, device)
         return device
+
+    def bricks(self, data: Volume | Store) -> tuple[int, int]:
+        """Returns the side of a brick, and the voxels around it."""
+        border = 2 if data.info.labels else 1
+        return self.brick_size, border if self.border is None else self.border
 
     def upward(self) -> Up | None:
         """What `--up` tells."""

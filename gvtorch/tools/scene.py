@@ -76,7 +76,7 @@ class SceneFlags:
         volume, look = self.source.read(path), self.look
         shader = look.chosen(volume)
         tree = N3Tree.from_volume(
-            *(volume, look.brick_size, look.border),
+            *(volume, *look.bricks(volume)),
             threshold=self.threshold,
             device=look.device(),
             progress=bar,

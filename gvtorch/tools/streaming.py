@@ -57,13 +57,14 @@ class Streaming:
             shader = filtered = Filtered.stored(store)
         if filtered is not None and filtered.component != look.component:
             raise ValueError(f"--component must be that of the colours, {filtered.component}")
+        brick_size, border = look.bricks(store)
         producer = StoredProducer(store, host_cache=self.host_cache, filtered=filtered)
         with Engine(
             producer,
             node_pool=self.node_pool,
             brick_pool=self.brick_pool,
-            brick_size=look.brick_size,
-            border=look.border,
+            brick_size=brick_size,
+            border=border,
             loading=self.loading,
             strict=self.strict,
             device=look.device(),
