@@ -282,3 +282,19 @@ def test_labels_are_told_among_media(volumes):
     hidden = (found.label == -1) & (alone.label > 0)
     assert ((found.label == alone.label) | hidden).float().mean() > 0.99
     assert (found.label > 0).float().mean() > 0.05
+
+
+@pytest.mark.backend("cpp")
+def test_of_surfaces_the_nearest_is_seen(volumes):
+    """Also where one takes its colour of a transfer function without any opacity."""
+    trees = {name: gv.N3Tree.from_volume(volumes[name], 8) for name in volumes}
+    hue = gv.TransferFunction([(0, 0)], [(0, 1, 0, 0), (1, 0, 0, 1)])
+    shaders = {"ct": gv.Isosurface(0.5, hue), "pet": gv.Isosurface(0.4)}
+    found = gv.render(trees, view(), shaders)
+    ct, pet = (gv.render(trees[name], view(), shaders[name]) for name in trees)
+    nearest = torch.where(ct.depth <= pet.depth, ct.color, pet.color)
+    assert torch.equal(found.color, nearest)
+    assert torch.equal(found.depth, torch.minimum(ct.depth, pet.depth))
+    hit = [one.depth < torch.inf for one in (ct, pet)]
+    assert (hit[0] & hit[1]).any(), "they overlap in the picture"
+    assert (hit[0] & (ct.depth < pet.depth)).any() and (hit[1] & (pet.depth < ct.depth)).any()

@@ -24,6 +24,8 @@ from .. import ops
 from ..base.records import Hits, Rays
 from ..ops.shading import pack
 from ..pool import N3Tree
+from ..shaders.built_in import Lit
+from ..shaders.filtered import Filtered
 from ..shaders.shader import Shader, check_shader
 from ..shaders.transfer_function import TransferFunction
 from .around import around
@@ -132,8 +134,9 @@ def overlaps(trees: Sequence[TreeTrace]) -> bool:
 
 
 def _shows(one: TreeTrace) -> bool:
-    """Whether a tree's transfer function shows anything at all."""
-    transfer = one.tracer.shader.transfer or one.tracer.shader
+    """False where a tree is hidden by a transfer function without any opacity."""
+    shader = one.tracer.shader  # what surfaces and others take of a function is its colour alone
+    transfer = shader.transfer if isinstance(shader, Lit | Filtered) else shader
     return not isinstance(transfer, TransferFunction) or bool(transfer.opacity[:, 1].any())
 
 
@@ -202,13 +205,15 @@ def _by_sample(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
 def _block(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     """The media in front of the nearest surface, over it."""
     surfaces = [one for one in trees if one.tracer.shader.cut_surface() is not None]
-    media = [one for one in trees if one not in surfaces]
     if not surfaces:
-        return _media(media, rays)
+        return _media(trees, rays)
+    media = [one for one in trees if one not in surfaces]
     back = reduce(_nearer, [one.trace(replace(rays, transmittance=None)) for one in surfaces])
     depth = back.depth.to(rays.range.dtype)
     front_range = torch.cat((rays.range[:, :1], torch.minimum(rays.range[:, 1:], depth)), 1)
-    front = _media(media, replace(rays, range=front_range))
+    front = _nothing(rays, trees[0].tracer.dtype, normals=False)
+    if media:
+        front = _media(media, replace(rays, range=front_range))
     hit_clear = 1 - trees[0].tracer.arguments.depth_alpha
     gone = rays.light() < hit_clear  # depth was found before these rays begin
     return over(front, replace(back, depth=torch.where(gone, torch.inf, back.depth)))
