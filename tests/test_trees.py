@@ -289,7 +289,7 @@ def test_of_surfaces_the_nearest_is_seen(volumes):
     """Also where one takes its colour of a transfer function without any opacity."""
     trees = {name: gv.N3Tree.from_volume(volumes[name], 8) for name in volumes}
     hue = gv.TransferFunction([(0, 0)], [(0, 1, 0, 0), (1, 0, 0, 1)])
-    shaders = {"ct": gv.Isosurface(0.5, hue), "pet": gv.Isosurface(0.4)}
+    shaders = {"ct": gv.Isosurface(0.5, hue, color_channel="value"), "pet": gv.Isosurface(0.4)}
     found = gv.render(trees, view(), shaders)
     ct, pet = (gv.render(trees[name], view(), shaders[name]) for name in trees)
     nearest = torch.where(ct.depth <= pet.depth, ct.color, pet.color)
