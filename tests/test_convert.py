@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import run
 from helpers.stores import assert_holds, noise, write_foreign
 
 import gvtorch as gv
@@ -25,7 +26,6 @@ from gvtorch.io.formats import FORMATS, find_format
 from gvtorch.io.reading import open_source
 from gvtorch.io.store import Store
 from gvtorch.io.store_layout import WORK
-from gvtorch.tools.cli import main
 
 ELSEWHERE = {
     "DICOM",
@@ -367,16 +367,6 @@ def test_a_dask_cluster(tmp_path, data, raw):
 
 
 # --- the command
-
-
-def run(capsys, *args: object) -> tuple[int, str, str]:
-    try:
-        main([str(arg) for arg in args])
-        code = 0
-    except SystemExit as end:
-        code = int(end.code or 0)
-    out, err = capsys.readouterr()
-    return code, out, err
 
 
 def test_command_converts_and_tells(tmp_path, raw, data, capsys):

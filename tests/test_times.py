@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import run
 from helpers.stores import assert_holds, noise, write_foreign
 
 import gvtorch as gv
@@ -16,19 +17,8 @@ from gvtorch.base.image_info import ChannelInfo, ImageInfo
 from gvtorch.io import conversion, shard
 from gvtorch.io.conversion import convert, estimate
 from gvtorch.io.store import Store
-from gvtorch.tools.cli import main
 
 TIMES = 3
-
-
-def run(capsys, *args: object) -> tuple[int, str, str]:
-    try:
-        main([str(arg) for arg in args])
-        code = 0
-    except SystemExit as end:
-        code = int(end.code or 0)
-    out, err = capsys.readouterr()
-    return code, out, err
 
 
 @pytest.fixture(scope="module")

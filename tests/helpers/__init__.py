@@ -52,3 +52,16 @@ def gvtorch(*args: object, cwd: str | Path = ".") -> subprocess.CompletedProcess
     for stream in (out, error):
         stream.seek(0)
     return subprocess.CompletedProcess(args, status, out.read(), error.read())
+
+
+def run(capsys, *args: object) -> tuple[int, str, str]:
+    """Runs the command line within this process, with the tests' own warnings, which are errors:
+    exit status, output and errors.
+    """
+    try:
+        main([str(arg) for arg in args])
+        code = 0
+    except SystemExit as end:
+        code = int(end.code or 0)
+    out, err = capsys.readouterr()
+    return code, out, err
