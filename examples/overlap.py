@@ -1,20 +1,24 @@
 """Two volumes in the same space: a CT scan, and a coarse map of uptake as from a PET scanner, which
-has voxels of another size at another place. They are composited by sample, so that each is seen
-through the other.
+has voxels of another size, at another place and turned. They are composited by sample, so that each
+is seen through the other.
 
 The uptake is made up here: what is full of contrast agent, blurred.
 """
 
+import math
+
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 import tyro
-from torch.nn.functional import avg_pool3d
+from torch.nn.functional import avg_pool3d, grid_sample
 
 import gvtorch as gv
 
 SCAN = Path(__file__).parent / "data" / "stent_256x128x128_int16.npz"
 COARSE = 4  # CT voxels along a side of one of the uptake's
+TILT = 20  # degrees by which the uptake's axes are turned about x
 BONE = gv.TransferFunction(
     opacity=[(150, 0), (260, 0.03), (420, 0.2), (1000, 0.8)],
     color=[(150, 0.45, 0.24, 0.18), (330, 0.8, 0.68, 0.55), (800, 1, 0.98, 0.92)],
@@ -35,32 +39,51 @@ class Settings:
     device: str = "cpu"
 
 
-def uptake_of(scan: gv.Volume) -> gv.Volume:
-    """Returns the uptake on a coarse grid, which begins half a coarse voxel farther in."""
+def pose_about(middle: torch.Tensor) -> torch.Tensor:
+    """(4, 4) from the uptake's axes to the world, about a place that stays where it is."""
+    cos, sin = math.cos(math.radians(TILT)), math.sin(math.radians(TILT))
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[1:3, 1:3] = torch.tensor([[cos, -sin], [sin, cos]])
+    pose[:3, 3] = middle - pose[:3, :3] @ middle
+    return pose
+
+
+def uptake_of(scan: gv.Volume) -> tuple[gv.Volume, torch.Tensor]:
+    """Returns the uptake on a coarse grid around the scan, and the pose (4, 4) of this grid."""
     value = scan.data[..., 0].float()
     blurred = ((value > 170) & (value < 330)).float()[None, None]
     for size in (9, 5):
         for axis in range(3):
             kernel = [size if axis == other else 1 for other in range(3)]
             blurred = avg_pool3d(blurred, kernel, 1, [side // 2 for side in kernel])
-    coarse = avg_pool3d(blurred, COARSE)[0, 0]
-    middle = (COARSE - 1) / 2
-    return gv.Volume(coarse / coarse.max(), (COARSE,) * 3, (middle,) * 3, name="uptake")
+    extent = torch.tensor(scan.extent, dtype=torch.float64)
+    middle = (extent - 1) / 2
+    pose, count = pose_about(middle), (1.3 * extent / COARSE).long()  # it is turned, and wider
+    origin = middle - (count - 1) / 2 * COARSE
+    axes = [o + COARSE * torch.arange(int(n)) for o, n in zip(origin, count, strict=True)]
+    own = torch.stack(torch.meshgrid(*axes[::-1], indexing="ij")[::-1], -1)  # x, y, z
+    world = own @ pose[:3, :3].T + pose[:3, 3]
+    place = (world - middle) / (extent / 2)  # -1 to 1 from face to face
+    coarse = grid_sample(blurred, place[None].float(), align_corners=False)[0, 0]
+    spacing, first = (float(COARSE),) * 3, tuple(origin.tolist())
+    return gv.Volume(coarse / coarse.max(), spacing, first, name="uptake"), pose
 
 
 def main(settings: Settings) -> None:
     """Renders both."""
     scan = gv.read_volume(SCAN)
+    uptake, pose = uptake_of(scan)
     trees = {
         "ct": gv.N3Tree.from_volume(scan, device=settings.device),
-        "uptake": gv.N3Tree.from_volume(uptake_of(scan), device=settings.device),
+        "uptake": gv.N3Tree.from_volume(uptake, device=settings.device),
     }
     sun = gv.DirectionalLight((1, 1.2, -0.8))
     shaders = {"ct": gv.Lit(BONE, light=sun), "uptake": UPTAKE}
     size = (settings.size, max(9, settings.size * 9 // 16))
     camera = gv.Camera.look_at((-270, -250, 150), (64, 62, 128), (0, 0, 1), 36, *size)
     sky = gv.Gradient((0.05, 0.06, 0.08), (0.005, 0.005, 0.01))
-    picture = gv.render(trees, camera, shaders, background=sky)
+    poses = {"uptake": pose}
+    picture = gv.render(trees, camera, shaders, background=sky, pose=poses)
     picture.save(settings.output)
     print(f"{settings.output}: {picture.stats.samples / 1e6:.1f} M samples")
 

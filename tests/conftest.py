@@ -126,7 +126,9 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     where it is marked for CUDA and there is none.
     """
     values = getattr(item, "callspec", None)
-    names = {v for v in (values.params.values() if values else ()) if v in tuple(DEVICES)}
+    names = {
+        v for v in (values.params.values() if values else ()) if isinstance(v, str) and v in DEVICES
+    }
     marked = {mark.args[0] for mark in item.iter_markers("backend")}
     item.user_properties += [("backend", name) for name in sorted(names | marked or {"no backend"})]
     if "cuda" in marked and (reason := available()["cuda"]):

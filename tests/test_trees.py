@@ -30,16 +30,26 @@ def volumes() -> dict[str, gv.Volume]:
     }
 
 
+def about(middle, turn: np.ndarray) -> np.ndarray:
+    """(4, 4) a turn about a place."""
+    made = np.eye(4)
+    made[:3, :3], made[:3, 3] = turn, middle - turn @ middle
+    return made
+
+
 def view(size: int = 24) -> gv.Camera:
     return gv.Camera.look_at((40, -34, 30), (12, 11, 11), (0, 0, 1), 38, size, size)
 
 
-def value_at(volume: gv.Volume, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def value_at(
+    volume: gv.Volume, place: np.ndarray, pose: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Trilinear values (k,) at world places (k, 3), the outermost voxels repeated to the box's
-    faces, and whether these lie in the box.
+    faces, and whether these lie in the box, which stands in the world by a pose (4, 4).
     """
     data = volume.data[..., 0].double().numpy()
-    grid = (place - volume.origin) / volume.spacing
+    own = (place - pose[:3, 3]) @ pose[:3, :3]
+    grid = (own - volume.origin) / volume.spacing
     inside = ((grid >= -0.5) & (grid <= np.array(volume.extent) - 0.5)).all(1)
     grid = grid.clip(0, np.array(volume.extent) - 1)
     low = np.minimum(grid.astype(int), np.array(volume.extent) - 2)
@@ -53,7 +63,11 @@ def value_at(volume: gv.Volume, place: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def dense(
-    volumes: list[gv.Volume], shaders: list[gv.TransferFunction], rays: gv.Rays, step: float
+    volumes: list[gv.Volume],
+    shaders: list[gv.TransferFunction],
+    poses: list[np.ndarray],
+    rays: gv.Rays,
+    step: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Marches straight through all volumes at once in float64: extinctions add."""
     origin, direction = rays.origin.numpy(), rays.direction.numpy()
@@ -61,8 +75,8 @@ def dense(
     for t in np.arange(0, 110, step) + step / 2:
         place = origin + t * direction
         total, glow = np.zeros(len(origin)), np.zeros((len(origin), 3))
-        for volume, shader in zip(volumes, shaders, strict=True):
-            value, inside = value_at(volume, place)
+        for volume, shader, pose in zip(volumes, shaders, poses, strict=True):
+            value, inside = value_at(volume, place, pose)
             rgba = shader(value)
             thick = -np.log1p(-rgba[:, 3]) / min(volume.spacing) * inside
             total, glow = total + thick, glow + thick[:, None] * rgba[:, :3]
@@ -72,10 +86,18 @@ def dense(
     return color, 1 - clear
 
 
+#: Where the second volume stands: its axes along the world's, and turned about its middle.
+POSES = {
+    "straight": np.eye(4),
+    "turned": about((16.0, 12.0, 8.0), np.array([[2, -2, 1], [1, 2, 2], [-2, -1, 2]]) / 3),
+}
+
+
 @pytest.mark.parametrize(
     "backend", [pytest.param(b, marks=pytest.mark.backend(b)) for b in DEVICES]
 )
-def test_trees_that_overlap_are_composited_by_sample_as_by_a_dense_marcher(volumes, backend):
+@pytest.mark.parametrize("pose", POSES)
+def test_trees_that_overlap_are_composited_by_sample_as_by_a_dense_marcher(volumes, pose, backend):
     size, step = (10, 0.5) if backend == "reference" else (24, 0.05)
     trees = {
         name: gv.N3Tree.from_volume(volume, 8, device=DEVICES[backend])
@@ -89,12 +111,17 @@ def test_trees_that_overlap_are_composited_by_sample_as_by_a_dense_marcher(volum
         stop_alpha=1,
         dtype=torch.float64,
         backend=backend,
+        pose={"pet": POSES[pose]},
     )
-    color, alpha = dense([*volumes.values()], [WARM, COLD], view(size).rays(), 0.02)
+    poses = [np.eye(4), POSES[pose]]
+    color, alpha = dense([*volumes.values()], [WARM, COLD], poses, view(size).rays(), 0.02)
     worst = 1e-4 if step < 0.1 else 4e-3
     assert np.abs(found.color.cpu().numpy().reshape(-1, 3) - color).max() < worst
     assert np.abs(found.alpha.cpu().numpy().ravel() - alpha).max() < worst
-    apart = [gv.render(trees[n], view(size), shaders[n], lod="finest") for n in trees]
+    apart = [
+        gv.render(trees[n], view(size), shaders[n], lod="finest", pose=place)
+        for n, place in zip(trees, poses, strict=True)
+    ]
     both = (apart[0].alpha > 0.1) & (apart[1].alpha > 0.1)
     assert both.float().mean() > 0.05, "they are seen through each other"
 
@@ -205,14 +232,15 @@ def test_a_layer_and_a_clip_cut_trees_that_overlap(volumes):
     torch.testing.assert_close(drawn.color.reshape(-1, 3), expected, atol=0.02, rtol=0)
 
 
+@pytest.mark.parametrize("pose", POSES)
 @pytest.mark.parametrize("brick_pool", ["8 MB", "120 kB"])
 @pytest.mark.backend("cpp")
-def test_streamed_trees_that_overlap_equal_resident_ones(volumes, brick_pool):
-    shaders = {"ct": WARM, "pet": gv.Lit(COLD)}
-    resident = pictures(volumes, shaders, size=12)
+def test_streamed_trees_that_overlap_equal_resident_ones(volumes, brick_pool, pose):
+    shaders, poses = {"ct": WARM, "pet": gv.Lit(COLD)}, {"pet": POSES[pose]}
+    resident = pictures(volumes, shaders, size=12, pose=poses)
     scene = {name: gv.VolumeProducer(volume) for name, volume in volumes.items()}
     with gv.Engine(scene, brick_pool=brick_pool) as engine:
-        streamed = engine.render(view(12), shaders)
+        streamed = engine.render(view(12), shaders, pose=poses)
         engine.validate()
         assert streamed.stats.converged
         if engine.cache.bricks.capacity < 30:

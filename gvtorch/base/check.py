@@ -288,6 +288,6 @@ def reals(where: str, name: str, value: Any, shape: tuple[int, ...] | None = Non
     if shape is not None and numbers.shape != shape:
         raise ValueError(f"{where}: {name} must be {shape} numbers, got {tuple(numbers.shape)}")
     if not bool(torch.isfinite(numbers).all()):
-        got = "NaN or infinity" if isinstance(value, Tensor) else repr(value)
+        got = "NaN or infinity" if hasattr(value, "dtype") else repr(value)
         raise ValueError(f"{where}: {name} must be finite, got {got}")
     return numbers

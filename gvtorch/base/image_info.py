@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 Rgb = tuple[float, float, float]
+Rows = tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +45,7 @@ class ImageInfo:
     quantity: str | None = None  # what the values measure, as in "HU"
     labels: bool = False  # values are numbers of things, which must not be blended
     space: str | None = None  # where x, y, z point: "right-anterior-superior", ...
+    pose: Rows | None = None  # (4, 4) from own axes to the world, of voxels kept as they lie there
     time_step: float | None = None  # from one time point to the next
     time_origin: float = 0.0  # of the first time point
     time_unit: str | None = None  # as OME-NGFF spells it: "second", ...
@@ -55,6 +57,8 @@ class ImageInfo:
         """Returns what is known as plain values."""
         found: dict[str, Any] = {"unit": self.unit, "quantity": self.quantity, "space": self.space}
         found["labels"] = self.labels or None
+        if self.pose is not None:
+            found["pose"] = "; ".join(" ".join(f"{n:.6g}" for n in row) for row in self.pose[:3])
         if self.time_step is not None:
             found["time step"] = f"{self.time_step:g} {self.time_unit or ''}".strip()
         found["channel info"] = {

@@ -151,17 +151,19 @@ class Engine:
         self, where: str, camera: Camera | Rays, shader: Shaders, options: RenderSettings
     ) -> View:
         """Checks what a frame is to show; see `frame`. Errors begin with `where`."""
-        placed = as_camera(where, camera).placed(self.box)
-        chosen = render_options(where, options, placed)
-        trace = partial(trace_trees, self._tracers(shader, chosen))
-        return View(placed, placed.numbers(self.device), trace, chosen)
+        camera = as_camera(where, camera)
+        chosen = render_options(where, options, camera)
+        trees = {name: source.tree for name, source in self.trees.items()}
+        box = box_around(where, trees, chosen.pose)
+        placed, trace = camera.placed(box), partial(trace_trees, self._tracers(shader, chosen, box))
+        return View(placed, placed.numbers(self.device), trace, chosen, box)
 
-    def _tracers(self, shaders: Shaders, options: RenderOptions) -> list[TreeTrace]:
-        """What traces rays through each tree."""
+    def _tracers(self, shaders: Shaders, options: RenderOptions, box: Tensor) -> list[TreeTrace]:
+        """What traces rays through each tree of a scene, given its (2, 3) box."""
         scene = {name: (one.tree, one.producer.channels) for name, one in self.trees.items()}
         by_level = self.options.loading == "levels"
         return tree_traces(
-            *("frame", scene, shaders, options, self.box), by_level=by_level, frame_1=self._frame_1
+            *("frame", scene, shaders, options, box), by_level=by_level, frame_1=self._frame_1
         )
 
     @contextmanager
@@ -416,7 +418,7 @@ class Engine:
         if self.device.type != "cuda":
             raise ValueError(f"Engine.capture: the engine must be on CUDA, it is on {self.device}")
         view = self.view("capture", camera, shader, options)
-        if overlaps(self._tracers(shader, view.options)):
+        if overlaps(self._tracers(shader, view.options, view.box)):
             raise ValueError(
                 "Engine.capture: trees that overlap can't be recorded: the host waits for them"
             )
@@ -432,8 +434,8 @@ class Engine:
 
     @cached_property
     def box(self) -> Tensor:
-        """(2, 3) float64 world corners around all trees."""
-        return box_around([source.tree for source in self.trees.values()])
+        """(2, 3) float64 world corners around all trees, where no pose turns them."""
+        return box_around("Engine", {name: source.tree for name, source in self.trees.items()})
 
     @property
     def failures(self) -> list[Failure]:
@@ -526,7 +528,7 @@ class FrameGraph:
         engine = self._engine
         with torch.cuda.device(engine.device), engine.new_frame(self._view.options) as stats:
             engine.number_picture()
-            self._view.numbers.copy_(camera.placed(engine.box).numbers(engine.device))
+            self._view.numbers.copy_(camera.placed(self._view.box).numbers(engine.device))
             with stage("replay"):
                 self._graph.replay()
             engine.read_back(stats, self._hits, self._collected)

@@ -17,6 +17,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from ..base.image_info import Rows
 from ..pool.downsample import round_array
 from . import boxes
 from .source import Index, VolumeSource
@@ -114,7 +115,10 @@ class StraightSource(VolumeSource):
 
 
 def straighten(
-    source: VolumeSource, oblique: Oblique | None = None, fill: float | None = None
+    source: VolumeSource,
+    oblique: Oblique | None = None,
+    fill: float | None = None,
+    place: Sequence[float] | None = None,
 ) -> VolumeSource:
     """Returns a source whose axes lie along the world's, and tells in a line what it did.
 
@@ -124,9 +128,10 @@ def straighten(
     Args:
         source: Returned as it is, if its axes lie along the world's.
         oblique: "resample" (the default), or "keep": the voxels stay as they are, and their axes
-            are taken for the world's.
+            are taken for the world's; `info.pose` tells how to turn them (`RenderOptions.pose`).
         fill: The value beside the source's box; the smallest one (of the time point that is read
             first), 0 of labels, if left out.
+        place: World place of the first voxel, if it is not what the file tells.
 
     Raises:
         ValueError: `oblique` is something else.
@@ -141,8 +146,11 @@ def straighten(
     turned = math.degrees(math.acos(min(1.0, (np.abs(affine[:, :3]).max(0) / lengths).min())))
     name = f"{Path(source.path).name}: voxel axes are turned by {turned:.3g} degrees"
     if oblique == "keep":
-        warnings.warn(f"{name}: kept, and taken for the world's axes", stacklevel=3)
-        return dataclasses.replace(source, oblique=None)
+        pose = _pose(affine[:, :3] / lengths, np.array(source.origin if place is None else place))
+        hint = "" if pose is None else "; info.pose turns them (gv.render(..., pose=...))"
+        warnings.warn(f"{name}: kept, and taken for the world's axes{hint}", stacklevel=3)
+        info = dataclasses.replace(source.info, pose=pose)
+        return dataclasses.replace(source, oblique=None, info=info)
     extent, spacing, origin, to_inner = _grid(affine, source.extent)
     if fill is None:
         fill = 0.0 if source.info.labels else _smallest(source)
@@ -184,6 +192,16 @@ def _grid(affine: np.ndarray, inner: Sequence[int]) -> tuple[np.ndarray, ...]:
     origin = (low + high - (extent - 1) * spacing) / 2
     to_inner = np.column_stack((inverse * spacing, inverse @ (origin - affine[:, 3])))
     return extent, spacing, origin, to_inner
+
+
+def _pose(turn: np.ndarray, origin: np.ndarray) -> Rows | None:
+    """(4, 4) what turns own axes about the first voxel; None where they are sheared."""
+    if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-4:
+        return None
+    left, _, right = np.linalg.svd(turn)
+    turn = left @ right
+    matrix = np.block([[turn, (origin - turn @ origin)[:, None]], [np.eye(4)[3:]]])
+    return tuple(map(tuple, matrix.tolist()))
 
 
 def _smallest(source: VolumeSource) -> float:

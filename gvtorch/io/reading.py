@@ -146,7 +146,7 @@ def open_source(
                 f"{text}: voxel axes are oblique, resampling finds their spacing: leave spacing "
                 "out, or keep the voxels as they are with oblique='keep' (--oblique keep)"
             )
-        source = straighten(source, oblique)
+        source = straighten(source, oblique, place=origin)
     if source.lost:
         told = " ".join("; ".join(source.lost).split())  # in one line, whatever the file says
         warnings.warn(f"{text}: not kept: {told}", stacklevel=2)

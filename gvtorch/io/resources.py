@@ -8,7 +8,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 
@@ -37,14 +37,15 @@ def memory_free() -> int:
 def worker_processes(count: int) -> Iterator[Executor]:
     """Starts worker processes, which leave Ctrl-C to this one from their first moment on."""
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(count, spawn, begin_worker) as pool:
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-        try:
-            with _interrupts_later():
+    with ExitStack() as stack:
+        with _interrupts_later():  # a semaphore that is half made would be left behind
+            pool = stack.enter_context(ProcessPoolExecutor(count, spawn, begin_worker))
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # making it unblocks
+            try:
                 for _ in range(count):  # each task starts a process, which inherits what is blocked
                     pool.submit(int)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
         yield pool
 
 

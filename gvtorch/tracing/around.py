@@ -180,7 +180,8 @@ def _project_pieces(tracer: Tracer, which: str, pieces: Iterable[Rays]) -> Hits:
 
 def _length_inside(tracer: Tracer, rays: Rays) -> Tensor:
     """(r,) world length of each ray inside the tree's box."""
-    enter, leave = tree_span(tracer.tree.place, rays.origin, rays.direction)
+    own = tracer.inside(rays)
+    enter, leave = tree_span(tracer.tree.place, own.origin, own.direction)
     first, last = rays.range.unbind(1)
     return (torch.minimum(last, leave) - torch.maximum(first, enter)).clamp(min=0)
 

@@ -27,6 +27,7 @@ from .around import around
 from .options import RenderOptions, RenderSettings, render_options
 from .pixels import View, tree_stats
 from .tracer import Batch, Tracer, march
+from .trees import box_around
 
 Image = Literal["samples", "nodes", "lod", "age", "fill"]
 IMAGES = get_args(Image)
@@ -124,9 +125,10 @@ def cost(
     check.instance("cost", "tree", tree, N3Tree)
     transfer = check.instance("cost", "shader", shader, TransferFunction)
     start = time.perf_counter()
-    placed = camera.placed(tree.box)
+    box = box_around("cost", {"": tree}, chosen.pose)
+    placed = camera.placed(box)
     counter = _Counter(tree, transfer, chosen)
-    view = View(placed, placed.numbers(tree.device), around(counter, chosen, tree.box), chosen)
+    view = View(placed, placed.numbers(tree.device), around(counter, chosen, box), chosen, box)
     columns = [
         (hits.samples, counter.take_nodes(), *_means(hits))
         for _, hits in view.blocks(_RAYS_A_BLOCK, progress)
@@ -170,7 +172,7 @@ class _Counter(Tracer):
         """Returns as features, for each ray, sums over its samples weighted by what they add to
         alpha: of 1, the node's depth, whether it has a brick, the brick's age and its fill.
         """
-        sums, hits, nodes = march(self, rays, self.shade, 5, limit=1, by_node=False)
+        sums, hits, nodes = march(self, self.inside(rays), self.shade, 5, limit=1, by_node=False)
         self._nodes = self._nodes + nodes
         return replace(hits, features=sums)
 

@@ -19,6 +19,7 @@ from ..pictures.background import Background, checked_background
 from .clip import Clip
 from .layer import Layer
 from .lighting import Lighting
+from .pose import Matrix, checked_poses
 from .thin_lens import ThinLens
 
 
@@ -40,6 +41,8 @@ class RenderOptions:
         clip: The region of interest; None: everything.
         lens: Depth of field; None: all is sharp.
         lighting: Shadows and light from all around; None: the shader's own.
+        pose: Where a tree stands: a (4, 4) matrix that turns and shifts (and may mirror) its own
+            axes into the world's, or one for each tree by name; None: its axes are the world's.
         backend: auto, reference, cpp or cuda; all give the same bits.
         dtype: Of rays and picture: float32, or float64 for very thin media and narrow cones.
     """
@@ -56,6 +59,7 @@ class RenderOptions:
     clip: Clip | None = None
     lens: ThinLens | None = None
     lighting: Lighting | None = None
+    pose: Matrix | Mapping[str, Matrix] | None = None
     backend: Backend = "auto"
     dtype: torch.dtype = torch.float32
 
@@ -77,6 +81,7 @@ class RenderOptions:
         for name, kind in _OBJECTS.items():
             if getattr(self, name) is not None:
                 check.instance(where, name, getattr(self, name), kind)
+        object.__setattr__(self, "pose", checked_poses(where, self.pose))
         if self.lens is not None and self.lod == "finest":
             raise ValueError(f"{where}: a lens blurs by level of detail: lod must be 'auto'")
         if self.dtype not in (torch.float32, torch.float64):
@@ -103,6 +108,7 @@ class RenderSettings(TypedDict, total=False):
     clip: Clip | None
     lens: ThinLens | None
     lighting: Lighting | None
+    pose: Matrix | Mapping[str, Matrix] | None
     backend: Backend
     dtype: torch.dtype
 

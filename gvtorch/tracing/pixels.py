@@ -77,7 +77,7 @@ def render(
         with stage("prepare"):
             traced, box = _traced("render", scene, shader, chosen)
         placed = camera.placed(box)
-        view = View(placed, placed.numbers(device), traced, chosen)
+        view = View(placed, placed.numbers(device), traced, chosen, box)
         hits = view.hits(progress)
         with stage("picture"):
             stats = tree_stats(trees, chosen, hits.samples)
@@ -147,8 +147,11 @@ def _traced(
     if not isinstance(scene, Mapping):
         if isinstance(shaders, Mapping):
             raise ValueError(f"{where}: shaders by name are for trees by name")
-        return around(Tracer(scene, shaders, options), options, scene.box), scene.box
-    box = box_around(trees)
+        if isinstance(options.pose, Mapping):
+            raise ValueError(f"{where}: poses by name are for trees by name")
+        box = box_around(where, {"": scene}, options.pose)
+        return around(Tracer(scene, shaders, options), options, box), box
+    box = box_around(where, scene, options.pose)
     named = {name: (tree, tree.channel_names) for name, tree in scene.items()}
     return partial(trace_trees, tree_traces(where, named, shaders, options, box)), box
 
@@ -173,6 +176,7 @@ class View:
     numbers: Tensor  # of the camera, on the device that traces
     trace_rays: Trace  # through all trees
     options: RenderOptions
+    box: Tensor  # (2, 3) world corners of the scene
 
     @property
     def rays(self) -> int:

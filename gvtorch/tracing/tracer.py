@@ -23,6 +23,7 @@ from ..shaders.module import PART_SAMPLES, ModuleShader
 from ..shaders.shader import Sampling, Shader, check_shader, interval_levels
 from .composite import tree_span
 from .options import RenderOptions
+from .pose import Pose
 
 _SAMPLES = {"cpu": 1 << 20, "cuda": 1 << 24}  # shaded at once
 
@@ -64,6 +65,7 @@ class Tracer:
         _check_step(tree, step, options)
         tree.warn_if_edited("render", learned=isinstance(shader, ModuleShader))
         self.tree, self.shader, self.channel = tree, shader, channel
+        self.pose = options.pose if isinstance(options.pose, Pose) else None
         if frame_1 is None:
             frame_1 = torch.full((1,), tree.frame, dtype=torch.int32, device=tree.device)
         scale = options.cone_scale * tree.flatness if options.lod == "auto" else 0.0
@@ -107,8 +109,17 @@ class Tracer:
         known = self.arguments
         return Tracer(self.tree, shader, options, by_level=known.by_level, frame_1=known.frame_1)
 
+    def inside(self, rays: Rays) -> Rays:
+        """World rays in the tree's own axes."""
+        return rays if self.pose is None else self.pose.inside(rays)
+
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays in world units."""
+        hits = self._trace(self.inside(rays))
+        return hits if self.pose is None else self.pose.outside(hits)
+
+    def _trace(self, rays: Rays) -> Hits:
+        """Traces rays in the tree's own axes."""
         if isinstance(self.shader, ModuleShader):
             return self._march_module(self.shader, rays)
         given = ops.RayArguments.of(rays)
@@ -116,7 +127,8 @@ class Tracer:
         if self.shading is None:
             fields = ops.trace_rays(given, self.arguments, backend=self.backend)
         else:
-            own = (self.shading, self.shader.parameter_tensor(self.tree, self.dtype))
+            numbers = self.shader.parameter_tensor(self.tree, self.dtype)
+            own = (self.shading, numbers if self.pose is None else self.pose.lit(numbers))
             fields = ops.shade_rays(
                 given, self.arguments, *own, op=self.shader.op, backend=self.backend
             )
@@ -131,7 +143,10 @@ class Tracer:
 
         def shade(batch: Batch) -> tuple[Tensor, Tensor]:
             values = batch.values(shader.channels)
-            color, alpha = shader(values, batch.positions, batch.directions, batch.lengths)
+            places, ways = batch.positions, batch.directions
+            if self.pose is not None:
+                places, ways = self.pose.places(places), self.pose.ways(ways)
+            color, alpha = shader(values, places, ways, batch.lengths)
             return color, alpha[:, 0]
 
         def block(rays: Rays) -> Hits:

@@ -31,6 +31,7 @@ from ..shaders.transfer_function import TransferFunction
 from .around import around
 from .composite import Trace, box_span, over
 from .options import RenderOptions
+from .pose import poses_of, world_box
 from .tracer import Batch, Tracer
 
 _PARTS = 8  # of what several trees fill: rays that have ended ask for nothing in those behind
@@ -47,7 +48,7 @@ Shaders = Shader | Mapping[str, Shader]
 class TreeTrace:
     """What traces rays through one of several trees."""
 
-    box: Tensor  # (2, 3) float64 world corners
+    box: Tensor  # (2, 3) float64 world corners around it
     trace: Trace  # with whatever the options put around
     tracer: Tracer  # the tree alone
 
@@ -73,7 +74,7 @@ def tree_traces(
     Raises:
         ValueError: A shader is missing, or a tree has no such channel; see `Tracer` and `around`.
     """
-    traces = []
+    traces, poses = [], poses_of(where, scene, options.pose)
     for name, (tree, channels) in scene.items():
         shader: Any = shaders.get(name) if isinstance(shaders, Mapping) else shaders
         check_shader(where, f"shader of tree {name!r}", shader)
@@ -84,15 +85,17 @@ def tree_traces(
                 raise ValueError(
                     f"{where}: tree {name!r} has no channel {needed!r}; it has {known}"
                 )
-        chosen = replace(options, channel=channel)
+        chosen = replace(options, channel=channel, pose=poses[name])
         tracer = Tracer(tree, shader, chosen, **settings)
-        traces.append(TreeTrace(tree.box, around(tracer, chosen, box), tracer))
+        here = world_box(tree.box, poses[name])
+        traces.append(TreeTrace(here, around(tracer, chosen, box), tracer))
     return traces
 
 
-def box_around(trees: Sequence[N3Tree]) -> Tensor:
-    """Returns (2, 3) float64 world corners around all trees."""
-    boxes = torch.stack([tree.box for tree in trees])
+def box_around(where: str, trees: Mapping[str, N3Tree], poses: Any = None) -> Tensor:
+    """Returns (2, 3) float64 world corners around all trees, given `RenderOptions.pose`."""
+    placed = poses_of(where, trees, poses)
+    boxes = torch.stack([world_box(tree.box, placed[name]) for name, tree in trees.items()])
     return torch.stack((boxes[:, 0].amin(0), boxes[:, 1].amax(0)))
 
 
@@ -404,11 +407,11 @@ def _cut(trees: Sequence[TreeTrace], rays: Rays) -> tuple[_Pieces, Tensor]:
     """Cuts rays wherever an interval that one of the trees samples begins or ends; where only one
     is sampled, its intervals stay together. Also tells (r,) bool which rays missed something.
     """
-    given = ops.RayArguments.of(replace(rays, transmittance=None))
     missed = torch.zeros(len(rays.origin), dtype=torch.bool, device=rays.origin.device)
     ray, place, change = [], [], []
     for number, one in enumerate(trees):
         tracer = one.tracer
+        given = ops.RayArguments.of(tracer.inside(replace(rays, transmittance=None)))
         segments = ops.trace_segments(given, tracer.arguments, by_node=True, backend=tracer.backend)
         missed |= segments.missed
         batch = Batch(tracer, given, segments, ops.list_samples(segments))
@@ -458,8 +461,9 @@ def _spans(trees: Sequence[TreeTrace], rays: Rays) -> Tensor:
     """
     spans = []
     for one in trees:
-        low, high = pack((one.box,), rays.origin.dtype, rays.origin.device).view(2, 3)
-        first, last = box_span(low, high, rays.origin, rays.direction)
+        own = one.tracer.inside(rays)
+        low, high = pack((one.tracer.tree.box,), own.origin.dtype, own.origin.device).view(2, 3)
+        first, last = box_span(low, high, own.origin, own.direction)
         near, far = rays.range.to(first).unbind(1)
         spans.append(torch.stack((torch.maximum(first, near), torch.minimum(last, far)), 1))
     return torch.stack(spans)

@@ -1,0 +1,265 @@
+"""Trees that are turned in the world (`RenderOptions.pose`): a camera and lights that are turned
+with them see the same picture.
+"""
+
+from __future__ import annotations
+
+import warnings
+from copy import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers import DEVICES
+from helpers.shaders import SHADERS
+from helpers.traces import SHADER
+from helpers.trees import on
+
+import gvtorch as gv
+from gvtorch.tracing.pose import Pose
+
+DEGREES = (20, -35, 50)
+BACKENDS = [pytest.param(b, marks=pytest.mark.backend(b)) for b in DEVICES]
+
+
+def matrix_of(degrees=DEGREES, shift=(30.0, -12.0, 7.0), mirrored: bool = False) -> np.ndarray:
+    """(4, 4) a turn about x, then y, then z, and a shift."""
+    made = np.diag([-1.0 if mirrored else 1.0, 1.0, 1.0, 1.0])
+    for axis, angle in enumerate(np.radians(degrees)):
+        a, b = [n for n in range(3) if n != axis]
+        one = np.eye(4)
+        one[[a, b], [a, b]] = np.cos(angle)
+        one[a, b], one[b, a] = -np.sin(angle), np.sin(angle)
+        made = one @ made
+    made[:3, 3] = shift
+    return made
+
+
+POSES = {
+    "a shift": matrix_of((0, 0, 0)),
+    "a turn": matrix_of(),
+    "a mirror": matrix_of(mirrored=True),
+}
+
+
+def turned(matrix: np.ndarray, ways: torch.Tensor) -> torch.Tensor:
+    return ways.double() @ torch.from_numpy(matrix[:3, :3]).T
+
+
+def rays_in_the_world(matrix: np.ndarray, rays: gv.Rays) -> gv.Rays:
+    """Rays that see from the world what `rays` see in the tree's own axes."""
+    own = rays.to(dtype=torch.float64)
+    origin = turned(matrix, own.origin) + torch.from_numpy(matrix[:3, 3])
+    return replace(own, origin=origin, direction=turned(matrix, own.direction))
+
+
+def light_in_the_world(matrix: np.ndarray, shader: gv.Shader) -> gv.Shader:
+    """The shader with its light turned with the tree."""
+    light = getattr(shader, "light", None)
+    if isinstance(light, gv.DirectionalLight):
+        light = replace(light, direction=(matrix[:3, :3] @ light.direction).tolist())
+    elif isinstance(light, gv.PointLight):
+        light = replace(light, position=(matrix @ (*light.position, 1.0))[:3].tolist())
+    else:
+        return shader
+    made = copy(shader)
+    made.light = light
+    return made
+
+
+def camera(tree: gv.N3Tree, size: int = 20) -> gv.Rays:
+    return gv.Camera.orbit(30, 25, 1.6, None, size, size).placed(tree.box).rays()
+
+
+def assert_same_picture(found: gv.Hits, expected: gv.Hits, matrix: np.ndarray, **near) -> None:
+    """But for the normals, which are turned with the tree."""
+    for name in ("color", "alpha", "depth", "features"):
+        one, other = (getattr(hits, name) for hits in (found, expected))
+        if other is not None:
+            torch.testing.assert_close(one, other, **near)
+    if expected.normal is not None:
+        normal = turned(matrix, expected.normal.cpu()).to(found.normal)
+        torch.testing.assert_close(found.normal, normal, **near)
+    for name in ("samples", "label"):
+        if getattr(expected, name) is not None:
+            assert torch.equal(getattr(found, name), getattr(expected, name)), name
+
+
+def some(hits: gv.Hits, which: torch.Tensor) -> gv.Hits:
+    """Those of some rays (r,) bool."""
+    return replace(
+        hits, **{n: t[which.to(t.device)] for n, t in vars(hits).items() if t is not None}
+    )
+
+
+NEAR = {"atol": 1e-9, "rtol": 1e-9}  # in float64; of light, which is float32 in no other way
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", SHADERS)
+def test_a_tree_that_is_turned_is_seen_by_a_camera_that_is_turned(channels, name, backend):
+    tree = on(gv.N3Tree.from_volume(channels, 4), DEVICES[backend])
+    rays, shader = camera(tree, 8 if backend == "reference" else 20), SHADERS[name]
+    options = {"dtype": torch.float64, "backend": backend}
+    own = gv.trace(tree, rays.to(tree.device), shader, **options)
+    assert (own.alpha > 0.1).any()
+    for matrix in POSES.values():
+        world = rays_in_the_world(matrix, rays).to(tree.device)
+        lit = light_in_the_world(matrix, shader)
+        found = gv.trace(tree, world, lit, pose=matrix, **options)
+        same = (found.samples == own.samples).cpu()  # a ray may graze a face, but for rounding
+        assert same.float().mean() > 0.95
+        assert_same_picture(*(some(hits, same) for hits in (found, own)), matrix, **NEAR)
+
+
+@pytest.fixture
+def tree(blobs) -> gv.N3Tree:
+    return gv.N3Tree.from_volume(blobs, 4)
+
+
+SUN = gv.DirectionalLight((1.0, -1.0, -2.0))
+
+
+@pytest.mark.backend("cpp")
+def test_clip_lens_and_lighting_stay_in_the_world(tree):
+    """They are given in world units, whatever the pose; here they are turned with it."""
+    rays, matrix = camera(tree), matrix_of()
+    world = rays_in_the_world(matrix, rays)
+    middle = tree.box.mean(0).numpy()
+    normal = np.array([0.6, 0.0, 0.8])
+    out = matrix[:3, :3] @ normal
+    faces = {
+        "own": (*normal, -normal @ middle),
+        "world": (*out, -normal @ middle - out @ matrix[:3, 3]),
+    }
+    suns = {"own": SUN, "world": light_in_the_world(matrix, gv.Lit(SHADER, light=SUN)).light}
+    for caps in (False, True):
+        for lighting in (False, True):
+            made = {}
+            for where, given in (("own", rays), ("world", world)):
+                options = {
+                    "clip": gv.Clip(planes=[faces[where]], caps=caps),
+                    "dtype": torch.float64,
+                    "pose": matrix if where == "world" else None,
+                }
+                if lighting:
+                    options["lighting"] = gv.Lighting(lights=[suns[where]], shadows=True)
+                made[where] = gv.trace(tree, given, gv.Lit(SHADER, light=suns[where]), **options)
+            assert (made["own"].alpha > 0.1).any()
+            torch.testing.assert_close(made["world"].color, made["own"].color, atol=1e-5, rtol=0)
+    lens = gv.ThinLens(aperture=2.0, focus=40.0)
+    blurred = [
+        gv.trace(tree, given, SHADER, lens=lens, dtype=torch.float64, pose=pose)
+        for given, pose in ((rays, None), (world, matrix))
+    ]
+    torch.testing.assert_close(blurred[1].color, blurred[0].color, atol=1e-9, rtol=0)
+
+
+@pytest.mark.backend("cpp")
+def test_a_module_shader_is_told_places_and_ways_of_the_world(tree):
+    seen: list[torch.Tensor] = []
+
+    class Told(torch.nn.Module):
+        def forward(self, values, positions, directions, lengths):
+            seen.extend((positions, directions))
+            return values.expand(-1, 3), values.clamp(0, 1) * 0.2
+
+    rays, matrix = camera(tree, 6), matrix_of()
+    shader = gv.ModuleShader(Told())
+    options = {"dtype": torch.float64, "stop_alpha": 1}
+    own = gv.trace(tree, rays, shader, **options)
+    found = gv.trace(tree, rays_in_the_world(matrix, rays), shader, pose=matrix, **options)
+    torch.testing.assert_close(found.color, own.color, **NEAR)
+    places, ways, world_places, world_ways = seen
+    shift = torch.from_numpy(matrix[:3, 3])
+    torch.testing.assert_close(world_places, turned(matrix, places) + shift, **NEAR)
+    torch.testing.assert_close(world_ways, turned(matrix, ways), **NEAR)
+
+
+@pytest.mark.parametrize("shader", [SHADER, gv.Lit(SHADER), gv.Projection("mean", SHADER)])
+@pytest.mark.backend("cpp")
+def test_streamed_equals_resident_and_an_orbit_camera_stands_around_it(blobs, shader):
+    matrix = matrix_of(shift=(300.0, 0.0, 0.0))
+    view = gv.Camera.orbit(40, 20, None, None, 48, 32)
+    resident = gv.render(gv.N3Tree.from_volume(blobs), view, shader, pose=matrix)
+    assert 0.01 < (resident.alpha > 0.05).float().mean() < 0.9
+    edge = torch.cat([resident.alpha[0], resident.alpha[-1], *resident.alpha[:, [0, -1]]])
+    assert bool((edge == 0).all()), "all of the turned box is in the picture"
+    with gv.Engine(gv.VolumeProducer(blobs), brick_pool="4 MB") as engine:
+        streamed = engine.render(view, shader, pose=matrix)
+        other = engine.render(view, shader)
+    assert torch.equal(streamed.color, resident.color)
+    assert torch.equal(streamed.depth, resident.depth)
+    assert not torch.equal(other.color, streamed.color)
+
+
+@pytest.mark.backend("cpp")
+def test_a_cost_counts_what_the_picture_samples(tree):
+    view = gv.Camera.orbit(40, 20, None, None, 24, 16)
+    picture = gv.render(tree, view, SHADER, pose=matrix_of())
+    assert torch.equal(gv.cost(tree, view, SHADER, pose=matrix_of()).samples, picture.samples)
+
+
+@pytest.mark.parametrize(
+    "pose, told",
+    [
+        (np.diag([2.0, 1, 1, 1]), "neither stretch nor shear"),
+        (np.eye(3), r"pose must be \(4, 4\)"),
+        (np.full((4, 4), np.nan), "finite"),
+        ("up", "numbers"),
+        ({"a": np.eye(4)}, "poses by name are for trees by name"),
+        (torch.eye(4, requires_grad=True), "gradient"),
+    ],
+)
+def test_what_is_no_pose_is_told_in_a_line(tree, pose, told):
+    with pytest.raises((ValueError, RuntimeError), match=told) as error:
+        gv.render(tree, gv.Camera.orbit(0, 0, None, None, 8, 8), SHADER, pose=pose)
+    assert "\n" not in str(error.value)
+
+
+def test_poses_of_several_trees_go_by_name(tree):
+    view = gv.Camera.orbit(0, 0, None, None, 8, 8)
+    trees = {"a": tree, "b": tree}
+    with pytest.raises(ValueError, match="by name"):
+        gv.render(trees, view, SHADER, pose=np.eye(4))
+    with pytest.raises(ValueError, match="no such tree; there is a, b"):
+        gv.render(trees, view, SHADER, pose={"c": np.eye(4)})
+
+
+def test_a_box_that_is_turned_lies_in_the_box_around_it():
+    box = torch.tensor([[-1.0, 2, 3], [4, 5, 9]], dtype=torch.float64)
+    pose = Pose.of("test", "pose", matrix_of())
+    around = pose.box(box)
+    inside = box[0] + torch.rand(1000, 3, dtype=torch.float64) * (box[1] - box[0])
+    placed = pose.places(inside)
+    assert bool(((placed >= around[0]) & (placed <= around[1])).all())
+    assert bool((placed.amax(0) > around[1] - 2).all())
+    assert bool((placed.amin(0) < around[0] + 2).all())
+
+
+def test_voxels_that_are_kept_tell_how_to_turn_them(tmp_path):
+    """The pose of a file's oblique voxels brings them to where the file says they lie."""
+    nibabel = pytest.importorskip("nibabel")
+    for mirrored in (False, True):
+        affine = matrix_of(mirrored=mirrored) @ np.diag([0.7, 1.0, 1.6, 1.0])
+        data = np.random.default_rng(0).random((5, 6, 7)).astype(np.float32)
+        nibabel.save(nibabel.Nifti1Image(data, affine), tmp_path / "a.nii")
+        for place in (None, (1.0, 2.0, 3.0)):
+            with pytest.warns(UserWarning, match="info.pose turns them"):
+                volume = gv.read_volume(tmp_path / "a.nii", oblique="keep", origin=place)
+            pose = Pose.of("test", "pose", volume.info.pose)
+            index = torch.tensor([[0, 0, 0], [4, 5, 6], [2, 0, 5]], dtype=torch.float64)
+            own = index * torch.tensor(volume.spacing) + torch.tensor(volume.origin)
+            expected = index.numpy() @ affine[:3, :3].T + (
+                affine[:3, 3] if place is None else place
+            )
+            np.testing.assert_allclose(pose.places(own).numpy(), expected, atol=1e-5)
+            assert np.array_equal(volume.data[..., 0].numpy(), data.T)
+        assert volume.info.describe()["pose"]
+    sheared = affine.copy()
+    sheared[:3, 0] += 0.3 * sheared[:3, 1]
+    nibabel.save(nibabel.Nifti1Image(data, sheared), tmp_path / "a.nii")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert gv.read_volume(tmp_path / "a.nii", oblique="keep").info.pose is None
