@@ -6,7 +6,6 @@ The uptake is made up here: what is full of contrast agent, blurred.
 """
 
 import math
-
 from dataclasses import dataclass
 from pathlib import Path
 
