@@ -230,6 +230,21 @@ def test_enhanced_images(tmp_path, data):
     assert np.array_equal(volume.data[..., 0].numpy(), expected[:, ::-1, ::-1].astype("f4"))
 
 
+def test_deflated_files(tmp_path, data):
+    """All of such a file but its first group is packed; these are smaller than their images."""
+    data = np.abs(data) // 16 * 16
+    several = enhanced(data)
+    several.file_meta.TransferSyntaxUID = "1.2.840.10008.1.2.1.99"
+    several.save_as(tmp_path / "enhanced.dcm", enforce_file_format=True)
+    assert (tmp_path / "enhanced.dcm").stat().st_size < data.size * 2
+    volume = gv.read_volume(tmp_path / "enhanced.dcm")
+    expected = data * 0.5 + np.arange(len(data))[:, None, None]
+    assert np.array_equal(volume.data[..., 0].numpy(), expected[:, ::-1, ::-1].astype("f4"))
+    source = open_source(tmp_path / "enhanced.dcm")
+    part = source.read_region((2, 0, 0), (3, 4, 5))
+    assert np.array_equal(part, volume.data.numpy()[2:3, :4, :5])
+
+
 def test_color_and_images_without_a_place(tmp_path):
     rgb = noise((2, 5, 7, 3))
     for z, image in enumerate(rgb):

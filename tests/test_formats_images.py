@@ -211,9 +211,50 @@ def test_legacy_vtk(tmp_path, grid, kind, cells):
     assert np.array_equal(volume.data[..., 0].numpy(), grid)
     assert volume.spacing == (0.5, 2, 3)
     assert volume.origin == ((11.25, 21, 31.5) if cells else (11, 20, 30))
-    if kind == "Binary":
-        other = gv.read_volume(tmp_path / "a.vtk", key="other")
-        assert np.array_equal(other.data[..., 0].numpy(), grid + 1)
+    other = gv.read_volume(tmp_path / "a.vtk", key="other")
+    assert np.array_equal(other.data[..., 0].numpy(), grid + 1)
+
+
+def write_legacy(file: Path, image, kind: str) -> Path:
+    writer = vtk.vtkStructuredPointsWriter()
+    writer.SetFileName(str(file))
+    writer.SetInputData(image)
+    getattr(writer, f"SetFileTypeTo{kind}")()
+    writer.Write()
+    return file
+
+
+@pytest.mark.parametrize("kind", ["Binary", "ASCII"])
+@pytest.mark.parametrize("dtype", ["uint8", "int8", "uint64", "ids"])
+def test_kinds_of_numbers_of_legacy_vtk(tmp_path, kind, dtype):
+    """VTK writes unsigned char as colours, in text as shares of 255; and its ids as int."""
+    grid = noise((3, 4, 5), "uint8" if dtype == "ids" else dtype)
+    image = vtk_image(grid)
+    if dtype == "ids":
+        ids = vtk.vtkIdTypeArray()
+        ids.SetNumberOfTuples(grid.size)
+        for at, value in enumerate(grid.ravel().tolist()):
+            ids.SetValue(at, value)
+        image.GetPointData().SetScalars(ids)
+    image.GetPointData().GetScalars().SetName("a 100%")
+    volume = gv.read_volume(write_legacy(tmp_path / "a.vtk", image, kind), key="a 100%")
+    assert np.array_equal(volume.data[..., 0].numpy(), grid.astype(volume.data.numpy().dtype))
+
+
+@pytest.mark.parametrize("kind", ["Binary", "ASCII"])
+def test_points_come_before_cells_in_legacy_vtk(tmp_path, grid, kind):
+    """As in XML, whatever the file has first; VTK itself writes cells first."""
+    image = vtk_image(grid)
+    cells = np.arange(6 * 8 * 11, dtype="f4").reshape(6, 8, 11)
+    array = numpy_support.numpy_to_vtk(cells.ravel(), deep=True)
+    array.SetName("cells")
+    image.GetCellData().AddArray(array)
+    file = write_legacy(tmp_path / "a.vtk", image, kind)
+    with pytest.warns(UserWarning, match=r"other arrays; key .*, cells"):
+        volume = gv.read_volume(file)
+    assert np.array_equal(volume.data[..., 0].numpy(), grid)
+    volume = gv.read_volume(file, key="cells")
+    assert np.array_equal(volume.data[..., 0].numpy(), cells)
 
 
 def test_other_vtk_files_are_named(tmp_path):

@@ -135,6 +135,25 @@ def test_tiff_of_simpleitk(tmp_path, packed):
     assert np.array_equal(part[..., 0], data[1:3, 2:8, 3:9])
 
 
+def test_colours_of_imagej(tmp_path):
+    data = noise((4, 9, 12, 3), "uint8")
+    tifffile.imwrite(tmp_path / "a.tif", data, imagej=True, metadata={"axes": "ZYXS", "spacing": 2})
+    volume = gv.read_volume(tmp_path / "a.tif")
+    assert np.array_equal(volume.data.numpy(), data) and volume.spacing[2] == 2
+    assert [c.name for c in volume.info.channels] == ["red", "green", "blue"]
+    assert volume.info.channels[1].color == (0, 1, 0)
+
+
+@pytest.mark.parametrize(("kind", "told"), [("miniswhite", "MinIsWhite"), ("palette", "palette")])
+def test_values_that_are_shown_otherwise_are_told(tmp_path, kind, told):
+    data = noise((4, 9, 12), "uint8")
+    options = {"colormap": np.zeros((3, 256), "uint16")} if kind == "palette" else {}
+    tifffile.imwrite(tmp_path / "a.tif", data, photometric=kind, **options)
+    with pytest.warns(UserWarning, match=f"not kept: .*{told}"):
+        volume = gv.read_volume(tmp_path / "a.tif")
+    assert np.array_equal(volume.data[..., 0].numpy(), data)
+
+
 def test_a_file_that_ends_before_its_tiles(tmp_path):
     file = ome(tmp_path / "a.tif", noise((1, 1, 4, 40, 50), "uint16"), compression="zlib")
     with tifffile.TiffFile(file) as tiff:

@@ -23,21 +23,24 @@ class PackedSource(VolumeSource):
 
     file: str
     offset: int
-    codec: Literal["zlib", "text"]
+    codec: Literal["zlib", "text", "shares"]  # shares: text that tells parts of 255
     fortran: bool = False
     whole: bool = True
 
     def read_stored(self, index: Index) -> np.ndarray:
         """Unpacks all, and returns a part."""
         count = math.prod(self.shape)
-        if self.codec == "text":
+        if self.codec != "zlib":
             with open(self.file, "rb") as stream:
                 stream.seek(self.offset)
                 words = stream.read(count * _TEXT).split(maxsplit=count)[:count]
             if len(words) != count:
                 raise ValueError(f"{self.path}: {count} numbers expected, got {len(words)}")
-            wide = np.dtype(self.stored).kind == "f"
-            data = np.array([float(w) if wide else int(w) for w in words]).astype(self.stored)
+            wide = np.dtype(self.stored).kind == "f" or self.codec == "shares"
+            data = np.array([float(w) if wide else int(w) for w in words])
+            if self.codec == "shares":
+                data = np.rint(data * 255).clip(0, 255)
+            data = data.astype(self.stored)
         else:
             need = count * np.dtype(self.stored).itemsize
             data = np.frombuffer(unpack_zlib(self.file, self.offset, need), self.stored)

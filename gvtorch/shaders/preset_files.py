@@ -25,8 +25,11 @@ from .presets import RAMP, SAMPLES, Pair, Points, converted, linear
 
 _GRID = 2**14  # cells of the grid on which the points of files lie, which makes short tables
 _PARTS = 16  # of the way between two colours, at least
+_FEW = 2048  # parts in all which files of few colours may have
 _BENT = 128  # parts of a curve of opacities
+_STRAIGHT, _SUDDEN = 0.01, 0.99  # sharpnesses of VTK's, below and above which nothing is bent
 _UNSATURATED = 0.05  # radians of Msh
+_APART = 0.33 * math.pi  # hues between which the way goes through white, as VTK has it
 
 
 def read_points(path: str | Path, name: str | None) -> tuple[Pair, float | None, bool]:
@@ -58,13 +61,18 @@ def read_points(path: str | Path, name: str | None) -> tuple[Pair, float | None,
             _only(file, name)
             return *_of_vp_json(file, content), False
         items = content if isinstance(content, list) else [content]
-        if not all(isinstance(item, dict) and "RGBPoints" in item for item in items):
+        if not all(
+            isinstance(i, dict) and i.keys() & {"RGBPoints", "IndexedColors"} for i in items
+        ):
             raise ValueError(
                 'expected {"opacity": ..., "color": ...}, a list of ParaView presets '
                 '({"Name": ..., "RGBPoints": ...}) or "volumeProperties" of 3D Slicer'
             )
         found = {str(item.get("Name", number)): item for number, item in enumerate(items)}
-        return _of_paraview(file, _chosen(file, found, name)), None, True
+        maps = {key: item for key, item in found.items() if "RGBPoints" in item}
+        if name in found.keys() - maps or not maps:  # ParaView's lists may hold both kinds
+            raise ValueError("holds colours of categories (IndexedColors), which are no function")
+        return _of_paraview(file, _chosen(file, maps, name)), None, True
     except (KeyError, TypeError, IndexError, ElementTree.ParseError, UnicodeDecodeError) as error:
         raise ValueError(f"{file}: no such file as its ending tells: {error!r}") from None
     except ValueError as error:
@@ -113,16 +121,18 @@ def _counted(text: str, width: int) -> np.ndarray:
 
 def _of_vp_json(file: Path, content: Mapping[str, Any]) -> tuple[Pair, float | None]:
     part = content["volumeProperties"][0]["components"][0]
-    color = [(p["x"], *p["color"]) for p in part["rgbTransferFunction"]["points"]]
+    color = [(p["x"], *p["color"], *_bent(p)) for p in part["rgbTransferFunction"]["points"]]
     gradient = [(p["x"], p["y"]) for p in part.get("gradientOpacity", {}).get("points", ())]
-    bent = [_bent(p) for p in part["scalarOpacity"]["points"]]
+    if part.get("disableGradientOpacity"):
+        gradient = []
+    bent = [(p["x"], p["y"], *_bent(p)) for p in part["scalarOpacity"]["points"]]
     _tell_lost(file, np.array(gradient or [(0, 1)]), shaded=bool(part.get("shade")))
     reference = part.get("scalarOpacityUnitDistance")
     return _points(_opacities(np.array(bent, float)), np.array(color, float)), reference
 
 
-def _bent(point: Mapping[str, float]) -> tuple[float, ...]:
-    return point["x"], point["y"], point.get("midpoint", 0.5), point.get("sharpness", 0.0)
+def _bent(point: Mapping[str, float]) -> tuple[float, float]:
+    return point.get("midpoint", 0.5), point.get("sharpness", 0.0)
 
 
 def _tell_lost(file: Path, gradient: np.ndarray, shaded: bool) -> None:
@@ -138,6 +148,8 @@ def _of_paraview(file: Path, item: Mapping[str, Any]) -> Pair:
     if space in ("Lab/CIEDE2000", "LabCIEDE2000"):
         warnings.warn(f"{file}: not kept: ColorSpace {space!r}, taken as 'Lab'", stacklevel=4)
         space = "Lab"
+    if space == "CIELAB":  # of one map that ParaView ships, and itself reads so
+        space = "RGB"
     known = ("RGB", "HSV", "Lab", "Diverging", "Step")
     if space not in known:
         raise ValueError(f"ColorSpace must be one of {', '.join(known)}, got {space!r}")
@@ -151,30 +163,41 @@ def _of_paraview(file: Path, item: Mapping[str, Any]) -> Pair:
 
 def _opacities(nodes: np.ndarray) -> np.ndarray:
     """(k, 2) of nodes (v, a), or (v, a, midpoint, sharpness) as VTK's vtkPiecewiseFunction has
-    them: between two nodes half the way is done at the midpoint, at sharpness 0 along straight
-    lines, else along a curve, which at 1 is nearly a step.
+    them.
     """
     nodes = nodes[np.argsort(nodes[:, 0], kind="stable")]
     if nodes.shape[1] == 2:
         return nodes
     points = []
     for (v, a, midpoint, sharp), (w, b, *_) in itertools.pairwise(nodes):
-        middle = min(max(midpoint, 1e-5), 1 - 1e-5)
-        if sharp < 0.01:
-            places, shares = np.array([0, middle]), np.array([0, 0.5])
-        else:
+        middle = _inside(midpoint)
+        places = np.array([0, *_around(middle)])
+        if _STRAIGHT <= sharp <= _SUDDEN:
             half = np.arange(_BENT // 2) / (_BENT // 2)  # as many on either side of the midpoint
             places = np.concatenate((half * middle, middle + half * (1 - middle)))
-            shares = _hermite(places, middle, sharp)
+        shares = _share(places, middle, sharp)
         points += list(zip(v + places * (w - v), a + shares * (b - a), strict=True))
     return np.array([*points, nodes[-1, :2]])
 
 
-def _hermite(place: np.ndarray, middle: float, sharp: float) -> np.ndarray:
-    """Share of the way, by VTK's definition: time is bent towards the midpoint, then a cubic with
-    slopes that fall as it gets sharper.
+def _inside(midpoint: float) -> float:
+    return min(max(midpoint, 1e-5), 1 - 1e-5)
+
+
+def _around(middle: float) -> tuple[float, float]:
+    return middle - 1e-9, middle
+
+
+def _share(place: np.ndarray, middle: float, sharp: float) -> np.ndarray:
+    """Share of the way, by VTK's definition: half at the midpoint; at sharpness 0 along straight
+    lines, at 1 all at once, else time is bent towards the midpoint, then a cubic with slopes that
+    fall as it gets sharper.
     """
     s = np.where(place < middle, 0.5 * place / middle, 0.5 + 0.5 * (place - middle) / (1 - middle))
+    if sharp < _STRAIGHT:
+        return s
+    if sharp > _SUDDEN:
+        return (place >= middle).astype(float)
     power = 1 + 10 * sharp
     low = 0.5 * (2 * s.clip(max=0.5)) ** power
     s = np.where(s < 0.5, low, 1 - 0.5 * (2 * (1 - s.clip(min=0.5))) ** power)
@@ -186,22 +209,30 @@ def _hermite(place: np.ndarray, middle: float, sharp: float) -> np.ndarray:
 def _points(
     opacity: np.ndarray, nodes: np.ndarray, space: str = "RGB", *, wrap: bool = False
 ) -> Pair:
-    """Opacity and linear colour on one grid, from sRGB nodes."""
+    """Opacity and linear colour on one grid, from sRGB nodes, which may have a midpoint and a
+    sharpness too.
+    """
     nodes = nodes[np.argsort(nodes[:, 0], kind="stable")]
     if not (np.isfinite(opacity).all() and np.isfinite(nodes).all()):
         raise ValueError("its numbers must be finite")
     ends = np.concatenate((opacity[:, 0], nodes[:, 0]))
     low, high = float(ends.min()), float(ends.max())
     step = ((high - low) or 1.0) / _GRID
-    values, colors = [nodes[:1, 0]], [nodes[:1, 1:]]
+    parts = max(_PARTS, _FEW // len(nodes))
+    values, colors = [nodes[:1, 0]], [nodes[:1, 1:4]]
     for first, last in itertools.pairwise(nodes):
         cells = (last[0] - first[0]) / step
-        count = max(1, math.ceil(SAMPLES * cells / _GRID), min(_PARTS, int(cells)))
+        count = max(1, math.ceil(SAMPLES * cells / _GRID), min(parts, int(cells)))
         share = np.arange(1, count + 1) / count
+        bend = tuple(first[4:])
+        if bend not in ((), (0.5, 0)):
+            share = np.sort(np.append(share, _around(_inside(bend[0]))))
         values.append(first[0] + share * (last[0] - first[0]))
+        if bend:
+            share = _share(share, _inside(bend[0]), bend[1])
         if space == "Step":  # the upper node's colour, from the lower on
             values[-1], share = np.array([first[0], last[0]]), np.ones(2)
-        colors.append(_between(first[1:], last[1:], share, space, wrap))
+        colors.append(_between(first[1:4], last[1:4], share, space, wrap))
     light = linear(np.concatenate(colors).clip(0, 1))
     colored = np.column_stack((np.concatenate(values), light))
     return _on_grid(opacity, low, step), _on_grid(colored, low, step)
@@ -216,7 +247,8 @@ def _on_grid(points: np.ndarray, low: float, step: float) -> Points:
         zip(places, points[:, 1:].tolist(), strict=True), lambda p: p[0]
     ):
         rows = [row for _, row in run]
-        for row in (rows[0], rows[-1]) if rows[0] != rows[-1] else rows[:1]:
+        jump = rows[0] != rows[-1] and last < at  # else one row, so that curves don't fall behind
+        for row in (rows[0], rows[-1]) if jump else rows[-1:]:
             last = max(int(at), last + 1)
             kept.append((low + last * step, *row))
     return kept
@@ -249,7 +281,7 @@ def _diverging(first: np.ndarray, last: np.ndarray, share: np.ndarray) -> np.nda
     (m1, s1, h1), (m2, s2, h2) = ends
     apart = abs(h1 - h2)
     white = np.array([max(m1, m2, 88.0), 0.0, 0.0])
-    if min(s1, s2) > _UNSATURATED and min(apart, 2 * math.pi - apart) > math.pi / 3:
+    if min(s1, s2) > _UNSATURATED and min(apart, 2 * math.pi - apart) > _APART:
         halves = [(ends[0], white, share[share <= 0.5] * 2)]
         halves += [(white, ends[1], share[share > 0.5] * 2 - 1)]
     else:
@@ -269,13 +301,15 @@ def _msh(lab: np.ndarray) -> np.ndarray:
 def _msh_mix(first: np.ndarray, last: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Straight in Msh; an unsaturated end takes a hue that turns away from the other's."""
     a, b = first.copy(), last.copy()
+    spun = False
     for gray, other in ((a, b), (b, a)):
         if gray[1] < _UNSATURATED < other[1]:
             m, s, h = other
-            gray[2] = h
+            gray[2], spun = h, True
             if m < gray[0] - 0.1:
                 spin = s * math.sqrt(gray[0] ** 2 - m**2) / (m * math.sin(s))
                 gray[2] = h + spin if h > -0.3 * math.pi else h - spin
     way = b - a
-    way[2] = (way[2] + math.pi) % (2 * math.pi) - math.pi  # the shorter one around
+    if not spun:  # of dark colours the turn may be more than one around
+        way[2] = (way[2] + math.pi) % (2 * math.pi) - math.pi  # the shorter one
     return a + share[:, None] * way

@@ -270,7 +270,7 @@ def _bytes_unpacked(file: str, images: int) -> int:
     """Bytes that the images of a file take if they are not packed, else 0."""
     header = _header(file)
     syntax = header.file_meta.get("TransferSyntaxUID") if "file_meta" in vars(header) else None
-    if syntax is None or syntax.is_compressed:
+    if syntax is None or syntax.is_compressed or syntax == _DEFLATED:
         return 0
     bits = int(header.get("BitsAllocated") or 0)
     return math.prod(_image_shape(header)) * images * bits // 8
@@ -278,8 +278,11 @@ def _bytes_unpacked(file: str, images: int) -> int:
 
 def _images(file: str, numbers: list[int]) -> Iterator[np.ndarray]:
     """Unpacks some of the images of a file."""
+    import pydicom
     from pydicom.filereader import read_file_meta_info
     from pydicom.pixels import iter_pixels
 
     syntax = read_file_meta_info(file).get("TransferSyntaxUID", "") if _has_magic(file) else ""
+    if syntax == _DEFLATED:  # which pydicom unpacks for whole files alone
+        return iter_pixels(pydicom.dcmread(file), indices=numbers)
     return iter_pixels(file, indices=numbers, decoding_plugin=plugin_of(str(syntax)))

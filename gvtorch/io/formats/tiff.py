@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,10 @@ from ..tiff_info import RGB, Told, imagej_info, ome_info, opened
 from .format import Format
 
 _JPEG = (6, 7, 34892, 33007)
+_LOST = {  # by kind of photometric interpretation
+    0: "that high values are meant to be dark (MinIsWhite)",
+    3: "its palette: values are its numbers",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,12 +175,14 @@ def _told(file: Any, series: Any, number: int, axes: str, shape: Sequence[int]) 
     width = shape[axes.index("c")] if "c" in axes else 1
     if series.kind == "ome":
         return ome_info(file.ome_metadata, number, series.name, width)
-    if series.kind == "imagej":
-        return imagej_info(file.imagej_metadata, _resolution(file), width)
-    colors = width in (3, 4) and series.keyframe.photometric in (2, 6)  # RGB, YCbCr
+    kind = int(series.keyframe.photometric)
+    colors = width in (3, 4) and kind in (2, 6)  # RGB, YCbCr
     names = [ChannelInfo(name=name, color=color) for name, color in RGB] if colors else []
     names += [ChannelInfo(name="alpha")] * (width - 3) if colors else []
-    lost = ["its palette: values are its numbers"] if series.keyframe.photometric == 3 else []
+    lost = [_LOST[kind]] if kind in _LOST else []
+    if series.kind == "imagej":
+        info, spacing, more = imagej_info(file.imagej_metadata, _resolution(file), width)
+        return replace(info, channels=tuple(names)) if colors else info, spacing, [*more, *lost]
     return ImageInfo(channels=tuple(names)), (1.0, 1.0, 1.0), lost
 
 

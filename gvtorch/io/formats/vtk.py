@@ -16,6 +16,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
+from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import numpy as np
@@ -29,6 +30,7 @@ from .format import Format
 _LEGACY = {
     "unsigned_char": "u1",
     "char": "i1",
+    "signed_char": "i1",
     "unsigned_short": "u2",
     "short": "i2",
     "unsigned_int": "u4",
@@ -37,7 +39,7 @@ _LEGACY = {
     "long": "i8",
     "vtktypeint64": "i8",
     "vtktypeuint64": "u8",
-    "vtkidtype": "i8",
+    "vtkidtype": "i4",  # which VTK writes as int
     "float": "f4",
     "double": "f8",
 }
@@ -309,14 +311,17 @@ def _open_mapped(path: str, content: mmap.mmap, key: str | None) -> VolumeSource
     found = arrays[_choose(path, names, key)]
     told = _told(path, points, affine, found, names if key is None else names[:1])
     told |= {"file": path, "offset": found["offset"], "stored": found["stored"]}
-    return ArraySource(**told) if binary else PackedSource(codec="text", **told)
+    if binary:
+        return ArraySource(**told)
+    return PackedSource(codec="shares" if found["colors"] else "text", **told)
 
 
 def _legacy_parts(
     path: str, content: mmap.mmap, at: int, binary: bool
 ) -> tuple[np.ndarray, list[int], list[dict[str, Any]]]:
-    """Affine, number of points, and the arrays: of text the first, since where it ends is not
-    known.
+    """Affine, number of points, and the arrays as XML's: at points, then in cells, scalars first.
+
+    In text the lines of numbers are passed over, which say nothing.
     """
     affine, points = np.eye(4), [1, 1, 1]
     arrays: list[dict[str, Any]] = []
@@ -341,10 +346,8 @@ def _legacy_parts(
             at += table.end() if table and name == "SCALARS" else 0
             arrays.append({**array, "offset": at})
             in_field -= name not in _ARRAYS
-            at += array["bytes"]
-            if not binary:
-                break
-    return affine, points, arrays
+            at += array["bytes"] * binary
+    return affine, points, sorted(arrays, key=lambda array: (array["cells"], not array["first"]))
 
 
 def _legacy_array(
@@ -353,7 +356,7 @@ def _legacy_array(
     """An array by the line that announces it."""
     kind = words[0].upper()
     if kind == "COLOR_SCALARS":
-        name, dtype, width = words[1], "u1", int(words[2])
+        name, dtype, width = words[1].replace("%%", "%"), "u1", int(words[2])  # VTK doubles them
     elif kind not in _ARRAYS:  # of a field
         name, width, dtype = words[0], int(words[1]), _LEGACY.get(words[3].lower(), "")
     else:
@@ -365,7 +368,9 @@ def _legacy_array(
     count = math.prod(max(n - 1, 1) if cells else n for n in points) * width
     size = np.dtype(dtype).itemsize
     return {
-        "name": name.replace("%20", " "),
+        "name": unquote(name),
+        "first": kind in ("SCALARS", "COLOR_SCALARS"),
+        "colors": kind == "COLOR_SCALARS",
         "width": width,
         "stored": ">" + dtype,
         "cells": cells,
