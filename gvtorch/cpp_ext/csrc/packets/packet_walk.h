@@ -361,9 +361,11 @@ struct PacketWalk {
     Mask going = which & ((known < 0) | ~((known == wanted) | (tile < 0) | (node < 0)));
     int32_t level = kMostLevels;
     for_lanes(going, [&](int lane) { level = smaller(level, known[lane] + 1); });
+    const Ints root = Ints{} + tree.root_tile;
+    const bool stamps_all = tree.shared_t[tree.root_tile];
     for (; any(going); ++level) {
       const Mask here = going & (reach == level - 1);
-      Ints next = Ints{} + tree.root, home = Ints{} + tree.root_tile;
+      Ints next = Ints{} + tree.root, home = root;
       if (level > 0) {
         const int32_t shift = top - level * tree.digit_bits, mask = (1 << tree.digit_bits) - 1;
         const Ints x = (cell.x >> shift) & mask, y = (cell.y >> shift) & mask, z = (cell.z >> shift) & mask;
@@ -371,7 +373,7 @@ struct PacketWalk {
         next = home * tree.nodes_per_tile + ((z << (2 * tree.digit_bits)) | (y << tree.digit_bits) | x);
       }
       next = here ? next : Ints{};
-      stamp(tree.stamp_t, here, home);
+      if (stamps_all) stamp(tree.stamp_t, here, home);
       const Ints next_brick = pick(tree.brick_tn, next);
       const Ints next_tile = pick(tree.child_tn, next);
       const Mask hides = hidden(here, next);
@@ -385,6 +387,7 @@ struct PacketWalk {
       going = going & ~(here & ((level == wanted) | (tile < 0) | hides));
     }
     path_depth = which ? reach : path_depth;
+    stamp(tree.stamp_t, which, reach > 0 ? own_lane(path_tile, larger(reach - 1, Ints{})) : root);
   }
 
   GV_HD Mask hidden(Mask here, Ints node) {
