@@ -112,6 +112,7 @@ def tiles(cache: Cache, targets: Targets, children: Children) -> Written:
         row, child = children.is_alias[rows].nonzero().unbind(1)
         target = tree.find(children.alias[rows][row, child])
         known = target >= 0
+        pool.shared_t[tree.number] = True
         _alias(cache, (tile[row] * per_tile + child)[known], target[known])
     return done
 

@@ -68,12 +68,22 @@ GV_HD T number(Half voxel) {
 }
 
 // Stamps: many rays store the same value, so a relaxed store is enough; the read first spares the cache line.
-GV_HD void store_stamp(int32_t* word, int32_t stamp) {
+GV_HD bool has_stamp(const int32_t* word, int32_t stamp) {
 #ifdef __CUDA_ARCH__
-  if (*reinterpret_cast<volatile int32_t*>(word) != stamp) *reinterpret_cast<volatile int32_t*>(word) = stamp;
+  return *reinterpret_cast<const volatile int32_t*>(word) == stamp;
 #else
-  if (__atomic_load_n(word, __ATOMIC_RELAXED) != stamp) __atomic_store_n(word, stamp, __ATOMIC_RELAXED);
+  return __atomic_load_n(word, __ATOMIC_RELAXED) == stamp;
 #endif
+}
+// Returns whether it was not there.
+GV_HD bool store_stamp(int32_t* word, int32_t stamp) {
+  if (has_stamp(word, stamp)) return false;
+#ifdef __CUDA_ARCH__
+  *reinterpret_cast<volatile int32_t*>(word) = stamp;
+#else
+  __atomic_store_n(word, stamp, __ATOMIC_RELAXED);
+#endif
+  return true;
 }
 
 // A byte that several threads may fill with the same value.
