@@ -97,7 +97,6 @@ class Engine:
         )
         self.readbacks = Readbacks()
         self.frames, self._closed = 0, False
-        self._frame_1 = torch.zeros(1, dtype=torch.int32, device=self.device)
         self._missed: Tensor | None = None  # (r,) bool, of the last picture's rays
         self._last: deque[FrameStats] = deque(maxlen=_KEPT)  # for the report
         self.trees: dict[str, ProducedTree] = {}
@@ -163,7 +162,7 @@ class Engine:
         scene = {name: (one.tree, one.producer.channels) for name, one in self.trees.items()}
         by_level = self.options.loading == "levels"
         return tree_traces(
-            *("frame", scene, shaders, options, box), by_level=by_level, frame_1=self._frame_1
+            *("frame", scene, shaders, options, box), by_level=by_level, frame_1=self.cache.frame_1
         )
 
     @contextmanager
@@ -269,8 +268,7 @@ class Engine:
     def number_picture(self) -> None:
         """Gives the next picture its number: what rays stamp with it is in use."""
         self.frames += 1
-        self.cache.frame = self.frames
-        self._frame_1.fill_(self.frames)
+        self.cache.frame_1.fill_(self.frames)
         for source in self.trees.values():
             source.tree.frame = self.frames
 
@@ -282,7 +280,7 @@ class Engine:
             most = min(_MOST_LISTED, self.cache.nodes.child_tn.numel())
             requests = RequestList.collect(self.cache.nodes, most)
         with stage("lru"):
-            use = self.cache.sort_by_use(self._frame_1)
+            use = self.cache.sort_by_use()
         with stage("count"):
             total = samples.sum(dtype=torch.int64).view(1)
             return Collected(requests, torch.cat((requests.count, use, total)))

@@ -11,6 +11,7 @@ from .cache import (
     link_tiles,
     locate,
     lru_partition,
+    put_rows,
     unlink,
 )
 from .registry import available
@@ -40,6 +41,7 @@ __all__ = [
     "list_samples",
     "locate",
     "lru_partition",
+    "put_rows",
     "sample_bricks",
     "shade_rays",
     "trace_rays",
