@@ -8,7 +8,7 @@ Detailed Voxel Rendering", I3D 2009; Crassin, PhD thesis 2011.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import cached_property, partial
@@ -42,6 +42,7 @@ from ..tracing.trees import (
 )
 from .production import Failure, Production
 from .ray_subsets import RaySubsets, scouts
+from .recorded import DeviceFrame, can_serve
 from .request_batch import ProducedTree
 from .setup import EngineOptions, EngineSettings, brick_bytes, make_pools, make_tree
 from .stats import Collected, Counts, FrameStats, Readback, Readbacks, Report
@@ -265,10 +266,13 @@ class Engine:
         self.number_picture()
         return view.hits(progress, again=again)
 
-    def number_picture(self) -> None:
-        """Gives the next picture its number: what rays stamp with it is in use."""
+    def number_picture(self, on_device: bool = True) -> None:
+        """Gives the next picture its number: what rays stamp with it is in use. The device is told
+        unless it counts for itself.
+        """
         self.frames += 1
-        self.cache.frame_1.fill_(self.frames)
+        if on_device:
+            self.cache.frame_1.fill_(self.frames)
         for source in self.trees.values():
             source.tree.frame = self.frames
 
@@ -391,16 +395,22 @@ class Engine:
 
     @explicit(RenderOptions)
     def capture(
-        self, camera: Camera | Rays, shader: Shaders, **options: Unpack[RenderSettings]
+        self,
+        camera: Camera | Rays,
+        shader: Shaders,
+        *,
+        batch: int = 512,
+        **options: Unpack[RenderSettings],
     ) -> FrameGraph:
         """Records a frame as a CUDA graph, for cameras of this number and size.
 
         Renders a frame first, as `frame` does with the same arguments. A replay reads the layer's
-        tensors where they lie.
+        tensors where they lie. Where all producers are `on_device`, production is recorded, too.
 
         Args:
             camera: Cameras as those of the replays.
             shader: For all trees, or one for each; no `ModuleShader`.
+            batch: Most bricks, and most node tiles, that a replay makes for each tree.
             **options: Fields of `RenderOptions`.
 
         Raises:
@@ -422,8 +432,14 @@ class Engine:
             )
         if view.options.layer is not None:
             view.options.layer.check_device("capture", self.device)
-        self.frame(camera, shader, **options)  # loads what is loaded at first use
-        return FrameGraph(self, view)
+        check.whole("capture", "batch", batch, low=1, high=1 << 16)
+        again = partial(self.frame, shader=shader, **options)
+        again(camera)  # loads what is loaded at first use
+        device_frame = None
+        if can_serve([*self.trees.values()]):
+            trees = [*self.trees.values()]
+            device_frame = DeviceFrame(self.cache, trees, self.scheduler, batch)
+        return FrameGraph(self, view, device_frame, again)
 
     @property
     def steady(self) -> bool:
@@ -483,25 +499,38 @@ class Engine:
 class FrameGraph:
     """A frame as one CUDA graph, which costs the host a single call. `Engine.capture` makes it.
 
-    A replay is the frame that `Engine.frame` would render, but it produces nothing. Where
-    `Engine.steady` is false, something was missed or an answer is on its way: then call
-    `Engine.frame` until it is true::
+    A replay is the frame that `Engine.frame` would render. Where all producers are `on_device`, it
+    also makes what the replay before it missed. Else it produces nothing; where `Engine.steady` is
+    false, something was missed or an answer is on its way: then call `Engine.frame` until it is
+    true::
 
         render = graph.replay if engine.steady else partial(engine.frame, shader=shader)
         picture, stats = render(camera)
     """
 
-    def __init__(self, engine: Engine, view: View) -> None:
-        """Records the frame; see `Engine.capture`."""
-        self._engine = engine
+    def __init__(
+        self,
+        engine: Engine,
+        view: View,
+        device_frame: DeviceFrame | None,
+        again: Callable[[Camera | Rays], tuple[Picture, FrameStats]],
+    ) -> None:
+        """Records the frame; see `Engine.capture`. `again` renders one that the host serves."""
+        self._engine, self._device_frame, self._again = engine, device_frame, again
         self._view = view = replace(view, numbers=view.numbers.clone())  # of a replay's camera
+        self._number = -1  # of its last picture
+        if device_frame is not None:
+            device_frame.serve()  # loads what is loaded at first use; nothing is asked for
         self._graph = torch.cuda.CUDAGraph()
         with (
             torch.cuda.device(engine.device),
             torch.cuda.graph(self._graph, capture_error_mode="thread_local"),
         ):
-            self._hits = view.hits()
-            self._collected = engine.collect_requests_and_use(self._hits.samples)
+            if device_frame is not None:
+                self._hits, self._collected = device_frame.run(view.hits)
+            else:
+                self._hits = view.hits()
+                self._collected = engine.collect_requests_and_use(self._hits.samples)
             self._picture = view.picture(self._hits, FrameStats())
 
     def replay(self, camera: Camera | Rays) -> tuple[Picture, FrameStats]:
@@ -523,9 +552,14 @@ class FrameGraph:
                 f"replay: camera must be {own[0]} of {own[2]}x{own[1]} pixels as captured "
                 f"({own[4]}), got {form[0]} of {form[2]}x{form[1]} ({form[4]})"
             )
-        engine = self._engine
+        engine, device_frame = self._engine, self._device_frame
+        if device_frame is not None and engine.readbacks.failed:
+            return self._again(camera)  # the host finds out which, and names them
         with torch.cuda.device(engine.device), engine.new_frame(self._view.options) as stats:
-            engine.number_picture()
+            if device_frame is not None and engine.frames != self._number:
+                device_frame.forget()  # another frame has been rendered since
+            engine.number_picture(on_device=device_frame is None)
+            self._number = engine.frames
             self._view.numbers.copy_(camera.placed(self._view.box).numbers(engine.device))
             with stage("replay"):
                 self._graph.replay()

@@ -129,6 +129,13 @@ class Counts(NamedTuple):
     bricks_used: int
     coarse_unused: int  # of the bricks unused
     samples: int
+    # What a frame on the device made; else it is known to the host.
+    tiles: int = 0
+    bricks: int = 0
+    constant: int = 0
+    tiles_evicted: int = 0
+    bricks_evicted: int = 0
+    failed: int = 0
 
     def by_kind(self) -> dict[str, int]:
         """Returns the number of requests by the name of their kind."""
@@ -139,7 +146,7 @@ class Collected(NamedTuple):
     """What a traced frame leaves on the device."""
 
     requests: RequestList
-    numbers: Tensor  # (11,) int64 `Counts`
+    numbers: Tensor  # (11,) or (17,) int64 `Counts`
 
 
 class Readback:
@@ -182,6 +189,10 @@ class Readback:
         stats, counts = self.stats, self.wait()
         add(stats.requests, counts.by_kind())
         stats.overflow, stats.converged = counts.found - counts.listed, self.converged()
+        for name in stats.produced:
+            stats.produced[name] += getattr(counts, name)
+        for name in stats.evicted:
+            stats.evicted[name] += getattr(counts, f"{name}_evicted")
         for name in ("misses", "tiles_used", "bricks_used", "samples"):
             setattr(stats, name, getattr(counts, name))
 
@@ -190,6 +201,7 @@ class Readbacks(deque[Readback]):
     """The frames whose counts are on their way, oldest first."""
 
     _steady = False
+    failed = False  # whether a node failed in the newest frame read back, on the device
 
     def catch_up(self, wait: bool) -> Readback | None:
         """Takes all frames whose counts are here. Waits for those of the others if `wait` is true,
@@ -220,6 +232,7 @@ class Readbacks(deque[Readback]):
     def _take(self) -> Readback:
         readback = self.popleft()
         self._steady = readback.converged()
+        self.failed = readback.wait().failed > 0
         readback.stats.settle()
         return readback
 
