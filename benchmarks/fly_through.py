@@ -7,8 +7,8 @@ The rate is bricks asked for over bricks asked for and bricks used, summed over 
 frame. Bricks of 8^3 and a border hold 1,000 bytes here, and 4,000 in the original: its 512 MB are
 128 MB here. How fast the camera moves decides: 1,200 frames are 20 s at 60 frames a second.
 
-With `--source formula` the solid is computed brick by brick on the device that renders; on CUDA
-each frame is then one graph, production included (`Engine.capture`), and the host does not wait.
+With `--source formula` the solid is computed brick by brick on the device that renders. On CUDA each
+frame is one graph (`Engine.capture`), with `--no-graph` it is `Engine.frame`.
 """
 
 from __future__ import annotations
@@ -44,6 +44,8 @@ class Settings:
     source: Literal["store", "formula"] = "store"
     pools: tuple[str, ...] = ("512 MB", "128 MB", "32 MB", "8 MB")
     loading: str = "straight"
+    graph: bool = True
+    """on CUDA: each frame is one graph"""
     device: str = "cpu"
     folder: Path | None = None
     """where the store is kept; a temporary folder if left out"""
@@ -116,7 +118,7 @@ def fly(producer: gv.Producer, pool: str, settings: Settings, console: Console) 
     options = {"brick_pool": pool, "node_pool": "64 MB", "loading": settings.loading}
     with gv.Engine(producer, device=settings.device, **options) as engine:
         engine.render(cameras[0], shader)  # the flight begins with what its first view needs
-        if engine.device.type == "cuda" and producer.on_device:
+        if engine.device.type == "cuda" and settings.graph:
             draw = engine.capture(cameras[0], shader).replay
         else:
             draw = partial(engine.frame, shader=shader)

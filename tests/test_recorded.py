@@ -9,7 +9,8 @@ import torch
 from helpers import DEVICES
 
 import gvtorch as gv
-from gvtorch.engine.recorded import DeviceFrame, can_serve
+from gvtorch.engine.recorded import recorded_frame
+from gvtorch.io.conversion import convert
 
 COMPILED = [pytest.param(b, marks=pytest.mark.backend(b)) for b in ("cpp", "cuda")]
 LOOK = gv.TransferFunction.from_points(
@@ -58,13 +59,17 @@ class Frames:
         self.engine, self.batch = engine, batch
         self.view = engine.view("test", camera, LOOK, {})
         trees = [*engine.trees.values()]
-        assert can_serve(trees)
-        self.device_frame = DeviceFrame(engine.cache, trees, engine.scheduler, batch)
+        made = recorded_frame(engine.cache, trees, engine.scheduler, batch, engine.production)
+        assert made is not None
+        self.served, self.number = made, -1
 
     def frame(self) -> tuple[gv.Hits, gv.FrameStats]:
         with self.engine.new_frame(self.view.options) as stats:
+            self.engine.readbacks.take_arrived()
+            self.served.begin(self.engine.frames != self.number, stats)
             self.engine.number_picture(on_device=False)
-            hits, collected = self.device_frame.run(self.view.hits)
+            self.number = self.engine.frames
+            hits, collected = self.served.run(self.view.hits)
             self.engine.read_back(stats, hits, collected)
         self.engine.readbacks.hold_back()
         return hits, stats.settle()
@@ -98,6 +103,64 @@ def test_they_come_to_the_picture_that_the_host_comes_to(backend, branching, kin
         assert made["tiles"] > 20 and (made["constant"] > 0) == kinds
     assert torch.equal(hits.color, expected.color.reshape(-1, 3))
     assert torch.equal(hits.depth, expected.depth.reshape(-1, 1))
+
+
+def on_the_host(blobs, tmp_path, which: str) -> gv.Producer:
+    """A producer that answers from the host: at once, by rows of a table, or later."""
+    if which == "store":
+        return gv.StoredProducer(convert(blobs, tmp_path))
+    return gv.VolumeProducer(blobs, hold=which)
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+@pytest.mark.parametrize("which", ["voxels", "bricks", "store"])
+@pytest.mark.parametrize("batch, pool", [(5, "4 MB"), (200, "4 MB"), (64, "150 kB")])
+def test_producers_on_the_host_answer_while_frames_go_on(
+    blobs, tmp_path, which, batch, pool, backend
+):
+    device = DEVICES[backend]
+    camera = view(24 if pool == "4 MB" else 6)
+    options = {"brick_size": 4, "brick_pool": pool, "device": device}
+    with gv.Engine(on_the_host(blobs, tmp_path / "one", which), **options) as engine:
+        expected = engine.render(camera, LOOK)
+        assert (expected.alpha > 0.5).any()
+    with gv.Engine(on_the_host(blobs, tmp_path / "two", which), **options) as engine:
+        frames, made = Frames(engine, camera, batch), 0
+        for _ in range(600):
+            hits, stats = frames.frame()
+            made += stats.produced["bricks"]
+            engine.production.wait(limit=0.05)
+            if stats.converged:
+                break
+        assert stats.converged and made > 8
+        engine.validate()
+        assert not sum(engine.production.pending.values())
+        picture, _ = engine.frame(camera, LOOK)  # the host goes on from there
+        assert torch.equal(picture.color, expected.color)
+        frames.frame()  # what it knew of slots is out of date
+        engine.validate()
+    assert torch.equal(hits.color, expected.color.reshape(-1, 3))
+    assert torch.equal(hits.depth, expected.depth.reshape(-1, 1))
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_what_fails_on_the_host_is_named_and_not_asked_for_again(blobs, backend):
+    class Spoiled(gv.VolumeProducer):
+        def fill(self, nodes):
+            bricks = super().fill(nodes)
+            errors = {n: "spoiled" for n, d in enumerate(nodes.depth.tolist()) if d == 3}
+            return gv.Bricks(data=bricks.data, errors=errors)
+
+    with gv.Engine(Spoiled(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        frames = Frames(engine, view(24), 64)
+        for _ in range(200):
+            hits, stats = frames.frame()
+            if stats.converged:
+                break
+        assert stats.converged and stats.failed == len(engine.failures) > 4
+        assert all(one.message == "spoiled" and one.loc[3] == 3 for one in engine.failures)
+        engine.validate()
+    assert bool(torch.isfinite(hits.color).all())
 
 
 @pytest.mark.parametrize("backend", COMPILED)
@@ -147,10 +210,33 @@ def test_what_the_host_would_have_to_see_to_is_refused():
             frames.frame()
 
 
-class Fog(Ball):
+class Unsaid(Ball):
     """The same, but not said to answer on the device."""
 
     on_device = False
+
+
+@pytest.mark.backend("cuda")
+def test_a_flight_through_a_store_does_not_wait(blobs, tmp_path):
+    path = [view(96, angle) for angle in torch.linspace(0, 90, 60).tolist()]
+    options = {"brick_size": 4, "brick_pool": "4 MB", "device": "cuda"}
+    with gv.Engine(on_the_host(blobs, tmp_path / "one", "store"), **options) as engine:
+        graph = engine.capture(path[0], LOOK, batch=64)
+        torch.cuda.synchronize()
+        torch.cuda.set_sync_debug_mode("error")
+        try:
+            for camera in path:
+                picture, stats = graph.replay(camera)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+        for _ in range(300):
+            picture, stats = graph.replay(path[-1])
+            engine.production.wait(limit=0.01)
+            if stats.settle().converged:
+                break
+        assert stats.converged
+        engine.validate()
+        assert torch.equal(engine.render(path[-1], LOOK).color, picture.color)
 
 
 @pytest.mark.backend("cuda")
@@ -178,7 +264,7 @@ def test_a_flight_is_replayed_without_the_host():
         engine.frame(view(96, 200), LOOK)  # another frame between two replays
         picture, stats = graph.replay(path[-1])
         assert stats.settle().converged and torch.equal(picture.color, shown)
-    with gv.Engine(Fog(1024), brick_pool="64 MB", device="cuda") as engine:
+    with gv.Engine(Unsaid(1024), brick_pool="64 MB", device="cuda") as engine:
         expected = engine.render(path[-1], LOOK)
         graph = engine.capture(path[-1], LOOK)
         picture, stats = graph.replay(view(96, 200))

@@ -132,7 +132,7 @@ def put_tiles(cache: Cache, targets: Targets, children: Children, free: Tensor) 
     unlink(cache.bricks.owner_b, tile_k, pool.capacity, per_tile)
     for held, values in ((pool.constants, children.constants), (pool.ranges, children.ranges)):
         for name, rows in values.items():
-            _put(held[name], slot, rows)
+            put_rows_of(held[name], slot, rows)
     words = (pool.child_tn, pool.brick_tn, pool.request_tn)
     places = (pool.loc_t4, pool.parent_t, pool.tree_t, pool.stamp_t, pool.shared_t)
     made = (children.child.contiguous(), children.brick.contiguous(), node, targets.loc)
@@ -141,7 +141,7 @@ def put_tiles(cache: Cache, targets: Targets, children: Children, free: Tensor) 
     return put
 
 
-def _put(held: Tensor, slot: Tensor, rows: Tensor) -> None:
+def put_rows_of(held: Tensor, slot: Tensor, rows: Tensor) -> None:
     """Writes rows (k, ...) into slots (k,) of a pool (s, ...), those of slot -1 left out; a row may
     be shorter than a slot.
     """
@@ -229,9 +229,9 @@ def _fill_slots(cache: Cache, slot: Tensor, data: Mapping[str, Tensor]) -> None:
     """Writes voxels that are on the device."""
     for name, held in cache.bricks.bricks.items():
         if name in data:
-            _put(held, slot, data[name])
+            put_rows_of(held, slot, data[name])
         elif not cache.bricks.channels[name].coarse:  # a tree without this channel
-            _put(held, slot, held.new_zeros(1).expand(len(slot), *held.shape[1:]))
+            put_rows_of(held, slot, held.new_zeros(1).expand(len(slot), *held.shape[1:]))
 
 
 def _brick_bytes(data: Voxels | Sequence[Chunk]) -> int:
@@ -264,11 +264,11 @@ def put_uniform(
     for name, words in pool.constants.items():
         flat = words.flatten(0, 1)
         nothing = flat.new_zeros(1).expand(len(node), flat.shape[1])
-        _put(flat, node, constants.get(name, nothing))
+        put_rows_of(flat, node, constants.get(name, nothing))
     link(pool.brick_tn, pool.request_tn, node.to(torch.int32), word, REQUEST_LOAD)
     child = pool.child_tn.view(-1, 1)
     below = child[node.clamp(min=0)]
-    _put(child, node, torch.where(below == ABSENT, TERMINAL, below))
+    put_rows_of(child, node, torch.where(below == ABSENT, TERMINAL, below))
     return wanted.sum()
 
 

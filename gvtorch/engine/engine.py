@@ -42,7 +42,7 @@ from ..tracing.trees import (
 )
 from .production import Failure, Production
 from .ray_subsets import RaySubsets, scouts
-from .recorded import DeviceFrame, can_serve
+from .recorded import DeviceFrame, HostFrame, recorded_frame
 from .request_batch import ProducedTree
 from .setup import EngineOptions, EngineSettings, brick_bytes, make_pools, make_tree
 from .stats import Collected, Counts, FrameStats, Readback, Readbacks, Report
@@ -405,7 +405,8 @@ class Engine:
         """Records a frame as a CUDA graph, for cameras of this number and size.
 
         Renders a frame first, as `frame` does with the same arguments. A replay reads the layer's
-        tensors where they lie. Where all producers are `on_device`, production is recorded, too.
+        tensors where they lie. Where all producers are `on_device`, or all `on_host`, a replay also
+        serves what the ones before missed.
 
         Args:
             camera: Cameras as those of the replays.
@@ -435,11 +436,9 @@ class Engine:
         check.whole("capture", "batch", batch, low=1, high=1 << 16)
         again = partial(self.frame, shader=shader, **options)
         again(camera)  # loads what is loaded at first use
-        device_frame = None
-        if can_serve([*self.trees.values()]):
-            trees = [*self.trees.values()]
-            device_frame = DeviceFrame(self.cache, trees, self.scheduler, batch)
-        return FrameGraph(self, view, device_frame, again)
+        trees = [*self.trees.values()]
+        served = recorded_frame(self.cache, trees, self.scheduler, batch, self.production)
+        return FrameGraph(self, view, served, again)
 
     @property
     def steady(self) -> bool:
@@ -500,9 +499,10 @@ class FrameGraph:
     """A frame as one CUDA graph, which costs the host a single call. `Engine.capture` makes it.
 
     A replay is the frame that `Engine.frame` would render. Where all producers are `on_device`, it
-    also makes what the replay before it missed. Else it produces nothing; where `Engine.steady` is
-    false, something was missed or an answer is on its way: then call `Engine.frame` until it is
-    true::
+    also makes what the replay before it missed; where all are `on_host`, these get the list of what
+    a replay missed once it has arrived, and a later one writes what they answered. Else it produces
+    nothing; where `Engine.steady` is false, something was missed or an answer is on its way: then
+    call `Engine.frame` until it is true::
 
         render = graph.replay if engine.steady else partial(engine.frame, shader=shader)
         picture, stats = render(camera)
@@ -512,22 +512,20 @@ class FrameGraph:
         self,
         engine: Engine,
         view: View,
-        device_frame: DeviceFrame | None,
+        served: DeviceFrame | HostFrame | None,
         again: Callable[[Camera | Rays], tuple[Picture, FrameStats]],
     ) -> None:
         """Records the frame; see `Engine.capture`. `again` renders one that the host serves."""
-        self._engine, self._device_frame, self._again = engine, device_frame, again
+        self._engine, self._served, self._again = engine, served, again
         self._view = view = replace(view, numbers=view.numbers.clone())  # of a replay's camera
         self._number = -1  # of its last picture
-        if device_frame is not None:
-            device_frame.serve()  # loads what is loaded at first use; nothing is asked for
         self._graph = torch.cuda.CUDAGraph()
         with (
             torch.cuda.device(engine.device),
             torch.cuda.graph(self._graph, capture_error_mode="thread_local"),
         ):
-            if device_frame is not None:
-                self._hits, self._collected = device_frame.run(view.hits)
+            if served is not None:
+                self._hits, self._collected = served.run(view.hits)
             else:
                 self._hits = view.hits()
                 self._collected = engine.collect_requests_and_use(self._hits.samples)
@@ -552,13 +550,15 @@ class FrameGraph:
                 f"replay: camera must be {own[0]} of {own[2]}x{own[1]} pixels as captured "
                 f"({own[4]}), got {form[0]} of {form[2]}x{form[1]} ({form[4]})"
             )
-        engine, device_frame = self._engine, self._device_frame
-        if device_frame is not None and engine.readbacks.failed:
-            return self._again(camera)  # the host finds out which, and names them
+        engine, served = self._engine, self._served
+        if served is not None and (engine.readbacks.failed or served.host_needed):
+            served.host_needed = False
+            return self._again(camera)  # the host finds out which nodes fail, and names them
         with torch.cuda.device(engine.device), engine.new_frame(self._view.options) as stats:
-            if device_frame is not None and engine.frames != self._number:
-                device_frame.forget()  # another frame has been rendered since
-            engine.number_picture(on_device=device_frame is None)
+            if served is not None:
+                engine.readbacks.take_arrived()
+                served.begin(engine.frames != self._number, stats)
+            engine.number_picture(on_device=served is None)
             self._number = engine.frames
             self._view.numbers.copy_(camera.placed(self._view.box).numbers(engine.device))
             with stage("replay"):

@@ -187,6 +187,10 @@ class Production:
                     answered += self._submit(part)
         return answered
 
+    def ask_ahead(self, batch: RequestBatch) -> None:
+        """Asks for a batch; its answer is among the late ones, also if it comes at once."""
+        self._held += self._submit(batch)
+
     def late(self) -> list[Answered]:
         """Returns the answers that came since the last call; gives up those that do not come."""
         answered = [*self._held]
@@ -355,12 +359,17 @@ class Production:
             self._add_up(batch, write.bricks(self.cache, batch.targets, answer.data), stats)
         return []
 
-    def _write_shipment(self, batch: RequestBatch, shipment: Shipment, stats: FrameStats) -> None:
-        """Writes voxels that are on their way; holds back those that found no room there."""
+    def hold_rest(self, batch: RequestBatch, shipment: Shipment) -> RequestBatch:
+        """Holds back the bricks that found no room on the way; returns the others' batch."""
         sent, rest = batch[: shipment.sent], batch[shipment.sent :]
         if len(rest):
             self._mark(rest)
             self._held.append(Answered(rest, Bricks(data=shipment.rest)))
+        return sent
+
+    def _write_shipment(self, batch: RequestBatch, shipment: Shipment, stats: FrameStats) -> None:
+        """Writes voxels that are on their way; holds back those that found no room there."""
+        sent = self.hold_rest(batch, shipment)
         if len(sent):
             self._add_up(sent, write.bricks(self.cache, sent.targets, shipment.chunks), stats)
 

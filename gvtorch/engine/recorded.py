@@ -1,12 +1,14 @@
-"""`DeviceFrame`: a frame of which the host knows nothing: requests chosen, answered and written in
-batches of fixed size, rays traced, requests and use collected, all on the device. Every shape is
-known beforehand, so that one CUDA graph holds it.
+"""`DeviceFrame` and `HostFrame`: frames that are recorded as one CUDA graph. Requests are chosen
+and answers written in batches of fixed size, so that every shape is known beforehand.
 
-A batch that is not full is padded with the root, whose answers are left out (node index -1).
+Producers on the device are recorded as well, and the host has no part in a frame. Those on the host
+get a frame's list with its counts, answer while the device goes on, and the frame after writes what
+has come; the host waits for nothing. Rows that are not taken hold node -1.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,53 +16,102 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..base.constants import CONSTANT, EMPTY, REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
+from ..base.constants import (
+    CONSTANT,
+    EMPTY,
+    REQUEST_LOAD,
+    REQUEST_PENDING_SHIFT,
+    REQUEST_PRIORITY,
+    REQUEST_SUBDIVIDE,
+)
 from ..base.records import Hits
-from ..cache import Cache, RequestList, Scheduler
-from ..cache.write import Targets, put_bricks, put_tiles, put_uniform
-from ..producers import Region
+from ..cache import KINDS, Cache, RequestList, Scheduler
+from ..cache.write import Put, Targets, put_bricks, put_rows_of, put_tiles, put_uniform
+from ..pool.staging import Shipment, upload
+from ..producers import Bricks, Region, Regions
 from ..producers.answer import checked_bricks, checked_regions
-from .request_batch import ProducedTree, RequestBatch, children_of
-from .stats import Collected
+from .production import Production
+from .request_batch import ProducedTree, RequestBatch, by_kind, children_of, shipped
+from .stats import Collected, FrameStats
 
 _MOST_LISTED = 1 << 15  # nodes whose requests are sorted
 _LAST = 1 << 40  # the rank of what is not asked for
 
 
-class DeviceFrame:
-    """Frames of an engine whose producers all answer on the device (`Producer.on_device`).
+class RecordedFrame:
+    """What both kinds share.
 
     Attributes:
-        batch: Most bricks, and most node tiles, that a frame makes for each tree.
+        batch: Most bricks, and most node tiles, that are chosen in a frame.
+        host_needed: Whether something came that only `Engine.frame` can deal with.
     """
+
+    host_needed = False
 
     def __init__(
         self, cache: Cache, trees: Sequence[ProducedTree], scheduler: Scheduler, batch: int
     ) -> None:
-        """Takes the memory of the requests that a frame leaves to the next one."""
+        """Takes the memory of what a frame leaves to the next one."""
         self.cache, self.trees, self.batch = cache, trees, batch
         self._coarse_first = scheduler.order == "coarse"
-        words, device = cache.nodes.request_tn, cache.frame_1.device
-        self._most = min(_MOST_LISTED, words.numel())
-        self._node, self._word = torch.zeros((2, self._most), dtype=torch.int32, device=device)
+        self._most = min(_MOST_LISTED, cache.nodes.request_tn.numel())
+        device = cache.frame_1.device
         self._unused = torch.zeros(2, dtype=torch.int64, device=device)  # tiles, bricks
 
-    def forget(self) -> None:
-        """Leaves no request to the next frame: what it would serve is out of date."""
-        self._word.zero_()
+    def collect(self, hits: Hits) -> tuple[RequestList, Tensor]:
+        """Lists requests, brings slots into the order of use, and counts both and the samples."""
+        requests = RequestList.collect(self.cache.nodes, self._most)
+        use = self.cache.sort_by_use()
+        self._unused.copy_(use[0:4:2])
+        samples = hits.samples.sum(dtype=torch.int64).view(1)
+        return requests, torch.cat((requests.count, use, samples))
+
+    def choose(self, kind: int, node_k: Tensor, word_k: Tensor) -> Tensor:
+        """(batch,) int64 nodes of a list that are served first, as `Scheduler.choose` takes them,
+        at most as many as there are slots; -1 behind the last.
+        """
+        nodes = self.cache.nodes
+        asked = (word_k & kind) != 0
+        node = node_k.clamp(min=0).to(torch.int64)
+        depth = nodes.loc_t4[node // nodes.nodes_per_tile, 3].to(torch.int64)
+        level = depth if self._coarse_first else -depth
+        small = REQUEST_PRIORITY - (word_k & REQUEST_PRIORITY).to(torch.int64)
+        rank = torch.where(asked, level * (REQUEST_PRIORITY + 1) + small, _LAST)
+        row = rank.argsort(stable=True)[: self.batch]
+        room = self._unused[int(kind == REQUEST_LOAD)]
+        served = asked[row] & (torch.arange(len(row), device=row.device) < room)
+        return torch.where(served, node[row], -1)
+
+    def tree_of(self, node: Tensor) -> Tensor:
+        """(k,) int32 numbers of the trees of nodes (k,); of any where the index is -1."""
+        nodes = self.cache.nodes
+        return nodes.tree_t[node.clamp(min=0) // nodes.nodes_per_tile]
+
+
+class DeviceFrame(RecordedFrame):
+    """Frames of an engine whose producers all answer on the device (`Producer.on_device`)."""
+
+    def __init__(
+        self, cache: Cache, trees: Sequence[ProducedTree], scheduler: Scheduler, batch: int
+    ) -> None:
+        """See `RecordedFrame`."""
+        super().__init__(cache, trees, scheduler, batch)
+        self._requests = torch.zeros((2, self._most), dtype=torch.int32, device=self._unused.device)
+        self.serve()  # loads what is loaded at first use; nothing is asked for
+
+    def begin(self, stale: bool, stats: FrameStats) -> None:
+        """Is called before a frame; `stale`: another one was rendered since the last of these."""
+        if stale:
+            self._requests.zero_()  # what would be served is out of date: the rays ask again
 
     def run(self, trace: Callable[[], Hits]) -> tuple[Hits, Collected]:
         """Serves what the last frame asked for, traces, and collects what is asked for now."""
         served = self.serve()
         self.cache.frame_1.add_(1)
         hits = trace()
-        requests = RequestList.collect(self.cache.nodes, self._most)
-        use = self.cache.sort_by_use()
-        self._node.copy_(requests.node)
-        self._word.copy_(requests.word)
-        self._unused.copy_(use[0:4:2])
-        samples = hits.samples.sum(dtype=torch.int64).view(1)
-        return hits, Collected(requests, torch.cat((requests.count, use, samples, served)))
+        requests, numbers = self.collect(hits)
+        self._requests.copy_(torch.stack((requests.node, requests.word)))
+        return hits, Collected(requests, torch.cat((numbers, served)))
 
     def serve(self) -> Tensor:
         """Answers the most wanted requests of the last frame.
@@ -72,8 +123,8 @@ class DeviceFrame:
         made = {kind: self._unused.new_zeros(2) for kind in (REQUEST_SUBDIVIDE, REQUEST_LOAD)}
         constant, failed = self._unused.new_zeros(2).split(1)
         for kind, ask in ((REQUEST_LOAD, self._fill), (REQUEST_SUBDIVIDE, self._subdivide)):
-            chosen, free = self._choose(kind), self._unused[int(kind == REQUEST_LOAD)].view(1)
-            number = self.cache.nodes.tree_t[chosen.clamp(min=0) // self.cache.nodes.nodes_per_tile]
+            chosen = self.choose(kind, *self._requests)
+            number, free = self.tree_of(chosen), self._unused[int(kind == REQUEST_LOAD)].view(1)
             for source in self.trees:
                 node = torch.where(number == source.tree.number, chosen, -1)
                 counts, bare, bad = ask(source, node, free)
@@ -81,20 +132,6 @@ class DeviceFrame:
                 constant, failed = constant + bare, failed + bad
         tiles, bricks = made.values()
         return torch.cat((tiles[:1], bricks[:1], constant, tiles[1:], bricks[1:], failed))
-
-    def _choose(self, kind: int) -> Tensor:
-        """(batch,) int64 nodes that are served first, as `Scheduler.choose` takes them; -1 behind
-        the last.
-        """
-        nodes = self.cache.nodes
-        asked = (self._word & kind) != 0
-        node = self._node.clamp(min=0).to(torch.int64)
-        depth = nodes.loc_t4[node // nodes.nodes_per_tile, 3].to(torch.int64)
-        level = depth if self._coarse_first else -depth
-        small = REQUEST_PRIORITY - (self._word & REQUEST_PRIORITY).to(torch.int64)
-        rank = torch.where(asked, level * (REQUEST_PRIORITY + 1) + small, _LAST)
-        row = rank.argsort(stable=True)[: self.batch]
-        return torch.where(asked[row], node[row], -1)
 
     def _fill(
         self, source: ProducedTree, node: Tensor, free: Tensor
@@ -136,6 +173,153 @@ class DeviceFrame:
         return RequestBatch(source, kind, Targets(source.tree, there, source.tree.loc(there)))
 
 
+class HostFrame(RecordedFrame):
+    """Frames of an engine whose producers all answer from the host (`Producer.on_host`)."""
+
+    def __init__(
+        self,
+        cache: Cache,
+        trees: Sequence[ProducedTree],
+        scheduler: Scheduler,
+        batch: int,
+        production: Production,
+    ) -> None:
+        """See `RecordedFrame`; `production` asks, and knows what is on its way."""
+        super().__init__(cache, trees, scheduler, batch)
+        self._production = production
+        self._made = self._unused.new_zeros(6)  # since the last frame: see `DeviceFrame.serve`
+
+    def begin(self, stale: bool, stats: FrameStats) -> None:
+        """Writes what has come, before a frame; `stale`: another one was rendered since the last
+        of these, which tells no more which slots are unused.
+        """
+        if stale:
+            self._unused.zero_()
+        queue = deque(self._production.late())
+        while queue:
+            batch, answer = queue.popleft()
+            if isinstance(answer, Regions):
+                self._write_tiles(batch, answer)
+            elif isinstance(answer, Shipment):
+                sent = self._production.hold_rest(batch, answer)
+                self._write_bricks(sent, answer.chunks)
+            else:
+                for kind, part in by_kind(batch, answer).items():
+                    self._write(kind, *part)
+        stats.pending = sum(self._production.pending.values())
+        stats.failed = len(self._production.failures)
+
+    def run(self, trace: Callable[[], Hits]) -> tuple[Hits, Collected]:
+        """Traces, collects, and chooses what the host is asked for; marks it as pending."""
+        self.cache.frame_1.add_(1)
+        hits = trace()
+        requests, numbers = self.collect(hits)
+        chosen, words = [], self.cache.nodes.request_tn.view(-1)
+        for kind in KINDS.values():
+            node = self.choose(kind, requests.node, requests.word)
+            marked = words[node.clamp(min=0)] | kind << REQUEST_PENDING_SHIFT
+            put_rows_of(words[:, None], node, marked[:, None])
+            number = self.tree_of(node)
+            loc = self.trees[0].tree.loc(node)
+            for source in self.trees[1:]:  # N may differ
+                mine = (number == source.tree.number)[:, None]
+                loc = torch.where(mine, source.tree.loc(node), loc)
+            chosen.append(torch.cat((node[:, None], number[:, None].to(torch.int64), loc), 1))
+        asked = torch.stack(chosen).flatten()
+        numbers = torch.cat((numbers, self._made, asked))
+        self._made.zero_()
+        return hits, Collected(requests, numbers, self._ask)
+
+    def _ask(self, asked: Tensor) -> int:
+        """Asks producers for the nodes that a frame chose: (2 * batch * 6,) int64 on the host, of
+        each kind rows of node, tree and place.
+        """
+        total = 0
+        for kind, listed in zip(KINDS.values(), asked.view(2, -1, 6), strict=True):
+            rows = listed[listed[:, 0] >= 0]
+            total += len(rows)
+            for source in self.trees:
+                mine = rows[rows[:, 1] == source.tree.number]
+                if len(mine):
+                    there = upload(mine, self._unused.device)
+                    targets = Targets(
+                        source.tree, there[:, 0].contiguous(), there[:, 2:].contiguous()
+                    )
+                    self._production.ask_ahead(
+                        RequestBatch(source, kind, targets, on_host=mine[:, 2:].contiguous())
+                    )
+        return total
+
+    def _write(self, kind: Region, batch: RequestBatch, answer: Bricks) -> None:
+        """Writes bricks of one kind."""
+        if kind is Region.ALIAS:
+            self._leave_to_host(batch)
+        elif kind is Region.EMPTY:
+            device = self._unused.device
+            assert answer.kind is not None
+            word = torch.where(answer.kind == Region.CONSTANT, CONSTANT, EMPTY).to(torch.int32)
+            constants = {name: upload(rows, device) for name, rows in answer.constants.items()}
+            bare = put_uniform(self.cache, batch.targets, upload(word, device), constants)
+            self._made[2] += bare
+        else:
+            sent = shipped(batch, answer, self._production.staging)
+            if isinstance(sent, Shipment):
+                self._write_bricks(self._production.hold_rest(batch, sent), sent.chunks)
+            else:
+                self._write_bricks(batch, answer.data)
+
+    def _write_bricks(self, batch: RequestBatch, data: Any) -> None:
+        if len(batch):
+            put = put_bricks(self.cache, batch.targets, data, self._unused[1:])
+            self._count(batch, put, 1)
+
+    def _write_tiles(self, batch: RequestBatch, answer: Regions) -> None:
+        if answer.alias is not None:
+            self._leave_to_host(batch)
+            return
+        children = children_of(batch, answer, self.cache)
+        put = put_tiles(self.cache, batch.targets, children, self._unused[:1])
+        self._count(batch, put, 0)
+
+    def _count(self, batch: RequestBatch, put: Put, which: int) -> None:
+        """Counts what was made; what found no slot may be asked for again."""
+        _, given, held = put.counts
+        self._unused[which] -= given
+        self._made[which] += given
+        self._made[3 + which] += held
+        self._ask_again(batch, put.wanted & (put.slot < 0))
+
+    def _leave_to_host(self, batch: RequestBatch) -> None:
+        """Lets `Engine.frame` ask again, which can look up what an alias stands for."""
+        self.host_needed = True
+        self._ask_again(batch, torch.ones_like(batch.targets.node, dtype=torch.bool))
+
+    def _ask_again(self, batch: RequestBatch, which: Tensor) -> None:
+        words, node = self.cache.nodes.request_tn.view(-1), batch.targets.node
+        bit = batch.kind << REQUEST_PENDING_SHIFT
+        words[node] &= ~torch.where(which, bit, 0).to(torch.int32)
+
+
+def recorded_frame(
+    cache: Cache,
+    trees: Sequence[ProducedTree],
+    scheduler: Scheduler,
+    batch: int,
+    production: Production,
+) -> DeviceFrame | HostFrame | None:
+    """Returns what serves a captured frame; None where producers answer neither all on the device
+    nor all from the host, or have coarse channels.
+    """
+    producers = [one.producer for one in trees]
+    if any(channel.coarse for one in producers for channel in one.channels.values()):
+        return None
+    if all(one.on_device for one in producers):
+        return DeviceFrame(cache, trees, scheduler, batch)
+    if all(one.on_host for one in producers):
+        return HostFrame(cache, trees, scheduler, batch, production)
+    return None
+
+
 def _only(targets: Targets, node: Tensor, which: Tensor) -> Targets:
     """The targets, without the padding and without those that are not among `which` (k,)."""
     return replace(targets, node=torch.where(which, node, -1))
@@ -149,11 +333,3 @@ def _finite(answers: Sequence[Mapping[str, Any]], count: int, device: torch.devi
             if values.is_floating_point():
                 good = good & torch.isfinite(values).flatten(1).all(1)
     return good
-
-
-def can_serve(trees: Sequence[ProducedTree]) -> bool:
-    """Whether all producers answer on the device, and none has coarse channels."""
-    return all(
-        one.producer.on_device and not any(c.coarse for c in one.producer.channels.values())
-        for one in trees
-    )

@@ -49,6 +49,7 @@ class RequestBatch:
     targets: Targets  # nodes to fill, or to subdivide
     fill_loc: Tensor | None = None  # (k, 4) filled in their stead: alias targets
     coarse: bool = False  # their bricks take coarse slots
+    on_host: Tensor | None = None  # (k, 4) the targets' places in host memory: for the producer
 
     def __len__(self) -> int:
         return len(self.targets)
@@ -71,7 +72,10 @@ class RequestBatch:
         if isinstance(index, Tensor):
             index = upload(index, self.targets.node.device)
         fill_loc = None if self.fill_loc is None else self.fill_loc[index]
-        return replace(self, targets=self.targets[index], fill_loc=fill_loc)
+        on_host = self.on_host
+        if on_host is not None:
+            on_host = on_host[index.cpu() if isinstance(index, Tensor) else index]
+        return replace(self, targets=self.targets[index], fill_loc=fill_loc, on_host=on_host)
 
     @property
     def nodes(self) -> Nodes:
@@ -81,7 +85,8 @@ class RequestBatch:
     @cached_property
     def loc(self) -> Tensor:
         """(m, 4) nodes to fill, or all children of the nodes to subdivide, node after node."""
-        loc, n = self.targets.loc, self.source.layout.branching
+        loc = self.targets.loc if self.on_host is None else self.on_host
+        n = self.source.layout.branching
         if self.kind == REQUEST_LOAD:
             return loc if self.fill_loc is None else self.fill_loc
         child = torch.arange(n**3, device=loc.device)
@@ -110,7 +115,7 @@ class Answered(NamedTuple):
 
 def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
     """Turns a producer's regions into the words of tiles."""
-    layout, nodes = batch.source.layout, batch.nodes
+    layout, nodes = batch.source.layout, replace(batch, on_host=None).nodes
     low = nodes.loc[:, :3] * (nodes.scale * layout.brick_size)[:, None]
     kind = torch.where((low >= layout.extent_3).any(1), Region.EMPTY, answer.kind)
     leaf = (kind == Region.EMPTY) | (kind == Region.CONSTANT) | (kind == Region.DATA_MAX_DEPTH)

@@ -146,7 +146,8 @@ class Collected(NamedTuple):
     """What a traced frame leaves on the device."""
 
     requests: RequestList
-    numbers: Tensor  # (11,) or (17,) int64 `Counts`
+    numbers: Tensor  # (11,) or (17,) int64 `Counts`, and behind these what `ask` takes
+    ask: Callable[[Tensor], int] | None = None  # told on the host; how many nodes were asked for
 
 
 class Readback:
@@ -154,8 +155,8 @@ class Readback:
 
     def __init__(self, stats: FrameStats, collected: Collected) -> None:
         """Starts the copy."""
-        self.stats, (self.requests, numbers) = stats, collected
-        self._pending = stats.pending > 0  # answers were on their way while it was traced
+        self.stats, (self.requests, numbers, self._ask) = stats, collected
+        self.pending = stats.pending > 0  # answers were on their way while it was traced
         self._numbers, self._event = numbers, None
         self._counts: Counts | None = None
         if numbers.is_cuda:
@@ -178,12 +179,18 @@ class Readback:
         if self._counts is None:
             if self._event is not None:
                 self._event.synchronize()
-            self._counts = Counts(*self._numbers.tolist())
+            self._counts = Counts(*self._numbers[: len(Counts._fields)].tolist())
         return self._counts
+
+    def ask(self) -> int:
+        """Asks for what the device chose, once; returns for how many nodes."""
+        ask, self._ask = self._ask, None
+        self.wait()
+        return 0 if ask is None else ask(self._numbers[len(Counts._fields) :])
 
     def converged(self) -> bool:
         """Whether nothing that could be served was missing; waits until the counts are here."""
-        return not (self.wait().found or self._pending)
+        return not (self.wait().found or self.pending)
 
     def _complete(self) -> None:
         stats, counts = self.stats, self.wait()
@@ -216,6 +223,11 @@ class Readbacks(deque[Readback]):
             newest = self._take()
         return newest
 
+    def take_arrived(self) -> None:
+        """Takes the frames whose counts are here; does not block."""
+        while self and self[0].arrived:
+            self._take()
+
     def hold_back(self) -> None:
         """Waits for the oldest frames while the host is too far ahead of the device."""
         while len(self) > _AHEAD:
@@ -231,6 +243,9 @@ class Readbacks(deque[Readback]):
 
     def _take(self) -> Readback:
         readback = self.popleft()
+        if readback.ask():
+            for later in self:
+                later.pending = True
         self._steady = readback.converged()
         self.failed = readback.wait().failed > 0
         readback.stats.settle()
