@@ -7,8 +7,8 @@ The rate is bricks asked for over bricks asked for and bricks used, summed over 
 frame. Bricks of 8^3 and a border hold 1,000 bytes here, and 4,000 in the original: its 512 MB are
 128 MB here. How fast the camera moves decides: 1,200 frames are 20 s at 60 frames a second.
 
-With `--source formula` the solid is computed brick by brick on the device that renders. On CUDA each
-frame is one graph (`Engine.capture`), with `--no-graph` it is `Engine.frame`.
+With `--source formula` the solid is computed brick by brick on the device that renders. On CUDA
+each frame is one graph (`Engine.capture`), with `--no-graph` it is `Engine.frame`.
 """
 
 from __future__ import annotations
