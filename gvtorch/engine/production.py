@@ -212,9 +212,10 @@ class Production:
         stats.stale, self._skipped = stats.stale + self._skipped, 0
         queue = deque(answers)
         while queue:
-            batch, answer = queue.popleft()
+            asked, answer = queue.popleft()
+            batch = asked.on_device()
             if isinstance(answer, Regions):
-                children = children_of(batch, answer, self.cache)
+                children = children_of(asked, answer, self.cache)
                 self._add_up(batch, write.tiles(self.cache, batch.targets, children), stats)
             elif isinstance(answer, Shipment):
                 self._write_shipment(batch, answer, stats)
@@ -406,6 +407,8 @@ class Production:
 
     def _mark(self, batch: RequestBatch) -> None:
         """Marks a batch as pending, where its nodes still lack what was asked for."""
+        if batch.on_host:
+            return  # it was marked when it was chosen
         lacking = batch.targets.lacking(self.cache, batch.kind)
         self.cache.mark_pending(batch.targets.node, batch.kind, lacking)
 

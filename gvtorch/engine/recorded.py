@@ -241,13 +241,9 @@ class HostFrame(RecordedFrame):
             for source in self.trees:
                 mine = rows[rows[:, 1] == source.tree.number]
                 if len(mine):
-                    there = upload(mine, self._unused.device)
-                    targets = Targets(
-                        source.tree, there[:, 0].contiguous(), there[:, 2:].contiguous()
-                    )
-                    self._production.ask_ahead(
-                        RequestBatch(source, kind, targets, on_host=mine[:, 2:].contiguous())
-                    )
+                    targets = Targets(source.tree, mine[:, 0].clone(), mine[:, 2:].clone())
+                    batch = RequestBatch(source, kind, targets, on_host=True)
+                    self._production.ask_ahead(batch)
         return total
 
     def _write(self, kind: Region, batch: RequestBatch, answer: Bricks) -> None:
@@ -259,7 +255,8 @@ class HostFrame(RecordedFrame):
             assert answer.kind is not None
             word = torch.where(answer.kind == Region.CONSTANT, CONSTANT, EMPTY).to(torch.int32)
             constants = {name: upload(rows, device) for name, rows in answer.constants.items()}
-            bare = put_uniform(self.cache, batch.targets, upload(word, device), constants)
+            targets = batch.on_device().targets
+            bare = put_uniform(self.cache, targets, upload(word, device), constants)
             self._made[2] += bare
         else:
             sent = shipped(batch, answer, self._production.staging)
@@ -270,16 +267,17 @@ class HostFrame(RecordedFrame):
 
     def _write_bricks(self, batch: RequestBatch, data: Any) -> None:
         if len(batch):
-            put = put_bricks(self.cache, batch.targets, data, self._unused[1:])
-            self._count(batch, put, 1)
+            there = batch.on_device()
+            put = put_bricks(self.cache, there.targets, data, self._unused[1:])
+            self._count(there, put, 1)
 
     def _write_tiles(self, batch: RequestBatch, answer: Regions) -> None:
         if answer.alias is not None:
             self._leave_to_host(batch)
             return
-        children = children_of(batch, answer, self.cache)
-        put = put_tiles(self.cache, batch.targets, children, self._unused[:1])
-        self._count(batch, put, 0)
+        children, there = children_of(batch, answer, self.cache), batch.on_device()
+        put = put_tiles(self.cache, there.targets, children, self._unused[:1])
+        self._count(there, put, 0)
 
     def _count(self, batch: RequestBatch, put: Put, which: int) -> None:
         """Counts what was made; what found no slot may be asked for again."""
@@ -292,7 +290,8 @@ class HostFrame(RecordedFrame):
     def _leave_to_host(self, batch: RequestBatch) -> None:
         """Lets `Engine.frame` ask again, which can look up what an alias stands for."""
         self.host_needed = True
-        self._ask_again(batch, torch.ones_like(batch.targets.node, dtype=torch.bool))
+        there = batch.on_device()
+        self._ask_again(there, torch.ones_like(there.targets.node, dtype=torch.bool))
 
     def _ask_again(self, batch: RequestBatch, which: Tensor) -> None:
         words, node = self.cache.nodes.request_tn.view(-1), batch.targets.node

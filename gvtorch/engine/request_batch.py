@@ -36,6 +36,11 @@ class ProducedTree:
     producer: Producer
     layout: Layout
 
+    @cached_property
+    def host_layout(self) -> Layout:
+        """The layout, with its tensors in host memory."""
+        return replace(self.layout, device=torch.device("cpu"))
+
     def __repr__(self) -> str:
         return f"ProducedTree({self.name!r}, {type(self.producer).__name__})"
 
@@ -49,7 +54,7 @@ class RequestBatch:
     targets: Targets  # nodes to fill, or to subdivide
     fill_loc: Tensor | None = None  # (k, 4) filled in their stead: alias targets
     coarse: bool = False  # their bricks take coarse slots
-    on_host: Tensor | None = None  # (k, 4) the targets' places in host memory: for the producer
+    on_host: bool = False  # the targets lie in host memory, and are marked as pending already
 
     def __len__(self) -> int:
         return len(self.targets)
@@ -72,21 +77,27 @@ class RequestBatch:
         if isinstance(index, Tensor):
             index = upload(index, self.targets.node.device)
         fill_loc = None if self.fill_loc is None else self.fill_loc[index]
-        on_host = self.on_host
-        if on_host is not None:
-            on_host = on_host[index.cpu() if isinstance(index, Tensor) else index]
-        return replace(self, targets=self.targets[index], fill_loc=fill_loc, on_host=on_host)
+        return replace(self, targets=self.targets[index], fill_loc=fill_loc)
+
+    def on_device(self) -> RequestBatch:
+        """The batch with its targets where the pools are; the host does not wait."""
+        if not self.on_host:
+            return self
+        tree, node, loc = vars(self.targets).values()
+        rows = upload(torch.cat((node[:, None], loc), 1), tree.device)
+        there = Targets(tree, rows[:, 0].contiguous(), rows[:, 1:].contiguous())
+        return replace(self, targets=there, on_host=False)
 
     @property
     def nodes(self) -> Nodes:
         """What the producer is asked about; made anew, for `Nodes` keep positions once computed."""
-        return Nodes(self.loc, self.source.layout, coarse=self.coarse)
+        layout = self.source.host_layout if self.on_host else self.source.layout
+        return Nodes(self.loc, layout, coarse=self.coarse)
 
     @cached_property
     def loc(self) -> Tensor:
         """(m, 4) nodes to fill, or all children of the nodes to subdivide, node after node."""
-        loc = self.targets.loc if self.on_host is None else self.on_host
-        n = self.source.layout.branching
+        loc, n = self.targets.loc, self.source.layout.branching
         if self.kind == REQUEST_LOAD:
             return loc if self.fill_loc is None else self.fill_loc
         child = torch.arange(n**3, device=loc.device)
@@ -114,8 +125,11 @@ class Answered(NamedTuple):
 
 
 def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
-    """Turns a producer's regions into the words of tiles."""
-    layout, nodes = batch.source.layout, replace(batch, on_host=None).nodes
+    """Turns a producer's regions into the words of tiles, on the pools' device; the host does not
+    wait.
+    """
+    nodes = batch.nodes
+    layout, device = nodes.layout, cache.frame_1.device
     low = nodes.loc[:, :3] * (nodes.scale * layout.brick_size)[:, None]
     kind = torch.where((low >= layout.extent_3).any(1), Region.EMPTY, answer.kind)
     leaf = (kind == Region.EMPTY) | (kind == Region.CONSTANT) | (kind == Region.DATA_MAX_DEPTH)
@@ -126,12 +140,13 @@ def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
     constants, ranges = dict(answer.constants), dict(answer.ranges)
     for name, words in cache.nodes.constants.items():  # also what another tree left in these tiles
         if name not in constants:
-            constants[name] = words.new_zeros((len(kind), words.shape[-1]))
+            shape = (len(kind), words.shape[-1])
+            constants[name] = torch.zeros(shape, dtype=words.dtype, device=kind.device)
         if name not in ranges:
             ranges[name] = _untold_range(cache, name, kind, answer.constants.get(name))
 
     def by_tile(values: Tensor) -> Tensor:
-        return values.unflatten(0, (len(batch), -1))
+        return upload(values, device).unflatten(0, (len(batch), -1))
 
     return Children(
         child=by_tile(child),
