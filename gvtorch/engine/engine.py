@@ -101,6 +101,7 @@ class Engine:
         self._missed: Tensor | None = None  # (r,) bool, of the last picture's rays
         self._last: deque[FrameStats] = deque(maxlen=_KEPT)  # for the report
         self.trees: dict[str, ProducedTree] = {}
+        self.recorded: list[HostFrame] = []  # what producers on the host serve, without this frame
         try:
             for number, (name, producer) in enumerate(producers.items()):
                 self.trees[name] = make_tree(self.cache, self.options, number, name, producer)
@@ -205,6 +206,7 @@ class Engine:
         requests again. The host waits for them only if an earlier frame is known to have requests,
         if an answer is due, if the host is too far ahead, or if `wait` is true.
         """
+        self.release()
         last = self.readbacks.catch_up(wait or self.production.due)
         if self.readbacks:
             return
@@ -213,6 +215,12 @@ class Engine:
             self.serve(last.requests, last.wait(), stats)
         with stage("write"):
             self.production.write(self.production.late(), stats)
+
+    def release(self, but: HostFrame | None = None) -> None:
+        """Lets captured frames, `but` one, forget what is on its way to them."""
+        for one in self.recorded:
+            if one is not but:
+                one.release()
 
     def serve(self, listed: RequestList, counts: Counts, stats: FrameStats) -> None:
         """Lets slots be taken again, chooses requests, asks the producers, and writes the answers
@@ -438,6 +446,8 @@ class Engine:
         again(camera)  # loads what is loaded at first use
         trees = [*self.trees.values()]
         served = recorded_frame(self.cache, trees, self.scheduler, batch, self.production)
+        if isinstance(served, HostFrame):
+            self.recorded.append(served)
         return FrameGraph(self, view, served, again)
 
     @property
@@ -556,6 +566,7 @@ class FrameGraph:
             return self._again(camera)  # the host finds out which nodes fail, and names them
         with torch.cuda.device(engine.device), engine.new_frame(self._view.options) as stats:
             if served is not None:
+                engine.release(but=served if isinstance(served, HostFrame) else None)
                 engine.readbacks.take_arrived()
                 served.begin(engine.frames != self._number, stats)
             engine.number_picture(on_device=served is None)
@@ -563,7 +574,10 @@ class FrameGraph:
             self._view.numbers.copy_(camera.placed(self._view.box).numbers(engine.device))
             with stage("replay"):
                 self._graph.replay()
-            engine.read_back(stats, self._hits, self._collected)
+            collected = self._collected
+            if isinstance(served, HostFrame):
+                collected = collected._replace(ask=partial(served.ask, served.turn))
+            engine.read_back(stats, self._hits, collected)
         engine.readbacks.hold_back()
         return replace(self._picture, stats=stats), stats
 

@@ -187,10 +187,6 @@ class Production:
                     answered += self._submit(part)
         return answered
 
-    def ask_ahead(self, batch: RequestBatch) -> None:
-        """Asks for a batch; its answer is among the late ones, also if it comes at once."""
-        self._held += self._submit(batch)
-
     def late(self) -> list[Answered]:
         """Returns the answers that came since the last call; gives up those that do not come."""
         answered = [*self._held]
@@ -212,10 +208,9 @@ class Production:
         stats.stale, self._skipped = stats.stale + self._skipped, 0
         queue = deque(answers)
         while queue:
-            asked, answer = queue.popleft()
-            batch = asked.on_device()
+            batch, answer = queue.popleft()
             if isinstance(answer, Regions):
-                children = children_of(asked, answer, self.cache)
+                children = children_of(batch, answer, self.cache)
                 self._add_up(batch, write.tiles(self.cache, batch.targets, children), stats)
             elif isinstance(answer, Shipment):
                 self._write_shipment(batch, answer, stats)
@@ -360,17 +355,12 @@ class Production:
             self._add_up(batch, write.bricks(self.cache, batch.targets, answer.data), stats)
         return []
 
-    def hold_rest(self, batch: RequestBatch, shipment: Shipment) -> RequestBatch:
-        """Holds back the bricks that found no room on the way; returns the others' batch."""
+    def _write_shipment(self, batch: RequestBatch, shipment: Shipment, stats: FrameStats) -> None:
+        """Writes voxels that are on their way; holds back those that found no room there."""
         sent, rest = batch[: shipment.sent], batch[shipment.sent :]
         if len(rest):
             self._mark(rest)
             self._held.append(Answered(rest, Bricks(data=shipment.rest)))
-        return sent
-
-    def _write_shipment(self, batch: RequestBatch, shipment: Shipment, stats: FrameStats) -> None:
-        """Writes voxels that are on their way; holds back those that found no room there."""
-        sent = self.hold_rest(batch, shipment)
         if len(sent):
             self._add_up(sent, write.bricks(self.cache, sent.targets, shipment.chunks), stats)
 
@@ -407,8 +397,6 @@ class Production:
 
     def _mark(self, batch: RequestBatch) -> None:
         """Marks a batch as pending, where its nodes still lack what was asked for."""
-        if batch.on_host:
-            return  # it was marked when it was chosen
         lacking = batch.targets.lacking(self.cache, batch.kind)
         self.cache.mark_pending(batch.targets.node, batch.kind, lacking)
 

@@ -2,14 +2,15 @@
 and answers written in batches of fixed size, so that every shape is known beforehand.
 
 Producers on the device are recorded as well, and the host has no part in a frame. Those on the host
-get a frame's list with its counts, answer while the device goes on, and the frame after writes what
-has come; the host waits for nothing. Rows that are not taken hold node -1.
+get a frame's list with its counts, answer while the device goes on, and a later frame writes what
+has come (mail.py); the host waits for nothing. Rows that are not taken hold node -1.
 """
 
 from __future__ import annotations
 
-from collections import deque
+import threading
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import CancelledError, Future
 from dataclasses import replace
 from typing import Any
 
@@ -25,13 +26,15 @@ from ..base.constants import (
     REQUEST_SUBDIVIDE,
 )
 from ..base.records import Hits
+from ..base.volume import movable
 from ..cache import KINDS, Cache, RequestList, Scheduler
-from ..cache.write import Put, Targets, put_bricks, put_rows_of, put_tiles, put_uniform
-from ..pool.staging import Shipment, upload
+from ..cache.write import Children, Put, Targets, put_bricks, put_rows_of, put_tiles, put_uniform
+from ..pool.staging import TableRows
 from ..producers import Bricks, Region, Regions
 from ..producers.answer import checked_bricks, checked_regions
+from .mail import Form, Mail
 from .production import Production
-from .request_batch import ProducedTree, RequestBatch, by_kind, children_of, shipped
+from .request_batch import ProducedTree, RequestBatch, children_of
 from .stats import Collected, FrameStats
 
 _MOST_LISTED = 1 << 15  # nodes whose requests are sorted
@@ -174,7 +177,11 @@ class DeviceFrame(RecordedFrame):
 
 
 class HostFrame(RecordedFrame):
-    """Frames of an engine whose producers all answer from the host (`Producer.on_host`)."""
+    """Frames of an engine whose producers all answer from the host (`Producer.on_host`).
+
+    What a frame chose comes to the host with its counts (`ask`). Answers are checked by the thread
+    that brings them, and posted; the next frame sends what has come, and writes it.
+    """
 
     def __init__(
         self,
@@ -184,33 +191,52 @@ class HostFrame(RecordedFrame):
         batch: int,
         production: Production,
     ) -> None:
-        """See `RecordedFrame`; `production` asks, and knows what is on its way."""
+        """See `RecordedFrame`; `production` knows what failed."""
         super().__init__(cache, trees, scheduler, batch)
         self._production = production
+        device = self._unused.device
         self._made = self._unused.new_zeros(6)  # since the last frame: see `DeviceFrame.serve`
+        self._mail = [Mail(_boxes(cache, one), batch, device) for one in trees]
+        self._by_tree = {one.tree.number: n for n, one in enumerate(trees)}
+        self.turn = 0  # answers to what was asked before the last `release` are dropped
+        self._asked = self._done = 0  # rows, since then
+        self.active = False  # whether frames have been rendered since then
+        self._lock = threading.Lock()
+
+    @property
+    def pending(self) -> int:
+        """Nodes whose answers are on their way."""
+        return max(0, self._asked - self._done - sum(mail.sent for mail in self._mail))
 
     def begin(self, stale: bool, stats: FrameStats) -> None:
-        """Writes what has come, before a frame; `stale`: another one was rendered since the last
-        of these, which tells no more which slots are unused.
+        """Sends what has come, before a frame; `stale`: another one was rendered since the last of
+        these, which tells no more which slots are unused.
         """
+        self.active = True
         if stale:
             self._unused.zero_()
-        queue = deque(self._production.late())
-        while queue:
-            batch, answer = queue.popleft()
-            if isinstance(answer, Regions):
-                self._write_tiles(batch, answer)
-            elif isinstance(answer, Shipment):
-                sent = self._production.hold_rest(batch, answer)
-                self._write_bricks(sent, answer.chunks)
-            else:
-                for kind, part in by_kind(batch, answer).items():
-                    self._write(kind, *part)
-        stats.pending = sum(self._production.pending.values())
-        stats.failed = len(self._production.failures)
+        for mail in self._mail:
+            mail.send()
+        stats.pending, stats.failed = self.pending, len(self._production.failures)
+
+    def release(self) -> None:
+        """Forgets what is on its way, for a frame that the host serves; rays ask for it again."""
+        if not self.active:
+            return
+        self.active = False
+        self.turn += 1
+        for mail in self._mail:
+            mail.forget()
+            mail.sent = 0
+        self._asked = self._done = 0
+        self._production.restore_pending()
 
     def run(self, trace: Callable[[], Hits]) -> tuple[Hits, Collected]:
-        """Traces, collects, and chooses what the host is asked for; marks it as pending."""
+        """Writes what was sent, traces, collects, and chooses what the host is asked for, which is
+        marked as pending.
+        """
+        for source, mail in zip(self.trees, self._mail, strict=True):
+            self._write(source, mail)
         self.cache.frame_1.add_(1)
         hits = trace()
         requests, numbers = self.collect(hits)
@@ -225,15 +251,53 @@ class HostFrame(RecordedFrame):
                 mine = (number == source.tree.number)[:, None]
                 loc = torch.where(mine, source.tree.loc(node), loc)
             chosen.append(torch.cat((node[:, None], number[:, None].to(torch.int64), loc), 1))
-        asked = torch.stack(chosen).flatten()
-        numbers = torch.cat((numbers, self._made, asked))
+        numbers = torch.cat((numbers, self._made, torch.stack(chosen).flatten()))
         self._made.zero_()
-        return hits, Collected(requests, numbers, self._ask)
+        return hits, Collected(requests, numbers)
 
-    def _ask(self, asked: Tensor) -> int:
+    def _write(self, source: ProducedTree, mail: Mail) -> None:
+        """Writes what was sent for one tree; what finds no slot may be asked for again."""
+        tiles, bricks, bare, again = (
+            mail.there[box] for box in ("tiles", "bricks", "bare", "again")
+        )
+        children = Children(
+            child=tiles["child"],
+            brick=tiles["brick"],
+            constants=_named(tiles, "constants"),
+            ranges=_named(tiles, "ranges"),
+            is_alias=torch.zeros_like(tiles["child"], dtype=torch.bool),
+            alias=None,
+        )
+        targets = [Targets(source.tree, box["node"], box["loc"]) for box in (tiles, bricks, bare)]
+        put = put_tiles(self.cache, targets[0], children, self._unused[:1])
+        self._count(REQUEST_SUBDIVIDE, targets[0], put, 0)
+        put = put_bricks(self.cache, targets[1], _named(bricks, "data"), self._unused[1:])
+        self._count(REQUEST_LOAD, targets[1], put, 1)
+        self._made[2] += put_uniform(
+            self.cache, targets[2], bare["word"], _named(bare, "constants")
+        )
+        self._ask_again(again["node"], again["bit"])
+        mail.clear()
+
+    def _count(self, kind: int, targets: Targets, put: Put, which: int) -> None:
+        _, given, held = put.counts
+        self._unused[which] -= given
+        self._made[which] += given
+        self._made[3 + which] += held
+        lost = torch.where(put.wanted & (put.slot < 0), targets.node, -1)
+        bit = torch.full_like(lost, kind << REQUEST_PENDING_SHIFT, dtype=torch.int32)
+        self._ask_again(lost, bit)
+
+    def _ask_again(self, node: Tensor, bit: Tensor) -> None:
+        words = self.cache.nodes.request_tn.view(-1, 1)
+        put_rows_of(words, node, words[node.clamp(min=0)] & ~bit[:, None])
+
+    def ask(self, turn: int, asked: Tensor) -> int:
         """Asks producers for the nodes that a frame chose: (2 * batch * 6,) int64 on the host, of
-        each kind rows of node, tree and place.
+        each kind rows of node, tree and place. Returns how many they are.
         """
+        if turn != self.turn:
+            return 0
         total = 0
         for kind, listed in zip(KINDS.values(), asked.view(2, -1, 6), strict=True):
             rows = listed[listed[:, 0] >= 0]
@@ -242,61 +306,147 @@ class HostFrame(RecordedFrame):
                 mine = rows[rows[:, 1] == source.tree.number]
                 if len(mine):
                     targets = Targets(source.tree, mine[:, 0].clone(), mine[:, 2:].clone())
-                    batch = RequestBatch(source, kind, targets, on_host=True)
-                    self._production.ask_ahead(batch)
+                    self._submit(turn, RequestBatch(source, kind, targets, on_host=True))
+        self._asked += total
         return total
 
-    def _write(self, kind: Region, batch: RequestBatch, answer: Bricks) -> None:
-        """Writes bricks of one kind."""
-        if kind is Region.ALIAS:
-            self._leave_to_host(batch)
-        elif kind is Region.EMPTY:
-            device = self._unused.device
-            assert answer.kind is not None
-            word = torch.where(answer.kind == Region.CONSTANT, CONSTANT, EMPTY).to(torch.int32)
-            constants = {name: upload(rows, device) for name, rows in answer.constants.items()}
-            targets = batch.on_device().targets
-            bare = put_uniform(self.cache, targets, upload(word, device), constants)
-            self._made[2] += bare
-        else:
-            sent = shipped(batch, answer, self._production.staging)
-            if isinstance(sent, Shipment):
-                self._write_bricks(self._production.hold_rest(batch, sent), sent.chunks)
-            else:
-                self._write_bricks(batch, answer.data)
+    def _submit(self, turn: int, batch: RequestBatch) -> None:
+        """Asks for a batch; a producer that raised is asked again for each half."""
 
-    def _write_bricks(self, batch: RequestBatch, data: Any) -> None:
-        if len(batch):
-            there = batch.on_device()
-            put = put_bricks(self.cache, there.targets, data, self._unused[1:])
-            self._count(there, put, 1)
+        def arrived(future: Future) -> None:
+            if turn == self.turn:
+                self._settle(turn, batch, future.result)
 
-    def _write_tiles(self, batch: RequestBatch, answer: Regions) -> None:
-        if answer.alias is not None:
-            self._leave_to_host(batch)
+        try:
+            answer = batch.ask()
+        except Exception as error:
+            self._split(turn, batch, error)
             return
-        children, there = children_of(batch, answer, self.cache), batch.on_device()
-        put = put_tiles(self.cache, there.targets, children, self._unused[:1])
-        self._count(there, put, 0)
+        if isinstance(answer, Future):
+            answer.add_done_callback(arrived)
+        else:
+            self._settle(turn, batch, lambda: answer)
 
-    def _count(self, batch: RequestBatch, put: Put, which: int) -> None:
-        """Counts what was made; what found no slot may be asked for again."""
-        _, given, held = put.counts
-        self._unused[which] -= given
-        self._made[which] += given
-        self._made[3 + which] += held
-        self._ask_again(batch, put.wanted & (put.slot < 0))
+    def _split(self, turn: int, batch: RequestBatch, error: Exception) -> None:
+        if len(batch) == 1:
+            self._fail(batch, f"{type(error).__name__}: {error}", error)
+            return
+        half = len(batch) // 2
+        self._submit(turn, batch[:half])
+        self._submit(turn, batch[half:])
+
+    def _settle(self, turn: int, batch: RequestBatch, answer: Callable[[], Any]) -> None:
+        """Checks an answer and posts it, in whatever thread brings it."""
+        try:
+            given = answer()
+        except CancelledError:
+            return  # the producer is closed
+        except Exception as error:
+            self._split(turn, batch, error)
+            return
+        try:
+            checked = batch.check(given)
+            bad = self._name_errors(batch, checked)
+            good = (~bad).nonzero()[:, 0]
+            if isinstance(checked, Regions):
+                self._post_tiles(batch, checked, good)
+            else:
+                self._post_bricks(batch, checked, good)
+        except ValueError as error:
+            self._fail(batch, str(error), error)
+
+    def _name_errors(self, batch: RequestBatch, answer: Regions | Bricks) -> Tensor:
+        """(k,) bool, which nodes of a batch have an item that failed; names them."""
+        bad = torch.zeros(len(batch), dtype=torch.bool)
+        per_node = len(batch.loc) // len(batch)
+        for index in sorted(answer.errors):
+            node = index // per_node
+            if not bad[node]:
+                bad[node] = True
+                self._fail(batch[node : node + 1], answer.errors[index])
+        return bad
+
+    def _fail(self, batch: RequestBatch, message: str, cause: BaseException | None = None) -> None:
+        """Counts and names a batch's nodes; they stay marked as pending: no ray asks again."""
+        with self._lock:
+            self._done += len(batch)
+            self._production.failures.add(batch, message, cause)
+
+    def _post_tiles(self, batch: RequestBatch, answer: Regions, good: Tensor) -> None:
+        if answer.alias is not None:
+            self._leave_to_host(batch[good])
+            return
+        made, targets = children_of(batch, answer, self.cache), batch.targets
+        rows = {"node": targets.node, "loc": targets.loc, "child": made.child, "brick": made.brick}
+        fields = {"constants": made.constants, "ranges": made.ranges}
+        self._post(batch, "tiles", rows, fields, good)
+
+    def _post_bricks(self, batch: RequestBatch, answer: Bricks, good: Tensor) -> None:
+        fields: dict[str, Mapping[str, Any]]
+        targets, kind = batch.targets, answer.kind
+        rows = {"node": targets.node, "loc": targets.loc}
+        data = {n: d.gather() if isinstance(d, TableRows) else d for n, d in answer.data.items()}
+        fields = {"data": data}
+        if kind is None:
+            self._post(batch, "bricks", rows, fields, good)
+            return
+        alias = kind[good] == Region.ALIAS
+        if bool(alias.any()):
+            self._leave_to_host(batch[good[alias]])
+        bare = (kind[good] == Region.EMPTY) | (kind[good] == Region.CONSTANT)
+        self._post(batch, "bricks", rows, fields, good[~bare & ~alias])
+        word = torch.where(kind == Region.CONSTANT, CONSTANT, EMPTY).to(torch.int32)
+        known = {
+            name: torch.zeros((len(kind), one.width), dtype=one.dtype)
+            for name, one in batch.source.producer.channels.items()
+        }
+        fields = {"constants": {**known, **answer.constants}}
+        self._post(batch, "bare", {**rows, "word": word}, fields, good[bare])
 
     def _leave_to_host(self, batch: RequestBatch) -> None:
         """Lets `Engine.frame` ask again, which can look up what an alias stands for."""
         self.host_needed = True
-        there = batch.on_device()
-        self._ask_again(there, torch.ones_like(there.targets.node, dtype=torch.bool))
+        bit = torch.full((len(batch),), batch.kind << REQUEST_PENDING_SHIFT, dtype=torch.int32)
+        self._post(batch, "again", {"node": batch.targets.node, "bit": bit}, {}, slice(None))
 
-    def _ask_again(self, batch: RequestBatch, which: Tensor) -> None:
-        words, node = self.cache.nodes.request_tn.view(-1), batch.targets.node
-        bit = batch.kind << REQUEST_PENDING_SHIFT
-        words[node] &= ~torch.where(which, bit, 0).to(torch.int32)
+    def _post(
+        self,
+        batch: RequestBatch,
+        box: str,
+        rows: Mapping[str, Tensor],
+        fields: Mapping[str, Mapping[str, Tensor]],
+        which: Tensor | slice,
+    ) -> None:
+        """Posts some rows: fields, and those that each channel has."""
+        flat = {f"{name}.{channel}": t for name, by in fields.items() for channel, t in by.items()}
+        mail = self._mail[self._by_tree[batch.source.tree.number]]
+        mail.post(box, {n: movable(t)[which].view(t.dtype) for n, t in {**rows, **flat}.items()})
+
+
+def _boxes(cache: Cache, source: ProducedTree) -> dict[str, Form]:
+    """What mail for a tree holds."""
+    words, place = torch.int32, {"loc": ((4,), torch.int64)}
+    own, n = source.producer.channels, source.layout.branching**3
+    kinds = cache.bricks.channels
+    tiles: dict[str, Any] = {"child": ((n,), words), "brick": ((n,), words)}
+    for name, one in kinds.items():
+        tiles[f"constants.{name}"] = ((n, one.width), one.dtype)
+        tiles[f"ranges.{name}"] = ((n, 2, one.width), one.dtype)
+    brick = (source.layout.side,) * 3
+    return {
+        "tiles": place | tiles,
+        "bricks": place | {f"data.{m}": ((*brick, c.width), c.dtype) for m, c in own.items()},
+        "bare": place
+        | {"word": ((), words)}
+        | {f"constants.{m}": ((c.width,), c.dtype) for m, c in own.items()},
+        "again": {"bit": ((), words)},
+    }
+
+
+def _named(box: Mapping[str, Tensor], field: str) -> dict[str, Tensor]:
+    """The channels of a field of a box."""
+    parts = (name.partition(".") for name in box)
+    return {channel: box[f"{field}.{channel}"] for name, _, channel in parts if name == field}
 
 
 def recorded_frame(

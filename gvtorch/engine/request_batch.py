@@ -54,7 +54,7 @@ class RequestBatch:
     targets: Targets  # nodes to fill, or to subdivide
     fill_loc: Tensor | None = None  # (k, 4) filled in their stead: alias targets
     coarse: bool = False  # their bricks take coarse slots
-    on_host: bool = False  # the targets lie in host memory, and are marked as pending already
+    on_host: bool = False  # the targets lie in host memory
 
     def __len__(self) -> int:
         return len(self.targets)
@@ -78,15 +78,6 @@ class RequestBatch:
             index = upload(index, self.targets.node.device)
         fill_loc = None if self.fill_loc is None else self.fill_loc[index]
         return replace(self, targets=self.targets[index], fill_loc=fill_loc)
-
-    def on_device(self) -> RequestBatch:
-        """The batch with its targets where the pools are; the host does not wait."""
-        if not self.on_host:
-            return self
-        tree, node, loc = vars(self.targets).values()
-        rows = upload(torch.cat((node[:, None], loc), 1), tree.device)
-        there = Targets(tree, rows[:, 0].contiguous(), rows[:, 1:].contiguous())
-        return replace(self, targets=there, on_host=False)
 
     @property
     def nodes(self) -> Nodes:
@@ -125,11 +116,9 @@ class Answered(NamedTuple):
 
 
 def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
-    """Turns a producer's regions into the words of tiles, on the pools' device; the host does not
-    wait.
-    """
+    """Turns a producer's regions into the words of tiles, where the regions lie."""
     nodes = batch.nodes
-    layout, device = nodes.layout, cache.frame_1.device
+    layout = nodes.layout
     low = nodes.loc[:, :3] * (nodes.scale * layout.brick_size)[:, None]
     kind = torch.where((low >= layout.extent_3).any(1), Region.EMPTY, answer.kind)
     leaf = (kind == Region.EMPTY) | (kind == Region.CONSTANT) | (kind == Region.DATA_MAX_DEPTH)
@@ -146,7 +135,7 @@ def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
             ranges[name] = _untold_range(cache, name, kind, answer.constants.get(name))
 
     def by_tile(values: Tensor) -> Tensor:
-        return upload(values, device).unflatten(0, (len(batch), -1))
+        return values.unflatten(0, (len(batch), -1))
 
     return Children(
         child=by_tile(child),
