@@ -44,6 +44,8 @@ class Settings:
     source: Literal["store", "formula"] = "store"
     pools: tuple[str, ...] = ("512 MB", "128 MB", "32 MB", "8 MB")
     loading: str = "straight"
+    workers: int = 4
+    """threads that read the store"""
     graph: bool = True
     """on CUDA: each frame is one graph"""
     device: str = "cpu"
@@ -163,7 +165,11 @@ def main(settings: Settings) -> None:
             table.add_column(column, justify="right")
         for pool in settings.pools:
             formula = settings.source == "formula"
-            producer = Worn(settings.side) if formula else gv.StoredProducer(store)
+            producer = (
+                Worn(settings.side)
+                if formula
+                else gv.StoredProducer(store, workers=settings.workers)
+            )
             table.add_row(*fly(producer, pool, settings, console))
         Console().print(table)
 

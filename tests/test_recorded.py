@@ -5,6 +5,7 @@ CUDA as one graph, which the host never waits for.
 from __future__ import annotations
 
 import time
+from concurrent.futures import Future
 from functools import partial
 
 import pytest
@@ -169,6 +170,62 @@ def test_what_fails_on_the_host_is_named_and_not_asked_for_again(blobs, backend)
         assert all(one.message == "spoiled" and one.loc[3] == 3 for one in engine.failures)
         engine.validate()
     assert bool(torch.isfinite(hits.color).all())
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_what_raises_costs_itself_alone_and_what_never_comes_is_given_up(blobs, backend):
+    class Unruly(gv.VolumeProducer):
+        patience = 0.2
+
+        def fill(self, nodes):
+            if bool((nodes.loc[:, 0] == 1).any()):
+                raise OSError("no such column")
+            if bool((nodes.loc[:, 0] == 2).all()):
+                return Future()  # never done
+            return super().fill(nodes)
+
+    with gv.Engine(Unruly(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        frames = Frames(engine, view(16), 64)
+        for _ in range(400):
+            hits, stats = frames.frame()
+            time.sleep(0.002)
+            if stats.converged:
+                break
+        assert stats.converged
+        told = {one.message for one in engine.failures}
+        assert "OSError: no such column" in told
+        assert told <= {"OSError: no such column", "no answer within 0.2 s"}
+        raised = [one for one in engine.failures if one.message.startswith("OSError")]
+        assert all(one.loc[0] == 1 for one in raised)
+        engine.validate()
+    assert bool(torch.isfinite(hits.color).all())
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_aliases_are_left_to_the_host(blobs, backend):
+    """Such a node is asked for again by a frame that the host serves."""
+
+    class Twice(gv.VolumeProducer):
+        def fill(self, nodes):
+            bricks = super().fill(nodes)
+            kind = torch.where(nodes.loc[:, 0] == 1, gv.Region.ALIAS, gv.Region.DATA)
+            alias = nodes.loc.clone()
+            alias[:, 0] = 0
+            return gv.Bricks(data=bricks.data, kind=kind, alias=alias)
+
+    with gv.Engine(Twice(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        expected = engine.render(view(16), LOOK)
+    with gv.Engine(Twice(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        frames = Frames(engine, view(16), 64)
+        for _ in range(100):
+            frames.frame()
+            time.sleep(0.001)
+            if frames.served.host_needed:
+                break
+        assert frames.served.host_needed
+        picture = engine.render(view(16), LOOK)
+        engine.validate()
+    assert torch.equal(picture.color, expected.color)
 
 
 @pytest.mark.parametrize("backend", COMPILED)

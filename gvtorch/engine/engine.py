@@ -490,6 +490,8 @@ class Engine:
     def close(self) -> None:
         """Lets go of what is on its way, and of the producers' files and threads."""
         self._closed = True
+        for one in self.recorded:
+            one.close()
         self.production.close()
         for source in self.trees.values():
             source.producer.close()

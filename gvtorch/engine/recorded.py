@@ -9,11 +9,13 @@ has come (mail.py); the host waits for nothing. Rows that are not taken hold nod
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -202,6 +204,8 @@ class HostFrame(RecordedFrame):
         self._asked = self._done = 0  # rows, since then
         self.active = False  # whether frames have been rendered since then
         self._lock = threading.Lock()
+        self._waiting: dict[Future, tuple[float, RequestBatch]] = {}  # until when
+        self._asker = ThreadPoolExecutor(1, thread_name_prefix="gvtorch-ask")
 
     @property
     def pending(self) -> int:
@@ -215,6 +219,7 @@ class HostFrame(RecordedFrame):
         self.active = True
         if stale:
             self._unused.zero_()
+        self._give_up()
         for mail in self._mail:
             mail.send()
         stats.pending, stats.failed = self.pending, len(self._production.failures)
@@ -225,11 +230,17 @@ class HostFrame(RecordedFrame):
             return
         self.active = False
         self.turn += 1
+        self._waiting.clear()
         for mail in self._mail:
             mail.forget()
             mail.sent = 0
-        self._asked = self._done = 0
+        with self._lock:
+            self._asked = self._done = 0
         self._production.restore_pending()
+
+    def close(self) -> None:
+        """Ends the thread that asks."""
+        self._asker.shutdown(wait=False, cancel_futures=True)
 
     def run(self, trace: Callable[[], Hits]) -> tuple[Hits, Collected]:
         """Writes what was sent, traces, collects, and chooses what the host is asked for, which is
@@ -293,28 +304,32 @@ class HostFrame(RecordedFrame):
         put_rows_of(words, node, words[node.clamp(min=0)] & ~bit[:, None])
 
     def ask(self, turn: int, asked: Tensor) -> int:
-        """Asks producers for the nodes that a frame chose: (2 * batch * 6,) int64 on the host, of
-        each kind rows of node, tree and place. Returns how many they are.
+        """Lets a thread ask producers for the nodes that a frame chose: (2 * batch * 6,) int64 on
+        the host, of each kind rows of node, tree and place. Returns how many they are.
         """
-        if turn != self.turn:
+        total = int(np.count_nonzero(asked.numpy()[::6] >= 0))
+        if turn != self.turn or not total:
             return 0
-        total = 0
+        with self._lock:
+            self._asked += total
+        self._asker.submit(self._ask, turn, asked)
+        return total
+
+    def _ask(self, turn: int, asked: Tensor) -> None:
         for kind, listed in zip(KINDS.values(), asked.view(2, -1, 6), strict=True):
             rows = listed[listed[:, 0] >= 0]
-            total += len(rows)
             for source in self.trees:
                 mine = rows[rows[:, 1] == source.tree.number]
                 if len(mine):
                     targets = Targets(source.tree, mine[:, 0].clone(), mine[:, 2:].clone())
                     self._submit(turn, RequestBatch(source, kind, targets, on_host=True))
-        self._asked += total
-        return total
 
     def _submit(self, turn: int, batch: RequestBatch) -> None:
         """Asks for a batch; a producer that raised is asked again for each half."""
 
         def arrived(future: Future) -> None:
-            if turn == self.turn:
+            there = self._waiting.pop(future, None) is not None  # else it was given up
+            if there and turn == self.turn:
                 self._settle(turn, batch, future.result)
 
         try:
@@ -323,9 +338,22 @@ class HostFrame(RecordedFrame):
             self._split(turn, batch, error)
             return
         if isinstance(answer, Future):
+            self._waiting[answer] = time.monotonic() + self._patience(batch), batch
             answer.add_done_callback(arrived)
         else:
             self._settle(turn, batch, lambda: answer)
+
+    def _patience(self, batch: RequestBatch) -> float:
+        own = batch.source.producer.patience
+        return self._production.patience if own is None else own
+
+    def _give_up(self) -> None:
+        """Counts answers as failed that have not come in time."""
+        now = time.monotonic()
+        for future, (until, batch) in list(self._waiting.items()):
+            if until < now and self._waiting.pop(future, None) is not None:
+                future.cancel()
+                self._fail(batch, f"no answer within {self._patience(batch):g} s")
 
     def _split(self, turn: int, batch: RequestBatch, error: Exception) -> None:
         if len(batch) == 1:
