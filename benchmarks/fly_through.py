@@ -6,16 +6,24 @@ The rate is bricks asked for over bricks asked for and bricks used, summed over 
 "unserved" is the share of nodes that were not there yet, those on their way counted again in each
 frame. Bricks of 8^3 and a border hold 1,000 bytes here, and 4,000 in the original: its 512 MB are
 128 MB here. How fast the camera moves decides: 1,200 frames are 20 s at 60 frames a second.
+
+With `--source formula` the solid is computed brick by brick on the device that renders. On CUDA
+each frame is one graph (`Engine.capture`), with `--no-graph` it is `Engine.frame`.
 """
 
 from __future__ import annotations
 
+import math
 import tempfile
+import time
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+import torch
 import tyro
 from rich.console import Console
 from rich.progress import track
@@ -32,12 +40,56 @@ class Settings:
 
     side: int = 1024
     frames: int = 1200
-    size: int = 512
+    size: tuple[int, int] = (512, 512)
+    source: Literal["store", "formula"] = "store"
     pools: tuple[str, ...] = ("512 MB", "128 MB", "32 MB", "8 MB")
     loading: str = "straight"
+    workers: int = 4
+    """threads that read the store"""
+    graph: bool = True
+    """on CUDA: each frame is one graph"""
     device: str = "cpu"
     folder: Path | None = None
     """where the store is kept; a temporary folder if left out"""
+
+
+class Worn(gv.Producer):
+    """The worn sphere (`worn_planes`), computed where it is wanted. Coarse voxels are those of a
+    solid whose edges are as soft as they are wide.
+    """
+
+    on_device = True
+    wear, octaves = 0.12, [(7.0 * 2.0**n, 1.9**-n) for n in range(5)]
+
+    def __init__(self, side: int) -> None:
+        super().__init__(side, channels={"value": gv.Channel(torch.uint8)})
+        #: By how much a value of the finest level changes at most from voxel to voxel.
+        self.steepest = 5.1 * (1 + self.wear * sum(2 * k * weight for k, weight in self.octaves))
+
+    def value(self, places, voxel):
+        """Values of places x, y, z, which broadcast, in voxels of a width; below 0 and above 255
+        they are cut off.
+        """
+        x, y, z = (2 / (self.extent[0] - 1) * place - 1 for place in places)
+        inside = 0.9 - (x * x + y * y + z * z).sqrt()
+        for k, weight in self.octaves:
+            (sx, cx), (sy, cy), (sz, cz) = (((k * a).sin(), (k * a).cos()) for a in (x, y, z))
+            inside = inside + self.wear * weight * (sx * cy + sy * cz + sz * cx)
+        return 128 + 2.5 * self.extent[0] / voxel * inside
+
+    def classify(self, nodes):
+        middle = self.value(nodes.center.float().unbind(1), 1)
+        reach = self.steepest * nodes.radius.float()
+        low, high = middle - reach, middle + reach
+        kind = torch.where(high < 0, gv.Region.EMPTY, gv.Region.DATA)
+        kind = torch.where(low > 255, gv.Region.CONSTANT, kind)
+        ends = torch.stack((low, high), 1).clamp(0, 255).to(torch.uint8)[..., None]
+        full = torch.full_like(ends[:, 0], 255)
+        return gv.Regions(kind=kind, constants={"value": full}, ranges={"value": ends})
+
+    def fill(self, nodes):
+        voxel = nodes.voxel_size.float()[:, :1, None, None]
+        return {"value": self.value(nodes.axes, voxel).clamp(0, 255).to(torch.uint8)}
 
 
 def write_volume(file: Path, side: int) -> None:
@@ -57,29 +109,39 @@ def flight(side: int) -> CameraPath:
     return CameraPath(eyes.tolist(), targets.tolist(), fov=[45.0] * len(keys))
 
 
-def fly(store: Path, pool: str, settings: Settings, console: Console) -> list[str]:
+def fly(producer: gv.Producer, pool: str, settings: Settings, console: Console) -> list[str]:
     """Flies once; returns a row of the table."""
     opacity = [(100, 0), (140, 0.9)]
     color = [(100, 0.3, 0.1, 0.05), (160, 0.9, 0.6, 0.3), (255, 1, 0.95, 0.8)]
+    all_stats = []
     shader = gv.TransferFunction.from_points(opacity, color, reference=4.0)
-    path, used, asked, missed = flight(settings.side), 0, 0, 0
+    path = flight(settings.side)
+    cameras = [path.camera(float(t), *settings.size) for t in np.linspace(0, 1, settings.frames)]
     options = {"brick_pool": pool, "node_pool": "64 MB", "loading": settings.loading}
-    with gv.Engine(gv.StoredProducer(store), device=settings.device, **options) as engine:
-        first = path.camera(0.0, settings.size, settings.size)
-        engine.render(first, shader)  # the flight begins with what its first view needs
-        places = np.linspace(0, 1, settings.frames)
-        for place in track(places, pool, console=console, transient=True):
-            view = path.camera(float(place), settings.size, settings.size)
-            _, stats = engine.frame(view, shader)
-            used, missed = used + stats.bricks_used, missed + stats.misses
-            asked += stats.requests["load"]
-        report = engine.report().as_dict()
+    with gv.Engine(producer, device=settings.device, **options) as engine:
+        engine.render(cameras[0], shader)  # the flight begins with what its first view needs
+        if engine.device.type == "cuda" and settings.graph:
+            draw = engine.capture(cameras[0], shader).replay
+        else:
+            draw = partial(engine.frame, shader=shader)
+        start = time.perf_counter()
+        for camera in track(cameras, pool, console=console, transient=True):
+            all_stats.append(draw(camera)[1])
+        for stats in all_stats:
+            stats.settle()
+        seconds = time.perf_counter() - start
         engine.validate()
+    used, missed = (sum(getattr(s, n) for s in all_stats) for n in ("bricks_used", "misses"))
+    asked, made = (
+        sum(getattr(stats, field)[name] for stats in all_stats)
+        for field, name in (("requests", "load"), ("produced", "bricks"))
+    )
+    times = sorted(stats.milliseconds for stats in all_stats)
     return [
         *(pool, f"{asked / (used + asked):.2%}", f"{missed / (used + missed):.2%}"),
         f"{used / settings.frames:,.0f}",
-        *(f"{report['milliseconds']['median']:.0f}", f"{report['bricks_per_second']:,.0f}"),
-        f"{report['megabytes_per_second']:.1f}",
+        *(f"{times[math.ceil(q * len(times)) - 1]:.2f}" for q in (0.5, 0.99)),
+        *(f"{settings.frames / seconds:,.0f}", f"{made / seconds:,.0f}"),
     ]
 
 
@@ -90,18 +152,25 @@ def main(settings: Settings) -> None:
     with kept as name:
         folder = Path(str(name))
         store, raw = folder / "worn.zarr", folder / f"worn_{settings.side}.raw"
-        if not store.exists():
+        if settings.source == "store" and not store.exists():
             console.print(f"making {store}")
             write_volume(raw, settings.side)
             gv.convert(raw, store, shape=(settings.side,) * 3, dtype="uint8")
             raw.unlink()
-        table = Table(title=f"{settings.frames} frames of {settings.size}^2, {settings.loading}")
+        width, height = settings.size
+        table = Table(title=f"{settings.frames} frames of {width}x{height}, {settings.loading}")
         for column in ("brick pool", "miss rate", "unserved", "bricks used a frame"):
             table.add_column(column, justify="right")
-        for column in ("ms a frame", "bricks / s", "MB / s"):
+        for column in ("median ms", "p99 ms", "frames / s", "bricks / s"):
             table.add_column(column, justify="right")
         for pool in settings.pools:
-            table.add_row(*fly(store, pool, settings, console))
+            formula = settings.source == "formula"
+            producer = (
+                Worn(settings.side)
+                if formula
+                else gv.StoredProducer(store, workers=settings.workers)
+            )
+            table.add_row(*fly(producer, pool, settings, console))
         Console().print(table)
 
 

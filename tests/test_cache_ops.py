@@ -138,7 +138,8 @@ def test_link_bricks_gives_nodes_slots_of_their_own(backend, data, slots):
     there += [int32(w, device) for w in before.values()]
     there.append(torch.ones(slots, dtype=torch.bool, device=device))
     node_k = torch.tensor([*chosen, -1, nodes], device=device)
-    ops.link_bricks(*there, node_k, int32([*taken, 0, 0], device), 9, backend=backend)
+    slot_k, frame = int32([*taken, 0, 0], device), int32([9], device)
+    ops.link_bricks(*there, node_k, slot_k, frame, backend=backend)
     shared = [True] * slots
     for node, slot in zip(chosen, taken, strict=True):
         brick[node], shared[slot] = slot, False
@@ -170,7 +171,7 @@ def test_link_tiles_writes_tiles_and_hangs_them_below_nodes(backend, data, tiles
     there = [t.to(device) for t in pool]
     row_k, tile_k = torch.tensor([*rows, -1]), int32([*sorted(fresh), 0])
     given_ = [t.to(device) for t in (*made, row_k, tile_k)]
-    ops.link_tiles(*there, *given_, 5, 9, backend=backend)
+    ops.link_tiles(*there, *given_, 5, int32([9], device), backend=backend)
 
     child, brick, asked, loc, parent, tree, stamp, shared = pool
     for row, tile in zip(rows, sorted(fresh), strict=True):
@@ -183,6 +184,26 @@ def test_link_tiles_writes_tiles_and_hangs_them_below_nodes(backend, data, tiles
         child.view(-1)[asking[row]] = tile
         asked.view(-1)[asking[row]] &= ~(SUBDIVIDE | SUBDIVIDE << PENDING)
     assert [t.tolist() for t in there] == [t.tolist() for t in pool]
+
+
+@fixed
+@given(data=st.data(), slots=st.integers(1, 20), width=st.sampled_from([1, 3, 4, 16, 30, 48]))
+def test_put_rows_writes_rows_into_slots(backend, data, slots, width):
+    device = DEVICES[backend]
+    chosen = data.draw(st.lists(st.integers(0, slots - 1), unique=True, max_size=slots))
+    places = data.draw(st.permutations([*chosen, -1, slots]))
+    generator = torch.Generator().manual_seed(data.draw(st.integers(0, 2**20)))
+    target, rows = (
+        torch.randint(256, (n, width), dtype=torch.uint8, generator=generator)
+        for n in (slots, len(places))
+    )
+    there = target.to(device)
+    slot_k = torch.tensor(places, device=device)
+    ops.put_rows(there, slot_k, rows.to(device), backend=backend)
+    for place, row in zip(places, rows, strict=True):
+        if 0 <= place < slots:
+            target[place] = row
+    assert torch.equal(there.cpu(), target)
 
 
 def a_pool(data, branching: int, tiles: int) -> dict[str, torch.Tensor]:
@@ -300,7 +321,7 @@ def test_cache_ops_pass_opcheck(compiled):
                 frame.bool(),
                 row,
                 none,
-                3,
+                frame,
             ),
         ),
         (
@@ -310,9 +331,10 @@ def test_cache_ops_pass_opcheck(compiled):
                 *[frame.clone() for _ in range(3)],
                 frame.bool(),
                 *(request, request, row, place, row, none),
-                *(1, 2),
+                *(1, frame),
             ),
         ),
+        (table.put_rows, (request.view(torch.uint8), row, request.view(torch.uint8).clone())),
         (table.locate, (request, frame.long(), 2, 4)),
         (
             table.lacking,
@@ -358,7 +380,7 @@ def test_nothing_to_do(backend):
         (lambda w: ops.unlink(w, w[0], 4, 0), "divisor must be an int >= 1"),
         (lambda w: ops.link(w, w, w[0], w[0, :2], LOAD), "word_k must be (8,)"),
         (
-            lambda w: ops.link_bricks(w, w, *[w[0]] * 3, w[0], w[0].long(), w[0], 1),
+            lambda w: ops.link_bricks(w, w, *[w[0]] * 3, w[0], w[0].long(), w[0], w[0, :1]),
             "shared_b must be (8,) bool",
         ),
         (
@@ -370,9 +392,13 @@ def test_nothing_to_do(backend):
                 *[torch.zeros((2, 9), dtype=torch.int32)] * 2,
                 *[w[0].long()] * 4,
                 0,
-                0,
+                w[0, :1],
             ),
             "tile_k must be (k,) int32",
+        ),
+        (
+            lambda w: ops.put_rows(w.view(torch.uint8), w[0].long(), w.view(torch.uint8)),
+            "rows_kb must be",
         ),
         (lambda w: ops.locate(w, w[0].long(), 2, 8), "loc_t4 must be (t, 4) int32"),
         (lambda w: ops.locate(w[:, :4].clone(), w[0], 2, 8), "node_k must be (k,) int64"),

@@ -256,7 +256,11 @@ def test_normals_of_three_trees_are_the_mean_by_the_light_that_each_takes():
         TreeTrace(
             box.double(),
             lambda _, one=one: one,
-            SimpleNamespace(shader=gv.TransferFunction([(0, 0), (1, 1)])),
+            SimpleNamespace(
+                shader=gv.TransferFunction([(0, 0), (1, 1)]),
+                inside=lambda rays: rays,
+                tree=SimpleNamespace(box=box),
+            ),
         )
         for box, one in zip(boxes, hits, strict=True)
     ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 
 from gvtorch.base import constants as config
@@ -11,14 +10,19 @@ from gvtorch.cache import LRU, Requests, Scheduler
 LOAD, SUBDIVIDE = config.REQUEST_LOAD, config.REQUEST_SUBDIVIDE
 
 
-def test_lru_takes_from_the_front_and_refuses_more_than_is_unused():
+def test_lru_gives_slots_from_the_front_as_far_as_they_are_unused():
     lru = LRU(6, 2, torch.device("cpu"))
     stamp = torch.tensor([9, 9, 9, 1, 9, 1], dtype=torch.int32)
     lru.unused = int(lru.sort(stamp, torch.tensor([9], dtype=torch.int32)))
     assert lru.order.tolist() == [3, 5, 2, 4] and lru.unused == 2
-    assert lru.take(1).tolist() == [3] and lru.order.tolist() == [5, 2, 4, 3]
-    with pytest.raises(ValueError, match="2 slots wanted, 1 are unused"):
-        lru.take(2)
+    wanted = torch.tensor([False, True, False])
+    assert lru.give(wanted, lru.free()).tolist() == [-1, 3, -1]
+    assert lru.order.tolist() == [5, 2, 4, 3]
+    lru.unused = 1
+    assert lru.give(~wanted, lru.free()).tolist() == [5, -1, -1], "no more are unused"
+    assert lru.order.tolist() == [2, 4, 3, 5]
+    nothing = LRU(2, 2, torch.device("cpu"))
+    assert nothing.give(wanted, nothing.free()).tolist() == [-1, -1, -1]
 
 
 def requests(depth, priority, coarse=None) -> dict[int, Requests]:

@@ -34,18 +34,32 @@ class LRU:
         self.order.copy_(order)
         return unused
 
-    def take(self, count: int) -> Tensor:
-        """Returns (count,) int32 slots from the front, and moves them to the back.
+    def free(self) -> Tensor:
+        """(1,) int64 `unused` on the device."""
+        return torch.full((1,), self.unused, device=self.order.device)
 
-        Raises:
-            ValueError: Fewer slots are unused.
+    def give(self, wanted: Tensor, most: Tensor) -> Tensor:
+        """Gives the first `most` (1,) of the rows that want one (k,) bool a slot each, from the
+        front, and moves these to the back; the host does not wait. It tells of it in `unused` once
+        it knows how many they are.
+
+        Returns:
+            (k,) int64 slots; -1 where a row gets none.
         """
-        if count > self.unused:
-            raise ValueError(f"LRU: {count} slots wanted, {self.unused} are unused")
-        taken = self.order[:count].clone()
-        self.order.copy_(self.order.roll(-count))
-        self.unused -= count
-        return taken
+        if not len(self):
+            return torch.full_like(wanted, -1, dtype=torch.int64)
+        rank = wanted.cumsum(0)
+        given = wanted & (rank <= most)
+        slot = self.order[(rank - 1).clamp(0, len(self) - 1)].to(torch.int64)
+        self._roll(given.sum())
+        return torch.where(given, slot, -1)
+
+    def _roll(self, count: Tensor) -> None:
+        if count.device.type == "cpu":
+            self.order.copy_(self.order.roll(-int(count)))
+            return
+        place = torch.arange(len(self), device=count.device) + count
+        self.order.copy_(self.order[place % len(self)])
 
     def __len__(self) -> int:
         """Number of slots."""
@@ -64,14 +78,15 @@ class Cache:
             all bricks; or, where the pool has coarse slots, one of the others and one of these.
         finest: (trees,) int64 depth from which on a tree's bricks need no coarse slots; 0: none
             needs one.
-        frame: Number of the last picture; what is written counts as used in it.
+        frame_1: (1,) int32 number of the last picture; what is written counts as used in it.
     """
 
     def __init__(self, nodes: NodePool, bricks: BrickPool, roots: int) -> None:
         """Locks the first `roots` tiles and bricks."""
-        self.nodes, self.bricks, self.frame = nodes, bricks, 0
+        self.nodes, self.bricks = nodes, bricks
         bricks.in_order()
         device = nodes.child_tn.device
+        self.frame_1 = torch.zeros(1, dtype=torch.int32, device=device)
         loads = [LRU(bricks.capacity, max(roots, bricks.coarse), device)]
         if bricks.coarse:
             loads.append(LRU(bricks.coarse, roots, device))
@@ -89,16 +104,16 @@ class Cache:
         rest = nodes.nbytes + bricks.nbytes - node_bytes - brick_bytes + order
         return {"node_pool": node_bytes, "brick_pool": brick_bytes, "bookkeeping": rest}
 
-    def sort_by_use(self, frame: Tensor) -> Tensor:
-        """Orders tiles and bricks by use in `frame` (1,), tiles on the way to used ones included;
-        the host does not wait.
+    def sort_by_use(self) -> Tensor:
+        """Orders tiles and bricks by use in the last picture, tiles on the way to used ones
+        included; the host does not wait.
 
         Returns:
             (5,) int64 tiles unused and used, bricks unused and used, and how many of the unused
             are coarse; `make_room` is told the unused ones, once the host knows them.
         """
-        self.nodes.mark_ancestors(frame)
-        counts, stamps = [], (self.nodes.stamp_t, self.bricks.stamp_b)
+        self.nodes.mark_ancestors(self.frame_1)
+        counts, frame, stamps = [], self.frame_1, (self.nodes.stamp_t, self.bricks.stamp_b)
         for group, stamp in zip(self.lru.values(), stamps, strict=True):
             unused, size = [lru.sort(stamp, frame) for lru in group], sum(map(len, group))
             locked = (stamp[: len(stamp) - size] == frame).sum()
@@ -163,4 +178,4 @@ class Cache:
 
     def __repr__(self) -> str:
         tiles, bricks = self.nodes.capacity, self.bricks.capacity
-        return f"Cache({tiles} tiles and {bricks} bricks, {self.frame} frames)"
+        return f"Cache({tiles} tiles and {bricks} bricks)"

@@ -8,17 +8,19 @@ Source: Crassin et al., "GigaVoxels", I3D 2009, section 5.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..base.constants import ABSENT, REQUEST_LOAD, REQUEST_SUBDIVIDE, TERMINAL
 from ..base.volume import movable
-from ..ops import lacking, link, link_bricks, link_tiles, unlink
+from ..ops import lacking, link, link_bricks, link_tiles, put_rows, unlink
 from ..pool import N3Tree
-from ..pool.staging import Chunk, Voxels, joined, on_device, wide_rows
+from ..pool.staging import Chunk, Voxels, on_device, row_bytes
 from .cache import Cache
 
 
@@ -76,45 +78,84 @@ class Children:
 
 
 def tiles(cache: Cache, targets: Targets, children: Children) -> Written:
-    """Gives nodes their children: takes tiles, unlinks, writes and links them."""
+    """Gives nodes their children; see `put_tiles`. The host waits for what came of it."""
+    (lru,) = cache.lru[REQUEST_SUBDIVIDE]
+    put = put_tiles(cache, targets, children, lru.free())
+    lasting, items, evicted = put.counts.tolist()
+    lru.unused -= items
+    done = Written(items=items, evicted=evicted, stale=len(targets) - lasting)
+    done.unplaced = max(0, lasting - items - lru.unused)
+    done.lost = put.wanted & (put.slot < 0) if items < lasting else None
+    if items and children.alias is not None:
+        row, child = (children.is_alias & (put.slot >= 0)[:, None]).nonzero().unbind(1)
+        target = targets.tree.find(children.alias[row, child])
+        known = target >= 0
+        node = put.slot[row] * cache.nodes.nodes_per_tile + child
+        cache.nodes.shared_t[targets.tree.number] = True
+        _alias(cache, node[known], target[known])
+    return done
+
+
+class Put(NamedTuple):
+    """What became of (k,) targets, on the device."""
+
+    wanted: Tensor  # (k,) bool, which lacked what was made for them
+    slot: Tensor  # (k,) int64 slots that they got, or -1
+    counts: Tensor  # (3,) int64 how many lacked it, how many got a slot, slots that held something
+
+    @classmethod
+    def of(cls, wanted: Tensor, slot: Tensor, owner: Tensor) -> Put:
+        """Counts; `owner` (s,) tells which slots held something."""
+        given = slot >= 0
+        held = given & (owner[slot.clamp(min=0)] >= 0)
+        return cls(wanted, slot, torch.stack([rows.sum() for rows in (wanted, given, held)]))
+
+
+def put_tiles(cache: Cache, targets: Targets, children: Children, free: Tensor) -> Put:
+    """Gives nodes, those of index -1 left out, their children: takes tiles, at most `free` (1,),
+    unlinks, writes and links them. The host does not wait, and every shape is that of the targets.
+    """
     (lru,), pool, per_tile = cache.lru[REQUEST_SUBDIVIDE], cache.nodes, cache.nodes.nodes_per_tile
     tree, node = targets.tree, targets.node
     wanted = targets.lacking(cache, REQUEST_SUBDIVIDE)
-    first = wanted & (wanted.cumsum(0) <= lru.unused)
-    tile_k = lru.order[: min(len(node), lru.unused)]
     # A late answer may be for nodes that are no longer used: those whose own tile is among the ones
     # given away have to wait.
+    front = lru.order[: len(node)].to(torch.int64)
+    most = torch.minimum(wanted.sum(), free)
     leaving = torch.zeros(pool.capacity, dtype=torch.bool, device=node.device)
-    leaving[tile_k.to(torch.int64)] = _among_first(tile_k, first.sum())
-    fit = first & ~leaving[node // per_tile]
-    used = (pool.parent_t[tile_k.to(torch.int64)] >= 0) & _among_first(tile_k, fit.sum())
-    counts = torch.stack([rows.sum() for rows in (wanted, first, fit, used)]).tolist()
-    lasting, taken, items, evicted = counts
-    stale, unplaced = len(node) - lasting, lasting - taken
-    done = Written(items=items, evicted=evicted, stale=stale, unplaced=unplaced)
-    done.lost = wanted & ~fit if items < lasting else None
-    tile_k = lru.take(taken)[:items]
-    if not items:
-        return done
+    leaving[front] = torch.arange(len(front), device=node.device) < most
+    staying = wanted & ~leaving[node.clamp(min=0) // per_tile]
+    slot = lru.give(staying, most)
+    put = Put.of(wanted, slot, pool.parent_t)
+    tile_k = slot.to(torch.int32)
     unlink(pool.child_tn, tile_k, pool.capacity)
     unlink(pool.parent_t, tile_k, pool.capacity, per_tile)
     unlink(cache.bricks.owner_b, tile_k, pool.capacity, per_tile)
-    rows, tile = torch.nonzero_static(fit, size=items)[:, 0], tile_k.to(torch.int64)
-    width = children.child.shape[1]
     for held, values in ((pool.constants, children.constants), (pool.ranges, children.ranges)):
-        for name, tensor in values.items():
-            movable(held[name])[tile, :width] = movable(tensor)[rows]
+        for name, rows in values.items():
+            put_rows_of(held[name], slot, rows)
     words = (pool.child_tn, pool.brick_tn, pool.request_tn)
     places = (pool.loc_t4, pool.parent_t, pool.tree_t, pool.stamp_t, pool.shared_t)
     made = (children.child.contiguous(), children.brick.contiguous(), node, targets.loc)
-    link_tiles(*words, *places, *made, rows, tile_k, tree.number, cache.frame)
-    if children.alias is not None:
-        row, child = children.is_alias[rows].nonzero().unbind(1)
-        target = tree.find(children.alias[rows][row, child])
-        known = target >= 0
-        pool.shared_t[tree.number] = True
-        _alias(cache, (tile[row] * per_tile + child)[known], target[known])
-    return done
+    rows = torch.arange(len(node), device=node.device)
+    link_tiles(*words, *places, *made, rows, tile_k, tree.number, cache.frame_1)
+    return put
+
+
+def put_rows_of(held: Tensor, slot: Tensor, rows: Tensor) -> None:
+    """Writes rows (k, ...) into slots (k,) of a pool (s, ...), those of slot -1 left out; a row may
+    be shorter than a slot.
+    """
+    target, made = _as_bytes(held), _as_bytes(rows.to(held.dtype))
+    if made.shape[1] < target.shape[1]:
+        made = torch.nn.functional.pad(made, (0, target.shape[1] - made.shape[1]))
+    put_rows(target, slot, made)
+
+
+def _as_bytes(rows: Tensor) -> Tensor:
+    """(k, b) uint8 view of rows (k, ...)."""
+    rows = rows.detach().contiguous()
+    return rows.view(len(rows), math.prod(rows.shape[1:])).view(torch.uint8)
 
 
 def _alias(cache: Cache, node: Tensor, target: Tensor) -> None:
@@ -130,90 +171,106 @@ def _alias(cache: Cache, node: Tensor, target: Tensor) -> None:
 
 
 def bricks(cache: Cache, targets: Targets, data: Voxels | Sequence[Chunk]) -> Written:
-    """Gives (k,) nodes their bricks: takes slots, unlinks, writes and links them. `data` is for
-    each channel (k, z, y, x, c), or what is on its way to the device; with a coarse channel they
-    get coarse slots.
-    """
+    """Gives (k,) nodes their bricks; see `put_bricks`. The host waits for what came of it."""
     first = data if isinstance(data, Mapping) else data[0].channels
     coarse = any(cache.bricks.channels[name].coarse for name in first)
-    lru, node = cache.lru[REQUEST_LOAD][coarse], targets.node
-    wanted = targets.lacking(cache, REQUEST_LOAD)
-    slot = lru.order[: min(len(node), lru.unused)].to(torch.int64)
-    used = (cache.bricks.owner_b[slot] >= 0) & _among_first(slot, wanted.sum())
-    lasting, evicted = torch.stack((wanted.sum(), used.sum())).tolist()
-    items = min(lasting, lru.unused)
-    stale, unplaced = len(node) - lasting, lasting - items
-    done = Written(items=items, evicted=evicted, stale=stale, unplaced=unplaced)
-    done.lost = wanted & (wanted.cumsum(0) > items) if unplaced else None
-    if not items:
-        return done
-    slot_k = lru.take(items)
-    if items < len(node):
-        rows = torch.nonzero_static(wanted, size=lasting)[:items, 0]
-        whole = joined(data, node.device)
-        data = {name: movable(some)[rows].view(some.dtype) for name, some in whole.items()}
-        node = node[rows]
-    done.nbytes = put_bricks(cache, slot_k, node, data)
+    lru = cache.lru[REQUEST_LOAD][coarse]
+    put = put_bricks(cache, targets, data, lru.free(), coarse)
+    lasting, items, evicted = put.counts.tolist()
+    lru.unused -= items
+    done = Written(items=items, evicted=evicted, stale=len(targets) - lasting)
+    done.unplaced = lasting - items
+    done.lost = put.wanted & (put.slot < 0) if done.unplaced else None
+    done.nbytes = items * _brick_bytes(data)
     return done
 
 
-def put_bricks(cache: Cache, slot_k: Tensor, node: Tensor, data: Voxels | Sequence[Chunk]) -> int:
-    """Writes voxels (see `bricks`) into (k,) int32 slots, each once, which lose what they held, and
-    links (k,) int64 nodes to them; returns bytes moved.
+def put_bricks(
+    cache: Cache,
+    targets: Targets,
+    data: Voxels | Sequence[Chunk],
+    free: Tensor,
+    coarse: bool = False,
+) -> Put:
+    """Gives (k,) nodes, those of index -1 left out, their bricks: takes slots, at most `free` (1,),
+    unlinks, writes and links them. The host does not wait.
+
+    Args:
+        cache: The pools.
+        targets: The nodes.
+        data: For each channel (k, z, y, x, c), or what is on its way to the device.
+        free: How many slots may be taken.
+        coarse: Whether they get coarse slots.
     """
-    nodes, pool, slot = cache.nodes, cache.bricks, slot_k.to(torch.int64)
+    wanted = targets.lacking(cache, REQUEST_LOAD)
+    slot = cache.lru[REQUEST_LOAD][coarse].give(wanted, free)
+    put = Put.of(wanted, slot, cache.bricks.owner_b)
+    write_slots(cache, slot, targets.node, data)
+    return put
+
+
+def write_slots(cache: Cache, slot: Tensor, node: Tensor, data: Voxels | Sequence[Chunk]) -> None:
+    """Writes voxels (see `put_bricks`) into slots (k,), each once, -1 left out, which lose what
+    they held, and links (k,) int64 nodes to them.
+    """
+    nodes, pool, slot_k = cache.nodes, cache.bricks, slot.to(torch.int32)
     unlink(nodes.brick_tn, slot_k, pool.capacity)
     with pool.writing():
         if isinstance(data, Mapping):
-            there = {name: on_device(rows, slot.device) for name, rows in data.items()}
-            nbytes = _fill_slots(cache, slot, there)
+            _fill_slots(cache, slot, {n: on_device(r, slot.device) for n, r in data.items()})
         else:
-            nbytes = 0
             for chunk in data:
                 with chunk as arrived:
-                    nbytes += _fill_slots(cache, slot[chunk.begin : chunk.end], arrived)
+                    _fill_slots(cache, slot[chunk.begin : chunk.end], arrived)
     slots = (pool.owner_b, pool.stamp_b, pool.born_b, pool.shared_b)
-    link_bricks(nodes.brick_tn, nodes.request_tn, *slots, node, slot_k, cache.frame)
-    return nbytes
+    link_bricks(nodes.brick_tn, nodes.request_tn, *slots, node, slot_k, cache.frame_1)
 
 
-def _fill_slots(cache: Cache, slot: Tensor, data: Mapping[str, Tensor]) -> int:
-    """Writes voxels that are on the device; returns how many bytes they are."""
-    nbytes = 0
+def _fill_slots(cache: Cache, slot: Tensor, data: Mapping[str, Tensor]) -> None:
+    """Writes voxels that are on the device."""
     for name, held in cache.bricks.bricks.items():
         if name in data:
-            to, rows = wide_rows(held, data[name])
-            to.index_copy_(0, slot, rows)
-            nbytes += rows.nbytes
-        elif not cache.bricks.channels[name].coarse:
-            wide_rows(held)[0].index_fill_(0, slot, 0)  # a tree without this channel
-    return nbytes
+            put_rows_of(held, slot, data[name])
+        elif not cache.bricks.channels[name].coarse:  # a tree without this channel
+            put_rows_of(held, slot, held.new_zeros(1).expand(len(slot), *held.shape[1:]))
+
+
+def _brick_bytes(data: Voxels | Sequence[Chunk]) -> int:
+    """Bytes of a brick, all channels together."""
+    if not isinstance(data, Mapping):
+        return data[0].brick_bytes
+    return sum(row_bytes(rows) for rows in data.values())
 
 
 def uniform(
     cache: Cache, targets: Targets, word: Tensor, constants: Mapping[str, Tensor]
 ) -> Written:
-    """Marks (k,) nodes as EMPTY or CONSTANT, as `word` (k,) int32 tells: they need no bricks.
-    `constants` are (k, c) for each channel; 0 for channels that are left out.
+    """Marks nodes as EMPTY or CONSTANT; see `put_uniform`. The host waits for what came of it."""
+    lasting = int(put_uniform(cache, targets, word, constants))
+    return Written(constant=lasting, stale=len(targets) - lasting)
+
+
+def put_uniform(
+    cache: Cache, targets: Targets, word: Tensor, constants: Mapping[str, Tensor]
+) -> Tensor:
+    """Marks (k,) nodes, those of index -1 left out, as EMPTY or CONSTANT, as `word` (k,) int32
+    tells: they need no bricks. `constants` are (k, c) for each channel; 0 for channels that are
+    left out. The host does not wait.
+
+    Returns:
+        () int64 how many still lacked it.
     """
     wanted = targets.lacking(cache, REQUEST_LOAD)
-    lasting = int(wanted.sum())
-    done = Written(constant=lasting, stale=len(targets) - lasting)
-    if not lasting:
-        return done
-    rows = torch.nonzero_static(wanted, size=lasting)[:, 0]
-    node, pool = targets.node[rows], cache.nodes
+    node, pool = torch.where(wanted, targets.node, -1), cache.nodes
     for name, words in pool.constants.items():
-        flat = movable(words).flatten(0, 1)
-        if name in constants:
-            flat[node] = movable(constants[name])[rows]
-        else:
-            flat.index_fill_(0, node, 0)
-    link(pool.brick_tn, pool.request_tn, node.to(torch.int32), word[rows], REQUEST_LOAD)
-    child = pool.child_tn.view(-1)
-    below = child[node]
-    child[node] = torch.where(below == ABSENT, TERMINAL, below)
-    return done
+        flat = words.flatten(0, 1)
+        nothing = flat.new_zeros(1).expand(len(node), flat.shape[1])
+        put_rows_of(flat, node, constants.get(name, nothing))
+    link(pool.brick_tn, pool.request_tn, node.to(torch.int32), word, REQUEST_LOAD)
+    child = pool.child_tn.view(-1, 1)
+    below = child[node.clamp(min=0)]
+    put_rows_of(child, node, torch.where(below == ABSENT, TERMINAL, below))
+    return wanted.sum()
 
 
 def share_bricks(cache: Cache, targets: Targets, other: Tensor) -> None:
@@ -233,8 +290,3 @@ def _copy_rows(words: Tensor, to: Tensor, source: Tensor) -> None:
     """Copies the rows of some nodes to others; words are (t, n, ...)."""
     flat = movable(words).flatten(0, 1)
     flat[to] = flat[source]
-
-
-def _among_first(rows: Tensor, count: Tensor) -> Tensor:
-    """(k,) bool: whether a row is one of the first `count`, a number on the device."""
-    return torch.arange(len(rows), device=rows.device) < count

@@ -8,7 +8,7 @@ Detailed Voxel Rendering", I3D 2009; Crassin, PhD thesis 2011.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import cached_property, partial
@@ -42,6 +42,7 @@ from ..tracing.trees import (
 )
 from .production import Failure, Production
 from .ray_subsets import RaySubsets, scouts
+from .recorded import DeviceFrame, HostFrame, recorded_frame
 from .request_batch import ProducedTree
 from .setup import EngineOptions, EngineSettings, brick_bytes, make_pools, make_tree
 from .stats import Collected, Counts, FrameStats, Readback, Readbacks, Report
@@ -97,10 +98,10 @@ class Engine:
         )
         self.readbacks = Readbacks()
         self.frames, self._closed = 0, False
-        self._frame_1 = torch.zeros(1, dtype=torch.int32, device=self.device)
         self._missed: Tensor | None = None  # (r,) bool, of the last picture's rays
         self._last: deque[FrameStats] = deque(maxlen=_KEPT)  # for the report
         self.trees: dict[str, ProducedTree] = {}
+        self.recorded: list[HostFrame] = []  # what producers on the host serve, without this frame
         try:
             for number, (name, producer) in enumerate(producers.items()):
                 self.trees[name] = make_tree(self.cache, self.options, number, name, producer)
@@ -163,7 +164,7 @@ class Engine:
         scene = {name: (one.tree, one.producer.channels) for name, one in self.trees.items()}
         by_level = self.options.loading == "levels"
         return tree_traces(
-            *("frame", scene, shaders, options, box), by_level=by_level, frame_1=self._frame_1
+            *("frame", scene, shaders, options, box), by_level=by_level, frame_1=self.cache.frame_1
         )
 
     @contextmanager
@@ -205,6 +206,7 @@ class Engine:
         requests again. The host waits for them only if an earlier frame is known to have requests,
         if an answer is due, if the host is too far ahead, or if `wait` is true.
         """
+        self.release()
         last = self.readbacks.catch_up(wait or self.production.due)
         if self.readbacks:
             return
@@ -213,6 +215,12 @@ class Engine:
             self.serve(last.requests, last.wait(), stats)
         with stage("write"):
             self.production.write(self.production.late(), stats)
+
+    def release(self, but: HostFrame | None = None) -> None:
+        """Lets captured frames, `but` one, forget what is on its way to them."""
+        for one in self.recorded:
+            if one is not but:
+                one.release()
 
     def serve(self, listed: RequestList, counts: Counts, stats: FrameStats) -> None:
         """Lets slots be taken again, chooses requests, asks the producers, and writes the answers
@@ -266,11 +274,13 @@ class Engine:
         self.number_picture()
         return view.hits(progress, again=again)
 
-    def number_picture(self) -> None:
-        """Gives the next picture its number: what rays stamp with it is in use."""
+    def number_picture(self, on_device: bool = True) -> None:
+        """Gives the next picture its number: what rays stamp with it is in use. The device is told
+        unless it counts for itself.
+        """
         self.frames += 1
-        self.cache.frame = self.frames
-        self._frame_1.fill_(self.frames)
+        if on_device:
+            self.cache.frame_1.fill_(self.frames)
         for source in self.trees.values():
             source.tree.frame = self.frames
 
@@ -282,7 +292,7 @@ class Engine:
             most = min(_MOST_LISTED, self.cache.nodes.child_tn.numel())
             requests = RequestList.collect(self.cache.nodes, most)
         with stage("lru"):
-            use = self.cache.sort_by_use(self._frame_1)
+            use = self.cache.sort_by_use()
         with stage("count"):
             total = samples.sum(dtype=torch.int64).view(1)
             return Collected(requests, torch.cat((requests.count, use, total)))
@@ -393,16 +403,23 @@ class Engine:
 
     @explicit(RenderOptions)
     def capture(
-        self, camera: Camera | Rays, shader: Shaders, **options: Unpack[RenderSettings]
+        self,
+        camera: Camera | Rays,
+        shader: Shaders,
+        *,
+        batch: int = 512,
+        **options: Unpack[RenderSettings],
     ) -> FrameGraph:
         """Records a frame as a CUDA graph, for cameras of this number and size.
 
         Renders a frame first, as `frame` does with the same arguments. A replay reads the layer's
-        tensors where they lie.
+        tensors where they lie. Where all producers are `on_device`, or all `on_host`, a replay also
+        serves what the ones before missed.
 
         Args:
             camera: Cameras as those of the replays.
             shader: For all trees, or one for each; no `ModuleShader`.
+            batch: Most bricks, and most node tiles, that a replay makes for each tree.
             **options: Fields of `RenderOptions`.
 
         Raises:
@@ -424,8 +441,14 @@ class Engine:
             )
         if view.options.layer is not None:
             view.options.layer.check_device("capture", self.device)
-        self.frame(camera, shader, **options)  # loads what is loaded at first use
-        return FrameGraph(self, view)
+        check.whole("capture", "batch", batch, low=1, high=1 << 16)
+        again = partial(self.frame, shader=shader, **options)
+        again(camera)  # loads what is loaded at first use
+        trees = [*self.trees.values()]
+        served = recorded_frame(self.cache, trees, self.scheduler, batch, self.production)
+        if isinstance(served, HostFrame):
+            self.recorded.append(served)
+        return FrameGraph(self, view, served, again)
 
     @property
     def steady(self) -> bool:
@@ -467,6 +490,8 @@ class Engine:
     def close(self) -> None:
         """Lets go of what is on its way, and of the producers' files and threads."""
         self._closed = True
+        for one in self.recorded:
+            one.close()
         self.production.close()
         for source in self.trees.values():
             source.producer.close()
@@ -485,25 +510,37 @@ class Engine:
 class FrameGraph:
     """A frame as one CUDA graph, which costs the host a single call. `Engine.capture` makes it.
 
-    A replay is the frame that `Engine.frame` would render, but it produces nothing. Where
-    `Engine.steady` is false, something was missed or an answer is on its way: then call
-    `Engine.frame` until it is true::
+    A replay is the frame that `Engine.frame` would render. Where all producers are `on_device`, it
+    also makes what the replay before it missed; where all are `on_host`, these get the list of what
+    a replay missed once it has arrived, and a later one writes what they answered. Else it produces
+    nothing; where `Engine.steady` is false, something was missed or an answer is on its way: then
+    call `Engine.frame` until it is true::
 
         render = graph.replay if engine.steady else partial(engine.frame, shader=shader)
         picture, stats = render(camera)
     """
 
-    def __init__(self, engine: Engine, view: View) -> None:
-        """Records the frame; see `Engine.capture`."""
-        self._engine = engine
+    def __init__(
+        self,
+        engine: Engine,
+        view: View,
+        served: DeviceFrame | HostFrame | None,
+        again: Callable[[Camera | Rays], tuple[Picture, FrameStats]],
+    ) -> None:
+        """Records the frame; see `Engine.capture`. `again` renders one that the host serves."""
+        self._engine, self._served, self._again = engine, served, again
         self._view = view = replace(view, numbers=view.numbers.clone())  # of a replay's camera
+        self._number = -1  # of its last picture
         self._graph = torch.cuda.CUDAGraph()
         with (
             torch.cuda.device(engine.device),
             torch.cuda.graph(self._graph, capture_error_mode="thread_local"),
         ):
-            self._hits = view.hits()
-            self._collected = engine.collect_requests_and_use(self._hits.samples)
+            if served is not None:
+                self._hits, self._collected = served.run(view.hits)
+            else:
+                self._hits = view.hits()
+                self._collected = engine.collect_requests_and_use(self._hits.samples)
             self._picture = view.picture(self._hits, FrameStats())
 
     def replay(self, camera: Camera | Rays) -> tuple[Picture, FrameStats]:
@@ -525,13 +562,24 @@ class FrameGraph:
                 f"replay: camera must be {own[0]} of {own[2]}x{own[1]} pixels as captured "
                 f"({own[4]}), got {form[0]} of {form[2]}x{form[1]} ({form[4]})"
             )
-        engine = self._engine
+        engine, served = self._engine, self._served
+        if served is not None and (engine.readbacks.failed or served.host_needed):
+            served.host_needed = False
+            return self._again(camera)  # the host finds out which nodes fail, and names them
         with torch.cuda.device(engine.device), engine.new_frame(self._view.options) as stats:
-            engine.number_picture()
+            if served is not None:
+                engine.release(but=served if isinstance(served, HostFrame) else None)
+                engine.readbacks.take_arrived()
+                served.begin(engine.frames != self._number, stats)
+            engine.number_picture(on_device=served is None)
+            self._number = engine.frames
             self._view.numbers.copy_(camera.placed(self._view.box).numbers(engine.device))
             with stage("replay"):
                 self._graph.replay()
-            engine.read_back(stats, self._hits, self._collected)
+            collected = self._collected
+            if isinstance(served, HostFrame):
+                collected = collected._replace(ask=partial(served.ask, served.turn))
+            engine.read_back(stats, self._hits, collected)
         engine.readbacks.hold_back()
         return replace(self._picture, stats=stats), stats
 

@@ -36,6 +36,11 @@ class ProducedTree:
     producer: Producer
     layout: Layout
 
+    @cached_property
+    def host_layout(self) -> Layout:
+        """The layout, with its tensors in host memory."""
+        return replace(self.layout, device=torch.device("cpu"))
+
     def __repr__(self) -> str:
         return f"ProducedTree({self.name!r}, {type(self.producer).__name__})"
 
@@ -49,6 +54,7 @@ class RequestBatch:
     targets: Targets  # nodes to fill, or to subdivide
     fill_loc: Tensor | None = None  # (k, 4) filled in their stead: alias targets
     coarse: bool = False  # their bricks take coarse slots
+    on_host: bool = False  # the targets lie in host memory
 
     def __len__(self) -> int:
         return len(self.targets)
@@ -76,7 +82,8 @@ class RequestBatch:
     @property
     def nodes(self) -> Nodes:
         """What the producer is asked about; made anew, for `Nodes` keep positions once computed."""
-        return Nodes(self.loc, self.source.layout, coarse=self.coarse)
+        layout = self.source.host_layout if self.on_host else self.source.layout
+        return Nodes(self.loc, layout, coarse=self.coarse)
 
     @cached_property
     def loc(self) -> Tensor:
@@ -109,8 +116,9 @@ class Answered(NamedTuple):
 
 
 def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
-    """Turns a producer's regions into the words of tiles."""
-    layout, nodes = batch.source.layout, batch.nodes
+    """Turns a producer's regions into the words of tiles, where the regions lie."""
+    nodes = batch.nodes
+    layout = nodes.layout
     low = nodes.loc[:, :3] * (nodes.scale * layout.brick_size)[:, None]
     kind = torch.where((low >= layout.extent_3).any(1), Region.EMPTY, answer.kind)
     leaf = (kind == Region.EMPTY) | (kind == Region.CONSTANT) | (kind == Region.DATA_MAX_DEPTH)
@@ -121,7 +129,8 @@ def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
     constants, ranges = dict(answer.constants), dict(answer.ranges)
     for name, words in cache.nodes.constants.items():  # also what another tree left in these tiles
         if name not in constants:
-            constants[name] = words.new_zeros((len(kind), words.shape[-1]))
+            shape = (len(kind), words.shape[-1])
+            constants[name] = torch.zeros(shape, dtype=words.dtype, device=kind.device)
         if name not in ranges:
             ranges[name] = _untold_range(cache, name, kind, answer.constants.get(name))
 

@@ -12,7 +12,7 @@ from ..base import check
 from ..base.constants import ABSENT, CONSTANT, EMPTY, TERMINAL
 from ..base.volume import movable
 from ..cache import Cache
-from ..cache.write import put_bricks
+from ..cache.write import write_slots
 from ..pool import BrickPool, Channel, N3Tree, NodePool
 from ..producers import Layout, Nodes, Producer, Region
 from ..producers.answer import checked_bricks, checked_regions
@@ -229,8 +229,8 @@ def _fill_root(cache: Cache, made: ProducedTree, patience: float) -> None:
     if kind in (Region.EMPTY, Region.CONSTANT):
         nodes.brick_tn.view(-1)[index] = EMPTY if kind == Region.EMPTY else CONSTANT
         return
-    slot = torch.tensor([number], dtype=torch.int32, device=root.loc.device)
-    put_bricks(cache, slot, slot.to(torch.int64) * nodes.nodes_per_tile, bricks.data)
+    slot = torch.tensor([number], device=root.loc.device)
+    write_slots(cache, slot, slot * nodes.nodes_per_tile, bricks.data)
     if made.layout.depth > 0 and kind != Region.DATA_MAX_DEPTH:
         nodes.child_tn.view(-1)[index] = ABSENT
 

@@ -129,6 +129,13 @@ class Counts(NamedTuple):
     bricks_used: int
     coarse_unused: int  # of the bricks unused
     samples: int
+    # What a frame on the device made; else it is known to the host.
+    tiles: int = 0
+    bricks: int = 0
+    constant: int = 0
+    tiles_evicted: int = 0
+    bricks_evicted: int = 0
+    failed: int = 0
 
     def by_kind(self) -> dict[str, int]:
         """Returns the number of requests by the name of their kind."""
@@ -139,7 +146,8 @@ class Collected(NamedTuple):
     """What a traced frame leaves on the device."""
 
     requests: RequestList
-    numbers: Tensor  # (11,) int64 `Counts`
+    numbers: Tensor  # (11,) or (17,) int64 `Counts`, and behind these what `ask` takes
+    ask: Callable[[Tensor], int] | None = None  # told on the host; how many nodes were asked for
 
 
 class Readback:
@@ -147,8 +155,8 @@ class Readback:
 
     def __init__(self, stats: FrameStats, collected: Collected) -> None:
         """Starts the copy."""
-        self.stats, (self.requests, numbers) = stats, collected
-        self._pending = stats.pending > 0  # answers were on their way while it was traced
+        self.stats, (self.requests, numbers, self._ask) = stats, collected
+        self.pending = stats.pending > 0  # answers were on their way while it was traced
         self._numbers, self._event = numbers, None
         self._counts: Counts | None = None
         if numbers.is_cuda:
@@ -171,17 +179,27 @@ class Readback:
         if self._counts is None:
             if self._event is not None:
                 self._event.synchronize()
-            self._counts = Counts(*self._numbers.tolist())
+            self._counts = Counts(*self._numbers[: len(Counts._fields)].tolist())
         return self._counts
+
+    def ask(self) -> int:
+        """Asks for what the device chose, once; returns for how many nodes."""
+        ask, self._ask = self._ask, None
+        self.wait()
+        return 0 if ask is None else ask(self._numbers[len(Counts._fields) :])
 
     def converged(self) -> bool:
         """Whether nothing that could be served was missing; waits until the counts are here."""
-        return not (self.wait().found or self._pending)
+        return not (self.wait().found or self.pending)
 
     def _complete(self) -> None:
         stats, counts = self.stats, self.wait()
         add(stats.requests, counts.by_kind())
         stats.overflow, stats.converged = counts.found - counts.listed, self.converged()
+        for name in stats.produced:
+            stats.produced[name] += getattr(counts, name)
+        for name in stats.evicted:
+            stats.evicted[name] += getattr(counts, f"{name}_evicted")
         for name in ("misses", "tiles_used", "bricks_used", "samples"):
             setattr(stats, name, getattr(counts, name))
 
@@ -190,6 +208,7 @@ class Readbacks(deque[Readback]):
     """The frames whose counts are on their way, oldest first."""
 
     _steady = False
+    failed = False  # whether a node failed in the newest frame read back, on the device
 
     def catch_up(self, wait: bool) -> Readback | None:
         """Takes all frames whose counts are here. Waits for those of the others if `wait` is true,
@@ -203,6 +222,11 @@ class Readbacks(deque[Readback]):
         ):
             newest = self._take()
         return newest
+
+    def take_arrived(self) -> None:
+        """Takes the frames whose counts are here; does not block."""
+        while self and self[0].arrived:
+            self._take()
 
     def hold_back(self) -> None:
         """Waits for the oldest frames while the host is too far ahead of the device."""
@@ -219,7 +243,11 @@ class Readbacks(deque[Readback]):
 
     def _take(self) -> Readback:
         readback = self.popleft()
+        if readback.ask():
+            for later in self:
+                later.pending = True
         self._steady = readback.converged()
+        self.failed = readback.wait().failed > 0
         readback.stats.settle()
         return readback
 

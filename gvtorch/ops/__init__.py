@@ -12,6 +12,7 @@ from .cache import (
     locate,
     lru_partition,
     mark_ancestors,
+    put_rows,
     unlink,
 )
 from .registry import available
@@ -42,6 +43,7 @@ __all__ = [
     "locate",
     "lru_partition",
     "mark_ancestors",
+    "put_rows",
     "sample_bricks",
     "shade_rays",
     "trace_rays",

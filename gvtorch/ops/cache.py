@@ -27,7 +27,7 @@ from ..base.constants import (
     TERMINAL,
 )
 from ..base.volume import movable
-from .registry import Backend, Flags, Longs, Words, choose_backend, op
+from .registry import Backend, Bytes, Flags, Longs, Words, choose_backend, op
 
 Count = Annotated[int, range(2**31)]
 Positive = Annotated[int, range(1, 2**31)]
@@ -157,13 +157,13 @@ def link_bricks(
     born_b: Words,
     shared_b: Flags,
     node_k: Longs,  # node indices, each once; those of no node are left out
-    slot_k: Words,  # their slots, each once
-    frame: int,  # number of the last picture
+    slot_k: Words,  # their slots, each once; -1 names none
+    frame_1: Words,  # number of the last picture
     *,
     backend: Backend = "auto",
 ) -> None:
     """Links nodes to bricks in slots, of which they become the only owners, and clears their
-    requests. The slots count as used in `frame`, and are first drawn in the next one.
+    requests. The slots count as used in that frame, and are first drawn in the next one.
 
     Mutates the first six.
     """
@@ -172,7 +172,7 @@ def link_bricks(
     node, slot_k = node_k[valid].to(torch.int32), slot_k[valid]
     slot = slot_k.to(torch.int64)
     owner_b[slot] = node
-    stamp_b[slot], born_b[slot], shared_b[slot] = frame, frame + 1, False
+    stamp_b[slot], born_b[slot], shared_b[slot] = frame_1, frame_1 + 1, False
     link(brick_tn, request_tn, node, slot_k, REQUEST_LOAD, backend=backend)
 
 
@@ -197,9 +197,9 @@ def link_tiles(
     node_j: Longs,  # the nodes
     loc_j4: Longs,  # their places
     row_k: Longs,  # which of the j nodes get tiles, each once
-    tile_k: Words,  # the tiles, each once, none of them a node's own
+    tile_k: Words,  # the tiles, each once, none of them a node's own; -1 names none
     tree: int,  # number of the tree
-    frame: int,  # number of the last picture: the tiles count as used in it
+    frame_1: Words,  # number of the last picture: the tiles count as used in it
     *,
     backend: Backend = "auto",
 ) -> None:
@@ -215,11 +215,27 @@ def link_tiles(
     tile, width, node = tile_k.to(torch.int64), child_jw.shape[1], node_j[row].to(torch.int32)
     child_tn[tile], brick_tn[tile] = TERMINAL, EMPTY
     child_tn[tile, :width], brick_tn[tile, :width] = child_jw[row], brick_jw[row]
-    request_tn[tile], stamp_t[tile], shared_t[tile] = 0, frame, False
+    request_tn[tile], stamp_t[tile], shared_t[tile] = 0, frame_1, False
     loc_t4[tile] = loc_j4[row].to(torch.int32)
     loc_t4[tile, 3] += 1
     parent_t[tile], tree_t[tile] = node, tree
     link(child_tn, request_tn, node, tile_k, REQUEST_SUBDIVIDE, backend=backend)
+
+
+@op()
+def put_rows(
+    target_sb: Bytes,  # slots
+    slot_k: Longs,  # where rows go, each slot once; -1 names none
+    rows_kb: Bytes,
+    *,
+    backend: Backend = "auto",
+) -> None:
+    """Writes rows into slots, bytes as they are.
+
+    Mutates `target_sb`.
+    """
+    valid = (slot_k >= 0) & (slot_k < len(target_sb))
+    target_sb[slot_k[valid]] = rows_kb[valid]
 
 
 @op()

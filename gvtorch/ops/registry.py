@@ -20,6 +20,7 @@ Backend = Literal["auto", "reference", "cpp", "cuda"]
 Words = Annotated[Tensor, torch.int32]
 Longs = Annotated[Tensor, torch.int64]
 Flags = Annotated[Tensor, torch.bool]
+Bytes = Annotated[Tensor, torch.uint8]
 _Twin = TypeVar("_Twin", bound=Callable[..., Any])
 
 
@@ -53,8 +54,8 @@ def op(also: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
     the twin, as its argument `backend` says: auto, reference, cpp or cuda.
 
     Tensors must be contiguous, on one device, and of the shape that their name ends with (of any,
-    if it has no such end) and the dtype of Words, Longs or Flags; numbers inside their range. Else
-    the op raises ValueError.
+    if it has no such end) and the dtype of Words, Longs, Flags or Bytes; numbers inside their
+    range. Else the op raises ValueError.
 
     Args:
         also: One more check, which gets the arguments by name.
@@ -69,7 +70,7 @@ def op(also: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
         places = {name: place for place, name in enumerate(names)}
         tensors = [
             (places[name], name, check.shape_of(name) if "_" in name else "", dtype)
-            for dtype in (torch.int32, torch.int64, torch.bool)
+            for dtype in (torch.int32, torch.int64, torch.bool, torch.uint8)
             for name, mark in marks.items()
             if mark == dtype
         ]
@@ -194,7 +195,8 @@ FAKES: dict[str, Callable[..., Any]] = {
     "lacking": lambda *, node_k, **_: torch.empty_like(node_k, dtype=torch.bool),
     "cut_bricks": _cut_bricks,
     **dict.fromkeys(
-        ("mark_ancestors", "unlink", "link", "link_bricks", "link_tiles"), lambda **_: None
+        ("mark_ancestors", "unlink", "link", "link_bricks", "link_tiles", "put_rows"),
+        lambda **_: None,
     ),
 }
 

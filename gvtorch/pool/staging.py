@@ -157,6 +157,11 @@ class Chunk:
         """Names of what it holds."""
         return tuple(self._data)
 
+    @property
+    def brick_bytes(self) -> int:
+        """Bytes of a brick, all channels together."""
+        return sum(row_bytes(rows) for rows in self._data.values())
+
     def __enter__(self) -> Mapping[str, Tensor]:
         if self._device.type == "cuda":
             torch.cuda.current_stream(self._device).wait_event(self._span.copied)
@@ -203,18 +208,18 @@ class Staging:
         count = len(next(iter(data.values())))
         if count == 0:
             return Shipment([], 0, data)
-        row_bytes = [_row_bytes(rows) for rows in data.values()]
+        widths = [row_bytes(rows) for rows in data.values()]
         cuda = self._device.type == "cuda"
         pinned = {name for name, rows in data.items() if cuda and _is_pinned(rows)}
         room = self.chunk if len(pinned) < len(data) else self.nbytes // 4  # nothing to overlap
-        per_chunk = (room - _ALIGN * len(data)) // sum(row_bytes)
+        per_chunk = (room - _ALIGN * len(data)) // sum(widths)
         if per_chunk < 1:
-            raise ValueError(f"Staging: a brick of {sum(row_bytes)} bytes is too large")
+            raise ValueError(f"Staging: a brick of {sum(widths)} bytes is too large")
         chunks: list[Chunk] = []
         begin = 0
         while begin < count:
             end = min(count, begin + per_chunk)
-            sizes = [-(-(end - begin) * size // _ALIGN) * _ALIGN for size in row_bytes]
+            sizes = [-(-(end - begin) * size // _ALIGN) * _ALIGN for size in widths]
             span = self._take(sum(sizes))
             if span is None:
                 break
@@ -237,7 +242,7 @@ class Staging:
         offset, arriving = span.begin, {}
         with torch.cuda.stream(self._stream) if self._stream else nullcontext():
             for (name, rows), size in zip(bricks.items(), sizes, strict=True):
-                at = slice(offset, offset + len(rows) * _row_bytes(rows))
+                at = slice(offset, offset + len(rows) * row_bytes(rows))
                 offset += size
                 arriving[name] = self._target[at].view(rows.dtype).view(rows.shape)
                 if isinstance(rows, Tensor) and name in pinned:
@@ -282,17 +287,6 @@ class Staging:
         self._host = torch.empty(self.nbytes, dtype=torch.uint8, pin_memory=cuda)
 
 
-def joined(data: Voxels | Sequence[Chunk], device: torch.device) -> dict[str, Tensor]:
-    """Returns all bricks on the device, in tensors of their own."""
-    if isinstance(data, Mapping):
-        return {name: on_device(rows, device) for name, rows in data.items()}
-    pieces: list[dict[str, Tensor]] = []
-    for chunk in data:
-        with chunk as arrived:
-            pieces.append({name: rows.clone() for name, rows in arrived.items()})
-    return {name: torch.cat([piece[name] for piece in pieces]) for name in pieces[0]}
-
-
 def upload(tensor: Tensor, device: torch.device) -> Tensor:
     """Returns a small tensor on the device; the host does not wait for the copy."""
     if device.type != "cuda" or tensor.device.type != "cpu" or tensor.numel() == 0:
@@ -304,5 +298,6 @@ def _is_pinned(rows: Tensor | TableRows) -> bool:
     return isinstance(rows, Tensor) and rows.is_contiguous() and rows.is_pinned()
 
 
-def _row_bytes(rows: Tensor | TableRows) -> int:
+def row_bytes(rows: Tensor | TableRows) -> int:
+    """Bytes of one of (k, ...) rows."""
     return math.prod(rows.shape[1:]) * rows.dtype.itemsize

@@ -20,21 +20,24 @@ from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 Form = TypeVar("Form", bound=Regions | Bricks)
 
 
-def checked_regions(answer: Any, nodes: Nodes, producer: Producer) -> Regions:
-    """Returns a producer's answer to `classify(nodes)` as `Regions` on the layout's device."""
+def checked_regions(answer: Any, nodes: Nodes, producer: Producer, *, look: bool = True) -> Regions:
+    """Returns a producer's answer to `classify(nodes)` as `Regions` on the layout's device. Without
+    `look` only types and shapes are checked, and the host waits for nothing.
+    """
     if isinstance(answer, Tensor):
         answer = Regions(kind=answer)
-    regions = _checked("classify", answer, Regions, "a tensor", nodes, producer)
+    regions = _checked("classify", answer, Regions, "a tensor", nodes, producer, look)
     return regions.each(lambda tensor: upload(tensor, nodes.layout.device))
 
 
-def checked_bricks(answer: Any, nodes: Nodes, producer: Producer) -> Bricks:
+def checked_bricks(answer: Any, nodes: Nodes, producer: Producer, *, look: bool = True) -> Bricks:
     """Returns a producer's answer to `fill(nodes)` as `Bricks`. Voxels stay where they are, unless
-    some channels lie on the host and others on the device: then all go to the device.
+    some channels lie on the host and others on the device: then all go to the device. For `look`
+    see `checked_regions`.
     """
     if isinstance(answer, Mapping):
         answer = Bricks(data=answer)
-    bricks = _checked("fill", answer, Bricks, "a dict of tensors", nodes, producer)
+    bricks = _checked("fill", answer, Bricks, "a dict of tensors", nodes, producer, look)
     if len({on_host({name: rows}) for name, rows in bricks.data.items()}) == 1:
         return bricks
     device = nodes.layout.device
@@ -64,7 +67,13 @@ def regions_of(
 
 
 def _checked(
-    method: str, answer: Any, form: type[Form], other: str, nodes: Nodes, producer: Producer
+    method: str,
+    answer: Any,
+    form: type[Form],
+    other: str,
+    nodes: Nodes,
+    producer: Producer,
+    look: bool,
 ) -> Form:
     """Returns the answer with a width in every shape, and with errors in place of bad items."""
     where = f"{type(producer).__name__}.{method}"
@@ -96,12 +105,32 @@ def _checked(
         name: _by_channel(where, name, by_channel, (count, *shapes[name]), producer)
         for name, by_channel in given.items()
     }
+    if not look:
+        _refuse_late(where, answer, [*fields.values()], layout.device)
+        return form(kind=kind, **fields)
     counts = _refuse_bad(kind, [*fields.values()], errors)
     missing = sorted(fine - {*fields["constants"]})
     if missing and counts[Region.CONSTANT]:
         raise ValueError(f"{where}: constants must hold channel {missing[0]!r} of CONSTANT items")
     alias = _alias(where, answer.alias, kind, layout, errors) if counts[Region.ALIAS] else None
     return form(kind=kind, alias=alias, errors=errors, **fields)
+
+
+def _refuse_late(
+    where: str,
+    answer: Any,
+    fields: Sequence[Mapping[str, Tensor | TableRows]],
+    device: torch.device,
+) -> None:
+    """Raises ValueError where an answer on the device has what the host would have to see to."""
+    if answer.alias is not None or answer.errors:
+        raise ValueError(f"{where}: a producer that is on_device answers without alias and errors")
+    for by_channel in fields:
+        for name, values in by_channel.items():
+            if isinstance(values, TableRows) or values.device != device:
+                raise ValueError(
+                    f"{where}: channel {name!r} of a producer that is on_device is not"
+                )
 
 
 def _by_channel(

@@ -318,11 +318,18 @@ class Producer(torch.nn.Module):
         patience: Seconds after which an answer that has not come counts as failed; None: the
             engine's.
         layout: Set by the engine that uses this producer; None while none does.
+        on_device: Whether `classify` and `fill` take and give tensors of the engine's device alone,
+            and never make the host wait or copy from its memory, so that `Engine.capture` can
+            record them. They are then asked for batches of one size, which the root fills up.
+        on_host: Whether they take places on the host (`Nodes.loc`), and give tensors there or
+            futures soon: a captured frame then asks them while the device renders.
         made_of: For coarse channels, what they are made of: shaders compare it with what they need.
         extent, spacing, origin, branching, channels, value_range, labels: See `__init__`.
     """
 
     patience: float | None = None
+    on_device: bool = False
+    on_host: bool = False
     layout: Layout | None = None
 
     def __init__(

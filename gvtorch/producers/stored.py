@@ -117,6 +117,7 @@ class StoredProducer(Producer):
     """Streams a `gvtorch convert` store, or any OME-Zarr image. Its channel is "value"."""
 
     patience = float("inf")  # reads end by themselves, after `timeout`
+    on_host = True
 
     def __init__(
         self,

@@ -24,6 +24,8 @@ _BATCH = 4096  # bricks cut from a level at a time
 class VolumeProducer(Producer):
     """Cuts bricks out of the levels of a volume; the same bits as `N3Tree.from_volume`."""
 
+    on_host = True
+
     def __init__(
         self,
         volume: Volume | Mapping[str, Volume],
@@ -93,7 +95,7 @@ class VolumeProducer(Producer):
                     self._tables[name] = BrickTable(_all_bricks(values, levels, layout))
             grids = torch.tensor([level.grid[::-1] for level in levels])
             count = grids.prod(1, keepdim=True)
-            self._grids = torch.cat((grids, count.cumsum(0) - count), 1).to(layout.device)
+            self._grids = torch.cat((grids, count.cumsum(0) - count), 1)
 
     def classify(self, nodes: Nodes) -> Regions:
         """CONSTANT where all finest voxels in reach are equal, EMPTY where none is above the
@@ -107,8 +109,9 @@ class VolumeProducer(Producer):
         layout, data = nodes.layout, {}
         held = {name: c for name, c in self.channels.items() if nodes.coarse or not c.coarse}
         if self._grids is not None:
-            (x, y, z), grid = nodes.loc[:, :3].unbind(1), self._grids[nodes.depth]
-            row = (grid[:, 3] + (z * grid[:, 1] + y) * grid[:, 0] + x).cpu()
+            x, y, z, level = nodes.loc.cpu().unbind(1)
+            wide, high, _, first = self._grids[level].unbind(1)
+            row = first + (z * high + y) * wide + x
             return Bricks(data={name: self._tables[name][row] for name in held})
         for name, channel in held.items():
             shape = (len(nodes), *(layout.side,) * 3, channel.width)

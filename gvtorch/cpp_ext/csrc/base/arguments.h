@@ -43,6 +43,7 @@ using MaybeWorld = TensorOf<double, 0, true>;
 using Words = TensorOf<int32_t>;
 using Longs = TensorOf<int64_t>;
 using Flags = TensorOf<bool>;
+using Bytes = TensorOf<uint8_t>;
 using Reals = TensorOf<AnyReal>;
 using MaybeReals = TensorOf<AnyReal, 0, true>;
 using Voxels = TensorOf<AnyVoxel>;
@@ -51,6 +52,8 @@ template <char kAlias>
 using Written = TensorOf<int32_t, kAlias>;
 template <char kAlias>
 using WrittenFlags = TensorOf<bool, kAlias>;
+template <char kAlias>
+using WrittenBytes = TensorOf<uint8_t, kAlias>;
 
 template <class T>
 struct NumberOf {

@@ -207,7 +207,7 @@ struct WritePointer {
   X(WrittenFlags<'f'>, shared_b, slots) \
   X(Longs, node_k, kAny)                \
   X(Words, slot_k, count)               \
-  X(Int, frame, kAny)
+  X(Words, frame_1, 1)
 
 // Gives nodes the bricks in slots, which are theirs from now on.
 struct LinkBrick {
@@ -219,8 +219,8 @@ struct LinkBrick {
     const int32_t slot = slot_k[index];
     if (node < 0 || node >= nodes || slot < 0 || slot >= slots) return;
     owner_b[slot] = static_cast<int32_t>(node);
-    stamp_b[slot] = frame;
-    born_b[slot] = frame + 1;
+    stamp_b[slot] = *frame_1;
+    born_b[slot] = *frame_1 + 1;
     shared_b[slot] = false;
     brick_tn[node] = slot;
     request_tn[node] &= ~(kLoad | (kLoad << kPendingShift));
@@ -243,7 +243,7 @@ struct LinkBrick {
   X(Longs, row_k, kAny)                        \
   X(Words, tile_k, count)                      \
   X(Int, tree, kAny)                           \
-  X(Int, frame, kAny)
+  X(Words, frame_1, 1)
 
 // Writes tiles and hangs them below nodes: an index is a word of a tile. Words beyond those of the tree are TERMINAL
 // and EMPTY. A node's own tile is not among those written.
@@ -270,10 +270,30 @@ struct LinkTile {
     }
     parent_t[tile] = static_cast<int32_t>(node);
     tree_t[tile] = tree;
-    stamp_t[tile] = frame;
+    stamp_t[tile] = *frame_1;
     shared_t[tile] = false;
     child_tn[node] = static_cast<int32_t>(tile);
     request_tn[node] &= ~(kSubdivide | (kSubdivide << kPendingShift));
+  }
+};
+
+#define GV_PUT_ROWS(X)                          \
+  X(WrittenBytes<'a'>, target_sb, slots* bytes) \
+  X(Longs, slot_k, kAny)                        \
+  X(Bytes, rows_kb, count* bytes)
+
+// Writes rows into slots, in words as wide as they allow: an index is a word. -1 is a place that is not taken.
+template <class Word>
+struct PutRows {
+  GV_PUT_ROWS(GV_VIEW)
+  int64_t slots, width;
+
+  GV_HD void operator()(int64_t index) const {
+    const int64_t row = index / width;
+    const int64_t slot = slot_k[row];
+    if (slot < 0 || slot >= slots) return;
+    reinterpret_cast<Word*>(target_sb)[slot * width + (index - row * width)] =
+        reinterpret_cast<const Word*>(rows_kb)[index];
   }
 };
 

@@ -7,6 +7,10 @@
 
 namespace gvtorch {
 
+struct alignas(16) Wide {  // as much as a thread moves at once
+  int64_t part_2[2];
+};
+
 template <class List>
 void compact(const Tensor& like, int64_t count, const List& list);
 
@@ -113,6 +117,28 @@ inline void run(const LinkTilesOp& a) {
   for_each(a.child_tn, count * per_tile, args);
 }
 
+GV_OP(PutRowsOp, "put_rows", GV_PUT_ROWS, "()");
+
+template <class Word>
+void put_words(const PutRowsOp& a, int64_t slots, int64_t count, int64_t bytes) {
+  const Like like{a.slot_k};
+  PutRows<Word> args{};
+  GV_PUT_ROWS(GV_TAKE)
+  args.slots = slots;
+  args.width = bytes / static_cast<int64_t>(sizeof(Word));
+  for_each(a.target_sb, count * args.width, args);
+}
+
+inline void run(const PutRowsOp& a) {
+  const int64_t slots = a.target_sb.size(0), count = a.slot_k.numel();
+  const int64_t bytes = slots > 0 ? a.target_sb.numel() / slots : 0;
+  const auto odd = reinterpret_cast<uintptr_t>(a.target_sb.data_ptr()) |
+                   reinterpret_cast<uintptr_t>(a.rows_kb.data_ptr()) | static_cast<uintptr_t>(bytes);
+  if (odd % sizeof(Wide) == 0) return put_words<Wide>(a, slots, count, bytes);
+  if (odd % sizeof(int32_t) == 0) return put_words<int32_t>(a, slots, count, bytes);
+  put_words<uint8_t>(a, slots, count, bytes);
+}
+
 GV_OP(LocateOp, "locate", GV_LOCATE, "Tensor loc_k4");
 
 inline Tensor run(const LocateOp& a) {
@@ -164,6 +190,6 @@ inline Tensor run(const CutBricksOp& a) {
 }
 
 using CacheOps = Types<CompactRequestsOp, MarkAncestorsOp, LruPartitionOp, UnlinkOp, LinkOp, LinkBricksOp, LinkTilesOp,
-                       LocateOp, LackingOp, CutBricksOp>;
+                       PutRowsOp, LocateOp, LackingOp, CutBricksOp>;
 
 }  // namespace gvtorch

@@ -1,0 +1,349 @@
+"""Frames that are served on the device, in batches of fixed size: on the CPU step by step, and on
+CUDA as one graph, which the host never waits for.
+"""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import Future
+from functools import partial
+
+import pytest
+import torch
+from helpers import DEVICES
+
+import gvtorch as gv
+from gvtorch.engine.recorded import HostFrame, recorded_frame
+from gvtorch.io.conversion import convert
+
+COMPILED = [pytest.param(b, marks=pytest.mark.backend(b)) for b in ("cpp", "cuda")]
+LOOK = gv.TransferFunction.from_points(
+    [(0, 0), (0.4, 0.9)], [(0.4, 0.1, 0.2, 0.7), (1, 1, 0.8, 0.4)], reference=0.1
+)
+
+
+class Ball(gv.Producer):
+    """A ball with bands; what lies outside is EMPTY, with `kinds` only once it is filled."""
+
+    on_device = True
+
+    def __init__(self, extent: int = 256, branching: int = 2, kinds: bool = False) -> None:
+        super().__init__(extent, box=((-1, -1, -1), (1, 1, 1)), branching=branching)
+        self.kinds, self.asked = kinds, []
+        self.register_buffer("bands", torch.tensor([6.0, 28.0, 4.0]))
+        self.register_buffer("spoiled", torch.zeros(()))  # above 0: bricks near here hold NaN
+
+    def classify(self, nodes):
+        self.asked.append(len(nodes))
+        if self.kinds:
+            return torch.full_like(nodes.depth, gv.Region.DATA)
+        outside = nodes.center.norm(dim=1) - nodes.radius > 0.9
+        return torch.where(outside, gv.Region.EMPTY, gv.Region.DATA)
+
+    def fill(self, nodes):
+        gap = 0.9 - nodes.positions.norm(dim=-1, keepdim=True)
+        inside = (0.5 + gap / nodes.voxel_size.float()[:, None, None, None, :1]).clamp(0, 1)
+        value = inside * (0.7 + 0.3 * (nodes.positions * self.bands).sum(-1, keepdim=True).sin())
+        near = (nodes.center[:, 0] > 0.3) & (nodes.depth > 2) & (self.spoiled > 0)
+        value = torch.where(near[:, None, None, None, None], torch.nan, value)
+        if not self.kinds:
+            return {"value": value}
+        kind = torch.where((value == 0).flatten(1).all(1), gv.Region.EMPTY, gv.Region.DATA)
+        return gv.Bricks(data={"value": value}, kind=kind)
+
+
+def view(size: int = 48, angle: float = 30) -> gv.Camera:
+    return gv.Camera.orbit(angle, 20, 0.9, None, size, size)
+
+
+class Frames:
+    """Frames of an engine, served on the device: without a graph, so that the CPU runs them."""
+
+    def __init__(self, engine: gv.Engine, camera: gv.Camera, batch: int) -> None:
+        self.engine, self.batch = engine, batch
+        self.view = engine.view("test", camera, LOOK, {})
+        trees = [*engine.trees.values()]
+        made = recorded_frame(engine.cache, trees, engine.scheduler, batch, engine.production)
+        assert made is not None
+        self.served, self.number = made, -1
+        if isinstance(made, HostFrame):
+            engine.recorded.append(made)
+
+    def frame(self) -> tuple[gv.Hits, gv.FrameStats]:
+        with self.engine.new_frame(self.view.options) as stats:
+            self.engine.release(but=self.served)
+            self.engine.readbacks.take_arrived()
+            self.served.begin(self.engine.frames != self.number, stats)
+            self.engine.number_picture(on_device=False)
+            self.number = self.engine.frames
+            hits, collected = self.served.run(self.view.hits)
+            if isinstance(self.served, HostFrame):
+                collected = collected._replace(ask=partial(self.served.ask, self.served.turn))
+            self.engine.read_back(stats, hits, collected)
+        self.engine.readbacks.hold_back()
+        return hits, stats.settle()
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+@pytest.mark.parametrize("branching, kinds, batch", [(2, False, 64), (2, True, 7), (3, False, 300)])
+def test_they_come_to_the_picture_that_the_host_comes_to(backend, branching, kinds, batch):
+    def engine() -> gv.Engine:
+        producer = Ball(branching=branching, kinds=kinds)
+        return gv.Engine(producer, brick_pool="16 MB", device=DEVICES[backend])
+
+    with engine() as served:
+        expected = served.render(view(), LOOK)
+        assert expected.stats.converged and (expected.alpha > 0.5).any()
+    with engine() as own:
+        frames = Frames(own, view(), batch)
+        own.trees["scene"].producer.asked.clear()
+        made = {"tiles": 0, "bricks": 0, "constant": 0}
+        for _ in range(400):
+            hits, stats = frames.frame()
+            assert stats.produced["tiles"] <= batch and stats.produced["bricks"] <= batch
+            made = {name: made[name] + stats.produced[name] for name in made}
+            if stats.converged:
+                break
+        assert stats.converged and not stats.capacity_exceeded
+        own.validate()
+        assert set(own.trees["scene"].producer.asked) == {batch * branching**3}
+        there = int((own.cache.bricks.owner_b >= 0).sum())
+        assert made["bricks"] == there - 1, "the root was there"
+        assert made["tiles"] > 20 and (made["constant"] > 0) == kinds
+    assert torch.equal(hits.color, expected.color.reshape(-1, 3))
+    assert torch.equal(hits.depth, expected.depth.reshape(-1, 1))
+
+
+def on_the_host(blobs, tmp_path, which: str) -> gv.Producer:
+    """A producer that answers from the host: at once, by rows of a table, or later."""
+    if which == "store":
+        return gv.StoredProducer(convert(blobs, tmp_path))
+    return gv.VolumeProducer(blobs, hold=which)
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+@pytest.mark.parametrize("which", ["voxels", "bricks", "store"])
+@pytest.mark.parametrize("batch, pool", [(5, "4 MB"), (200, "4 MB"), (64, "150 kB")])
+def test_producers_on_the_host_answer_while_frames_go_on(
+    blobs, tmp_path, which, batch, pool, backend
+):
+    device = DEVICES[backend]
+    camera = view(24 if pool == "4 MB" else 6)
+    options = {"brick_size": 4, "brick_pool": pool, "device": device}
+    with gv.Engine(on_the_host(blobs, tmp_path / "one", which), **options) as engine:
+        expected = engine.render(camera, LOOK)
+        assert (expected.alpha > 0.5).any()
+    with gv.Engine(on_the_host(blobs, tmp_path / "two", which), **options) as engine:
+        frames, made = Frames(engine, camera, batch), 0
+        for _ in range(600):
+            hits, stats = frames.frame()
+            made += stats.produced["bricks"]
+            time.sleep(0.002 * (which == "store"))
+            if stats.converged:
+                break
+        assert stats.converged and made > 8
+        engine.validate()
+        assert frames.served.pending == 0
+        picture, _ = engine.frame(camera, LOOK)  # the host goes on from there
+        assert torch.equal(picture.color, expected.color)
+        frames.frame()  # what it knew of slots is out of date
+        engine.validate()
+    assert torch.equal(hits.color, expected.color.reshape(-1, 3))
+    assert torch.equal(hits.depth, expected.depth.reshape(-1, 1))
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_what_fails_on_the_host_is_named_and_not_asked_for_again(blobs, backend):
+    class Spoiled(gv.VolumeProducer):
+        def fill(self, nodes):
+            bricks = super().fill(nodes)
+            errors = {n: "spoiled" for n, d in enumerate(nodes.depth.tolist()) if d == 3}
+            return gv.Bricks(data=bricks.data, errors=errors)
+
+    with gv.Engine(Spoiled(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        frames = Frames(engine, view(24), 64)
+        for _ in range(200):
+            hits, stats = frames.frame()
+            if stats.converged:
+                break
+        assert stats.converged and stats.failed == len(engine.failures) > 4
+        assert all(one.message == "spoiled" and one.loc[3] == 3 for one in engine.failures)
+        engine.validate()
+    assert bool(torch.isfinite(hits.color).all())
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_what_raises_costs_itself_alone_and_what_never_comes_is_given_up(blobs, backend):
+    class Unruly(gv.VolumeProducer):
+        patience = 0.2
+
+        def fill(self, nodes):
+            if bool((nodes.loc[:, 0] == 1).any()):
+                raise OSError("no such column")
+            if bool((nodes.loc[:, 0] == 2).all()):
+                return Future()  # never done
+            return super().fill(nodes)
+
+    with gv.Engine(Unruly(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        frames = Frames(engine, view(16), 64)
+        for _ in range(400):
+            hits, stats = frames.frame()
+            time.sleep(0.002)
+            if stats.converged:
+                break
+        assert stats.converged
+        told = {one.message for one in engine.failures}
+        assert "OSError: no such column" in told
+        assert told <= {"OSError: no such column", "no answer within 0.2 s"}
+        raised = [one for one in engine.failures if one.message.startswith("OSError")]
+        assert all(one.loc[0] == 1 for one in raised)
+        engine.validate()
+    assert bool(torch.isfinite(hits.color).all())
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_aliases_are_left_to_the_host(blobs, backend):
+    """Such a node is asked for again by a frame that the host serves."""
+
+    class Twice(gv.VolumeProducer):
+        def fill(self, nodes):
+            bricks = super().fill(nodes)
+            kind = torch.where(nodes.loc[:, 0] == 1, gv.Region.ALIAS, gv.Region.DATA)
+            alias = nodes.loc.clone()
+            alias[:, 0] = 0
+            return gv.Bricks(data=bricks.data, kind=kind, alias=alias)
+
+    with gv.Engine(Twice(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        expected = engine.render(view(16), LOOK)
+    with gv.Engine(Twice(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        frames = Frames(engine, view(16), 64)
+        for _ in range(100):
+            frames.frame()
+            time.sleep(0.001)
+            if frames.served.host_needed:
+                break
+        assert frames.served.host_needed
+        picture = engine.render(view(16), LOOK)
+        engine.validate()
+    assert torch.equal(picture.color, expected.color)
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_a_pool_that_is_too_small_gives_away_what_is_used_least(backend):
+    """Flown around with a pool of a few hundred bricks: the way back is whole."""
+    with gv.Engine(Ball(), brick_pool="1 MB", node_pool="60 kB", device=DEVICES[backend]) as engine:
+        evicted = 0
+        for angle in (0, 50, 100, 180, 270, 0):
+            frames = Frames(engine, view(24, angle), 32)
+            for _ in range(200):
+                hits, stats = frames.frame()
+                evicted += stats.evicted["bricks"] + stats.evicted["tiles"]
+                if stats.converged:
+                    break
+            engine.validate()
+            assert stats.converged, angle
+        assert evicted > 50
+        picture = engine.render(view(24, 0), LOOK)
+    assert torch.equal(hits.color, picture.color.reshape(-1, 3))
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_bricks_with_nan_are_left_out_and_counted(backend):
+    with gv.Engine(Ball(), brick_pool="16 MB", device=DEVICES[backend]) as engine:
+        frames = Frames(engine, view(), 512)
+        engine.trees["scene"].producer.spoiled.fill_(1)
+        for _ in range(12):
+            hits, _ = frames.frame()
+        assert engine.readbacks.failed or engine.readbacks[-1].wait().failed > 0
+        engine.validate()
+        assert bool(torch.isfinite(hits.color).all())
+        picture = engine.render(view(), LOOK)  # the host names them
+        assert len(engine.failures) > 0 and "NaN" in engine.failures[0].message
+        assert torch.isfinite(picture.color).all()
+
+
+@pytest.mark.backend("cpp")
+def test_what_the_host_would_have_to_see_to_is_refused():
+    class Named(Ball):
+        def fill(self, nodes):
+            return gv.Bricks(data=super().fill(nodes), errors={0: "no"})
+
+    with gv.Engine(Ball(), brick_pool="16 MB") as engine:
+        frames = Frames(engine, view(), 8)
+        engine.trees["scene"].producer.__class__ = Named
+        with pytest.raises(ValueError, match="without alias and errors"):
+            frames.frame()
+
+
+class Unsaid(Ball):
+    """The same, but not said to answer on the device."""
+
+    on_device = False
+
+
+@pytest.mark.backend("cuda")
+def test_a_flight_through_a_store_does_not_wait(blobs, tmp_path):
+    path = [view(96, angle) for angle in torch.linspace(0, 90, 60).tolist()]
+    options = {"brick_size": 4, "brick_pool": "4 MB", "device": "cuda"}
+    with gv.Engine(on_the_host(blobs, tmp_path / "one", "store"), **options) as engine:
+        graph = engine.capture(path[0], LOOK, batch=64)
+        torch.cuda.synchronize()
+        torch.cuda.set_sync_debug_mode("error")
+        try:
+            for camera in path:
+                picture, stats = graph.replay(camera)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+        for _ in range(300):
+            picture, stats = graph.replay(path[-1])
+            time.sleep(0.002)
+            if stats.settle().converged:
+                break
+        assert stats.converged
+        engine.validate()
+        assert torch.equal(engine.render(path[-1], LOOK).color, picture.color)
+
+
+@pytest.mark.backend("cuda")
+def test_a_flight_is_replayed_without_the_host():
+    """The graph makes what it misses, and comes to the picture of the host."""
+    path = [view(96, angle) for angle in torch.linspace(0, 90, 60).tolist()]
+    with gv.Engine(Ball(1024), brick_pool="64 MB", device="cuda") as engine:
+        graph = engine.capture(path[0], LOOK, batch=256)
+        torch.cuda.synchronize()
+        torch.cuda.set_sync_debug_mode("error")
+        try:
+            for camera in path:
+                picture, stats = graph.replay(camera)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+        for _ in range(60):
+            picture, stats = graph.replay(path[-1])
+            if stats.settle().converged:
+                break
+        assert stats.converged and sum(stats.produced.values()) == 0
+        engine.validate()
+        shown = picture.color.clone()
+        served = engine.render(path[-1], LOOK)
+        assert torch.equal(served.color, shown)
+        engine.frame(view(96, 200), LOOK)  # another frame between two replays
+        picture, stats = graph.replay(path[-1])
+        assert stats.settle().converged and torch.equal(picture.color, shown)
+    with gv.Engine(Unsaid(1024), brick_pool="64 MB", device="cuda") as engine:
+        expected = engine.render(path[-1], LOOK)
+        graph = engine.capture(path[-1], LOOK)
+        picture, stats = graph.replay(view(96, 200))
+        assert not stats.settle().converged and sum(stats.produced.values()) == 0
+    assert torch.equal(expected.color, shown)
+
+
+@pytest.mark.backend("cuda")
+def test_a_node_that_fails_in_a_replay_is_named_by_the_host():
+    with gv.Engine(Ball(), brick_pool="16 MB", device="cuda") as engine:
+        graph = engine.capture(view(), LOOK)
+        engine.trees["scene"].producer.spoiled.fill_(1)
+        for _ in range(40):
+            picture, _ = graph.replay(view())
+        assert len(engine.failures) > 0 and "NaN" in engine.failures[0].message
+        assert torch.isfinite(picture.color).all()
+        engine.validate()
