@@ -34,7 +34,11 @@ class Slice:
     """where: 50%, the index of a voxel, or a place such as 12.5mm; for all axes also three, as in
     50%,40%,12"""
     up: Annotated[str | None, arg(metavar="+z")] = None
-    """which axis is up in the picture; if left out -y (rows run down) across z, else +z"""
+    """which axis is up in the picture; if left out as for patients, see --plain; of data without
+    such directions -y (rows run down) across z, else +z"""
+    plain: bool = False
+    """patients are shown as radiologists look at them, their right on the left, with letters at the
+    edges (R right, L left, A front, P back, S head, I feet); plain: without letters"""
     scale: Annotated[float, arg(metavar="PIXELS")] = 1.0
     """pixels along the shortest side of a voxel"""
     level: Annotated[int, arg(metavar="N")] = 0
@@ -54,6 +58,7 @@ class Slice:
         """Reads, colours, writes."""
         from ..pictures.files import checked_path
         from ..tracing import slice_picture
+        from ..tracing.slices import radiological_views
 
         checked_path("--output", self.output, self.bits, KINDS)
         places: Any = tuple(self.at.split(","))
@@ -62,6 +67,7 @@ class Slice:
         with Bar() as bar:
             bar("reading", 0, 0)
             data = self._open()
+            views = radiological_views(data.info.space) if self.up is None else {}
             span, colors = None, None
             if self.tf is None:
                 text = self.window or "auto"
@@ -77,10 +83,14 @@ class Slice:
                 level=self.level,
                 scale=self.scale,
                 up=self.up,
+                radiological=bool(views),
+                letters=bool(views) and not self.plain,
             )
-        picture.save(self.output, bits=self.bits)
         height, width, _ = picture.color.shape
-        print(f"{self.output}: {width}x{height}")
+        picture.save(self.output, bits=self.bits)
+        names = [view.name for axis, view in views.items() if self.axis in (axis, "all")]
+        shown = f", {' and '.join(names)}: right is on the left" if names else ""
+        print(f"{self.output}: {width}x{height}{shown}")
 
     def _open(self) -> Volume | Store:
         from ..io.store import Store

@@ -7,6 +7,7 @@ of the plane are read.
 from __future__ import annotations
 
 import re
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from ..base.records import RenderStats
 from ..base.volume import Volume
 from ..io.store import Store
 from ..io.window import window
+from ..pictures.letters import draw_letters
 from ..pictures.picture import Picture
 from ..shaders.presets import display_grays
 from ..shaders.transfer_function import TransferFunction
@@ -23,6 +25,12 @@ from ..shaders.transfer_function import TransferFunction
 At = float | int | str
 #: What is up in the picture of a plane across an axis: rows of a file run down, heads are up.
 UP = {"x": "+z", "y": "+z", "z": "-y"}
+#: Where an axis of the world points, as `ImageInfo.space` tells it, by its letter.
+_LETTERS = {w: w[0].upper() for w in ("right", "left", "anterior", "posterior", "superior")}
+_LETTERS["inferior"] = "I"
+_OPPOSITE = {**dict(zip("RAS", "LPI", strict=True)), **dict(zip("LPI", "RAS", strict=True))}
+#: Radiological planes, by what lies across them: name, what is up, what is on the left.
+_VIEWS = {"S": ("axial", "A", "R"), "A": ("coronal", "S", "R"), "R": ("sagittal", "S", "A")}
 _GAP = 4  # pixels between the three planes
 _MOST = 65536  # pixels along a side
 _UNITS = {
@@ -50,6 +58,8 @@ def slice_picture(
     level: int = 0,
     scale: float = 1.0,
     up: str | None = None,
+    radiological: bool = False,
+    letters: bool = False,
 ) -> Picture:
     """Returns a plane of voxels across an axis as a picture; of voxels that are not cubes, pixels
     keep the proportions.
@@ -69,6 +79,10 @@ def slice_picture(
         scale: Pixels along the shortest side of a voxel.
         up: Which axis is up in the picture of one plane, as in "+y"; -y (rows run down, as in
             files) across z, else +z. The other runs to the right.
+        radiological: Patients as radiologists look at them: an axial plane from the feet (front
+            up), a coronal one from the front, a sagittal one from their left; so their right is on
+            the left. For data whose `info.space` tells where its axes point, without `up`.
+        letters: Draws letters (R, L, A, P, S, I) at the edges of radiological planes, over voxels.
 
     Raises:
         ValueError: An argument is unknown, or out of its range.
@@ -84,23 +98,66 @@ def slice_picture(
         colors = TransferFunction(*display_grays()).stretched(*ends)
     elif span is not None:
         raise ValueError(f"{where}: span is for grays; colors have values of their own")
+    views = {n: PlaneView("", up) for n, up in UP.items()}
+    if radiological:
+        if up is not None:
+            raise ValueError(f"{where}: radiological planes have an up of their own")
+        views = radiological_views(data.info.space)
+        if not views:
+            raise ValueError(f"{where}: the data does not tell where its axes point (info.space)")
+        if not letters:
+            views = {n: view._replace(letters="") for n, view in views.items()}
+    elif letters:
+        raise ValueError(f"{where}: letters are for radiological planes")
     if axis != "all":
         if isinstance(at, tuple):
             raise ValueError(f"{where}: at must be one place for axis {axis}, got {at!r}")
         pixel = min(plane.spacing[n] for n in "xyz" if n != axis) / scale
-        return _picture(plane.colored(axis, at, UP[axis] if up is None else up, pixel, colors))
+        view = views[axis] if up is None else PlaneView("", up)
+        return _picture(plane.colored(axis, at, view, pixel, colors))
     if up is not None:
         raise ValueError(f"{where}: up is for one plane, not for axis 'all'")
     places = at if isinstance(at, tuple) else (at, at, at)
     pixel = min(plane.spacing.values()) / scale
     x, y, z = (
-        plane.colored(n, place, UP[n], pixel, colors)
+        plane.colored(n, place, views[n], pixel, colors)
         for n, place in zip("xyz", places, strict=True)
     )
     (top, left), (bottom, right) = y.shape[:2], (z.shape[0], x.shape[1])
     image = np.zeros((top + _GAP + bottom, left + _GAP + right, 3), np.float32)
     image[:top, :left], image[:top, left + _GAP :], image[top + _GAP :, :left] = y, x, z
     return _picture(image)
+
+
+class PlaneView(NamedTuple):
+    """How the plane across an axis is looked at."""
+
+    name: str  # axial, coronal or sagittal, where that is known
+    up: str  # as in "+z"
+    mirrored: bool = False  # the other axis runs to the left
+    letters: str = ""  # what lies above, to the right, below and to the left, as in ALPR
+
+
+def radiological_views(space: str | None) -> dict[str, PlaneView]:
+    """Returns how radiologists look at the planes across x, y and z, given `ImageInfo.space`; none
+    where that does not tell where the axes point.
+    """
+    words = (space or "").split("-")
+    if len(words) != 3 or not _LETTERS.keys() >= set(words):
+        return {}
+    towards = {axis: _LETTERS[word] for axis, word in zip("xyz", words, strict=True)}
+    views = {}
+    for axis, letter in towards.items():
+        name, above, left = _VIEWS[letter if letter in _VIEWS else _OPPOSITE[letter]]
+        found = {n: to for n, to in towards.items() if n != axis}
+        rows = next((n for n, to in found.items() if to in (above, _OPPOSITE[above])), "")
+        columns = next((n for n, to in found.items() if to in (left, _OPPOSITE[left])), "")
+        if not rows or not columns:
+            return {}
+        up = ("+" if found[rows] == above else "-") + rows
+        letters = above + _OPPOSITE[left] + _OPPOSITE[above] + left
+        views[axis] = PlaneView(name, up, found[columns] == left, letters)
+    return views
 
 
 class _Plane:
@@ -176,9 +233,10 @@ class _Plane:
         return part[..., self.component].squeeze(number)
 
     def colored(
-        self, axis: str, at: At, up: str, pixel: float, colors: TransferFunction
+        self, axis: str, at: At, view: PlaneView, pixel: float, colors: TransferFunction
     ) -> np.ndarray:
         """(h, w, 3) float32 linear light of the plane, of pixels so wide in world units."""
+        up = view.up
         others = [n for n in "zyx" if n != axis]  # of the rows and columns
         if up not in [sign + n for n in others for sign in "+-"]:
             raise ValueError(
@@ -190,7 +248,11 @@ class _Plane:
             values, others = values.T, others[::-1]
         rows, columns = (_pixels(self.extent[n], self.spacing[n] / pixel) for n in others)
         rows = rows[::-1] if up[0] == "+" else rows
-        return colors(values)[..., :3].astype(np.float32)[np.ix_(rows, columns)]
+        columns = columns[::-1] if view.mirrored else columns
+        image = colors(values)[..., :3].astype(np.float32)[np.ix_(rows, columns)]
+        if view.letters:
+            draw_letters(image, view.letters)
+        return image
 
 
 def _pixels(count: int, size: float) -> np.ndarray:
