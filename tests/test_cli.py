@@ -438,3 +438,51 @@ def test_mistakes_with_stores_get_one_line(scan_store, tmp_path, make, message):
     assert run.returncode == 2 and len(lines) == 1, run.stderr
     assert lines[0].startswith("gvtorch: error: ") and message in lines[0]
     assert not list(tmp_path.glob("*.png")) and not list(tmp_path.glob("*.mp4"))
+
+
+def test_patients_stand_upright_and_face_the_camera(tmp_path):
+    """A nose on an upright head: at its front, and nearer to the camera than the head."""
+    nibabel = pytest.importorskip("nibabel")
+    z, y, x = np.meshgrid(*[np.arange(40)] * 3, indexing="ij")
+    head = np.hypot(x - 20, y - 18) < 9
+    nose = np.hypot(np.hypot(x - 20, y - 30), z - 30) < 4
+    values = (100.0 * head + 900.0 * nose).astype(np.float32)
+    nibabel.save(nibabel.Nifti1Image(values.T, np.eye(4)), tmp_path / "a.nii")
+    flags = ("--size", "64x64", "--tf", "gray", "--window", "0,900", "-o", tmp_path / "a.png")
+    run = gvtorch("render", tmp_path / "a.nii", *flags, "--npz", tmp_path / "a.npz")
+    assert run.returncode == 0, run.stderr
+    color = np.load(tmp_path / "a.npz")["color"][..., 0]
+    row, column = np.unravel_index(color.argmax(), color.shape)
+    assert row < 34, "z = 30 of 40 is above the middle"
+    turned = gvtorch("render", tmp_path / "a.nii", *flags, "--camera", "orbit:210,20", "--up", "z")
+    assert turned.returncode == 0
+    again = gvtorch("render", tmp_path / "a.nii", *flags[:-1], tmp_path / "b.png")
+    assert again.returncode == 0
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_what_is_left_out_is_told(tmp_path):
+    """Channels that are not shown, and a picture in which nothing is."""
+    tifffile = pytest.importorskip("tifffile")
+    data = np.random.default_rng(0).integers(0, 99, (5, 2, 9, 9)).astype(np.uint8)
+    names = {"axes": "ZCYX", "Channel": {"Name": ["DAPI", "actin"]}}
+    tifffile.imwrite(tmp_path / "a.ome.tif", data, metadata=names, ome=True)
+    flags = ("--size", "16x16", "-o", tmp_path / "a.png")
+    run = gvtorch("render", tmp_path / "a.ome.tif", *flags)
+    assert "channel 0 (DAPI) of 2 is shown" in run.stderr
+    assert not gvtorch("render", tmp_path / "a.ome.tif", *flags, "--component", 1).stderr
+    surface = ("--shader", "isosurface", "--value", "9999", "--component", 1)
+    run = gvtorch("render", tmp_path / "a.ome.tif", *flags, *surface)
+    assert run.returncode == 0 and "nothing is seen: values range from" in run.stderr
+
+
+def test_info_counts_labels(tmp_path):
+    values = np.zeros((6, 6, 6), np.int32)
+    values[1], values[3] = 7, 2_000_000_001
+    np.save(tmp_path / "a.npy", values)
+    for flags in ((), ("--labels",)):
+        run = gvtorch("info", tmp_path / "a.npy", *flags)
+        assert run.returncode == 0 and "2, 7 to 2000000001" in run.stdout
+        assert ("told as labels" in run.stderr) == (not flags)
+    gvtorch("convert", tmp_path / "a.npy", tmp_path / "a.zarr", "--labels", "--workers", 1)
+    assert "2, 7 to 2000000001" in gvtorch("info", tmp_path / "a.zarr").stdout

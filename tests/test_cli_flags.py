@@ -163,7 +163,7 @@ OWN_KEYS = '[{"eye": [1, 2, 3], "target": [0, 0, 0], "up": [0, 1, 0], "fov": 20}
             ),
             "--max-frames is for --mode converge",
         ),
-        (lambda t: ["render", "S", "-o", t / "a.png", "--up", "up"], "--up must be 3 numbers"),
+        (lambda t: ["render", "S", "-o", t / "a.png", "--up", "up"], "--up must be +x, -x"),
         (lambda t: ["render", "S", "-o", t / "a.png", "--up", "+w"], "up must be one of +x, -x"),
         (
             lambda t: ["render", "S", "-o", t / "a.png", "--show", "lod", "--tone", "aces"],

@@ -140,7 +140,7 @@ def test_several_series_are_asked_about(tmp_path, data):
 @pytest.mark.parametrize(
     ("depths", "message"),
     [
-        ([0, 1, 2, 4, 5, 6], r"1 slices are missing after slice 3 of 6: the next lies 2 mm"),
+        ([0, 1, 2, 4, 5, 6], r"1 slice is missing after slice 3 of 6: the next lies 2 mm"),
         ([0, 1, 2.5, 4, 4.5, 6], "not evenly apart: 0.5 to 1.5 mm"),
         ([0, 1, 2, 2, 3, 4], "slices are there 1 to 2 times"),
     ],

@@ -154,3 +154,71 @@ def test_flags_that_do_nothing_or_are_wrong(volume, tmp_path, flags, message):
     run = gvtorch("slice", tmp_path / "a.npy", "-o", tmp_path / "a.png", *flags)
     assert run.returncode == 2 and len(run.stderr.splitlines()) == 1, run.stderr
     assert message in run.stderr and not (tmp_path / "a.png").exists()
+
+
+def patient(space: str | None) -> gv.Volume:
+    """Numbers that tell a voxel's place: z, y, x."""
+    values = np.arange(48 * 50 * 52, dtype=np.float32).reshape(48, 50, 52)
+    return gv.Volume(values, info=gv.ImageInfo(space=space))
+
+
+RAS, LPS = "right-anterior-superior", "left-posterior-superior"
+
+
+def test_patients_are_seen_as_radiologists_see_them():
+    """Front, or head, up; their right on the left, in a sagittal plane their front."""
+    values = patient(RAS).data[..., 0].numpy()
+    for space, data in ((RAS, values), (LPS, values[:, ::-1, ::-1])):  # the same patient
+        volume = gv.Volume(data.copy(), info=gv.ImageInfo(space=space))
+        mid = {"x": 20, "y": 20, "z": 20} if space == RAS else {"x": 31, "y": 29, "z": 20}
+        span = (0, float(values.max()))
+        cut = {
+            n: gv.slice_picture(volume, n, at, span=span, radiological=True).color[..., 0].numpy()
+            for n, at in mid.items()
+        }
+        grays = gv.slice_picture(patient(None), "z", 0, span=span)  # any: only the order counts
+        assert grays.color.shape[:2] == (50, 52)
+
+        def order(image: np.ndarray) -> np.ndarray:
+            return image.ravel().argsort().argsort()
+
+        assert np.array_equal(order(cut["z"]), order(values[20, ::-1, ::-1])), space
+        assert np.array_equal(order(cut["y"]), order(values[::-1, 20, ::-1])), space
+        assert np.array_equal(order(cut["x"]), order(values[::-1, ::-1, 20])), space
+
+
+def test_letters_stand_at_the_edges_and_nowhere_else():
+    options = {"span": (0, 1e6), "radiological": True}
+    plain = gv.slice_picture(patient(RAS), "z", 0, **options).color
+    drawn = gv.slice_picture(patient(RAS), "z", 0, **options, letters=True).color
+    changed = (plain != drawn).any(2)
+    for edge in (changed[:12], changed[-12:], changed[:, :12], changed[:, -12:]):
+        assert edge.any()
+    assert not changed[14:-14, 14:-14].any()
+    small = gv.Volume(np.zeros((9, 9, 9), np.float32), info=gv.ImageInfo(space=RAS))
+    assert not gv.slice_picture(small, **options, letters=True).color.any()
+
+
+@pytest.mark.parametrize(
+    ("space", "options", "message"),
+    [
+        (None, {"radiological": True}, "does not tell where its axes point"),
+        ("right-left-superior", {"radiological": True}, "does not tell where its axes point"),
+        (RAS, {"radiological": True, "up": "+y"}, "an up of their own"),
+        (RAS, {"letters": True}, "letters are for radiological planes"),
+    ],
+)
+def test_views_that_can_not_be_are_refused(space, options, message):
+    with pytest.raises(ValueError, match=message):
+        gv.slice_picture(patient(space), **options)
+
+
+def test_the_command_shows_patients(tmp_path):
+    nibabel = pytest.importorskip("nibabel")
+    data = patient(RAS).data[..., 0].numpy().T
+    nibabel.save(nibabel.Nifti1Image(data, np.eye(4)), tmp_path / "a.nii")
+    out = tmp_path / "a.png"
+    run = gvtorch("slice", tmp_path / "a.nii", "-o", out)
+    assert run.returncode == 0 and "axial: right is on the left" in run.stdout
+    run = gvtorch("slice", tmp_path / "a.nii", "-o", tmp_path / "b.png", "--plain")
+    assert run.returncode == 0 and out.read_bytes() != (tmp_path / "b.png").read_bytes()

@@ -201,11 +201,23 @@ class Volume:
             "spacing": list(self.spacing),
             "origin": list(self.origin),
             **self.info.describe(),
+            **self._labels_told(),
             "range": [low, high],
             "mean": total / values.size,
             "histogram": [int(count) for count in counts],
             "bytes": self.data.nbytes,
         }
+
+    def _labels_told(self) -> dict[str, Any]:
+        """How many labels there are, without the background 0, and which; of labels alone."""
+        if not self.info.labels:
+            return {}
+        known = self.label_values
+        names = movable(self.data).unique().to(torch.int64) if known is None else known
+        names = names[names != 0]
+        ends = f", {int(names.min())} to {int(names.max())}" if len(names) else ""
+        counted = "" if known is None else "; the other numbers are places in their list"
+        return {"labels": f"{len(names)}{ends}{counted}"}
 
     def __repr__(self) -> str:
         dtype = str(self.data.dtype).removeprefix("torch.")

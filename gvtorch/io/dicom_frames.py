@@ -248,8 +248,9 @@ def _step(where: str, places: np.ndarray, normal: np.ndarray) -> np.ndarray:
         times = gaps[at] / usual
         missing = round(times) - 1
         if missing > 0 and abs(times - round(times)) < 0.1:
+            many = "slices are" if missing > 1 else "slice is"
             raise ValueError(
-                f"{where}: {missing} slices are missing after slice {at + 1} of {len(places)}: "
+                f"{where}: {missing} {many} missing after slice {at + 1} of {len(places)}: "
                 f"the next lies {gaps[at]:.4g} mm further, others {usual:.4g} mm"
             )
         raise ValueError(

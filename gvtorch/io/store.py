@@ -214,6 +214,7 @@ class Store:
             "unit": None,
             **self.info.describe(),
             **times,
+            **self._labels_told(),
             "levels": self.levels,
             "level extents": [list(self.level_extent(level)) for level in range(self.levels)],
             "blocks": f"{self.block}^3+{self.border}" if self.has_blocks else "none",
@@ -223,6 +224,14 @@ class Store:
             "disk bytes": sum(file.stat().st_size for file in files),
             **({"not kept": list(self.lost)} if self.lost else {}),
         }
+
+    def _labels_told(self) -> dict[str, Any]:
+        """How many labels there are, without the background 0, and which, where it is known."""
+        if self.label_values is None:
+            return {}
+        names = self.label_values[self.label_values != 0]
+        ends = f", {int(names.min())} to {int(names.max())}" if len(names) else ""
+        return {"labels": f"{len(names)}{ends}"}
 
     def level_extent(self, level: int) -> tuple[int, int, int]:
         """(x, y, z) voxels of a level, 0 the finest."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import re
 import sys
 import time
@@ -64,7 +65,14 @@ class Info:
             with Bar() as bar:
                 bar("reading", 0, 0)
                 source = open_source(self.path, most=MAX_VOXELS, **options)
-                content = volume_of(source, nan).describe()
+                try:
+                    content = volume_of(source, nan).describe()
+                except ValueError as error:
+                    if "--labels" not in str(error):
+                        raise
+                    warnings.warn(f"{error}; told as labels", stacklevel=2)
+                    source = open_source(self.path, most=MAX_VOXELS, **options | {"labels": True})
+                    content = volume_of(source, nan).describe()
             if source.times > 1:
                 content |= {"times": source.times, "time": source.time}
         if self.json:
@@ -282,7 +290,16 @@ def _joined(args: list[str]) -> list[str]:
 
 
 def main(args: list[str] | None = None) -> None:
-    """Runs the command line and ends the process."""
+    """Runs the command line and ends the process, quietly where nobody reads on (`| head`)."""
+    try:
+        _run(args)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        sys.exit(1)
+
+
+def _run(args: list[str] | None) -> None:
     args = _joined(sys.argv[1:] if args is None else args)
     if args == ["--version"]:
         from .. import __version__
@@ -312,6 +329,8 @@ def main(args: list[str] | None = None) -> None:
     )
     try:
         command.run()
+    except BrokenPipeError:
+        raise
     except (ValueError, OSError, ImportError, MemoryError) as error:
         text = " ".join(str(error).split()) or type(error).__name__
         print(f"gvtorch: error: {text}", file=sys.stderr)

@@ -13,12 +13,10 @@ from tyro.conf import Positional, arg
 
 from ..base.declared import declared_names
 from .common import Bar, size, volume_formats
-from .look import parse_orbit
-from .scene import SceneFlags
+from .look import first_orbit, parse_orbit, stance
+from .scene import Scene, SceneFlags
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from ..cameras.path import CameraPath
 
 _FILMS = tuple(declared_names("pictures.video", "FILMS"))
@@ -40,8 +38,8 @@ class Fly:
     fps: Annotated[int | None, arg(metavar="N")] = None
     """pictures a second of a film or a turntable; 25 if left out"""
     orbit: Annotated[str | None, arg(metavar="AZ,EL[,DIST]")] = None
-    """where an orbit starts: degrees, and largest sides of the box; 30,20 if left out, and all of
-    the box in each picture"""
+    """where an orbit starts: degrees, and largest sides of the box; as of gvtorch render if left
+    out, and all of the box in each picture"""
     stats: Annotated[Path | None, arg(metavar="FILE.jsonl")] = None
     """one JSON line a frame; stats.jsonl beside the pictures if left out"""
     scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()
@@ -68,7 +66,7 @@ class Fly:
             bar = stack.enter_context(Bar())
             film = Video(self.output, width, height, fps=fps) if is_film else None
             scene = stack.enter_context(self.scene.open(self.path, options, bar))
-            path = self._path(scene.box, width, height)
+            path = self._path(scene, width, height)
             if film is not None:
                 stack.enter_context(film)
             else:
@@ -131,18 +129,19 @@ class Fly:
         look = self.scene.look
         return CameraPath.from_json(self.flight, up=look.upward(), fov=look.fov)
 
-    def _path(self, box: Tensor, width: int, height: int) -> CameraPath:
+    def _path(self, scene: Scene, width: int, height: int) -> CameraPath:
         from ..cameras.path import CameraPath
 
         if self.flight != "orbit":
             return self._keys()
-        azimuth, elevation, distance = parse_orbit("--orbit", self.orbit or "30,20")
+        text = self.orbit or first_orbit(scene.space)
+        azimuth, elevation, distance = parse_orbit("--orbit", text)
         look = self.scene.look
         return CameraPath.orbit(
-            *(box, look.camera_model, look.fov),
+            *(scene.box, look.camera_model, look.fov),
             azimuth=azimuth,
             elevation=elevation,
             distance=distance,
-            up=look.upward() or "+y",
+            up=look.upward() or stance(scene.space)[0],
             fit=(width, height) if distance is None else None,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -45,7 +46,8 @@ class Look:
     size: Annotated[str, arg(metavar="WxH")] = "512x512"
     """pixels"""
     up: Annotated[str | None, arg(metavar="+z|X,Y,Z")] = None
-    """direction that is up in the picture; +y if left out"""
+    """direction that is up in the picture; if left out +z of patients, whose head is there, else
+    +y"""
     tf: Annotated[str | None, arg(metavar="FILE|PRESET")] = None
     """transfer function: gray, hot, vessels, bone or tissue; ct-bone, ct-soft, ct-lung or
     ct-vessels (Hounsfield units); a colour map of matplotlib; a file of gvtorch, ParaView or 3D
@@ -129,6 +131,10 @@ class Look:
         """What `--up` tells."""
         if self.up is None or (self.up[:1] in ("+", "-") and self.up[1:].isalpha()):
             return self.up
+        if self.up in ("x", "y", "z"):
+            return f"+{self.up}"
+        if "," not in self.up:
+            raise ValueError(f"--up must be +x, -x, +y, -y, +z, -z or X,Y,Z, got {self.up!r}")
         return numbers("--up", self.up, 3, float)
 
     def _channels(self, data: Volume | Store) -> Channels:
@@ -173,10 +179,23 @@ class Look:
                     raise ValueError(f"{flag} is for values: an isosurface has one")
             check_component(data, self.component)
             return BY_NAME[self.shader](TransferFunction([(0, 1)]), self.value or 0.0)
+        _tell_of_others(data, self.component)
         transfer = chosen_transfer(self.tf, self.window, data, self.component)
         if self.shader == "filtered":  # its colours are made with the tree
             return Filtered(transfer, component=self.component)
         return BY_NAME[self.shader](transfer, 0.0)
+
+
+def _tell_of_others(data: Volume | Store, component: int) -> None:
+    """Warns where one channel of several is shown that nobody asked for."""
+    names = [one.name for one in data.info.channels]
+    if len(names) > 1 and component == 0:
+        first = f" ({names[0]})" if names[0] else ""
+        warnings.warn(
+            f"channel 0{first} of {len(names)} is shown: --component N shows another, "
+            "--shader channels all",
+            stacklevel=2,
+        )
 
 
 def parse_orbit(flag: str, text: str) -> tuple[float, float, float | None]:
@@ -190,16 +209,35 @@ def parse_orbit(flag: str, text: str) -> tuple[float, float, float | None]:
     return azimuth, elevation, distance
 
 
-def parse_camera(text: str, look: Look, width: int, height: int) -> Camera:
-    """Makes a camera from `orbit:AZ,EL`, `orbit:AZ,EL,DIST` or `look:ex,ey,ez,tx,ty,tz`.
+def stance(space: str | None) -> tuple[Up, float]:
+    """Returns what is up, and the azimuth of the front, by where x, y and z point
+    (`ImageInfo.space`): of patients the head and the face.
+    """
+    words = (space or "").split("-")
+    if len(words) == 3 and words[2] == "superior" and words[1] in ("anterior", "posterior"):
+        return "+z", 180.0 if words[1] == "anterior" else 0.0
+    return "+y", 0.0
+
+
+def first_orbit(space: str | None) -> str:
+    """AZ,EL of a camera that nobody placed: a little from the side, and from above."""
+    return f"{stance(space)[1] + 30:g},20"
+
+
+def parse_camera(
+    text: str | None, look: Look, width: int, height: int, space: str | None = None
+) -> Camera:
+    """Makes a camera from `orbit:AZ,EL`, `orbit:AZ,EL,DIST` or `look:ex,ey,ez,tx,ty,tz`; `space`
+    tells what is up, and where it stands, if they are left out.
 
     Raises:
         ValueError: The text is none of these, or a number is out of its range.
     """
     from ..cameras import Camera
 
-    up, shape = look.upward() or "+y", (look.fov, width, height, look.camera_model)
-    kind, _, rest = text.partition(":")
+    up = look.upward() or stance(space)[0]
+    shape = (look.fov, width, height, look.camera_model)
+    kind, _, rest = (text or f"orbit:{first_orbit(space)}").partition(":")
     if kind == "orbit":
         azimuth, elevation, distance = parse_orbit("--camera orbit", rest)
         fit = distance is None

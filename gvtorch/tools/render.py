@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -35,10 +36,10 @@ class Render:
     """float32 color, alpha and depth, int32 samples"""
     stats: Annotated[Path | None, arg(metavar="FILE.json")] = None
     """milliseconds, rays, samples, nodes, bricks, bytes; of stores requests and misses too"""
-    camera: Annotated[str, arg(metavar="CAMERA")] = "orbit:30,20"
-    """orbit:AZIMUTH,ELEVATION (degrees), from where the whole box is in the picture;
-    orbit:AZIMUTH,ELEVATION,DISTANCE (largest sides of the box); or look:ex,ey,ez,tx,ty,tz (world
-    units)"""
+    camera: Annotated[str | None, arg(metavar="CAMERA")] = None
+    """orbit:AZIMUTH,ELEVATION (degrees; +x runs to the right at azimuth 0), from where the whole
+    box is in the picture; orbit:AZIMUTH,ELEVATION,DISTANCE (largest sides of the box); or
+    look:ex,ey,ez,tx,ty,tz (world units); if left out orbit:30,20, of patients from the front"""
     show: Literal["picture", "samples", "nodes", "lod", "age", "fill"] = "picture"
     """the picture, or what each ray cost: samples, nodes visited; or what it saw: depth of the
     nodes, age of the bricks in frames, share of their voxels that is not transparent"""
@@ -50,9 +51,10 @@ class Render:
         look = self.scene.look
         width, height = size(look.size)
         self._check()
-        camera = parse_camera(self.camera, look, width, height)
+        parse_camera(self.camera, look, width, height)
         options = look.options()
         with Bar() as bar, self.scene.open(self.path, options, bar) as scene:
+            camera = parse_camera(self.camera, look, width, height, scene.space)
             stats = self._take(scene, camera, bar)
         if self.stats is not None:
             content = {**stats.as_dict(), "extent": scene.extent}
@@ -85,6 +87,10 @@ class Render:
             developed = self.develop.wrap(scene.render)
             return render_tiles(developed, camera, self.output, bits=self.bits, progress=bar)
         picture = self.develop.wrap(partial(scene.render, progress=bar))(camera)
+        if self.show == "picture" and not bool(picture.alpha.any()):
+            ends = scene.values
+            known = "" if ends is None else f": values range from {ends[0]:g} to {ends[1]:g}"
+            warnings.warn(f"nothing is seen{known}", stacklevel=2)
         shown = picture if self.show == "picture" else scene.cost(camera).picture(self.show)
         shown.save(self.output, bits=self.bits)
         if self.npz is not None:

@@ -35,6 +35,8 @@ class Scene:
     cost: Callable[[Camera], Cost]
     box: Tensor  # (2, 3) float64 world
     extent: tuple[int, ...]  # (x, y, z) voxels
+    space: str | None  # where x, y and z point
+    values: tuple[float, float] | None  # the smallest and the largest, if known
     engine: Engine | None = None  # of a store
 
 
@@ -90,6 +92,8 @@ class SceneFlags:
             partial(cost, tree, shader=shader, **options),
             tree.box,
             volume.extent,
+            volume.info.space,
+            volume.value_range,
         )
 
     @contextmanager
@@ -101,12 +105,13 @@ class SceneFlags:
             raise ValueError("--threshold is for volumes; a store's is set by gvtorch convert")
         refuse_for_store(self.source)
         streaming = self.streaming
-        with streaming.open(path, self.look, self.source.time or 0) as (engine, shader):
+        store = streaming.store(path, self.source.time)
+        with streaming.open(store, self.look) as (engine, shader):
             (tree,) = (source.tree for source in engine.trees.values())
             mode, most = streaming.mode or "converge", streaming.max_frames
             yield Scene(
                 partial(engine.render, shader=shader, mode=mode, max_frames=most, **options),
                 partial(cost, tree, shader=shader, **options),
-                *(tree.box, tree.extent, engine),
+                *(tree.box, tree.extent, store.info.space, None, engine),
             )
             tell_failures(engine)

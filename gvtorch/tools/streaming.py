@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from .look import Look
 if TYPE_CHECKING:
     from ..base.records import RenderStats
     from ..engine import Engine, FrameStats
+    from ..io.store import Store
     from ..shaders import Shader
 
 
@@ -40,17 +42,28 @@ class Streaming:
     strict: tyro.conf.FlagCreatePairsOff[bool] = False
     """a block that can't be read ends the work"""
 
-    @contextmanager
-    def open(self, path: str, look: Look, time: int = 0) -> Iterator[tuple[Engine, Shader]]:
-        """Opens a store at a time point: the engine over it, and the transfer function."""
-        from ..engine.engine import Engine
+    def store(self, path: str, time: int | None) -> Store:
+        """Opens a store at a time point; tells which, where nobody did."""
         from ..io.store import Store
+
+        found = Store.open(path, image=self.image, time=time or 0)
+        if time is None and found.times > 1:
+            warnings.warn(
+                f"{path}: has {found.times} time points, this is the first; --time N shows "
+                f"another, up to {found.times - 1}",
+                stacklevel=2,
+            )
+        return found
+
+    @contextmanager
+    def open(self, store: Store, look: Look) -> Iterator[tuple[Engine, Shader]]:
+        """Gives an engine over a store, and the transfer function."""
+        from ..engine.engine import Engine
         from ..producers import StoredProducer
         from ..shaders import Filtered
 
         if self.mode not in (None, "converge") and self.max_frames != type(self)().max_frames:
             raise ValueError(f"--max-frames is for --mode converge, not {self.mode}")
-        store = Store.open(path, image=self.image, time=time)
         shader = look.chosen(store)
         filtered = shader if isinstance(shader, Filtered) else None
         if filtered is not None and look.tf is None:

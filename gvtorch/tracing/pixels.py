@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from os import PathLike
 from typing import Any, Unpack
 
 import torch
@@ -118,7 +119,14 @@ def _resident(where: str, scene: Any) -> Scene:
     """The trees of a scene; what is a volume becomes one."""
 
     def tree_of(one: Any) -> N3Tree:
-        return one if isinstance(one, N3Tree) else N3Tree.from_volume(as_volume(one, where=where))
+        if isinstance(one, N3Tree):
+            return one
+        if isinstance(one, (str, PathLike)):
+            raise ValueError(f"{where}: {str(one)!r} is a path: gv.read_volume reads it")
+        try:
+            return N3Tree.from_volume(as_volume(one, where=where))
+        except ValueError as error:
+            raise ValueError(f"{error}; gv.as_volume takes axes, nan and more") from None
 
     if isinstance(scene, Mapping):
         return {name: tree_of(one) for name, one in scene.items()}

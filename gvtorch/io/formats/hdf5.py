@@ -109,7 +109,7 @@ def _choose(path: str, file: Any, key: str | None) -> str:
     if not names:
         raise ValueError(f"{path}: holds no data set of three or more axes")
     listed = ", ".join(f"{path}:/{name.strip('/')} {text}" for name, text in names.items())
-    raise ValueError(f"{path}: holds {len(names)} data sets, choose one: {listed}")
+    raise ValueError(f"{path}: holds {len(names)} data sets, choose one with key (--key): {listed}")
 
 
 def _volumes(group: Any) -> dict[str, str]:

@@ -46,7 +46,7 @@ def open_npz(path: str, key: str | None = None, axes: str | None = None) -> Arra
         names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
     if key is None and len(names) != 1:
         raise ValueError(
-            f"{path}: holds {len(names)} arrays, choose one with key: {', '.join(names)}"
+            f"{path}: holds {len(names)} arrays, choose one with key (--key): {', '.join(names)}"
         )
     chosen = names[0] if key is None else key
     if chosen not in names:
