@@ -452,7 +452,7 @@ def test_patients_stand_upright_and_face_the_camera(tmp_path):
     run = gvtorch("render", tmp_path / "a.nii", *flags, "--npz", tmp_path / "a.npz")
     assert run.returncode == 0, run.stderr
     color = np.load(tmp_path / "a.npz")["color"][..., 0]
-    row, column = np.unravel_index(color.argmax(), color.shape)
+    row, _ = np.unravel_index(color.argmax(), color.shape)
     assert row < 34, "z = 30 of 40 is above the middle"
     turned = gvtorch("render", tmp_path / "a.nii", *flags, "--camera", "orbit:210,20", "--up", "z")
     assert turned.returncode == 0

@@ -73,10 +73,11 @@ class Frames:
         with self.engine.new_frame(self.view.options) as stats:
             self.engine.release(but=self.served)
             self.engine.readbacks.take_arrived()
-            self.served.begin(self.engine.frames != self.number, stats)
+            if self.served.begin(self.engine.frames != self.number, self.engine.steady, stats):
+                self.served.serve()
             self.engine.number_picture(on_device=False)
             self.number = self.engine.frames
-            hits, collected = self.served.run(self.view.hits)
+            hits, collected = self.served.draw(self.view.hits)
             if isinstance(self.served, HostFrame):
                 collected = collected._replace(ask=partial(self.served.ask, self.served.turn))
             self.engine.read_back(stats, hits, collected)

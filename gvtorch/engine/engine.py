@@ -508,7 +508,8 @@ class Engine:
 
 
 class FrameGraph:
-    """A frame as one CUDA graph, which costs the host a single call. `Engine.capture` makes it.
+    """A frame as CUDA graphs, one that serves and one that draws, which cost the host a call each.
+    `Engine.capture` makes it.
 
     A replay is the frame that `Engine.frame` would render. Where all producers are `on_device`, it
     also makes what the replay before it missed; where all are `on_host`, these get the list of what
@@ -531,13 +532,13 @@ class FrameGraph:
         self._engine, self._served, self._again = engine, served, again
         self._view = view = replace(view, numbers=view.numbers.clone())  # of a replay's camera
         self._number = -1  # of its last picture
-        self._graph = torch.cuda.CUDAGraph()
-        with (
-            torch.cuda.device(engine.device),
-            torch.cuda.graph(self._graph, capture_error_mode="thread_local"),
-        ):
+        self._serve, self._draw = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
+        if served is not None:
+            with _recorded(self._serve, engine.device):
+                served.serve()
+        with _recorded(self._draw, engine.device):
             if served is not None:
-                self._hits, self._collected = served.run(view.hits)
+                self._hits, self._collected = served.draw(view.hits)
             else:
                 self._hits = view.hits()
                 self._collected = engine.collect_requests_and_use(self._hits.samples)
@@ -570,12 +571,15 @@ class FrameGraph:
             if served is not None:
                 engine.release(but=served if isinstance(served, HostFrame) else None)
                 engine.readbacks.take_arrived()
-                served.begin(engine.frames != self._number, stats)
+                stale = engine.frames != self._number
+                with stage("serve"):
+                    if served.begin(stale, engine.steady, stats):
+                        self._serve.replay()
             engine.number_picture(on_device=served is None)
             self._number = engine.frames
             self._view.numbers.copy_(camera.placed(self._view.box).numbers(engine.device))
             with stage("replay"):
-                self._graph.replay()
+                self._draw.replay()
             collected = self._collected
             if isinstance(served, HostFrame):
                 collected = collected._replace(ask=partial(served.ask, served.turn))
@@ -585,3 +589,10 @@ class FrameGraph:
 
     def __repr__(self) -> str:
         return f"FrameGraph({self._view.camera!r})"
+
+
+@contextmanager
+def _recorded(graph: torch.cuda.CUDAGraph, device: torch.device) -> Iterator[None]:
+    """Records what the block does on the device."""
+    with torch.cuda.device(device), torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        yield

@@ -39,7 +39,7 @@ from .production import Production
 from .request_batch import ProducedTree, RequestBatch, children_of
 from .stats import Collected, FrameStats
 
-_MOST_LISTED = 1 << 15  # nodes whose requests are sorted
+_MOST_LISTED = 1 << 14  # nodes whose requests are sorted
 _LAST = 1 << 40  # the rank of what is not asked for
 
 
@@ -62,6 +62,9 @@ class RecordedFrame:
         self._most = min(_MOST_LISTED, cache.nodes.request_tn.numel())
         device = cache.frame_1.device
         self._unused = torch.zeros(2, dtype=torch.int64, device=device)  # tiles, bricks
+        # Since the last frame: tiles and bricks that were made, nodes that need none, tiles and
+        # bricks that were replaced, nodes that failed.
+        self._made = self._unused.new_zeros(6)
 
     def collect(self, hits: Hits) -> tuple[RequestList, Tensor]:
         """Lists requests, brings slots into the order of use, and counts both and the samples."""
@@ -69,7 +72,9 @@ class RecordedFrame:
         use = self.cache.sort_by_use()
         self._unused.copy_(use[0:4:2])
         samples = hits.samples.sum(dtype=torch.int64).view(1)
-        return requests, torch.cat((requests.count, use, samples))
+        numbers = torch.cat((requests.count, use, samples, self._made))
+        self._made.zero_()
+        return requests, numbers
 
     def choose(self, kind: int, node_k: Tensor, word_k: Tensor) -> Tensor:
         """(batch,) int64 nodes of a list that are served first, as `Scheduler.choose` takes them,
@@ -104,27 +109,24 @@ class DeviceFrame(RecordedFrame):
         self._requests = torch.zeros((2, self._most), dtype=torch.int32, device=self._unused.device)
         self.serve()  # loads what is loaded at first use; nothing is asked for
 
-    def begin(self, stale: bool, stats: FrameStats) -> None:
-        """Is called before a frame; `stale`: another one was rendered since the last of these."""
+    def begin(self, stale: bool, steady: bool, stats: FrameStats) -> bool:
+        """Tells before a frame whether it is to be served. `stale`: another one was rendered since
+        the last of these; `steady`: the newest of which the host knows missed nothing.
+        """
         if stale:
             self._requests.zero_()  # what would be served is out of date: the rays ask again
+        return not steady
 
-    def run(self, trace: Callable[[], Hits]) -> tuple[Hits, Collected]:
-        """Serves what the last frame asked for, traces, and collects what is asked for now."""
-        served = self.serve()
+    def draw(self, trace: Callable[[], Hits]) -> tuple[Hits, Collected]:
+        """Traces, and collects what is asked for now."""
         self.cache.frame_1.add_(1)
         hits = trace()
         requests, numbers = self.collect(hits)
         self._requests.copy_(torch.stack((requests.node, requests.word)))
-        return hits, Collected(requests, torch.cat((numbers, served)))
+        return hits, Collected(requests, numbers)
 
-    def serve(self) -> Tensor:
-        """Answers the most wanted requests of the last frame.
-
-        Returns:
-            (6,) int64 tiles and bricks that were made, nodes that need none, tiles and bricks that
-            were replaced, and nodes that failed.
-        """
+    def serve(self) -> None:
+        """Answers the most wanted requests of the last frame."""
         made = {kind: self._unused.new_zeros(2) for kind in (REQUEST_SUBDIVIDE, REQUEST_LOAD)}
         constant, failed = self._unused.new_zeros(2).split(1)
         for kind, ask in ((REQUEST_LOAD, self._fill), (REQUEST_SUBDIVIDE, self._subdivide)):
@@ -136,7 +138,7 @@ class DeviceFrame(RecordedFrame):
                 made[kind], free = made[kind] + counts, free - counts[:1]
                 constant, failed = constant + bare, failed + bad
         tiles, bricks = made.values()
-        return torch.cat((tiles[:1], bricks[:1], constant, tiles[1:], bricks[1:], failed))
+        self._made += torch.cat((tiles[:1], bricks[:1], constant, tiles[1:], bricks[1:], failed))
 
     def _fill(
         self, source: ProducedTree, node: Tensor, free: Tensor
@@ -197,7 +199,6 @@ class HostFrame(RecordedFrame):
         super().__init__(cache, trees, scheduler, batch)
         self._production = production
         device = self._unused.device
-        self._made = self._unused.new_zeros(6)  # since the last frame: see `DeviceFrame.serve`
         self._mail = [Mail(_boxes(cache, one), batch, device) for one in trees]
         self._by_tree = {one.tree.number: n for n, one in enumerate(trees)}
         self.turn = 0  # answers to what was asked before the last `release` are dropped
@@ -212,17 +213,18 @@ class HostFrame(RecordedFrame):
         """Nodes whose answers are on their way."""
         return max(0, self._asked - self._done - sum(mail.sent for mail in self._mail))
 
-    def begin(self, stale: bool, stats: FrameStats) -> None:
-        """Sends what has come, before a frame; `stale`: another one was rendered since the last of
-        these, which tells no more which slots are unused.
+    def begin(self, stale: bool, steady: bool, stats: FrameStats) -> bool:
+        """Sends what has come, before a frame, and tells whether there was anything: then it is to
+        be served. `stale`: another frame was rendered since the last of these, which tells no more
+        which slots are unused.
         """
         self.active = True
         if stale:
             self._unused.zero_()
         self._give_up()
-        for mail in self._mail:
-            mail.send()
+        sent = [mail.send() for mail in self._mail]
         stats.pending, stats.failed = self.pending, len(self._production.failures)
+        return any(sent)
 
     def release(self) -> None:
         """Forgets what is on its way, for a frame that the host serves; rays ask for it again."""
@@ -242,12 +244,13 @@ class HostFrame(RecordedFrame):
         """Ends the thread that asks."""
         self._asker.shutdown(wait=False, cancel_futures=True)
 
-    def run(self, trace: Callable[[], Hits]) -> tuple[Hits, Collected]:
-        """Writes what was sent, traces, collects, and chooses what the host is asked for, which is
-        marked as pending.
-        """
+    def serve(self) -> None:
+        """Writes what was sent."""
         for source, mail in zip(self.trees, self._mail, strict=True):
             self._write(source, mail)
+
+    def draw(self, trace: Callable[[], Hits]) -> tuple[Hits, Collected]:
+        """Traces, collects, and chooses what the host is asked for, which is marked as pending."""
         self.cache.frame_1.add_(1)
         hits = trace()
         requests, numbers = self.collect(hits)
@@ -262,8 +265,7 @@ class HostFrame(RecordedFrame):
                 mine = (number == source.tree.number)[:, None]
                 loc = torch.where(mine, source.tree.loc(node), loc)
             chosen.append(torch.cat((node[:, None], number[:, None].to(torch.int64), loc), 1))
-        numbers = torch.cat((numbers, self._made, torch.stack(chosen).flatten()))
-        self._made.zero_()
+        numbers = torch.cat((numbers, torch.stack(chosen).flatten()))
         return hits, Collected(requests, numbers)
 
     def _write(self, source: ProducedTree, mail: Mail) -> None:
