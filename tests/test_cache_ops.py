@@ -67,31 +67,6 @@ def test_lru_equals_a_python_list_over_random_traces(backend, data, size):
 
 
 @fixed
-@given(data=st.data(), tiles=st.integers(1, 30), per_tile=st.sampled_from([1, 8, 27]))
-def test_mark_ancestors_stamps_the_way_up_to_the_root_or_a_shared_tile(
-    backend, data, tiles, per_tile
-):
-    """Any pointers, even around in circles and out of the pool."""
-    device = DEVICES[backend]
-
-    def draw(numbers: st.SearchStrategy) -> list:
-        return data.draw(st.lists(numbers, min_size=tiles, max_size=tiles))
-
-    stamp, parent = draw(st.integers(3, 5)), draw(st.integers(-1, (tiles + 1) * per_tile))
-    shared = draw(st.sampled_from([False, False, True]))
-    stamp_t, parent_t = int32(stamp, device), int32(parent, device)
-    shared_t, frame = torch.tensor(shared, device=device), int32([5], device)
-    ops.mark_ancestors(stamp_t, parent_t, shared_t, frame, per_tile, backend=backend)
-    on_the_way = [tile for tile in range(tiles) if stamp[tile] == 5]
-    for tile in on_the_way:
-        above = parent[tile] // per_tile
-        if parent[tile] >= 0 and not shared[tile] and above < tiles and stamp[above] != 5:
-            stamp[above] = 5
-            on_the_way.append(above)
-    assert stamp_t.tolist() == stamp
-
-
-@fixed
 @given(
     pointers=st.lists(st.integers(-3, 40), min_size=1, max_size=200),
     leaving=st.lists(st.integers(-1, 45), max_size=30),
@@ -274,16 +249,6 @@ def test_kernels_equal_twins_on_a_large_pool(compiled):
     actual = ops.lru_partition(*(t.to(device) for t in (order, stamp, frame)), backend=compiled)
     assert all(torch.equal(a.cpu(), e) for a, e in zip(actual, expected, strict=True))
 
-    parent = torch.randint(-9, 4_000_000, (500_000,), generator=generator, dtype=torch.int32)
-    parent = torch.minimum(parent, 8 * torch.arange(500_000, dtype=torch.int32) - 1)  # roots first
-    shared = torch.rand(500_000, generator=generator) < 0.1
-    stamp = (torch.rand(500_000, generator=generator) < 0.2).to(torch.int32)
-    there = [t.to(device) for t in (stamp, parent, shared, frame)]
-    before = int(stamp.sum())
-    ops.mark_ancestors(stamp, parent, shared, frame, 8, backend="reference")
-    ops.mark_ancestors(*there, 8, backend=compiled)
-    assert torch.equal(there[0].cpu(), stamp) and int(stamp.sum()) > 1.2 * before
-
     tiles, per_tile = 150_000, 8
     pool = [
         torch.randint(-1, high, shape, generator=generator, dtype=torch.int32)
@@ -309,7 +274,6 @@ def test_cache_ops_pass_opcheck(compiled):
     for op, arguments in (
         (table.compact_requests, (request, 3)),
         (table.lru_partition, (int32([2, 0, 1], device), int32([1, 0, 1], device), frame)),
-        (table.mark_ancestors, (frame.clone(), none - 1, frame.bool(), frame, 8)),
         (table.unlink, (request, int32([0, -1], device), 4, 1)),
         (table.link, (request, request.clone(), frame, frame, LOAD)),
         (
@@ -350,7 +314,6 @@ def test_nothing_to_do(backend):
     request = torch.zeros((1, 8), dtype=torch.int32, device=device)
     assert ops.compact_requests(request, 4, backend=backend)[2].tolist() == [0, 0, 0]
     assert int(ops.lru_partition(none, none, frame, backend=backend)[1]) == 0
-    ops.mark_ancestors(none, none, none.bool(), frame, 8, backend=backend)
     ops.unlink(request, none, 0, backend=backend)
     ops.link(request, request.clone(), none, none, LOAD, backend=backend)
     places = torch.zeros((1, 4), dtype=torch.int32, device=device)
@@ -368,14 +331,6 @@ def test_nothing_to_do(backend):
         (lambda w: ops.compact_requests(w.T, 4), "request_tn must be contiguous"),
         (lambda w: ops.compact_requests(w, 0), "capacity must be an int >= 1"),
         (lambda w: ops.lru_partition(w, w[0], w[0, :1]), "order_k must be (k,)"),
-        (
-            lambda w: ops.mark_ancestors(w[0], w[1], w[2, :3] > 0, w[0, :1], 8),
-            "shared_t must be (8,) bool",
-        ),
-        (
-            lambda w: ops.mark_ancestors(w[0], w[1], w[2] > 0, w[0, :1], 0),
-            "per_tile must be an int >= 1",
-        ),
         (lambda w: ops.unlink(w, w, 4), "slot_k must be (k,)"),
         (lambda w: ops.unlink(w, w[0], 4, 0), "divisor must be an int >= 1"),
         (lambda w: ops.link(w, w, w[0], w[0, :2], LOAD), "word_k must be (8,)"),

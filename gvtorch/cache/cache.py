@@ -105,14 +105,12 @@ class Cache:
         return {"node_pool": node_bytes, "brick_pool": brick_bytes, "bookkeeping": rest}
 
     def sort_by_use(self) -> Tensor:
-        """Orders tiles and bricks by use in the last picture, tiles on the way to used ones
-        included; the host does not wait.
+        """Orders tiles and bricks by use in the last picture; the host does not wait.
 
         Returns:
             (5,) int64 tiles unused and used, bricks unused and used, and how many of the unused
             are coarse; `make_room` is told the unused ones, once the host knows them.
         """
-        self.nodes.mark_ancestors(self.frame_1)
         counts, frame, stamps = [], self.frame_1, (self.nodes.stamp_t, self.bricks.stamp_b)
         for group, stamp in zip(self.lru.values(), stamps, strict=True):
             unused, size = [lru.sort(stamp, frame) for lru in group], sum(map(len, group))

@@ -91,7 +91,6 @@ def tiles(cache: Cache, targets: Targets, children: Children) -> Written:
         target = targets.tree.find(children.alias[row, child])
         known = target >= 0
         node = put.slot[row] * cache.nodes.nodes_per_tile + child
-        cache.nodes.shared_t[targets.tree.number] = True
         _alias(cache, node[known], target[known])
     return done
 

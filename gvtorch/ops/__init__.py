@@ -11,7 +11,6 @@ from .cache import (
     link_tiles,
     locate,
     lru_partition,
-    mark_ancestors,
     put_rows,
     unlink,
 )
@@ -42,7 +41,6 @@ __all__ = [
     "list_samples",
     "locate",
     "lru_partition",
-    "mark_ancestors",
     "put_rows",
     "sample_bricks",
     "shade_rays",

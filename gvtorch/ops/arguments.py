@@ -69,10 +69,8 @@ class TraceArguments(NamedTuple):
     # The node pool; words are int32.
     child_tn: Tensor  # tile of a node's children, or ABSENT, TERMINAL
     brick_tn: Tensor  # a node's brick slot, or ABSENT, EMPTY, CONSTANT
-    shared_t: Tensor  # bool; of the root's tile: whether any tile of the tree is shared
     request_tn: Tensor  # request words; written: what rays missed
-    stamp_t: Tensor  # last frame that used a tile; written for the last tile of each descent, and
-    # where tiles are shared for all on the way: see `mark_ancestors`
+    stamp_t: Tensor  # last frame that used a tile; written
     stamp_b: Tensor  # last frame that used a brick; written
     frame_1: Tensor  # number of this frame
     root: int  # index of the root node

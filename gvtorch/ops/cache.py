@@ -62,30 +62,6 @@ def compact_requests(
 
 
 @op()
-def mark_ancestors(
-    stamp_t: Words,
-    parent_t: Words,
-    shared_t: Flags,
-    frame_1: Words,  # number of this frame
-    per_tile: Positive,  # nodes of a tile
-    *,
-    backend: Backend = "auto",
-) -> None:
-    """Stamps the tiles on the way to those that this frame stamped, as far up as parents tell: on
-    the way to a shared tile, rays have stamped each.
-
-    Mutates `stamp_t`.
-    """
-    tile = (stamp_t == frame_1).nonzero()[:, 0]
-    while len(tile):
-        node = parent_t[tile[~shared_t[tile]]]
-        tile = (node[node >= 0] // per_tile).unique().to(torch.int64)
-        tile = tile[tile < len(stamp_t)]
-        tile = tile[stamp_t[tile] != frame_1]
-        stamp_t[tile] = frame_1
-
-
-@op()
 def lru_partition(
     order_k: Words,  # slots; those that are never given away are not among them
     stamp_s: Words,  # last frame that used each slot

@@ -89,7 +89,6 @@ def check_trace(
         *_fields(arguments, table.dtype, "domain_2"),
         *_fields(arguments, torch.int32, "child_tn brick_tn request_tn stamp_t stamp_b"),
         *_fields(arguments, torch.int32, "opaque_m frame_1"),
-        *_fields(arguments, torch.bool, "shared_t"),
     ]
     sizes = check_rays(where, rays) | check_channel(where, arguments, device)
     sizes = check.tensors(where, device, fields, sizes)

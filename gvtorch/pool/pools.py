@@ -17,7 +17,6 @@ from ..base import check
 from ..base.arrays import as_volume
 from ..base.constants import ABSENT
 from ..base.volume import CHANNEL_DTYPES, Volume, movable
-from ..ops import mark_ancestors
 
 _COMMON = ("extent", "spacing", "origin")  # what the volumes of one tree share
 
@@ -181,11 +180,9 @@ class NodePool(_Pool):
             the tile's nodes; node x at that depth = loc x * N + child x.
         parent_t: (t,) int32 index of the node whose children this tile holds, -1 for a root tile.
         tree_t: (t,) int32 number of the tree that owns the tile.
-        stamp_t: (t,) int32 usage stamp: the last frame in which a ray's descent ended in the tile
-            or passed through it (see `mark_ancestors`), or after which it was written; -1 for
-            never.
-        shared_t: (t,) bool, whether other nodes may point to the tile as well (aliases); of a root
-            tile, whether any tile of its tree may be shared.
+        stamp_t: (t,) int32 usage stamp: the last frame in which a ray passed through, or after
+            which the tile was written; -1 for never.
+        shared_t: (t,) bool, whether other nodes may point to the tile as well (aliases).
         constants: For each channel that is not coarse (t, n, c): the value of CONSTANT nodes, the
             mean of EMPTY ones.
         ranges: For each of these (t, n, 2, c): smallest and largest value in reach of the node's
@@ -236,12 +233,6 @@ class NodePool(_Pool):
     def nodes_per_tile(self) -> int:
         """n = N ** 3."""
         return self.child_tn.shape[1]
-
-    def mark_ancestors(self, frame: Tensor) -> None:
-        """Stamps the tiles that rays passed through in `frame` (1,) int32, of which the rays have
-        stamped the last one of each descent.
-        """
-        mark_ancestors(self.stamp_t, self.parent_t, self.shared_t, frame, self.nodes_per_tile)
 
     def __repr__(self) -> str:
         return self._shown(f"tiles of {self.nodes_per_tile} nodes")

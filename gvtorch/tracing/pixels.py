@@ -83,7 +83,6 @@ def render(
         with stage("picture"):
             stats = tree_stats(trees, chosen, hits.samples)
             for one in trees:
-                one.nodes.mark_ancestors(torch.full_like(one.nodes.stamp_t[:1], one.frame))
                 stats.tiles_used += int((one.nodes.stamp_t == one.frame).sum())
                 stats.bricks_used += int((one.bricks.stamp_b == one.frame).sum())
             picture = view.picture(hits, stats)

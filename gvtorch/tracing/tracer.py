@@ -93,7 +93,6 @@ class Tracer:
             component=options.component if shader.component is None else shader.component,
             child_tn=tree.nodes.child_tn,
             brick_tn=tree.nodes.brick_tn,
-            shared_t=tree.nodes.shared_t,
             request_tn=tree.nodes.request_tn,
             stamp_t=tree.nodes.stamp_t,
             stamp_b=tree.bricks.stamp_b,

@@ -202,7 +202,6 @@ class TreeTracer(torch.nn.Module):
             component=self.component,
             child_tn=self.child_tn,
             brick_tn=self.brick_tn,
-            shared_t=self.shared_t,
             request_tn=self.request_tn,
             stamp_t=self.stamp_t,
             stamp_b=self.stamp_b,

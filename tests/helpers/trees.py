@@ -37,23 +37,6 @@ def on(tree: gv.N3Tree, device: str) -> gv.N3Tree:
     return copy
 
 
-def share(tree: gv.N3Tree, seed: int) -> gv.N3Tree:
-    """A copy in which a quarter of the nodes that have children have those of others, from any
-    depth; of some of these the tiles know no parent.
-    """
-    copy = on(tree, "cpu")
-    nodes, generator = copy.nodes, torch.Generator().manual_seed(seed)
-    child = nodes.child_tn.view(-1)
-    owner = (child >= 0).nonzero()[1:, 0]  # the root keeps its own
-    owner = owner[torch.randperm(len(owner), generator=generator)]
-    some, others, *_ = owner.tensor_split(4)
-    child[some[: len(others)]] = child[others]
-    shared = child[others].long()
-    nodes.parent_t[shared[::3]] = -1
-    nodes.shared_t[shared] = nodes.shared_t[tree.number] = True
-    return copy
-
-
 def forget(tree: gv.N3Tree, share: float, seed: int) -> gv.N3Tree:
     """A copy in which a share of the bricks and of the tiles is not there yet."""
     copy = on(tree, "cpu")

@@ -91,15 +91,15 @@ class Tree:
         self, position_r3: Tensor, wanted_r: Tensor, hides: Callable[[Tensor], Tensor]
     ) -> Descent:
         """Descends from the root to the wanted depth, or as far as tiles exist and something is
-        seen; stamps the last tiles, and where tiles are shared those on the way as well.
+        seen; stamps the tiles.
         """
         a, n = self.arguments, self.levels.branching
-        stamps_all = bool(a.shared_t[a.root // self.per_tile])
         node, depth = torch.full_like(wanted_r, a.root), torch.zeros_like(wanted_r)
         none = torch.full_like(node, -1)
         at = Descent(node, depth, none, hides(node), none, depth, none, depth)
         going = torch.ones_like(node, dtype=torch.bool)
         while True:
+            a.stamp_t[torch.unique(at.node[going] // self.per_tile)] = a.frame_1[0]
             answers = going & (self.brick_n[at.node] != ABSENT)
             at.fine = torch.where(answers, at.node, at.fine)
             at.fine_depth = torch.where(answers, at.depth, at.fine_depth)
@@ -109,10 +109,7 @@ class Tree:
 
             tile = self.child_n[at.node].to(torch.int64)
             going = going & (at.depth < wanted_r) & (tile >= 0) & ~at.hidden
-            last = not going.any()
-            if last or stamps_all:
-                a.stamp_t[torch.unique(at.node // self.per_tile)] = a.frame_1[0]
-            if last:
+            if not going.any():
                 return at
             x, y, z = (self.levels.cells(position_r3, at.depth + going) % n).unbind(1)
             child = tile * self.per_tile + (z * n + y) * n + x

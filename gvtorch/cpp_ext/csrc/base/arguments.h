@@ -93,7 +93,6 @@ using Bool = NumberOf<bool>;
   X(Int, component, channels)                 \
   X(Words, child_tn, nodes)                   \
   X(Words, brick_tn, nodes)                   \
-  X(Flags, shared_t, tiles)                   \
   X(Written<'a'>, request_tn, nodes)          \
   X(Written<'b'>, stamp_t, tiles)             \
   X(Written<'c'>, stamp_b, bricks)            \

@@ -68,22 +68,12 @@ GV_HD T number(Half voxel) {
 }
 
 // Stamps: many rays store the same value, so a relaxed store is enough; the read first spares the cache line.
-GV_HD bool has_stamp(const int32_t* word, int32_t stamp) {
+GV_HD void store_stamp(int32_t* word, int32_t stamp) {
 #ifdef __CUDA_ARCH__
-  return *reinterpret_cast<const volatile int32_t*>(word) == stamp;
+  if (*reinterpret_cast<volatile int32_t*>(word) != stamp) *reinterpret_cast<volatile int32_t*>(word) = stamp;
 #else
-  return __atomic_load_n(word, __ATOMIC_RELAXED) == stamp;
+  if (__atomic_load_n(word, __ATOMIC_RELAXED) != stamp) __atomic_store_n(word, stamp, __ATOMIC_RELAXED);
 #endif
-}
-// Returns whether it was not there.
-GV_HD bool store_stamp(int32_t* word, int32_t stamp) {
-  if (has_stamp(word, stamp)) return false;
-#ifdef __CUDA_ARCH__
-  *reinterpret_cast<volatile int32_t*>(word) = stamp;
-#else
-  __atomic_store_n(word, stamp, __ATOMIC_RELAXED);
-#endif
-  return true;
 }
 
 // A byte that several threads may fill with the same value.

@@ -79,28 +79,6 @@ struct ListRequests {
 
 // --- The order of use
 
-#define GV_MARK_ANCESTORS(X)      \
-  X(Written<'a'>, stamp_t, tiles) \
-  X(Words, parent_t, tiles)       \
-  X(Flags, shared_t, tiles)       \
-  X(Words, frame_1, 1)            \
-  X(Int, per_tile, kAny)
-
-// From a stamped tile up to the root, or to a shared tile. A tile that has the stamp already was an index that walks up
-// itself, or another one walks on from it.
-struct MarkAncestors {
-  GV_MARK_ANCESTORS(GV_VIEW)
-  int64_t tiles;
-
-  GV_HD void operator()(int64_t index) const {
-    if (!has_stamp(&stamp_t[index], *frame_1)) return;
-    for (int64_t tile = index; parent_t[tile] >= 0 && !shared_t[tile];) {
-      tile = parent_t[tile] / per_tile;
-      if (tile >= tiles || !store_stamp(&stamp_t[tile], *frame_1)) return;
-    }
-  }
-};
-
 #define GV_LRU_PARTITION(X) X(Words, order_k, kAny) X(Words, stamp_s, kAny) X(Words, frame_1, 1)
 
 struct UseArgs {

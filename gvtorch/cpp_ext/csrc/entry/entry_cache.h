@@ -28,18 +28,6 @@ inline auto run(const CompactRequestsOp& a) {
   return std::make_tuple(node_k, word_k, count_3);
 }
 
-GV_OP(MarkAncestorsOp, "mark_ancestors", GV_MARK_ANCESTORS, "()");
-
-inline void run(const MarkAncestorsOp& a) {
-  const Like like{a.stamp_t};
-  const int64_t tiles = a.stamp_t.numel();
-  MarkAncestors args{};
-  GV_MARK_ANCESTORS(GV_TAKE)
-  STD_TORCH_CHECK(a.per_tile >= 1, "gvtorch: per_tile out of range");
-  args.tiles = tiles;
-  for_each(a.stamp_t, tiles, args);
-}
-
 GV_OP(LruPartitionOp, "lru_partition", GV_LRU_PARTITION, "(Tensor order_k, Tensor unused_1)");
 
 inline auto run(const LruPartitionOp& a) {
@@ -189,7 +177,7 @@ inline Tensor run(const CutBricksOp& a) {
   return bricks_kzyxc;
 }
 
-using CacheOps = Types<CompactRequestsOp, MarkAncestorsOp, LruPartitionOp, UnlinkOp, LinkOp, LinkBricksOp, LinkTilesOp,
-                       PutRowsOp, LocateOp, LackingOp, CutBricksOp>;
+using CacheOps = Types<CompactRequestsOp, LruPartitionOp, UnlinkOp, LinkOp, LinkBricksOp, LinkTilesOp, PutRowsOp,
+                       LocateOp, LackingOp, CutBricksOp>;
 
 }  // namespace gvtorch

@@ -361,13 +361,9 @@ struct PacketWalk {
     Mask going = which & ((known < 0) | ~((known == wanted) | (tile < 0) | (node < 0)));
     int32_t level = kMostLevels;
     for_lanes(going, [&](int lane) { level = smaller(level, known[lane] + 1); });
-    const Ints root = Ints{} + tree.root_tile;
-    const Mask knows = which & ~going;
-    if (any(knows)) stamp(tree.stamp_t, knows, from > 0 ? own_lane(path_tile, larger(from - 1, Ints{})) : root);
-    const bool stamps_all = tree.shared_t[tree.root_tile];
     for (; any(going); ++level) {
       const Mask here = going & (reach == level - 1);
-      Ints next = Ints{} + tree.root, home = root;
+      Ints next = Ints{} + tree.root, home = Ints{} + tree.root_tile;
       if (level > 0) {
         const int32_t shift = top - level * tree.digit_bits, mask = (1 << tree.digit_bits) - 1;
         const Ints x = (cell.x >> shift) & mask, y = (cell.y >> shift) & mask, z = (cell.z >> shift) & mask;
@@ -375,6 +371,7 @@ struct PacketWalk {
         next = home * tree.nodes_per_tile + ((z << (2 * tree.digit_bits)) | (y << tree.digit_bits) | x);
       }
       next = here ? next : Ints{};
+      stamp(tree.stamp_t, here, home);
       const Ints next_brick = pick(tree.brick_tn, next);
       const Ints next_tile = pick(tree.child_tn, next);
       const Mask hides = hidden(here, next);
@@ -385,9 +382,7 @@ struct PacketWalk {
       path_brick[level] = here ? brick : path_brick[level];
       path_tile[level] = here ? tile : path_tile[level];
       reach = reach - here;
-      const Mask last = here & ((level == wanted) | (tile < 0) | hides);
-      stamp(tree.stamp_t, stamps_all ? here : last, home);
-      going = going & ~last;
+      going = going & ~(here & ((level == wanted) | (tile < 0) | hides));
     }
     path_depth = which ? reach : path_depth;
   }

@@ -56,7 +56,6 @@ struct Levels {
 struct TreeView {
   const int32_t* child_tn;
   const int32_t* brick_tn;
-  const bool* shared_t;
   int32_t* request_tn;
   int32_t* stamp_t;
   int32_t root, root_tile;
@@ -175,8 +174,7 @@ void with_digits(const TraceArgs& args, const Body& body) {
   body(static_cast<Digits<T>*>(nullptr));
 }
 
-// Descends to `wanted` depth, or as far as tiles exist and something is seen; stamps the last tile, from which
-// `mark_ancestors` (cache.h) finds those on the way. Where tiles are shared it can't: then all are stamped here.
+// Descends to `wanted` depth, or as far as tiles exist and something is seen; stamps every tile on the way.
 // The coarse holder is looked for where two levels blend.
 template <class Number, class Hides>
 GV_HD Place descend(const TreeView& tree, Number& digits, int32_t wanted, bool blend, int32_t frame,
@@ -184,8 +182,8 @@ GV_HD Place descend(const TreeView& tree, Number& digits, int32_t wanted, bool b
   Place place;
   place.node = tree.root;
   int32_t own_tile = tree.root_tile;  // of the node
-  const bool stamps_all = tree.shared_t[tree.root_tile];
   for (;;) {
+    store_stamp(&tree.stamp_t[own_tile], frame);
     place.brick = tree.brick_tn[place.node];
     place.tile = tree.child_tn[place.node];
     place.hidden = hides(place.node);
@@ -193,9 +191,7 @@ GV_HD Place descend(const TreeView& tree, Number& digits, int32_t wanted, bool b
       if (blend && place.depth < wanted) place.coarse = {place.node, place.brick, place.depth};
       place.fine = {place.node, place.brick, place.depth};
     }
-    const bool last = place.depth == wanted || place.tile < 0 || place.hidden;
-    if (last || stamps_all) store_stamp(&tree.stamp_t[own_tile], frame);
-    if (last) return place;
+    if (place.depth == wanted || place.tile < 0 || place.hidden) return place;
     place.depth = place.depth + 1;
     place.parent = place.node;
     own_tile = place.tile;
