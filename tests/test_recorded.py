@@ -13,7 +13,8 @@ import torch
 from helpers import DEVICES
 
 import gvtorch as gv
-from gvtorch.engine.recorded import HostFrame, recorded_frame
+from gvtorch.engine.host_frame import HostFrame
+from gvtorch.engine.setup import make_recorded_frame
 from gvtorch.io.conversion import convert
 
 COMPILED = [pytest.param(b, marks=pytest.mark.backend(b)) for b in ("cpp", "cuda")]
@@ -63,7 +64,7 @@ class Frames:
         self.engine, self.batch = engine, batch
         self.view = engine.view("test", camera, LOOK, {})
         trees = [*engine.trees.values()]
-        made = recorded_frame(engine.cache, trees, engine.scheduler, batch, engine.production)
+        made = make_recorded_frame(engine.cache, trees, engine.scheduler, batch, engine.production)
         assert made is not None
         self.served, self.number = made, -1
         if isinstance(made, HostFrame):

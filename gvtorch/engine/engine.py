@@ -40,11 +40,19 @@ from ..tracing.trees import (
     trace_trees,
     tree_traces,
 )
+from .device_frame import DeviceFrame
+from .host_frame import HostFrame
 from .production import Failure, Production
 from .ray_subsets import RaySubsets, scouts
-from .recorded import DeviceFrame, HostFrame, recorded_frame
 from .request_batch import ProducedTree
-from .setup import EngineOptions, EngineSettings, brick_bytes, make_pools, make_tree
+from .setup import (
+    EngineOptions,
+    EngineSettings,
+    brick_bytes,
+    make_pools,
+    make_recorded_frame,
+    make_tree,
+)
 from .stats import Collected, Counts, FrameStats, Readback, Readbacks, Report
 
 Scene = Producer | Mapping[str, Producer]
@@ -445,7 +453,7 @@ class Engine:
         again = partial(self.frame, shader=shader, **options)
         again(camera)  # loads what is loaded at first use
         trees = [*self.trees.values()]
-        served = recorded_frame(self.cache, trees, self.scheduler, batch, self.production)
+        served = make_recorded_frame(self.cache, trees, self.scheduler, batch, self.production)
         if isinstance(served, HostFrame):
             self.recorded.append(served)
         return FrameGraph(self, view, served, again)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypedDict
 
@@ -11,12 +11,14 @@ import torch
 from ..base import check
 from ..base.constants import ABSENT, CONSTANT, EMPTY, TERMINAL
 from ..base.volume import movable
-from ..cache import Cache
+from ..cache import Cache, Scheduler
 from ..cache.write import write_slots
 from ..pool import BrickPool, Channel, N3Tree, NodePool
 from ..producers import Layout, Nodes, Producer, Region
 from ..producers.answer import checked_bricks, checked_regions
-from .production import ProductionError
+from .device_frame import DeviceFrame
+from .host_frame import HostFrame
+from .production import Production, ProductionError
 from .request_batch import ProducedTree
 
 
@@ -242,3 +244,23 @@ def _raise_first(errors: Mapping[int, str]) -> None:
 
 def _now(answer: Any, patience: float) -> Any:
     return answer.result(patience) if hasattr(answer, "result") else answer
+
+
+def make_recorded_frame(
+    cache: Cache,
+    trees: Sequence[ProducedTree],
+    scheduler: Scheduler,
+    batch: int,
+    production: Production,
+) -> DeviceFrame | HostFrame | None:
+    """Returns what serves a captured frame; None where producers answer neither all on the device
+    nor all from the host, or have coarse channels.
+    """
+    producers = [one.producer for one in trees]
+    if any(channel.coarse for one in producers for channel in one.channels.values()):
+        return None
+    if all(one.on_device for one in producers):
+        return DeviceFrame(cache, trees, scheduler, batch)
+    if all(one.on_host for one in producers):
+        return HostFrame(cache, trees, scheduler, batch, production)
+    return None

@@ -1,0 +1,331 @@
+"""`HostFrame`: recorded frames whose producers answer from the host, while the device goes on."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..base.constants import (
+    CONSTANT,
+    EMPTY,
+    REQUEST_LOAD,
+    REQUEST_PENDING_SHIFT,
+    REQUEST_SUBDIVIDE,
+)
+from ..base.records import Hits
+from ..base.volume import movable
+from ..cache import KINDS, Cache, Scheduler
+from ..cache.write import Children, Put, Targets, put_bricks, put_rows_of, put_tiles, put_uniform
+from ..pool.staging import TableRows
+from ..producers import Bricks, Region, Regions
+from .mail import Form, Mail
+from .production import Production
+from .recorded import RecordedFrame
+from .request_batch import ProducedTree, RequestBatch, children_of
+from .stats import Collected, FrameStats
+
+
+class HostFrame(RecordedFrame):
+    """Frames of an engine whose producers all answer from the host (`Producer.on_host`).
+
+    What a frame chose comes to the host with its counts (`ask`). Answers are checked by the thread
+    that brings them, and posted; the next frame sends what has come, and writes it.
+    """
+
+    def __init__(
+        self,
+        cache: Cache,
+        trees: Sequence[ProducedTree],
+        scheduler: Scheduler,
+        batch: int,
+        production: Production,
+    ) -> None:
+        """See `RecordedFrame`; `production` knows what failed."""
+        super().__init__(cache, trees, scheduler, batch)
+        self._production = production
+        device = self._unused.device
+        self._mail = [Mail(_boxes(cache, one), batch, device) for one in trees]
+        self._by_tree = {one.tree.number: n for n, one in enumerate(trees)}
+        self.turn = 0  # answers to what was asked before the last `release` are dropped
+        self._asked = self._done = 0  # rows, since then
+        self.active = False  # whether frames have been rendered since then
+        self._lock = threading.Lock()
+        self._waiting: dict[Future, tuple[float, RequestBatch]] = {}  # until when
+        self._asker = ThreadPoolExecutor(1, thread_name_prefix="gvtorch-ask")
+
+    @property
+    def pending(self) -> int:
+        """Nodes whose answers are on their way."""
+        return max(0, self._asked - self._done - sum(mail.sent for mail in self._mail))
+
+    def begin(self, stale: bool, steady: bool, stats: FrameStats) -> bool:
+        """Sends what has come, before a frame, and tells whether there was anything: then it is to
+        be served. `stale`: another frame was rendered since the last of these, which tells no more
+        which slots are unused.
+        """
+        self.active = True
+        if stale:
+            self._unused.zero_()
+        self._give_up()
+        sent = [mail.send() for mail in self._mail]
+        stats.pending, stats.failed = self.pending, len(self._production.failures)
+        return any(sent)
+
+    def release(self) -> None:
+        """Forgets what is on its way, for a frame that the host serves; rays ask for it again."""
+        if not self.active:
+            return
+        self.active = False
+        self.turn += 1
+        self._waiting.clear()
+        for mail in self._mail:
+            mail.forget()
+            mail.sent = 0
+        with self._lock:
+            self._asked = self._done = 0
+        self._production.restore_pending()
+
+    def close(self) -> None:
+        """Ends the thread that asks."""
+        self._asker.shutdown(wait=False, cancel_futures=True)
+
+    def serve(self) -> None:
+        """Writes what was sent."""
+        for source, mail in zip(self.trees, self._mail, strict=True):
+            self._write(source, mail)
+
+    def draw(self, trace: Callable[[], Hits]) -> tuple[Hits, Collected]:
+        """Traces, collects, and chooses what the host is asked for, which is marked as pending."""
+        self.cache.frame_1.add_(1)
+        hits = trace()
+        requests, numbers = self.collect(hits)
+        chosen, words = [], self.cache.nodes.request_tn.view(-1)
+        for kind in KINDS.values():
+            node = self.choose(kind, requests.node, requests.word)
+            marked = words[node.clamp(min=0)] | kind << REQUEST_PENDING_SHIFT
+            put_rows_of(words[:, None], node, marked[:, None])
+            number = self.tree_of(node)
+            loc = self.trees[0].tree.loc(node)
+            for source in self.trees[1:]:  # N may differ
+                mine = (number == source.tree.number)[:, None]
+                loc = torch.where(mine, source.tree.loc(node), loc)
+            chosen.append(torch.cat((node[:, None], number[:, None].to(torch.int64), loc), 1))
+        numbers = torch.cat((numbers, torch.stack(chosen).flatten()))
+        return hits, Collected(requests, numbers)
+
+    def _write(self, source: ProducedTree, mail: Mail) -> None:
+        """Writes what was sent for one tree; what finds no slot may be asked for again."""
+        tiles, bricks, bare, again = (
+            mail.there[box] for box in ("tiles", "bricks", "bare", "again")
+        )
+        children = Children(
+            child=tiles["child"],
+            brick=tiles["brick"],
+            constants=_named(tiles, "constants"),
+            ranges=_named(tiles, "ranges"),
+            is_alias=torch.zeros_like(tiles["child"], dtype=torch.bool),
+            alias=None,
+        )
+        targets = [Targets(source.tree, box["node"], box["loc"]) for box in (tiles, bricks, bare)]
+        put = put_tiles(self.cache, targets[0], children, self._unused[:1])
+        self._count(REQUEST_SUBDIVIDE, targets[0], put, 0)
+        put = put_bricks(self.cache, targets[1], _named(bricks, "data"), self._unused[1:])
+        self._count(REQUEST_LOAD, targets[1], put, 1)
+        self._made[2] += put_uniform(
+            self.cache, targets[2], bare["word"], _named(bare, "constants")
+        )
+        self._ask_again(again["node"], again["bit"])
+        mail.clear()
+
+    def _count(self, kind: int, targets: Targets, put: Put, which: int) -> None:
+        _, given, held = put.counts
+        self._unused[which] -= given
+        self._made[which] += given
+        self._made[3 + which] += held
+        lost = torch.where(put.wanted & (put.slot < 0), targets.node, -1)
+        bit = torch.full_like(lost, kind << REQUEST_PENDING_SHIFT, dtype=torch.int32)
+        self._ask_again(lost, bit)
+
+    def _ask_again(self, node: Tensor, bit: Tensor) -> None:
+        words = self.cache.nodes.request_tn.view(-1, 1)
+        put_rows_of(words, node, words[node.clamp(min=0)] & ~bit[:, None])
+
+    def ask(self, turn: int, asked: Tensor) -> int:
+        """Lets a thread ask producers for the nodes that a frame chose: (2 * batch * 6,) int64 on
+        the host, of each kind rows of node, tree and place. Returns how many they are.
+        """
+        total = int(np.count_nonzero(asked.numpy()[::6] >= 0))
+        if turn != self.turn or not total:
+            return 0
+        with self._lock:
+            self._asked += total
+        self._asker.submit(self._ask, turn, asked)
+        return total
+
+    def _ask(self, turn: int, asked: Tensor) -> None:
+        for kind, listed in zip(KINDS.values(), asked.view(2, -1, 6), strict=True):
+            rows = listed[listed[:, 0] >= 0]
+            for source in self.trees:
+                mine = rows[rows[:, 1] == source.tree.number]
+                if len(mine):
+                    targets = Targets(source.tree, mine[:, 0].clone(), mine[:, 2:].clone())
+                    self._submit(turn, RequestBatch(source, kind, targets, on_host=True))
+
+    def _submit(self, turn: int, batch: RequestBatch) -> None:
+        """Asks for a batch; a producer that raised is asked again for each half."""
+
+        def arrived(future: Future) -> None:
+            there = self._waiting.pop(future, None) is not None  # else it was given up
+            if there and turn == self.turn:
+                self._settle(turn, batch, future.result)
+
+        try:
+            answer = batch.ask()
+        except Exception as error:
+            self._split(turn, batch, error)
+            return
+        if isinstance(answer, Future):
+            self._waiting[answer] = time.monotonic() + self._patience(batch), batch
+            answer.add_done_callback(arrived)
+        else:
+            self._settle(turn, batch, lambda: answer)
+
+    def _patience(self, batch: RequestBatch) -> float:
+        own = batch.source.producer.patience
+        return self._production.patience if own is None else own
+
+    def _give_up(self) -> None:
+        """Counts answers as failed that have not come in time."""
+        now = time.monotonic()
+        for future, (until, batch) in list(self._waiting.items()):
+            if until < now and self._waiting.pop(future, None) is not None:
+                future.cancel()
+                self._fail(batch, f"no answer within {self._patience(batch):g} s")
+
+    def _split(self, turn: int, batch: RequestBatch, error: Exception) -> None:
+        if len(batch) == 1:
+            self._fail(batch, f"{type(error).__name__}: {error}", error)
+            return
+        half = len(batch) // 2
+        self._submit(turn, batch[:half])
+        self._submit(turn, batch[half:])
+
+    def _settle(self, turn: int, batch: RequestBatch, answer: Callable[[], Any]) -> None:
+        """Checks an answer and posts it, in whatever thread brings it."""
+        try:
+            given = answer()
+        except CancelledError:
+            return  # the producer is closed
+        except Exception as error:
+            self._split(turn, batch, error)
+            return
+        try:
+            checked = batch.check(given)
+            bad = self._name_errors(batch, checked)
+            good = (~bad).nonzero()[:, 0]
+            if isinstance(checked, Regions):
+                self._post_tiles(batch, checked, good)
+            else:
+                self._post_bricks(batch, checked, good)
+        except ValueError as error:
+            self._fail(batch, str(error), error)
+
+    def _name_errors(self, batch: RequestBatch, answer: Regions | Bricks) -> Tensor:
+        """(k,) bool, which nodes of a batch have an item that failed; names them."""
+        bad = torch.zeros(len(batch), dtype=torch.bool)
+        per_node = len(batch.loc) // len(batch)
+        for index in sorted(answer.errors):
+            node = index // per_node
+            if not bad[node]:
+                bad[node] = True
+                self._fail(batch[node : node + 1], answer.errors[index])
+        return bad
+
+    def _fail(self, batch: RequestBatch, message: str, cause: BaseException | None = None) -> None:
+        """Counts and names a batch's nodes; they stay marked as pending: no ray asks again."""
+        with self._lock:
+            self._done += len(batch)
+            self._production.failures.add(batch, message, cause)
+
+    def _post_tiles(self, batch: RequestBatch, answer: Regions, good: Tensor) -> None:
+        if answer.alias is not None:
+            self._leave_to_host(batch[good])
+            return
+        made, targets = children_of(batch, answer, self.cache), batch.targets
+        rows = {"node": targets.node, "loc": targets.loc, "child": made.child, "brick": made.brick}
+        fields = {"constants": made.constants, "ranges": made.ranges}
+        self._post(batch, "tiles", rows, fields, good)
+
+    def _post_bricks(self, batch: RequestBatch, answer: Bricks, good: Tensor) -> None:
+        fields: dict[str, Mapping[str, Any]]
+        targets, kind = batch.targets, answer.kind
+        rows = {"node": targets.node, "loc": targets.loc}
+        data = {n: d.gather() if isinstance(d, TableRows) else d for n, d in answer.data.items()}
+        fields = {"data": data}
+        if kind is None:
+            self._post(batch, "bricks", rows, fields, good)
+            return
+        alias = kind[good] == Region.ALIAS
+        if bool(alias.any()):
+            self._leave_to_host(batch[good[alias]])
+        bare = (kind[good] == Region.EMPTY) | (kind[good] == Region.CONSTANT)
+        self._post(batch, "bricks", rows, fields, good[~bare & ~alias])
+        word = torch.where(kind == Region.CONSTANT, CONSTANT, EMPTY).to(torch.int32)
+        known = {
+            name: torch.zeros((len(kind), one.width), dtype=one.dtype)
+            for name, one in batch.source.producer.channels.items()
+        }
+        fields = {"constants": {**known, **answer.constants}}
+        self._post(batch, "bare", {**rows, "word": word}, fields, good[bare])
+
+    def _leave_to_host(self, batch: RequestBatch) -> None:
+        """Lets `Engine.frame` ask again, which can look up what an alias stands for."""
+        self.host_needed = True
+        bit = torch.full((len(batch),), batch.kind << REQUEST_PENDING_SHIFT, dtype=torch.int32)
+        self._post(batch, "again", {"node": batch.targets.node, "bit": bit}, {}, slice(None))
+
+    def _post(
+        self,
+        batch: RequestBatch,
+        box: str,
+        rows: Mapping[str, Tensor],
+        fields: Mapping[str, Mapping[str, Tensor]],
+        which: Tensor | slice,
+    ) -> None:
+        """Posts some rows: fields, and those that each channel has."""
+        flat = {f"{name}.{channel}": t for name, by in fields.items() for channel, t in by.items()}
+        mail = self._mail[self._by_tree[batch.source.tree.number]]
+        mail.post(box, {n: movable(t)[which].view(t.dtype) for n, t in {**rows, **flat}.items()})
+
+
+def _boxes(cache: Cache, source: ProducedTree) -> dict[str, Form]:
+    """What mail for a tree holds."""
+    words, place = torch.int32, {"loc": ((4,), torch.int64)}
+    own, n = source.producer.channels, source.layout.branching**3
+    kinds = cache.bricks.channels
+    tiles: dict[str, Any] = {"child": ((n,), words), "brick": ((n,), words)}
+    for name, one in kinds.items():
+        tiles[f"constants.{name}"] = ((n, one.width), one.dtype)
+        tiles[f"ranges.{name}"] = ((n, 2, one.width), one.dtype)
+    brick = (source.layout.side,) * 3
+    return {
+        "tiles": place | tiles,
+        "bricks": place | {f"data.{m}": ((*brick, c.width), c.dtype) for m, c in own.items()},
+        "bare": place
+        | {"word": ((), words)}
+        | {f"constants.{m}": ((c.width,), c.dtype) for m, c in own.items()},
+        "again": {"bit": ((), words)},
+    }
+
+
+def _named(box: Mapping[str, Tensor], field: str) -> dict[str, Tensor]:
+    """The channels of a field of a box."""
+    parts = (name.partition(".") for name in box)
+    return {channel: box[f"{field}.{channel}"] for name, _, channel in parts if name == field}
