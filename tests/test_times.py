@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from helpers import run
+from helpers import gvtorch, run
 from helpers.stores import assert_holds, noise, write_foreign
 
 import gvtorch as gv
@@ -306,3 +307,42 @@ def test_info_of_channels_and_times_together(tmp_path):
     volume = gv.Volume(noise((9, 9, 9, 2)), info=info)
     assert convert(volume, tmp_path / "a.zarr").info == info
     assert gv.read_volume(tmp_path / "a.zarr").info == info
+
+
+@pytest.mark.parametrize("kind", ["npy", "zarr"])
+def test_a_film_over_time(tmp_path, kind):
+    """A picture of each time point, from where an orbit starts; more pictures are spread evenly."""
+    data = np.zeros((4, 6, 8, 10), np.uint8)
+    for moment, values in enumerate(data):
+        values[:, :, 2 * moment : 2 * moment + 2] = 200
+    file = tmp_path / "a.npy"
+    np.save(file, data)
+    flags = ("--axes", "tzyx")
+    if kind == "zarr":
+        assert gvtorch("convert", file, tmp_path / "a.zarr", *flags, "--workers", 1).returncode == 0
+        file, flags = tmp_path / "a.zarr", ()
+    look = ("--size", "24x24", "--window", "0,200", *flags)
+
+    def fly(*more) -> list[bytes]:
+        folder = tmp_path / "f"
+        shutil.rmtree(folder, ignore_errors=True)
+        run = gvtorch("fly", file, "-o", folder, *look, *more)
+        assert run.returncode == 0, run.stderr
+        assert "time points" not in run.stderr
+        return [one.read_bytes() for one in sorted(folder.glob("*.png"))]
+
+    whole = fly("--times", "all", "--orbit", "30,20,2.4")
+    assert len(whole) == len(set(whole)) == 4
+    for moment in range(4):
+        out = tmp_path / "one.png"
+        place = ("--camera", "orbit:30,20,2.4", "--time", moment)
+        run = gvtorch("render", file, "-o", out, *look, *place)
+        assert run.returncode == 0 and out.read_bytes() == whole[moment]
+    some = fly("--times", "1-2", "--frames", 5, "--orbit", "30,20,2.4")
+    assert some == [whole[n] for n in (1, 1, 1, 2, 2)]
+    assert len(set(fly("--times", "0-0", "--turntable", "0.12"))) == 3, "the camera moves"
+    for wrong, message in (("3-9", "from 0 to 3"), ("x", "must be all or A-B")):
+        run = gvtorch("fly", file, "-o", tmp_path / "g", *look, "--times", wrong)
+        assert run.returncode == 2 and message in run.stderr and not (tmp_path / "g").exists()
+    both = gvtorch("fly", file, "-o", tmp_path / "g", *look, "--times", "all", "--time", 1)
+    assert both.returncode == 2 and "leave one out" in both.stderr

@@ -25,15 +25,17 @@ def parse_channels(text: str | None, image: Volume | Store) -> Channels:
     if text is None:
         return Channels.of(image)
     items = [item.strip() for item in text.split(";")]
+    names = {one.name: str(number) for number, one in enumerate(image.info.channels) if one.name}
     wanted: dict[int, list[str]] = {}
     for item in items:
-        number, *rest = item.split(":")
+        name, *rest = item.split(":")
+        number = names.get(name, name)
         if item == "opacity":
             continue
         if not number.isdigit() or len(rest) > 2:
             raise ValueError(
-                "--channel must hold NUMBER:COLOR:LO,HI, where what is left out or auto is the "
-                f"image's, or opacity; got {item!r}"
+                "--channel must hold NUMBER:COLOR:LO,HI, or a name for the number, where what is "
+                f"left out or auto is the image's, or opacity; got {item!r}"
             )
         if int(number) in wanted:
             raise ValueError(f"--channel names channel {number} twice")

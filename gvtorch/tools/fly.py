@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,6 +12,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from ..base.declared import declared_names
+from ..io.ngff import is_zarr
 from .common import Bar, size, volume_formats
 from .look import first_orbit, parse_orbit, stance
 from .scene import Scene, SceneFlags
@@ -34,14 +35,17 @@ class Fly:
     turntable: Annotated[float | None, arg(metavar="SECONDS")] = None
     """an orbit that takes so long: instead of --frames"""
     frames: Annotated[int | None, arg(metavar="N")] = None
-    """number of pictures; 100 if left out"""
+    """number of pictures; 100 if left out, or one for each of --times"""
+    times: Annotated[str | None, arg(metavar="all|A-B")] = None
+    """a film over time: all time points, or those from A to B; the camera stands still where an
+    orbit starts, unless --turntable or --path FILE.json move it"""
     fps: Annotated[int | None, arg(metavar="N")] = None
     """pictures a second of a film or a turntable; 25 if left out"""
     orbit: Annotated[str | None, arg(metavar="AZ,EL[,DIST]")] = None
     """where an orbit starts: degrees, and largest sides of the box; as of gvtorch render if left
     out, and all of the box in each picture"""
     stats: Annotated[Path | None, arg(metavar="FILE.jsonl")] = None
-    """one JSON line a frame; stats.jsonl beside the pictures if left out"""
+    """what each picture cost, one JSON line a frame"""
     scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()
 
     def run(self) -> None:
@@ -65,29 +69,72 @@ class Fly:
         with ExitStack() as stack:
             bar = stack.enter_context(Bar())
             film = Video(self.output, width, height, fps=fps) if is_film else None
-            scene = stack.enter_context(self.scene.open(self.path, options, bar))
-            path = self._path(scene, width, height)
-            if film is not None:
-                stack.enter_context(film)
-            else:
-                self.output.mkdir(exist_ok=True)
-            lines = stack.enter_context(self._stats_file().open("w", encoding="utf-8"))
-            for number in range(frames):
-                bar("frames", number, frames)
-                place = number / max(1, frames - 1 + (self.flight == "orbit"))
-                picture = scene.render(path.camera(place, width, height, look.camera_model))
-                lines.write(json.dumps({"picture": number, **picture.stats.as_dict()}) + "\n")
-                if film is not None:
-                    film.add(picture)
-                else:
-                    picture.save(self.output / f"{number:04d}.png")
+            lines = None
+            if self.stats is not None:
+                lines = stack.enter_context(self.stats.open("w", encoding="utf-8"))
+            coarse = 0
+            for moment, numbers in self._parts(frames):
+                source = self.scene.source
+                source = source if moment is None else replace(source, time=moment)
+                with replace(self.scene, source=source).open(self.path, options, bar) as scene:
+                    path = self._path(scene, width, height)
+                    if numbers.start == 0 and film is not None:  # what is there can be read
+                        stack.enter_context(film)
+                    elif film is None:
+                        self.output.mkdir(exist_ok=True)
+                    for number in numbers:
+                        bar("frames", number, frames)
+                        camera = path.camera(
+                            self._place(number, frames), width, height, look.camera_model
+                        )
+                        picture = scene.render(camera)
+                        told = picture.stats.as_dict()
+                        coarse += not told.get("converged", True)
+                        if lines is not None:
+                            lines.write(json.dumps({"picture": number, **told}) + "\n")
+                        if film is not None:
+                            film.add(picture)
+                        else:
+                            picture.save(self.output / f"{number:04d}.png")
             bar("frames", frames, frames)
-            report = scene.engine.report() if scene.engine is not None else None
-        if report is not None:
-            from rich.console import Console
+        missing = f", {coarse} of them are not complete" if coarse else ""
+        print(f"{self.output}: {frames} pictures{missing}")
 
-            Console().print(report)
-        print(f"{self.output}: {frames} pictures; what each cost: {self._stats_file()}")
+    def _place(self, number: int, frames: int) -> float:
+        """Where on its path, 0 to 1, the camera of a picture is."""
+        if self.times is not None and self.turntable is None and self.flight == "orbit":
+            return 0.0
+        return number / max(1, frames - 1 + (self.flight == "orbit"))
+
+    def _parts(self, frames: int) -> list[tuple[int | None, range]]:
+        """Time points, and the pictures that are taken of each; None: of whichever is read."""
+        if self.times is None:
+            return [(None, range(frames))]
+        moments = self._moments()
+        ends = [-(-number * frames // len(moments)) for number in range(len(moments) + 1)]
+        return [(m, range(a, b)) for m, a, b in zip(moments, ends, ends[1:], strict=False) if a < b]
+
+    def _moments(self) -> range:
+        """The time points that `--times` names."""
+        from ..io.reading import open_source
+        from ..io.store import Store
+
+        if self.scene.source.time is not None:
+            raise ValueError("--times and --time both tell which: leave one out")
+        if is_zarr(self.path):
+            count = Store.open(self.path, image=self.scene.streaming.image).times
+        else:
+            options = self.scene.source.options()
+            del options["nan"]
+            count = open_source(self.path, **options).times
+        first, _, last = (self.times or "").partition("-")
+        if self.times == "all":
+            return range(count)
+        if first.isdigit() and last.isdigit() and int(first) <= int(last) < count:
+            return range(int(first), int(last) + 1)
+        raise ValueError(
+            f"--times must be all or A-B, from 0 to {count - 1} of {self.path}, got {self.times!r}"
+        )
 
     def _length(self) -> tuple[int, int]:
         """Number of pictures, and pictures a second."""
@@ -97,22 +144,15 @@ class Fly:
         if self.turntable is None:
             if self.fps is not None and self.output.suffix not in _FILMS:
                 raise ValueError("--fps is for a film or --turntable: pictures have no speed")
-            return check.whole(
-                "fly", "--frames", self.frames or 100 * (self.frames is None), low=1
-            ), fps
+            most = 100 if self.times is None else len(self._moments())
+            frames = most if self.frames is None else self.frames
+            return check.whole("fly", "--frames", frames, low=1), fps
         if self.frames is not None:
             raise ValueError("--turntable and --frames both tell how many pictures: leave one out")
         if self.flight != "orbit":
             raise ValueError("--turntable goes once around: not with --path FILE.json")
         seconds = check.number("fly", "--turntable", self.turntable, low=0, open_low=True)
         return max(1, round(seconds * fps)), fps
-
-    def _stats_file(self) -> Path:
-        if self.stats is not None:
-            return self.stats
-        if self.output.suffix in _FILMS:
-            return self.output.with_suffix(".jsonl")
-        return self.output / "stats.jsonl"
 
     def _check_path(self) -> None:
         """Raises what is wrong with the path before the volume is read."""
