@@ -7,6 +7,7 @@ from __future__ import annotations
 import time
 from concurrent.futures import Future
 from functools import partial
+from typing import Any
 
 import pytest
 import torch
@@ -283,57 +284,54 @@ class Unsaid(Ball):
     on_device = False
 
 
+def flown(
+    engine: gv.Engine, path: list[gv.Camera], batch: int
+) -> tuple[Any, gv.Picture, gv.FrameStats]:
+    """Replays a flight without a wait of the host, then its last view until it is whole."""
+    graph = engine.capture(path[0], LOOK, batch=batch)
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for camera in path:
+            picture, stats = graph.replay(camera)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    for _ in range(300):
+        picture, stats = graph.replay(path[-1])
+        time.sleep(0.002)
+        if stats.settle().converged:
+            break
+    assert stats.converged
+    engine.validate()
+    return graph, picture, stats
+
+
+PATH = [view(96, 1.5 * number) for number in range(61)]
+
+
 @pytest.mark.backend("cuda")
 def test_a_flight_through_a_store_does_not_wait(blobs, tmp_path):
-    path = [view(96, angle) for angle in torch.linspace(0, 90, 60).tolist()]
     options = {"brick_size": 4, "brick_pool": "4 MB", "device": "cuda"}
     with gv.Engine(on_the_host(blobs, tmp_path / "one", "store"), **options) as engine:
-        graph = engine.capture(path[0], LOOK, batch=64)
-        torch.cuda.synchronize()
-        torch.cuda.set_sync_debug_mode("error")
-        try:
-            for camera in path:
-                picture, stats = graph.replay(camera)
-        finally:
-            torch.cuda.set_sync_debug_mode("default")
-        for _ in range(300):
-            picture, stats = graph.replay(path[-1])
-            time.sleep(0.002)
-            if stats.settle().converged:
-                break
-        assert stats.converged
-        engine.validate()
-        assert torch.equal(engine.render(path[-1], LOOK).color, picture.color)
+        _, picture, _ = flown(engine, PATH, 64)
+        assert torch.equal(engine.render(PATH[-1], LOOK).color, picture.color)
 
 
 @pytest.mark.backend("cuda")
 def test_a_flight_is_replayed_without_the_host():
     """The graph makes what it misses, and comes to the picture of the host."""
-    path = [view(96, angle) for angle in torch.linspace(0, 90, 60).tolist()]
     with gv.Engine(Ball(1024), brick_pool="64 MB", device="cuda") as engine:
-        graph = engine.capture(path[0], LOOK, batch=256)
-        torch.cuda.synchronize()
-        torch.cuda.set_sync_debug_mode("error")
-        try:
-            for camera in path:
-                picture, stats = graph.replay(camera)
-        finally:
-            torch.cuda.set_sync_debug_mode("default")
-        for _ in range(60):
-            picture, stats = graph.replay(path[-1])
-            if stats.settle().converged:
-                break
-        assert stats.converged and sum(stats.produced.values()) == 0
-        engine.validate()
+        graph, picture, stats = flown(engine, PATH, 256)
+        assert sum(stats.produced.values()) == 0
         shown = picture.color.clone()
-        served = engine.render(path[-1], LOOK)
+        served = engine.render(PATH[-1], LOOK)
         assert torch.equal(served.color, shown)
         engine.frame(view(96, 200), LOOK)  # another frame between two replays
-        picture, stats = graph.replay(path[-1])
+        picture, stats = graph.replay(PATH[-1])
         assert stats.settle().converged and torch.equal(picture.color, shown)
     with gv.Engine(Unsaid(1024), brick_pool="64 MB", device="cuda") as engine:
-        expected = engine.render(path[-1], LOOK)
-        graph = engine.capture(path[-1], LOOK)
+        expected = engine.render(PATH[-1], LOOK)
+        graph = engine.capture(PATH[-1], LOOK)
         picture, stats = graph.replay(view(96, 200))
         assert not stats.settle().converged and sum(stats.produced.values()) == 0
     assert torch.equal(expected.color, shown)
