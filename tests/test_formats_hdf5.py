@@ -55,7 +55,9 @@ def test_several_sets_are_asked_about(tmp_path, grid):
     file = tmp_path / "a.h5"
     with h5py.File(file, "w") as out:
         out["a"], out["g/b"], out["words"] = grid, grid + 1, "text"
-    with pytest.raises(ValueError, match=r"2 data sets, choose one with key .*: .*a\.h5:/a .*a\.h5:/g/b \(7"):
+    with pytest.raises(
+        ValueError, match=r"2 data sets, choose one with key .*: .*a\.h5:/a .*a\.h5:/g/b \(7"
+    ):
         gv.read_volume(file)
     assert np.array_equal(gv.read_volume(file, key="g/b").data[..., 0].numpy(), grid + 1)
     with pytest.raises(ValueError, match="no data set '/c'; it holds a, g/b"):
