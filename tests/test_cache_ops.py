@@ -66,19 +66,47 @@ def test_lru_equals_a_python_list_over_random_traces(backend, data, size):
         model = model[take:] + model[:take]
 
 
+def owned_slots(data, nodes: int, slots: int) -> tuple[list[int], list[int], list[bool]]:
+    """Pointers, owners and flags as a pool has them: an owner points to its slot, any other node
+    only to shared ones.
+    """
+    shared = data.draw(st.lists(st.booleans(), min_size=slots, max_size=slots))
+    owners = data.draw(st.permutations(range(nodes)))[:slots]
+    kept = data.draw(st.lists(st.booleans(), min_size=slots, max_size=slots))
+    owner = [node if keep else -1 for node, keep in zip(owners, kept, strict=False)]
+    owner += [-1] * (slots - len(owner))
+    free = [-3, -2, -1, *(slot for slot in range(slots) if shared[slot])]
+    pointer = data.draw(st.lists(st.sampled_from(free), min_size=nodes, max_size=nodes))
+    for slot, node in enumerate(owner):
+        if node >= 0:
+            pointer[node] = slot
+    return pointer, owner, shared
+
+
 @fixed
-@given(
-    pointers=st.lists(st.integers(-3, 40), min_size=1, max_size=200),
-    leaving=st.lists(st.integers(-1, 45), max_size=30),
-    divisor=st.integers(1, 5),
-    slots=st.integers(0, 41),
-)
-def test_unlink_clears_every_pointer_to_a_slot(backend, pointers, leaving, divisor, slots):
+@given(data=st.data(), tiles=st.integers(1, 6), slots=st.integers(0, 30))
+def test_unlink_takes_slots_from_all_their_nodes(backend, data, tiles, slots):
     device = DEVICES[backend]
-    words_ = int32(pointers, device)
-    ops.unlink(words_, int32(leaving, device), slots, divisor, backend=backend)
-    gone = {slot for slot in leaving if 0 <= slot < slots}
-    assert words_.tolist() == [-1 if p >= 0 and p // divisor in gone else p for p in pointers]
+    pointer, owner, shared = owned_slots(data, 8 * tiles, slots)
+    leaving = data.draw(st.lists(st.integers(-1, slots + 3), unique=True, max_size=10))
+    pointer_tn, owner_s = int32(pointer, device).view(-1, 8), int32(owner, device)
+    shared_s = torch.tensor(shared, dtype=torch.bool, device=device)
+    ops.unlink(pointer_tn, owner_s, shared_s, int32(leaving, device), backend=backend)
+    assert pointer_tn.view(-1).tolist() == [-1 if p >= 0 and p in leaving else p for p in pointer]
+    assert owner_s.tolist() == [-1 if slot in leaving else o for slot, o in enumerate(owner)]
+
+
+@fixed
+@given(data=st.data(), tiles=st.integers(1, 6), slots=st.integers(0, 30))
+def test_orphan_clears_the_owner_of_what_leaving_tiles_held(backend, data, tiles, slots):
+    device = DEVICES[backend]
+    pointer, owner, _ = owned_slots(data, 8 * tiles, slots)
+    leaving = data.draw(st.lists(st.integers(-1, tiles + 3), unique=True, max_size=10))
+    owner_s = int32(owner, device)
+    pointer_tn = int32(pointer, device).view(-1, 8)
+    ops.orphan(pointer_tn, owner_s, int32(leaving, device), backend=backend)
+    assert owner_s.tolist() == [-1 if o >= 0 and o // 8 in leaving else o for o in owner]
+    assert pointer_tn.view(-1).tolist() == pointer
 
 
 @fixed
@@ -274,7 +302,8 @@ def test_cache_ops_pass_opcheck(compiled):
     for op, arguments in (
         (table.compact_requests, (request, 3)),
         (table.lru_partition, (int32([2, 0, 1], device), int32([1, 0, 1], device), frame)),
-        (table.unlink, (request, int32([0, -1], device), 4, 1)),
+        (table.unlink, (request, frame.clone(), frame.bool(), int32([0, -1], device))),
+        (table.orphan, (request, frame.clone(), int32([0, -1], device))),
         (table.link, (request, request.clone(), frame, frame, LOAD)),
         (
             table.link_bricks,
@@ -314,7 +343,8 @@ def test_nothing_to_do(backend):
     request = torch.zeros((1, 8), dtype=torch.int32, device=device)
     assert ops.compact_requests(request, 4, backend=backend)[2].tolist() == [0, 0, 0]
     assert int(ops.lru_partition(none, none, frame, backend=backend)[1]) == 0
-    ops.unlink(request, none, 0, backend=backend)
+    ops.unlink(request, none, none.bool(), none, backend=backend)
+    ops.orphan(request, none, none, backend=backend)
     ops.link(request, request.clone(), none, none, LOAD, backend=backend)
     places = torch.zeros((1, 4), dtype=torch.int32, device=device)
     loc = ops.locate(places, none.long(), 2, 8, backend=backend)
@@ -331,8 +361,8 @@ def test_nothing_to_do(backend):
         (lambda w: ops.compact_requests(w.T, 4), "request_tn must be contiguous"),
         (lambda w: ops.compact_requests(w, 0), "capacity must be an int >= 1"),
         (lambda w: ops.lru_partition(w, w[0], w[0, :1]), "order_k must be (k,)"),
-        (lambda w: ops.unlink(w, w, 4), "slot_k must be (k,)"),
-        (lambda w: ops.unlink(w, w[0], 4, 0), "divisor must be an int >= 1"),
+        (lambda w: ops.unlink(w, w[0], w[0, :3] > 0, w[0]), "shared_s must be (8,) bool"),
+        (lambda w: ops.orphan(w, w[0], w), "tile_k must be (k,)"),
         (lambda w: ops.link(w, w, w[0], w[0, :2], LOAD), "word_k must be (8,)"),
         (
             lambda w: ops.link_bricks(w, w, *[w[0]] * 3, w[0], w[0].long(), w[0], w[0, :1]),

@@ -12,6 +12,7 @@ LOAD, SUBDIVIDE = config.REQUEST_LOAD, config.REQUEST_SUBDIVIDE
 
 def test_lru_gives_slots_from_the_front_as_far_as_they_are_unused():
     lru = LRU(6, 2, torch.device("cpu"))
+    assert lru.give(torch.ones(4, dtype=torch.bool), lru.free()).tolist() == [2, 3, 4, 5]
     stamp = torch.tensor([9, 9, 9, 1, 9, 1], dtype=torch.int32)
     lru.unused = int(lru.sort(stamp, torch.tensor([9], dtype=torch.int32)))
     assert lru.order.tolist() == [3, 5, 2, 4] and lru.unused == 2
@@ -23,6 +24,17 @@ def test_lru_gives_slots_from_the_front_as_far_as_they_are_unused():
     assert lru.order.tolist() == [2, 4, 3, 5]
     nothing = LRU(2, 2, torch.device("cpu"))
     assert nothing.give(wanted, nothing.free()).tolist() == [-1, -1, -1]
+
+
+def test_slots_that_never_held_anything_stay_in_front_unread():
+    lru, frame = LRU(6, 2, torch.device("cpu")), torch.tensor([9], dtype=torch.int32)
+    assert lru.give(torch.ones(2, dtype=torch.bool), lru.free()).tolist() == [2, 3]
+    assert lru.order.tolist() == [4, 5, 2, 3] and lru.fresh == 2
+    stamp = torch.tensor([9, 9, 9, 1, -1, -1], dtype=torch.int32)
+    assert int(lru.sort(stamp, frame)) == 3 and lru.order.tolist() == [4, 5, 3, 2]
+    lru.unused = 3
+    assert lru.give(torch.ones(3, dtype=torch.bool), lru.free()).tolist() == [4, 5, 3]
+    assert lru.fresh == 0 and lru.order.tolist() == [2, 4, 5, 3]
 
 
 def requests(depth, priority, coarse=None) -> dict[int, Requests]:

@@ -16,12 +16,15 @@ class LRU:
     Attributes:
         order: (k,) int32 slots without the locked ones, changed in place: CUDA graphs read it.
         unused: How many at the front the last picture did not use; these may be taken.
+        fresh: How many of these, the first, never held anything, so that a frame need not look at
+            them; 0 on CUDA, where the host does not know.
     """
 
     def __init__(self, capacity: int, locked: int, device: torch.device) -> None:
         """Starts with slots `locked` to `capacity`, all free."""
         self.order = torch.arange(locked, capacity, dtype=torch.int32, device=device)
         self.unused = len(self)
+        self.fresh = len(self) if device.type == "cpu" else 0
 
     def sort(self, stamp: Tensor, frame: Tensor) -> Tensor:
         """Moves the slots that `frame` (1,) int32 did not use to the front, each part in its old
@@ -30,9 +33,10 @@ class LRU:
         Returns:
             (1,) int64 number of unused slots; `unused` is set once the host knows it.
         """
-        order, unused = lru_partition(self.order, stamp, frame)
-        self.order.copy_(order)
-        return unused
+        held = self.order[self.fresh :]
+        order, unused = lru_partition(held, stamp, frame)
+        held.copy_(order)
+        return unused + self.fresh
 
     def free(self) -> Tensor:
         """(1,) int64 `unused` on the device."""
@@ -56,7 +60,9 @@ class LRU:
 
     def _roll(self, count: Tensor) -> None:
         if count.device.type == "cpu":
-            self.order.copy_(self.order.roll(-int(count)))
+            given = int(count)
+            self.fresh = max(0, self.fresh - given)
+            self.order.copy_(self.order.roll(-given))
             return
         place = torch.arange(len(self), device=count.device) + count
         self.order.copy_(self.order[place % len(self)])
@@ -93,6 +99,11 @@ class Cache:
         self.lru = {REQUEST_SUBDIVIDE: [LRU(nodes.capacity, roots, device)], REQUEST_LOAD: loads}
         self.finest = torch.zeros(roots, dtype=torch.int64, device=device)
         self._no_coarse = torch.zeros(1, dtype=torch.int64, device=device)
+
+    def requests(self) -> Tensor:
+        """(t, n) request words of the tiles that ever held something: the others have none."""
+        (lru,) = self.lru[REQUEST_SUBDIVIDE]
+        return self.nodes.request_tn[: self.nodes.capacity - lru.fresh]
 
     def memory(self) -> dict[str, int]:
         """Returns bytes: what the pools hold, and the bookkeeping apart."""

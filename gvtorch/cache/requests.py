@@ -22,7 +22,6 @@ from ..base.constants import (
     REQUEST_SUBDIVIDE,
 )
 from ..ops import compact_requests
-from ..pool import NodePool
 from .cache import Cache
 
 #: The kinds of request by the names that statistics show.
@@ -74,11 +73,11 @@ class RequestList:
     count: Tensor  # (5,) int64: see `compact_requests`, then requests of each kind
 
     @classmethod
-    def collect(cls, nodes: NodePool, capacity: int) -> RequestList:
+    def collect(cls, cache: Cache, capacity: int) -> RequestList:
         """Takes the requests, at most `capacity` nodes, out of a pool's request words, which are
         cleared, their pending bits excepted; the host does not wait.
         """
-        node, word, count = compact_requests(nodes.request_tn, capacity)
+        node, word, count = compact_requests(cache.requests(), capacity)
         kinds = [(word & kind).ne(0).sum().view(1) for kind in KINDS.values()]
         return cls(node=node, word=word, count=torch.cat((count, *kinds)))
 

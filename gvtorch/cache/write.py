@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ..base.constants import ABSENT, REQUEST_LOAD, REQUEST_SUBDIVIDE, TERMINAL
 from ..base.volume import movable
-from ..ops import lacking, link, link_bricks, link_tiles, put_rows, unlink
+from ..ops import lacking, link, link_bricks, link_tiles, orphan, put_rows, unlink
 from ..pool import N3Tree
 from ..pool.staging import Chunk, Voxels, on_device, row_bytes
 from .cache import Cache
@@ -127,9 +127,9 @@ def put_tiles(cache: Cache, targets: Targets, children: Children, free: Tensor) 
     slot = lru.give(staying, most)
     put = Put.of(wanted, slot, pool.parent_t)
     tile_k = slot.to(torch.int32)
-    unlink(pool.child_tn, tile_k, pool.capacity)
-    unlink(pool.parent_t, tile_k, pool.capacity, per_tile)
-    unlink(cache.bricks.owner_b, tile_k, pool.capacity, per_tile)
+    unlink(pool.child_tn, pool.parent_t, pool.shared_t, tile_k)
+    orphan(pool.child_tn, pool.parent_t, tile_k)
+    orphan(pool.brick_tn, cache.bricks.owner_b, tile_k)
     for held, values in ((pool.constants, children.constants), (pool.ranges, children.ranges)):
         for name, rows in values.items():
             put_rows_of(held[name], slot, rows)
@@ -213,7 +213,7 @@ def write_slots(cache: Cache, slot: Tensor, node: Tensor, data: Voxels | Sequenc
     they held, and links (k,) int64 nodes to them.
     """
     nodes, pool, slot_k = cache.nodes, cache.bricks, slot.to(torch.int32)
-    unlink(nodes.brick_tn, slot_k, pool.capacity)
+    unlink(nodes.brick_tn, pool.owner_b, pool.shared_b, slot_k)
     with pool.writing():
         if isinstance(data, Mapping):
             _fill_slots(cache, slot, {n: on_device(r, slot.device) for n, r in data.items()})

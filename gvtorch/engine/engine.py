@@ -298,7 +298,7 @@ class Engine:
         """
         with stage("requests"):
             most = min(_MOST_LISTED, self.cache.nodes.child_tn.numel())
-            requests = RequestList.collect(self.cache.nodes, most)
+            requests = RequestList.collect(self.cache, most)
         with stage("lru"):
             use = self.cache.sort_by_use()
         with stage("count"):

@@ -44,7 +44,7 @@ class RecordedFrame:
 
     def collect(self, hits: Hits) -> tuple[RequestList, Tensor]:
         """Lists requests, brings slots into the order of use, and counts both and the samples."""
-        requests = RequestList.collect(self.cache.nodes, self._most)
+        requests = RequestList.collect(self.cache, self._most)
         use = self.cache.sort_by_use()
         self._unused.copy_(use[0:4:2])
         samples = hits.samples.sum(dtype=torch.int64).view(1)

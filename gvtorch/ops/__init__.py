@@ -11,6 +11,7 @@ from .cache import (
     link_tiles,
     locate,
     lru_partition,
+    orphan,
     put_rows,
     unlink,
 )
@@ -41,6 +42,7 @@ __all__ = [
     "list_samples",
     "locate",
     "lru_partition",
+    "orphan",
     "put_rows",
     "sample_bricks",
     "shade_rays",

@@ -80,23 +80,52 @@ def lru_partition(
     return torch.cat((order_k[~used], order_k[used])), (~used).sum().view(1)
 
 
+def _marked(slot_k: Tensor, slots: int) -> Tensor:
+    """(slots + 1,) bool: the slots that are listed; the last stands for none."""
+    marked = torch.zeros(slots + 1, dtype=torch.bool, device=slot_k.device)
+    marked[slot_k[(slot_k >= 0) & (slot_k < slots)].to(torch.int64)] = True
+    return marked
+
+
 @op()
 def unlink(
-    pointer: Words,  # of any shape; those >= 0 name a slot
+    pointer_tn: Words,  # child or brick words; those >= 0 name a slot
+    owner_s: Words,  # the node that each slot belongs to, or ABSENT
+    shared_s: Flags,  # whether other nodes may point to it as well
     slot_k: Words,  # slots that change hands; -1 names none
-    slots: Count,  # how many there are
-    divisor: Positive = 1,  # a word names slot word // divisor: nodes a tile, if it is a node index
     *,
     backend: Backend = "auto",
 ) -> None:
-    """Clears every pointer to slots that change hands, shared ones too: it becomes ABSENT.
+    """Takes slots from their nodes: every pointer to them becomes ABSENT, and so does their owner.
 
-    Mutates `pointer`.
+    Only its owner points to a slot that is not shared; so the compiled op reads all words only
+    where a shared slot changes hands.
+
+    Mutates `pointer_tn` and `owner_s`.
     """
-    leaving = torch.zeros(slots + 1, dtype=torch.bool, device=pointer.device)
-    leaving[slot_k[(slot_k >= 0) & (slot_k < slots)].to(torch.int64)] = True
-    named = torch.where(pointer >= 0, pointer // divisor, slots).clamp(max=slots)
-    pointer[leaving[named.to(torch.int64)]] = ABSENT
+    slots = len(owner_s)
+    leaving = _marked(slot_k, slots)
+    named = torch.where(pointer_tn >= 0, pointer_tn, slots).clamp(max=slots)
+    pointer_tn[leaving[named.to(torch.int64)]] = ABSENT
+    owner_s[leaving[:slots]] = ABSENT
+
+
+@op()
+def orphan(
+    pointer_tn: Words,  # child or brick words
+    owner_s: Words,  # the node that each slot belongs to, or ABSENT: one that points to it
+    tile_k: Words,  # tiles that change hands; -1 names none
+    *,
+    backend: Backend = "auto",
+) -> None:
+    """Clears the owner of the slots that belong to the nodes of tiles that change hands.
+
+    Mutates `owner_s`.
+    """
+    tiles, per_tile = pointer_tn.shape
+    leaving = _marked(tile_k, tiles)
+    tile = torch.where(owner_s >= 0, owner_s // per_tile, tiles).clamp(max=tiles)
+    owner_s[leaving[tile.to(torch.int64)]] = ABSENT
 
 
 def _check_kind(*, kind: int, **_: Any) -> None:

@@ -194,7 +194,9 @@ FAKES: dict[str, Callable[..., Any]] = {
     "locate": lambda *, node_k, **_: node_k.new_empty((node_k.shape[0], 4)),
     "lacking": lambda *, node_k, **_: torch.empty_like(node_k, dtype=torch.bool),
     "cut_bricks": _cut_bricks,
-    **dict.fromkeys(("unlink", "link", "link_bricks", "link_tiles", "put_rows"), lambda **_: None),
+    **dict.fromkeys(
+        ("unlink", "orphan", "link", "link_bricks", "link_tiles", "put_rows"), lambda **_: None
+    ),
 }
 
 

@@ -130,29 +130,59 @@ struct SplitByUse : UseArgs {
 
 // --- Pointers
 
-#define GV_UNLINK(X)             \
-  X(Written<'a'>, pointer, kAny) \
-  X(Words, slot_k, kAny)         \
-  X(Int, slots, kAny)            \
-  X(Int, divisor, kAny)
+#define GV_UNLINK(X)                \
+  X(Written<'a'>, pointer_tn, kAny) \
+  X(Written<'b'>, owner_s, kAny)    \
+  X(Flags, shared_s, slots)         \
+  X(Words, slot_k, kAny)
 
 struct UnlinkArgs {
   GV_UNLINK(GV_VIEW)
+  int64_t nodes, slots;
   uint8_t* leaving_s;
+  int32_t* any_shared;
 };
 
-struct MarkSlot : UnlinkArgs {
+// An index is one of the slots that change hands.
+struct TakeFromOwner : UnlinkArgs {
   GV_HD void operator()(int64_t index) const {
     const int32_t slot = slot_k[index];
-    if (slot >= 0 && slot < slots) leaving_s[slot] = 1;
+    if (slot < 0 || slot >= slots) return;
+    const int32_t owner = owner_s[slot];
+    if (owner >= 0 && owner < nodes && pointer_tn[owner] == slot) pointer_tn[owner] = kAbsent;
+    owner_s[slot] = kAbsent;
+    if (!shared_s[slot]) return;
+    leaving_s[slot] = 1;
+    *any_shared = 1;
   }
 };
 
-// A word names a slot when it is >= 0; `divisor` turns node indices into tiles.
-struct ClearPointer : UnlinkArgs {
+// An index is a word. Only shared slots have pointers beside their owner's.
+struct ClearShared : UnlinkArgs {
   GV_HD void operator()(int64_t index) const {
-    const int32_t word = pointer[index];
-    if (word >= 0 && word / divisor < slots && leaving_s[word / divisor]) pointer[index] = -1;
+    if (*any_shared == 0) return;
+    const int32_t word = pointer_tn[index];
+    if (word >= 0 && word < slots && leaving_s[word] != 0) pointer_tn[index] = kAbsent;
+  }
+};
+
+#define GV_ORPHAN(X)             \
+  X(Words, pointer_tn, kAny)     \
+  X(Written<'a'>, owner_s, kAny) \
+  X(Words, tile_k, kAny)
+
+// An index is a node of a tile that changes hands.
+struct ClearOwner {
+  GV_ORPHAN(GV_VIEW)
+  int64_t tiles, slots, per_tile;
+
+  GV_HD void operator()(int64_t index) const {
+    const int64_t which = index / per_tile;
+    const int64_t tile = tile_k[which];
+    if (tile < 0 || tile >= tiles) return;
+    const int64_t node = tile * per_tile + (index - which * per_tile);
+    const int32_t slot = pointer_tn[node];
+    if (slot >= 0 && slot < slots && owner_s[slot] == node) owner_s[slot] = kAbsent;
   }
 };
 

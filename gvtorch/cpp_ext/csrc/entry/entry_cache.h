@@ -54,14 +54,34 @@ inline auto run(const LruPartitionOp& a) {
 GV_OP(UnlinkOp, "unlink", GV_UNLINK, "()");
 
 inline void run(const UnlinkOp& a) {
-  const Like like{a.pointer};
+  const Like like{a.pointer_tn};
+  const int64_t slots = a.owner_s.numel();
   UnlinkArgs args{};
   GV_UNLINK(GV_TAKE)
-  STD_TORCH_CHECK(a.divisor >= 1, "gvtorch: divisor out of range");
-  const Tensor leaving_s = torch::stable::new_zeros(a.pointer, {a.slots}, ScalarType::Byte);
+  args.nodes = a.pointer_tn.numel();
+  args.slots = slots;
+  const Tensor leaving_s = torch::stable::new_zeros(a.pointer_tn, {slots}, ScalarType::Byte);
+  const Tensor any_shared = torch::stable::new_zeros(a.pointer_tn, {1});
   args.leaving_s = lay(leaving_s);
-  for_each(a.pointer, a.slot_k.numel(), MarkSlot{args});
-  for_each(a.pointer, a.pointer.numel(), ClearPointer{args});
+  args.any_shared = lay(any_shared);
+  for_each(a.pointer_tn, a.slot_k.numel(), TakeFromOwner{args});
+#ifndef __CUDACC__
+  if (*args.any_shared == 0) return;
+#endif
+  for_each(a.pointer_tn, args.nodes, ClearShared{args});
+}
+
+GV_OP(OrphanOp, "orphan", GV_ORPHAN, "()");
+
+inline void run(const OrphanOp& a) {
+  const Like like{a.pointer_tn};
+  ClearOwner args{};
+  GV_ORPHAN(GV_TAKE)
+  STD_TORCH_CHECK(a.pointer_tn.dim() == 2, "gvtorch: pointer_tn must be (t, n)");
+  args.tiles = a.pointer_tn.size(0);
+  args.per_tile = a.pointer_tn.size(1);
+  args.slots = a.owner_s.numel();
+  for_each(a.pointer_tn, a.tile_k.numel() * args.per_tile, args);
 }
 
 GV_OP(LinkOp, "link", GV_LINK, "()");
@@ -177,7 +197,7 @@ inline Tensor run(const CutBricksOp& a) {
   return bricks_kzyxc;
 }
 
-using CacheOps = Types<CompactRequestsOp, LruPartitionOp, UnlinkOp, LinkOp, LinkBricksOp, LinkTilesOp, PutRowsOp,
-                       LocateOp, LackingOp, CutBricksOp>;
+using CacheOps = Types<CompactRequestsOp, LruPartitionOp, UnlinkOp, OrphanOp, LinkOp, LinkBricksOp, LinkTilesOp,
+                       PutRowsOp, LocateOp, LackingOp, CutBricksOp>;
 
 }  // namespace gvtorch
