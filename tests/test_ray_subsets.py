@@ -7,21 +7,52 @@ import torch
 import gvtorch as gv
 from gvtorch.engine.ray_subsets import RaySubsets
 
+CPU = torch.device("cpu")
+LOADED = gv.FrameStats(produced={"bricks": 3})
+
 
 def test_scouts_go_first():
-    subsets = RaySubsets(64, 8, torch.device("cpu"))
-    assert subsets.next.all()
-    subsets.update(torch.ones(64, dtype=torch.bool), gv.FrameStats(produced={"bricks": 3}), 0)
-    assert subsets.next.nonzero()[:, 0].tolist() == [0, 4, 32, 36]
-    subsets.update(torch.zeros(64, dtype=torch.bool), gv.FrameStats(), 0)
+    subsets = RaySubsets(32 * 32, 32, CPU, ahead=True)
+    assert subsets.next.nonzero()[:, 0].tolist() == [0, 16, 16 * 32, 16 * 32 + 16]
+    missed = torch.ones(32 * 32, dtype=torch.bool)
+    subsets.update(missed, LOADED, 0)
+    assert int(subsets.next.sum()) == 4 and not subsets.done
+    subsets.update(~missed, gv.FrameStats(), 0)
     assert subsets.done == 4 and int(subsets.next.sum()) == 60
+    subsets.update(~missed, gv.FrameStats(), 0)
+    assert subsets.done == 64 and int(subsets.next.sum()) == 32 * 32 - 64
+    subsets.update(~missed, gv.FrameStats(), 0)
+    assert subsets.over and subsets.whole
+
+
+def test_a_few_scouts_go_on_with_the_others():
+    subsets = RaySubsets(64 * 64, 64, CPU, ahead=True)
+    missed = torch.zeros(64 * 64, dtype=torch.bool)
+    missed[0] = True
+    subsets.update(missed, LOADED, 0)
+    assert subsets.done == 15 and int(subsets.next.sum()) == 256 - 15 and subsets.next[0]
     subsets.trace_all()
-    assert torch.equal(subsets.next, ~torch.isin(torch.arange(64), torch.tensor([0, 4, 32, 36])))
+    assert int(subsets.next.sum()) == 64 * 64 - 15
+
+
+def test_scouts_that_get_nothing_do_not_end_the_picture():
+    subsets, missed = RaySubsets(256, 16, CPU, ahead=True), torch.ones(256, dtype=torch.bool)
+    subsets.update(missed, gv.FrameStats(produced={"bricks": 0}), 0)
+    assert not subsets.over and subsets.next.all(), "every ray gets a colour"
+    subsets.update(missed, gv.FrameStats(produced={"bricks": 0}), 0)
+    assert subsets.over and not subsets.whole
+
+
+def test_all_go_first_where_little_is_missing():
+    subsets = RaySubsets(64, 8, CPU, ahead=False)
+    assert subsets.next.all()
+    subsets.update(torch.ones(64, dtype=torch.bool), LOADED, 0)
+    assert subsets.next.nonzero()[:, 0].tolist() == [0]
 
 
 def test_subsets_are_halved_where_nothing_moves(monkeypatch):
-    monkeypatch.setattr("gvtorch.engine.ray_subsets._STRIDE", 1)
-    subsets = RaySubsets(16, 16, torch.device("cpu"))
+    monkeypatch.setattr("gvtorch.engine.ray_subsets._STRIDES", (1,))
+    subsets = RaySubsets(16, 16, CPU, ahead=False)
     full = gv.FrameStats(capacity_exceeded=True, produced={"bricks": 0})
     everyone = torch.ones(16, dtype=torch.bool)
     for expected in (8, 4, 2, 1):
@@ -39,6 +70,6 @@ def test_subsets_are_halved_where_nothing_moves(monkeypatch):
     subsets.update(~subsets.next, loaded, 0)
     subsets.update(~subsets.next, loaded, 0)
     assert subsets.over and subsets.whole and subsets.done == 16
-    subsets = RaySubsets(1, 1, torch.device("cpu"))
+    subsets = RaySubsets(1, 1, CPU, ahead=False)
     subsets.update(everyone[:1], full, 0)
     assert subsets.over and not subsets.whole, "a ray that does not fit alone is given up"

@@ -267,8 +267,6 @@ class Engine:
                 hits = empty_hits(self.device, view.options.dtype, view.rays)
                 if self._missed is not None and len(self._missed) == view.rays:
                     hits.missed.copy_(self._missed)
-                else:  # a picture of another size
-                    hits.missed.fill_(True)
             view.hits(again=(hits, scouts(hits.missed, view.camera.width)))
             collected = self.collect_requests_and_use(hits.samples[:0])
             counts = Counts(*collected.numbers.tolist())  # what misses something waits anyway
@@ -380,8 +378,13 @@ class Engine:
 
     def _converge(self, view: View, most: int, progress: Progress) -> tuple[Hits, FrameStats]:
         """Renders at most `most` frames, each of the rays that still miss something."""
-        subsets = RaySubsets(view.rays, view.camera.width, self.device)
+        last, ahead = self._missed, most > 1
+        if last is not None and len(last) == view.rays:
+            ahead = ahead and bool(last.any())  # else this picture will hardly miss anything
+        subsets = RaySubsets(view.rays, view.camera.width, self.device, ahead=ahead)
         total, again = FrameStats(), None
+        if ahead:
+            again = empty_hits(self.device, view.options.dtype, view.rays), subsets.next
         for number in range(1, most + 1):
             hits, stats = self._served_frame(view, again)
             subsets.update(hits.missed, stats, total.failed)

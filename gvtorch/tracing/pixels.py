@@ -282,10 +282,10 @@ def _write(hits: Hits, pixels: Pixels, part: Hits, count: int) -> None:
 
 
 def empty_hits(device: torch.device, dtype: torch.dtype, pixels: int) -> Hits:
-    """Takes the memory of a picture."""
+    """Takes the memory of a picture, of which no ray was traced yet: all miss something."""
     color, alpha, depth = (
         torch.empty((pixels, width), dtype=dtype, device=device) for width in (3, 1, 1)
     )
-    samples = torch.empty(pixels, dtype=torch.int32, device=device)
-    missed = torch.empty_like(samples, dtype=torch.bool)
+    samples = torch.zeros(pixels, dtype=torch.int32, device=device)
+    missed = torch.ones_like(samples, dtype=torch.bool)
     return Hits(color=color, alpha=alpha, depth=depth, samples=samples, missed=missed)
