@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 
@@ -55,6 +55,7 @@ class Timings:
         return total
 
 
+_NOTHING = nullcontext()
 _timings: ContextVar[Timings | None] = ContextVar("gvtorch_timings", default=None)
 
 
@@ -64,10 +65,8 @@ def stage(name: str) -> Iterator[None]:
     costs nothing where neither is on.
     """
     timings = _timings.get()
-    if timings is None and not torch.autograd._profiler_enabled():
-        yield
-        return
-    with torch.profiler.record_function(f"gvtorch.{name}"):
+    profiled = torch.autograd._profiler_enabled()
+    with torch.profiler.record_function(f"gvtorch.{name}") if profiled else _NOTHING:
         if timings is None:
             yield
             return
