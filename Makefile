@@ -1,5 +1,6 @@
 # make demo   sets up .venv, renders the bundled CT scan, prints where the picture lies
 # make test   sets up .venv, runs every test
+# make soak   random flights with faults (FRAMES=100000): pools in order, memory flat, pictures exact
 # make lint   ruff, mypy, clang-format
 # make bench  every workload on this machine, beside peers: docs/performance (ARGS=--quick: tiny sizes)
 # make wheel  one wheel for every Python >= 3.11, every torch >= 2.11 and every card, with a manylinux tag, in dist/
@@ -20,7 +21,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constr
 ARCHS_GIVEN := $(GVTORCH_CUDA_ARCHS)
 export GVTORCH_CUDA_ARCHS ?= $(or $(NATIVE),90)
 
-.PHONY: demo test lint format bench wheel clean
+.PHONY: demo test soak lint format bench wheel clean
 .DELETE_ON_ERROR:
 
 # The scan as a store on disk, seen through a brick pool an eighth of its size in bricks.
@@ -35,6 +36,10 @@ demo: $(VENV)/ready
 
 test: $(VENV)/ready
 	OMP_NUM_THREADS=1 GVTORCH_REQUIRE=$(REQUIRE) $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal $(ARGS)
+
+FRAMES ?= 100000
+soak: $(VENV)/ready
+	OMP_NUM_THREADS=1 GVTORCH_SOAK=$(FRAMES) $(BIN)/python -m pytest -s tests/test_soak.py
 
 lint: $(VENV)/ready
 	$(BIN)/ruff check .

@@ -6,16 +6,14 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import Future
-from functools import partial
 from typing import Any
 
 import pytest
 import torch
 from helpers import DEVICES
+from helpers.recorded import Frames
 
 import gvtorch as gv
-from gvtorch.engine.host_frame import HostFrame
-from gvtorch.engine.setup import make_recorded_frame
 from gvtorch.io.conversion import convert
 
 COMPILED = [pytest.param(b, marks=pytest.mark.backend(b)) for b in ("cpp", "cuda")]
@@ -58,35 +56,6 @@ def view(size: int = 48, angle: float = 30) -> gv.Camera:
     return gv.Camera.orbit(angle, 20, 0.9, None, size, size)
 
 
-class Frames:
-    """Frames of an engine, served on the device: without a graph, so that the CPU runs them."""
-
-    def __init__(self, engine: gv.Engine, camera: gv.Camera, batch: int) -> None:
-        self.engine, self.batch = engine, batch
-        self.view = engine.view("test", camera, LOOK, {})
-        trees = [*engine.trees.values()]
-        made = make_recorded_frame(engine.cache, trees, engine.scheduler, batch, engine.production)
-        assert made is not None
-        self.served, self.number = made, -1
-        if isinstance(made, HostFrame):
-            engine.recorded.append(made)
-
-    def frame(self) -> tuple[gv.Hits, gv.FrameStats]:
-        with self.engine.new_frame(self.view.options) as stats:
-            self.engine.release(but=self.served)
-            self.engine.readbacks.take_arrived()
-            if self.served.begin(self.engine.frames != self.number, self.engine.steady, stats):
-                self.served.serve()
-            self.engine.number_picture(on_device=False)
-            self.number = self.engine.frames
-            hits, collected = self.served.draw(self.view.hits)
-            if isinstance(self.served, HostFrame):
-                collected = collected._replace(ask=partial(self.served.ask, self.served.turn))
-            self.engine.read_back(stats, hits, collected)
-        self.engine.readbacks.hold_back()
-        return hits, stats.settle()
-
-
 @pytest.mark.parametrize("backend", COMPILED)
 @pytest.mark.parametrize("branching, kinds, batch", [(2, False, 64), (2, True, 7), (3, False, 300)])
 def test_they_come_to_the_picture_that_the_host_comes_to(backend, branching, kinds, batch):
@@ -98,7 +67,7 @@ def test_they_come_to_the_picture_that_the_host_comes_to(backend, branching, kin
         expected = served.render(view(), LOOK)
         assert expected.stats.converged and (expected.alpha > 0.5).any()
     with engine() as own:
-        frames = Frames(own, view(), batch)
+        frames = Frames(own, view(), LOOK, batch)
         own.trees["scene"].producer.asked.clear()
         made = {"tiles": 0, "bricks": 0, "constant": 0}
         for _ in range(400):
@@ -137,7 +106,7 @@ def test_producers_on_the_host_answer_while_frames_go_on(
         expected = engine.render(camera, LOOK)
         assert (expected.alpha > 0.5).any()
     with gv.Engine(on_the_host(blobs, tmp_path / "two", which), **options) as engine:
-        frames, made = Frames(engine, camera, batch), 0
+        frames, made = Frames(engine, camera, LOOK, batch), 0
         for _ in range(600):
             hits, stats = frames.frame()
             made += stats.produced["bricks"]
@@ -164,7 +133,7 @@ def test_what_fails_on_the_host_is_named_and_not_asked_for_again(blobs, backend)
             return gv.Bricks(data=bricks.data, errors=errors)
 
     with gv.Engine(Spoiled(blobs), brick_size=4, device=DEVICES[backend]) as engine:
-        frames = Frames(engine, view(24), 64)
+        frames = Frames(engine, view(24), LOOK, 64)
         for _ in range(200):
             hits, stats = frames.frame()
             if stats.converged:
@@ -188,7 +157,7 @@ def test_what_raises_costs_itself_alone_and_what_never_comes_is_given_up(blobs, 
             return super().fill(nodes)
 
     with gv.Engine(Unruly(blobs), brick_size=4, device=DEVICES[backend]) as engine:
-        frames = Frames(engine, view(16), 64)
+        frames = Frames(engine, view(16), LOOK, 64)
         for _ in range(400):
             hits, stats = frames.frame()
             time.sleep(0.002)
@@ -219,7 +188,7 @@ def test_aliases_are_left_to_the_host(blobs, backend):
     with gv.Engine(Twice(blobs), brick_size=4, device=DEVICES[backend]) as engine:
         expected = engine.render(view(16), LOOK)
     with gv.Engine(Twice(blobs), brick_size=4, device=DEVICES[backend]) as engine:
-        frames = Frames(engine, view(16), 64)
+        frames = Frames(engine, view(16), LOOK, 64)
         for _ in range(100):
             frames.frame()
             time.sleep(0.001)
@@ -237,7 +206,7 @@ def test_a_pool_that_is_too_small_gives_away_what_is_used_least(backend):
     with gv.Engine(Ball(), brick_pool="1 MB", node_pool="60 kB", device=DEVICES[backend]) as engine:
         evicted = 0
         for angle in (0, 50, 100, 180, 270, 0):
-            frames = Frames(engine, view(24, angle), 32)
+            frames = Frames(engine, view(24, angle), LOOK, 32)
             for _ in range(200):
                 hits, stats = frames.frame()
                 evicted += stats.evicted["bricks"] + stats.evicted["tiles"]
@@ -253,7 +222,7 @@ def test_a_pool_that_is_too_small_gives_away_what_is_used_least(backend):
 @pytest.mark.parametrize("backend", COMPILED)
 def test_bricks_with_nan_are_left_out_and_counted(backend):
     with gv.Engine(Ball(), brick_pool="16 MB", device=DEVICES[backend]) as engine:
-        frames = Frames(engine, view(), 512)
+        frames = Frames(engine, view(), LOOK, 512)
         engine.trees["scene"].producer.spoiled.fill_(1)
         for _ in range(12):
             hits, _ = frames.frame()
@@ -272,7 +241,7 @@ def test_what_the_host_would_have_to_see_to_is_refused():
             return gv.Bricks(data=super().fill(nodes), errors={0: "no"})
 
     with gv.Engine(Ball(), brick_pool="16 MB") as engine:
-        frames = Frames(engine, view(), 8)
+        frames = Frames(engine, view(), LOOK, 8)
         engine.trees["scene"].producer.__class__ = Named
         with pytest.raises(ValueError, match="without alias and errors"):
             frames.frame()
