@@ -4,6 +4,7 @@ CUDA as one graph, which the host never waits for.
 
 from __future__ import annotations
 
+import threading
 import time
 from concurrent.futures import Future
 from typing import Any
@@ -122,6 +123,33 @@ def test_producers_on_the_host_answer_while_frames_go_on(
         engine.validate()
     assert torch.equal(hits.color, expected.color.reshape(-1, 3))
     assert torch.equal(hits.depth, expected.depth.reshape(-1, 1))
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_what_was_asked_before_a_frame_of_the_host_is_dropped_however_late(blobs, backend):
+    class Slow(gv.VolumeProducer):
+        gate = threading.Event()
+
+        def fill(self, nodes):
+            if threading.current_thread().name.startswith("gvtorch-ask"):
+                self.gate.wait()
+            return super().fill(nodes)
+
+    with gv.Engine(Slow(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        Slow.gate.set()
+        frames, asker = Frames(engine, view(24), LOOK, 64), engine.recorded[0]
+        while not frames.frame()[1].requests["load"]:
+            asker._asker.submit(int).result()
+        Slow.gate.clear()
+        frames.frame()  # asks for these, and is held up
+        engine.release()
+        for _ in range(2):
+            frames.frame()  # asks again
+        Slow.gate.set()
+        asker._asker.submit(int).result()  # both answers are here
+        for _ in range(3):
+            frames.frame()
+            engine.validate()
 
 
 @pytest.mark.parametrize("backend", COMPILED)

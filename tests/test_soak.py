@@ -20,7 +20,7 @@ from helpers.recorded import Frames
 import gvtorch as gv
 
 COMPILED = [pytest.param(b, marks=pytest.mark.backend(b)) for b in ("cpp", "cuda")]
-FRAMES = int(os.environ.get("GVTORCH_SOAK", "600"))
+FRAMES = int(os.environ.get("GVTORCH_SOAK", "2000"))
 LOOK = gv.TransferFunction.preset("gray", 0, 1)
 FAULTS = ("raises", "nan", "errors", "never")
 
@@ -137,4 +137,4 @@ def test_random_flights_end_in_the_resident_picture(blobs, backend):
             print(f"{frames:,} frames, {flights:,} flights, {megabytes:,.0f} MB", flush=True)
     grown = resident_bytes() - after_a_fifth
     assert FRAMES < 10_000 or grown < 50e6, f"{grown / 1e6:.0f} MB more"
-    assert compared >= 0.5 * flights
+    assert compared > 0.4 * flights

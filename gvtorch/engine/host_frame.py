@@ -83,12 +83,12 @@ class HostFrame(RecordedFrame):
         if not self.active:
             return
         self.active = False
-        self.turn += 1
         self._waiting.clear()
-        for mail in self._mail:
-            mail.forget()
-            mail.sent = 0
-        with self._lock:
+        with self._lock:  # what a thread works on now is posted before, and dropped, or not at all
+            self.turn += 1
+            for mail in self._mail:
+                mail.forget()
+                mail.sent = 0
             self._asked = self._done = 0
         self._production.restore_pending()
 
@@ -207,11 +207,11 @@ class HostFrame(RecordedFrame):
         for future, (until, batch) in list(self._waiting.items()):
             if until < now and self._waiting.pop(future, None) is not None:
                 future.cancel()
-                self._fail(batch, f"no answer within {self._patience(batch):g} s")
+                self._fail(self.turn, batch, f"no answer within {self._patience(batch):g} s")
 
     def _split(self, turn: int, batch: RequestBatch, error: Exception) -> None:
         if len(batch) == 1:
-            self._fail(batch, f"{type(error).__name__}: {error}", error)
+            self._fail(turn, batch, f"{type(error).__name__}: {error}", error)
             return
         half = len(batch) // 2
         self._submit(turn, batch[:half])
@@ -228,16 +228,16 @@ class HostFrame(RecordedFrame):
             return
         try:
             checked = batch.check(given)
-            bad = self._name_errors(batch, checked)
+            bad = self._name_errors(turn, batch, checked)
             good = (~bad).nonzero()[:, 0]
             if isinstance(checked, Regions):
-                self._post_tiles(batch, checked, good)
+                self._post_tiles(turn, batch, checked, good)
             else:
-                self._post_bricks(batch, checked, good)
+                self._post_bricks(turn, batch, checked, good)
         except ValueError as error:
-            self._fail(batch, str(error), error)
+            self._fail(turn, batch, str(error), error)
 
-    def _name_errors(self, batch: RequestBatch, answer: Regions | Bricks) -> Tensor:
+    def _name_errors(self, turn: int, batch: RequestBatch, answer: Regions | Bricks) -> Tensor:
         """(k,) bool, which nodes of a batch have an item that failed; names them."""
         bad = torch.zeros(len(batch), dtype=torch.bool)
         per_node = len(batch.loc) // len(batch)
@@ -245,64 +245,73 @@ class HostFrame(RecordedFrame):
             node = index // per_node
             if not bad[node]:
                 bad[node] = True
-                self._fail(batch[node : node + 1], answer.errors[index])
+                self._fail(turn, batch[node : node + 1], answer.errors[index])
         return bad
 
-    def _fail(self, batch: RequestBatch, message: str, cause: BaseException | None = None) -> None:
+    def _fail(
+        self, turn: int, batch: RequestBatch, message: str, cause: BaseException | None = None
+    ) -> None:
         """Counts and names a batch's nodes; they stay marked as pending: no ray asks again."""
         with self._lock:
-            self._done += len(batch)
-            self._production.failures.add(batch, message, cause)
+            if turn == self.turn:
+                self._done += len(batch)
+                self._production.failures.add(batch, message, cause)
 
-    def _post_tiles(self, batch: RequestBatch, answer: Regions, good: Tensor) -> None:
+    def _post_tiles(self, turn: int, batch: RequestBatch, answer: Regions, good: Tensor) -> None:
         if answer.alias is not None:
-            self._leave_to_host(batch[good])
+            self._leave_to_host(turn, batch[good])
             return
         made, targets = children_of(batch, answer, self.cache), batch.targets
         rows = {"node": targets.node, "loc": targets.loc, "child": made.child, "brick": made.brick}
         fields = {"constants": made.constants, "ranges": made.ranges}
-        self._post(batch, "tiles", rows, fields, good)
+        self._post(turn, batch, "tiles", rows, fields, good)
 
-    def _post_bricks(self, batch: RequestBatch, answer: Bricks, good: Tensor) -> None:
+    def _post_bricks(self, turn: int, batch: RequestBatch, answer: Bricks, good: Tensor) -> None:
         fields: dict[str, Mapping[str, Any]]
         targets, kind = batch.targets, answer.kind
         rows = {"node": targets.node, "loc": targets.loc}
         data = {n: d.gather() if isinstance(d, TableRows) else d for n, d in answer.data.items()}
         fields = {"data": data}
         if kind is None:
-            self._post(batch, "bricks", rows, fields, good)
+            self._post(turn, batch, "bricks", rows, fields, good)
             return
         alias = kind[good] == Region.ALIAS
         if bool(alias.any()):
-            self._leave_to_host(batch[good[alias]])
+            self._leave_to_host(turn, batch[good[alias]])
         bare = (kind[good] == Region.EMPTY) | (kind[good] == Region.CONSTANT)
-        self._post(batch, "bricks", rows, fields, good[~bare & ~alias])
+        self._post(turn, batch, "bricks", rows, fields, good[~bare & ~alias])
         word = torch.where(kind == Region.CONSTANT, CONSTANT, EMPTY).to(torch.int32)
         known = {
             name: torch.zeros((len(kind), one.width), dtype=one.dtype)
             for name, one in batch.source.producer.channels.items()
         }
         fields = {"constants": {**known, **answer.constants}}
-        self._post(batch, "bare", {**rows, "word": word}, fields, good[bare])
+        self._post(turn, batch, "bare", {**rows, "word": word}, fields, good[bare])
 
-    def _leave_to_host(self, batch: RequestBatch) -> None:
+    def _leave_to_host(self, turn: int, batch: RequestBatch) -> None:
         """Lets `Engine.frame` ask again, which can look up what an alias stands for."""
         self.host_needed = True
         bit = torch.full((len(batch),), batch.kind << REQUEST_PENDING_SHIFT, dtype=torch.int32)
-        self._post(batch, "again", {"node": batch.targets.node, "bit": bit}, {}, slice(None))
+        self._post(turn, batch, "again", {"node": batch.targets.node, "bit": bit}, {}, slice(None))
 
     def _post(
         self,
+        turn: int,
         batch: RequestBatch,
         box: str,
         rows: Mapping[str, Tensor],
         fields: Mapping[str, Mapping[str, Tensor]],
         which: Tensor | slice,
     ) -> None:
-        """Posts some rows: fields, and those that each channel has."""
+        """Posts some rows: fields, and those that each channel has. A node may be posted once
+        alone, so what was asked before the last `release` is dropped: it may be asked for again.
+        """
         flat = {f"{name}.{channel}": t for name, by in fields.items() for channel, t in by.items()}
         mail = self._mail[self._by_tree[batch.source.tree.number]]
-        mail.post(box, {n: movable(t)[which].view(t.dtype) for n, t in {**rows, **flat}.items()})
+        some = {n: movable(t)[which].view(t.dtype) for n, t in {**rows, **flat}.items()}
+        with self._lock:
+            if turn == self.turn:
+                mail.post(box, some)
 
 
 def _boxes(cache: Cache, source: ProducedTree) -> dict[str, Form]:
