@@ -49,6 +49,8 @@ class Settings:
     graph: bool = True
     """on CUDA: each frame is one graph"""
     device: str = "cpu"
+    resident: bool = False
+    """also fly through a tree that is all in memory: what the cache costs"""
     folder: Path | None = None
     """where the store is kept; a temporary folder if left out"""
 
@@ -109,14 +111,35 @@ def flight(side: int) -> CameraPath:
     return CameraPath(eyes.tolist(), targets.tolist(), fov=[45.0] * len(keys))
 
 
-def fly(producer: gv.Producer, pool: str, settings: Settings, console: Console) -> list[str]:
-    """Flies once; returns a row of the table."""
+def scene(settings: Settings) -> tuple[gv.TransferFunction, list[gv.Camera]]:
+    """What is seen of the solid, and from where."""
     opacity = [(100, 0), (140, 0.9)]
     color = [(100, 0.3, 0.1, 0.05), (160, 0.9, 0.6, 0.3), (255, 1, 0.95, 0.8)]
+    path, places = flight(settings.side), np.linspace(0, 1, settings.frames)
+    cameras = [path.camera(float(t), *settings.size) for t in places]
+    return gv.TransferFunction.from_points(opacity, color, reference=4.0), cameras
+
+
+def quantiles(times: list[float]) -> list[str]:
+    """Median and 99th percentile of milliseconds."""
+    return [f"{sorted(times)[math.ceil(q * len(times)) - 1]:.2f}" for q in (0.5, 0.99)]
+
+
+def fly_resident(store: Path, settings: Settings, console: Console) -> list[str]:
+    """The same pictures of a tree that is all in memory; returns a row of the table."""
+    tree = gv.N3Tree.from_volume(gv.read_volume(store), device=settings.device)
+    shader, cameras = scene(settings)
+    pictures = [gv.render(tree, c, shader) for c in track(cameras, "resident", console=console)]
+    times = [picture.stats.milliseconds for picture in pictures]
+    used = sum(picture.stats.bricks_used for picture in pictures)
+    rate = f"{1e3 * len(times) / sum(times):,.0f}"
+    return ["resident", "", "", f"{used / len(times):,.0f}", *quantiles(times), rate, ""]
+
+
+def fly(producer: gv.Producer, pool: str, settings: Settings, console: Console) -> list[str]:
+    """Flies once; returns a row of the table."""
     all_stats = []
-    shader = gv.TransferFunction.from_points(opacity, color, reference=4.0)
-    path = flight(settings.side)
-    cameras = [path.camera(float(t), *settings.size) for t in np.linspace(0, 1, settings.frames)]
+    shader, cameras = scene(settings)
     options = {"brick_pool": pool, "node_pool": "64 MB", "loading": settings.loading}
     with gv.Engine(producer, device=settings.device, **options) as engine:
         engine.render(cameras[0], shader)  # the flight begins with what its first view needs
@@ -136,11 +159,11 @@ def fly(producer: gv.Producer, pool: str, settings: Settings, console: Console) 
         sum(getattr(stats, field)[name] for stats in all_stats)
         for field, name in (("requests", "load"), ("produced", "bricks"))
     )
-    times = sorted(stats.milliseconds for stats in all_stats)
+    times = [stats.milliseconds for stats in all_stats]
     return [
         *(pool, f"{asked / (used + asked):.2%}", f"{missed / (used + missed):.2%}"),
         f"{used / settings.frames:,.0f}",
-        *(f"{times[math.ceil(q * len(times)) - 1]:.2f}" for q in (0.5, 0.99)),
+        *quantiles(times),
         *(f"{settings.frames / seconds:,.0f}", f"{made / seconds:,.0f}"),
     ]
 
@@ -171,6 +194,8 @@ def main(settings: Settings) -> None:
                 else gv.StoredProducer(store, workers=settings.workers)
             )
             table.add_row(*fly(producer, pool, settings, console))
+        if settings.resident and settings.source == "store":
+            table.add_row(*fly_resident(store, settings, console))
         Console().print(table)
 
 
