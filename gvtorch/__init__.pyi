@@ -27,6 +27,9 @@ from .producers import (
     VolumeProducer as VolumeProducer,
 )
 
+# Functions of place.
+from .fields import noise as noise
+
 # Cameras and rays.
 from .base.records import Hits as Hits, Rays as Rays
 from .cameras import Camera as Camera, CameraPath as CameraPath, CustomCamera as CustomCamera

@@ -15,7 +15,7 @@ from helpers import ROOT
 PACKAGE = ROOT / "gvtorch"
 FLOORS = [
     {"base"},
-    {"cpp_ext"},
+    {"cpp_ext", "fields"},
     {"ops"},
     {"pool"},
     {"cameras", "io"},

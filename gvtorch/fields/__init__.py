@@ -1,0 +1,5 @@
+"""Functions of place."""
+
+from . import noise
+
+__all__ = ["noise"]
