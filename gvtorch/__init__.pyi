@@ -16,9 +16,13 @@ from .pool import (
     NodePool as NodePool,
 )
 
+# Functions of place.
+from .fields import Field as Field, Solid as Solid, sdf as sdf
+
 # What makes the content of a tree.
 from .producers import (
     Bricks as Bricks,
+    FieldProducer as FieldProducer,
     Nodes as Nodes,
     Producer as Producer,
     Region as Region,

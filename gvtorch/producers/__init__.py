@@ -1,11 +1,13 @@
 """Producers: what makes the content of trees."""
 
+from .field import FieldProducer
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 from .stored import StoredProducer
 from .volume import VolumeProducer
 
 __all__ = [
     "Bricks",
+    "FieldProducer",
     "Layout",
     "Nodes",
     "Producer",
