@@ -16,9 +16,20 @@ from .pool import (
     NodePool as NodePool,
 )
 
+# Functions of place.
+from .fields import (
+    Field as Field,
+    SampledDistance as SampledDistance,
+    Solid as Solid,
+    noise as noise,
+    sdf as sdf,
+)
+
 # What makes the content of a tree.
 from .producers import (
     Bricks as Bricks,
+    FieldProducer as FieldProducer,
+    Hypertexture as Hypertexture,
     Nodes as Nodes,
     Producer as Producer,
     Region as Region,
@@ -26,9 +37,6 @@ from .producers import (
     StoredProducer as StoredProducer,
     VolumeProducer as VolumeProducer,
 )
-
-# Functions of place.
-from .fields import noise as noise
 
 # Cameras and rays.
 from .base.records import Hits as Hits, Rays as Rays

@@ -15,10 +15,10 @@ from helpers import ROOT
 PACKAGE = ROOT / "gvtorch"
 FLOORS = [
     {"base"},
-    {"cpp_ext", "fields"},
+    {"cpp_ext"},
     {"ops"},
     {"pool"},
-    {"cameras", "io"},
+    {"cameras", "fields", "io"},
     {"cache", "opengl", "pictures", "producers", "shaders"},
     {"tracing"},
     {"engine"},

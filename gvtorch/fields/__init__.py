@@ -1,5 +1,21 @@
-"""Functions of place."""
+"""Fields: functions of place, in torch alone."""
 
-from . import noise
+from . import noise, sdf
+from .distance import Distance
+from .field import Bounds, Field, Interval, Values, length, tighter
+from .sampled import SampledDistance
+from .solid import Solid
 
-__all__ = ["noise"]
+__all__ = [
+    "Bounds",
+    "Distance",
+    "Field",
+    "Interval",
+    "SampledDistance",
+    "Solid",
+    "Values",
+    "length",
+    "noise",
+    "sdf",
+    "tighter",
+]

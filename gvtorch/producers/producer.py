@@ -277,7 +277,7 @@ class Bricks(Answer):
     """
 
     data: Voxels  # for each channel (k, z, y, x, c), border included
-    kind: Tensor | None = None  # (k,) of `Region`; None: all DATA
+    kind: Tensor | None = None  # (k,) of `Region`, -1: not finite; None: all DATA
     constants: Mapping[str, Tensor] = field(default_factory=dict)  # as in `Regions`
     alias: Tensor | None = None  # as in `Regions`
     errors: Mapping[int, str] = field(default_factory=dict, repr=False)  # as in `Regions`
