@@ -6,13 +6,16 @@ Source: Hart, "Sphere tracing", 1996 (Lipschitz bounds); an interpolated value c
 
 from __future__ import annotations
 
+import itertools
+import math
+
 import torch
 from torch import Tensor
 
 from ..base import check
 from ..base.volume import Volume
 from .distance import WHITE, Color, Distance
-from .field import length
+from .field import Interval, length
 
 
 class SampledDistance(Distance):
@@ -45,12 +48,14 @@ class SampledDistance(Distance):
         self.vector("origin", volume.origin)
         self.vector("last", [n - 1 for n in volume.extent])
         self.register_buffer("steepest", _steepest(values, self.spacing))
+        self.register_buffer("apart", _apart(values, self.spacing))
 
     values: Tensor
     spacing: Tensor
     origin: Tensor
     last: Tensor
     steepest: Tensor
+    apart: Tensor
 
     def forward(self, points: Tensor) -> Tensor:
         at = (points - self.origin.to(points)) / self.spacing.to(points)
@@ -76,9 +81,22 @@ class SampledDistance(Distance):
 
     def slope(self, center: Tensor, half: Tensor) -> Tensor:
         """Inside that of the steepest cell; outside the distance to the box adds to it."""
+        return torch.where(self._inside(center, half), self.steepest, self.steepest + 1)
+
+    def bounds(self, center: Tensor, half: Tensor) -> Interval:
+        """As far around the value in the middle as the slope allows, or as voxels do: a value is a
+        mean of voxels that lie half a cell's diagonal away on average, at either end.
+        """
+        middle, radius = self(center), length(half)
+        most = self.apart * (radius + length(self.spacing))
+        most = torch.where(self._inside(center, half), most, most + radius)
+        most = torch.minimum(most, self.slope(center, half) * radius)
+        return middle - most, middle + most
+
+    def _inside(self, center: Tensor, half: Tensor) -> Tensor:
+        """(k,) bool, which boxes lie in that of the volume."""
         high = self.origin + self.last * self.spacing
-        inside = ((center - half >= self.origin) & (center + half <= high)).all(1)
-        return torch.where(inside, self.steepest, self.steepest + 1)
+        return ((center - half >= self.origin) & (center + half <= high)).all(1)
 
     def box(self) -> Tensor:
         """The volume's box, of voxel centres."""
@@ -98,3 +116,22 @@ def _steepest(values: Tensor, spacing: Tensor) -> Tensor:
         squares = squares + (most.to(torch.float64) / spacing[axis]) ** 2
     assert isinstance(squares, Tensor)
     return squares.max().sqrt()
+
+
+def _apart(values: Tensor, spacing: Tensor) -> Tensor:
+    """() float64 how much two voxels differ at most by unit of length between them, however far.
+
+    Between the 26 neighbours that is looked up. A way from voxel to voxel by neighbours is at most
+    sqrt(1 + (sqrt 2 - 1)^2 + (sqrt 3 - sqrt 2)^2) = 1.128 times as long as the straight one; sqrt 3
+    times where voxels are no cubes.
+    """
+    most = torch.zeros((), dtype=torch.float64, device=values.device)
+    for step in itertools.product((-1, 0, 1), repeat=3):  # x, y, z
+        if step <= (0, 0, 0):  # as well known from the other end
+            continue
+        here = [slice(max(-n, 0), min(-n, 0) or None) for n in step[::-1]]
+        there = [slice(max(n, 0), min(n, 0) or None) for n in step[::-1]]
+        differ = (values[tuple(here)] - values[tuple(there)]).abs().amax().to(torch.float64)
+        most = torch.maximum(most, differ / length(torch.tensor(step).to(spacing) * spacing))
+    cubes = bool((spacing == spacing[0]).all())
+    return most * (1.1282 if cubes else math.sqrt(3))

@@ -137,13 +137,17 @@ class Hypertexture(Producer):
     def prepare(self, layout: Layout) -> None:
         """Works out what the voxels of each level are made with."""
         sides = [max(layout.spacing) * layout.branching**n for n in range(layout.depth, -1, -1)]
-        self._levels = [self.level(side) for side in sides]
+        self._levels = [self._level(side) for side in sides]
         worn = [level.left[0] + level.soft for level in self._levels]
         # What holds at a node must hold at all finer ones.
         finer = [max(worn[depth:]) for depth in range(len(worn))]
         self._worn = torch.tensor(finer, dtype=torch.float64, device=layout.device)
 
-    def level(self, side: float) -> Level:
+    def level_of(self, depth: int) -> Level:
+        """Returns what the voxels of a depth are made with; known once an engine uses this."""
+        return self._levels[depth]
+
+    def _level(self, side: float) -> Level:
         """Returns what voxels of a side, in world units, are made with."""
         kept, variance = [], self.softness**2 / 5 + (side / self.thickness) ** 2 / 12
         for one in self.octaves:
@@ -192,7 +196,7 @@ class Hypertexture(Producer):
         for depth in nodes.depth.unique().tolist():
             here = (nodes.depth == depth).nonzero()[:, 0]
             for rows in here.split(_BATCH if device.type == "cpu" else len(here)):
-                for name, values in self._made(nodes[rows], self._levels[depth]).items():
+                for name, values in self._made(nodes[rows], self.level_of(depth)).items():
                     data[name][rows] = values.to(data[name].dtype)
         return data
 
