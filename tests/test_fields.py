@@ -43,6 +43,84 @@ def block():
     return sdf.Box((1.0, 0.6, 0.8), round=0.1, color=BLUE)
 
 
+def np_torus(p, radius=0.6, tube=0.2):
+    """The nearest of the ring's middle points is at the same angle."""
+    angle = np.arctan2(p[:, 1], p[:, 0])
+    ring = radius * np.stack((np.cos(angle), np.sin(angle), 0 * angle), 1)
+    return np.linalg.norm(p - ring, axis=1) - tube
+
+
+def np_capsule(p, a=(-0.3, 0.1, 0.2), b=(0.4, -0.2, 0.5), radius=0.25):
+    along = np.array(b) - a
+    share = np.clip((p - a) @ along / (along @ along), 0, 1)
+    return np.linalg.norm(p - (np.array(a) + share[:, None] * along), axis=1) - radius
+
+
+def np_gyroid(p, period=1.3):
+    x, y, z = 2 * np.pi / period * p.T
+    waves = np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
+    return waves * period / (2 * np.pi * 3**0.5)
+
+
+def np_cylinder(p, radius=0.4, half=0.5):
+    """The nearest point of the solid, or the nearest wall from within."""
+    rho = np.hypot(p[:, 0], p[:, 1])
+    outside = np.hypot(np.maximum(rho - radius, 0), np.maximum(np.abs(p[:, 2]) - half, 0))
+    return np.where(outside > 0, outside, np.maximum(rho - radius, np.abs(p[:, 2]) - half))
+
+
+def np_square_ring(p, radius=0.6):
+    flat = np.stack((np.hypot(p[:, 0], p[:, 1]) - radius, p[:, 2], 0 * p[:, 0]), 1)
+    return np_box(flat, (0.4, 0.3, 0.5), 0.05)
+
+
+def np_repeated(p, counts=(4, 1, 0)):
+    """The nearest of all of them."""
+    found = np.full(len(p), np.inf)
+    for x in range(-counts[0], counts[0] + 1):
+        for y in range(-counts[1], counts[1] + 1):
+            found = np.minimum(found, np_capsule(p - np.array((1.5 * x, 1.1 * y, 0))))
+    return found
+
+
+def np_twisted(p, rate=1.5):
+    angle = -rate * p[:, 2]
+    x = np.cos(angle) * p[:, 0] - np.sin(angle) * p[:, 1]
+    y = np.sin(angle) * p[:, 0] + np.cos(angle) * p[:, 1]
+    return np_box(np.stack((x, y, p[:, 2]), 1))
+
+
+def np_sponge(p, levels=3):
+    """The largest of a cube and of bars along all axes, of all sizes."""
+    found = np_box(p, (1, 1, 1), 0)
+    for cell in 3.0 ** -np.arange(levels):
+        x, y, z = np.abs((p + cell / 2) % cell - cell / 2).T
+        for one, other in ((x, y), (y, z), (z, x)):
+            found = np.maximum(found, cell / 6 - np.maximum(one, other))
+    return found
+
+
+def np_turned(p, degrees=40):
+    """About (1, 1, 1), by SciPy's convention: the angle of a rotation vector."""
+    k, a = np.ones(3) / 3**0.5, np.deg2rad(-degrees)
+    cross = np.cross(k, p)
+    q = p * np.cos(a) + cross * np.sin(a) + k * (p @ k)[:, None] * (1 - np.cos(a))
+    return np_box(q)
+
+
+STRETCH = ((1.2, 0.3, 0.0), (0.0, 0.7, 0.0), (0.1, 0.0, 1.0))
+
+
+def np_stretched(p):
+    least = np.linalg.svd(np.array(STRETCH))[1].min()
+    q = np.linalg.solve(np.array(STRETCH), (p - np.array((0.1, 0.2, -0.1))).T).T
+    return least * np_box(q)
+
+
+def capsule():
+    return sdf.Capsule((-0.3, 0.1, 0.2), (0.4, -0.2, 0.5), 0.25, color=BLUE)
+
+
 #: By name: the shape, and its value by NumPy.
 SHAPES = {
     "sphere": (ball, np_sphere),
@@ -61,6 +139,35 @@ SHAPES = {
     "smooth difference": (
         lambda: sdf.SmoothDifference(ball(), block(), 0.3),
         lambda p: -np_smooth(-np_sphere(p), np_box(p), 0.3),
+    ),
+    "torus": (lambda: sdf.Torus(0.6, 0.2), np_torus),
+    "capsule": (capsule, np_capsule),
+    "plane": (lambda: sdf.Plane((1, 2, -2), 0.3), lambda p: p @ [1 / 3, 2 / 3, -2 / 3] - 0.3),
+    "gyroid": (lambda: sdf.Gyroid(1.3), np_gyroid),
+    "gyroid shell": (
+        lambda: sdf.Shell(sdf.Gyroid(1.3), 0.1) & ball(),
+        lambda p: np.maximum(np.abs(np_gyroid(p)) - 0.05, np_sphere(p)),
+    ),
+    "sponge": (lambda: sdf.Menger(3), np_sponge),
+    "extrusion": (lambda: sdf.Extrusion(sdf.Sphere(0.4), 1.0), np_cylinder),
+    "revolution": (
+        lambda: sdf.Revolution(sdf.Box((0.4, 0.3, 0.5), round=0.05), 0.6),
+        np_square_ring,
+    ),
+    "offset": (lambda: sdf.Offset(block(), 0.1), lambda p: np_box(p) - 0.1),
+    "shell": (lambda: sdf.Shell(block(), 0.1), lambda p: np.abs(np_box(p)) - 0.05),
+    "moved": (
+        lambda: sdf.moved(capsule(), 0.1, 0.2, -0.3),
+        lambda p: np_capsule(p - [0.1, 0.2, -0.3]),
+    ),
+    "rotated": (lambda: sdf.rotated(block(), (1, 1, 1), 40), np_turned),
+    "scaled": (lambda: sdf.scaled(block(), 0.5), lambda p: 0.5 * np_box(p / 0.5)),
+    "stretched": (lambda: sdf.Transform(block(), STRETCH, (0.1, 0.2, -0.1)), np_stretched),
+    "twist": (lambda: sdf.Twist(block(), 1.5), np_twisted),
+    "repeated": (lambda: sdf.Repeat(capsule(), (1.5, 1.1, 0), (9, 3, 1)), np_repeated),
+    "repeated for ever": (
+        lambda: sdf.Repeat(capsule(), (1.5, 1.1, 0)),
+        lambda p: np_repeated(p, (4, 4, 0)),
     ),
 }
 
@@ -96,7 +203,7 @@ def inside(center, half, count, seed=3):
 def test_values_are_those_of_numpy(named):
     shape, by_numpy = named
     points = random_points(20_000)
-    expected = by_numpy(points.numpy())
+    expected = np.asarray(by_numpy(points.numpy()))
     assert np.abs(shape(points).numpy() - expected).max() < 1e-12
     single = shape(points.float())
     assert single.dtype == torch.float32 and np.abs(single.numpy() - expected).max() < 2e-6
@@ -127,6 +234,16 @@ def test_gradients_are_those_of_differences(named):
     )
     apart = (shape.gradient(points) - by_steps).abs().amax(1)
     assert apart.quantile(0.99) < 1e-6, "but where two surfaces meet"
+
+
+def test_nothing_lies_beyond_a_box(named):
+    shape, _ = named
+    box = shape.box()
+    if box is not None:
+        low, high = box.unbind(0)
+        points = random_points(100_000, 8.0)
+        inside = shape(points) < 0
+        assert inside.any() and ((points >= low) & (points <= high)).all(1)[inside].all()
 
 
 def test_shapes_have_the_colour_of_what_is_nearer():
@@ -178,8 +295,8 @@ def test_no_voxel_is_dropped(named):
                 assert (rows >= low[:, None]).all() and (rows <= high[:, None]).all(), name
             for region in gv.Region:
                 told[region] += int((kind == region).sum())
-    assert told[gv.Region.EMPTY] > 0.5 * sum(told.values())
-    assert told[gv.Region.CONSTANT] > 1000 * (not [*shape.children()]) - 1, "of one colour"
+    assert told[gv.Region.EMPTY] > 0.25 * sum(told.values())
+    assert told[gv.Region.EMPTY] + told[gv.Region.CONSTANT] > 0.4 * sum(told.values())
 
 
 def test_a_solid_holds_the_share_of_each_voxel():
@@ -272,6 +389,15 @@ BOX = ((0, 0, 0), (1, 1, 1))
         (lambda: sdf.Sphere(color=(2, 0, 0)), "Sphere: color must be in 0 to 1"),
         (lambda: sdf.Union(sdf.Sphere(), 3), "Union: second must be a Distance, got int"),
         (lambda: sdf.SmoothUnion(ball(), ball(), 0), "SmoothUnion: width must be finite and > 0"),
+        (lambda: sdf.Plane((0, 0, 0)), "Plane: normal must have a direction"),
+        (lambda: sdf.rotated(ball(), (0, 0, 0), 3), "rotated: axis must have a direction"),
+        (lambda: sdf.scaled(ball(), 0), "Transform: matrix must have an inverse"),
+        (lambda: sdf.Transform(ball(), torch.eye(4)), "Transform: matrix must be (3, 3) numbers"),
+        (lambda: sdf.Shell(ball(), -1), "Shell: thickness must be finite and > 0"),
+        (lambda: sdf.Repeat(ball(), (1, 3, 3)), "Repeat: the shape must lie within its cell"),
+        (lambda: sdf.Repeat(sdf.Gyroid(), (1, 3, 3)), "within its cell, it has no box"),
+        (lambda: sdf.Repeat(ball(), (2, 0, 0), (2, 1, 1)), "Repeat: count must be odd"),
+        (lambda: sdf.Repeat(ball(), (0, 0, 0)), "Repeat: period must be >= 0"),
         (lambda: gv.FieldProducer(3), "FieldProducer: field must be a Module, got int"),
         (lambda: gv.FieldProducer(Waves()), "box must be given: the field does not tell"),
         (

@@ -11,18 +11,47 @@ from .distance import (
     SmoothUnion,
     Union,
 )
-from .shapes import Box, Sphere
+from .shapes import Box, Capsule, Gyroid, Menger, Plane, Sphere, Torus
+from .spaces import (
+    Extrusion,
+    Offset,
+    Repeat,
+    Revolution,
+    Shell,
+    Space,
+    Transform,
+    Twist,
+    moved,
+    rotated,
+    scaled,
+)
 
 __all__ = [
     "Box",
+    "Capsule",
     "Difference",
     "Distance",
+    "Extrusion",
+    "Gyroid",
     "Intersection",
+    "Menger",
     "Negative",
+    "Offset",
     "Pair",
+    "Plane",
+    "Repeat",
+    "Revolution",
+    "Shell",
     "SmoothDifference",
     "SmoothIntersection",
     "SmoothUnion",
+    "Space",
     "Sphere",
+    "Torus",
+    "Transform",
+    "Twist",
     "Union",
+    "moved",
+    "rotated",
+    "scaled",
 ]
