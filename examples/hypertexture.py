@@ -4,6 +4,8 @@ where rays ask for it, around any shape: --volume takes signed distances, such a
 """
 
 from dataclasses import dataclass, replace
+from functools import partial, reduce
+from itertools import starmap
 from pathlib import Path
 
 import torch
@@ -14,7 +16,19 @@ import gvtorch as gv
 SUN = gv.DirectionalLight((-0.7, -0.75, -0.65), (1.5, 1.3, 1.05), angle=3)
 SKY = gv.Gradient((0.16, 0.22, 0.31), (0.68, 0.72, 0.72))
 STONE = [(-0.13, 0.08, 0.055, 0.04), (-0.07, 0.3, 0.22, 0.15), (0, 0.55, 0.49, 0.41)]
-HAIR = [(0.0, 0.02, 0.008, 0.004), (0.4, 0.3, 0.12, 0.04), (0.75, 0.85, 0.52, 0.25), (1, 1, 0.9, 0.7)]
+LIMBS = (  # of a hare: where each begins and ends, and its radius
+    *(((-0.1, -0.15, 0), (0.35, -0.12, 0), 0.46), ((-0.55, 0.35, 0), (-0.68, 0.32, 0), 0.27)),
+    *(((-0.52, 0.6, z), (-0.36, 1.12, 2 * z), 0.1) for z in (-0.15, 0.15)),
+    *(((-0.4, -0.5, z), (-0.68, -0.53, z), 0.12) for z in (-0.22, 0.22)),
+    *(((0.35, -0.45, z), (-0.02, -0.52, z), 0.16) for z in (-0.3, 0.3)),
+    ((0.82, -0.02, 0), (0.86, 0.02, 0), 0.15),
+)
+HAIR = [
+    (0.0, 0.02, 0.008, 0.004),
+    (0.4, 0.3, 0.12, 0.04),
+    (0.75, 0.85, 0.52, 0.25),
+    (1, 1, 0.9, 0.7),
+]
 
 
 @dataclass
@@ -32,16 +46,17 @@ class Fur(gv.Field):
     """Hairs on a shape: 0 between them, else from 0.1 at the roots to 1 at the tips."""
 
     prefiltered = True
-    threshold = {"value": 0.0}
 
-    def __init__(self, shape, length=0.16, frequency=26.0):
+    def __init__(self, shape, length=0.11, frequency=36.0):
         """Takes the shape, how long hairs are, and how many stand on a unit."""
         super().__init__()
         self.shape, self.length, self.frequency = shape, length, frequency
+        self.threshold = {"value": 0.0}
 
     def filtered(self, points, size):
         """A hair is where noise at its root on the shape is above the height."""
         away, _, normal = self.shape.surface_and_gradient(points)
+        normal = normal / normal.norm(dim=-1, keepdim=True).clamp(min=0.5)
         height = away / self.length
         root = points - away[..., None] * normal
         fall = points.new_tensor((0.25, 1.0, 0.1)) * (0.5 * self.length)
@@ -66,15 +81,14 @@ class Fur(gv.Field):
 
 def main(settings: Settings) -> None:
     """Renders both side by side."""
-    sdf = gv.sdf
-    shape = (sdf.Box((1.7, 1.7, 1.7), round=0.12) - sdf.Sphere(1.03)) | sdf.Sphere(0.7)
+    shape = reduce(partial(gv.sdf.SmoothUnion, width=0.12), starmap(gv.sdf.Capsule, LIMBS))
     if settings.volume is not None:
         shape = gv.SampledDistance(gv.read_volume(settings.volume))
     rock = gv.Hypertexture(
-        shape,
+        gv.sdf.Offset(shape, 0.03),  # as much as density 1/2 lies below the surface
         settings.extent,
-        thickness=0.09,
-        frequency=5,
+        thickness=0.075,
+        frequency=6,
         octaves=6,
         gain=0.55,
         softness=0.12,
@@ -88,8 +102,10 @@ def main(settings: Settings) -> None:
             [(0.02, 0), (0.1, 0.5), (1, 0.6)], HAIR
         ),
     }
-    lighting = gv.Lighting(ambient=(0.75, 0.88, 1.1), occlusion=0.9, reach=0.08, cones=8, frame="box")
-    camera = gv.Camera.orbit(-33, 22, 1.6, 40, settings.size * 8 // 9, settings.size)
+    lighting = gv.Lighting(
+        ambient=(0.75, 0.88, 1.1), occlusion=0.9, reach=0.08, cones=8, frame="box"
+    )
+    camera = gv.Camera.orbit(-30, 16, 1.45, 36, settings.size * 8 // 9, settings.size)
     pictures = []
     for producer, look in looks.items():
         engine = gv.Engine(producer, device=settings.device, brick_pool="1 GB")

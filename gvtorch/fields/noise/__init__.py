@@ -7,13 +7,16 @@ from .bounds import Bounds, bounds
 from .cellular import cellular
 from .fractal import fbm, fbm_bounds, ridged, turbulence, warp
 from .grid import perlin_grid
+from .levels import OctaveSum, inherit
 
 __all__ = [
     "Bounds",
+    "OctaveSum",
     "bounds",
     "cellular",
     "fbm",
     "fbm_bounds",
+    "inherit",
     "perlin",
     "perlin_grid",
     "ridged",

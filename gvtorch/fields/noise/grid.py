@@ -71,7 +71,7 @@ def perlin_grid(
     return out
 
 
-def most_cells(axes: tuple[Tensor, ...]) -> int:
+def most_cells(axes: Sequence[Tensor]) -> int:
     """Returns the most cells of the lattice from which a row of coordinates takes points."""
     spans = [one.floor()[:, -1] - one.floor()[:, 0] for one in axes]
     return int(max(float(span.max()) for span in spans)) + 1
