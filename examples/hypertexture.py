@@ -15,7 +15,7 @@ import gvtorch as gv
 
 SUN = gv.DirectionalLight((-0.7, -0.75, -0.65), (1.5, 1.3, 1.05), angle=3)
 SKY = gv.Gradient((0.16, 0.22, 0.31), (0.68, 0.72, 0.72))
-STONE = [(-0.13, 0.08, 0.055, 0.04), (-0.07, 0.3, 0.22, 0.15), (0, 0.55, 0.49, 0.41)]
+STONE = [(-0.1, 0.06, 0.04, 0.03), (-0.05, 0.28, 0.2, 0.13), (0.03, 0.55, 0.49, 0.41)]
 LIMBS = (  # of a hare: where each begins and ends, and its radius
     *(((-0.1, -0.15, 0), (0.35, -0.12, 0), 0.46), ((-0.55, 0.35, 0), (-0.68, 0.32, 0), 0.27)),
     *(((-0.52, 0.6, z), (-0.36, 1.12, 2 * z), 0.1) for z in (-0.15, 0.15)),
@@ -42,70 +42,27 @@ class Settings:
     device: str = "cpu"
 
 
-class Fur(gv.Field):
-    """Hairs on a shape: 0 between them, else from 0.1 at the roots to 1 at the tips."""
-
-    prefiltered = True
-
-    def __init__(self, shape, length=0.11, frequency=36.0):
-        """Takes the shape, how long hairs are, and how many stand on a unit."""
-        super().__init__()
-        self.shape, self.length, self.frequency = shape, length, frequency
-        self.threshold = {"value": 0.0}
-
-    def filtered(self, points, size):
-        """A hair is where noise at its root on the shape is above the height."""
-        away, _, normal = self.shape.surface_and_gradient(points)
-        normal = normal / normal.norm(dim=-1, keepdim=True).clamp(min=0.5)
-        height = away / self.length
-        root = points - away[..., None] * normal
-        fall = points.new_tensor((0.25, 1.0, 0.1)) * (0.5 * self.length)
-        root = root + (height * height)[..., None] * fall
-        seen = (-0.82 * (size[..., 0] * self.frequency) ** 2).exp()
-        hairs = gv.noise.perlin(root * self.frequency) * seen
-        inside = ((0.45 + 0.7 * hairs - height) * 5).clamp(0, 1)
-        return {"value": inside * (0.1 + 0.9 * height.clamp(0, 1))}
-
-    def bounds(self, center, half):
-        """Hairs end at 1.2 of their length at most; skin begins 0.5 of it below the surface."""
-        low, high = self.shape.bounds(center, half)
-        most = torch.where(low > 1.2 * self.length, 0.0, 1.0)
-        skin = high < -0.5 * self.length
-        return {"value": (0.1 * skin.to(low), torch.where(skin, 0.1, most.to(low)))}
-
-    def box(self):
-        """Around the shape and its hairs."""
-        box = self.shape.box()
-        return torch.stack((box[0] - self.length, box[1] + self.length))
-
-
 def main(settings: Settings) -> None:
     """Renders both side by side."""
     shape = reduce(partial(gv.sdf.SmoothUnion, width=0.12), starmap(gv.sdf.Capsule, LIMBS))
     if settings.volume is not None:
         shape = gv.SampledDistance(gv.read_volume(settings.volume))
-    rock = gv.Hypertexture(
-        gv.sdf.Offset(shape, 0.03),  # as much as density 1/2 lies below the surface
-        settings.extent,
-        thickness=0.075,
-        frequency=6,
-        octaves=6,
-        gain=0.55,
-        softness=0.12,
-        distances=True,
-    )
+    rough = {"thickness": 0.075, "frequency": 6, "gain": 0.55, "softness": 0.12}
+    # Offset by as much as density 1/2 lies below the surface.
+    grown = gv.sdf.Offset(shape, 0.03)
+    rock = gv.Hypertexture(grown, settings.extent, octaves=6, distances=True, **rough)
+    fur = gv.Fur(shape, length=0.11, frequency=36, fall=(-0.12, -0.5, -0.05))
     stone = gv.TransferFunction.from_points([(-1, 1), (1, 1)], STONE)
+    hair = gv.TransferFunction.from_points([(0.02, 0), (0.1, 0.5), (1, 0.6)], HAIR)
     light = {"light": SUN, "ambient": 0.35, "diffuse": 0.85, "specular": 0.05, "shininess": 12}
     looks = {
         rock: gv.Isosurface(0.5, stone, color_channel="distance", **light),
-        gv.FieldProducer(Fur(shape), settings.extent): gv.TransferFunction.from_points(
-            [(0.02, 0), (0.1, 0.5), (1, 0.6)], HAIR
-        ),
+        gv.FieldProducer(fur, settings.extent): hair,
     }
     lighting = gv.Lighting(
         ambient=(0.75, 0.88, 1.1), occlusion=0.9, reach=0.08, cones=8, frame="box"
     )
-    camera = gv.Camera.orbit(-30, 16, 1.45, 36, settings.size * 8 // 9, settings.size)
+    camera = gv.Camera.orbit(-30, 16, 1.55, 36, settings.size * 8 // 9, settings.size)
     pictures = []
     for producer, look in looks.items():
         engine = gv.Engine(producer, device=settings.device, brick_pool="1 GB")

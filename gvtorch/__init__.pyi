@@ -19,6 +19,7 @@ from .pool import (
 # Functions of place.
 from .fields import (
     Field as Field,
+    Fur as Fur,
     SampledDistance as SampledDistance,
     Solid as Solid,
     noise as noise,

@@ -3,6 +3,7 @@
 from . import noise, sdf
 from .distance import Distance
 from .field import Bounds, Field, Interval, Values, length, tighter
+from .fur import Fur
 from .sampled import SampledDistance
 from .solid import Solid
 
@@ -10,6 +11,7 @@ __all__ = [
     "Bounds",
     "Distance",
     "Field",
+    "Fur",
     "Interval",
     "SampledDistance",
     "Solid",

@@ -22,8 +22,6 @@ from ..pool import Channel
 from .producer import Layout, Nodes, Producer, Region, Regions
 
 _BATCH = 128  # bricks that are made at a time on the CPU, whose caches then hold what is between
-_VARIANCE = 0.0728  # of gradient noise
-_LOST = 0.82  # exp(-this * (voxel / cell)^2): a point's share in the mean of noise over its voxel
 _COARSEST = 1.5  # cells a voxel, from which on the mean tells nothing of the noise
 _GRID = 0.5  # cells a voxel, up to which noise is made grid by grid
 _ROUNDED = 1e-4  # what rounding may add to a sum of octaves, in units of the amplitude
@@ -152,8 +150,8 @@ class Hypertexture(Producer):
         kept, variance = [], self.softness**2 / 5 + (side / self.thickness) ** 2 / 12
         for one in self.octaves:
             cells = side * one.frequency
-            share = math.exp(-_LOST * cells * cells) if cells <= _COARSEST else 0.0
-            variance += one.amplitude**2 * _VARIANCE * (1 - share * share)
+            share = math.exp(-noise.LOST * cells * cells) if cells <= _COARSEST else 0.0
+            variance += one.amplitude**2 * noise.VARIANCE * (1 - share * share)
             if share:
                 kept.append(one._replace(amplitude=one.amplitude * share))
         high = noise.bounds(noise.perlin).high

@@ -3,13 +3,15 @@ periodic on request, of float32 or float64, and its bounds are known.
 """
 
 from .basis import perlin, simplex, value
-from .bounds import Bounds, bounds
+from .bounds import LOST, VARIANCE, Bounds, bounds
 from .cellular import cellular
 from .fractal import fbm, fbm_bounds, ridged, turbulence, warp
 from .grid import perlin_grid
 from .levels import OctaveSum, inherit
 
 __all__ = [
+    "LOST",
+    "VARIANCE",
     "Bounds",
     "OctaveSum",
     "bounds",

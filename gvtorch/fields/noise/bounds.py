@@ -21,6 +21,12 @@ from torch import Tensor
 from .basis import perlin, simplex, value
 from .cellular import cellular
 
+#: The mean of gradient noise over a cube follows the noise in its middle by
+#: exp(-LOST * (side / cell)^2): fitted to within 0.03 for cubes of up to 1.5 cells.
+LOST = 0.82
+#: Mean square of gradient noise in space.
+VARIANCE = 0.0728
+
 #: A noise of one frequency: points, seed and period to values.
 Basis = Callable[..., Tensor]
 
