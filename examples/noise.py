@@ -50,9 +50,8 @@ class Ball(gv.Field):
 
     def bounds(self, center, half):
         """Nothing lies beyond the radius 1."""
-        near = (center.abs() - half).clamp(min=0).norm(dim=1, keepdim=True)
-        most = (near < 1).to(center).expand(-1, 4)
-        return {"rgba": (0 * most, most)}
+        near = (center.abs() - half).clamp(min=0).norm(dim=1, keepdim=True) < 1
+        return {"rgba": (torch.zeros(len(near), 4).to(center), near.to(center).expand(-1, 4))}
 
 
 @dataclass

@@ -231,10 +231,21 @@ def test_gradient_noise_has_the_gradients_of_autograd():
         assert torch.autograd.gradcheck(one, points)
 
 
-def test_noise_compiles_to_the_same_bits():
+@pytest.mark.parametrize("name", ["perlin", "simplex", "cellular", "fbm", "warp"])
+def test_noise_compiles_to_one_graph(name):
+    """Without a break where the host would look at values, and to the same bits on the CPU."""
+    points, plain = random_points(3000, 3, torch.float32), getattr(noise, name)
+    compiled = torch.compile(plain, fullgraph=True, backend="aot_eager")
+    assert torch.equal(compiled(points, seed=3), plain(points, seed=3))
+
+
+def test_fused_noise_has_the_same_bits():
     points = random_points(3000, 3, torch.float32)
+    axes = [points[:200, axis, None] + torch.arange(6) * 0.25 for axis in range(3)]
     compiled = torch.compile(noise.perlin, fullgraph=True)
     assert torch.equal(compiled(points, seed=3), noise.perlin(points, seed=3))
+    grids = torch.compile(noise.perlin_grid, fullgraph=True)
+    assert torch.equal(grids(*axes, cells=3), noise.perlin_grid(*axes, cells=3))
 
 
 @pytest.mark.parametrize("step", [0.01, 0.25, 0.5, 0.9])

@@ -1,7 +1,7 @@
 """`Fur`: hairs on a shape, to be coloured by a transfer function alone.
 
-Source: Perlin, Hoffert, "Hypertexture", SIGGRAPH 1989, section on fur (noise where a point's root
-    is on the surface); how hairs end and fall is our own.
+Source: Perlin, Hoffert, "Hypertexture", SIGGRAPH 1989 (fur as noise around a surface); how hairs
+    end and fall is our own.
 """
 
 from __future__ import annotations

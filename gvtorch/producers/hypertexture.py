@@ -1,8 +1,8 @@
 """`Hypertexture`: noise around the surface of a shape, made where rays ask for it.
 
 Sources: Perlin, Hoffert, "Hypertexture", SIGGRAPH 1989 (density functions around a soft surface);
-    Guehl, Neyret et al., AFIG 2012, on GigaVoxels (the formula, and to stop at the octave from
-    which on nothing can change any more).
+    the GigaVoxels presentation at AFIG 2012 (the formula, and to stop at the octave from which on
+    nothing can change any more). How voxels are filtered is our own.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Level(NamedTuple):
     """What the voxels of a level are made with."""
 
     octaves: list[Octave]  # with amplitudes as the voxels see them
-    left: list[float]  # the most that octave 0, 1, ... and all after it can add; at the end 0
+    left: list[float]  # the most that octave 0, 1, ... and all after it can add
     soft: float  # half the width of the step from 0 to 1
     side: float  # of a voxel, world units
 
@@ -92,10 +92,10 @@ class Hypertexture(Producer):
             distances: Whether there is a channel "distance".
             skip: Whether octaves that can't matter are left out.
             box: World corners; left out: around the shape and what noise adds to it.
-            dtype: Of the channels.
+            dtype: Of the channels: float16, bfloat16 or float32.
 
         Raises:
-            ValueError: A number is out of its range, or there is no box.
+            ValueError: A number is out of its range, the dtype another, or there is no box.
         """
         where = type(self).__name__
         check.instance(where, "shape", shape, Distance)
@@ -105,12 +105,10 @@ class Hypertexture(Producer):
         softness = check.number(where, "softness", softness, low=0, open_low=True)
         series = [*octaves_of(where, octaves, lacunarity, gain, seed)]
         most = amplitude * sum(one.amplitude for one in series) * noise.bounds(noise.perlin).high
-        if box is None:
-            box = _box_around(where, shape, thickness * max(most + softness - 0.5, 0.0))
-        if isinstance(extent, int):
-            check.whole(where, "extent", extent, low=1, high=2**40)
-            sides = [high - low for low, high in zip(*box, strict=True)]
-            extent = [max(1, round(extent * side / max(sides))) for side in sides]
+        reach = thickness * max(most + softness - 0.5, 0.0)
+        extent, box = _cut_out(where, shape, reach, extent, box)
+        if not dtype.is_floating_point:
+            raise ValueError(f"{where}: dtype must be one of floats, got {dtype}")
         channels = {"density": Channel(dtype)}
         if distances:
             channels["distance"] = Channel(dtype)
@@ -121,8 +119,8 @@ class Hypertexture(Producer):
             Octave(amplitude * one.amplitude, frequency * one.frequency, one.seed) for one in series
         ]
         self.wanted = self.made = 0
-        reach = max(abs(float(end)) for corner in box for end in corner)
-        fine = reach <= 0.5 * DEEP_VOXELS * min(self.spacing)
+        far = max(abs(float(end)) for corner in box for end in corner)
+        fine = far <= 0.5 * DEEP_VOXELS * min(self.spacing)
         self.dtype = torch.float32 if fine else torch.float64
         self._levels: list[Level] = []
         self._worn = torch.empty(0)
@@ -157,7 +155,7 @@ class Hypertexture(Producer):
         high = noise.bounds(noise.perlin).high
         left = [high * sum(one.amplitude for one in kept[n:]) for n in range(len(kept) + 1)]
         margin = _ROUNDED * max(1.0, *left)
-        left = [*(one + margin for one in left[:-1]), 0.0]
+        left = [one + margin for one in left]
         return Level(kept, left, math.sqrt(5 * variance), side)
 
     def at(self, points: Tensor) -> dict[str, Tensor]:
@@ -249,9 +247,22 @@ def _noise_at(axes: Sequence[Tensor], seed: int, spacing: float) -> Tensor:
     return noise.perlin(points, seed=seed)
 
 
-def _box_around(where: str, shape: Distance, by: float) -> list[list[float]]:
-    """Corners of a box around a shape, and `by` more."""
-    box = shape.box()
-    if box is None or not bool(box.isfinite().all()):
-        raise ValueError(f"{where}: box must be given: the shape does not tell where it ends")
-    return [(box[0] - by).tolist(), (box[1] + by).tolist()]
+def _cut_out(
+    where: str,
+    shape: Distance,
+    reach: float,
+    extent: int | Sequence[int],
+    box: Sequence[Sequence[float]] | None,
+) -> tuple[Sequence[int], Sequence[Sequence[float]]]:
+    """Extent along x, y, z, and a box: left out, what lies within `reach` of the shape's."""
+    if box is None:
+        own = shape.box()
+        if own is None or not bool(own.isfinite().all()):
+            raise ValueError(f"{where}: box must be given: the shape does not tell where it ends")
+        box = [(own[0] - reach).tolist(), (own[1] + reach).tolist()]
+    if not isinstance(extent, int):
+        return extent, box
+    check.whole(where, "extent", extent, low=1, high=2**40)
+    sides = [high - low for low, high in zip(*box, strict=True)]
+    check.triple(where, "sides of the box", sides, positive=True)
+    return [max(1, round(extent * side / max(sides))) for side in sides], box
