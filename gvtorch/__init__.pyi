@@ -17,7 +17,16 @@ from .pool import (
 )
 
 # Functions of place.
-from .fields import Field as Field, Solid as Solid, sdf as sdf
+from .fields import (
+    Field as Field,
+    Fractal as Fractal,
+    Iteration as Iteration,
+    Julia as Julia,
+    Mandelbox as Mandelbox,
+    Mandelbulb as Mandelbulb,
+    Solid as Solid,
+    sdf as sdf,
+)
 
 # What makes the content of a tree.
 from .producers import (
