@@ -19,7 +19,12 @@ from .pool import (
 # Functions of place.
 from .fields import (
     Field as Field,
+    Fractal as Fractal,
     Fur as Fur,
+    Iteration as Iteration,
+    Julia as Julia,
+    Mandelbox as Mandelbox,
+    Mandelbulb as Mandelbulb,
     SampledDistance as SampledDistance,
     Solid as Solid,
     noise as noise,

@@ -73,7 +73,7 @@ def _points(record: Record, case: str, points: torch.Tensor) -> None:
         try:
             run = make(in_numpy)
         except ImportError:
-            record.peers[who] = f"needs {who}: pip install {who}"
+            record.peers[who] = f"not installed ({who})"
             continue
         record.peers[who] = "ran"
         _add(record, case, who, len(points), run, eager)

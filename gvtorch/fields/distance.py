@@ -31,9 +31,11 @@ class Distance(Field):
     Attributes:
         exact: Whether the value is the distance itself near the surface, so that its gradient has
             length 1 there.
+        smooth: Whether the surface has a normal nearly everywhere, not rough at every size.
     """
 
     exact: bool = True
+    smooth: bool = True
     color: Tensor
 
     def __init__(self, color: Color = WHITE) -> None:
@@ -99,6 +101,7 @@ class Pair(Distance):
         self.first = check.instance(where, "first", first, Distance)
         self.second = check.instance(where, "second", second, Distance)
         self.exact = first.exact and second.exact
+        self.smooth = first.smooth and second.smooth
 
     def mix(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
         """Returns the value made of two values, and the second one's share of the colour."""
@@ -185,7 +188,7 @@ class Negative(Distance):
         """Takes the shape, with its colour."""
         super().__init__()
         self.shape = check.instance("Negative", "shape", shape, Distance)
-        self.exact = shape.exact
+        self.exact, self.smooth = shape.exact, shape.smooth
 
     def forward(self, points: Tensor) -> Tensor:
         return -self.shape(points)

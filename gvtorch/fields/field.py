@@ -38,10 +38,13 @@ class Field(nn.Module):
             place of sampling `forward` several times a voxel.
         threshold: By channel, the value up to which a voxel shows nothing: where all channels named
             here are proven to stay at or below theirs, nothing is made. None: every value counts.
+        margin: How many voxels beyond its bricks a prefiltered field is asked for, so that `finish`
+            can look at neighbours.
         dtypes: By channel, the dtype of voxels that suits it; float32 for others.
     """
 
     prefiltered: bool = False
+    margin: int = 0
     dtypes: Mapping[str, torch.dtype] = MappingProxyType({})
     threshold: Mapping[str, float] | None = None
 
@@ -56,6 +59,13 @@ class Field(nn.Module):
         which broadcasts with the points. Called if `prefiltered`.
         """
         raise NotImplementedError(f"{type(self).__name__}: filtered is not written")
+
+    def finish(self, values: Mapping[str, Tensor], size: Tensor) -> Mapping[str, Tensor]:
+        """Returns channels (k, z, y, x, c) made of what `filtered` gave on a grid that is `margin`
+        voxels wider on all sides, by channel (k, z + 2 margin, y + 2 margin, x + 2 margin, c), for
+        voxels of sides `size` (k, 3). Called if there is a margin.
+        """
+        raise NotImplementedError(f"{type(self).__name__}: finish is not written")
 
     def bounds(self, center: Tensor, half: Tensor) -> Bounds:
         """Returns intervals that hold `forward` everywhere in boxes center - half to center + half,
@@ -106,3 +116,19 @@ def length(vectors: Tensor) -> Tensor:
 def tighter(one: Interval, other: Interval) -> Interval:
     """Returns what two intervals that both hold have in common."""
     return torch.maximum(one[0], other[0]), torch.minimum(one[1], other[1])
+
+
+def parts_of(center: Tensor, half: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Returns the count^3 parts of each of k boxes, box after box, (k * count^3, 3) each: of many
+    small boxes intervals tell more than of a large one. `joined` makes them intervals of the boxes.
+    """
+    place = (torch.arange(count, device=center.device, dtype=center.dtype) + 0.5) * 2 / count - 1
+    at = torch.stack(torch.meshgrid(place, place, place, indexing="ij"), -1).view(1, -1, 3)
+    parts = (center[:, None] + half[:, None] * at).flatten(0, 1)
+    return parts, (half / count).repeat_interleave(count**3, 0)
+
+
+def joined(interval: Interval, count: int) -> Interval:
+    """Returns (k,) intervals that hold those of the count^3 parts of each of k boxes."""
+    low, high = (end.unflatten(0, (-1, count**3)) for end in interval)
+    return low.amin(1), high.amax(1)

@@ -28,7 +28,7 @@ class Space(Distance):
         """Takes the shape, with its colour."""
         super().__init__()
         self.shape = check.instance(type(self).__name__, "shape", shape, Distance)
-        self.exact = shape.exact
+        self.exact, self.smooth = shape.exact, shape.smooth
 
     def place(self, points: Tensor) -> Tensor:
         """Returns the points (..., 3) at which the shape is asked."""
@@ -180,7 +180,7 @@ class Repeat(Distance):
         super().__init__()
         where = type(self).__name__
         self.shape = check.instance(where, "shape", shape, Distance)
-        self.exact = shape.exact
+        self.exact, self.smooth = shape.exact, shape.smooth
         self.vector("period", period)
         self._axes = [axis for axis in range(3) if float(self.period[axis]) != 0]
         if bool((self.period < 0).any()) or not self._axes:
@@ -225,6 +225,11 @@ class Repeat(Distance):
     def slope(self, center: Tensor, half: Tensor) -> Tensor:
         """The shape's, anywhere within reach of a cell."""
         return self.shape.slope(*self._reach(center, half))
+
+    def bounds(self, center: Tensor, half: Tensor) -> Interval:
+        """The slope, and what the shape tells of all places at which it is asked."""
+        known = self.shape.bounds(*self._reach(center, half))
+        return tighter(known, super().bounds(center, half))
 
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         return self.shape.colors(*self._reach(center, half))

@@ -94,7 +94,7 @@ class FieldProducer(Producer):
             raise ValueError(f"{where}: channels must be {given} numbers wide, got {widths}")
         if dtype not in (None, torch.float32, torch.float64):
             raise ValueError(f"{where}: dtype must be torch.float32 or torch.float64, got {dtype}")
-        self.field, self._prefiltered = field, known is not None and known.prefiltered
+        self.field = field
         count = branching if samples is None else samples
         self.samples = check.whole(where, "samples", count, low=1, high=64)
         places = (torch.arange(self.samples, dtype=torch.float64) + 0.5) / self.samples - 0.5
@@ -163,19 +163,28 @@ class FieldProducer(Producer):
 
     def _made(self, nodes: Nodes) -> dict[str, Tensor]:
         """Values of the voxels of some bricks, (k, z, y, x, c) by channel."""
-        if self.dtype == torch.float64:
-            points = nodes.center[:, None, None, None] + nodes.local_positions
-        else:
-            points = nodes.positions
-        where, size = type(self).__name__, nodes.voxel_size.to(self.dtype)[:, None, None, None]
-        if self._prefiltered:
-            found = self.field.filtered(points, size)  # type: ignore[operator]
-            return _by_channel(where, found, points)
+        where, field = type(self).__name__, self.field
+        size = nodes.voxel_size.to(self.dtype)[:, None, None, None]
+        if isinstance(field, Field) and field.prefiltered:
+            points = self._points(nodes.wider(field.margin))
+            found = _by_channel(where, field.filtered(points, size), points)
+            if field.margin == 0:
+                return found
+            side = nodes.layout.side
+            like = points[:, :side, :side, :side]
+            return _by_channel(where, field.finish(found, size[:, 0, 0, 0]), like)
+        points = self._points(nodes)
         total: dict[str, Any] = {}
         for offset in self.offsets.to(size).unbind(0):
             values = _by_channel(where, self.field(points + size * offset), points)
             total = {name: total.get(name, 0) + value for name, value in values.items()}
         return {name: value / len(self.offsets) for name, value in total.items()}
+
+    def _points(self, nodes: Nodes) -> Tensor:
+        """(k, z, y, x, 3) world positions of the voxels, border included."""
+        if self.dtype == torch.float64:
+            return nodes.center[:, None, None, None] + nodes.local_positions
+        return nodes.positions
 
     def _bounds(self, center: Tensor, half: Tensor, size: Tensor) -> dict[str, Interval]:
         """For each channel of which anything is known, its interval, (k, c) each."""

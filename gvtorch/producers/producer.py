@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -61,6 +61,16 @@ class Layout:
             origin=producer.origin,
             device=device,
         )
+
+    def wider(self, by: int) -> Layout:
+        """Returns the layout of bricks with a border that is wider by so many voxels; kept."""
+        if by not in self._wider:
+            self._wider[by] = replace(self, border=self.border + by)
+        return self._wider[by]
+
+    @functools.cached_property
+    def _wider(self) -> dict[int, Layout]:
+        return {}
 
     @property
     def side(self) -> int:
@@ -119,6 +129,13 @@ class Nodes:
     def __getitem__(self, index: slice | Tensor) -> Nodes:
         """Returns some of the nodes."""
         return Nodes(self.loc[index], self.layout, coarse=self.coarse)
+
+    def wider(self, by: int) -> Nodes:
+        """Returns the same nodes with a border that is wider by so many voxels: what a producer
+        evaluates where voxels are made of their neighbours.
+        """
+        layout = self.layout.wider(by) if by else self.layout
+        return Nodes(self.loc, layout, coarse=self.coarse)
 
     @property
     def depth(self) -> Tensor:
