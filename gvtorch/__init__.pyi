@@ -24,8 +24,13 @@ from .fields import (
     Julia as Julia,
     Mandelbox as Mandelbox,
     Mandelbulb as Mandelbulb,
+    Painted as Painted,
     Solid as Solid,
+    blend as blend,
+    mask as mask,
     sdf as sdf,
+    stack as stack,
+    warp as warp,
 )
 
 # What makes the content of a tree.
@@ -38,6 +43,7 @@ from .producers import (
     Regions as Regions,
     StoredProducer as StoredProducer,
     VolumeProducer as VolumeProducer,
+    cache_field as cache_field,
 )
 
 # Cameras and rays.
