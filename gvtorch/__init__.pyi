@@ -25,10 +25,15 @@ from .fields import (
     Julia as Julia,
     Mandelbox as Mandelbox,
     Mandelbulb as Mandelbulb,
+    Painted as Painted,
     SampledDistance as SampledDistance,
     Solid as Solid,
+    blend as blend,
+    mask as mask,
     noise as noise,
     sdf as sdf,
+    stack as stack,
+    warp as warp,
 )
 
 # What makes the content of a tree.
@@ -42,6 +47,7 @@ from .producers import (
     Regions as Regions,
     StoredProducer as StoredProducer,
     VolumeProducer as VolumeProducer,
+    cache_field as cache_field,
 )
 
 # Cameras and rays.

@@ -1,6 +1,6 @@
 """Producers: what makes the content of trees."""
 
-from .field import FieldProducer
+from .field import FieldProducer, cache_field
 from .hypertexture import Hypertexture
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 from .stored import StoredProducer
@@ -17,4 +17,5 @@ __all__ = [
     "Regions",
     "StoredProducer",
     "VolumeProducer",
+    "cache_field",
 ]
