@@ -16,15 +16,38 @@ from .pool import (
     NodePool as NodePool,
 )
 
+# Functions of place.
+from .fields import (
+    Field as Field,
+    Fractal as Fractal,
+    Fur as Fur,
+    Iteration as Iteration,
+    Julia as Julia,
+    Mandelbox as Mandelbox,
+    Mandelbulb as Mandelbulb,
+    Painted as Painted,
+    SampledDistance as SampledDistance,
+    Solid as Solid,
+    blend as blend,
+    mask as mask,
+    noise as noise,
+    sdf as sdf,
+    stack as stack,
+    warp as warp,
+)
+
 # What makes the content of a tree.
 from .producers import (
     Bricks as Bricks,
+    FieldProducer as FieldProducer,
+    Hypertexture as Hypertexture,
     Nodes as Nodes,
     Producer as Producer,
     Region as Region,
     Regions as Regions,
     StoredProducer as StoredProducer,
     VolumeProducer as VolumeProducer,
+    cache_field as cache_field,
 )
 
 # Cameras and rays.

@@ -33,6 +33,7 @@ FIGURES = {
     "lru": {"slots_per_second", "times", "same"},
     "compact": {"words_bytes_per_second", "times", "same"},
     "produce": {"bricks_per_second", "voxels_per_second"},
+    "noise": {"values_per_second", "times", "max_difference"},
     "stream": {"bytes_per_second", "copy_share", "moved_bytes"},
     "convert": {"source_bytes_per_second", "memory_bytes", "disk_bytes"},
     "blocks": {"blocks_per_second"},

@@ -18,7 +18,7 @@ FLOORS = [
     {"cpp_ext"},
     {"ops"},
     {"pool"},
-    {"cameras", "io"},
+    {"cameras", "fields", "io"},
     {"cache", "opengl", "pictures", "producers", "shaders"},
     {"tracing"},
     {"engine"},

@@ -23,6 +23,7 @@ WORKLOADS = {
     "lru": "1 M slots ordered by use, beside torch.sort",
     "compact": "requests listed out of 8 M nodes, beside torch.nonzero",
     "produce": "10^3-voxel bricks made by a torch producer, eager and compiled",
+    "noise": "gradient noise at points and on grids, beside NumPy and libraries of noise",
     "stream": "10^3-voxel bricks from host memory into the pool, beside a plain copy",
     "convert": "a volume file to a store",
     "blocks": "random blocks with border out of a store, beside tensorstore and zarr",
@@ -35,11 +36,14 @@ PEERS = {
     "vtk": "vtk",
     "tensorstore": "zarr",  # which writes the chunks that are read
     "zarr": "zarr",
+    "pyfastnoiselite": "pyfastnoiselite",
+    "pyfastnoisesimd": "pyfastnoisesimd",
 }
 _HOME = {
     **{"march": "march", "first_hit": "march", "bricks": "march", "frame": "frames"},
     **{"shaders": "shaders", "lens": "lens", "opengl": "exchange"},
     **{"stream": "frames", "lru": "cache", "compact": "cache", "produce": "produce"},
+    **{"noise": "noise"},
     **{"convert": "storage", "blocks": "storage"},
 }
 

@@ -52,6 +52,7 @@ from .setup import (
     make_pools,
     make_recorded_frame,
     make_tree,
+    renew_tree,
 )
 from .stats import Collected, Counts, FrameStats, Readback, Readbacks, Report
 
@@ -109,10 +110,12 @@ class Engine:
         self._missed: Tensor | None = None  # (r,) bool, of the last picture's rays
         self._last: deque[FrameStats] = deque(maxlen=_KEPT)  # for the report
         self.trees: dict[str, ProducedTree] = {}
+        self._versions: dict[str, int] = {}  # of what they hold
         self.recorded: list[HostFrame] = []  # what producers on the host serve, without this frame
         try:
             for number, (name, producer) in enumerate(producers.items()):
                 self.trees[name] = make_tree(self.cache, self.options, number, name, producer)
+                self._versions[name] = producer.version
         except Exception:
             self.close()
             raise
@@ -214,6 +217,7 @@ class Engine:
         requests again. The host waits for them only if an earlier frame is known to have requests,
         if an answer is due, if the host is too far ahead, or if `wait` is true.
         """
+        self.renew()
         self.release()
         last = self.readbacks.catch_up(wait or self.production.due)
         if self.readbacks:
@@ -223,6 +227,21 @@ class Engine:
             self.serve(last.requests, last.wait(), stats)
         with stage("write"):
             self.production.write(self.production.late(), stats)
+
+    def renew(self) -> None:
+        """Drops what trees hold whose producers tell of another content (`Producer.changed`), and
+        makes their roots anew; the host waits for that. The next frames make the rest again.
+        """
+        changed = [s for n, s in self.trees.items() if s.producer.version != self._versions[n]]
+        if not changed:
+            return
+        self.release()
+        self.readbacks.catch_up(wait=True)  # what they list is no longer asked for
+        for source in changed:
+            self.production.forget(source)
+            renew_tree(self.cache, source, self.options.patience)
+            self._versions[source.name] = source.producer.version
+        self._missed = None
 
     def release(self, but: HostFrame | None = None) -> None:
         """Lets captured frames, `but` one, forget what is on its way to them."""
@@ -466,6 +485,11 @@ class Engine:
         """True if the newest frame read back missed nothing; does not block."""
         return self.readbacks.steady
 
+    @property
+    def changed(self) -> bool:
+        """Whether a producer has told of another content since it was last asked."""
+        return any(one.producer.version != self._versions[n] for n, one in self.trees.items())
+
     @cached_property
     def box(self) -> Tensor:
         """(2, 3) float64 world corners around all trees, where no pose turns them."""
@@ -575,6 +599,8 @@ class FrameGraph:
                 f"({own[4]}), got {form[0]} of {form[2]}x{form[1]} ({form[4]})"
             )
         engine, served = self._engine, self._served
+        if engine.changed:
+            return self._again(camera)  # which makes the changed trees anew
         if served is not None and (engine.readbacks.failed or served.host_needed):
             served.host_needed = False
             return self._again(camera)  # the host finds out which nodes fail, and names them

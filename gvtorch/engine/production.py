@@ -95,9 +95,12 @@ class Failures:
             failure, cause = first
             raise ProductionError(str(failure)) from cause
 
-    def forget(self) -> None:
+    def forget(self, tree: str | None = None) -> None:
+        """Forgets those of a tree, or all."""
+        kept = [one for one in self.newest if tree not in (None, one.tree)]
         self.newest.clear()
-        self._places.clear()
+        self.newest.extend(kept)
+        self._places = {place for place in self._places if tree not in (None, place[0])}
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,6 +241,14 @@ class Production:
             self.cache.mark_pending(everything, kind, False)
         for batch in self._under_way():
             self._mark(batch)
+
+    def forget(self, source: ProducedTree) -> None:
+        """Forgets what is on its way for a tree, and what failed there."""
+        for item in [item for item in self._waiting if item.batch.source is source]:
+            item.asked.cancel()
+            self._waiting.remove(item)
+        self._held = [one for one in self._held if one.batch.source is not source]
+        self.failures.forget(source.name)
 
     def close(self) -> None:
         """Forgets what is on its way."""

@@ -13,6 +13,7 @@ from ..base.constants import ABSENT, CONSTANT, EMPTY, TERMINAL
 from ..base.volume import movable
 from ..cache import Cache, Scheduler
 from ..cache.write import write_slots
+from ..ops import unlink
 from ..pool import BrickPool, Channel, N3Tree, NodePool
 from ..producers import Layout, Nodes, Producer, Region
 from ..producers.answer import checked_bricks, checked_regions
@@ -205,6 +206,22 @@ def make_tree(
         ) from error
     producer.layout = layout  # it serves this engine now
     return made
+
+
+def renew_tree(cache: Cache, made: ProducedTree, patience: float) -> None:
+    """Drops all that a tree holds and makes its root anew: its producer's content has changed."""
+    nodes, bricks, per_tile = cache.nodes, cache.bricks, cache.nodes.nodes_per_tile
+    number = made.tree.number
+    own = nodes.tree_t == number
+    tile = (own & (nodes.parent_t >= 0)).nonzero()[:, 0]
+    slot = ((bricks.owner_b >= 0) & own[bricks.owner_b.clamp(min=0) // per_tile]).nonzero()[:, 0]
+    unlink(nodes.child_tn, tile.to(torch.int32), nodes.capacity)
+    unlink(nodes.brick_tn, slot.to(torch.int32), bricks.capacity)
+    nodes.child_tn[tile], nodes.brick_tn[tile], nodes.request_tn[tile] = ABSENT, ABSENT, 0
+    nodes.parent_t[tile], nodes.stamp_t[tile], nodes.shared_t[tile] = -1, -1, False
+    bricks.owner_b[slot], bricks.stamp_b[slot], bricks.shared_b[slot] = -1, -1, False
+    nodes.child_tn[number], nodes.brick_tn[number], nodes.request_tn[number] = TERMINAL, EMPTY, 0
+    _fill_root(cache, made, patience)
 
 
 def _fill_root(cache: Cache, made: ProducedTree, patience: float) -> None:

@@ -1,11 +1,15 @@
 """Producers: what makes the content of trees."""
 
+from .field import FieldProducer, cache_field
+from .hypertexture import Hypertexture
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 from .stored import StoredProducer
 from .volume import VolumeProducer
 
 __all__ = [
     "Bricks",
+    "FieldProducer",
+    "Hypertexture",
     "Layout",
     "Nodes",
     "Producer",
@@ -13,4 +17,5 @@ __all__ = [
     "Regions",
     "StoredProducer",
     "VolumeProducer",
+    "cache_field",
 ]

@@ -199,7 +199,8 @@ def _refuse_bad(
     counts, finite = read[: len(Region)], read[len(Region) :]
     if kind is not None and sum(counts) < len(kind):
         for index in ((kind < Region.EMPTY) | (kind > Region.ALIAS)).nonzero()[:, 0].tolist():
-            errors[index] = f"{int(kind[index])} is no Region"
+            made = int(kind[index])
+            errors[index] = "the values are not finite" if made == -1 else f"{made} is no Region"
     for (channel, values), whole in zip(floats, finite, strict=True):
         if whole:
             continue

@@ -8,9 +8,10 @@ Source: Crassin et al., "GigaVoxels", I3D 2009, section 5; Crassin, PhD thesis 2
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -22,7 +23,7 @@ from ..base.volume import Volume, movable
 from ..pool import Channel
 from ..pool.pools import phrase
 from ..pool.pyramid import tree_depth
-from ..pool.staging import TableRows, Voxels
+from ..pool.staging import TableRows, Voxels, on_device
 
 
 class Region(IntEnum):
@@ -61,6 +62,16 @@ class Layout:
             origin=producer.origin,
             device=device,
         )
+
+    def wider(self, by: int) -> Layout:
+        """Returns the layout of bricks with a border that is wider by so many voxels; kept."""
+        if by not in self._wider:
+            self._wider[by] = replace(self, border=self.border + by)
+        return self._wider[by]
+
+    @functools.cached_property
+    def _wider(self) -> dict[int, Layout]:
+        return {}
 
     @property
     def side(self) -> int:
@@ -119,6 +130,13 @@ class Nodes:
     def __getitem__(self, index: slice | Tensor) -> Nodes:
         """Returns some of the nodes."""
         return Nodes(self.loc[index], self.layout, coarse=self.coarse)
+
+    def wider(self, by: int) -> Nodes:
+        """Returns the same nodes with a border that is wider by so many voxels: what a producer
+        evaluates where voxels are made of their neighbours.
+        """
+        layout = self.layout.wider(by) if by else self.layout
+        return Nodes(self.loc, layout, coarse=self.coarse)
 
     @property
     def depth(self) -> Tensor:
@@ -227,6 +245,21 @@ def _broadcast(places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]
 
 
+def _between(bricks: Tensor, row: Tensor, place: Tensor) -> Tensor:
+    """(p, c) float32 values between the eight voxels of bricks (k, z, y, x, c) around places (p, 3)
+    of bricks (p,).
+    """
+    low = place.floor().clamp(max=bricks.shape[1] - 2)
+    share, low = (place - low).to(torch.float32), low.to(torch.int64)
+    found = bricks.new_zeros((len(row), bricks.shape[-1]), dtype=torch.float32)
+    for corner in itertools.product((0, 1), repeat=3):
+        away = torch.tensor(corner, device=low.device)
+        x, y, z = (low + away).unbind(1)
+        weight = torch.where(away == 1, share, 1 - share).prod(1, keepdim=True)
+        found += weight * bricks[row, z, y, x].to(torch.float32)
+    return found
+
+
 class Answer:
     """What a producer answers: tensors, a row for each of k items, most of them by channel."""
 
@@ -277,7 +310,7 @@ class Bricks(Answer):
     """
 
     data: Voxels  # for each channel (k, z, y, x, c), border included
-    kind: Tensor | None = None  # (k,) of `Region`; None: all DATA
+    kind: Tensor | None = None  # (k,) of `Region`, -1: not finite; None: all DATA
     constants: Mapping[str, Tensor] = field(default_factory=dict)  # as in `Regions`
     alias: Tensor | None = None  # as in `Regions`
     errors: Mapping[int, str] = field(default_factory=dict, repr=False)  # as in `Regions`
@@ -324,8 +357,11 @@ class Producer(torch.nn.Module):
         on_host: Whether they take places on the host (`Nodes.loc`), and give tensors there or
             futures soon: a captured frame then asks them while the device renders.
         made_of: For coarse channels, what they are made of: shaders compare it with what they need.
+        version: Number of the content, see `changed`.
         extent, spacing, origin, branching, channels, value_range, labels: See `__init__`.
     """
+
+    version: int = 0
 
     patience: float | None = None
     on_device: bool = False
@@ -410,6 +446,42 @@ class Producer(torch.nn.Module):
             channels (`Channel.coarse`) are there if `nodes.coarse` is true, and only then.
         """
         raise NotImplementedError(f"{type(self).__name__}: fill is not written")
+
+    def changed(self) -> None:
+        """Tells that the content is another one from now on, such as at another time: the engine
+        drops what it holds and asks again, from its next frame on.
+        """
+        self.version += 1
+
+    def at(self, points: Tensor) -> dict[str, Tensor]:
+        """Returns the values at world points (..., 3), for each channel (..., c) float32, as
+        renderers read them: between the eight nearest voxels of the finest level. Needs no engine;
+        without one, this prepares the producer for bricks of 8^3.
+
+        Raises:
+            ValueError: A brick can't be made.
+        """
+        if self.layout is None:
+            layout = Layout.of(self, 8, 1, points.device)
+            self.prepare(layout)
+        else:
+            layout = self.layout
+        place = (points.reshape(-1, 3).to(layout.origin_3) - layout.origin_3) / layout.spacing_3
+        place = torch.minimum(place.clamp(min=0), layout.extent_3 - 1)  # in voxels
+        depth = torch.full_like(place[:, :1], layout.depth)
+        node = torch.cat(((place / layout.brick_size).floor(), depth), 1).to(torch.int64)
+        loc, row = node.unique(dim=0, return_inverse=True)
+        answer: Any = self.fill(Nodes(loc, layout))
+        answer = answer.result() if isinstance(answer, Future) else answer
+        answer = answer if isinstance(answer, Bricks) else Bricks(data=answer)
+        for message in answer.errors.values():
+            raise ValueError(f"{type(self).__name__}.at: {message}")
+        inner = place - node[:, :3] * layout.brick_size + layout.border
+        found = {}
+        for name, rows in answer.data.items():
+            bricks = on_device(rows, row.device).view(len(loc), *(layout.side,) * 3, -1)
+            found[name] = _between(bricks, row, inner).view(*points.shape[:-1], -1)
+        return found
 
     def close(self) -> None:
         """Closes files and ends threads; does nothing unless overridden."""

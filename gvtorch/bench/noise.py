@@ -1,0 +1,135 @@
+"""Gradient noise at points and on grids, beside NumPy and libraries of noise: `noise`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..fields import noise as gv_noise
+from .record import Record, clock, synchronize
+
+_SIDE = 10  # of a brick with its border
+_CHUNK = 1 << 13  # points at a time, so that NumPy's temporaries stay in the caches
+
+
+def noise(record: Record) -> None:
+    """Points all over 100 cells a side, and bricks of 10^3 points at 2 to 32 a cell."""
+    settings = record.settings
+    count = {"cpu": 1 << 20, "cuda": 1 << 25}[settings.device.type] >> (8 * settings.quick)
+    random = torch.Generator().manual_seed(5)
+    points = 100 * torch.rand((count, 3), generator=random)
+    case = f"{count:,} points"
+    if record.wants(case):
+        _points(record, case, points)
+    bricks = count // _SIDE**3
+    for voxels in (2, 8, 32):
+        case = f"{bricks:,} bricks, {voxels} voxels a cell"
+        if not record.wants(case):
+            continue
+        start = 100 * torch.rand((bricks, 3), generator=random)
+        reach = torch.arange(_SIDE) / voxels
+        axes = [(start[:, n, None] + reach).to(settings.device) for n in range(3)]
+        cells = -(-(_SIDE - 1) // voxels) + 1
+        x, y, z = axes
+        places = x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]
+        at_points = partial(gv_noise.perlin, places)
+        on_grid = partial(gv_noise.perlin_grid, *axes, cells=cells)
+        total = bricks * _SIDE**3
+        plain = _add(record, case, "points", total, at_points)
+        apart = float((on_grid() - at_points()).abs().max())
+        _add(record, case, "grid", total, on_grid, plain, max_difference=apart)
+
+
+def _points(record: Record, case: str, points: torch.Tensor) -> None:
+    """The same points by everyone; peers have hashes of their own, so values can't be compared."""
+    device = record.settings.device
+    on_device, in_numpy = points.to(device), points.numpy()
+    eager = _add(record, case, "points", len(points), lambda: gv_noise.perlin(on_device))
+    compiled = torch.compile(gv_noise.perlin, fullgraph=True, dynamic=False)
+    try:
+        compiled(on_device)
+        synchronize(device)
+        _add(record, case, "compiled", len(points), lambda: compiled(on_device), eager)
+    except Exception as error:  # whatever the compiler finds missing here
+        reason = str(error).strip().splitlines()
+        record.note(f"compiled: it does not work here: {reason[0] if reason else type(error)}")
+    if device.type == "cuda":
+        return
+    table = np.tile(np.random.default_rng(0).permutation(256), 3)
+
+    def in_chunks() -> None:
+        for begin in range(0, len(in_numpy), _CHUNK):
+            perlin_numpy(in_numpy[begin : begin + _CHUNK], table)
+
+    _add(record, case, "NumPy", len(points), in_chunks, eager)
+    wanted = record.settings.peers
+    for who, make in (("pyfastnoiselite", _fastnoiselite), ("pyfastnoisesimd", _fastnoisesimd)):
+        if wanted is not None and who not in wanted:
+            continue
+        try:
+            run = make(in_numpy)
+        except ImportError:
+            record.peers[who] = f"not installed ({who})"
+            continue
+        record.peers[who] = "ran"
+        _add(record, case, who, len(points), run, eager)
+    record.note("pyfast...: C++ on one thread, without torch; NumPy is on one thread as well")
+
+
+def perlin_numpy(points: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """Improved noise of (n, 3) points as the paper tells it, by a permuted table of 3 * 256."""
+    cell = np.floor(points).astype(np.int64)
+    offset = points - cell
+    x, y, z = (cell & 255).T
+    fades = (offset**3 * (offset * (offset * 6 - 15) + 10)).T
+    values = []
+    for corner in range(8):
+        step = [corner >> axis & 1 for axis in range(3)]
+        bits = table[table[table[x + step[0]] + y + step[1]] + z + step[2]] & 15
+        dx, dy, dz = (offset - step).T
+        first = np.where(bits < 8, dx, dy)
+        second = np.where(bits < 4, dy, np.where((bits == 12) | (bits == 14), dx, dz))
+        values.append(np.where(bits & 1, -first, first) + np.where(bits & 2, -second, second))
+    for fade in fades:
+        pairs = zip(values[::2], values[1::2], strict=True)
+        values = [low + fade * (high - low) for low, high in pairs]
+    return values[0]
+
+
+def _fastnoiselite(points: np.ndarray) -> Callable[[], object]:
+    from pyfastnoiselite.pyfastnoiselite import FastNoiseLite, NoiseType
+
+    source, places = FastNoiseLite(1), np.ascontiguousarray(points.T)
+    source.noise_type, source.frequency = NoiseType.NoiseType_Perlin, 1.0
+    return lambda: source.gen_from_coords(places)
+
+
+def _fastnoisesimd(points: np.ndarray) -> Callable[[], object]:
+    import pyfastnoisesimd
+
+    source = pyfastnoisesimd.Noise(seed=1, numWorkers=1)
+    source.noiseType, source.frequency = pyfastnoisesimd.NoiseType.Perlin, 1.0
+    places = pyfastnoisesimd.empty_coords(len(points))
+    places[:3, : len(points)] = points.T
+    return lambda: source.genFromCoords(places)
+
+
+def _add(
+    record: Record,
+    case: str,
+    who: str,
+    count: int,
+    run: Callable[[], object],
+    other: float | None = None,
+    **figures: Any,
+) -> float:
+    """Takes a row; `other` are the milliseconds of what its speed is told in."""
+    timing = clock(run, record.settings)
+    ratio = {} if other is None else {"times": timing.median / other}
+    rates = {"values_per_second": 1e3 * count / timing.median}
+    record.add(case, who, timing, **rates, **ratio, **figures)
+    return timing.median

@@ -1,0 +1,134 @@
+"""`Field`: values that are a function of place, such as distances, noise or a small network. Fields
+know no voxels, nodes or bricks; `FieldProducer` makes these of them.
+
+Source of the intervals: Moore, "Interval analysis", 1966; Snyder, "Interval analysis for computer
+    graphics", SIGGRAPH 1992 (a function that is bounded over a box is sampled only where it
+    matters).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ..base import check
+
+#: One value a point (...,), several (..., c), or these by channel.
+Values = Tensor | Mapping[str, Tensor]
+#: Smallest and largest value over each of k boxes, (k,) or (k, c) float64; infinite: not known.
+Interval = tuple[Tensor, Tensor]
+#: An interval; for fields of several channels by name, those that are left out are not known.
+Bounds = Interval | Mapping[str, Interval] | None
+
+
+class Field(nn.Module):
+    """Base of fields. A subclass writes `forward`, and `bounds` where it can: what is bounded need
+    not be produced where it is not seen.
+
+    All methods are pure functions of tensors in torch: no shape depends on values and the host
+    never waits, so that they can be compiled and recorded. Numbers that may change between
+    pictures are buffers (see `number` and `vector`), edited in place.
+
+    Attributes:
+        prefiltered: Whether the field knows its own means over voxels: `filtered` is called in
+            place of sampling `forward` several times a voxel.
+        threshold: By channel, the value up to which a voxel shows nothing: where all channels named
+            here are proven to stay at or below theirs, nothing is made. None: every value counts.
+        margin: How many voxels beyond its bricks a prefiltered field is asked for, so that `finish`
+            can look at neighbours.
+        dtypes: By channel, the dtype of voxels that suits it; float32 for others.
+    """
+
+    prefiltered: bool = False
+    margin: int = 0
+    dtypes: Mapping[str, torch.dtype] = MappingProxyType({})
+    threshold: Mapping[str, float] | None = None
+
+    def forward(self, points: Tensor) -> Values:
+        """Returns the values at points (..., 3), float32 or float64, in world units: (...,),
+        (..., c), or these by channel, of the dtype of the points.
+        """
+        raise NotImplementedError(f"{type(self).__name__}: forward is not written")
+
+    def filtered(self, points: Tensor, size: Tensor) -> Values:
+        """Returns the means over voxels around points (..., 3), whose sides are `size` (..., 3),
+        which broadcasts with the points. Called if `prefiltered`.
+        """
+        raise NotImplementedError(f"{type(self).__name__}: filtered is not written")
+
+    def finish(self, values: Mapping[str, Tensor], size: Tensor) -> Mapping[str, Tensor]:
+        """Returns channels (k, z, y, x, c) made of what `filtered` gave on a grid that is `margin`
+        voxels wider on all sides, by channel (k, z + 2 margin, y + 2 margin, x + 2 margin, c), for
+        voxels of sides `size` (k, 3). Called if there is a margin.
+        """
+        raise NotImplementedError(f"{type(self).__name__}: finish is not written")
+
+    def bounds(self, center: Tensor, half: Tensor) -> Bounds:
+        """Returns intervals that hold `forward` everywhere in boxes center - half to center + half,
+        (k, 3) float64. They may be wide, but never too narrow; None: nothing is known.
+        """
+        return None
+
+    def filtered_bounds(self, center: Tensor, half: Tensor, size: Tensor) -> Bounds:
+        """Returns the same for the means over voxels that lie in the boxes, of sides `size` (k, 3)
+        float64 and of all smaller ones. What holds for values holds for their means.
+        """
+        return self.bounds(center, half)
+
+    def box(self) -> Tensor | None:
+        """Returns (2, 3) float64 corners of a box beyond which there is nothing; None: unknown."""
+        return None
+
+    def number(self, name: str, value: Any, **limits: Any) -> None:
+        """Keeps a number as a buffer `name`, () float64; `limits` are those of `check.number`.
+
+        A () float64 tensor leaves the dtype of what it is multiplied with as it is.
+
+        Raises:
+            ValueError: It is not finite, or beyond its limits.
+        """
+        number = check.number(type(self).__name__, name, value, **limits)
+        self.register_buffer(name, torch.tensor(number, dtype=torch.float64))
+
+    def vector(self, name: str, value: Sequence[float] | Tensor, **limits: Any) -> None:
+        """Keeps x, y, z as a buffer `name`, (3,) float64: `.to(points)` before use.
+
+        Raises:
+            ValueError: They are not three finite numbers, or beyond their limits.
+        """
+        triple = check.triple(type(self).__name__, name, value, **limits)
+        self.register_buffer(name, torch.tensor(triple, dtype=torch.float64))
+
+    def __repr__(self) -> str:
+        parts = ", ".join(type(part).__name__ for part in self.children())
+        return f"{type(self).__name__}({parts})"
+
+
+def length(vectors: Tensor) -> Tensor:
+    """Returns (...,) lengths of vectors (..., c), whose gradient at 0 is 0, not NaN."""
+    return torch.linalg.vector_norm(vectors, dim=-1)
+
+
+def tighter(one: Interval, other: Interval) -> Interval:
+    """Returns what two intervals that both hold have in common."""
+    return torch.maximum(one[0], other[0]), torch.minimum(one[1], other[1])
+
+
+def parts_of(center: Tensor, half: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Returns the count^3 parts of each of k boxes, box after box, (k * count^3, 3) each: of many
+    small boxes intervals tell more than of a large one. `joined` makes them intervals of the boxes.
+    """
+    place = (torch.arange(count, device=center.device, dtype=center.dtype) + 0.5) * 2 / count - 1
+    at = torch.stack(torch.meshgrid(place, place, place, indexing="ij"), -1).view(1, -1, 3)
+    parts = (center[:, None] + half[:, None] * at).flatten(0, 1)
+    return parts, (half / count).repeat_interleave(count**3, 0)
+
+
+def joined(interval: Interval, count: int) -> Interval:
+    """Returns (k,) intervals that hold those of the count^3 parts of each of k boxes."""
+    low, high = (end.unflatten(0, (-1, count**3)) for end in interval)
+    return low.amin(1), high.amax(1)

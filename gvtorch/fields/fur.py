@@ -1,0 +1,91 @@
+"""`Fur`: hairs on a shape, to be coloured by a transfer function alone.
+
+Source: Perlin, Hoffert, "Hypertexture", SIGGRAPH 1989 (fur as noise around a surface); how hairs
+    end and fall is our own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from . import noise
+from .distance import Distance, grown
+from .field import Field, Interval, length
+
+_SKIN = 0.1  # value of skin and roots
+_HALF, _SPREAD = 0.45, 0.7  # height at which hairs end, in lengths: half + spread * noise
+_SHARP = 5.0  # how fast a hair ends, by lengths
+
+
+class Fur(Field):
+    """Value 0 between hairs, and from 0.1 at their roots to 1 at tips one length high. A point
+    belongs to a hair where the noise at its root, the nearest point of the shape, is above its
+    height.
+
+    A voxel has the value in its middle, with the contrast that its size leaves between hairs.
+    """
+
+    prefiltered = True
+    threshold: Mapping[str, float] = {"value": 0.0}
+    length: Tensor
+    frequency: Tensor
+    fall: Tensor
+
+    def __init__(
+        self,
+        shape: Distance,
+        *,
+        length: float,
+        frequency: float,
+        fall: Sequence[float] = (0.0, 0.0, 0.0),
+        seed: int = 0,
+    ) -> None:
+        """Takes the shape and its hairs.
+
+        Args:
+            shape: What they stand on.
+            length: World units.
+            frequency: Hairs a world unit.
+            fall: How far a tip one length high is moved, in lengths; less far down, by the square.
+            seed: Of the noise.
+        """
+        super().__init__()
+        self.shape = check.instance("Fur", "shape", shape, Distance)
+        self.number("length", length, low=0, open_low=True)
+        self.number("frequency", frequency, low=0, open_low=True)
+        self.vector("fall", fall)
+        self.seed = check.whole("Fur", "seed", seed, low=-(2**62), high=2**62)
+
+    def forward(self, points: Tensor) -> Mapping[str, Tensor]:
+        return self.filtered(points, torch.zeros_like(points))
+
+    def filtered(self, points: Tensor, size: Tensor) -> Mapping[str, Tensor]:
+        away, _, gradient = self.shape.surface_and_gradient(points)
+        height = away / self.length
+        normal = gradient / length(gradient).clamp(min=0.5)[..., None]
+        fallen = (height * height * self.length)[..., None] * self.fall.to(points)
+        root = points - away[..., None] * normal - fallen
+        cells = size.amax(-1).to(points) * self.frequency
+        seen = torch.exp(-noise.LOST * cells * cells)
+        hairs = noise.perlin(root * self.frequency, seed=self.seed) * seen
+        inside = ((_HALF + _SPREAD * hairs - height) * _SHARP).clamp(0, 1)
+        return {"value": inside * (_SKIN + (1 - _SKIN) * height.clamp(0, 1))}
+
+    def bounds(self, center: Tensor, half: Tensor) -> Mapping[str, Interval]:
+        """0 above all hairs, the skin's value below all roots, else 0 to 1."""
+        low, high = self.shape.bounds(center, half)
+        reach = _SPREAD * noise.bounds(noise.perlin).high
+        above = low > (_HALF + reach) * self.length
+        skin = high < (_HALF - reach - 1 / _SHARP) * self.length
+        least = _SKIN * skin.to(low)
+        return {"value": (least, torch.where(skin, least, (~above).to(low)))}
+
+    def box(self) -> Tensor | None:
+        """Around the shape and its hairs."""
+        box = self.shape.box()
+        reach = _HALF + _SPREAD * noise.bounds(noise.perlin).high
+        return None if box is None else grown(box, reach * self.length)

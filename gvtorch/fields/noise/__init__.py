@@ -1,0 +1,29 @@
+"""Noise as functions of place: `gv.noise.perlin(points)` and others. It is deterministic by seed,
+periodic on request, of float32 or float64, and its bounds are known.
+"""
+
+from .basis import perlin, simplex, value
+from .bounds import LOST, VARIANCE, Bounds, bounds
+from .cellular import cellular
+from .fractal import fbm, fbm_bounds, ridged, turbulence, warp
+from .grid import perlin_grid
+from .levels import OctaveSum, inherit
+
+__all__ = [
+    "LOST",
+    "VARIANCE",
+    "Bounds",
+    "OctaveSum",
+    "bounds",
+    "cellular",
+    "fbm",
+    "fbm_bounds",
+    "inherit",
+    "perlin",
+    "perlin_grid",
+    "ridged",
+    "simplex",
+    "turbulence",
+    "value",
+    "warp",
+]

@@ -1,0 +1,224 @@
+"""Sums of octaves of a noise, and places moved by noise.
+
+Source: Perlin, "An image synthesizer", SIGGRAPH 1985 (turbulence); Musgrave, in Ebert et al.,
+    "Texturing and modeling: a procedural approach", 3rd edition 2003, chapter 16 (fractal sums,
+    lacunarity, ridges whose detail gathers on the crests); Quilez, "Domain warping", 2002.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...base import check
+from .basis import perlin
+from .bounds import Basis, Bounds, bounds
+from .lattice import Period, Points, coordinates, periods
+
+#: Seeds of the octaves of a sum, and of the components of a warp, are so far apart.
+_NEXT_OCTAVE, _NEXT_AXIS = 0x10001, 0x3000007
+
+
+class Octave(NamedTuple):
+    """One octave of a sum."""
+
+    amplitude: float
+    frequency: float
+    seed: int
+
+
+def octaves_of(
+    where: str, octaves: int, lacunarity: float, gain: float, seed: int
+) -> Iterator[Octave]:
+    """Yields the octaves of a sum: amplitudes 1, gain, gain^2, ..., frequencies 1, lacunarity, ...
+
+    Raises:
+        ValueError: There are none, more than 64, or a number is not positive.
+    """
+    check.whole(where, "octaves", octaves, low=1, high=64)
+    check.number(where, "lacunarity", lacunarity, low=0, open_low=True)
+    check.number(where, "gain", gain, low=0, open_low=True)
+    check.whole(where, "seed", seed, low=-(2**62), high=2**62)
+    for number in range(octaves):
+        yield Octave(gain**number, lacunarity**number, seed + number * _NEXT_OCTAVE)
+
+
+def fbm(
+    points: Points,
+    *,
+    octaves: int = 6,
+    lacunarity: float = 2.0,
+    gain: float = 0.5,
+    basis: Basis = perlin,
+    seed: int = 0,
+    period: Period = None,
+) -> Tensor:
+    """Fractal sum (fractional Brownian motion): octaves of a noise, each `lacunarity` times as fine
+    as the one before and `gain` times as strong.
+
+    Args:
+        points: As in `perlin`.
+        octaves: How many, 1 to 64.
+        lacunarity, gain: Of an octave to the one before.
+        basis: The noise that is summed: `perlin`, `value`, `simplex`, `cellular`, or your own
+            function of points, `seed` and `period`.
+        seed: Of the first octave; each has its own.
+        period: Of the first octave, in its cells; the lacunarity must then be a whole number.
+
+    Returns:
+        (...) of the points' dtype, within `fbm_bounds`.
+
+    Raises:
+        ValueError: An argument is not that.
+    """
+    total: Tensor | None = None
+    for amplitude, noise in _layers(
+        "noise.fbm", points, octaves, lacunarity, gain, basis, seed, period
+    ):
+        total = amplitude * noise if total is None else total + amplitude * noise
+    return check.instance("noise.fbm", "basis", total, Tensor)
+
+
+def turbulence(
+    points: Points,
+    *,
+    octaves: int = 6,
+    lacunarity: float = 2.0,
+    gain: float = 0.5,
+    basis: Basis = perlin,
+    seed: int = 0,
+    period: Period = None,
+) -> Tensor:
+    """The sum of the absolute values of octaves: creases where they pass 0, as in flames and
+    marble. Arguments, result and errors are those of `fbm`.
+    """
+    total: Tensor | None = None
+    for amplitude, noise in _layers(
+        "noise.turbulence", points, octaves, lacunarity, gain, basis, seed, period
+    ):
+        part = amplitude * noise.abs()
+        total = part if total is None else total + part
+    return check.instance("noise.turbulence", "basis", total, Tensor)
+
+
+def ridged(
+    points: Points,
+    *,
+    octaves: int = 6,
+    lacunarity: float = 2.0,
+    gain: float = 0.5,
+    sharpness: float = 2.0,
+    basis: Basis = perlin,
+    seed: int = 0,
+    period: Period = None,
+) -> Tensor:
+    """Ridges: octaves of (1 - |noise|)^2, each weighted by the one before, so that valleys stay
+    smooth and detail gathers on the crests.
+
+    Args:
+        points, octaves, lacunarity, gain, basis, seed, period: As in `fbm`; noises lie in -1 to 1.
+        sharpness: An octave's weight is the one before times this, at most 1.
+
+    Returns:
+        (...) of the points' dtype, from 0 to the sum of the amplitudes.
+
+    Raises:
+        ValueError: An argument is not that.
+    """
+    where = "noise.ridged"
+    check.number(where, "sharpness", sharpness, low=0)
+    total: Tensor | None = None
+    weight: Tensor | None = None
+    for amplitude, noise in _layers(where, points, octaves, lacunarity, gain, basis, seed, period):
+        crest = (1 - noise.abs()) * (1 - noise.abs())
+        crest = crest if weight is None else crest * weight
+        weight = (crest * sharpness).clamp(0, 1)
+        total = amplitude * crest if total is None else total + amplitude * crest
+    return check.instance(where, "basis", total, Tensor)
+
+
+def warp(
+    points: Points,
+    *,
+    amplitude: float = 1.0,
+    octaves: int = 1,
+    lacunarity: float = 2.0,
+    gain: float = 0.5,
+    basis: Basis = perlin,
+    seed: int = 0,
+    period: Period = None,
+) -> Tensor:
+    """Domain warp: points moved by a vector of noise, to be handed to another function of place.
+
+    Args:
+        points, octaves, lacunarity, gain, basis, seed, period: As in `fbm`.
+        amplitude: The noises, one for each axis, are multiplied by this.
+
+    Returns:
+        (..., n) points. A function of slope s has a slope of at most
+        s * (1 + amplitude * sqrt(n) * slope of the noise) of them.
+
+    Raises:
+        ValueError: An argument is not that.
+    """
+    axes = coordinates("noise.warp", points)
+    check.number("noise.warp", "amplitude", amplitude)
+    moved = []
+    for axis, place in enumerate(axes):
+        shift = fbm(
+            axes,
+            octaves=octaves,
+            lacunarity=lacunarity,
+            gain=gain,
+            basis=basis,
+            seed=seed + (axis + 1) * _NEXT_AXIS,
+            period=period,
+        )
+        moved.append(place + amplitude * shift)
+    return torch.stack(moved, -1)
+
+
+def fbm_bounds(
+    *,
+    octaves: int = 6,
+    lacunarity: float = 2.0,
+    gain: float = 0.5,
+    basis: Basis = perlin,
+    n: int = 3,
+) -> Bounds:
+    """Returns the bounds of `fbm` in n dimensions; those of an octave times its amplitude add up.
+
+    Raises:
+        ValueError: An argument is not that, or nothing is known of the noise.
+    """
+    one = bounds(basis, n)
+    series = [*octaves_of("noise.fbm_bounds", octaves, lacunarity, gain, 0)]
+    high = sum(octave.amplitude for octave in series)
+    slope = sum(octave.amplitude * octave.frequency for octave in series)
+    return Bounds(one.low * high, one.high * high, one.slope * slope)
+
+
+def _layers(
+    where: str,
+    points: Points,
+    octaves: int,
+    lacunarity: float,
+    gain: float,
+    basis: Basis,
+    seed: int,
+    period: Period,
+) -> Iterator[tuple[float, Tensor]]:
+    """Yields amplitude and noise of each octave."""
+    axes = coordinates(where, points)
+    every = periods(where, period, len(axes))
+    if period is not None and lacunarity != int(lacunarity):
+        raise ValueError(f"{where}: with a period lacunarity must be whole, got {lacunarity!r}")
+    for octave in octaves_of(where, octaves, lacunarity, gain, seed):
+        finer = None
+        if period is not None:
+            finer = [int(one or 1) * int(octave.frequency) for one in every]
+        places = [one * octave.frequency for one in axes]
+        yield octave.amplitude, basis(places, seed=octave.seed, period=finer)

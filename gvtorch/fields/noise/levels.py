@@ -1,0 +1,192 @@
+"""Octaves by level: the sum of the coarse octaves in a brick, interpolated from its parent's brick,
+so that a level evaluates fine octaves alone.
+
+The centres of a child's voxels are never those of its parent's, so what a child takes over is
+interpolated. Gradient noise has two continuous derivatives, so the error falls with the third power
+of (voxel / cell), whatever the order. Of one octave of amplitude 1, by the parent's voxels a cell,
+6 points along each axis, 600 bricks:
+
+    voxels a cell   2     4     8       16      32      64
+    largest         1.3   0.09  5.3e-3  6.5e-4  6.0e-5  7.2e-6
+    mean square     0.13  0.01  5.7e-4  5.4e-5  4.4e-6  4.6e-7
+
+If an octave were taken over from the first level that holds it, at 2 voxels a cell, it would be
+lost. So each is evaluated until its cells are `settled` voxels wide, and taken over from then on:
+at 16, with about the error of storing float16, to which each further level adds an eighth. A level
+then evaluates 4 octaves, however many there are before them.
+
+Source: Lagrange's interpolation; the original engine's sample of noise that is inherited from the
+    parent's brick gave the idea.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ...base import check
+from .fractal import Octave, octaves_of
+from .grid import perlin_grid
+
+#: Interpolated from so many voxels along each axis.
+POINTS = 6
+
+
+def inherit(
+    parents: Tensor, child: Tensor, *, border: int = 1, branching: int = 2, points: int = POINTS
+) -> Tensor:
+    """Returns values at the voxels of children, borders included, out of their parents' bricks.
+
+    Args:
+        parents: (k, z, y, x) float32 or float64 bricks with their borders, cubes.
+        child: (k, 3) int64 which child each is, x y z, 0 to branching - 1.
+        border: Voxels around a brick, 1 at least.
+        branching: N.
+        points: Voxels that a value is interpolated from along each axis.
+
+    Returns:
+        (k, z, y, x) of the same dtype: exact, but for rounding, where values are a polynomial of
+        degree `points` - 1 along each axis; see above for noise.
+
+    Raises:
+        ValueError: Shapes do not fit, there is no border, or there are fewer voxels than `points`.
+    """
+    where = "noise.inherit"
+    if parents.dim() != 4 or len(set(parents.shape[1:])) > 1 or not parents.is_floating_point():
+        raise ValueError(
+            f"{where}: parents must be (k, s, s, s) floats, got {check.describe(parents)}"
+        )
+    if child.shape != (len(parents), 3):
+        shape = f"({len(parents)}, 3)"
+        raise ValueError(f"{where}: child must be {shape} int64, got {check.describe(child)}")
+    side = parents.shape[1]
+    check.whole(where, "border", border, low=1, high=(side - 1) // 2)
+    check.whole(where, "points", points, low=2, high=side)
+    weights = _weights(side, border, branching, points, parents.dtype, parents.device)
+    x, y, z = (weights[child[:, axis]] for axis in range(3))  # (k, s, s) each
+    found = parents.flatten(1, 2) @ x.mT  # along x
+    found = found.view(-1, side, side, side).transpose(2, 3).flatten(1, 2) @ y.mT
+    found = found.view(-1, side, side, side).permute(0, 3, 2, 1).flatten(1, 2) @ z.mT  # (y, x, z)
+    return found.view(-1, side, side, side).permute(0, 3, 1, 2)
+
+
+class OctaveSum:
+    """The sum of `fbm` in bricks of any level, of those octaves that its voxels can hold.
+
+    Attributes:
+        octaves: All of them.
+        made: Octaves of voxels that were evaluated so far.
+        wanted: Those that a plain sum would have taken.
+    """
+
+    def __init__(
+        self,
+        *,
+        frequency: float = 1.0,
+        octaves: int = 12,
+        lacunarity: float = 2.0,
+        gain: float = 0.5,
+        seed: int = 0,
+        hold: float = 2.0,
+        settled: float = 16.0,
+    ) -> None:
+        """Takes the sum.
+
+        Args:
+            frequency: Cells of the first octave a world unit.
+            octaves, lacunarity, gain, seed: As in `fbm`.
+            hold: Voxels a cell from which on a level has an octave.
+            settled: Voxels a cell from which on children take it over; infinite: never.
+
+        Raises:
+            ValueError: A number is out of its range.
+        """
+        where = "noise.OctaveSum"
+        check.number(where, "frequency", frequency, low=0, open_low=True)
+        self.hold = check.number(where, "hold", hold, low=0, open_low=True)
+        if not settled >= self.hold:
+            raise ValueError(f"{where}: settled must be >= hold, {hold:g}, got {settled!r}")
+        self.settled = settled
+        series = octaves_of(where, octaves, lacunarity, gain, seed)
+        self.octaves = [one._replace(frequency=one.frequency * frequency) for one in series]
+        self.made = self.wanted = 0
+
+    def held(self, side: float) -> list[Octave]:
+        """Returns the octaves that voxels of a side, in world units, can hold."""
+        return self._wide(side, self.hold)
+
+    def bricks(
+        self,
+        axes: Sequence[Tensor],
+        side: float,
+        parents: Tensor | None = None,
+        child: Tensor | None = None,
+        *,
+        border: int = 1,
+        branching: int = 2,
+    ) -> tuple[Tensor, Tensor]:
+        """Returns the sum in k bricks of a level, and the part of it that their children may take
+        over, both (k, z, y, x).
+
+        Args:
+            axes: x, y, z: (k, s) float32 or float64 world places of voxel centres, with borders.
+            side: Of the level's voxels, world units.
+            parents: (k, z, y, x) what the parents' children may take over; None: all octaves are
+                evaluated here.
+            child: (k, 3) which children these bricks are, see `inherit`.
+            border, branching: As in `inherit`.
+        """
+        above = self._wide(side * branching, self.settled)
+        calm = self._wide(side, self.settled)
+        held = self.held(side)
+        size = axes[0].shape[0] * axes[0].shape[1] * axes[1].shape[1] * axes[2].shape[1]
+        self.wanted += size * len(held)
+        if parents is None or child is None or not above:
+            settled = self._evaluated(axes, side, calm)
+        else:
+            settled = inherit(parents, child, border=border, branching=branching)
+            settled = settled + self._evaluated(axes, side, calm[len(above) :])
+        return settled + self._evaluated(axes, side, held[len(calm) :]), settled
+
+    def _wide(self, side: float, voxels: float) -> list[Octave]:
+        """The octaves whose cells are at least so many voxels wide."""
+        return [one for one in self.octaves if side * one.frequency * voxels <= 1 + 1e-9]
+
+    def _evaluated(self, axes: Sequence[Tensor], side: float, octaves: Sequence[Octave]) -> Tensor:
+        """The sum of octaves, (k, z, y, x); zeros if there are none."""
+        x, y, z = axes
+        total = x.new_zeros((len(x), z.shape[1], y.shape[1], x.shape[1]))
+        for one in octaves:
+            places = [axis * one.frequency for axis in axes]
+            cells = math.ceil((max(total.shape[1:]) - 1) * side * one.frequency) + 1
+            total += one.amplitude * perlin_grid(*places, seed=one.seed, cells=cells)
+            self.made += total.numel()
+        return total
+
+
+@functools.cache
+def _weights(
+    side: int, border: int, branching: int, points: int, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    """(N, s, s): by child and its voxel along an axis, the weights of the parent's voxels."""
+    size = side - 2 * border
+    children = []
+    for child in range(branching):
+        rows = []
+        for voxel in range(-border, size + border):
+            place = (child * size + voxel + 0.5) / branching - 0.5 + border  # in parent's voxels
+            first = min(max(int(place) - points // 2 + 1, 0), side - points)
+            row = [0.0] * side
+            for one in range(first, first + points):
+                weight = 1.0
+                for other in range(first, first + points):
+                    if other != one:
+                        weight *= (place - other) / (one - other)
+                row[one] = weight
+            rows.append(row)
+        children.append(rows)
+    return torch.tensor(children, dtype=dtype, device=device)

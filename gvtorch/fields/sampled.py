@@ -1,0 +1,137 @@
+"""`SampledDistance`: a volume of signed distances as a field, such as that of a mesh.
+
+Source: Hart, "Sphere tracing", 1996 (Lipschitz bounds); an interpolated value changes at most as
+    fast as its neighbouring voxels differ.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from ..base.volume import Volume
+from .distance import WHITE, Color, Distance
+from .field import Interval, length
+
+
+class SampledDistance(Distance):
+    """Distances between voxels are interpolated; beyond the volume's outermost voxel centres they
+    go on with the distance to these.
+
+    Args of the constructor: `volume`, one number a voxel, world units, negative inside.
+    """
+
+    exact = False
+
+    def __init__(self, volume: Volume, *, color: Color = WHITE) -> None:
+        """Takes the volume, whose place in the world is the field's.
+
+        Raises:
+            ValueError: It has not one number a voxel, or less than 2 voxels along an axis.
+        """
+        super().__init__(color)
+        check.instance("SampledDistance", "volume", volume, Volume)
+        data = volume.data
+        if data.shape[3] != 1 or min(volume.extent) < 2:
+            got = " x ".join(map(str, volume.extent))
+            raise ValueError(
+                "SampledDistance: volume must have 1 number a voxel and at least 2 voxels along "
+                f"each axis, got {data.shape[3]} and {got}"
+            )
+        values = data[..., 0].to(torch.float32)
+        self.register_buffer("values", values)
+        self.vector("spacing", volume.spacing)
+        self.vector("origin", volume.origin)
+        self.vector("last", [n - 1 for n in volume.extent])
+        self.register_buffer("steepest", _steepest(values, self.spacing))
+        self.register_buffer("apart", _apart(values, self.spacing))
+
+    values: Tensor
+    spacing: Tensor
+    origin: Tensor
+    last: Tensor
+    steepest: Tensor
+    apart: Tensor
+
+    def forward(self, points: Tensor) -> Tensor:
+        at = (points - self.origin.to(points)) / self.spacing.to(points)
+        inside = at.clamp(min=torch.zeros_like(self.last).to(at), max=self.last.to(at))
+        low = torch.minimum(inside.floor(), self.last.to(at) - 1)
+        share = inside - low
+        _, y, x = self.values.shape
+        first = low.to(torch.int64)
+        first = (first[..., 2] * y + first[..., 1]) * x + first[..., 0]
+        flat = self.values.reshape(-1)
+        corners = [
+            flat[first + (dz * y + dy) * x + dx].to(at)
+            for dz in (0, 1)
+            for dy in (0, 1)
+            for dx in (0, 1)
+        ]
+        for axis in range(3):
+            weight = share[..., axis]
+            pairs = zip(corners[::2], corners[1::2], strict=True)
+            corners = [torch.lerp(one, other, weight) for one, other in pairs]
+        beyond = length((at - inside) * self.spacing.to(points))
+        return corners[0] + beyond
+
+    def slope(self, center: Tensor, half: Tensor) -> Tensor:
+        """Inside that of the steepest cell; outside the distance to the box adds to it."""
+        return torch.where(self._inside(center, half), self.steepest, self.steepest + 1)
+
+    def bounds(self, center: Tensor, half: Tensor) -> Interval:
+        """As far around the value in the middle as the slope allows, or as voxels do: a value is a
+        mean of voxels that lie half a cell's diagonal away on average, at either end.
+        """
+        middle, radius = self(center), length(half)
+        most = self.apart * (radius + length(self.spacing))
+        most = torch.where(self._inside(center, half), most, most + radius)
+        most = torch.minimum(most, self.slope(center, half) * radius)
+        return middle - most, middle + most
+
+    def _inside(self, center: Tensor, half: Tensor) -> Tensor:
+        """(k,) bool, which boxes lie in that of the volume."""
+        high = self.origin + self.last * self.spacing
+        return ((center - half >= self.origin) & (center + half <= high)).all(1)
+
+    def box(self) -> Tensor:
+        """The volume's box, of voxel centres."""
+        return torch.stack((self.origin, self.origin + self.last * self.spacing))
+
+
+def _steepest(values: Tensor, spacing: Tensor) -> Tensor:
+    """() float64 the largest slope between voxels (z, y, x): along each axis, within a cell of 8
+    voxels it is at most the largest difference along one of the cell's edges.
+    """
+    squares: Tensor | float = 0.0
+    for axis in range(3):
+        steps = values.diff(dim=2 - axis).abs()
+        window = [2, 2, 2]
+        window[2 - axis] = 1
+        most = torch.nn.functional.max_pool3d(steps[None], window, stride=1)[0]
+        squares = squares + (most.to(torch.float64) / spacing[axis]) ** 2
+    assert isinstance(squares, Tensor)
+    return squares.max().sqrt()
+
+
+def _apart(values: Tensor, spacing: Tensor) -> Tensor:
+    """() float64 how much two voxels differ at most by unit of length between them, however far.
+
+    Between the 26 neighbours that is looked up. A way from voxel to voxel by neighbours is at most
+    sqrt(1 + (sqrt 2 - 1)^2 + (sqrt 3 - sqrt 2)^2) = 1.128 times as long as the straight one; sqrt 3
+    times where voxels are no cubes.
+    """
+    most = torch.zeros((), dtype=torch.float64, device=values.device)
+    for step in itertools.product((-1, 0, 1), repeat=3):  # x, y, z
+        if step <= (0, 0, 0):  # as well known from the other end
+            continue
+        here = [slice(max(-n, 0), min(-n, 0) or None) for n in step[::-1]]
+        there = [slice(max(n, 0), min(n, 0) or None) for n in step[::-1]]
+        differ = (values[tuple(here)] - values[tuple(there)]).abs().amax().to(torch.float64)
+        most = torch.maximum(most, differ / length(torch.tensor(step).to(spacing) * spacing))
+    cubes = bool((spacing == spacing[0]).all())
+    return most * (1.1282 if cubes else math.sqrt(3))

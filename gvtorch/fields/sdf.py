@@ -1,0 +1,57 @@
+"""All distance fields under one name: `gv.sdf.Sphere(1) - gv.sdf.Box((1, 1, 1))`."""
+
+from .distance import (
+    Difference,
+    Distance,
+    Intersection,
+    Negative,
+    Pair,
+    SmoothDifference,
+    SmoothIntersection,
+    SmoothUnion,
+    Union,
+)
+from .shapes import Box, Capsule, Gyroid, Menger, Plane, Sphere, Torus
+from .spaces import (
+    Extrusion,
+    Offset,
+    Repeat,
+    Revolution,
+    Shell,
+    Space,
+    Transform,
+    Twist,
+    moved,
+    rotated,
+    scaled,
+)
+
+__all__ = [
+    "Box",
+    "Capsule",
+    "Difference",
+    "Distance",
+    "Extrusion",
+    "Gyroid",
+    "Intersection",
+    "Menger",
+    "Negative",
+    "Offset",
+    "Pair",
+    "Plane",
+    "Repeat",
+    "Revolution",
+    "Shell",
+    "SmoothDifference",
+    "SmoothIntersection",
+    "SmoothUnion",
+    "Space",
+    "Sphere",
+    "Torus",
+    "Transform",
+    "Twist",
+    "Union",
+    "moved",
+    "rotated",
+    "scaled",
+]

@@ -1,0 +1,210 @@
+"""Shapes as signed distances.
+
+Sources: Hart, "Sphere tracing", 1996, appendix (sphere, box, torus, plane); distances to a segment
+    and to a triangle of coordinates are plain geometry.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from .distance import WHITE, Color, Distance
+from .field import Interval, length
+
+
+class Sphere(Distance):
+    """A ball around the origin."""
+
+    radius: Tensor
+
+    def __init__(self, radius: float = 1.0, *, color: Color = WHITE) -> None:
+        """Takes its radius."""
+        super().__init__(color)
+        self.number("radius", radius, low=0, open_low=True)
+
+    def forward(self, points: Tensor) -> Tensor:
+        return length(points) - self.radius
+
+    def bounds(self, center: Tensor, half: Tensor) -> Interval:
+        """The nearest and the farthest point of the box: exact."""
+        away = center.abs()
+        near, far = (away - half).clamp(min=0), away + half
+        return length(near) - self.radius, length(far) - self.radius
+
+    def box(self) -> Tensor:
+        return _mirrored(self.radius.expand(3))
+
+
+class Box(Distance):
+    """A box around the origin, with edges rounded by a radius."""
+
+    size: Tensor
+    round: Tensor
+
+    def __init__(
+        self, size: Sequence[float] = (1.0, 1.0, 1.0), *, round: float = 0.0, color: Color = WHITE
+    ) -> None:
+        """Takes its sides and how far its edges are rounded, at most half of the shortest side."""
+        super().__init__(color)
+        self.vector("size", size, positive=True)
+        self.number("round", round, low=0, high=float(self.size.min()) / 2)
+
+    def forward(self, points: Tensor) -> Tensor:
+        beyond = points.abs() - (self.size / 2 - self.round).to(points)
+        return length(beyond.clamp(min=0)) + beyond.amax(-1).clamp(max=0) - self.round
+
+    def bounds(self, center: Tensor, half: Tensor) -> Interval:
+        """The nearest and the farthest point of the box: exact, for the value rises with |x|, |y|
+        and |z|.
+        """
+        away = center.abs()
+        return self((away - half).clamp(min=0)), self(away + half)
+
+    def box(self) -> Tensor:
+        return _mirrored(self.size / 2)
+
+
+class Torus(Distance):
+    """A ring around the z axis."""
+
+    radius: Tensor
+    tube: Tensor
+
+    def __init__(self, radius: float = 1.0, tube: float = 0.25, *, color: Color = WHITE) -> None:
+        """Takes the radius of its middle line and that of its tube."""
+        super().__init__(color)
+        self.number("radius", radius, low=0, open_low=True)
+        self.number("tube", tube, low=0, open_low=True)
+
+    def forward(self, points: Tensor) -> Tensor:
+        away = length(points[..., :2]) - self.radius
+        return length(torch.stack((away, points[..., 2]), -1)) - self.tube
+
+    def box(self) -> Tensor:
+        wide = self.radius + self.tube
+        return _mirrored(torch.stack((wide, wide, self.tube)))
+
+
+class Capsule(Distance):
+    """What is within a radius of a line from one point to another."""
+
+    start: Tensor
+    end: Tensor
+    radius: Tensor
+
+    def __init__(
+        self,
+        start: Sequence[float] = (0.0, 0.0, -0.5),
+        end: Sequence[float] = (0.0, 0.0, 0.5),
+        radius: float = 0.25,
+        *,
+        color: Color = WHITE,
+    ) -> None:
+        """Takes the ends of the line and the radius."""
+        super().__init__(color)
+        self.vector("start", start)
+        self.vector("end", end)
+        self.number("radius", radius, low=0, open_low=True)
+
+    def forward(self, points: Tensor) -> Tensor:
+        start, way = self.start.to(points), (self.end - self.start).to(points)
+        share = ((points - start) * way).sum(-1, keepdim=True) / (way * way).sum().clamp(min=1e-30)
+        return length(points - start - share.clamp(0, 1) * way) - self.radius
+
+    def box(self) -> Tensor:
+        low, high = torch.minimum(self.start, self.end), torch.maximum(self.start, self.end)
+        return torch.stack((low - self.radius, high + self.radius))
+
+
+class Plane(Distance):
+    """What lies below a plane, against its normal."""
+
+    normal: Tensor
+    height: Tensor
+
+    def __init__(
+        self,
+        normal: Sequence[float] = (0.0, 0.0, 1.0),
+        height: float = 0.0,
+        *,
+        color: Color = WHITE,
+    ) -> None:
+        """Takes the normal, of any length but 0, and how far along it the plane lies."""
+        super().__init__(color)
+        self.vector("normal", normal)
+        if not float(self.normal.norm()) > 0:
+            raise ValueError(f"Plane: normal must have a direction, got {tuple(normal)}")
+        self.normal /= self.normal.norm()
+        self.number("height", height)
+
+    def forward(self, points: Tensor) -> Tensor:
+        return (points * self.normal.to(points)).sum(-1) - self.height
+
+    def bounds(self, center: Tensor, half: Tensor) -> Interval:
+        """The corners nearest to the plane and farthest from it: exact."""
+        middle, most = self(center), (half * self.normal.abs()).sum(1)
+        return middle - most, middle + most
+
+
+class Gyroid(Distance):
+    """One side of Schoen's surface, sin x cos y + sin y cos z + sin z cos x = 0, without end. The
+    value is that sum over sqrt(3), the most that it changes by unit of length, times the length of
+    a radian: at most the distance, at the surface 0.7 to 1 times as much.
+
+    Source: Schoen, "Infinite periodic minimal surfaces without self-intersections", NASA TN D-5541,
+        1970 (the surface; the sum is its usual approximation). The slope: Cauchy's inequality
+        bounds the squares of the three derivatives, which then add up to at most 3.
+    """
+
+    period: Tensor
+    exact = False
+
+    def __init__(self, period: float = 1.0, *, color: Color = WHITE) -> None:
+        """Takes the length after which it is the same again, along every axis."""
+        super().__init__(color)
+        self.number("period", period, low=0, open_low=True)
+
+    def forward(self, points: Tensor) -> Tensor:
+        radian = self.period / (2 * math.pi)
+        sine, cosine = (points / radian).sin(), (points / radian).cos()
+        return (sine * cosine.roll(-1, -1)).sum(-1) * (radian / math.sqrt(3))
+
+
+class Menger(Distance):
+    """Menger's sponge in the cube from -1/2 to 1/2: a cube without the middle crosses of its 3^3
+    parts, and so on. The value is at most the distance.
+
+    Source: Menger, "Allgemeine Raeume und Cartesische Raeume", 1926 (the sponge); Quilez, "Menger
+        fractal", 2011 (crosses of all sizes by folding space).
+    """
+
+    exact = True  # next to its faces
+
+    def __init__(self, levels: int = 4, *, color: Color = WHITE) -> None:
+        """Takes how often parts are taken out, at most 30."""
+        super().__init__(color)
+        self.levels = check.whole("Menger", "levels", levels, low=0, high=30)
+
+    def forward(self, points: Tensor) -> Tensor:
+        beyond = points.abs() - 0.5
+        found = length(beyond.clamp(min=0)) + beyond.amax(-1).clamp(max=0)
+        cell = 1.0
+        for _ in range(self.levels):
+            # From the middle of the cell, along every axis, for cells touch at odd halves.
+            away = (points - cell * (points / cell).detach().round()).abs()
+            found = torch.maximum(found, cell / 6 - away.sort(-1).values[..., 1])
+            cell /= 3
+        return found
+
+    def box(self) -> Tensor:
+        return _mirrored(torch.full((3,), 0.5, dtype=torch.float64, device=self.color.device))
+
+
+def _mirrored(high: Tensor) -> Tensor:
+    """(2, 3) box from -high to high (3,)."""
+    return torch.stack((-high, high))

@@ -1,0 +1,310 @@
+"""`FieldProducer`: a function of place as a producer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ..base import check
+from ..base.constants import DEEP_VOXELS
+from ..fields import Distance, Field, Interval, Solid
+from ..pool import Channel
+from .producer import Bricks, Nodes, Producer, Region, Regions
+
+_BATCH = 128  # bricks that are made at a time on the CPU, whose caches then hold what is between
+_MARGIN = 1 / 32  # voxels by which boxes are taken wider, so that rounded places lie in them
+_ROUNDED = 2.0**-18  # relative width by which intervals are, for values are rounded too
+
+
+class FieldProducer(Producer):
+    """Evaluates a field where rays ask for it: any `Field`, or any module that makes values
+    (..., c), or {channel: (..., c)}, of world positions (..., 3).
+
+    A voxel of any level is the mean of `samples`^3 values spread evenly over it; fields that know
+    their own means (`Field.prefiltered`), such as `Solid`, tell them at one evaluation. Regions
+    that the field's bounds prove uniform or invisible are never made.
+
+    Attributes:
+        field: The field.
+        dtype: Of the places that it is asked for.
+    """
+
+    on_device = True
+    offsets: Tensor  # (samples^3, 3) in voxels
+
+    def __init__(
+        self,
+        field: nn.Module,
+        extent: int | Sequence[int] = 1024,
+        *,
+        box: Sequence[Sequence[float]] | None = None,
+        channels: Mapping[str, Channel] | None = None,
+        samples: int | None = None,
+        threshold: float | Mapping[str, float] | None = None,
+        dtype: torch.dtype | None = None,
+        branching: int = 2,
+        value_range: Mapping[str, tuple[float, float]] | None = None,
+    ) -> None:
+        """Takes the field and where to cut voxels out of it.
+
+        Args:
+            field: A field or module; a `Distance` stands for the `Solid` that it bounds.
+            extent: Voxels of the finest level, (x, y, z), or along the longest side of the box.
+            box: World corners ((x, y, z), (x, y, z)); left out: around what the field says that it
+                fills, 2 voxels wider.
+            channels: What voxels hold; left out: float32, or as the field names it. In channels of
+                integers 1 stands for the largest number of the dtype.
+            samples: n of the n^3 values that a voxel is the mean of; left out: `branching`, so that
+                the level above the finest is the mean of the voxels' middles below it.
+            threshold: What shows nothing is not made: the value up to which no channel is seen, or
+                by name those channels that decide; left out: the field's, or None: all is seen.
+            dtype: float32 or float64, of places; left out: float64 where float32 can't tell the
+                finest voxels apart.
+            branching: N.
+            value_range: For each channel its smallest and largest value, where they are known.
+
+        Raises:
+            ValueError: The field gives no values of the shapes above, a channel differs from what
+                it gives, its box is unknown or infinite, or a number is out of its range.
+        """
+        where = type(self).__name__
+        check.instance(where, "field", field, nn.Module)
+        field = Solid(field) if isinstance(field, Distance) else field
+        known = field if isinstance(field, Field) else None
+        if box is None:
+            extent, box = _cut_out(where, known, extent)
+        elif isinstance(extent, int):
+            extent = _cubes(where, extent, box)
+        given = _channels_of(where, field)
+        dtypes: Mapping[str, torch.dtype] = getattr(field, "dtypes", {})
+        own = {n: Channel(dtypes.get(n, torch.float32), width) for n, width in given.items()}
+        super().__init__(
+            extent,
+            channels=own if channels is None else channels,
+            box=box,
+            branching=branching,
+            value_range=value_range,
+        )
+        widths = {name: channel.width for name, channel in self.channels.items()}
+        if widths != given:
+            raise ValueError(f"{where}: channels must be {given} numbers wide, got {widths}")
+        if dtype not in (None, torch.float32, torch.float64):
+            raise ValueError(f"{where}: dtype must be torch.float32 or torch.float64, got {dtype}")
+        self.field = field
+        count = branching if samples is None else samples
+        self.samples = check.whole(where, "samples", count, low=1, high=64)
+        places = (torch.arange(self.samples, dtype=torch.float64) + 0.5) / self.samples - 0.5
+        self.register_buffer("offsets", torch.cartesian_prod(places, places, places))
+        self.threshold = self._thresholds(where, known, threshold)
+        reach = max(abs(float(end)) for corner in box for end in corner)
+        fine = reach <= 0.5 * DEEP_VOXELS * min(self.spacing)
+        self.dtype = dtype or (torch.float32 if fine else torch.float64)
+
+    def _thresholds(
+        self, where: str, field: Field | None, threshold: float | Mapping[str, float] | None
+    ) -> Mapping[str, float] | None:
+        """By channel, up to where it shows nothing."""
+        if threshold is None:
+            return None if field is None else field.threshold
+        if not isinstance(threshold, Mapping):
+            threshold = dict.fromkeys(self.channels, threshold)
+        for name in threshold:
+            if name not in self.channels:
+                known = ", ".join(self.channels)
+                raise ValueError(f"{where}: threshold has channel {name!r}; there are {known}")
+        return {n: check.number(where, "threshold", value) for n, value in threshold.items()}
+
+    def classify(self, nodes: Nodes) -> Regions:
+        """EMPTY where no channel is proven to pass its threshold, CONSTANT where all are proven to
+        have one value; and the ranges of values that are known.
+        """
+        layout = nodes.layout
+        size = nodes.voxel_size
+        half = size * (0.5 * layout.brick_size + layout.border + _MARGIN)
+        known = self._bounds(nodes.center, half, size)
+        one_value = empty = torch.zeros_like(nodes.depth, dtype=torch.bool)
+        if len(known) == len(self.channels):
+            one_value = torch.stack([(high == low).all(1) for low, high in known.values()]).all(0)
+        if self.threshold is not None and {*self.threshold} <= {*known}:
+            unseen = [(known[n][1] <= most).all(1) for n, most in self.threshold.items()]
+            empty = torch.stack(unseen).all(0)
+        kind = torch.where(one_value, int(Region.CONSTANT), int(Region.DATA))
+        kind, uniform = torch.where(empty, int(Region.EMPTY), kind), (one_value & ~empty)[:, None]
+        constants, ranges = {}, {}
+        for name, (low, high) in known.items():
+            slack = _ROUNDED * torch.maximum(low.abs(), high.abs())
+            slack = torch.where(uniform, 0.0, slack)
+            constants[name] = self._stored(name, torch.where(uniform, low, 0.0))
+            ranges[name] = self._stored(name, torch.stack((low - slack, high + slack), 1))
+        return Regions(kind=kind, constants=constants, ranges=ranges)
+
+    def fill(self, nodes: Nodes) -> Bricks:
+        """Evaluates the field at every voxel, border included."""
+        batch = _BATCH if nodes.loc.device.type == "cpu" else len(nodes)
+        parts = [self._made(nodes[at : at + batch]) for at in range(0, len(nodes), max(batch, 1))]
+        data = {name: torch.cat([part[name] for part in parts]) for name in self.channels}
+        stored = {name: self._stored(name, rows) for name, rows in data.items()}
+        whole = [n for n, channel in self.channels.items() if not channel.dtype.is_floating_point]
+        if not whole:
+            return Bricks(data=stored)
+        finite = torch.stack([data[name].isfinite().flatten(1).all(1) for name in whole]).all(0)
+        # Integers can't hold NaN: such bricks fail by a kind that there is none of.
+        return Bricks(data=stored, kind=torch.where(finite, int(Region.DATA), -1))
+
+    def at(self, points: Tensor) -> dict[str, Tensor]:
+        """Returns the values at points (..., 3), for each channel (..., c), without an engine: of
+        the field itself, in the dtype of the points, not filtered and not rounded.
+        """
+        return _by_channel(type(self).__name__, self.field(points), points)
+
+    @property
+    def time(self) -> float:
+        """The time of the parts of the field that have one, a buffer `time`; setting it makes them
+        anew (`changed`). AttributeError if none has.
+        """
+        return float(self._clocks()[0])
+
+    @time.setter
+    def time(self, value: float) -> None:
+        time = check.number(type(self).__name__, "time", value)
+        for clock in self._clocks():
+            clock.fill_(time)
+        self.changed()
+
+    def _clocks(self) -> list[Tensor]:
+        clocks = [one for n, one in self.field.named_buffers() if n.rpartition(".")[2] == "time"]
+        if not clocks:
+            raise AttributeError(f"{type(self).__name__}: no part of the field has a time")
+        return clocks
+
+    def _made(self, nodes: Nodes) -> dict[str, Tensor]:
+        """Values of the voxels of some bricks, (k, z, y, x, c) by channel."""
+        where, field = type(self).__name__, self.field
+        size = nodes.voxel_size.to(self.dtype)[:, None, None, None]
+        if isinstance(field, Field) and field.prefiltered:
+            points = self._points(nodes.wider(field.margin))
+            found = _by_channel(where, field.filtered(points, size), points)
+            if field.margin == 0:
+                return found
+            side = nodes.layout.side
+            like = points[:, :side, :side, :side]
+            return _by_channel(where, field.finish(found, size[:, 0, 0, 0]), like)
+        points = self._points(nodes)
+        total: dict[str, Any] = {}
+        for offset in self.offsets.to(size).unbind(0):
+            values = _by_channel(where, self.field(points + size * offset), points)
+            total = {name: total.get(name, 0) + value for name, value in values.items()}
+        return {name: value / len(self.offsets) for name, value in total.items()}
+
+    def _points(self, nodes: Nodes) -> Tensor:
+        """(k, z, y, x, 3) world positions of the voxels, border included."""
+        if self.dtype == torch.float64:
+            return nodes.center[:, None, None, None] + nodes.local_positions
+        return nodes.positions
+
+    def _bounds(self, center: Tensor, half: Tensor, size: Tensor) -> dict[str, Interval]:
+        """For each channel of which anything is known, its interval, (k, c) each."""
+        if not isinstance(self.field, Field):
+            return {}
+        found = self.field.filtered_bounds(center, half, size)
+        if found is None:
+            return {}
+        by_channel = found if isinstance(found, Mapping) else {"value": found}
+        known = {}
+        for name, ends in by_channel.items():
+            width = self.channels[name].width
+            shape = (len(center), width)
+            low, high = (end[:, None] if end.dim() == 1 else end for end in ends)
+            if low.shape != shape or high.shape != shape:
+                raise ValueError(
+                    f"{type(self.field).__name__}.bounds: {name!r} must be ({len(center)}, {width})"
+                    f" each, got {check.describe(low)} and {check.describe(high)}"
+                )
+            known[name] = (low, high)
+        return known
+
+    def _stored(self, name: str, values: Tensor) -> Tensor:
+        """Values in a channel's dtype."""
+        channel = self.channels[name]
+        least, most = channel.limits
+        if channel.dtype.is_floating_point:
+            return values.clamp(least, most).to(channel.dtype)
+        return (values * most).round().clamp(least, most).to(channel.dtype)
+
+
+def cache_field(
+    field: nn.Module, extent: int | Sequence[int] = 1024, **options: Any
+) -> FieldProducer:
+    """Returns a producer of any module from positions (..., 3) to values (..., c), or to these by
+    channel, such as a network: the engine keeps what rays ask for. Arguments as `FieldProducer`.
+    """
+    return FieldProducer(field, extent, **options)
+
+
+def _by_channel(where: str, values: Any, points: Tensor) -> dict[str, Tensor]:
+    """Values of a field at points (..., 3) as (..., c) by channel; ValueError if they are not."""
+    if isinstance(values, Tensor):
+        values = {"value": values}
+    if not isinstance(values, Mapping) or not values:
+        raise ValueError(
+            f"{where}: field must give a tensor, or a dict of them, got {type(values).__name__}"
+        )
+    found, lead = {}, points.shape[:-1]
+    for name, value in values.items():
+        if not isinstance(value, Tensor) or not value.dtype.is_floating_point:
+            raise ValueError(
+                f"{where}: field must give floats for {name!r}, got {check.describe(value)}"
+            )
+        wide = value[..., None] if value.shape == lead else value
+        if wide.shape[:-1] != lead:
+            sizes = ", ".join(str(size) for size in lead)
+            raise ValueError(
+                f"{where}: field must give ({sizes}) or ({sizes}, c) for {name!r} "
+                f"at ({sizes}, 3) points, got {check.describe(value)}"
+            )
+        found[name] = wide
+    return found
+
+
+def _channels_of(where: str, field: nn.Module) -> dict[str, int]:
+    """By channel, how many numbers a field gives: it is asked for 2 x 5 points."""
+    there = [*field.parameters(), *field.buffers()]
+    device = there[0].device if there else torch.device("cpu")
+    points = torch.full((2, 5, 3), 0.25, device=device)
+    with torch.no_grad():
+        if isinstance(field, Field) and field.prefiltered:
+            values = field.filtered(points, points)
+        else:
+            values = field(points)
+    return {n: value.shape[-1] for n, value in _by_channel(where, values, points).items()}
+
+
+def _cut_out(where: str, field: Field | None, extent: int | Sequence[int]) -> tuple[Any, Any]:
+    """Extent and box around what a field fills, 2 voxels wider."""
+    box = None if field is None else field.box()
+    if box is None or not bool(torch.isfinite(box).all()) or not bool((box[1] > box[0]).all()):
+        raise ValueError(f"{where}: box must be given: the field does not tell where it ends")
+    sides, middle = box[1] - box[0], box.mean(0)
+    if isinstance(extent, int):
+        check.whole(where, "extent", extent, low=5, high=2**40)
+        voxel = sides.max() / (extent - 4)
+        extent = [math.ceil(float(side / voxel) - 1e-9) + 4 for side in sides]
+        half = torch.tensor(extent, dtype=torch.float64) * voxel / 2
+    else:
+        half = sides / 2 * (1 + 4 / torch.tensor([max(n, 5) - 4 for n in extent]))
+    return extent, ((middle - half).tolist(), (middle + half).tolist())
+
+
+def _cubes(where: str, extent: int, box: Sequence[Sequence[float]]) -> list[int]:
+    """Extent along x, y, z, so that voxels of a box are cubes or nearly so."""
+    if len(box) != 2:
+        raise ValueError(f"{where}: box must be two corners, got {box!r}")
+    low, high = (check.triple(where, "box", corner) for corner in box)
+    sides = [b - a for a, b in zip(low, high, strict=True)]
+    check.whole(where, "extent", extent, low=1, high=2**40)
+    check.triple(where, "sides of the box", sides, positive=True)
+    return [max(1, round(extent * side / max(sides))) for side in sides]

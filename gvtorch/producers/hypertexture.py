@@ -1,0 +1,268 @@
+"""`Hypertexture`: noise around the surface of a shape, made where rays ask for it.
+
+Sources: Perlin, Hoffert, "Hypertexture", SIGGRAPH 1989 (density functions around a soft surface);
+    the GigaVoxels presentation at AFIG 2012 (the formula, and to stop at the octave from which on
+    nothing can change any more). How voxels are filtered is our own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from ..base.constants import DEEP_VOXELS
+from ..fields import Distance, noise
+from ..fields.noise.fractal import Octave, octaves_of
+from ..pool import Channel
+from .producer import Layout, Nodes, Producer, Region, Regions
+
+_BATCH = 128  # bricks that are made at a time on the CPU, whose caches then hold what is between
+_COARSEST = 1.5  # cells a voxel, from which on the mean tells nothing of the noise
+_GRID = 0.5  # cells a voxel, up to which noise is made grid by grid
+_ROUNDED = 1e-4  # what rounding may add to a sum of octaves, in units of the amplitude
+
+
+class Level(NamedTuple):
+    """What the voxels of a level are made with."""
+
+    octaves: list[Octave]  # with amplitudes as the voxels see them
+    left: list[float]  # the most that octave 0, 1, ... and all after it can add
+    soft: float  # half the width of the step from 0 to 1
+    side: float  # of a voxel, world units
+
+
+class Hypertexture(Producer):
+    """Density around a shape's surface:
+
+        density = smoothstep(1/2 - softness, 1/2 + softness)(s),
+        s = -distance / thickness + amplitude * noise(frequency * place),
+
+    where noise is a sum of octaves. An octave is left out where density is 0 or 1 already, whatever
+    it and all after it add, brick by brick; the voxels' bits are the same with and without it. And
+    regions are never made where the distance proves that.
+
+    A voxel is the mean over its cube, to a good approximation: an octave counts by as much as its
+    mean follows it, and what is lost in the mean, of noise and of the distance, makes the step from
+    0 to 1 wider: the smoothstep is replaced by the one that has the variance of them all.
+
+    Channels are "density", and "distance" if asked for: that of the shape, in world units, by which
+    a transfer function may colour (`Isosurface(0.5, colors, color_channel="distance")`).
+
+    Attributes:
+        wanted: Octaves of voxels that a plain sum would have taken so far.
+        made: Those that were evaluated.
+        skip: Whether octaves are left out; may be changed at any time.
+    """
+
+    on_host = True
+
+    def __init__(
+        self,
+        shape: Distance,
+        extent: int | Sequence[int] = 1024,
+        *,
+        thickness: float,
+        amplitude: float = 1.0,
+        frequency: float = 1.0,
+        octaves: int = 6,
+        lacunarity: float = 2.0,
+        gain: float = 0.5,
+        softness: float = 0.1,
+        seed: int = 0,
+        distances: bool = False,
+        skip: bool = True,
+        box: Sequence[Sequence[float]] | None = None,
+        dtype: torch.dtype = torch.float16,
+    ) -> None:
+        """Takes the shape, and how rough it is.
+
+        Args:
+            shape: Any distance field, which may change by more than 1 a unit if it tells so.
+            extent: Voxels of the finest level, (x, y, z), or along the longest side of the box.
+            thickness: World units by which the surface moves where s changes by 1.
+            amplitude: Of the first octave, in s.
+            frequency: Cells of the first octave a world unit.
+            octaves, lacunarity, gain, seed: As in `noise.fbm`.
+            softness: Half the width of the step from 0 to 1, in s.
+            distances: Whether there is a channel "distance".
+            skip: Whether octaves that can't matter are left out.
+            box: World corners; left out: around the shape and what noise adds to it.
+            dtype: Of the channels: float16, bfloat16 or float32.
+
+        Raises:
+            ValueError: A number is out of its range, the dtype another, or there is no box.
+        """
+        where = type(self).__name__
+        check.instance(where, "shape", shape, Distance)
+        thickness = check.number(where, "thickness", thickness, low=0, open_low=True)
+        amplitude = check.number(where, "amplitude", amplitude, low=0)
+        frequency = check.number(where, "frequency", frequency, low=0, open_low=True)
+        softness = check.number(where, "softness", softness, low=0, open_low=True)
+        series = [*octaves_of(where, octaves, lacunarity, gain, seed)]
+        most = amplitude * sum(one.amplitude for one in series) * noise.bounds(noise.perlin).high
+        reach = thickness * max(most + softness - 0.5, 0.0)
+        extent, box = _cut_out(where, shape, reach, extent, box)
+        if not dtype.is_floating_point:
+            raise ValueError(f"{where}: dtype must be one of floats, got {dtype}")
+        channels = {"density": Channel(dtype)}
+        if distances:
+            channels["distance"] = Channel(dtype)
+        super().__init__(extent, channels=channels, box=box, value_range={"density": (0.0, 1.0)})
+        self.shape, self.skip = shape, skip
+        self.thickness, self.softness = thickness, softness
+        self.octaves = [
+            Octave(amplitude * one.amplitude, frequency * one.frequency, one.seed) for one in series
+        ]
+        self.wanted = self.made = 0
+        far = max(abs(float(end)) for corner in box for end in corner)
+        fine = far <= 0.5 * DEEP_VOXELS * min(self.spacing)
+        self.dtype = torch.float32 if fine else torch.float64
+        self._levels: list[Level] = []
+        self._worn = torch.empty(0)
+
+    @property
+    def saved(self) -> float:
+        """The share of octaves that were not evaluated, 0 to 1."""
+        return 1 - self.made / max(self.wanted, 1)
+
+    def prepare(self, layout: Layout) -> None:
+        """Works out what the voxels of each level are made with."""
+        sides = [max(layout.spacing) * layout.branching**n for n in range(layout.depth, -1, -1)]
+        self._levels = [self._level(side) for side in sides]
+        worn = [level.left[0] + level.soft for level in self._levels]
+        # What holds at a node must hold at all finer ones.
+        finer = [max(worn[depth:]) for depth in range(len(worn))]
+        self._worn = torch.tensor(finer, dtype=torch.float64, device=layout.device)
+
+    def level_of(self, depth: int) -> Level:
+        """Returns what the voxels of a depth are made with; known once an engine uses this."""
+        return self._levels[depth]
+
+    def _level(self, side: float) -> Level:
+        """Returns what voxels of a side, in world units, are made with."""
+        kept, variance = [], self.softness**2 / 5 + (side / self.thickness) ** 2 / 12
+        for one in self.octaves:
+            cells = side * one.frequency
+            share = math.exp(-noise.LOST * cells * cells) if cells <= _COARSEST else 0.0
+            variance += one.amplitude**2 * noise.VARIANCE * (1 - share * share)
+            if share:
+                kept.append(one._replace(amplitude=one.amplitude * share))
+        high = noise.bounds(noise.perlin).high
+        left = [high * sum(one.amplitude for one in kept[n:]) for n in range(len(kept) + 1)]
+        margin = _ROUNDED * max(1.0, *left)
+        left = [one + margin for one in left]
+        return Level(kept, left, math.sqrt(5 * variance), side)
+
+    def at(self, points: Tensor) -> dict[str, Tensor]:
+        """Returns the channels (..., 1) at points (..., 3), of the points' dtype, not filtered."""
+        distance = self.shape(points)
+        total = distance * (-1 / self.thickness)
+        for one in self.octaves:
+            total = total + one.amplitude * noise.perlin(points * one.frequency, seed=one.seed)
+        return self._channels(total, distance, self.softness)
+
+    def classify(self, nodes: Nodes) -> Regions:
+        """EMPTY and CONSTANT where the distance proves density 0 or 1 whatever the noise is."""
+        layout = nodes.layout
+        half = nodes.voxel_size * (0.5 * layout.brick_size + layout.border)
+        low, high = self.shape.bounds(nodes.center, half)
+        worn = self._worn.to(low.device)[nodes.depth]
+        kind = torch.full_like(nodes.depth, Region.DATA)
+        if "distance" not in self.channels:
+            full = -high / self.thickness - worn >= 0.5
+            kind = torch.where(full, Region.CONSTANT, kind)
+        kind = torch.where(-low / self.thickness + worn <= 0.5, Region.EMPTY, kind)
+        is_full = (kind == Region.CONSTANT)[:, None].to(self.channels["density"].dtype)
+        return Regions(kind=kind, constants={"density": is_full})
+
+    def fill(self, nodes: Nodes) -> dict[str, Tensor]:
+        """Makes the bricks, level by level, in batches."""
+        side = nodes.layout.side
+        shape = (len(nodes), side, side, side, 1)
+        device = nodes.loc.device
+        data = {
+            name: torch.empty(shape, dtype=channel.dtype, device=device)
+            for name, channel in self.channels.items()
+        }
+        for depth in nodes.depth.unique().tolist():
+            here = (nodes.depth == depth).nonzero()[:, 0]
+            for rows in here.split(_BATCH if device.type == "cpu" else len(here)):
+                for name, values in self._made(nodes[rows], self.level_of(depth)).items():
+                    data[name][rows] = values.to(data[name].dtype)
+        return data
+
+    def _made(self, nodes: Nodes, level: Level) -> dict[str, Tensor]:
+        """Channels (k, z, y, x, 1) of nodes of a level."""
+        if self.dtype == torch.float64:
+            points = nodes.center[:, None, None, None] + nodes.local_positions
+        else:
+            points = nodes.positions
+        distance = self.shape(points)
+        total = distance * (-1 / self.thickness)
+        centers = nodes.center
+        axes = [
+            centers[:, axis, None] + local.flatten(1) for axis, local in enumerate(nodes.local_axes)
+        ]
+        active = torch.arange(len(nodes), device=total.device)
+        values = total.clone()
+        self.wanted += total.numel() * len(level.octaves)
+        for number, one in enumerate(level.octaves):
+            if self.skip:
+                away = (values - 0.5).abs().flatten(1).amin(1)
+                needed = (away < level.soft + level.left[number]).nonzero()[:, 0]
+                if len(needed) < len(active):
+                    total[active] = values
+                    active, values = active[needed], values[needed]
+            if not len(active):
+                break
+            self.made += values.numel()
+            places = [(axis[active] * one.frequency).to(self.dtype) for axis in axes]
+            values = values + one.amplitude * _noise_at(
+                places, one.seed, level.side * one.frequency
+            )
+        total[active] = values
+        return self._channels(total, distance, level.soft)
+
+    def _channels(self, total: Tensor, distance: Tensor, soft: float) -> dict[str, Tensor]:
+        """The channels (..., 1) out of s and distances (...)."""
+        t = ((total - (0.5 - soft)) / (2 * soft)).clamp(0, 1)
+        found = {"density": t * t * (3 - 2 * t), "distance": distance}
+        return {name: found[name][..., None] for name in self.channels}
+
+
+def _noise_at(axes: Sequence[Tensor], seed: int, spacing: float) -> Tensor:
+    """Gradient noise (k, z, y, x) at all combinations of coordinates along x, y, z, (k, s) each,
+    which lie at most `spacing` apart.
+    """
+    if spacing <= _GRID:
+        cells = math.ceil((axes[0].shape[1] - 1) * spacing) + 1
+        return noise.perlin_grid(*axes, seed=seed, cells=cells)
+    x, y, z = axes
+    points = x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]
+    return noise.perlin(points, seed=seed)
+
+
+def _cut_out(
+    where: str,
+    shape: Distance,
+    reach: float,
+    extent: int | Sequence[int],
+    box: Sequence[Sequence[float]] | None,
+) -> tuple[Sequence[int], Sequence[Sequence[float]]]:
+    """Extent along x, y, z, and a box: left out, what lies within `reach` of the shape's."""
+    if box is None:
+        own = shape.box()
+        if own is None or not bool(own.isfinite().all()):
+            raise ValueError(f"{where}: box must be given: the shape does not tell where it ends")
+        box = [(own[0] - reach).tolist(), (own[1] + reach).tolist()]
+    if not isinstance(extent, int):
+        return extent, box
+    check.whole(where, "extent", extent, low=1, high=2**40)
+    sides = [high - low for low, high in zip(*box, strict=True)]
+    check.triple(where, "sides of the box", sides, positive=True)
+    return [max(1, round(extent * side / max(sides))) for side in sides], box

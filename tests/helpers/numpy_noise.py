@@ -1,0 +1,138 @@
+"""Noises point by point in plain NumPy and float64: what `gv.noise` is tested against."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+
+FIRST, SECOND = 0x2C1B3C6D, 0x297A2D39
+AXIS = (0x632BE59B, 0x4F1BBCDD, 0x1E3779B9)
+WORD = 0xFFFFFFFF
+
+
+def signed_shift(word: int, by: int) -> int:
+    """Shift to the right of 32 bits that keeps the sign."""
+    value = word - 2**32 if word >= 2**31 else word
+    return (value >> by) & WORD
+
+
+def salt(seed: int, axis: int) -> int:
+    word = (seed + (seed >> 32) * 0x61C88647) & WORD
+    word = (word * 0x9E3779B1 + AXIS[axis]) & WORD
+    word = (word ^ word >> 16) * FIRST & WORD
+    word = (word ^ word >> 16) * SECOND & WORD
+    return word ^ word >> 15
+
+
+def scramble(place: int, seed: int, axis: int) -> int:
+    word = ((place & WORD) ^ salt(seed, axis)) * FIRST & WORD
+    word = (word ^ signed_shift(word, 15)) * SECOND & WORD
+    return word ^ signed_shift(word, 13)
+
+
+def join(first: int, second: int) -> int:
+    word = (first ^ second) * FIRST & WORD
+    return (word ^ signed_shift(word, 15)) * SECOND & WORD
+
+
+def lattice_hash(place, seed, period=None) -> int:
+    """Hash of a lattice point (x, y) or (x, y, z)."""
+    every = period or (None,) * len(place)
+    place = [one if p is None else one % p for one, p in zip(place, every, strict=True)]
+    words = [scramble(one, seed, axis) for axis, one in enumerate(place)]
+    word = words[0]
+    for other in words[1:]:
+        word = join(word, other)
+    return word
+
+
+def edge(word: int) -> tuple[float, float, float]:
+    """The middle of a cube's edge that a hash chooses."""
+    first = -1.0 if word >> 6 & 1 else 1.0
+    second = -1.0 if word >> 7 & 1 else 1.0
+    part = signed_shift(word, 8)
+    part = part - 2**32 if part >= 2**31 else part
+    if part + 2796203 < 0:  # the first third
+        return (0.0, first, second)
+    if 2796203 - part < 0:  # the last third
+        return (first, second, 0.0)
+    return (first, 0.0, second)
+
+
+def fade(t: float) -> float:
+    return 6 * t**5 - 15 * t**4 + 10 * t**3
+
+
+def _on_lattice(point, corner_value) -> float:
+    cell = [math.floor(one) for one in point]
+    total = 0.0
+    for step in itertools.product((0, 1), repeat=len(point)):
+        corner = [a + b for a, b in zip(cell, step, strict=True)]
+        away = [a - b for a, b in zip(point, corner, strict=True)]
+        weight = math.prod(fade(1 - abs(one)) for one in away)
+        total += weight * corner_value(corner, away)
+    return total
+
+
+def perlin(point, seed=0, period=None) -> float:
+    def ramp(corner, away):
+        return float(np.dot(edge(lattice_hash(corner, seed, period))[: len(away)], away))
+
+    return _on_lattice(point, ramp)
+
+
+def value(point, seed=0, period=None) -> float:
+    def random(corner, _):
+        word = lattice_hash(corner, seed, period)
+        return (word - 2**32 if word >= 2**31 else word) / 2**31
+
+    return _on_lattice(point, random)
+
+
+def simplex(point, seed=0, period=None) -> float:
+    """The sum over all corners near the point, however far from its own simplex."""
+    n = len(point)
+    skew, back = ((3**0.5 - 1) / 2, (3 - 3**0.5) / 6) if n == 2 else (1 / 3, 1 / 6)
+    middle = [round(one + skew * sum(point)) for one in point]
+    total = 0.0
+    for step in itertools.product(range(-3, 4), repeat=n):
+        corner = [a + b for a, b in zip(middle, step, strict=True)]
+        away = np.subtract(point, np.subtract(corner, back * sum(corner)))
+        near = 0.5 - float(away @ away)
+        if near <= 0:
+            continue
+        place, every = corner, period
+        if n == 3:
+            place = [6 * one - sum(corner) for one in corner]
+            every = period and [6 * one for one in period]
+        total += near**4 * float(np.dot(edge(lattice_hash(place, seed, every))[:n], away))
+    return total * (70.148 if n == 2 else 76.88)
+
+
+def cellular(point, feature="F1", jitter=1.0, reach=1, seed=0, period=None) -> float:
+    """Sorted distances to the points of all cells near, cut at `reach`."""
+    cell = [math.floor(one) for one in point]
+    found = []
+    for step in itertools.product(range(-3, 4), repeat=len(point)):
+        corner = [a + b for a, b in zip(cell, step, strict=True)]
+        every = period or (None,) * len(point)
+        wrapped = [one if p is None else one % p for one, p in zip(corner, every, strict=True)]
+        words = [scramble(one, seed, axis) for axis, one in enumerate(wrapped)]
+        word = words[-1]
+        for other in words[-2::-1]:
+            word = join(word, other)
+        stray = [(word >> 2 + 10 * axis & 1023) / 1023 for axis in range(len(point))]
+        at = [c + 0.5 * (1 - jitter) + jitter * s for c, s in zip(corner, stray, strict=True)]
+        found.append(math.dist(at, point))
+    first, second = (min(one, reach) for one in sorted(found)[:2])
+    return {"F1": first, "F2": second, "F2-F1": second - first}[feature]
+
+
+def fbm(point, octaves=6, lacunarity=2.0, gain=0.5, seed=0) -> float:
+    total = 0.0
+    for octave in range(octaves):
+        place = [one * lacunarity**octave for one in point]
+        total += gain**octave * perlin(place, seed + octave * 0x10001)
+    return total

@@ -1,0 +1,180 @@
+"""Fields made of fields, values that change with time, and values at points without an engine."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers.pictures import GRAY, camera
+
+import gvtorch as gv
+from gvtorch.fields import Field
+
+BOX = ((-1, -1, -1), (1, 1, 1))
+
+
+class Ramp(Field):
+    """Rises along x, from 0 at -1 to 1 at 1, clamped to a part of that."""
+
+    def __init__(self, low=0.0, high=1.0):
+        super().__init__()
+        self.low, self.high = low, high
+
+    def forward(self, points):
+        return ((points[..., 0] + 1) / 2).clamp(self.low, self.high)
+
+    def bounds(self, center, half):
+        return self(center - half), self(center + half)
+
+
+class Pulse(Field):
+    """A ball that grows with time."""
+
+    def __init__(self):
+        super().__init__()
+        self.number("time", 0.5)
+
+    def forward(self, points):
+        return (self.time - points.norm(dim=-1)).clamp(min=0)
+
+    def bounds(self, center, half):
+        far = center.norm(dim=1)
+        reach = half.norm(dim=1)
+        return (self.time - far - reach).clamp(min=0), (self.time - far + reach).clamp(min=0)
+
+
+class Sway(torch.nn.Module):
+    def forward(self, points):
+        return 0.3 * (5 * points.flip(-1)).sin()
+
+
+def random_points(count=4000):
+    generator = torch.Generator().manual_seed(5)
+    return 2.4 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1.2
+
+
+FIELDS = {
+    "warp": lambda: gv.warp(Pulse(), Sway(), most=0.2),
+    "blend": lambda: gv.blend(Ramp(0.2, 0.4), Pulse(), Ramp()),
+    "mask": lambda: gv.mask(Pulse(), Ramp()),
+    "stack": lambda: gv.stack(a=Ramp(), b=Pulse(), rock=gv.stack(c=Ramp(0.1, 0.3))),
+}
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_intervals_of_combinations_hold(name):
+    field, generator = FIELDS[name](), torch.Generator().manual_seed(6)
+    center = random_points(20_000)
+    half = 10 ** (-2 * torch.rand(20_000, 1, generator=generator).double()) * torch.ones(3)
+    at = 2 * torch.rand(20_000, 30, 3, generator=generator).double() - 1
+    values, known = field(center[:, None] + half[:, None] * at), field.bounds(center, half)
+    if isinstance(values, torch.Tensor):
+        values, known = {"value": values}, {"value": known}
+    assert {*values} == {*known}
+    for channel, rows in values.items():
+        low, high = known[channel]
+        assert (rows >= low[:, None] - 1e-12).all() and (rows <= high[:, None] + 1e-12).all()
+        assert ((high - low) < 0.5).double().mean() > 0.2
+
+
+def test_combinations_are_what_their_words_say():
+    points = random_points()
+    ramp, pulse = Ramp()(points), Pulse()(points)
+    assert torch.allclose(gv.mask(Pulse(), Ramp())(points), ramp * pulse)
+    blend = gv.blend(Ramp(0.2, 0.4), Pulse(), Ramp())(points)
+    assert torch.allclose(blend, (1 - ramp) * Ramp(0.2, 0.4)(points) + ramp * pulse)
+    way = Sway()(points)
+    way = way * (0.2 / way.norm(dim=1, keepdim=True)).clamp(max=1)
+    assert torch.allclose(gv.warp(Pulse(), Sway(), most=0.2)(points), Pulse()(points + way))
+    stack = gv.stack(a=Ramp(), rock=gv.stack(c=Ramp(0.1, 0.3)))(points)
+    assert [*stack] == ["a", "rock_c"] and torch.equal(stack["a"], ramp)
+    shape = gv.Painted(gv.sdf.Sphere(), Sway())
+    assert torch.equal(shape.surface(points)[1], Sway()(points).clamp(0, 1))
+
+
+@pytest.mark.backend("cpp")
+def test_another_time_is_made_anew_and_is_as_if_it_had_always_been():
+    view = camera(32, distance=1.6)
+    producer = gv.FieldProducer(Pulse(), 64, box=BOX, threshold=0.0)
+    with gv.Engine(producer, brick_size=4) as engine:
+        first = engine.render(view, GRAY)
+        assert producer.time == 0.5 and not engine.changed
+        producer.time = 0.9
+        assert engine.changed
+        second = engine.render(view, GRAY)
+        engine.validate()
+        assert not engine.changed and second.stats.produced["bricks"] > 0
+        producer.time = 0.5
+        third = engine.render(view, GRAY)
+        engine.validate()
+        again = engine.render(view, GRAY)
+        assert not any(again.stats.produced.values())
+    late = gv.FieldProducer(Pulse(), 64, box=BOX, threshold=0.0)
+    late.time = 0.9
+    with gv.Engine(late, brick_size=4) as engine:
+        assert torch.equal(engine.render(view, GRAY).color, second.color)
+    assert torch.equal(first.color, third.color) and not torch.equal(first.color, second.color)
+
+
+@pytest.mark.backend("cpp")
+def test_only_the_tree_that_changed_is_made_anew():
+    """Two trees in one pool: what the other holds stays."""
+    still = gv.FieldProducer(Ramp(), 32, box=((2, -1, -1), (4, 1, 1)))
+    moving = gv.FieldProducer(Pulse(), 32, box=BOX, threshold=0.0)
+    view = gv.Camera.look_at((1.5, 0, 9), (1.5, 0, 0), (0, 1, 0), 40, 32, 32)
+    with gv.Engine({"still": still, "moving": moving}, brick_size=4) as engine:
+        engine.render(view, GRAY, lod="finest")
+        pool = engine.cache.nodes
+        before = int(((pool.tree_t == 0) & (pool.parent_t >= 0)).sum())
+        moving.time = 0.8
+        engine.frame(view, GRAY)
+        engine.validate()
+        assert int(((pool.tree_t == 0) & (pool.parent_t >= 0)).sum()) == before > 0
+        assert engine.render(view, GRAY).stats.converged
+
+
+def test_a_field_without_a_time_says_so():
+    with pytest.raises(AttributeError, match="no part of the field has a time"):
+        gv.FieldProducer(Ramp(), 32, box=BOX).time = 1.0
+    with pytest.raises(ValueError, match="time must be finite"):
+        gv.FieldProducer(Pulse(), 32, box=BOX).time = float("nan")
+
+
+def test_a_network_becomes_a_producer():
+    """Any module: here one whose values are known at the voxels' middles."""
+    torch.manual_seed(0)
+    network = torch.nn.Sequential(torch.nn.Linear(3, 16), torch.nn.Tanh(), torch.nn.Linear(16, 2))
+    producer = gv.cache_field(network, 16, box=BOX, samples=1)
+    assert producer.channels == {"value": gv.Channel(torch.float32, 2)}
+    points = random_points(50).float()
+    assert torch.equal(producer.at(points)["value"], network(points))
+
+
+@pytest.mark.backend("cpp")
+def test_producers_of_any_kind_tell_values_at_points(blobs):
+    """Trilinear between voxels, as a dense interpolation by torch gives."""
+    points = torch.rand(500, 3).double() * 60 - 5
+    producer = gv.VolumeProducer(blobs)
+    found = producer.at(points)["value"][:, 0]
+    data = blobs.data[..., 0].float()
+    z, y, x = data.shape
+    size = torch.tensor((x, y, z)).double()
+    place = (points - torch.tensor(blobs.origin)) / torch.tensor(blobs.spacing)
+    place = torch.minimum(place.clamp(min=0), size - 1)
+    grid = (2 * place / (size - 1) - 1).float().view(1, 1, 1, -1, 3)
+    expected = torch.nn.functional.grid_sample(data[None, None], grid, align_corners=True)
+    assert (found - expected.flatten()).abs().max() < 1e-3 * data.abs().max()
+    with gv.Engine(producer, brick_size=8) as engine:
+        assert torch.allclose(producer.at(points)["value"][:, 0], found, atol=1e-4)
+        assert engine.trees
+
+
+def test_wider_nodes_are_the_same_voxels_and_more():
+    from gvtorch.producers import Layout
+
+    producer = gv.FieldProducer(Ramp(), 32, box=BOX)
+    layout = Layout.of(producer, 4, 1, torch.device("cpu"))
+    nodes = gv.Nodes(torch.tensor([[0, 0, 0, 0], [3, 1, 2, 2], [7, 7, 0, 3]]), layout)
+    wide = nodes.wider(2)
+    assert wide.positions.shape == (3, 10, 10, 10, 3)
+    assert torch.equal(wide.positions[:, 2:-2, 2:-2, 2:-2], nodes.positions)
+    assert nodes.wider(2).layout is wide.layout and nodes.wider(0).layout is layout

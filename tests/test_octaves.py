@@ -1,0 +1,108 @@
+"""Octaves by level: what children take over of their parents' bricks, against the direct sum."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import gvtorch as gv
+
+noise = gv.noise
+
+
+def axes_of(corner: torch.Tensor, side: float) -> list[torch.Tensor]:
+    """Places of the voxels of bricks of 8^3 and a border of 1, from their (k, 3) low corners on."""
+    reach = (torch.arange(-1, 9, dtype=torch.float64) + 0.5) * side
+    return [corner[:, axis, None] + reach for axis in range(3)]
+
+
+def descent(total, levels, count=40, side=1 / 16, seed=0):
+    """From `count` random bricks down: by level its axes, voxel side, sums and what is settled."""
+    random = torch.Generator().manual_seed(seed)
+    corner = torch.randint(-9, 9, (count, 3), generator=random) * 8.0 * side
+    parents = child = None
+    for _ in range(levels):
+        axes = axes_of(corner, side)
+        found, settled = total.bricks(axes, side, parents, child)
+        yield axes, side, found, settled
+        child = torch.randint(0, 2, (count, 3), generator=random)
+        corner, side, parents = corner + child * 4 * side, side / 2, settled
+
+
+def direct(total, axes, side):
+    x, y, z = axes
+    points = x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]
+    parts = [
+        one.amplitude * noise.perlin([p * one.frequency for p in points], seed=one.seed)
+        for one in total.held(side)
+    ]
+    return torch.stack(parts).sum(0)
+
+
+def test_polynomials_are_inherited_exactly():
+    random = torch.Generator().manual_seed(1)
+    corner = torch.rand((20, 3), generator=random, dtype=torch.float64)
+    child = torch.randint(0, 3, (20, 3), generator=random)
+
+    def values(axes):
+        x, y, z = axes[0][:, None, None, :], axes[1][:, None, :, None], axes[2][:, :, None, None]
+        return (x**5 - x) * (y**4 + 2 * y) * (1 - z**5) + x - 2 * y * z
+
+    parents = values(axes_of(corner, 0.1))
+    children = values(axes_of(corner + child.double() * 0.8 / 3, 0.1 / 3))
+    found = noise.inherit(parents, child, branching=3)
+    torch.testing.assert_close(found, children, atol=1e-9, rtol=0)
+    assert (noise.inherit(parents, child, branching=3, points=4) - children).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize(("settled", "most"), [(4, 0.2), (8, 8e-3), (16, 9e-4), (32, 9e-5)])
+def test_levels_equal_the_direct_sum(settled, most):
+    total = noise.OctaveSum(octaves=14, gain=0.6, settled=settled)
+    worst = 0.0
+    for axes, side, found, _ in descent(total, 11):
+        worst = max(worst, float((found - direct(total, axes, side)).abs().max()))
+    assert len(total.held(side)) == 14 and 0.05 * most < worst < most
+
+
+def test_what_is_never_settled_is_the_direct_sum():
+    total = noise.OctaveSum(octaves=8, settled=float("inf"))
+    for axes, side, found, settled in descent(total, 5):
+        torch.testing.assert_close(found, direct(total, axes, side), atol=1e-12, rtol=0)
+        assert not settled.any()
+    assert total.made == total.wanted
+
+
+def test_a_level_evaluates_four_octaves_however_many_there_are():
+    total = noise.OctaveSum(octaves=14, settled=16)
+    before = 0
+    for depth, (_, side, found, _) in enumerate(descent(total, 11)):
+        made, before = total.made - before, total.made
+        held = len(total.held(side))
+        assert held == min(depth + 4, 14)
+        # Those whose cells are 2, 4, 8 and, for the last time, 16 voxels wide.
+        assert made == min(4, 14 - depth) * found.numel()
+    assert total.made < 0.45 * total.wanted
+
+
+def test_bricks_without_parents_are_whole():
+    total = noise.OctaveSum(octaves=10)
+    for axes, side, found, settled in descent(total, 6):
+        alone, calm = total.bricks(axes, side)
+        assert (alone - direct(total, axes, side)).abs().max() < 1e-12
+        assert (alone - found).abs().max() < 1e-3 and (calm - settled).abs().max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda p, c: noise.inherit(p[..., 1:], c), "parents must be (k, s, s, s) floats, got (2,"),
+        (lambda p, c: noise.inherit(p, c[:1]), "child must be (2, 3) int64, got (1, 3) int64"),
+        (lambda p, c: noise.inherit(p, c, border=0), "border must be an int >= 1 and <= 4, got 0"),
+        (lambda p, c: noise.inherit(p, c, points=11), "points must be an int >= 2 and <= 10"),
+        (lambda p, c: noise.OctaveSum(settled=1), "settled must be >= hold, 2, got 1"),
+    ],
+)
+def test_bad_input_gives_one_clear_line(call, message):
+    with pytest.raises(ValueError, match="noise") as error:
+        call(torch.zeros(2, 10, 10, 10), torch.zeros(2, 3, dtype=torch.int64))
+    assert message in str(error.value) and "\n" not in str(error.value)
