@@ -215,11 +215,11 @@ def renew_tree(cache: Cache, made: ProducedTree, patience: float) -> None:
     own = nodes.tree_t == number
     tile = (own & (nodes.parent_t >= 0)).nonzero()[:, 0]
     slot = ((bricks.owner_b >= 0) & own[bricks.owner_b.clamp(min=0) // per_tile]).nonzero()[:, 0]
-    unlink(nodes.child_tn, tile.to(torch.int32), nodes.capacity)
-    unlink(nodes.brick_tn, slot.to(torch.int32), bricks.capacity)
+    unlink(nodes.child_tn, nodes.parent_t, nodes.shared_t, tile.to(torch.int32))
+    unlink(nodes.brick_tn, bricks.owner_b, bricks.shared_b, slot.to(torch.int32))
     nodes.child_tn[tile], nodes.brick_tn[tile], nodes.request_tn[tile] = ABSENT, ABSENT, 0
-    nodes.parent_t[tile], nodes.stamp_t[tile], nodes.shared_t[tile] = -1, -1, False
-    bricks.owner_b[slot], bricks.stamp_b[slot], bricks.shared_b[slot] = -1, -1, False
+    nodes.stamp_t[tile], nodes.shared_t[tile] = -1, False
+    bricks.stamp_b[slot], bricks.shared_b[slot] = -1, False
     nodes.child_tn[number], nodes.brick_tn[number], nodes.request_tn[number] = TERMINAL, EMPTY, 0
     _fill_root(cache, made, patience)
 
