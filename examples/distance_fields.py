@@ -57,7 +57,7 @@ def main(settings: Settings) -> None:
     with gv.Engine(producer, brick_pool="1 GB", device=settings.device) as engine:
         found = engine.render(camera, paint, **options)  # without light: less is traced again
         print(f"{producer}: {found.stats}")
-        picture, _ = engine.frame(camera, paint, lighting=light, **options)
+        picture = engine.render(camera, paint, "balanced", productions=2, lighting=light, **options)
     picture.save(settings.output)
     print(f"{settings.output}: {picture.stats.bricks_used} bricks in use")
 

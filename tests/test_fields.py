@@ -545,3 +545,31 @@ def test_values_at_points_need_no_engine():
     producer, points = gv.FieldProducer(Waves(), box=BOX), random_points(10)
     found = producer.at(points)
     assert torch.equal(found["a"][:, 0], points.sum(-1).sin()) and found["b"].shape == (10, 2)
+
+
+def test_deep_voxels_are_told_apart():
+    """2^33 voxels a side: places are float64 by themselves, and values those of the field there."""
+    bulb = gv.Mandelbulb(8, iterations=20)
+    producer = gv.FieldProducer(bulb, 2**33)
+    assert producer.dtype == torch.float64
+    assert gv.FieldProducer(bulb, 2**16).dtype == torch.float32
+    layout = Layout.of(producer, 8, 1, torch.device("cpu"))
+    ways = torch.nn.functional.normalize(random_points(400), dim=1)
+    near, far = torch.zeros(400, 1).double(), torch.full((400, 1), 1.3).double()
+    for _ in range(50):  # onto the surface: the middle is inside, the end is not
+        middle = (near + far) / 2
+        inside = bulb(ways * middle)[:, None] < 0
+        near, far = torch.where(inside, middle, near), torch.where(inside, far, middle)
+    points = ways * near
+    voxel = ((points - layout.origin_3) / layout.spacing_3).floor().to(torch.int64)
+    depth = torch.full_like(voxel[:, :1], layout.depth)
+    nodes = gv.Nodes(torch.cat((voxel // 8, depth), 1), layout)
+    rgba = producer.fill(nodes).data["rgba"]
+    across = (rgba[:, :, :, 1:, 3] - rgba[:, :, :, :-1, 3]).abs().amax((1, 2, 3))
+    assert (across > 0).double().mean() > 0.3, "bricks of 2e-9 of the box see the surface"
+    places = nodes.center[:, None, None, None] + nodes.local_positions
+    side = nodes.voxel_size[:, :1, None, None]
+    expected = (0.5 - bulb(places) / side).clamp(0, 1)
+    assert (rgba[..., 3] - expected).abs().max() < 1e-3
+    empty = producer.classify(nodes).kind == gv.Region.EMPTY
+    assert not rgba[empty].any()
