@@ -1,4 +1,4 @@
-"""A sphere that is computed, not stored: your own producer, and its picture.
+"""A sphere that is computed, not stored: a formula of your own, and its picture.
 
 65,536^3 voxels would take 1,100 TB; the picture needs a few MB of them.
 """
