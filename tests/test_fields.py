@@ -11,6 +11,7 @@ from helpers.pictures import GRAY, camera
 
 import gvtorch as gv
 from gvtorch.fields import Field
+from gvtorch.fields.fractals import Power
 from gvtorch.producers import Layout
 
 sdf = gv.sdf
@@ -249,6 +250,33 @@ def test_fractals_are_those_of_numpy(name):
     expected, found = by_numpy(points.numpy()), make()(points).numpy()
     same = np.isclose(found, expected, rtol=1e-6, atol=1e-12)
     assert same.mean() > 0.999 and (expected < 0).any(), "rounding may tip who escapes"
+
+
+class Burning(gv.Iteration):
+    """A step of one's own: the bulb's of n = 2, of coordinates without their signs."""
+
+    def __init__(self):
+        super().__init__()
+        self.power = Power(2)
+
+    def forward(self, z):
+        return self.power(z.abs())
+
+
+def test_any_iteration_makes_a_fractal_and_what_is_not_known_is_not_proven():
+    shape, points = gv.Fractal(Burning(), iterations=8), random_points(500, 3.0)
+    expected = np_escape(points.numpy(), lambda z: np_power(np.abs(z), 2), None, 8, 2.0, np_log)
+    assert np.isclose(shape(points).numpy(), expected, rtol=1e-6).mean() > 0.995
+    center, half = random_boxes(2000)
+    low, high = shape.bounds(center, half)
+    value = shape(inside(center, half, 20))
+    assert (value >= low[:, None]).all() and (value <= high[:, None]).all()
+    center, half = torch.full((1, 3), 5.0).double(), torch.full((1, 3), 0.1).double()
+    assert shape.bounds(center, half)[0] > 0, "beyond the bailout it escapes at once"
+    with pytest.raises(ValueError, match="Fractal: iteration must be a Iteration, got int"):
+        gv.Fractal(3)
+    with pytest.raises(ValueError, match="colors must be three colours, got 1"):
+        gv.Mandelbulb(colors=((0, 0, 0),))
 
 
 def random_points(count, side=4.0, seed=0):
