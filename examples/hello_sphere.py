@@ -1,4 +1,4 @@
-"""A sphere that is computed, not stored: your own producer, and its picture.
+"""A sphere that is computed, not stored: a formula of your own, and its picture.
 
 65,536^3 voxels would take 1,100 TB; the picture needs a few MB of them.
 """
@@ -8,26 +8,22 @@ import tyro
 
 import gvtorch as gv
 
-RADIUS, BANDS = 0.9, torch.tensor([6.0, 28.0, 4.0])
+BOX = ((-1, -1, -1), (1, 1, 1))
+BANDS = torch.tensor([6.0, 28.0, 4.0])
 
 
-class Sphere(gv.Producer):
-    """Bands of density 0.4 to 1 inside the radius, with a rim one voxel wide."""
+class Bands(torch.nn.Module):
+    """Density 0.4 to 1, in bands."""
 
-    def classify(self, nodes):
-        outside = nodes.center.norm(dim=1) - nodes.radius > RADIUS
-        return torch.where(outside, gv.Region.EMPTY, gv.Region.DATA)
-
-    def fill(self, nodes):
-        gap = RADIUS - nodes.positions.norm(dim=-1, keepdim=True)
-        inside = (0.5 + gap / nodes.voxel_size.float()[:, None, None, None, :1]).clamp(0, 1)
-        bands = (nodes.positions * BANDS.to(gap)).sum(-1, keepdim=True).sin()
-        return {"value": inside * (0.7 + 0.3 * bands)}
+    def forward(self, points):
+        return 0.7 + 0.3 * (points * BANDS.to(points)).sum(-1).sin()
 
 
 def main(output: str = "hello_sphere.png", device: str = "cpu", size: int = 400) -> None:
     """Renders the sphere."""
-    engine = gv.Engine(Sphere(65536, box=((-1, -1, -1), (1, 1, 1))), device=device)
+    inside = gv.Solid(gv.sdf.Sphere(0.9), colors=False)
+    sphere = gv.FieldProducer(gv.mask(Bands(), inside), 65536, box=BOX, threshold=0)
+    engine = gv.Engine(sphere, device=device)
     look = gv.TransferFunction.from_points(
         [(0, 0), (0.4, 0.9)], [(0.4, 0.1, 0.2, 0.7), (1, 1, 0.8, 0.4)], reference=0.06
     )

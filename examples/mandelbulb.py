@@ -10,7 +10,7 @@ import tyro
 
 import gvtorch as gv
 
-SUN = gv.DirectionalLight((1.0, -0.5, -1.2), (1.7, 1.4, 1.05), angle=4)
+SUN = gv.DirectionalLight((0.3, -1.0, -0.9), (1.35, 1.1, 0.8), angle=4)
 SKY = gv.Gradient((0.02, 0.03, 0.05), (0.2, 0.22, 0.26))
 COLORS = ((1.0, 0.8, 0.45), (0.75, 0.22, 0.12), (0.1, 0.18, 0.35))  # of three orbit traps
 
@@ -35,12 +35,14 @@ def main(settings: Settings) -> None:
     }[settings.fractal]
     producer = gv.FieldProducer(gv.Solid(shape, normals=False), settings.extent)
     stone = gv.StoredColor(
-        "rgba", premultiplied=True, lit=True, light=SUN, ambient=0.45, diffuse=1.0, specular=0.15
+        "rgba", premultiplied=True, lit=True, light=SUN, ambient=0.4, diffuse=0.85, specular=0.15
     )
     size = {"width": settings.size * 16 // 9, "height": settings.size}
-    camera = gv.Camera.orbit(35, 28, distance=1.5, **size)
+    camera = gv.Camera.orbit(35, 28, distance=1.8, **size)
     options = {"cone_scale": 3.0, "background": SKY}
-    light = gv.Lighting(ambient=(0.5, 0.7, 1.0), occlusion=1.0, reach=0.08, frame="box", cones=4)
+    light = gv.Lighting(  # no shadows: its own crevices shade it enough
+        ambient=(0.6, 0.75, 1.0), shadows=0, occlusion=1.0, reach=0.12, frame="box", cones=3
+    )
     with gv.Engine(producer, brick_pool="1 GB", device=settings.device) as engine:
         found = engine.render(camera, stone, **options)  # without light: less is traced again
         print(f"{producer}: {found.stats}")

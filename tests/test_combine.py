@@ -8,6 +8,7 @@ from helpers.pictures import GRAY, camera
 
 import gvtorch as gv
 from gvtorch.fields import Field
+from gvtorch.producers import Layout
 
 BOX = ((-1, -1, -1), (1, 1, 1))
 
@@ -91,6 +92,25 @@ def test_combinations_are_what_their_words_say():
     assert torch.equal(shape.surface(points)[1], Sway()(points).clamp(0, 1))
 
 
+def test_a_mask_hides_what_it_hides():
+    """A plain module behind a solid: its mean is taken where the solid is, elsewhere none is."""
+    network = torch.nn.Linear(3, 2)
+    field = gv.mask(network, gv.Solid(gv.sdf.Sphere(0.7), colors=False))
+    producer = gv.FieldProducer(field, 64, box=BOX, threshold=0)
+    axis = torch.arange(8)
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+    layout = Layout.of(producer, 8, 1, torch.device("cpu"))
+    nodes = gv.Nodes(torch.stack((x, y, z, torch.full_like(x, 3)), -1).flatten(0, 2), layout)
+    kind, data = producer.classify(nodes).kind, producer.fill(nodes).data["value"]
+    inside = (0.5 - (nodes.positions.norm(dim=-1) - 0.7) * 32).clamp(0, 1)[..., None]
+    assert torch.allclose(data, network(nodes.positions) * inside, atol=1e-5)
+    assert not data[kind == gv.Region.EMPTY].any() and (kind == gv.Region.EMPTY).sum() > 200
+    with pytest.raises(ValueError, match="takes no field with a margin"):
+        gv.mask(network, gv.Solid(gv.Mandelbulb()))
+    with pytest.raises(ValueError, match="needs one channel, got rgba, normal"):
+        gv.mask(network, gv.Solid(gv.sdf.Sphere()))(torch.zeros(2, 3))
+
+
 @pytest.mark.backend("cpp")
 def test_another_time_is_made_anew_and_is_as_if_it_had_always_been():
     view = camera(32, distance=1.6)
@@ -118,7 +138,7 @@ def test_another_time_is_made_anew_and_is_as_if_it_had_always_been():
 @pytest.mark.backend("cpp")
 def test_only_the_tree_that_changed_is_made_anew():
     """Two trees in one pool: what the other holds stays."""
-    still = gv.FieldProducer(Ramp(), 32, box=((2, -1, -1), (4, 1, 1)))
+    still = gv.FieldProducer(Ramp(-9, 9), 32, box=((2, -1, -1), (4, 1, 1)))
     moving = gv.FieldProducer(Pulse(), 32, box=BOX, threshold=0.0)
     view = gv.Camera.look_at((1.5, 0, 9), (1.5, 0, 0), (0, 1, 0), 40, 32, 32)
     with gv.Engine({"still": still, "moving": moving}, brick_size=4) as engine:
@@ -169,8 +189,6 @@ def test_producers_of_any_kind_tell_values_at_points(blobs):
 
 
 def test_wider_nodes_are_the_same_voxels_and_more():
-    from gvtorch.producers import Layout
-
     producer = gv.FieldProducer(Ramp(), 32, box=BOX)
     layout = Layout.of(producer, 4, 1, torch.device("cpu"))
     nodes = gv.Nodes(torch.tensor([[0, 0, 0, 0], [3, 1, 2, 2], [7, 7, 0, 3]]), layout)

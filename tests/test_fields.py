@@ -11,6 +11,7 @@ from helpers.pictures import GRAY, camera
 
 import gvtorch as gv
 from gvtorch.fields import Field
+from gvtorch.fields.fractals import Power
 from gvtorch.producers import Layout
 
 sdf = gv.sdf
@@ -249,6 +250,33 @@ def test_fractals_are_those_of_numpy(name):
     expected, found = by_numpy(points.numpy()), make()(points).numpy()
     same = np.isclose(found, expected, rtol=1e-6, atol=1e-12)
     assert same.mean() > 0.999 and (expected < 0).any(), "rounding may tip who escapes"
+
+
+class Burning(gv.Iteration):
+    """A step of one's own: the bulb's of n = 2, of coordinates without their signs."""
+
+    def __init__(self):
+        super().__init__()
+        self.power = Power(2)
+
+    def forward(self, z):
+        return self.power(z.abs())
+
+
+def test_any_iteration_makes_a_fractal_and_what_is_not_known_is_not_proven():
+    shape, points = gv.Fractal(Burning(), iterations=8), random_points(500, 3.0)
+    expected = np_escape(points.numpy(), lambda z: np_power(np.abs(z), 2), None, 8, 2.0, np_log)
+    assert np.isclose(shape(points).numpy(), expected, rtol=1e-6).mean() > 0.995
+    center, half = random_boxes(2000)
+    low, high = shape.bounds(center, half)
+    value = shape(inside(center, half, 20))
+    assert (value >= low[:, None]).all() and (value <= high[:, None]).all()
+    center, half = torch.full((1, 3), 5.0).double(), torch.full((1, 3), 0.1).double()
+    assert shape.bounds(center, half)[0] > 0, "beyond the bailout it escapes at once"
+    with pytest.raises(ValueError, match="Fractal: iteration must be a Iteration, got int"):
+        gv.Fractal(3)
+    with pytest.raises(ValueError, match="colors must be three colours, got 1"):
+        gv.Mandelbulb(colors=((0, 0, 0),))
 
 
 def random_points(count, side=4.0, seed=0):
@@ -545,3 +573,31 @@ def test_values_at_points_need_no_engine():
     producer, points = gv.FieldProducer(Waves(), box=BOX), random_points(10)
     found = producer.at(points)
     assert torch.equal(found["a"][:, 0], points.sum(-1).sin()) and found["b"].shape == (10, 2)
+
+
+def test_deep_voxels_are_told_apart():
+    """2^33 voxels a side: places are float64 by themselves, and values those of the field there."""
+    bulb = gv.Mandelbulb(8, iterations=20)
+    producer = gv.FieldProducer(bulb, 2**33)
+    assert producer.dtype == torch.float64
+    assert gv.FieldProducer(bulb, 2**16).dtype == torch.float32
+    layout = Layout.of(producer, 8, 1, torch.device("cpu"))
+    ways = torch.nn.functional.normalize(random_points(400), dim=1)
+    near, far = torch.zeros(400, 1).double(), torch.full((400, 1), 1.3).double()
+    for _ in range(50):  # onto the surface: the middle is inside, the end is not
+        middle = (near + far) / 2
+        inside = bulb(ways * middle)[:, None] < 0
+        near, far = torch.where(inside, middle, near), torch.where(inside, far, middle)
+    points = ways * near
+    voxel = ((points - layout.origin_3) / layout.spacing_3).floor().to(torch.int64)
+    depth = torch.full_like(voxel[:, :1], layout.depth)
+    nodes = gv.Nodes(torch.cat((voxel // 8, depth), 1), layout)
+    rgba = producer.fill(nodes).data["rgba"]
+    across = (rgba[:, :, :, 1:, 3] - rgba[:, :, :, :-1, 3]).abs().amax((1, 2, 3))
+    assert (across > 0).double().mean() > 0.3, "bricks of 2e-9 of the box see the surface"
+    places = nodes.center[:, None, None, None] + nodes.local_positions
+    side = nodes.voxel_size[:, :1, None, None]
+    expected = (0.5 - bulb(places) / side).clamp(0, 1)
+    assert (rgba[..., 3] - expected).abs().max() < 1e-3
+    empty = producer.classify(nodes).kind == gv.Region.EMPTY
+    assert not rgba[empty].any()

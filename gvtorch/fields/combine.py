@@ -7,7 +7,7 @@ What an interval of the parts tells of the whole is worked out by interval arith
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
@@ -96,43 +96,69 @@ class Stack(Field):
             {name: check.instance("Stack", name, one, nn.Module) for name, one in fields.items()}
         )
 
+        self.prefiltered = _prefiltered("Stack", fields.values())
+
     def forward(self, points: Tensor) -> Mapping[str, Tensor]:
         return _flat({name: field(points) for name, field in self.fields.items()})
 
+    def filtered(self, points: Tensor, size: Tensor) -> Mapping[str, Tensor]:
+        """What is not prefiltered is taken at the middles of voxels."""
+        return _flat({name: _ask(field, points, size) for name, field in self.fields.items()})
+
     def bounds(self, center: Tensor, half: Tensor) -> Mapping[str, Interval]:
-        known = {}
-        for name, field in self.fields.items():
-            found = field.bounds(center, half) if isinstance(field, Field) else None
-            if found is not None:
-                known[name] = found
-        return _flat(known)
+        return self.filtered_bounds(center, half, None)
+
+    def filtered_bounds(
+        self, center: Tensor, half: Tensor, size: Tensor | None
+    ) -> Mapping[str, Interval]:
+        known = {n: _known(field, center, half, size) for n, field in self.fields.items()}
+        return _flat({name: found for name, found in known.items() if found is not None})
 
 
 class Blend(Field):
     """The one field where a mask is 0, the other where it is 1, and a mix between."""
 
     def __init__(self, first: nn.Module, second: nn.Module, mask: nn.Module) -> None:
-        """Takes two fields of the same channels, and a mask of one value."""
+        """Takes two fields of the same channels, and a mask of one value, such as the density of a
+        `Solid`.
+        """
         super().__init__()
-        self.first = check.instance("Blend", "first", first, nn.Module)
-        self.second = check.instance("Blend", "second", second, nn.Module)
-        self.mask = check.instance("Blend", "mask", mask, nn.Module)
+        where = type(self).__name__
+        self.first = check.instance(where, "first", first, nn.Module)
+        self.second = check.instance(where, "second", second, nn.Module)
+        self.mask = check.instance(where, "mask", mask, nn.Module)
+
+        self.prefiltered = _prefiltered(where, (first, second, mask))
 
     def forward(self, points: Tensor) -> Values:
-        first, second, share = self.first(points), self.second(points), self.mask(points)
-        if isinstance(first, Mapping):
+        return self._mix(self.first(points), self.second(points), self.mask(points))
+
+    def filtered(self, points: Tensor, size: Tensor) -> Values:
+        """Mixes means; what is not prefiltered is taken at the middles of voxels."""
+        parts = (self.first, self.second, self.mask)
+        first, second, share = (_ask(part, points, size) for part in parts)
+        return self._mix(first, second, share)
+
+    def _mix(self, first: Values, second: Values, mask: Values) -> Values:
+        share = _single(mask)
+        if isinstance(first, Mapping) and isinstance(second, Mapping):
             return {name: _mixed(one, second[name], share) for name, one in first.items()}
-        return _mixed(first, second, share)
+        return _mixed(_single(first), _single(second), share)
 
     def bounds(self, center: Tensor, half: Tensor) -> Bounds:
+        return self.filtered_bounds(center, half, None)
+
+    def filtered_bounds(self, center: Tensor, half: Tensor, size: Tensor | None) -> Bounds:
         """What lies between both; one alone where the mask is known to be 0 or 1."""
-        parts = (self.first, self.second)
-        found = [part.bounds(center, half) if isinstance(part, Field) else None for part in parts]
+        found = [_known(part, center, half, size) for part in (self.first, self.second)]
         if found[0] is None or found[1] is None:
             return None
-        share = self.mask.bounds(center, half) if isinstance(self.mask, Field) else None
+        share = _known(self.mask, center, half, size)
         none = torch.zeros_like(center[:, 0])
-        low, high = (none, none + 1) if share is None or isinstance(share, Mapping) else share
+        if isinstance(share, Mapping):
+            share = next(iter(share.values())) if len(share) == 1 else None
+        low, high = (none, none + 1) if share is None else share
+        low, high = low.reshape(len(none)), high.reshape(len(none))
         if isinstance(found[0], Mapping) and isinstance(found[1], Mapping):
             both = {*found[0]} & {*found[1]}
             return {n: _between(found[0][n], found[1][n], low, high) for n in both}
@@ -142,35 +168,78 @@ class Blend(Field):
 
 
 class Mask(Blend):
-    """A field where a mask is 1, and nothing, 0, where it is 0."""
+    """A field where a mask is 1, and nothing, 0, where it is 0: there nothing is made."""
 
     def __init__(self, field: nn.Module, mask: nn.Module) -> None:
-        """Takes the field and a mask of one value."""
-        super().__init__(_Nothing(field), field, mask)
+        """Takes the field and a mask of one value; see `Blend`."""
+        super().__init__(field, field, mask)
         if isinstance(field, Field):
-            self.threshold, self.dtypes = field.threshold, field.dtypes
+            self.dtypes = field.dtypes
 
-
-class _Nothing(Field):
-    """0 in all channels of a field."""
-
-    def __init__(self, field: nn.Module) -> None:
-        super().__init__()
-        self.field = check.instance("Mask", "field", field, nn.Module)
+    def _mix(self, first: Values, second: Values, mask: Values) -> Values:
+        if isinstance(first, Mapping):
+            return {n: _mixed(torch.zeros_like(v), v, _single(mask)) for n, v in first.items()}
+        return _mixed(torch.zeros_like(first), first, _single(mask))
 
     def forward(self, points: Tensor) -> Values:
-        values = self.field(points)
-        if isinstance(values, Mapping):
-            return {name: torch.zeros_like(one) for name, one in values.items()}
-        return torch.zeros_like(values)
+        return self._mix(values := self.first(points), values, self.mask(points))
 
-    def bounds(self, center: Tensor, half: Tensor) -> Bounds:
-        found = self.field.bounds(center, half) if isinstance(self.field, Field) else None
-        if found is None:
-            return None
+    def filtered(self, points: Tensor, size: Tensor) -> Values:
+        values = _ask(self.first, points, size)
+        return self._mix(values, values, _ask(self.mask, points, size))
+
+    def filtered_bounds(self, center: Tensor, half: Tensor, size: Tensor | None) -> Bounds:
+        """0 where the mask is; else between 0 and the field."""
+        share = _known(self.mask, center, half, size)
+        if isinstance(share, Mapping):
+            share = next(iter(share.values())) if len(share) == 1 else None
+        none = torch.zeros_like(center[:, 0])
+        low, high = (none, none + 1) if share is None else share
+        low, high = low.reshape(len(none)), high.reshape(len(none))
+        found = _known(self.first, center, half, size)
+        if found is None:  # of a field of one number, what is hidden is known all the same
+            wild = torch.full_like(none, torch.inf)
+            found = (-wild, wild)
         if isinstance(found, Mapping):
-            return {n: (torch.zeros_like(a), torch.zeros_like(b)) for n, (a, b) in found.items()}
-        return torch.zeros_like(found[0]), torch.zeros_like(found[1])
+            return {n: _between(_zero(one), one, low, high) for n, one in found.items()}
+        return _between(_zero(found), found, low, high)
+
+
+def _zero(interval: Interval) -> Interval:
+    return torch.zeros_like(interval[0]), torch.zeros_like(interval[1])
+
+
+def _prefiltered(where: str, parts: Iterable[nn.Module]) -> bool:
+    """Whether any part tells its own means; ValueError where one needs its neighbours for them."""
+    fields = [part for part in parts if isinstance(part, Field)]
+    if any(field.margin for field in fields):
+        raise ValueError(f"{where}: takes no field with a margin, such as a Solid of differences")
+    return any(field.prefiltered for field in fields)
+
+
+def _ask(part: nn.Module, points: Tensor, size: Tensor) -> Values:
+    """The means over voxels, or the values at their middles."""
+    if isinstance(part, Field) and part.prefiltered:
+        return part.filtered(points, size)
+    return part(points)
+
+
+def _known(part: nn.Module, center: Tensor, half: Tensor, size: Tensor | None) -> Bounds:
+    """What a part is known to be, of voxels of `size` if there is one."""
+    if not isinstance(part, Field):
+        return None
+    if size is None or not part.prefiltered:
+        return part.bounds(center, half)
+    return part.filtered_bounds(center, half, size)
+
+
+def _single(values: Values) -> Tensor:
+    """(...,) of a field of one number; ValueError where there are several channels."""
+    if isinstance(values, Mapping):
+        if len(values) != 1:
+            raise ValueError(f"Blend: needs one channel, got {', '.join(values)}")
+        (values,) = values.values()
+    return values
 
 
 def _flat(by_name: Mapping[str, Any]) -> dict[str, Any]:
@@ -187,7 +256,11 @@ def _flat(by_name: Mapping[str, Any]) -> dict[str, Any]:
 def _mixed(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
     """Between two values (...,) or (..., c), by a share (...,), which is taken to 0 to 1."""
     share = share.clamp(0, 1)
-    return torch.lerp(first, second, share if first.dim() == share.dim() else share[..., None])
+    if first.dim() < share.dim():
+        share = share[..., 0]
+    elif first.dim() > share.dim():
+        share = share[..., None]
+    return torch.lerp(first, second, share)
 
 
 def _between(first: Interval, second: Interval, low: Tensor, high: Tensor) -> Interval:

@@ -5,10 +5,11 @@ A point z runs through z -> f(z) + c again and again. Those that stay within `ba
 fractal. Of those that escape, a distance is estimated from how fast neighbours part.
 
 **What is proven.** The estimate is no bound: for the bulb, whose map stretches more along circles
-of latitude than the number that is used for all directions, it can be several times too large. So
-intervals do not trust it. They follow the middle of a box, and a radius around it that holds the
-orbits of all points of the box (`Iteration.ranges` bounds how much the map stretches there). That
-bounds where and when they escape, and so the very number that `forward` gives, whatever it means.
+of latitude than the number that is used for all directions, it is more than 30 times too large in
+places next to the axis. So intervals do not trust it. They follow the middle of a box, and a radius
+around it that holds the orbits of all points of the box (`Iteration.ranges` bounds how much the map
+stretches there). That bounds where and when they escape, and so the very number that `forward`
+gives, whatever it means.
 
 Sources: White, Nylander, "The Mandelbulb", 2009 (z^n in spherical coordinates); Lowe, "Mandelbox",
     2010; Hart, Sandin, Kauffman, "Ray tracing deterministic 3-D fractals", SIGGRAPH 1989 (distance

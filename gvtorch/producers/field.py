@@ -216,9 +216,11 @@ class FieldProducer(Producer):
         by_channel = found if isinstance(found, Mapping) else {"value": found}
         known = {}
         for name, ends in by_channel.items():
+            if name not in self.channels:
+                continue
             width = self.channels[name].width
             shape = (len(center), width)
-            low, high = (end[:, None] if end.dim() == 1 else end for end in ends)
+            low, high = (e[:, None].expand(shape) if e.dim() == 1 else e for e in ends)
             if low.shape != shape or high.shape != shape:
                 raise ValueError(
                     f"{type(self.field).__name__}.bounds: {name!r} must be ({len(center)}, {width})"
