@@ -17,7 +17,7 @@ FLOORS = [
     {"base"},
     {"cpp_ext"},
     {"ops"},
-    {"pool"},
+    {"meshes", "pool"},
     {"cameras", "io"},
     {"cache", "opengl", "pictures", "producers", "shaders"},
     {"tracing"},

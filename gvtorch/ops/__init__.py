@@ -23,6 +23,7 @@ from .trace import (
     trace_rays,
     trace_segments,
 )
+from .voxelize import voxelize
 
 __all__ = [
     "RayArguments",
@@ -47,4 +48,5 @@ __all__ = [
     "trace_rays",
     "trace_segments",
     "unlink",
+    "voxelize",
 ]
