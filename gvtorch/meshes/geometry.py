@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -138,7 +137,7 @@ class Geometry:
         """Side of the cubes that have lists of their own: the largest into which a cube can be cut
         that has few triangles, as far as their mean size tells.
         """
-        size = (0.5 * self.area.sum() / len(self.corner)).sqrt().clamp(min=1e-300)
+        size = (self.area.sum() / len(self.corner)).sqrt()
         most = max(1.0, math.sqrt(_LONG) * float(size / voxel_3.max()))
         fitting = [n for n in range(1, min(side, MOST_VOXELS) + 1) if side % n == 0]
         return max(n for n in fitting if n <= most or n == 1)
@@ -196,9 +195,3 @@ class Geometry:
             start = (steps + 0.5) * quarter
             none = self.winding(low + start.to(low.dtype) * unit)
         return voxelize(corner, solid, first, start, none, voxel, side, thickness / unit)
-
-
-def box_of(mesh: Mesh) -> tuple[np.ndarray, float]:
-    """(2, 3) bounds of a mesh, and its longest side."""
-    bounds = mesh.bounds
-    return bounds, float((bounds[1] - bounds[0]).max())

@@ -132,17 +132,16 @@ def solids(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """
     _, same = np.unique(mesh.vertices, axis=0, return_inverse=True)
     faces = same.reshape(-1)[mesh.faces]
-    whole = (faces != np.roll(faces, 1, axis=1)).all(1)
-    kept = np.flatnonzero(whole)
+    same_two = faces == np.roll(faces, 1, axis=1)
+    kept = np.flatnonzero(~same_two.any(1))
     if not len(kept):
         raise ValueError(f"{mesh.name}: no triangle has three corners")
     faces = faces[kept]
     turned = np.sort(faces, axis=1)
-    even = _is_even(faces)
     _, first, place = np.unique(turned, axis=0, return_index=True, return_inverse=True)
     place = place.reshape(-1)
     ways = np.zeros((len(first), 2), bool)
-    ways[place, even.astype(int)] = True
+    ways[place, _evenness(faces)] = True
     back_to_back = ways.all(1)
     faces, kept = faces[first], kept[first]
     order = np.argsort(kept)  # as they came
@@ -150,10 +149,10 @@ def solids(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     return kept, _closed(faces, ~back_to_back) & ~back_to_back
 
 
-def _is_even(faces: np.ndarray) -> np.ndarray:
-    """(f,) bool whether the corners' order is an even permutation of their sorted one."""
+def _evenness(faces: np.ndarray) -> np.ndarray:
+    """(f,) 1 where the corners' order is an even permutation of their sorted one, else 0."""
     a, b, c = faces.T
-    return ((a < b).astype(int) + (b < c) + (a < c)) % 2 == 1
+    return ((a < b).astype(np.int64) + (b < c) + (a < c)) % 2
 
 
 def _closed(faces: np.ndarray, counted: np.ndarray) -> np.ndarray:

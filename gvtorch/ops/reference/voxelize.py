@@ -68,7 +68,8 @@ def _nearest(place_p3: Tensor, corner_n33: Tensor) -> tuple[Tensor, Tensor, Tens
     normal = _cross(b - a, c - a)
     length2 = _dot(normal, normal)
     inside = (length2 > 0).expand(len(place_p3), -1)
-    best, toward = None, None
+    best = torch.full(inside.shape, torch.inf, dtype=a.dtype, device=a.device)
+    toward = torch.zeros_like(normal).expand(*inside.shape, 3)
     for corner, edge in ((a, b - a), (b, c - b), (c, a - c)):
         beside = _cross(edge, normal)  # out of the triangle
         from_corner = place_p3[:, None] - corner
@@ -78,11 +79,8 @@ def _nearest(place_p3: Tensor, corner_n33: Tensor) -> tuple[Tensor, Tensor, Tens
         along = (_dot(from_corner, edge) * inverse).clamp(0, 1)
         from_edge = from_corner - edge * along[..., None]
         gap2 = _dot(from_edge, from_edge)
-        if best is None:
-            best, toward = gap2, from_edge
-        else:
-            toward = torch.where((gap2 < best)[..., None], from_edge, toward)
-            best = torch.minimum(gap2, best)
+        toward = torch.where((gap2 < best)[..., None], from_edge, toward)
+        best = torch.minimum(gap2, best)
     height = _dot(normal, place_p3[:, None] - a)
     over = height * height / torch.where(length2 > 0, length2, 1)
     best = torch.where(inside, over, best)

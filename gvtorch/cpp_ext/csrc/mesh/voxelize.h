@@ -22,12 +22,24 @@ constexpr double kFlat = 1e-3, kTouch = 1e-6;
   X(Int, side, kMostVoxels + 1)        \
   X(Float, thickness, kAny)
 
+// The voxels of a row that are looked at together: on the CPU a vector of float32, else one.
+#ifdef __CUDACC__
 template <class T>
-GV_HD Vec3<T> minus(Vec3<T> a, Vec3<T> b) {
+using Together = T;
+#else
+template <class T>
+using Together = std::conditional_t<std::is_same_v<T, float>, Floats, T>;
+#endif
+template <class T>
+constexpr int32_t kTogether = static_cast<int32_t>(sizeof(Together<T>) / sizeof(T));
+
+// A place may be of one number an axis, or of a vector of them (F) where the triangle's are numbers (T).
+template <class F, class T>
+GV_HD Vec3<F> minus(Vec3<F> a, Vec3<T> b) {
   return {a.x - b.x, a.y - b.y, a.z - b.z};
 }
-template <class T>
-GV_HD T inner(Vec3<T> a, Vec3<T> b) {
+template <class F, class T>
+GV_HD auto inner(Vec3<F> a, Vec3<T> b) {
   return a.x * b.x + a.y * b.y + a.z * b.z;
 }
 template <class T>
@@ -39,13 +51,15 @@ GV_HD Vec3<T> outer(Vec3<T> a, Vec3<T> b) {
 template <class T>
 struct Triangle {
   Vec3<T> corner[3], edge[3], beside[3], normal;
-  T inverse2[3], length2;
+  T inverse2[3], length2, most;  // most: what `beside` may give inside; less where there is no area
 
   GV_HD explicit Triangle(const T* at) {
     for (int i = 0; i < 3; ++i) corner[i] = {at[3 * i], at[3 * i + 1], at[3 * i + 2]};
     for (int i = 0; i < 3; ++i) edge[i] = minus(corner[(i + 1) % 3], corner[i]);
     normal = outer(edge[0], minus(corner[2], corner[0]));
-    length2 = inner(normal, normal);
+    const T squared = inner(normal, normal);
+    length2 = squared > 0 ? squared : static_cast<T>(1);
+    most = static_cast<T>(squared > 0 ? 0 : -1);
     for (int i = 0; i < 3; ++i) {
       beside[i] = outer(edge[i], normal);
       const T edge2 = inner(edge[i], edge[i]);
@@ -53,29 +67,25 @@ struct Triangle {
     }
   }
 
-  GV_HD Vec3<T> from_edge(int i, Vec3<T> place) const {
-    const Vec3<T> from = minus(place, corner[i]);
-    const T along = inner(from, edge[i]) * inverse2[i];
-    const T raised = along > 0 ? along : static_cast<T>(0);
-    const T t = raised < 1 ? raised : static_cast<T>(1);
-    return {from.x - edge[i].x * t, from.y - edge[i].y * t, from.z - edge[i].z * t};
+  template <class F>
+  GV_HD Vec3<F> from_edge(int i, Vec3<F> place) const {
+    const Vec3<F> from = minus(place, corner[i]);
+    const F t = clamp(inner(from, edge[i]) * inverse2[i], F{}, F{} + 1);
+    return {from.x - t * edge[i].x, from.y - t * edge[i].y, from.z - t * edge[i].z};
   }
-  // Whether the nearest place of the triangle's plane lies in the triangle. No branches: rows are done in vectors.
-  GV_HD bool over(Vec3<T> place) const {
-    bool inside = length2 > 0;
-    for (int i = 0; i < 3; ++i) inside = inside & (inner(beside[i], minus(place, corner[i])) <= 0);
-    return inside;
+  // Whether the nearest place of the triangle's plane lies in the triangle.
+  template <class F>
+  GV_HD auto over(Vec3<F> place) const {
+    const F first = inner(minus(place, corner[0]), beside[0]), second = inner(minus(place, corner[1]), beside[1]),
+            third = inner(minus(place, corner[2]), beside[2]);
+    return larger(larger(first, second), third) <= most + F{};
   }
-  GV_HD T gap2(Vec3<T> place) const {
-    T best{};
-    for (int i = 0; i < 3; ++i) {
-      const Vec3<T> from = from_edge(i, place);
-      const T gap2 = inner(from, from);
-      best = i == 0 || gap2 < best ? gap2 : best;
-    }
-    const T height = inner(normal, minus(place, corner[0]));
-    const T above = height * height / (length2 > 0 ? length2 : static_cast<T>(1));
-    return over(place) ? above : best;
+  template <class F>
+  GV_HD F gap2(Vec3<F> place) const {
+    const Vec3<F> from0 = from_edge(0, place), from1 = from_edge(1, place), from2 = from_edge(2, place);
+    const F best = smaller(smaller(inner(from0, from0), inner(from1, from1)), inner(from2, from2));
+    const F height = inner(minus(place, corner[0]), normal);
+    return select(over(place), height * height / length2, best);
   }
   // A vector along which the nearest place lies, of any length and sign.
   GV_HD Vec3<T> away(Vec3<T> place, T gap2) const {
@@ -184,33 +194,43 @@ struct VoxelizeRow {
     const T y = (static_cast<T>(row % side) + half) * voxel.y;
     const T z = (static_cast<T>(row / side % side) + half) * voxel.z;
     const Vec3<T> start{start_k3[3 * cube], start_k3[3 * cube + 1], start_k3[3 * cube + 2]};
-    T gap2[kMostVoxels];
-    int32_t nearest[kMostVoxels], count[kMostVoxels];
-    for (int32_t i = 0; i < side; ++i) {
-      gap2[i] = bit_cast<float>(0x7f800000);
-      nearest[i] = -1;
-      count[i] = winding_k[cube];
+    using F = Together<T>;
+    using I = typename LanesOf<F>::Int;
+    constexpr int32_t kMostPacks = kMostVoxels / kTogether<T>;
+    const int32_t packs = (side + kTogether<T> - 1) / kTogether<T>;
+    F place[kMostPacks], best[kMostPacks];
+    I found[kMostPacks];
+    int32_t count[kMostVoxels];
+    for (int32_t pack = 0; pack < packs; ++pack) {
+      best[pack] = F{} + bit_cast<float>(0x7f800000);
+      found[pack] = I{} - 1;
+      for (int32_t lane = 0; lane < kTogether<T>; ++lane) {
+        set_lane(place[pack], lane, (static_cast<T>(pack * kTogether<T> + lane) + half) * voxel.x);
+      }
     }
+    for (int32_t i = 0; i < side; ++i) count[i] = winding_k[cube];
     // Lists that would lead out of the triangles are cut.
     const int64_t begin = clamp<int64_t>(first_k[cube], 0, triangles);
     const int64_t end = clamp<int64_t>(first_k[cube + 1], 0, triangles);
     for (int64_t m = begin; m < end; ++m) {
       const Triangle<T> triangle(corner_m33 + 9 * m);
-      const auto own = static_cast<int32_t>(m);
-      for (int32_t i = 0; i < side; ++i) {
-        const T found = triangle.gap2({(static_cast<T>(i) + half) * voxel.x, y, z});
-        nearest[i] = found < gap2[i] ? own : nearest[i];
-        gap2[i] = found < gap2[i] ? found : gap2[i];
+      for (int32_t pack = 0; pack < packs; ++pack) {
+        const F gap2 = triangle.gap2(Vec3<F>{place[pack], F{} + y, F{} + z});
+        const auto nearer = gap2 < best[pack];
+        found[pack] = select(nearer, I{} + static_cast<int32_t>(m), found[pack]);
+        best[pack] = select(nearer, gap2, best[pack]);
       }
       if (solid_m[m]) cross(triangle.corner, start, voxel.x, y, z, count);
     }
     for (int32_t i = 0; i < side; ++i) {
       const int64_t at = row * side + i;
-      const T gap = square_root(gap2[i]);
-      distance_kzyx[at] = gap;
-      nearest_kzyx[at] = nearest[i];
+      const int32_t pack = i / kTogether<T>, lane = i % kTogether<T>;
+      const T gap2 = lane_of(best[pack], lane);
+      const int32_t nearest = lane_of(found[pack], lane);
+      distance_kzyx[at] = square_root(gap2);
+      nearest_kzyx[at] = nearest;
       winding_kzyx[at] = count[i];
-      coverage_kzyx[at] = coverage({(static_cast<T>(i) + half) * voxel.x, y, z}, gap2[i], nearest[i], count[i], voxel);
+      coverage_kzyx[at] = coverage({lane_of(place[pack], lane), y, z}, gap2, nearest, count[i], voxel);
     }
   }
 
