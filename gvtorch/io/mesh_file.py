@@ -54,7 +54,6 @@ def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
             file_type=ending,
             resolver=resolver,
             process=False,
-            maintain_order=True,
             allow_remote=False,
         )
         parts = _parts(trimesh, loaded)

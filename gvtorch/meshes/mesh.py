@@ -132,8 +132,8 @@ def solids(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """
     _, same = np.unique(mesh.vertices, axis=0, return_inverse=True)
     faces = same.reshape(-1)[mesh.faces]
-    same_two = faces == np.roll(faces, 1, axis=1)
-    kept = np.flatnonzero(~same_two.any(1))
+    a, b, c = faces.T
+    kept = np.flatnonzero((a != b) & (b != c) & (c != a))
     if not len(kept):
         raise ValueError(f"{mesh.name}: no triangle has three corners")
     faces = faces[kept]
@@ -142,7 +142,7 @@ def solids(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     place = place.reshape(-1)
     ways = np.zeros((len(first), 2), bool)
     ways[place, _evenness(faces)] = True
-    back_to_back = ways.all(1)
+    back_to_back = ways[:, 0] & ways[:, 1]
     faces, kept = faces[first], kept[first]
     order = np.argsort(kept)  # as they came
     faces, kept, back_to_back = faces[order], kept[order], back_to_back[order]

@@ -34,7 +34,7 @@ class Paint:
         rows = [one.color for one in mesh.materials]
         self._base = torch.tensor(rows, dtype=torch.float32, device=device)
         self._textures = [
-            None if one.texture is None else _linear(torch.from_numpy(one.texture)).to(device)
+            None if one.texture is None else _linear(torch.tensor(one.texture)).to(device)
             for one in mesh.materials
         ]
         self._normal = _corner_normals(mesh, geometry)

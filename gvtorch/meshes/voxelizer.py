@@ -20,7 +20,7 @@ from .paint import Paint, nearest_weights
 CHANNELS = {
     "coverage": (torch.uint8, 1),
     "distance": (torch.float32, 1),
-    "color": (torch.uint8, 4),
+    "color": (torch.float16, 4),
     "normal": (torch.int8, 3),
     "material": (torch.uint8, 1),
 }
@@ -43,7 +43,7 @@ class Voxelizer:
             coverage uint8, 255 times the share of the voxel that is filled.
             distance float32, to the surface in world units, below 0 inside of solids; no farther
                 than `band`.
-            color uint8 x 4, premultiplied linear red, green, blue, and opacity: the surface's at
+            color float16 x 4, premultiplied linear red, green, blue, and opacity: the surface's at
                 the nearest place, times the coverage; its mean farther inside than the band.
             normal int8 x 3, 127 times the unit normal at the nearest place; 0 beyond the band.
             material uint8, 1 + the material of the nearest triangle where the voxel is half filled
@@ -268,6 +268,6 @@ def _mean(name: str, values: Tensor, finer: int) -> Tensor:
 def _stored(name: str, values: Tensor) -> Tensor:
     """Returns values in the dtype of their channel, rounded to the nearest, ties to even."""
     dtype, _ = CHANNELS[name]
-    if name in ("distance", "material"):
+    if name in ("distance", "color", "material"):
         return values.to(dtype)
     return (values * torch.iinfo(dtype).max).round_().to(dtype)
