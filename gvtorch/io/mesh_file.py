@@ -57,8 +57,6 @@ def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
             allow_remote=False,
         )
         parts = _parts(trimesh, loaded)
-    except ImportError:
-        raise
     except Exception as error:  # a damaged file may raise anything
         reason = resolver.missing or " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{path}: can't be read as {ending}: {reason}") from error

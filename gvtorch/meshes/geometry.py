@@ -17,6 +17,7 @@ from .hierarchy import Hierarchy
 from .mesh import Mesh, solids
 
 _LONG = 24  # triangles a cube, beyond which smaller cubes are worth their own lists
+_FLOAT32 = 2048.0  # voxels that triangles may reach away from their cube, in float32
 _POINTS = 1 << 14  # places that are asked for together
 
 
@@ -161,11 +162,11 @@ class Geometry:
             some = self._full_cubes(low_k3[full], voxel_3, side, count[full], face, thickness)
             gap, row, winding, share = some
             unit = float(voxel_3.min())
-            gap = gap * unit
+            gap = gap.to(torch.float32) * unit
             within = gap <= reach
             distance[full] = torch.where(within, gap, torch.inf)
             nearest[full] = torch.where(within, face[row.long()], -1)
-            inside[full], coverage[full] = winding != 0, share
+            inside[full], coverage[full] = winding != 0, share.to(torch.float32)
         return Cubes(distance=distance, face=nearest, inside=inside, coverage=coverage)
 
     def _full_cubes(
@@ -181,10 +182,13 @@ class Geometry:
         unit = float(voxel_3.min())
         first = torch.cat((count.new_zeros(1), count.cumsum(0)))
         owner = torch.repeat_interleave(count)
-        corner = ((self.corner[face] - low[owner, None]) / unit).to(torch.float32)
+        corner = (self.corner[face] - low[owner, None]) / unit
+        # float32 knows the corners of a triangle to 2^-24 of its size.
+        real = torch.float32 if float(corner.abs().max()) < _FLOAT32 else torch.float64
+        corner = corner.to(real)
         solid, none = self.solid[face], torch.zeros(len(low), dtype=torch.int32, device=low.device)
-        voxel = (voxel_3 / unit).to(torch.float32)
-        start = torch.zeros((len(low), 3), device=low.device)
+        voxel = (voxel_3 / unit).to(real)
+        start = torch.zeros((len(low), 3), dtype=real, device=low.device)
         if self._closed is not None:
             # The winding number is counted from the one of eight places that is the farthest from
             # the surface, where rounding can't move a place to its other side.
