@@ -25,6 +25,7 @@ WORKLOADS = {
     "produce": "10^3-voxel bricks made by a torch producer, eager and compiled",
     "stream": "10^3-voxel bricks from host memory into the pool, beside a plain copy",
     "convert": "a volume file to a store",
+    "voxelize": "a mesh of 100,000 triangles to voxels and to a store, beside peers",
     "blocks": "random blocks with border out of a store, beside tensorstore and zarr",
 }
 #: What else does the same, by the names of `--peers`, and what must be installed for it.
@@ -35,12 +36,14 @@ PEERS = {
     "vtk": "vtk",
     "tensorstore": "zarr",  # which writes the chunks that are read
     "zarr": "zarr",
+    "trimesh": "trimesh",
+    "igl": "libigl",
 }
 _HOME = {
     **{"march": "march", "first_hit": "march", "bricks": "march", "frame": "frames"},
     **{"shaders": "shaders", "lens": "lens", "opengl": "exchange"},
     **{"stream": "frames", "lru": "cache", "compact": "cache", "produce": "produce"},
-    **{"convert": "storage", "blocks": "storage"},
+    **{"convert": "storage", "blocks": "storage", "voxelize": "voxelize"},
 }
 
 

@@ -4,6 +4,7 @@ of it.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -52,6 +53,11 @@ class Geometry:
         self._closed_corner = self.corner[self.solid]
         if len(self._closed_corner):
             self._closed = Hierarchy(self._closed_corner)
+
+    @functools.cached_property
+    def _size(self) -> float:
+        """Square root of the median triangle's area: a few large ones tell nothing of the many."""
+        return float(self.area.median().sqrt())
 
     @property
     def area(self) -> Tensor:
@@ -136,10 +142,9 @@ class Geometry:
 
     def _part(self, side: int, voxel_3: Tensor) -> int:
         """Side of the cubes that have lists of their own: the largest into which a cube can be cut
-        that has few triangles, as far as their mean size tells.
+        that has few triangles, as far as their median size tells.
         """
-        size = (self.area.sum() / len(self.corner)).sqrt()
-        most = max(1.0, math.sqrt(_LONG) * float(size / voxel_3.max()))
+        most = max(1.0, math.sqrt(_LONG) * self._size / float(voxel_3.max()))
         fitting = [n for n in range(1, min(side, MOST_VOXELS) + 1) if side % n == 0]
         return max(n for n in fitting if n <= most or n == 1)
 

@@ -41,10 +41,8 @@ class Hierarchy:
             self.levels.append((low, high))
 
     def near(self, low_k3: Tensor, high_k3: Tensor, reach: float) -> tuple[Tensor, Tensor]:
-        """Lists for each box the triangles that may come within a reach of it. None that does is
-        left out; a few that do not are in the list.
-
-        With an infinite reach: all that may be the nearest of some place in the box.
+        """Lists for each box the triangles within a reach of it that may be the nearest of some
+        place in it. None that is so is left out; some that are not may be in the list.
 
         Args:
             low_k3: (k, 3) float64 low corners of boxes.
@@ -66,12 +64,13 @@ class Hierarchy:
 
     def _search(self, low_k3: Tensor, high_k3: Tensor, reach: float) -> tuple[Tensor, Tensor]:
         """Returns pairs of boxes and places in the lowest level, sorted."""
-        nearest = reach == torch.inf
-        most = torch.full_like(low_k3[:, 0], reach)
-        if nearest:
-            most = self._some_distance(low_k3, high_k3)
         center, half = 0.5 * (low_k3 + high_k3), 0.5 * (high_k3 - low_k3)
         radius = half.norm(dim=1)
+        # Where a box is small beside the reach, some triangle soon shows that most are too far.
+        nearest = reach > 2 * float(radius.max())
+        most = torch.full_like(radius, reach)
+        if nearest:
+            most = torch.minimum(most, self._some_distance(low_k3, high_k3))
         device, top = low_k3.device, len(self.levels[-1][0])
         box = torch.arange(len(low_k3), device=device).repeat_interleave(top)
         node = torch.arange(top, device=device).repeat(len(low_k3))

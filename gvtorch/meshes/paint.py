@@ -9,7 +9,7 @@ from torch import Tensor
 from .geometry import Geometry
 from .mesh import Mesh
 
-_CREASE = 0.7  # cosine between a corner's mean normal and its triangle's below which it is an edge
+_CREASE = 0.9  # cosine between a corner's mean normal and its triangle's below which it is an edge
 
 
 class Paint:
