@@ -5,7 +5,6 @@ of it.
 from __future__ import annotations
 
 import functools
-import math
 from dataclasses import dataclass
 
 import torch
@@ -17,7 +16,7 @@ from ..ops.voxelize import MOST_VOXELS
 from .hierarchy import Hierarchy
 from .mesh import Mesh, solids
 
-_LONG = 24  # triangles a cube, beyond which smaller cubes are worth their own lists
+_LIST, _TEST = 1e-5, 1.2e-8  # seconds: to find the list of a cube; of a voxel and a triangle
 _FLOAT32 = 2048.0  # voxels that triangles may reach away from their cube, in float32
 _POINTS = 1 << 14  # places that are asked for together
 
@@ -141,12 +140,16 @@ class Geometry:
         return Cubes(**{name: joined(values) for name, values in vars(found).items()})
 
     def _part(self, side: int, voxel_3: Tensor) -> int:
-        """Side of the cubes that have lists of their own: the largest into which a cube can be cut
-        that has few triangles, as far as their median size tells.
+        """Side of the cubes that have lists of their own, of those into which a cube can be cut:
+        the one that costs least, if all triangles were as large as the median one. A cube's list
+        holds those of a surface two voxels wider than the cube.
         """
-        most = max(1.0, math.sqrt(_LONG) * self._size / float(voxel_3.max()))
-        fitting = [n for n in range(1, min(side, MOST_VOXELS) + 1) if side % n == 0]
-        return max(n for n in fitting if n <= most or n == 1)
+        size = max(self._size / float(voxel_3.max()), 1e-6)
+
+        def cost(part: int) -> float:
+            return _LIST / part**3 + _TEST * ((part + 2) / size) ** 2
+
+        return min((n for n in range(1, min(side, MOST_VOXELS) + 1) if side % n == 0), key=cost)
 
     def _small_cubes(
         self, low_k3: Tensor, voxel_3: Tensor, side: int, reach: float, thickness: float
