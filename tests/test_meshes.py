@@ -116,11 +116,13 @@ def test_signed_distance_of_a_box_in_closed_form():
 
 @pytest.mark.parametrize("name", SHARED)
 def test_signed_distance_is_libigl_s(name):
-    """At 10^5 places; the sign where igl's winding number is one of a closed mesh."""
+    """At 10^5 places (of the open bunny 10^4); the sign against igl's winding number of what is
+    closed.
+    """
     igl = pytest.importorskip("igl", reason="the peer libigl is not installed")
     mesh = gv.read_mesh(shared(SHARED[name]))
     size = float((mesh.bounds[1] - mesh.bounds[0]).max())
-    point = places(mesh, 100_000)
+    point = places(mesh, 10_000 if name == "open bunny" else 100_000)
     geometry = Geometry(mesh)
     found = geometry.signed_distance(torch.from_numpy(point)).numpy()
     squared, *_ = igl.point_mesh_squared_distance(point, mesh.vertices, mesh.faces)
@@ -129,9 +131,9 @@ def test_signed_distance_is_libigl_s(name):
     if not len(closed):
         assert (found >= 0).all()
         return
-    some = point[:5000]
+    some = point[:2000]
     winding = igl.winding_number(mesh.vertices, closed, some)
-    assert np.array_equal(np.abs(winding) > 0.5, found[:5000] < 0) and (found < 0).sum() > 100
+    assert np.array_equal(np.abs(winding) > 0.5, found[:2000] < 0) and (found < 0).sum() > 100
 
 
 def test_nested_and_crossing_parts_have_whole_winding_numbers():
