@@ -12,14 +12,14 @@ constexpr int32_t kMostVoxels = 16;  // along a side of a cube: a row's numbers 
 constexpr double kFlat = 1e-3, kTouch = 1e-6;
 
 // triangles, cubes
-#define GV_VOXELIZE(X)                 \
-  X(Reals, corner_m33, 9 * triangles)  \
-  X(Flags, solid_m, triangles)         \
-  X(Longs, first_k, cubes + 1)         \
-  X(Reals, start_k3, 3 * cubes)        \
-  X(Words, winding_k, cubes)           \
-  X(Reals, voxel_3, 3)                 \
-  X(Int, side, kMostVoxels + 1)        \
+#define GV_VOXELIZE(X)                \
+  X(Reals, corner_m33, 9 * triangles) \
+  X(Flags, solid_m, triangles)        \
+  X(Longs, first_k, cubes + 1)        \
+  X(Reals, start_k3, 3 * cubes)       \
+  X(Words, winding_k, cubes)          \
+  X(Reals, voxel_3, 3)                \
+  X(Int, side, kMostVoxels + 1)       \
   X(Float, thickness, kAny)
 
 // The voxels of a row that are looked at together: on the CPU a vector of float32, else one.
@@ -123,8 +123,8 @@ GV_HD Pierced<T> pierced(Vec3<T> place, const Vec3<T>* corner, int axis) {
       u = v;
       v = kept;
     }
-    const T area = (v[first] - u[first]) * (place[second] - u[second]) -
-                   (v[second] - u[second]) * (place[first] - u[first]);
+    const T area =
+        (v[first] - u[first]) * (place[second] - u[second]) - (v[second] - u[second]) * (place[first] - u[first]);
     side[i] = swap ? -area : area;
     positive[i] = (area >= 0) != swap;
   }
