@@ -5,9 +5,12 @@ from .base.arrays import as_volume as as_volume
 from .base.image_info import ChannelInfo as ChannelInfo, ImageInfo as ImageInfo
 from .base.volume import Volume as Volume
 from .io.conversion import convert as convert, estimate as estimate
+from .io.mesh_file import read_mesh as read_mesh
+from .io.mesh_source import voxelize as voxelize
 from .io.reading import read_volume as read_volume
 from .io.store import Store as Store
 from .io.window import window as window
+from .meshes.mesh import Material as Material, Mesh as Mesh
 from .pool import (
     BrickPool as BrickPool,
     BrickTable as BrickTable,
@@ -41,6 +44,7 @@ from .producers import (
     Bricks as Bricks,
     FieldProducer as FieldProducer,
     Hypertexture as Hypertexture,
+    MeshProducer as MeshProducer,
     Nodes as Nodes,
     Producer as Producer,
     Region as Region,

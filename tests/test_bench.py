@@ -37,6 +37,7 @@ FIGURES = {
     "stream": {"bytes_per_second", "copy_share", "moved_bytes"},
     "convert": {"source_bytes_per_second", "memory_bytes", "disk_bytes"},
     "blocks": {"blocks_per_second"},
+    "voxelize": {"voxels_per_second", "memory_bytes", "disk_bytes", "max_difference"},
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers import meshes
 from helpers.pictures import GRAY
 
 import gvtorch as gv
@@ -83,6 +84,11 @@ def test_data_and_producers_tell_of_themselves_in_one_line(tmp_path):
             "Bricks(data={a: (3, 10, 10, 10, 1) uint8})",
         ),
         (gv.Producer((4, 5, 6)), "Producer(4x5x6 (x, y, z), N=2, value float32x1)"),
+        (
+            gv.MeshProducer(meshes.box(), resolution=32),
+            "MeshProducer(32x24x16 (x, y, z), N=2, coverage uint8x1)",
+        ),
+        (meshes.box(), "Mesh(12 triangles, 1 materials, from (0, 0, 0) to (1, 0.7, 0.4))"),
         (gv.VolumeProducer(volume), "VolumeProducer(10x10x10 (x, y, z), N=2, value uint8x1)"),
         (gv.StoredProducer(tmp_path / "a.zarr"), "StoredProducer(10x10x10 (x, y, z), N=2, value"),
     ):

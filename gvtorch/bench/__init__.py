@@ -26,6 +26,7 @@ WORKLOADS = {
     "noise": "gradient noise at points and on grids, beside NumPy and libraries of noise",
     "stream": "10^3-voxel bricks from host memory into the pool, beside a plain copy",
     "convert": "a volume file to a store",
+    "voxelize": "a mesh of 100,000 triangles to voxels and to a store, beside peers",
     "blocks": "random blocks with border out of a store, beside tensorstore and zarr",
 }
 #: What else does the same, by the names of `--peers`, and what must be installed for it.
@@ -38,12 +39,14 @@ PEERS = {
     "zarr": "zarr",
     "pyfastnoiselite": "pyfastnoiselite",
     "pyfastnoisesimd": "pyfastnoisesimd",
+    "trimesh": "trimesh",
+    "igl": "libigl",
 }
 _HOME = {
     **{"march": "march", "first_hit": "march", "bricks": "march", "frame": "frames"},
     **{"shaders": "shaders", "lens": "lens", "opengl": "exchange"},
     **{"stream": "frames", "lru": "cache", "compact": "cache", "produce": "produce"},
-    **{"noise": "noise"},
+    **{"noise": "noise", "voxelize": "voxelize"},
     **{"convert": "storage", "blocks": "storage"},
 }
 

@@ -115,7 +115,7 @@ class _Plan:
 
 
 def convert(
-    source: str | Path | Volume | Any,
+    source: str | Path | Volume | VolumeSource | Any,
     store: str | Path,
     *,
     block: int = 32,
@@ -140,7 +140,8 @@ def convert(
 
     Args:
         source: A file or folder that `read_volume` knows, an OME-Zarr image, a volume, or an array
-            as of `as_volume`; one of dask, zarr or h5py is computed or read part by part.
+            as of `as_volume`; one of dask, zarr or h5py is computed or read part by part. Or a
+            `VolumeSource`, as it is.
         store: The folder to make.
         block: Voxels along a side of a block, 32 or 64.
         threshold: Blocks with no value above it are not written; see `N3Tree.from_volume`.
@@ -228,6 +229,8 @@ def _source(
     that are written.
     """
     check.known("convert", options, FormatSettings)
+    if isinstance(source, VolumeSource):
+        return source
     if isinstance(source, Volume):
         if time not in (None, 0):
             raise ValueError(no_time(source.name, time, 1))
@@ -431,6 +434,9 @@ def _executor(given: Executor | None, plan: _Plan) -> AbstractContextManager[Exe
 
 
 def _fingerprint(given: Any, source: VolumeSource) -> list[Any]:
+    own = source.fingerprint()
+    if own is not None:
+        return own
     if isinstance(given, Volume):
         return unfinished.fingerprint(given)
     if isinstance(given, (str, Path)):
@@ -443,7 +449,7 @@ def _fingerprint(given: Any, source: VolumeSource) -> list[Any]:
 def _told_how_to_go_on(plan: _Plan) -> Iterator[None]:
     """Tells how to resume where the work is broken off from outside."""
     target = plan.target
-    command = shlex.join(("gvtorch", "convert", plan.settings["source"], str(target), "--resume"))
+    command = shlex.join((*plan.task.source.command(str(target)), "--resume"))
     try:
         yield
     except BrokenExecutor:
@@ -476,7 +482,7 @@ def _staged(plan: _Plan, pool: Executor) -> _Plan:
 
 def _in_file(plan: _Plan, source: VolumeSource) -> VolumeSource:
     if not isinstance(source, MemorySource):
-        return source
+        return source.staged(plan.target / WORK)
     file = plan.target / WORK / "source.npy"
     np.save(file, source.data)
     axes = "tzyxc"[-source.data.ndim :]

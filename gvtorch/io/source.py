@@ -18,6 +18,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from time import time_ns
 from typing import IO, Any, Self
 
@@ -91,6 +92,18 @@ class VolumeSource(ABC):
     def at_time(self, time: int) -> Self:
         """Returns the source of another time point."""
         return self if time == self.time else dataclasses.replace(self, time=time)
+
+    def staged(self, folder: Path) -> VolumeSource:
+        """Returns a source that other processes can read: what lies in memory goes to a folder."""
+        return self
+
+    def fingerprint(self) -> list[Any] | None:
+        """Returns what is the same while the content is; None: the path tells."""
+        return None
+
+    def command(self, store: str) -> tuple[str, ...]:
+        """Returns the words by which the command line makes a store of it."""
+        return ("gvtorch", "convert", self.path, store)
 
     def covers(self, index: Index) -> bool:
         """Whether an index takes the whole array."""

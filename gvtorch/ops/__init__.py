@@ -24,6 +24,7 @@ from .trace import (
     trace_rays,
     trace_segments,
 )
+from .voxelize import voxelize
 
 __all__ = [
     "RayArguments",
@@ -49,4 +50,5 @@ __all__ = [
     "trace_rays",
     "trace_segments",
     "unlink",
+    "voxelize",
 ]

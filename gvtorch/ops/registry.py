@@ -173,6 +173,14 @@ def _cut_bricks(*, values_zyxc: Tensor, place_k3: Tensor, brick_size: int, borde
     return values_zyxc.new_empty((place_k3.shape[0], side, side, side, values_zyxc.shape[3]))
 
 
+def _voxelize(
+    *, corner_m33: Tensor, first_k: Tensor, side: int, **_: Any
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    real = corner_m33.new_empty((first_k.shape[0] - 1, side, side, side))
+    whole = torch.empty_like(real, dtype=torch.int32)
+    return real, whole, torch.empty_like(whole), torch.empty_like(real)
+
+
 FAKES: dict[str, Callable[..., Any]] = {
     "trace_rays": _trace_rays,
     "shade_rays": _shade_rays,
@@ -194,6 +202,7 @@ FAKES: dict[str, Callable[..., Any]] = {
     "locate": lambda *, node_k, **_: node_k.new_empty((node_k.shape[0], 4)),
     "lacking": lambda *, node_k, **_: torch.empty_like(node_k, dtype=torch.bool),
     "cut_bricks": _cut_bricks,
+    "voxelize": _voxelize,
     **dict.fromkeys(
         ("unlink", "orphan", "link", "link_bricks", "link_tiles", "put_rows"), lambda **_: None
     ),

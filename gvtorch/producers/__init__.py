@@ -2,6 +2,7 @@
 
 from .field import FieldProducer, cache_field
 from .hypertexture import Hypertexture
+from .mesh import MeshProducer
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 from .stored import StoredProducer
 from .volume import VolumeProducer
@@ -11,6 +12,7 @@ __all__ = [
     "FieldProducer",
     "Hypertexture",
     "Layout",
+    "MeshProducer",
     "Nodes",
     "Producer",
     "Region",

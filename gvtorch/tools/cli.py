@@ -1,4 +1,5 @@
-"""The command line: `gvtorch info`, `render`, `fly`, `slice`, `convert`, `filter` and `bench`.
+"""The command line: `gvtorch info`, `render`, `fly`, `slice`, `convert`, `voxelize`,
+`filter` and `bench`.
 
 torch is imported inside the commands, so that `--help` answers at once. A mistake of the user ends
 in one line on standard error and status 2.
@@ -14,10 +15,9 @@ import re
 import sys
 import time
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from tyro.conf import Positional, arg
@@ -29,9 +29,7 @@ from .common import Bar, ReadOptions, given, refuse_for_store, volume_formats
 from .fly import Fly
 from .render import Render
 from .slice import Slice
-
-if TYPE_CHECKING:
-    from concurrent.futures import Executor
+from .voxelize import Voxelize, cluster
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +118,7 @@ class Convert:
             _print_table(_readable(estimate(self.path, self.store, **common).as_dict()))
             return
         start = time.perf_counter()
-        with Bar(speed=True) as bar, self._cluster() as executor:
+        with Bar(speed=True) as bar, cluster(self.scheduler) as executor:
             store = convert(
                 *(self.path, self.store),
                 **common,
@@ -133,18 +131,6 @@ class Convert:
         extent = "x".join(str(n) for n in store.extent)
         times = f" at {store.times} times" if store.times > 1 else ""
         print(f"{self.store}: {extent}{times}, {store.levels} levels, {size} in {seconds:.1f} s")
-
-    @contextlib.contextmanager
-    def _cluster(self) -> Iterator[Executor | None]:
-        if self.scheduler is None:
-            yield None
-            return
-        try:
-            from distributed import Client
-        except ImportError:
-            raise ImportError("--scheduler needs dask: pip install distributed") from None
-        with Client(self.scheduler, timeout="20s") as client:
-            yield client.get_executor()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -259,7 +245,7 @@ def _sparkline(counts: list[int]) -> str:
 
 _COMMANDS: dict[str, Any] = {
     **{"info": Info, "render": Render, "fly": Fly, "slice": Slice, "convert": Convert},
-    **{"filter": Filter, "bench": Bench},
+    **{"voxelize": Voxelize, "filter": Filter, "bench": Bench},
 }
 
 

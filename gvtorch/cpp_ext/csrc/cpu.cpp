@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "entry/entry_cache.h"
+#include "entry/entry_mesh.h"
 #include "entry/entry_segments.h"
 #include "packets/trace_chunks.h"
 
@@ -99,10 +100,12 @@ STABLE_TORCH_LIBRARY(gvtorch, library) {
   gvtorch::define(library, gvtorch::RayOps{});
   gvtorch::define(library, gvtorch::SegmentOps{});
   gvtorch::define(library, gvtorch::CacheOps{});
+  gvtorch::define(library, gvtorch::MeshOps{});
 }
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) {
   gvtorch::implement(library, gvtorch::RayOps{});
   gvtorch::implement(library, gvtorch::SegmentOps{});
   gvtorch::implement(library, gvtorch::CacheOps{});
+  gvtorch::implement(library, gvtorch::MeshOps{});
 }

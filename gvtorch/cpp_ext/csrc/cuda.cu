@@ -4,6 +4,7 @@
 #include <cub/block/block_scan.cuh>
 
 #include "entry/entry_cache.h"
+#include "entry/entry_mesh.h"
 #include "entry/entry_segments.h"
 
 namespace gvtorch {
@@ -94,4 +95,5 @@ STABLE_TORCH_LIBRARY_IMPL(gvtorch, CUDA, library) {
   gvtorch::implement(library, gvtorch::RayOps{});
   gvtorch::implement(library, gvtorch::SegmentOps{});
   gvtorch::implement(library, gvtorch::CacheOps{});
+  gvtorch::implement(library, gvtorch::MeshOps{});
 }

@@ -1,0 +1,160 @@
+"""Meshes to voxels: `voxelize`, triangles to a region of a grid and to a store, beside other
+libraries in the same run.
+
+The mesh is made up: a sphere with bumps, of as many triangles as are asked for.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..io.mesh_source import voxelize as voxelize_store
+from ..meshes.mesh import Mesh
+from ..meshes.voxelizer import Voxelizer
+from . import PEERS
+from .record import Record, clock, spread
+from .storage import Memory
+
+_PART = 256  # voxels along a side of the regions that are asked for
+
+
+def voxelize(record: Record) -> None:
+    """Coverage of 100,000 triangles: all finest voxels into memory, and a store of all levels."""
+    settings = record.settings
+    faces, side = (2_000, 64) if settings.quick else (100_000, 1024)
+    mesh = bumps(faces)
+    count = f"{len(mesh.faces):,} triangles"
+    device = settings.device
+    case = f"{count}, {side}^3 in memory"
+    if record.wants(case):
+        settings.tell(case)
+        filled = [0.0]
+
+        def run() -> None:
+            filled[0] = _volume(Voxelizer(mesh, resolution=side, device=device))
+
+        timing = clock(run, settings)
+        a, b, c = mesh.corners.transpose(1, 0, 2)
+        volume = float((a * np.cross(b, c)).sum() / 6)
+        record.add(
+            *(case, "gvtorch", timing),
+            voxels_per_second=1e3 * side**3 / timing.median,
+            max_difference=abs(filled[0] - volume) / volume,
+        )
+    case = f"{count}, {side}^3 to a store"
+    if record.wants(case):
+        _store(record, case, mesh, side)
+    _peers(record, mesh, 64 if settings.quick else 256)
+    record.note("difference: of the volume from the mesh's own, relative to it")
+
+
+def _volume(grid: Voxelizer) -> float:
+    """Makes all finest voxels, part by part; their volume."""
+    total = 0.0
+    x, y, z = grid.extent
+    for k in range(0, z, _PART):
+        for j in range(0, y, _PART):
+            for i in range(0, x, _PART):
+                high = min(k + _PART, z), min(j + _PART, y), min(i + _PART, x)
+                part = grid.region((k, j, i), high)["coverage"]
+                total += int(part.sum(dtype=torch.int64)) / 255
+    return total * grid.spacing**3
+
+
+def _store(record: Record, case: str, mesh: Mesh, side: int) -> None:
+    settings = record.settings
+    times: list[float] = []
+    most = 0
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "mesh.zarr"
+        began = time.perf_counter()
+        while not times or (
+            len(times) < settings.repeats and time.perf_counter() - began < settings.seconds
+        ):
+            settings.tell(f"{case}: {len(times) + 1}")
+            shutil.rmtree(path, ignore_errors=True)
+            with Memory() as memory:
+                start = time.perf_counter()
+                store = voxelize_store(mesh, path, resolution=side)
+                times.append(1e3 * (time.perf_counter() - start))
+            most = max(most, memory.most)
+        timing = spread(times)
+        record.add(
+            *(case, "gvtorch", timing),
+            voxels_per_second=1e3 * side**3 / timing.median,
+            memory_bytes=most,
+            disk_bytes=store.describe()["disk bytes"],
+        )
+    record.note("memory: the most that this process and its workers held together, not warmed up")
+
+
+def _peers(record: Record, mesh: Mesh, side: int) -> None:
+    """Signed distances of all voxels near the surface, and of as many places, which igl is asked
+    for; a filled grid of as many voxels, which trimesh makes.
+    """
+    settings = record.settings
+    wanted = settings.peers
+    runs: dict[str, Callable[[], object]] = {}
+    case = f"{len(mesh.faces):,} triangles, {side}^3 beside peers"
+    if not record.wants(case):
+        return
+    grid = Voxelizer(mesh, resolution=side, device=settings.device)
+    runs["gvtorch"] = lambda: _volume(Voxelizer(mesh, resolution=side, device=settings.device))
+    for name in ("trimesh", "igl"):
+        if wanted is None or name in wanted:
+            here = importlib.util.find_spec(name) is not None
+            record.peers[name] = "ran" if here else f"not installed ({PEERS[name]})"
+    if record.peers.get("trimesh") == "ran":
+        import trimesh
+
+        other = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        runs["trimesh"] = lambda: other.voxelized(grid.spacing).fill()
+        record.note("trimesh: voxelized().fill(): whole voxels, by cutting triangles until small")
+    if record.peers.get("igl") == "ran":
+        import igl
+
+        at = [
+            np.arange(n) * grid.spacing + o for n, o in zip(grid.extent, grid.origin, strict=True)
+        ]
+        place = np.stack(np.meshgrid(*at, indexing="ij"), -1).reshape(-1, 3)[::64]
+        runs["igl"] = lambda: igl.signed_distance(place, mesh.vertices, mesh.faces)
+        record.note("igl: signed_distance of every 64th voxel's centre, its rate for all")
+    median = 0.0
+    for who, run in runs.items():
+        settings.tell(f"{case}: {who}")
+        timing = clock(run, settings)
+        median = median or timing.median
+        share = 64 if who == "igl" else 1
+        more = {} if who == "gvtorch" else {"times": share * timing.median / median}
+        rate = 1e3 * side**3 / share / timing.median
+        record.add(case, who, timing, voxels_per_second=rate, **more)
+
+
+def bumps(faces: int) -> Mesh:
+    """A sphere with bumps of two sizes, of about so many triangles, closed."""
+    rows = max(4, round((faces / 4) ** 0.5))
+    columns = 2 * rows
+    a, b = np.meshgrid(
+        np.arange(1, rows) * np.pi / rows, np.arange(columns) * 2 * np.pi / columns, indexing="ij"
+    )
+    radius = 1 + 0.08 * np.sin(9 * a) * np.sin(8 * b) + 0.02 * np.sin(40 * a) * np.cos(36 * b)
+    ring = np.stack((np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)), -1)
+    points = np.concatenate(((radius[..., None] * ring).reshape(-1, 3), [[0, 0, 1], [0, 0, -1]]))
+    index = np.arange((rows - 1) * columns).reshape(rows - 1, columns)
+    beside = np.roll(index, -1, 1)
+    p, q, r, s = index[:-1], index[1:], beside[1:], beside[:-1]
+    top, bottom = np.full(columns, len(points) - 2), np.full(columns, len(points) - 1)
+    parts = (
+        *(np.stack((p, q, r), -1), np.stack((p, r, s), -1)),
+        *(np.stack((top, index[0], beside[0]), -1),),
+        *(np.stack((bottom, beside[-1], index[-1]), -1),),
+    )
+    return Mesh(vertices=points, faces=np.concatenate([part.reshape(-1, 3) for part in parts]))

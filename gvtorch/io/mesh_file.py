@@ -1,0 +1,261 @@
+"""`read_mesh`: a file of triangles, by trimesh, as a `Mesh`: OBJ, PLY, STL, glTF and others; parts
+of a scene are put in place and joined.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..meshes.mesh import MOST_FACES, Material, Mesh
+
+#: Endings that are read, also with .gz behind them. Others of trimesh's need more than it, or
+#: unpickle what they find.
+ENDINGS = ("obj", "ply", "stl", "gltf", "glb", "off")
+_FACE_BYTES = 1  # a triangle takes more bytes than this in any of them
+
+
+def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
+    """Reads a mesh: textures, colours of vertices, materials, the parts of a scene in their places.
+    Only files beside it are read (materials, textures, buffers), and nothing is fetched.
+
+    Args:
+        path: A file whose name ends in obj, ply, stl, gltf, glb or off, or these and .gz.
+        texture: An image that is laid on all that has texture coordinates, in place of its own.
+
+    Returns:
+        The mesh.
+
+    Raises:
+        FileNotFoundError: It is not there.
+        ValueError: It is none of these, is damaged, has no triangles, places that are NaN, indices
+            out of range, or names a texture or a buffer that is not there.
+        ImportError: trimesh is not installed.
+    """
+    path = Path(path)
+    ending, packed = _ending(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"file not found: {path}")
+    try:
+        import trimesh
+    except ImportError:
+        raise ImportError(f"{path}: meshes need trimesh: pip install gvtorch[mesh]") from None
+    content = _content(path, packed)
+    _check_claims(path, ending, content)
+    resolver: Any = _Beside(path)
+    try:
+        loaded = trimesh.load(
+            io.BytesIO(content),
+            file_type=ending,
+            resolver=resolver,
+            process=False,
+            allow_remote=False,
+        )
+        parts = _parts(trimesh, loaded)
+    except Exception as error:  # a damaged file may raise anything
+        reason = resolver.missing or " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{path}: can't be read as {ending}: {reason}") from error
+    if resolver.missing:
+        raise ValueError(f"{path}: {resolver.missing}")
+    if not parts:
+        raise ValueError(f"{path}: has no triangles")
+    has_images = bool(resolver.images) or ending in ("gltf", "glb")
+    mesh = _joined(path, ending, parts, has_images or texture is not None)
+    return mesh if texture is None else _textured(mesh, Path(texture))
+
+
+def _textured(mesh: Mesh, texture: Path) -> Mesh:
+    """The mesh with one image on all of it."""
+    if mesh.uv is None:
+        raise ValueError(f"{mesh.name}: has no texture coordinates for {texture}")
+    if not texture.is_file():
+        raise FileNotFoundError(f"file not found: {texture}")
+    from PIL import Image
+
+    try:
+        with Image.open(texture) as image:
+            pixels = np.asarray(image.convert("RGBA"), np.uint8)
+    except (OSError, ValueError, SyntaxError) as error:
+        raise ValueError(f"{texture}: can't be read as an image: {error}") from None
+    painted = tuple(Material(name=m.name, color=(1.0,) * 4, texture=pixels) for m in mesh.materials)
+    return replace(mesh, materials=painted)
+
+
+def _ending(path: Path) -> tuple[str, bool]:
+    name = path.name.lower()
+    packed = name.endswith(".gz")
+    ending = name.removesuffix(".gz").rpartition(".")[2]
+    if ending not in ENDINGS:
+        raise ValueError(f"{path}: a mesh's name must end in {', '.join(ENDINGS)} (or .gz behind)")
+    return ending, packed
+
+
+def _content(path: Path, packed: bool) -> bytes:
+    if not packed:
+        return path.read_bytes()
+    try:
+        return gzip.decompress(path.read_bytes())
+    except (OSError, EOFError) as error:
+        raise ValueError(f"{path}: can't be unpacked: {error}") from None
+
+
+def _check_claims(path: Path, ending: str, content: bytes) -> None:
+    """Raises ValueError where a header tells of more triangles than the file can hold, or than a
+    mesh may have, before memory is asked for.
+    """
+    claimed = None
+    if ending == "stl" and len(content) >= 84 and not content[:5].lower() == b"solid":
+        claimed = int.from_bytes(content[80:84], "little")
+    if ending == "ply":
+        for line in content[:65536].partition(b"end_header")[0].splitlines():
+            words = line.split()
+            if words[:2] in ([b"element", b"face"], [b"element", b"vertex"]) and len(words) == 3:
+                claimed = max(claimed or 0, int(words[2]) if words[2].isdigit() else 0)
+    if ending == "off":
+        numbers = content[:4096].split()[1:3]
+        claimed = max((int(n) for n in numbers if n.isdigit()), default=None)
+    if claimed is None:
+        return
+    if claimed > len(content) // _FACE_BYTES:
+        raise ValueError(
+            f"{path}: tells of {claimed} triangles or vertices in {len(content)} bytes: damaged"
+        )
+    if claimed > MOST_FACES:
+        raise ValueError(f"{path}: at most {MOST_FACES} triangles, it tells of {claimed}")
+
+
+class _Beside:
+    """What trimesh asks for the files that a mesh names: those in its own folder, and below it."""
+
+    def __init__(self, path: Path) -> None:
+        self._folder, self.missing = path.absolute().parent, ""
+        self.images = 0  # that were handed out
+
+    def get(self, name: str) -> bytes:
+        """Returns a file's content."""
+        plain = str(name).strip().replace("\\", "/").replace("%20", " ")
+        if "://" in plain:
+            self.missing = f"names {plain}, and nothing is fetched"
+            raise ValueError(self.missing)
+        file = (self._folder / plain).resolve()
+        inside = file.is_relative_to(self._folder.resolve())
+        if not inside or not file.is_file():
+            where = "is not there" if inside else "lies in another folder"
+            # An OBJ names its material library even where nobody kept one: it is white then.
+            if not plain.lower().endswith(".mtl"):
+                self.missing = f"names {plain}, which {where}"
+            raise FileNotFoundError(f"{plain} {where}")
+        self.images += file.suffix.lower() not in (".mtl", ".bin")
+        return file.read_bytes()
+
+    def __getitem__(self, name: str) -> bytes:
+        return self.get(name)
+
+    def namespaced(self, _namespace: str) -> _Beside:
+        """Returns itself: there are no folders of their own."""
+        return self
+
+
+def _parts(trimesh: Any, loaded: Any) -> list[Any]:
+    """Returns the meshes of what was loaded, in their places."""
+    found = loaded.dump(concatenate=False) if isinstance(loaded, trimesh.Scene) else [loaded]
+    found = found if isinstance(found, list) else [found]
+    return [one for one in found if isinstance(one, trimesh.Trimesh) and len(one.faces)]
+
+
+def _joined(path: Path, ending: str, parts: list[Any], mapped: bool) -> Mesh:
+    """Joins trimesh's meshes. OBJ and PLY tell colours as they are shown, glTF linear ones.
+    Not `mapped`: no image came, and where there are texture coordinates, trimesh made one up.
+    """
+    vertices, faces, colors, uvs, numbers = [], [], [], [], []
+    materials: list[Material] = []
+    known: dict[int, int] = {}
+    before = 0
+    for part in parts:
+        own, places = np.asarray(part.faces, np.int64), np.asarray(part.vertices, np.float64)
+        if own.min() < 0 or own.max() >= len(places):
+            wrong = own.min() if own.min() < 0 else own.max()
+            raise ValueError(f"{path}: a triangle names vertex {wrong}, there are {len(places)}")
+        faces.append(own + before)
+        vertices.append(places)
+        before += len(places)
+        look = part.visual
+        uv = getattr(look, "uv", None)
+        uvs.append(np.zeros((len(own), 3, 2)) if uv is None else np.asarray(uv)[own][..., :2])
+        colors.append(_colors(part, own, ending))
+        material = getattr(look, "material", None)
+        if id(material) not in known:
+            known[id(material)] = len(materials)
+            materials.append(_material(path, material, ending, mapped and uv is not None))
+        numbers.append(np.full(len(own), known[id(material)]))
+    plain = all(one is None for one in colors)
+    white = [
+        np.ones((len(own), 3, 4), np.float32) if color is None else color
+        for own, color in zip(faces, colors, strict=True)
+    ]
+    textured = mapped and any(getattr(p.visual, "uv", None) is not None for p in parts)
+    return Mesh(
+        vertices=np.concatenate(vertices),
+        faces=np.concatenate(faces),
+        color=None if plain else np.concatenate(white),
+        uv=np.concatenate(uvs).astype(np.float32) if textured else None,
+        material=np.concatenate(numbers),
+        materials=tuple(materials),
+        name=str(path),
+    )
+
+
+def _colors(part: Any, faces: np.ndarray, ending: str) -> np.ndarray | None:
+    """(f, 3, 4) float32 linear colours of corners, where vertices or triangles have some."""
+    look, attributes = part.visual, part.vertex_attributes
+    if look.kind == "vertex":
+        told = np.asarray(look.vertex_colors)[faces]
+    elif look.kind == "face":
+        told = np.repeat(np.asarray(look.face_colors)[:, None], 3, axis=1)
+    elif "color" in attributes and np.asarray(attributes["color"]).shape[-1] in (3, 4):
+        told = np.asarray(attributes["color"])[faces]
+    else:
+        return None
+    if told.shape[-1] == 3:
+        told = np.concatenate((told, np.full_like(told[..., :1], 255)), -1)
+    value = told.astype(np.float32) / (255 if told.dtype == np.uint8 else 1)
+    if ending not in ("gltf", "glb"):
+        value[..., :3] = to_linear(value[..., :3])
+    return value
+
+
+def _material(path: Path, material: Any, ending: str, mapped: bool) -> Material:
+    """One of ours out of trimesh's; grey where there is none."""
+    if material is None:
+        return Material(color=(1.0, 1.0, 1.0, 1.0))
+    gltf = ending in ("gltf", "glb")
+    if not gltf and not mapped and getattr(material, "image", None) is not None:
+        return Material(color=(1.0, 1.0, 1.0, 1.0))
+    base = getattr(material, "baseColorFactor", None) if gltf else material.main_color
+    image = getattr(material, "baseColorTexture" if gltf else "image", None)
+    color = np.ones(4) if base is None else np.asarray(base, np.float64)
+    if base is not None and np.asarray(base).dtype.kind in "ui":
+        color = color / 255
+    if image is not None and not gltf:
+        color = np.ones(4)  # its texture is all
+    if not gltf:
+        color[:3] = to_linear(color[:3])
+    texture = None
+    if image is not None and mapped:
+        try:
+            texture = np.asarray(image.convert("RGBA"), np.uint8)
+        except (OSError, ValueError, SyntaxError) as error:
+            raise ValueError(f"{path}: a texture can't be read: {error}") from None
+    red, green, blue, opacity = (float(n) for n in color)
+    name = str(getattr(material, "name", "") or "")
+    return Material(name=name, color=(red, green, blue, opacity), texture=texture)
+
+
+def to_linear(value: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB values, 0 to 1 (IEC 61966-2-1)."""
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)

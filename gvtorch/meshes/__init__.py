@@ -1,0 +1,1 @@
+"""Triangles, and what voxels hold of them."""

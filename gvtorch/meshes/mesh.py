@@ -1,0 +1,184 @@
+"""`Mesh`: triangles with what is painted on them, and which of them bound solids."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+MOST_FACES = 2**28  # triangles of a mesh: they and their hierarchy would take 100 GB
+
+
+@dataclass(frozen=True, kw_only=True)
+class Material:
+    """How some triangles of a mesh look."""
+
+    name: str = ""
+    color: tuple[float, float, float, float] = (0.8, 0.8, 0.8, 1.0)  # linear RGB, opacity
+    texture: np.ndarray | None = field(default=None, repr=False)  # (h, w, 4) uint8, sRGB; row 0 top
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Mesh:
+    """Triangles, checked, with one entry a corner of what is painted on them.
+
+    Raises ValueError where a field has the wrong shape, an index is out of range, a place is not
+    finite, or there is no triangle.
+    """
+
+    vertices: np.ndarray  # (v, 3) float64, world units, x y z
+    faces: np.ndarray  # (f, 3) int64 vertices, counter-clockwise seen from outside
+    color: np.ndarray | None = None  # (f, 3, 4) float32 of each corner, linear RGB and opacity
+    uv: np.ndarray | None = None  # (f, 3, 2) float32 of each corner, (0, 0) is a texture's low left
+    material: np.ndarray | None = None  # (f,) int64 into materials; all the first if left out
+    materials: tuple[Material, ...] = (Material(),)
+    name: str = "mesh"  # for messages
+
+    def __post_init__(self) -> None:
+        """Checks and converts the fields."""
+        count = len(np.asarray(self.faces))
+        for field_name, shape, dtype in (
+            ("vertices", (None, 3), np.float64),
+            ("faces", (None, 3), np.int64),
+            ("color", (count, 3, 4), np.float32),
+            ("uv", (count, 3, 2), np.float32),
+            ("material", (count,), np.int64),
+        ):
+            value = getattr(self, field_name)
+            if value is None:
+                continue
+            value = np.ascontiguousarray(value, dtype)
+            fits = value.ndim == len(shape) and all(
+                n is None or n == m for n, m in zip(shape, value.shape, strict=True)
+            )
+            if not fits:
+                wanted = ", ".join("n" if n is None else str(n) for n in shape)
+                raise ValueError(f"{self.name}: {field_name} must be ({wanted}), got {value.shape}")
+            object.__setattr__(self, field_name, value)
+        if self.material is None:
+            object.__setattr__(self, "material", np.zeros(count, np.int64))
+        self._check()
+
+    def _check(self) -> None:
+        if not len(self.faces):
+            raise ValueError(f"{self.name}: has no triangles")
+        if len(self.faces) > MOST_FACES:
+            raise ValueError(f"{self.name}: at most {MOST_FACES} triangles, got {len(self.faces)}")
+        low, high = int(self.faces.min()), int(self.faces.max())
+        if low < 0 or high >= len(self.vertices):
+            wrong = low if low < 0 else high
+            raise ValueError(
+                f"{self.name}: a triangle names vertex {wrong}, there are {len(self.vertices)}"
+            )
+        used = self.vertices[self.faces.ravel()] if len(self.vertices) else self.vertices
+        bad = int((~np.isfinite(used)).any(1).sum())
+        if bad:
+            raise ValueError(f"{self.name}: {bad} corners of triangles are NaN or infinite")
+        assert self.material is not None
+        if self.material.min() < 0 or self.material.max() >= len(self.materials):
+            wrong = int(self.material.max())
+            raise ValueError(
+                f"{self.name}: a triangle names material {wrong}, there are {len(self.materials)}"
+            )
+        if not (self.bounds[1] > self.bounds[0]).any():
+            raise ValueError(f"{self.name}: all triangles lie in one point")
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """(2, 3) float64 lowest and highest corner of the triangles."""
+        used = self.vertices[np.unique(self.faces)]
+        return np.stack((used.min(0), used.max(0)))
+
+    @property
+    def corners(self) -> np.ndarray:
+        """(f, 3, 3) float64 places of the corners."""
+        return self.vertices[self.faces]
+
+    def only(self, kept: np.ndarray) -> Mesh:
+        """Returns the mesh with some of its triangles, (m,) int64."""
+        assert self.material is not None
+        return Mesh(
+            vertices=self.vertices,
+            faces=self.faces[kept],
+            color=None if self.color is None else self.color[kept],
+            uv=None if self.uv is None else self.uv[kept],
+            material=self.material[kept],
+            materials=self.materials,
+            name=self.name,
+        )
+
+    def __repr__(self) -> str:
+        """Tells counts and bounds."""
+        low, high = (", ".join(f"{n:.6g}" for n in corner) for corner in self.bounds)
+        painted = [n for n in ("color", "uv") if getattr(self, n) is not None]
+        return (
+            f"Mesh({len(self.faces)} triangles, {len(self.materials)} materials, "
+            f"from ({low}) to ({high})" + (f", {', '.join(painted)})" if painted else ")")
+        )
+
+
+def solids(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Finds which triangles bound solids. Triangles that lie on others, corner by corner, are left
+    out but for one of them; those without area stay, for they close gaps, unless two corners are
+    one.
+
+    A part is a set of triangles that hang together by edges (vertices at the same place count as
+    one). It bounds a solid if each edge is gone along as often one way as the other: then every
+    place has a whole winding number. Others are sheets, and so is a part of which only triangles
+    remain that lie back to back.
+
+    Returns:
+        kept (m,) int64 triangles; solid (m,) bool.
+    """
+    _, same = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    faces = same.reshape(-1)[mesh.faces]
+    a, b, c = faces.T
+    kept = np.flatnonzero((a != b) & (b != c) & (c != a))
+    if not len(kept):
+        raise ValueError(f"{mesh.name}: no triangle has three corners")
+    faces = faces[kept]
+    turned = np.sort(faces, axis=1)
+    _, first, place = np.unique(turned, axis=0, return_index=True, return_inverse=True)
+    place = place.reshape(-1)
+    ways = np.zeros((len(first), 2), bool)
+    ways[place, _evenness(faces)] = True
+    back_to_back = ways[:, 0] & ways[:, 1]
+    faces, kept = faces[first], kept[first]
+    order = np.argsort(kept)  # as they came
+    faces, kept, back_to_back = faces[order], kept[order], back_to_back[order]
+    return kept, _closed(faces, ~back_to_back) & ~back_to_back
+
+
+def _evenness(faces: np.ndarray) -> np.ndarray:
+    """(f,) 1 where the corners' order is an even permutation of their sorted one, else 0."""
+    a, b, c = faces.T
+    return ((a < b).astype(np.int64) + (b < c) + (a < c)) % 2
+
+
+def _closed(faces: np.ndarray, counted: np.ndarray) -> np.ndarray:
+    """(f,) bool whether a triangle's part, among those that are counted, is closed."""
+    begin, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    low, high = np.minimum(begin, end), np.maximum(begin, end)
+    _, edge = np.unique(low * (faces.max() + 1) + high, return_inverse=True)
+    edge = edge.reshape(-1)
+    face = np.repeat(np.arange(len(faces)), 3)
+    own = counted[face]
+    balance = np.bincount(edge[own], np.where(begin < end, 1, -1)[own], edge.max() + 1)
+    part = _parts(face[own], edge[own], len(faces), edge.max() + 1)
+    open_parts = np.unique(part[face[own][balance[edge[own]] != 0]])
+    return ~np.isin(part, open_parts)
+
+
+def _parts(face: np.ndarray, edge: np.ndarray, faces: int, edges: int) -> np.ndarray:
+    """(faces,) the smallest triangle of each part; pairs (face, edge) hang together."""
+    label = np.arange(faces)
+    while True:
+        least = np.full(edges, faces)
+        np.minimum.at(least, edge, label[face])
+        new = label.copy()
+        np.minimum.at(new, face, least[edge])
+        np.minimum.at(new, label, new)  # what an old label's triangle learns, all of its label do
+        new = new[new]
+        if (new == label).all():
+            return label
+        label = new

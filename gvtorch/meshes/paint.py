@@ -1,0 +1,133 @@
+"""`Paint`: colour, normal and material of places on a mesh."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .geometry import Geometry
+from .mesh import Mesh
+
+_CREASE = 0.9  # cosine between a corner's mean normal and its triangle's below which it is an edge
+
+
+class Paint:
+    """What is painted on the triangles of a geometry, corner by corner.
+
+    Attributes:
+        material: (f,) int64 of each triangle.
+        mean_color: (4,) colour of all the surface, by area.
+        main_material: The one with the most area.
+    """
+
+    def __init__(self, mesh: Mesh, geometry: Geometry) -> None:
+        """Lays colours, textures and normals ready on the geometry's device."""
+        kept, device = geometry.kept.numpy(), geometry.corner.device
+
+        def lay(values: np.ndarray | None) -> Tensor | None:
+            return None if values is None else torch.from_numpy(values[kept]).to(device)
+
+        material = lay(mesh.material)
+        assert material is not None
+        self.material, self._color, self._uv = material, lay(mesh.color), lay(mesh.uv)
+        rows = [one.color for one in mesh.materials]
+        self._base = torch.tensor(rows, dtype=torch.float32, device=device)
+        self._textures = [
+            None if one.texture is None else _linear(torch.tensor(one.texture)).to(device)
+            for one in mesh.materials
+        ]
+        self._normal = _corner_normals(mesh, geometry)
+        area = geometry.area.to(torch.float32)
+        third = torch.full((len(area), 3), 1 / 3, device=device)
+        color = self.color(torch.arange(len(area), device=device), third)
+        share = (area / area.sum().clamp(min=1e-30))[:, None]
+        self.mean_color = (color * share).sum(0)
+        sums = torch.zeros(len(rows), device=device).index_add_(0, material, area)
+        self.main_material = int(sums.argmax())
+
+    def color(self, face_p: Tensor, weight_p3: Tensor) -> Tensor:
+        """Returns (p, 4) float32 linear RGB and opacity at places on triangles, by the weights of
+        their corners.
+        """
+        material = self.material[face_p]
+        color = self._base[material]
+        if self._color is not None:
+            color = color * (self._color[face_p] * weight_p3[..., None]).sum(1)
+        if self._uv is not None:
+            for number, texture in enumerate(self._textures):
+                here = (material == number).nonzero()[:, 0] if texture is not None else ()
+                if texture is not None and len(here):
+                    uv = (self._uv[face_p[here]] * weight_p3[here][..., None]).sum(1)
+                    color[here] = color[here] * _bilinear(texture, uv)
+        return color
+
+    def normal(self, face_p: Tensor, weight_p3: Tensor) -> Tensor:
+        """Returns (p, 3) float32 unit normals, smooth where the surface is."""
+        normal = (self._normal[face_p] * weight_p3[..., None]).sum(1)
+        return torch.nn.functional.normalize(normal, dim=1)
+
+
+def nearest_weights(place_p3: Tensor, corner_p33: Tensor) -> Tensor:
+    """Returns (p, 3) weights of a triangle's corners at what of it is nearest to a place.
+
+    Args:
+        place_p3: (p, 3) places.
+        corner_p33: (p, 3, 3) a triangle for each.
+    """
+    edge = corner_p33.roll(-1, 1) - corner_p33
+    normal = torch.linalg.cross(edge[:, 0], -edge[:, 2])
+    away = place_p3[:, None] - corner_p33
+    area = (torch.linalg.cross(edge, away) * normal[:, None]).sum(2)  # (p, 3) beside each edge
+    inside = (area >= 0).all(1) & (area.sum(1) > 0)
+    plane = area.roll(-1, 1) / area.sum(1, keepdim=True)  # a corner's weight: its far edge's area
+    along = (away * edge).sum(2) / (edge * edge).sum(2).clamp(min=torch.finfo(edge.dtype).tiny)
+    along = along.clamp(0, 1)
+    gap = away - edge * along[..., None]
+    best = (gap * gap).sum(2).argmin(1, keepdim=True)
+    t = along.gather(1, best)
+    rim = torch.zeros_like(along).scatter(1, best, 1 - t).scatter(1, (best + 1) % 3, t)
+    return torch.where(inside[:, None], plane, rim)
+
+
+def _linear(texture: Tensor) -> Tensor:
+    """(h, w, 4) float16 linear RGB and opacity of sRGB bytes (IEC 61966-2-1)."""
+    value = torch.arange(256) / 255
+    table = torch.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    rgb = table[texture[..., :3].long()]
+    return torch.cat((rgb, texture[..., 3:].float() / 255), -1).to(torch.float16)
+
+
+def _bilinear(texture: Tensor, uv: Tensor) -> Tensor:
+    """(p, 4) values of a texture that repeats; v runs upwards."""
+    high, wide = texture.shape[:2]
+    x, y = uv[:, 0] * wide - 0.5, (1 - uv[:, 1]) * high - 0.5
+    x0, y0 = x.floor(), y.floor()
+    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
+    total = torch.zeros((len(uv), 4), device=uv.device)
+    for dy, wy in ((0, 1 - fy), (1, fy)):
+        for dx, wx in ((0, 1 - fx), (1, fx)):
+            row, column = (y0 + dy).long() % high, (x0 + dx).long() % wide
+            total += wx * wy * texture[row, column].float()
+    return total
+
+
+def _corner_normals(mesh: Mesh, geometry: Geometry) -> Tensor:
+    """(f, 3, 3) float32: at each corner the mean of the normals that meet there, weighted by angle
+    (Thuermer, Wuethrich, "Computing vertex normals from polygonal facets", J. Graphics Tools 1998);
+    the triangle's own where it lies at an edge.
+    """
+    corner = geometry.corner
+    _, same = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    vertex = torch.from_numpy(same.reshape(-1)[mesh.faces[geometry.kept.numpy()]])
+    vertex = vertex.to(corner.device)
+    unit = torch.nn.functional.normalize
+    edge = unit(corner.roll(-1, 1) - corner, dim=2)
+    angle = torch.acos((edge * -edge.roll(1, 1)).sum(2).clamp(-1, 1))
+    own = unit(torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), dim=1)
+    own = own[:, None].expand(-1, 3, 3)
+    sums = own.new_zeros((int(vertex.max()) + 1, 3))
+    sums.index_add_(0, vertex.flatten(), (own * angle[..., None]).reshape(-1, 3))
+    mean = unit(sums, dim=1)[vertex]
+    smooth = (mean * own).sum(2, keepdim=True) > _CREASE
+    return torch.where(smooth, mean, own).to(torch.float32)

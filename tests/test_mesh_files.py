@@ -1,0 +1,290 @@
+"""Files of meshes: what trimesh wrote comes back; and `gvtorch voxelize`, a mesh to a store."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers import gvtorch, meshes, shared
+
+import gvtorch as gv
+from gvtorch.io import shard
+from gvtorch.io.mesh_source import MeshSource
+from gvtorch.io.store_layout import WORK
+from gvtorch.meshes.voxelizer import Voxelizer
+
+trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed")
+
+CUBE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\n"
+
+
+def as_trimesh(mesh: gv.Mesh):
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+
+
+@pytest.mark.parametrize("ending", ["obj", "ply", "stl", "glb", "off", "gltf"])
+def test_every_format_comes_back(tmp_path, ending):
+    expected = meshes.torus(1.0, 0.4, (12, 8))
+    file = tmp_path / f"torus.{ending}"
+    if ending == "gltf":
+        for name, content in trimesh.exchange.gltf.export_gltf(
+            trimesh.Scene(as_trimesh(expected))
+        ).items():
+            (tmp_path / name).write_bytes(content)
+        file = tmp_path / "model.gltf"
+    else:
+        as_trimesh(expected).export(file)
+    found = gv.read_mesh(file)
+    assert found.name == str(file)
+    order = np.lexsort(found.corners.reshape(-1, 9).round(4).T)
+    other = np.lexsort(expected.corners.reshape(-1, 9).round(4).T)
+    assert np.abs(found.corners[order] - expected.corners[other]).max() < 1e-6
+    assert np.isclose(meshes.volume(found), meshes.volume(expected), rtol=1e-5)
+
+
+def test_parts_of_a_scene_stand_in_their_places(tmp_path):
+    scene = trimesh.Scene()
+    ball = as_trimesh(meshes.sphere(2))
+    for number, shift in enumerate(((0, 0, 0), (3, 0, 0), (0, 5, 0))):
+        place = trimesh.transformations.translation_matrix(shift)
+        place[:3, :3] *= number + 1
+        scene.add_geometry(ball, node_name=f"n{number}", transform=place)
+    scene.export(tmp_path / "three.glb")
+    found = gv.read_mesh(tmp_path / "three.glb")
+    assert len(found.faces) == 3 * len(ball.faces)
+    assert np.allclose(found.bounds, [[-3, -2, -3], [5, 8, 3]], atol=0.1)
+    assert meshes.volume(found) == pytest.approx((1 + 8 + 27) * ball.volume, rel=1e-5)
+
+
+def test_colours_of_vertices_and_triangles(tmp_path):
+    ball = as_trimesh(meshes.sphere(1))
+    color = np.random.default_rng(0).integers(0, 256, (len(ball.vertices), 4), np.uint8)
+    color[:, 3] = 255
+    ball.visual.vertex_colors = color
+    ball.export(tmp_path / "a.ply")
+    found = gv.read_mesh(tmp_path / "a.ply")
+    value = color[ball.faces][..., :3] / 255
+    linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    assert found.color is not None and np.abs(found.color[..., :3] - linear).max() < 1e-6
+    flat = trimesh.Trimesh(ball.vertices, ball.faces, process=False)
+    flat.visual.face_colors = (
+        color[: len(ball.faces)] if len(ball.faces) < len(color) else [255] * 4
+    )
+    flat.export(tmp_path / "b.ply")
+    assert gv.read_mesh(tmp_path / "b.ply").color is not None
+
+
+def write_textured(folder: Path, image: str = "dots.png") -> Path:
+    from PIL import Image
+
+    pixels = np.zeros((4, 4, 3), np.uint8)
+    pixels[:2] = (255, 0, 0)
+    Image.fromarray(pixels).save(folder / "dots.png")
+    (folder / "a.mtl").write_text(f"newmtl dots\nKd 1 1 1\nmap_Kd {image}\n")
+    uv = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+    text = CUBE.split("f ", 1)[0] + uv + "usemtl dots\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
+    (folder / "a.obj").write_text("mtllib a.mtl\n" + text)
+    return folder / "a.obj"
+
+
+def test_textures_and_materials_of_an_obj(tmp_path):
+    mesh = gv.read_mesh(write_textured(tmp_path))
+    texture = mesh.materials[0].texture
+    assert texture is not None and texture.shape == (4, 4, 4) and texture[0, 0, 0] == 255
+    assert mesh.uv is not None and np.array_equal(mesh.uv, mesh.corners[..., :2].astype(np.float32))
+
+
+def test_a_texture_is_laid_on(tmp_path):
+    file = write_textured(tmp_path)
+    (tmp_path / "a.mtl").unlink()
+    assert gv.read_mesh(file).materials[0].texture is None
+    mesh = gv.read_mesh(file, texture=tmp_path / "dots.png")
+    assert mesh.materials[0].texture is not None and mesh.uv is not None
+    (tmp_path / "plain.obj").write_text(CUBE)
+    with pytest.raises(ValueError, match="has no texture coordinates"):
+        gv.read_mesh(tmp_path / "plain.obj", texture=tmp_path / "dots.png")
+
+
+def test_real_files():
+    castle = gv.read_mesh(shared("meshes/kaykit/building_castle_blue.gltf"))
+    assert len(castle.faces) == 5659 and castle.uv is not None
+    assert castle.materials[0].texture is not None
+    assert castle.materials[0].texture.shape == (1024, 1024, 4)
+    oak = gv.read_mesh(shared("meshes/oak_tree_leaves.ply.gz"))
+    assert len(oak.faces) == 16046 and oak.color is not None
+    spot = gv.read_mesh(
+        shared("meshes/spot/spot_triangulated.obj.gz"),
+        texture=shared("meshes/spot/spot_texture.png"),
+    )
+    assert spot.uv is not None
+    side = np.abs(spot.uv - np.roll(spot.uv, 1, axis=1)).max()
+    assert side < 0.2  # no triangle reaches from one chart to another
+
+
+# --- Bad files
+
+
+def stl(claimed: int) -> bytes:
+    return bytes(80) + claimed.to_bytes(4, "little") + bytes(50)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.obj", b"v 0 0 0\nv 1 0 0\n", "has no triangles"),
+        ("a.obj", b"", "a.obj"),
+        ("a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "NaN"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "a.obj"),
+        ("a.stl", stl(1_000_000_000), "tells of 1000000000 triangles"),
+        (
+            "a.ply",
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\n"
+            b"property float y\nproperty float z\nelement face 1000000000\n"
+            b"property list uchar int vertex_indices\nend_header\n",
+            "tells of 1000000000 triangles",
+        ),
+        ("a.off", b"OFF 3 1000000000 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "tells of 1000000000"),
+        ("a.gltf", b'{"asset": {"version": "2.0"}', "can't be read as gltf"),
+        ("a.glb", bytes(64), "can't be read as glb"),
+        ("a.obj.gz", b"no gzip", "can't be unpacked"),
+        ("a.blend", b"x", "a mesh's name must end in"),
+        ("a.pkl", b"x", "a mesh's name must end in"),
+    ],
+)
+def test_bad_files_are_told_in_a_line(tmp_path, name, content, said):
+    (tmp_path / name).write_bytes(content)
+    run = gvtorch("voxelize", tmp_path / name, "-o", tmp_path / "a.zarr")
+    assert run.returncode == 2 and run.stderr.count("\n") == 1, run.stderr
+    assert said in run.stderr and run.stderr.startswith("gvtorch: error: ")
+    assert not (tmp_path / "a.zarr").exists()
+
+
+def test_missing_files_and_far_ones_are_told(tmp_path):
+    with pytest.raises(FileNotFoundError, match="file not found"):
+        gv.read_mesh(tmp_path / "none.obj")
+    file = write_textured(tmp_path, "none.png")
+    with pytest.raises(ValueError, match=r"names none\.png, which is not there"):
+        gv.read_mesh(file)
+    write_textured(tmp_path, "../dots.png")
+    with pytest.raises(ValueError, match=r"names \.\./dots\.png, which lies in another folder"):
+        gv.read_mesh(file)
+    write_textured(tmp_path, "http://localhost:1/dots.png")
+    with pytest.raises(ValueError, match="nothing is fetched"):
+        gv.read_mesh(file)
+    buffer = {"uri": "none.bin", "byteLength": 12}
+    (tmp_path / "a.gltf").write_text(json.dumps({"asset": {"version": "2.0"}, "buffers": [buffer]}))
+    with pytest.raises(ValueError, match=r"a\.gltf: .*none\.bin"):
+        gv.read_mesh(tmp_path / "a.gltf")
+
+
+def test_damaged_files_are_told(tmp_path):
+    """Whatever bytes change: a mesh, or one line."""
+    file = tmp_path / "a.glb"
+    as_trimesh(meshes.torus(1.0, 0.4, (8, 6))).export(file)
+    good = file.read_bytes()
+    random, told = np.random.default_rng(0), 0
+    for _ in range(60):
+        bad = bytearray(good[: random.integers(20, len(good))] if random.random() < 0.5 else good)
+        for _ in range(random.integers(1, 20)):
+            bad[random.integers(0, len(bad))] = random.integers(0, 256)
+        file.write_bytes(bytes(bad))
+        try:
+            gv.read_mesh(file)
+        except (ValueError, MemoryError) as error:
+            assert "\n" not in str(error) and "a.glb" in str(error)
+            told += 1
+    assert told > 20
+
+
+# --- Stores
+
+
+@pytest.fixture(scope="module")
+def torus_file(tmp_path_factory) -> Path:
+    file = tmp_path_factory.mktemp("mesh") / "torus.ply"
+    as_trimesh(meshes.torus(1.0, 0.4, (48, 24))).export(file)
+    return file
+
+
+@pytest.mark.parametrize("channel", ["coverage", "distance", "color", "normal", "material"])
+def test_a_store_holds_the_voxels_and_their_means(tmp_path, torus_file, channel):
+    store = tmp_path / "a.zarr"
+    run = gvtorch("voxelize", torus_file, "-o", store, "--resolution", 90, "--channels", channel)
+    assert run.returncode == 0 and "90x90x29" in run.stdout, run.stderr
+    opened = gv.Store.open(store)
+    grid = Voxelizer(gv.read_mesh(torus_file), resolution=90, channels=(channel,))
+    x, y, z = grid.extent
+    assert opened.extent == grid.extent and opened.spacing[0] == pytest.approx(grid.spacing)
+    assert opened.origin == pytest.approx(grid.origin)
+    whole = grid.region((0, 0, 0), (z, y, x))[channel].numpy()
+    assert np.array_equal(opened.read_region(0, (0, 0, 0), (z, y, x)), whole)
+    if channel == "coverage":
+        coarse = opened.read_region(1, (0, 0, 0), (z // 2, y // 2, x // 2))
+        means = whole[: z // 2 * 2].reshape(z // 2, 2, y // 2, 2, x // 2, 2, 1).mean((1, 3, 5))
+        assert np.abs(coarse - means).max() <= 0.5
+        assert opened.info.quantity == "coverage"
+    assert opened.info.labels == (channel == "material")
+
+
+def test_a_mesh_in_memory_goes_to_worker_processes(tmp_path):
+    mesh = meshes.sphere(3)
+    store = gv.voxelize(mesh, tmp_path / "a.zarr", resolution=300, workers=2)
+    assert not (tmp_path / "a.zarr" / WORK).exists()
+    total = store.read_region(0, (0, 0, 0), store.extent[::-1]).sum(dtype=np.float64) / 255
+    assert total * store.spacing[0] ** 3 == pytest.approx(meshes.volume(mesh), rel=1e-3)
+
+
+def test_a_broken_off_voxelization_goes_on(tmp_path, torus_file, monkeypatch):
+    original, ran = shard.write_shard, []
+
+    def stop(job, level, place):
+        if "memory" not in job.root["driver"]:
+            ran.append(place)
+            if len(ran) == 3:
+                raise KeyboardInterrupt
+        return original(job, level, place)
+
+    store = tmp_path / "a.zarr"
+    words = ("voxelize", torus_file, "-o", store, "--resolution", 300, "--workers", 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(shard, "write_shard", stop)
+        run = gvtorch(*words)
+    assert run.returncode == 130 and "2 of" in run.stderr
+    assert f"gvtorch voxelize {torus_file} -o {store}" in run.stderr and "--resume" in run.stderr
+    changed = gvtorch(*words, "--band", 6, "--resume")
+    assert changed.returncode == 2 and "not the one that it was begun with" in changed.stderr
+    done = gvtorch(*words, "--resume")
+    assert done.returncode == 0, done.stderr
+    assert gv.Store.open(store).extent == (300, 300, 89)
+
+
+def test_a_source_travels_without_its_mesh(tmp_path, torus_file):
+    source = MeshSource.of(torus_file, "coverage", 64, 4.0, 1.0)
+    away = pickle.loads(pickle.dumps(source.staged(tmp_path)))
+    assert away.mesh is None and len(pickle.dumps(away)) < 4000
+    low, high = (2, 10, 10), (20, 40, 50)
+    assert np.array_equal(away.read_region(low, high), source.read_region(low, high))
+
+
+def test_a_dask_cluster_voxelizes(tmp_path, torus_file):
+    distributed = pytest.importorskip("distributed", reason="dask is not installed")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
+    ) as cluster:
+        address = cluster.scheduler_address
+        words = ("--resolution", 40, "--scheduler", address)
+        run = gvtorch("voxelize", torus_file, "-o", tmp_path / "a.zarr", *words)
+    assert run.returncode == 0, run.stderr
+
+
+def test_a_torch_mesh_of_a_store_is_streamed(tmp_path, torus_file):
+    store = gv.voxelize(torus_file, tmp_path / "a.zarr", resolution=64)
+    engine = gv.Engine(gv.StoredProducer(store))
+    camera = gv.Camera.orbit(30, 40, 1.5, width=48, height=48)
+    picture = engine.render(camera, gv.Isosurface(127))
+    assert torch.isfinite(picture.color).all() and picture.alpha.max() > 0.9
+    engine.close() if hasattr(engine, "close") else None

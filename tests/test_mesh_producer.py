@@ -1,0 +1,194 @@
+"""`MeshProducer`: bricks of triangles, at every level."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from helpers import meshes
+
+import gvtorch as gv
+from gvtorch.meshes.voxelizer import Voxelizer
+from gvtorch.producers import Layout, Nodes, Region
+
+CPU = torch.device("cpu")
+#: How far voxels may be apart, and which share of them farther.
+BOUNDS = {
+    "coverage": (1, 2e-4),
+    "distance": (1e-5, 2e-4),
+    "color": (2e-3, 2e-4),
+    "normal": (1, 5e-3),
+    "material": (0, 2e-4),
+}
+ALL = ("coverage", "distance", "color", "normal", "material")
+
+
+def all_nodes(layout: Layout, depth: int) -> Nodes:
+    count = -(-torch.tensor(layout.extent) // (layout.brick_size << (layout.depth - depth)))
+    place = torch.cartesian_prod(*(torch.arange(int(n)) for n in count))
+    return Nodes(torch.cat((place, torch.full((len(place), 1), depth)), 1), layout)
+
+
+@pytest.fixture(scope="module")
+def mesh() -> gv.Mesh:
+    return meshes.joined(meshes.torus(1.0, 0.4, (48, 24)), meshes.sheet(3, 1.3))
+
+
+@pytest.fixture(scope="module")
+def world(mesh):
+    """A producer of all channels, its layout, and its finest voxels as the store has them."""
+    producer = gv.MeshProducer(mesh, resolution=100, channels=ALL)
+    layout = Layout.of(producer, 8, 1, CPU)
+    producer.prepare(layout)
+    x, y, z = producer.extent
+    voxels = Voxelizer(mesh, resolution=100, channels=ALL).region((0, 0, 0), (z, y, x))
+    return producer, layout, voxels
+
+
+def cut(voxels: torch.Tensor, nodes: Nodes) -> torch.Tensor:
+    """Bricks with border out of finest voxels, clamped at the faces as a volume's are."""
+    from gvtorch.ops import cut_bricks
+
+    return cut_bricks(voxels.contiguous(), nodes.loc[:, [2, 1, 0]].contiguous(), 8, 1)
+
+
+def inner(nodes: Nodes, voxels: torch.Tensor) -> torch.Tensor:
+    """(k, s, s, s) whether a voxel of a finest brick lies in the volume."""
+    size = torch.tensor(voxels.shape[:3])
+    at = nodes.loc[:, [2, 1, 0], None] * 8 + torch.arange(-1, 9)
+    there = (at >= 0) & (at < size[:, None])
+    return there[:, 0, :, None, None] & there[:, 1, None, :, None] & there[:, 2, None, None, :]
+
+
+def test_finest_bricks_hold_the_store_s_voxels(world):
+    producer, layout, voxels = world
+    nodes = all_nodes(layout, layout.depth)
+    made = producer.fill(nodes).data
+    there = inner(nodes, voxels["coverage"])
+    for name, expected in voxels.items():
+        found, wanted = (one[there].double() for one in (made[name], cut(expected, nodes)))
+        apart = (found - wanted).abs().amax(1)
+        # Cubes begin elsewhere, so that float32 rounds otherwise: between two triangles that are
+        # equally far, the other one tells the normal.
+        bound, share = BOUNDS[name]
+        assert (apart > bound).double().mean() < share, name
+
+
+def test_regions_are_proved_at_every_level(world):
+    """EMPTY and CONSTANT nodes hold one value in reach, as made and in the finest voxels."""
+    producer, layout, voxels = world
+    alone = gv.MeshProducer(producer.voxelizer.mesh, resolution=100)
+    seen = []
+    for depth in range(layout.depth + 1):
+        nodes = all_nodes(layout, depth)
+        for one in (producer, alone):
+            regions = one.classify(nodes)
+            proved = regions.kind != Region.DATA
+            if not proved.any():
+                continue
+            made = one.fill(nodes[proved]).data
+            for name, values in made.items():
+                value = regions.constants[name][proved]
+                assert torch.equal(values, value[:, None, None, None].expand_as(values)), name
+            scale = 2 ** (layout.depth - depth)
+            for loc, value in zip(
+                nodes.loc[proved].tolist(), regions.constants["coverage"][proved], strict=True
+            ):
+                low = [max(0, (n * 8 - 1) * scale) for n in loc[2::-1]]
+                high = [((n + 1) * 8 + 1) * scale for n in loc[2::-1]]
+                box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+                assert (voxels["coverage"][box] == value).all()
+        kinds = alone.classify(nodes).kind
+        seen.append([int((kinds == kind).sum()) for kind in Region])
+    assert seen[0][Region.DATA] == 1
+    assert seen[-1][Region.EMPTY] > 100 and seen[-1][Region.CONSTANT] >= 3
+
+
+def test_a_coarse_voxel_is_nearly_the_mean_below(world):
+    """One level up to rounding; farther up as far as planes in an eighth of a voxel tell."""
+    producer, layout, voxels = world
+    bounds = {  # by scale: mean and largest difference of the coverage, of distances in voxels
+        2: (2.5e-4, 2.6e-3, 1e-5, 1e-4),
+        4: (1.2e-3, 0.06, 0.02, 0.2),
+        8: (5e-3, 0.08, 0.09, 0.5),
+    }
+    for scale, bound in bounds.items():
+        depth = layout.depth - scale.bit_length() + 1
+        nodes = all_nodes(layout, depth)
+        made = producer.fill(nodes).data
+        for name, unit, (mean, most) in (
+            ("coverage", 255.0, bound[:2]),
+            ("distance", producer.spacing[0], bound[2:]),
+        ):
+            values = voxels[name].double() / unit
+            z, y, x = (n // scale for n in values.shape[:3])
+            values = values[: z * scale, : y * scale, : x * scale]
+            below = values.reshape(z, scale, y, scale, x, scale).mean((1, 3, 5))
+            found = torch.zeros(*(8 * (int(n) + 1) for n in nodes.loc[:, [2, 1, 0]].amax(0)))
+            for (a, b, c, _), brick in zip(nodes.loc.tolist(), made[name], strict=True):
+                own = (slice(8 * n, 8 * n + 8) for n in (c, b, a))
+                found[tuple(own)] = brick[1:-1, 1:-1, 1:-1, 0] / unit
+            apart = (found[:z, :y, :x] - below).abs()
+            assert apart.mean() < mean and apart.max() < most, (name, scale)
+
+
+def test_the_volume_stays_from_level_to_level():
+    """Of a solid, to a hundredth as far up as it is three voxels thick."""
+    ball = meshes.sphere(4)
+    producer = gv.MeshProducer(ball, resolution=128)
+    layout = Layout.of(producer, 8, 1, CPU)
+    producer.prepare(layout)
+    for depth in range(1, layout.depth + 1):
+        nodes = all_nodes(layout, depth)
+        filled = producer.fill(nodes).data["coverage"][:, 1:-1, 1:-1, 1:-1].double().sum() / 255
+        size = producer.spacing[0] * 2 ** (layout.depth - depth)
+        assert float(filled) * size**3 == pytest.approx(meshes.volume(ball), rel=0.01)
+
+
+def test_streamed_is_the_resident_tree_of_its_voxels(world):
+    """Of the finest level, drawn from small pools."""
+    producer, _, voxels = world
+    place = producer.spacing, producer.origin
+    tree = gv.N3Tree.from_volume({"coverage": gv.Volume(voxels["coverage"], *place)}, 8)
+    alone = gv.MeshProducer(producer.voxelizer.mesh, resolution=100)
+    engine = gv.Engine(alone)
+    camera = gv.Camera.orbit(25, 50, 1.3, width=64, height=48)
+    for lod, bound in (("finest", 0.003), ("auto", 0.02)):
+        surface = gv.Isosurface(127, (0.8, 0.7, 0.6))
+        told = {"lod": lod}
+        expected = gv.render(tree, camera, surface, **told)
+        found = engine.render(camera, surface, **told)
+        apart = (found.color - expected.color).abs()
+        assert apart.mean() < bound and (apart > 0.1).double().mean() < 0.02
+        assert expected.alpha.mean() > 0.2
+
+
+def test_deep_levels_are_made_where_one_looks():
+    """2^26 voxels along a side: a brick of the finest level, against the triangle's plane there."""
+    ball = meshes.of_corners(meshes.sphere(2).corners)
+    producer = gv.MeshProducer(ball, resolution=2**26, channels=("distance",))
+    layout = Layout.of(producer, 8, 1, CPU)
+    producer.prepare(layout)
+    corner = ball.corners[40]
+    place = corner.mean(0)
+    at = (place - np.array(producer.origin)) / producer.spacing[0] + 0.5
+    loc = torch.tensor([[*(int(n) // 8 for n in at), layout.depth]])
+    nodes = Nodes(loc, layout)
+    assert producer.classify(nodes).kind.item() == Region.DATA
+    found = producer.fill(nodes).data["distance"][0, ..., 0].double()
+    normal = np.cross(corner[1] - corner[0], corner[2] - corner[0])
+    normal /= np.linalg.norm(normal)
+    local = [one[0].double() for one in nodes.local_axes]
+    shift = nodes.center[0].numpy() - place
+    height = sum(n * (x + s) for n, x, s in zip(normal, local, shift, strict=True))
+    exact = height.clamp(-producer.voxelizer.band, producer.voxelizer.band)
+    assert (found - exact).abs().max() < 1e-3 * producer.spacing[0]
+
+
+def test_a_file_is_read(tmp_path):
+    pytest.importorskip("trimesh", reason="trimesh is not installed")
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    producer = gv.MeshProducer(tmp_path / "a.obj", resolution=32)
+    assert producer.extent == (32, 32, 5)
+    with pytest.raises(ValueError, match="channels must be some of"):
+        gv.MeshProducer(tmp_path / "a.obj", channels=("value",))
