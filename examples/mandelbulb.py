@@ -29,7 +29,7 @@ class Settings:
 def main(settings: Settings) -> None:
     """Streams what the picture needs, then lights it."""
     shape = {
-        "bulb": gv.Mandelbulb(8, iterations=5, colors=COLORS),
+        "bulb": gv.Mandelbulb(8, iterations=6, colors=COLORS),
         "julia": gv.Julia((-0.2, 0.5, 0.3), 2, iterations=12, colors=COLORS),
         "box": gv.Mandelbox(2.0, iterations=12, colors=COLORS),
     }[settings.fractal]
@@ -38,8 +38,8 @@ def main(settings: Settings) -> None:
         "rgba", premultiplied=True, lit=True, light=SUN, ambient=0.4, diffuse=0.85, specular=0.15
     )
     size = {"width": settings.size * 16 // 9, "height": settings.size}
-    camera = gv.Camera.orbit(35, 28, distance=1.8, **size)
-    options = {"cone_scale": 3.0, "background": SKY}
+    camera = gv.Camera.orbit(35, 28, distance=2.05, **size)
+    options = {"cone_scale": 2.4, "background": SKY}
     light = gv.Lighting(  # no shadows: its own crevices shade it enough
         ambient=(0.6, 0.75, 1.0), shadows=0, occlusion=1.0, reach=0.12, frame="box", cones=3
     )
