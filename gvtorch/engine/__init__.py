@@ -1,6 +1,7 @@
 """The engine: frames that stream what the rays ask for."""
 
-from .engine import Engine, FrameGraph
+from .engine import Engine
+from .frame_graph import FrameGraph
 from .production import Failure, ProductionError
 from .setup import EngineOptions, EngineSettings
 from .stats import FrameStats

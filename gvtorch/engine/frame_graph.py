@@ -1,0 +1,134 @@
+"""`FrameGraph`: a frame as CUDA graphs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
+from functools import partial
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from ..base.records import Hits, Rays
+from ..base.stage import stage
+from ..cameras import Camera
+from ..cameras.custom import as_camera
+from ..pictures import Picture
+from ..tracing import RenderOptions
+from ..tracing.pixels import View
+from .device_frame import DeviceFrame
+from .host_frame import HostFrame
+from .stats import Collected, FrameStats, Readbacks
+
+
+class Steps(Protocol):
+    """The steps of a frame: `Engine` has them."""
+
+    device: torch.device
+    frames: int
+    readbacks: Readbacks
+
+    @property
+    def steady(self) -> bool: ...
+    @property
+    def changed(self) -> bool: ...
+    def new_frame(self, options: RenderOptions) -> AbstractContextManager[FrameStats]: ...
+    def release(self, but: HostFrame | None = None) -> None: ...
+    def number_picture(self, on_device: bool = True) -> None: ...
+    def collect_requests_and_use(self, samples: Tensor) -> Collected: ...
+    def read_back(self, stats: FrameStats, hits: Hits, collected: Collected) -> None: ...
+
+
+class FrameGraph:
+    """A frame as CUDA graphs, one that serves and one that draws, which cost the host a call each.
+    `Engine.capture` makes it.
+
+    A replay is the frame that `Engine.frame` would render. Where all producers are `on_device`, it
+    also makes what the replay before it missed; where all are `on_host`, these get the list of what
+    a replay missed once it has arrived, and a later one writes what they answered. Else it produces
+    nothing; where `Engine.steady` is false, something was missed or an answer is on its way: then
+    call `Engine.frame` until it is true::
+
+        render = graph.replay if engine.steady else partial(engine.frame, shader=shader)
+        picture, stats = render(camera)
+    """
+
+    def __init__(
+        self,
+        engine: Steps,
+        view: View,
+        served: DeviceFrame | HostFrame | None,
+        again: Callable[[Camera | Rays], tuple[Picture, FrameStats]],
+    ) -> None:
+        """Records the frame; see `Engine.capture`. `again` renders one that the host serves."""
+        self._engine, self._served, self._again = engine, served, again
+        self._view = view = replace(view, numbers=view.numbers.clone())  # of a replay's camera
+        self._number = -1  # of its last picture
+        self._serve, self._draw = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
+        if served is not None:
+            with _recorded(self._serve, engine.device):
+                served.serve()
+        with _recorded(self._draw, engine.device):
+            if served is not None:
+                self._hits, self._collected = served.draw(view.hits)
+            else:
+                self._hits = view.hits()
+                self._collected = engine.collect_requests_and_use(self._hits.samples)
+            self._picture = view.picture(self._hits, FrameStats())
+
+    def replay(self, camera: Camera | Rays) -> tuple[Picture, FrameStats]:
+        """Renders a frame; the host does not wait for the device.
+
+        Args:
+            camera: As many cameras of the same size as were captured.
+
+        Returns:
+            The picture, which the next replay overwrites, and what it cost; see `Engine.frame`.
+
+        Raises:
+            ValueError: The camera differs in number or size, or the engine is closed.
+        """
+        camera = as_camera("replay", camera)
+        form, own = camera.form, self._view.camera.form
+        if form != own:
+            raise ValueError(
+                f"replay: camera must be {own[0]} of {own[2]}x{own[1]} pixels as captured "
+                f"({own[4]}), got {form[0]} of {form[2]}x{form[1]} ({form[4]})"
+            )
+        engine, served = self._engine, self._served
+        if engine.changed:
+            return self._again(camera)  # which makes the changed trees anew
+        if served is not None and (engine.readbacks.failed or served.host_needed):
+            served.host_needed = False
+            return self._again(camera)  # the host finds out which nodes fail, and names them
+        with torch.cuda.device(engine.device), engine.new_frame(self._view.options) as stats:
+            if served is not None:
+                engine.release(but=served if isinstance(served, HostFrame) else None)
+                engine.readbacks.take_arrived()
+                stale = engine.frames != self._number
+                with stage("serve"):
+                    if served.begin(stale, engine.steady, stats):
+                        self._serve.replay()
+            engine.number_picture(on_device=served is None)
+            self._number = engine.frames
+            self._view.numbers.copy_(camera.placed(self._view.box).numbers(engine.device))
+            with stage("replay"):
+                self._draw.replay()
+            collected = self._collected
+            if isinstance(served, HostFrame):
+                collected = collected._replace(ask=partial(served.ask, served.turn))
+            engine.read_back(stats, self._hits, collected)
+        engine.readbacks.hold_back()
+        return replace(self._picture, stats=stats), stats
+
+    def __repr__(self) -> str:
+        return f"FrameGraph({self._view.camera!r})"
+
+
+@contextmanager
+def _recorded(graph: torch.cuda.CUDAGraph, device: torch.device) -> Iterator[None]:
+    """Records what the block does on the device."""
+    with torch.cuda.device(device), torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        yield
