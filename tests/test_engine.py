@@ -370,7 +370,7 @@ def test_a_wandering_camera_leaves_memory_flat(blobs):
                 live.append(sum(isinstance(one, torch.Tensor) for one in gc.get_objects()))
                 pages.append(int(Path("/proc/self/statm").read_text().split()[1]))
         engine.validate()
-        assert len(live) == 4 and max(live) - min(live) <= 8, live
+        assert len(live) == 4 and max(live) - live[0] <= 8, live  # what others left may go
         assert (pages[-1] - pages[0]) * 4096 < 20e6, "resident memory is flat"
         assert evicted > 1000 and len(engine.production.failures) == 0
 
