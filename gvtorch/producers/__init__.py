@@ -3,6 +3,7 @@
 from .field import FieldProducer, cache_field
 from .hypertexture import Hypertexture
 from .mesh import MeshProducer
+from .points import PointProducer
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 from .stored import StoredProducer
 from .volume import VolumeProducer
@@ -14,6 +15,7 @@ __all__ = [
     "Layout",
     "MeshProducer",
     "Nodes",
+    "PointProducer",
     "Producer",
     "Region",
     "Regions",

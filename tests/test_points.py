@@ -1,0 +1,145 @@
+"""Points as voxels: beside a dense histogram at every level, sums, proofs, pictures, bad input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+import gvtorch as gv
+from gvtorch.producers import Layout
+
+BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+CPU = torch.device("cpu")
+
+
+def some_points(count: int = 4000, width: int = 2) -> tuple[torch.Tensor, torch.Tensor]:
+    """Clusters away from the faces; most regions hold nothing."""
+    random = torch.Generator().manual_seed(3)
+    middle = torch.rand((12, 3), generator=random) * 1.4 - 0.7
+    place = middle[torch.randint(0, 12, (count,), generator=random)]
+    place = place + 0.06 * torch.randn((count, 3), generator=random).clamp(-2.5, 2.5)
+    return place.double(), torch.rand((count, width), generator=random).double() + 0.1
+
+
+def dense(place: torch.Tensor, value: torch.Tensor, side: int) -> np.ndarray:
+    """(z, y, x, c) sums of the points in voxels, by NumPy."""
+    parts = [
+        np.histogramdd(
+            place.flip(1).numpy(), (side,) * 3, [(-1, 1)] * 3, weights=value[:, c].numpy()
+        )[0]
+        for c in range(value.shape[1])
+    ]
+    return np.stack(parts, -1)
+
+
+def prepared(branching: int = 2, side: int = 64, **options) -> tuple[gv.PointProducer, Layout]:
+    producer = gv.PointProducer(*some_points(), side, box=BOX, branching=branching, **options)
+    layout = Layout.of(producer, 4, 1, CPU)
+    producer.prepare(layout)
+    return producer, layout
+
+
+def all_nodes(layout: Layout, depth: int) -> gv.Nodes:
+    along = torch.arange(layout.branching**depth)
+    loc = torch.cartesian_prod(along, along, along).flip(1)
+    return gv.Nodes(torch.cat((loc, torch.full((len(loc), 1), depth)), 1), layout)
+
+
+@pytest.mark.parametrize("branching, side", [(2, 64), (3, 36)])
+def test_every_level_is_the_histogram_and_its_mean(branching, side):
+    producer, layout = prepared(branching, side)
+    place, value = some_points()
+    total = value.sum(0).numpy()
+    finest = dense(place, value, side)
+    for depth in range(layout.depth, -1, -1):
+        nodes = all_nodes(layout, depth)
+        bricks = producer.fill(nodes)["value"]
+        along, n = branching**depth, side // branching ** (layout.depth - depth)
+        own = bricks[:, 1:-1, 1:-1, 1:-1].reshape(along, along, along, 4, 4, 4, 2)
+        level = own.permute(0, 3, 1, 4, 2, 5, 6).reshape(n, n, n, 2)
+        assert np.allclose(level, finest, rtol=1e-6, atol=1e-7)
+        scale = branching ** (3 * (layout.depth - depth))
+        assert np.allclose(level.double().sum((0, 1, 2)) * scale, total, rtol=1e-6)
+        wide = np.pad(finest, ((1, 1), (1, 1), (1, 1), (0, 0)))
+        for row in range(0, len(nodes), 37):
+            x, y, z = (4 * nodes.loc[row, :3]).tolist()
+            brick = wide[z : z + 6, y : y + 6, x : x + 6]
+            assert np.allclose(bricks[row], brick, rtol=1e-6, atol=1e-7), "with its border"
+        if depth:
+            finest = finest.reshape(*(n // branching, branching) * 3, 2).mean((1, 3, 5))
+
+
+@pytest.mark.parametrize("branching, side", [(2, 64), (3, 36)])
+def test_what_is_proven_holds_for_all_below(branching, side):
+    producer, layout = prepared(branching, side)
+    levels = {d: producer.fill(all_nodes(layout, d))["value"] for d in range(layout.depth + 1)}
+    empty = 0
+    for depth in range(layout.depth + 1):
+        nodes = all_nodes(layout, depth)
+        regions = producer.classify(nodes)
+        low, high = regions.ranges["value"].unbind(1)
+        for below in range(depth, layout.depth + 1):
+            inner = all_nodes(layout, below).loc[:, :3] // branching ** (below - depth)
+            along = branching**depth
+            owner = inner[:, 0] + inner[:, 1] * along + inner[:, 2] * along**2
+            voxels = levels[below].flatten(1, 3)
+            assert (voxels >= low[owner][:, None]).all() and (voxels <= high[owner][:, None]).all()
+            bare = regions.kind[owner] == gv.Region.EMPTY
+            assert not voxels[bare].any()
+        empty += int((regions.kind == gv.Region.EMPTY).sum())
+    assert empty > 100
+
+
+@pytest.mark.backend("cpp")
+def test_streamed_points_are_the_picture_of_the_dense_volume():
+    place, value = some_points(width=1)
+    look = gv.TransferFunction.from_points([(0, 0), (3, 0.8)], [(0, 1, 0.5, 0.2), (3, 1, 1, 1)])
+    camera = gv.Camera.orbit(20, 30, 1.2, None, 40, 32)
+    volume = gv.Volume(
+        torch.from_numpy(dense(place, value, 64)).float(),
+        spacing=(2 / 64,) * 3,
+        origin=(-1 + 1 / 64,) * 3,
+    )
+    expected = gv.render(gv.N3Tree.from_volume(volume, 4), camera, look)
+    producer = gv.PointProducer(place, value[:, 0], 64, box=BOX)
+    with gv.Engine(producer, brick_size=4, brick_pool="300 kB") as engine:
+        picture = engine.render(camera, look)
+        engine.validate()
+    assert picture.stats.converged and (expected.alpha > 0.2).any()
+    assert torch.allclose(picture.color, expected.color, atol=1e-5)
+
+
+def test_the_box_is_around_all_points_unless_given():
+    place, value = some_points()
+    producer = gv.PointProducer(place, value)
+    assert max(producer.extent) == 1024 and producer._value.sum() == pytest.approx(value.sum())
+    part = gv.PointProducer(place, value, box=((0, 0, 0), (1, 1, 1)))
+    assert 0 < len(part._value) < len(place), "points outside are left out"
+    one = gv.PointProducer(torch.zeros(1, 3))
+    assert one.extent == (1024, 1024, 1024) and len(one._value) == 1
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: gv.PointProducer(torch.zeros(0, 3)), r"positions must be (n, 3), n >= 1"),
+        (lambda: gv.PointProducer(torch.zeros(4, 2)), r"positions must be (n, 3)"),
+        (lambda: gv.PointProducer(torch.full((2, 3), torch.nan)), "positions must be finite"),
+        (lambda: gv.PointProducer(torch.zeros(2, 3), torch.ones(3)), r"values must be (2,) or"),
+        (lambda: gv.PointProducer(torch.zeros(2, 3), torch.ones(2) / 0), "values must be finite"),
+        (
+            lambda: gv.PointProducer(torch.zeros(2, 3), box=((1, 1, 1), (2, 2, 2))),
+            "no point lies in the box",
+        ),
+        (lambda: gv.PointProducer(torch.zeros(2, 3), dtype=torch.uint8), "dtype must be one of"),
+        (
+            lambda: gv.Engine(gv.PointProducer(torch.rand(9, 3), extent=2**30)),
+            "more voxels than a 64-bit number tells apart",
+        ),
+    ],
+)
+def test_bad_points_are_named(call, message):
+    with pytest.raises((ValueError, gv.ProductionError)) as caught:
+        call()
+    assert message in str(caught.value)
