@@ -324,3 +324,30 @@ def test_a_frame_that_is_broken_off_loses_nothing(later):
         engine.validate()
         assert picture.stats.converged and picture.stats.failed == 0 and len(broken) == 3
         assert torch.equal(picture.color, plain.render(view, GRAY, lod="finest").color)
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.float32])
+def test_loaded_bricks_narrow_the_ranges_of_nodes_without_children(dtype):
+    """`classify` tells bounds; once a brick is there, its voxels tell its range, borders included."""
+
+    class Loose(Ball):
+        def fill(self, nodes):
+            value = super().fill(nodes)["value"]
+            return {"value": value if dtype.is_floating_point else (200 * value).to(dtype)}
+
+    options = {"channels": {"value": gv.Channel(dtype)}}
+    shader = gv.TransferFunction.preset("gray", 0, 1 if dtype.is_floating_point else 200)
+    with gv.Engine(Loose(**options), **SIZE) as engine:
+        picture = engine.render(camera(64), shader)
+        nodes, pool = engine.cache.nodes, engine.cache.bricks
+        held = nodes.brick_tn >= 0
+        leaf = held & (nodes.child_tn == config.TERMINAL)
+        slot = nodes.brick_tn[leaf].to(torch.int64)
+        voxels = pool.bricks["value"].to(torch.float64).flatten(1, 3)[slot]
+        ranges = nodes.ranges["value"].to(torch.float64)
+        assert leaf.sum() > 20
+        assert torch.equal(ranges[leaf], torch.stack((voxels.amin(1), voxels.amax(1)), 1))
+        told = torch.tensor(gv.Channel(dtype).limits, dtype=torch.float64)[:, None]
+        assert (held & ~leaf).any() and (ranges[held & ~leaf] == told).all()
+        assert torch.equal(engine.render(camera(64), shader).color, picture.color)

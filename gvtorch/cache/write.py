@@ -216,11 +216,15 @@ def write_slots(cache: Cache, slot: Tensor, node: Tensor, data: Voxels | Sequenc
     unlink(nodes.brick_tn, pool.owner_b, pool.shared_b, slot_k)
     with pool.writing():
         if isinstance(data, Mapping):
-            _fill_slots(cache, slot, {n: on_device(r, slot.device) for n, r in data.items()})
+            arrived = {n: on_device(r, slot.device) for n, r in data.items()}
+            _fill_slots(cache, slot, arrived)
+            _narrow_ranges(cache, slot, node, arrived)
         else:
             for chunk in data:
                 with chunk as arrived:
-                    _fill_slots(cache, slot[chunk.begin : chunk.end], arrived)
+                    some = slice(chunk.begin, chunk.end)
+                    _fill_slots(cache, slot[some], arrived)
+                    _narrow_ranges(cache, slot[some], node[some], arrived)
     slots = (pool.owner_b, pool.stamp_b, pool.born_b, pool.shared_b)
     link_bricks(nodes.brick_tn, nodes.request_tn, *slots, node, slot_k, cache.frame_1)
 
@@ -232,6 +236,22 @@ def _fill_slots(cache: Cache, slot: Tensor, data: Mapping[str, Tensor]) -> None:
             put_rows_of(held, slot, data[name])
         elif not cache.bricks.channels[name].coarse:  # a tree without this channel
             put_rows_of(held, slot, held.new_zeros(1).expand(len(slot), *held.shape[1:]))
+
+
+def _narrow_ranges(cache: Cache, slot: Tensor, node: Tensor, data: Mapping[str, Tensor]) -> None:
+    """Gives nodes (k,) that have no finer level the ranges of their voxels, borders included: what
+    `classify` told may have been a bound.
+    """
+    nodes = cache.nodes
+    finest = nodes.child_tn.view(-1)[node.clamp(min=0)] == TERMINAL
+    index = torch.where(finest & (slot >= 0), node, -1)
+    for name, words in nodes.ranges.items():
+        if name in data and not cache.bricks.channels[name].coarse:
+            voxels = data[name].flatten(1, 3)
+            if voxels.dtype == torch.uint16:  # which torch can't compare
+                voxels = voxels.to(torch.int32)
+            ends = torch.stack((voxels.amin(1), voxels.amax(1)), 1)
+            put_rows_of(words.flatten(0, 1), index, ends)
 
 
 def _brick_bytes(data: Voxels | Sequence[Chunk]) -> int:

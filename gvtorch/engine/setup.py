@@ -248,10 +248,10 @@ def _fill_root(cache: Cache, made: ProducedTree, patience: float) -> None:
     if kind in (Region.EMPTY, Region.CONSTANT):
         nodes.brick_tn.view(-1)[index] = EMPTY if kind == Region.EMPTY else CONSTANT
         return
-    slot = torch.tensor([number], device=root.loc.device)
-    write_slots(cache, slot, slot * nodes.nodes_per_tile, bricks.data)
     if made.layout.depth > 0 and kind != Region.DATA_MAX_DEPTH:
         nodes.child_tn.view(-1)[index] = ABSENT
+    slot = torch.tensor([number], device=root.loc.device)
+    write_slots(cache, slot, slot * nodes.nodes_per_tile, bricks.data)
 
 
 def _raise_first(errors: Mapping[int, str]) -> None:
