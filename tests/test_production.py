@@ -329,7 +329,7 @@ def test_a_frame_that_is_broken_off_loses_nothing(later):
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.float32])
 def test_loaded_bricks_narrow_the_ranges_of_nodes_without_children(dtype):
-    """`classify` tells bounds; once a brick is there, its voxels tell its range, borders included."""
+    """`classify` tells bounds; once a brick is there, its voxels tell, borders included."""
 
     class Loose(Ball):
         def fill(self, nodes):
