@@ -146,8 +146,8 @@ class SparseSource(VolumeSource, ABC):
         """Fills a part."""
         with _LOCK:  # the first thread looks for the nodes
             grid = self.grid()
-        low, high = ([n + at for n, at in zip(ends, self.low, strict=True)]
-                     for ends in zip(*((s.start, s.stop) for s in index[:3]), strict=True))  # fmt: skip
+        low = [part.start + at for part, at in zip(index[:3], self.low, strict=True)]
+        high = [part.stop + at for part, at in zip(index[:3], self.low, strict=True)]
         values = grid.fill(low, high)
         return values[..., index[3]] if len(index) > 3 else values[..., 0]
 

@@ -190,7 +190,7 @@ class VdbWriter:
     def numbers(self, grid: Grid, values: np.ndarray) -> bytes:
         """Numbers, packed."""
         content = np.ascontiguousarray(values.astype("f2") if grid.half else values).tobytes()
-        if self.version < 222 and not self.packing or not self.packing & (ZIP | BLOSC):
+        if (self.version < 222 and not self.packing) or not self.packing & (ZIP | BLOSC):
             return content
         if self.packing & ZIP:
             packed = zlib.compress(content)
@@ -233,16 +233,39 @@ NANO_DTYPES = {
 }  # fmt: skip
 
 
+def _nano_leaf(
+    kind: str, rng: np.random.Generator, steps: int | None
+) -> tuple[bytes, np.ndarray, bytes]:
+    """A leaf's values as it holds them, as (512, c) or (512,), and what stands before codes."""
+    dtype, width = _numbers(kind)
+    if steps:
+        codes = rng.integers(0, 2**steps, 512)
+        flags = codes[:, None] >> np.arange(steps) & 1
+        least, step = np.float32(0.25), np.float32(0.125)
+        head = struct.pack("<2f", least, step)
+        return bits(flags.reshape(-1)), codes.astype("f4") * step + least, head
+    if dtype.kind == "b":
+        found = rng.random(512) < 0.5
+        return bits(found), found, b""
+    found = rng.integers(0, 100, (512, width)).astype(dtype)
+    return found.tobytes(), found, b""
+
+
+def _numbers(kind: str) -> tuple[np.dtype, int]:
+    return np.dtype(NANO_DTYPES.get(kind, "f4")), int(kind[3]) if kind[:3] == "Vec" else 1
+
+
 def nano_grid(kind: str, rng: np.random.Generator, bits_of_leaf: int = 8) -> tuple[bytes, Any]:
-    """A NanoVDB grid of two leaves at (-8, 0, 0) and (0, 8, 16), a tile of 8 voxels at (0, 0, 16)
-    and one of 128 at (128, 0, 0); and its (16, 16, 24, c) voxels from (-8, 0, 0) on.
+    """A NanoVDB grid of two leaves at (-8, 0, 0) and (0, 8, 16), and tiles at (0, 0, 16), of 8
+    voxels, (128, 0, 0), of 128, and (8192, 0, 0), of 4096; and its (16, 16, 24, c) voxels from
+    (-8, 0, 0) on.
     """
-    number, root, of_tile, tile, up, upper, low, lower, entry, values, leaf = NANO[kind]
-    dtype, width = np.dtype(NANO_DTYPES.get(kind, "f4")), int(kind[3]) if kind[:3] == "Vec" else 1
+    number, root, tile_value, tile, up, upper, low, lower, entry, values, leaf = NANO[kind]
+    dtype, width = _numbers(kind)
     steps = {"Fp4": 4, "Fp8": 8, "Fp16": 16, "FpN": bits_of_leaf}.get(kind)
     leaf += 64 * bits_of_leaf if kind == "FpN" else 0
     at_root = 672 + 64
-    at_upper = [at_root + root + 2 * tile, at_root + root + 2 * tile + upper]
+    at_upper = [at_root + root + 3 * tile, at_root + root + 3 * tile + upper]
     at_lower = [at_upper[1] + upper, at_upper[1] + upper + lower]
     at_leaf = [at_lower[1] + lower, at_lower[1] + lower + leaf]
     out = bytearray(at_leaf[1] + leaf)
@@ -251,12 +274,15 @@ def nano_grid(kind: str, rng: np.random.Generator, bits_of_leaf: int = 8) -> tup
     out[296 + 88 : 296 + 88 + 72] = np.diag((0.5, 0.25, 2.0)).tobytes()
     struct.pack_into("<3d", out, 528, 10, 20, 30)
     struct.pack_into("<4q", out, 672, at_leaf[0] - 672, at_lower[0] - 672, at_upper[0] - 672, 64)
-    struct.pack_into("<6iI", out, at_root, -8, 0, 0, 7, 15, 23, 2)
+    struct.pack_into("<6iI", out, at_root, -8, 0, 0, 7, 15, 23, 3)
     back, fill = (np.full(width, n).astype(dtype) for n in (1, 3))
     at = at_root + (32 if dtype.itemsize == 8 else 28)
     out[at : at + back.nbytes] = back.tobytes()
     box = np.tile(back, (16, 16, 24, 1))
     box[8:, :8, 16:] = fill
+    at = at_root + root + 2 * tile
+    struct.pack_into("<Qq", out, at, 2 << 42, 0)
+    out[at + tile_value : at + tile_value + fill.nbytes] = fill.tobytes()
     for n, place in enumerate(((-8, 0, 0), (0, 8, 16))):
         keys = [(p & 0xFFFFFFFF) >> 12 for p in place]
         key = keys[0] << 42 | keys[1] << 21 | keys[2]
@@ -272,22 +298,14 @@ def nano_grid(kind: str, rng: np.random.Generator, bits_of_leaf: int = 8) -> tup
                 out[begin : begin + back.nbytes] = back.tobytes()
             out[base + 32 + count**3 // 8 + index // 8] |= 1 << index % 8
             struct.pack_into("<q", out, base + entries + index * entry, child - base)
-        begin = at_lower[n] + low + (2 if n else 2 + 256 * 8) * entry  # (0, 0, 16), and one outside
         if n:
-            out[begin : begin + fill.nbytes] = fill.tobytes()
-        if steps:
-            codes = rng.integers(0, 2**steps, 512)
-            least, step = np.float32(0.25), np.float32(0.125)
-            struct.pack_into("<2f", out, at_leaf[n] + 80, least, step)
-            out[at_leaf[n] + 15] = steps.bit_length() - 1 << 5
-            flags = codes[:, None] >> np.arange(steps) & 1
-            content, found = bits(flags.reshape(-1)), codes.astype("f4") * step + least
-        elif dtype.kind == "b":
-            found = rng.random(512) < 0.5
-            content = bits(found)
-        else:
-            found = rng.integers(0, 100, (512, width)).astype(dtype)
-            content = found.tobytes()
+            for begin in (at_lower[n] + low + 2 * entry, at_upper[n] + up + 1024 * entry):
+                out[begin : begin + fill.nbytes] = fill.tobytes()
+        content, found, head = _nano_leaf(kind, rng, steps)
+        out[at_leaf[n] + 15 : at_leaf[n] + 16] = bytes(
+            [steps.bit_length() - 1 << 5 if steps else 0]
+        )
+        out[at_leaf[n] + 80 : at_leaf[n] + 80 + len(head)] = head
         begin = at_leaf[n] + values
         out[begin : begin + len(content)] = content
         i, j, k = (p - o for p, o in zip(place, (-8, 0, 0), strict=True))

@@ -1,8 +1,8 @@
 """NanoVDB (`.nvdb`, versions 32.*): grids as they lie in memory, packed as a whole or not.
 
 A file is one segment after another: a head, what is told of each grid, then the grids. A grid is
-672 bytes of head (name, transform, class, type), 64 of tree, the root with its tiles, and nodes that
-lie anywhere behind, found by offsets. Each part is laid out as a C++ compiler lays out its struct.
+672 bytes of head (name, transform, class, type), 64 of tree, the root with its tiles, and nodes
+that lie anywhere behind, found by offsets. Each part is laid out as C++ lays out its struct.
 Source: the NanoVDB headers of OpenVDB (NanoVDB.h, PNanoVDB.h, io/IO.h) tell the layout.
 """
 
@@ -175,7 +175,9 @@ def _content(path: str, head: Head, most: int = 0) -> Any:
                 if most:
                     return zlib.decompressobj().decompress(part, most)
                 return unpack("zip", part, head.size)
-            parts.append(unpack("blosc", part, int.from_bytes(part[4:8], "little"), head.size - size))
+            parts.append(
+                unpack("blosc", part, int.from_bytes(part[4:8], "little"), head.size - size)
+            )
             size += len(parts[-1])
         return b"".join(parts)
 
@@ -271,10 +273,10 @@ class NanoGrid(SparseGrid):
         for level in (0, 1):
             least = layout.entries[1] if level == 0 else layout.leaf
             below = list(_children(data, layout, level, found[-1], origins[-1]))
-            places, corner = (np.concatenate(part) if part else np.zeros(shape, np.int64)
-                              for part, shape in zip(zip(*below) or ((), ()), ((0,), (0, 3))))  # fmt: skip
+            none = np.zeros((0, 3), np.int64)
+            places = np.concatenate([none[:, 0], *(part for part, _ in below)])
+            origins.append(np.concatenate([none, *(corners for _, corners in below)]))
             found.append(_checked(places, len(data), least))
-            origins.append(corner)
         return cls(
             dtype=np.dtype(dtype),
             background=np.ndarray((width,), dtype, data, _ROOT + _up(28, np.dtype(dtype).itemsize)),

@@ -90,7 +90,8 @@ class Cursor:
 
     def told(self) -> dict[str, Any]:
         """Reads metadata; of kinds that are not known the values are left out."""
-        found, count = {}, self.number("<I")
+        found: dict[str, Any] = {}
+        count = self.number("<I")
         if count > _MOST_TOLD:
             raise ValueError(f"has {count} metadata")
         for _ in range(count):
@@ -159,9 +160,7 @@ def open_openvdb(path: str, key: str | None = None) -> VdbSource:
     else:
         low, high = VdbGrid.read(path, number).box()
     grid_class = str(entry.told.get("class", ""))
-    given = describe(
-        path, entry.name, grid_class, np.dtype(dtype), width, low, high, entry.affine
-    )
+    given = describe(path, entry.name, grid_class, np.dtype(dtype), width, low, high, entry.affine)
     return VdbSource(number=number, lost=lost, **given)
 
 
@@ -192,7 +191,9 @@ def _entries(data: Any) -> tuple[int, list[Entry]]:
     if magic != _MAGIC:
         raise ValueError("does not begin as VDB files do")
     if version not in _VERSIONS:
-        raise ValueError(f"is of file version {version}; {_VERSIONS[0]} to {_VERSIONS[-1]} are known")
+        raise ValueError(
+            f"is of file version {version}; {_VERSIONS[0]} to {_VERSIONS[-1]} are known"
+        )
     cursor.skip(8)  # of the library
     with_places = cursor.number("<?")
     packed = cursor.number("<?") if version < _MASKED else False
@@ -280,7 +281,7 @@ class _Packing:
         chosen = np.zeros(len(active), bool)
         if code in (3, 4, 5):
             chosen = _mask(cursor.take(len(active) // 8))
-        written = self._written(code, np.count_nonzero(active), len(active))
+        written = self._written(code, int(np.count_nonzero(active)), len(active))
         values = self._read(cursor, written)
         if written == len(active):
             return values
@@ -397,7 +398,11 @@ class _Topology:
         places = self._leaves(leaves, kind, active.tolist())
         return {
             "origins": tuple(np.concatenate([none, *part]) for part in self.origins),
-            "places": (np.array(self.places[0], np.int64), np.array(self.places[1], np.int64), places),
+            "places": (
+                np.array(self.places[0], np.int64),
+                np.array(self.places[1], np.int64),
+                places,
+            ),
             "root_places": table["place"].astype(np.int64),
             "root_values": table["value"],
         }
@@ -410,7 +415,7 @@ class _Topology:
         is_child, active = (_mask(cursor.take(n**3 // 8)) for _ in range(2))
         which = np.flatnonzero(is_child)
         written = n**3 if self.packing.masked else n**3 - len(which)
-        self.packing.skip(cursor, np.count_nonzero(active), written)
+        self.packing.skip(cursor, int(np.count_nonzero(active)), written)
         corners = origin + np.stack(np.unravel_index(which, (n, n, n)), 1) * SIDES[level + 1]
         if level == 0:
             for corner in corners:
