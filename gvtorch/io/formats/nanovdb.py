@@ -1,0 +1,352 @@
+"""NanoVDB (`.nvdb`, versions 32.*): grids as they lie in memory, packed as a whole or not.
+
+A file is one segment after another: a head, what is told of each grid, then the grids. A grid is
+672 bytes of head (name, transform, class, type), 64 of tree, the root with its tiles, and nodes
+that lie anywhere behind, found by offsets. Each part is laid out as C++ lays out its struct.
+Source: the NanoVDB headers of OpenVDB (NanoVDB.h, PNanoVDB.h, io/IO.h) tell the layout.
+"""
+
+from __future__ import annotations
+
+import functools
+import mmap
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..sparse_grid import COUNTS, VOXELS, SparseGrid, SparseSource, choose, describe, unpack
+from .format import Format
+
+_FILES = (b"NanoVDB0", b"NanoVDB2")
+_GRIDS = (b"NanoVDB0", b"NanoVDB1")
+_VERSION = 32
+_CODECS = {0: "none", 1: "zip", 2: "blosc"}
+_CLASSES = {1: "level set", 2: "fog volume", 3: "staggered"}
+_TREE, _ROOT = 672, 736  # bytes before the tree, and before the root
+_META = struct.Struct("<4Q2I6d6i3d8I2HI")
+_MOST_GRIDS, _MOST_NAME = 4096, 4096
+_ALIGN = 32
+# By number of the type: its name, dtype of a number, numbers of a value.
+_TYPES: dict[int, tuple[str, str, int]] = {
+    1: ("float", "<f4", 1),
+    2: ("double", "<f8", 1),
+    3: ("int16", "<i2", 1),
+    4: ("int32", "<i4", 1),
+    5: ("int64", "<i8", 1),
+    6: ("Vec3f", "<f4", 3),
+    7: ("Vec3d", "<f8", 3),
+    8: ("Mask", "|b1", 1),
+    10: ("uint32", "<u4", 1),
+    11: ("bool", "|b1", 1),
+    13: ("Fp4", "<f4", 1),
+    14: ("Fp8", "<f4", 1),
+    15: ("Fp16", "<f4", 1),
+    16: ("FpN", "<f4", 1),
+    17: ("Vec4f", "<f4", 4),
+    18: ("Vec4d", "<f8", 4),
+    24: ("Vec3u8", "|u1", 3),
+    25: ("Vec3u16", "<u2", 3),
+    26: ("uint8", "|u1", 1),
+}
+_REFUSED = {
+    9: "Half", 12: "RGBA8", 19: "Index", 20: "OnIndex", 21: "IndexMask", 22: "OnIndexMask",
+    23: "PointIndex",
+}  # fmt: skip
+_BITS = {"Fp4": 4, "Fp8": 8, "Fp16": 16}
+
+
+class Head(NamedTuple):
+    """What a file tells of a grid, and where it lies."""
+
+    name: str
+    kind: int
+    grid_class: int
+    codec: str
+    size: int  # bytes of the grid
+    offset: int  # in the file
+    packed: int  # bytes in the file
+
+
+@dataclass(frozen=True, kw_only=True)
+class NanoSource(SparseSource):
+    """A grid of a file."""
+
+    number: int
+
+    @property
+    def peak_bytes(self) -> int:
+        """As of any source, and the grid itself."""
+        head = _heads(self.path)[self.number]
+        return super().peak_bytes + (head.size if head.codec != "none" else 0)
+
+    def grid(self) -> NanoGrid:
+        return _grid(self.path, self.number, self.opened)
+
+
+@Format("NanoVDB", ".nvdb", options=("key",))
+def open_nanovdb(path: str, key: str | None = None) -> NanoSource:
+    """Opens a grid; see `choose`."""
+    heads = _heads(path)
+    number, lost = choose(path, [head.name for head in heads], key)
+    head = heads[number]
+    if head.kind not in _TYPES:
+        kind = _REFUSED.get(head.kind, f"type {head.kind}")
+        raise ValueError(
+            f"{path}: grid {head.name!r} holds {kind}, which is no grid of numbers here"
+        )
+    _, dtype, width = _TYPES[head.kind]
+    affine, low, high = _place(_content(path, head, _ROOT + 24))
+    kind = _CLASSES.get(head.grid_class, "")
+    told = describe(path, head.name, kind, np.dtype(dtype), width, low, high, affine)
+    return NanoSource(number=number, lost=lost, **told)
+
+
+def _heads(path: str) -> list[Head]:
+    """All grids of a file."""
+    found: list[Head] = []
+    size = os.stat(path).st_size
+    with open(path, "rb") as file:
+        while file.tell() < size:
+            magic, version, count, _ = struct.unpack("<8sIHH", file.read(16))
+            if magic not in _FILES or version >> 21 != _VERSION:
+                told = f"of version {version >> 21}" if magic in _FILES else repr(magic)
+                raise ValueError(f"begins a segment {told}; expected NanoVDB of version {_VERSION}")
+            for head in [_head(file) for _ in range(count)]:
+                at = file.tell()
+                packed = _packed(file, head, size)
+                found.append(head._replace(offset=at, packed=packed))
+                if packed > size - at:
+                    raise ValueError(
+                        f"grid {head.name!r} takes {packed} bytes, the file has {size - at}"
+                    )
+                file.seek(at + packed)
+            if len(found) > _MOST_GRIDS or not count:
+                raise ValueError(f"has {len(found)} grids; expected 1 to {_MOST_GRIDS}")
+    return found
+
+
+def _head(file: Any) -> Head:
+    told = _META.unpack(file.read(_META.size))
+    length, codec = told[21], told[29]
+    if not 0 < length <= _MOST_NAME or codec not in _CODECS:
+        raise ValueError(f"a grid's head is damaged: a name of {length} bytes, codec {codec}")
+    name = file.read(length).rstrip(b"\0").decode("utf-8", "replace")
+    return Head(name, told[4], told[5], _CODECS[codec], told[0], 0, told[1])
+
+
+def _packed(file: Any, head: Head, end: int) -> int:
+    """Bytes that a grid takes in the file: of packed ones writers tell it with or without the
+    length before each part, so it is counted.
+    """
+    if head.codec == "none":
+        return head.packed
+    count, size = 0, 0
+    while size < head.size:
+        (length,) = struct.unpack("<Q", file.read(8))
+        if head.codec == "zip":
+            return 8 + length
+        part = file.read(16)
+        if not 16 <= length <= end or (told := int.from_bytes(part[4:8], "little")) < 1:
+            raise ValueError(f"grid {head.name!r} has a packed part of {length} bytes")
+        file.seek(length - 16, os.SEEK_CUR)
+        count, size = count + 8 + length, size + told
+    return count
+
+
+def _content(path: str, head: Head, most: int = 0) -> Any:
+    """A grid's bytes, mapped or unpacked; no more than its first `most`, if that is cheaper."""
+    with open(path, "rb") as file:
+        if head.codec == "none":
+            if head.size > head.packed or head.size < _ROOT:
+                raise ValueError(f"{head.size} bytes of a grid expected, {head.packed} found")
+            mapped = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+            return mapped[head.offset : head.offset + head.size]
+        file.seek(head.offset)
+        parts, size = [], 0
+        while size < (most or head.size):
+            (length,) = struct.unpack("<Q", file.read(8))
+            part = file.read(length)
+            if head.codec == "zip":
+                if most:
+                    return zlib.decompressobj().decompress(part, most)
+                return unpack("zip", part, head.size)
+            parts.append(
+                unpack("blosc", part, int.from_bytes(part[4:8], "little"), head.size - size)
+            )
+            size += len(parts[-1])
+        return b"".join(parts)
+
+
+def _place(grid: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(4, 4) from voxels to the world, and (3,) the first active voxel and what is behind the last
+    one; as the grid's head and its root tell.
+    """
+    if len(grid) < _ROOT + 24 or bytes(grid[:8]) not in _GRIDS:
+        raise ValueError("a grid does not begin as grids of NanoVDB do")
+    affine = np.eye(4)
+    affine[:3, :3] = np.frombuffer(grid, "<f8", 9, 384).reshape(3, 3)
+    affine[:3, 3] = np.frombuffer(grid, "<f8", 3, 528)
+    if struct.unpack_from("<q", grid, _TREE + 24)[0] != _ROOT - _TREE:
+        raise ValueError("a grid's root does not follow its head")
+    box = np.frombuffer(grid, "<i4", 6, _ROOT).astype(np.int64)
+    return affine, box[:3], box[3:] + 1
+
+
+@functools.lru_cache(maxsize=2)
+def _grid(path: str, number: int, _opened: int) -> NanoGrid:
+    head = _heads(path)[number]
+    return NanoGrid.of(_content(path, head), *_TYPES[head.kind])
+
+
+class Layout(NamedTuple):
+    """Where things lie in the nodes of a type."""
+
+    tiles: int  # bytes before the root's tiles
+    tile: int  # bytes of one
+    tile_value: int  # bytes before its value
+    entry: int  # bytes of an entry of an upper or lower node
+    entries: tuple[int, int]  # bytes before the entries of an upper, of a lower node
+    values: int  # bytes before the voxels of a leaf
+    leaf: int  # bytes of a leaf; of FpN: without its codes
+
+    @classmethod
+    def of(cls, kind: str, dtype: str, width: int) -> Layout:
+        """As a compiler lays out the structs: a value, then smallest, largest, mean, deviation."""
+        item = np.dtype(dtype).itemsize
+        value = item * width
+        mean = item if dtype == "|b1" else 8 if item == 8 else 4
+
+        def behind(start: int, values: int) -> int:
+            """What follows so many values, then mean and deviation, on a border of 32 bytes."""
+            return _up(_up(_up(start, item) + values * value, mean) + 2 * mean, _ALIGN)
+
+        at = _up(20, item)
+        plain = {"Mask": 0, "bool": 64, "FpN": 0}
+        codes = 64 * _BITS[kind] if kind in _BITS else plain.get(kind, VOXELS * value)
+        values = 16 if kind == "Mask" else 96 if kind in _BITS or kind == "FpN" else behind(80, 2)
+        return cls(
+            tiles=behind(28, 3),
+            tile=_up(at + value, _ALIGN),
+            tile_value=at,
+            entry=_up(max(value, 8), 8),
+            entries=(behind(32 + 2 * 4096, 2), behind(32 + 2 * 512, 2)),
+            values=values,
+            leaf=96 if kind == "Mask" else _up(values + codes, _ALIGN),
+        )
+
+
+def _up(n: int, step: int) -> int:
+    return -(-n // step) * step
+
+
+@dataclass(kw_only=True)
+class NanoGrid(SparseGrid):
+    """A grid in memory."""
+
+    data: Any  # the grid's bytes
+    kind: str
+    layout: Layout
+    places: tuple[np.ndarray, np.ndarray, np.ndarray]  # bytes before each node, as `origins`
+
+    @classmethod
+    def of(cls, data: Any, kind: str, dtype: str, width: int) -> NanoGrid:
+        """Finds the nodes."""
+        layout = Layout.of(kind, dtype, width)
+        (count,) = struct.unpack_from("<I", data, _ROOT + 24)
+        fields = {
+            "names": ["key", "child", "value"],
+            "formats": ["<u8", "<i8", (dtype, (width,))],
+            "offsets": [0, 8, layout.tile_value],
+            "itemsize": layout.tile,
+        }
+        table = np.ndarray((count,), np.dtype(fields), data, _ROOT + layout.tiles)  # type: ignore[call-overload]
+        keys = table["key"][:, None] >> np.array((42, 21, 0), np.uint64) & np.uint64(2**21 - 1)
+        corners = (keys.astype(np.int64) << 44 >> 44) * 4096  # 20 bits, signed
+        inner = table["child"] != 0
+        found = [_checked(_ROOT + table["child"][inner], len(data), layout.entries[0])]
+        origins = [corners[inner]]
+        for level in (0, 1):
+            least = layout.entries[1] if level == 0 else layout.leaf
+            below = list(_children(data, layout, level, found[-1], origins[-1]))
+            none = np.zeros((0, 3), np.int64)
+            places = np.concatenate([none[:, 0], *(part for part, _ in below)])
+            origins.append(np.concatenate([none, *(corners for _, corners in below)]))
+            found.append(_checked(places, len(data), least))
+        return cls(
+            dtype=np.dtype(dtype),
+            background=np.ndarray((width,), dtype, data, _ROOT + _up(28, np.dtype(dtype).itemsize)),
+            origins=(origins[0], origins[1], origins[2]),
+            root_places=corners[~inner],
+            root_values=table["value"][~inner],
+            data=data,
+            kind=kind,
+            layout=layout,
+            places=(found[0], found[1], found[2]),
+        )
+
+    def tiles(self, level: int, number: int) -> tuple[np.ndarray, np.ndarray]:
+        n, place = COUNTS[level], int(self.places[level][number])
+        width, item = len(self.background), self.dtype.itemsize
+        at = place + self.layout.entries[level]
+        values = np.ndarray((n**3, width), self.dtype, self.data, at, (self.layout.entry, item))
+        is_child = _mask(self.data, place + 32 + n**3 // 8, n**3)
+        return values.reshape(n, n, n, width), ~is_child.reshape(n, n, n)
+
+    def leaves(self, numbers: np.ndarray) -> np.ndarray:
+        out = np.empty((len(numbers), VOXELS, len(self.background)), self.dtype)
+        for at, place in enumerate(self.places[2][numbers].tolist()):
+            out[at] = self._voxels(place)
+        return out
+
+    def _voxels(self, place: int) -> np.ndarray:
+        """(512, c) of a leaf."""
+        begin = place + self.layout.values
+        if self.kind in ("Mask", "bool"):
+            return _mask(self.data, begin, VOXELS)[:, None]
+        if self.kind in _BITS or self.kind == "FpN":
+            low, step = np.frombuffer(self.data, "<f4", 2, place + 80)
+            bits = _BITS.get(self.kind) or 1 << (self.data[place + 15] >> 5)
+            return (_codes(self.data, begin, bits) * step + low)[:, None]
+        width = len(self.background)
+        return np.frombuffer(self.data, self.dtype, VOXELS * width, begin).reshape(VOXELS, width)
+
+
+def _mask(data: Any, at: int, count: int) -> np.ndarray:
+    return np.unpackbits(np.frombuffer(data, "u1", count // 8, at), bitorder="little").view(bool)
+
+
+def _codes(data: Any, at: int, bits: int) -> np.ndarray:
+    """(512,) float32 numbers of so many bits, the lowest bits of a byte first."""
+    if bits > 16:
+        raise ValueError(f"a leaf has numbers of {bits} bits")
+    if bits == 16:
+        return np.frombuffer(data, "<u2", VOXELS, at).astype(np.float32)
+    packed = np.frombuffer(data, "u1", VOXELS * bits // 8, at)
+    shifts = np.arange(0, 8, bits, dtype=np.uint8)
+    return ((packed[:, None] >> shifts) & (2**bits - 1)).reshape(-1).astype(np.float32)
+
+
+def _children(
+    data: Any, layout: Layout, level: int, places: np.ndarray, origins: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """By node: bytes before each of its children, and their first voxels."""
+    n, side = COUNTS[level], COUNTS[level + 1] * (8 if level == 0 else 1)
+    for place, origin in zip(places.tolist(), origins, strict=True):
+        which = np.flatnonzero(_mask(data, place + 32 + n**3 // 8, n**3))
+        steps = np.ndarray((n**3,), "<i8", data, place + layout.entries[level], (layout.entry,))
+        corner = np.stack(np.unravel_index(which, (n, n, n)), 1)
+        yield place + steps[which], origin + corner * side
+
+
+def _checked(places: np.ndarray, size: int, least: int) -> np.ndarray:
+    """Places of nodes, all of them different and with so many bytes behind."""
+    if len(places) and not (places.min() >= _ROOT and places.max() <= size - least):
+        raise ValueError(f"a node lies outside of the grid's {size} bytes")
+    if len(np.unique(places)) != len(places):
+        raise ValueError("several places of the tree share a node")
+    return places

@@ -1,0 +1,448 @@
+"""OpenVDB (`.vdb`, file versions 220 to 224): trees 5-4-3 of numbers, vectors and masks.
+
+A file is a head, what is told of each grid with its place, and the grids: metadata, transform,
+topology (masks, and the tiles of inner nodes), then the values of the leaves one after another.
+`Parser` walks through topology and leaves once and keeps where each node's values begin; they are
+unpacked where they are asked for. Inactive values that are not the background's are told in a few
+bytes, see `_Packing`.
+Source: the source code of OpenVDB (io/Archive.cc, io/Compression.h, tree/*.h) tells the format.
+"""
+
+from __future__ import annotations
+
+import functools
+import mmap
+import re
+import struct
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..sparse_grid import COUNTS, SIDES, VOXELS, SparseGrid, SparseSource, choose, describe, unpack
+from .format import Format
+
+_MAGIC = 0x56444220
+_VERSIONS = range(220, 225)
+_MASKED = 222  # the version from which on values are packed by masks, and grids tell their packing
+_MOST_GRIDS, _MOST_TOLD, _MOST_NAME = 4096, 65536, 1 << 20
+_ZIP, _ACTIVE, _BLOSC = 1, 2, 4
+_TYPES: dict[str, tuple[str, int]] = {
+    "float": ("<f4", 1),
+    "double": ("<f8", 1),
+    "int32": ("<i4", 1),
+    "int64": ("<i8", 1),
+    "bool": ("|b1", 1),
+    "mask": ("|b1", 1),
+    "vec3s": ("<f4", 3),
+    "vec3d": ("<f8", 3),
+    "vec3i": ("<i4", 3),
+}
+_TOLD = {"vec3i": "<3i", "int32": "<i", "int64": "<q", "float": "<f", "double": "<d", "bool": "<?"}
+# How many doubles a transform's map has, and which of them are translation and scale.
+_MAPS = {
+    "UniformScaleMap": (15, None, 0),
+    "ScaleMap": (15, None, 0),
+    "UniformScaleTranslateMap": (18, 0, 3),
+    "ScaleTranslateMap": (18, 0, 3),
+    "TranslationMap": (3, 0, None),
+}
+
+
+class Cursor:
+    """Reads a file's bytes from a place on."""
+
+    def __init__(self, data: Any, at: int = 0) -> None:
+        self.data, self.at = data, at
+
+    def skip(self, count: int) -> int:
+        """Goes on by so many bytes; returns where they begin."""
+        begin = self.at
+        if count < 0 or begin + count > len(self.data):
+            raise ValueError(f"ends at {len(self.data)}, within {count} bytes from {begin} on")
+        self.at = begin + count
+        return begin
+
+    def take(self, count: int) -> bytes:
+        """Reads bytes."""
+        begin = self.skip(count)
+        return bytes(self.data[begin : begin + count])
+
+    def numbers(self, layout: str) -> tuple[Any, ...]:
+        """Reads numbers, as `struct` tells them."""
+        return struct.unpack(layout, self.take(struct.calcsize(layout)))
+
+    def number(self, layout: str) -> Any:
+        """Reads a number."""
+        return self.numbers(layout)[0]
+
+    def array(self, dtype: Any, count: int) -> np.ndarray:
+        """Reads an array."""
+        dtype = np.dtype(dtype)
+        return np.frombuffer(self.data, dtype, count, self.skip(count * dtype.itemsize))
+
+    def text(self) -> str:
+        """Reads a string."""
+        length = self.number("<I")
+        if length > _MOST_NAME:
+            raise ValueError(f"has a name of {length} bytes")
+        return self.take(length).decode("utf-8", "replace")
+
+    def told(self) -> dict[str, Any]:
+        """Reads metadata; of kinds that are not known the values are left out."""
+        found: dict[str, Any] = {}
+        count = self.number("<I")
+        if count > _MOST_TOLD:
+            raise ValueError(f"has {count} metadata")
+        for _ in range(count):
+            name, kind, size = self.text(), self.text(), self.number("<I")
+            value = self.take(size)
+            if kind == "string":
+                found[name] = value.decode("utf-8", "replace")
+            elif kind in _TOLD and struct.calcsize(_TOLD[kind]) == size:
+                numbers = struct.unpack(_TOLD[kind], value)
+                found[name] = numbers if len(numbers) > 1 else numbers[0]
+        return found
+
+
+@dataclass
+class Entry:
+    """What a file tells of a grid."""
+
+    unique: str  # its name, with a number where several share it
+    tree: str  # its kind of tree
+    half: bool
+    parent: str  # whose tree it shares
+    at: int  # where it begins
+    leaves_at: int
+    compression: int = 0
+    told: dict[str, Any] = field(default_factory=dict)
+    affine: np.ndarray = field(default_factory=lambda: np.eye(4))
+    tree_at: int = 0
+
+    @property
+    def name(self) -> str:
+        """As users know it: "density", or "density[1]" of the second one."""
+        name, _, number = self.unique.partition("\x1e")
+        return f"{name}[{number}]" if number not in ("", "0") else name
+
+
+@dataclass(frozen=True, kw_only=True)
+class VdbSource(SparseSource):
+    """A grid of a file; `number` is that of the grid whose tree it is."""
+
+    number: int
+
+    def grid(self) -> VdbGrid:
+        return _grid(self.path, self.number, self.opened)
+
+
+@Format("OpenVDB", ".vdb", options=("key",))
+def open_openvdb(path: str, key: str | None = None) -> VdbSource:
+    """Opens a grid; see `choose`."""
+    with _mapped(path) as data:
+        version, entries = _entries(data)
+        at, lost = choose(path, [entry.name for entry in entries], key)
+        entry = entries[at]
+        number = at
+        if entry.parent:
+            owners = [n for n, other in enumerate(entries) if other.unique == entry.parent]
+            if not owners or entries[owners[0]].parent:
+                raise ValueError(f"grid {entry.name!r} shares the tree of {entry.parent!r}, "
+                                 "which is not there")  # fmt: skip
+            number = owners[0]
+        _read_head(data, entry, version)
+    kind = _kind(entry)
+    dtype, width = _TYPES[kind]
+    told = entry.told.get("file_bbox_min"), entry.told.get("file_bbox_max")
+    if all(isinstance(one, tuple) for one in told):
+        low, high = np.array(told[0]), np.array(told[1]) + 1
+    else:
+        low, high = VdbGrid.read(path, number).box()
+    grid_class = str(entry.told.get("class", ""))
+    given = describe(path, entry.name, grid_class, np.dtype(dtype), width, low, high, entry.affine)
+    return VdbSource(number=number, lost=lost, **given)
+
+
+@functools.lru_cache(maxsize=2)
+def _grid(path: str, number: int, _opened: int) -> VdbGrid:
+    return VdbGrid.read(path, number)
+
+
+def _mapped(path: str) -> mmap.mmap:
+    with open(path, "rb") as file:
+        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+
+
+def _kind(entry: Entry) -> str:
+    """The kind of values of a grid."""
+    found = re.fullmatch(r"Tree_(\w+?)_5_4_3", entry.tree)
+    if found is None or found[1] not in _TYPES:
+        raise ValueError(
+            f"grid {entry.name!r} is a {entry.tree}; known are trees 5_4_3 of {', '.join(_TYPES)}"
+        )
+    return found[1]
+
+
+def _entries(data: Any) -> tuple[int, list[Entry]]:
+    """The version of a file, and what it tells of its grids."""
+    cursor = Cursor(data)
+    magic, version = cursor.numbers("<qI")
+    if magic != _MAGIC:
+        raise ValueError("does not begin as VDB files do")
+    if version not in _VERSIONS:
+        raise ValueError(
+            f"is of file version {version}; {_VERSIONS[0]} to {_VERSIONS[-1]} are known"
+        )
+    cursor.skip(8)  # of the library
+    with_places = cursor.number("<?")
+    packed = cursor.number("<?") if version < _MASKED else False
+    cursor.skip(36)  # uuid
+    cursor.told()
+    count = cursor.number("<i")
+    if not with_places:
+        raise ValueError("is a stream that does not tell where its grids lie; write it as a file")
+    if not 0 <= count <= _MOST_GRIDS:
+        raise ValueError(f"has {count} grids")
+    entries = []
+    for _ in range(count):
+        unique, tree, parent = cursor.text(), cursor.text(), cursor.text()
+        at, leaves_at, end = cursor.numbers("<3q")
+        if not 0 <= at <= leaves_at <= end <= len(data):
+            raise ValueError(f"a grid from {at} to {end} in a file of {len(data)} bytes")
+        half = tree.endswith("_HalfFloat")
+        entry = Entry(unique, tree.removesuffix("_HalfFloat"), half, parent, at, leaves_at)
+        entry.compression = _ZIP if packed else 0
+        entries.append(entry)
+        cursor.at = end  # what is told of the next one
+    return version, entries
+
+
+def _read_head(data: Any, entry: Entry, version: int) -> None:
+    """Adds what stands before a grid's tree: packing, metadata, transform."""
+    cursor = Cursor(data, entry.at)
+    if version >= _MASKED:
+        entry.compression = cursor.number("<I")
+    entry.told = cursor.told()
+    kind = cursor.text()
+    if kind in _MAPS:
+        count, translation, scale = _MAPS[kind]
+        numbers = cursor.array("<f8", count)
+        if translation is not None:
+            entry.affine[:3, 3] = numbers[translation : translation + 3]
+        if scale is not None:
+            entry.affine[[0, 1, 2], [0, 1, 2]] = numbers[scale : scale + 3]
+    elif kind in ("AffineMap", "UnitaryMap"):
+        entry.affine = cursor.array("<f8", 16).reshape(4, 4).T.copy()  # of row vectors
+    else:
+        raise ValueError(f"grid {entry.name!r} lies in the world by a {kind}, which is not known")
+    entry.tree_at = cursor.at
+
+
+@dataclass(frozen=True)
+class _Packing:
+    """How values of a grid's nodes are written.
+
+    A byte tells what inactive values are; where packing is by active values, only these follow:
+    0: the background; 1: minus the background; 2: one number, which is told; 3: minus the
+    background and the background, 4: a number and the background, 5: two numbers, one for each of
+    which a mask tells; 6: all values are written.
+    """
+
+    stored: np.dtype  # of the values in the file
+    dtype: np.dtype
+    width: int
+    background: np.ndarray
+    compression: int
+    masked: bool  # as of version 222
+
+    def skip(self, cursor: Cursor, active: int, count: int) -> None:
+        """Goes behind the values of a node, of which so many are active."""
+        if self.masked:
+            code = cursor.number("<B")
+            told = {2: 1, 4: 1, 5: 2}.get(code, 0)
+            cursor.skip(told * self.dtype.itemsize * self.width)
+            cursor.skip(count // 8 if code in (3, 4, 5) else 0)
+            count = self._written(code, active, count)
+        size = count * self.stored.itemsize * self.width
+        cursor.skip(abs(cursor.number("<q")) if self.compression & (_ZIP | _BLOSC) else size)
+
+    def values(self, cursor: Cursor, active: np.ndarray) -> np.ndarray:
+        """Reads the values of a node, (n, c), of which those are active (n,)."""
+        if not self.masked:
+            return self._read(cursor, len(active))
+        code = cursor.number("<B")
+        one = self.background
+        zero = one if code == 0 else ~one if self.dtype.kind == "b" else -one
+        if code in (2, 4, 5):
+            zero = cursor.array(self.dtype, self.width)
+        if code == 5:
+            one = cursor.array(self.dtype, self.width)
+        chosen = np.zeros(len(active), bool)
+        if code in (3, 4, 5):
+            chosen = _mask(cursor.take(len(active) // 8))
+        written = self._written(code, int(np.count_nonzero(active)), len(active))
+        values = self._read(cursor, written)
+        if written == len(active):
+            return values
+        out = np.where(chosen[:, None], one, zero)
+        out[active] = values
+        return out
+
+    def _written(self, code: int, active: int, count: int) -> int:
+        if code > 6:
+            raise ValueError(f"a node's values are packed in an unknown way ({code})")
+        return active if self.compression & _ACTIVE and code != 6 else count
+
+    def _read(self, cursor: Cursor, count: int) -> np.ndarray:
+        """Reads numbers that may be packed."""
+        count *= self.width
+        size = int(count) * self.stored.itemsize
+        if self.compression & (_ZIP | _BLOSC):
+            length = cursor.number("<q")
+            content = cursor.take(abs(length))
+            if length > 0:
+                codec = "blosc" if self.compression & _BLOSC else "zip"
+                content = unpack(codec, content, size)
+        else:
+            content = cursor.take(size)
+        if len(content) != size:
+            raise ValueError(f"{size} bytes of values expected, {len(content)} found")
+        values = np.frombuffer(content, self.stored).astype(self.dtype, copy=False)
+        return values.reshape(-1, self.width)
+
+
+@dataclass(kw_only=True)
+class VdbGrid(SparseGrid):
+    """A grid of a file; `places` tell where the values of each node are, as `origins`."""
+
+    data: Any
+    kind: str
+    packing: _Packing
+    places: tuple[np.ndarray, np.ndarray, np.ndarray]
+
+    @classmethod
+    def read(cls, path: str, number: int) -> VdbGrid:
+        """Finds the nodes of a grid."""
+        data = _mapped(path)
+        version, entries = _entries(data)
+        entry = entries[number]
+        _read_head(data, entry, version)
+        kind = _kind(entry)
+        name, width = _TYPES[kind]
+        dtype = np.dtype(name)
+        cursor = Cursor(data, entry.tree_at)
+        if (buffers := cursor.number("<I")) != 1:
+            raise ValueError(f"grid {entry.name!r} has {buffers} buffers; expected 1")
+        background = cursor.array(dtype, width)
+        stored = np.dtype("<f2") if entry.half and dtype.kind == "f" else dtype
+        compression = entry.compression
+        packing = _Packing(stored, dtype, width, background, compression, version >= _MASKED)
+        topology = _Topology(cursor, packing)
+        return cls(
+            dtype=dtype,
+            background=background,
+            data=data,
+            kind=kind,
+            packing=packing,
+            **topology.read(Cursor(data, entry.leaves_at), kind),
+        )
+
+    def tiles(self, level: int, number: int) -> tuple[np.ndarray, np.ndarray]:
+        n = COUNTS[level]
+        cursor = Cursor(self.data, int(self.places[level][number]))
+        is_child, active = (_mask(cursor.take(n**3 // 8)) for _ in range(2))
+        if self.packing.masked:
+            values = self.packing.values(cursor, active)
+        else:  # those of tiles alone are written
+            values = np.zeros((n**3, self.packing.width), self.dtype)
+            values[~is_child] = self.packing.values(cursor, active[~is_child])
+        return values.reshape(n, n, n, -1), ~is_child.reshape(n, n, n)
+
+    def leaves(self, numbers: np.ndarray) -> np.ndarray:
+        out = np.empty((len(numbers), VOXELS, self.packing.width), self.dtype)
+        for at, place in enumerate(self.places[2][numbers].tolist()):
+            cursor = Cursor(self.data, place)
+            active = _mask(cursor.take(VOXELS // 8))
+            if self.kind == "mask":
+                out[at, :, 0] = active
+            elif self.kind == "bool":
+                cursor.skip(12)
+                out[at, :, 0] = _mask(cursor.take(VOXELS // 8))
+            else:
+                cursor.skip(0 if self.packing.masked else 13)
+                out[at] = self.packing.values(cursor, active)
+        return out
+
+
+class _Topology:
+    """Finds the nodes of a tree, whose root `cursor` has come to."""
+
+    def __init__(self, cursor: Cursor, packing: _Packing) -> None:
+        self.cursor, self.packing = cursor, packing
+        self.origins: tuple[list[Any], ...] = ([], [], [])
+        self.places: tuple[list[Any], ...] = ([], [], [])
+
+    def read(self, leaves: Cursor, kind: str) -> dict[str, Any]:
+        """Returns `origins`, `places`, `root_places` and `root_values` of a `VdbGrid`; the values
+        of leaves begin at `leaves`.
+        """
+        cursor, packing = self.cursor, self.packing
+        tiles, children = cursor.numbers("<2I")
+        value = (packing.dtype, (packing.width,))
+        table = cursor.array([("place", "<i4", (3,)), ("value", *value), ("on", "u1")], tiles)
+        for _ in range(children):
+            self._node(0, np.array(cursor.numbers("<3i"), np.int64))
+        counts, none = self.places[2], np.zeros((0, 3), np.int64)
+        active = np.concatenate(counts) if counts else none[:, 0]
+        places = self._leaves(leaves, kind, active.tolist())
+        return {
+            "origins": tuple(np.concatenate([none, *part]) for part in self.origins),
+            "places": (
+                np.array(self.places[0], np.int64),
+                np.array(self.places[1], np.int64),
+                places,
+            ),
+            "root_places": table["place"].astype(np.int64),
+            "root_values": table["value"],
+        }
+
+    def _node(self, level: int, origin: np.ndarray) -> None:
+        """Goes through a node and all below it."""
+        cursor, n = self.cursor, COUNTS[level]
+        self.origins[level].append(origin[None])
+        self.places[level].append(cursor.at)
+        is_child, active = (_mask(cursor.take(n**3 // 8)) for _ in range(2))
+        which = np.flatnonzero(is_child)
+        written = n**3 if self.packing.masked else n**3 - len(which)
+        self.packing.skip(cursor, int(np.count_nonzero(active)), written)
+        corners = origin + np.stack(np.unravel_index(which, (n, n, n)), 1) * SIDES[level + 1]
+        if level == 0:
+            for corner in corners:
+                self._node(1, corner)
+            return
+        masks = cursor.array("u1", len(which) * VOXELS // 8).reshape(-1, VOXELS // 8)
+        self.origins[2].append(corners)
+        self.places[2].append(np.unpackbits(masks, axis=1).sum(1, dtype=np.int64))
+
+    def _leaves(self, cursor: Cursor, kind: str, active: list[int]) -> np.ndarray:
+        """Where the values of each leaf begin; so many voxels of each are active."""
+        places = np.empty(len(active), np.int64)
+        for number, count in enumerate(active):
+            places[number] = cursor.skip(VOXELS // 8)
+            if kind == "mask":
+                cursor.skip(12)
+            elif kind == "bool":
+                cursor.skip(12 + VOXELS // 8)
+            elif self.packing.masked:
+                self.packing.skip(cursor, count, VOXELS)
+            else:
+                cursor.skip(12)
+                if (buffers := cursor.number("<b")) != 1:
+                    raise ValueError(f"a leaf has {buffers} buffers; expected 1")
+                self.packing.skip(cursor, count, VOXELS)
+        return places
+
+
+def _mask(content: bytes) -> np.ndarray:
+    return np.unpackbits(np.frombuffer(content, "u1"), bitorder="little").view(bool)

@@ -1,0 +1,237 @@
+"""Sparse grids of VDB's shape, read box by box without a dense copy of the whole.
+
+A root, upper nodes of 32^3 entries, lower nodes of 16^3 and leaves of 8^3 voxels: 4096, 128 and 8
+voxels a side. An entry that is no child is a tile, one value for all of its voxels; what nothing
+covers has the background value. `SparseGrid` fills boxes, whatever file the nodes lie in;
+`SparseSource` is a grid as a volume: the box of its active voxels.
+
+Source: Museth, "VDB: High-resolution sparse volumes with dynamic topology", ACM TOG 2013.
+"""
+
+from __future__ import annotations
+
+import importlib
+import threading
+import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..base.image_info import ChannelInfo, ImageInfo
+from ..base.volume import check_extent
+from .source import Index, VolumeSource, place_axes
+
+SIDES = (4096, 128, 8)  # voxels along a side of an upper node, a lower node and a leaf
+COUNTS = (32, 16, 8)  # entries along a side of each
+VOXELS = 512  # of a leaf
+MOST_INDEX = 2**31
+_BATCH = 4096  # leaves
+_LOCK = threading.Lock()
+_QUANTITIES = {"level set": "signed distance", "fog volume": "density"}
+
+
+@dataclass(kw_only=True)
+class SparseGrid(ABC):
+    """The nodes of a grid; all places are voxel indices i, j, k."""
+
+    dtype: np.dtype
+    background: np.ndarray  # (c,)
+    origins: tuple[np.ndarray, np.ndarray, np.ndarray]  # (n, 3) int64 of uppers, lowers and leaves
+    root_places: np.ndarray  # (t, 3) int64 of the root's tiles
+    root_values: np.ndarray  # (t, c)
+
+    @abstractmethod
+    def tiles(self, level: int, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns (n, n, n, c) values of an upper (0) or lower (1) node's entries, and (n, n, n)
+        bool, whether each is a tile.
+        """
+
+    @abstractmethod
+    def leaves(self, numbers: np.ndarray) -> np.ndarray:
+        """Returns (k, 512, c) the voxels of leaves (k,)."""
+
+    def fill(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
+        """Returns (i, j, k, c) values of a box."""
+        leaf, a, b = SIDES[2], np.asarray(low), np.asarray(high)
+        start, stop = a // leaf * leaf, -(-b // leaf) * leaf  # whole leaves
+        out = np.empty((*(stop - start), len(self.background)), self.dtype)
+        out[:] = self.background
+        self._write(out, start, SIDES[0], self.root_places, self.root_values)
+        for level in (0, 1):
+            for number in self._hits(self.origins[level], SIDES[level], start, stop):
+                places, values = self._shown(level, number, start, stop)
+                self._write(out, start, SIDES[level + 1], places, values)
+        hits = self._hits(self.origins[2], leaf, start, stop)
+        blocks = _blocks(out)
+        for first in range(0, len(hits), _BATCH):
+            numbers = hits[first : first + _BATCH]
+            i, j, k = ((self.origins[2][numbers] - start) // leaf).T
+            blocks[i, :, j, :, k] = self.leaves(numbers).reshape(-1, 8, 8, 8, out.shape[3])
+        return out[tuple(slice(x - s, y - s) for x, y, s in zip(a, b, start, strict=True))]
+
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """(3,) lowest voxel and (3,) what is behind the highest, of all leaves and all tiles that
+        differ from the background.
+        """
+        low, high = [self.origins[2]], [self.origins[2] + SIDES[2]]
+        everywhere = np.array((-MOST_INDEX,) * 3), np.array((MOST_INDEX,) * 3)
+        found = [(SIDES[0], self.root_places[self._differ(self.root_values)])]
+        for level in (0, 1):
+            for number in range(len(self.origins[level])):
+                found.append((SIDES[level + 1], self._shown(level, number, *everywhere)[0]))
+        for side, places in found:
+            low.append(places)
+            high.append(places + side)
+        if not sum(map(len, low)):
+            raise ValueError("the grid is empty")
+        return np.concatenate(low).min(0), np.concatenate(high).max(0)
+
+    def _shown(
+        self, level: int, number: int, start: np.ndarray, stop: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(t, 3) places and (t, c) values of a node's tiles in a box that are not background."""
+        values, is_tile = self.tiles(level, number)
+        side, origin = SIDES[level + 1], self.origins[level][number]
+        a = np.maximum((start - origin) // side, 0)
+        b = np.minimum(-((origin - stop) // side), COUNTS[level])
+        index = tuple(slice(x, y) for x, y in zip(a, b, strict=True))
+        chosen = is_tile[index] & self._differ(values[index])
+        return origin + (a + np.argwhere(chosen)) * side, values[index][chosen]
+
+    def _differ(self, values: np.ndarray) -> np.ndarray:
+        return (values != self.background).any(-1)
+
+    @staticmethod
+    def _hits(origins: np.ndarray, side: int, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
+        """(k,) numbers of the nodes in a box."""
+        return np.flatnonzero(((origins < stop) & (origins + side > start)).all(1))
+
+    @staticmethod
+    def _write(
+        out: np.ndarray, start: np.ndarray, side: int, places: np.ndarray, values: np.ndarray
+    ) -> None:
+        """Writes tiles into a box that begins at `start`."""
+        size = np.array(out.shape[:3])
+        if side == SIDES[2]:
+            i, j, k = ((places - start) // side).T
+            _blocks(out)[i, :, j, :, k] = values[:, None, None, None]
+            return
+        for place, value in zip(places - start, values, strict=True):
+            a, b = np.maximum(place, 0), np.minimum(place + side, size)
+            if (a < b).all():
+                out[a[0] : b[0], a[1] : b[1], a[2] : b[2]] = value
+
+
+def _blocks(out: np.ndarray) -> np.ndarray:
+    """A box of whole leaves as (i, 8, j, 8, k, 8, c), without a copy."""
+    i, j, k, c = out.shape
+    return out.reshape(i // 8, 8, j // 8, 8, k // 8, 8, c)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SparseSource(VolumeSource, ABC):
+    """A grid of a file; the array is (i, j, k), or (i, j, k, c)."""
+
+    key: str  # the grid's name
+    low: tuple[int, int, int]  # voxel 0
+
+    @abstractmethod
+    def grid(self) -> SparseGrid:
+        """Returns the grid, which is kept."""
+
+    def read_stored(self, index: Index) -> np.ndarray:
+        """Fills a part."""
+        with _LOCK:  # the first thread looks for the nodes
+            grid = self.grid()
+        low = [part.start + at for part, at in zip(index[:3], self.low, strict=True)]
+        high = [part.stop + at for part, at in zip(index[:3], self.low, strict=True)]
+        values = grid.fill(low, high)
+        return values[..., index[3]] if len(index) > 3 else values[..., 0]
+
+
+def describe(
+    path: str,
+    name: str,
+    kind: str,
+    stored: np.dtype,
+    width: int,
+    low: np.ndarray,
+    high: np.ndarray,
+    affine: np.ndarray,
+) -> dict[str, Any]:
+    """The fields of a source.
+
+    Args:
+        path, name: Of the file and the grid.
+        kind: The grid's class: "level set", "fog volume", ...
+        stored: Dtype of a number.
+        width: Numbers of a voxel.
+        low, high: (3,) Voxel 0, and what is behind the last one.
+        affine: (4, 4) From voxel indices to the world.
+    """
+    size = [int(n) for n in high - low]
+    if min(size) < 1 or np.abs((low, high)).max() > MOST_INDEX:
+        raise ValueError(f"{path}: grid {name!r} has no active voxel")
+    check_extent(path, size, most=1 << 62)
+    shifted = affine.astype(np.float64)
+    shifted[:3, 3] += shifted[:3, :3] @ low
+    shape = (*size, width) if width > 1 else tuple(size)
+    names = [f"{name}.{'xyzw'[n]}" for n in range(width)] if width > 1 else [name]
+    return {
+        "path": path,
+        "shape": shape,
+        "stored": stored.str,
+        "key": name,
+        "low": tuple(low.tolist()),
+        "info": ImageInfo(
+            channels=tuple(ChannelInfo(name=one) for one in names) if name else (),
+            quantity=_QUANTITIES.get(kind),
+        ),
+        **place_axes(path, shifted, shape, component=3 if width > 1 else None),
+    }
+
+
+def choose(path: str, names: Sequence[str], key: str | None) -> tuple[int, tuple[str, ...]]:
+    """Which grid is meant: `key` names it or its number; the only one, "density", or the first, if
+    left out. And what to say of the others.
+    """
+    if not names:
+        raise ValueError(f"{path}: holds no grid")
+    listed = ", ".join(names[:20])
+    if key is None:
+        at = names.index("density") if "density" in names else 0
+        others = f"{len(names) - 1} other grids; key (--key) chooses among {listed}"
+        return at, (others,) if len(names) > 1 else ()
+    key = key.removeprefix("/")  # of file.vdb:/density
+    if key in names:
+        return names.index(key), ()
+    if key.isdigit() and int(key) < len(names):
+        return int(key), ()
+    raise ValueError(f"{path}: has no grid {key!r}; it holds {listed}")
+
+
+def unpack(codec: str, packed: Any, need: int, most: int | None = None) -> bytes:
+    """Unpacks a part that must be of `need` bytes, and of no more than `most`: "zip" (zlib) or
+    "blosc".
+    """
+    if not need:
+        return b""
+    if codec == "zip":
+        found = zlib.decompressobj().decompress(packed, need + 1)
+    else:
+        told = int.from_bytes(packed[4:8], "little"), int.from_bytes(packed[12:16], "little")
+        if len(packed) < 16 or told != (need, len(packed)) or need > (most or need):
+            raise ValueError(f"a packed part of {need} bytes expected, its head tells of {told[0]}")
+        try:
+            imagecodecs = importlib.import_module("imagecodecs")
+        except ImportError as error:
+            raise ImportError(
+                f"grids packed by Blosc need imagecodecs: pip install 'gvtorch[io]' ({error})"
+            ) from None
+        found = bytes(imagecodecs.blosc_decode(bytes(packed), out=need))
+    if len(found) != need:
+        raise ValueError(f"a part of {need} bytes expected, {len(found)} found")
+    return found

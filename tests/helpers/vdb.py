@@ -1,0 +1,344 @@
+"""Writes grids as OpenVDB and NanoVDB files, from what is told of the formats; see the heads of
+gvtorch/io/formats/openvdb.py and nanovdb.py.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+SIDE = {0: 32, 1: 16}  # entries along a side of an upper and of a lower node
+REACH = (4096, 128, 8)  # voxels along a side of what the root, an upper and a lower node hold
+ZIP, ACTIVE, BLOSC = 1, 2, 4
+Place = tuple[int, int, int]
+
+
+@dataclass
+class Grid:
+    """A grid: leaves are (512, c) values and (512,) bool, whether they are active; tiles lie in the
+    root (0), in uppers (1) and in lowers (2): a value (c,) by the first voxel.
+    """
+
+    kind: str
+    background: Any
+    leaves: dict[Place, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    tiles: tuple[dict[Place, Any], ...] = ({}, {}, {})
+    name: str = "density"
+    told: dict[str, tuple[str, bytes]] = field(default_factory=dict)
+    map: tuple[str, bytes] = ("UniformScaleMap", struct.pack("<15d", *(0.5,) * 3, *(0,) * 12))
+    half: bool = False
+    parent: str = ""
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Of a number."""
+        kinds = {"float": "f4", "double": "f8", "int32": "i4", "int64": "i8", "bool": "?"}
+        kinds |= {"mask": "?", "vec3s": "f4", "vec3d": "f8", "vec3i": "i4"}
+        return np.dtype(kinds[self.kind])
+
+    def value(self, value: Any) -> np.ndarray:
+        """(c,) of a value."""
+        width = 3 if self.kind.startswith("vec3") else 1
+        return np.broadcast_to(np.asarray(value, self.dtype), (width,))
+
+    def dense(self, low: Place, high: Place) -> np.ndarray:
+        """(i, j, k, c) of a box, voxel by voxel."""
+        out = np.empty((*np.subtract(high, low), len(self.value(0))), self.dtype)
+        for at in np.ndindex(out.shape[:3]):
+            out[at] = self.at(tuple(int(n) for n in np.add(at, low)))
+        return out
+
+    def at(self, voxel: Place) -> np.ndarray:
+        """(c,) of a voxel."""
+        corner = tuple(n // 8 * 8 for n in voxel)
+        if corner in self.leaves:
+            i, j, k = np.subtract(voxel, corner)
+            value = self.leaves[corner][0][i * 64 + j * 8 + k]
+            return value.astype("f2").astype(self.dtype) if self.half else value
+        for reach, tiles in zip(REACH, self.tiles, strict=True):
+            corner = tuple(n // reach * reach for n in voxel)
+            if corner in tiles:
+                value = self.value(tiles[corner])
+                inner = self.half and reach != 4096
+                return value.astype("f2").astype(self.dtype) if inner else value
+        return self.value(self.background)
+
+
+def text(content: str) -> bytes:
+    """A string."""
+    return struct.pack("<I", len(content)) + content.encode()
+
+
+def told(entries: dict[str, tuple[str, bytes]]) -> bytes:
+    """Metadata."""
+    parts = [text(n) + text(k) + struct.pack("<I", len(v)) + v for n, (k, v) in entries.items()]
+    return struct.pack("<I", len(parts)) + b"".join(parts)
+
+
+def bits(flags: np.ndarray) -> bytes:
+    """A mask, its first bit the lowest of the first byte."""
+    return np.packbits(np.asarray(flags, bool), bitorder="little").tobytes()
+
+
+class VdbWriter:
+    """Writes grids of one file version and packing."""
+
+    def __init__(self, version: int = 224, packing: int = ACTIVE) -> None:
+        self.version, self.packing = version, packing
+        self.codes: set[int] = set()  # how inactive values were told
+
+    def write(self, path: Path, *grids: Grid, places: bool = True) -> Path:
+        """Writes a file."""
+        out = struct.pack("<qIII?", 0x56444220, self.version, 10, 0, places)
+        out += struct.pack("<?", bool(self.packing)) if self.version < 222 else b""
+        out += b"0" * 36 + told({"creator": ("string", b"tests"), "odd": ("matrix", b"1234")})
+        out += struct.pack("<i", len(grids))
+        for grid in grids:
+            kind = f"Tree_{grid.kind}_5_4_3" + "_HalfFloat" * grid.half
+            out += text(grid.name) + text(kind) + text(grid.parent)
+            head = struct.pack("<I", self.packing) if self.version >= 222 else b""
+            head += told(grid.told) + text(grid.map[0]) + grid.map[1]
+            tree, leaves = (b"", b"") if grid.parent else self.tree(grid)
+            at = len(out) + 24
+            ends = at + len(head) + len(tree)
+            out += struct.pack("<3q", at, ends, ends + len(leaves)) + head + tree + leaves
+        path.write_bytes(out)
+        return path
+
+    def tree(self, grid: Grid) -> tuple[bytes, bytes]:
+        """Topology, and values of leaves."""
+        places = [set(grid.leaves) | set(grid.tiles[2]), set(grid.tiles[1])]
+        lowers = sorted({tuple(n // 128 * 128 for n in place) for place in places[0]})
+        uppers = sorted({tuple(n // 4096 * 4096 for n in place) for place in (*lowers, *places[1])})
+        out = struct.pack("<I", 1) + grid.value(grid.background).tobytes()
+        out += struct.pack("<2I", len(grid.tiles[0]), len(uppers))
+        for place, value in grid.tiles[0].items():
+            out += struct.pack("<3i", *place) + grid.value(value).tobytes() + b"\x01"
+        leaves = b""
+        for upper in uppers:
+            below = [p for p in lowers if tuple(n // 4096 * 4096 for n in p) == upper]
+            out += struct.pack("<3i", *upper) + self.node(grid, 0, upper, below)
+            for lower in below:
+                inside = [p for p in grid.leaves if tuple(n // 128 * 128 for n in p) == lower]
+                inside.sort()
+                out += self.node(grid, 1, lower, inside)
+                out += b"".join(bits(grid.leaves[place][1]) for place in inside)
+                leaves += b"".join(self.leaf(grid, place) for place in inside)
+        return out, leaves
+
+    def node(self, grid: Grid, level: int, origin: Place, children: list[Place]) -> bytes:
+        """Masks and tiles of an upper (0) or a lower node."""
+        n, side = SIDE[level], REACH[level + 1]
+        active, values = np.zeros(n**3, bool), np.tile(grid.value(grid.background), (n**3, 1))
+        is_child = active.copy()
+
+        def number(place: Place) -> int:
+            return int(np.ravel_multi_index(np.subtract(place, origin) // side, (n, n, n)))
+
+        is_child[[number(place) for place in children]] = True
+        for place, value in grid.tiles[level + 1].items():
+            if tuple(p // REACH[level] * REACH[level] for p in place) == origin:
+                active[number(place)] = sum(place) % 16 == 0  # some are
+                values[number(place)] = value
+        if self.version < 222:
+            return bits(is_child) + bits(active) + self.numbers(grid, values[~is_child])
+        return bits(is_child) + bits(active) + self.values(grid, values, active)
+
+    def leaf(self, grid: Grid, place: Place) -> bytes:
+        """The values of a leaf."""
+        values, active = grid.leaves[place]
+        head = bits(active)
+        if grid.kind in ("mask", "bool"):
+            head += struct.pack("<3i", *place)
+            return head + bits(values[:, 0]) * (grid.kind == "bool")
+        if self.version < 222:
+            return head + struct.pack("<3ib", *place, 1) + self.numbers(grid, values)
+        return head + self.values(grid, values, active)
+
+    def values(self, grid: Grid, values: np.ndarray, active: np.ndarray) -> bytes:
+        """Values of a node; how the inactive ones are told follows from what they are."""
+        back = grid.value(grid.background)
+        minus = ~back if back.dtype.kind == "b" else -back
+        code, extra = 6, b""
+        if self.packing & ACTIVE:
+            seen = list(dict.fromkeys(map(tuple, values[~active].tolist())))
+            b, m = tuple(back.tolist()), tuple(minus.tolist())
+            others = [np.array(value, grid.dtype).tobytes() for value in seen]
+            if set(seen) <= {b}:
+                code = 0
+            elif seen == [m]:
+                code = 1
+            elif len(seen) == 1:
+                code, extra = 2, others[0]
+            elif set(seen) == {b, m}:
+                code, extra = 3, bits((values == back).all(1) & ~active)
+            elif len(seen) == 2 and b in seen:
+                rest = others[1 - seen.index(b)]
+                code, extra = 4, rest + bits((values == back).all(1) & ~active)
+            elif len(seen) == 2:
+                chosen = (values == seen[1]).all(1) & ~active
+                code, extra = 5, others[0] + others[1] + bits(chosen)
+        self.codes.add(code)
+        written = values[active] if code != 6 else values
+        return struct.pack("<B", code) + extra + self.numbers(grid, written)
+
+    def numbers(self, grid: Grid, values: np.ndarray) -> bytes:
+        """Numbers, packed."""
+        content = np.ascontiguousarray(values.astype("f2") if grid.half else values).tobytes()
+        if (self.version < 222 and not self.packing) or not self.packing & (ZIP | BLOSC):
+            return content
+        if self.packing & ZIP:
+            packed = zlib.compress(content)
+        else:
+            import imagecodecs
+
+            size = grid.dtype.itemsize
+            packed = imagecodecs.blosc_encode(content, compressor="lz4", typesize=size)
+        if len(packed) >= len(content):
+            return struct.pack("<q", -len(content)) + content
+        return struct.pack("<q", len(packed)) + packed
+
+
+#: Of NanoVDB's PNanoVDB.h: bytes of a root, before its tiles' values, of a tile; before the entries
+#: of an upper and a lower, of both, of an entry; before a leaf's values, of a leaf.
+NANO = {
+    "float": (1, 64, 20, 32, 8256, 270400, 1088, 33856, 8, 96, 2144),
+    "double": (2, 96, 24, 32, 8256, 270400, 1088, 33856, 8, 128, 4224),
+    "int16": (3, 64, 20, 32, 8256, 270400, 1088, 33856, 8, 96, 1120),
+    "int32": (4, 64, 20, 32, 8256, 270400, 1088, 33856, 8, 96, 2144),
+    "int64": (5, 96, 24, 32, 8256, 270400, 1088, 33856, 8, 128, 4224),
+    "Vec3f": (6, 96, 20, 32, 8256, 532544, 1088, 66624, 16, 128, 6272),
+    "Vec3d": (7, 128, 24, 64, 8288, 794720, 1120, 99424, 24, 160, 12448),
+    "Mask": (8, 64, 20, 32, 8256, 270400, 1088, 33856, 8, 16, 96),
+    "bool": (11, 64, 20, 32, 8256, 270400, 1088, 33856, 8, 96, 160),
+    "Fp4": (13, 64, 20, 32, 8256, 270400, 1088, 33856, 8, 96, 352),
+    "Fp8": (14, 64, 20, 32, 8256, 270400, 1088, 33856, 8, 96, 608),
+    "Fp16": (15, 64, 20, 32, 8256, 270400, 1088, 33856, 8, 96, 1120),
+    "FpN": (16, 64, 20, 32, 8256, 270400, 1088, 33856, 8, 96, 96),
+    "Vec4f": (17, 96, 20, 64, 8288, 532576, 1120, 66656, 16, 128, 8320),
+    "Vec4d": (18, 160, 24, 64, 8320, 1056896, 1152, 132224, 32, 160, 16544),
+    "Vec3u8": (24, 64, 20, 32, 8256, 270400, 1088, 33856, 8, 96, 1632),
+    "Vec3u16": (25, 64, 20, 32, 8256, 270400, 1088, 33856, 8, 128, 3200),
+    "uint8": (26, 64, 20, 32, 8256, 270400, 1088, 33856, 8, 96, 608),
+}
+NANO_DTYPES = {
+    "float": "f4", "double": "f8", "int16": "i2", "int32": "i4", "int64": "i8", "Vec3f": "f4",
+    "Vec3d": "f8", "Mask": "?", "bool": "?", "Vec4f": "f4", "Vec4d": "f8", "Vec3u8": "u1",
+    "Vec3u16": "u2", "uint8": "u1",
+}  # fmt: skip
+
+
+def _nano_leaf(
+    kind: str, rng: np.random.Generator, steps: int | None
+) -> tuple[bytes, np.ndarray, bytes]:
+    """A leaf's values as it holds them, as (512, c) or (512,), and what stands before codes."""
+    dtype, width = _numbers(kind)
+    if steps:
+        codes = rng.integers(0, 2**steps, 512)
+        flags = codes[:, None] >> np.arange(steps) & 1
+        least, step = np.float32(0.25), np.float32(0.125)
+        head = struct.pack("<2f", least, step)
+        return bits(flags.reshape(-1)), codes.astype("f4") * step + least, head
+    if dtype.kind == "b":
+        found = rng.random(512) < 0.5
+        return bits(found), found, b""
+    found = rng.integers(0, 100, (512, width)).astype(dtype)
+    return found.tobytes(), found, b""
+
+
+def _numbers(kind: str) -> tuple[np.dtype, int]:
+    return np.dtype(NANO_DTYPES.get(kind, "f4")), int(kind[3]) if kind[:3] == "Vec" else 1
+
+
+def nano_grid(kind: str, rng: np.random.Generator, bits_of_leaf: int = 8) -> tuple[bytes, Any]:
+    """A NanoVDB grid of two leaves at (-8, 0, 0) and (0, 8, 16), and tiles at (0, 0, 16), of 8
+    voxels, (128, 0, 0), of 128, and (8192, 0, 0), of 4096; and its (16, 16, 24, c) voxels from
+    (-8, 0, 0) on.
+    """
+    number, root, tile_value, tile, up, upper, low, lower, entry, values, leaf = NANO[kind]
+    dtype, width = _numbers(kind)
+    steps = {"Fp4": 4, "Fp8": 8, "Fp16": 16, "FpN": bits_of_leaf}.get(kind)
+    leaf += 64 * bits_of_leaf if kind == "FpN" else 0
+    at_root = 672 + 64
+    at_upper = [at_root + root + 3 * tile, at_root + root + 3 * tile + upper]
+    at_lower = [at_upper[1] + upper, at_upper[1] + upper + lower]
+    at_leaf = [at_lower[1] + lower, at_lower[1] + lower + leaf]
+    out = bytearray(at_leaf[1] + leaf)
+    struct.pack_into("<QQII", out, 0, 0x314244566F6E614E, 0, 32 << 21 | 6 << 10, 0)
+    struct.pack_into("<IIQ", out, 24, 0, 1, len(out))
+    out[296 + 88 : 296 + 88 + 72] = np.diag((0.5, 0.25, 2.0)).tobytes()
+    struct.pack_into("<3d", out, 528, 10, 20, 30)
+    struct.pack_into("<4q", out, 672, at_leaf[0] - 672, at_lower[0] - 672, at_upper[0] - 672, 64)
+    struct.pack_into("<6iI", out, at_root, -8, 0, 0, 7, 15, 23, 3)
+    back, fill = (np.full(width, n).astype(dtype) for n in (1, 3))
+    at = at_root + (32 if dtype.itemsize == 8 else 28)
+    out[at : at + back.nbytes] = back.tobytes()
+    box = np.tile(back, (16, 16, 24, 1))
+    box[8:, :8, 16:] = fill
+    at = at_root + root + 2 * tile
+    struct.pack_into("<Qq", out, at, 2 << 42, 0)
+    out[at + tile_value : at + tile_value + fill.nbytes] = fill.tobytes()
+    for n, place in enumerate(((-8, 0, 0), (0, 8, 16))):
+        keys = [(p & 0xFFFFFFFF) >> 12 for p in place]
+        key = keys[0] << 42 | keys[1] << 21 | keys[2]
+        struct.pack_into("<Qq", out, at_root + root + n * tile, key, at_upper[n] - at_root)
+        cells = [p // 128 % 32 for p in place], [p // 8 % 16 for p in place]
+        for base, count, cell, entries, child in (
+            (at_upper[n], 32, cells[0], up, at_lower[n]),
+            (at_lower[n], 16, cells[1], low, at_leaf[n]),
+        ):
+            index = int(np.ravel_multi_index(cell, (count,) * 3))
+            for one in range(count**3):
+                begin = base + entries + one * entry
+                out[begin : begin + back.nbytes] = back.tobytes()
+            out[base + 32 + count**3 // 8 + index // 8] |= 1 << index % 8
+            struct.pack_into("<q", out, base + entries + index * entry, child - base)
+        if n:
+            for begin in (at_lower[n] + low + 2 * entry, at_upper[n] + up + 1024 * entry):
+                out[begin : begin + fill.nbytes] = fill.tobytes()
+        content, found, head = _nano_leaf(kind, rng, steps)
+        out[at_leaf[n] + 15 : at_leaf[n] + 16] = bytes(
+            [steps.bit_length() - 1 << 5 if steps else 0]
+        )
+        out[at_leaf[n] + 80 : at_leaf[n] + 80 + len(head)] = head
+        begin = at_leaf[n] + values
+        out[begin : begin + len(content)] = content
+        i, j, k = (p - o for p, o in zip(place, (-8, 0, 0), strict=True))
+        box[i : i + 8, j : j + 8, k : k + 8] = found.reshape(8, 8, 8, width)
+    return bytes(out), (number, box)
+
+
+def nano_file(
+    path: Path, *grids: tuple[str, int, bytes], codec: int = 0, count_length: bool = True
+) -> Path:
+    """Writes grids (name, number of the type, content) into a segment of a `.nvdb` file."""
+    heads, parts = b"", b""
+    for name, kind, content in grids:
+        packed = content
+        if codec == 1:
+            packed = zlib.compress(content)
+        elif codec == 2:
+            import imagecodecs
+
+            half = len(content) // 2 // 8 * 8
+            packed, *rest = (
+                imagecodecs.blosc_encode(part, compressor="lz4", typesize=4)
+                for part in (content[:half], content[half:])
+            )
+            packed += struct.pack("<Q", len(rest[0])) + rest[0]
+            first = len(packed) - 8 - len(rest[0])
+        length = struct.pack("<Q", first if codec == 2 else len(packed)) if codec else b""
+        size = len(packed) + len(length) * count_length
+        heads += struct.pack(
+            "<4Q2I6d6i3d8I2HI", len(content), size, 0, 0, kind, 2, *(0,) * 6, *(0,) * 6,
+            *(0,) * 3, len(name) + 1, *(0,) * 7, codec, 0, 32 << 21,
+        ) + name.encode() + b"\0"  # fmt: skip
+        parts += length + packed
+    head = struct.pack("<8sIHH", b"NanoVDB2", 32 << 21 | 6 << 10, len(grids), codec)
+    path.write_bytes(head + heads + parts)
+    return path
