@@ -46,6 +46,7 @@ from .producers import (
     Hypertexture as Hypertexture,
     MeshProducer as MeshProducer,
     Nodes as Nodes,
+    OctaveProducer as OctaveProducer,
     PointProducer as PointProducer,
     Producer as Producer,
     Region as Region,

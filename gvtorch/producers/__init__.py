@@ -3,6 +3,7 @@
 from .field import FieldProducer, cache_field
 from .hypertexture import Hypertexture
 from .mesh import MeshProducer
+from .octaves import OctaveProducer
 from .points import PointProducer
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 from .stored import StoredProducer
@@ -15,6 +16,7 @@ __all__ = [
     "Layout",
     "MeshProducer",
     "Nodes",
+    "OctaveProducer",
     "PointProducer",
     "Producer",
     "Region",
