@@ -43,6 +43,7 @@ from .fields import (
 from .producers import (
     Bricks as Bricks,
     FieldProducer as FieldProducer,
+    FromChildren as FromChildren,
     Hypertexture as Hypertexture,
     MeshProducer as MeshProducer,
     Nodes as Nodes,

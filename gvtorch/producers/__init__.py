@@ -1,5 +1,6 @@
 """Producers: what makes the content of trees."""
 
+from .children import FromChildren
 from .field import FieldProducer, cache_field
 from .hypertexture import Hypertexture
 from .mesh import MeshProducer
@@ -12,6 +13,7 @@ from .volume import VolumeProducer
 __all__ = [
     "Bricks",
     "FieldProducer",
+    "FromChildren",
     "Hypertexture",
     "Layout",
     "MeshProducer",
