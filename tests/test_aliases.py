@@ -41,9 +41,9 @@ class Cells(gv.VolumeProducer):
     def same(self, nodes):
         """Places of alias targets, and which nodes are aliases."""
         depth = nodes.layout.depth - (CELL // nodes.layout.brick_size).bit_length() + 1
-        one = self.one.to(nodes.loc.device)
-        is_cell = (nodes.depth == depth) & (nodes.loc[:, :3] != one).any(1)
-        return torch.cat((one.expand(len(nodes), 3), nodes.loc[:, 3:]), 1), is_cell
+        loc = nodes.loc.cpu()
+        is_cell = (loc[:, 3] == depth) & (loc[:, :3] != self.one).any(1)
+        return torch.cat((self.one.expand(len(nodes), 3), loc[:, 3:]), 1), is_cell
 
     def classify(self, nodes):
         self.asked += len(nodes)

@@ -157,12 +157,13 @@ class FromChildren(Producer):
         )
         place, row = grid.reshape(-1, 3).unique(dim=0, return_inverse=True)
         blocks = self._blocks(layout, torch.cat((place, torch.full_like(place[:, :1], depth)), 1))
-        x, y, z = (inner.numpy() for inner in (voxel % brick).unbind(1))
-        index = (
+        inner = (voxel % brick).numpy()
+        x, y, z = inner[:, 0], inner[:, 1], inner[:, 2]
+        at = (
             *(row.view(grid.shape[:4]).numpy(), z[:, :, None, None]),
             *(y[:, None, :, None], x[:, None, None]),
         )
-        return {name: values[index] for name, values in blocks.items()}
+        return {name: values[at] for name, values in blocks.items()}
 
     def _blocks(self, layout: Layout, loc: Tensor) -> Blocks:
         """The voxels of nodes of one level at places (k, 4)."""
