@@ -43,9 +43,11 @@ from .fields import (
 from .producers import (
     Bricks as Bricks,
     FieldProducer as FieldProducer,
+    FromChildren as FromChildren,
     Hypertexture as Hypertexture,
     MeshProducer as MeshProducer,
     Nodes as Nodes,
+    OctaveProducer as OctaveProducer,
     PointProducer as PointProducer,
     Producer as Producer,
     Region as Region,

@@ -8,6 +8,7 @@ from torch import Tensor
 from ..base.constants import REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUEST_SUBDIVIDE
 from ..ops import lru_partition
 from ..pool import BrickPool, NodePool
+from .aliases import Aliases
 
 
 class LRU:
@@ -80,6 +81,7 @@ class Cache:
 
     Attributes:
         nodes, bricks: The pools.
+        aliases: Nodes that are the same as others.
         lru: The orders of use of tiles (REQUEST_SUBDIVIDE) and of bricks (REQUEST_LOAD): one for
             all bricks; or, where the pool has coarse slots, one of the others and one of these.
         finest: (trees,) int64 depth from which on a tree's bricks need no coarse slots; 0: none
@@ -90,6 +92,7 @@ class Cache:
     def __init__(self, nodes: NodePool, bricks: BrickPool, roots: int) -> None:
         """Locks the first `roots` tiles and bricks."""
         self.nodes, self.bricks = nodes, bricks
+        self.aliases = Aliases(nodes, bricks)
         bricks.in_order()
         device = nodes.child_tn.device
         self.frame_1 = torch.zeros(1, dtype=torch.int32, device=device)
@@ -123,6 +126,7 @@ class Cache:
             are coarse; `make_room` is told the unused ones, once the host knows them.
         """
         counts, frame, stamps = [], self.frame_1, (self.nodes.stamp_t, self.bricks.stamp_b)
+        self.aliases.keep(frame)
         for group, stamp in zip(self.lru.values(), stamps, strict=True):
             unused, size = [lru.sort(stamp, frame) for lru in group], sum(map(len, group))
             locked = (stamp[: len(stamp) - size] == frame).sum()

@@ -22,6 +22,7 @@ from ..base.constants import (
     REQUEST_SUBDIVIDE,
 )
 from ..ops import compact_requests
+from .aliases import by_target
 from .cache import Cache
 
 #: The kinds of request by the names that statistics show.
@@ -82,15 +83,17 @@ class RequestList:
         return cls(node=node, word=word, count=torch.cat((count, *kinds)))
 
     def by_kind(self, cache: Cache, counts: Mapping[str, int]) -> dict[int, Requests]:
-        """Returns the requests of each kind; the host does not wait. It has read back the `counts`,
-        how many there are of each kind, by name.
+        """Returns the requests of each kind, those of aliases at their targets. It has read back
+        the `counts`, how many there are of each kind, by name; the host waits only where there are
+        aliases.
         """
-        requests = {}
+        asked = {}
         for name, kind in KINDS.items():
             row = torch.nonzero_static((self.word & kind).ne(0), size=counts[name])[:, 0]
             node, priority = self.node[row].to(torch.int64), self.word[row] & REQUEST_PRIORITY
-            requests[kind] = Requests.of(cache, kind, node, priority)
-        return requests
+            asked[kind] = node, priority
+        asked = by_target(cache.aliases, asked) if len(cache.aliases) else asked
+        return {kind: Requests.of(cache, kind, *rows) for kind, rows in asked.items()}
 
 
 def _fits(coarse: Tensor, room: Sequence[int]) -> Tensor:

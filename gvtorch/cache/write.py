@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from ..base.constants import ABSENT, REQUEST_LOAD, REQUEST_SUBDIVIDE, TERMINAL
-from ..base.volume import movable
 from ..ops import lacking, link, link_bricks, link_tiles, orphan, put_rows, unlink
 from ..pool import N3Tree
 from ..pool.staging import Chunk, Voxels, on_device, row_bytes
@@ -75,6 +74,7 @@ class Children:
     ranges: Mapping[str, Tensor]  # (k, n, 2, c)
     is_alias: Tensor  # (k, n) bool
     alias: Tensor | None  # (k, n, 4) loc of alias targets
+    alias_tree: int  # number of their tree
 
 
 def tiles(cache: Cache, targets: Targets, children: Children) -> Written:
@@ -88,10 +88,9 @@ def tiles(cache: Cache, targets: Targets, children: Children) -> Written:
     done.lost = put.wanted & (put.slot < 0) if items < lasting else None
     if items and children.alias is not None:
         row, child = (children.is_alias & (put.slot >= 0)[:, None]).nonzero().unbind(1)
-        target = targets.tree.find(children.alias[row, child])
-        known = target >= 0
-        node = put.slot[row] * cache.nodes.nodes_per_tile + child
-        _alias(cache, node[known], target[known])
+        node, tree = put.slot[row] * cache.nodes.nodes_per_tile + child, targets.tree
+        goal = children.alias[row, child]
+        cache.aliases.add(node, tree.number, tree.loc(node), goal, children.alias_tree)
     return done
 
 
@@ -155,18 +154,6 @@ def _as_bytes(rows: Tensor) -> Tensor:
     """(k, b) uint8 view of rows (k, ...)."""
     rows = rows.detach().contiguous()
     return rows.view(len(rows), math.prod(rows.shape[1:])).view(torch.uint8)
-
-
-def _alias(cache: Cache, node: Tensor, target: Tensor) -> None:
-    """Points (k,) nodes, which own neither, to the tiles and bricks of their alias targets (k,)."""
-    pool = cache.nodes
-    child, brick = pool.child_tn.view(-1), pool.brick_tn.view(-1)
-    child[node], brick[node] = child[target], brick[target]
-    for words in (*pool.constants.values(), *pool.ranges.values()):
-        _copy_rows(words, node, target)
-    for shared, pointer in ((pool.shared_t, child), (cache.bricks.shared_b, brick)):
-        slot = pointer[node]
-        shared[slot[slot >= 0].to(torch.int64)] = True
 
 
 def bricks(cache: Cache, targets: Targets, data: Voxels | Sequence[Chunk]) -> Written:
@@ -292,20 +279,11 @@ def put_uniform(
     return wanted.sum()
 
 
-def share_bricks(cache: Cache, targets: Targets, other: Tensor) -> None:
-    """Points (k,) nodes to the bricks of their alias targets `other` (k,) int64, be they voxels,
-    EMPTY or CONSTANT; nodes that are gone or served already are left alone.
+def aliases(cache: Cache, targets: Targets, goal: Tensor, goal_tree: int) -> Written:
+    """Makes (k,) nodes aliases of what lies at places `goal` (k, 4) of a tree; nodes that are gone
+    or served already are left alone.
     """
-    wanted, pool = targets.lacking(cache, REQUEST_LOAD), cache.nodes
-    node, other = targets.node[wanted], other[wanted]
-    word = pool.brick_tn.view(-1)[other]
-    cache.bricks.shared_b[word[word >= 0].to(torch.int64)] = True
-    for words in pool.constants.values():
-        _copy_rows(words, node, other)
-    link(pool.brick_tn, pool.request_tn, node.to(torch.int32), word, REQUEST_LOAD)
-
-
-def _copy_rows(words: Tensor, to: Tensor, source: Tensor) -> None:
-    """Copies the rows of some nodes to others; words are (t, n, ...)."""
-    flat = movable(words).flatten(0, 1)
-    flat[to] = flat[source]
+    wanted = targets.lacking(cache, REQUEST_LOAD)
+    chosen, tree = targets[wanted], targets.tree.number
+    cache.aliases.add(chosen.node, tree, chosen.loc, goal[wanted], goal_tree)
+    return Written(constant=len(chosen), stale=len(targets) - len(chosen))

@@ -18,6 +18,7 @@ from ..cache import Cache, Scheduler
 from ..cache.write import Targets, put_bricks, put_tiles, put_uniform
 from ..producers import Region
 from ..producers.answer import checked_bricks, checked_regions
+from .parents import once, parent_bricks, ready
 from .recorded import RecordedFrame
 from .request_batch import ProducedTree, RequestBatch, children_of
 from .stats import Collected, FrameStats
@@ -59,6 +60,8 @@ class DeviceFrame(RecordedFrame):
             number, free = self.tree_of(chosen), self._unused[int(kind == REQUEST_LOAD)].view(1)
             for source in self.trees:
                 node = torch.where(number == source.tree.number, chosen, -1)
+                if kind == REQUEST_LOAD and source.producer.needs_parent:
+                    node = once(ready(self.cache, node, source.layout.depth))
                 counts, bare, bad = ask(source, node, free)
                 made[kind], free = made[kind] + counts, free - counts[:1]
                 constant, failed = constant + bare, failed + bad
@@ -102,7 +105,10 @@ class DeviceFrame(RecordedFrame):
     def _asked(self, source: ProducedTree, kind: int, node: Tensor) -> RequestBatch:
         """What a producer is asked of nodes (k,); the root where the index is -1."""
         there = torch.where(node >= 0, node, source.tree.root)
-        return RequestBatch(source, kind, Targets(source.tree, there, source.tree.loc(there)))
+        batch = RequestBatch(source, kind, Targets(source.tree, there, source.tree.loc(there)))
+        if kind == REQUEST_LOAD and source.producer.needs_parent:
+            return replace(batch, parents=parent_bricks(self.cache, source, there))
+        return batch
 
 
 def _only(targets: Targets, node: Tensor, which: Tensor) -> Targets:

@@ -26,7 +26,7 @@ from ..cameras import Camera
 from ..cameras.custom import as_camera
 from ..ops.trace import choose_backend
 from ..pictures import Picture
-from ..producers import Producer
+from ..producers import Layout, Producer
 from ..shaders.shader import Shader
 from ..tracing import RenderOptions
 from ..tracing.options import RenderSettings, render_options
@@ -112,8 +112,9 @@ class Engine:
         self._versions: dict[str, int] = {}  # of what they hold
         self.recorded: list[HostFrame] = []  # what producers on the host serve, without this frame
         try:
-            for number, (name, producer) in enumerate(producers.items()):
-                self.trees[name] = make_tree(self.cache, self.options, number, name, producer)
+            layouts: dict[str, Layout] = {}
+            for name, producer in producers.items():
+                self.trees[name] = make_tree(self.cache, self.options, layouts, name, producer)
                 self._versions[name] = producer.version
         except Exception:
             self.close()

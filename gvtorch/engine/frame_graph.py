@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..base.records import Hits, Rays
 from ..base.stage import stage
+from ..cache import Cache
 from ..cameras import Camera
 from ..cameras.custom import as_camera
 from ..pictures import Picture
@@ -28,6 +29,7 @@ class Steps(Protocol):
 
     device: torch.device
     frames: int
+    cache: Cache
     readbacks: Readbacks
 
     @property
@@ -100,9 +102,12 @@ class FrameGraph:
         engine, served = self._engine, self._served
         if engine.changed:
             return self._again(camera)  # which makes the changed trees anew
-        if served is not None and (engine.readbacks.failed or served.host_needed):
+        if served is not None and (
+            engine.readbacks.failed or served.host_needed or len(engine.cache.aliases)
+        ):
             served.host_needed = False
-            return self._again(camera)  # the host finds out which nodes fail, and names them
+            # The host finds out which nodes fail, and names them; it asks for targets of aliases.
+            return self._again(camera)
         with torch.cuda.device(engine.device), engine.new_frame(self._view.options) as stats:
             if served is not None:
                 engine.release(but=served if isinstance(served, HostFrame) else None)

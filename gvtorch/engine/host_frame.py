@@ -132,6 +132,7 @@ class HostFrame(RecordedFrame):
             ranges=_named(tiles, "ranges"),
             is_alias=torch.zeros_like(tiles["child"], dtype=torch.bool),
             alias=None,
+            alias_tree=source.tree.number,
         )
         targets = [Targets(source.tree, box["node"], box["loc"]) for box in (tiles, bricks, bare)]
         put = put_tiles(self.cache, targets[0], children, self._unused[:1])

@@ -10,18 +10,19 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future
 from concurrent.futures import wait as wait_for
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..base.constants import ABSENT, CONSTANT, EMPTY, REQUEST_LOAD
+from ..base.constants import CONSTANT, EMPTY, REQUEST_LOAD, REQUEST_PENDING_SHIFT
 from ..cache import KINDS, Cache, Scheduler, write
 from ..cache.write import Targets, Written
 from ..pool import Staging
 from ..pool.staging import Shipment, upload
 from ..producers import Bricks, Region, Regions
+from . import parents
 from .request_batch import (
     Answered,
     ProducedTree,
@@ -65,9 +66,15 @@ class Failures:
         self.newest: deque[Failure] = deque(maxlen=_KEPT)
         self._places: set[tuple[str, int, tuple[int, ...]]] = set()  # tree, kind, loc
         self._first: tuple[Failure, BaseException | None] | None = None
+        self._known = 0
 
     def __len__(self) -> int:
         return len(self._places)
+
+    def changed(self) -> bool:
+        """Whether there are others than at the last call."""
+        before, self._known = self._known, len(self)
+        return before != self._known
 
     def add(self, batch: RequestBatch, message: str, cause: BaseException | None) -> None:
         """Takes note of a batch's nodes."""
@@ -181,6 +188,8 @@ class Production:
             for source, node in self._by_tree(trees, nodes):
                 targets = Targets(source.tree, node, source.tree.loc(node))
                 batch = RequestBatch(source, kind, targets)
+                if kind == REQUEST_LOAD and source.producer.needs_parent:
+                    batch = self._with_parents(batch)
                 failed = self.failures.among(batch)
                 if failed is not None:  # before its tile was given away: it is marked again
                     again, batch = batch[failed], batch[~failed]
@@ -209,9 +218,7 @@ class Production:
     def write(self, answers: Sequence[Answered], stats: FrameStats) -> None:
         """Writes answers into the pools and adds up what they did."""
         stats.stale, self._skipped = stats.stale + self._skipped, 0
-        queue = deque(answers)
-        while queue:
-            batch, answer = queue.popleft()
+        for batch, answer in answers:
             if isinstance(answer, Regions):
                 children = children_of(batch, answer, self.cache)
                 self._add_up(batch, write.tiles(self.cache, batch.targets, children), stats)
@@ -219,7 +226,9 @@ class Production:
                 self._write_shipment(batch, answer, stats)
             else:
                 for kind, part in by_kind(batch, answer).items():
-                    queue += self._write_bricks(kind, *part, stats)
+                    self._write_bricks(kind, *part, stats)
+        if answers or self.failures.changed():
+            self.cache.aliases.update()
         stats.pending, stats.failed = sum(self.pending.values()), len(self.failures)
 
     def wait(self, more: float = 0.0, limit: float = _LONGEST) -> None:
@@ -276,6 +285,26 @@ class Production:
             for tree, mask, count in zip(trees, masks, masks.sum(1).tolist(), strict=True)
             if count
         ]
+
+    def _with_parents(self, batch: RequestBatch) -> RequestBatch:
+        """The batch with the bricks of its nodes' parents. Nodes whose parents have none wait until
+        they have: ancestors are asked for in their place.
+        """
+        cache, source = self.cache, batch.source
+        batch = batch[parents.unlink_lost(cache, batch.targets.node).nonzero()[:, 0]]
+        node = parents.ready(cache, batch.targets.node, source.layout.depth)
+        words, bit = cache.nodes.request_tn.view(-1), REQUEST_LOAD << REQUEST_PENDING_SHIFT
+        pending = (words[node] & bit) != 0
+        above = replace(batch, targets=Targets(source.tree, node, source.tree.loc(node)))
+        failed = self.failures.among(above)
+        if failed is not None:
+            lost = (failed & (node != batch.targets.node)).nonzero()[:, 0]
+            if len(lost):
+                self._fail(batch[lost], "the brick of its parent can't be made")
+        first = parents.once(torch.where(pending, -1, node))
+        asked = above[(first >= 0).nonzero()[:, 0]]
+        bricks = parents.parent_bricks(cache, source, asked.targets.node)
+        return replace(asked, parents=bricks)
 
     def _submit(self, batch: RequestBatch) -> list[Answered]:
         """Asks for a batch; returns what is answered at once."""
@@ -348,23 +377,25 @@ class Production:
 
     def _write_bricks(
         self, kind: Region, batch: RequestBatch, answer: Any, stats: FrameStats
-    ) -> list[Answered]:
-        """Writes bricks of one kind; returns further ones, made for aliases of what is not here."""
+    ) -> None:
+        """Writes bricks of one kind."""
         if kind is Region.ALIAS:
-            return self._write_aliases(batch, upload(answer.alias, batch.targets.node.device))
+            goal = upload(answer.alias, batch.targets.node.device)
+            written = write.aliases(self.cache, batch.targets, goal, batch.alias_tree(answer))
+            self._add_up(batch, written, stats)
+            return
         if kind is Region.EMPTY:
             device = batch.targets.node.device
             word = torch.where(answer.kind == Region.CONSTANT, CONSTANT, EMPTY).to(torch.int32)
             constants = {name: upload(rows, device) for name, rows in answer.constants.items()}
             written = write.uniform(self.cache, batch.targets, upload(word, device), constants)
             self._add_up(batch, written, stats)
-            return []
+            return
         sent = shipped(batch, answer, self.staging)
         if isinstance(sent, Shipment):
             self._write_shipment(batch, sent, stats)
         else:
             self._add_up(batch, write.bricks(self.cache, batch.targets, answer.data), stats)
-        return []
 
     def _write_shipment(self, batch: RequestBatch, shipment: Shipment, stats: FrameStats) -> None:
         """Writes voxels that are on their way; holds back those that found no room there."""
@@ -374,22 +405,6 @@ class Production:
             self._held.append(Answered(rest, Bricks(data=shipment.rest)))
         if len(sent):
             self._add_up(sent, write.bricks(self.cache, sent.targets, shipment.chunks), stats)
-
-    def _write_aliases(self, batch: RequestBatch, alias: Tensor) -> list[Answered]:
-        """Shares bricks of alias targets (k, 4); those that are not here are made for the alias."""
-        tree, targets = batch.source.tree, batch.targets
-        other = tree.find(alias)
-        words = self.cache.nodes.brick_tn.view(-1)
-        there = (other >= 0) & (words[other.clamp(min=0)] != ABSENT)
-        write.share_bricks(self.cache, targets[there], other[there])
-        if bool(there.all()):
-            return []
-        alone = batch[~there]
-        if batch.fill_loc is not None:
-            self._fail(alone, "an ALIAS of an ALIAS whose brick is not here")
-            return []
-        made = RequestBatch(batch.source, batch.kind, alone.targets, alias[~there])
-        return [answered for part in made.by_slots() for answered in self._submit(part)]
 
     def _add_up(self, batch: RequestBatch, written: Written, stats: FrameStats) -> None:
         """Adds up what a write did; what found no slot may be asked for again."""

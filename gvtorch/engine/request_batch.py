@@ -52,7 +52,7 @@ class RequestBatch:
     source: ProducedTree
     kind: int
     targets: Targets  # nodes to fill, or to subdivide
-    fill_loc: Tensor | None = None  # (k, 4) filled in their stead: alias targets
+    parents: Mapping[str, Tensor] | None = None  # (k, z, y, x, c) bricks, for who needs them
     coarse: bool = False  # their bricks take coarse slots
     on_host: bool = False  # the targets lie in host memory
 
@@ -76,25 +76,32 @@ class RequestBatch:
     def __getitem__(self, index: slice | Tensor) -> RequestBatch:
         if isinstance(index, Tensor):
             index = upload(index, self.targets.node.device)
-        fill_loc = None if self.fill_loc is None else self.fill_loc[index]
-        return replace(self, targets=self.targets[index], fill_loc=fill_loc)
+        parents = self.parents
+        if parents is not None:
+            parents = {name: rows[index] for name, rows in parents.items()}
+        return replace(self, targets=self.targets[index], parents=parents)
 
     @property
     def nodes(self) -> Nodes:
         """What the producer is asked about; made anew, for `Nodes` keep positions once computed."""
         layout = self.source.host_layout if self.on_host else self.source.layout
-        return Nodes(self.loc, layout, coarse=self.coarse)
+        return Nodes(self.loc, layout, coarse=self.coarse, parents=self.parents)
 
     @cached_property
     def loc(self) -> Tensor:
         """(m, 4) nodes to fill, or all children of the nodes to subdivide, node after node."""
         loc, n = self.targets.loc, self.source.layout.branching
         if self.kind == REQUEST_LOAD:
-            return loc if self.fill_loc is None else self.fill_loc
+            return loc
         child = torch.arange(n**3, device=loc.device)
         digits = torch.stack((child % n, child // n % n, child // n**2, torch.ones_like(child)), 1)
         low = torch.cat((loc[:, :3] * n, loc[:, 3:]), 1)
         return (low[:, None] + digits).flatten(0, 1)
+
+    def alias_tree(self, answer: Regions | Bricks) -> int:
+        """Number of the tree in which the alias targets of an answer lie."""
+        name, layout = answer.alias_tree, self.source.layout
+        return self.source.tree.number if name is None else [*layout.scene].index(name)
 
     def ask(self) -> Any:
         """Calls the producer."""
@@ -144,6 +151,7 @@ def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
         ranges={name: by_tile(values) for name, values in ranges.items()},
         is_alias=by_tile(kind == Region.ALIAS),
         alias=None if answer.alias is None else by_tile(answer.alias),
+        alias_tree=batch.alias_tree(answer),
     )
 
 

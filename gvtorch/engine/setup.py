@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypedDict
 
 import torch
@@ -166,12 +166,14 @@ def brick_bytes(channels: Mapping[str, Channel], options: EngineOptions) -> int:
 
 
 def make_tree(
-    cache: Cache, options: EngineOptions, number: int, name: str, producer: Producer
+    cache: Cache, options: EngineOptions, scene: dict[str, Layout], name: str, producer: Producer
 ) -> ProducedTree:
-    """Makes a tree with its root node, which is never given away."""
+    """Makes a tree with its root node, which is never given away, and adds it to the `scene`."""
     nodes = cache.nodes
     device = nodes.child_tn.device
     layout = Layout.of(producer, options.brick_size, options.border, device)
+    number, layout = len(scene), replace(layout, scene=scene)
+    scene[name] = layout
     if producer.layout is not None:
         raise ValueError(
             f"Engine: the producer of tree {name!r} serves another engine: "
@@ -191,6 +193,7 @@ def make_tree(
         labels=producer.labels,
     )
     tree.made_of = dict(producer.made_of)
+    cache.aliases.trees[number] = tree
     nodes.child_tn[number], nodes.brick_tn[number] = TERMINAL, EMPTY
     nodes.tree_t[number] = number
     if any(channel.coarse for channel in producer.channels.values()):
@@ -212,6 +215,7 @@ def renew_tree(cache: Cache, made: ProducedTree, patience: float) -> None:
     """Drops all that a tree holds and makes its root anew: its producer's content has changed."""
     nodes, bricks, per_tile = cache.nodes, cache.bricks, cache.nodes.nodes_per_tile
     number = made.tree.number
+    cache.aliases.clear(number)
     own = nodes.tree_t == number
     tile = (own & (nodes.parent_t >= 0)).nonzero()[:, 0]
     slot = ((bricks.owner_b >= 0) & own[bricks.owner_b.clamp(min=0) // per_tile]).nonzero()[:, 0]
@@ -271,13 +275,13 @@ def make_recorded_frame(
     production: Production,
 ) -> DeviceFrame | HostFrame | None:
     """Returns what serves a captured frame; None where producers answer neither all on the device
-    nor all from the host, or have coarse channels.
+    nor all from the host, have coarse channels, or need from the host what their parents hold.
     """
     producers = [one.producer for one in trees]
     if any(channel.coarse for one in producers for channel in one.channels.values()):
         return None
     if all(one.on_device for one in producers):
         return DeviceFrame(cache, trees, scheduler, batch)
-    if all(one.on_host for one in producers):
+    if all(one.on_host and not one.needs_parent for one in producers):
         return HostFrame(cache, trees, scheduler, batch, production)
     return None

@@ -146,17 +146,25 @@ class N3Tree:
 
     def find(self, loc: Tensor) -> Tensor:
         """Returns (k,) int64 nodes at places (k, 4) x, y, z, depth; -1 where there is none yet."""
-        n = self.branching
-        node = torch.full_like(loc[:, 0], self.root)
+        node, exact = self.nearest(loc)
+        return torch.where(exact, node, -1)
+
+    def nearest(self, loc: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns (k,) int64 nodes at places (k, 4) x, y, z, depth, or their nearest ancestors that
+        there are, and (k,) bool whether it is the node itself.
+        """
+        n, node = self.branching, torch.full_like(loc[:, 0], self.root)
+        exact = torch.ones_like(node, dtype=torch.bool)
         child = self.nodes.child_tn.view(-1)
         for level in range(1, int(loc[:, 3].max()) + 1 if len(loc) else 0):
-            tile = torch.where(node >= 0, child[node.clamp(min=0)].to(torch.int64), -1)
+            tile = child[node].to(torch.int64)
             up = (loc[:, 3] - level).clamp(min=0)
             x, y, z = (loc[:, axis] // n**up % n for axis in range(3))
             below = tile * self.nodes.nodes_per_tile + (z * n + y) * n + x
             deeper = level <= loc[:, 3]
-            node = torch.where(deeper, torch.where(tile >= 0, below, -1), node)
-        return node
+            exact = exact & (~deeper | (tile >= 0))
+            node = torch.where(deeper & exact, below, node)
+        return node, exact
 
     def __repr__(self) -> str:
         extent = "x".join(str(n) for n in self.extent)

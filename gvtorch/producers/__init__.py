@@ -1,8 +1,10 @@
 """Producers: what makes the content of trees."""
 
+from .children import FromChildren
 from .field import FieldProducer, cache_field
 from .hypertexture import Hypertexture
 from .mesh import MeshProducer
+from .octaves import OctaveProducer
 from .points import PointProducer
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 from .stored import StoredProducer
@@ -11,10 +13,12 @@ from .volume import VolumeProducer
 __all__ = [
     "Bricks",
     "FieldProducer",
+    "FromChildren",
     "Hypertexture",
     "Layout",
     "MeshProducer",
     "Nodes",
+    "OctaveProducer",
     "PointProducer",
     "Producer",
     "Region",

@@ -15,7 +15,7 @@ from ..base import check
 from ..pool import Channel, TableRows
 from ..pool.pyramid import NodeSummary
 from ..pool.staging import on_device, on_host, upload
-from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
+from .producer import Bricks, Nodes, Producer, Region, Regions
 
 Form = TypeVar("Form", bound=Regions | Bricks)
 
@@ -112,8 +112,11 @@ def _checked(
     missing = sorted(fine - {*fields["constants"]})
     if missing and counts[Region.CONSTANT]:
         raise ValueError(f"{where}: constants must hold channel {missing[0]!r} of CONSTANT items")
-    alias = _alias(where, answer.alias, kind, layout, errors) if counts[Region.ALIAS] else None
-    return form(kind=kind, alias=alias, errors=errors, **fields)
+    if not counts[Region.ALIAS]:
+        return form(kind=kind, errors=errors, **fields)
+    alias = _alias(where, answer, kind, nodes, errors)
+    tree = answer.alias_tree
+    return form(kind=kind, alias=alias, alias_tree=tree, errors=errors, **fields)
 
 
 def _refuse_late(
@@ -159,8 +162,20 @@ def _by_channel(
     return result
 
 
-def _alias(where: str, alias: Any, kind: Tensor, layout: Layout, errors: dict[int, str]) -> Tensor:
-    """Returns (k, 4) alias targets; wrong places become errors."""
+def _alias(
+    where: str, answer: Regions | Bricks, kind: Tensor, nodes: Nodes, errors: dict[int, str]
+) -> Tensor:
+    """Returns (k, 4) alias targets; places that are none become errors."""
+    alias: Any = answer.alias
+    layout, name = nodes.layout, answer.alias_tree
+    if name is not None:
+        if name not in layout.scene:
+            known = ", ".join(layout.scene)
+            raise ValueError(f"{where}: alias_tree must be one of {known}, got {name!r}")
+        layout = layout.scene[name]
+        if layout.branching != nodes.layout.branching:
+            own = nodes.layout.branching
+            raise ValueError(f"{where}: tree {name!r} has N={layout.branching}, this one N={own}")
     if not isinstance(alias, Tensor) or alias.shape != (len(kind), 4):
         raise ValueError(
             f"{where}: alias must be ({len(kind)}, 4) where an item is ALIAS, "
@@ -168,11 +183,20 @@ def _alias(where: str, alias: Any, kind: Tensor, layout: Layout, errors: dict[in
         )
     alias = alias.to(device=kind.device, dtype=torch.int64)
     depth = alias[:, 3]
-    nodes = float(layout.branching) ** depth.clamp(0, layout.depth).to(torch.float64)
-    inside = ((alias[:, :3] >= 0) & (alias[:, :3] < nodes[:, None])).all(1)
+    side = float(layout.branching) ** depth.clamp(0, layout.depth).to(torch.float64)
+    inside = ((alias[:, :3] >= 0) & (alias[:, :3] < side[:, None])).all(1)
     wrong = (kind == Region.ALIAS) & ~(inside & (depth >= 0) & (depth <= layout.depth))
     for index in wrong.nonzero()[:, 0].tolist():
-        errors.setdefault(index, f"alias {tuple(alias[index].tolist())} is no node of this tree")
+        tree = "this tree" if name is None else f"tree {name!r}"
+        errors.setdefault(index, f"alias {tuple(alias[index].tolist())} is no node of {tree}")
+    if layout.extent is not nodes.layout.extent:  # of another producer
+        return alias
+    loc = nodes.loc.to(alias.device)
+    up = layout.branching ** (depth - loc[:, 3]).clamp(0, layout.depth)
+    around = (alias[:, :3] // up[:, None] == loc[:, :3]).all(1) & (depth >= loc[:, 3])
+    for index in ((kind == Region.ALIAS) & around).nonzero()[:, 0].tolist():
+        one, other = tuple(alias[index].tolist()), tuple(loc[index].tolist())
+        errors.setdefault(index, f"alias {one} lies in the node itself, {other}")
     return alias
 
 

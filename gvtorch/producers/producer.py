@@ -20,6 +20,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.volume import Volume, movable
+from ..fields.noise import inherit
 from ..pool import Channel
 from ..pool.pools import phrase
 from ..pool.pyramid import tree_depth
@@ -33,7 +34,7 @@ class Region(IntEnum):
     CONSTANT = 1  # one value everywhere, also in its children
     DATA = 2  # voxels; its children may hold more detail
     DATA_MAX_DEPTH = 3  # voxels; its children hold no more detail and are never asked for
-    ALIAS = 4  # the same as another node of the tree, the alias target, with all below it
+    ALIAS = 4  # the same as another node, the alias target, with all below it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +49,7 @@ class Layout:
     spacing: tuple[float, float, float]  # world size of a finest voxel
     origin: tuple[float, float, float]  # world place of the centre of voxel 0
     device: torch.device  # of the pools
+    scene: Mapping[str, Layout] = field(default_factory=dict, repr=False, compare=False)  # trees
 
     @classmethod
     def of(cls, producer: Producer, brick_size: int, border: int, device: torch.device) -> Layout:
@@ -117,11 +119,20 @@ class Nodes:
         layout: How the tree's world is cut: brick size, border, spacing and the like.
         coarse: Whether their bricks hold coarse channels as well: then all are above the finest
             level; where a producer has such channels and this is False, all are of the finest.
+        parents: For each channel (k, z, y, x, c) the bricks of their parents, with borders, as they
+            are stored; None unless `Producer.needs_parent`, and of the root, which has none.
     """
 
-    def __init__(self, loc: Tensor, layout: Layout, *, coarse: bool = False) -> None:
+    def __init__(
+        self,
+        loc: Tensor,
+        layout: Layout,
+        *,
+        coarse: bool = False,
+        parents: Mapping[str, Tensor] | None = None,
+    ) -> None:
         """Holds the places."""
-        self.loc, self.layout, self.coarse = loc, layout, coarse
+        self.loc, self.layout, self.coarse, self.parents = loc, layout, coarse, parents
         self._known: dict[str, Tensor] = {}  # a cache of properties that torch.compile can trace
 
     def __len__(self) -> int:
@@ -129,14 +140,40 @@ class Nodes:
 
     def __getitem__(self, index: slice | Tensor) -> Nodes:
         """Returns some of the nodes."""
-        return Nodes(self.loc[index], self.layout, coarse=self.coarse)
+        parents = self.parents
+        if parents is not None:
+            parents = {name: rows[index] for name, rows in parents.items()}
+        return Nodes(self.loc[index], self.layout, coarse=self.coarse, parents=parents)
 
     def wider(self, by: int) -> Nodes:
         """Returns the same nodes with a border that is wider by so many voxels: what a producer
         evaluates where voxels are made of their neighbours.
         """
-        layout = self.layout.wider(by) if by else self.layout
-        return Nodes(self.loc, layout, coarse=self.coarse)
+        return Nodes(self.loc, self.layout.wider(by), coarse=self.coarse) if by else self
+
+    @property
+    def child(self) -> Tensor:
+        """(k, 3) int64 which child of its parent each is, x y z, 0 to N - 1."""
+        return self.loc[:, :3] % self.layout.branching
+
+    def inherited(self, points: int = 2) -> dict[str, Tensor]:
+        """Returns for each channel (k, z, y, x, c) float32 what `parents` hold where these nodes
+        have their voxels, border included: interpolated from `points` voxels along each axis, see
+        `gv.noise.inherit`; 2 is what renderers read.
+
+        Raises:
+            ValueError: There are no parents, or bricks have no border.
+        """
+        if self.parents is None:
+            raise ValueError("Nodes.inherited: the producer must have needs_parent, and no root")
+        layout, found = self.layout, {}
+        cut = {"border": layout.border, "branching": layout.branching, "points": points}
+        for name, bricks in self.parents.items():
+            width = bricks.shape[-1]
+            flat = bricks.movedim(-1, 1).flatten(0, 1).to(torch.float32)
+            rows = inherit(flat, self.child.repeat_interleave(width, 0), **cut)
+            found[name] = rows.unflatten(0, (-1, width)).movedim(1, -1)
+        return found
 
     @property
     def depth(self) -> Tensor:
@@ -296,6 +333,7 @@ class Regions(Answer):
     constants: Mapping[str, Tensor] = field(default_factory=dict)  # (k, c), see `Region.CONSTANT`
     ranges: Mapping[str, Tensor] = field(default_factory=dict)  # (k, 2, c) smallest, largest value
     alias: Tensor | None = None  # (k, 4) int64 places of alias targets; other rows are not read
+    alias_tree: str | None = None  # name of the tree that they are of; None: this one
     errors: Mapping[int, str] = field(default_factory=dict, repr=False)  # by item, why it failed
 
 
@@ -313,6 +351,7 @@ class Bricks(Answer):
     kind: Tensor | None = None  # (k,) of `Region`, -1: not finite; None: all DATA
     constants: Mapping[str, Tensor] = field(default_factory=dict)  # as in `Regions`
     alias: Tensor | None = None  # as in `Regions`
+    alias_tree: str | None = None  # as in `Regions`
     errors: Mapping[int, str] = field(default_factory=dict, repr=False)  # as in `Regions`
 
 
@@ -356,6 +395,9 @@ class Producer(torch.nn.Module):
             record them. They are then asked for batches of one size, which the root fills up.
         on_host: Whether they take places on the host (`Nodes.loc`), and give tensors there or
             futures soon: a captured frame then asks them while the device renders.
+        needs_parent: Whether `fill` is to be handed the bricks of the nodes' parents
+            (`Nodes.parents`): a node whose parent has no brick then waits until it has. Engines on
+            CUDA record this where the producer is `on_device`.
         made_of: For coarse channels, what they are made of: shaders compare it with what they need.
         version: Number of the content, see `changed`.
         extent, spacing, origin, branching, channels, value_range, labels: See `__init__`.
@@ -366,6 +408,7 @@ class Producer(torch.nn.Module):
     patience: float | None = None
     on_device: bool = False
     on_host: bool = False
+    needs_parent: bool = False
     layout: Layout | None = None
 
     def __init__(
@@ -471,17 +514,30 @@ class Producer(torch.nn.Module):
         depth = torch.full_like(place[:, :1], layout.depth)
         node = torch.cat(((place / layout.brick_size).floor(), depth), 1).to(torch.int64)
         loc, row = node.unique(dim=0, return_inverse=True)
-        answer: Any = self.fill(Nodes(loc, layout))
+        bricks_of = self._filled(loc, layout)
+        inner = place - node[:, :3] * layout.brick_size + layout.border
+        found = {}
+        for name, bricks in bricks_of.items():
+            found[name] = _between(bricks, row, inner).view(*points.shape[:-1], -1)
+        return found
+
+    def _filled(self, loc: Tensor, layout: Layout) -> dict[str, Tensor]:
+        """For each channel (k, z, y, x, c) the bricks of nodes of one level at places (k, 4); what
+        these need of their parents is made first. ValueError where one can't be made.
+        """
+        parents = None
+        if self.needs_parent and bool((loc[:, 3] > 0).all()):
+            above = torch.cat((loc[:, :3] // layout.branching, loc[:, 3:] - 1), 1)
+            above, row = above.unique(dim=0, return_inverse=True)
+            made = self._filled(above, layout)
+            parents = {name: bricks[row] for name, bricks in made.items()}
+        answer: Any = self.fill(Nodes(loc, layout, parents=parents))
         answer = answer.result() if isinstance(answer, Future) else answer
         answer = answer if isinstance(answer, Bricks) else Bricks(data=answer)
         for message in answer.errors.values():
             raise ValueError(f"{type(self).__name__}.at: {message}")
-        inner = place - node[:, :3] * layout.brick_size + layout.border
-        found = {}
-        for name, rows in answer.data.items():
-            bricks = on_device(rows, row.device).view(len(loc), *(layout.side,) * 3, -1)
-            found[name] = _between(bricks, row, inner).view(*points.shape[:-1], -1)
-        return found
+        shape = (len(loc), *(layout.side,) * 3, -1)
+        return {name: on_device(rows, loc.device).view(shape) for name, rows in answer.data.items()}
 
     def close(self) -> None:
         """Closes files and ends threads; does nothing unless overridden."""

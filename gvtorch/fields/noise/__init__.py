@@ -8,12 +8,14 @@ from .cellular import cellular
 from .fractal import fbm, fbm_bounds, ridged, turbulence, warp
 from .grid import perlin_grid
 from .levels import OctaveSum, inherit
+from .spline import SplineSum
 
 __all__ = [
     "LOST",
     "VARIANCE",
     "Bounds",
     "OctaveSum",
+    "SplineSum",
     "bounds",
     "cellular",
     "fbm",

@@ -1,0 +1,104 @@
+"""A flight at a place on the Mandelbulb's surface, from the whole bulb to 10^-9 of it, on the way
+that has the most room. 2^33 voxels a side; a pool of fixed size holds what a picture needs.
+"""
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+import tyro
+
+import gvtorch as gv
+
+BOX = 2.4  # world units along a side
+PLACES = (1.0, 6.0, 12.0, 18.0, 24.0, 29.0)  # of the six pictures: 2^-n of the box away
+WAY = torch.nn.functional.normalize(torch.tensor([0.5, 0.32, 0.81]).double(), dim=0)
+COLORS = ((1.0, 0.8, 0.45), (0.75, 0.22, 0.12), (0.1, 0.18, 0.35))  # of three orbit traps
+HAZE = torch.tensor([0.30, 0.36, 0.46])
+OPTIONS = {"cone_scale": 2.4}
+
+
+@dataclass
+class Settings:
+    """Writes six places of the flight, side by side, and a film if it has frames."""
+
+    output: Path = Path("mandelbulb_zoom.png")
+    size: int = 720
+    film: Path = Path("mandelbulb_zoom.mp4")
+    frames: int = 0
+    device: str = "cpu"
+
+
+def plan(shape: gv.Mandelbulb) -> tuple[torch.Tensor, torch.Tensor]:
+    """The place where a line from outside meets the bulb, and by level the eye's direction."""
+    outside, inside = 1.3, 0.2
+    for _ in range(6):  # to 10^-16
+        along = torch.linspace(outside, inside, 2001, dtype=torch.float64)
+        first = int((shape(along[:, None] * WAY) < 0).nonzero()[0])
+        outside, inside = float(along[first - 1]), float(along[first])
+    random = torch.Generator().manual_seed(0)
+    ways = torch.nn.functional.normalize(torch.randn((2000, 3), generator=random).double())
+    place, chosen = outside * WAY, [WAY]
+    for level in range(32):
+        far = BOX * 0.5**level
+        room = (shape(place + far * ways) / far).clamp(max=0.3)
+        chosen.append(ways[(room + 0.35 * ways @ chosen[-1]).argmax()])
+    return place, torch.stack(chosen[1:])
+
+
+def look(place: torch.Tensor, ways: torch.Tensor, level: float, width: int, height: int):
+    """The camera 2^-level of the box away from the place, and a stone in its sun."""
+    way = torch.lerp(ways[int(level)], ways[int(level) + 1], level % 1)
+    eye, up = place + BOX * 0.5**level * way / way.norm(), torch.tensor([0.0, 0.0, 1.0]).double()
+    sun = -way - 0.9 * torch.nn.functional.normalize(torch.linalg.cross(way, up), dim=0) - 0.5 * up
+    light = gv.DirectionalLight(tuple(sun.tolist()), (1.5, 1.25, 0.9), angle=4)
+    stone = gv.StoredColor("rgba", premultiplied=True, lit=True, light=light, ambient=0.35)
+    size = {"fov": 60, "width": width, "height": height}
+    return gv.Camera.look_at(tuple(eye.tolist()), tuple(place.tolist()), **size), stone
+
+
+def fly(engine: gv.Engine, route: tuple[torch.Tensor, torch.Tensor], settings: Settings) -> None:
+    """Films the way from 2^-4 to 2^-30 of the box, and tells how long each frame took."""
+    height, width, took = settings.size, settings.size * 16 // 9 // 2 * 2, []
+    with gv.Video(settings.film, width, height, fps=30) as film:
+        for level in torch.linspace(4, 30, settings.frames).tolist():
+            camera, stone = look(*route, level, width, height)
+            began = time.perf_counter()
+            picture, stats = engine.frame(camera, stone, **OPTIONS)
+            misses = stats.misses  # waits for the device
+            took.append(1e3 * (time.perf_counter() - began))
+            film.add(picture)
+            print(f"2^-{level:.2f} of the box: {took[-1]:.1f} ms, {misses} nodes missed")
+    late, middle = sum(one > 1e3 / 30 for one in took), sorted(took)[len(took) // 2]
+    print(f"{len(took)} frames: {middle:.1f} ms, at most {max(took):.1f}; {late} over 1/30 s")
+
+
+def main(settings: Settings) -> None:
+    """Flies there, then renders the six places."""
+    shape = gv.Mandelbulb(8, iterations=20, colors=COLORS)
+    route, solid = plan(shape), gv.Solid(shape, normals=False)
+    producer = gv.FieldProducer(solid, 2**33, box=((-BOX / 2,) * 3, (BOX / 2,) * 3))
+    limits = {"brick_pool": "512 MB", "time_budget": 10.0 if settings.frames else None}
+    pictures, size = [], (settings.size * 16 // 27 + 1, settings.size // 2)
+    with gv.Engine(producer, device=settings.device, **limits) as engine:
+        if settings.frames:
+            fly(engine, route, settings)
+        for level in PLACES:
+            camera, stone = look(*route, level, *size)
+            found = engine.render(camera, stone, **OPTIONS)  # without light: less is traced again
+            print(f"2^-{level:g} of the box: {found.stats}", flush=True)
+            light = gv.Lighting(shadows=0, occlusion=1.0, reach=0.1 * BOX * 0.5**level)
+            lit = engine.frame(camera, stone, lighting=light, **OPTIONS)[0].to("cpu")
+            clear = lit.alpha * torch.exp(-0.5 * lit.depth / (BOX * 0.5**level))
+            pictures.append(replace(lit, color=1.15 * clear * lit.color + (1 - clear) * HAZE))
+    both = {}
+    for name in ("color", "alpha"):
+        tiles = [getattr(one, name) for one in pictures]
+        both[name] = torch.cat([torch.cat(tiles[row : row + 3], 1) for row in (0, 3)])
+    replace(pictures[0], **both).save(settings.output)
+    print(settings.output)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings))

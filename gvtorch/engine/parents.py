@@ -1,0 +1,72 @@
+"""What producers are handed that need the bricks of their nodes' parents (`Producer.needs_parent`):
+a node whose parent has none waits, and the nearest ancestor whose parent has one is asked for.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..base.constants import ABSENT
+from ..base.volume import movable
+from ..cache import Cache
+from ..ops import unlink
+from .request_batch import ProducedTree
+
+
+def ready(cache: Cache, node: Tensor, depth: int) -> Tensor:
+    """Returns for (k,) int64 nodes of a tree of a depth, or -1, those or their nearest ancestors
+    whose parents have bricks or need none; the host does not wait.
+    """
+    words = cache.nodes.brick_tn.view(-1)
+    for _ in range(depth):
+        parent = _parent(cache, node)
+        bare = (parent >= 0) & (words[parent.clamp(min=0)] == ABSENT)
+        node = torch.where(bare, parent, node)
+    return node
+
+
+def once(node: Tensor) -> Tensor:
+    """Returns nodes (k,) with -1 in the place of all but the first of those that are equal; the
+    host does not wait.
+    """
+    held, order = node.sort(stable=True)
+    again = torch.zeros_like(held, dtype=torch.bool)
+    again[1:] = held[1:] == held[:-1]
+    return torch.where(torch.zeros_like(again).scatter(0, order, again), -1, node)
+
+
+def parent_bricks(cache: Cache, source: ProducedTree, node: Tensor) -> dict[str, Tensor]:
+    """Returns for each channel (k, z, y, x, c) the bricks of the parents of nodes (k,), which have
+    some, or one value; of a root its own. The host does not wait.
+    """
+    parent = _parent(cache, node)
+    parent = torch.where(parent >= 0, parent, node)
+    word, found = cache.nodes.brick_tn.view(-1)[parent], {}
+    for name, channel in source.producer.channels.items():
+        if channel.coarse:
+            continue
+        held, constants = cache.bricks.bricks[name].detach(), cache.nodes.constants[name]
+        rows = movable(held)[word.clamp(min=0).to(torch.int64)]
+        one = movable(constants).flatten(0, 1)[parent][:, None, None, None]
+        uniform = (word < ABSENT)[:, None, None, None, None]  # EMPTY, CONSTANT
+        rows = torch.where(uniform, one, rows)
+        found[name] = rows.view(held.dtype)
+    return found
+
+
+def unlink_lost(cache: Cache, node: Tensor) -> Tensor:
+    """Returns which of (k,) nodes hang in a tree, (k,) bool. Tiles of the others, which live below
+    aliases alone and know no parent, lose these: they are asked for where they belong.
+    """
+    tile = node // cache.nodes.nodes_per_tile
+    hangs = (cache.nodes.parent_t[tile] >= 0) | (tile < len(cache.aliases.trees))
+    lost = tile[~hangs].unique().to(torch.int32)
+    unlink(cache.nodes.child_tn, cache.nodes.parent_t, cache.nodes.shared_t, lost)
+    return hangs
+
+
+def _parent(cache: Cache, node: Tensor) -> Tensor:
+    """(k,) int64 parents of nodes, -1 for a root and for -1."""
+    tile = node.clamp(min=0) // cache.nodes.nodes_per_tile
+    return torch.where(node >= 0, cache.nodes.parent_t[tile].to(torch.int64), -1)

@@ -1,0 +1,250 @@
+"""`FromChildren`: coarse levels for producers that know their finest level alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import Future
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..base import check
+from ..pool.pyramid import coarser, from_numpy, to_numpy
+from ..pool.staging import on_device
+from .answer import checked_bricks, checked_regions
+from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
+
+_AT_ONCE = 64  # blocks of a level that are made together, out of N^3 times as many below
+
+Blocks = dict[str, np.ndarray]  # for each channel (k, z, y, x, c) without borders
+
+
+class FromChildren(Producer):
+    """A producer's finest level, and coarse levels that are the means of what lies below.
+
+    A coarse voxel is the mean of the N^3 voxels below it as they are stored, so that pictures are
+    those of a resident tree (`N3Tree.from_volume`) in every bit. That has its price: the root is
+    made of all finest bricks, and what is above them is kept in memory, without borders, at most
+    1 / (N^3 - 1) of the finest level. So this is for trees of a few levels. Where the producer's
+    `classify` tells that nodes are EMPTY or CONSTANT, nothing below is made. Formulas are better
+    sampled more finely, see `FieldProducer`.
+
+    Attributes:
+        producer: Who knows the finest level. It is asked to `classify` nodes of all levels.
+        levels: The most levels that a tree may have above the finest.
+    """
+
+    def __init__(self, producer: Producer, levels: int = 5) -> None:
+        """Takes the producer, and how many levels may be made of its finest one.
+
+        Raises:
+            ValueError: It makes labels, whose means say nothing, or coarse channels, or it needs
+                its parents' bricks.
+        """
+        where = type(self).__name__
+        check.instance(where, "producer", producer, Producer)
+        if producer.labels or producer.needs_parent:
+            what = "makes labels" if producer.labels else "needs its parents' bricks"
+            raise ValueError(f"{where}: {type(producer).__name__} {what}")
+        if any(channel.coarse for channel in producer.channels.values()):
+            raise ValueError(f"{where}: {type(producer).__name__} makes coarse channels itself")
+        super().__init__(
+            producer.extent,
+            channels=producer.channels,
+            spacing=producer.spacing,
+            origin=producer.origin,
+            branching=producer.branching,
+            value_range=producer.value_range,
+        )
+        self.producer, self.patience = producer, producer.patience
+        self.levels = check.whole(where, "levels", levels, low=1, high=10)
+        self._kept: dict[tuple[int, ...], Blocks] = {}  # blocks above the finest level, by place
+        self._known = producer.version  # they are of this content
+
+    @property
+    def version(self) -> int:  # type: ignore[override]
+        """That of the producer."""
+        return self.producer.version
+
+    def changed(self) -> None:
+        """See `Producer.changed`."""
+        self.producer.changed()
+
+    def prepare(self, layout: Layout) -> None:
+        """Refuses trees that are too deep."""
+        if layout.depth > self.levels:
+            count = layout.branching ** (3 * layout.depth)
+            raise ValueError(
+                f"{type(self).__name__}: the root of a tree {layout.depth} levels deep is made of "
+                f"{count} finest bricks; the most is levels={self.levels}"
+            )
+        self._kept.clear()
+        self.producer.prepare(layout)
+
+    def close(self) -> None:
+        """Closes the producer."""
+        self._kept.clear()
+        self.producer.close()
+
+    def classify(self, nodes: Nodes) -> Regions | Tensor | Future:
+        """As the producer does."""
+        return self.producer.classify(nodes)
+
+    def fill(self, nodes: Nodes) -> Bricks | Mapping[str, Tensor] | Future:
+        """The producer's bricks of the finest level, and means of what lies below of others."""
+        finest = nodes.depth == nodes.layout.depth
+        if bool(finest.all()):
+            return self.producer.fill(nodes)
+        if self._known != self.producer.version:
+            self._known = self.producer.version
+            self._kept.clear()
+        if bool(finest.any()):
+            return self._mixed(nodes, finest)
+        return Bricks(data=self._coarse(nodes))
+
+    def _mixed(self, nodes: Nodes, finest: Tensor) -> Bricks:
+        """Bricks of nodes some of which are of the finest level."""
+        fine, coarse = ((mask.nonzero()[:, 0]) for mask in (finest, ~finest))
+        own = self._asked(nodes[fine])
+        kind = torch.full((len(nodes),), int(Region.DATA))
+        if own.kind is not None:
+            kind[fine.cpu()] = own.kind.cpu()
+        data, constants, above = {}, {}, self._coarse(nodes[coarse])
+        order = torch.cat((fine, coarse)).argsort().cpu()
+        for name, rows in above.items():
+            both = [to_numpy(on_device(own.data[name], rows.device)), to_numpy(rows)]
+            data[name] = from_numpy(np.concatenate(both)[order.numpy()], rows.dtype)
+            if name in own.constants:
+                one = to_numpy(own.constants[name].cpu())
+                none = np.zeros((len(coarse), *one.shape[1:]), one.dtype)
+                constants[name] = from_numpy(np.concatenate((one, none))[order.numpy()], rows.dtype)
+        errors = {int(fine[index]): message for index, message in own.errors.items()}
+        return Bricks(data=data, kind=kind, constants=constants, errors=errors)
+
+    def _asked(self, nodes: Nodes) -> Bricks:
+        """The producer's answer, checked."""
+        answer: Any = self.producer.fill(nodes)
+        answer = answer.result() if isinstance(answer, Future) else answer
+        found = checked_bricks(answer, nodes, self.producer)
+        if found.kind is not None and bool((found.kind == Region.ALIAS).any()):
+            raise ValueError(f"{type(self).__name__}: bricks may be no aliases here")
+        return found
+
+    def _coarse(self, nodes: Nodes) -> dict[str, Tensor]:
+        """(k, z, y, x, c) bricks of coarse nodes, borders included."""
+        layout, loc = nodes.layout, nodes.loc.cpu()
+        shape = (len(loc), *(layout.side,) * 3)
+        found = {n: np.empty((*shape, c.width), _held(c.dtype)) for n, c in self.channels.items()}
+        for depth in loc[:, 3].unique().tolist():
+            for rows in (loc[:, 3] == depth).nonzero()[:, 0].split(_AT_ONCE):
+                low = loc[rows, :3] * layout.brick_size - layout.border
+                for name, values in self._region(layout, depth, low, layout.side).items():
+                    found[name][rows.numpy()] = values
+        return {n: from_numpy(found[n], c.dtype) for n, c in self.channels.items()}
+
+    def _region(self, layout: Layout, depth: int, low: Tensor, size: int) -> Blocks:
+        """size^3 voxels of a level from voxels `low` (k, 3) x y z on; beyond the level's faces the
+        outermost repeat.
+        """
+        step, brick = layout.branching ** (layout.depth - depth), layout.brick_size
+        last = torch.tensor([-(-n // step) - 1 for n in layout.extent])[:, None]
+        voxel = (low[:, :, None] + torch.arange(size)).clamp(min=0).minimum(last)
+        x, y, z = (voxel // brick).unbind(1)
+        grid = torch.stack(
+            torch.broadcast_tensors(x[:, None, None], y[:, None, :, None], z[:, :, None, None]), -1
+        )
+        place, row = grid.reshape(-1, 3).unique(dim=0, return_inverse=True)
+        blocks = self._blocks(layout, torch.cat((place, torch.full_like(place[:, :1], depth)), 1))
+        inner = (voxel % brick).numpy()
+        x, y, z = inner[:, 0], inner[:, 1], inner[:, 2]
+        at = (
+            *(row.view(grid.shape[:4]).numpy(), z[:, :, None, None]),
+            *(y[:, None, :, None], x[:, None, None]),
+        )
+        return {name: values[at] for name, values in blocks.items()}
+
+    def _blocks(self, layout: Layout, loc: Tensor) -> Blocks:
+        """The voxels of nodes of one level at places (k, 4)."""
+        if int(loc[0, 3]) == layout.depth:
+            return self._known_blocks(layout, loc)
+        keys = [tuple(place) for place in loc.tolist()]
+        missing = [row for row, key in enumerate(keys) if key not in self._kept]
+        found: dict[tuple[int, ...], Blocks] = {}
+        for begin in range(0, len(missing), _AT_ONCE):
+            rows = missing[begin : begin + _AT_ONCE]
+            made = self._known_blocks(layout, loc[rows])
+            for at, row in enumerate(rows):
+                found[keys[row]] = {name: values[at] for name, values in made.items()}
+        self._kept |= found
+        return {name: np.stack([self._kept[key][name] for key in keys]) for name in self.channels}
+
+    def _known_blocks(self, layout: Layout, loc: Tensor) -> Blocks:
+        """The same, of nodes that are made: those of one value hold that."""
+        nodes = Nodes(loc.to(layout.device), layout)
+        answer: Any = self.producer.classify(nodes)
+        answer = answer.result() if isinstance(answer, Future) else answer
+        regions = checked_regions(answer, nodes, self.producer)
+        _raise_first(regions.errors)
+        kind = regions.kind.cpu()
+        if bool((kind == Region.ALIAS).any()):
+            raise ValueError(f"{type(self).__name__}: regions may be no aliases here")
+        found = _uniform(self, regions.constants, len(loc), layout.brick_size)
+        rest = ((kind != Region.EMPTY) & (kind != Region.CONSTANT)).nonzero()[:, 0]
+        if len(rest):
+            whole = int(loc[0, 3]) == layout.depth
+            made = self._finest(nodes[rest]) if whole else self._means(layout, loc[rest])
+            for name, values in made.items():
+                found[name][rest.numpy()] = values
+        return found
+
+    def _means(self, layout: Layout, loc: Tensor) -> Blocks:
+        """Means of the voxels of the level below."""
+        n, size, depth = layout.branching, layout.brick_size, int(loc[0, 3])
+        found = {}
+        low = loc[:, :3] * (size * n)
+        for name, values in self._region(layout, depth + 1, low, size * n).items():
+            # Blocks lie one behind the other: none of the means reaches into two.
+            stacked = values.reshape(-1, *values.shape[2:])
+            told = "mean", n, self.channels[name].dtype, layout.spacing, layout.depth - depth
+            found[name] = coarser(stacked, *told).reshape(len(loc), size, size, size, -1)
+        return found
+
+    def _finest(self, nodes: Nodes) -> Blocks:
+        """What the producer makes of finest nodes."""
+        bricks, border = self._asked(nodes), nodes.layout.border
+        _raise_first(bricks.errors)
+        size = nodes.layout.brick_size
+        found = _uniform(self, bricks.constants, len(nodes), size)
+        inner = slice(border, border + size)
+        data = torch.ones(len(nodes), dtype=torch.bool)
+        if bricks.kind is not None:
+            kind = bricks.kind.cpu()
+            data = (kind != Region.EMPTY) & (kind != Region.CONSTANT)
+        for name, rows in bricks.data.items():
+            values = to_numpy(on_device(rows, torch.device("cpu")))
+            found[name][data.numpy()] = values[data.numpy(), inner, inner, inner]
+        return found
+
+
+def _uniform(
+    producer: Producer, constants: Mapping[str, Tensor], count: int, size: int
+) -> dict[str, np.ndarray]:
+    """(k, z, y, x, c) for each channel, of the constants (k, c) that are told, else 0."""
+    found = {}
+    for name, channel in producer.channels.items():
+        found[name] = np.zeros((count, size, size, size, channel.width), _held(channel.dtype))
+        if name in constants:
+            found[name][:] = to_numpy(constants[name].cpu())[:, None, None, None]
+    return found
+
+
+def _held(dtype: torch.dtype) -> np.dtype:
+    """The dtype of arrays that hold a channel."""
+    return to_numpy(torch.zeros(0, dtype=dtype)).dtype
+
+
+def _raise_first(errors: Mapping[int, str]) -> None:
+    for message in errors.values():
+        raise ValueError(message)

@@ -1,0 +1,97 @@
+"""`OctaveProducer`: sums of octaves of noise of which each level adds the finest to what the bricks
+of its parents hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from ..base.constants import DEEP_VOXELS
+from ..fields.noise import OctaveSum, SplineSum
+from ..pool import Channel
+from .producer import Nodes, Producer
+
+
+class OctaveProducer(Producer):
+    """Bricks of a `gv.noise.SplineSum` or `gv.noise.OctaveSum`, or of what is made of it.
+
+    A level holds the sum of the octaves that its voxels can hold. Where children can't take over
+    what voxels hold as it is, the channel "inherited" has what they can. Cells begin at the low
+    corner of the box.
+
+    Attributes:
+        total: The sum.
+        values: What voxels are made of it by; None: they hold it.
+    """
+
+    needs_parent = True
+
+    def __init__(
+        self,
+        total: OctaveSum | SplineSum,
+        extent: int | Sequence[int],
+        *,
+        box: Sequence[Sequence[float]] | None = None,
+        values: Callable[[Tensor, Nodes], Tensor] | None = None,
+        value_range: tuple[float, float] | None = None,
+    ) -> None:
+        """Takes the sum and where to cut voxels out of it.
+
+        Args:
+            total: The sum; a `SplineSum` needs cells that are 2^n voxels wide.
+            extent: Voxels of the finest level, one number or (x, y, z).
+            box: World corners ((x, y, z), (x, y, z)), of voxels that are cubes.
+            values: A function of the sum (k, z, y, x) in some nodes, and of these nodes, such as a
+                density: of the same shape.
+            value_range: Smallest and largest value, where they are known.
+
+        Raises:
+            ValueError: Voxels are no cubes, or see `Producer`.
+        """
+        where = type(self).__name__
+        if not isinstance(total, (OctaveSum, SplineSum)):
+            kind = type(total).__name__
+            raise ValueError(f"{where}: total must be a SplineSum or an OctaveSum, got {kind}")
+        self._names = ["value"]
+        if isinstance(total, OctaveSum) or values is not None:
+            self._names.append("inherited")
+        super().__init__(
+            extent,
+            channels={name: Channel() for name in self._names},
+            box=box,
+            value_range=None if value_range is None else {"value": value_range},
+        )
+        if max(self.spacing) > min(self.spacing) * (1 + 1e-9):
+            raise ValueError(f"{where}: voxels must be cubes, got sides {self.spacing}")
+        self.total, self.values = total, values
+
+    def fill(self, nodes: Nodes) -> dict[str, Tensor]:
+        """Adds the finest octaves, level by level."""
+        shape = (len(nodes), *(nodes.layout.side,) * 3)
+        found = {name: torch.empty(shape, device=nodes.loc.device) for name in self._names}
+        for depth in nodes.depth.unique().tolist():
+            rows = (nodes.depth == depth).nonzero()[:, 0]
+            sums = self._sums(nodes[rows], depth)
+            for name, values in zip(self._names, sums, strict=False):
+                found[name][rows] = values
+        return found
+
+    def _sums(self, nodes: Nodes, depth: int) -> tuple[Tensor, Tensor]:
+        """What nodes of one level hold, and what their children take over, (k, z, y, x)."""
+        layout = nodes.layout
+        side = self.spacing[0] * float(layout.branching) ** (layout.depth - depth)
+        reach = layout.reach.to(nodes.loc.device)
+        places = (nodes.loc[:, :3, None] * layout.brick_size + reach + 0.5) * side
+        parents = None if nodes.parents is None else nodes.parents[self._names[-1]][..., 0]
+        if isinstance(self.total, OctaveSum):
+            deep = max(self.extent) > DEEP_VOXELS
+            places = places.to(torch.float64 if deep else torch.float32)
+            parents = None if parents is None else parents.to(places.dtype)
+        cut = {"border": layout.border, "branching": layout.branching}
+        values, settled = self.total.bricks(places.unbind(1), side, parents, nodes.child, **cut)
+        if self.values is not None:
+            values = self.values(values, nodes)
+        return values, settled
