@@ -15,8 +15,6 @@ from ..meshes.voxelizer import CHANNELS, Voxelizer
 from ..pool import Channel
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 
-_FINER = 2  # places along a side that a coarse voxel is the mean of
-
 
 class MeshProducer(Producer):
     """Makes bricks of a mesh at any level, out of its triangles: nothing is made that is not looked
@@ -27,6 +25,8 @@ class MeshProducer(Producer):
     surface lie in a voxel; colours and normals come of the surface within `band` voxels of each
     level.
     """
+
+    on_device = True
 
     def __init__(
         self,
@@ -75,43 +75,34 @@ class MeshProducer(Producer):
 
     def classify(self, nodes: Nodes) -> Regions:
         """EMPTY outside and CONSTANT inside, where no triangle comes near any voxel in reach."""
-        grid, layout = self.voxelizer, nodes.layout
-        kind = torch.full((len(nodes),), int(Region.DATA), device=grid.device)
-        inside = torch.zeros(len(nodes), dtype=torch.bool, device=grid.device)
-        for here, low, voxel in _by_depth(nodes, grid):
-            high = low + layout.side * voxel
-            bare = here[~grid.geometry.touched(low, high, grid.reach(voxel))]
-            inside[bare] = grid.geometry.winding(nodes.center.to(grid.device)[bare]) != 0
-            kind[bare] = int(Region.CONSTANT)
-        constants = grid.constants(inside)
+        grid = self.voxelizer
+        low, voxel = _cubes(nodes, grid)
+        touched, within = grid.touched(low, nodes.layout.side * voxel, voxel)
+        bare, inside = ~touched.flatten(1).any(1), within[:, 0, 0, 0]
+        kind = torch.where(bare, int(Region.CONSTANT), int(Region.DATA))
         if "distance" not in grid.channels:
-            kind[(kind == Region.CONSTANT) & ~inside] = int(Region.EMPTY)
-        return Regions(kind=kind, constants=constants)
+            kind = torch.where(bare & ~inside, int(Region.EMPTY), kind)
+        return Regions(kind=kind, constants=grid.constants(inside))
 
     def fill(self, nodes: Nodes) -> Bricks:
-        """Makes the bricks, level by level."""
-        grid, layout = self.voxelizer, nodes.layout
-        data = {
-            name: torch.empty(
-                (len(nodes), *(layout.side,) * 3, one.width), dtype=one.dtype, device=grid.device
-            )
-            for name, one in self.channels.items()
-        }
-        for here, low, voxel in _by_depth(nodes, grid):
-            finer = 1 if voxel < 1.5 * grid.spacing else _FINER
-            for name, made in grid.cubes(low, voxel, layout.side, finer=finer).items():
-                data[name][here] = made
-        return Bricks(data=data)
+        """Makes the bricks."""
+        grid, side = self.voxelizer, nodes.layout.side
+        low, voxel = _cubes(nodes, grid)
+        coarse = nodes.depth.to(grid.device) < nodes.layout.depth
+        if grid.device.type != "cpu":
+            return Bricks(data=grid.cubes(low, voxel, side, coarse_k=coarse))
+        # The finest are of one place, which the host may look at here.
+        order = coarse.to(torch.int8).argsort(stable=True)
+        fine, rest = order.split([len(order) - int(coarse.sum()), int(coarse.sum())])
+        parts = [grid.cubes(low[fine], voxel[fine], side)]
+        parts.append(grid.cubes(low[rest], voxel[rest], side, coarse_k=coarse[rest]))
+        back = order.argsort()
+        return Bricks(data={n: torch.cat([p[n] for p in parts])[back] for n in self.channels})
 
 
-def _by_depth(nodes: Nodes, grid: Voxelizer) -> list[tuple[Tensor, Tensor, float]]:
-    """For each depth which of the nodes it has, (m,), the low corners of their bricks with border,
-    (m, 3) float64, and the size of their voxels.
+def _cubes(nodes: Nodes, grid: Voxelizer) -> tuple[Tensor, Tensor]:
+    """(k, 3) float64 low corners of the nodes' bricks with their borders, and (k,) float64 sizes of
+    their voxels.
     """
-    found = []
     low = nodes.box[:, 0] - nodes.layout.border * nodes.voxel_size
-    for depth in nodes.depth.unique().tolist():
-        here = (nodes.depth == depth).nonzero()[:, 0]
-        voxel = grid.spacing * nodes.layout.branching ** (nodes.layout.depth - depth)
-        found.append((here.to(grid.device), low[here].to(grid.device), float(voxel)))
-    return found
+    return low.to(grid.device).contiguous(), nodes.voxel_size[:, 0].to(grid.device)
