@@ -87,6 +87,8 @@ def find_image(
             top, root = root, child(root, inner)
             deeper = _attributes(f"{where}/{inner}", root, deadline)
             found = _parse_image(where, deeper, None) if deeper else None
+            own = deeper.get("gvtorch") if deeper else None
+            layout = None if own is None else StoreLayout.parse(f"{where}/{inner}", own)
             if found is not None and image is None and series is not None:
                 found = _with_series(where, top, found, deadline, inner)
     if found is None:

@@ -44,15 +44,17 @@ class Geometry:
         largest: World size of the bounds of the largest.
     """
 
-    def __init__(self, mesh: Mesh, device: torch.device | str = "cpu") -> None:
-        """Builds the hierarchy."""
-        kept, solid = solids(mesh)
+    def __init__(
+        self, mesh: Mesh, device: torch.device | str = "cpu", *, solid: bool = True
+    ) -> None:
+        """Builds the hierarchy; not `solid`: all are sheets."""
+        kept, closed = solids(mesh)
         corner = torch.from_numpy(mesh.vertices[mesh.faces[kept]]).to(device)
         self.hierarchy = Hierarchy(corner)
         order = self.hierarchy.order
         self.corner = corner[order].contiguous()
         self.kept = torch.from_numpy(kept)[order.cpu()]
-        self.solid = torch.from_numpy(solid).to(device)[order]
+        self.solid = torch.from_numpy(closed & solid).to(device)[order]
         bounds = self.corner.amax(1) - self.corner.amin(1)
         self.size = float((self.corner.amax((0, 1)) - self.corner.amin((0, 1))).max())
         self.detail, self.largest = float(self.area.median().sqrt()), float(bounds.max())

@@ -8,13 +8,15 @@ Source: Jacobson, Kavan, Sorkine-Hornung, "Robust inside-outside segmentation us
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 
 from .mesh import Mesh, edges_of, parts_of, solids, welded
 from .winding import WindingNumber
+
+Solid = Literal["auto", "always", "never"]  # which parts are solids: closed ones, filled ones, none
 
 _RINGS = 4  # of triangles between a hole's rim and its middle
 _STEPS = 12  # of the bisection
@@ -108,6 +110,18 @@ def told_of_holes(mesh: Mesh) -> str:
         f"{mesh.name}: {holes} holes of {int(edges[nearly].sum())} edges leave {len(nearly)} parts "
         'open: they become sheets; solid="always" (--solid always) fills them'
     )
+
+
+def check_solid(where: str, solid: str) -> None:
+    """Raises ValueError unless it is a `Solid`."""
+    known = get_args(Solid)
+    if solid not in known:
+        raise ValueError(f"{where}: solid must be one of {', '.join(known)}, got {solid!r}")
+
+
+def prepared(mesh: Mesh, solid: Solid) -> Mesh:
+    """Returns what is made into voxels."""
+    return filled(mesh) if solid == "always" else mesh
 
 
 def filled(mesh: Mesh) -> Mesh:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ..base import check
 from .geometry import Cubes, Geometry
+from .holes import Solid, check_solid, prepared
 from .mesh import Mesh
 from .paint import Paint
 
@@ -30,6 +31,16 @@ _CUBE, _PARTS = 8, 4  # voxels along a side of the cubes of a region; of so many
 _BATCH = 1 << 20  # voxels that are made together
 _FINER = 2  # places along a side that a coarse voxel is the mean of
 _DIAGONAL = 0.5 * math.sqrt(3)  # from a voxel's centre to its corner
+
+
+def check_channels(where: str, channels: str | Sequence[str]) -> tuple[str, ...]:
+    """Returns names of channels, once each; raises ValueError where one is unknown."""
+    names = (channels,) if isinstance(channels, str) else tuple(channels)
+    unknown = [name for name in names if name not in CHANNELS]
+    if unknown or not names or len({*names}) < len(names):
+        what = f"{unknown[0]!r}" if unknown else f"{names!r}"
+        raise ValueError(f"{where}: channels must be some of {', '.join(CHANNELS)}, got {what}")
+    return names
 
 
 class Voxelizer:
@@ -62,6 +73,7 @@ class Voxelizer:
         channels: Sequence[str] = ("coverage",),
         band: float = 4.0,
         thickness: float = 1.0,
+        solid: Solid = "auto",
         device: torch.device | str = "cpu",
     ) -> None:
         """Lays the grid around the mesh.
@@ -72,6 +84,8 @@ class Voxelizer:
             channels: Of `CHANNELS`.
             band: In finest voxels, at least 2.
             thickness: Of sheets, in finest voxels.
+            solid: auto: what is closed is a solid; always: holes are filled before; never: all is a
+                sheet.
             device: Where it is worked out.
 
         Raises:
@@ -79,11 +93,9 @@ class Voxelizer:
         """
         where = "voxelize"
         check.whole(where, "resolution", resolution, low=8, high=2**30)
-        channels = (channels,) if isinstance(channels, str) else tuple(channels)
-        unknown = [name for name in channels if name not in CHANNELS]
-        if unknown or not channels or len({*channels}) < len(channels):
-            what = f"{unknown[0]!r}" if unknown else f"{channels!r}"
-            raise ValueError(f"{where}: channels must be some of {', '.join(CHANNELS)}, got {what}")
+        check_solid(where, solid)
+        channels = check_channels(where, channels)
+        mesh = prepared(mesh, solid)
         if "material" in channels and len(mesh.materials) > 255:
             raise ValueError(
                 f"{mesh.name}: {len(mesh.materials)} materials, a uint8 tells 255 apart"
@@ -101,7 +113,7 @@ class Voxelizer:
         self.band = check.number(where, "band", band, low=2) * self.spacing
         self.thickness = check.number(where, "thickness", thickness, low=0.1) * self.spacing
         self.device = torch.device(device)
-        self.geometry = Geometry(mesh, self.device)
+        self.geometry = Geometry(mesh, self.device, solid=solid != "never")
         self._wide = not self.geometry.is_narrow(self.spacing)
         places = torch.tensor(list(itertools.product(range(_FINER), repeat=3)))
         self._places = places.to(self.device, torch.float64)

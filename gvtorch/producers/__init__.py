@@ -2,6 +2,7 @@
 
 from .field import FieldProducer, cache_field
 from .hypertexture import Hypertexture
+from .joined import JoinedProducer, StoredChannels
 from .mesh import MeshProducer
 from .points import PointProducer
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
@@ -12,6 +13,7 @@ __all__ = [
     "Bricks",
     "FieldProducer",
     "Hypertexture",
+    "JoinedProducer",
     "Layout",
     "MeshProducer",
     "Nodes",
@@ -19,6 +21,7 @@ __all__ = [
     "Producer",
     "Region",
     "Regions",
+    "StoredChannels",
     "StoredProducer",
     "VolumeProducer",
     "cache_field",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..io.mesh_file import read_mesh
+from ..meshes.holes import Solid, told_of_holes
 from ..meshes.mesh import Mesh
 from ..meshes.voxelizer import CHANNELS, Voxelizer
 from ..pool import Channel
@@ -36,6 +38,7 @@ class MeshProducer(Producer):
         channels: Sequence[str] = ("coverage",),
         band: float = 4.0,
         thickness: float = 1.0,
+        solid: Solid = "auto",
     ) -> None:
         """Takes a mesh.
 
@@ -45,18 +48,23 @@ class MeshProducer(Producer):
             channels: coverage, distance, color, normal, material; see `Voxelizer`.
             band: Finest voxels up to which the nearest place of the surface counts.
             thickness: Finest voxels, of what bounds no solid.
+            solid: auto: what is closed is a solid; always: holes are filled before; never: all is a
+                sheet.
 
         Raises:
             ValueError: A number is out of its range, a channel unknown, or see `read_mesh`.
         """
         mesh = mesh if isinstance(mesh, Mesh) else read_mesh(mesh)
+        if solid == "auto" and (told := told_of_holes(mesh)):
+            warnings.warn(told, stacklevel=2)
         self._told: dict[str, Any] = {
             "resolution": resolution,
             "channels": channels,
             "band": band,
             "thickness": thickness,
         }
-        grid = Voxelizer(mesh, **self._told)
+        grid = Voxelizer(mesh, **self._told, solid=solid)
+        self._told["solid"] = "auto" if solid == "always" else solid  # the holes are filled now
         ranges = {"coverage": (0.0, 255.0), "distance": (-grid.band, grid.band)}
         super().__init__(
             grid.extent,
