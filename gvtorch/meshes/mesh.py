@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+_LEAST = 1e-30  # world units that a mesh may span; 1 / _LEAST at most: their squares are numbers
 MOST_FACES = 2**28  # triangles of a mesh: they and their hierarchy would take 100 GB
 
 
@@ -82,6 +83,11 @@ class Mesh:
             )
         if not (self.bounds[1] > self.bounds[0]).any():
             raise ValueError(f"{self.name}: all triangles lie in one point")
+        with np.errstate(over="ignore"):
+            size = max(float((self.bounds[1] - self.bounds[0]).max()), float(abs(used).max()))
+        if not _LEAST <= size <= 1 / _LEAST:
+            told = f"{_LEAST:g} to {1 / _LEAST:g} can be told"
+            raise ValueError(f"{self.name}: spans {size:.3g} world units; {told}")
 
     @property
     def bounds(self) -> np.ndarray:
