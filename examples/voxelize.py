@@ -22,7 +22,7 @@ class Settings:
     size: int = 480  # height of the picture
     mesh: Path | None = None  # a file in place of the knot
     texture: Path | None = None  # for that file
-    resolution: int = 768
+    resolution: int = 512
     device: str = "cpu"
 
 
@@ -40,8 +40,10 @@ def knot_on_plate() -> gv.Mesh:
     points = middle + radius * (np.cos(a) * up + np.sin(a) * side)
     hue = 0.05 + 0.75 * (0.5 + 0.5 * np.cos(t + np.array((0.0, 1.9, 3.6)))) ** 1.6
     rope = grid(points, hue * (0.35 + 0.65 * groove))
-    profile = np.array([(0.5, -0.67), (0.5, -0.8), (2.3, -0.8), (2.3, -0.67)])[None]
-    turn = np.concatenate((np.cos(t), 0 * t, np.sin(t)), -1)
+    wide = np.linspace(0.5, 2.3, 13)
+    below, above = np.stack((wide, 0 * wide - 0.8), 1), np.stack((wide, 0 * wide - 0.67), 1)
+    profile = np.concatenate((above, below[::-1]))[None, ::-1]
+    turn = np.concatenate((np.cos(t), 0 * t, np.sin(t)), -1)[::4]
     ring = grid(profile[..., :1] * turn + profile[..., 1:] * np.array((0, 1, 0)), PLATE)
     corners, colors = (np.concatenate(both) for both in zip(rope, ring, strict=True))
     faces = np.arange(3 * len(corners)).reshape(-1, 3)

@@ -263,7 +263,7 @@ def test_a_broken_off_voxelization_goes_on(tmp_path, torus_file, monkeypatch):
 
 
 def test_a_source_travels_without_its_mesh(tmp_path, torus_file):
-    source = MeshSource.of(torus_file, "coverage", 64, 4.0, 1.0)
+    source = MeshSource.of(torus_file, resolution=64)["coverage"]
     away = pickle.loads(pickle.dumps(source.staged(tmp_path)))
     assert away.mesh is None and len(pickle.dumps(away)) < 4000
     low, high = (2, 10, 10), (20, 40, 50)

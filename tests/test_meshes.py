@@ -157,30 +157,29 @@ def test_rays_through_edges_and_corners_count_once():
     assert ((winding == 0) | (winding == 1)).all()
 
 
-# --- Lists
+# --- The search
 
 
-@pytest.mark.parametrize("reach", [0.0, 0.05, torch.inf])
-def test_lists_miss_no_triangle(reach):
-    """20,000 places in boxes of all sizes: the nearest triangle, found by force, is in the list."""
+@pytest.mark.parametrize("reach", [0.05, torch.inf])
+@pytest.mark.parametrize("detail", [0.0, 1.0])
+def test_the_search_misses_no_triangle(reach, detail):
+    """20,000 places, one by one and packed: the nearest triangle is the one found by force."""
     mesh = meshes.joined(meshes.torus(1.0, 0.4, (24, 12)), meshes.sheet(3, 2.0))
     geometry = Geometry(mesh)
-    generator = torch.Generator().manual_seed(1)
-    count = 1000
-    middle = torch.from_numpy(places(mesh, count, 3))
-    half = torch.rand((count, 3), generator=generator, dtype=torch.float64) ** 4 * 0.5
-    first, face = geometry.hierarchy.near(middle - half, middle + half, reach)
-    listed = torch.zeros((count, len(geometry.corner)), dtype=torch.bool)
-    listed[torch.repeat_interleave(first.diff()), face] = True
-    for _ in range(20):
-        random = torch.rand((count, 3), generator=generator, dtype=torch.float64)
-        place = middle + (2 * random - 1) * half
-        own = distance_to(geometry.corner, place)
-        distance = own.amin(1)
-        due = distance <= reach
-        # Triangles at an edge are equally near: one of them must be there.
-        own = (own <= distance[:, None] * (1 + 1e-12) + 1e-15) & listed
-        assert own[due].any(1).all()
+    geometry.detail = detail
+    low = torch.from_numpy(places(mesh, 40, 3))
+    size = torch.tensor([0.1, 0.1, reach], dtype=torch.float64).expand(40, 3).contiguous()
+    found = geometry.cubes(low, size, 8, 0.0, weights=True, wide=False)
+    z, y, x = torch.meshgrid(*[torch.arange(8) * 0.1 + 0.05] * 3, indexing="ij")
+    place = (low[:, None] + torch.stack((x, y, z), -1).view(-1, 3)).view(-1, 3)
+    exact = torch.cat([distance_to(geometry.corner, part).amin(1) for part in place.split(2000)])
+    near = exact < reach * (1 - 1e-5)
+    distance, face = found.distance.view(-1), found.face.view(-1).long()
+    assert (distance[near] - exact[near]).abs().max() < 1e-5
+    assert (face[exact > reach * (1 + 1e-5)] == -1).all() and near.sum() > 300
+    # The weights tell the place itself.
+    at = (found.weight.view(-1, 3, 1) * geometry.corner[face.clamp(min=0)]).sum(1)
+    assert ((at - place).norm(dim=1) - exact)[near].abs().max() < 1e-5
 
 
 def distance_to(corner: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
@@ -200,14 +199,21 @@ def distance_to(corner: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
 
 
 def test_boxes_that_nothing_touches_hold_nothing():
-    """10^5 random boxes: where none is listed, all the box is farther than the reach."""
+    """10^5 random boxes: where none is found, all the box is farther than the reach."""
     mesh = meshes.torus(1.0, 0.4, (24, 12))
     geometry = Geometry(mesh)
     generator = torch.Generator().manual_seed(2)
     middle = torch.from_numpy(places(mesh, 100_000, 5))
     half = torch.rand((100_000, 1), generator=generator, dtype=torch.float64) ** 3 * 0.3
-    touched = geometry.touched(middle - half, middle + half, 0.02)
+    reach = torch.full_like(half[:, 0], 0.02)
+    parts, inside = geometry.touched(
+        (middle - half).contiguous(), 2 * half[:, 0], reach, parts=2, wide=True
+    )
+    touched = parts.flatten(1).any(1)
     bare, size = middle[~touched], half[~touched]
+    within = inside.flatten(1)[~touched]
+    assert torch.equal(within.all(1), within.any(1))
+    assert torch.equal(within[:, 0], geometry.signed_distance(bare) < 0)
     assert 30_000 < len(bare) < 90_000
     random = torch.rand(bare.shape, generator=generator, dtype=torch.float64)
     inner = (geometry.signed_distance(bare + (2 * random - 1) * size)).abs()

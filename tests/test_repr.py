@@ -89,6 +89,10 @@ def test_data_and_producers_tell_of_themselves_in_one_line(tmp_path):
             gv.MeshProducer(meshes.box(), resolution=32),
             "MeshProducer(32x24x16 (x, y, z), N=2, coverage uint8x1)",
         ),
+        (
+            gv.JoinedProducer({"solid": gv.MeshProducer(meshes.box(), resolution=32)}),
+            "JoinedProducer(32x24x16 (x, y, z), N=2, solid uint8x1)",
+        ),
         (meshes.box(), "Mesh(12 triangles, 1 materials, from (0, 0, 0) to (1, 0.7, 0.4))"),
         (gv.VolumeProducer(volume), "VolumeProducer(10x10x10 (x, y, z), N=2, value uint8x1)"),
         (gv.StoredProducer(tmp_path / "a.zarr"), "StoredProducer(10x10x10 (x, y, z), N=2, value"),

@@ -8,47 +8,69 @@ import pytest
 import torch
 from helpers import DEVICES
 
+from gvtorch.meshes.hierarchy import Hierarchy
 from gvtorch.ops import voxelize
 from gvtorch.ops.reference.voxelize import box_share
 
 
-def cubes(side: int = 8, dtype=torch.float32, device="cpu", count: int = 5, each: int = 7):
-    """Cubes with random triangles, some without area, some twice, and a cube without any."""
+def cubes(side: int = 8, device="cpu", each: int = 40):
+    """Cubes of voxels near and far, some out of reach, one left out, in random triangles, some of
+    which have no area, some of which stand twice.
+    """
     generator = torch.Generator().manual_seed(side)
-    middle = torch.rand((count * each, 1, 3), generator=generator) * (side + 4) - 2
-    corner = middle + 2 * torch.randn((count * each, 3, 3), generator=generator)
+    middle = torch.rand((each, 1, 3), generator=generator) * (side + 4) - 2
+    corner = (middle + 2 * torch.randn((each, 3, 3), generator=generator)).double()
     corner[0] = corner[0, 0]  # a point
     corner[1, 2] = corner[1, 1]  # a line
     corner[3] = corner[2]
-    first = torch.cat((torch.arange(count + 1) * each, torch.tensor([count * each])))
+    hierarchy = Hierarchy(corner)
+    sizes = ((1, 1, 3), (0.7, 1.3, torch.inf), (1.2, 1.2, 0.5), (1, 1, -1), (0, 1, 1), (0.01, 1, 2))
     arguments = (
-        corner.to(dtype),
-        torch.rand(count * each, generator=generator) < 0.7,
-        first,
-        (torch.rand((count + 1, 3), generator=generator) * side).to(dtype),
-        torch.randint(-1, 2, (count + 1,), dtype=torch.int32, generator=generator),
-        torch.tensor([1.0, 1.3, 1.7], dtype=dtype),
+        corner[hierarchy.order].contiguous(),
+        torch.rand(each, generator=generator) < 0.7,
+        hierarchy.box,
+        torch.rand((len(sizes), 3), generator=generator).double() * 2 - 1,
+        torch.tensor(sizes, dtype=torch.float64),
     )
     return (*(one.to(device) for one in arguments), side, 1.25)
 
 
-@pytest.mark.parametrize("side", [1, 3, 8, 10, 16])
-def test_compiled_is_the_twin_in_every_bit(compiled, side):
-    given = cubes(side, device=DEVICES[compiled])
-    expected = voxelize(*given, backend="reference")
-    found = voxelize(*given, backend=compiled)
+def known(given, detail: float = 0.0, weights: bool = True, wide: bool = False):
+    """Arguments of the bare op."""
+    return (*given, detail, weights, wide)
+
+
+@pytest.mark.parametrize("side", [1, 3, 8, 10, 16, 20])
+@pytest.mark.parametrize("detail", [0.0, 0.9])
+def test_compiled_is_the_twin_in_every_bit(compiled, side, detail):
+    """Also where voxels are looked at one by one, as they are where triangles are small."""
+    given = cubes(side, DEVICES[compiled])
+    expected = voxelize(*given, weights=True, backend="reference")
+    found = voxelize(*given, weights=True, detail=detail, backend=compiled)
     for one, other in zip(found, expected, strict=True):
         assert torch.equal(one, other)
-    distance, nearest, winding, coverage = found
-    assert (nearest[-1] == -1).all() and (distance[-1] == torch.inf).all()
+    distance, nearest, winding, coverage, weight = found
+    assert (nearest[3:5] == -1).all() and (distance[3:5] == torch.inf).all()
+    assert (winding[4] == 0).all() and (coverage[4] == 0).all()
     assert len(winding.unique()) > 1 and 0 < coverage.mean() < 1
+    assert torch.equal((nearest >= 0).float(), weight.sum(-1).round())
 
 
 def test_float64_agrees_to_rounding(compiled):
-    given = cubes(dtype=torch.float64, device=DEVICES[compiled])
+    given = cubes(device=DEVICES[compiled])
+    expected = voxelize(*given, weights=True, wide=True, backend="reference")
+    found = voxelize(*given, weights=True, wide=True, backend=compiled)
+    assert found[0].dtype == torch.float64
+    for one, other in zip(found, expected, strict=True):
+        assert torch.allclose(one.double(), other.double(), rtol=0, atol=1e-12)
+
+
+def test_a_large_hierarchy_is_gone_through(compiled):
+    """5,000 triangles, five levels of boxes, against all of them."""
+    given = cubes(6, DEVICES[compiled], each=5000)
     expected = voxelize(*given, backend="reference")
     for one, other in zip(voxelize(*given, backend=compiled), expected, strict=True):
-        assert torch.allclose(one.double(), other.double(), rtol=0, atol=1e-12, equal_nan=True)
+        assert torch.equal(one, other)
 
 
 def test_share_of_a_box_below_a_plane_is_its_volume():
@@ -57,17 +79,16 @@ def test_share_of_a_box_below_a_plane_is_its_volume():
     normal = torch.randn((20000, 3), generator=generator, dtype=torch.float64)
     normal = normal[(normal.abs() / normal.abs().sum(1, keepdim=True)).amin(1) > 0.02]
     unit = normal / normal.norm(dim=1, keepdim=True)
-    voxel = torch.tensor([1.0, 1.4, 0.6], dtype=torch.float64)
     offset = (torch.rand(len(unit), generator=generator, dtype=torch.float64) - 0.5) * 2
-    size = unit.abs() * voxel
+    size = unit.abs()
     total = torch.zeros_like(offset)
     for corner in range(8):
         picked = [axis for axis in range(3) if corner >> axis & 1]
         rest = offset + size.sum(1) / 2 - sum(size[:, axis] for axis in picked)
         total += (-1) ** len(picked) * rest.clamp(min=0) ** 3
     exact = total / (6 * size.prod(1))
-    assert (box_share(normal, offset, voxel) - exact).abs().max() < 1e-9
-    single = box_share(normal.float(), offset.float(), voxel.float())
+    assert (box_share(normal, offset) - exact).abs().max() < 1e-9
+    single = box_share(normal.float(), offset.float())
     assert (single - exact).abs().max() < 1e-3
 
 
@@ -77,7 +98,7 @@ def test_share_of_planes_along_the_axes():
         normal[:, axis] = -3.0
         offset = torch.linspace(-0.7, 0.7, 101)
         exact = (offset + 0.5).clamp(0, 1)
-        assert (box_share(normal, offset, torch.ones(3)) - exact).abs().max() < 1 / 1024
+        assert (box_share(normal, offset) - exact).abs().max() < 1 / 1024
 
 
 @pytest.mark.parametrize("solid", [True, False])
@@ -91,10 +112,16 @@ def test_a_plane_fills_its_exact_share(backend, solid):
     corner = torch.stack((middle + far * u, middle - far * u + 2 * far * v, middle - far * (u + v)))
     if torch.linalg.cross(corner[1] - corner[0], corner[2] - corner[0]) @ normal < 0:
         corner = corner.flip(0)
-    start = middle - 3 * normal  # inside, below the plane
+    faces = corner.double()[None]
+    if solid:  # closed far away, behind it
+        apex = (middle - 500 * normal).double()
+        others = [torch.stack((faces[0, (i + 1) % 3], faces[0, i], apex)) for i in range(3)]
+        faces = torch.stack((faces[0], *others))
+    hierarchy = Hierarchy(faces)
+    size = torch.tensor([[1.0, 1.0, torch.inf]], dtype=torch.float64)
     device = DEVICES[backend]
-    given = (corner[None], torch.tensor([solid]), torch.tensor([0, 1]), start[None])
-    given = (*given, torch.tensor([1 if solid else 0], dtype=torch.int32), torch.ones(3))
+    given = (faces[hierarchy.order].contiguous(), torch.full((len(faces),), solid), hierarchy.box)
+    given = (*given, torch.zeros(1, 3, dtype=torch.float64), size)
     found = voxelize(*(one.to(device) for one in given), 8, 1.5, backend=backend)
     at = (torch.arange(8 * 32) + 0.5) / 32
     z, y, x = torch.meshgrid(at, at, at, indexing="ij")
@@ -110,10 +137,9 @@ def test_a_plane_fills_its_exact_share(backend, solid):
 
 
 def test_opcheck(compiled):
-    given = cubes(4, device=DEVICES[compiled])
-    torch.library.opcheck(torch.ops.gvtorch.voxelize.default, given)
-    wide = cubes(4, torch.float64, DEVICES[compiled])
-    torch.library.opcheck(torch.ops.gvtorch.voxelize.default, wide)
+    given = cubes(4, DEVICES[compiled])
+    for told in ({}, {"weights": False}, {"wide": True}):
+        torch.library.opcheck(torch.ops.gvtorch.voxelize.default, known(given, **told))
 
 
 class _Module(torch.nn.Module):
@@ -121,18 +147,17 @@ class _Module(torch.nn.Module):
         self,
         corner: torch.Tensor,
         solid: torch.Tensor,
-        first: torch.Tensor,
-        start: torch.Tensor,
-        winding: torch.Tensor,
-        voxel: torch.Tensor,
+        box: torch.Tensor,
+        low: torch.Tensor,
+        size: torch.Tensor,
     ) -> torch.Tensor:
-        found = torch.ops.gvtorch.voxelize(corner, solid, first, start, winding, voxel, 4, 1.0)
+        found = torch.ops.gvtorch.voxelize(corner, solid, box, low, size, 4, 1.0, 0.0, True, False)
         return found[3]
 
 
 @pytest.mark.filterwarnings("ignore")
 def test_scripts_compiles_and_exports(compiled):
-    *tensors, _, _ = cubes(4, device=DEVICES[compiled])
+    *tensors, _, _ = cubes(4, DEVICES[compiled])
     expected = _Module()(*tensors)
     file = io.BytesIO()
     torch.jit.save(torch.jit.script(_Module()), file)
@@ -147,14 +172,14 @@ def test_scripts_compiles_and_exports(compiled):
 @pytest.mark.parametrize(
     ("place", "value", "said"),
     [
-        (0, torch.zeros(3, 3), "corner_m33 must be (m, 3, 3) float32"),
-        (0, torch.zeros(2, 3, 3, dtype=torch.int32), "corner_m33 must be float32 or float64"),
-        (1, torch.zeros(2, dtype=torch.bool), "solid_m must be (35,) bool"),
-        (2, torch.zeros(3, dtype=torch.int64), "first_k must be (7,) int64"),
-        (3, torch.zeros(6, 3, dtype=torch.float64), "start_k3 must be"),
-        (5, torch.zeros(4), "voxel_3 must be (3,) float32"),
-        (6, 17, "side must be"),
-        (7, -1.0, "thickness must be"),
+        (0, torch.zeros(3, 3), "corner_f33 must be (f, 3, 3) float64"),
+        (0, torch.zeros(0, 3, 3, dtype=torch.float64), "corner_f33 must hold at least one"),
+        (1, torch.zeros(2, dtype=torch.bool), "solid_f must be (40,) bool"),
+        (2, torch.zeros(40, 6, dtype=torch.float64), "box_n6 must be (45, 6) float64"),
+        (3, torch.zeros(6, 3), "low_k3 must be"),
+        (4, torch.zeros(5, 3, dtype=torch.float64), "size_k3 must be (6, 3)"),
+        (5, 33, "side must be"),
+        (6, -1.0, "thickness must be"),
     ],
 )
 def test_bad_arguments_are_told_in_a_line(place, value, said):
@@ -169,17 +194,18 @@ def test_bad_arguments_are_told_in_a_line(place, value, said):
 def test_memory_stays_safe_without_the_python_checks(compiled):
     good = cubes(device=DEVICES[compiled])
     for place, value in (
+        (0, good[0][:0].contiguous()),
         (1, good[1][:3]),
+        (2, good[2][:40].contiguous()),
         (3, good[3][:2].contiguous()),
         (4, good[4][:1]),
-        (5, good[5][:2]),
-        (6, 17),
-        (6, 0),
+        (5, 33),
+        (5, 0),
     ):
-        given = [*good]
+        given = [*known(good)]
         given[place] = value
         with pytest.raises(RuntimeError, match="gvtorch"):
             torch.ops.gvtorch.voxelize(*given)
-    beyond = [*good]
-    beyond[2] = good[2] * 1000 - 5  # lists that lead out of the triangles are cut
-    torch.ops.gvtorch.voxelize(*beyond)
+    nan = [*known(good)]
+    nan[2], nan[4] = good[2] * torch.nan, good[4] * torch.nan
+    torch.ops.gvtorch.voxelize(*nan)

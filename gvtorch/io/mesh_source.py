@@ -1,5 +1,5 @@
-"""A mesh as a volume that is read region by region (`MeshSource`), and `voxelize`, which writes it
-into a store by the writer of `convert`.
+"""A mesh as volumes that are read region by region (`MeshSource`, one a channel), and `voxelize`,
+which writes them into a store by the writer of `convert`.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import functools
 import json
 import multiprocessing
 import threading
+import warnings
 import zlib
 from collections.abc import Sequence
 from concurrent.futures import Executor
@@ -22,8 +23,10 @@ import torch
 from ..base import check
 from ..base.image_info import ChannelInfo, ImageInfo
 from ..base.stage import Progress, no_progress
+from ..meshes.holes import Solid, check_solid, prepared, told_of_holes
 from ..meshes.mesh import Material, Mesh
-from ..meshes.voxelizer import CHANNELS, Voxelizer
+from ..meshes.voxelizer import CHANNELS, Voxelizer, check_channels
+from .channels import convert_channels
 from .conversion import convert
 from .mesh_file import read_mesh
 from .source import VolumeSource
@@ -42,41 +45,66 @@ class MeshSource(VolumeSource):
     resolution: int
     band: float
     thickness: float
+    solid: Solid
     marks: tuple[Any, ...]  # what is the same while the mesh is
-    mesh: Mesh | None = dataclasses.field(default=None, repr=False)
+    words: tuple[str, ...] = ()  # of the command line beside these
+    several: bool = False  # whether its store holds other channels, too
+    mesh: Mesh | None = dataclasses.field(default=None, repr=False)  # with its holes filled
     file: str = ""  # where it lies, if not in memory
 
     @classmethod
     def of(
-        cls, given: str | Path | Mesh, channel: str, resolution: int, band: float, thickness: float
-    ) -> MeshSource:
-        """Reads the mesh, and lays a grid around it; see `voxelize`."""
-        if channel not in CHANNELS:
-            raise ValueError(
-                f"voxelize: channel must be one of {', '.join(CHANNELS)}, got {channel!r}"
+        cls,
+        given: str | Path | Mesh,
+        channels: str | Sequence[str] = "coverage",
+        *,
+        resolution: int,
+        band: float = 4.0,
+        thickness: float = 1.0,
+        solid: Solid = "auto",
+        texture: str | Path | None = None,
+    ) -> dict[str, MeshSource]:
+        """Reads the mesh, and lays a grid around it: a source for each channel; see `voxelize`."""
+        check_solid("voxelize", solid)
+        names = check_channels("voxelize", channels)
+        if isinstance(given, Mesh):
+            if texture is not None:
+                raise ValueError("voxelize: texture is for files: a Mesh has its own")
+            mesh, marks, name = given, list[Any](), given.name
+        else:
+            mesh, marks, name = read_mesh(given, texture=texture), fingerprint(given), str(given)
+        if solid == "auto" and (told := told_of_holes(mesh)):
+            warnings.warn(told, stacklevel=3)
+        marks.insert(0, _checksum(mesh))
+        mesh = prepared(mesh, solid)
+        grid: dict[str, Any] = {"resolution": resolution, "band": band, "thickness": thickness}
+        made = Voxelizer(mesh, channels=names, **grid, solid=_as_it_is(solid))
+        told_words = [word for key, n in grid.items() for word in (f"--{key}", f"{n:g}")]
+        words = ("--channels", ",".join(names), *told_words, "--solid", solid)
+        found = {}
+        for channel in names:
+            dtype, width = CHANNELS[channel]
+            x, y, z = made.extent
+            colors = tuple(ChannelInfo(name=n) for n in _COLORS) if channel == "color" else ()
+            found[channel] = cls(
+                path=name,
+                shape=(z, y, x, width),
+                axes="zyxc",
+                stored=str(dtype).removeprefix("torch."),
+                spacing=(made.spacing,) * 3,
+                origin=made.origin,
+                info=ImageInfo(channels=colors, quantity=channel, labels=channel == "material"),
+                channel=channel,
+                resolution=resolution,
+                band=band,
+                thickness=thickness,
+                solid=solid,
+                marks=tuple(marks),
+                words=words if texture is None else (*words, "--texture", str(texture)),
+                several=len(names) > 1,
+                mesh=mesh,
             )
-        mesh = given if isinstance(given, Mesh) else read_mesh(given)
-        marks: list[Any] = [_checksum(mesh)]
-        if not isinstance(given, Mesh):
-            marks += fingerprint(given)
-        told: dict[str, Any] = {"resolution": resolution, "band": band, "thickness": thickness}
-        grid = Voxelizer(mesh, channels=(channel,), **told)
-        dtype, width = CHANNELS[channel]
-        x, y, z = grid.extent
-        names = tuple(ChannelInfo(name=name) for name in _COLORS) if channel == "color" else ()
-        return cls(
-            path=str(given) if not isinstance(given, Mesh) else mesh.name,
-            shape=(z, y, x, width),
-            axes="zyxc",
-            stored=str(dtype).removeprefix("torch."),
-            spacing=(grid.spacing,) * 3,
-            origin=grid.origin,
-            info=ImageInfo(channels=names, quantity=channel, labels=channel == "material"),
-            channel=channel,
-            **told,
-            marks=tuple(marks),
-            mesh=mesh,
-        )
+        return found
 
     def staged(self, folder: Path) -> MeshSource:
         """Writes the mesh to a file in the folder."""
@@ -88,13 +116,13 @@ class MeshSource(VolumeSource):
 
     def fingerprint(self) -> list[Any]:
         """The mesh, and what is made of it."""
-        return [*self.marks, self.channel, self.resolution, self.band, self.thickness]
+        told = [self.channel, self.resolution, self.band, self.thickness, self.solid]
+        return [*self.marks, *told]
 
     def command(self, store: str) -> tuple[str, ...]:
         """As `gvtorch voxelize` takes it."""
-        numbers = {"resolution": self.resolution, "band": self.band, "thickness": self.thickness}
-        told = [word for name, n in numbers.items() for word in (f"--{name}", f"{n:g}")]
-        return ("gvtorch", "voxelize", self.path, "-o", store, "--channel", self.channel, *told)
+        store = str(Path(store).parent) if self.several else store
+        return ("gvtorch", "voxelize", self.path, "-o", store, *self.words)
 
     def read_stored(self, index: tuple[slice, ...]) -> np.ndarray:
         """Makes a part."""
@@ -120,7 +148,13 @@ def _voxelizer(source: MeshSource) -> Voxelizer:
         channels=(source.channel,),
         band=source.band,
         thickness=source.thickness,
+        solid=_as_it_is(source.solid),
     )
+
+
+def _as_it_is(solid: Solid) -> Solid:
+    """What is asked of a mesh whose holes are filled already."""
+    return "auto" if solid == "always" else solid
 
 
 def voxelize(
@@ -128,9 +162,11 @@ def voxelize(
     store: str | Path,
     *,
     resolution: int = 1024,
-    channel: str = "coverage",
+    channels: str | Sequence[str] = "coverage",
     band: float = 4.0,
     thickness: float = 1.0,
+    solid: Solid = "auto",
+    texture: str | Path | None = None,
     block: int = 32,
     executor: Executor | None = None,
     workers: int | None = None,
@@ -147,29 +183,30 @@ def voxelize(
         mesh: A `Mesh`, or a file that `read_mesh` knows.
         store: The folder to make.
         resolution: Finest voxels along the longest side.
-        channel: coverage, distance, color, normal or material; see `Voxelizer`.
+        channels: One or several of coverage, distance, color, normal and material; see `Voxelizer`.
+            Several lie side by side in the folder, for `StoredChannels`.
         band: Finest voxels up to which the nearest place of the surface counts.
         thickness: Finest voxels, of what bounds no solid.
+        solid: auto: what is closed is a solid; always: holes are filled before; never: all is a
+            sheet.
+        texture: As of `read_mesh`, of files.
         block, executor, workers, resume, progress: As of `convert`.
 
     Returns:
-        The store, open. Its coarse levels are means of those below (of materials the most
-        frequent).
+        The store, open; of several channels that of the first. Its coarse levels are means of those
+        below (of materials the most frequent).
 
     Raises:
         ValueError, OSError, KeyboardInterrupt: As of `read_mesh` and `convert`.
     """
     check.whole("voxelize", "resolution", resolution, low=8, high=2**20)
-    source = MeshSource.of(mesh, channel, resolution, band, thickness)
-    return convert(
-        source,
-        store,
-        block=block,
-        executor=executor,
-        workers=workers,
-        resume=resume,
-        progress=progress,
-    )
+    grid: dict[str, Any] = {"resolution": resolution, "band": band, "thickness": thickness}
+    sources = MeshSource.of(mesh, channels, **grid, solid=solid, texture=texture)
+    told: dict[str, Any] = {"block": block, "executor": executor, "workers": workers}
+    told |= {"resume": resume, "progress": progress}
+    if len(sources) > 1:
+        return convert_channels(sources, store, **told)
+    return convert(next(iter(sources.values())), store, **told)
 
 
 def _arrays(mesh: Mesh) -> dict[str, np.ndarray]:

@@ -19,6 +19,7 @@ from .omero import forget_assumed, read_channels, write_channels
 from .remote import is_file_url
 from .store_layout import WORK, Deadline, StoreLayout, child, read_key
 
+SEVERAL = "gvtorch_channels"  # attribute that names the images of a store of several channels
 _MOST_LEVELS = 64
 _MOST_JSON = 1 << 24  # bytes
 _DEFAULT_AXES = "tczyx"  # of versions 0.1 and 0.2
@@ -79,13 +80,17 @@ def find_image(
     found = _parse_image(where, attributes, image)
     series = _member(attributes, "bioformats2raw.layout")
     if found is None and layout is None:
-        inner = "0" if image is None else image  # where converters of microscopy files put it
+        first = attributes.get(SEVERAL, ["0"])  # where converters of microscopy files put it
+        named = isinstance(first, list) and first and isinstance(first[0], str)
+        inner = image if image is not None else first[0] if named else "0"
         if ".." not in inner and not inner.startswith("/"):
             top, root = root, child(root, inner)
             deeper = _attributes(f"{where}/{inner}", root, deadline)
             found = _parse_image(where, deeper, None) if deeper else None
+            own = deeper.get("gvtorch") if deeper else None
+            layout = None if own is None else StoreLayout.parse(f"{where}/{inner}", own)
             if found is not None and image is None and series is not None:
-                found = _with_series(where, top, found, deadline)
+                found = _with_series(where, top, found, deadline, inner)
     if found is None:
         asked = "no multiscale image" if image is None else f"no image {image!r}"
         plate = "; it is a plate: name a field of view, as in 'A/1/0'"
@@ -185,7 +190,7 @@ def _told_beside(found: MultiscaleImage, others: list[str]) -> MultiscaleImage:
 
 
 def _with_series(
-    where: str, root: Any, found: MultiscaleImage, deadline: Deadline
+    where: str, root: Any, found: MultiscaleImage, deadline: Deadline, first: str
 ) -> MultiscaleImage:
     """Names the other images that converters of microscopy files lay side by side."""
     others: list[str] = []
@@ -193,7 +198,7 @@ def _with_series(
         listed = _attributes(f"{where}/OME", child(root, "OME"), deadline) or {}
         series = _member(listed, "series")
         if isinstance(series, list):
-            others = [str(path) for path in series if path != "0"]
+            others = [str(path) for path in series if path != first]
         elif _attributes(f"{where}/1", child(root, "1"), deadline) is not None:
             others = ["1"]
     except (OSError, ValueError):  # what is beside the image does not keep it from opening

@@ -141,7 +141,10 @@ class Store:
             OSError: It can't be read.
         """
         where, root, deadline = str(location), kvstore(location), Deadline(_OPEN_TIMEOUT)
+        top = root
         root, found, own = find_image(where, root, image, deadline)
+        if own and root != top:  # one of several channels, a store of its own
+            where = root if isinstance(root, str) else root["path"].rstrip("/")
         stored, chosen, sizes = open_arrays(where, root, found, time, channels, deadline)
         dtype = value_dtype(stored[0].array.dtype.numpy_dtype)
         if dtype not in DTYPES:

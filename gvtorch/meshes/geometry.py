@@ -4,59 +4,60 @@ of it.
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ..ops import voxelize
-from ..ops.reference.voxelize import pierced
-from ..ops.voxelize import MOST_VOXELS
 from .hierarchy import Hierarchy
 from .mesh import Mesh, solids
 
-_LIST, _TEST = 1e-5, 1.2e-8  # seconds: to find the list of a cube; of a voxel and a triangle
 _FLOAT32 = 2048.0  # voxels that triangles may reach away from their cube, in float32
-_POINTS = 1 << 14  # places that are asked for together
+_HALF_DIAGONAL = 0.5 * 3**0.5  # of a cube of side 1
+_POINTS = 1 << 20  # places that are asked for together
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cubes:
     """What k cubes of side^3 voxels hold; see `ops.voxelize`."""
 
-    distance: Tensor  # (k, z, y, x) to the nearest place, in world units; infinite beyond the reach
-    face: Tensor  # (k, z, y, x) int64 the nearest triangle, -1 beyond the reach
+    distance: Tensor  # (k, z, y, x) float32 to the nearest place, world units; inf beyond the reach
+    face: Tensor  # (k, z, y, x) int32 the nearest triangle, -1 beyond the reach
     inside: Tensor  # (k, z, y, x) bool
-    coverage: Tensor  # (k, z, y, x) 0 to 1
+    coverage: Tensor  # (k, z, y, x) float32, 0 to 1
+    weight: Tensor  # (k, z, y, x, 3) of the nearest triangle's corners there; or of no cubes
 
 
 class Geometry:
-    """The triangles of a mesh in their hierarchy.
+    """The triangles of a mesh in their hierarchy. All that it tells is worked out without waiting
+    for the device.
 
     Attributes:
         kept: (f,) int64 the mesh's triangles that are here: see `solids`.
         corner: (f, 3, 3) float64 corners.
         solid: (f,) bool, whether a triangle bounds a solid.
         hierarchy: Boxes around them.
+        size: World size of their bounds.
+        detail: World size of a usual one, the square root of the median area: a few large ones tell
+            nothing of the many.
+        largest: World size of the bounds of the largest.
     """
 
-    def __init__(self, mesh: Mesh, device: torch.device | str = "cpu") -> None:
-        """Builds the hierarchy."""
-        kept, solid = solids(mesh)
-        self.kept = torch.from_numpy(kept)
-        self.corner = torch.from_numpy(mesh.vertices[mesh.faces[kept]]).to(device)
-        self.solid = torch.from_numpy(solid).to(device)
-        self.hierarchy = Hierarchy(self.corner)
-        self._closed: Hierarchy | None = None
-        self._closed_corner = self.corner[self.solid]
-        if len(self._closed_corner):
-            self._closed = Hierarchy(self._closed_corner)
-
-    @functools.cached_property
-    def _size(self) -> float:
-        """Square root of the median triangle's area: a few large ones tell nothing of the many."""
-        return float(self.area.median().sqrt())
+    def __init__(
+        self, mesh: Mesh, device: torch.device | str = "cpu", *, solid: bool = True
+    ) -> None:
+        """Builds the hierarchy; not `solid`: all are sheets."""
+        kept, closed = solids(mesh)
+        corner = torch.from_numpy(mesh.vertices[mesh.faces[kept]]).to(device)
+        self.hierarchy = Hierarchy(corner)
+        order = self.hierarchy.order
+        self.corner = corner[order].contiguous()
+        self.kept = torch.from_numpy(kept)[order.cpu()]
+        self.solid = torch.from_numpy(closed & solid).to(device)[order]
+        bounds = self.corner.amax(1) - self.corner.amin(1)
+        self.size = float((self.corner.amax((0, 1)) - self.corner.amin((0, 1))).max())
+        self.detail, self.largest = float(self.area.median().sqrt()), float(bounds.max())
 
     @property
     def area(self) -> Tensor:
@@ -65,145 +66,102 @@ class Geometry:
         return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1)
 
     def winding(self, place_p3: Tensor) -> Tensor:
-        """Returns (p,) int32 how often closed parts wind around places: how many more of their
-        triangles are left than entered on the way from there along x.
-        """
-        total = torch.zeros(len(place_p3), dtype=torch.int32, device=place_p3.device)
-        if self._closed is None or not len(place_p3):
-            return total
-        high = place_p3.clone()
-        high[:, 0] = torch.inf
-        # A ray is a box without width; rays that begin beyond the mesh meet nothing.
-        high[:, 0] = torch.maximum(self._closed_corner[..., 0].max(), place_p3[:, 0])
-        first, face = self._closed.near(place_p3, high, 0.0)
-        ray = torch.repeat_interleave(first.diff())
-        at, way = pierced(place_p3[ray], self._closed_corner[face], 0)
-        ahead = (way * (at > place_p3[ray, 0])).to(torch.int32)
-        return total.index_add_(0, ray, ahead)
+        """Returns (p,) int32 how often closed parts wind around places (p, 3)."""
+        return self._at(place_p3, -1.0)[0]
 
     def signed_distance(self, place_p3: Tensor) -> Tensor:
         """Returns (p,) float64 distances to the nearest triangle, below 0 inside of closed parts;
         to what float64 can tell, anywhere.
         """
-        parts = []
-        for place in place_p3.to(self.corner).split(_POINTS):
-            first, face = self.hierarchy.near(place, place, torch.inf)
-            size = float((self.corner.amax((0, 1)) - self.corner.amin((0, 1))).max())
-            owner = torch.repeat_interleave(first.diff())
-            corner = (self.corner[face] - place[owner, None]) / size + 0.5
-            middle = torch.full_like(place, 0.5)
-            distance, *_ = voxelize(
-                corner,
-                self.solid[face],
-                first,
-                middle,
-                torch.zeros(len(place), dtype=torch.int32, device=place.device),
-                torch.ones_like(place[0]),
-                1,
-                0.0,
-            )
-            inside = self.winding(place) != 0
-            distance = distance.view(-1) * size
-            parts.append(torch.where(inside, -distance, distance))
-        return torch.cat(parts) if parts else place_p3.new_empty(0, dtype=torch.float64)
+        winding, distance = self._at(place_p3, torch.inf)
+        return torch.where(winding != 0, -distance, distance)
 
-    def touched(self, low_k3: Tensor, high_k3: Tensor, reach: float) -> Tensor:
-        """Returns (k,) bool, whether a triangle may come within a reach of each box."""
-        return self.hierarchy.near(low_k3, high_k3, reach)[0].diff() > 0
+    def _at(self, place_p3: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+        """(p,) winding numbers, and distances up to a reach: of voxels as large as the mesh."""
+        found = []
+        for place in place_p3.to(self.corner).split(_POINTS):
+            size = place.new_tensor((self.size, self.size, reach)).expand(len(place), 3)
+            low = place - 0.5 * self.size
+            distance, _, winding, *_ = self._voxelize(low, size.contiguous(), 1, 0.0, wide=True)
+            found.append((winding.view(-1), distance.view(-1) * self.size))
+        if not found:
+            none = self.corner.new_empty(0)
+            return none.to(torch.int32), none
+        winding, distance = (torch.cat(parts) for parts in zip(*found, strict=True))
+        return winding, distance
+
+    def touched(
+        self, low_k3: Tensor, size_k: Tensor, reach_k: Tensor, *, parts: int = 4, wide: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Tells which parts of boxes are near triangles: a ball around each is looked at.
+
+        Args:
+            low_k3: (k, 3) float64 low corners of the boxes, which are cubes.
+            size_k: (k,) float64 their sides.
+            reach_k: (k,) float64 world distance.
+            parts: Along a side of a box.
+            wide: As of `cubes`, for voxels as large as parts.
+
+        Returns:
+            (k, parts, parts, parts) bool, z y x: False where no triangle comes within the reach of
+            a part; bool, whether it lies inside then.
+        """
+        part = size_k / parts
+        reach = (reach_k + _HALF_DIAGONAL * part) * (1 + 1e-3)  # more than float32 rounds
+        size = torch.stack((part, part, reach), 1)
+        _, nearest, winding, *_ = self._voxelize(low_k3, size, parts, 0.0, wide=wide)
+        return nearest >= 0, winding != 0
+
+    def is_narrow(self, voxel: float) -> bool:
+        """Whether float32 will do for voxels of a size, and larger ones."""
+        return self.largest < _FLOAT32 * voxel
 
     def cubes(
-        self, low_k3: Tensor, voxel_3: Tensor, side: int, reach: float, thickness: float
+        self,
+        low_k3: Tensor,
+        size_k3: Tensor,
+        side: int,
+        thickness: float,
+        *,
+        weights: bool,
+        wide: bool,
     ) -> Cubes:
         """Looks at cubes of side^3 voxels.
 
         Args:
-            low_k3: (k, 3) float64 low corners of the cubes, world units.
-            voxel_3: (3,) float64 size of a voxel.
-            side: Voxels along a side of a cube; cut into smaller cubes where that saves work.
-            reach: How far the nearest triangle may be, world units.
+            low_k3: (k, 3) float64 low corners of the cubes' first voxels, world units.
+            size_k3: (k, 3) float64 world sizes: a voxel's side, the distance from one voxel to the
+                next, and how far the nearest triangle may be; no side leaves a cube out.
+            side: Voxels along a side of a cube.
             thickness: Of sheets, world units.
+            weights: Whether weights are wanted.
+            wide: Whether it is worked out in float64.
         """
-        part = self._part(side, voxel_3)
-        parts = side // part
-        at = torch.arange(parts, device=low_k3.device) * part
-        z, y, x = torch.meshgrid(at, at, at, indexing="ij")
-        offset = torch.stack((x, y, z), -1).view(-1, 3) * voxel_3
-        low = (low_k3[:, None] + offset).view(-1, 3)
-        found = self._small_cubes(low, voxel_3, part, reach, thickness)
-        if parts == 1:
-            return found
+        distance, face, winding, coverage, weight = self._voxelize(
+            low_k3, size_k3, side, thickness, weights=weights, wide=wide
+        )
+        unit = size_k3[:, :1, None, None].to(distance.dtype)
+        return Cubes(
+            distance=torch.where(face >= 0, distance * unit, torch.inf).to(torch.float32),
+            face=face,
+            inside=winding != 0,
+            coverage=coverage.to(torch.float32),
+            weight=weight.to(torch.float32),
+        )
 
-        def joined(values: Tensor) -> Tensor:
-            values = values.view(-1, parts, parts, parts, part, part, part)
-            return values.permute(0, 1, 4, 2, 5, 3, 6).reshape(-1, side, side, side)
-
-        return Cubes(**{name: joined(values) for name, values in vars(found).items()})
-
-    def _part(self, side: int, voxel_3: Tensor) -> int:
-        """Side of the cubes that have lists of their own, of those into which a cube can be cut:
-        the one that costs least, if all triangles were as large as the median one. A cube's list
-        holds those of a surface two voxels wider than the cube.
-        """
-        size = max(self._size / float(voxel_3.max()), 1e-6)
-
-        def cost(part: int) -> float:
-            return _LIST / part**3 + _TEST * ((part + 2) / size) ** 2
-
-        return min((n for n in range(1, min(side, MOST_VOXELS) + 1) if side % n == 0), key=cost)
-
-    def _small_cubes(
-        self, low_k3: Tensor, voxel_3: Tensor, side: int, reach: float, thickness: float
-    ) -> Cubes:
-        high = low_k3 + side * voxel_3
-        first, face = self.hierarchy.near(low_k3, high, reach)
-        count = first.diff()
-        full = (count > 0).nonzero()[:, 0]
-        shape = (len(low_k3), side, side, side)
-        center = 0.5 * (low_k3 + high)
-        bare = (count == 0).nonzero()[:, 0]
-        inside = torch.zeros(shape, dtype=torch.bool, device=low_k3.device)
-        inside[bare] = (self.winding(center[bare]) != 0)[:, None, None, None]
-        coverage = inside.to(torch.float32)
-        distance = torch.full_like(coverage, torch.inf)
-        nearest = torch.full(shape, -1, dtype=torch.int64, device=low_k3.device)
-        if len(full):
-            some = self._full_cubes(low_k3[full], voxel_3, side, count[full], face, thickness)
-            gap, row, winding, share = some
-            unit = float(voxel_3.min())
-            gap = gap.to(torch.float32) * unit
-            within = gap <= reach
-            distance[full] = torch.where(within, gap, torch.inf)
-            nearest[full] = torch.where(within, face[row.long()], -1)
-            inside[full], coverage[full] = winding != 0, share.to(torch.float32)
-        return Cubes(distance=distance, face=nearest, inside=inside, coverage=coverage)
-
-    def _full_cubes(
+    def _voxelize(
         self,
         low: Tensor,
-        voxel_3: Tensor,
+        size: Tensor,
         side: int,
-        count: Tensor,
-        face: Tensor,
         thickness: float,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """`voxelize` of cubes that have triangles, in units of the smallest side of a voxel."""
-        unit = float(voxel_3.min())
-        first = torch.cat((count.new_zeros(1), count.cumsum(0)))
-        owner = torch.repeat_interleave(count)
-        corner = (self.corner[face] - low[owner, None]) / unit
-        # float32 knows the corners of a triangle to 2^-24 of its size.
-        real = torch.float32 if float(corner.abs().max()) < _FLOAT32 else torch.float64
-        corner = corner.to(real)
-        solid, none = self.solid[face], torch.zeros(len(low), dtype=torch.int32, device=low.device)
-        voxel = (voxel_3 / unit).to(real)
-        start = torch.zeros((len(low), 3), dtype=real, device=low.device)
-        if self._closed is not None:
-            # The winding number is counted from the one of eight places that is the farthest from
-            # the surface, where rounding can't move a place to its other side.
-            quarter = voxel * (side / 2)
-            gap = voxelize(corner, solid, first, start, none, quarter, 2, 0.0)[0].view(-1, 8)
-            best = gap.argmax(1)
-            steps = torch.stack((best % 2, best // 2 % 2, best // 4), 1)
-            start = (steps + 0.5) * quarter
-            none = self.winding(low + start.to(low.dtype) * unit)
-        return voxelize(corner, solid, first, start, none, voxel, side, thickness / unit)
+        *,
+        wide: bool,
+        weights: bool = False,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        return voxelize(
+            *(self.corner, self.solid, self.hierarchy.box, low, size, side, thickness),
+            detail=self.detail,
+            weights=weights,
+            wide=wide,
+        )

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+_LEAST = 1e-30  # world units that a mesh may span; 1 / _LEAST at most: their squares are numbers
 MOST_FACES = 2**28  # triangles of a mesh: they and their hierarchy would take 100 GB
 
 
@@ -82,6 +83,11 @@ class Mesh:
             )
         if not (self.bounds[1] > self.bounds[0]).any():
             raise ValueError(f"{self.name}: all triangles lie in one point")
+        with np.errstate(over="ignore"):
+            size = max(float((self.bounds[1] - self.bounds[0]).max()), float(abs(used).max()))
+        if not _LEAST <= size <= 1 / _LEAST:
+            told = f"{_LEAST:g} to {1 / _LEAST:g} can be told"
+            raise ValueError(f"{self.name}: spans {size:.3g} world units; {told}")
 
     @property
     def bounds(self) -> np.ndarray:
@@ -130,8 +136,7 @@ def solids(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         kept (m,) int64 triangles; solid (m,) bool.
     """
-    _, same = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    faces = same.reshape(-1)[mesh.faces]
+    faces = welded(mesh)
     a, b, c = faces.T
     kept = np.flatnonzero((a != b) & (b != c) & (c != a))
     if not len(kept):
@@ -155,21 +160,38 @@ def _evenness(faces: np.ndarray) -> np.ndarray:
     return ((a < b).astype(np.int64) + (b < c) + (a < c)) % 2
 
 
-def _closed(faces: np.ndarray, counted: np.ndarray) -> np.ndarray:
-    """(f,) bool whether a triangle's part, among those that are counted, is closed."""
+def welded(mesh: Mesh) -> np.ndarray:
+    """(f, 3) int64 vertices, those at the same place being one."""
+    _, same = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    return same.reshape(-1)[mesh.faces]
+
+
+def edges_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Returns of each corner of each triangle (3 f,) the edge that begins there, the vertices where
+    it begins and ends, and for each edge how much oftener it is gone along from its lower vertex to
+    its higher one than back.
+    """
     begin, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     low, high = np.minimum(begin, end), np.maximum(begin, end)
     _, edge = np.unique(low * (faces.max() + 1) + high, return_inverse=True)
     edge = edge.reshape(-1)
-    face = np.repeat(np.arange(len(faces)), 3)
-    own = counted[face]
-    balance = np.bincount(edge[own], np.where(begin < end, 1, -1)[own], edge.max() + 1)
-    part = _parts(face[own], edge[own], len(faces), edge.max() + 1)
-    open_parts = np.unique(part[face[own][balance[edge[own]] != 0]])
-    return ~np.isin(part, open_parts)
+    balance = np.bincount(edge, np.where(begin < end, 1, -1)).astype(np.int64)
+    return edge, begin, end, balance
 
 
-def _parts(face: np.ndarray, edge: np.ndarray, faces: int, edges: int) -> np.ndarray:
+def _closed(faces: np.ndarray, counted: np.ndarray) -> np.ndarray:
+    """(f,) bool whether a triangle's part, among those that are counted, is closed."""
+    closed = np.zeros(len(faces), bool)
+    own = np.flatnonzero(counted)
+    if len(own):
+        edge, _, _, balance = edges_of(faces[own])
+        face = np.repeat(np.arange(len(own)), 3)
+        part = parts_of(face, edge, len(own), len(balance))
+        closed[own] = ~np.isin(part, np.unique(part[face[balance[edge] != 0]]))
+    return closed
+
+
+def parts_of(face: np.ndarray, edge: np.ndarray, faces: int, edges: int) -> np.ndarray:
     """(faces,) the smallest triangle of each part; pairs (face, edge) hang together."""
     label = np.arange(faces)
     while True:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -33,10 +35,10 @@ class Paint:
         self.material, self._color, self._uv = material, lay(mesh.color), lay(mesh.uv)
         rows = [one.color for one in mesh.materials]
         self._base = torch.tensor(rows, dtype=torch.float32, device=device)
-        self._textures = [
-            None if one.texture is None else _linear(torch.tensor(one.texture)).to(device)
-            for one in mesh.materials
-        ]
+        textures = [one.texture for one in mesh.materials]
+        self._texel, self._sheet = None, None
+        if self._uv is not None and any(one is not None for one in textures):
+            self._texel, self._sheet = _side_by_side(textures, device)
         self._normal = _corner_normals(mesh, geometry)
         area = geometry.area.to(torch.float32)
         third = torch.full((len(area), 3), 1 / 3, device=device)
@@ -54,40 +56,15 @@ class Paint:
         color = self._base[material]
         if self._color is not None:
             color = color * (self._color[face_p] * weight_p3[..., None]).sum(1)
-        if self._uv is not None:
-            for number, texture in enumerate(self._textures):
-                here = (material == number).nonzero()[:, 0] if texture is not None else ()
-                if texture is not None and len(here):
-                    uv = (self._uv[face_p[here]] * weight_p3[here][..., None]).sum(1)
-                    color[here] = color[here] * _bilinear(texture, uv)
+        if self._uv is not None and self._texel is not None and self._sheet is not None:
+            uv = (self._uv[face_p] * weight_p3[..., None]).sum(1)
+            color = color * _bilinear(self._texel, self._sheet[material], uv)
         return color
 
     def normal(self, face_p: Tensor, weight_p3: Tensor) -> Tensor:
         """Returns (p, 3) float32 unit normals, smooth where the surface is."""
         normal = (self._normal[face_p] * weight_p3[..., None]).sum(1)
         return torch.nn.functional.normalize(normal, dim=1)
-
-
-def nearest_weights(place_p3: Tensor, corner_p33: Tensor) -> Tensor:
-    """Returns (p, 3) weights of a triangle's corners at what of it is nearest to a place.
-
-    Args:
-        place_p3: (p, 3) places.
-        corner_p33: (p, 3, 3) a triangle for each.
-    """
-    edge = corner_p33.roll(-1, 1) - corner_p33
-    normal = torch.linalg.cross(edge[:, 0], -edge[:, 2])
-    away = place_p3[:, None] - corner_p33
-    area = (torch.linalg.cross(edge, away) * normal[:, None]).sum(2)  # (p, 3) beside each edge
-    inside = (area >= 0).all(1) & (area.sum(1) > 0)
-    plane = area.roll(-1, 1) / area.sum(1, keepdim=True)  # a corner's weight: its far edge's area
-    along = (away * edge).sum(2) / (edge * edge).sum(2).clamp(min=torch.finfo(edge.dtype).tiny)
-    along = along.clamp(0, 1)
-    gap = away - edge * along[..., None]
-    best = (gap * gap).sum(2).argmin(1, keepdim=True)
-    t = along.gather(1, best)
-    rim = torch.zeros_like(along).scatter(1, best, 1 - t).scatter(1, (best + 1) % 3, t)
-    return torch.where(inside[:, None], plane, rim)
 
 
 def _linear(texture: Tensor) -> Tensor:
@@ -98,9 +75,29 @@ def _linear(texture: Tensor) -> Tensor:
     return torch.cat((rgb, texture[..., 3:].float() / 255), -1).to(torch.float16)
 
 
-def _bilinear(texture: Tensor, uv: Tensor) -> Tensor:
-    """(p, 4) values of a texture that repeats; v runs upwards."""
-    high, wide = texture.shape[:2]
+def _side_by_side(
+    textures: Sequence[np.ndarray | None], device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """(n, 4) float16 texels of all textures, row after row, and (m, 3) int64 of each its first
+    texel, its height and width. One that is missing is a white texel.
+    """
+    white = torch.ones((1, 1, 4), dtype=torch.float16)
+    known: dict[int, Tensor] = {}
+    firsts, sheets, parts, total = dict[int, int](), [], [], 0
+    for one in textures:
+        if id(one) not in known:
+            known[id(one)] = white if one is None else _linear(torch.tensor(one))
+            firsts[id(one)] = total
+            parts.append(known[id(one)].view(-1, 4))
+            total += len(parts[-1])
+        high, wide, _ = known[id(one)].shape
+        sheets.append((firsts[id(one)], high, wide))
+    return torch.cat(parts).to(device), torch.tensor(sheets, device=device)
+
+
+def _bilinear(texel: Tensor, sheet_p3: Tensor, uv: Tensor) -> Tensor:
+    """(p, 4) values of textures that repeat; v runs upwards."""
+    first, high, wide = sheet_p3.unbind(1)
     x, y = uv[:, 0] * wide - 0.5, (1 - uv[:, 1]) * high - 0.5
     x0, y0 = x.floor(), y.floor()
     fx, fy = (x - x0)[:, None], (y - y0)[:, None]
@@ -108,7 +105,7 @@ def _bilinear(texture: Tensor, uv: Tensor) -> Tensor:
     for dy, wy in ((0, 1 - fy), (1, fy)):
         for dx, wx in ((0, 1 - fx), (1, fx)):
             row, column = (y0 + dy).long() % high, (x0 + dx).long() % wide
-            total += wx * wy * texture[row, column].float()
+            total += wx * wy * texel[first + row * wide + column].float()
     return total
 
 

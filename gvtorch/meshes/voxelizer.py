@@ -7,14 +7,16 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..base import check
 from .geometry import Cubes, Geometry
+from .holes import Solid, check_solid, prepared
 from .mesh import Mesh
-from .paint import Paint, nearest_weights
+from .paint import Paint
 
 #: Each channel's dtype and how many numbers a voxel has.
 CHANNELS = {
@@ -25,9 +27,20 @@ CHANNELS = {
     "material": (torch.uint8, 1),
 }
 _MARGIN = 2  # voxels around the mesh
-_CUBE, _BLOCK = 8, 32  # voxels along a side of the cubes of a region; of cubes looked at before
-_BATCH = 1 << 21  # voxels that are made together
+_CUBE, _PARTS = 8, 4  # voxels along a side of the cubes of a region; of so many one is looked for
+_BATCH = 1 << 20  # voxels that are made together
+_FINER = 2  # places along a side that a coarse voxel is the mean of
 _DIAGONAL = 0.5 * math.sqrt(3)  # from a voxel's centre to its corner
+
+
+def check_channels(where: str, channels: str | Sequence[str]) -> tuple[str, ...]:
+    """Returns names of channels, once each; raises ValueError where one is unknown."""
+    names = (channels,) if isinstance(channels, str) else tuple(channels)
+    unknown = [name for name in names if name not in CHANNELS]
+    if unknown or not names or len({*names}) < len(names):
+        what = f"{unknown[0]!r}" if unknown else f"{names!r}"
+        raise ValueError(f"{where}: channels must be some of {', '.join(CHANNELS)}, got {what}")
+    return names
 
 
 class Voxelizer:
@@ -60,6 +73,7 @@ class Voxelizer:
         channels: Sequence[str] = ("coverage",),
         band: float = 4.0,
         thickness: float = 1.0,
+        solid: Solid = "auto",
         device: torch.device | str = "cpu",
     ) -> None:
         """Lays the grid around the mesh.
@@ -70,6 +84,8 @@ class Voxelizer:
             channels: Of `CHANNELS`.
             band: In finest voxels, at least 2.
             thickness: Of sheets, in finest voxels.
+            solid: auto: what is closed is a solid; always: holes are filled before; never: all is a
+                sheet.
             device: Where it is worked out.
 
         Raises:
@@ -77,11 +93,9 @@ class Voxelizer:
         """
         where = "voxelize"
         check.whole(where, "resolution", resolution, low=8, high=2**30)
-        channels = (channels,) if isinstance(channels, str) else tuple(channels)
-        unknown = [name for name in channels if name not in CHANNELS]
-        if unknown or not channels or len({*channels}) < len(channels):
-            what = f"{unknown[0]!r}" if unknown else f"{channels!r}"
-            raise ValueError(f"{where}: channels must be some of {', '.join(CHANNELS)}, got {what}")
+        check_solid(where, solid)
+        channels = check_channels(where, channels)
+        mesh = prepared(mesh, solid)
         if "material" in channels and len(mesh.materials) > 255:
             raise ValueError(
                 f"{mesh.name}: {len(mesh.materials)} materials, a uint8 tells 255 apart"
@@ -99,36 +113,45 @@ class Voxelizer:
         self.band = check.number(where, "band", band, low=2) * self.spacing
         self.thickness = check.number(where, "thickness", thickness, low=0.1) * self.spacing
         self.device = torch.device(device)
-        self.geometry = Geometry(mesh, self.device)
+        self.geometry = Geometry(mesh, self.device, solid=solid != "never")
+        self._wide = not self.geometry.is_narrow(self.spacing)
+        places = torch.tensor(list(itertools.product(range(_FINER), repeat=3)))
+        self._places = places.to(self.device, torch.float64)
         painted = {"color", "normal", "material"} & {*channels}
         self.paint = Paint(mesh, self.geometry) if painted else None
 
-    def reach(self, voxel: float) -> float:
-        """World distance from voxels of a size up to which triangles matter to them."""
-        share = _DIAGONAL * voxel + 0.5 * self.thickness
-        near = {"coverage"} == {*self.channels}
-        return share * (1 + 1e-6) if near else max(share * (1 + 1e-6), self.band)
+    def reach(self, voxel_k: Tensor) -> Tensor:
+        """World distances from voxels of sizes (k,) up to which triangles matter to them."""
+        share = (_DIAGONAL * voxel_k + 0.5 * self.thickness) * (1 + 1e-6)
+        return share if {"coverage"} == {*self.channels} else share.clamp(min=self.band)
+
+    def touched(self, low_k3: Tensor, size_k: Tensor, voxel_k: Tensor) -> tuple[Tensor, Tensor]:
+        """As `Geometry.touched`, for what may change voxels of sizes (k,) float64 in boxes."""
+        return self.geometry.touched(
+            low_k3, size_k, self.reach(voxel_k), parts=_PARTS, wide=self._wide
+        )
 
     def cubes(
-        self, low_k3: Tensor, voxel: float, side: int, *, finer: int = 1
+        self, low_k3: Tensor, voxel_k: Tensor, side: int, *, coarse_k: Tensor | None = None
     ) -> dict[str, Tensor]:
-        """Makes k cubes of voxels.
+        """Makes k cubes of voxels, on the device and without waiting for it.
 
         Args:
             low_k3: (k, 3) float64 low corners, world units.
-            voxel: World size of a voxel.
+            voxel_k: (k,) float64 world sizes of their voxels.
             side: Voxels along a side of a cube.
-            finer: Each voxel is the mean of so many along each axis.
+            coarse_k: (k,) bool, whose voxels are means of 2^3 places in each; of none if left out.
 
         Returns:
             By channel (k, z, y, x, c) of its dtype.
         """
         parts: dict[str, list[Tensor]] = {name: [] for name in self.channels}
-        step = max(1, _BATCH // (side * finer) ** 3)
-        for low in low_k3.to(self.device, torch.float64).split(step):
-            made = self._make(low, voxel / finer, side * finer)
-            for name, values in made.items():
-                parts[name].append(_stored(name, _mean(name, values, finer)))
+        step = max(1, _BATCH // side**3)
+        for begin in range(0, len(low_k3), step):
+            part = slice(begin, begin + step)
+            coarse = None if coarse_k is None else coarse_k[part]
+            for name, values in self._make(low_k3[part], voxel_k[part], side, coarse).items():
+                parts[name].append(_stored(name, values))
         empty = (0, side, side, side)
         return {
             name: torch.cat(own) if own else torch.empty((*empty, width), dtype=dtype)
@@ -145,12 +168,12 @@ class Voxelizer:
         inside = inside_k.view(shape)
         far = Cubes(
             distance=torch.full(shape, torch.inf, device=self.device),
-            face=torch.full(shape, -1, dtype=torch.int64, device=self.device),
+            face=torch.full(shape, -1, dtype=torch.int32, device=self.device),
             inside=inside,
             coverage=inside.to(torch.float32),
+            weight=torch.zeros((*shape, 3), device=self.device),
         )
-        place = torch.zeros((len(inside_k), 3), dtype=torch.float64, device=self.device)
-        made = self._channels(far, place, self.spacing)
+        made = self._channels(far)
         return {name: _stored(name, values)[:, 0, 0, 0] for name, values in made.items()}
 
     def region(self, low: Sequence[int], high: Sequence[int]) -> dict[str, Tensor]:
@@ -159,67 +182,85 @@ class Voxelizer:
         Returns:
             By channel (z, y, x, c) of its dtype, on the CPU.
         """
-        first = [n // _BLOCK for n in low]
-        blocks = [-(-b // _BLOCK) - a for a, b in zip(first, high, strict=True)]
-        out = {
-            name: torch.empty(
-                (*(n * _BLOCK for n in blocks), CHANNELS[name][1]), dtype=CHANNELS[name][0]
-            )
-            for name in self.channels
-        }
-        places = torch.tensor(list(itertools.product(*map(range, blocks)))).view(-1, 3)
-        world = self._corner((places + torch.tensor(first)) * _BLOCK)
-        size = _BLOCK * self.spacing
-        touched = self.geometry.touched(world, world + size, self.reach(self.spacing)).cpu()
-        bare = places[~touched]
-        inside = self.geometry.winding(world[~touched.to(world.device)] + 0.5 * size) != 0
-        constants = self.constants(inside)
-        for name, values in out.items():
-            for zyx, value in zip(bare.tolist(), constants[name].cpu(), strict=True):
-                values[tuple(slice(n * _BLOCK, (n + 1) * _BLOCK) for n in zyx)] = value
-        self._cut_region(places[touched], torch.tensor(first), low, high, out)
-        start = [n - a * _BLOCK for n, a in zip(low, first, strict=True)]
-        box = tuple(slice(s, s + b - a) for s, a, b in zip(start, low, high, strict=True))
-        return {name: values[box] for name, values in out.items()}
+        block = _CUBE * _PARTS
+        first = torch.tensor([n // block for n in low])
+        count = [-(-b // block) - n // block for n, b in zip(low, high, strict=True)]
+        blocks = torch.tensor(list(itertools.product(*map(range, count)))).view(-1, 3)
+        world = self._corner((blocks + first) * block)
+        voxel = world.new_full((len(world),), self.spacing)
+        found = self.touched(world, block * voxel, voxel)
 
-    def _cut_region(
-        self,
-        blocks: Tensor,
-        first: Tensor,
-        low: Sequence[int],
-        high: Sequence[int],
-        out: dict[str, Tensor],
-    ) -> None:
-        """Fills the blocks (k, 3) of a region that triangles touch, z y x, cube by cube."""
-        per = _BLOCK // _CUBE
-        inner = torch.tensor(list(itertools.product(range(per), repeat=3)))
-        cubes = (blocks[:, None] * per + inner).view(-1, 3)
-        at = (cubes + first * per) * _CUBE
+        def joined(values: Tensor) -> Tensor:  # (z, y, x) cubes
+            values = values.cpu().view(*count, _PARTS, _PARTS, _PARTS).permute(0, 3, 1, 4, 2, 5)
+            return values.reshape([n * _PARTS for n in count])
+
+        near, inside = map(joined, found)
+        cubes = near.nonzero()
+        at = (cubes + first * _PARTS) * _CUBE
+        # Those behind the region's end are not asked for.
         wanted = ((at + _CUBE > torch.tensor(low)) & (at < torch.tensor(high))).all(1)
-        cubes, at = cubes[wanted], at[wanted]
-        views = {
-            name: values.view(
-                *itertools.chain(*((n // _CUBE, _CUBE) for n in values.shape[:3])), values.shape[3]
-            ).permute(0, 2, 4, 1, 3, 5, 6)
+        out = self._blank(inside)
+        for some in torch.stack((cubes, at), 1)[wanted].split(max(1, _BATCH // _CUBE**3)):
+            size = torch.full((len(some),), self.spacing, dtype=torch.float64, device=self.device)
+            for name, values in self.cubes(self._corner(some[:, 1]), size, _CUBE).items():
+                out[name][some[:, 0].unbind(1)] = values.cpu()
+        start = [n - int(a) * block for n, a in zip(low, first, strict=True)]
+        box = tuple(slice(s, s + b - a) for s, a, b in zip(start, low, high, strict=True))
+        return {
+            name: values.permute(0, 3, 1, 4, 2, 5, 6).flatten(0, 1).flatten(1, 2).flatten(2, 3)[box]
             for name, values in out.items()
         }
-        step = max(1, _BATCH // _CUBE**3)
-        for zyx, corner in zip(cubes.split(step), at.split(step), strict=True):
-            made = self.cubes(self._corner(corner), self.spacing, _CUBE)
-            for name, values in made.items():
-                views[name][zyx.unbind(1)] = values.cpu()
+
+    def _blank(self, inside: Tensor) -> dict[str, Tensor]:
+        """By channel (gz, gy, gx, z, y, x, c) cubes far from all triangles, (gz, gy, gx) inside or
+        not.
+        """
+        both = self.constants(torch.tensor([False, True], device=self.device))
+        return {
+            name: torch.where(inside[..., None], values[1].cpu(), values[0].cpu())[
+                ..., None, None, None, :
+            ].repeat(1, 1, 1, _CUBE, _CUBE, _CUBE, 1)
+            for name, values in both.items()
+        }
 
     def _corner(self, zyx: Tensor) -> Tensor:
         """(k, 3) float64 world place of the low corner of voxels z, y, x."""
         origin = torch.tensor(self.origin, dtype=torch.float64)
         return (origin + (zyx.flip(1) - 0.5) * self.spacing).to(self.device)
 
-    def _make(self, low: Tensor, voxel: float, side: int) -> dict[str, Tensor]:
-        size = torch.full((3,), voxel, dtype=torch.float64, device=self.device)
-        found = self.geometry.cubes(low, size, side, self.reach(voxel), self.thickness)
-        return self._channels(found, low, voxel)
+    def _make(
+        self, low: Tensor, voxel: Tensor, side: int, coarse: Tensor | None
+    ) -> dict[str, Tensor]:
+        """By channel (k, z, y, x, c) of cubes, means of places where they are coarse; labels are
+        those of the last place.
+        """
+        if coarse is None:
+            return self._look(low, voxel, voxel, side)
+        own = torch.where(coarse, voxel / _FINER, voxel)
+        used = coarse.view(-1, 1, 1, 1, 1)
 
-    def _channels(self, found: Cubes, low: Tensor, voxel: float) -> dict[str, Tensor]:
+        def mean(begin: int, end: int) -> dict[str, Tensor]:
+            """Of some of the places, half by half: of equal values it is the same."""
+            if end - begin == 1:
+                there = own if begin == 0 else torch.where(coarse, own, 0)
+                return self._look(low + self._places[begin] * own[:, None], there, voxel, side)
+            middle = (begin + end) // 2
+            first, second = mean(begin, middle), mean(middle, end)
+            return {
+                name: torch.where(
+                    used, second[name] if name == "material" else 0.5 * (one + second[name]), one
+                )
+                for name, one in first.items()
+            }
+
+        return mean(0, len(self._places))
+
+    def _look(self, low: Tensor, voxel: Tensor, step: Tensor, side: int) -> dict[str, Tensor]:
+        size = torch.stack((voxel, step, self.reach(voxel)), 1)
+        told: dict[str, Any] = {"weights": self.paint is not None, "wide": self._wide}
+        return self._channels(self.geometry.cubes(low, size, side, self.thickness, **told))
+
+    def _channels(self, found: Cubes) -> dict[str, Tensor]:
         """By channel (k, z, y, x, c) float32 of what was found (materials int64)."""
         made: dict[str, Tensor] = {}
         if "coverage" in self.channels:
@@ -227,42 +268,22 @@ class Voxelizer:
         if "distance" in self.channels:
             distance = found.distance.clamp(max=self.band)
             made["distance"] = torch.where(found.inside, -distance, distance)[..., None]
-        if self.paint is None:
-            return {name: made[name] for name in self.channels}
-        near = (
-            (found.face >= 0)
-            if "normal" in self.channels
-            else (found.face >= 0) & (found.coverage > 0)
-        )
-        at = near.nonzero()
-        face = found.face[near]
-        local = (at[:, 1:].flip(1) + 0.5) * voxel
-        corner = (self.geometry.corner[face] - low[at[:, 0], None]).to(torch.float32)
-        weight = nearest_weights(local.to(torch.float32) / voxel, corner / voxel)
-        if "color" in self.channels:
-            color = self.paint.mean_color.expand(*near.shape, 4).clone()
-            color[near] = self.paint.color(face, weight)
-            opacity = color[..., 3:] * found.coverage[..., None]
-            made["color"] = torch.cat((color[..., :3] * opacity, opacity), -1)
-        if "normal" in self.channels:
-            made["normal"] = torch.zeros((*near.shape, 3), device=self.device)
-            made["normal"][near] = self.paint.normal(face, weight)
-        if "material" in self.channels:
-            material = torch.full_like(found.face, self.paint.main_material + 1)
-            material[near] = self.paint.material[face] + 1
-            made["material"] = torch.where(found.coverage >= 0.5, material, 0)[..., None]
+        if self.paint is not None:
+            near, face = found.face[..., None] >= 0, found.face.clamp(min=0).view(-1)
+            shape, weight = found.face.shape, found.weight.view(-1, 3)
+            if "color" in self.channels:
+                color = self.paint.color(face, weight).view(*shape, 4)
+                color = torch.where(near, color, self.paint.mean_color)
+                opacity = color[..., 3:] * found.coverage[..., None]
+                made["color"] = torch.cat((color[..., :3] * opacity, opacity), -1)
+            if "normal" in self.channels:
+                normal = self.paint.normal(face, weight).view(*shape, 3)
+                made["normal"] = normal * near
+            if "material" in self.channels:
+                material = self.paint.material[face].view(*shape, 1)
+                material = torch.where(near, material, self.paint.main_material) + 1
+                made["material"] = material * (found.coverage[..., None] >= 0.5)
         return {name: made[name] for name in self.channels}
-
-
-def _mean(name: str, values: Tensor, finer: int) -> Tensor:
-    """(k, z, y, x, c) means over cubes of finer^3; of labels the one in the middle."""
-    if finer == 1:
-        return values
-    if name == "material":
-        return values[:, finer // 2 :: finer, finer // 2 :: finer, finer // 2 :: finer]
-    k, z, y, x, c = values.shape
-    blocks = values.view(k, z // finer, finer, y // finer, finer, x // finer, finer, c)
-    return blocks.mean((2, 4, 6))
 
 
 def _stored(name: str, values: Tensor) -> Tensor:

@@ -174,11 +174,13 @@ def _cut_bricks(*, values_zyxc: Tensor, place_k3: Tensor, brick_size: int, borde
 
 
 def _voxelize(
-    *, corner_m33: Tensor, first_k: Tensor, side: int, **_: Any
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    real = corner_m33.new_empty((first_k.shape[0] - 1, side, side, side))
+    *, low_k3: Tensor, side: int, weights: bool, wide: bool, **_: Any
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    cubes, cube = low_k3.shape[0], (side, side, side)
+    real = low_k3.new_empty((cubes, *cube), dtype=torch.float64 if wide else torch.float32)
     whole = torch.empty_like(real, dtype=torch.int32)
-    return real, whole, torch.empty_like(whole), torch.empty_like(real)
+    weight = real.new_empty((cubes if weights else 0, *cube, 3))
+    return real, whole, torch.empty_like(whole), torch.empty_like(real), weight
 
 
 FAKES: dict[str, Callable[..., Any]] = {

@@ -1,4 +1,4 @@
-"""`voxelize`: what cubes of voxels hold of the triangles near them."""
+"""`voxelize`: what cubes of voxels hold of a mesh."""
 
 from __future__ import annotations
 
@@ -9,74 +9,87 @@ from ..base import check
 from .reference import voxelize as twin
 from .registry import Backend, choose_backend
 
-MOST_VOXELS = 16  # along a side of a cube
+MOST_VOXELS = 32  # along a side of a cube
+ARITY = 8  # boxes in a box
 
 
 def voxelize(
-    corner_m33: Tensor,  # (m, 3, 3)
-    solid_m: Tensor,  # (m,)
-    first_k: Tensor,  # (k + 1,)
-    start_k3: Tensor,  # (k, 3)
-    winding_k: Tensor,  # (k,)
-    voxel_3: Tensor,  # (3,)
+    corner_f33: Tensor,  # (f, 3, 3)
+    solid_f: Tensor,  # (f,)
+    box_n6: Tensor,  # (n, 6)
+    low_k3: Tensor,  # (k, 3)
+    size_k3: Tensor,  # (k, 3)
     side: int,
     thickness: float,
     *,
+    detail: float = 0.0,
+    weights: bool = False,
+    wide: bool = False,
     backend: Backend = "auto",
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Finds for each voxel of k cubes the nearest of the cube's own triangles, and what share of
-    the voxel is filled.
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Finds for each voxel of k cubes the nearest triangle of a mesh, how often the mesh winds
+    around it, and what share of the voxel is filled. Nothing waits for the host, and no shape
+    depends on values.
 
-    Lengths are in voxels (of any unit near the size of one): triangles far smaller or larger than
-    1e9 of them underflow or overflow. The surface is taken as a plane through each voxel, so shares
-    are exact where it is one. On the CPU, C++ and the twin agree in every bit of float32.
+    The surface is taken as a plane through each voxel, so shares are exact where it is one. On the
+    CPU, C++ and the twin agree in every bit of float32. In float32 a triangle that comes near a
+    cube should reach no farther than some thousand voxels away from it.
 
     Args:
-        corner_m33: (m, 3, 3) float32 or float64 corners of triangles, x y z, from the low corner of
-            the cube whose they are; those of a cube one after another.
-        solid_m: (m,) bool, whether the triangle bounds a solid; else it is a sheet.
-        first_k: (k + 1,) int64: cube i has triangles first_k[i] to first_k[i + 1] - 1.
-        start_k3: (k, 3) a place in each cube, away from the surface.
-        winding_k: (k,) int32 winding number there, of all triangles that bound solids. A cube's own
-            triangles must be all that the cube contains parts of.
-        voxel_3: (3,) sides of a voxel along x, y, z; voxel x has its centre at (x + 1/2) of them.
-        side: Voxels along a side of a cube, at most 16.
-        thickness: Of sheets.
+        corner_f33: (f, 3, 3) float64 corners of at least one triangle, x y z, world units.
+        solid_f: (f,) bool, whether the triangle bounds a solid; else it is a sheet. Those of
+            solids close each other's edges: then winding numbers are whole.
+        box_n6: (n, 6) float64 low and high corners of boxes: one around each triangle, then one
+            around each 8 of those (the last may hold fewer), and so on until at most 8 are left.
+        low_k3: (k, 3) float64 low corners of the first voxels of the cubes, world units.
+        size_k3: (k, 3) float64 world sizes: the side of a voxel, the distance from one to the next
+            along each axis, and how far away triangles are looked for (below 0: none are). Where
+            the side is not above 0, the cube is left out: nothing is in it.
+        side: Voxels along a side of a cube, at most 32.
+        thickness: Of sheets, world units.
+        detail: World size of a usual triangle: tells how to search, and changes no result.
+        weights: Whether weights are wanted.
+        wide: Whether it is worked out in float64.
         backend: auto, reference, cpp or cuda.
 
     Returns:
-        distance_kzyx (k, side, side, side) to the nearest place, infinite without triangles;
-        nearest_kzyx int32 the triangle's row, the first of those that are equally near, -1 for
-        none; winding_kzyx int32 winding number of the voxel's centre, not 0 inside of solids;
-        coverage_kzyx the filled share, 0 to 1.
+        distance_kzyx (k, side, side, side) to the nearest place, in voxels, infinite beyond the
+        reach; nearest_kzyx int32 the triangle, the first of those that are equally near, -1 beyond
+        the reach; winding_kzyx int32 winding number of the voxel's centre, not 0 inside of solids;
+        coverage_kzyx the filled share, 0 to 1; weight_kzyx3 weights of the triangle's corners at
+        the nearest place, of no cubes unless they are wanted.
 
     Raises:
         ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.
     """
-    where, device, real = "voxelize", corner_m33.device, corner_m33.dtype
-    if real not in (torch.float32, torch.float64):
-        raise ValueError(
-            f"{where}: corner_m33 must be float32 or float64, got {check.describe(corner_m33)}"
-        )
+    where, device, world = "voxelize", corner_f33.device, torch.float64
+    if not len(corner_f33):
+        raise ValueError(f"{where}: corner_f33 must hold at least one triangle")
     check.tensors(
         where,
         device,
         (
-            ("corner_m33", corner_m33, "m33", real),
-            ("solid_m", solid_m, "m", torch.bool),
-            ("winding_k", winding_k, "k", torch.int32),
-            ("start_k3", start_k3, "k3", real),
-            ("voxel_3", voxel_3, "3", real),
-            ("first_k", first_k, "f", torch.int64),
+            ("corner_f33", corner_f33, "f33", world),
+            ("solid_f", solid_f, "f", torch.bool),
+            ("low_k3", low_k3, "k3", world),
+            ("size_k3", size_k3, "k3", world),
+            ("box_n6", box_n6, "n6", world),
         ),
+        {"n": boxes_of(len(corner_f33))},
     )
-    if len(first_k) != len(winding_k) + 1:
-        raise ValueError(
-            f"{where}: first_k must be ({len(winding_k) + 1},) int64, got {check.describe(first_k)}"
-        )
     check.whole(where, "side", side, low=1, high=MOST_VOXELS)
     thickness = check.number(where, "thickness", thickness, low=0)
-    arguments = (corner_m33, solid_m, first_k, start_k3, winding_k, voxel_3, side, thickness)
+    detail = check.number(where, "detail", detail, low=0)
+    arguments = (corner_f33, solid_f, box_n6, low_k3, size_k3, side, thickness)
     if choose_backend(backend, device) == "reference":
-        return twin.voxelize(*arguments)
-    return torch.ops.gvtorch.voxelize(*arguments)
+        return twin.voxelize(*arguments, detail, weights, wide)
+    return torch.ops.gvtorch.voxelize(*arguments, detail, weights, wide)
+
+
+def boxes_of(triangles: int) -> int:
+    """Returns how many boxes there are in the hierarchy of so many triangles."""
+    floor = total = triangles
+    while floor > ARITY:
+        floor = -(-floor // ARITY)
+        total += floor
+    return total

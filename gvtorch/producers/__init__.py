@@ -3,6 +3,7 @@
 from .children import FromChildren
 from .field import FieldProducer, cache_field
 from .hypertexture import Hypertexture
+from .joined import JoinedProducer, StoredChannels
 from .mesh import MeshProducer
 from .octaves import OctaveProducer
 from .points import PointProducer
@@ -15,6 +16,7 @@ __all__ = [
     "FieldProducer",
     "FromChildren",
     "Hypertexture",
+    "JoinedProducer",
     "Layout",
     "MeshProducer",
     "Nodes",
@@ -23,6 +25,7 @@ __all__ = [
     "Producer",
     "Region",
     "Regions",
+    "StoredChannels",
     "StoredProducer",
     "VolumeProducer",
     "cache_field",

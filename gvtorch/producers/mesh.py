@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,11 @@ import torch
 from torch import Tensor
 
 from ..io.mesh_file import read_mesh
+from ..meshes.holes import Solid, told_of_holes
 from ..meshes.mesh import Mesh
 from ..meshes.voxelizer import CHANNELS, Voxelizer
 from ..pool import Channel
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
-
-_FINER = 2  # places along a side that a coarse voxel is the mean of
 
 
 class MeshProducer(Producer):
@@ -28,6 +28,8 @@ class MeshProducer(Producer):
     level.
     """
 
+    on_device = True
+
     def __init__(
         self,
         mesh: Mesh | str | Path,
@@ -36,6 +38,7 @@ class MeshProducer(Producer):
         channels: Sequence[str] = ("coverage",),
         band: float = 4.0,
         thickness: float = 1.0,
+        solid: Solid = "auto",
     ) -> None:
         """Takes a mesh.
 
@@ -45,18 +48,23 @@ class MeshProducer(Producer):
             channels: coverage, distance, color, normal, material; see `Voxelizer`.
             band: Finest voxels up to which the nearest place of the surface counts.
             thickness: Finest voxels, of what bounds no solid.
+            solid: auto: what is closed is a solid; always: holes are filled before; never: all is a
+                sheet.
 
         Raises:
             ValueError: A number is out of its range, a channel unknown, or see `read_mesh`.
         """
         mesh = mesh if isinstance(mesh, Mesh) else read_mesh(mesh)
+        if solid == "auto" and (told := told_of_holes(mesh)):
+            warnings.warn(told, stacklevel=2)
         self._told: dict[str, Any] = {
             "resolution": resolution,
             "channels": channels,
             "band": band,
             "thickness": thickness,
         }
-        grid = Voxelizer(mesh, **self._told)
+        grid = Voxelizer(mesh, **self._told, solid=solid)
+        self._told["solid"] = "auto" if solid == "always" else solid  # the holes are filled now
         ranges = {"coverage": (0.0, 255.0), "distance": (-grid.band, grid.band)}
         super().__init__(
             grid.extent,
@@ -75,43 +83,34 @@ class MeshProducer(Producer):
 
     def classify(self, nodes: Nodes) -> Regions:
         """EMPTY outside and CONSTANT inside, where no triangle comes near any voxel in reach."""
-        grid, layout = self.voxelizer, nodes.layout
-        kind = torch.full((len(nodes),), int(Region.DATA), device=grid.device)
-        inside = torch.zeros(len(nodes), dtype=torch.bool, device=grid.device)
-        for here, low, voxel in _by_depth(nodes, grid):
-            high = low + layout.side * voxel
-            bare = here[~grid.geometry.touched(low, high, grid.reach(voxel))]
-            inside[bare] = grid.geometry.winding(nodes.center.to(grid.device)[bare]) != 0
-            kind[bare] = int(Region.CONSTANT)
-        constants = grid.constants(inside)
+        grid = self.voxelizer
+        low, voxel = _cubes(nodes, grid)
+        touched, within = grid.touched(low, nodes.layout.side * voxel, voxel)
+        bare, inside = ~touched.flatten(1).any(1), within[:, 0, 0, 0]
+        kind = torch.where(bare, int(Region.CONSTANT), int(Region.DATA))
         if "distance" not in grid.channels:
-            kind[(kind == Region.CONSTANT) & ~inside] = int(Region.EMPTY)
-        return Regions(kind=kind, constants=constants)
+            kind = torch.where(bare & ~inside, int(Region.EMPTY), kind)
+        return Regions(kind=kind, constants=grid.constants(inside))
 
     def fill(self, nodes: Nodes) -> Bricks:
-        """Makes the bricks, level by level."""
-        grid, layout = self.voxelizer, nodes.layout
-        data = {
-            name: torch.empty(
-                (len(nodes), *(layout.side,) * 3, one.width), dtype=one.dtype, device=grid.device
-            )
-            for name, one in self.channels.items()
-        }
-        for here, low, voxel in _by_depth(nodes, grid):
-            finer = 1 if voxel < 1.5 * grid.spacing else _FINER
-            for name, made in grid.cubes(low, voxel, layout.side, finer=finer).items():
-                data[name][here] = made
-        return Bricks(data=data)
+        """Makes the bricks."""
+        grid, side = self.voxelizer, nodes.layout.side
+        low, voxel = _cubes(nodes, grid)
+        coarse = nodes.depth.to(grid.device) < nodes.layout.depth
+        if grid.device.type != "cpu":
+            return Bricks(data=grid.cubes(low, voxel, side, coarse_k=coarse))
+        # The finest are of one place, which the host may look at here.
+        order = coarse.to(torch.int8).argsort(stable=True)
+        fine, rest = order.split([len(order) - int(coarse.sum()), int(coarse.sum())])
+        parts = [grid.cubes(low[fine], voxel[fine], side)]
+        parts.append(grid.cubes(low[rest], voxel[rest], side, coarse_k=coarse[rest]))
+        back = order.argsort()
+        return Bricks(data={n: torch.cat([p[n] for p in parts])[back] for n in self.channels})
 
 
-def _by_depth(nodes: Nodes, grid: Voxelizer) -> list[tuple[Tensor, Tensor, float]]:
-    """For each depth which of the nodes it has, (m,), the low corners of their bricks with border,
-    (m, 3) float64, and the size of their voxels.
+def _cubes(nodes: Nodes, grid: Voxelizer) -> tuple[Tensor, Tensor]:
+    """(k, 3) float64 low corners of the nodes' bricks with their borders, and (k,) float64 sizes of
+    their voxels.
     """
-    found = []
     low = nodes.box[:, 0] - nodes.layout.border * nodes.voxel_size
-    for depth in nodes.depth.unique().tolist():
-        here = (nodes.depth == depth).nonzero()[:, 0]
-        voxel = grid.spacing * nodes.layout.branching ** (nodes.layout.depth - depth)
-        found.append((here.to(grid.device), low[here].to(grid.device), float(voxel)))
-    return found
+    return low.to(grid.device).contiguous(), nodes.voxel_size[:, 0].to(grid.device)

@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from ..cameras.camera import Up
     from ..cameras.models import CameraModel
     from ..io.store import Store
-    from ..shaders import Channels, Labels, Shader
+    from ..shaders import Channels, Labels, Shader, StoredColor
     from ..tracing import Clip, ThinLens
 
     ShaderName = str
 else:
     CameraModel = str  # checked by the camera, since its module would load torch
     ShaderName = Literal[
-        (*declared_names("shaders.built_in", "BY_NAME"), "filtered", "channels", "labels")
+        (*declared_names("shaders.built_in", "BY_NAME"), "filtered", "channels", "labels", "colors")
     ]
 
 _WHOLE = ("isosurface", "maximum", "minimum", "mean")  # see one value, or a whole ray
@@ -59,7 +59,8 @@ class Look:
     shader: ShaderName = "plain"
     """what is made of the values; filtered: plain, but right from afar (stores: gvtorch filter);
     channels: all numbers of a voxel, each in its colour and window as the file tells, else found;
-    labels: each in its colour, also if left out where there are labels"""
+    labels: each in its colour, also if left out where there are labels; colors: those of a mesh,
+    lit where its normals are stored beside them, also if left out"""
     channel: Annotated[str | None, arg(metavar="N:COLOR:LO,HI;...")] = None
     """of --shader channels: which ones; colour is a name or #RRGGBB, and what is left out or auto
     is the file's; opacity as an item: they hide each other, else they are added"""
@@ -152,6 +153,17 @@ class Look:
         check_component(data, self.component)
         return Labels()
 
+    def stored_colors(self, store: Store, names: tuple[str, ...]) -> StoredColor:
+        """Returns the shader of a mesh's colours, and of its normals, if they are named."""
+        from ..shaders import StoredColor
+
+        self._refuse("colours are stored", "component")
+        # What is opaque is so within a voxel: the light enters no farther.
+        told: dict[str, Any] = {"reference": 0.3 * min(store.spacing), "premultiplied": True}
+        if len(names) == 1:
+            return StoredColor("value", lit=True, **told)
+        return StoredColor("color", normals="normal", **told)
+
     def _refuse(self, why: str, *more: str) -> None:
         """Raises ValueError where a flag of transfer functions is given."""
         for name in ("tf", "window", "value", *more):
@@ -169,6 +181,8 @@ class Look:
             return self._channels(data)
         if self.channel is not None:
             raise ValueError("--channel is for --shader channels")
+        if self.shader == "colors":
+            raise ValueError("--shader colors is for stores of meshes: --channels color,normal")
         if self.shader == "labels" or (self.shader == "plain" and data.info.labels):
             return self._labels(data)
         if (self.value is None) == (self.shader == "isosurface"):

@@ -44,9 +44,12 @@ class Streaming:
 
     def store(self, path: str, time: int | None) -> Store:
         """Opens a store at a time point; tells which, where nobody did."""
+        from ..io.channels import channel_names
         from ..io.store import Store
 
-        found = Store.open(path, image=self.image, time=time or 0)
+        names = channel_names(path) if self.image is None else ()
+        image = "color" if "color" in names else self.image
+        found = Store.open(path, image=image, time=time or 0)
         if time is None and found.times > 1:
             warnings.warn(
                 f"{path}: has {found.times} time points, this is the first; --time N shows "
@@ -55,23 +58,44 @@ class Streaming:
             )
         return found
 
+    def _drawn(self, store: Store, look: Look) -> tuple[str, ...]:
+        """The channels of a mesh that are drawn as they are: color, and normal, by which it is lit;
+        none where something else is asked for.
+        """
+        from ..io.channels import channel_names
+
+        if look.shader not in ("plain", "colors") or look.tf is not None:
+            return ()
+        if store.info.quantity != "color" or store.width != 4:
+            return ()
+        folder = store.location.rpartition("/")[0]
+        beside = self.image is None and "normal" in channel_names(folder)
+        return ("color", "normal") if beside else ("color",)
+
     @contextmanager
     def open(self, store: Store, look: Look) -> Iterator[tuple[Engine, Shader]]:
         """Gives an engine over a store, and the transfer function."""
         from ..engine.engine import Engine
-        from ..producers import StoredProducer
+        from ..producers import Producer, StoredChannels, StoredProducer
         from ..shaders import Filtered
 
         if self.mode not in (None, "converge") and self.max_frames != type(self)().max_frames:
             raise ValueError(f"--max-frames is for --mode converge, not {self.mode}")
-        shader = look.chosen(store)
+        names = self._drawn(store, look)
+        shader = look.stored_colors(store, names) if names else look.chosen(store)
         filtered = shader if isinstance(shader, Filtered) else None
         if filtered is not None and look.tf is None:
             shader = filtered = Filtered.stored(store)
         if filtered is not None and filtered.component != look.component:
             raise ValueError(f"--component must be that of the colours, {filtered.component}")
         brick_size, border = look.bricks(store)
-        producer = StoredProducer(store, host_cache=self.host_cache, filtered=filtered)
+        producer: Producer
+        if len(names) > 1:
+            producer = StoredChannels(
+                store.location.rpartition("/")[0], names, host_cache=self.host_cache
+            )
+        else:
+            producer = StoredProducer(store, host_cache=self.host_cache, filtered=filtered)
         with Engine(
             producer,
             node_pool=self.node_pool,

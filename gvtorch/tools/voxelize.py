@@ -29,17 +29,19 @@ class Voxelize:
     """the folder to make"""
     resolution: Annotated[int, arg(metavar="N")] = 1024
     """voxels along the mesh's longest side"""
-    channels: Annotated[
-        Literal["coverage", "distance", "color", "normal", "material"], arg(aliases=["--channel"])
-    ] = "coverage"
-    """what a voxel holds: the filled share; the signed distance, up to the band; premultiplied
-    linear colour and opacity; the surface's normal; the material, as labels. One for each store"""
+    channels: Annotated[str, arg(aliases=["--channel"], metavar="NAME,NAME,...")] = "coverage"
+    """what a voxel holds, one or several: coverage, the filled share; distance, signed, up to the
+    band; color, premultiplied linear colour and opacity; normal, the surface's; material, labels.
+    color and normal together are drawn as they are, lit"""
     texture: Annotated[Path | None, arg(metavar="IMAGE")] = None
     """an image that is laid on all that has texture coordinates"""
     band: Annotated[float, arg(metavar="VOXELS")] = 4.0
     """how far from the surface distances, colours and normals are told"""
     thickness: Annotated[float, arg(metavar="VOXELS")] = 1.0
     """of parts that are not closed"""
+    solid: Literal["auto", "always", "never"] = "auto"
+    """auto: what is closed is a solid, all else a sheet; always: holes are filled; never: all is a
+    sheet"""
     block: Literal[32, 64] = 32
     """voxels along a side of a block"""
     workers: Annotated[int | None, arg(metavar="N")] = None
@@ -51,21 +53,23 @@ class Voxelize:
 
     def run(self) -> None:
         """Voxelizes."""
-        from ..io.mesh_file import read_mesh
+        from ..io.channels import channel_names
         from ..io.mesh_source import voxelize
         from ..io.resources import amount
+        from ..io.store import Store
 
         if self.scheduler is not None and self.workers is not None:
             raise ValueError("--scheduler brings its own workers: leave --workers out")
         start = time.perf_counter()
         with Bar(speed=True) as bar, cluster(self.scheduler) as executor:
             store = voxelize(
-                self.path if self.texture is None else read_mesh(self.path, texture=self.texture),
-                self.output,
+                *(self.path, self.output),
                 resolution=self.resolution,
-                channel=self.channels,
+                channels=tuple(name.strip() for name in self.channels.split(",")),
                 band=self.band,
                 thickness=self.thickness,
+                solid=self.solid,
+                texture=self.texture,
                 block=self.block,
                 workers=self.workers,
                 executor=executor,
@@ -73,7 +77,9 @@ class Voxelize:
                 progress=bar,
             )
         seconds = time.perf_counter() - start
-        size = amount(store.describe()["disk bytes"])
+        names = channel_names(self.output)
+        stores = [Store.open(self.output, image=name) for name in names] or [store]
+        size = amount(sum(one.describe()["disk bytes"] for one in stores))
         extent = "x".join(str(n) for n in store.extent)
         print(f"{self.output}: {extent}, {store.levels} levels, {size} in {seconds:.1f} s")
 

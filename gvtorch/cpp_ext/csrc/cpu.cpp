@@ -15,21 +15,26 @@ namespace gvtorch {
 
 // packet.cpp, compiled once for each instruction set.
 using ShadeChunk = void(const ShadeArgs& args, int64_t begin, int64_t end);
+using VoxelizeChunk = void(const VoxelizeArgs& args, int64_t begin, int64_t end);  // rows
 namespace baseline {
 ShadeChunk shade_chunk;
-}
+VoxelizeChunk voxelize_chunk;
+}  // namespace baseline
 #ifdef GV_X86
 namespace avx2 {
 ShadeChunk shade_chunk;
-}
+VoxelizeChunk voxelize_chunk;
+}  // namespace avx2
 namespace avx512 {
 ShadeChunk shade_chunk;
-}
+VoxelizeChunk voxelize_chunk;
+}  // namespace avx512
 #endif
 
 struct Processor {
   const char* name;
   ShadeChunk* shade_chunk;
+  VoxelizeChunk* voxelize_chunk;
 };
 
 // The widest instructions that this processor has; GVTORCH_CPU=baseline, avx2 or avx512 asks for fewer.
@@ -41,11 +46,11 @@ inline Processor find_processor() {
   const bool wide = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("f16c");
   if (asked == "avx512" && wide && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
       __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl")) {
-    return {"avx512", &avx512::shade_chunk};
+    return {"avx512", &avx512::shade_chunk, &avx512::voxelize_chunk};
   }
-  if ((asked == "avx512" || asked == "avx2") && wide) return {"avx2", &avx2::shade_chunk};
+  if ((asked == "avx512" || asked == "avx2") && wide) return {"avx2", &avx2::shade_chunk, &avx2::voxelize_chunk};
 #endif
-  return {"baseline", &baseline::shade_chunk};
+  return {"baseline", &baseline::shade_chunk, &baseline::voxelize_chunk};
 }
 
 inline const Processor& processor() {
@@ -60,6 +65,15 @@ void FusedShaders::run(const Tensor& like, ShadeArgs args, bool wide) {
   if (wide) return shade_fused<double>(like, args);
   if (!(args.shader == kPlainShader ? packs(args) : shades(args))) return shade_fused<float>(like, args);
   trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) { processor().shade_chunk(args, begin, end); });
+}
+
+void voxelize(const Tensor& like, const VoxelizeArgs& args) {
+  constexpr int64_t kRows = 16;  // at a time
+  const int64_t rows = args.cubes * args.side * args.side;
+  const auto chunk = [&](int64_t number) {
+    processor().voxelize_chunk(args, number * kRows, std::min(rows, (number + 1) * kRows));
+  };
+  for_each(like, (rows + kRows - 1) / kRows, chunk, 1);
 }
 
 // See cache.h. Threads count chunks, then take them: ranks do not depend on the number of threads.

@@ -13,6 +13,12 @@ void FusedShaders::run(const Tensor& like, ShadeArgs args, bool wide) {
   wide ? shade_fused<double>(like, args) : shade_fused<float>(like, args);
 }
 
+void voxelize(const Tensor& like, const VoxelizeArgs& args) {
+  const int64_t voxels = args.cubes * args.side * args.side * args.side;
+  if (args.wide) return for_each(like, voxels, VoxelizePack<double>{args});
+  for_each(like, voxels, VoxelizePack<float>{args});
+}
+
 // `compact` of cache.h in three kernels: blocks count chunks, one block adds the counts up, and blocks take their
 // chunks. What a chunk has nothing of is not read again.
 constexpr int kThreads = 256;

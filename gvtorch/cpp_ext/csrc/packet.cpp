@@ -1,5 +1,6 @@
-// Tracing on the CPU in float32, compiled once for each instruction set (build.py), GV_NAMESPACE its name. Nothing of
-// torch or of the standard library's templates may stand here: see hd.h.
+// Tracing and voxelizing on the CPU, compiled once for each instruction set (build.py), GV_NAMESPACE its name. Nothing
+// of torch or of the standard library's templates may stand here: see hd.h.
+#include "mesh/voxelize.h"
 #include "packets/packet_walk.h"
 
 namespace gvtorch {
@@ -18,6 +19,16 @@ void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end) {
     if (far) return trace_packets<Plain<float>, TypedValues<Voxel, true>>(args, begin, end);
     return trace_packets<Plain<float>, TypedValues<Voxel, false>>(args, begin, end);
   });
+}
+
+template <class T>
+void voxelize_rows(const VoxelizeArgs& args, int64_t begin, int64_t end) {
+  const VoxelizePack<T> pack{args};
+  for (int64_t index = begin * pack.packs(); index < end * pack.packs(); ++index) pack(index);
+}
+
+void voxelize_chunk(const VoxelizeArgs& args, int64_t begin, int64_t end) {
+  args.wide ? voxelize_rows<double>(args, begin, end) : voxelize_rows<float>(args, begin, end);
 }
 
 }  // namespace GV_NAMESPACE

@@ -1,9 +1,9 @@
-"""The twin of `voxelize`: what cubes of voxels hold of the triangles near them, in plain torch, one
-cube after the other. It defines what the compiled op gives, in every bit of float32.
+"""The twin of `voxelize`: what cubes of voxels hold of a mesh, in plain torch, one cube after the
+other, all triangles for each voxel. It defines what the compiled op gives, in every bit of float32.
 
 Sources: Ericson, "Real-Time Collision Detection", 2005, section 5.1.5 (closest point on a
     triangle); Jacobson, Kavan, Sorkine-Hornung, "Robust inside-outside segmentation using
-    generalized winding numbers", SIGGRAPH 2013 (the number counted here along axes); Scardovelli,
+    generalized winding numbers", SIGGRAPH 2013 (the number counted here along x); Scardovelli,
     Zaleski, "Analytical relations connecting linear interfaces and volume fractions in rectangular
     grids", J. Comput. Phys. 164, 2000, section 2.
 """
@@ -17,35 +17,51 @@ from .exact import sqrt_exact
 
 FLAT = 1e-3  # least share of the normal's sum along an axis, see `box_share`
 TOUCH = 1e-6  # squared distance in voxels below which the triangle's own normal is taken
+_PAIRS = 1 << 20  # of place and triangle that are looked at together
 
 
 def voxelize(
-    corner_m33: Tensor,
-    solid_m: Tensor,
-    first_k: Tensor,
-    start_k3: Tensor,
-    winding_k: Tensor,
-    voxel_3: Tensor,
+    corner_f33: Tensor,
+    solid_f: Tensor,
+    box_n6: Tensor,
+    low_k3: Tensor,
+    size_k3: Tensor,
     side: int,
     thickness: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """See `ops.voxelize`."""
-    items, cube = len(first_k) - 1, (side,) * 3
-    distance = corner_m33.new_empty((items, *cube))
-    nearest = torch.empty((items, *cube), dtype=torch.int32, device=corner_m33.device)
-    winding, coverage = torch.empty_like(nearest), torch.empty_like(distance)
-    at = torch.arange(side, device=corner_m33.device).to(corner_m33.dtype) + 0.5
-    z, y, x = torch.meshgrid(at * voxel_3[2], at * voxel_3[1], at * voxel_3[0], indexing="ij")
-    place_p3 = torch.stack((x, y, z), -1).view(-1, 3)
-    for item, (begin, end) in enumerate(first_k.unfold(0, 2, 1).tolist()):
-        corner, solid = corner_m33[begin:end], solid_m[begin:end]
-        gap, row, away = _nearest(place_p3, corner)
-        count = winding_k[item] + _crossed(start_k3[item], place_p3, corner, solid)
-        share = _coverage(gap, away, count, row, solid, voxel_3, thickness)
-        nearest[item] = torch.where(row >= 0, row + begin, -1).to(torch.int32).view(cube)
-        distance[item], coverage[item] = gap.view(cube), share.view(cube)
-        winding[item] = count.to(torch.int32).view(cube)
-    return distance, nearest, winding, coverage
+    detail: float,
+    weights: bool,
+    wide: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """See `ops.voxelize`. Boxes and detail only save work, so they are not looked at here."""
+    real = torch.float64 if wide else torch.float32
+    items, cube = len(low_k3), (side,) * 3
+    distance = torch.full((items, *cube), torch.inf, dtype=real, device=low_k3.device)
+    nearest = torch.full((items, *cube), -1, dtype=torch.int32, device=low_k3.device)
+    winding, coverage = torch.zeros_like(nearest), torch.zeros_like(distance)
+    weight = distance.new_zeros((items if weights else 0, *cube, 3))
+    at = torch.arange(side, device=low_k3.device).to(real)
+    for item in range(items):
+        voxel, step, reach = size_k3[item]
+        if not voxel > 0:
+            continue
+        inverse = 1 / voxel
+        corner = ((corner_f33 - low_k3[item]) * inverse).to(real)
+        along = at * (step * inverse).to(real) + 0.5
+        z, y, x = torch.meshgrid(along, along, along, indexing="ij")
+        places = torch.stack((x, y, z), -1).view(-1, 3)
+        half = (0.5 * thickness * inverse).to(real)
+        flat = [one[item].view(-1) for one in (distance, nearest, winding, coverage)]
+        for begin in range(0, len(places), max(1, _PAIRS // len(corner))):
+            part = slice(begin, begin + max(1, _PAIRS // len(corner)))
+            gap, row, away = _nearest(places[part], corner, (reach * inverse).to(real))
+            count = _ahead(places[part], corner, solid_f)
+            share = _coverage(gap, away, count, row, solid_f, half)
+            for out, values in zip(flat, (gap, row, count, share), strict=True):
+                out[part] = values.to(out.dtype)
+            if weights:
+                found = _weights(places[part], corner[row.clamp(min=0)])
+                weight[item].view(-1, 3)[part] = torch.where(row[:, None] >= 0, found, 0)
+    return distance, nearest, winding, coverage, weight
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
@@ -57,14 +73,11 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
     return torch.stack([a[..., i] * b[..., j] - a[..., j] * b[..., i] for i, j in turns], -1)
 
 
-def _nearest(place_p3: Tensor, corner_n33: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns for each place the distance to the nearest of n triangles, which it is (-1: there is
-    none), and a vector (p, 3) along which it lies, of any length and sign.
+def _nearest(place_p3: Tensor, corner_f33: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns for each place the distance to the nearest of f triangles, which it is (-1: none is
+    within the reach), and a vector (p, 3) along which it lies, of any length and sign.
     """
-    if not len(corner_n33):
-        far = torch.full_like(place_p3[:, 0], torch.inf)
-        return far, torch.full_like(far, -1, dtype=torch.int64), torch.zeros_like(place_p3)
-    a, b, c = corner_n33.unbind(1)
+    a, b, c = corner_f33.unbind(1)
     normal = _cross(b - a, c - a)
     length2 = _dot(normal, normal)
     inside = (length2 > 0).expand(len(place_p3), -1)
@@ -90,95 +103,109 @@ def _nearest(place_p3: Tensor, corner_n33: Tensor) -> tuple[Tensor, Tensor, Tens
     each = torch.arange(len(place_p3), device=a.device)
     flat = inside[each, row] | (gap2 < TOUCH)
     away = torch.where(flat[:, None], normal[row], toward[each, row])
-    return sqrt_exact(gap2), row, away
+    near = (gap2 <= reach * reach) & (reach >= 0)
+    return sqrt_exact(torch.where(near, gap2, torch.inf)), torch.where(near, row, -1), away
 
 
-def _crossed(start_3: Tensor, place_p3: Tensor, corner_n33: Tensor, solid_n: Tensor) -> Tensor:
-    """Returns (p,) int64 by how much the winding number at each place is larger than at the start:
-    triangles are counted along z, then y, then x, the way on which they are crossed outwards as 1.
+def _weights(place_p3: Tensor, corner_p33: Tensor) -> Tensor:
+    """Returns (p, 3) weights of a triangle's corners at what of it is nearest to a place."""
+    a, b, c = corner_p33.unbind(1)
+    normal = _cross(b - a, c - a)
+    length2 = _dot(normal, normal)
+    inside = length2 > 0
+    over, gaps, shares = [], [], []
+    for corner, edge in ((a, b - a), (b, c - b), (c, a - c)):
+        from_corner = place_p3 - corner
+        area = _dot(_cross(edge, normal), from_corner)
+        inside = inside & (area <= 0)
+        over.append(-area / torch.where(length2 > 0, length2, 1))
+        edge2 = _dot(edge, edge)
+        inverse = 1 / torch.where(edge2 > 0, edge2, 1)
+        shares.append((_dot(from_corner, edge) * inverse).clamp(0, 1))
+        from_edge = from_corner - edge * shares[-1][..., None]
+        gaps.append(_dot(from_edge, from_edge))
+    plane = torch.stack((over[1], over[2], over[0]), 1)  # a corner's weight: its far edge's area
+    first = (gaps[0] <= gaps[1]) & (gaps[0] <= gaps[2])
+    second = ~first & (gaps[1] <= gaps[2])
+    third, zero = ~first & ~second, torch.zeros_like(gaps[0])
+    rim = zero[:, None].expand(-1, 3)
+    for at, (here, t) in enumerate(zip((first, second, third), shares, strict=True)):
+        own = [zero, zero, zero]
+        own[at], own[(at + 1) % 3] = 1 - t, t
+        rim = torch.where(here[:, None], torch.stack(own, 1), rim)
+    return torch.where(inside[:, None], plane, rim)
+
+
+def _ahead(place_p3: Tensor, corner_f33: Tensor, solid_f: Tensor) -> Tensor:
+    """Returns (p,) int64 winding numbers: triangles that lie ahead along x, those whose normals
+    point ahead as 1.
     """
-    total = torch.zeros(len(place_p3), dtype=torch.int64, device=place_p3.device)
-    here = start_3.expand(len(place_p3), 3).clone()
-    for axis in (2, 1, 0):
-        before = here[:, axis].clone()
-        where, way = pierced(here[:, None], corner_n33, axis)
-        here[:, axis] = place_p3[:, axis]
-        ahead = (where > here[:, axis, None]).long() - (where > before[:, None]).long()
-        total += (way * solid_n * ahead).sum(1)
-    return total
+    where, way = pierced(place_p3[:, None], corner_f33)
+    return (way * solid_f * (where > place_p3[:, :1]).long()).sum(1)
 
 
-def pierced(place: Tensor, corner: Tensor, axis: int) -> tuple[Tensor, Tensor]:
-    """Finds where lines along an axis through places pierce triangles. Two triangles at an edge
-    agree on whose side a line passes, and a line through an edge passes as if it were moved aside
-    by nearly nothing, the same way for all: so none slips through.
+def pierced(place: Tensor, corner: Tensor) -> tuple[Tensor, Tensor]:
+    """Finds where lines along x through places pierce triangles. Two triangles at an edge agree on
+    whose side a line passes, and a line through an edge passes as if it were moved aside by nearly
+    nothing, the same way for all: so none slips through.
 
     Args:
         place: (..., 3) places.
         corner: (..., 3, 3) triangles; leading dimensions broadcast.
-        axis: 0, 1 or 2.
 
     Returns:
-        (...) coordinate along the axis; (...) int64: 1 where the triangle's normal points along
-        the axis, -1 where against it, 0 where the line passes beside.
+        (...) x; (...) int64: 1 where the triangle's normal points along x, -1 where against it, 0
+        where the line passes beside.
     """
-    first, second = (axis + 1) % 3, (axis + 2) % 3
-    p, q = place[..., first], place[..., second]
+    y, z = place[..., 1], place[..., 2]
     sides, positive = [], []
     for one, other in ((1, 2), (2, 0), (0, 1)):
         u, v = corner[..., one, :], corner[..., other, :]
-        u0, u1, v0, v1 = u[..., first], u[..., second], v[..., first], v[..., second]
+        u0, u1, v0, v1 = u[..., 1], u[..., 2], v[..., 1], v[..., 2]
         swap = (u0 > v0) | ((u0 == v0) & (u1 > v1))
         a0, b0 = torch.where(swap, v0, u0), torch.where(swap, u0, v0)
         a1, b1 = torch.where(swap, v1, u1), torch.where(swap, u1, v1)
-        area = (b0 - a0) * (q - a1) - (b1 - a1) * (p - a0)
+        area = (b0 - a0) * (z - a1) - (b1 - a1) * (y - a0)
         sides.append(torch.where(swap, -area, area))
         positive.append((area >= 0) != swap)
     total = sides[0] + sides[1] + sides[2]
     same = (positive[0] == positive[1]) & (positive[1] == positive[2]) & (total != 0)
-    height = sides[0] * corner[..., 0, axis] + sides[1] * corner[..., 1, axis]
-    height = height + sides[2] * corner[..., 2, axis]
+    height = sides[0] * corner[..., 0, 0] + sides[1] * corner[..., 1, 0]
+    height = height + sides[2] * corner[..., 2, 0]
     way = torch.where(positive[0], 1, -1) * same
     return height / torch.where(total != 0, total, 1), way
 
 
 def _coverage(
-    gap: Tensor,
-    away: Tensor,
-    winding: Tensor,
-    row: Tensor,
-    solid_n: Tensor,
-    voxel_3: Tensor,
-    thickness: float,
+    gap: Tensor, away: Tensor, winding: Tensor, row: Tensor, solid_f: Tensor, half: Tensor
 ) -> Tensor:
     """Returns (p,) the share of each voxel that is filled, the surface taken as the plane at the
-    nearest place: inside of it, or where the nearest triangle bounds no solid, half of a thickness
-    to either side.
+    nearest place: inside of it, or where the nearest triangle bounds no solid, `half` of a
+    thickness to either side.
     """
-    inside = winding != 0
-    if not len(solid_n):
-        return inside.to(gap.dtype)
-    below = box_share(away, gap, voxel_3)
-    half = 0.5 * thickness
-    layer = box_share(away, gap + half, voxel_3) - box_share(away, gap - half, voxel_3)
-    one = torch.ones_like(gap)
-    outside = torch.where(solid_n[row], one - below, layer)
-    return torch.where(inside, torch.where(solid_n[row], below, one), outside)
+    inside = (winding != 0).to(gap.dtype)
+    near = row >= 0
+    gap = torch.where(near, gap, 0)
+    solid = solid_f[row.clamp(min=0)]
+    below = box_share(away, gap)
+    layer = box_share(away, gap + half) - box_share(away, gap - half)
+    share = torch.where(solid, torch.where(winding != 0, below, 1 - below), layer)
+    share = torch.where(solid | (winding == 0), share, inside)
+    return torch.where(near, share, inside)
 
 
-def box_share(normal_p3: Tensor, offset_p: Tensor, voxel_3: Tensor) -> Tensor:
-    """Returns (p,) the share of a box that lies below a plane, in closed form.
+def box_share(normal_p3: Tensor, offset_p: Tensor) -> Tensor:
+    """Returns (p,) the share of a voxel, a cube of side 1, that lies below a plane, in closed form.
 
     Exact but for planes within `FLAT` of an axis, which are turned by less than that: the formula
     would divide by nothing there. The share is then right to 3e-4.
 
     Args:
         normal_p3: (p, 3) normals of planes, of any length; that of length 0 gives 1/2.
-        offset_p: (p,) how far the plane lies above the box's centre, along the normal.
-        voxel_3: (3,) sides of the box.
+        offset_p: (p,) how far the plane lies above the voxel's centre, along the normal.
     """
     length = sqrt_exact(_dot(normal_p3, normal_p3))
-    size = torch.stack([normal_p3[..., i].abs() * voxel_3[i] for i in range(3)], -1)
+    size = normal_p3.abs()
     sum0 = size[..., 0] + size[..., 1] + size[..., 2]
     least = FLAT * sum0
     x, y, z = (torch.maximum(size[..., i], least) for i in range(3))

@@ -7,31 +7,37 @@
 namespace gvtorch {
 
 GV_OP(VoxelizeOp, "voxelize", GV_VOXELIZE,
-      "(Tensor distance_kzyx, Tensor nearest_kzyx, Tensor winding_kzyx, Tensor coverage_kzyx)");
+      "(Tensor distance_kzyx, Tensor nearest_kzyx, Tensor winding_kzyx, Tensor coverage_kzyx, Tensor weight_kzyx3)");
+
+void voxelize(const Tensor& like, const VoxelizeArgs& args);  // in cpu.cpp and in cuda.cu
 
 inline auto run(const VoxelizeOp& a) {
-  const Like like{a.corner_m33, a.corner_m33.scalar_type()};
-  const int64_t triangles = a.corner_m33.numel() / 9, cubes = a.first_k.numel() - 1, side = a.side;
-  STD_TORCH_CHECK(cubes >= 0 && triangles <= INT32_MAX, "gvtorch: first_k is empty, or too many triangles");
+  const ScalarType real = a.wide ? ScalarType::Double : ScalarType::Float;
+  const Like like{a.corner_f33, real};
+  const int64_t triangles = a.corner_f33.numel() / 9, cubes = a.low_k3.numel() / 3, side = a.side;
+  STD_TORCH_CHECK(triangles >= 1 && triangles <= INT32_MAX / 2, "gvtorch: corner_f33 has no triangles, or too many");
   STD_TORCH_CHECK(side >= 1, "gvtorch: side out of range");
-  Tensor distance_kzyx, nearest_kzyx, winding_kzyx, coverage_kzyx;
-  with_real(a.corner_m33, [&](auto real) {
-    using T = decltype(real);
-    VoxelizeRow<T> args{};
-    GV_VOXELIZE(GV_TAKE)
-    args.triangles = triangles;
-    const auto make = [&](auto*& pointer, ScalarType dtype) {
-      Tensor made = torch::stable::new_empty(a.corner_m33, {cubes, side, side, side}, dtype);
-      pointer = lay(made);
-      return made;
-    };
-    distance_kzyx = make(args.distance_kzyx, like.real);
-    nearest_kzyx = make(args.nearest_kzyx, ScalarType::Int);
-    winding_kzyx = make(args.winding_kzyx, ScalarType::Int);
-    coverage_kzyx = make(args.coverage_kzyx, like.real);
-    for_each(a.corner_m33, cubes * side * side, args);
-  });
-  return std::make_tuple(distance_kzyx, nearest_kzyx, winding_kzyx, coverage_kzyx);
+  VoxelizeArgs args{};
+  int64_t boxes = 0;
+  for (int64_t floor = triangles; args.floors == 0 || args.first[args.floors] - args.first[args.floors - 1] > kArity;
+       floor = (floor + kArity - 1) / kArity) {
+    boxes += floor;
+    args.first[++args.floors] = static_cast<int32_t>(boxes);
+  }
+  GV_VOXELIZE(GV_TAKE)
+  args.triangles = triangles;
+  args.cubes = cubes;
+  const auto make = [&](auto*& pointer, ScalarType dtype) {
+    Tensor made = torch::stable::new_empty(a.corner_f33, {cubes, side, side, side}, dtype);
+    pointer = lay(made);
+    return made;
+  };
+  Tensor distance_kzyx = make(args.distance_kzyx, real), nearest_kzyx = make(args.nearest_kzyx, ScalarType::Int);
+  Tensor winding_kzyx = make(args.winding_kzyx, ScalarType::Int), coverage_kzyx = make(args.coverage_kzyx, real);
+  Tensor weight_kzyx3 = torch::stable::new_empty(a.corner_f33, {a.weights ? cubes : 0, side, side, side, 3}, real);
+  args.weight_kzyx3 = lay(weight_kzyx3);
+  voxelize(a.corner_f33, args);
+  return std::make_tuple(distance_kzyx, nearest_kzyx, winding_kzyx, coverage_kzyx, weight_kzyx3);
 }
 
 using MeshOps = Types<VoxelizeOp>;

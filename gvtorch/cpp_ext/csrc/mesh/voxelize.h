@@ -1,26 +1,47 @@
-// The body of `voxelize`: what cubes of voxels hold of the triangles near them. Twin and sources:
-// ops/reference/voxelize.py, whose order of operations is kept. Coordinates are in voxels, from a cube's low corner.
+// The body of `voxelize`: what cubes of voxels hold of a mesh. Every voxel goes down a hierarchy of boxes by itself, so
+// that nobody makes lists of triangles and nobody waits for their length. Twin and sources: ops/reference/voxelize.py,
+// which looks at all triangles; what is found does not depend on the way. Coordinates are in voxels, from a cube's low
+// corner.
 #pragma once
 
 #include "base/arguments.h"
 #include "base/arithmetic.h"
 
 namespace gvtorch {
-inline namespace GV_NAMESPACE {
 
-constexpr int32_t kMostVoxels = 16;  // along a side of a cube: a row's numbers stay in registers and first cache
+constexpr int32_t kMostVoxels = 32;  // along a side of a cube
+constexpr int32_t kArity = 8;        // boxes in a box
+constexpr int32_t kMostFloors = 12;  // levels of boxes: of 2^33 triangles
+constexpr int32_t kWaiting = (kArity - 1) * kMostFloors + kArity;
 constexpr double kFlat = 1e-3, kTouch = 1e-6;
+constexpr double kCoarse = 2;  // triangles along a side of a voxel from which on each voxel goes down alone
 
-// triangles, cubes
+// triangles, boxes, cubes
 #define GV_VOXELIZE(X)                \
-  X(Reals, corner_m33, 9 * triangles) \
-  X(Flags, solid_m, triangles)        \
-  X(Longs, first_k, cubes + 1)        \
-  X(Reals, start_k3, 3 * cubes)       \
-  X(Words, winding_k, cubes)          \
-  X(Reals, voxel_3, 3)                \
+  X(World, corner_f33, 9 * triangles) \
+  X(Flags, solid_f, triangles)        \
+  X(World, box_n6, 6 * boxes)         \
+  X(World, low_k3, 3 * cubes)         \
+  X(World, size_k3, 3 * cubes)        \
   X(Int, side, kMostVoxels + 1)       \
-  X(Float, thickness, kAny)
+  X(Float, thickness, kAny)           \
+  X(Float, detail, kAny)              \
+  X(Bool, weights, kAny)              \
+  X(Bool, wide, kAny)
+
+#define GV_VIEW_MESH(kind, name, limit) kinds::kind::View name;
+
+// What the kernels get: boxes of floor i begin at first[i], the lowest are those of the triangles.
+struct VoxelizeArgs {
+  GV_VOXELIZE(GV_VIEW_MESH)
+  int64_t triangles, cubes;
+  int32_t first[kMostFloors + 1], floors;
+
+  void *distance_kzyx, *coverage_kzyx, *weight_kzyx3;
+  int32_t *nearest_kzyx, *winding_kzyx;
+};
+
+inline namespace GV_NAMESPACE {
 
 // The voxels of a row that are looked at together: on the CPU a vector of float32, else one.
 #ifdef __CUDACC__
@@ -87,6 +108,28 @@ struct Triangle {
     const F height = inner(minus(place, corner[0]), normal);
     return select(over(place), height * height / length2, best);
   }
+  // Weights of the corners at the nearest place.
+  GV_HD Vec3<T> weight(Vec3<T> place) const {
+    Vec3<T> found{};
+    if (over(place)) {
+      for (int i = 0; i < 3; ++i) found[(i + 2) % 3] = -inner(minus(place, corner[i]), beside[i]) / length2;
+      return found;
+    }
+    int at = 0;
+    T best{};
+    for (int i = 0; i < 3; ++i) {
+      const Vec3<T> from = from_edge(i, place);
+      const T own = inner(from, from);
+      if (i == 0 || own < best) {
+        at = i;
+        best = own;
+      }
+    }
+    const T t = clamp(inner(minus(place, corner[at]), edge[at]) * inverse2[at], T{}, T{} + 1);
+    found[at] = 1 - t;
+    found[(at + 1) % 3] = t;
+    return found;
+  }
   // A vector along which the nearest place lies, of any length and sign.
   GV_HD Vec3<T> away(Vec3<T> place, T gap2) const {
     if (over(place) || gap2 < static_cast<T>(kTouch)) return normal;
@@ -104,42 +147,40 @@ struct Triangle {
   }
 };
 
-// Where a line along an axis pierces a triangle (`at`), and which way its normal points along it; 0: it passes beside.
+// Where a line along x pierces a triangle (`at`), and which way its normal points along it; 0: it passes beside.
 template <class T>
 struct Pierced {
   T at;
   int32_t way;
 };
 template <class T>
-GV_HD Pierced<T> pierced(Vec3<T> place, const Vec3<T>* corner, int axis) {
-  const int first = (axis + 1) % 3, second = (axis + 2) % 3;
+GV_HD Pierced<T> pierced(T y, T z, const Vec3<T>* corner) {
   T side[3];
   bool positive[3];
   for (int i = 0; i < 3; ++i) {
     Vec3<T> u = corner[(i + 1) % 3], v = corner[(i + 2) % 3];
-    const bool swap = u[first] > v[first] || (u[first] == v[first] && u[second] > v[second]);
+    const bool swap = u.y > v.y || (u.y == v.y && u.z > v.z);
     if (swap) {
       const Vec3<T> kept = u;
       u = v;
       v = kept;
     }
-    const T area =
-        (v[first] - u[first]) * (place[second] - u[second]) - (v[second] - u[second]) * (place[first] - u[first]);
+    const T area = (v.y - u.y) * (z - u.z) - (v.z - u.z) * (y - u.y);
     side[i] = swap ? -area : area;
     positive[i] = (area >= 0) != swap;
   }
   const T total = side[0] + side[1] + side[2];
   if (positive[0] != positive[1] || positive[1] != positive[2] || total == 0) return {0, 0};
-  const T height = side[0] * corner[0][axis] + side[1] * corner[1][axis] + side[2] * corner[2][axis];
+  const T height = side[0] * corner[0].x + side[1] * corner[1].x + side[2] * corner[2].x;
   return {height / total, positive[0] ? 1 : -1};
 }
 
-// The share of a box below a plane. Scardovelli and Zaleski 2000.
+// The share of a voxel below a plane. Scardovelli and Zaleski 2000.
 template <class T>
-GV_HD T box_share(Vec3<T> normal, T offset, Vec3<T> voxel) {
+GV_HD T box_share(Vec3<T> normal, T offset) {
   const T length = square_root(inner(normal, normal));
-  const T x0 = (normal.x < 0 ? -normal.x : normal.x) * voxel.x, y0 = (normal.y < 0 ? -normal.y : normal.y) * voxel.y,
-          z0 = (normal.z < 0 ? -normal.z : normal.z) * voxel.z;
+  const T x0 = normal.x < 0 ? -normal.x : normal.x, y0 = normal.y < 0 ? -normal.y : normal.y,
+          z0 = normal.z < 0 ? -normal.z : normal.z;
   const T least = static_cast<T>(kFlat) * (x0 + y0 + z0);
   const T x = larger(x0, least), y = larger(y0, least), z = larger(z0, least);
   const T low = smaller(x, y), high = larger(x, y), rest = smaller(high, z);
@@ -171,94 +212,206 @@ GV_HD T box_share(Vec3<T> normal, T offset, Vec3<T> voxel) {
   return clamp(share, static_cast<T>(0), static_cast<T>(1));
 }
 
-// An index is a row of voxels along x.
+// The boxes that are still to be looked at.
 template <class T>
-struct VoxelizeRow {
-  const T* corner_m33;
-  const bool* solid_m;
-  const int64_t* first_k;
-  const T* start_k3;
-  const int32_t* winding_k;
-  const T* voxel_3;
-  int32_t side;
-  double thickness;
-  int64_t triangles;
+struct Waiting {
+  int32_t box[kWaiting], floor[kWaiting];
+  T gap2[kWaiting];
+  int32_t count = 0;
 
-  T *distance_kzyx, *coverage_kzyx;
-  int32_t *nearest_kzyx, *winding_kzyx;
+  GV_HD void push(int32_t own, int32_t at, T gap) {
+    box[count] = own;
+    floor[count] = at;
+    gap2[count] = gap;
+    ++count;
+  }
+};
 
-  GV_HD void operator()(int64_t row) const {
-    const int64_t cube = row / (side * side);
-    const Vec3<T> voxel{voxel_3[0], voxel_3[1], voxel_3[2]};
+// An index is as many voxels of a row along x as are looked at together. T: in which it is computed.
+template <class T>
+struct VoxelizePack {
+  VoxelizeArgs a;
+
+  static constexpr T kMargin = static_cast<T>(sizeof(T) == 4 ? 1e-2 : 1e-9);  // more than rounding moves a triangle
+  static constexpr int32_t kPack = kTogether<T>;
+
+  struct Cube {
+    double low[3], inverse;
+    T step, reach;
+
+    GV_HD T local(double value, int axis) const { return static_cast<T>((value - low[axis]) * inverse); }
+  };
+
+  GV_HD int32_t packs() const { return (a.side + kPack - 1) / kPack; }
+
+  GV_HD void operator()(int64_t index) const {
+    const int64_t row = index / packs(), cube = row / (a.side * a.side);
+    const int32_t begin = static_cast<int32_t>(index % packs()) * kPack;
+    const int32_t end = begin + kPack < a.side ? begin + kPack : a.side;
+    const double voxel = a.size_k3[3 * cube];
+    if (!(voxel > 0)) {
+      for (int32_t i = begin; i < end; ++i) write(row * a.side + i, {}, infinite(), -1, 0);
+      return;
+    }
+    const double inverse = 1 / voxel;
+    const Cube own{{a.low_k3[3 * cube], a.low_k3[3 * cube + 1], a.low_k3[3 * cube + 2]},
+                   inverse,
+                   static_cast<T>(a.size_k3[3 * cube + 1] * inverse),
+                   static_cast<T>(a.size_k3[3 * cube + 2] * inverse)};
     const auto half = static_cast<T>(0.5);
-    const T y = (static_cast<T>(row % side) + half) * voxel.y;
-    const T z = (static_cast<T>(row / side % side) + half) * voxel.z;
-    const Vec3<T> start{start_k3[3 * cube], start_k3[3 * cube + 1], start_k3[3 * cube + 2]};
-    using F = Together<T>;
+    const T y = static_cast<T>(row % a.side) * own.step + half,
+            z = static_cast<T>(row / a.side % a.side) * own.step + half;
+    int32_t winding[kPack] = {};
+    wind(own, begin, end, y, z, winding);
+    if (kPack == 1 || voxel > kCoarse * a.detail) {
+      for (int32_t i = begin; i < end; ++i) look<T>(own, row, i, i + 1, y, z, winding + (i - begin));
+    } else {
+      look<Together<T>>(own, row, begin, end, y, z, winding);
+    }
+  }
+
+  static GV_HD T infinite() { return static_cast<T>(bit_cast<float>(0x7f800000)); }
+  static GV_HD T place(const Cube& cube, int32_t i) { return static_cast<T>(i) * cube.step + static_cast<T>(0.5); }
+
+  GV_HD Triangle<T> triangle(const Cube& cube, int64_t number) const {
+    T at[9];
+    for (int i = 0; i < 9; ++i) at[i] = cube.local(a.corner_f33[9 * number + i], i % 3);
+    return Triangle<T>(at);
+  }
+  // How far a box is from a place along an axis, 0 in it.
+  GV_HD T beside(const Cube& cube, int64_t box, int axis, T low, T high) const {
+    const T below = cube.local(a.box_n6[6 * box + axis], axis) - high;
+    const T above = low - cube.local(a.box_n6[6 * box + 3 + axis], axis);
+    return larger(larger(below, above), static_cast<T>(0));
+  }
+
+  // Calls meet(triangle) for all triangles whose boxes are as near as `gap2(box)` says and `most()` allows, those of
+  // nearer boxes first.
+  template <class Gap, class Most, class Meet>
+  GV_HD void descend(const Gap& gap2, const Most& most, const Meet& meet) const {
+    Waiting<T> waiting;
+    int32_t floor = a.floors, from = 0, to = a.first[a.floors] - a.first[a.floors - 1];
+    while (true) {
+      --floor;  // the boxes from..to of this floor
+      const int32_t before = waiting.count;
+      for (int32_t box = from; box < to; ++box) {
+        const T gap = gap2(a.first[floor] + box);
+        if (!(gap <= most())) continue;
+        int32_t at = waiting.count;  // the nearest of them lies on top
+        waiting.push(box, floor, gap);
+        for (; at > before && waiting.gap2[at - 1] < gap; --at) {
+          waiting.box[at] = waiting.box[at - 1];
+          waiting.gap2[at] = waiting.gap2[at - 1];
+        }
+        waiting.box[at] = box;
+        waiting.gap2[at] = gap;
+      }
+      bool found = false;
+      while (waiting.count > 0 && !found) {
+        const int32_t top = --waiting.count;
+        if (!(waiting.gap2[top] <= most())) continue;
+        if (waiting.floor[top] == 0) {
+          meet(waiting.box[top]);
+          continue;
+        }
+        floor = waiting.floor[top];
+        from = waiting.box[top] * kArity;
+        const int32_t there = a.first[floor] - a.first[floor - 1];
+        to = from + kArity < there ? from + kArity : there;
+        found = true;
+      }
+      if (!found) return;
+    }
+  }
+
+  // Winding numbers of the voxels begin..end of a row: triangles ahead along x, those whose normals point ahead as 1.
+  GV_HD void wind(const Cube& cube, int32_t begin, int32_t end, T y, T z, int32_t* winding) const {
+    const T x = place(cube, begin);
+    descend(
+        [&](int64_t box) {
+          const T ahead = cube.local(a.box_n6[6 * box + 3], 0);
+          const bool passed =
+              !(ahead >= x - kMargin) || beside(cube, box, 1, y, y) > kMargin || beside(cube, box, 2, z, z) > kMargin;
+          return static_cast<T>(passed ? 1 : 0);
+        },
+        [] { return static_cast<T>(0); },
+        [&](int64_t number) {
+          if (!a.solid_f[number]) return;
+          Vec3<T> corner[3];
+          for (int i = 0; i < 9; ++i) corner[i / 3][i % 3] = cube.local(a.corner_f33[9 * number + i], i % 3);
+          const Pierced<T> along = pierced(y, z, corner);
+          for (int32_t i = begin; i < end; ++i) winding[i - begin] += along.way * (along.at > place(cube, i));
+        });
+  }
+
+  // Finds the nearest triangles of voxels begin..end of a row together, and writes what they hold.
+  template <class F>
+  GV_HD void look(const Cube& cube, int64_t row, int32_t begin, int32_t end, T y, T z, const int32_t* winding) const {
     using I = typename LanesOf<F>::Int;
-    constexpr int32_t kMostPacks = kMostVoxels / kTogether<T>;
-    const int32_t packs = (side + kTogether<T> - 1) / kTogether<T>;
-    F place[kMostPacks], best[kMostPacks];
-    I found[kMostPacks];
-    int32_t count[kMostVoxels];
-    for (int32_t pack = 0; pack < packs; ++pack) {
-      best[pack] = F{} + bit_cast<float>(0x7f800000);
-      found[pack] = I{} - 1;
-      for (int32_t lane = 0; lane < kTogether<T>; ++lane) {
-        set_lane(place[pack], lane, (static_cast<T>(pack * kTogether<T> + lane) + half) * voxel.x);
-      }
+    constexpr int32_t kOwn = static_cast<int32_t>(sizeof(F) / sizeof(T));
+    F x{}, best{};
+    I found = I{} - 1;
+    for (int32_t lane = 0; lane < kOwn; ++lane) {  // those behind the row's end are as its last
+      set_lane(x, lane, place(cube, begin + lane < end ? begin + lane : end - 1));
+      set_lane(best, lane, cube.reach * cube.reach);
     }
-    for (int32_t i = 0; i < side; ++i) count[i] = winding_k[cube];
-    // Lists that would lead out of the triangles are cut.
-    const int64_t begin = clamp<int64_t>(first_k[cube], 0, triangles);
-    const int64_t end = clamp<int64_t>(first_k[cube + 1], 0, triangles);
-    for (int64_t m = begin; m < end; ++m) {
-      const Triangle<T> triangle(corner_m33 + 9 * m);
-      for (int32_t pack = 0; pack < packs; ++pack) {
-        const F gap2 = triangle.gap2(Vec3<F>{place[pack], F{} + y, F{} + z});
-        const auto nearer = gap2 < best[pack];
-        found[pack] = select(nearer, I{} + static_cast<int32_t>(m), found[pack]);
-        best[pack] = select(nearer, gap2, best[pack]);
+    const T low = place(cube, begin), high = place(cube, end - 1);
+    T limit = cube.reach + kMargin, limit2 = cube.reach >= 0 ? limit * limit : static_cast<T>(-1);
+    descend(
+        [&](int64_t box) {
+          const T gx = beside(cube, box, 0, low, high), gy = beside(cube, box, 1, y, y),
+                  gz = beside(cube, box, 2, z, z);
+          return gx * gx + gy * gy + gz * gz;
+        },
+        [&] { return limit2; },
+        [&](int64_t number) {
+          const auto own = I{} + static_cast<int32_t>(number);
+          const F gap2 = triangle(cube, number).gap2(Vec3<F>{x, F{} + y, F{} + z});
+          const auto nearer = gap2 < best || (gap2 == best && (found < 0 || own < found));
+          if (!any(nearer)) return;
+          found = select(nearer, own, found);
+          best = select(nearer, gap2, best);
+          T worst = lane_of(best, 0);
+          for (int32_t lane = 1; lane < kOwn; ++lane) worst = larger(worst, lane_of(best, lane));
+          limit = square_root(worst) + kMargin;
+          limit2 = limit * limit;
+        });
+    for (int32_t i = begin; i < end; ++i) {
+      const int32_t nearest = lane_of(found, i - begin);
+      const T gap2 = nearest < 0 ? infinite() : lane_of(best, i - begin);
+      const int64_t at = row * a.side + i;
+      if (nearest < 0) {
+        write(at, {}, gap2, nearest, winding[i - begin]);
+      } else {
+        const Triangle<T> own = triangle(cube, nearest);
+        const Vec3<T> here{lane_of(x, i - begin), y, z};
+        write(at, here, gap2, nearest, winding[i - begin], &own, cube.inverse);
       }
-      if (solid_m[m]) cross(triangle.corner, start, voxel.x, y, z, count);
-    }
-    for (int32_t i = 0; i < side; ++i) {
-      const int64_t at = row * side + i;
-      const int32_t pack = i / kTogether<T>, lane = i % kTogether<T>;
-      const T gap2 = lane_of(best[pack], lane);
-      const int32_t nearest = lane_of(found[pack], lane);
-      distance_kzyx[at] = square_root(gap2);
-      nearest_kzyx[at] = nearest;
-      winding_kzyx[at] = count[i];
-      coverage_kzyx[at] = coverage({lane_of(place[pack], lane), y, z}, gap2, nearest, count[i], voxel);
     }
   }
 
-  // Adds by how much a triangle makes the winding numbers of a row larger than that at the start.
-  GV_HD void cross(const Vec3<T>* corner, Vec3<T> start, T step, T y, T z, int32_t* count) const {
-    const Pierced<T> up = pierced(start, corner, 2);
-    const Pierced<T> across = pierced({start.x, start.y, z}, corner, 1);
-    const Pierced<T> along = pierced({start.x, y, z}, corner, 0);
-    const int32_t before = up.way * ((up.at > z) - (up.at > start.z)) +
-                           across.way * ((across.at > y) - (across.at > start.y)) - along.way * (along.at > start.x);
-    if (before == 0 && along.way == 0) return;
-    for (int32_t i = 0; i < side; ++i) {
-      count[i] += before + along.way * (along.at > (static_cast<T>(i) + static_cast<T>(0.5)) * step);
+  GV_HD void write(int64_t at, Vec3<T> here, T gap2, int32_t nearest, int32_t winding,
+                   const Triangle<T>* triangle = nullptr, double inverse = 0) const {
+    const T gap = square_root(gap2), full = winding != 0 ? 1 : 0;
+    static_cast<T*>(a.distance_kzyx)[at] = gap;
+    a.nearest_kzyx[at] = nearest;
+    a.winding_kzyx[at] = winding;
+    T share = full;
+    Vec3<T> weight{};
+    if (triangle != nullptr) {
+      const Vec3<T> away = triangle->away(here, gap2);
+      const T half = static_cast<T>(0.5 * a.thickness * inverse);
+      if (a.solid_f[nearest]) {
+        const T below = box_share(away, gap);
+        share = winding != 0 ? below : 1 - below;
+      } else if (winding == 0) {
+        share = box_share(away, gap + half) - box_share(away, gap - half);
+      }
+      if (a.weights) weight = triangle->weight(here);
     }
-  }
-
-  GV_HD T coverage(Vec3<T> place, T gap2, int32_t nearest, int32_t winding, Vec3<T> voxel) const {
-    const T full = winding != 0 ? 1 : 0;
-    if (nearest < 0) return full;
-    const Triangle<T> triangle(corner_m33 + 9 * static_cast<int64_t>(nearest));
-    const Vec3<T> away = triangle.away(place, gap2);
-    const T gap = square_root(gap2);
-    if (solid_m[nearest]) {
-      const T below = box_share(away, gap, voxel);
-      return winding != 0 ? below : 1 - below;
-    }
-    const T half = static_cast<T>(0.5 * thickness);
-    return winding != 0 ? full : box_share(away, gap + half, voxel) - box_share(away, gap - half, voxel);
+    static_cast<T*>(a.coverage_kzyx)[at] = share;
+    if (!a.weights) return;
+    for (int i = 0; i < 3; ++i) static_cast<T*>(a.weight_kzyx3)[3 * at + i] = weight[i];
   }
 };
 

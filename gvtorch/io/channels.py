@@ -1,0 +1,137 @@
+"""Stores of several channels: images of one grid, each of a dtype of its own, side by side in one
+folder, as OME-Zarr lays several images (`bioformats2raw.layout`).
+
+    STORE.zarr/zarr.json      names the channels; written last
+    STORE.zarr/OME/zarr.json  names them for other readers
+    STORE.zarr/NAME/ ...      a store for each, see store_layout.py
+    STORE.zarr/.gvtorch-work  only while it is made: what it was begun with
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ..base.stage import Progress, no_progress
+from . import unfinished
+from .conversion import convert
+from .ngff import SEVERAL, parse_json, read_json
+from .source import VolumeSource
+from .store import Store
+from .store_layout import WORK, Deadline, kvstore
+
+_TIMEOUT = 20.0  # seconds
+
+
+def channel_names(location: str | Path) -> tuple[str, ...]:
+    """Returns the channels of a store of several; () of any other place.
+
+    Raises:
+        ValueError: The metadata is damaged.
+        OSError: It can't be read.
+    """
+    where = str(location)
+    content = read_json(where, kvstore(location), "zarr.json", Deadline(_TIMEOUT)) or {}
+    attributes = content.get("attributes")
+    named = attributes.get(SEVERAL) if isinstance(attributes, dict) else None
+    if named is None:
+        return ()
+    if not isinstance(named, list) or not named or not all(_plain(name) for name in named):
+        raise ValueError(f"{where}: damaged: {SEVERAL} is {named!r}")
+    return tuple(named)
+
+
+def convert_channels(
+    sources: Mapping[str, VolumeSource],
+    store: str | Path,
+    *,
+    resume: bool = False,
+    progress: Progress = no_progress,
+    **told: Any,
+) -> Store:
+    """Writes a store of several channels, one after the other.
+
+    Args:
+        sources: By name, of letters, digits, "-" and "_"; all of one extent, spacing and origin.
+        store: The folder to make.
+        resume: Go on with a half-written one.
+        progress: Told ("converting", bytes done, bytes in all) of all channels together.
+        **told: block, executor and workers, as of `convert`.
+
+    Returns:
+        The store of the first channel, open; `Store.open(store, image=NAME)` opens another.
+
+    Raises:
+        ValueError: The sources have different grids, a name does not do, or `resume` finds a store
+            of other channels.
+        FileExistsError, OSError, KeyboardInterrupt: As of `convert`.
+    """
+    target = Path(store)
+    _check(sources)
+    begun = _begun(target, resume)
+    target.mkdir(exist_ok=True)
+    (target / WORK).mkdir(exist_ok=True)
+    manifest = target / WORK / "channels.json"
+    marks = json.loads(json.dumps({name: one.fingerprint() for name, one in sources.items()}))
+    if begun and parse_json(str(manifest), manifest.read_bytes()) != {"sources": marks}:
+        raise ValueError(
+            f"{target}: was begun with another source, other channels or other settings; remove "
+            "the store to begin again"
+        )
+    unfinished.write_json(manifest, {"sources": marks})
+    total, before = sum(one.nbytes for one in sources.values()), 0
+    for name, source in sources.items():
+        if not (target / name / "zarr.json").exists():
+            half = (target / name / WORK / "manifest.json").exists()
+            if not half:
+                shutil.rmtree(target / name, ignore_errors=True)
+            share = _share(progress, before, source.nbytes, total)
+            convert(source, target / name, resume=half, progress=share, **told)
+        before += source.nbytes
+        progress("converting", before, total)
+    (target / "OME").mkdir(exist_ok=True)
+    series = {"ome": {"version": "0.5", "series": [*sources]}}
+    unfinished.write_json(target / "OME" / "zarr.json", unfinished.group(series))
+    root = {"ome": {"version": "0.5", "bioformats2raw.layout": 3}, SEVERAL: [*sources]}
+    unfinished.write_json(target / "zarr.json", unfinished.group(root))
+    shutil.rmtree(target / WORK, ignore_errors=True)
+    return Store.open(target)
+
+
+def _share(progress: Progress, before: int, own: int, total: int) -> Progress:
+    """Tells what one channel adds to those before it."""
+
+    def tell(stage: str, done: int, of: int) -> None:
+        progress(stage, before + own * done // max(of, 1), total)
+
+    return tell
+
+
+def _check(sources: Mapping[str, VolumeSource]) -> None:
+    grids = {(one.extent, one.spacing, one.origin) for one in sources.values()}
+    if len(grids) != 1:
+        raise ValueError(f"a store's channels must be of one grid, got {len(grids)}")
+    for name in sources:
+        if not _plain(name):
+            raise ValueError(f"a channel's name is made of letters, digits, - and _, got {name!r}")
+
+
+def _plain(name: Any) -> bool:
+    return isinstance(name, str) and re.fullmatch(r"[\w-]{1,64}", name, re.ASCII) is not None
+
+
+def _begun(target: Path, resume: bool) -> bool:
+    """Returns whether there is a half-written store to go on with; raises as `is_begun`."""
+    if not (target / WORK / "channels.json").exists():
+        return unfinished.is_begun(target, resume=False)
+    if (target / "zarr.json").exists():
+        raise FileExistsError(f"{target}: there is a store already; remove it or choose a new name")
+    if not resume:
+        raise FileExistsError(
+            f"{target}: half-written; --resume (resume=True) goes on with it, or remove it"
+        )
+    return True

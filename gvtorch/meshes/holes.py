@@ -1,0 +1,230 @@
+"""Holes of meshes: where they are, and `filled`, which closes them along the surface on which the
+generalised winding number is one half; then all else takes the mesh as the solid that it bounds.
+
+Source: Jacobson, Kavan, Sorkine-Hornung, "Robust inside-outside segmentation using generalized
+    winding numbers", SIGGRAPH 2013, section 3 (that surface closes what is open).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+
+from .mesh import Mesh, edges_of, parts_of, solids, welded
+from .winding import WindingNumber
+
+Solid = Literal["auto", "always", "never"]  # which parts are solids: closed ones, filled ones, none
+
+_RINGS = 4  # of triangles between a hole's rim and its middle
+_STEPS = 12  # of the bisection
+_FEW = 0.02  # edges of holes for each triangle, up to which a part is nearly closed
+_FLAT = 1e-3  # volume of a part, over its area^(3/2), below which it encloses nothing
+
+
+@dataclass(frozen=True)
+class Rim:
+    """A hole's rim: corners of triangles, one after another around it, such that the hole lies to
+    their left seen from outside.
+    """
+
+    part: int  # the part that it belongs to, by one of its triangles
+    face: np.ndarray  # (n,) the triangle along each edge
+    corner: np.ndarray  # (n,) the corner of it at which the rim's edge begins
+
+
+def rims(mesh: Mesh) -> tuple[list[Rim], np.ndarray]:
+    """Returns the rims of all holes of what is open; and (f,) of each triangle its part, -1 where
+    it is left out (see `solids`).
+    """
+    kept, _ = solids(mesh)
+    faces = welded(mesh)[kept]
+    edge, begin, end, balance = edges_of(faces)
+    face = np.repeat(np.arange(len(faces)), 3)
+    part = np.full(len(mesh.faces), -1)
+    own = parts_of(face, edge, len(faces), int(edge.max()) + 1)
+    part[kept] = kept[own]
+    # An edge that is gone along once too often is gone back along the rim; of several triangles
+    # at one edge those are taken that came first.
+    spare = np.abs(balance)[edge]
+    ahead = np.sign(balance)[edge] == np.where(begin < end, 1, -1)
+    order = np.lexsort((np.arange(len(edge)), edge))
+    some = order[(spare > 0)[order] & ahead[order]]
+    rank = np.arange(len(some)) - np.searchsorted(edge[some], edge[some])
+    some = some[rank < spare[some]]
+    found = []
+    for loop in _loops(end[some], begin[some]):
+        at = some[loop]
+        found.append(Rim(int(part[kept[face[at[0]]]]), kept[face[at]], (at + 1) % 3))
+    return found, part
+
+
+def _loops(begin: np.ndarray, end: np.ndarray) -> list[np.ndarray]:
+    """Splits edges, of which as many end in each vertex as begin there, into loops that pass no
+    vertex twice: (n,) edges each, in order.
+    """
+    leaving: dict[int, list[int]] = {}
+    for number, vertex in enumerate(begin.tolist()):
+        leaving.setdefault(vertex, []).append(number)
+    ends, begins = end.tolist(), begin.tolist()
+    found = []
+    for vertex in list(leaving):
+        while leaving[vertex]:
+            path: list[int] = []
+            seen = {vertex: 0}
+            here = vertex
+            while True:
+                number = leaving[here].pop()
+                path.append(number)
+                here = ends[number]
+                if here in seen:
+                    loop = path[seen[here] :]
+                    found.append(np.array(loop))
+                    del path[seen[here] :]
+                    for one in loop[1:]:
+                        seen.pop(begins[one], None)
+                    if not path:
+                        break
+                else:
+                    seen[here] = len(path)
+    return found
+
+
+def told_of_holes(mesh: Mesh) -> str:
+    """Returns a line where parts of a mesh are nearly closed, else nothing."""
+    kept, solid = solids(mesh)
+    if solid.all():
+        return ""
+    found, part = rims(mesh)
+    count = np.bincount(part[kept], minlength=len(mesh.faces))
+    edges = np.bincount(
+        [one.part for one in found], [len(one.face) for one in found], len(mesh.faces)
+    )
+    nearly = np.flatnonzero((edges > 0) & (edges <= _FEW * count))
+    holes = sum(one.part in nearly for one in found)
+    if not holes:
+        return ""
+    return (
+        f"{mesh.name}: {holes} holes of {int(edges[nearly].sum())} edges leave {len(nearly)} parts "
+        'open: they become sheets; solid="always" (--solid always) fills them'
+    )
+
+
+def check_solid(where: str, solid: str) -> None:
+    """Raises ValueError unless it is a `Solid`."""
+    known = get_args(Solid)
+    if solid not in known:
+        raise ValueError(f"{where}: solid must be one of {', '.join(known)}, got {solid!r}")
+
+
+def prepared(mesh: Mesh, solid: Solid) -> Mesh:
+    """Returns what is made into voxels."""
+    return filled(mesh) if solid == "always" else mesh
+
+
+def filled(mesh: Mesh) -> Mesh:
+    """Returns the mesh with its holes closed. What encloses nothing even then, such as a leaf,
+    stays as it is.
+    """
+    found, part = rims(mesh)
+    if not found:
+        return mesh
+    opened = np.isin(part, [one.part for one in found])
+    winding = WindingNumber(torch.from_numpy(mesh.corners[opened]))
+    caps = [(one.part, _cap(mesh, one, winding)) for one in found]
+    a, b, c = mesh.corners.transpose(1, 0, 2)
+    cross = np.cross(b - a, c - a)
+    area = np.bincount(part[opened], 0.5 * np.linalg.norm(cross[opened], axis=1), len(part))
+    volume = np.zeros(len(part))
+    for owner in {one.part for one in found}:
+        corners = np.concatenate(
+            [mesh.corners[part == owner], *(cap.corners for other, cap in caps if other == owner)]
+        )
+        corners = corners - corners.mean((0, 1))
+        volume[owner] = (corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    round_enough = np.abs(volume) > _FLAT * area**1.5
+    return _joined(mesh, [cap for owner, cap in caps if round_enough[owner]])
+
+
+def _cap(mesh: Mesh, rim: Rim, winding: WindingNumber) -> Mesh:
+    """Triangles that close a hole: rings from its rim to its middle, moved along the rim's normal
+    to where the winding number is one half.
+    """
+    assert mesh.material is not None
+    around, n = np.arange(len(rim.face)), len(rim.face)
+    place = mesh.vertices[mesh.faces[rim.face, rim.corner]]
+    middle = place.mean(0)
+    arm = place - middle
+    normal = np.cross(arm, np.roll(arm, -1, 0)).sum(0)
+    size = np.linalg.norm(normal)
+    share = np.arange(1, _RINGS + 1)[:, None, None] / _RINGS  # 0 at the rim
+    inner = middle + arm * (1 - share[:-1])
+    points = np.concatenate((inner.reshape(-1, 3), middle[None]))
+    if size > 0:
+        points = _on_half(points, normal / size, np.linalg.norm(arm, axis=1).mean(), winding)
+    points = np.concatenate((place, points))
+    ring = np.arange(_RINGS * n).reshape(_RINGS, n)
+    ring = np.concatenate((ring, np.full((1, n), _RINGS * n)))
+    a, b = ring[:-1], np.roll(ring[:-1], -1, 1)
+    c, d = np.roll(ring[1:], -1, 1), ring[1:]
+    faces = np.concatenate((np.stack((a, b, c), -1)[:-1], np.stack((a, c, d), -1)[:-1]))
+    last = np.stack((a[-1], b[-1], d[-1]), -1)
+    faces = np.concatenate((faces.reshape(-1, 3), last))
+
+    def spread(values: np.ndarray | None) -> np.ndarray | None:
+        """Of each corner what the rim has, in the middle its mean."""
+        if values is None:
+            return None
+        own = values[rim.face, rim.corner]
+        mean = own.mean(0)
+        rings = mean + (own - mean) * (1 - np.arange(_RINGS)[:, None, None] / _RINGS)
+        return np.concatenate((rings.reshape(-1, own.shape[1]), mean[None]))[faces]
+
+    owner = np.concatenate((np.tile(around, 2 * (_RINGS - 1)), around))
+    return Mesh(
+        vertices=points,
+        faces=faces,
+        color=spread(mesh.color),
+        uv=spread(mesh.uv),
+        material=mesh.material[rim.face][owner],
+        materials=mesh.materials,
+        name=mesh.name,
+    )
+
+
+def _on_half(
+    points: np.ndarray, normal: np.ndarray, reach: float, winding: WindingNumber
+) -> np.ndarray:
+    """Moves points (p, 3) along a normal to where the winding number is +-1/2, no farther than a
+    reach; those that have no such place near them stay.
+    """
+    place, way = torch.from_numpy(points), torch.from_numpy(normal)
+
+    def more(t: torch.Tensor) -> torch.Tensor:
+        return winding(place + t[:, None] * way).abs() > 0.5
+
+    low = torch.full_like(place[:, 0], -reach)
+    high, inside = -low, more(low)
+    crosses = inside != more(high)
+    for _ in range(_STEPS):
+        middle = 0.5 * (low + high)
+        same = more(middle) == inside
+        low, high = torch.where(same, middle, low), torch.where(same, high, middle)
+    moved = torch.where(crosses, 0.5 * (low + high), 0)
+    return (place + moved[:, None] * way).numpy()
+
+
+def _joined(mesh: Mesh, caps: list[Mesh]) -> Mesh:
+    """The mesh and its caps as one."""
+    every = [mesh, *caps]
+    first = np.cumsum([0, *(len(one.vertices) for one in every)])
+
+    def all_of(name: str) -> np.ndarray | None:
+        own = [getattr(one, name) for one in every]
+        return None if own[0] is None else np.concatenate(own)
+
+    faces = [one.faces + start for one, start in zip(every, first, strict=False)]
+    told: dict[str, Any] = {name: all_of(name) for name in ("vertices", "color", "uv", "material")}
+    return replace(mesh, faces=np.concatenate(faces), **told)

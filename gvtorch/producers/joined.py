@@ -1,0 +1,218 @@
+"""`JoinedProducer`: the channels of several producers of one grid, as one; `StoredChannels`: those
+of a store of several channels.
+"""
+
+from __future__ import annotations
+
+import functools
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from ..io.channels import channel_names
+from ..io.store import Store
+from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
+from .stored import StoredProducer
+
+
+class JoinedProducer(Producer):
+    """Asks several producers for the same nodes; each gives one channel, under a name of its own.
+
+    A node is EMPTY where all say so, and CONSTANT where none has voxels for it.
+
+    Attributes:
+        producers: By the name of its channel.
+    """
+
+    def __init__(self, producers: Mapping[str, Producer]) -> None:
+        """Takes producers of one channel each.
+
+        Args:
+            producers: By the name that the channel of each gets.
+
+        Raises:
+            ValueError: One has several channels, or they differ in extent, place or branching.
+        """
+        where = type(self).__name__
+        if not producers:
+            raise ValueError(f"{where}: producers must hold at least one")
+        channels, ranges, labels = dict[str, Any](), dict[str, Any](), dict[str, Any]()
+        for name, one in producers.items():
+            check.instance(where, f"producers[{name!r}]", one, Producer)
+            if len(one.channels) != 1:
+                known = ", ".join(one.channels)
+                raise ValueError(
+                    f"{where}: each producer must have one channel, {name!r} has {known}"
+                )
+            ((own, channel),) = one.channels.items()
+            channels[name] = channel
+            ranges |= {name: one.value_range[own]} if own in one.value_range else {}
+            labels |= {name: one.labels[own]} if own in one.labels else {}
+        first = next(iter(producers.values()))
+        for name, one in producers.items():
+            for what in ("extent", "spacing", "origin", "branching"):
+                if getattr(one, what) != getattr(first, what):
+                    raise ValueError(
+                        f"{where}: {what} of {name!r} is {getattr(one, what)}, that of the first "
+                        f"{getattr(first, what)}"
+                    )
+        super().__init__(
+            first.extent,
+            channels=channels,
+            spacing=first.spacing,
+            origin=first.origin,
+            branching=first.branching,
+            value_range=ranges,
+            labels=labels,
+        )
+        self.producers = torch.nn.ModuleDict(producers)
+        self.on_host = all(one.on_host for one in producers.values())
+        waits = [one.patience for one in producers.values() if one.patience is not None]
+        self.patience = max(waits) if waits else None
+
+    def _each(self) -> dict[str, Producer]:
+        return {name: one for name, one in self.producers.items() if isinstance(one, Producer)}
+
+    def prepare(self, layout: Layout) -> None:
+        """Prepares all."""
+        for one in self._each().values():
+            one.prepare(layout)
+
+    def classify(self, nodes: Nodes) -> Regions | Future:
+        """Asks all."""
+        answers = {name: one.classify(nodes) for name, one in self._each().items()}
+        return _when_all(answers, functools.partial(_joined_regions, nodes, self._each()))
+
+    def fill(self, nodes: Nodes) -> Bricks | Future:
+        """Asks all."""
+        answers = {name: one.fill(nodes) for name, one in self._each().items()}
+        return _when_all(answers, functools.partial(_joined_bricks, self._each()))
+
+    def close(self) -> None:
+        """Closes all."""
+        for one in self._each().values():
+            one.close()
+
+
+class StoredChannels(JoinedProducer):
+    """Streams the channels of a store that `gvtorch voxelize` made with several of them."""
+
+    def __init__(
+        self,
+        store: str | Path,
+        channels: Sequence[str] | None = None,
+        *,
+        host_cache: int | str = "512 MB",
+        timeout: float = 30.0,
+        workers: int = 4,
+    ) -> None:
+        """Opens the store.
+
+        Args:
+            store: A folder or a URL.
+            channels: Which of them; None takes all.
+            host_cache: Most bytes of decoded blocks kept in host memory, of all together.
+            timeout: As of `StoredProducer`.
+            workers: Number of threads that read a channel.
+
+        Raises:
+            ValueError: It has no such channel, or is no store of several; or see `StoredProducer`.
+            OSError: It can't be read.
+        """
+        known = channel_names(store)
+        if not known:
+            raise ValueError(f"{store}: is no store of several channels: take StoredProducer")
+        names = known if channels is None else tuple(channels)
+        for name in names:
+            if name not in known:
+                raise ValueError(f"{store}: has no channel {name!r}; there are {', '.join(known)}")
+        limit = check.nbytes("StoredChannels", "host_cache", host_cache) // max(len(names), 1)
+        told: dict[str, Any] = {"host_cache": limit, "timeout": timeout, "workers": workers}
+        super().__init__(
+            {name: StoredProducer(Store.open(store, image=name), **told) for name in names}
+        )
+
+
+def _when_all(answers: Mapping[str, Any], join: Callable[[Mapping[str, Any]], Any]) -> Any:
+    """Joins answers, once all are there if some come later."""
+    late = [one for one in answers.values() if isinstance(one, Future)]
+    if not late:
+        return join(answers)
+    found: Future = Future()
+    found.set_running_or_notify_cancel()
+    left, lock = len(late), threading.Lock()
+
+    def arrived(_: Future) -> None:
+        nonlocal left
+        with lock:
+            left -= 1
+            if left:
+                return
+        try:
+            found.set_result(
+                join({n: a.result() if isinstance(a, Future) else a for n, a in answers.items()})
+            )
+        except BaseException as error:  # a read that failed or was cancelled
+            found.set_exception(error)
+
+    for one in late:
+        one.add_done_callback(arrived)
+    return found
+
+
+def _joined_kinds(kinds: Sequence[Tensor | None], count: int) -> Tensor:
+    """(k,) of regions that hold for all."""
+    data = torch.full((count,), int(Region.DATA))
+    given = torch.stack([data if kind is None else kind.to(torch.int64).cpu() for kind in kinds])
+    if bool((given == Region.ALIAS).any()):
+        raise ValueError("JoinedProducer: producers must answer without alias")
+    voxels = (given == Region.DATA) | (given == Region.DATA_MAX_DEPTH)
+    deepest = (~voxels | (given == Region.DATA_MAX_DEPTH)).all(0)
+    kind = torch.where(deepest, int(Region.DATA_MAX_DEPTH), int(Region.DATA))
+    kind = torch.where(voxels.any(0), kind, int(Region.CONSTANT))
+    return torch.where((given == Region.EMPTY).all(0), int(Region.EMPTY), kind)
+
+
+def _joined_regions(
+    nodes: Nodes, producers: Mapping[str, Producer], answers: Mapping[str, Any]
+) -> Regions:
+    given = {
+        name: one if isinstance(one, Regions) else Regions(kind=one)
+        for name, one in answers.items()
+    }
+    constants, ranges = dict[str, Tensor](), dict[str, Tensor]()
+    for name, one in given.items():
+        ((own, channel),) = producers[name].channels.items()
+        zero = torch.zeros((len(nodes), channel.width), dtype=channel.dtype)
+        constants[name] = one.constants.get(own, zero).view(len(nodes), -1).to(channel.dtype)
+        ranges |= {name: one.ranges[own]} if own in one.ranges else {}
+    kind = _joined_kinds([one.kind for one in given.values()], len(nodes))
+    return Regions(kind=kind, constants=constants, ranges=ranges, errors=_errors(given))
+
+
+def _joined_bricks(producers: Mapping[str, Producer], answers: Mapping[str, Any]) -> Bricks:
+    data, constants, given = dict[str, Any](), dict[str, Tensor](), dict[str, Bricks]()
+    for name, one in answers.items():
+        given[name] = one if isinstance(one, Bricks) else Bricks(data=one)
+        (own,) = producers[name].channels
+        data[name] = given[name].data[own]
+        constants |= {name: given[name].constants[own]} if own in given[name].constants else {}
+    errors = _errors(given)
+    if all(one.kind is None for one in given.values()):
+        return Bricks(data=data, errors=errors)
+    counts = [len(one.kind) for one in given.values() if one.kind is not None]
+    kind = _joined_kinds([one.kind for one in given.values()], counts[0])
+    if len(constants) < len(given):  # some tell no constants: their voxels do
+        kind = torch.where(kind == Region.CONSTANT, int(Region.DATA), kind)
+    return replace(Bricks(data=data, errors=errors), kind=kind, constants=constants)
+
+
+def _errors(given: Mapping[str, Regions | Bricks]) -> dict[int, str]:
+    return {row: text for one in given.values() for row, text in one.errors.items()}

@@ -1,0 +1,157 @@
+"""Holes: winding numbers of what is open, against libigl, and what fills holes."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from helpers import gvtorch, meshes, shared
+
+import gvtorch as gv
+from gvtorch.meshes.holes import filled, rims, told_of_holes
+from gvtorch.meshes.mesh import solids
+from gvtorch.meshes.voxelizer import Voxelizer
+from gvtorch.meshes.winding import winding_number
+
+
+def without(mesh: gv.Mesh, *faces: int) -> gv.Mesh:
+    return mesh.only(np.setdiff1d(np.arange(len(mesh.faces)), faces))
+
+
+def cut(mesh: gv.Mesh, height: float) -> gv.Mesh:
+    """The triangles below a height."""
+    return mesh.only(np.flatnonzero(mesh.corners[:, :, 2].max(1) < height))
+
+
+def test_a_plane_hole_is_half_wound_around():
+    """A box without its lid: 1 far inside less the solid angle of the lid, 1/2 on it."""
+    box = meshes.box((-1, -1, -1), (1, 1, 1))
+    lid = np.flatnonzero((box.corners[:, :, 2] == 1).all(1))
+    opened = without(box, *lid)
+    found = winding_number(opened, [[0, 0, 0], [0, 0, 1], [0.3, -0.2, 1], [0, 0, 5], [0, 0, -1.5]])
+    angle = 4 * np.arcsin(4 / (4 + 4 * 16)) / (4 * np.pi)  # of a 2 x 2 square, 4 away
+    assert np.abs(found[:4] - [5 / 6, 0.5, 0.5, angle]).max() < 1e-3
+    assert abs(found[4]) < 0.1
+
+
+@pytest.mark.parametrize("name", ["open bunny", "castle", "ball"])
+def test_winding_numbers_are_libigl_s(name):
+    igl = pytest.importorskip("igl", reason="the peer libigl is not installed")
+    if name == "ball":
+        mesh = cut(meshes.sphere(5), 0.6)
+    elif name == "castle":
+        mesh = gv.read_mesh(shared("meshes/kaykit/building_castle_blue.gltf"))
+    else:
+        mesh = gv.read_mesh(shared("meshes/stanford_bunny.obj.gz"))
+    low, high = mesh.bounds
+    point = low - 0.1 + (high - low + 0.2) * np.random.default_rng(0).random((1000, 3))
+    apart = np.abs(winding_number(mesh, point) - igl.winding_number(*triangles(mesh), point))
+    assert apart.max() < 0.02 and apart.mean() < 2e-3
+
+
+def triangles(mesh: gv.Mesh) -> tuple[np.ndarray, np.ndarray]:
+    return mesh.vertices, mesh.faces
+
+
+def test_rims_go_around_every_hole():
+    ball = meshes.sphere(3)
+    opened = without(ball, 0, 100, 101, 200)
+    found, _ = rims(opened)
+    assert sorted(len(one.face) for one in found) in ([3, 3, 4], [3, 3, 3, 3])
+    assert not rims(ball)[0]
+
+
+def test_filling_closes_what_has_holes():
+    ball = meshes.sphere(4)
+    opened = without(ball, 3, 4, 5, 300, 301, 700)
+    closed = filled(opened)
+    assert solids(closed)[1].all()
+    assert meshes.volume(closed) == pytest.approx(meshes.volume(ball), rel=2e-3)
+    assert filled(ball) is ball
+
+
+def test_a_plane_hole_is_filled_by_its_plane():
+    """Half a ball, of which the disc is missing; also inside out."""
+    ball = meshes.sphere(4)
+    half = cut(ball, 1e-9)
+    for one in (half, meshes.of_corners(half.corners[:, ::-1].copy())):
+        closed = filled(one)
+        new = closed.corners[len(one.faces) :]
+        assert solids(closed)[1].all() and np.abs(new[..., 2]).max() < 2e-3
+        assert abs(meshes.volume(closed)) == pytest.approx(meshes.volume(ball) / 2, rel=2e-3)
+
+
+def test_what_encloses_nothing_stays_a_sheet():
+    leaf, ball = meshes.sheet(4), meshes.of_corners(meshes.sphere(3).corners + 3)
+    closed = filled(meshes.joined(leaf, without(ball, 5)))
+    _, solid = solids(closed)
+    assert not solid[:32].any() and solid[32:].all()
+
+
+def test_fillings_have_the_colours_around_them():
+    ball = meshes.sphere(3)
+    color = np.tile(np.array((0.2, 0.4, 0.6, 1.0), np.float32), (len(ball.faces), 3, 1))
+    painted = gv.Mesh(
+        vertices=ball.vertices,
+        faces=ball.faces,
+        color=color,
+        uv=np.zeros((len(ball.faces), 3, 2)) + 0.25,
+        material=np.full(len(ball.faces), 1),
+        materials=(gv.Material(), gv.Material()),
+    )
+    closed = filled(without(painted, 3, 4))
+    assert closed.color is not None and closed.uv is not None and closed.material is not None
+    assert np.allclose(closed.color, color[0, 0]) and np.allclose(closed.uv, 0.25)
+    assert (closed.material == 1).all() and len(closed.faces) > len(ball.faces)
+
+
+def test_the_bunny_s_inside_is_where_libigl_winds_around_it():
+    """The filled bunny against igl's winding number of the open one, and its volume against the
+    bunny that others closed.
+    """
+    igl = pytest.importorskip("igl", reason="the peer libigl is not installed")
+    opened = gv.read_mesh(shared("meshes/stanford_bunny.obj.gz"))
+    with pytest.warns(UserWarning, match=r"5 holes of 223 edges leave 1 parts open"):
+        gv.MeshProducer(opened, resolution=32)
+    grid = Voxelizer(opened, resolution=64, solid="always")
+    low, high = opened.bounds
+    point = low + (high - low) * np.random.default_rng(1).random((3000, 3))
+    inside = np.abs(igl.winding_number(*triangles(opened), point)) > 0.5
+    found = grid.geometry.signed_distance(torch.from_numpy(point)).numpy() < 0
+    assert (found != inside).mean() < 1e-3 and 500 < inside.sum() < 2500
+    covered = grid.region((0, 0, 0), grid.extent[::-1])["coverage"].double().sum() / 255
+    volume = abs(meshes.volume(grid.mesh))
+    assert float(covered) * grid.spacing**3 == pytest.approx(volume, rel=2e-3)
+
+
+def test_solid_tells_what_is_filled():
+    ball = without(meshes.sphere(4), 7, 8)
+    sums = {}
+    for solid in ("auto", "always", "never"):
+        grid = Voxelizer(ball, resolution=48, solid=solid)
+        covered = grid.region((0, 0, 0), grid.extent[::-1])["coverage"].double().sum() / 255
+        sums[solid] = float(covered) * grid.spacing**3
+    assert sums["always"] == pytest.approx(meshes.volume(meshes.sphere(4)), rel=5e-3)
+    assert sums["auto"] == sums["never"] == pytest.approx(4 * np.pi * grid.spacing, rel=0.02)
+    closed = Voxelizer(meshes.sphere(4), resolution=48, solid="never")
+    assert not closed.geometry.solid.any()
+    with pytest.raises(ValueError, match="solid must be one of auto, always, never, got 'yes'"):
+        Voxelizer(ball, solid="yes")
+
+
+def test_few_holes_are_told_in_a_line(tmp_path):
+    trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed")
+    ball = without(meshes.sphere(4), 7, 8)
+    file = tmp_path / "ball.ply"
+    trimesh.Trimesh(ball.vertices, ball.faces, process=False).export(file)
+    words = ("voxelize", file, "-o")
+    run = gvtorch(*words, tmp_path / "a.zarr", "--resolution", 32)
+    assert run.returncode == 0 and run.stderr.count("\n") == 1, run.stderr
+    assert "2 holes of 6 edges" in run.stderr and "--solid always" in run.stderr
+    run = gvtorch(*words, tmp_path / "b.zarr", "--resolution", 32, "--solid", "always")
+    assert run.returncode == 0 and not run.stderr
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert told_of_holes(meshes.sphere(3)) == told_of_holes(meshes.sheet(4)) == ""
