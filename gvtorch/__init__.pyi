@@ -11,6 +11,8 @@ from .io.reading import read_volume as read_volume
 from .io.store import Store as Store
 from .io.window import window as window
 from .meshes.mesh import Material as Material, Mesh as Mesh
+from .points.points import Points as Points
+from .points.sorted import SortedPoints as SortedPoints, sort_points as sort_points
 from .pool import (
     BrickPool as BrickPool,
     BrickTable as BrickTable,
