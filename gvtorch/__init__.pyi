@@ -7,6 +7,8 @@ from .base.volume import Volume as Volume
 from .io.conversion import convert as convert, estimate as estimate
 from .io.mesh_file import read_mesh as read_mesh
 from .io.mesh_source import voxelize as voxelize
+from .io.point_file import PointFile as PointFile, read_points as read_points
+from .io.point_source import splat as splat
 from .io.reading import read_volume as read_volume
 from .io.store import Store as Store
 from .io.window import window as window

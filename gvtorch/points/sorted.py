@@ -9,7 +9,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -20,15 +20,15 @@ from ..base.stage import Progress, no_progress
 from .codes import Codes, peak, shares
 from .grid import Grid
 from .points import Points
-from .table import Rows, Runs, Table, grouped
+from .table import Fold, Rows, Runs, Table, grouped
 
 _META = "points.json"
 _VERSION = 1
 _FULL = 512  # rows in one voxel from which on a level is kept
 _COPIES = 8  # of a block of rows that are in memory while it is sorted
-_ADDED = {"value": np.add.reduceat}
-_WITH_ENDS = {**_ADDED, "low": np.minimum.reduceat, "high": np.maximum.reduceat}
-_ALL_ADDED = dict.fromkeys(("value", "low", "high"), np.add.reduceat)
+_ADDED: Mapping[str, Fold] = {"value": np.add.reduceat}
+_WITH_ENDS: Mapping[str, Fold] = {**_ADDED, "low": np.minimum.reduceat, "high": np.maximum.reduceat}
+_ALL_ADDED: Mapping[str, Fold] = dict.fromkeys(("value", "low", "high"), np.add.reduceat)
 
 
 class PointSource(Protocol):
@@ -134,7 +134,7 @@ def sort_points(
     """Sorts points along a curve through a grid of voxels, once, and adds them up in its levels.
 
     Args:
-        points: `Points`, or what `open_points` gives, which is read part by part (twice, unless
+        points: `Points`, or a `PointFile`, which is read part by part (twice, unless
             there is a box).
         extent: Voxels of the finest level, (x, y, z), or along the longest side of the box.
         box: World corners ((x, y, z), (x, y, z)); points outside are left out. Around all points,

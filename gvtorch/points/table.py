@@ -4,7 +4,7 @@ of rows, and what is made of them in one pass: merged, and added up.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -140,7 +140,7 @@ class Runs:
         self._table.remove()
 
 
-def grouped(blocks: Iterable[Rows], folds: dict[str, Fold], divide: int = 1) -> Iterator[Rows]:
+def grouped(blocks: Iterable[Rows], folds: Mapping[str, Fold], divide: int = 1) -> Iterator[Rows]:
     """Yields a row for each code, divided by a number, of sorted blocks of rows: each column folded
     over the rows that share it. Columns without a fold are left out.
     """
