@@ -92,6 +92,7 @@ from .tracing import (
     ThinLens as ThinLens,
     TreeTracer as TreeTracer,
     cost as cost,
+    point_layer as point_layer,
     render as render,
     slice_picture as slice_picture,
     trace as trace,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -199,3 +200,20 @@ def _add_wide(points: SortedPoints, cubes: Cubes, out: np.ndarray) -> None:
                 plane = (z[:, :, None] * y[:, None, :]).reshape(len(here), -1)
                 line = (x[:, :, None] * value[:, None, :]).reshape(len(here), -1)
                 out[cube[start]] += (plane.T @ line).reshape(out.shape[1:])
+
+
+def narrow_near(points: SortedPoints, center: np.ndarray, reach: float) -> np.ndarray:
+    """Returns which points (m,) that are narrower than a finest voxel are in a cube of the world,
+    twice as wide as `reach`; their rows are `points.points[0].rows`.
+    """
+    if 0 not in points.points:
+        return np.empty(0, np.int64)
+    grid, level = points.grid, 0
+    while level < grid.levels - 1 and grid.spacing_3.min() * grid.branching**level < reach / 4:
+        level += 1
+    size = grid.spacing_3 * grid.branching**level
+    first, last = (np.floor((center - grid.low + way * reach) / size) for way in (-1, 1))
+    most = math.ceil(max(grid.extent) / grid.branching**level)
+    low, high = (np.clip(end, -1, most).astype(np.int64) for end in (first, last))
+    cubes = Cubes(low[None], int((high - low).max()) + 1, level)
+    return _in_cubes(points, points.points[0].rows["code"], 0, cubes).row
