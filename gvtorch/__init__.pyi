@@ -7,10 +7,14 @@ from .base.volume import Volume as Volume
 from .io.conversion import convert as convert, estimate as estimate
 from .io.mesh_file import read_mesh as read_mesh
 from .io.mesh_source import voxelize as voxelize
+from .io.point_file import PointFile as PointFile, read_points as read_points
+from .io.point_source import splat as splat
 from .io.reading import read_volume as read_volume
 from .io.store import Store as Store
 from .io.window import window as window
 from .meshes.mesh import Material as Material, Mesh as Mesh
+from .points.points import Points as Points
+from .points.sorted import SortedPoints as SortedPoints, sort_points as sort_points
 from .pool import (
     BrickPool as BrickPool,
     BrickTable as BrickTable,
@@ -92,6 +96,7 @@ from .tracing import (
     ThinLens as ThinLens,
     TreeTracer as TreeTracer,
     cost as cost,
+    point_layer as point_layer,
     render as render,
     slice_picture as slice_picture,
     trace as trace,

@@ -17,7 +17,7 @@ FLOORS = [
     {"base"},
     {"cpp_ext"},
     {"ops"},
-    {"meshes", "pool"},
+    {"meshes", "points", "pool"},
     {"cameras", "fields", "io"},
     {"cache", "opengl", "pictures", "producers", "shaders"},
     {"tracing"},

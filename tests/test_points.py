@@ -1,12 +1,17 @@
-"""Points as voxels: beside a dense histogram at every level, sums, proofs, pictures, bad input."""
+"""Points as voxels: beside dense sums at every level, proofs, pictures, bad input."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
 import torch
 
 import gvtorch as gv
+from gvtorch.points.points import Points
+from gvtorch.points.sorted import sort_points
+from gvtorch.points.splat import Cubes, values
 from gvtorch.producers import Layout
 
 BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -22,19 +27,55 @@ def some_points(count: int = 4000, width: int = 2) -> tuple[torch.Tensor, torch.
     return place.double(), torch.rand((count, width), generator=random).double() + 0.1
 
 
-def dense(place: torch.Tensor, value: torch.Tensor, side: int) -> np.ndarray:
-    """(z, y, x, c) sums of the points in voxels, by NumPy."""
-    parts = [
-        np.histogramdd(
-            place.flip(1).numpy(), (side,) * 3, [(-1, 1)] * 3, weights=value[:, c].numpy()
-        )[0]
-        for c in range(value.shape[1])
-    ]
-    return np.stack(parts, -1)
+def some_radii(count: int = 4000) -> torch.Tensor:
+    """None, below a voxel of 1/32, some voxels, many; inside of the box."""
+    random = torch.Generator().manual_seed(4)
+    radius = torch.tensor([0.0, 0.01, 0.04, 0.1])[
+        torch.randint(0, 4, (count,), generator=random)
+    ].double()
+    radius[:6] = torch.tensor([0.3, 0.5, 0.9, 0.7, 0.2, 3.0])
+    return radius
 
 
-def prepared(branching: int = 2, side: int = 64, **options) -> tuple[gv.PointProducer, Layout]:
-    producer = gv.PointProducer(*some_points(), side, box=BOX, branching=branching, **options)
+def dense(
+    place: torch.Tensor, value: torch.Tensor, side: int, radius: torch.Tensor | None = None
+) -> np.ndarray:
+    """(z, y, x, c) sums of the points in voxels: a histogram, or a product of sums of four uniform
+    random numbers (Irwin, Hall) for each point."""
+    if radius is None:
+        parts = [
+            np.histogramdd(
+                place.flip(1).numpy(), (side,) * 3, [(-1, 1)] * 3, weights=value[:, c].numpy()
+            )[0]
+            for c in range(value.shape[1])
+        ]
+        return np.stack(parts, -1)
+    edges = np.linspace(-1, 1, side + 1)
+    out = np.zeros((side,) * 3 + (value.shape[1],))
+    for at, weight, reach in zip(place.numpy(), value.numpy(), radius.tolist(), strict=True):
+        parts = [np.diff(share_below(edges, at[axis], reach)) for axis in (2, 1, 0)]
+        held = tuple(slice(part.nonzero()[0][0], part.nonzero()[0][-1] + 1) for part in parts)
+        z, y, x = (part[some] for part, some in zip(parts, held, strict=True))
+        out[held] += z[:, None, None, None] * y[:, None, None] * x[:, None] * weight
+    return out
+
+
+def share_below(edges: np.ndarray, center: float, reach: float) -> np.ndarray:
+    """The share of a point below places along an axis."""
+    if reach == 0:
+        return (edges > center).astype(float)
+    x = np.clip(2 * (edges - center) / reach + 2, 0, 4)
+    terms = [(-1) ** k * math.comb(4, k) * np.maximum(x - k, 0) ** 4 for k in range(5)]
+    return np.sum(terms, 0) / 24
+
+
+def prepared(
+    branching: int = 2, side: int = 64, wide: bool = False, **options
+) -> tuple[gv.PointProducer, Layout]:
+    place, value = some_points()
+    radius = some_radii() if wide else None
+    given = {"radius": radius, "box": BOX, "branching": branching, **options}
+    producer = gv.PointProducer(place, value, side, **given)
     layout = Layout.of(producer, 4, 1, CPU)
     producer.prepare(layout)
     return producer, layout
@@ -46,12 +87,16 @@ def all_nodes(layout: Layout, depth: int) -> gv.Nodes:
     return gv.Nodes(torch.cat((loc, torch.full((len(loc), 1), depth)), 1), layout)
 
 
-@pytest.mark.parametrize("branching, side", [(2, 64), (3, 36)])
-def test_every_level_is_the_histogram_and_its_mean(branching, side):
-    producer, layout = prepared(branching, side)
+@pytest.mark.parametrize(
+    "branching, side, wide", [(2, 64, False), (3, 36, False), (2, 64, True), (3, 36, True)]
+)
+def test_every_level_is_the_dense_sum_and_its_mean(branching, side, wide):
+    producer, layout = prepared(branching, side, wide)
     place, value = some_points()
-    total = value.sum(0).numpy()
-    finest = dense(place, value, side)
+    radius = some_radii() if wide else None
+    finest = dense(place, value, side, radius)
+    total = finest.sum((0, 1, 2))
+    assert wide or np.allclose(total, value.sum(0).numpy(), rtol=1e-12), "none is outside"
     for depth in range(layout.depth, -1, -1):
         nodes = all_nodes(layout, depth)
         bricks = producer.fill(nodes)["value"]
@@ -61,18 +106,32 @@ def test_every_level_is_the_histogram_and_its_mean(branching, side):
         assert np.allclose(level, finest, rtol=1e-6, atol=1e-7)
         scale = branching ** (3 * (layout.depth - depth))
         assert np.allclose(level.double().sum((0, 1, 2)) * scale, total, rtol=1e-6)
-        wide = np.pad(finest, ((1, 1), (1, 1), (1, 1), (0, 0)))
+        wide_level = np.pad(finest, ((1, 1), (1, 1), (1, 1), (0, 0)))
         for row in range(0, len(nodes), 37):
             x, y, z = (4 * nodes.loc[row, :3]).tolist()
-            brick = wide[z : z + 6, y : y + 6, x : x + 6]
+            brick = wide_level[z : z + 6, y : y + 6, x : x + 6]
             assert np.allclose(bricks[row], brick, rtol=1e-6, atol=1e-7), "with its border"
         if depth:
             finest = finest.reshape(*(n // branching, branching) * 3, 2).mean((1, 3, 5))
 
 
-@pytest.mark.parametrize("branching, side", [(2, 64), (3, 36)])
-def test_what_is_proven_holds_for_all_below(branching, side):
-    producer, layout = prepared(branching, side)
+@pytest.mark.parametrize("wide", [False, True])
+def test_mass_is_the_same_at_every_level_to_rounding_of_float64(wide):
+    place, value = some_points()
+    radius = some_radii().clamp(max=0.3) if wide else None
+    points = sort_points(Points(place, value, radius=radius), 48)
+    for level in range(points.grid.levels):
+        side = -(-48 // 2**level)
+        held = values(points, Cubes(np.zeros((1, 3), np.int64), side, level))
+        total = held.sum((0, 1, 2, 3)) * 8**level
+        assert np.allclose(total, value.sum(0).numpy(), rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    "branching, side, wide", [(2, 64, False), (3, 36, False), (2, 64, True), (3, 36, True)]
+)
+def test_what_is_proven_holds_for_all_below(branching, side, wide):
+    producer, layout = prepared(branching, side, wide)
     levels = {d: producer.fill(all_nodes(layout, d))["value"] for d in range(layout.depth + 1)}
     empty = 0
     for depth in range(layout.depth + 1):
@@ -88,7 +147,37 @@ def test_what_is_proven_holds_for_all_below(branching, side):
             bare = regions.kind[owner] == gv.Region.EMPTY
             assert not voxels[bare].any()
         empty += int((regions.kind == gv.Region.EMPTY).sum())
-    assert empty > 100
+    assert empty > 100 or wide  # a point of radius 3 is everywhere
+
+
+def test_empty_regions_are_proven_beside_wide_points_too():
+    place, value = some_points()
+    producer = gv.PointProducer(place, value - 0.6, 64, box=BOX, radius=some_radii().clamp(max=0.1))
+    layout = Layout.of(producer, 4, 1, CPU)
+    nodes = all_nodes(layout, layout.depth)
+    regions, bricks = producer.classify(nodes), producer.fill(nodes)["value"]
+    bare = regions.kind == gv.Region.EMPTY
+    assert 100 < int(bare.sum()) < len(nodes) - 100
+    assert not bricks[bare].any() and bricks[~bare].flatten(1).any(1).float().mean() > 0.9
+    low, high = regions.ranges["value"].unbind(1)
+    assert (low < 0).any() and (bricks.amin((1, 2, 3)) >= low).all()
+    assert (bricks.amax((1, 2, 3)) <= high).all()
+
+
+def test_points_that_are_drawn_are_missing_at_the_finest_level_alone():
+    (all_, layout), (drawn, _) = prepared(wide=True), prepared(wide=True, drawn=True)
+    place, value = some_points()
+    broad = some_radii() > 2 / 64
+    for depth in range(layout.depth + 1):
+        nodes = all_nodes(layout, depth)
+        bricks = drawn.fill(nodes)["value"]
+        if depth < layout.depth:
+            assert torch.equal(bricks, all_.fill(nodes)["value"])
+            continue
+        only = gv.PointProducer(place[broad], value[broad], 64, box=BOX, radius=some_radii()[broad])
+        assert torch.allclose(bricks, only.fill(nodes)["value"], rtol=1e-6, atol=1e-9)
+        kind = drawn.classify(nodes).kind
+        assert not bricks[kind == gv.Region.EMPTY].any()
 
 
 @pytest.mark.backend("cpp")
@@ -113,11 +202,12 @@ def test_streamed_points_are_the_picture_of_the_dense_volume():
 def test_the_box_is_around_all_points_unless_given():
     place, value = some_points()
     producer = gv.PointProducer(place, value)
-    assert max(producer.extent) == 1024 and producer._value.sum() == pytest.approx(value.sum())
+    held = producer.points.points[0].rows["value"]
+    assert max(producer.extent) == 1024 and held.sum() == pytest.approx(float(value.sum()))
     part = gv.PointProducer(place, value, box=((0, 0, 0), (1, 1, 1)))
-    assert 0 < len(part._value) < len(place), "points outside are left out"
+    assert 0 < len(part.points) < len(place), "points outside are left out"
     one = gv.PointProducer(torch.zeros(1, 3))
-    assert one.extent == (1024, 1024, 1024) and len(one._value) == 1
+    assert one.extent == (1024, 1024, 1024) and len(one.points) == 1
 
 
 @pytest.mark.parametrize(

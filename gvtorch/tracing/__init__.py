@@ -9,6 +9,7 @@ from .options import RenderOptions as RenderOptions
 from .options import RenderSettings as RenderSettings
 from .pixels import render as render
 from .pixels import trace as trace
+from .point_layer import point_layer as point_layer
 from .slices import slice_picture as slice_picture
 from .thin_lens import ThinLens as ThinLens
 from .tree_tracer import TreeTracer as TreeTracer

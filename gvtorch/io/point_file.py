@@ -1,0 +1,264 @@
+"""`read_points`: points out of arrays (NPZ), PLY files and FITS tables, by the names of columns.
+
+PLY: Turk, "The PLY polygon file format", 1994. Its rows are mapped, since a scan may be larger than
+memory; FITS tables come through astropy.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypedDict, Unpack
+
+import numpy as np
+
+from ..points.points import Points
+from .mesh_file import to_linear
+from .source import told_as
+
+ENDINGS = ("npz", "ply", "fits", "fit", "fits.gz")
+_ALL = 2**62  # points
+_PLACES = ("position", "pos", "xyz", "points", "coord")
+_VALUES = ("value", "mass", "lumin", "intensit", "weight", "flux", "bright", "densit")
+_COLORS = ("color", "colour", "rgb")
+_RADII = ("radius", "radii", "smoothing")
+_PLY_TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+_MOST_HEADER = 65536  # bytes
+
+
+class ColumnNames(TypedDict, total=False):
+    """Which columns are what; those left out are known by their names."""
+
+    positions: str | Sequence[str]  # one of three numbers, or three
+    values: str | Sequence[str]
+    colors: str | Sequence[str]  # one of three or four numbers, or three
+    radius: str | float  # or one for all, world units
+
+
+class PointFile:
+    """A file of points that is read in parts.
+
+    Attributes:
+        path: The file.
+        columns: All columns of numbers, by name, (n,) or (n, k), mapped where the format allows.
+        used: For each of positions, values, colors, radius the columns that it is made of.
+    """
+
+    def __init__(self, path: str | Path, **names: Unpack[ColumnNames]) -> None:
+        """Opens the file, see `read_points`."""
+        self.path = Path(path)
+        self.columns = _columns(self.path)
+        radius = names.get("radius")
+        self._constant = radius if isinstance(radius, (int, float)) else None
+        self.used = _chosen(self.path, self.columns, names)
+
+    def __len__(self) -> int:
+        return len(self.columns[self.used["positions"][0]])
+
+    def blocks(self, count: int) -> Iterator[Points]:
+        """Yields all points, so many at a time; ValueError if a number is not finite."""
+        for start in range(0, len(self), count):
+            part = slice(start, start + count)
+            with told_as(ValueError, str(self.path), "can't be read"):
+                found = {name: self._joined(used, part) for name, used in self.used.items()}
+                if "colors" in found:
+                    kinds = {self.columns[name].dtype for name in self.used["colors"]}
+                    found["colors"] = _linear(found["colors"][:, :3], kinds)
+                radius = found["radius"][:, 0] if "radius" in found else self._constant
+                yield Points(found["positions"], found.get("values"), found.get("colors"), radius)
+
+    def _joined(self, names: Sequence[str], part: slice) -> np.ndarray:
+        columns = [np.asarray(self.columns[name][part]) for name in names]
+        return np.concatenate([one[:, None] if one.ndim == 1 else one for one in columns], 1)
+
+
+def read_points(path: str | Path, **names: Unpack[ColumnNames]) -> Points:
+    """Reads points from an archive of arrays (.npz), a PLY file or the first table of a FITS file.
+
+    Args:
+        path: The file.
+        **names: Which columns are positions, values, colors and radius: a name, or several in a
+            list or with commas between them ("x,y,z"). Left out, positions are x, y and z or
+            a column of three numbers that is called position, pos, xyz, points or coord (or begins
+            so); values one that is called value, mass, luminosity, intensity, weight, flux,
+            brightness or density; colors red, green and blue, r, g and b, or one called color or
+            rgb; radius one called radius or smoothing length, and may be a number for all.
+
+    Returns:
+        The points. Colours that are whole numbers are taken as sRGB, others as linear.
+
+    Raises:
+        FileNotFoundError: It is not there.
+        ValueError: It is none of these formats or damaged, a column is missing, several may be
+            meant, or a number is not finite.
+        ImportError: astropy is not installed.
+    """
+    return next(PointFile(path, **names).blocks(_ALL))
+
+
+def _columns(path: Path) -> dict[str, np.ndarray]:
+    name = path.name.lower()
+    ending = next((one for one in ENDINGS if name.endswith("." + one)), None)
+    if ending is None:
+        raise ValueError(f"{path}: a name of points must end in {', '.join(ENDINGS)}")
+    if not path.is_file():
+        raise FileNotFoundError(f"file not found: {path}")
+    read = {"npz": _read_npz, "ply": _read_ply}.get(ending, _read_fits)
+    with told_as(ValueError, str(path), f"can't be read as {ending}"):
+        found = {n: one for n, one in read(path).items() if one.dtype.kind in "iuf" and one.ndim}
+    sizes = [len(one) for one in found.values()]
+    count = max(sizes, key=sizes.count) if sizes else 0  # of most columns
+    if not count:
+        raise ValueError(f"{path}: holds no columns of numbers")
+    return {n: one for n, one in found.items() if len(one) == count and one.ndim <= 2}
+
+
+def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as content:
+        return dict(content)
+
+
+def _read_fits(path: Path) -> dict[str, np.ndarray]:
+    try:
+        from astropy.io import fits
+    except ImportError:
+        raise ImportError(f"{path}: FITS needs astropy: pip install gvtorch[io]") from None
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*truncated.*")
+        with path.open("rb") as file, fits.open(file, memmap=True) as units:
+            for unit in units:
+                if isinstance(unit, fits.BinTableHDU | fits.TableHDU) and len(unit.data):
+                    return {name: np.asarray(unit.data[name]) for name in unit.columns.names}
+    raise ValueError("it has no table with rows")
+
+
+def _read_ply(path: Path) -> dict[str, np.ndarray]:
+    """The vertices; what stands before them must have rows of one size."""
+    with path.open("rb") as file:
+        head = file.read(_MOST_HEADER)
+        lines = head.partition(b"end_header")[0].decode("ascii").splitlines()
+        start = head.find(b"\n", head.find(b"end_header")) + 1
+        if not lines or lines[0].strip() != "ply" or start == 0:
+            raise ValueError("it has no header of PLY")
+        layout, elements = _ply_header(lines)
+        skipped = 0
+        for name, count, kinds in elements:
+            if name != "vertex":
+                if kinds is None or layout == "ascii":
+                    raise ValueError(f"its vertices stand behind {name}")
+                skipped += count * np.dtype(kinds).itemsize
+                continue
+            if kinds is None:
+                raise ValueError("its vertices have lists")
+            size = path.stat().st_size - start - skipped
+            dtype = np.dtype(kinds)
+            least = count * (2 * len(kinds) - 1 if layout == "ascii" else dtype.itemsize)
+            if not 0 < least <= size:
+                raise ValueError(f"{count} vertices take {least} bytes, it has {size}")
+            if layout == "ascii":
+                file.seek(start)
+                lines_of = itertools.islice(file, count)
+                table = np.loadtxt(lines_of, np.float64, ndmin=2, usecols=range(len(kinds)))
+                if len(table) != count:
+                    raise ValueError(f"{count} vertices are told, {len(table)} are there")
+                return {n: table[:, i].astype(k[1:]) for i, (n, k) in enumerate(kinds)}
+            rows = np.memmap(path, dtype, "r", start + skipped, (count,))
+            return {column: rows[column] for column, _ in kinds}
+    raise ValueError("it has no vertices")
+
+
+def _ply_header(
+    lines: Sequence[str],
+) -> tuple[str, list[tuple[str, int, list[tuple[str, str]] | None]]]:
+    """ascii, < or >; and for each element its name, rows, and columns (None: lists are among)."""
+    order, layout = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}, ""
+    elements: list[tuple[str, int, list[tuple[str, str]] | None]] = []
+    for words in (line.split() for line in lines[1:]):
+        if words[:1] == ["format"]:
+            layout = order[words[1]]
+        elif words[:1] == ["element"]:
+            elements.append((words[1], int(words[2]), []))
+        elif words[:1] == ["property"]:
+            name, count, kinds = elements[-1]
+            if words[1] == "list" or kinds is None:
+                elements[-1] = (name, count, None)
+            else:
+                kinds.append((words[2], layout + _PLY_TYPES[words[1]]))
+    if not layout:
+        raise ValueError("its header tells no format")
+    return ("ascii" if layout == "=" else layout), elements
+
+
+def _chosen(
+    path: Path, columns: Mapping[str, np.ndarray], names: ColumnNames
+) -> dict[str, list[str]]:
+    """For each part the columns that it is made of."""
+    widths = {name: math.prod(one.shape[1:]) for name, one in columns.items()}
+    plain = {name.lower(): name for name in columns}
+    found: dict[str, list[str]] = {}
+    given: Any
+    for what, given in names.items():
+        if given is None or isinstance(given, (int, float)):
+            continue
+        words = given.split(",") if isinstance(given, str) else list(given)
+        found[what] = [word.strip() for word in words]
+        for word in found[what]:
+            if word not in columns:
+                raise ValueError(f"{path}: has no column {word!r}; it has {', '.join(columns)}")
+
+    def called(what: str, begins: Sequence[str], sizes: Sequence[int]) -> None:
+        fits = [
+            name
+            for low, name in plain.items()
+            if low.startswith(tuple(begins)) and widths[name] in sizes
+        ]
+        if len(fits) > 1:
+            raise ValueError(
+                f"{path}: {' or '.join(fits)} may be its {what}: say which, as in {what}={fits[0]}"
+            )
+        if fits:
+            found[what] = fits
+
+    def three(what: str, *groups: str) -> bool:
+        for group in groups:
+            words = group.split()
+            if all(word in plain and widths[plain[word]] == 1 for word in words):
+                found[what] = [plain[word] for word in words]
+                return True
+        return False
+
+    if "positions" not in found and not three("positions", "x y z"):
+        called("positions", _PLACES, [3])
+    if "positions" not in found:
+        told = ", ".join(f"{name} ({width})" for name, width in widths.items())
+        raise ValueError(f"{path}: which columns are positions? It has {told}")
+    if "colors" not in found and not three("colors", "red green blue", "r g b"):
+        called("colors", _COLORS, [3, 4])
+    if "values" not in found:
+        called("values", _VALUES, [1, 2, 3, 4])
+    if names.get("radius") is None:
+        called("radius", _RADII, [1])
+    for what, sizes in (("positions", (3,)), ("colors", (3, 4)), ("radius", (1,))):
+        total = sum(widths[name] for name in found.get(what, ()))
+        if what in found and total not in sizes:
+            raise ValueError(f"{path}: {what} must be {sizes[0]} numbers, the columns are {total}")
+    return found
+
+
+def _linear(colors: np.ndarray, kinds: set[Any]) -> np.ndarray:
+    """Linear light of whole numbers, which are sRGB; of others themselves."""
+    if not all(kind.kind in "iu" for kind in kinds):
+        return colors
+    return to_linear(colors / max(np.iinfo(kind).max for kind in kinds))

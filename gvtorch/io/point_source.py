@@ -1,0 +1,207 @@
+"""Points as a volume that is read region by region (`SplatSource`), and `splat`, which writes it
+into a store by the writer of `convert`.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import shutil
+import zlib
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Unpack
+
+import numpy as np
+
+from ..base import check
+from ..base.image_info import ChannelInfo, ImageInfo
+from ..base.stage import Progress, no_progress
+from ..points.points import Points
+from ..points.sorted import PointSource, SortedPoints, sort_points
+from ..points.splat import region
+from .conversion import convert
+from .point_file import ColumnNames, PointFile
+from .source import VolumeSource
+from .store import Store
+from .store_layout import WORK
+from .unfinished import fingerprint, is_begun, write_json
+
+CHANNELS = ("value", "color")
+_COLORS = ("red", "green", "blue", "opacity")
+_MADE_OF = "made_of.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplatSource(VolumeSource):
+    """Sorted points in finest voxels."""
+
+    folder: str
+    marks: tuple[Any, ...]  # what is the same while the points and settings are
+    words: tuple[str, ...]  # of the command line
+
+    def fingerprint(self) -> list[Any]:
+        """The points, and what is made of them."""
+        return list(self.marks)
+
+    def command(self, store: str) -> tuple[str, ...]:
+        """As `gvtorch splat` takes it."""
+        return ("gvtorch", "splat", self.path, "-o", store, *self.words)
+
+    def read_stored(self, index: tuple[slice, ...]) -> np.ndarray:
+        """Adds a part up."""
+        low, high = (
+            tuple(end) for end in zip(*((s.start, s.stop) for s in index[:3]), strict=True)
+        )
+        held = region(_opened(self.folder), low, high)[..., index[3]]
+        with np.errstate(over="ignore"):
+            return held.astype(np.float32)
+
+
+@functools.lru_cache(maxsize=2)
+def _opened(folder: str) -> SortedPoints:
+    return SortedPoints.open(folder)
+
+
+@dataclass(frozen=True)
+class _Lit:
+    """Points whose values are light."""
+
+    points: PointSource
+    opacity: float
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def blocks(self, count: int) -> Iterator[Points]:
+        for part in self.points.blocks(count):
+            yield part.lit(self.opacity)
+
+
+def splat(
+    points: str | Path | Points,
+    store: str | Path,
+    *,
+    extent: int | Sequence[int] = 1024,
+    channel: str = "value",
+    opacity: float = 1e-4,
+    box: Sequence[Sequence[float]] | None = None,
+    memory: int | str = "1 GB",
+    block: int = 32,
+    executor: Executor | None = None,
+    workers: int | None = None,
+    resume: bool = False,
+    progress: Progress = no_progress,
+    **names: Unpack[ColumnNames],
+) -> Store:
+    """Writes points into a store, out of core: they are sorted on disk, beside the half-written
+    store, and read from there part by part.
+
+    Larger ones start worker processes; a script that calls this needs the usual
+    `if __name__ == "__main__":` around its work.
+
+    Args:
+        points: A file as of `read_points`, or `Points`.
+        store: The folder to make.
+        extent, box: As of `sort_points`.
+        channel: value: sums of the values in a finest voxel; color: light, as of `Points.lit`.
+        opacity: Of a point, for color.
+        memory: Bytes that sorting takes, roughly.
+        block, executor, workers, resume, progress: As of `convert`.
+        **names: As of `read_points`.
+
+    Returns:
+        The store, open, of float32.
+
+    Raises:
+        ValueError, OSError, KeyboardInterrupt: As of `read_points`, `sort_points` and `convert`.
+    """
+    target = Path(store)
+    if channel not in CHANNELS:
+        raise ValueError(f"splat: channel must be one of {', '.join(CHANNELS)}, got {channel!r}")
+    begun = is_begun(target, resume=resume)
+    source: Any = points if isinstance(points, Points) else PointFile(points, **names)
+    told = {"extent": extent, "box": box, "channel": channel}
+    marks: list[Any] = [_marks(points), {**told, "opacity": opacity, **names}]
+    if channel == "color":
+        source = _Lit(source, check.number("splat", "opacity", opacity, low=0, high=1))
+    folder = target / WORK / "points"
+    _sort(source, folder, marks, begun, extent=extent, box=box, memory=memory, progress=progress)
+    _opened.cache_clear()
+    found = _opened(str(folder))
+    grid = found.grid
+    x, y, z = grid.extent
+    channels = tuple(ChannelInfo(name=name) for name in _COLORS) if channel == "color" else ()
+    dx, dy, dz = grid.spacing_3.tolist()
+    return convert(
+        SplatSource(
+            path="points" if isinstance(points, Points) else str(points),
+            shape=(z, y, x, found.width),
+            axes="zyxc",
+            stored="float32",
+            spacing=(dx, dy, dz),
+            origin=grid.origin,
+            info=ImageInfo(channels=channels, quantity=channel),
+            folder=str(folder),
+            marks=tuple(marks),
+            words=_words(extent, channel, opacity, box, names),
+        ),
+        target,
+        block=block,
+        executor=executor,
+        workers=workers,
+        resume=resume,
+        progress=progress,
+    )
+
+
+def _sort(source: PointSource, folder: Path, marks: list[Any], begun: bool, **options: Any) -> None:
+    """Sorts the points into a folder, unless it holds them already."""
+    made_of = folder / _MADE_OF
+    told = json.loads(json.dumps(marks))
+    if made_of.exists() and json.loads(made_of.read_text(encoding="utf-8")) == told:
+        return
+    if begun:
+        raise ValueError(
+            f"{folder.parent.parent}: was begun with other points or settings; "
+            "remove the store to begin again"
+        )
+    shutil.rmtree(folder, ignore_errors=True)
+    try:
+        sort_points(source, folder=folder, **options)
+    except BaseException:
+        shutil.rmtree(folder.parent.parent, ignore_errors=True)  # nothing else is there
+        raise
+    write_json(made_of, told)
+
+
+def _marks(points: str | Path | Points) -> list[Any]:
+    """What is the same while points are."""
+    if not isinstance(points, Points):
+        return fingerprint(points)
+    total = 0
+    for one in (points.positions, points.values, points.colors, points.radius):
+        if one is not None:
+            total = zlib.crc32(np.ascontiguousarray(one).tobytes(), total)
+    return [len(points), total]
+
+
+def _words(
+    extent: int | Sequence[int],
+    channel: str,
+    opacity: float,
+    box: Sequence[Sequence[float]] | None,
+    names: ColumnNames,
+) -> tuple[str, ...]:
+    """Flags of the command line."""
+    sizes = [extent] if isinstance(extent, int) else extent
+    words = ["--extent", ",".join(map(str, sizes)), "--channel", channel]
+    words += ["--opacity", f"{opacity:g}"] if channel == "color" else []
+    words += ["--box", ",".join(f"{n!r}" for end in box for n in end)] if box else []
+    for name, given in names.items():
+        if given is not None:
+            plain = isinstance(given, (str, float, int))
+            words += [f"--{name}", str(given) if plain else ",".join(given)]  # type: ignore[arg-type]
+    return tuple(words)

@@ -1,0 +1,1 @@
+"""Points with values: what voxels of any size hold of them."""

@@ -1,0 +1,79 @@
+"""`Codes`: numbers of voxels along a curve that fills a node before it leaves it, and the kernel by
+which a point that is wider than a voxel is shared among several.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+_MOST = 2**62  # codes of an int64
+
+
+class Codes:
+    """The digits of x, y and z to base N, in turn (Morton's order for N = 2). So the voxels of a
+    node, at any level, have codes without a gap: those of its first voxel's code, divided by N^3
+    for each level up.
+
+    Source: Morton, "A computer oriented geodetic data base", 1966.
+    """
+
+    def __init__(self, branching: int, side: int) -> None:
+        """Lays the curve through a cube of at least `side` voxels; ValueError if it is too long."""
+        self.branching, self.digits = branching, 1
+        while branching**self.digits < side:
+            self.digits += 1
+        if branching ** (3 * self.digits) > _MOST:
+            raise ValueError(
+                f"points: an extent of {side} has more voxels than a 64-bit number tells apart; "
+                "take a smaller one"
+            )
+        self._low = branching ** -(-self.digits // 2)
+        at = np.arange(self._low)
+        self._spread = np.zeros(self._low, np.int64)
+        for digit in range(-(-self.digits // 2)):
+            self._spread += at // branching**digit % branching * branching ** (3 * digit)
+
+    def of(self, voxel_k3: np.ndarray) -> np.ndarray:
+        """Returns (k,) int64 codes of voxels x, y, z, inside the cube of any level."""
+        code = np.zeros(len(voxel_k3), np.int64)
+        for axis in (2, 1, 0):
+            high, low = np.divmod(voxel_k3[:, axis], self._low)
+            code *= self.branching
+            code += self._spread[low]
+            code += self._spread[high] * self._low**3
+        return code
+
+    @functools.lru_cache(maxsize=8)  # noqa: B019, a producer has one
+    def places(self, side: int) -> np.ndarray:
+        """Returns (side^3, 3) x, y, z of the codes from 0 on; `side` is a power of N."""
+        at = np.indices((side,) * 3).reshape(3, -1).T
+        found = np.empty_like(at)
+        found[self.of(at)] = at
+        return found
+
+
+def shares(edge: np.ndarray, center: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Returns what each interval between edges (k, m + 1), rising, holds of points at (k,) that
+    reach as far as (k,), > 0: (k, m), which adds up to 1 where the edges enclose the point.
+
+    A point's density is a product of cubic splines along x, y and z, and its share of a box the
+    product of these integrals. So the shares of the boxes in a box add up to that box's share.
+    Source: the M4 kernel of Monaghan, Lattanzio, "A refined particle method for astrophysical
+    problems", 1985, along each axis, and integrated.
+    """
+    away = 2 * np.clip((edge - center[:, None]) / radius[:, None], -1, 1)  # knots at integers
+    far = np.abs(away)
+    rest = 2 - far
+    inner = 0.5 - far * (2 / 3 - far * far * (1 / 3 - far / 8))
+    tail = np.where(far > 1, rest * rest * rest * rest / 24, inner)  # beyond it
+    below = np.where(away < 0, tail, 1 - tail)
+    return below[:, 1:] - below[:, :-1]
+
+
+def peak(radius: np.ndarray, size_3: np.ndarray) -> np.ndarray:
+    """Returns (k,) the most that a box of a size holds of points with radii (k,)."""
+    safe = np.maximum(radius, np.finfo(np.float64).tiny)
+    share = np.minimum(1, 4 / 3 * size_3 / safe[:, None])
+    return share[:, 0] * share[:, 1] * share[:, 2]

@@ -1,0 +1,104 @@
+"""`Points`: positions with values, and what goes with them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..base import check
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points in the world. Tensors and lists become arrays; float32 stays, all else is float64.
+
+    Attributes:
+        positions: (n, 3) x, y, z.
+        values: (n, c) numbers that add up, such as mass, light, or premultiplied colour and
+            opacity; (n,) counts as (n, 1); 1 each if left out.
+        colors: (n, 3) linear red, green, blue, at least 0.
+        radius: (n,) world units, or one for all: how far a point reaches along each axis. 0, or
+            left out: it is in one voxel.
+    """
+
+    positions: Any
+    values: Any = None
+    colors: Any = None
+    radius: Any = None
+
+    def __post_init__(self) -> None:
+        place = _numbers("positions", self.positions)
+        count = len(place) if place.ndim == 2 else 0
+        if place.ndim != 2 or place.shape[1] != 3 or not count:
+            raise ValueError(f"Points: positions must be (n, 3), n >= 1, got {place.shape}")
+        ones = np.ones((count, 1), np.float32)
+        value = ones if self.values is None else _numbers("values", self.values)
+        value = value[:, None] if value.ndim == 1 else value
+        if value.ndim != 2 or len(value) != count or not value.shape[1]:
+            raise ValueError(
+                f"Points: values must be ({count},) or ({count}, c), got {value.shape}"
+            )
+        object.__setattr__(self, "positions", place)
+        object.__setattr__(self, "values", value)
+        for name, shape in (("colors", (count, 3)), ("radius", (count,))):
+            if (given := getattr(self, name)) is None:
+                continue
+            part = _numbers(name, given)
+            part = np.broadcast_to(part, shape) if name == "radius" and not part.ndim else part
+            if part.shape != shape:
+                raise ValueError(f"Points: {name} must be {shape}, got {part.shape}")
+            if bool((part < 0).any()):
+                raise ValueError(f"Points: {name} must be at least 0, got {part.min():g}")
+            object.__setattr__(self, name, part)
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @property
+    def width(self) -> int:
+        """Numbers of a point's value."""
+        return int(self.values.shape[1])
+
+    def part(self, start: int, stop: int) -> Points:
+        """Returns some of the points; nothing is copied."""
+        names = ("positions", "values", "colors", "radius")
+        cut = (None if (one := getattr(self, n)) is None else one[start:stop] for n in names)
+        return Points(*cut)
+
+    def blocks(self, count: int) -> Iterator[Points]:
+        """Yields all points, so many at a time."""
+        for start in range(0, len(self), count):
+            yield self.part(start, start + count)
+
+    def lit(self, opacity: float = 1e-4) -> Points:
+        """Returns points whose values are light: red, green, blue (the first value times the
+        colour, white where there is none) and an opacity, as
+        `gv.StoredColor("value", premultiplied=True)` reads them.
+        """
+        check.number("Points.lit", "opacity", opacity, low=0, high=1, open_low=True)
+        color = np.ones((1, 3)) if self.colors is None else self.colors
+        light = self.values[:, :1] * color
+        return replace(self, values=np.concatenate((light, np.full_like(light[:, :1], opacity)), 1))
+
+    def __repr__(self) -> str:
+        told = [f"{len(self)}", f"values of {self.width}"]
+        told += [name for name in ("colors", "radius") if getattr(self, name) is not None]
+        return f"Points({', '.join(told)})"
+
+
+def _numbers(name: str, value: Any) -> np.ndarray:
+    check.no_gradient("Points", name, value)
+    try:
+        found = value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else value
+        found = np.asarray(found)
+        if found.dtype != np.float32:
+            found = found.astype(np.float64, copy=False)
+    except (TypeError, ValueError, RuntimeError):
+        raise ValueError(f"Points: {name} must be numbers, got {check.shown(value)}") from None
+    if not bool(np.isfinite(found).all()):
+        raise ValueError(f"Points: {name} must be finite, got NaN or infinity")
+    return found

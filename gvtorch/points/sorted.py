@@ -1,0 +1,337 @@
+"""`SortedPoints`: points in the order of a curve, and their sums in voxels of coarser levels; in
+memory, or in a folder of files that are mapped. Made in bounded memory (`sort_points`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from ..base import check
+from ..base.stage import Progress, no_progress
+from .codes import Codes, peak, shares
+from .grid import Grid
+from .points import Points
+from .table import Fold, Rows, Runs, Table, grouped
+
+_META = "points.json"
+_VERSION = 1
+_FULL = 512  # rows in one voxel from which on a level is kept
+_COPIES = 8  # of a block of rows that are in memory while it is sorted
+_ADDED: Mapping[str, Fold] = {"value": np.add.reduceat}
+_WITH_ENDS: Mapping[str, Fold] = {**_ADDED, "low": np.minimum.reduceat, "high": np.maximum.reduceat}
+_ALL_ADDED: Mapping[str, Fold] = dict.fromkeys(("value", "low", "high"), np.add.reduceat)
+
+
+class PointSource(Protocol):
+    """What points come from: `Points`, or a file that is read in parts."""
+
+    def __len__(self) -> int: ...
+
+    def blocks(self, count: int, /) -> Iterator[Points]:
+        """Yields all points, so many at a time; may be called again."""
+
+
+class SortedPoints:
+    """Points by level and code.
+
+    Attributes:
+        grid: The voxels.
+        codes: Their numbers.
+        width: Numbers of a point's value.
+        points: By level, the points that are as wide as its voxels (of level 0 and narrower): code
+            of the finest voxel, position, value and radius.
+        sums: By level, as many as it pays to keep: code of each voxel that holds something, its
+            sum, and the smallest and largest sum of a finest voxel in it.
+        folder: Where it lies; None: in memory.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        width: int,
+        points: dict[int, Table],
+        sums: dict[int, Table],
+        folder: Path | None = None,
+    ) -> None:
+        """Holds them."""
+        self.grid, self.width, self.points, self.sums = grid, width, points, sums
+        self.codes = Codes(grid.branching, max(grid.extent))
+        self.folder = folder
+
+    @classmethod
+    def open(cls, folder: str | Path) -> SortedPoints:
+        """Opens what `sort_points` wrote.
+
+        Raises:
+            FileNotFoundError, ValueError: It is not there, or damaged.
+        """
+        folder = Path(folder)
+        meta = check.json_file("sorted points", folder / _META)
+        try:
+            if meta["version"] != _VERSION:
+                raise ValueError(f"version {meta['version']!r}, this reads {_VERSION}")
+            told = meta["grid"]
+            box = (told["low"], told["high"])
+            grid = Grid.around("grid", (), told["extent"], box, told["branching"])
+            tables = {
+                what: {
+                    int(level): Table.mapped(
+                        folder,
+                        f"{what}_{int(level)}",
+                        check.whole("rows", "count", told["count"], low=1),
+                        {name: (str(d), tuple(s)) for name, (d, s) in told["kinds"].items()},
+                    )
+                    for level, told in meta[what].items()
+                }
+                for what in ("points", "sums")
+            }
+            return cls(grid, int(meta["width"]), tables["points"], tables["sums"], folder)
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
+            raise ValueError(f"{folder}: no sorted points: {error}") from None
+
+    def __len__(self) -> int:
+        return sum(len(table) for table in self.points.values())
+
+    def __repr__(self) -> str:
+        x, y, z = self.grid.extent
+        place = "in memory" if self.folder is None else str(self.folder)
+        return f"SortedPoints({len(self)}, values of {self.width}, {x}x{y}x{z} (x, y, z), {place})"
+
+    def save(self) -> None:
+        """Writes what `open` reads, the last step of making it."""
+        assert self.folder is not None
+        told = {
+            what: {level: {"count": len(one), "kinds": one.kinds} for level, one in tables.items()}
+            for what, tables in (("points", self.points), ("sums", self.sums))
+        }
+        grid = dataclasses.asdict(self.grid)
+        meta = {"version": _VERSION, "width": self.width, "grid": grid, **told}
+        with (self.folder / _META).open("w", encoding="utf-8") as file:
+            json.dump(meta, file)
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def sort_points(
+    points: PointSource,
+    extent: int | Sequence[int] = 1024,
+    *,
+    box: Sequence[Sequence[float]] | None = None,
+    branching: int = 2,
+    folder: str | Path | None = None,
+    memory: int | str = "1 GB",
+    progress: Progress = no_progress,
+) -> SortedPoints:
+    """Sorts points along a curve through a grid of voxels, once, and adds them up in its levels.
+
+    Args:
+        points: `Points`, or a `PointFile`, which is read part by part (twice, unless
+            there is a box).
+        extent: Voxels of the finest level, (x, y, z), or along the longest side of the box.
+        box: World corners ((x, y, z), (x, y, z)); points outside are left out. Around all points,
+            as far as they reach, if left out.
+        branching: N.
+        folder: To make; it appears when all is done. In memory if left out.
+        memory: Bytes that sorting takes, roughly; for a folder.
+        progress: Told ("sorting", points done, of all).
+
+    Raises:
+        ValueError: A number is out of its range or not finite, or no point lies in the box.
+        FileExistsError: The folder is there.
+        OSError: The disk is full.
+    """
+    where, target = "sort_points", None if folder is None else Path(folder)
+    if target is not None and target.exists():
+        raise FileExistsError(f"{target}: is there already; remove it or choose a new name")
+    first = next(iter(points.blocks(1)))
+    row = 8 + sum(one.itemsize * (one.size // len(one)) for one in _columns(first).values())
+    block = len(points)
+    if target is not None:
+        block = max(4096, check.nbytes(where, "memory", memory) // (_COPIES * row))
+    grid = Grid.around(where, points.blocks(block), extent, box, branching)
+    draft = None if target is None else target.with_name(f".{target.name}.draft")
+    if draft is not None:
+        shutil.rmtree(draft, ignore_errors=True)
+        draft.mkdir(parents=True)
+    try:
+        maker = _Maker(grid, first.width, draft, block, progress)
+        maker.read(where, points)
+        maker.add_up()
+        made = SortedPoints(grid, first.width, maker.points, maker.sums, draft)
+        if draft is None or target is None:
+            return made
+        made.save()
+        draft.replace(target)
+        return SortedPoints.open(target)
+    except BaseException:
+        if draft is not None:
+            shutil.rmtree(draft, ignore_errors=True)
+        raise
+
+
+def _columns(points: Points) -> Rows:
+    """The columns of a row of points."""
+    rows = {"position": points.positions, "value": points.values}
+    return rows if points.radius is None else {**rows, "radius": points.radius}
+
+
+class _Maker:
+    """The steps of `sort_points`, and where its tables lie."""
+
+    def __init__(
+        self, grid: Grid, width: int, folder: Path | None, block: int, progress: Progress
+    ) -> None:
+        self.grid, self.width, self.folder, self.block = grid, width, folder, block
+        self.codes = Codes(grid.branching, max(grid.extent))
+        self.points: dict[int, Table] = {}
+        self.sums: dict[int, Table] = {}
+        self.progress = progress
+
+    def read(self, where: str, source: PointSource) -> None:
+        """Sorts the points by level and code."""
+        runs: dict[int, Runs] = {}
+        total, done = len(source), 0
+        for part in source.blocks(self.block):
+            self.progress("sorting", done, 2 * total)
+            done += len(part)
+            voxel, inside = self.grid.voxel(part.positions)
+            rows = {name: one[inside] for name, one in _columns(part).items()}
+            rows["code"] = self.codes.of(voxel)
+            if part.radius is None:
+                self._runs(runs, 0).append(rows)
+                continue
+            own = self.grid.own_level(rows["radius"])
+            for level in np.unique(own).tolist():
+                here = own == level
+                self._runs(runs, level).append({name: one[here] for name, one in rows.items()})
+        runs = {level: one for level, one in sorted(runs.items()) if len(one)}
+        if not runs:
+            raise ValueError(f"{where}: no point lies in the box")
+        for level, unsorted in runs.items():
+            self.points[level] = Table(self.folder, f"points_{level}")
+            for rows in unsorted.sorted():
+                self.points[level].append(rows)
+                self.progress("sorting", total + sum(map(len, self.points.values())), 2 * total)
+            unsorted.remove()
+
+    def _runs(self, runs: dict[int, Runs], level: int) -> Runs:
+        if level not in runs:
+            runs[level] = Runs(Table(self.folder, f"runs_{level}"), self.block)
+        return runs[level]
+
+    def add_up(self) -> None:
+        """Makes the sums, level by level, of those that are kept below."""
+        for level in range(self.grid.levels):
+            self.progress("adding up", level, self.grid.levels)
+            own = self._own(level)
+            below, divide = self._below(level)
+            if own is None:
+                made, pays = self._kept(f"sums_{level}", below, divide)
+                if pays:
+                    self.sums[level] = made
+                else:
+                    made.remove()
+                continue
+            both = Runs(Table(self.folder, f"both_{level}"), self.block)
+            for rows in grouped(below, _WITH_ENDS, divide):
+                both.append(rows)
+            for rows in own.sorted():
+                both.append(rows)
+            own.remove()
+            self.sums[level] = Table(self.folder, f"sums_{level}")
+            for rows in grouped(both.sorted(), _ALL_ADDED):
+                self.sums[level].append(rows)
+            both.remove()
+        self.progress("adding up", self.grid.levels, self.grid.levels)
+
+    def _below(self, level: int) -> tuple[Iterator[Rows], int]:
+        """What is kept below a level, sorted, and how many of its voxels one of the level has."""
+        n = self.grid.branching**3
+        if kept := [one for one in self.sums if one < level]:
+            return self.sums[kept[-1]].blocks(self.block), n ** (level - kept[-1])
+        if 0 not in self.points or self._is_wide(0):
+            return iter(()), n**level
+        return finest_sums(self.points[0].blocks(self.block)), n**level
+
+    def _is_wide(self, level: int) -> bool:
+        return level in self.points and "radius" in self.points[level].rows
+
+    def _kept(self, name: str, below: Iterator[Rows], divide: int) -> tuple[Table, bool]:
+        """The sums of a level, and whether they are worth keeping: they are half as many, or there
+        are voxels in which many rows would have to be added up each time.
+        """
+        before, most = 0, 0
+        ones = ({"rows": np.ones(len(rows["code"]), np.int64), **rows} for rows in below)
+        made = Table(self.folder, name)
+        for rows in grouped(ones, {**_WITH_ENDS, "rows": np.add.reduceat}, divide):
+            count = rows.pop("rows")
+            before, most = before + int(count.sum()), max(most, int(count.max(initial=0)))
+            if len(count):
+                made.append(rows)
+        return made, 0 < 2 * len(made) <= before or most > _FULL
+
+    def _own(self, level: int) -> Runs | None:
+        """What points that are as wide as a level's voxels add to them; None if there are none."""
+        if not self._is_wide(level):
+            return None
+        runs = Runs(Table(self.folder, f"own_{level}"), self.block)
+        for rows in self.points[level].blocks(max(1, self.block // 27)):
+            runs.append(self._spread(rows, level))
+        return runs
+
+    def _spread(self, rows: Rows, level: int) -> Rows:
+        """The shares of points (k,) in the voxels of their own level."""
+        n = self.grid.branching**level
+        size = self.grid.spacing_3 * n
+        place, radius = rows["position"].astype(np.float64), rows["radius"].astype(np.float64)
+        voxel = np.floor((place - self.grid.low) / size).astype(np.int64)
+        reach = min(int(np.ceil(radius.max() / size.min())), math.ceil(max(self.grid.extent) / n))
+        count = 2 * reach + 1
+        first = voxel - reach
+        narrow = radius == 0  # wholly in its voxel
+        parts = []
+        for axis, edge in enumerate(self.grid.edges(first, count, level)):
+            part = shares(edge, place[:, axis], np.where(narrow, 1.0, radius))
+            parts.append(np.where(narrow[:, None], np.arange(count) == reach, part))
+        x, y, z = parts
+        share = (z[:, :, None, None] * y[:, None, :, None] * x[:, None, None, :]).reshape(-1)
+        step = np.indices((count,) * 3).reshape(3, -1).T[:, ::-1]
+        at = (first[:, None] + step).reshape(-1, 3)
+        row = np.repeat(np.arange(len(place)), count**3)
+        some = share > 0
+        row, share = row[some], share[some]
+        value = rows["value"][row].astype(np.float64)
+        # A finest voxel holds all of it at most, or its share at the point's centre.
+        most = share if level == 0 else peak(radius, self.grid.spacing_3)[row]
+        ends = ends_of(most[:, None] * value)
+        return {"code": self.codes.of(at[some]), "value": share[:, None] * value, **ends}
+
+
+def finest_sums(blocks: Iterator[Rows]) -> Iterator[Rows]:
+    """Yields the sums of points in finest voxels, from blocks of sorted points."""
+    points = (
+        {
+            "code": rows["code"],
+            "value": rows["value"].astype(np.float64),
+            "rows": np.ones(len(rows["code"]), np.int64),
+        }
+        for rows in blocks
+    )
+    for rows in grouped(points, {**_ADDED, "rows": np.add.reduceat}):
+        yield rows | ends_of(rows["value"])
+
+
+def ends_of(value: np.ndarray) -> Rows:
+    """The smallest and largest of values and 0, as float32."""
+    with np.errstate(over="ignore"):
+        ends = value.astype(np.float32)
+    return {"low": np.minimum(ends, 0), "high": np.maximum(ends, 0)}
