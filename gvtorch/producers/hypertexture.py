@@ -23,7 +23,6 @@ from .producer import Layout, Nodes, Producer, Region, Regions
 
 _BATCH = 128  # bricks that are made at a time on the CPU, whose caches then hold what is between
 _COARSEST = 1.5  # cells a voxel, from which on the mean tells nothing of the noise
-_GRID = 0.5  # cells a voxel, up to which noise is made grid by grid
 _ROUNDED = 1e-4  # what rounding may add to a sum of octaves, in units of the amplitude
 
 
@@ -204,10 +203,6 @@ class Hypertexture(Producer):
             points = nodes.positions
         distance = self.shape(points)
         total = distance * (-1 / self.thickness)
-        centers = nodes.center
-        axes = [
-            centers[:, axis, None] + local.flatten(1) for axis, local in enumerate(nodes.local_axes)
-        ]
         active = torch.arange(len(nodes), device=total.device)
         values = total.clone()
         self.wanted += total.numel() * len(level.octaves)
@@ -217,14 +212,11 @@ class Hypertexture(Producer):
                 needed = (away < level.soft + level.left[number]).nonzero()[:, 0]
                 if len(needed) < len(active):
                     total[active] = values
-                    active, values = active[needed], values[needed]
+                    active, values, points = active[needed], values[needed], points[needed]
             if not len(active):
                 break
             self.made += values.numel()
-            places = [(axis[active] * one.frequency).to(self.dtype) for axis in axes]
-            values = values + one.amplitude * _noise_at(
-                places, one.seed, level.side * one.frequency
-            )
+            values = values + one.amplitude * noise.perlin(points * one.frequency, seed=one.seed)
         total[active] = values
         return self._channels(total, distance, level.soft)
 
@@ -233,18 +225,6 @@ class Hypertexture(Producer):
         t = ((total - (0.5 - soft)) / (2 * soft)).clamp(0, 1)
         found = {"density": t * t * (3 - 2 * t), "distance": distance}
         return {name: found[name][..., None] for name in self.channels}
-
-
-def _noise_at(axes: Sequence[Tensor], seed: int, spacing: float) -> Tensor:
-    """Gradient noise (k, z, y, x) at all combinations of coordinates along x, y, z, (k, s) each,
-    which lie at most `spacing` apart.
-    """
-    if spacing <= _GRID:
-        cells = math.ceil((axes[0].shape[1] - 1) * spacing) + 1
-        return noise.perlin_grid(*axes, seed=seed, cells=cells)
-    x, y, z = axes
-    points = x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]
-    return noise.perlin(points, seed=seed)
 
 
 def _cut_out(

@@ -5,12 +5,17 @@
 
 #include "entry/entry_cache.h"
 #include "entry/entry_mesh.h"
+#include "entry/entry_noise.h"
 #include "entry/entry_segments.h"
 
 namespace gvtorch {
 
 void FusedShaders::run(const Tensor& like, ShadeArgs args, bool wide) {
   wide ? shade_fused<double>(like, args) : shade_fused<float>(like, args);
+}
+
+void make_noise(const Tensor& like, const NoiseArgs& args, int64_t points) {
+  is_wide(like) ? noise_each<double>(like, args, points) : noise_each<float>(like, args, points);
 }
 
 // `compact` of cache.h in three kernels: blocks count chunks, one block adds the counts up, and blocks take their
@@ -96,4 +101,5 @@ STABLE_TORCH_LIBRARY_IMPL(gvtorch, CUDA, library) {
   gvtorch::implement(library, gvtorch::SegmentOps{});
   gvtorch::implement(library, gvtorch::CacheOps{});
   gvtorch::implement(library, gvtorch::MeshOps{});
+  gvtorch::implement(library, gvtorch::NoiseOps{});
 }

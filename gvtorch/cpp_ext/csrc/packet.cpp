@@ -1,5 +1,6 @@
-// Tracing on the CPU in float32, compiled once for each instruction set (build.py), GV_NAMESPACE its name. Nothing of
-// torch or of the standard library's templates may stand here: see hd.h.
+// Tracing and noise on the CPU in float32, compiled once for each instruction set (build.py), GV_NAMESPACE its name.
+// Nothing of torch or of the standard library's templates may stand here: see hd.h.
+#include "noise/noise.h"
 #include "packets/packet_walk.h"
 
 namespace gvtorch {
@@ -18,6 +19,10 @@ void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end) {
     if (far) return trace_packets<Plain<float>, TypedValues<Voxel, true>>(args, begin, end);
     return trace_packets<Plain<float>, TypedValues<Voxel, false>>(args, begin, end);
   });
+}
+
+void noise_chunk(const NoiseArgs& args, int64_t begin, int64_t end) {
+  with_noise(args, [&](auto kind, auto axes) { noise_in_lanes<kind.value, axes.value>(args, begin, end); });
 }
 
 }  // namespace GV_NAMESPACE
