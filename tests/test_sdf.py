@@ -135,3 +135,40 @@ def test_shapes_have_the_colour_of_what_is_nearer():
         found = shape.surface(inside(center, half, 12))[1]
         assert (found >= low[:, None] - 1e-6).all() and (found <= high[:, None] + 1e-6).all()
         assert (low == high).all(1).double().mean() > 0.02, "of shapes that nearly touch"
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_what_matters_near_a_box_has_the_same_bits(name):
+    """Values, colours and gradients of float32, in boxes of the size of some bricks and of all."""
+    shape = ALL[name][0]()
+    size = 7.0 if name == "mandelbox" else 1.2
+    random = torch.Generator().manual_seed(4)
+    for wide in (0.01, 0.06, 0.3, 1.0):
+        for _ in range(12):
+            middle = (2 * torch.rand(1, 3, generator=random, dtype=torch.float64) - 1) * size
+            center = middle + wide * size * (torch.rand(5, 3, generator=random).double() - 0.5)
+            half = torch.full_like(center, 0.2 * wide * size)
+            points = inside(center, half, 30).float()
+            near = shape.near(center, half)
+            for one, other in zip(near.surface(points), shape.surface(points), strict=True):
+                assert torch.equal(one, other)
+            assert torch.equal(near(points), shape(points))
+
+
+def test_what_does_not_matter_is_not_asked():
+    class Counted(sdf.Sphere):
+        asked = 0
+
+        def forward(self, points):
+            Counted.asked += len(points)
+            return super().forward(points)
+
+    far = sdf.moved(Counted(0.1), 5, 0, 0)
+    shape = sdf.SmoothUnion(sdf.rotated(ball() | far, (0, 0, 1), 90), block(), 0.1) - far
+    center, half = torch.zeros(3, 3).double(), torch.full((3, 3), 0.8).double()
+    near = gv.Solid(shape).near(center, half)
+    Counted.asked = 0
+    near.filtered(torch.zeros(7, 3), torch.ones(7, 3))
+    assert Counted.asked == 0 and isinstance(near.shape, sdf.SmoothUnion)
+    gv.Solid(shape).filtered(torch.zeros(7, 3), torch.ones(7, 3))
+    assert Counted.asked > 0

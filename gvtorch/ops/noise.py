@@ -59,7 +59,7 @@ def noise(
     for one in each:
         check.whole(where, "period", one, low=0, high=2**28)
     salt = [one & 0xFFFFFFFF for one in twin.salts(seed)]
-    arguments = (*salt, *each, float(jitter), reach)
+    arguments: tuple = (*salt, *each, float(jitter), reach)
     learns = torch.is_grad_enabled() and point_pn.requires_grad
     chosen = choose_backend.__wrapped__(backend, device)  # torch.compile warns of caches
     if chosen == "reference" or (learns and backend == "auto"):

@@ -18,10 +18,11 @@ from ..base import check
 from ..base.constants import DEEP_VOXELS
 from ..fields import Distance, noise
 from ..fields.noise.fractal import Octave, octaves_of
+from ..meshes.hierarchy import morton
 from ..pool import Channel
 from .producer import Layout, Nodes, Producer, Region, Regions
 
-_BATCH = 128  # bricks that are made at a time on the CPU, whose caches then hold what is between
+_BATCH = 64  # bricks that are made at a time on the CPU, whose caches then hold what is between
 _COARSEST = 1.5  # cells a voxel, from which on the mean tells nothing of the noise
 _ROUNDED = 1e-4  # what rounding may add to a sum of octaves, in units of the amplitude
 
@@ -180,7 +181,7 @@ class Hypertexture(Producer):
         return Regions(kind=kind, constants={"density": is_full})
 
     def fill(self, nodes: Nodes) -> dict[str, Tensor]:
-        """Makes the bricks, level by level, in batches."""
+        """Makes the bricks, level by level, in batches of such as are near each other."""
         side = nodes.layout.side
         shape = (len(nodes), side, side, side, 1)
         device = nodes.loc.device
@@ -190,6 +191,7 @@ class Hypertexture(Producer):
         }
         for depth in nodes.depth.unique().tolist():
             here = (nodes.depth == depth).nonzero()[:, 0]
+            here = here[morton(nodes.center[here]).argsort()]
             for rows in here.split(_BATCH if device.type == "cpu" else len(here)):
                 for name, values in self._made(nodes[rows], self.level_of(depth)).items():
                     data[name][rows] = values.to(data[name].dtype)
@@ -201,7 +203,8 @@ class Hypertexture(Producer):
             points = nodes.center[:, None, None, None] + nodes.local_positions
         else:
             points = nodes.positions
-        distance = self.shape(points)
+        half = nodes.voxel_size * (0.5 * nodes.layout.brick_size + nodes.layout.border)
+        distance = self.shape.near(nodes.center, half)(points)
         total = distance * (-1 / self.thickness)
         active = torch.arange(len(nodes), device=total.device)
         values = total.clone()
