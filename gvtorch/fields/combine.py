@@ -43,6 +43,9 @@ class Painted(Distance):
     def near(self, center: Tensor, half: Tensor) -> Distance:
         return self.replaced(shape=self.shape.near(center, half))
 
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        return self.shape.alike(center, half)
+
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         return torch.zeros_like(center), torch.ones_like(center)
 

@@ -22,6 +22,7 @@ from .field import Field, Interval, length
 
 Color = Sequence[float]  # linear red, green, blue, 0 to 1
 WHITE = (0.8, 0.8, 0.8)
+_HASH = 0x9E3779B1
 _ROUNDED = 2.0**-16  # of the size of places: values differ by less where float32 rounds them
 
 
@@ -161,6 +162,13 @@ class Pair(Distance):
         first, second = self.first.near(center, half), self.second.near(center, half)
         return self.replaced(first=first, second=second)
 
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        least, most = self._share(center, half, _ROUNDED)
+        own = torch.where(most == 0, 0, torch.where(least == 1, 1, 2))
+        first = torch.where(own == 1, 0, self.first.alike(center, half))
+        second = torch.where(own == 0, 0, self.second.alike(center, half))
+        return (first * _HASH + second) * 3 + own
+
     def box(self) -> Tensor | None:
         return around(self.first.box(), self.second.box())
 
@@ -227,6 +235,9 @@ class Negative(Distance):
 
     def near(self, center: Tensor, half: Tensor) -> Distance:
         return self.replaced(shape=self.shape.near(center, half))
+
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        return self.shape.alike(center, half)
 
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         return self.shape.colors(center, half)

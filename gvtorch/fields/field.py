@@ -90,6 +90,12 @@ class Field(nn.Module):
         """
         return self
 
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        """Returns (k,) int64 numbers, equal for boxes in which the same parts of the field matter:
+        these are best asked for together; see `near`.
+        """
+        return torch.zeros_like(center[:, 0], dtype=torch.int64)
+
     def replaced(self, **parts: nn.Module) -> Self:
         """Returns this field with other parts by name, which shares all else with it."""
         other = copy.copy(self)

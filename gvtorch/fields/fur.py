@@ -88,6 +88,9 @@ class Fur(Field):
     def near(self, center: Tensor, half: Tensor) -> Self:
         return self.replaced(shape=self.shape.near(center, half))
 
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        return self.shape.alike(center, half)
+
     def box(self) -> Tensor | None:
         """Around the shape and its hairs."""
         box = self.shape.box()

@@ -121,6 +121,9 @@ class Solid(Field):
     def near(self, center: Tensor, half: Tensor) -> Self:
         return self.replaced(shape=self.shape.near(center, half))
 
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        return self.shape.alike(center, half)
+
     def box(self) -> Tensor | None:
         return self.shape.box()
 

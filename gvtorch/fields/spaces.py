@@ -65,6 +65,9 @@ class Space(Distance):
     def near(self, center: Tensor, half: Tensor) -> Distance:
         return self.replaced(shape=self.shape.near(*self.over(center, half)))
 
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        return self.shape.alike(*self.over(center, half))
+
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         return self.shape.colors(*self.over(center, half))
 
@@ -236,6 +239,9 @@ class Repeat(Distance):
 
     def near(self, center: Tensor, half: Tensor) -> Distance:
         return self.replaced(shape=self.shape.near(*self._reach(center, half)))
+
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        return self.shape.alike(*self._reach(center, half))
 
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         return self.shape.colors(*self._reach(center, half))

@@ -30,7 +30,7 @@ class Hierarchy:
         """Sorts (f, 3, 3) float64 triangles and makes all levels."""
         low, high = corner_f33.amin(1), corner_f33.amax(1)
         self._corner = corner_f33
-        self.order = morton(0.5 * (low + high)).argsort()
+        self.order = _morton(0.5 * (low + high)).argsort()
         low, high = low[self.order], high[self.order]
         self._margin = float((high.amax(0) - low.amin(0)).max()) * _MARGIN
         self.levels = [(low, high)]
@@ -131,7 +131,7 @@ class Hierarchy:
         return box[kept[:, 0]], place[kept[:, 0]]
 
 
-def morton(place_f3: Tensor) -> Tensor:
+def _morton(place_f3: Tensor) -> Tensor:
     """Returns (f,) int64 codes: places that are close have close codes."""
     low, high = place_f3.amin(0), place_f3.amax(0)
     size = (high - low).max().clamp(min=torch.finfo(place_f3.dtype).tiny)

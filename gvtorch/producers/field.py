@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from ..base import check
 from ..base.constants import DEEP_VOXELS
 from ..fields import Distance, Field, Interval, Solid
-from ..meshes.hierarchy import morton
 from ..pool import Channel
 from .producer import Bricks, Nodes, Producer, Region, Regions
 
@@ -144,15 +143,18 @@ class FieldProducer(Producer):
         return Regions(kind=kind, constants=constants, ranges=ranges)
 
     def fill(self, nodes: Nodes) -> Bricks:
-        """Evaluates the field at every voxel, border included. On the CPU in batches of bricks near
-        each other, and what of the field matters there.
+        """Evaluates the field at every voxel, border included. On the CPU in batches of bricks in
+        which the same parts of it matter, and these parts alone.
         """
         if nodes.loc.device.type != "cpu" or torch.compiler.is_compiling():
             data = self._made(nodes, self.field)
         else:
-            order = morton(nodes.center).argsort()
-            parts = [self._made(some, self._near(some)) for some in _split(nodes[order], _BATCH)]
-            back = order.argsort()
+            beyond = getattr(self.field, "margin", 0) + _MARGIN
+            order, parts = [], []
+            for rows, field in alike(self.field, nodes, beyond, _BATCH):
+                order.append(rows)
+                parts.append(self._made(nodes[rows], field))
+            back = torch.cat(order).argsort()
             data = {name: torch.cat([part[name] for part in parts])[back] for name in self.channels}
         stored = {name: self._stored(name, rows) for name, rows in data.items()}
         whole = [n for n, channel in self.channels.items() if not channel.dtype.is_floating_point]
@@ -187,14 +189,6 @@ class FieldProducer(Producer):
         if not clocks:
             raise AttributeError(f"{type(self).__name__}: no part of the field has a time")
         return clocks
-
-    def _near(self, nodes: Nodes) -> nn.Module:
-        """The field, or what of it matters in some bricks."""
-        field, layout = self.field, nodes.layout
-        if not isinstance(field, Field):
-            return field
-        reach = 0.5 * layout.brick_size + layout.border + field.margin + _MARGIN
-        return field.near(nodes.center, nodes.voxel_size * reach)
 
     def _made(self, nodes: Nodes, field: nn.Module) -> dict[str, Tensor]:
         """Values of the voxels of some bricks, (k, z, y, x, c) by channel."""
@@ -262,10 +256,21 @@ def cache_field(
     return FieldProducer(field, extent, **options)
 
 
-def _split(nodes: Nodes, count: int) -> Iterator[Nodes]:
-    """Yields so many nodes at a time."""
-    for at in range(0, len(nodes), count):
-        yield nodes[at : at + count]
+def alike(
+    field: nn.Module, nodes: Nodes, beyond: float, count: int
+) -> Iterator[tuple[Tensor, nn.Module]]:
+    """Yields rows of at most so many nodes in which the same parts of a field matter, and these
+    parts, up to `beyond` voxels behind the brick's border. Waits for the device.
+    """
+    if not isinstance(field, Field):
+        yield from ((rows, field) for rows in torch.arange(len(nodes)).split(count))
+        return
+    center, layout = nodes.center, nodes.layout
+    half = nodes.voxel_size * (0.5 * layout.brick_size + layout.border + beyond)
+    _, kind = field.alike(center, half).unique(return_inverse=True)
+    for group in kind.argsort(stable=True).split(kind.bincount().tolist()):
+        near = field.near(center[group], half[group])
+        yield from ((rows, near) for rows in group.split(count))
 
 
 def _by_channel(where: str, values: Any, points: Tensor) -> dict[str, Tensor]:

@@ -12,14 +12,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..base import check
 from ..base.constants import DEEP_VOXELS
 from ..fields import Distance, noise
 from ..fields.noise.fractal import Octave, octaves_of
-from ..meshes.hierarchy import morton
 from ..pool import Channel
+from .field import alike
 from .producer import Layout, Nodes, Producer, Region, Regions
 
 _BATCH = 64  # bricks that are made at a time on the CPU, whose caches then hold what is between
@@ -181,7 +181,7 @@ class Hypertexture(Producer):
         return Regions(kind=kind, constants={"density": is_full})
 
     def fill(self, nodes: Nodes) -> dict[str, Tensor]:
-        """Makes the bricks, level by level, in batches of such as are near each other."""
+        """Makes the bricks, level by level, in batches in which the same of the shape matters."""
         side = nodes.layout.side
         shape = (len(nodes), side, side, side, 1)
         device = nodes.loc.device
@@ -191,20 +191,20 @@ class Hypertexture(Producer):
         }
         for depth in nodes.depth.unique().tolist():
             here = (nodes.depth == depth).nonzero()[:, 0]
-            here = here[morton(nodes.center[here]).argsort()]
-            for rows in here.split(_BATCH if device.type == "cpu" else len(here)):
-                for name, values in self._made(nodes[rows], self.level_of(depth)).items():
-                    data[name][rows] = values.to(data[name].dtype)
+            count = _BATCH if device.type == "cpu" else len(here)
+            for rows, shape in alike(self.shape, nodes[here], 0, count):
+                made = self._made(nodes[here[rows]], self.level_of(depth), shape)
+                for name, values in made.items():
+                    data[name][here[rows]] = values.to(data[name].dtype)
         return data
 
-    def _made(self, nodes: Nodes, level: Level) -> dict[str, Tensor]:
-        """Channels (k, z, y, x, 1) of nodes of a level."""
+    def _made(self, nodes: Nodes, level: Level, shape: nn.Module) -> dict[str, Tensor]:
+        """Channels (k, z, y, x, 1) of nodes of a level, of what of the shape matters there."""
         if self.dtype == torch.float64:
             points = nodes.center[:, None, None, None] + nodes.local_positions
         else:
             points = nodes.positions
-        half = nodes.voxel_size * (0.5 * nodes.layout.brick_size + nodes.layout.border)
-        distance = self.shape.near(nodes.center, half)(points)
+        distance = shape(points)
         total = distance * (-1 / self.thickness)
         active = torch.arange(len(nodes), device=total.device)
         values = total.clone()
