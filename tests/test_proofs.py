@@ -54,7 +54,7 @@ PRODUCERS = {
     "differences": of_field(lambda: gv.Solid(ball() | block(), differences=True)),
     "painted": of_field(lambda: gv.Painted(sdf.SmoothUnion(ball(), block(), 0.2), Stripes())),
     "warped": of_field(
-        lambda: gv.warp(gv.Solid(ball(), colors=False), Sway(), most=0.1), threshold=0.0, samples=1
+        lambda: gv.warp(gv.Solid(ball(), colors=False), Sway(), most=0.1), threshold=0.0
     ),
     "masked": of_field(lambda: gv.mask(Stripes(), gv.Solid(ball(), colors=False)), threshold=0.0),
     "blended": of_field(
@@ -143,12 +143,10 @@ def test_intervals_of_fields_hold_in_random_boxes(name):
                 assert (value >= low - 1e-9).all() and (value <= high + 1e-9).all(), channel
 
 
-#: Mean and largest difference of a level from the mean of the one below, where they are not these.
-MEANS = {"density": (0.01, 0.25)}
-
-
 def test_a_level_is_the_mean_of_the_one_below(name):
-    """As far as the filter tells: of what is seen, from the finest to the root."""
+    """As far as filters tell what voxels hold of what is smaller than they are: of the variation of
+    a level a tenth, at the root a third.
+    """
     producer = PRODUCERS[name]()
     producer.prepare(Layout.of(producer, 8, 1, torch.device("cpu")))
     below = None
@@ -157,7 +155,7 @@ def test_a_level_is_the_mean_of_the_one_below(name):
         count = 2**depth
         levels = {}
         for channel, rows in data.items():
-            if channel == "normal":
+            if channel.endswith("normal"):  # a direction: of a mean of colours, no mean itself
                 continue
             grid = rows.float().view(*(count,) * 3, 8, 8, 8, -1).permute(0, 3, 1, 4, 2, 5, 6)
             levels[channel] = grid.reshape(*(8 * count,) * 3, -1)
@@ -165,5 +163,5 @@ def test_a_level_is_the_mean_of_the_one_below(name):
             side = len(grid)
             mean = below[channel].view(side, 2, side, 2, side, 2, -1).mean((1, 3, 5))
             apart = (grid - mean).abs()
-            print(name, depth, channel, float(apart.mean()), float(apart.max()), float(mean.std()))
+            assert apart.mean() < (0.03 + 0.3 / count) * mean.std(), channel
         below = levels
