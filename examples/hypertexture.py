@@ -1,6 +1,6 @@
 """Hypertexture: a weathered rock, whose distance and normals noise perturbs, coloured by a transfer
 function of the distance; and fur, which a transfer function alone makes of noise. Both are made
-where rays ask for it, around any shape: --volume takes signed distances, such as a bunny's.
+where rays ask for it, around any shape: --mesh takes a closed mesh, --volume signed distances.
 """
 
 from dataclasses import dataclass, replace
@@ -38,6 +38,7 @@ class Settings:
     output: Path = Path("hypertexture.png")
     size: int = 720
     extent: int = 384
+    mesh: Path | None = None  # whose largest side is scaled to 2, y up
     volume: Path | None = None  # of signed distances
     device: str = "cpu"
 
@@ -45,7 +46,12 @@ class Settings:
 def main(settings: Settings) -> None:
     """Renders both side by side."""
     shape = reduce(partial(gv.sdf.SmoothUnion, width=0.12), starmap(gv.sdf.Capsule, LIMBS))
-    if settings.volume is not None:
+    if settings.mesh is not None:
+        mesh = gv.read_mesh(settings.mesh)
+        low, high = mesh.bounds
+        moved = (mesh.vertices - (low + high) / 2) * (2 / (high - low).max())
+        shape = gv.SampledDistance.of_mesh(replace(mesh, vertices=moved))
+    elif settings.volume is not None:
         shape = gv.SampledDistance(gv.read_volume(settings.volume))
     rough = {"thickness": 0.075, "frequency": 6, "gain": 0.55, "softness": 0.12}
     # Offset by as much as density 1/2 lies below the surface.
@@ -65,7 +71,7 @@ def main(settings: Settings) -> None:
     camera = gv.Camera.orbit(-30, 16, 1.55, 36, settings.size * 8 // 9, settings.size)
     pictures = []
     for producer, look in looks.items():
-        engine = gv.Engine(producer, device=settings.device, brick_pool="1 GB")
+        engine = gv.Engine(producer, device=settings.device, brick_pool="256 MB")
         lit = {"lighting": lighting} if producer is rock else {}
         pictures.append(engine.render(camera, look, background=SKY, **lit))
     both = torch.cat([picture.color for picture in pictures], dim=1)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers import numpy_noise
+from helpers import meshes, numpy_noise
 
 import gvtorch as gv
 from gvtorch.producers import Layout
@@ -190,9 +190,35 @@ def test_a_volume_of_distances_stands_for_the_shape():
     assert error.max() < 0.05 and error.mean() < 1e-3
 
 
+@pytest.mark.parametrize("name", ["ball", "torus"])
+def test_distances_to_a_mesh(name):
+    """Against closed forms: near the surface triangle by triangle, beyond it handed on."""
+    mesh, distance = {
+        "ball": (meshes.sphere(4), lambda p: p.norm(dim=1) - 1),
+        "torus": (
+            meshes.torus(),
+            lambda p: torch.hypot(torch.hypot(p[:, 0], p[:, 1]) - 1, p[:, 2]) - 0.4,
+        ),
+    }[name]
+    shape = gv.SampledDistance.of_mesh(mesh, resolution=32, reach=0.3)
+    random = torch.Generator().manual_seed(0)
+    points = 4 * torch.rand((50_000, 3), generator=random, dtype=torch.float64) - 2
+    low, high = shape.box()
+    points = points[((points >= low) & (points <= high)).all(1)]
+    right = distance(points) / shape.spacing[0]
+    error = (shape(points) / shape.spacing[0] - right).abs()  # in voxels
+    assert error[right.abs() < 2].max() < 0.15 and error.mean() < 0.1 and error.max() < 0.8
+    assert bool(((shape(points) < 0) == (right < 0))[right.abs() > 0.1].all())
+    assert right.max() > 8, "the volume goes on around the mesh"
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
+        (
+            lambda: gv.SampledDistance.of_mesh(meshes.sphere(1), reach=-1),
+            "SampledDistance: reach must be finite and >= 0 and <= 4, got -1",
+        ),
         (lambda: rough(thickness=0), "Hypertexture: thickness must be finite and > 0, got 0"),
         (lambda: rough(softness=math.nan), "Hypertexture: softness must be finite and > 0, got na"),
         (

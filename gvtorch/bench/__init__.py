@@ -23,7 +23,7 @@ WORKLOADS = {
     "lru": "1 M slots ordered by use, beside torch.sort",
     "compact": "requests listed out of 8 M nodes, beside torch.nonzero",
     "produce": "10^3-voxel bricks made by a torch producer, eager and compiled",
-    "noise": "gradient noise at points and on grids, beside NumPy and libraries of noise",
+    "noise": "noise at points, beside its twin, NumPy and libraries of noise",
     "stream": "10^3-voxel bricks from host memory into the pool, beside a plain copy",
     "convert": "a volume file to a store",
     "voxelize": "a mesh of 100,000 triangles to voxels and to a store, beside peers",

@@ -1,4 +1,4 @@
-"""Gradient noise at points and on grids, beside NumPy and libraries of noise: `noise`."""
+"""Noise at points, beside its twin, NumPy and libraries of noise: `noise`."""
 
 from __future__ import annotations
 
@@ -10,50 +10,49 @@ import numpy as np
 import torch
 
 from ..fields import noise as gv_noise
+from ..ops import noise as op
 from .record import Record, clock, synchronize
 
-_SIDE = 10  # of a brick with its border
 _CHUNK = 1 << 13  # points at a time, so that NumPy's temporaries stay in the caches
 
 
 def noise(record: Record) -> None:
-    """Points all over 100 cells a side, and bricks of 10^3 points at 2 to 32 a cell."""
+    """Points all over 100 cells a side."""
     settings = record.settings
     count = {"cpu": 1 << 20, "cuda": 1 << 25}[settings.device.type] >> (8 * settings.quick)
-    random = torch.Generator().manual_seed(5)
-    points = 100 * torch.rand((count, 3), generator=random)
+    points = 100 * torch.rand((count, 3), generator=torch.Generator().manual_seed(5))
     case = f"{count:,} points"
     if record.wants(case):
         _points(record, case, points)
-    bricks = count // _SIDE**3
-    for voxels in (2, 8, 32):
-        case = f"{bricks:,} bricks, {voxels} voxels a cell"
-        if not record.wants(case):
-            continue
-        start = 100 * torch.rand((bricks, 3), generator=random)
-        reach = torch.arange(_SIDE) / voxels
-        axes = [(start[:, n, None] + reach).to(settings.device) for n in range(3)]
-        cells = -(-(_SIDE - 1) // voxels) + 1
-        x, y, z = axes
-        places = x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]
-        at_points = partial(gv_noise.perlin, places)
-        on_grid = partial(gv_noise.perlin_grid, *axes, cells=cells)
-        total = bricks * _SIDE**3
-        plain = _add(record, case, "points", total, at_points)
-        apart = float((on_grid() - at_points()).abs().max())
-        _add(record, case, "grid", total, on_grid, plain, max_difference=apart)
+    kinds = {"value": gv_noise.value, "simplex": gv_noise.simplex, "cellular": gv_noise.cellular}
+    for name, kind in kinds.items():
+        case = f"{count:,} points, {name}"
+        if record.wants(case):
+            _kind(record, case, points, kind)
+    case = f"{count:,} points, 6 octaves"
+    if record.wants(case):
+        _kind(record, case, points, gv_noise.fbm)
+
+
+def _kind(record: Record, case: str, points: torch.Tensor, kind: Callable[..., Any]) -> None:
+    """One noise, of the op."""
+    places = points.to(record.settings.device)
+    _add(record, case, "op", len(points), lambda: kind(places))
 
 
 def _points(record: Record, case: str, points: torch.Tensor) -> None:
     """The same points by everyone; peers have hashes of their own, so values can't be compared."""
     device = record.settings.device
     on_device, in_numpy = points.to(device), points.numpy()
-    eager = _add(record, case, "points", len(points), lambda: gv_noise.perlin(on_device))
-    compiled = torch.compile(gv_noise.perlin, fullgraph=True, dynamic=False)
+    eager = _add(record, case, "op", len(points), lambda: gv_noise.perlin(on_device))
+    twin = partial(op, kind="perlin", backend="reference")
+    apart = float((twin(on_device) - gv_noise.perlin(on_device)).abs().max())
+    _add(record, case, "twin", len(points), lambda: twin(on_device), eager, max_difference=apart)
+    compiled = torch.compile(twin, fullgraph=True, dynamic=False)
     try:
         compiled(on_device)
         synchronize(device)
-        _add(record, case, "compiled", len(points), lambda: compiled(on_device), eager)
+        _add(record, case, "twin, compiled", len(points), lambda: compiled(on_device), eager)
     except Exception as error:  # whatever the compiler finds missing here
         reason = str(error).strip().splitlines()
         record.note(f"compiled: it does not work here: {reason[0] if reason else type(error)}")

@@ -40,6 +40,12 @@ class Painted(Distance):
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         return self.shape.bounds(center, half)
 
+    def near(self, center: Tensor, half: Tensor) -> Distance:
+        return self.replaced(shape=self.shape.near(center, half))
+
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        return self.shape.alike(center, half)
+
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         return torch.zeros_like(center), torch.ones_like(center)
 

@@ -22,6 +22,8 @@ from .field import Field, Interval, length
 
 Color = Sequence[float]  # linear red, green, blue, 0 to 1
 WHITE = (0.8, 0.8, 0.8)
+_HASH = 0x9E3779B1
+_ROUNDED = 2.0**-16  # of the size of places: values differ by less where float32 rounds them
 
 
 class Distance(Field):
@@ -76,6 +78,9 @@ class Distance(Field):
         middle, most = self(center), self.slope(center, half) * length(half)
         return middle - most, middle + most
 
+    def near(self, center: Tensor, half: Tensor) -> Distance:
+        return self
+
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         """Returns intervals (k, 3) float64 that hold the colours everywhere in boxes."""
         color = self.color.to(center).expand_as(center)
@@ -104,7 +109,9 @@ class Pair(Distance):
         self.smooth = first.smooth and second.smooth
 
     def mix(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the value made of two values, and the second one's share of the colour."""
+        """Returns the value made of two values, and the second one's share of the colour, which
+        only rises, or only falls, with either value. Where it is 0 or 1, the value is one of them.
+        """
         raise NotImplementedError
 
     def forward(self, points: Tensor) -> Tensor:
@@ -126,12 +133,8 @@ class Pair(Distance):
         return self.mix(*low)[0], self.mix(*high)[0]
 
     def colors(self, center: Tensor, half: Tensor) -> Interval:
-        """One shape's where it alone counts, else what lies between both; the share only rises, or
-        only falls, with either value.
-        """
-        (a, b), (c, d) = self.first.bounds(center, half), self.second.bounds(center, half)
-        ends = torch.stack((self.mix(a, d)[1].to(a), self.mix(b, c)[1].to(a)))
-        low, high = ends.amin(0)[:, None], ends.amax(0)[:, None]
+        """One shape's where it alone counts, else what lies between both."""
+        low, high = (end[:, None] for end in self._share(center, half, 0.0))
         own, other = self.first.colors(center, half), self.second.colors(center, half)
         hull = torch.minimum(own[0], other[0]), torch.maximum(own[1], other[1])
         first, second = (
@@ -139,6 +142,32 @@ class Pair(Distance):
             for one, two, both in zip(own, other, hull, strict=True)
         )
         return first, second
+
+    def _share(self, center: Tensor, half: Tensor, rounded: float) -> Interval:
+        """(k,) the second one's share in boxes, of values that are rounded by a part of places."""
+        slack = rounded * (center.abs() + half).amax(1)
+        (a, b), (c, d) = self.first.bounds(center, half), self.second.bounds(center, half)
+        shares = self.mix(a - slack, d + slack)[1], self.mix(b + slack, c - slack)[1]
+        ends = torch.stack([share.to(a) for share in shares])
+        return ends.amin(0), ends.amax(0)
+
+    def near(self, center: Tensor, half: Tensor) -> Distance:
+        """One shape where it alone counts in all boxes."""
+        least, most = self._share(center, half, _ROUNDED)
+        alone = torch.stack(((most == 0).all(), (least == 1).all())).tolist()
+        if alone[0]:
+            return self.first.near(center, half)
+        if alone[1]:
+            return self.second.near(center, half)
+        first, second = self.first.near(center, half), self.second.near(center, half)
+        return self.replaced(first=first, second=second)
+
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        least, most = self._share(center, half, _ROUNDED)
+        own = torch.where(most == 0, 0, torch.where(least == 1, 1, 2))
+        first = torch.where(own == 1, 0, self.first.alike(center, half))
+        second = torch.where(own == 0, 0, self.second.alike(center, half))
+        return (first * _HASH + second) * 3 + own
 
     def box(self) -> Tensor | None:
         return around(self.first.box(), self.second.box())
@@ -203,6 +232,12 @@ class Negative(Distance):
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         low, high = self.shape.bounds(center, half)
         return -high, -low
+
+    def near(self, center: Tensor, half: Tensor) -> Distance:
+        return self.replaced(shape=self.shape.near(center, half))
+
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        return self.shape.alike(center, half)
 
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         return self.shape.colors(center, half)

@@ -8,9 +8,10 @@ Source of the intervals: Moore, "Interval analysis", 1966; Snyder, "Interval ana
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -78,6 +79,28 @@ class Field(nn.Module):
         float64 and of all smaller ones. What holds for values holds for their means.
         """
         return self.bounds(center, half)
+
+    def near(self, center: Tensor, half: Tensor) -> Field:
+        """Returns a field of the same values, in every bit, in all of k boxes, (k, 3) float64 each,
+        without the parts that do not matter there; itself unless overridden. Unlike all other
+        methods it looks at values, so the host waits.
+
+        Source: Keeter, "Massively parallel rendering of complex closed-form implicit surfaces",
+            SIGGRAPH 2020 (formulas that are shortened region by region).
+        """
+        return self
+
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        """Returns (k,) int64 numbers, equal for boxes in which the same parts of the field matter:
+        these are best asked for together; see `near`.
+        """
+        return torch.zeros_like(center[:, 0], dtype=torch.int64)
+
+    def replaced(self, **parts: nn.Module) -> Self:
+        """Returns this field with other parts by name, which shares all else with it."""
+        other = copy.copy(self)
+        other._modules = {**self._modules, **parts}
+        return other
 
     def box(self) -> Tensor | None:
         """Returns (2, 3) float64 corners of a box beyond which there is nothing; None: unknown."""

@@ -7,6 +7,7 @@ Source: Perlin, Hoffert, "Hypertexture", SIGGRAPH 1989 (fur as noise around a su
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -83,6 +84,12 @@ class Fur(Field):
         skin = high < (_HALF - reach - 1 / _SHARP) * self.length
         least = _SKIN * skin.to(low)
         return {"value": (least, torch.where(skin, least, (~above).to(low)))}
+
+    def near(self, center: Tensor, half: Tensor) -> Self:
+        return self.replaced(shape=self.shape.near(center, half))
+
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        return self.shape.alike(center, half)
 
     def box(self) -> Tensor | None:
         """Around the shape and its hairs."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -116,6 +117,12 @@ class Solid(Field):
             turned = torch.where(deep, 0.0, 1.0).to(low)[:, None].expand(-1, 3)
             known["normal"] = (-turned, turned)
         return known
+
+    def near(self, center: Tensor, half: Tensor) -> Self:
+        return self.replaced(shape=self.shape.near(center, half))
+
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        return self.shape.alike(center, half)
 
     def box(self) -> Tensor | None:
         return self.shape.box()

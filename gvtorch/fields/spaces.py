@@ -62,6 +62,12 @@ class Space(Distance):
         known = self.value(low, center), self.value(high, center)
         return tighter(known, super().bounds(center, half))
 
+    def near(self, center: Tensor, half: Tensor) -> Distance:
+        return self.replaced(shape=self.shape.near(*self.over(center, half)))
+
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        return self.shape.alike(*self.over(center, half))
+
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         return self.shape.colors(*self.over(center, half))
 
@@ -230,6 +236,12 @@ class Repeat(Distance):
         """The slope, and what the shape tells of all places at which it is asked."""
         known = self.shape.bounds(*self._reach(center, half))
         return tighter(known, super().bounds(center, half))
+
+    def near(self, center: Tensor, half: Tensor) -> Distance:
+        return self.replaced(shape=self.shape.near(*self._reach(center, half)))
+
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        return self.shape.alike(*self._reach(center, half))
 
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         return self.shape.colors(*self._reach(center, half))

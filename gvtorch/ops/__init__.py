@@ -15,6 +15,7 @@ from .cache import (
     put_rows,
     unlink,
 )
+from .noise import noise
 from .registry import available
 from .trace import (
     composite,
@@ -43,6 +44,7 @@ __all__ = [
     "list_samples",
     "locate",
     "lru_partition",
+    "noise",
     "orphan",
     "put_rows",
     "sample_bricks",

@@ -205,6 +205,7 @@ FAKES: dict[str, Callable[..., Any]] = {
     "lacking": lambda *, node_k, **_: torch.empty_like(node_k, dtype=torch.bool),
     "cut_bricks": _cut_bricks,
     "voxelize": _voxelize,
+    "noise": lambda *, point_pn, **_: point_pn.new_empty((point_pn.shape[0],)),
     **dict.fromkeys(
         ("unlink", "orphan", "link", "link_bricks", "link_tiles", "put_rows"), lambda **_: None
     ),
@@ -283,6 +284,7 @@ if not _reasons["cpp"]:
         _register_fake(getattr(torch.ops.gvtorch, _name), _fake)
     _refuse_gradients(torch.ops.gvtorch.trace_rays)
     _refuse_gradients(torch.ops.gvtorch.shade_rays)
+    _refuse_gradients(torch.ops.gvtorch.noise)
     torch.library.register_autograd(
         "gvtorch::sample_bricks", _sample_gradient, setup_context=_save_samples
     )

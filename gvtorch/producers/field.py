@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -15,7 +15,7 @@ from ..fields import Distance, Field, Interval, Solid
 from ..pool import Channel
 from .producer import Bricks, Nodes, Producer, Region, Regions
 
-_BATCH = 128  # bricks that are made at a time on the CPU, whose caches then hold what is between
+_BATCH = 64  # bricks that are made at a time on the CPU, whose caches then hold what is between
 _MARGIN = 1 / 32  # voxels by which boxes are taken wider, so that rounded places lie in them
 _ROUNDED = 2.0**-18  # relative width by which intervals are, for values are rounded too
 
@@ -143,10 +143,19 @@ class FieldProducer(Producer):
         return Regions(kind=kind, constants=constants, ranges=ranges)
 
     def fill(self, nodes: Nodes) -> Bricks:
-        """Evaluates the field at every voxel, border included."""
-        batch = _BATCH if nodes.loc.device.type == "cpu" else len(nodes)
-        parts = [self._made(nodes[at : at + batch]) for at in range(0, len(nodes), max(batch, 1))]
-        data = {name: torch.cat([part[name] for part in parts]) for name in self.channels}
+        """Evaluates the field at every voxel, border included. On the CPU in batches of bricks in
+        which the same parts of it matter, and these parts alone.
+        """
+        if nodes.loc.device.type != "cpu" or torch.compiler.is_compiling():
+            data = self._made(nodes, self.field)
+        else:
+            beyond = getattr(self.field, "margin", 0) + _MARGIN
+            order, parts = [], []
+            for rows, field in alike(self.field, nodes, beyond, _BATCH):
+                order.append(rows)
+                parts.append(self._made(nodes[rows], field))
+            back = torch.cat(order).argsort()
+            data = {name: torch.cat([part[name] for part in parts])[back] for name in self.channels}
         stored = {name: self._stored(name, rows) for name, rows in data.items()}
         whole = [n for n, channel in self.channels.items() if not channel.dtype.is_floating_point]
         if not whole:
@@ -181,9 +190,9 @@ class FieldProducer(Producer):
             raise AttributeError(f"{type(self).__name__}: no part of the field has a time")
         return clocks
 
-    def _made(self, nodes: Nodes) -> dict[str, Tensor]:
+    def _made(self, nodes: Nodes, field: nn.Module) -> dict[str, Tensor]:
         """Values of the voxels of some bricks, (k, z, y, x, c) by channel."""
-        where, field = type(self).__name__, self.field
+        where = type(self).__name__
         size = nodes.voxel_size.to(self.dtype)[:, None, None, None]
         if isinstance(field, Field) and field.prefiltered:
             points = self._points(nodes.wider(field.margin))
@@ -196,7 +205,7 @@ class FieldProducer(Producer):
         points = self._points(nodes)
         total: dict[str, Any] = {}
         for offset in self.offsets.to(size).unbind(0):
-            values = _by_channel(where, self.field(points + size * offset), points)
+            values = _by_channel(where, field(points + size * offset), points)
             total = {name: total.get(name, 0) + value for name, value in values.items()}
         return {name: value / len(self.offsets) for name, value in total.items()}
 
@@ -245,6 +254,23 @@ def cache_field(
     channel, such as a network: the engine keeps what rays ask for. Arguments as `FieldProducer`.
     """
     return FieldProducer(field, extent, **options)
+
+
+def alike(
+    field: nn.Module, nodes: Nodes, beyond: float, count: int
+) -> Iterator[tuple[Tensor, nn.Module]]:
+    """Yields rows of at most so many nodes in which the same parts of a field matter, and these
+    parts, up to `beyond` voxels behind the brick's border. Waits for the device.
+    """
+    if not isinstance(field, Field):
+        yield from ((rows, field) for rows in torch.arange(len(nodes)).split(count))
+        return
+    center, layout = nodes.center, nodes.layout
+    half = nodes.voxel_size * (0.5 * layout.brick_size + layout.border + beyond)
+    _, kind = field.alike(center, half).unique(return_inverse=True)
+    for group in kind.argsort(stable=True).split(kind.bincount().tolist()):
+        near = field.near(center[group], half[group])
+        yield from ((rows, near) for rows in group.split(count))
 
 
 def _by_channel(where: str, values: Any, points: Tensor) -> dict[str, Tensor]:

@@ -12,18 +12,18 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..base import check
 from ..base.constants import DEEP_VOXELS
 from ..fields import Distance, noise
 from ..fields.noise.fractal import Octave, octaves_of
 from ..pool import Channel
+from .field import alike
 from .producer import Layout, Nodes, Producer, Region, Regions
 
-_BATCH = 128  # bricks that are made at a time on the CPU, whose caches then hold what is between
+_BATCH = 64  # bricks that are made at a time on the CPU, whose caches then hold what is between
 _COARSEST = 1.5  # cells a voxel, from which on the mean tells nothing of the noise
-_GRID = 0.5  # cells a voxel, up to which noise is made grid by grid
 _ROUNDED = 1e-4  # what rounding may add to a sum of octaves, in units of the amplitude
 
 
@@ -181,7 +181,7 @@ class Hypertexture(Producer):
         return Regions(kind=kind, constants={"density": is_full})
 
     def fill(self, nodes: Nodes) -> dict[str, Tensor]:
-        """Makes the bricks, level by level, in batches."""
+        """Makes the bricks, level by level, in batches in which the same of the shape matters."""
         side = nodes.layout.side
         shape = (len(nodes), side, side, side, 1)
         device = nodes.loc.device
@@ -191,23 +191,21 @@ class Hypertexture(Producer):
         }
         for depth in nodes.depth.unique().tolist():
             here = (nodes.depth == depth).nonzero()[:, 0]
-            for rows in here.split(_BATCH if device.type == "cpu" else len(here)):
-                for name, values in self._made(nodes[rows], self.level_of(depth)).items():
-                    data[name][rows] = values.to(data[name].dtype)
+            count = _BATCH if device.type == "cpu" else len(here)
+            for rows, shape in alike(self.shape, nodes[here], 0, count):
+                made = self._made(nodes[here[rows]], self.level_of(depth), shape)
+                for name, values in made.items():
+                    data[name][here[rows]] = values.to(data[name].dtype)
         return data
 
-    def _made(self, nodes: Nodes, level: Level) -> dict[str, Tensor]:
-        """Channels (k, z, y, x, 1) of nodes of a level."""
+    def _made(self, nodes: Nodes, level: Level, shape: nn.Module) -> dict[str, Tensor]:
+        """Channels (k, z, y, x, 1) of nodes of a level, of what of the shape matters there."""
         if self.dtype == torch.float64:
             points = nodes.center[:, None, None, None] + nodes.local_positions
         else:
             points = nodes.positions
-        distance = self.shape(points)
+        distance = shape(points)
         total = distance * (-1 / self.thickness)
-        centers = nodes.center
-        axes = [
-            centers[:, axis, None] + local.flatten(1) for axis, local in enumerate(nodes.local_axes)
-        ]
         active = torch.arange(len(nodes), device=total.device)
         values = total.clone()
         self.wanted += total.numel() * len(level.octaves)
@@ -217,14 +215,11 @@ class Hypertexture(Producer):
                 needed = (away < level.soft + level.left[number]).nonzero()[:, 0]
                 if len(needed) < len(active):
                     total[active] = values
-                    active, values = active[needed], values[needed]
+                    active, values, points = active[needed], values[needed], points[needed]
             if not len(active):
                 break
             self.made += values.numel()
-            places = [(axis[active] * one.frequency).to(self.dtype) for axis in axes]
-            values = values + one.amplitude * _noise_at(
-                places, one.seed, level.side * one.frequency
-            )
+            values = values + one.amplitude * noise.perlin(points * one.frequency, seed=one.seed)
         total[active] = values
         return self._channels(total, distance, level.soft)
 
@@ -233,18 +228,6 @@ class Hypertexture(Producer):
         t = ((total - (0.5 - soft)) / (2 * soft)).clamp(0, 1)
         found = {"density": t * t * (3 - 2 * t), "distance": distance}
         return {name: found[name][..., None] for name in self.channels}
-
-
-def _noise_at(axes: Sequence[Tensor], seed: int, spacing: float) -> Tensor:
-    """Gradient noise (k, z, y, x) at all combinations of coordinates along x, y, z, (k, s) each,
-    which lie at most `spacing` apart.
-    """
-    if spacing <= _GRID:
-        cells = math.ceil((axes[0].shape[1] - 1) * spacing) + 1
-        return noise.perlin_grid(*axes, seed=seed, cells=cells)
-    x, y, z = axes
-    points = x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]
-    return noise.perlin(points, seed=seed)
 
 
 def _cut_out(

@@ -8,33 +8,29 @@
 
 #include "entry/entry_cache.h"
 #include "entry/entry_mesh.h"
+#include "entry/entry_noise.h"
 #include "entry/entry_segments.h"
+#include "packets/chunks.h"
 #include "packets/trace_chunks.h"
 
 namespace gvtorch {
 
 // packet.cpp, compiled once for each instruction set.
-using ShadeChunk = void(const ShadeArgs& args, int64_t begin, int64_t end);
-using VoxelizeChunk = void(const VoxelizeArgs& args, int64_t begin, int64_t end);  // rows
 namespace baseline {
-ShadeChunk shade_chunk;
-VoxelizeChunk voxelize_chunk;
+extern const Chunks chunks;
 }  // namespace baseline
 #ifdef GV_X86
 namespace avx2 {
-ShadeChunk shade_chunk;
-VoxelizeChunk voxelize_chunk;
+extern const Chunks chunks;
 }  // namespace avx2
 namespace avx512 {
-ShadeChunk shade_chunk;
-VoxelizeChunk voxelize_chunk;
+extern const Chunks chunks;
 }  // namespace avx512
 #endif
 
 struct Processor {
   const char* name;
-  ShadeChunk* shade_chunk;
-  VoxelizeChunk* voxelize_chunk;
+  const Chunks& chunks;
 };
 
 // The widest instructions that this processor has; GVTORCH_CPU=baseline, avx2 or avx512 asks for fewer.
@@ -46,11 +42,11 @@ inline Processor find_processor() {
   const bool wide = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("f16c");
   if (asked == "avx512" && wide && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
       __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl")) {
-    return {"avx512", &avx512::shade_chunk, &avx512::voxelize_chunk};
+    return {"avx512", avx512::chunks};
   }
-  if ((asked == "avx512" || asked == "avx2") && wide) return {"avx2", &avx2::shade_chunk, &avx2::voxelize_chunk};
+  if ((asked == "avx512" || asked == "avx2") && wide) return {"avx2", avx2::chunks};
 #endif
-  return {"baseline", &baseline::shade_chunk, &baseline::voxelize_chunk};
+  return {"baseline", baseline::chunks};
 }
 
 inline const Processor& processor() {
@@ -64,16 +60,25 @@ extern "C" __attribute__((visibility("default"))) const char* gvtorch_instructio
 void FusedShaders::run(const Tensor& like, ShadeArgs args, bool wide) {
   if (wide) return shade_fused<double>(like, args);
   if (!(args.shader == kPlainShader ? packs(args) : shades(args))) return shade_fused<float>(like, args);
-  trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) { processor().shade_chunk(args, begin, end); });
+  trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) { processor().chunks.shade(args, begin, end); });
 }
 
 void voxelize(const Tensor& like, const VoxelizeArgs& args) {
   constexpr int64_t kRows = 16;  // at a time
   const int64_t rows = args.cubes * args.side * args.side;
   const auto chunk = [&](int64_t number) {
-    processor().voxelize_chunk(args, number * kRows, std::min(rows, (number + 1) * kRows));
+    processor().chunks.voxelize(args, number * kRows, std::min(rows, (number + 1) * kRows));
   };
   for_each(like, (rows + kRows - 1) / kRows, chunk, 1);
+}
+
+void make_noise(const Tensor& like, const NoiseArgs& args, int64_t points) {
+  if (is_wide(like)) return noise_each<double>(like, args, points);
+  constexpr int64_t kChunk = 1 << 11;
+  const auto chunk = [&](int64_t number) {
+    processor().chunks.noise(args, number * kChunk, std::min(points, (number + 1) * kChunk));
+  };
+  for_each(like, (points + kChunk - 1) / kChunk, chunk, 1);
 }
 
 // See cache.h. Threads count chunks, then take them: ranks do not depend on the number of threads.
@@ -115,6 +120,7 @@ STABLE_TORCH_LIBRARY(gvtorch, library) {
   gvtorch::define(library, gvtorch::SegmentOps{});
   gvtorch::define(library, gvtorch::CacheOps{});
   gvtorch::define(library, gvtorch::MeshOps{});
+  gvtorch::define(library, gvtorch::NoiseOps{});
 }
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) {
@@ -122,4 +128,5 @@ STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) {
   gvtorch::implement(library, gvtorch::SegmentOps{});
   gvtorch::implement(library, gvtorch::CacheOps{});
   gvtorch::implement(library, gvtorch::MeshOps{});
+  gvtorch::implement(library, gvtorch::NoiseOps{});
 }

@@ -5,6 +5,7 @@
 
 #include "entry/entry_cache.h"
 #include "entry/entry_mesh.h"
+#include "entry/entry_noise.h"
 #include "entry/entry_segments.h"
 
 namespace gvtorch {
@@ -17,6 +18,10 @@ void voxelize(const Tensor& like, const VoxelizeArgs& args) {
   const int64_t voxels = args.cubes * args.side * args.side * args.side;
   if (args.wide) return for_each(like, voxels, VoxelizePack<double>{args});
   for_each(like, voxels, VoxelizePack<float>{args});
+}
+
+void make_noise(const Tensor& like, const NoiseArgs& args, int64_t points) {
+  is_wide(like) ? noise_each<double>(like, args, points) : noise_each<float>(like, args, points);
 }
 
 // `compact` of cache.h in three kernels: blocks count chunks, one block adds the counts up, and blocks take their
@@ -102,4 +107,5 @@ STABLE_TORCH_LIBRARY_IMPL(gvtorch, CUDA, library) {
   gvtorch::implement(library, gvtorch::SegmentOps{});
   gvtorch::implement(library, gvtorch::CacheOps{});
   gvtorch::implement(library, gvtorch::MeshOps{});
+  gvtorch::implement(library, gvtorch::NoiseOps{});
 }

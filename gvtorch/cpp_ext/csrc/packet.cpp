@@ -1,6 +1,8 @@
-// Tracing and voxelizing on the CPU, compiled once for each instruction set (build.py), GV_NAMESPACE its name. Nothing
-// of torch or of the standard library's templates may stand here: see hd.h.
+// Tracing, voxelizing and noise on the CPU, compiled once for each instruction set (build.py), GV_NAMESPACE its name.
+// Nothing of torch or of the standard library's templates may stand here: see hd.h.
 #include "mesh/voxelize.h"
+#include "noise/noise.h"
+#include "packets/chunks.h"
 #include "packets/packet_walk.h"
 
 namespace gvtorch {
@@ -30,6 +32,13 @@ void voxelize_rows(const VoxelizeArgs& args, int64_t begin, int64_t end) {
 void voxelize_chunk(const VoxelizeArgs& args, int64_t begin, int64_t end) {
   args.wide ? voxelize_rows<double>(args, begin, end) : voxelize_rows<float>(args, begin, end);
 }
+
+void noise_chunk(const NoiseArgs& args, int64_t begin, int64_t end) {
+  with_noise(args, [&](auto kind, auto axes) { noise_in_lanes<kind.value, axes.value>(args, begin, end); });
+}
+
+extern const Chunks chunks;
+const Chunks chunks = {shade_chunk, voxelize_chunk, noise_chunk};
 
 }  // namespace GV_NAMESPACE
 }  // namespace gvtorch

@@ -6,7 +6,6 @@ from .basis import perlin, simplex, value
 from .bounds import LOST, VARIANCE, Bounds, bounds
 from .cellular import cellular
 from .fractal import fbm, fbm_bounds, ridged, turbulence, warp
-from .grid import perlin_grid
 from .levels import OctaveSum, inherit
 from .spline import SplineSum
 
@@ -22,7 +21,6 @@ __all__ = [
     "fbm_bounds",
     "inherit",
     "perlin",
-    "perlin_grid",
     "ridged",
     "simplex",
     "turbulence",

@@ -6,15 +6,12 @@ Source: Worley, "A cellular texture basis function", SIGGRAPH 1996. Here each ce
 
 from __future__ import annotations
 
-import itertools
 from typing import Literal
 
-import torch
 from torch import Tensor
 
 from ...base import check
-from . import lattice
-from .lattice import Period, Points
+from .lattice import Period, Points, at_points
 
 Feature = Literal["F1", "F2", "F2-F1"]
 FEATURES: tuple[Feature, ...] = ("F1", "F2", "F2-F1")
@@ -48,54 +45,9 @@ def cellular(
     Raises:
         ValueError: An argument is not that.
     """
-    axes = lattice.coordinates("noise.cellular", points)
-    every = lattice.periods("noise.cellular", period, len(axes))
-    jitter = check.number("noise.cellular", "jitter", jitter, low=0, high=1)
-    reach = check.whole("noise.cellular", "reach", reach, low=1, high=2)
+    where = "noise.cellular"
+    check.number(where, "jitter", jitter, low=0, high=1)
+    check.whole(where, "reach", reach, low=1, high=2)
     if feature not in FEATURES:
-        raise ValueError(f"noise.cellular: feature must be one of {FEATURES}, got {feature!r}")
-
-    def evaluate(*axes: Tensor) -> Tensor:
-        first = second = torch.full_like(axes[0], float(reach) ** 2)
-        for bits, away in _neighbours(axes, seed, every, reach, jitter):
-            square = torch.zeros_like(first)
-            for axis, low in enumerate(away):
-                stray = ((bits >> (2 + 10 * axis)) & 1023).to(low.dtype)
-                distance = stray * (jitter / 1023) + low
-                square = square + distance * distance
-            second = torch.minimum(second, torch.maximum(first, square))
-            first = torch.minimum(first, square)
-        if feature == "F1":
-            return first.sqrt()
-        return second.sqrt() if feature == "F2" else second.sqrt() - first.sqrt()
-
-    return lattice.in_chunks(evaluate, axes)
-
-
-def _neighbours(
-    axes: tuple[Tensor, ...],
-    seed: int,
-    period: tuple[int | None, ...],
-    reach: int,
-    jitter: float,
-) -> list[tuple[Tensor, list[Tensor]]]:
-    """Returns for each cell in reach its int32 hashes, and along each axis how far the least place
-    of its point is from where we are.
-    """
-    steps, hashes, lows = range(-reach, reach + 1), [], []
-    for axis, (place, every) in enumerate(zip(axes, period, strict=True)):
-        floor = place.detach().floor()
-        own, least = floor.to(torch.int32), 0.5 * (1 - jitter) - (place - floor)
-        ends = [lattice.wrapped(own + step, every) for step in steps]
-        hashes.append([lattice.scramble(end, seed, axis) for end in ends])
-        lows.append([least + step for step in steps])
-    found = []
-    for row in itertools.product(range(len(steps)), repeat=len(axes) - 1):  # z, y
-        part = hashes[-1][row[0]]
-        for axis, at in zip(range(len(axes) - 2, 0, -1), row[1:], strict=True):
-            part = lattice.join(part, hashes[axis][at])
-        for at in range(len(steps)):
-            where = (at, *reversed(row))
-            away = [low[step] for low, step in zip(lows, where, strict=True)]
-            found.append((lattice.join(part, hashes[0][at]), away))
-    return found
+        raise ValueError(f"{where}: feature must be one of {FEATURES}, got {feature!r}")
+    return at_points(where, feature, points, seed, period, jitter=jitter, reach=reach)

@@ -16,7 +16,7 @@ from torch import Tensor
 from ...base import check
 from .basis import perlin
 from .bounds import Basis, Bounds, bounds
-from .lattice import Period, Points, coordinates, periods
+from .lattice import Period, Points, as_points, periods
 
 #: Seeds of the octaves of a sum, and of the components of a warp, are so far apart.
 _NEXT_OCTAVE, _NEXT_AXIS = 0x10001, 0x3000007
@@ -164,12 +164,11 @@ def warp(
     Raises:
         ValueError: An argument is not that.
     """
-    axes = coordinates("noise.warp", points)
+    place = as_points("noise.warp", points)
     check.number("noise.warp", "amplitude", amplitude)
-    moved = []
-    for axis, place in enumerate(axes):
-        shift = fbm(
-            axes,
+    shifts = [
+        fbm(
+            place,
             octaves=octaves,
             lacunarity=lacunarity,
             gain=gain,
@@ -177,8 +176,9 @@ def warp(
             seed=seed + (axis + 1) * _NEXT_AXIS,
             period=period,
         )
-        moved.append(place + amplitude * shift)
-    return torch.stack(moved, -1)
+        for axis in range(place.shape[-1])
+    ]
+    return place + amplitude * torch.stack(shifts, -1)
 
 
 def fbm_bounds(
@@ -212,13 +212,12 @@ def _layers(
     period: Period,
 ) -> Iterator[tuple[float, Tensor]]:
     """Yields amplitude and noise of each octave."""
-    axes = coordinates(where, points)
-    every = periods(where, period, len(axes))
+    place = as_points(where, points)
+    every = periods(where, period, place.shape[-1])
     if period is not None and lacunarity != int(lacunarity):
         raise ValueError(f"{where}: with a period lacunarity must be whole, got {lacunarity!r}")
     for octave in octaves_of(where, octaves, lacunarity, gain, seed):
         finer = None
         if period is not None:
-            finer = [int(one or 1) * int(octave.frequency) for one in every]
-        places = [one * octave.frequency for one in axes]
-        yield octave.amplitude, basis(places, seed=octave.seed, period=finer)
+            finer = [one * int(octave.frequency) for one in every]
+        yield octave.amplitude, basis(place * octave.frequency, seed=octave.seed, period=finer)

@@ -22,15 +22,15 @@ Source: Lagrange's interpolation; the original engine's sample of noise that is 
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from ...base import check
+from .basis import perlin
 from .fractal import Octave, octaves_of
-from .grid import perlin_grid
+from .lattice import as_points
 
 #: Interpolated from so many voxels along each axis.
 POINTS = 6
@@ -146,24 +146,24 @@ class OctaveSum:
         size = axes[0].shape[0] * axes[0].shape[1] * axes[1].shape[1] * axes[2].shape[1]
         self.wanted += size * len(held)
         if parents is None or child is None or not above:
-            settled = self._evaluated(axes, side, calm)
+            settled = self._evaluated(axes, calm)
         else:
             settled = inherit(parents, child, border=border, branching=branching)
-            settled = settled + self._evaluated(axes, side, calm[len(above) :])
-        return settled + self._evaluated(axes, side, held[len(calm) :]), settled
+            settled = settled + self._evaluated(axes, calm[len(above) :])
+        return settled + self._evaluated(axes, held[len(calm) :]), settled
 
     def _wide(self, side: float, voxels: float) -> list[Octave]:
         """The octaves whose cells are at least so many voxels wide."""
         return [one for one in self.octaves if side * one.frequency * voxels <= 1 + 1e-9]
 
-    def _evaluated(self, axes: Sequence[Tensor], side: float, octaves: Sequence[Octave]) -> Tensor:
+    def _evaluated(self, axes: Sequence[Tensor], octaves: Sequence[Octave]) -> Tensor:
         """The sum of octaves, (k, z, y, x); zeros if there are none."""
         x, y, z = axes
         total = x.new_zeros((len(x), z.shape[1], y.shape[1], x.shape[1]))
+        axes = (x[:, None, None, :], y[:, None, :, None], z[:, :, None, None])
+        places = as_points("noise.OctaveSum", axes)
         for one in octaves:
-            places = [axis * one.frequency for axis in axes]
-            cells = math.ceil((max(total.shape[1:]) - 1) * side * one.frequency) + 1
-            total += one.amplitude * perlin_grid(*places, seed=one.seed, cells=cells)
+            total += one.amplitude * perlin(places * one.frequency, seed=one.seed)
             self.made += total.numel()
         return total
 

@@ -31,8 +31,19 @@ def larger(a: Tensor, b: Tensor) -> Tensor:
 
 
 def sqrt_exact(value: Tensor) -> Tensor:
-    """Square root, rounded once in float32: torch's own may be an ulp beside it on the CPU."""
-    return torch.sqrt(value.to(torch.float64)).to(value.dtype)
+    """Square root, rounded once: torch's own may be an ulp beside it on the CPU. In float64 that is
+    mended by the remainder, whose product is exact in halves (Dekker, "A floating-point technique
+    for extending the available precision", 1971).
+    """
+    root = torch.sqrt(value.to(torch.float64))
+    if value.dtype != torch.float64:
+        return root.to(value.dtype)
+    near = root.detach()
+    wide = near * 134217729.0  # 2^27 + 1
+    high = wide - (wide - near)
+    low, square = near - high, near * near
+    left = value.detach() - square - (high * high - square + 2 * high * low + low * low)
+    return root + torch.where((near > 0) & (near < 1e140), left / (2 * near), 0.0)
 
 
 def _polynomial(x: Tensor, highest: float, *coefficients: float) -> Tensor:

@@ -1,0 +1,18 @@
+// What packet.cpp gives for each instruction set that it is compiled for: functions of items `begin` to `end`.
+#pragma once
+
+#include <cstdint>
+
+namespace gvtorch {
+
+struct ShadeArgs;
+struct VoxelizeArgs;
+struct NoiseArgs;
+
+struct Chunks {
+  void (*shade)(const ShadeArgs& args, int64_t begin, int64_t end);        // rays
+  void (*voxelize)(const VoxelizeArgs& args, int64_t begin, int64_t end);  // rows of voxels
+  void (*noise)(const NoiseArgs& args, int64_t begin, int64_t end);        // points, in float32
+};
+
+}  // namespace gvtorch

@@ -1,0 +1,67 @@
+"""`noise`: gradient, value, simplex and cellular noise at points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from .reference import noise as twin
+from .registry import Backend, choose_backend
+
+KINDS = twin.KINDS
+
+
+def noise(
+    point_pn: Tensor,  # (p, n)
+    kind: str,
+    *,
+    seed: int = 0,
+    period: Sequence[int] = (0, 0, 0),
+    jitter: float = 1.0,
+    reach: int = 1,
+    backend: Backend = "auto",
+) -> Tensor:
+    """Evaluates a noise of one frequency at p points, in the plane (n = 2) or in space (n = 3).
+
+    On all backends and devices every bit is the same. Where gradients by the points are recorded,
+    the twin is evaluated, which torch can differentiate.
+
+    Args:
+        point_pn: (p, n) float32 or float64, in cells. Beyond 2^31 nothing is defined; NaN gives
+            NaN.
+        kind: perlin, value, simplex; F1, F2 or F2-F1 of cellular noise.
+        seed: Another noise for each.
+        period: After how many cells the noise repeats along x, y, z; 0: never.
+        jitter: How far the points of cellular noise stray in their cells, 0 to 1.
+        reach: How many cells around its own cellular noise searches, 1 or 2.
+        backend: auto, reference, cpp or cuda.
+
+    Returns:
+        (p,) of the same dtype.
+
+    Raises:
+        ValueError: A tensor of the wrong shape or dtype, or a number out of its range.
+    """
+    where, device = "noise", point_pn.device
+    n = point_pn.shape[1] if point_pn.dim() == 2 else 0
+    if n not in (2, 3) or point_pn.dtype not in (torch.float32, torch.float64):
+        got = check.describe(point_pn)
+        raise ValueError(f"{where}: point_pn must be (p, 2) or (p, 3) floats, got {got}")
+    if kind not in KINDS:
+        raise ValueError(f"{where}: kind must be one of {KINDS}, got {kind!r}")
+    check.whole(where, "seed", seed, low=-(2**63))
+    check.number(where, "jitter", jitter, low=0, high=1)
+    check.whole(where, "reach", reach, low=1, high=2)
+    each = (*period, 0, 0, 0)[:3]
+    for one in each:
+        check.whole(where, "period", one, low=0, high=2**28)
+    salt = [one & 0xFFFFFFFF for one in twin.salts(seed)]
+    arguments: tuple = (*salt, *each, float(jitter), reach)
+    learns = torch.is_grad_enabled() and point_pn.requires_grad
+    chosen = choose_backend.__wrapped__(backend, device)  # torch.compile warns of caches
+    if chosen == "reference" or (learns and backend == "auto"):
+        return twin.noise(point_pn, KINDS.index(kind), *arguments)
+    return torch.ops.gvtorch.noise(point_pn.contiguous(), KINDS.index(kind), *arguments)

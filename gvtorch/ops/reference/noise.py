@@ -1,0 +1,302 @@
+"""The twin of `noise`: gradient, value, simplex and cellular noise of points, in plain torch.
+
+Integers wrap at 32 bits, so hashes are equal on every device, and floats are made by + - * and
+square roots alone, in one order. Nothing depends on values but numbers: no shape, no branch.
+
+Sources: Perlin, "Improving noise", SIGGRAPH 2002 (fade, the twelve gradients); Perlin, "Noise
+    hardware", SIGGRAPH course notes 2001, and Gustavson, "Simplex noise demystified", 2005 (simplex
+    noise); Gustavson, McEwan, "Tiling simplex noise and flow noise in two and three dimensions",
+    JCGT 2022 (which periods simplices have); Worley, "A cellular texture basis function", SIGGRAPH
+    1996 (here each cell has one point, not a Poisson distributed number of them). The hash is our
+    own: products with odd numbers and shifts, its avalanche measured in the tests.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .exact import sqrt_exact
+
+#: Points evaluated together on the CPU: their temporaries then stay in its caches.
+CHUNK = 1 << 16
+#: In the order of `NoiseKind` in csrc/noise/noise.h.
+KINDS = ("perlin", "value", "simplex", "F1", "F2", "F2-F1")
+
+_FIRST, _SECOND = 0x2C1B3C6D, 0x297A2D39  # odd, about half of their bits set
+_AXIS = (0x632BE59B, 0x4F1BBCDD, 0x1E3779B9)
+_THIRD = 2796203  # 2^23 / 3
+_TOP = {torch.float32: -(2**31), torch.float64: -(2**63)}
+_ONE = {torch.float32: 0x3F800000, torch.float64: 0x3FF0000000000000}  # the bits of 1.0
+#: Simplex noise times this lies in -1 to 1, by dimensions; see `bounds`.
+_SIMPLEX_SCALE = {2: 70.148, 3: 76.880}
+_SKEW = {2: (math.sqrt(3) - 1) / 2, 3: 1 / 3}
+_UNSKEW = {2: (3 - math.sqrt(3)) / 6, 3: 1 / 6}
+
+
+class Given(NamedTuple):
+    """What a noise is made with, but for points."""
+
+    salt: tuple[int, int, int]  # int32
+    period: tuple[int, int, int]  # 0: none
+    jitter: float
+    reach: int
+
+
+class Cell(NamedTuple):
+    """Along one axis: where points lie in their cell, and the hashes of the cell's two ends."""
+
+    offset: Tensor  # from the cell's low end, 0 to 1
+    low: Tensor  # int32
+    high: Tensor  # int32
+
+
+def noise(
+    point_pn: Tensor,
+    kind: int,
+    salt_x: int,
+    salt_y: int,
+    salt_z: int,
+    period_x: int,
+    period_y: int,
+    period_z: int,
+    jitter: float,
+    reach: int,
+) -> Tensor:
+    """See `ops.noise`."""
+    salt = [one - 2**32 if one >= 2**31 else one for one in (salt_x, salt_y, salt_z)]
+    given = Given((salt[0], salt[1], salt[2]), (period_x, period_y, period_z), jitter, reach)
+    make: Callable[..., Tensor] = (_perlin, _value, _simplex, _cellular)[min(kind, 3)]
+
+    def evaluate(*axes: Tensor) -> Tensor:
+        return make(axes, given) if kind < 3 else make(axes, given, KINDS[kind])
+
+    return in_chunks(evaluate, point_pn.unbind(1))
+
+
+def _perlin(axes: Sequence[Tensor], given: Given) -> Tensor:
+    found = cells(axes, given)
+    ends = [(cell.offset, cell.offset - 1) for cell in found]
+    ramps = []
+    for number, bits in enumerate(corners(found)):
+        away = [end[number >> axis & 1] for axis, end in enumerate(ends)]
+        ramps.append(ramp(bits, away))
+    return blend(ramps, [fade(cell.offset) for cell in found])
+
+
+def _value(axes: Sequence[Tensor], given: Given) -> Tensor:
+    found = cells(axes, given)
+    values = [bits.to(axes[0].dtype) * 2.0**-31 for bits in corners(found)]
+    return blend(values, [fade(cell.offset) for cell in found])
+
+
+def _simplex(axes: Sequence[Tensor], given: Given) -> Tensor:
+    """Ramps fade by (1/2 - r^2)^4, which is 0 before the next corner's cell begins. The 0.6 that is
+    often used in space is not, and such noise jumps.
+    """
+    n = len(axes)
+    skew = sum(axes[1:], axes[0]).detach() * _SKEW[n]
+    floors = [(one.detach() + skew).floor() for one in axes]
+    back = sum(floors[1:], floors[0]) * _UNSKEW[n]
+    offsets = [one - (floor - back) for one, floor in zip(axes, floors, strict=True)]
+    places = [floor.to(torch.int32) for floor in floors]
+    rank, total = _ranks(offsets), torch.zeros_like(axes[0])
+    for corner in range(n + 1):
+        steps = [(one + corner >= n).to(torch.int32) for one in rank]  # the `corner` largest
+        away = [
+            offset - step + corner * _UNSKEW[n] for offset, step in zip(offsets, steps, strict=True)
+        ]
+        square = away[0] * away[0]
+        for one in away[1:]:
+            square = square + one * one
+        near = (0.5 - square).clamp_min(0)
+        bits = _simplex_hash([a + b for a, b in zip(places, steps, strict=True)], given)
+        total = total + near * near * (near * near) * ramp(bits, away)
+    return total * _SIMPLEX_SCALE[n]
+
+
+def _cellular(axes: Sequence[Tensor], given: Given, feature: str) -> Tensor:
+    first = second = torch.full_like(axes[0], float(given.reach) ** 2)
+    for bits, away in _neighbours(axes, given):
+        square = torch.zeros_like(first)
+        for axis, low in enumerate(away):
+            stray = ((bits >> (2 + 10 * axis)) & 1023).to(low.dtype)
+            distance = stray * (given.jitter / 1023) + low
+            square = square + distance * distance
+        second = torch.minimum(second, torch.maximum(first, square))
+        first = torch.minimum(first, square)
+    if feature == "F1":
+        return sqrt_exact(first)
+    return sqrt_exact(second) if feature == "F2" else sqrt_exact(second) - sqrt_exact(first)
+
+
+def _ranks(offsets: list[Tensor]) -> list[Tensor]:
+    """Returns int32 how many other offsets are smaller; of equal ones the first ranks higher."""
+    ranks = [torch.zeros_like(offsets[0], dtype=torch.int32) for _ in offsets]
+    for first in range(len(offsets)):
+        for second in range(first + 1, len(offsets)):
+            above = (offsets[first] >= offsets[second]).to(torch.int32)
+            ranks[first] = ranks[first] + above
+            ranks[second] = ranks[second] + (1 - above)
+    return ranks
+
+
+def _simplex_hash(places: list[Tensor], given: Given) -> Tensor:
+    """Returns int32 hashes of corners by their int32 skewed coordinates.
+
+    In space, 6 times the coordinates without skew are whole numbers, and a period wraps those.
+    """
+    if len(places) == 3:
+        total = sum(places[1:], places[0])
+        places = [
+            wrapped(6 * place - total, 6 * every)
+            for place, every in zip(places, given.period, strict=True)
+        ]
+    bits = scramble(places[0], given.salt[0])
+    for place, salt in zip(places[1:], given.salt[1:], strict=False):
+        bits = join(bits, scramble(place, salt))
+    return bits
+
+
+def _neighbours(axes: Sequence[Tensor], given: Given) -> list[tuple[Tensor, list[Tensor]]]:
+    """Returns for each cell in reach its int32 hashes, and along each axis how far the least place
+    of its point is from where we are.
+    """
+    steps, hashes, lows = range(-given.reach, given.reach + 1), [], []
+    for place, salt, every in zip(axes, given.salt, given.period, strict=False):
+        floor = place.detach().floor()
+        own, least = floor.to(torch.int32), 0.5 * (1 - given.jitter) - (place - floor)
+        ends = [wrapped(own + step, every) for step in steps]
+        hashes.append([scramble(end, salt) for end in ends])
+        lows.append([least + step for step in steps])
+    found = []
+    for row in itertools.product(range(len(steps)), repeat=len(axes) - 1):  # z, y
+        part = hashes[-1][row[0]]
+        for axis, at in zip(range(len(axes) - 2, 0, -1), row[1:], strict=True):
+            part = join(part, hashes[axis][at])
+        for at in range(len(steps)):
+            where = (at, *reversed(row))
+            away = [low[step] for low, step in zip(lows, where, strict=True)]
+            found.append((join(part, hashes[0][at]), away))
+    return found
+
+
+def salts(seed: int) -> tuple[int, int, int]:
+    """Returns for x, y and z 32 bits, as int32, that stand for a seed."""
+    x, y, z = (_salt(seed, axis) for axis in range(3))
+    return x, y, z
+
+
+def _salt(seed: int, axis: int) -> int:
+    bits = ((seed + (seed >> 32) * 0x61C88647) * 0x9E3779B1 + _AXIS[axis]) & 0xFFFFFFFF
+    for factor in (_FIRST, _SECOND):
+        bits ^= bits >> 16
+        bits = bits * factor & 0xFFFFFFFF
+    bits ^= bits >> 15
+    return bits - 2**32 if bits >= 2**31 else bits
+
+
+def scramble(lattice: Tensor, salt: int) -> Tensor:
+    """Returns int32 hashes of int32 coordinates along an axis, by the axis' salt."""
+    bits = lattice.bitwise_xor(salt).mul_(_FIRST)
+    bits = bits.bitwise_xor_(bits >> 15).mul_(_SECOND)
+    return bits.bitwise_xor_(bits >> 13)
+
+
+def join(first: Tensor, second: Tensor) -> Tensor:
+    """Returns int32 hashes of pairs of hashes; their high bits are the best ones.
+
+    The shift is arithmetic, so that a word and its complement become one. That costs one bit of 32
+    and saves the mask that a logical shift needs.
+    """
+    bits = first.bitwise_xor(second).mul_(_FIRST)
+    return bits.bitwise_xor_(bits >> 15).mul_(_SECOND)
+
+
+def cells(axes: Sequence[Tensor], given: Given) -> list[Cell]:
+    """Returns for each axis where points lie in the cells of the integer lattice."""
+    found = []
+    for place, salt, every in zip(axes, given.salt, given.period, strict=False):
+        floor = place.detach().floor()
+        low = floor.to(torch.int32)
+        ends = wrapped(low, every), wrapped(low + 1, every)
+        found.append(Cell(place - floor, *(scramble(end, salt) for end in ends)))
+    return found
+
+
+def wrapped(lattice: Tensor, period: int) -> Tensor:
+    """Returns lattice coordinates in the first period; 0: there is none."""
+    return lattice.remainder(period) if period else lattice
+
+
+def corners(found: Sequence[Cell]) -> list[Tensor]:
+    """Returns the int32 hashes of a cell's 2^n corners, x running fastest."""
+    x, y = found[0], found[1]
+    hashes = [join(a, b) for b in (y.low, y.high) for a in (x.low, x.high)]
+    if len(found) == 2:
+        return hashes
+    return [join(a, b) for b in (found[2].low, found[2].high) for a in hashes]
+
+
+def fade(offset: Tensor) -> Tensor:
+    """Returns 6 t^5 - 15 t^4 + 10 t^3, whose first two derivatives are 0 at 0 and 1."""
+    return offset * offset * offset * ((offset * 6 - 15) * offset + 10)
+
+
+def blend(values: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
+    """Returns 2^n values interpolated along x, then y, then z, by the weights of high ends."""
+    for weight in weights:
+        pairs = zip(values[::2], values[1::2], strict=True)
+        values = [low + weight * (high - low) for low, high in pairs]
+    return values[0]
+
+
+def gradient(bits: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns x, y, z of the gradient that int32 hashes choose: from a cube's centre to the middle
+    of one of its twelve edges, so two of them are 1 or -1 and one is 0.
+
+    Signs are bits 6 and 7, and the upper 24 bits, in thirds, tell which is 0. They are floats made
+    bit by bit, since a choice by `torch.where` takes 20 times as long as an addition on the CPU.
+    """
+    third = bits >> 8
+    not_x, not_z = (third + _THIRD) >> 31, (_THIRD - third) >> 31  # -1 where that one is 0, else 0
+    wide = bits
+    if dtype == torch.float64:
+        wide, not_x, not_z = (one.to(torch.int64) for one in (bits, not_x, not_z))
+    size = 31 if dtype == torch.float32 else 63
+    first = ((wide << (size - 6)) & _TOP[dtype]).bitwise_or_(_ONE[dtype])  # 1.0 or -1.0
+    second = ((wide << (size - 7)) & _TOP[dtype]).bitwise_or_(_ONE[dtype])
+    in_x, in_z = first & not_x.bitwise_not_(), second & not_z.bitwise_not_()
+    in_y = first.bitwise_xor_(in_x).bitwise_or_(second.bitwise_xor_(in_z))
+    return in_x.view(dtype), in_y.view(dtype), in_z.view(dtype)
+
+
+def ramp(bits: Tensor, away: Sequence[Tensor]) -> Tensor:
+    """Returns the scalar product of the gradient that hashes choose and (x, y) or (x, y, z). In the
+    plane it is that of the plane z = 0 in space.
+    """
+    own = gradient(bits, away[0].dtype)
+    total = own[0] * away[0] + own[1] * away[1]
+    return total if len(away) == 2 else total + own[2] * away[2]
+
+
+def in_chunks(evaluate: Callable[..., Tensor], axes: Sequence[Tensor]) -> Tensor:
+    """Returns `evaluate(*axes)`, an elementwise function of coordinates of one shape. In chunks on
+    the CPU, unless gradients are recorded or torch.compile fuses the operations.
+    """
+    first = axes[0]
+    whole = first.device.type != "cpu" or torch.compiler.is_compiling()
+    learns = torch.is_grad_enabled() and any(one.requires_grad for one in axes)
+    if whole or learns or first.numel() <= CHUNK:
+        return evaluate(*axes)
+    flat = [one.reshape(-1) for one in axes]
+    out = torch.empty(first.numel(), dtype=first.dtype)
+    for begin in range(0, len(out), CHUNK):
+        part = slice(begin, begin + CHUNK)
+        out[part] = evaluate(*(one[part] for one in flat))
+    return out.view(first.shape)

@@ -1,0 +1,174 @@
+"""Distance fields and fractals: values against NumPy, intervals and slopes against brute force."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from helpers.shapes import (
+    ALL,
+    BLUE,
+    FRACTALS,
+    RED,
+    SHAPES,
+    ball,
+    block,
+    inside,
+    np_escape,
+    np_log,
+    np_power,
+    random_boxes,
+    random_points,
+)
+
+import gvtorch as gv
+from gvtorch.fields.fractals import Power
+
+sdf = gv.sdf
+
+
+@pytest.fixture(params=SHAPES, name="named")
+def _named(request):
+    make, by_numpy = SHAPES[request.param]
+    return make(), by_numpy
+
+
+@pytest.fixture(params=ALL)
+def shape(request):
+    return ALL[request.param][0]()
+
+
+@pytest.mark.parametrize("name", FRACTALS)
+def test_fractals_are_those_of_numpy(name):
+    make, by_numpy = FRACTALS[name]
+    points = random_points(1500, 10.0 if name == "mandelbox" else 3.0)
+    expected, found = by_numpy(points.numpy()), make()(points).numpy()
+    same = np.isclose(found, expected, rtol=1e-6, atol=1e-12)
+    assert same.mean() > 0.999 and (expected < 0).any(), "rounding may tip who escapes"
+
+
+class Burning(gv.Iteration):
+    """A step of one's own: the bulb's of n = 2, of coordinates without their signs."""
+
+    def __init__(self):
+        super().__init__()
+        self.power = Power(2)
+
+    def forward(self, z):
+        return self.power(z.abs())
+
+
+def test_any_iteration_makes_a_fractal_and_what_is_not_known_is_not_proven():
+    shape, points = gv.Fractal(Burning(), iterations=8), random_points(500, 3.0)
+    expected = np_escape(points.numpy(), lambda z: np_power(np.abs(z), 2), None, 8, 2.0, np_log)
+    assert np.isclose(shape(points).numpy(), expected, rtol=1e-6).mean() > 0.995
+    center, half = random_boxes(2000)
+    low, high = shape.bounds(center, half)
+    value = shape(inside(center, half, 20))
+    assert (value >= low[:, None]).all() and (value <= high[:, None]).all()
+    center, half = torch.full((1, 3), 5.0).double(), torch.full((1, 3), 0.1).double()
+    assert shape.bounds(center, half)[0] > 0, "beyond the bailout it escapes at once"
+    with pytest.raises(ValueError, match="Fractal: iteration must be a Iteration, got int"):
+        gv.Fractal(3)
+    with pytest.raises(ValueError, match="colors must be three colours, got 1"):
+        gv.Mandelbulb(colors=((0, 0, 0),))
+
+
+def test_values_are_those_of_numpy(named):
+    shape, by_numpy = named
+    points = random_points(20_000)
+    expected = np.asarray(by_numpy(points.numpy()))
+    assert np.abs(shape(points).numpy() - expected).max() < 1e-12
+    single = shape(points.float())
+    assert single.dtype == torch.float32 and np.abs(single.numpy() - expected).max() < 2e-6
+
+
+def test_intervals_hold_in_random_boxes(shape):
+    """10^5 boxes: no value at 27 points of each lies beyond, and the slope is never passed."""
+    center, half = random_boxes(100_000)
+    low, high = shape.bounds(center, half)
+    steep = shape.slope(center, half)
+    for at in torch.arange(len(center)).split(20_000):
+        points = inside(center[at], half[at], 27)
+        value = shape(points)
+        assert (value >= low[at, None] - 1e-12).all() and (value <= high[at, None] + 1e-12).all()
+        change = (value[:, :13] - value[:, 13:26]).abs()
+        way = (points[:, :13] - points[:, 13:26]).norm(dim=-1)
+        assert (change <= steep[at, None] * way * (1 + 1e-9) + 1e-12).all()
+    if not isinstance(shape, gv.Mandelbox):  # all boxes lie within it
+        assert ((low > 0) | (high < 0)).double().mean() > 0.15, "and they say something"
+
+
+def test_gradients_are_those_of_differences(named):
+    shape, _ = named
+    points, step = random_points(5000), 1e-6
+    steps = step * torch.eye(3, dtype=torch.float64)
+    by_steps = torch.stack(
+        [(shape(points + one) - shape(points - one)) / (2 * step) for one in steps], -1
+    )
+    apart = (shape.gradient(points) - by_steps).abs().amax(1)
+    assert apart.quantile(0.99) < 1e-6, "but where two surfaces meet"
+
+
+def test_nothing_lies_beyond_a_box(shape):
+    box = shape.box()
+    if box is not None:
+        low, high = box.unbind(0)
+        points = random_points(100_000, 14.0 if isinstance(shape, gv.Mandelbox) else 8.0)
+        found = shape(points) < 0
+        assert found.any() and ((points >= low) & (points <= high)).all(1)[found].all()
+
+
+def test_shapes_have_the_colour_of_what_is_nearer():
+    union, points = ball() | block(), random_points(2000)
+    value, color = union.surface(points)
+    nearer = torch.where(
+        (block()(points) < ball()(points))[:, None], torch.tensor(BLUE), torch.tensor(RED)
+    )
+    assert torch.equal(value, union(points)) and torch.allclose(color, nearer.double())
+    smooth = sdf.SmoothUnion(ball(), block(), 0.3).surface(points)[1]
+    low, high = torch.tensor((RED, BLUE)).double().aminmax(dim=0)
+    assert ((smooth >= low - 1e-6) & (smooth <= high + 1e-6)).all()
+    center, half = random_boxes(20_000)
+    for shape in (union, ball() - block(), sdf.SmoothUnion(ball(), block(), 0.3)):
+        low, high = shape.colors(center, half)
+        found = shape.surface(inside(center, half, 12))[1]
+        assert (found >= low[:, None] - 1e-6).all() and (found <= high[:, None] + 1e-6).all()
+        assert (low == high).all(1).double().mean() > 0.02, "of shapes that nearly touch"
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_what_matters_near_a_box_has_the_same_bits(name):
+    """Values, colours and gradients of float32, in boxes of the size of some bricks and of all."""
+    shape = ALL[name][0]()
+    size = 7.0 if name == "mandelbox" else 1.2
+    random = torch.Generator().manual_seed(4)
+    for wide in (0.01, 0.06, 0.3, 1.0):
+        for _ in range(12):
+            middle = (2 * torch.rand(1, 3, generator=random, dtype=torch.float64) - 1) * size
+            center = middle + wide * size * (torch.rand(5, 3, generator=random).double() - 0.5)
+            half = torch.full_like(center, 0.2 * wide * size)
+            points = inside(center, half, 30).float()
+            near = shape.near(center, half)
+            for one, other in zip(near.surface(points), shape.surface(points), strict=True):
+                assert torch.equal(one, other)
+            assert torch.equal(near(points), shape(points))
+
+
+def test_what_does_not_matter_is_not_asked():
+    class Counted(sdf.Sphere):
+        asked = 0
+
+        def forward(self, points):
+            Counted.asked += len(points)
+            return super().forward(points)
+
+    far = sdf.moved(Counted(0.1), 5, 0, 0)
+    shape = sdf.SmoothUnion(sdf.rotated(ball() | far, (0, 0, 1), 90), block(), 0.1) - far
+    center, half = torch.zeros(3, 3).double(), torch.full((3, 3), 0.8).double()
+    near = gv.Solid(shape).near(center, half)
+    Counted.asked = 0
+    near.filtered(torch.zeros(7, 3), torch.ones(7, 3))
+    assert Counted.asked == 0 and isinstance(near.shape, sdf.SmoothUnion)
+    gv.Solid(shape).filtered(torch.zeros(7, 3), torch.ones(7, 3))
+    assert Counted.asked > 0
