@@ -28,7 +28,8 @@ from .tracer import Tracer
 class TreeTracer(torch.nn.Module):
     """Traces world rays through a resident tree, as `render` does. Pools are buffers: `.to(device)`
     moves them. Their dtypes stay as kernels need them, also where `half()`, `bfloat16()` or
-    `double()` of a net that holds the module changes those of others.
+    `double()` of a net that holds the module changes those of others. Any number of threads may
+    trace at a time, while none writes into its buffers.
 
     Buffers and numbers have the names of the ops' arguments. Light and material of a lit shader are
     the buffer `parameter_54`, see `ops.shade_rays`; it may be edited.
