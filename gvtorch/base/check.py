@@ -212,6 +212,14 @@ def nbytes(where: str, name: str, value: Any) -> int:
     return whole(where, name, value, low=1, high=2**62)
 
 
+def words(where: str, name: str, value: Tensor, low: int, high: int) -> None:
+    """Raises ValueError unless all integers of a tensor are in [low, high]."""
+    ends = (int(value.amin()), int(value.amax())) if value.numel() else ()
+    bad = next((end for end in ends if not low <= end <= high), None)
+    if bad is not None:
+        raise ValueError(f"{where}: {name} holds {bad}, must be {low} to {high}")
+
+
 def number(
     where: str,
     name: str,

@@ -186,11 +186,8 @@ class N3Tree:
         """Raises ValueError unless every pointer leads to a tile or brick that exists, only shared
         ones are pointed to twice, and each tile's place is that of its parent.
         """
+        self._check_words()
         child, brick = self.nodes.child_tn, self.nodes.brick_tn
-        if bool(((child < TERMINAL) | (child >= self.nodes.capacity)).any()):
-            raise ValueError("N3Tree: a child pointer leads out of the node pool")
-        if bool(((brick < CONSTANT) | (brick >= self.bricks.capacity)).any()):
-            raise ValueError("N3Tree: a brick pointer leads out of the brick pool")
         both = (("tile", child, self.nodes.shared_t), ("brick", brick, self.bricks.shared_b))
         for name, pointers, shared in both:
             used = pointers[pointers >= 0].to(torch.int64)
@@ -203,6 +200,16 @@ class N3Tree:
         above[:, 3] += 1
         if not torch.equal(places[tile], above):
             raise ValueError("N3Tree: a tile's place is not that of its parent")
+
+    def _check_words(self) -> None:
+        nodes, most = self.nodes, self.bricks.capacity - 1
+        check.words("N3Tree", "child_tn", nodes.child_tn, TERMINAL, nodes.capacity - 1)
+        check.words("N3Tree", "brick_tn", nodes.brick_tn, CONSTANT, most)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Raises ValueError if a pickle holds pointers that lead out of the pools."""
+        vars(self).update(state)
+        self._check_words()
 
     @classmethod
     def from_volume(
