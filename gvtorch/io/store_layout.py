@@ -75,6 +75,7 @@ class StoreLayout:
     value_range: Sequence[Sequence[float]] | None = None  # [low, high] of each channel
     times: int = 1  # time points
     label_count: int | None = None  # of labels that were counted off
+    files_sum: int | None = None  # checksum of the list of checksums, see checksums.py
 
     @property
     def axes(self) -> str:
@@ -270,6 +271,7 @@ class StoreLayout:
             "times": _is_whole(times, own["version"], MOST_TIMES if own["version"] > 1 else 1),
             "dtype": own.get("dtype") in list(DTYPES),
             "label_count": count is None or _is_whole(count, 1, 2**24),
+            "files_sum": own.get("files_sum") is None or _is_whole(own["files_sum"], 0, 2**32 - 1),
             "channels": _is_whole(own.get("channels"), 1, 2**16),
             "block": own.get("block") in BLOCKS,
             "border": own.get("border") == BORDER,
@@ -284,7 +286,7 @@ class StoreLayout:
             if not good:
                 raise ValueError(f"{where}: damaged: gvtorch.{key} is {own.get(key)!r}")
         told = {key: own[key] for key in ("dtype", "block", "value_range")}
-        told |= {"times": times, "label_count": count}
+        told |= {"times": times, "label_count": count, "files_sum": own.get("files_sum")}
         return cls(
             extent=tuple(extent), width=own["channels"], threshold=own.get("threshold"), **told
         )
@@ -416,9 +418,12 @@ def child(root: Any, path: str) -> Any:
     return {**root, "path": f"{root.get('path', '')}{path}/"}
 
 
-def read_key(where: str, root: Any, name: str, deadline: Deadline, last: int | None = None) -> Any:
-    """Returns the content of a file in a folder, up to byte `last`; None if there is no such file.
-    Raises as `Deadline.wait`, and ValueError if there can be no such folder.
+def read_key(
+    where: str, root: Any, name: str, deadline: Deadline, part: slice | None = None
+) -> Any:
+    """Returns the content of a file in a folder, or a part of its bytes, which may count from its
+    end; None if there is no such file. Raises as `Deadline.wait`, and ValueError if there can be no
+    such folder.
     """
     import tensorstore as ts
 
@@ -426,7 +431,7 @@ def read_key(where: str, root: Any, name: str, deadline: Deadline, last: int | N
         folder = deadline.wait(ts.KvStore.open(root, context=context()), where)
     except StoreError as error:
         raise ValueError(f"{where}: not a store: {error}") from None
-    found = deadline.wait(folder.read(name, byte_range=slice(0, last)), f"{where}/{name}")
+    found = deadline.wait(folder.read(name, byte_range=part), f"{where}/{name}")
     return found.value if found.state == "value" else None
 
 

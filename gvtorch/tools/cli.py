@@ -117,7 +117,7 @@ class Convert:
             del common["spacing"]
             _print_table(_readable(estimate(self.path, self.store, **common).as_dict()))
             return
-        start = time.perf_counter()
+        start, finished = time.perf_counter(), (self.store / "zarr.json").exists()
         with Bar(speed=True) as bar, cluster(self.scheduler) as executor:
             store = convert(
                 *(self.path, self.store),
@@ -126,6 +126,9 @@ class Convert:
                 resume=self.resume,
                 progress=bar,
             )
+        if finished:  # --resume had nothing to do
+            print(f"{self.store}: is finished already")
+            return
         seconds = time.perf_counter() - start
         size = amount(store.describe()["disk bytes"])
         extent = "x".join(str(n) for n in store.extent)
