@@ -17,10 +17,9 @@ from typing import Any
 from ..base.image_info import ImageInfo
 from .omero import forget_assumed, read_channels, write_channels
 from .remote import is_file_url
-from .store_layout import WORK, Deadline, StoreLayout, child, read_key
+from .store_layout import MOST_JSON, WORK, Deadline, StoreLayout, child, read_key
 
 _MOST_LEVELS = 64
-_MOST_JSON = 1 << 24  # bytes
 _DEFAULT_AXES = "tczyx"  # of versions 0.1 and 0.2
 #: Lengths of a metre, to compare axes of different units.
 _METRES = {
@@ -100,14 +99,14 @@ def find_image(
 
 
 def read_json(
-    where: str, root: Any, name: str, deadline: Deadline, most: int = _MOST_JSON
+    where: str, root: Any, name: str, deadline: Deadline, most: int = MOST_JSON
 ) -> dict[str, Any] | None:
     """Reads a JSON object of a folder, as `parse_json`; returns None if there is no such file."""
-    content = read_key(where, root, name, deadline)
+    content = read_key(where, root, name, deadline, most=most)
     return None if content is None else parse_json(f"{where}/{name}", content, most)
 
 
-def parse_json(where: str, content: bytes, most: int = _MOST_JSON) -> dict[str, Any]:
+def parse_json(where: str, content: bytes, most: int = MOST_JSON) -> dict[str, Any]:
     """Reads a JSON object; raises ValueError if it is damaged, no object, or of more than `most`
     bytes.
     """

@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
+from .http import is_http, read_http
 from .resources import cores
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ BLOCKS = (32, 64)  # voxels along a side of a block
 WORK = ".gvtorch-work"
 MOST_VOXELS = 2**40
 MOST_TIMES = 2**20
+MOST_JSON = 1 << 24  # bytes of metadata
 DTYPES = {"uint8": 1, "int8": 1, "uint16": 2, "int16": 2, "float16": 2, "float32": 4}  # bytes
 GROUPS = ("gvtorch", "gvtorch/blocks", "gvtorch/cells")
 _PLAIN_CHUNK = 64  # voxels
@@ -353,15 +355,24 @@ class Deadline:
         self.timeout = timeout
         self._end = time.monotonic() + timeout
 
+    @property
+    def left(self) -> float:
+        """Seconds until then."""
+        return max(0.0, self._end - time.monotonic())
+
+    def over(self, where: str) -> TimeoutError:
+        """What is raised then."""
+        return TimeoutError(f"{where}: no answer within {self.timeout:g} s")
+
     def wait(self, future: Any, where: str) -> Any:
         """Returns the result of one of tensorstore's futures; raises TimeoutError if it took too
         long, StoreError if it failed.
         """
         try:
-            return future.result(timeout=max(0.0, self._end - time.monotonic()))
+            return future.result(timeout=self.left)
         except TimeoutError:
             future.cancel()
-            raise TimeoutError(f"{where}: no answer within {self.timeout:g} s") from None
+            raise self.over(where) from None
         except Exception as error:  # tensorstore raises what its status maps to
             raise StoreError(f"{where}: {short(error)}") from None
 
@@ -419,14 +430,28 @@ def child(root: Any, path: str) -> Any:
 
 
 def read_key(
-    where: str, root: Any, name: str, deadline: Deadline, part: slice | None = None
+    where: str,
+    root: Any,
+    name: str,
+    deadline: Deadline,
+    part: slice | None = None,
+    most: int = MOST_JSON,
 ) -> Any:
     """Returns the content of a file in a folder, or a part of its bytes, which may count from its
-    end; None if there is no such file. Raises as `Deadline.wait`, and ValueError if there can be no
-    such folder.
+    end; None if there is no such file. Behind http it is at most `most` bytes. Raises as
+    `Deadline.wait`, and ValueError if there can be no such folder.
     """
     import tensorstore as ts
 
+    if is_http(root):
+        url = child(root, name)
+        url = f"{url.partition('?')[0].rstrip('/')}{url[url.find('?') :] if '?' in url else ''}"
+        try:
+            return read_http(url, deadline.left, most, part)
+        except TimeoutError:
+            raise deadline.over(f"{where}/{name}") from None
+        except (OSError, ValueError) as error:
+            raise StoreError(f"{where}/{name}: {short(error)}") from None
     try:
         folder = deadline.wait(ts.KvStore.open(root, context=context()), where)
     except StoreError as error:
