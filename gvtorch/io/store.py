@@ -51,7 +51,8 @@ _READERS = 4  # threads that read such groups
 
 
 class Store:
-    """A volume that is read in parts. Safe to use from several threads.
+    """A volume that is read in parts. Safe to use from several threads, and pickled: it is opened
+    again where it is unpickled. A process that was forked after a store was opened can't read any.
 
     Attributes:
         location: Path or URL.
@@ -111,6 +112,7 @@ class Store:
             self.value_range = [ranges[c] for c in np.arange(layout.width)[channels]]
         self.layout, self._levels, self._channels = layout, levels, channels
         self.root = kvstore(location)
+        self._asked: dict[str, Any] = {}  # of `open`
         self.all_channels = isinstance(channels, slice)
         self.coarse: dict[str, CoarseChannel] = {}
         self.pool = pool
@@ -167,11 +169,15 @@ class Store:
             label_values=names,
             pool=pool,
         )
+        self._asked = {"location": location, "image": image, "time": time, "channels": channels}
         if own:
             self._open_own(deadline)
             if found.own.get("checksum", (kept := sum_of(found.own))) != kept:
                 raise ValueError(f"{where}: damaged: gvtorch's metadata is not what was written")
         return self
+
+    def __reduce__(self) -> Any:
+        return partial(Store.open, **self._asked), ()
 
     def _open_own(self, deadline: Deadline) -> None:
         """Opens blocks and cells of all levels, and compares them with what they must be."""

@@ -352,6 +352,7 @@ class Deadline:
     """The time at which reads are given up: `timeout` seconds after this is made."""
 
     def __init__(self, timeout: float) -> None:
+        check_process()
         self.timeout = timeout
         self._end = time.monotonic() + timeout
 
@@ -383,11 +384,28 @@ def short(error: BaseException) -> str:
     return " ".join(text.split())[:400] or type(error).__name__
 
 
+_process: int | None = None  # that uses tensorstore
+
+
+def check_process() -> None:
+    """Raises StoreError in a process that was forked from one that had used tensorstore, which has
+    lost its threads and would end the process.
+    """
+    if _process not in (None, os.getpid()):
+        raise StoreError(
+            "stores can't be read in a process that was forked after one was opened: open the "
+            "first one in the workers, or start these by 'spawn' or 'forkserver' "
+            "(DataLoader(multiprocessing_context='forkserver'))"
+        )
+
+
 @functools.cache
 def context() -> Any:
     """tensorstore's resources: no cache (the pools and their host cache are it), few threads."""
     import tensorstore as ts
 
+    global _process  # noqa: PLW0603
+    _process = os.getpid()
     return ts.Context(
         {
             "cache_pool": {"total_bytes_limit": 0},

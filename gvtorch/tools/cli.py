@@ -240,10 +240,11 @@ def _sparkline(counts: list[int]) -> str:
     """Bars of the counts' logarithms: most volumes are mostly air."""
     import math
 
-    most = math.log1p(max(counts))
+    most = math.log1p(max(1, *counts))
     if not (sys.stdout.encoding or "ascii").lower().startswith("utf"):
         return ", ".join(str(count) for count in counts)
-    return "".join(" ▁▂▃▄▅▆▇█"[math.ceil(8 * math.log1p(count) / most)] for count in counts)
+    bars = (min(8, math.ceil(8 * math.log1p(count) / most)) for count in counts)
+    return "".join(" ▁▂▃▄▅▆▇█"[bar] for bar in bars)
 
 
 _COMMANDS: dict[str, Any] = {
