@@ -494,6 +494,67 @@ def test_folders_of_headers_that_the_environment_names_count(tmp_path):
 
 
 @pytest.mark.backend("cpp")
+def test_what_is_included_otherwise_counts_as_well(tmp_path):
+    """By a macro, over two lines, and in brackets: no stale library is used."""
+    header = write(tmp_path, ADD.replace("COLOR", "kA + kB + kC"))
+    ways = '#define FILE_A "a.h"\n#include FILE_A\n#include \\\n"b.h"\n#include <c.h>\n'
+    header.write_text(ways + header.read_text())
+    (tmp_path / "found").mkdir()
+    compiler = quick_compiler(tmp_path)
+    folders = {"a": tmp_path, "b": tmp_path, "c": tmp_path / "found"}
+    values = dict.fromkeys("abc", 0.125)
+    own = {"CPATH": str(tmp_path / "found"), "CXX": compiler}
+    for changed in ("", "a", "c"):
+        values |= {changed: 0.25} if changed else {}
+        for name, value in values.items():
+            text = f"constexpr float k{name.upper()} = {value}f;\n"
+            (folders[name] / f"{name}.h").write_text(text)
+        assert in_processes(1, header, **own) == [str(sum(values.values()))], changed
+
+
+@pytest.mark.backend("cpp")
+def test_no_name_of_a_user_comes_to_a_shell(tmp_path, monkeypatch):
+    """nvcc hands its arguments to a shell; a compiler here does so as well."""
+    real, compiler = shutil.which(compilers.find_cxx()[0]), tmp_path / "c++"
+    compiler.write_text(f'#!/bin/sh\neval "{real} $* -O0"\n')
+    compiler.chmod(0o755)
+    folder = tmp_path / "a b;touch $(touch beside)`touch beside`"
+    folder.mkdir()
+    (folder / "color.h").write_text("constexpr float kColor = 0.5f;\n")
+    header = write(folder, ADD.replace("COLOR", "kColor"), "own $(touch here);'\".h")
+    header.write_text('#include "color.h"\n' + header.read_text())
+    monkeypatch.setenv("CXX", str(compiler))
+    monkeypatch.setenv("GVTORCH_CACHE", str(folder / "cache"))
+    monkeypatch.chdir(tmp_path)
+    shader = gv.CompiledShader(header, "Own")
+    tree = gv.N3Tree.from_volume(gv.Volume(torch.ones(8, 8, 8)), 8)
+    picture = gv.render(tree, gv.Camera.orbit(width=1, height=1), shader)
+    assert float(picture.color[0, 0, 0]) == 0.5
+    assert not [file for file in tmp_path.rglob("*") if file.name in ("beside", "here")]
+
+
+@pytest.mark.backend("cpp")
+def test_folders_above_and_libraries_are_looked_at(tmp_path, monkeypatch):
+    header = write(tmp_path, ADD.replace("COLOR", "0.5"))
+    cache = tmp_path / "above" / "cache"
+    own = {"GVTORCH_CACHE": str(cache), "CXX": quick_compiler(tmp_path)}
+    for name, value in own.items():
+        monkeypatch.setenv(name, value)
+    left = cache / "shaders" / "draft-killed"
+    left.mkdir(parents=True)
+    os.utime(left, (1, 1))
+    assert in_processes(1, header, **own) == ["0.5"]
+    assert not left.exists(), "what a killed compilation left is gone"
+    (library,) = (cache / "shaders").iterdir()
+    for place in (library, cache.parent):
+        mode = place.stat().st_mode
+        place.chmod(0o777)
+        with pytest.raises(RuntimeError, match=rf"others may write to {place}; GVTORCH_CACHE"):
+            gv.CompiledShader(header, "Own")
+        place.chmod(mode)
+
+
+@pytest.mark.backend("cpp")
 def test_it_is_unpickled_in_another_process(tmp_path, monkeypatch):
     monkeypatch.setenv("CXX", quick_compiler(tmp_path))
     shader = gv.CompiledShader(write(tmp_path, ADD.replace("COLOR", "0.5")), "Own")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import http.server
 import threading
+import time
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -14,6 +17,7 @@ from helpers.stores import noise
 import gvtorch as gv
 from gvtorch.io import remote
 from gvtorch.io.conversion import convert
+from gvtorch.io.store import Store
 
 
 class Server(ThreadingHTTPServer):
@@ -203,3 +207,38 @@ def test_other_schemes_through_fsspec(tmp_path, server, grid):
 )
 def test_what_is_the_url_of_a_file(url, is_file):
     assert remote.is_file_url(url) == is_file
+
+
+class Endless(http.server.BaseHTTPRequestHandler):
+    """Answers with what never ends, as fast as it can or a byte at a time."""
+
+    pause = 0.0
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.end_headers()
+        with contextlib.suppress(OSError):
+            while not Endless.over:
+                self.wfile.write(b"[" * (1 if self.pause else 1 << 20))
+                time.sleep(self.pause)
+
+    over = False
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.mark.parametrize("pause", [0.0, 0.05])
+def test_a_server_without_an_end_is_given_up(pause, monkeypatch):
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Endless)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    monkeypatch.setattr(Endless, "pause", pause)
+    monkeypatch.setattr("gvtorch.io.store._OPEN_TIMEOUT", 1.0)
+    url = f"http://127.0.0.1:{server.server_port}/a.zarr"
+    try:
+        with pytest.raises(OSError, match=r"more than 16777216 bytes|no answer within 1 s"):
+            Store.open(url)
+    finally:
+        monkeypatch.setattr(Endless, "over", True)
+        server.shutdown()
+        server.server_close()

@@ -195,6 +195,7 @@ def memory(where: str, what: str, nbytes: int, device: torch.device) -> None:
         )
 
 
+_LEAST = 1e-60  # of positive numbers, so that their ratios and squares are numbers
 _UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30, "TIB": 2**40}
 
@@ -212,6 +213,14 @@ def nbytes(where: str, name: str, value: Any) -> int:
     return whole(where, name, value, low=1, high=2**62)
 
 
+def words(where: str, name: str, value: Tensor, low: int, high: int) -> None:
+    """Raises ValueError unless all integers of a tensor are in [low, high]."""
+    ends = (int(value.amin()), int(value.amax())) if value.numel() else ()
+    bad = next((end for end in ends if not low <= end <= high), None)
+    if bad is not None:
+        raise ValueError(f"{where}: {name} holds {bad}, must be {low} to {high}")
+
+
 def number(
     where: str,
     name: str,
@@ -227,7 +236,7 @@ def number(
     no_gradient(where, name, value)
     try:
         result = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{where}: {name} must be a number, got {value!r}") from None
     inside = low < result <= high if open_low else low <= result <= high
     if not (math.isfinite(result) and inside):
@@ -262,6 +271,8 @@ def triple(
     x, y, z = (number(where, name, item) for item in items)
     if positive and min(x, y, z) <= 0:
         raise ValueError(f"{where}: {name} must be positive, got {(x, y, z)}")
+    if positive and not _LEAST <= min(x, y, z) <= max(x, y, z) <= 1 / _LEAST:
+        raise ValueError(f"{where}: {name} must be {_LEAST:g} to {1 / _LEAST:g}, got {(x, y, z)}")
     return (x, y, z)
 
 
@@ -283,7 +294,7 @@ def reals(where: str, name: str, value: Any, shape: tuple[int, ...] | None = Non
     no_gradient(where, name, value)
     try:
         numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         raise ValueError(f"{where}: {name} must be numbers, got {value!r}") from None
     if shape is not None and numbers.shape != shape:
         raise ValueError(f"{where}: {name} must be {shape} numbers, got {tuple(numbers.shape)}")

@@ -77,7 +77,8 @@ class LRU:
 
 
 class Cache:
-    """The pools of several trees. The first slots belong to the roots and are never given away.
+    """The pools of several trees. The first slots belong to the roots and are never given away. For
+    one thread at a time: that of its engine, or the one that holds `Engine.lock`.
 
     Attributes:
         nodes, bricks: The pools.

@@ -1,10 +1,15 @@
 """Compiles a user's shader, a C++ header, into a library of one op, and keeps the library.
 
 csrc/user_shader.h says what a header holds, csrc/user.cpp how it becomes an op. A library is found
-by a digest of all that it is made of: the header and what it includes from its folder, gvtorch's
-headers, the flags (and with them the CPU's instruction set), torch's version, and the compilers
-(path, size, time of change, and the environment variables that they read). It is written beside its
-place and then renamed, so two processes may compile the same one at once.
+by a digest of all that it is made of: the header and what it includes, gvtorch's headers, the flags
+(and with them the CPU's instruction set), torch's version, and the compilers (path, size, time of
+change, and the environment variables that they read). It is written beside its place and then
+renamed, so two processes may compile the same one at once.
+
+What a header includes is found by looking at its lines. What the compiler reads beside, by a macro
+or from another folder, is noted in a file (OP.more) and is part of the digest from then on.
+Compilers get names of ours in the folder where they run: no name of a user comes to a shell. A
+library is looked at (its owner, who may write, its digest) and loaded by one descriptor.
 
 Environment:
     GVTORCH_CACHE  folder of the libraries; else gvtorch in XDG_CACHE_HOME or in ~/.cache. gvtorch
@@ -14,9 +19,11 @@ Environment:
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import hashlib
+import json
 import os
 import platform
 import re
@@ -26,6 +33,7 @@ import stat
 import subprocess
 import tempfile
 import threading
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +45,8 @@ from . import SOURCES, compilers, instructions
 _INCLUDE = re.compile(r'^[ \t]*#[ \t]*include[ \t]*"([^"\n]+)"', re.MULTILINE)
 _NAME = re.compile(r"(?=.{1,128}$)[A-Za-z_]\w*(::[A-Za-z_]\w*)*", re.ASCII)
 _READ_BY_COMPILERS = ("CPATH", "CPLUS_INCLUDE_PATH", "NVCC_PREPEND_FLAGS", "NVCC_APPEND_FLAGS")
+_HEADER, _DRAFT = "gv_user_header.h", "draft-"  # what compilers see of a user's header
+_LONGEST = 3600.0  # seconds after which a compilation has been killed
 _lock = threading.Lock()
 
 
@@ -51,6 +61,8 @@ class ShaderSource:
     header: Path
     name: str  # of the struct, with its namespaces
     digest: str
+    known: tuple[Path, ...]  # the header, and what its lines include
+    more: Path  # where the other files that it is compiled from are noted
 
     @staticmethod
     def read(header: Path, name: str) -> ShaderSource:
@@ -60,7 +72,8 @@ class ShaderSource:
         while waiting:
             file = waiting.pop()
             known[file] = text = file.read_bytes()
-            for named in _INCLUDE.findall(text.decode(errors="replace")):
+            lines = text.decode(errors="replace").replace("\\\r\n", "").replace("\\\n", "")
+            for named in _INCLUDE.findall(lines):
                 beside = (file.parent / named).resolve()
                 if beside.is_file() and beside not in known:
                     waiting.append(beside)
@@ -68,7 +81,11 @@ class ShaderSource:
         for file in sorted(known):
             digest.update(os.fsencode(os.path.relpath(file, header.parent)) + b"\0")
             digest.update(hashlib.sha256(known[file]).digest())
-        return ShaderSource(header, name, digest.hexdigest())
+        more = _folder() / f"{name.replace('::', '_')}_{digest.hexdigest()[:16]}.more"
+        for file in _noted(more):
+            digest.update(os.fsencode(file) + b"\0")
+            digest.update(hashlib.sha256(file.read_bytes()).digest() if file.is_file() else b"none")
+        return ShaderSource(header, name, digest.hexdigest(), tuple(known), more)
 
     @property
     def op(self) -> str:
@@ -109,8 +126,10 @@ def load(header: str | os.PathLike[str], name: str) -> UserShader:
             "CompiledShader: name must be that of a C++ struct, of at most 128 letters, "
             f"got {name!r}"
         )
-    source = ShaderSource.read(path, name)
-    library = ctypes.CDLL(str(_loaded(source, ())))
+    compiled(ShaderSource.read(path, name), ())
+    source = ShaderSource.read(path, name)  # the compiler may have told of more files
+    _loaded(source, ())
+    library = _handles[source.op, "cpu"]
     library.gvtorch_uniforms.restype = ctypes.c_char_p
     names = library.gvtorch_uniforms().decode()
     return UserShader(
@@ -141,6 +160,7 @@ def reload(shader: UserShader) -> UserShader:
 
 
 _libraries: dict[tuple[str, str], Path] = {}  # the loaded ones, by op and device type
+_handles: dict[tuple[str, str], ctypes.CDLL] = {}
 
 
 def libraries(op: str) -> list[Path]:
@@ -154,10 +174,16 @@ def _loaded(source: ShaderSource, archs: Sequence[str]) -> Path:
     with _lock:
         if key not in _libraries:
             library = compiled(source, archs)
+            checked = _opened(library)
             try:
-                torch.ops.load_library(library)
-            except OSError as error:  # its cause has the loader's words
-                raise RuntimeError(f"CompiledShader: {error.__cause__ or error}") from None
+                with (
+                    torch._ops.dl_open_guard()
+                ):  # as torch.ops.load_library, which takes links away
+                    _handles[key] = ctypes.CDLL(checked)
+            except OSError as error:
+                text = str(error).replace(checked, str(library))
+                raise RuntimeError(f"CompiledShader: {text}") from None
+            torch.ops.loaded_libraries.add(str(library))
             _libraries[key] = library
         return _libraries[key]
 
@@ -181,27 +207,33 @@ def compiled(source: ShaderSource, archs: Sequence[str]) -> Path:
             f"CompiledShader: no compiler {command[0]!r} to compile {header.name} for {for_whom} "
             f"with; {'NVCC' if archs else 'CXX'} names another"
         )
+    _sweep(library.parent)
     try:
-        scratch = tempfile.TemporaryDirectory(dir=library.parent)
+        scratch = tempfile.TemporaryDirectory(prefix=_DRAFT, dir=library.parent)
     except OSError as error:
         raise _refused(error) from None
     with scratch as folder:
-        target = Path(folder) / library.name
+        target = Path(folder) / "shader.so"
+        (Path(folder) / "beside").symlink_to(header.parent)
+        (Path(folder) / _HEADER).symlink_to(header)
         include, link = compilers.torch_flags()
+        quoted = ["-Xcompiler=-iquote,beside"] if archs else ["-iquote", "beside"]
         call = [*command, *flags, f"-DGV_USER_SHADER={name}", f"-DGV_USER_OP={op}"]
-        call += [f"-DGV_NAMESPACE=user_{op}", "-I", str(SOURCES), *include]
-        call += ["-include", str(header), str(SOURCES / "user.cpp"), "-o", str(target)]
-        call += link
+        call += [f"-DGV_NAMESPACE=user_{op}", *quoted, "-I", str(SOURCES), *include]
+        call += ["-include", _HEADER, str(SOURCES / "user.cpp"), "-o", target.name]
+        call += [*link, "-MD", "-MF", "shader.d"]
         run = subprocess.run(
             call, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace",
-            check=False,
+            check=False, cwd=folder,
         )  # fmt: skip
         if run.returncode or not target.exists():
+            said = run.stdout.replace("beside/", f"{header.parent}/").replace(_HEADER, str(header))
             raise CompileError(
-                f"{header}: {name} did not compile for {for_whom} with: {shlex.join(call)}\n"
-                f"{run.stdout}"
+                f"{header}: {name} did not compile for {for_whom} with: {shlex.join(call)}\n{said}"
             )
         source.require_unchanged()
+        if _note(source, Path(folder)):  # its digest is another one now, and so is its op
+            return compiled(ShaderSource.read(header, name), archs)
         with target.open("ab") as file:
             file.write(hashlib.sha256(target.read_bytes()).digest())
         target.chmod(0o644)
@@ -209,17 +241,87 @@ def compiled(source: ShaderSource, archs: Sequence[str]) -> Path:
     return library
 
 
+def _note(source: ShaderSource, folder: Path) -> bool:
+    """Notes the files that a compiler has read and the source does not know; returns whether there
+    are any. Those of gvtorch, of torch and of the system are no user's.
+    """
+    try:
+        told = (folder / "shader.d").read_text(errors="surrogateescape")
+    except OSError:
+        return False  # a compiler that does not tell
+    words = re.findall(r"(?:[^\s\\]|\\.)+", told.partition(":")[2].replace("\\\n", " "))
+    names = (re.sub(r"\\(.)", r"\1", word).replace("$$", "$") for word in words)
+    read = {(folder / name).resolve() for name in names}
+    torch_root = Path(torch.__file__).resolve().parent
+    ours = (SOURCES.resolve(), torch_root, Path("/usr"), folder.resolve())
+    noted = set(_noted(source.more))
+    more = {
+        file
+        for file in read - noted - {known.resolve() for known in source.known}
+        if not any(file.is_relative_to(root) for root in ours)
+    }
+    if not more:
+        return False
+    draft = folder / "more"
+    draft.write_text(json.dumps(sorted(map(str, more | noted))))
+    draft.replace(source.more)
+    return True
+
+
+def _noted(more: Path) -> list[Path]:
+    """The files that were noted of a source."""
+    try:
+        told = json.loads(more.read_text())
+    except (OSError, ValueError, RecursionError):
+        return []
+    return [Path(file) for file in told] if isinstance(told, list) else []
+
+
+def _sweep(folder: Path) -> None:
+    """Removes what killed compilations have left."""
+    for draft in folder.glob(f"{_DRAFT}*"):
+        with contextlib.suppress(OSError):
+            if time.time() - draft.lstat().st_mtime > _LONGEST:
+                shutil.rmtree(draft, ignore_errors=True)
+
+
 def _is_intact(library: Path) -> bool:
     """Returns whether a library is in the cache and ends with the digest of its other bytes, which
     it lacks where a crash or a full disk cut it short.
     """
     try:
-        kept = library.read_bytes()
+        with library.open("rb") as file:
+            _check_owner(library, os.fstat(file.fileno()))
+            kept = file.read()
     except FileNotFoundError:
         return False
     except OSError as error:
         raise _refused(error) from None
     return kept[-32:] == hashlib.sha256(kept[:-32]).digest()
+
+
+def _opened(library: Path) -> str:
+    """Opens a library, looks at it once more, and returns a path of what is open, so that nothing
+    else can be loaded in its place. It stays open: the loader knows libraries by their paths.
+    """
+    try:
+        file = os.open(library, os.O_RDONLY | os.O_CLOEXEC)
+        _check_owner(library, os.fstat(file))
+    except OSError as error:
+        raise _refused(error) from None
+    path = f"/proc/self/fd/{file}"
+    return path if os.path.exists(path) else str(library)
+
+
+def _check_owner(path: Path, state: os.stat_result) -> None:
+    """Raises RuntimeError if others may change what is loaded as code. In a folder with the sticky
+    bit others may not rename or remove what is not theirs.
+    """
+    if state.st_uid not in (0, os.geteuid()):
+        raise _refused(f"{path} is another user's")
+    sticky = stat.S_ISDIR(state.st_mode) and state.st_mode & stat.S_ISVTX
+    if state.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not sticky:
+        raise _refused(f"others may write to {path}")
 
 
 def _compiler(archs: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -240,14 +342,15 @@ def _folder() -> Path:
         named = os.environ.get("GVTORCH_CACHE")
         base = named or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "gvtorch"
         folder = Path(base).expanduser().absolute() / "shaders"
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        state = folder.stat()
+        for one in (*reversed(folder.parents), folder):  # `parents=True` would let others write
+            if not one.exists():
+                one.mkdir(mode=0o700, exist_ok=True)
+        real = folder.resolve()
+        states = {one: one.stat() for one in (real, *real.parents)}
     except (OSError, RuntimeError) as error:  # the latter: there is no home
         raise _refused(error) from None
-    if state.st_uid not in (0, os.geteuid()):
-        raise _refused(f"{folder} is another user's")
-    if state.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        raise _refused(f"others may write to {folder}")
+    for one, state in states.items():
+        _check_owner(one, state)
     return folder
 
 

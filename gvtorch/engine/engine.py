@@ -7,11 +7,12 @@ Detailed Voxel Rendering", I3D 2009; Crassin, PhD thesis 2011.
 
 from __future__ import annotations
 
+import threading
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from functools import cached_property, partial
-from typing import Literal, Unpack
+from functools import cached_property, partial, wraps
+from typing import Any, Literal, TypeVar, Unpack, cast
 
 import torch
 from torch import Tensor
@@ -60,12 +61,30 @@ Scene = Producer | Mapping[str, Producer]
 _MOST_LISTED = 1 << 17  # nodes whose requests one frame lists
 _KEPT = 1000  # frames in a report
 _MOST_PRODUCED = 256 * 10**6  # bytes of voxels produced in one frame
+_Method = TypeVar("_Method", bound=Callable[..., Any])
+
+
+def _alone(method: _Method) -> _Method:
+    """Lets a method of an engine run in one thread at a time."""
+
+    @wraps(method)
+    def run(self: Engine, *given: Any, **named: Any) -> Any:
+        with self.lock:
+            return method(self, *given, **named)
+
+    return cast("_Method", run)
 
 
 class Engine:
     """A scene of one or more trees in one pair of pools.
 
+    Several threads may use an engine: they take turns, a picture at a time. To look at its pools
+    from another thread than the one that renders, hold `lock`. Producers are asked by the thread
+    that renders, and by one of its own for each captured frame; they must not render with the
+    engine themselves, nor wait for a thread that does.
+
     Attributes:
+        lock: Held while a picture is rendered (`threading.RLock`).
         options: How it was made.
         trees: Trees and their producers, by name.
         cache: Pools, order of use and requests.
@@ -89,7 +108,11 @@ class Engine:
             ProductionError: A root can't be produced.
         """
         check.known("Engine", options, EngineSettings)
-        self.options = EngineOptions(**options)
+        self.options, self.lock, self._rendering = (
+            EngineOptions(**options),
+            threading.RLock(),
+            False,
+        )
         self.device = check.device("Engine", self.options.device)
         producers = dict(scene) if isinstance(scene, Mapping) else {"scene": scene}
         nodes, bricks = make_pools(producers, self.options, self.device)
@@ -121,6 +144,7 @@ class Engine:
             raise
 
     @explicit(RenderOptions)
+    @_alone
     def frame(
         self,
         camera: Camera | Rays,
@@ -180,11 +204,22 @@ class Engine:
 
     @contextmanager
     def new_frame(self, options: RenderOptions) -> Iterator[FrameStats]:
-        """Keeps the statistics of the frame that the block renders. If the block raises, only what
-        is on its way stays marked as pending.
+        """Keeps the statistics of the frame that the block renders; the block has the engine for
+        itself. If it raises, only what is on its way stays marked as pending.
         """
-        if self._closed:
-            raise ValueError("Engine: it is closed")
+        with self.lock:
+            if self._closed:
+                raise ValueError("Engine: it is closed")
+            if self._rendering:
+                raise RuntimeError("Engine: a frame within a frame: a producer or progress renders")
+            self._rendering = True
+            try:
+                yield from self._new_frame(options)
+            finally:
+                self._rendering = False
+
+    def _new_frame(self, options: RenderOptions) -> Iterator[FrameStats]:
+        """See `new_frame`."""
         stats = FrameStats(
             frame=self.frames + 1,
             backend=choose_backend(options.backend, self.device),
@@ -332,6 +367,7 @@ class Engine:
         self.readbacks.append(Readback(stats, collected))
 
     @explicit(RenderOptions)
+    @_alone
     def render(
         self,
         camera: Camera | Rays,
@@ -432,6 +468,7 @@ class Engine:
         return hits, stats
 
     @explicit(RenderOptions)
+    @_alone
     def capture(
         self,
         camera: Camera | Rays,
@@ -500,6 +537,7 @@ class Engine:
         """The last nodes that could not be produced, by name; `stats.failed` counts all."""
         return list(self.production.failures.newest)
 
+    @_alone
     def forget_failures(self) -> None:
         """Lets nodes that could not be produced be asked for again."""
         self.production.failures.forget()
@@ -509,6 +547,7 @@ class Engine:
         """Returns bytes: what the pools hold, and the bookkeeping apart."""
         return self.cache.memory()
 
+    @_alone
     def report(self) -> Report:
         """Returns what the last frames took: print it, or `as_dict()` for JSON."""
         tiles, bricks = self.cache.nodes.parent_t, self.cache.bricks.owner_b
@@ -516,6 +555,7 @@ class Engine:
         occupancy = {name: float((owner >= 0).float().mean()) for name, owner in slots.items()}
         return Report(self._last, occupancy, self.memory())
 
+    @_alone
     def validate(self) -> None:
         """Raises ValueError unless the pools are in order: see `N3Tree` and `Cache`."""
         for source in self.trees.values():
@@ -523,14 +563,17 @@ class Engine:
         self.cache.validate()
 
     def close(self) -> None:
-        """Lets go of what is on its way, and of the producers' files and threads."""
-        self._closed = True
-        for one in self.recorded:
-            one.close()
-        self.production.close()
-        for source in self.trees.values():
-            source.producer.close()
-            source.producer.layout = None
+        """Lets go of what is on its way, and of the producers' files and threads, after the frame
+        that another thread renders now.
+        """
+        self._closed = True  # a picture of many frames ends with this one
+        with self.lock:
+            for one in self.recorded:
+                one.close()
+            self.production.close()
+            for source in self.trees.values():
+                source.producer.close()
+                source.producer.layout = None
 
     def __enter__(self) -> Engine:
         return self

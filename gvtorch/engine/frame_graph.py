@@ -30,6 +30,7 @@ class Steps(Protocol):
     device: torch.device
     frames: int
     cache: Cache
+    lock: AbstractContextManager[object]
     readbacks: Readbacks
 
     @property
@@ -45,7 +46,8 @@ class Steps(Protocol):
 
 class FrameGraph:
     """A frame as CUDA graphs, one that serves and one that draws, which cost the host a call each.
-    `Engine.capture` makes it.
+    `Engine.capture` makes it. Replays take turns with the other frames of the engine; the picture
+    is one buffer, so one thread should replay a graph.
 
     A replay is the frame that `Engine.frame` would render. Where all producers are `on_device`, it
     also makes what the replay before it missed; where all are `on_host`, these get the list of what
@@ -99,6 +101,11 @@ class FrameGraph:
                 f"replay: camera must be {own[0]} of {own[2]}x{own[1]} pixels as captured "
                 f"({own[4]}), got {form[0]} of {form[2]}x{form[1]} ({form[4]})"
             )
+        with self._engine.lock:
+            return self._replay(camera)
+
+    def _replay(self, camera: Camera | Rays) -> tuple[Picture, FrameStats]:
+        """See `replay`."""
         engine, served = self._engine, self._served
         if engine.changed:
             return self._again(camera)  # which makes the changed trees anew

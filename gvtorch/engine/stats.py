@@ -6,6 +6,7 @@ its requests are served once its readback has arrived.
 from __future__ import annotations
 
 import statistics
+import threading
 from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass, field, replace
@@ -21,6 +22,7 @@ _AHEAD = 3  # most frames that the host may be ahead of the device
 #: Fields of `FrameStats` that are known when the device has finished the frame.
 _LATE = {"milliseconds", "stages", "samples", "tiles_used", "bricks_used"}
 _LATE |= {"requests", "misses", "overflow", "converged"}
+_settling = threading.RLock()  # one thread completes statistics, others wait for it
 
 
 @dataclass(kw_only=True, repr=False)
@@ -56,9 +58,10 @@ class FrameStats(RenderStats):
 
     def __post_init__(self) -> None:
         self._unread: tuple[Callable[[], None], ...] = ()
+        self._begun = False  # a thread completes them now
 
     def __getattribute__(self, name: str) -> Any:
-        if name in _LATE and self._unread:
+        if name in _LATE and (self._unread or self._begun):
             self.settle()
         return super().__getattribute__(name)
 
@@ -68,9 +71,15 @@ class FrameStats(RenderStats):
 
     def settle(self) -> FrameStats:
         """Waits until the device has finished the frame; returns the statistics, now complete."""
-        unread, self._unread = self._unread, ()
-        for complete in unread:
-            complete()
+        with _settling:
+            if self._unread:
+                self._begun = True
+                unread, self._unread = self._unread, ()
+                try:
+                    for complete in unread:
+                        complete()
+                finally:
+                    self._begun = False
         return self
 
     def following(self, before: FrameStats) -> FrameStats:
@@ -236,7 +245,7 @@ class Readbacks(deque[Readback]):
     @property
     def steady(self) -> bool:
         """True if the newest frame read back had converged; does not block."""
-        for readback in self:
+        for readback in tuple(self):  # another thread may render
             if readback.arrived:
                 self._steady = readback.converged()
         return self._steady

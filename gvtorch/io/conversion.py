@@ -53,6 +53,7 @@ from .store_layout import (
     kvstore,
     opened,
 )
+from .unfinished import Done
 
 _FEW = 4  # tasks of level 0 up to which processes are not worth their start
 _AHEAD = 64  # tasks handed to an executor that does not tell how many workers it has
@@ -155,7 +156,7 @@ def convert(
         executor: Runs the tasks, such as a dask client's `get_executor()`; the store's folder must
             be the same for all of its workers. A pool of processes if left out.
         workers: Number of processes of that pool; one a core if left out.
-        resume: Go on with a half-written store.
+        resume: Go on with a half-written store; one that is finished is given as it is.
         progress: Told ("converting", bytes done, bytes in all).
         **options: shape, dtype, key and axes, as of `read_volume`.
 
@@ -171,6 +172,8 @@ def convert(
         KeyboardInterrupt: It was interrupted; `resume` goes on, as the message says.
     """
     target = Path(store)
+    if resume and unfinished.is_finished(target) and (whole := Store.open(target)).has_blocks:
+        return whole
     begun = unfinished.is_begun(target, resume=resume)
     opened_source = _source(source, spacing, origin, time, oblique, labels, options)
     opened_source = _counted(opened_source, target, time, workers, progress)
@@ -494,7 +497,7 @@ def _write_levels(
 ) -> None:
     layout = plan.task.layout
     total = _voxels(layout) * layout.voxel_bytes
-    done = sum(work.done.values()) * layout.voxel_bytes
+    done = sum(one.voxels for one in work.done.values()) * layout.voxel_bytes
     progress("converting", done, total)
     counted = isinstance(pool, (ProcessPoolExecutor, ThreadPoolExecutor))
     ahead = 2 * plan.workers + 2 if counted else _AHEAD
@@ -508,7 +511,7 @@ def _write_levels(
             for result in results:
                 bad += result.bad
                 if not result.bad:
-                    work.note({(level, *result.place): result.voxels})
+                    work.note({(level, *result.place): Done(result.voxels, result.files)})
                     done += result.voxels * layout.voxel_bytes
                     progress("converting", done, total)
         if bad:

@@ -17,11 +17,10 @@ from typing import Any
 from ..base.image_info import ImageInfo
 from .omero import forget_assumed, read_channels, write_channels
 from .remote import is_file_url
-from .store_layout import WORK, Deadline, StoreLayout, child, read_key
+from .store_layout import MOST_JSON, WORK, Deadline, StoreLayout, child, read_key
 
 SEVERAL = "gvtorch_channels"  # attribute that names the images of a store of several channels
 _MOST_LEVELS = 64
-_MOST_JSON = 1 << 24  # bytes
 _DEFAULT_AXES = "tczyx"  # of versions 0.1 and 0.2
 #: Lengths of a metre, to compare axes of different units.
 _METRES = {
@@ -49,6 +48,7 @@ class MultiscaleImage:
     name: str
     info: ImageInfo = field(default_factory=ImageInfo)
     lost: tuple[str, ...] = ()  # what is told beside, a few words each
+    own: dict[str, Any] = field(default_factory=dict)  # what gvtorch tells of it
 
 
 def is_zarr(path: str | Path) -> bool:
@@ -97,22 +97,26 @@ def find_image(
         of = plate if _member(attributes, "plate") is not None else ""
         raise ValueError(f"{where}: has {asked} (NGFF multiscales){of}")
     if layout is not None and isinstance(own, dict):
-        found = replace(found, info=_own_info(own.get("info"), found.info))
+        found = replace(found, info=_own_info(own.get("info"), found.info), own=own)
     else:
         found = _with_labels(where, root, found, deadline)
     return root, found, layout
 
 
-def read_json(where: str, root: Any, name: str, deadline: Deadline) -> dict[str, Any] | None:
+def read_json(
+    where: str, root: Any, name: str, deadline: Deadline, most: int = MOST_JSON
+) -> dict[str, Any] | None:
     """Reads a JSON object of a folder, as `parse_json`; returns None if there is no such file."""
-    content = read_key(where, root, name, deadline)
-    return None if content is None else parse_json(f"{where}/{name}", content)
+    content = read_key(where, root, name, deadline, most=most)
+    return None if content is None else parse_json(f"{where}/{name}", content, most)
 
 
-def parse_json(where: str, content: bytes) -> dict[str, Any]:
-    """Reads a JSON object; raises ValueError if it is damaged, no object, or far too large."""
-    if len(content) > _MOST_JSON:
-        raise ValueError(f"{where}: {len(content)} bytes of JSON are too many")
+def parse_json(where: str, content: bytes, most: int = MOST_JSON) -> dict[str, Any]:
+    """Reads a JSON object; raises ValueError if it is damaged, no object, or of more than `most`
+    bytes.
+    """
+    if len(content) > most:
+        raise ValueError(f"{where}: more than {most} bytes of JSON are too many")
     try:
         found = json.loads(content)
     except (ValueError, RecursionError) as error:

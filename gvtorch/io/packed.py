@@ -6,8 +6,10 @@ from __future__ import annotations
 
 import math
 import zlib
+from bz2 import BZ2Decompressor
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import IO, Any, Literal
 
 import numpy as np
 
@@ -49,14 +51,42 @@ class PackedSource(VolumeSource):
 
 def unpack_zlib(file: str, offset: int, need: int) -> bytes:
     """Unpacks zlib or gzip data of a file, which must be of `need` bytes."""
-    engine, parts, size = zlib.decompressobj(zlib.MAX_WBITS | 32), [], 0
+    return unpack(file, offset, need, "zlib")
+
+
+def unpack(file: str, offset: int, need: int, codec: str) -> bytes:
+    """Unpacks "zlib" (or gzip) or "bz2" data of a file, which must be of `need` bytes, and no
+    further than these.
+    """
+    parts, size = [], 0
     with open(file, "rb") as stream:
         stream.seek(offset)
-        while size <= need and (packed := engine.unconsumed_tail or stream.read(_READ)):
-            parts.append(engine.decompress(packed, need + 1 - size or 1))
-            size += len(parts[-1])
-            if engine.eof:
-                break
+        for part in _unpacked(stream, codec, need):
+            parts.append(part)
+            size += len(part)
     if size != need:
         raise ValueError(f"{file}: {need} bytes expected, {'more' if size > need else size} found")
     return b"".join(parts)
+
+
+def _unpacked(stream: IO[bytes], codec: str, need: int) -> Iterator[bytes]:
+    """Parts of at most one byte more than is needed, of one stream after another."""
+    size, packed = 0, b""
+    engine: Any = None
+    while size <= need:
+        if engine is None or engine.eof:  # gzip and bzip2 files may hold several streams
+            packed = (engine.unused_data if engine else b"") or stream.read(_READ)
+            if not packed or (engine and not packed.startswith((b"\x1f\x8b", b"BZh"))):
+                return
+            engine = (
+                zlib.decompressobj(zlib.MAX_WBITS | 32) if codec == "zlib" else BZ2Decompressor()
+            )
+        elif codec == "zlib":
+            packed = engine.unconsumed_tail or stream.read(_READ)
+        else:
+            packed = stream.read(_READ) if engine.needs_input else b""
+        if not packed and (codec == "zlib" or engine.needs_input):
+            return
+        part = engine.decompress(packed, need + 1 - size)
+        size += len(part)
+        yield part

@@ -19,12 +19,14 @@ from ..base import check
 from ..base.constants import MAX_VOXELS
 from ..base.volume import Volume, check_extent
 from .arrays import ObjectSource, as_source
+from .budget import check_files, check_regular, header_budget
 from .formats import FORMATS, find_format, split_path
 from .level_reader import no_time
 from .ngff import is_zarr
 from .oblique import Oblique, straighten
 from .remote import fetch, is_file_url, split_url
-from .source import MemorySource, VolumeSource, told_as
+from .resources import amount, memory_free
+from .source import ArraySource, MemorySource, VolumeSource, told_as
 from .store_layout import DTYPES, MOST_TIMES, MOST_VOXELS, StoreError
 
 _MOST_CHANNELS = 2**10
@@ -127,7 +129,9 @@ def open_source(
     given: dict[str, Any] = {name: v for name, v in options.items() if v is not None}
     text, kind, opener = _find(path, given)
     with told_as(ValueError, text, f"can't be read as {kind}", StoreError, TimeoutError):
-        source = opener(**given)
+        with header_budget(text):
+            source = opener(**given)
+        check_files(source)
         if labels:
             source = dataclasses.replace(source, info=dataclasses.replace(source.info, labels=True))
         check_extent(text, (*source.extent, source.width), most=most)
@@ -169,6 +173,8 @@ def _find(path: Any, given: dict[str, Any]) -> tuple[str, str, Callable[..., Vol
             given["key"] = inner
         if not is_zarr(text) and not Path(text).exists():
             raise FileNotFoundError(f"volume not found: {path}")
+        if "://" not in text:
+            check_regular(text)
         found = find_format(text, raw="shape" in given)
         kind, known = found.name, found.options
         opener = partial(found.open, text)
@@ -196,9 +202,21 @@ def placed(
     )
 
 
+def _mapped(source: VolumeSource) -> bool:
+    """Whether a file's numbers stay in the file."""
+    same = np.dtype(source.stored).name == source.dtype
+    return isinstance(source, ArraySource) and not source.whole and same
+
+
 def read_whole(source: VolumeSource, first: int = 0, times: int = 1) -> np.ndarray:
     """Reads whole time points, (t, z, y, x, c); raises ValueError if the file is damaged."""
     is_array = isinstance(source, (ObjectSource, MemorySource))
+    if not isinstance(source, MemorySource) and not _mapped(source):
+        free, needed = memory_free(), source.peak_bytes + (times - 1) * source.nbytes
+        if needed > free:
+            raise ValueError(
+                f"{source.path}: takes {amount(needed)} of memory, {amount(free)} are free"
+            )
     kind = "an array" if is_array else find_format(source.path, raw=True).name
     with told_as(ValueError, source.path, f"can't be read as {kind}", StoreError, TimeoutError):
         return source.read_times(first, first + times)

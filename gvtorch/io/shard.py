@@ -8,7 +8,7 @@ depends on no other task of its own level, and may be run again after a crash.
 from __future__ import annotations
 
 import errno
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ..pool.downsample import pool_max, pool_mean, pool_min, round_array, window
 from . import boxes
+from .checksums import Files, shard_files
 from .level_reader import Pool, StoredArray
 from .source import VolumeSource
 from .store import needed_cells
@@ -44,7 +45,8 @@ class ShardResult:
 
     place: Place
     voxels: int
-    bad: int  # values that are not finite; the shard is not written then
+    bad: int = 0  # values that are not finite; the shard is not written then
+    files: Files = field(default_factory=dict)  # checksums of the store's files that it wrote
 
 
 def write_shard(conversion: Conversion, level: int, place: Place) -> ShardResult:
@@ -85,7 +87,9 @@ def write_shard(conversion: Conversion, level: int, place: Place) -> ShardResult
         writes.append(write(conversion.root, layout.blocks(level), at, blocks, time))
     for begun in writes:
         finish(begun, conversion.root.get("path", "store"))
-    return ShardResult(place, int(np.prod(size)), 0)
+    specs = (layout.plain(level), layout.cells(level), layout.blocks(level))
+    files = shard_files(conversion.root, specs, place, Deadline(_TIMEOUT))
+    return ShardResult(place, int(np.prod(size)), files=files)
 
 
 def _from_source(

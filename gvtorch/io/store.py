@@ -25,6 +25,7 @@ from ..base.labels import background
 from ..pool.downsample import pool_majority, pool_mean
 from . import boxes
 from .boxes import Zyx
+from .checksums import Checksums, sum_of
 from .level_reader import LevelReader, Pool, open_arrays
 from .ngff import MultiscaleImage, find_image, read_json
 from .store_layout import (
@@ -50,7 +51,8 @@ _READERS = 4  # threads that read such groups
 
 
 class Store:
-    """A volume that is read in parts. Safe to use from several threads.
+    """A volume that is read in parts. Safe to use from several threads, and pickled: it is opened
+    again where it is unpickled. A process that was forked after a store was opened can't read any.
 
     Attributes:
         location: Path or URL.
@@ -110,6 +112,7 @@ class Store:
             self.value_range = [ranges[c] for c in np.arange(layout.width)[channels]]
         self.layout, self._levels, self._channels = layout, levels, channels
         self.root = kvstore(location)
+        self._asked: dict[str, Any] = {}  # of `open`
         self.all_channels = isinstance(channels, slice)
         self.coarse: dict[str, CoarseChannel] = {}
         self.pool = pool
@@ -117,6 +120,7 @@ class Store:
         self._blocks: list[Any] = []
         self._cells: list[Any] = []
         self._seen: set[tuple[Any, ...]] = set()
+        self._sums = Checksums(location, self.root, layout, time)
 
     @classmethod
     def open(
@@ -168,9 +172,15 @@ class Store:
             label_values=names,
             pool=pool,
         )
+        self._asked = {"location": location, "image": image, "time": time, "channels": channels}
         if own:
             self._open_own(deadline)
+            if found.own.get("checksum", (kept := sum_of(found.own))) != kept:
+                raise ValueError(f"{where}: damaged: gvtorch's metadata is not what was written")
         return self
+
+    def __reduce__(self) -> Any:
+        return partial(Store.open, **self._asked), ()
 
     def _open_own(self, deadline: Deadline) -> None:
         """Opens blocks and cells of all levels, and compares them with what they must be."""
@@ -273,6 +283,7 @@ class Store:
         data = self._levels.read(self._checked(level), low, high, deadline)
         if self.has_blocks:
             start, stop = boxes.clamp(low, high, self.layout.shape(level))
+            self._check_sums(self.layout.plain(level), start, stop, deadline)
             inside = data[boxes.index(np.subtract(start, low).clip(0), data.shape[:3])]
             self._check_shards(self.layout.plain(level), inside, start, stop, deadline)
         return data
@@ -317,6 +328,7 @@ class Store:
     def _read_cells(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         future = self._cells[level][boxes.index(low, high)].read(order="C")
         data = deadline.wait(future, f"{self.location}: cells of level {level}")
+        self._check_sums(self.layout.cells(level), low, high, deadline)
         self._check_shards(self.layout.cells(level), data, low, high, deadline)
         return data
 
@@ -346,6 +358,13 @@ class Store:
         shard = zyx // (layout.shard // self.block)
         order = np.lexsort((*zyx.T[::-1], *shard.T[::-1]))
         errors = self._read_stored(self._blocks[level], level, zyx, order, out, deadline)
+        for place in np.unique(shard, axis=0):
+            try:
+                self._sums.check(layout.blocks(level), tuple(place.tolist()), deadline)
+            except (StoreError, ValueError) as error:
+                for row in np.flatnonzero((shard == place).all(1)).tolist():
+                    out[row] = 0
+                    errors.setdefault(row, self._error(level, zyx[row], error))
         for row in _blank(out):
             if row not in errors:
                 try:
@@ -473,7 +492,7 @@ class Store:
                 continue
             chunk = (0, *place) if first else (*place, *[0] * (len(shape) - 3))
             name = "/".join(map(str, ("c", *moment, *chunk)))
-            if read_key(where, child(self.root, spec["path"]), name, deadline, 1) is None:
+            if read_key(where, child(self.root, spec["path"]), name, deadline, slice(0, 1)) is None:
                 raise StoreError(f"{where}: shard {place} z y x: missing chunk")
             self._seen.add(key)
 
@@ -505,7 +524,17 @@ class Store:
                 pass
         return errors
 
-    def _error(self, level: int, at: np.ndarray, error: StoreError) -> str:
+    def _check_sums(self, spec: dict[str, Any], low: Zyx, high: Zyx, deadline: Deadline) -> None:
+        """Raises StoreError if a shard that items `low` to `high` of an array, z y x, lie in is not
+        the one that was written.
+        """
+        per = spec["metadata"]["chunk_grid"]["configuration"]["chunk_shape"]
+        per = per[len(per) - 3 :] if "dimension_names" in spec["metadata"] else per[-5:-2]
+        ends = zip(low, high, per, strict=True)
+        for place in itertools.product(*(range(a // n, (b - 1) // n + 1) for a, b, n in ends)):
+            self._sums.check(spec, place, deadline)
+
+    def _error(self, level: int, at: np.ndarray, error: Exception) -> str:
         z, y, x = at.tolist()
         text = str(error).removeprefix(f"{self.location}: ")
         return f"{self.location}: block ({z}, {y}, {x}) z y x of level {level}: {text}"

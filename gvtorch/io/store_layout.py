@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
+from .http import is_http, read_http
 from .resources import cores
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ BLOCKS = (32, 64)  # voxels along a side of a block
 WORK = ".gvtorch-work"
 MOST_VOXELS = 2**40
 MOST_TIMES = 2**20
+MOST_JSON = 1 << 24  # bytes of metadata
 DTYPES = {"uint8": 1, "int8": 1, "uint16": 2, "int16": 2, "float16": 2, "float32": 4}  # bytes
 GROUPS = ("gvtorch", "gvtorch/blocks", "gvtorch/cells")
 _PLAIN_CHUNK = 64  # voxels
@@ -75,6 +77,7 @@ class StoreLayout:
     value_range: Sequence[Sequence[float]] | None = None  # [low, high] of each channel
     times: int = 1  # time points
     label_count: int | None = None  # of labels that were counted off
+    files_sum: int | None = None  # checksum of the list of checksums, see checksums.py
 
     @property
     def axes(self) -> str:
@@ -270,6 +273,7 @@ class StoreLayout:
             "times": _is_whole(times, own["version"], MOST_TIMES if own["version"] > 1 else 1),
             "dtype": own.get("dtype") in list(DTYPES),
             "label_count": count is None or _is_whole(count, 1, 2**24),
+            "files_sum": own.get("files_sum") is None or _is_whole(own["files_sum"], 0, 2**32 - 1),
             "channels": _is_whole(own.get("channels"), 1, 2**16),
             "block": own.get("block") in BLOCKS,
             "border": own.get("border") == BORDER,
@@ -284,7 +288,7 @@ class StoreLayout:
             if not good:
                 raise ValueError(f"{where}: damaged: gvtorch.{key} is {own.get(key)!r}")
         told = {key: own[key] for key in ("dtype", "block", "value_range")}
-        told |= {"times": times, "label_count": count}
+        told |= {"times": times, "label_count": count, "files_sum": own.get("files_sum")}
         return cls(
             extent=tuple(extent), width=own["channels"], threshold=own.get("threshold"), **told
         )
@@ -348,18 +352,28 @@ class Deadline:
     """The time at which reads are given up: `timeout` seconds after this is made."""
 
     def __init__(self, timeout: float) -> None:
+        check_process()
         self.timeout = timeout
         self._end = time.monotonic() + timeout
+
+    @property
+    def left(self) -> float:
+        """Seconds until then."""
+        return max(0.0, self._end - time.monotonic())
+
+    def over(self, where: str) -> TimeoutError:
+        """What is raised then."""
+        return TimeoutError(f"{where}: no answer within {self.timeout:g} s")
 
     def wait(self, future: Any, where: str) -> Any:
         """Returns the result of one of tensorstore's futures; raises TimeoutError if it took too
         long, StoreError if it failed.
         """
         try:
-            return future.result(timeout=max(0.0, self._end - time.monotonic()))
+            return future.result(timeout=self.left)
         except TimeoutError:
             future.cancel()
-            raise TimeoutError(f"{where}: no answer within {self.timeout:g} s") from None
+            raise self.over(where) from None
         except Exception as error:  # tensorstore raises what its status maps to
             raise StoreError(f"{where}: {short(error)}") from None
 
@@ -370,11 +384,28 @@ def short(error: BaseException) -> str:
     return " ".join(text.split())[:400] or type(error).__name__
 
 
+_process: int | None = None  # that uses tensorstore
+
+
+def check_process() -> None:
+    """Raises StoreError in a process that was forked from one that had used tensorstore, which has
+    lost its threads and would end the process.
+    """
+    if _process not in (None, os.getpid()):
+        raise StoreError(
+            "stores can't be read in a process that was forked after one was opened: open the "
+            "first one in the workers, or start these by 'spawn' or 'forkserver' "
+            "(DataLoader(multiprocessing_context='forkserver'))"
+        )
+
+
 @functools.cache
 def context() -> Any:
     """tensorstore's resources: no cache (the pools and their host cache are it), few threads."""
     import tensorstore as ts
 
+    global _process  # noqa: PLW0603
+    _process = os.getpid()
     return ts.Context(
         {
             "cache_pool": {"total_bytes_limit": 0},
@@ -416,17 +447,34 @@ def child(root: Any, path: str) -> Any:
     return {**root, "path": f"{root.get('path', '')}{path}/"}
 
 
-def read_key(where: str, root: Any, name: str, deadline: Deadline, last: int | None = None) -> Any:
-    """Returns the content of a file in a folder, up to byte `last`; None if there is no such file.
-    Raises as `Deadline.wait`, and ValueError if there can be no such folder.
+def read_key(
+    where: str,
+    root: Any,
+    name: str,
+    deadline: Deadline,
+    part: slice | None = None,
+    most: int = MOST_JSON,
+) -> Any:
+    """Returns the content of a file in a folder, or a part of its bytes, which may count from its
+    end; None if there is no such file. Behind http it is at most `most` bytes. Raises as
+    `Deadline.wait`, and ValueError if there can be no such folder.
     """
     import tensorstore as ts
 
+    if is_http(root):
+        url = child(root, name)
+        url = f"{url.partition('?')[0].rstrip('/')}{url[url.find('?') :] if '?' in url else ''}"
+        try:
+            return read_http(url, deadline.left, most, part)
+        except TimeoutError:
+            raise deadline.over(f"{where}/{name}") from None
+        except (OSError, ValueError) as error:
+            raise StoreError(f"{where}/{name}: {short(error)}") from None
     try:
         folder = deadline.wait(ts.KvStore.open(root, context=context()), where)
     except StoreError as error:
         raise ValueError(f"{where}: not a store: {error}") from None
-    found = deadline.wait(folder.read(name, byte_range=slice(0, last)), f"{where}/{name}")
+    found = deadline.wait(folder.read(name, byte_range=part), f"{where}/{name}")
     return found.value if found.state == "value" else None
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ from ..base.units import spacing_of, time_unit
 Told = tuple[ImageInfo, tuple[float, float, float], list[str]]  # info, spacing, what is not kept
 _MOST_XML = 1 << 28  # characters
 _MOST_PLANES = 1 << 16
+_MOST_LISTED = 1 << 22  # planes that a file may tell of
 RGB = (("red", (1.0, 0.0, 0.0)), ("green", (0.0, 1.0, 0.0)), ("blue", (0.0, 0.0, 1.0)))
 
 
@@ -41,12 +43,23 @@ def opened(path: str) -> Iterator[tuple[Any, list[str]]]:
     log.addHandler(heard)
     try:
         with tifffile.TiffFile(path) as file:
-            len(file.pages)  # finds out where the chain of pages ends
+            pages = len(file.pages)  # finds out where the chain of pages ends
+            _check_planes(path, file.pages.first.description if pages else "")
             yield file, heard.warned
             if heard.damage:
                 raise ValueError(f"{path}: damaged: {heard.damage[0]}")
     finally:
         log.removeHandler(heard)
+
+
+def _check_planes(path: str, text: str) -> None:
+    """Raises ValueError where OME-XML tells of more planes than a list of them can be made for."""
+    counts = dict[str, int]()
+    for name, number in re.findall(r'\b(Size[CZT]|PlaneCount)="(\d+)"', text[:_MOST_XML]):
+        counts[name] = max(counts.get(name, 1), int(number[:20]))
+    for total in (counts.pop("PlaneCount", 1), math.prod(counts.values())):
+        if total > _MOST_LISTED:
+            raise ValueError(f"{path}: tells of {total} planes, at most {_MOST_LISTED} are read")
 
 
 class _Heard(logging.Handler):

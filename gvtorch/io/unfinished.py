@@ -10,31 +10,39 @@ import os
 import shutil
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 from ..base.image_info import ImageInfo
 from ..base.volume import Volume, movable
+from .checksums import LIST, Files, sum_of
 from .ngff import image_metadata, parse_json
 from .store_layout import GROUPS, WORK, StoreLayout
 
 Task = tuple[int, ...]  # level, z, y, x, or level, t, z, y, x
+_JOURNAL, _MANIFEST, _LOCK = "journal.jsonl", "manifest.json", "lock"
+
+
+class Done(NamedTuple):
+    """What a task that is done has written."""
+
+    voxels: int
+    files: Files  # checksums
 
 
 class UnfinishedStore:
     """A store that is being made, by this process alone."""
 
-    def __init__(self, target: Path, journal: IO[str]) -> None:
-        """Takes the folder over."""
-        self.done: dict[Task, int] = {}
+    def __init__(self, target: Path, journal: IO[str], done: Mapping[Task, Done]) -> None:
+        """Takes the folder over; `done` stands in the journal already."""
+        self.done = dict(done)
         self._target, self._journal = target, journal
 
-    def note(self, done: Mapping[Task, int]) -> None:
+    def note(self, done: Mapping[Task, Done]) -> None:
         """Writes down that tasks are done; on disk when this returns."""
         self.done |= done
-        for task, voxels in done.items():
-            self._journal.write(json.dumps({"task": task, "voxels": voxels}) + "\n")
+        self._journal.writelines(_line(*item) for item in done.items())
         self._journal.flush()
         os.fsync(self._journal.fileno())
 
@@ -42,13 +50,22 @@ class UnfinishedStore:
         """Writes the metadata, the root's last of all, and removes the hidden folder."""
         for name in GROUPS:
             write_json(self._target / name / "zarr.json", group({}))
+        files = {name: one for done in self.done.values() for name, one in done.files.items()}
+        write_json(self._target / LIST, {"files": files})
         place = {"spacing": settings["spacing"], "origin": settings["origin"]}
         name = Path(os.path.realpath(self._target)).name.removesuffix(".zarr")
         image, beside = image_metadata(name, layout, info, **place)
         own = layout.attributes(place) | ({"info": beside} if beside else {})
+        own["files_sum"] = sum_of(files)
+        own["checksum"] = sum_of(json.loads(json.dumps(own)))
         attributes = {"ome": image, "gvtorch": own}
         write_json(self._target / "zarr.json", group(attributes))
         shutil.rmtree(self._target / WORK, ignore_errors=True)
+
+
+def is_finished(target: Path) -> bool:
+    """Returns whether there is a whole store."""
+    return (target / "zarr.json").exists()
 
 
 def is_begun(target: Path, *, resume: bool) -> bool:
@@ -59,9 +76,9 @@ def is_begun(target: Path, *, resume: bool) -> bool:
             else.
         FileNotFoundError: Its parent folder is not there.
     """
-    if (target / "zarr.json").exists():
+    if is_finished(target):
         raise FileExistsError(f"{target}: there is a store already; remove it or choose a new name")
-    manifest = target / WORK / "manifest.json"
+    manifest = target / WORK / _MANIFEST
     if manifest.exists():
         if not resume:
             raise FileExistsError(
@@ -79,31 +96,66 @@ def is_begun(target: Path, *, resume: bool) -> bool:
 
 @contextmanager
 def claimed(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator[UnfinishedStore]:
-    """Makes or takes over the hidden folder; raises OSError if another process is at work there,
-    and ValueError if settings or source differ from those of the store to resume.
+    """Makes or takes over the hidden folder. What is there is looked at once more under the lock:
+    another process may have begun, or even finished, since `is_begun` was asked.
+
+    Raises:
+        OSError: Another process is at work there.
+        FileExistsError: As of `is_begun`.
+        ValueError: Settings or source differ from those of the store to resume.
+    """
+    folder = target / WORK
+    with _locked(target):
+        begun = is_begun(target, resume=resume)
+        done = {}
+        if begun:
+            _compare(target, settings)
+            done = _read_journal(folder / _JOURNAL)
+        else:
+            write_json(folder / _MANIFEST, settings)
+        draft = folder / f".{_JOURNAL}.draft"
+        with draft.open("w", encoding="utf-8") as journal:
+            journal.writelines(_line(*item) for item in done.items())
+            journal.flush()
+            os.fsync(journal.fileno())
+            rename(draft, folder / _JOURNAL)
+            yield UnfinishedStore(target, journal, done)
+
+
+@contextmanager
+def _locked(target: Path) -> Iterator[None]:
+    """Holds the lock of a target; a folder that this made and nothing was written into goes again.
+    The process before may have removed the folder with the lock that this one was waiting for.
     """
     import fcntl
 
-    folder = target / WORK
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "lock").open("a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise OSError(f"{target}: another process is converting to it") from None
-        done = {}
-        if resume:
-            _compare(target, settings)
-            done = _read_journal(folder / "journal.jsonl")
-        with (folder / "journal.jsonl").open("w", encoding="utf-8") as journal:
-            work = UnfinishedStore(target, journal)
-            work.note(done)
-            write_json(folder / "manifest.json", settings)
-            yield work
+    folder, made = target / WORK, not target.exists()
+    while True:
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / _LOCK).open("a") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise OSError(f"{target}: another process is converting to it") from None
+            try:
+                same = os.path.samestat(os.fstat(lock.fileno()), (folder / _LOCK).stat())
+            except FileNotFoundError:
+                same = False
+            if not same:
+                continue
+            try:
+                yield
+            finally:
+                if {entry.name for entry in folder.iterdir()} <= {_LOCK} if folder.exists() else ():
+                    shutil.rmtree(folder, ignore_errors=True)
+                    if made:
+                        with suppress(OSError):
+                            target.rmdir()
+            return
 
 
 def _compare(target: Path, settings: dict[str, Any]) -> None:
-    manifest = target / WORK / "manifest.json"
+    manifest = target / WORK / _MANIFEST
     before = parse_json(str(manifest), manifest.read_bytes())
     plain = json.loads(json.dumps(settings))
     if before.get("fingerprint") != plain["fingerprint"]:
@@ -121,19 +173,27 @@ def _compare(target: Path, settings: dict[str, Any]) -> None:
 
 def count_done(target: Path) -> int:
     """Number of tasks that a journal names as done."""
-    journal = target / WORK / "journal.jsonl"
+    journal = target / WORK / _JOURNAL
     return journal.read_bytes().count(b"\n") if journal.exists() else 0
 
 
-def _read_journal(path: Path) -> dict[Task, int]:
-    """Finished tasks; a last line that was cut off is none."""
+def _line(task: Task, done: Done) -> str:
+    """A line of the journal, with its checksum."""
+    entry = {"task": list(task), "voxels": done.voxels, "files": done.files}
+    return json.dumps(entry | {"checksum": sum_of(entry)}) + "\n"
+
+
+def _read_journal(path: Path) -> dict[Task, Done]:
+    """Finished tasks. A line that was cut off or changed tells of none: its task runs again."""
     done = {}
-    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
+    for line in path.read_bytes().splitlines() if path.exists() else []:
         try:
             entry = json.loads(line)
-            done[tuple(int(n) for n in entry["task"])] = int(entry["voxels"])
-        except (ValueError, KeyError, TypeError):
-            break
+            if entry["checksum"] == sum_of(entry):
+                task = tuple(int(n) for n in entry["task"])
+                done[task] = Done(int(entry["voxels"]), dict(entry["files"]))
+        except (ValueError, KeyError, TypeError, RecursionError):
+            continue
     return done
 
 
@@ -149,6 +209,11 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
         json.dump(content, file, indent=1, allow_nan=False)
         file.flush()
         os.fsync(file.fileno())
+    rename(draft, path)
+
+
+def rename(draft: Path, path: Path) -> None:
+    """Gives a file its name; on disk when this returns."""
     draft.replace(path)
     folder = os.open(path.parent, os.O_RDONLY)
     try:

@@ -7,6 +7,7 @@ introduction).
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
 import tempfile
@@ -64,16 +65,40 @@ def write_image(path: Path, layers: Layers, *, transparent: bool, bits: int | No
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """A place to write to, which takes the file's name once the block ends well."""
-    handle, name = tempfile.mkstemp(suffix=path.suffix, dir=path.parent)
-    os.close(handle)
     try:
-        yield Path(name)
+        handle, name = tempfile.mkstemp(suffix=path.suffix, dir=path.parent)
+        os.close(handle)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from None
+    try:
+        try:
+            yield Path(name)
+        except OSError as error:  # what stands there already stays
+            if error.filename not in (None, name):
+                raise
+            text = error.strerror or str(error)
+            raise OSError(
+                error.errno or errno.EIO, f"can't be written: {text}", str(path)
+            ) from None
         mask = os.umask(0)
         os.umask(mask)
         os.chmod(name, 0o666 & ~mask)
         os.replace(name, path)
     finally:
         Path(name).unlink(missing_ok=True)
+
+
+@contextmanager
+def _told() -> Iterator[None]:
+    """Raises OSError for whatever a library raises when it can't write."""
+    try:
+        yield
+    except (OSError, MemoryError):
+        raise
+    except Exception as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        number = errno.ENOSPC if "No space left" in text else errno.EIO
+        raise OSError(number, text) from None
 
 
 def side_by_side(layers: Layers) -> Layers:
@@ -119,7 +144,8 @@ def write_png(path: Path, layers: Layers, *, transparent: bool, bits: int = 8) -
 
     image = np.ascontiguousarray(tiff_pixels(side_by_side(layers), transparent, bits))
     write = write_image_png_u8 if bits == 8 else write_image_png_u16
-    write(str(path), image, "rgba" if transparent else "rgb")
+    with _told():
+        write(str(path), image, "rgba" if transparent else "rgb")
 
 
 def write_tiff(
@@ -165,7 +191,8 @@ def _write_exr(path: Path, layers: Layers, bits: int) -> None:
     channels["Z"] = np.ascontiguousarray(layers["depth"][..., 0])
     channels["samples"] = layers["samples"][..., 0].astype(np.uint32, "C")
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    OpenEXR.File(header, channels).write(str(path))
+    with _told():
+        OpenEXR.File(header, channels).write(str(path))
 
 
 def read_image(path: str | Path) -> Tensor:

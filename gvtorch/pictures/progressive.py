@@ -54,7 +54,7 @@ def _renderer(where: str, render: Callable[[Camera], Any]) -> Callable[[Camera],
 
 
 class Progressive:
-    """The running mean of jittered frames; does not wait for the device.
+    """The running mean of jittered frames; does not wait for the device. For one thread at a time.
 
     A pixel's mean begins with its first frame without a miss, and leaves out later frames with one.
     Until then the pixel shows the newest frame.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import threading
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -16,6 +17,7 @@ from ..base.constants import CONSTANT, TERMINAL
 from ..base.image_info import ImageInfo
 from ..base.labels import background
 from ..base.stage import Progress, no_progress
+from ..base.turns import Turns
 from ..base.volume import Volume, movable
 from ..ops import locate
 from .pools import (
@@ -29,6 +31,8 @@ from .pools import (
 from .pyramid import TreePlan, levels_by_depth, tree_depth
 from .refresh import BrickLevels
 
+_numbering = threading.Lock()
+
 
 class N3Tree:
     """A tree of nodes, each of which covers a cube of space and has N^3 children or none.
@@ -36,6 +40,10 @@ class N3Tree:
     The root cube holds brick_size * N ** depth voxels of the finest level along each axis, and the
     scene fills it from its low corner. Tree units are [0, 1] over the root cube; spacing may differ
     by axis, so the cube is a box in the world.
+
+    Several threads may render a tree at a time; `refresh` in one of them while others render or
+    read raises RuntimeError, and so does the reverse. What is written into its tensors by hand is
+    not seen: that must not happen meanwhile.
 
     Attributes:
         nodes: The node pool.
@@ -55,6 +63,7 @@ class N3Tree:
         filters: For channels whose coarse levels are no means, their `Volume.filter`.
         infos: For channels that a volume told more of, its `Volume.info`.
         threshold: See `from_volume`.
+        turns: Which threads use it now.
     """
 
     def __init__(
@@ -91,6 +100,7 @@ class N3Tree:
         self.infos: dict[str, ImageInfo] = {}
         self.threshold: float | None = None
         self._place: Tensor | None = None
+        self.turns = Turns()
 
     @property
     def device(self) -> torch.device:
@@ -140,6 +150,11 @@ class N3Tree:
             self._place = torch.stack((self.box[0], size, high)).to(self.device)
         return self._place
 
+    def next_frame(self) -> None:
+        """Gives the next picture its number."""
+        with _numbering:
+            self.frame += 1
+
     def loc(self, node: Tensor) -> Tensor:
         """Returns the places (k, 4) int64 x, y, z, depth of nodes (k,) of this tree."""
         return locate(self.nodes.loc_t4, node, self.branching, self.nodes.nodes_per_tile)
@@ -179,11 +194,8 @@ class N3Tree:
         """Raises ValueError unless every pointer leads to a tile or brick that exists, only shared
         ones are pointed to twice, and each tile's place is that of its parent.
         """
+        self._check_words()
         child, brick = self.nodes.child_tn, self.nodes.brick_tn
-        if bool(((child < TERMINAL) | (child >= self.nodes.capacity)).any()):
-            raise ValueError("N3Tree: a child pointer leads out of the node pool")
-        if bool(((brick < CONSTANT) | (brick >= self.bricks.capacity)).any()):
-            raise ValueError("N3Tree: a brick pointer leads out of the brick pool")
         both = (("tile", child, self.nodes.shared_t), ("brick", brick, self.bricks.shared_b))
         for name, pointers, shared in both:
             used = pointers[pointers >= 0].to(torch.int64)
@@ -196,6 +208,16 @@ class N3Tree:
         above[:, 3] += 1
         if not torch.equal(places[tile], above):
             raise ValueError("N3Tree: a tile's place is not that of its parent")
+
+    def _check_words(self) -> None:
+        nodes, most = self.nodes, self.bricks.capacity - 1
+        check.words("N3Tree", "child_tn", nodes.child_tn, TERMINAL, nodes.capacity - 1)
+        check.words("N3Tree", "brick_tn", nodes.brick_tn, CONSTANT, most)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Raises ValueError if a pickle holds pointers that lead out of the pools."""
+        vars(self).update(state)
+        self._check_words()
 
     @classmethod
     def from_volume(
@@ -285,7 +307,8 @@ class N3Tree:
                 f"the tree has {', '.join(self.channel_names)}"
             )
         z, y, x = reversed(self.extent)
-        data = self._levels().read(name, 0, (0, 0, 0), (z, y, x))
+        with self.turns.using("N3Tree.to_volume"):
+            data = self._levels().read(name, 0, (0, 0, 0), (z, y, x))
         table = self.labels.get(name)
         if table is not None:
             data = table[data.to(torch.int64)]
@@ -311,6 +334,7 @@ class N3Tree:
 
         Raises:
             ValueError: The box is none, or not all of the tree is in memory, as in an engine.
+            RuntimeError: Another thread renders the tree.
         """
         low, high = (0, 0, 0), self.extent
         if box is not None:
@@ -328,15 +352,16 @@ class N3Tree:
         tables = {name: None if one is None else one.numpy() for name, one in self.labels.items()}
         empty = {name: background(table) for name, table in tables.items()}
         told = filters, empty, self.spacing, self.threshold
-        self._levels().refresh(low[::-1], high[::-1], *told)
-        tile, child = divmod(self.root, self.nodes.nodes_per_tile)
-        for name in fine:
-            held = self.nodes.ranges[name]
-            two = movable(held)[tile, child].view(held.dtype).float()  # (2, c)
-            self.value_range[name] = (float(two[0].min()), float(two[1].max()))
-        for name in self.made_of:
-            self.made_of[name] = {}
-        self.bricks.in_order()
+        with self.turns.changing("N3Tree.refresh"):
+            self._levels().refresh(low[::-1], high[::-1], *told)
+            tile, child = divmod(self.root, self.nodes.nodes_per_tile)
+            for name in fine:
+                held = self.nodes.ranges[name]
+                two = movable(held)[tile, child].view(held.dtype).float()  # (2, c)
+                self.value_range[name] = (float(two[0].min()), float(two[1].max()))
+            for name in self.made_of:
+                self.made_of[name] = {}
+            self.bricks.in_order()
 
     def _levels(self) -> BrickLevels:
         return BrickLevels(

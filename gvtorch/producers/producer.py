@@ -386,6 +386,9 @@ class Producer(torch.nn.Module):
     """Base of producers. A subclass writes `fill`, which makes the bricks of a batch of nodes, and
     where that saves work `classify`, which tells what nodes hold.
 
+    One engine uses a producer, and asks it from one thread at a time: the one that renders, or that
+    of a captured frame. Its futures may be done in any thread.
+
     Attributes:
         patience: Seconds after which an answer that has not come counts as failed; None: the
             engine's.

@@ -5,6 +5,7 @@ largest and mean value of 8^3 voxels) tell which nodes need no bricks before any
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -114,7 +115,8 @@ class _Cubes:
 
 
 class StoredProducer(Producer):
-    """Streams a `gvtorch convert` store, or any OME-Zarr image. Its channel is "value"."""
+    """Streams a `gvtorch convert` store, or any OME-Zarr image. Its channel is "value". Pickled, it
+    opens its store again in the other process."""
 
     patience = float("inf")  # reads end by themselves, after `timeout`
     on_host = True
@@ -190,9 +192,29 @@ class StoredProducer(Producer):
             labels={_CHANNEL: store.label_values} if store.info.labels else None,
         )
         self.store, self.timeout, self.made_of = store, seconds, made_of
-        self._cache = HostCache(limit)
-        self._closed = threading.Event()
-        self._threads = ThreadPoolExecutor(workers, thread_name_prefix="gvtorch-store")
+        self._limit, self._workers = limit, workers
+        self._begin()
+
+    def _begin(self) -> None:
+        """Makes what a process has for itself: its cache and its threads."""
+        self._cache, self._closed = HostCache(self._limit), threading.Event()
+        self._threads = ThreadPoolExecutor(self._workers, thread_name_prefix="gvtorch-store")
+        self._process = os.getpid()
+
+    def _submit(self, work: Callable[[Nodes], Any], nodes: Nodes) -> Future:
+        """Lets a thread work; threads that were made before a fork are not in the child."""
+        if os.getpid() != self._process:
+            self._begin()
+        return self._threads.submit(work, nodes)
+
+    def __getstate__(self) -> dict[str, Any]:
+        own = ("_cache", "_closed", "_threads", "_process")
+        return {name: value for name, value in vars(self).items() if name not in own}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Opens the store again, in this process."""
+        super().__setstate__(state)
+        self._begin()
 
     def prepare(self, layout: Layout) -> None:
         """Checks that bricks can be cut out of blocks, where the store has coarse channels."""
@@ -209,11 +231,11 @@ class StoredProducer(Producer):
         """Tells later what the cells say; all DATA at once if the store has none."""
         if not self.store.has_blocks:
             return Regions(kind=torch.full((len(nodes),), Region.DATA))
-        return self._threads.submit(self._classify, nodes)
+        return self._submit(self._classify, nodes)
 
     def fill(self, nodes: Nodes) -> Future:
         """Reads and cuts bricks, later."""
-        return self._threads.submit(self._fill, nodes)
+        return self._submit(self._fill, nodes)
 
     def close(self) -> None:
         """Ends the threads without waiting for reads that run."""

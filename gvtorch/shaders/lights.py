@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any, ClassVar, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -33,7 +34,7 @@ def a_number(low: float = -inf, high: float = inf) -> Check:
 
     def checked(owner: Any, name: str, value: Any) -> Any:
         check_number(kind_of(owner), name, value, low=low, high=high)
-        return value
+        return float(value) if isinstance(value, np.ndarray) else value
 
     return checked
 
@@ -43,7 +44,7 @@ def a_triple(low: float = -inf, high: float = inf, zero: bool = True) -> Check:
 
     def checked(owner: Any, name: str, value: Any) -> Any:
         check_triple(kind_of(owner), name, value, low=low, high=high, zero=zero)
-        return value
+        return tuple(value.tolist()) if isinstance(value, np.ndarray) else value
 
     return checked
 
@@ -156,7 +157,7 @@ class LitShader(Shader):
         Raises:
             ValueError: A number is negative or not finite.
         """
-        self.normals, self.light = normals, light or Headlight()
+        self.normals, self.light = normals, Headlight() if light is None else light
         self.ambient, self.diffuse = ambient, diffuse
         self.specular, self.shininess = specular, shininess
 

@@ -343,7 +343,7 @@ def _points(where: str, name: str, points: Points, width: int) -> np.ndarray:
         for number in (number for row in rows for number in row):
             check.no_gradient(where, name, number)
         array = np.array([[float(number) for number in row] for row in rows])
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{where}: {name} must be a list of points {names}") from None
     if array.ndim != 2 or array.shape[0] == 0 or array.shape[1] != width:
         raise ValueError(f"{where}: {name} must be a list of points {names}, got {points!r}")

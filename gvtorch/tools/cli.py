@@ -118,7 +118,7 @@ class Convert:
             del common["spacing"]
             _print_table(_readable(estimate(self.path, self.store, **common).as_dict()))
             return
-        start = time.perf_counter()
+        start, finished = time.perf_counter(), (self.store / "zarr.json").exists()
         with Bar(speed=True) as bar, cluster(self.scheduler) as executor:
             store = convert(
                 *(self.path, self.store),
@@ -127,6 +127,9 @@ class Convert:
                 resume=self.resume,
                 progress=bar,
             )
+        if finished:  # --resume had nothing to do
+            print(f"{self.store}: is finished already")
+            return
         seconds = time.perf_counter() - start
         size = amount(store.describe()["disk bytes"])
         extent = "x".join(str(n) for n in store.extent)
@@ -238,10 +241,11 @@ def _sparkline(counts: list[int]) -> str:
     """Bars of the counts' logarithms: most volumes are mostly air."""
     import math
 
-    most = math.log1p(max(counts))
+    most = math.log1p(max(1, *counts))
     if not (sys.stdout.encoding or "ascii").lower().startswith("utf"):
         return ", ".join(str(count) for count in counts)
-    return "".join(" ▁▂▃▄▅▆▇█"[math.ceil(8 * math.log1p(count) / most)] for count in counts)
+    bars = (min(8, math.ceil(8 * math.log1p(count) / most)) for count in counts)
+    return "".join(" ▁▂▃▄▅▆▇█"[bar] for bar in bars)
 
 
 _COMMANDS: dict[str, Any] = {

@@ -25,7 +25,7 @@ from ..shaders.shader import Shader
 from ..shaders.transfer_function import TransferFunction
 from .around import around
 from .options import RenderOptions, RenderSettings, render_options
-from .pixels import View, tree_stats
+from .pixels import View, tree_stats, using
 from .tracer import Batch, Tracer, march
 from .trees import box_around
 
@@ -129,10 +129,11 @@ def cost(
     placed = camera.placed(box)
     counter = _Counter(tree, transfer, chosen)
     view = View(placed, placed.numbers(tree.device), around(counter, chosen, box), chosen, box)
-    columns = [
-        (hits.samples, counter.take_nodes(), *_means(hits))
-        for _, hits in view.blocks(_RAYS_A_BLOCK, progress)
-    ]
+    with using("cost", [tree]):
+        columns = [
+            (hits.samples, counter.take_nodes(), *_means(hits))
+            for _, hits in view.blocks(_RAYS_A_BLOCK, progress)
+        ]
     joined = [torch.cat(parts) for parts in zip(*columns, strict=True)]
     stats = tree_stats([tree], chosen, joined[0])
     stats.milliseconds = 1e3 * (time.perf_counter() - start)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from os import PathLike
@@ -63,28 +64,32 @@ def render(
         progress: Told how many rows are done.
         **options: Fields of `RenderOptions`.
 
+    Several threads may render one tree; `stats` then tell the use of all of them.
+
     Returns:
         The picture, (h, w, c) for one camera and (n, h, w, c) for a batch.
 
     Raises:
         ValueError: An option is unknown or out of its range, or the backend can't be used.
+        RuntimeError: Another thread refreshes the tree.
     """
     camera = as_camera("render", camera)
     chosen = render_options("render", options, camera)
     scene = _resident("render", tree)
     trees = _trees("render", scene)
     device, start = trees[0].device, time.perf_counter()
-    with collect_timings(device) as timings:
+    with using("render", trees), collect_timings(device) as timings:
         with stage("prepare"):
             traced, box = _traced("render", scene, shader, chosen)
+            numbers = [one.frame for one in trees]
         placed = camera.placed(box)
         view = View(placed, placed.numbers(device), traced, chosen, box)
         hits = view.hits(progress)
         with stage("picture"):
             stats = tree_stats(trees, chosen, hits.samples)
-            for one in trees:
-                stats.tiles_used += int((one.nodes.stamp_t == one.frame).sum())
-                stats.bricks_used += int((one.bricks.stamp_b == one.frame).sum())
+            for one, number in zip(trees, numbers, strict=True):
+                stats.tiles_used += int((one.nodes.stamp_t >= number).sum())
+                stats.bricks_used += int((one.bricks.stamp_b >= number).sum())
             picture = view.picture(hits, stats)
     stats.stages = timings.as_dict()
     stats.milliseconds = 1e3 * (time.perf_counter() - start)
@@ -111,7 +116,8 @@ def trace(tree: Scene, rays: Rays, shader: Shaders, **options: Unpack[RenderSett
     """
     chosen = render_options("trace", options)
     check.instance("trace", "rays", rays, Rays)
-    return _traced("trace", tree, shader, chosen)[0](rays)
+    with using("trace", _trees("trace", tree)):
+        return _traced("trace", tree, shader, chosen)[0](rays)
 
 
 def _resident(where: str, scene: Any) -> Scene:
@@ -145,13 +151,21 @@ def _trees(where: str, scene: Scene) -> list[N3Tree]:
     return trees
 
 
+def using(where: str, trees: Sequence[N3Tree]) -> ExitStack:
+    """Lets a block render trees; raises RuntimeError while another thread changes one of them."""
+    with ExitStack() as stack:
+        for tree in trees:
+            stack.enter_context(tree.turns.using(where))
+        return stack.pop_all()
+
+
 def _traced(
     where: str, scene: Scene, shaders: Shaders, options: RenderOptions
 ) -> tuple[Trace, Tensor]:
     """Begins a frame: what traces rays through a scene, and its box."""
     trees = _trees(where, scene)
     for tree in trees:
-        tree.frame += 1
+        tree.next_frame()
     if not isinstance(scene, Mapping):
         if isinstance(shaders, Mapping):
             raise ValueError(f"{where}: shaders by name are for trees by name")

@@ -6,7 +6,7 @@ archive import `gvtorch.ops` first; C++ programs open `libgvtorch_cpu.so`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Self
 
 import torch
@@ -28,7 +28,8 @@ from .tracer import Tracer
 class TreeTracer(torch.nn.Module):
     """Traces world rays through a resident tree, as `render` does. Pools are buffers: `.to(device)`
     moves them. Their dtypes stay as kernels need them, also where `half()`, `bfloat16()` or
-    `double()` of a net that holds the module changes those of others.
+    `double()` of a net that holds the module changes those of others. Any number of threads may
+    trace at a time, while none writes into its buffers.
 
     Buffers and numbers have the names of the ops' arguments. Light and material of a lit shader are
     the buffer `parameter_54`, see `ops.shade_rays`; it may be edited.
@@ -141,6 +142,19 @@ class TreeTracer(torch.nn.Module):
                 "libraries first"
             )
         super().__setstate__({**state, "shade_rays": op})
+        _check_words(self._buffers, "")
+
+    @torch.jit.unused
+    def _load_from_state_dict(
+        self, state: dict[str, Any], prefix: str, _told: Any, strict: bool, *lists: list[str]
+    ) -> None:
+        """Refuses words that lead out of the pools; nothing is loaded then."""
+        try:
+            _check_words(state, prefix)
+        except ValueError as error:
+            lists[-1].append(str(error))
+            return
+        super()._load_from_state_dict(state, prefix, _told, strict, *lists)
 
     def forward(
         self, origin: Tensor, direction: Tensor, cone: Tensor, range: Tensor
@@ -226,6 +240,16 @@ class TreeTracer(torch.nn.Module):
             other_tnc=_given(self.other_tnc),
             other_component=self.other_component,
         )
+
+
+def _check_words(tensors: Mapping[str, Any], prefix: str) -> None:
+    """Raises ValueError where words lead out of the pools that come with them."""
+    given = [tensors.get(prefix + name) for name in ("child_tn", "brick_tn", "bricks_bzyxc")]
+    if not all(isinstance(one, Tensor) for one in given):
+        return  # a part is loaded: kernels take such words for absent
+    child, brick, bricks = given
+    check.words("TreeTracer", f"{prefix}child_tn", child, config.TERMINAL, len(child) - 1)
+    check.words("TreeTracer", f"{prefix}brick_tn", brick, config.CONSTANT, len(bricks) - 1)
 
 
 def _led(rows: Tensor, lead: list[int]) -> Tensor:

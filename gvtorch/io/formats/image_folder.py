@@ -7,6 +7,7 @@ Source: ISO/IEC 15948 (PNG), IHDR; ISO/IEC 10918-1 (JPEG), SOF; Microsoft, BITMA
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from ...base.image_info import ChannelInfo, ImageInfo
 from ...base.volume import check_extent
 from ..dicom_codecs import jpeg_size
 from ..ngff import is_zarr
+from ..resources import amount, memory_free
 from ..source import Index, VolumeSource
 from ..tiff_info import RGB, opened
 from .format import Format
@@ -56,7 +58,7 @@ def _slices(path: str) -> list[Path]:
     files: dict[str, list[Path]] = {}
     for file in Path(path).iterdir():
         kind = file.suffix.lower()
-        if kind in (*_TIFF, *_CODECS) and not file.name.startswith("."):
+        if kind in (*_TIFF, *_CODECS) and not file.name.startswith(".") and file.is_file():
             files.setdefault(_CODECS.get(kind, "tiff"), []).append(file)
     if len(files) > 1:
         kinds = " and ".join(f"{len(of)} {kind}" for kind, of in sorted(files.items()))
@@ -78,7 +80,12 @@ def open_folder(path: str) -> SlicesSource:
             "DICOM files"
         )
     files.sort(key=lambda file: _natural(file.name))
-    check_extent(str(files[0]), _shape(str(files[0])), most=_MOST_PIXELS)
+    shape, free = _shape(str(files[0])), memory_free()
+    check_extent(str(files[0]), shape, most=_MOST_PIXELS)
+    if 8 * math.prod(shape) > free:
+        raise ValueError(
+            f"{files[0]}: {shape} pixels may take more than {amount(free)}, what is free"
+        )
     first = _image(str(files[0]))
     if first.ndim not in (2, 3):
         raise ValueError(f"{files[0]}: expected one slice (y, x) or (y, x, c), got {first.shape}")

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo
+from ..budget import check_regular
 from ..packed import PackedSource
 from ..source import ArraySource, VolumeSource, place_axes
 from ..tiff_info import RGB
@@ -75,6 +76,7 @@ def open_metaimage(path: str) -> VolumeSource:
     is_here = file.upper() == "LOCAL"
     data = path if is_here else str(Path(path).parent / file)
     offset = end if is_here else int(header.get("HeaderSize", 0))
+    check_regular(data)
     if header.get("BinaryData", "True").lower() != "true":
         return PackedSource(file=data, offset=offset, codec="text", fortran=True, **told)
     if header.get("CompressedData", "False").lower() == "true":

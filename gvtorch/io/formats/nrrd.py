@@ -6,6 +6,8 @@ Source: "Definition of NRRD File Format" (teem.sourceforge.net/nrrd/format.html)
 
 from __future__ import annotations
 
+import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo
 from ...base.named_axes import ask_axes
+from ..packed import PackedSource, unpack
 from ..source import ArraySource, Index, VolumeSource, place_axes
 from .format import Format
 
@@ -28,6 +31,13 @@ _TYPES = {
     **dict.fromkeys(("ulonglong", "unsigned long long", "uint64"), "u8"),
     **{"float": "f4", "double": "f8"},
 }
+_ENCODINGS = {
+    **{"raw": "raw"},
+    **dict.fromkeys(("txt", "text", "ascii"), "text"),
+    **dict.fromkeys(("gz", "gzip"), "zlib"),
+    **dict.fromkeys(("bz2", "bzip2"), "bz2"),
+}
+_MOST_SKIPPED = 1 << 24  # bytes of what is unpacked
 _LENGTHS = {
     **dict.fromkeys(("m", "meter", "metre"), "meter"),
     **dict.fromkeys(("cm", "centimeter"), "centimeter"),
@@ -58,13 +68,44 @@ _UNKEPT = ("measurement frame", "old min", "oldmin", "old max", "oldmax")
 
 @dataclass(frozen=True, kw_only=True)
 class NrrdSource(VolumeSource):
-    """A NRRD file that is packed, text, or spread over several files: pynrrd reads it whole."""
+    """Numbers that are packed, text, or behind lines to skip; unpacked no further than the header
+    tells.
+    """
+
+    file: str
+    offset: int  # of the first line
+    lines: int
+    skip: int  # bytes of what is unpacked; -1: the numbers are its last
+    encoding: str
+    whole: bool = True
 
     def read_stored(self, index: Index) -> np.ndarray:
         """Reads all, and returns a part."""
-        import nrrd
-
-        return nrrd.read(self.path, index_order="F")[0][index]
+        count, kind = math.prod(self.shape), np.dtype(self.stored)
+        need = count * kind.itemsize
+        with open(self.file, "rb") as stream:
+            stream.seek(self.offset)
+            for number in range(self.lines):
+                if not stream.readline():
+                    raise ValueError(f"{self.file}: has {number} of {self.lines} lines to skip")
+            at = stream.tell()
+        skipped = max(0, self.skip)
+        if self.encoding == "text":
+            source = PackedSource(
+                path=self.path, shape=(count,), axes="x", stored=self.stored,
+                file=self.file, offset=at + skipped, codec="text",
+            )  # fmt: skip
+            data = source.read_stored((slice(None),))
+        elif self.encoding == "raw":
+            found = os.stat(self.file).st_size - at - skipped
+            if found < need or (found > need and self.skip >= 0):
+                raise ValueError(f"{self.path}: takes {need} bytes, the file has {found}")
+            begin = os.stat(self.file).st_size - need if self.skip < 0 else at + skipped
+            data = np.fromfile(self.file, kind, count, offset=begin)
+        else:
+            content = unpack(self.file, at, need + skipped, self.encoding)
+            data = np.frombuffer(content, kind, count, skipped)
+        return data.reshape(self.shape, order="F")[index]
 
 
 @Format("NRRD", ".nrrd", ".nhdr", options=("axes",), library="nrrd", package="pynrrd")
@@ -76,9 +117,17 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
         header = nrrd.read_header(file)
         offset = file.tell()
     shape = tuple(int(n) for n in header["sizes"])
+    if header.get("dimension") != len(shape):
+        raise ValueError(f"{path}: {len(shape)} sizes, dimension {header.get('dimension')}")
     kind = _TYPES.get(str(header["type"]).lower().removesuffix("_t"))
     if kind is None:
         raise ValueError(f"{path}: type {header['type']!r} is unknown")
+    encoding = _ENCODINGS.get(str(header["encoding"]).lower())
+    if encoding is None:
+        known = ", ".join(sorted(_ENCODINGS))
+        raise ValueError(f"{path}: encoding {header['encoding']!r} is unknown; known: {known}")
+    if np.dtype(kind).itemsize > 1 and encoding != "text" and "endian" not in header:
+        raise ValueError(f"{path}: endian is not told, and its numbers have several bytes")
     letters = _letters(path, header, shape, axes)
     info, lost = _info(header, letters, shape)
     told: dict[str, Any] = {
@@ -95,14 +144,21 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
     data = header.get("data file", header.get("datafile"))
     skip = int(header.get("byte skip", header.get("byteskip", 0)))
     lines = int(header.get("line skip", header.get("lineskip", 0)))
-    one_file = data is None or (
-        isinstance(data, str) and not data.startswith("LIST") and "%" not in data
-    )
-    if header["encoding"] != "raw" or lines or skip < 0 or not one_file:
-        return NrrdSource(whole=True, **told)
-    file_path = path if data is None else str(Path(path).parent / data)
-    offset = skip if data is not None else offset + skip
-    return ArraySource(file=file_path, offset=offset, fortran=True, **told)
+    if data is not None and (not isinstance(data, str) or data.startswith("LIST") or "%" in data):
+        raise ValueError(f"{path}: its numbers lie in several files (data file: {data})")
+    if skip < -1 or lines < 0 or (skip == -1 and encoding != "raw"):
+        raise ValueError(f"{path}: byte skip {skip}, line skip {lines}")
+    file_path, first = (path, offset) if data is None else (str(Path(path).parent / data), 0)
+    size = os.stat(file_path).st_size
+    if max(skip, lines) > size and encoding in ("raw", "text"):
+        raise ValueError(f"{path}: skips {max(skip, lines)} bytes or lines of {size} bytes")
+    if skip > _MOST_SKIPPED and encoding not in ("raw", "text"):
+        raise ValueError(f"{path}: byte skip {skip} of what is packed, at most {_MOST_SKIPPED}")
+    if encoding != "raw" or lines or skip < 0:
+        return NrrdSource(
+            file=file_path, offset=first, lines=lines, skip=skip, encoding=encoding, **told
+        )
+    return ArraySource(file=file_path, offset=first + skip, fortran=True, exact=True, **told)
 
 
 def _letters(path: str, header: dict[str, Any], shape: tuple[int, ...], axes: str | None) -> str:

@@ -84,7 +84,10 @@ class Tree:
 
     def __init__(self, a: TraceArguments) -> None:
         self.arguments, self.levels = a, Levels(a, a.table_lm4.dtype)
-        self.child_n, self.brick_n = a.child_tn.view(-1), a.brick_tn.view(-1)
+        # A word that names what the pool has not counts as absent.
+        child, brick, tiles, bricks = a.child_tn, a.brick_tn, len(a.child_tn), len(a.bricks_bzyxc)
+        self.child_n = torch.where(child < tiles, child, ABSENT).view(-1)
+        self.brick_n = torch.where(brick < bricks, brick, ABSENT).view(-1)
         self.request_n, self.per_tile = a.request_tn.view(-1), a.child_tn.shape[1]
 
     def descend(

@@ -372,8 +372,9 @@ struct PacketWalk {
       }
       next = here ? next : Ints{};
       stamp(tree.stamp_t, here, home);
-      const Ints next_brick = pick(tree.brick_tn, next);
-      const Ints next_tile = pick(tree.child_tn, next);
+      const Ints brick_word = pick(tree.brick_tn, next), tile_word = pick(tree.child_tn, next);
+      const Ints next_brick = brick_word < tree.bricks ? brick_word : Ints{} + kAbsent;  // as TreeView::within
+      const Ints next_tile = tile_word < tree.tiles ? tile_word : Ints{} + kAbsent;
       const Mask hides = hidden(here, next);
       node = here ? next | (hides & INT32_MIN) : node;
       brick = here ? next_brick : brick;

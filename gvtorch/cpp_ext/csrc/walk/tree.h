@@ -63,6 +63,13 @@ struct TreeView {
   int32_t nodes_per_tile;
   int32_t max_depth;
   int32_t digit_bits;  // of a tree that is not deep: N is 2 to the power of it; else 0
+  int32_t tiles, bricks;
+
+  // Words of a node. One that names what the pool has not counts as absent, so that no word, whoever wrote it, leads
+  // out of the pools.
+  GV_HD int32_t tile_of(int32_t node) const { return within(child_tn[node], tiles); }
+  GV_HD int32_t brick_of(int32_t node) const { return within(brick_tn[node], bricks); }
+  GV_HD static int32_t within(int32_t word, int32_t count) { return word < count ? word : kAbsent; }
 };
 
 inline int32_t digit_bits_of(const TraceArgs& args) {
@@ -184,8 +191,8 @@ GV_HD Place descend(const TreeView& tree, Number& digits, int32_t wanted, bool b
   int32_t own_tile = tree.root_tile;  // of the node
   for (;;) {
     store_stamp(&tree.stamp_t[own_tile], frame);
-    place.brick = tree.brick_tn[place.node];
-    place.tile = tree.child_tn[place.node];
+    place.brick = tree.brick_of(place.node);
+    place.tile = tree.tile_of(place.node);
     place.hidden = hides(place.node);
     if (place.brick != kAbsent) {
       if (blend && place.depth < wanted) place.coarse = {place.node, place.brick, place.depth};

@@ -77,10 +77,18 @@ struct Walk {
       : rays{args.origin_r3,  args.direction_r3,        args.cone_r2, args.range_r2, args.place_33,
              args.cone_scale, digit_bits_of(args) == 0, args.clear_r},
         order{args.rays, args.width},
-        tree{args.child_tn,      args.brick_tn,       args.request_tn,
-             args.stamp_t,       args.root,           args.root / args.nodes_per_tile,
-             args.branching,     args.nodes_per_tile, args.max_depth,
-             digit_bits_of(args)},
+        tree{args.child_tn,
+             args.brick_tn,
+             args.request_tn,
+             args.stamp_t,
+             args.root,
+             args.root / args.nodes_per_tile,
+             args.branching,
+             args.nodes_per_tile,
+             args.max_depth,
+             digit_bits_of(args),
+             static_cast<int32_t>(args.nodes / args.nodes_per_tile),
+             static_cast<int32_t>(args.bricks)},
         levels(args.root_voxel, args.side - 2 * args.border, args.branching),
         options{static_cast<T>(args.step), static_cast<T>(args.stop_alpha), static_cast<T>(args.depth_alpha),
                 args.by_level},
@@ -178,7 +186,7 @@ struct Walk {
   GV_HD bool mark_missing(const Place& place, int32_t wanted, bool blend, T cone) const {
     const bool absent = place.brick == kAbsent;
     const bool deeper = place.depth < wanted && place.tile == kAbsent;
-    const bool above = blend && place.depth == wanted && tree.brick_tn[place.parent] == kAbsent;
+    const bool above = blend && place.depth == wanted && tree.brick_of(place.parent) == kAbsent;
     if (deeper && !(options.by_level && absent)) request(place.node, place.depth, cone, kSubdivide);
     if (absent && (options.by_level || !deeper || place.fine.node < 0)) {
       request(place.node, place.depth, cone, kLoad);

@@ -1,0 +1,55 @@
+"""`Turns`: many threads may use a thing at a time, or one alone may change it. What does not go
+together raises at once: to wait would hide a race in the caller's program.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+class Turns:
+    """Who uses a thing now. A thread may use what it changes, and change what it uses."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._users: Counter[int] = Counter()  # by thread
+        self._changer: int | None = None
+
+    @contextmanager
+    def using(self, where: str) -> Iterator[None]:
+        """Lets the block read; raises RuntimeError while another thread changes the thing."""
+        me = threading.get_ident()
+        with self._lock:
+            if self._changer not in (None, me):
+                raise RuntimeError(f"{where}: another thread changes this tree")
+            self._users[me] += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._users[me] -= 1
+                if not self._users[me]:
+                    del self._users[me]
+
+    @contextmanager
+    def changing(self, where: str) -> Iterator[None]:
+        """Lets the block write; raises RuntimeError while another thread uses the thing."""
+        me = threading.get_ident()
+        with self._lock:
+            before = self._changer
+            if before not in (None, me):
+                raise RuntimeError(f"{where}: another thread changes this tree")
+            if set(self._users) - {me}:
+                raise RuntimeError(f"{where}: another thread renders or reads this tree")
+            self._changer = me
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._changer = before
+
+    def __reduce__(self) -> tuple[type[Turns], tuple[()]]:
+        return Turns, ()  # nobody uses a copy

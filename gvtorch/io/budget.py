@@ -1,0 +1,111 @@
+"""What reading a header may take. The libraries that read files parse what they are told, for as
+long and into as much memory as it says; a header that takes more than its file can be worth is
+damaged.
+
+A thread looks after the one that reads. It counts processor time of that thread alone, so a busy
+machine makes no difference, and memory of the process, of which other threads may take a part: so
+memory counts only after a while, and far beyond what a file holds.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import stat
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from .resources import amount
+
+SECONDS = 5.0  # of processor time for any header
+SECONDS_A_BYTE = 5e-7  # and for each byte of its file
+MEMORY = 512 * 10**6  # bytes of memory for any header
+MEMORY_A_BYTE = 40  # and for each byte of its file
+_PATIENCE = 0.5  # seconds of processor time before memory counts
+_LOOK = 0.05  # seconds
+
+
+class _TooMuch(BaseException):
+    """Ends the reading thread's work; libraries swallow what is an `Exception`."""
+
+
+def check_regular(path: str | Path) -> None:
+    """Raises ValueError for a pipe, a device or a socket, which may never end."""
+    mode = os.stat(path).st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise ValueError(f"{path}: is no regular file")
+
+
+def check_files(source: object) -> None:
+    """Raises ValueError if a source would read what is no regular file."""
+    for file in (getattr(source, "file", None), *getattr(source, "files", ())):
+        if isinstance(file, str) and os.path.exists(file):
+            check_regular(file)
+
+
+@contextmanager
+def header_budget(path: str) -> Iterator[None]:
+    """Raises ValueError if the block, which reads a header, takes more than its file allows."""
+    try:
+        size = os.stat(path).st_size if os.path.isfile(path) else 0
+    except (OSError, ValueError):
+        size = 0
+    if not hasattr(time, "pthread_getcpuclockid"):
+        yield
+        return
+    seconds = SECONDS + SECONDS_A_BYTE * size
+    most = MEMORY + MEMORY_A_BYTE * size
+    watch = _Watch(seconds, most)
+    try:
+        with watch:
+            yield
+    except _TooMuch:
+        raise ValueError(
+            f"{path}: damaged: its header takes more than {seconds:.0f} s of processor time or "
+            f"{amount(most)}, which is too much for {size} bytes"
+        ) from None
+
+
+class _Watch:
+    """Looks after the thread that enters."""
+
+    def __init__(self, seconds: float, most: int) -> None:
+        self._seconds, self._most = seconds, most
+        self._reader = threading.get_ident()
+        self._clock = time.pthread_getcpuclockid(self._reader)
+        self._begin, self._memory = time.clock_gettime(self._clock), _resident()
+        self._over, self._lock, self._ended = threading.Event(), threading.Lock(), False
+
+    def __enter__(self) -> None:
+        threading.Thread(target=self._look, daemon=True, name="gvtorch-budget").start()
+
+    def __exit__(self, *_error: object) -> None:
+        with (
+            self._lock
+        ):  # nothing is sent from now on; what was sent and has not come is taken back
+            self._ended = True
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._reader), None)
+        self._over.set()
+
+    def _look(self) -> None:
+        while not self._over.wait(_LOOK):
+            with self._lock:
+                if self._ended:
+                    return
+                spent = time.clock_gettime(self._clock) - self._begin
+                greedy = spent > _PATIENCE and _resident() - self._memory > self._most
+                if spent > self._seconds or greedy:
+                    error = ctypes.py_object(_TooMuch)
+                    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._reader), error)
+
+
+def _resident() -> int:
+    """Bytes of memory that this process holds; 0 where it is not told."""
+    if not sys.platform.startswith("linux"):
+        return 0
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")

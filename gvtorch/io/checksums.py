@@ -1,0 +1,104 @@
+"""Checksums of a store: they tell a file that another one was copied over from the right one, which
+the checksums that each chunk has in itself can't.
+
+    STORE.zarr/gvtorch/checksums.json   {"files": {"gvtorch/cells/0/c/0/0/0/0/0": CRC-32, ...}}
+
+That of cells is of the whole file, that of pyramid and blocks of the file's end, where its index
+lies. A file is looked at when it is first read. The root's metadata carries its own checksum and
+that of the list. Stores without a list are read as they are.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import zlib
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from .ngff import read_json
+from .store_layout import Deadline, StoreError, StoreLayout, read_key
+
+LIST = "gvtorch/checksums.json"
+_LINE = 128  # bytes of a file's line in the list, at most
+_INDEX_ENTRY = 16  # bytes: where a chunk lies in its shard, and how long it is
+Files = dict[str, int | None]  # CRC-32 by a file's place in the store; None: there is none
+
+
+def sum_of(content: Mapping[str, Any]) -> int:
+    """CRC-32 of what JSON holds, however it is written, the key "checksum" left out."""
+    kept = {name: value for name, value in content.items() if name != "checksum"}
+    return zlib.crc32(json.dumps(kept, sort_keys=True, separators=(",", ":")).encode())
+
+
+def shard_files(
+    root: Any, specs: Iterable[Mapping[str, Any]], place: tuple[int, ...], deadline: Deadline
+) -> Files:
+    """Reads the checksums of the shards at a place (t,) z, y, x of arrays of the store."""
+    found: Files = {}
+    for spec in specs:
+        name = file_of(spec, place)
+        content = read_key(root.get("path", "store"), root, name, deadline, part=_part(spec))
+        found[name] = None if content is None else zlib.crc32(content)
+    return found
+
+
+def file_of(spec: Mapping[str, Any], place: tuple[int, ...]) -> str:
+    """Where a shard lies in the store."""
+    shape, names = spec["metadata"]["shape"], spec["metadata"].get("dimension_names", "")
+    at = list(place)
+    if "c" in names:  # its shards hold all channels
+        at.insert(len(at) - 3, 0)
+    at += [0] * (len(shape) - len(at))
+    return "/".join(map(str, (spec["path"], "c", *at)))
+
+
+def _part(spec: Mapping[str, Any]) -> slice | None:
+    """What of a file its checksum is of; None: all."""
+    if spec["path"].startswith("gvtorch/cells"):
+        return None
+    shard = spec["metadata"]["chunk_grid"]["configuration"]["chunk_shape"]
+    chunk = spec["metadata"]["codecs"][0]["configuration"]["chunk_shape"]
+    return slice(-(_INDEX_ENTRY * (math.prod(shard) // math.prod(chunk)) + 4), None)
+
+
+class Checksums:
+    """The list of a store, read when it is first needed. Safe to use from several threads."""
+
+    def __init__(self, where: str, root: Any, layout: StoreLayout, time: int) -> None:
+        self._where, self._root, self._sum = where, root, layout.files_sum
+        self._time = (time,) if layout.times > 1 else ()
+        shards = sum(math.prod(layout.shards(level)) for level in range(layout.levels))
+        self._most = _LINE * (1 + 3 * layout.times * shards)
+        self._files: Mapping[str, Any] | None = None
+        self._seen: set[str] = set()
+
+    def check(self, spec: Mapping[str, Any], place: tuple[int, ...], deadline: Deadline) -> None:
+        """Raises StoreError unless the shard at a place z, y, x is the one that was written."""
+        if self._sum is None:
+            return
+        name = file_of(spec, (*self._time, *place))
+        if name in self._seen:
+            return
+        if self._files is None:
+            self._files = self._read(deadline)
+        wanted = self._files.get(name)
+        where = f"{self._where}/{name}"
+        if wanted is not None:  # what should not be there is never asked for
+            content = read_key(self._where, self._root, name, deadline, part=_part(spec))
+            if content is None:
+                return  # zeros come of it, and the store finds out why
+            if zlib.crc32(content) != wanted:
+                raise StoreError(f"{where}: its checksum is not the one that was written")
+        self._seen.add(name)
+
+    def _read(self, deadline: Deadline) -> Mapping[str, Any]:
+        try:
+            content = read_json(self._where, self._root, LIST, deadline, self._most)
+        except ValueError as error:
+            raise StoreError(str(error)) from None
+        files = None if content is None else content.get("files")
+        if not isinstance(files, dict) or sum_of(files) != self._sum:
+            what = "is missing" if content is None else "is not the one that was written"
+            raise StoreError(f"{self._where}/{LIST}: {what}")
+        return files

@@ -1,0 +1,276 @@
+"""Several converters of one target; journals and files that are not what was written."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers import gvtorch
+from helpers.stores import assert_holds, noise
+
+import gvtorch as gv
+from gvtorch.io import conversion, shard, unfinished
+from gvtorch.io.conversion import convert
+from gvtorch.io.store import Store
+from gvtorch.io.store_layout import WORK
+
+SHAPE = (20, 30, 260, 1)  # two shards a row
+
+
+@pytest.fixture
+def data() -> np.ndarray:
+    return noise(SHAPE)
+
+
+@pytest.fixture
+def raw(tmp_path, data) -> Path:
+    file = tmp_path / "a_260x30x20_uint8.raw"
+    file.write_bytes(data.tobytes())
+    return file
+
+
+def listed(folder: Path) -> dict[str, bytes]:
+    files = (file for file in folder.rglob("*") if file.is_file())
+    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
+
+
+def test_a_converter_that_starts_at_the_same_time_leaves_a_finished_store_alone(
+    tmp_path, raw, monkeypatch
+):
+    target, other = tmp_path / "a.zarr", noise(SHAPE, seed=1)
+    original, before = conversion._plan, {}
+
+    def plan(*given):
+        """The other one starts later and is done first."""
+        if not before:
+            before["running"] = b""
+            convert(gv.Volume(other), target)
+            before.update(listed(target))
+        return original(*given)
+
+    monkeypatch.setattr(conversion, "_plan", plan)
+    with pytest.raises(FileExistsError, match="there is a store already"):
+        convert(raw, target)
+    del before["running"]
+    assert listed(target) == before and not (target / WORK).exists()
+    assert_holds(Store.open(target), other)
+
+
+def test_a_converter_does_not_take_over_what_another_has_begun(tmp_path, raw, data, monkeypatch):
+    target, original = tmp_path / "a.zarr", conversion._plan
+
+    def plan(*given):
+        with monkeypatch.context() as patch:
+            patch.setattr(conversion, "_plan", original)
+            patch.setattr(shard, "write_shard", lambda *_: 1 / 0)
+            patch.setattr(conversion, "_check_room", lambda *_: None)
+            patch.setattr(conversion, "_estimate", lambda *_: None)
+            with pytest.raises(ZeroDivisionError):
+                convert(raw, target, workers=1)
+        return original(*given)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(conversion, "_plan", plan)
+        with pytest.raises(FileExistsError, match="half-written; --resume"):
+            convert(raw, target)
+    assert_holds(convert(raw, target, resume=True), data)
+
+
+def test_the_lock_of_a_target_that_went_away_is_taken_anew(tmp_path, monkeypatch):
+    import fcntl
+
+    target, original, turns = tmp_path / "a.zarr", fcntl.flock, []
+
+    def flock(*given):
+        if not turns:
+            shutil.rmtree(target)  # the one before removed it, with the lock that this one opened
+        turns.append(given)
+        return original(*given)
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with unfinished.claimed(target, {}, resume=False):
+        assert len(turns) == 2 and (target / WORK / "lock").exists()
+
+
+def test_resume_of_a_finished_store_says_so(tmp_path, raw, data):
+    target = tmp_path / "a.zarr"
+    assert gvtorch("convert", raw, target).returncode == 0
+    before = listed(target)
+    run = gvtorch("convert", raw, target, "--resume")
+    assert run.returncode == 0 and "is finished already" in run.stdout
+    assert listed(target) == before
+    run = gvtorch("convert", raw, target)
+    assert run.returncode == 2 and "there is a store already" in run.stderr
+
+
+# --- the journal
+
+
+@pytest.fixture
+def begun(tmp_path, raw, monkeypatch) -> Path:
+    """A store of which three tasks are done."""
+    original, ran = shard.write_shard, []
+
+    def write(task, level, place):
+        if len(ran) == 3:
+            raise ZeroDivisionError
+        result = original(task, level, place)
+        if task.root["driver"] == "file":
+            ran.append(place)
+        return result
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shard, "write_shard", write)
+        with pytest.raises(ZeroDivisionError):
+            convert(raw, tmp_path / "a.zarr", workers=1)
+    return tmp_path / "a.zarr"
+
+
+def tasks_of_resuming(raw: Path, target: Path, monkeypatch) -> list[tuple[int, ...]]:
+    original, ran = shard.write_shard, []
+
+    def write(task, level, place):
+        ran.append((level, *place))
+        return original(task, level, place)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shard, "write_shard", write)
+        convert(raw, target, workers=1, resume=True)
+    return ran
+
+
+@pytest.mark.parametrize("how", ["cut", "changed", "nonsense", "empty"])
+def test_a_damaged_line_of_the_journal_has_its_task_done_again(begun, raw, data, monkeypatch, how):
+    journal = begun / WORK / "journal.jsonl"
+    lines = journal.read_text().splitlines(keepends=True)
+    assert len(lines) == 3
+    lines[1] = {
+        "cut": lines[1][:-20],  # the next line hangs on it
+        "changed": lines[1].replace('"voxels": ', '"voxels": 1'),
+        "nonsense": "[" * 10**5 + "\n",
+        "empty": "\n",
+    }[how]
+    again = json.loads(journal.read_text().splitlines()[1])["task"]
+    journal.write_text("".join(lines))
+    ran = tasks_of_resuming(raw, begun, monkeypatch)
+    assert tuple(again) in ran and (0, 0, 0, 0) not in ran
+    assert_holds(Store.open(begun), data)
+
+
+def test_the_journal_is_there_as_a_whole_at_any_time(begun, raw, data, monkeypatch):
+    """A crash while it is written anew loses nothing that is done."""
+    before = (begun / WORK / "journal.jsonl").read_bytes()
+
+    def crash(*_):
+        raise ZeroDivisionError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(unfinished, "rename", crash)
+        with pytest.raises(ZeroDivisionError):
+            convert(raw, begun, workers=1, resume=True)
+    assert (begun / WORK / "journal.jsonl").read_bytes() == before
+    assert len(tasks_of_resuming(raw, begun, monkeypatch)) == 5
+    assert_holds(Store.open(begun), data)
+
+
+# --- files copied over others
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    target = tmp_path_factory.mktemp("whole") / "a.zarr"
+    two = np.stack([noise((40, 40, 300, 1), seed=seed) for seed in (0, 1)])
+    np.save(target.with_name("a.npy"), two[..., 0])
+    convert(target.with_name("a.npy"), target, axes="tzyx", workers=1)
+    return target
+
+
+@pytest.fixture
+def copied(whole, tmp_path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "b.zarr"))
+
+
+def refusals(target: Path) -> list[str]:
+    """What is said of reading the first time point in each of three ways."""
+    try:
+        store = Store.open(target)
+    except (ValueError, OSError) as error:
+        return [str(error)]
+    said = []
+    places = np.array(list(np.ndindex(*store.block_grid(0))))
+    said += sorted(set(store.read_blocks(0, places)[1].values()))
+    for read, size in ((store.read_cells, store.cell_grid(0)), (store.read_region, None)):
+        try:
+            read(0, (0, 0, 0), size or store.level_extent(0)[::-1])
+        except OSError as error:
+            said.append(str(error))
+    return said
+
+
+def test_whole_stores_are_read(whole, copied):
+    assert refusals(whole) == refusals(copied) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "other"),
+    [
+        ("gvtorch/cells/0/c/0/0/0/0/0/0", "gvtorch/cells/0/c/0/0/0/1/0/0"),
+        ("gvtorch/cells/0/c/0/0/0/1/0/0", "gvtorch/cells/0/c/1/0/0/1/0/0"),
+        ("gvtorch/blocks/0/c/0/0/0/0/0/0/0/0", "gvtorch/blocks/0/c/1/0/0/0/0/0/0/0"),
+        ("0/c/0/0/0/0/0", "0/c/1/0/0/0/0"),
+    ],
+)
+def test_a_file_copied_over_another_is_an_error(copied, name, other):
+    assert (copied / name).exists()
+    shutil.copyfile(copied / other, copied / name)
+    said = refusals(copied)
+    assert said and all(name in one and "checksum" in one for one in said)
+
+
+def test_metadata_that_is_not_what_was_written_is_an_error(copied, whole):
+    root = copied / "zarr.json"
+    content = json.loads(root.read_text())
+    content["attributes"]["gvtorch"]["spacing"] = [1.0, 1.0, 1.5]
+    root.write_text(json.dumps(content))
+    assert refusals(copied) == [f"{copied}: damaged: gvtorch's metadata is not what was written"]
+    content["attributes"]["gvtorch"]["spacing"] = [1.0, 1.0, 1.0]
+    content["attributes"]["ome"]["omero"] = {"channels": []}  # other tools may write there
+    root.write_text(json.dumps(content, indent=3))
+    assert refusals(copied) == []
+    sums = copied / "gvtorch/checksums.json"
+    listed = sums.read_text()
+    for text in ("{}", '{"files": {}}', "[" * 10**5, None):
+        sums.unlink() if text is None else sums.write_text(text)
+        said = refusals(copied)
+        assert len(said) >= 3 and all("checksums.json" in one for one in said), said
+    sums.write_text(listed)
+    assert refusals(copied) == []
+
+
+def test_a_store_without_checksums_is_read(copied):
+    root = copied / "zarr.json"
+    content = json.loads(root.read_text())
+    own = content["attributes"]["gvtorch"]
+    del own["checksum"], own["files_sum"]
+    root.write_text(json.dumps(content))
+    (copied / "gvtorch/checksums.json").unlink()
+    assert refusals(copied) == []
+
+
+def test_a_streamed_node_of_a_wrong_file_fails_alone(copied):
+    name = "gvtorch/blocks/0/c/0/0/0/1/0/0/0/0"
+    shutil.copyfile(copied / name.replace("c/0", "c/1", 1), copied / name)
+    with gv.Engine(gv.StoredProducer(str(copied))) as engine:
+        look = gv.TransferFunction.preset("gray", 0, 255)
+        for azimuth in (0, 90, 180, 270):
+            view = gv.Camera.orbit(azimuth, width=24, height=16, distance=1)
+            picture = engine.render(view, look, lod="finest")
+            assert torch.isfinite(picture.color).all()
+        assert {"checksum" in failure.message for failure in engine.failures} == {True}
+        assert all(
+            failure.loc[3] == engine.trees["scene"].tree.depth for failure in engine.failures
+        )

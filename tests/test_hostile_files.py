@@ -1,0 +1,133 @@
+"""Small files that tell of more than a machine has, or never end: each is refused in one line, with
+little memory and time, and `convert` says what `read_volume` says.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.hostile import write_all
+
+import gvtorch as gv
+from gvtorch.io import budget, reading
+
+MEMORY = 1500 << 20  # bytes of address space beyond what the libraries take
+SECONDS = 8  # of processor time a file
+
+READER = """
+import json, resource, sys, time, warnings
+import gvtorch as gv
+from gvtorch.io import budget, conversion
+from gvtorch.io.reading import open_source
+warnings.simplefilter("ignore")
+budget.SECONDS, budget.SECONDS_A_BYTE = 0.3, 0
+paths, memory = json.loads(sys.stdin.read())
+used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + memory, -1))
+
+def convert(path):
+    source = conversion._source(path, None, None, None, None, False, {})
+    source.read_region((0, 0, 0), source.extent[::-1])
+
+for path in paths:
+    told = []
+    for read in (gv.read_volume, convert):
+        begin = time.process_time()
+        try:
+            read(path)
+            told += ["read", ""]
+        except (ValueError, OSError) as error:
+            told += ["refused", str(error)]
+        except BaseException as error:
+            told += [type(error).__name__, str(error)]
+        told.append(time.process_time() - begin)
+    print(json.dumps(told), flush=True)
+"""
+HONEST = ("cards.fits", "tiles.tif")  # wasteful, and right
+
+
+def test_files_that_eat_a_machine_are_refused(tmp_path):
+    paths = write_all(tmp_path)
+    run = subprocess.run(
+        [sys.executable, "-X", "faulthandler", "-c", READER],
+        input=json.dumps([[str(path) for path in paths], MEMORY]),
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    lines = [json.loads(line) for line in run.stdout.splitlines() if line.startswith("[")]
+    at = paths[len(lines)].name if len(lines) < len(paths) else ""
+    assert run.returncode == 0 and not at, f"{at}: {run.returncode} {run.stderr[-2000:]}"
+    for path, (kind, message, seconds, other, _, more) in zip(paths, lines, strict=True):
+        assert kind == other == ("read" if path.name in HONEST else "refused"), (path.name, message)
+        assert kind == "read" or ("\n" not in message and str(tmp_path) in message), message
+        assert "MemoryError" not in message and "allocate" not in message, message
+        assert max(seconds, more) < SECONDS, (path.name, seconds, more)
+
+
+def test_a_budget_ends_the_work_of_its_thread_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(budget, "SECONDS", 0.2)
+    (tmp_path / "a.npy").touch()
+    ended = threading.Event()
+
+    def other() -> None:
+        while not ended.wait(0.01):
+            pass
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    with pytest.raises(ValueError, match=r"a\.npy: damaged: its header takes more than 0 s"):
+        with budget.header_budget(str(tmp_path / "a.npy")):
+            while True:
+                try:
+                    sum(range(1000))
+                except Exception:  # as libraries do
+                    pass
+    assert thread.is_alive()
+    ended.set()
+    thread.join()
+    with budget.header_budget(str(tmp_path / "a.npy")):
+        time.sleep(0.5)  # to wait takes nothing
+    begin = time.process_time()
+    while time.process_time() - begin < 0.5:
+        sum(range(1000))
+
+
+def test_what_is_larger_than_memory_is_told_before(tmp_path, monkeypatch):
+    np.savez_compressed(tmp_path / "a.npz", np.zeros((100, 100, 100), np.uint8))
+    np.save(tmp_path / "b.npy", np.zeros((100, 100, 100), np.uint8))
+    monkeypatch.setattr(reading, "memory_free", lambda: 10**6)
+    with pytest.raises(ValueError, match=r"a\.npz: takes 2\.0 MB of memory, 1\.0 MB are free"):
+        gv.read_volume(tmp_path / "a.npz")
+    assert gv.read_volume(tmp_path / "b.npy").extent == (100, 100, 100)  # it stays in its file
+
+
+@pytest.mark.parametrize("encoding", ["gzip", "bzip2", "text", "raw"])
+@pytest.mark.parametrize("lines", [0, 2])
+def test_nrrd_data_behind_lines_and_bytes(tmp_path, encoding, lines):
+    import bz2
+    import gzip
+
+    data = np.arange(24, dtype="<i2").reshape(2, 3, 4)
+    words = " ".join(map(str, data.ravel())).encode()
+    packed = {
+        "gzip": lambda: gzip.compress(b"ab" + data.tobytes()),
+        "bzip2": lambda: bz2.compress(b"ab" + data.tobytes()),
+        "text": lambda: b"  " + words,
+        "raw": lambda: b"ab" + data.tobytes(),
+    }[encoding]()
+    Path(tmp_path / "a.nrrd").write_bytes(
+        f"NRRD0004\ntype: short\ndimension: 3\nsizes: 4 3 2\nencoding: {encoding}\nendian: little\n"
+        f"line skip: {lines}\nbyte skip: 2\n\n".encode()
+        + b"a line\n" * lines
+        + packed
+    )
+    assert np.array_equal(gv.read_volume(tmp_path / "a.nrrd").data[..., 0].numpy(), data)

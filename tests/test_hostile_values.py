@@ -1,0 +1,150 @@
+"""Full disks, numbers that no float holds, values at the ends of their types: one line each, and
+nothing lost.
+"""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers import gvtorch
+from helpers.pictures import GRAY
+
+import gvtorch as gv
+from gvtorch.tools import cli
+
+HUGE = 10**400
+VIEW = gv.Camera.orbit(width=8, height=8)
+KINDS = ("png", "exr", "npz", "npy", "tif")
+
+
+@contextmanager
+def full_disk(size: int) -> Iterator[None]:
+    """No file may become longer: writing fails as on a full disk, in any library."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.fixture(scope="module")
+def picture() -> gv.Picture:
+    tree = gv.N3Tree.from_volume(gv.Volume(torch.rand(8, 8, 8)))
+    found = gv.render(tree, gv.Camera.orbit(width=100, height=80), GRAY)
+    noise = torch.rand(found.color.shape, generator=torch.Generator().manual_seed(0))
+    return replace(found, color=noise)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_full_disk_is_told_and_the_old_picture_stays(tmp_path, picture, kind):
+    file = tmp_path / f"a.{kind}"
+    file.write_bytes(b"old")
+    with full_disk(2000), pytest.raises(OSError, match=r"a\.\w+") as caught:
+        picture.save(file)
+    assert "\n" not in str(caught.value)
+    assert file.read_bytes() == b"old" and [*tmp_path.iterdir()] == [file]
+    picture.save(file)
+    assert file.stat().st_size > 2000
+
+
+@pytest.mark.parametrize("kind", ["png", "exr"])
+def test_the_command_line_tells_of_a_full_disk_in_a_line(tmp_path, small, kind):
+    with full_disk(500):
+        run = gvtorch("render", small, "-o", tmp_path / f"a.{kind}", "--size", "64x64")
+    assert run.returncode == 2, run.stderr
+    assert run.stderr.startswith("gvtorch: error: ") and run.stderr.count("\n") == 1, run.stderr
+    assert not [*tmp_path.iterdir()]
+
+
+ENDS = {
+    "half": np.array([-65504, 65504, 0, 1], np.float16),
+    "single": np.array([-3.4028235e38, 3.4028235e38, 0, 1], np.float32),
+    "constant": np.full(4, 3.4028235e38, np.float32),
+    "denormal": np.array([0, 1e-45], np.float32),
+    "neighbours": np.array([1, 1.001], np.float16),
+    "zero": np.zeros(4, np.float16),
+    "bytes": np.full(4, 7, np.uint8),
+    "label": np.full(4, 70_000, np.int64),
+}
+
+
+@pytest.mark.parametrize("name", ENDS)
+def test_info_of_values_at_the_ends(tmp_path, name):
+    values = np.zeros((len(ENDS[name]), 2, 3), ENDS[name].dtype)
+    values[:] = ENDS[name][:, None, None]
+    np.save(tmp_path / "a.npy", values)
+    for flags in ((), ("--json",)):
+        run = gvtorch("info", tmp_path / "a.npy", *flags)
+        assert run.returncode == 0 and "range" in run.stdout, run.stderr
+
+
+def test_bars_of_any_counts():
+    for counts in ([0, 0], [0, 1], [1], [2**62, 1], [3, 6, 2**53 + 1]):
+        assert cli._sparkline(counts)
+
+
+NUMBERS = {
+    "camera": lambda: gv.Camera.orbit(HUGE),
+    "function": lambda: gv.TransferFunction.from_points([(0, 0), (HUGE, 1)]),
+    "spacing": lambda: gv.Volume(torch.zeros(4, 4, 4), spacing=(HUGE, 1, 1)),
+    "ratio": lambda: gv.Volume(torch.zeros(4, 4, 4), spacing=(1e300, 1e-300, 1)),
+    "denormal": lambda: gv.Volume(torch.zeros(4, 4, 4), spacing=(5e-324, 1, 1)),
+    "light": lambda: gv.Headlight((HUGE, 1, 1)),
+    "one number": lambda: gv.Headlight(np.float32(1)),
+    "several lights": lambda: gv.Lit(GRAY, light=np.array([1.0, 2.0])),
+    "border": lambda: gv.BrickPool(1, {"value": gv.Channel()}, border=2**63 - 1),
+}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_numbers_out_of_range_have_one_clear_line(name):
+    with pytest.raises(ValueError, match=r"must|greater") as caught:
+        NUMBERS[name]()
+    assert "\n" not in str(caught.value) and "ambiguous" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["[" * 10**5, "1" * 5000, f'{{"opacity": [[{HUGE}, 0], [1, 1]]}}'])
+def test_json_of_any_depth_and_length_is_told(tmp_path, small, text):
+    file = tmp_path / "a.json"
+    file.write_text(text)
+    for command in (
+        ("render", small, "--tf", file, "-o", tmp_path / "a.png"),
+        ("fly", small, "--path", file, "-o", tmp_path / "a.mp4"),
+    ):
+        run = gvtorch(*command)
+        assert run.returncode == 2 and "Traceback" not in run.stderr, run.stderr
+        assert run.stderr.count("\n") == 1 and len(run.stderr) < 20_000, run.stderr
+
+
+def test_a_damaged_directory_of_an_archive_is_told(tmp_path):
+    file = tmp_path / "a.npz"
+    np.savez_compressed(file, a=np.zeros((4, 4, 4), np.uint8))
+    whole = file.read_bytes()
+    begin = whole.index(b"PK\x01\x02")
+    for seed in range(60):
+        pick = np.random.default_rng(seed)
+        broken = bytearray(whole)
+        for _ in range(4):
+            broken[pick.integers(begin, len(whole))] = pick.integers(256)
+        file.write_bytes(broken)
+        try:
+            gv.read_volume(file)
+        except (ValueError, OSError) as error:
+            assert str(Path(file)) in str(error) and "\n" not in str(error)
+
+
+def test_lights_take_arrays(picture):
+    volume = gv.Volume(torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(1)))
+    expected, made = (
+        gv.render(volume, VIEW, gv.Lit(GRAY, light=gv.Headlight(color))).color
+        for color in ((0.5, 0.25, 1.0), np.array([0.5, 0.25, 1.0]))
+    )
+    assert torch.equal(made, expected)
