@@ -1,4 +1,4 @@
-"""The command line: `gvtorch info`, `render`, `fly`, `slice`, `convert`, `voxelize`,
+"""The command line: `gvtorch info`, `view`, `render`, `fly`, `slice`, `convert`, `voxelize`,
 `filter` and `bench`.
 
 torch is imported inside the commands, so that `--help` answers at once. A mistake of the user ends
@@ -29,6 +29,7 @@ from .common import Bar, ReadOptions, given, refuse_for_store, volume_formats
 from .fly import Fly
 from .render import Render
 from .slice import Slice
+from .view import View
 from .voxelize import Voxelize, cluster
 
 
@@ -244,8 +245,8 @@ def _sparkline(counts: list[int]) -> str:
 
 
 _COMMANDS: dict[str, Any] = {
-    **{"info": Info, "render": Render, "fly": Fly, "slice": Slice, "convert": Convert},
-    **{"voxelize": Voxelize, "filter": Filter, "bench": Bench},
+    **{"info": Info, "view": View, "render": Render, "fly": Fly, "slice": Slice},
+    **{"convert": Convert, "voxelize": Voxelize, "filter": Filter, "bench": Bench},
 }
 
 

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from tyro.conf import arg
@@ -16,8 +16,10 @@ from .look import Look
 
 if TYPE_CHECKING:
     from ..base.records import RenderStats
+    from ..base.volume import Volume
     from ..engine import Engine, FrameStats
     from ..io.store import Store
+    from ..producers import StoredProducer
     from ..shaders import Shader
 
 
@@ -55,33 +57,41 @@ class Streaming:
             )
         return found
 
-    @contextmanager
-    def open(self, store: Store, look: Look) -> Iterator[tuple[Engine, Shader]]:
-        """Gives an engine over a store, and the transfer function."""
-        from ..engine.engine import Engine
+    def content(self, store: Store, look: Look) -> tuple[StoredProducer, Shader]:
+        """Returns what streams a store, and the shader."""
         from ..producers import StoredProducer
         from ..shaders import Filtered
 
-        if self.mode not in (None, "converge") and self.max_frames != type(self)().max_frames:
-            raise ValueError(f"--max-frames is for --mode converge, not {self.mode}")
         shader = look.chosen(store)
         filtered = shader if isinstance(shader, Filtered) else None
         if filtered is not None and look.tf is None:
             shader = filtered = Filtered.stored(store)
         if filtered is not None and filtered.component != look.component:
             raise ValueError(f"--component must be that of the colours, {filtered.component}")
-        brick_size, border = look.bricks(store)
-        producer = StoredProducer(store, host_cache=self.host_cache, filtered=filtered)
-        with Engine(
-            producer,
-            node_pool=self.node_pool,
-            brick_pool=self.brick_pool,
-            brick_size=brick_size,
-            border=border,
-            loading=self.loading,
-            strict=self.strict,
-            device=look.device(),
-        ) as engine:
+        return StoredProducer(store, host_cache=self.host_cache, filtered=filtered), shader
+
+    def memory(self, look: Look, data: Volume | Store) -> dict[str, Any]:
+        """Returns fields of `EngineOptions`."""
+        brick_size, border = look.bricks(data)
+        return {
+            "node_pool": self.node_pool,
+            "brick_pool": self.brick_pool,
+            "brick_size": brick_size,
+            "border": border,
+            "loading": self.loading,
+            "strict": self.strict,
+            "device": look.device(),
+        }
+
+    @contextmanager
+    def open(self, store: Store, look: Look) -> Iterator[tuple[Engine, Shader]]:
+        """Gives an engine over a store, and the transfer function."""
+        from ..engine.engine import Engine
+
+        if self.mode not in (None, "converge") and self.max_frames != type(self)().max_frames:
+            raise ValueError(f"--max-frames is for --mode converge, not {self.mode}")
+        producer, shader = self.content(store, look)
+        with Engine(producer, **self.memory(look, store)) as engine:
             yield engine, shader
 
 
