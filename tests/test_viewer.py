@@ -83,6 +83,10 @@ def test_pictures_stop_when_nothing_changes_and_go_on_when_something_does(sessio
     )
     state = page.of("state")[-1]["state"]
     assert state["options"]["background"] == [0.0, 0.5, 0.0] and state["options"]["step"] == 0.5
+    whole = {name: one for name, one in page.of("welcome")[0]["state"].items() if name != "camera"}
+    page.send("change", state=whole)  # as undo does
+    page.until(lambda: page.of("state")[-1]["state"]["options"]["background"] == [0.0, 0.0, 0.0])
+    assert not page.of("refused")
 
 
 def test_at_most_one_picture_is_on_its_way(session):
@@ -598,3 +602,25 @@ def test_a_missing_library_is_one_line(monkeypatch, small):
     run = gvtorch("view", small, "--no-browser")
     assert run.returncode == 2 and "pip install 'gvtorch[view]'" in run.stderr
     assert len(run.stderr.splitlines()) == 1
+
+
+def test_the_widget_joins_leaves_and_has_a_png(session):
+    pytest.importorskip("anywidget")
+    from gvtorch.viewer.notebook import widget
+
+    made, sent = widget(session), []
+    made.send = lambda content, buffers=None: sent.append((content, buffers))
+    made._take(made, {"joined": True}, [])
+    session.ask(lambda: None)
+    made._take(made, {"text": '{"type": "hello", "width": 64, "height": 48}'}, [])
+    for _ in range(100):
+        session.ask(lambda: None)
+        if any(buffers for _, buffers in sent):
+            break
+    assert json.loads(sent[0][0]["text"])["type"] == "welcome"
+    made._take(made, {"joined": False}, [])
+    assert session.ask(lambda: len(session.clients)) == 0
+    shown = made._repr_mimebundle_()
+    bundle = shown[0] if isinstance(shown, tuple) else shown
+    still = pixels(bundle["image/png"])
+    assert still.shape == (540, 960, 3) and still.max() > 100

@@ -96,11 +96,11 @@ def widget(session: Session, height: int = 560) -> Any:
 
         def _post(self, data: str | bytes) -> None:
             if self._loop is None:
-                self._send(data)
+                self._hand(data)
             else:
-                self._loop.call_soon_threadsafe(self._send, data)
+                self._loop.call_soon_threadsafe(self._hand, data)
 
-        def _send(self, data: str | bytes) -> None:
+        def _hand(self, data: str | bytes) -> None:
             if isinstance(data, str):
                 self.send({"text": data})
             else:

@@ -288,7 +288,7 @@ def _sequence(where: str, hint: Any, content: Any, now: Any, depth: int) -> Any:
 
 
 def _mapping(where: str, hint: Any, content: Any, depth: int) -> Any:
-    if not isinstance(content, dict) or len(content) > MOST_ITEMS or "kind" in content:
+    if not isinstance(content, dict) or len(content) > MOST_ITEMS:
         raise _Other("an object by name")
     key, value = get_args(hint)
     made = {}

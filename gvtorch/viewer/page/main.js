@@ -7,14 +7,15 @@ address.protocol = location.protocol === "https:" ? "wss:" : "ws:";
 /** Opens the socket, and opens it again when it was lost. */
 function connect(take, gone) {
   let socket = null;
-  let wait = 500;
+  let wait = 500, why = "";
   const open = () => {
     socket = new WebSocket(address);
     socket.binaryType = "arraybuffer";
-    socket.onopen = () => { wait = 500; };
+    socket.onopen = () => { [wait, why] = [500, ""]; };
     socket.onmessage = (event) => take(event.data);
     socket.onclose = (event) => {
-      gone(event.wasClean && event.code === 1001 ? "The view was closed." : "");
+      if (event.wasClean && event.code === 1001) why = "The view was closed.";
+      gone(why);
       setTimeout(open, wait);
       wait = Math.min(8000, wait * 2);
     };
