@@ -123,4 +123,7 @@ from .pictures import (
 )
 from . import opengl as opengl
 
+# Looking at a scene in the browser or a notebook.
+from .viewer import Viewer as Viewer, ViewState as ViewState, view as view
+
 __version__: str

@@ -16,7 +16,7 @@ import gvtorch as gv
 from gvtorch.ops import available
 
 pytest.register_assert_rewrite("helpers")
-from helpers import ABSENT, DATA, DEVICES, gvtorch  # noqa: E402
+from helpers import ABSENT, DATA, DEVICES, browser, gvtorch  # noqa: E402
 
 _REQUIRED = os.environ.get("GVTORCH_REQUIRE", "")
 _ran: Counter[str] = Counter()
@@ -25,7 +25,8 @@ _absent: set[str] = set()
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
-        "markers", "backend(name): runs on this backend, or in OpenGL; counted in the summary"
+        "markers",
+        "backend(name): runs on this backend, in OpenGL or a browser; counted in the summary",
     )
 
 
@@ -144,13 +145,14 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    counts = ", ".join(
-        f"{name} {_ran[name]}" for name in ("reference", "cpp", "cuda", "opengl", "no backend")
-    )
+    groups = ("reference", "cpp", "cuda", "opengl", "browser", "no backend")
+    counts = ", ".join(f"{name} {_ran[name]}" for name in groups)
     terminalreporter.write_line(f"passed by backend: {counts}")
     for name, reason in available().items():
         if reason:
             terminalreporter.write_line(f"backend {name} did not run: {reason}")
+    if reason := browser.absent():
+        terminalreporter.write_line(f"browser did not run: {reason}")
     for name in _missing():
         terminalreporter.write_line(f"GVTORCH_REQUIRE: {name} did not run, so the tests failed")
     for path in sorted(_absent):
@@ -181,6 +183,8 @@ def _missing() -> list[str]:
         "ome_zarr_models",
         "vtk",
         "moderngl",
+        "aiohttp",
+        "anywidget",
     )
     _ran["io"] = int(all(importlib.util.find_spec(name) for name in libraries))
     return [name for name in filter(None, _REQUIRED.split(",")) if not _ran[name]]

@@ -96,7 +96,7 @@ def test_up_turns_orbits_flights_and_keys(small, tmp_path):
 
 def test_a_misspelt_word_gets_the_right_one(small, tmp_path):
     for args, message in (
-        (["rendr", small], "unknown command 'rendr'; known: info, render, fly, slice"),
+        (["rendr", small], "unknown command 'rendr'; known: info, view, render, fly"),
         (["rendr", small], "(did you mean render?)"),
         (["render", small, "-o", "a.png", "--camra", "orbit:1,2"], "(did you mean --camera?)"),
         (["slice", small, "-o", "a.png", "--axiz", "z"], "Unrecognized options: --axiz"),

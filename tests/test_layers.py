@@ -22,6 +22,7 @@ FLOORS = [
     {"cache", "opengl", "pictures", "producers", "shaders"},
     {"tracing"},
     {"engine"},
+    {"viewer"},
     {"bench"},
     {"tools"},
 ]

@@ -55,7 +55,7 @@ def window(
             raise ValueError(f"window: percent must be a low and a high one, got {percent}")
     width = data.width if isinstance(data, Store) else data.data.shape[3]
     check.whole("window", "component", component, low=0, high=width - 1)
-    values = _looked_at(data)[..., component].ravel()
+    values = looked_at(data)[..., component].ravel()
     if percent is not None:
         return _span(*np.percentile(values, percent))
     low, high = np.percentile(values, (_TAIL, 100 - _TAIL))
@@ -72,7 +72,7 @@ def windows(
     """Returns what `window` returns of several components between the same percentiles, which are
     right; up to the largest value where what is bright is rarer than that.
     """
-    values, spans = _looked_at(data), []
+    values, spans = looked_at(data), []
     for component in components:
         low, high = np.percentile(values[..., component], percent)
         spans.append(_span(low, high if high > low else values[..., component].max()))
@@ -87,7 +87,7 @@ def value_range(data: Volume | Store) -> tuple[float, float]:
         return data.value_range
     if data.value_range is not None:
         return min(low for low, _ in data.value_range), max(high for _, high in data.value_range)
-    values = _looked_at(data)
+    values = looked_at(data)
     return float(values.min()), float(values.max())
 
 
@@ -97,7 +97,7 @@ def _span(low: float, high: float) -> tuple[float, float]:
     return (low, high) if high > low else (low, low + max(1.0, 1e-6 * abs(low)))
 
 
-def _looked_at(data: Volume | Store) -> np.ndarray:
+def looked_at(data: Volume | Store) -> np.ndarray:
     """Values (..., c) that stand for all."""
     if isinstance(data, Volume):
         bfloat = data.data.dtype == torch.bfloat16  # which NumPy has not

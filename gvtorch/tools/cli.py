@@ -1,4 +1,4 @@
-"""The command line: `gvtorch info`, `render`, `fly`, `slice`, `convert`, `voxelize`, `splat`,
+"""The command line: `gvtorch info`, `view`, `render`, `fly`, `slice`, `convert`, `voxelize`, `splat`,
 `filter` and `bench`.
 
 torch is imported inside the commands, so that `--help` answers at once. A mistake of the user ends
@@ -30,6 +30,7 @@ from .fly import Fly
 from .render import Render
 from .slice import Slice
 from .splat import Splat
+from .view import View
 from .voxelize import Voxelize, cluster
 
 
@@ -249,8 +250,9 @@ def _sparkline(counts: list[int]) -> str:
 
 
 _COMMANDS: dict[str, Any] = {
-    **{"info": Info, "render": Render, "fly": Fly, "slice": Slice, "convert": Convert},
-    **{"voxelize": Voxelize, "splat": Splat, "filter": Filter, "bench": Bench},
+    **{"info": Info, "view": View, "render": Render, "fly": Fly, "slice": Slice},
+    **{"convert": Convert, "voxelize": Voxelize, "splat": Splat, "filter": Filter},
+    **{"bench": Bench},
 }
 
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from tyro.conf import Positional, arg
 
-from .common import Bar, size, volume_formats
+from .common import Bar, given, size, volume_formats
 from .image import KINDS, STRIPS, Develop
 from .look import parse_camera
 from .scene import Scene, SceneFlags
@@ -21,6 +21,7 @@ from .streaming import told
 if TYPE_CHECKING:
     from ..base.records import RenderStats
     from ..cameras import Camera
+    from ..viewer.state import Eye
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +37,9 @@ class Render:
     """float32 color, alpha and depth, int32 samples"""
     stats: Annotated[Path | None, arg(metavar="FILE.json")] = None
     """milliseconds, rays, samples, nodes, bricks, bytes; of stores requests and misses too"""
+    state: Annotated[Path | None, arg(metavar="FILE.json")] = None
+    """what gvtorch view saved: camera, shader and all that says how it is shown; a picture of
+    --size"""
     camera: Annotated[str | None, arg(metavar="CAMERA")] = None
     """orbit:AZIMUTH,ELEVATION (degrees; +x runs to the right at azimuth 0), from where the whole
     box is in the picture; orbit:AZIMUTH,ELEVATION,DISTANCE (largest sides of the box); or
@@ -53,16 +57,46 @@ class Render:
         self._check()
         parse_camera(self.camera, look, width, height)
         options = look.options()
-        with Bar() as bar, self.scene.open(self.path, options, bar) as scene:
+        with Bar() as bar, self.scene.open(self.path, options, bar) as opened:
+            scene, eye, taking = self._as_saved(opened, options)
             camera = parse_camera(self.camera, look, width, height, scene.space)
-            stats = self._take(scene, camera, bar)
+            camera = camera if eye is None else eye.camera(width, height, scene.box)
+            stats = taking._take(scene, camera, bar)
         if self.stats is not None:
             content = {**stats.as_dict(), "extent": scene.extent}
             self.stats.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
         print(f"{self.output}: {width}x{height}, {told(stats)}")
 
+    def _as_saved(self, scene: Scene, options: dict[str, Any]) -> tuple[Scene, Eye | None, Render]:
+        """The scene as a saved state shows it, its camera, and this command with its flags."""
+        if self.state is None:
+            return scene, None, self
+        from ..tracing import RenderOptions
+        from ..viewer.state import ViewState
+
+        component = options["component"]
+        now = ViewState(
+            shader=scene.shader, options=RenderOptions(**options), component=component
+        ).read(self.state)
+        own = {"shader": now.shader, **now.settings()}
+        shown = replace(scene, render=partial(scene.render, **own), cost=partial(scene.cost, **own))
+        return shown, now.camera, replace(self, show=now.show, develop=Develop(**vars(now.develop)))
+
+    def _check_state(self) -> None:
+        """Raises ValueError where a flag tells what a saved state does."""
+        if self.state is None:
+            return
+        if not self.state.is_file():
+            raise FileNotFoundError(f"state not found: {self.state}")
+        free = ("--size", "--backend", "--brick-size", "--border", "--component", "--up")
+        flags = [one for one in given(self.scene.look) if one not in free] + self.develop.given()
+        flags += ["--camera"] * (self.camera is not None) + ["--show"] * (self.show != "picture")
+        if flags:
+            raise ValueError(f"--state tells what {flags[0]} does: leave one out")
+
     def _check(self) -> None:
         """Raises what is wrong with files and flags before the volume is read."""
+        self._check_state()
         from ..pictures.files import checked_path
 
         _check_suffix("--output", self.output, *KINDS)

@@ -21,9 +21,9 @@ from .streaming import Streaming, tell_failures
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from ..cameras import Camera
     from ..engine import Engine
     from ..pictures import Picture
+    from ..shaders import Shader
     from ..tracing import Cost
 
 
@@ -32,7 +32,8 @@ class Scene:
     """What is there."""
 
     render: Callable[..., Picture]  # of a camera
-    cost: Callable[[Camera], Cost]
+    shader: Shader
+    cost: Callable[..., Cost]
     box: Tensor  # (2, 3) float64 world
     extent: tuple[int, ...]  # (x, y, z) voxels
     space: str | None  # where x, y and z point
@@ -89,6 +90,7 @@ class SceneFlags:
             )
         return Scene(
             partial(render, tree, shader=shader, **options),
+            shader,
             partial(cost, tree, shader=shader, **options),
             tree.box,
             volume.extent,
@@ -111,6 +113,7 @@ class SceneFlags:
             mode, most = streaming.mode or "converge", streaming.max_frames
             yield Scene(
                 partial(engine.render, shader=shader, mode=mode, max_frames=most, **options),
+                shader,
                 partial(cost, tree, shader=shader, **options),
                 *(tree.box, tree.extent, store.info.space, None, engine),
             )

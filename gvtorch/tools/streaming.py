@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from tyro.conf import arg
@@ -16,8 +16,10 @@ from .look import Look
 
 if TYPE_CHECKING:
     from ..base.records import RenderStats
+    from ..base.volume import Volume
     from ..engine import Engine, FrameStats
     from ..io.store import Store
+    from ..producers import Producer
     from ..shaders import Shader
 
 
@@ -72,15 +74,11 @@ class Streaming:
         beside = self.image is None and "normal" in channel_names(folder)
         return ("color", "normal") if beside else ("color",)
 
-    @contextmanager
-    def open(self, store: Store, look: Look) -> Iterator[tuple[Engine, Shader]]:
-        """Gives an engine over a store, and the transfer function."""
-        from ..engine.engine import Engine
-        from ..producers import Producer, StoredChannels, StoredProducer
+    def content(self, store: Store, look: Look) -> tuple[Producer, Shader]:
+        """Returns what streams a store, and the shader."""
+        from ..producers import StoredChannels, StoredProducer
         from ..shaders import Filtered
 
-        if self.mode not in (None, "converge") and self.max_frames != type(self)().max_frames:
-            raise ValueError(f"--max-frames is for --mode converge, not {self.mode}")
         names = self._drawn(store, look)
         shader = look.stored_colors(store, names) if names else look.chosen(store)
         filtered = shader if isinstance(shader, Filtered) else None
@@ -88,24 +86,33 @@ class Streaming:
             shader = filtered = Filtered.stored(store)
         if filtered is not None and filtered.component != look.component:
             raise ValueError(f"--component must be that of the colours, {filtered.component}")
-        brick_size, border = look.bricks(store)
-        producer: Producer
         if len(names) > 1:
-            producer = StoredChannels(
-                store.location.rpartition("/")[0], names, host_cache=self.host_cache
-            )
-        else:
-            producer = StoredProducer(store, host_cache=self.host_cache, filtered=filtered)
-        with Engine(
-            producer,
-            node_pool=self.node_pool,
-            brick_pool=self.brick_pool,
-            brick_size=brick_size,
-            border=border,
-            loading=self.loading,
-            strict=self.strict,
-            device=look.device(),
-        ) as engine:
+            folder = store.location.rpartition("/")[0]
+            return StoredChannels(folder, names, host_cache=self.host_cache), shader
+        return StoredProducer(store, host_cache=self.host_cache, filtered=filtered), shader
+
+    def memory(self, look: Look, data: Volume | Store) -> dict[str, Any]:
+        """Returns fields of `EngineOptions`."""
+        brick_size, border = look.bricks(data)
+        return {
+            "node_pool": self.node_pool,
+            "brick_pool": self.brick_pool,
+            "brick_size": brick_size,
+            "border": border,
+            "loading": self.loading,
+            "strict": self.strict,
+            "device": look.device(),
+        }
+
+    @contextmanager
+    def open(self, store: Store, look: Look) -> Iterator[tuple[Engine, Shader]]:
+        """Gives an engine over a store, and the transfer function."""
+        from ..engine.engine import Engine
+
+        if self.mode not in (None, "converge") and self.max_frames != type(self)().max_frames:
+            raise ValueError(f"--max-frames is for --mode converge, not {self.mode}")
+        producer, shader = self.content(store, look)
+        with Engine(producer, **self.memory(look, store)) as engine:
             yield engine, shader
 
 

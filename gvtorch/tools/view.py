@@ -1,0 +1,132 @@
+"""`gvtorch view`: a volume, a store or a script's scene in a page that turns it."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from tyro.conf import Positional, arg
+
+from ..io.ngff import is_zarr
+from .common import Bar, given, refuse_for_store, volume_formats
+from .look import parse_camera
+from .scene import SceneFlags
+
+if TYPE_CHECKING:
+    from ..cameras import Camera
+    from ..shaders import Shader
+    from ..viewer.scene import Scene
+
+_PATH = f"""a volume: {volume_formats()}; or a Python file that sets scene (what gv.view takes) and
+perhaps shader, camera and options"""
+_NAMES = ("scene", "shader", "camera", "options")  # that a script may set
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """Look at a volume or a store in the browser: turn it, and edit how it is shown."""
+
+    path: Positional[Annotated[str, arg(metavar="PATH|SCRIPT.py", help=_PATH)]]
+    state: Annotated[Path | None, arg(metavar="FILE.json")] = None
+    """what the page saved: camera, shader and all that says how it is shown"""
+    camera: Annotated[str | None, arg(metavar="CAMERA")] = None
+    """where it stands at first, as of gvtorch render"""
+    host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
+    """where pages are served; 0.0.0.0: also to other machines, to those who know the address"""
+    port: Annotated[int, arg(metavar="N")] = 0
+    """0: any that is free"""
+    allow: Annotated[str, arg(metavar="NAME,NAME")] = ""
+    """further names under which browsers may reach this machine"""
+    browser: bool = True
+    """open it; else the address is only printed"""
+    scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()
+
+    def run(self) -> None:
+        """Opens the scene, and serves it until Ctrl-C."""
+        from ..viewer import view
+        from ..viewer.server import aiohttp_web
+
+        aiohttp_web()
+        if self.scene.look.size != type(self.scene.look)().size:
+            raise ValueError("--size is for pictures: a page has its own")
+        if self.state is not None and not self.state.is_file():
+            raise FileNotFoundError(f"state not found: {self.state}")
+        what, shader, camera, options = self._opened()
+        view(
+            *(what, shader, camera),
+            state=self.state,
+            host=self.host,
+            port=self.port,
+            allow=[name for name in self.allow.split(",") if name],
+            browser=self.browser,
+            wait=True,
+            **options,
+        )
+
+    def _opened(self) -> tuple[Any, Shader | None, Camera | None, dict[str, Any]]:
+        """What is looked at, its shader, its camera, and fields of `RenderOptions`."""
+        if self.path.endswith(".py"):
+            return self._run_script()
+        look = self.scene.look
+        parse_camera(self.camera, look, 16, 9)
+        options = look.options()
+        with Bar() as bar:
+            bar("reading", 0, 0)
+            scene, shader = self._store() if is_zarr(self.path) else self._volume()
+        return scene, shader, parse_camera(self.camera, look, 16, 9, scene.info.space), options
+
+    def _store(self) -> tuple[Scene, Shader]:
+        from ..engine.engine import Engine
+        from ..viewer.scene import Scene
+
+        if self.scene.threshold is not None:
+            raise ValueError("--threshold is for volumes; a store's is set by gvtorch convert")
+        refuse_for_store(self.scene.source)
+        look, streaming = self.scene.look, self.scene.streaming
+        store = streaming.store(self.path, self.scene.source.time)
+        producer, shader = streaming.content(store, look)
+        engine = Engine(producer, **streaming.memory(look, store))
+
+        def remake() -> Any:
+            return streaming.content(store, look)[0]
+
+        return Scene(store.name, engine, data=store, remake=remake), shader
+
+    def _volume(self) -> tuple[Scene, Shader]:
+        from ..engine.engine import Engine
+        from ..producers import VolumeProducer
+        from ..shaders import Filtered
+        from ..viewer.scene import Scene
+
+        look, volume = self.scene.look, self.scene.source.read(self.path)
+        shader = look.chosen(volume)
+        filtered = shader if isinstance(shader, Filtered) else None
+
+        def remake() -> Any:
+            return VolumeProducer(volume, threshold=self.scene.threshold, filtered=filtered)
+
+        engine = Engine(remake(), **self.scene.streaming.memory(look, volume))
+        return Scene(volume.name, engine, data=volume, remake=remake), shader
+
+    def _run_script(self) -> tuple[Any, Shader | None, Camera | None, dict[str, Any]]:
+        """What a script sets."""
+        import runpy
+
+        flags = [
+            one
+            for group in ("look", "streaming", "source")
+            for one in given(getattr(self.scene, group))
+        ]
+        if flags or self.camera:
+            raise ValueError(f"{(flags or ['--camera'])[0]} is for files: the script tells")
+        if not Path(self.path).is_file():
+            raise FileNotFoundError(f"script not found: {self.path}")
+        sys.path.insert(0, str(Path(self.path).resolve().parent))
+        found = runpy.run_path(self.path)
+        if "scene" not in found:
+            raise ValueError(f"{self.path}: must set scene, as in scene = gv.FieldProducer(...)")
+        what, shader, camera, options = (found.get(name) for name in _NAMES)
+        return what, shader, camera, dict(options or {})

@@ -1,0 +1,241 @@
+"""`Client`: one page that looks: its camera, its picture that gets better while it rests, and what
+is on the way to it. All but `send` and `ack` runs in the thread that renders.
+"""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Callable
+from threading import Lock
+from typing import Any
+
+from ..cameras import Camera
+from ..pictures import Picture, Progressive
+from .protocol import told, with_picture
+from .scene import Scene
+from .state import Eye, ViewState
+
+Send = Callable[[str | bytes], None]  # from any thread; does not block
+
+_REST = 0.18  # seconds without a move, after which a camera rests although nobody said so
+_EVERY = 0.3  # seconds between pictures of a camera at rest
+_DRAFT, _FINAL = 78, 94  # JPEG quality
+_SMALLEST = 0.08  # of the resolution
+_STILL_FRAMES = 3  # frames in which nothing more came, after which nothing more is waited for
+
+
+class Interrupted(Exception):
+    """Something newer is to be shown."""
+
+
+class Client:
+    """A page.
+
+    Attributes:
+        number: Its name for others.
+        eye: Its camera.
+        size: (width, height) pixels of its picture.
+        follows: The number of the client whose camera it takes, or None.
+        picture: The last one.
+        monitor: Whether it is told the figures of each frame.
+    """
+
+    def __init__(self, number: int, send: Send, eye: Eye) -> None:
+        """Takes a function that sends a text or bytes to the page."""
+        self.number, self._send = number, send
+        self.eye, self.size, self.rate = eye, (0, 0), 25.0
+        self.follows: int | None = None
+        self.monitor = False
+        self._moving, self._moved, self._sent = False, 0.0, 0.0
+        self._drawn: tuple[Any, ...] | None = None  # what the last picture showed
+        self._progressive: Progressive | None = None
+        self._settled, self._still, self._done = False, 0, False
+        self._last_sent = self._not_before = 0.0
+        self._milliseconds = 2e-3 / 4  # of a pixel
+        self.picture: Picture | None = None
+        self._camera: Camera | None = None
+        self._frames = 0
+        self._lock = Lock()
+        self._in_flight: int | None = None
+        self._waiting: tuple[int, bytes] | None = None
+
+    # The network's side.
+
+    def tell(self, kind: str, **content: Any) -> None:
+        """Sends a text."""
+        self._send(told(kind, **content))
+
+    def ack(self, number: int) -> None:
+        """Notes that a picture was drawn, and sends the next one if it waits."""
+        with self._lock:
+            if number != self._in_flight:
+                return
+            self._in_flight, waiting = None, self._waiting
+            self._waiting = None
+        if waiting is not None:
+            self._post(*waiting)
+
+    def send_file(self, name: str, data: bytes) -> None:
+        """Sends a file to be kept."""
+        self._send(with_picture({"file": name}, data))
+
+    def _post(self, number: int, data: bytes) -> None:
+        """Sends a picture, or keeps it until the one before is drawn."""
+        with self._lock:
+            if self._in_flight is not None:
+                self._waiting = number, data
+                return
+            self._in_flight = number
+        self._send(data)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a picture waits for the network."""
+        return self._waiting is not None
+
+    # The renderer's side.
+
+    def move(self, eye: Eye, moving: bool, sent: float) -> None:
+        """Takes a camera."""
+        self.eye, self._moving, self._moved, self._sent = eye, moving, time.monotonic(), sent
+        self._done = False
+
+    def stir(self, resting: bool) -> None:
+        """Notes that what is shown has changed."""
+        self._progressive, self._done, self._drawn = None, False, None
+        self._settled, self._still = False, 0
+        if not resting:
+            self._moving, self._moved = True, time.monotonic()
+
+    def resized(self, width: int, height: int, rate: float) -> None:
+        """Takes the size of the picture."""
+        if (width, height) != self.size:
+            self.size = (width, height)
+            self.stir(False)
+        self.rate = rate
+
+    @property
+    def resting(self) -> bool:
+        """Whether the camera stands still."""
+        return not self._moving or time.monotonic() - self._moved > _REST
+
+    def wants(self) -> bool:
+        """Whether there is something to be drawn now."""
+        if not self.waits() or self.busy or time.monotonic() < self._not_before:
+            return False
+        return self.resting or self._drawn != (self.eye, self.size)
+
+    def waits(self) -> bool:
+        """Whether it will want something without being told."""
+        return bool(self.size[0]) and not self._done
+
+    def rest_for(self, seconds: float) -> None:
+        """Draws nothing for a while, after a picture failed."""
+        self._not_before = time.monotonic() + seconds
+
+    def draw(self, scene: Scene, state: ViewState, newer: Callable[[], bool]) -> Picture | None:
+        """Draws and sends the next picture: a coarse one while the camera moves, else one more
+        frame of the mean. Returns it, or None if `newer` said that it is out of date.
+        """
+        if self._drawn != (self.eye, self.size):
+            return self._draft(scene, state)
+        try:
+            return self._refined(scene, state, newer)
+        except Interrupted:
+            return None
+
+    def _draft(self, scene: Scene, state: ViewState) -> Picture:
+        width, height = self.size
+        wanted = 1e3 / self.rate
+        scale = (wanted / (self._milliseconds * width * height)) ** 0.5
+        scale = min(1.0, max(_SMALLEST, scale))
+        small = max(1, round(width * scale)), max(1, round(height * scale))
+        camera, start = self.eye.camera(*small, scene.box), time.perf_counter()
+        picture = scene.frame(camera, state)
+        took = 1e3 * (time.perf_counter() - start)
+        measured = took / (small[0] * small[1])
+        self._milliseconds += 0.4 * (measured - self._milliseconds)
+        self._drawn, self._progressive = (self.eye, self.size), None
+        self._settled, self._still = False, 0
+        self._show(picture, camera, state, _DRAFT, took, final=False)
+        return picture
+
+    def _refined(self, scene: Scene, state: ViewState, newer: Callable[[], bool]) -> Picture | None:
+        def check(what: str, done: int, total: int) -> None:
+            if done < total and newer():
+                raise Interrupted
+
+        width, height = self.size
+        camera, start = self.eye.camera(width, height, scene.box), time.perf_counter()
+        if state.show != "picture":
+            camera = self.eye.camera(max(1, width // 2), max(1, height // 2), scene.box)
+            picture = scene.cost(camera, state, check)
+            self._done = True
+            self._show(picture, camera, state, _FINAL, 1e3 * (time.perf_counter() - start))
+            return picture
+        if self._progressive is None:
+            self._progressive = Progressive(lambda one: scene.frame(one, state, check))
+        if not self._settled:
+            self._progressive.reset()  # what was missing is there now
+        picture = self._progressive.frame(camera)
+        took = 1e3 * (time.perf_counter() - start)
+        if not self._settled:
+            self._still = self._still + 1 if scene.settled(picture) else 0
+            converged = getattr(picture.stats, "converged", True)
+            self._settled = converged or self._still >= _STILL_FRAMES
+        count = self._progressive.count if self._settled else 0
+        self._done = count >= state.develop.samples
+        first = count & (count - 1) == 0 and self._settled
+        if first or self._done or time.monotonic() - self._last_sent > _EVERY or not self._settled:
+            self._show(picture, camera, state, _FINAL, took, final=self._done)
+        return picture
+
+    def _show(
+        self,
+        picture: Picture,
+        camera: Camera,
+        state: ViewState,
+        quality: int,
+        took: float,
+        final: bool = True,
+    ) -> None:
+        self.picture, self._camera = picture, camera
+        self._frames += 1
+        self._last_sent = time.monotonic()
+        shown = picture if state.show != "picture" and final else state.develop.develop(picture)
+        data = jpeg(shown, quality)
+        head = {
+            "number": self._frames,
+            "camera": vars(self.eye),
+            "sent": self._sent,
+            "milliseconds": round(took, 2),
+            "samples": self._progressive.count if self._progressive is not None else 0,
+            "final": final,
+            "missed": bool(picture.missed.any()) if picture.missed is not None else False,
+        }
+        self._post(self._frames, with_picture(head, data))
+
+    def picked(self, x: float, y: float) -> list[float] | None:
+        """Returns the world place (3,) that is seen at a place of the last picture, or None."""
+        if self.picture is None or self._camera is None:
+            return None
+        rows, columns = self.picture.nearest.shape[:2]
+        row = min(rows - 1, int(y * rows))
+        column = min(columns - 1, int(x * columns))
+        distance = float(self.picture.nearest[row, column, 0])
+        if not distance < float("inf"):
+            return None
+        rays = self._camera.rays(rows=(row, row + 1))
+        place = rays.origin[column] + distance * rays.direction[column]
+        return place.tolist()
+
+
+def jpeg(picture: Picture, quality: int) -> bytes:
+    """Returns a picture as a JPEG file."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    image = Image.fromarray(picture.to_srgb8().numpy())
+    image.save(out, "JPEG", quality=quality, subsampling=0 if quality > 90 else 2)
+    return out.getvalue()

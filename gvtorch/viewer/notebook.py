@@ -1,0 +1,134 @@
+"""`widget`: the same page below the cell of a notebook (JupyterLab, VS Code, Colab), by anywidget.
+
+The page's modules travel as texts, and a few lines hand them to the browser in the order of their
+imports; messages and pictures go through the notebook's own connection.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+from typing import Any
+
+from .client import Client
+from .server import page_files
+from .session import Session, png
+
+_FIRST = "app.js"
+_IMPORT = re.compile(r'from "\./([a-z]+\.js)"')
+
+#: Makes modules of the page's texts, and mounts it with the notebook's model as its transport.
+_BOOT = """
+const texts = %s;
+const made = {};
+const address = (name) => made[name] ??= URL.createObjectURL(new Blob(
+  [texts[name].replace(/from "\\.\\/([a-z]+\\.js)"/g, (_, other) => `from "${address(other)}"`)],
+  { type: "text/javascript" }));
+export default {
+  async render({ model, el }) {
+    const { mount } = await import(address("app.js"));
+    const root = document.createElement("div");
+    root.className = "gv";
+    root.style.height = `${model.get("height")}px`;
+    el.append(root);
+    const connect = (take) => {
+      model.on("msg:custom", (content, buffers) => {
+        take(buffers.length ? buffers[0] : content.text);
+      });
+      return (text) => model.send({ text });
+    };
+    mount(root, connect);
+    model.send({ joined: true });
+    return () => model.send({ joined: false });
+  },
+};
+"""
+
+
+def module_text() -> str:
+    """Returns the whole page as one JavaScript module."""
+    files = {name: data.decode() for name, data in page_files().items() if name.endswith(".js")}
+    wanted, left = {}, [_FIRST]
+    while left:
+        name = left.pop()
+        if name not in wanted:
+            wanted[name] = files[name]
+            left += _IMPORT.findall(files[name])
+    return _BOOT % json.dumps(wanted)
+
+
+def widget(session: Session, height: int = 560) -> Any:
+    """Returns what a notebook shows of a session: the live page, or where nothing live can be, a
+    PNG.
+
+    Raises:
+        ImportError: anywidget is not installed.
+    """
+    try:
+        import anywidget
+        import traitlets
+    except ImportError as error:
+        text = f"view needs {error.name} in a notebook: pip install 'gvtorch[notebook]'"
+        raise ImportError(text) from None
+
+    class ViewWidget(anywidget.AnyWidget):
+        """A view below a cell; `session` is what it shows, `close_view` ends it."""
+
+        _esm = module_text()
+        _css = page_files()["style.css"].decode()
+        height = traitlets.Int(560).tag(sync=True)
+
+        def __init__(self, session: Session, **options: Any) -> None:
+            super().__init__(**options)
+            self.session = session
+            self._client: Client | None = None
+            self._loop = _loop()
+            self.on_msg(self._take)
+
+        def _take(self, _widget: Any, content: Any, _buffers: Any) -> None:
+            if content.get("joined") is not None:
+                if self._client is not None:
+                    self.session.leave(self._client)
+                self._client = self.session.join(self._post) if content["joined"] else None
+            elif self._client is not None and isinstance(content.get("text"), str):
+                self.session.receive(self._client, content["text"])
+
+        def _post(self, data: str | bytes) -> None:
+            if self._loop is None:
+                self._hand(data)
+            else:
+                self._loop.call_soon_threadsafe(self._hand, data)
+
+        def _hand(self, data: str | bytes) -> None:
+            if isinstance(data, str):
+                self.send({"text": data})
+            else:
+                self.send({}, buffers=[data])
+
+        def _repr_mimebundle_(self, **options: Any) -> Any:
+            bundle = super()._repr_mimebundle_(**options)
+            data = bundle[0] if isinstance(bundle, tuple) else dict(bundle or {})
+            data["image/png"] = self.png()
+            return (data, bundle[1]) if isinstance(bundle, tuple) else data
+
+        def png(self, width: int = 960, height: int = 540) -> bytes:
+            """Returns what is shown, as a PNG file."""
+            eye = self.session.state.camera
+            assert eye is not None
+            made = self.session.ask(lambda: self.session.still(eye, width, height), 600)
+            return png(made)
+
+        def close_view(self) -> None:
+            """Ends the view; an engine that was handed in stays open."""
+            self.session.close()
+
+    return ViewWidget(session, height=height)
+
+
+def _loop() -> Any:
+    """The event loop that runs here, if there is one."""
+    try:
+        return asyncio.get_running_loop()
+    except RuntimeError:
+        return None

@@ -1,0 +1,87 @@
+// A camera as the state tells it, {eye, target, up, fov, model}, and how it moves; no DOM here.
+import { add, clamp, cross, dot, length, sub, times, turned, unit } from "./vectors.js";
+
+export const distance = (c) => length(sub(c.target, c.eye));
+
+/** Unit vectors to the right, up and forward of the picture. */
+export function axes(c) {
+  const forward = unit(sub(c.target, c.eye));
+  let right = cross(forward, c.up);
+  if (length(right) < 1e-9 * length(c.up)) right = cross(forward, Math.abs(c.up[2]) > 0.9 ? [0, 1, 0] : [0, 0, -1]);
+  right = unit(right);
+  return { right, up: cross(right, forward), forward };
+}
+
+/** World units that half the picture's height shows at the target's distance. */
+export const halfHeight = (c) => distance(c) * Math.tan(((Math.min(c.fov, 170) / 2) * Math.PI) / 180);
+
+/** Goes around the target by angles to the right and up. */
+export function orbited(c, yaw, pitch) {
+  const pole = unit(c.up), away = sub(c.eye, c.target);
+  const { right } = axes(c);
+  const angle = Math.acos(clamp(dot(unit(away), pole), -1, 1));  // from the pole
+  const tilt = clamp(angle - pitch, 0.02, Math.PI - 0.02) - angle;
+  const lifted = turned(away, right, tilt);
+  return { ...c, eye: add(c.target, turned(lifted, pole, -yaw)) };
+}
+
+/** Looks elsewhere from the same place. */
+export function looked(c, yaw, pitch) {
+  const pole = unit(c.up), towards = sub(c.target, c.eye);
+  const { right } = axes(c);
+  const angle = Math.acos(clamp(dot(unit(towards), pole), -1, 1));
+  const tilt = clamp(angle - pitch, 0.02, Math.PI - 0.02) - angle;
+  return { ...c, target: add(c.eye, turned(turned(towards, right, -tilt), pole, -yaw)) };
+}
+
+export function shifted(c, move) {
+  return { ...c, eye: add(c.eye, move), target: add(c.target, move) };
+}
+
+/** Shifts by shares of half the picture's height, so that what is at the target stays under the pointer. */
+export function panned(c, x, y) {
+  const { right, up } = axes(c), half = halfHeight(c);
+  return shifted(c, add(times(right, -x * half), times(up, y * half)));
+}
+
+/** The world place at the target's distance under a place of the picture: x, y in half heights from its middle. */
+export function under(c, x, y) {
+  const { right, up } = axes(c), half = halfHeight(c);
+  return add(c.target, add(times(right, x * half), times(up, -y * half)));
+}
+
+/** Comes nearer (factor < 1) to a place. */
+export function zoomed(c, factor, place) {
+  const near = (p) => add(place, times(sub(p, place), factor));
+  return { ...c, eye: near(c.eye), target: near(c.target) };
+}
+
+/** Looks along an axis: axis 0, 1, 2 and side +1 or -1 of where the eye stands. */
+export function facing(c, axis, side, up) {
+  const away = [0, 0, 0];
+  away[axis] = side;
+  const along = Math.abs(dot(unit(up), away)) > 0.9;
+  const other = axis === 1 ? [0, 0, -side] : [0, 1, 0];
+  return { ...c, eye: add(c.target, times(away, distance(c))), up: along ? other : up };
+}
+
+/** Place in the picture, in half heights from its middle (x right, y down), and depth; null: behind the eye. */
+export function projected(c, place) {
+  const { right, up, forward } = axes(c), from = sub(place, c.eye);
+  const depth = dot(from, forward);
+  const half = c.model === "ortho" ? halfHeight(c) : (depth * halfHeight(c)) / distance(c);
+  if (c.model !== "ortho" && depth <= 1e-9 * distance(c)) return null;
+  return { x: dot(from, right) / half, y: -dot(from, up) / half, depth };
+}
+
+/** Between two cameras; t from 0 to 1. */
+export function between(a, b, t) {
+  const mix = (p, q) => add(times(p, 1 - t), times(q, t));
+  const far = Math.exp((1 - t) * Math.log(distance(a)) + t * Math.log(distance(b)));
+  const target = mix(a.target, b.target);
+  let away = mix(unit(sub(a.eye, a.target)), unit(sub(b.eye, b.target)));
+  if (length(away) < 1e-3) away = add(away, times(axes(a).right, 0.1));
+  let up = mix(unit(a.up), unit(b.up));
+  if (length(up) < 1e-3) up = b.up;
+  return { ...b, target, eye: add(target, times(unit(away), far)), up, fov: (1 - t) * a.fov + t * b.fov };
+}

@@ -1,0 +1,71 @@
+// Elements in a line.
+
+/** Makes an element: el("div.a.b", {title: "..."}, child, "text"). */
+export function el(kind, props = {}, ...children) {
+  const [tag, ...classes] = kind.split(".");
+  const made = document.createElement(tag);
+  made.className = classes.join(" ");
+  for (const [name, value] of Object.entries(props)) {
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else if (name === "style") Object.assign(made.style, value);
+    else if (name in made && name !== "list") made[name] = value;
+    else made.setAttribute(name, value);
+  }
+  made.append(...children.filter((one) => one !== null && one !== undefined));
+  return made;
+}
+
+/** An icon of strokes in a box of 24 x 24. */
+export function icon(path) {
+  const space = "http://www.w3.org/2000/svg";
+  const svg = document.createElementNS(space, "svg");
+  svg.setAttribute("viewBox", "0 0 24 24");
+  const line = document.createElementNS(space, "path");
+  line.setAttribute("d", path);
+  svg.append(line);
+  return svg;
+}
+
+export const ICONS = {
+  orbit: "M12 4a8 8 0 1 0 8 8M20 4v5h-5M12 9.5v5M9.5 12h5",
+  pan: "M12 3v18M3 12h18M9 6l3-3 3 3M9 18l3 3 3-3M6 9l-3 3 3 3M18 9l3 3-3 3",
+  fly: "M3 13l18-8-6 16-3.5-6.5z",
+  window: "M12 3a9 9 0 1 0 0 18V3zM12 3a9 9 0 0 1 0 18",
+  home: "M4 9V4h5M20 9V4h-5M4 15v5h5M20 15v5h-5",
+  ortho: "M4 8l8-4 8 4v8l-8 4-8-4zM4 8l8 4 8-4M12 12v8",
+  camera: "M4 8h4l2-3h4l2 3h4v11H4zM12 16.5a3.5 3.5 0 1 0 0-7 3.5 3.5 0 0 0 0 7z",
+  undo: "M9 7L4 12l5 5M4 12h10a6 6 0 0 1 6 6",
+  save: "M12 4v11M8 11l4 4 4-4M4 20h16",
+  open: "M12 15V4M8 8l4-4 4 4M4 20h16",
+  panel: "M4 5h16v14H4zM15 5v14",
+  monitor: "M3 12h4l3-7 4 14 3-7h4",
+  close: "M6 6l12 12M18 6L6 18",
+  plus: "M12 5v14M5 12h14",
+};
+
+/** A button with an icon. */
+export function iconButton(name, title, onclick) {
+  const made = el("button.gv-icon", { title, onclick, type: "button", ariaLabel: title });
+  made.append(icon(ICONS[name]));
+  return made;
+}
+
+/** Keeps a file that the page made. */
+export function keep(name, content, type) {
+  const url = URL.createObjectURL(new Blob([content], { type }));
+  el("a", { href: url, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(url), 10000);
+}
+
+/** Asks for a JSON file; gives its content to `take`. */
+export function openJson(take, fail) {
+  const input = el("input", { type: "file", accept: ".json,application/json" });
+  input.onchange = async () => {
+    try {
+      take(JSON.parse(await input.files[0].text()));
+    } catch (error) {
+      fail(`${input.files[0].name}: ${error.message}`);
+    }
+  };
+  input.click();
+}

@@ -1,0 +1,111 @@
+// Figures of the frames, as they come: time by stage, rates, pools, misses.
+import { el } from "./dom.js";
+import { short } from "./vectors.js";
+
+const KEPT = 120;
+const STAGES = ["#6fb1ff", "#f2b56b", "#8fd460", "#d68cff", "#ff7a6b", "#5fd4c4", "#e6d35c", "#9aa7bd"];
+
+export class MonitorView {
+  constructor(app) {
+    this.app = app;
+    this.frames = [];
+    this.times = [];
+    this.chart = el("canvas.gv-chart");
+    this.misses = el("canvas.gv-chart");
+    this.stages = el("div.gv-stages");
+    this.table = el("div.gv-figures");
+    this.element = el("div.gv-monitor", {},
+      el("div.gv-caption", {}, "milliseconds a frame"), this.chart, this.stages,
+      el("div.gv-caption", {}, "bricks missed, of those wanted"), this.misses, this.table);
+  }
+
+  /** Notes when a picture was drawn. */
+  drawn() {
+    const now = performance.now();
+    this.times = [...this.times.filter((time) => now - time < 2000), now];
+  }
+
+  take(figures) {
+    this.frames.push(figures);
+    if (this.frames.length > KEPT) this.frames.shift();
+    this.draw();
+  }
+
+  draw() {
+    const last = this.frames.at(-1);
+    if (!last || !this.element.isConnected) return;
+    const names = [...new Set(this.frames.flatMap((one) => Object.keys(one.stages)))];
+    this.bars(names);
+    this.line();
+    const own = names.filter((name) => last.stages[name] >= 0.05).sort((a, b) => last.stages[b] - last.stages[a]).slice(0, 8);
+    this.stages.replaceChildren(...own.map((name) => el("span.gv-stage-name", {},
+      el("i", { style: { background: STAGES[names.indexOf(name) % STAGES.length] } }), `${name} ${last.stages[name].toFixed(1)}`)));
+    const report = last.report, rows = [
+      ["pictures / s", short(this.rate())],
+      ["from hand to picture", this.latency()],
+      ["samples", short(last.samples)],
+      ["rays", short(last.rays)],
+      ["bricks used", short(last.bricks_used)],
+      ["requests", short(Object.values(last.requests ?? {}).reduce((a, b) => a + b, 0))],
+    ];
+    if (report) {
+      rows.push(["bricks / s", short(report.bricks_per_second)]);
+      rows.push(["hit rate", `${(100 * report.hit_rate).toFixed(1)} %`]);
+      for (const [name, share] of Object.entries(report.occupancy)) rows.push([`${name} in use`, `${(100 * share).toFixed(1)} %`]);
+    }
+    if (last.failed) rows.push(["failed", short(last.failed)]);
+    this.table.replaceChildren(...rows.flatMap(([name, value]) => [el("span", {}, name), el("b", {}, String(value))]));
+  }
+
+  rate() {
+    const now = performance.now();
+    return this.times.filter((time) => now - time < 2000).length / 2;
+  }
+
+  latency() {
+    const sorted = [...this.app.view.latencies].sort((a, b) => a - b);
+    if (!sorted.length) return "–";
+    const at = (share) => sorted[Math.min(sorted.length - 1, Math.floor(share * sorted.length))].toFixed(0);
+    return `${at(0.5)} ms, 95 %: ${at(0.95)} ms`;
+  }
+
+  surface(canvas) {
+    const ratio = window.devicePixelRatio || 1, [wide, tall] = [canvas.clientWidth, canvas.clientHeight];
+    [canvas.width, canvas.height] = [wide * ratio, tall * ratio];
+    const c = canvas.getContext("2d");
+    c.scale(ratio, ratio);
+    return { c, wide, tall };
+  }
+
+  bars(names) {
+    const { c, wide, tall } = this.surface(this.chart);
+    const sums = this.frames.map((one) => one.milliseconds);
+    const most = Math.max(20, ...sums), step = wide / KEPT;
+    this.frames.forEach((one, n) => {
+      let y = tall;
+      const x = wide - (this.frames.length - n) * step;
+      names.forEach((name, at) => {
+        const height = ((one.stages[name] ?? 0) / most) * tall;
+        c.fillStyle = STAGES[at % STAGES.length];
+        c.fillRect(x, y - height, Math.max(1, step - 0.5), height);
+        y -= height;
+      });
+    });
+    c.fillStyle = "rgba(235,240,250,.6)";
+    c.font = "10px system-ui, sans-serif";
+    c.fillText(`${most.toFixed(0)} ms`, 3, 10);
+  }
+
+  line() {
+    const { c, wide, tall } = this.surface(this.misses), step = wide / KEPT;
+    c.beginPath();
+    this.frames.forEach((one, n) => {
+      const x = wide - (this.frames.length - n - 0.5) * step, y = tall - 2 - (one.miss_rate ?? 0) * (tall - 4);
+      if (n) c.lineTo(x, y);
+      else c.moveTo(x, y);
+    });
+    c.strokeStyle = "#f2b56b";
+    c.lineWidth = 1.5;
+    c.stroke();
+  }
+}

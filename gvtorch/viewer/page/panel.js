@@ -1,0 +1,185 @@
+// The panel: sections of controls for every part of the state.
+import { Controls } from "./controls.js";
+import { axes } from "./camera.js";
+import { el, iconButton, keep, openJson } from "./dom.js";
+import { TransferEditor, domain } from "./transfer.js";
+import { dot } from "./vectors.js";
+
+const HIDDEN = ["transfer", "kind", "camera", "looks"];
+
+export class Panel {
+  constructor(app) {
+    this.app = app;
+    this.open = new Set(["Colours", "Shader", "Picture"]);
+    this.controls = new Controls(app.schema, (kind, name) => this.first(kind, name));
+    this.editor = new TransferEditor((f, rest) => app.changeTransfer(f, rest));
+    this.body = el("div.gv-sections");
+    this.element = el("aside.gv-panel", {}, this.body);
+  }
+
+  /** A new object of a class, as the page makes them. */
+  first(kind, name) {
+    const { app } = this, now = app.state.shader;
+    const told = this.controls.schema[kind].fields, made = { kind };
+    for (const field of Object.keys(told)) {
+      if (field in now && name === "shader") made[field] = now[field];
+    }
+    const transfer = app.transfer() ?? app.lastTransfer;
+    const [low, high] = domain(transfer);
+    const middle = low + 0.5 * (high - low);
+    const { forward } = axes(app.camera);
+    const inBox = ["world", "box"].includes(told.frame?.default);
+    const known = {
+      transfer, value: middle, which: "maximum", channel: app.channelNames[0],
+      direction: forward.map((one) => Number(one.toFixed(3))), position: app.camera.eye,
+      aperture: 0.05, focus: 2, frame: "box", top: [0.1, 0.13, 0.18], bottom: [0.01, 0.012, 0.016],
+      looks: [{ kind: "ChannelLook", window: [low, high] }],
+    };
+    for (const [field, one] of Object.entries(told)) {
+      const needed = !("default" in one) && !one.optional;
+      if (field in known && (needed || (field === "frame" && inBox)) && made[field] === undefined) made[field] = known[field];
+    }
+    return kind === "TransferFunction" ? transfer : made;
+  }
+
+  section(name, ...rows) {
+    const shown = rows.flat().filter(Boolean);
+    if (!shown.length) return null;
+    const made = el("details.gv-section", { open: this.open.has(name) }, el("summary", {}, name), ...shown);
+    made.addEventListener("toggle", () => (made.open ? this.open.add(name) : this.open.delete(name)));
+    return made;
+  }
+
+  /** Makes all rows anew from the state. */
+  show() {
+    const { app } = this, { state } = app, top = this.body.scrollTop;
+    const put = (name) => (value, rest) => app.change({ [name]: value }, rest);
+    const transfer = app.transfer();
+    if (transfer) this.editor.set(transfer);
+    const sections = [
+      this.section("Colours", transfer ? this.colours() : [], this.looks()),
+      this.section("Shader", this.shader()),
+      this.section("Picture", this.controls.fields({ kind: "Development", ...state.develop }, put("develop")),
+        this.controls.fields(state.options, put("options"), { only: ["background"] }), this.showing()),
+      this.section("Clip", this.clip()),
+      this.section("Light and lens", this.controls.fields(state.options, put("options"), { only: ["lighting", "lens"] })),
+      this.section("Sampling", this.controls.fields(state.options, put("options"), { only: ["step", "lod", "stop_alpha", "depth_alpha", "cone_scale"] })),
+      this.section("Scene", this.parameters()),
+      this.section("Camera", this.camera()),
+      this.section("Memory", this.memory()),
+      this.section("Monitor", app.monitor.element),
+    ];
+    this.body.replaceChildren(...sections.filter(Boolean));
+    for (const made of this.body.children) {
+      if (made.firstChild.textContent === "Monitor") made.addEventListener("toggle", () => app.watch(made.open));
+    }
+    this.body.scrollTop = top;
+    app.monitor.draw();
+  }
+
+  colours() {
+    const { app, editor } = this;
+    const names = app.presets;
+    const pick = el("select", { title: "Colours by name; colour maps keep the opacity", onchange: () => app.preset(names[pick.selectedIndex - 1]) },
+      el("option", {}, "presets"), ...names.map((name) => el("option", {}, name)));
+    const tick = (text, checked, onchange) => el("label.gv-tick", {}, el("input", { type: "checkbox", checked, onchange: (e) => onchange(e.target.checked) }), text);
+    return [
+      editor.element,
+      el("div.gv-bar", {}, pick,
+        tick("log", editor.log, (on) => { editor.log = on; editor.draw(); }),
+        tick("in view", app.inView, (on) => app.askHistogram(on)),
+        el("span.gv-gap"),
+        iconButton("open", "Load a transfer function (JSON)", () => openJson((f) => app.changeTransfer({ kind: "TransferFunction", ...f }, true), (why) => app.say(why, true))),
+        iconButton("save", "Save the transfer function (JSON)", () => {
+          const { kind, ...content } = app.transfer();
+          keep("transfer.json", JSON.stringify(content), "application/json");
+        })),
+    ];
+  }
+
+  /** Channels of an image: each with its colour, window and whether it is shown. */
+  looks() {
+    const { app } = this, { shader } = app.state;
+    if (!shader.looks) return [];
+    return shader.looks.map((look, at) => {
+      const set = (value, rest) => app.change({ shader: { ...shader, looks: shader.looks.map((old, n) => (n === at ? value : old)) } }, rest);
+      if (look.kind !== "ChannelLook") return null;
+      const name = look.name || app.channels[look.component ?? at] || `channel ${look.component ?? at}`;
+      return el("div.gv-group", {}, el("div.gv-row.gv-strong", {}, name),
+        el("div.gv-inner", {}, ...this.controls.fields(look, set, { only: ["visible", "window", "opacity"] }),
+          el("label.gv-row", {}, el("span.gv-name", {}, "color"), this.controls.color(Array.isArray(look.color) ? look.color : null, (color, rest) => set({ ...look, color }, rest)))));
+    });
+  }
+
+  shader() {
+    const { app } = this, { shader } = app.state, put = (value, rest) => app.change({ shader: value }, rest);
+    const known = app.schema.ViewState.fields.shader.choices.map((one) => one.kind);
+    if (shader.kept) return [el("div.gv-row", {}, el("span.gv-name", {}, "shader"), el("span.gv-dim", {}, shader.kept.split("(")[0]))];
+    const wanted = known.filter((kind) => app.offers(kind) || kind === shader.kind);
+    const pick = el("select", { onchange: () => put(this.first(wanted[pick.selectedIndex], "shader"), true) }, ...wanted.map((kind) => el("option", {}, words(kind))));
+    pick.selectedIndex = wanted.indexOf(shader.kind);
+    const rows = this.controls.fields(shader, put, { without: [...HIDDEN, ...(shader.kind === "TransferFunction" ? ["opacity", "color"] : ["channel", "normals", "color_channel", "color_component"])] });
+    return [el("label.gv-row", {}, el("span.gv-name", {}, "shader"), pick), ...rows];
+  }
+
+  showing() {
+    const { app } = this;
+    const tick = (name, text) => el("label.gv-tick", {}, el("input", { type: "checkbox", checked: app.shown[name], onchange: (e) => { app.shown[name] = e.target.checked; app.view.overlay(); } }), text);
+    const rows = this.controls.fields({ kind: "ViewState", ...app.state }, (value, rest) => app.change({ show: value.show }, rest), { only: ["show"] });
+    return [...rows, el("div.gv-bar", {}, tick("axes", "axes"), tick("scale", "scale bar"), tick("box", "box"))];
+  }
+
+  clip() {
+    const { app } = this, clip = app.state.options.clip;
+    const put = (value, rest) => app.changeClip(value, rest);
+    const crop = el("label.gv-row", {}, el("span.gv-name", {}, "crop box"),
+      el("input.gv-flag", { type: "checkbox", checked: !!app.cropBox(), onchange: (e) => app.setCrop(e.target.checked) }));
+    const planes = (clip?.planes ?? []).map((plane, at) => {
+      const set = (value, rest) => put({ ...clip, planes: clip.planes.map((old, n) => (n === at ? value : old)) }, rest);
+      return el("div.gv-row", {}, el("span.gv-name", {}, `plane ${at + 1}`), el("span.gv-both", {},
+        this.controls.number({ type: "number", range: [-0.9, 0.9] }, plane[3], (d, rest) => set([...plane.slice(0, 3), d], rest)),
+        el("button.gv-small", { type: "button", title: "Keep the other side", onclick: () => set(plane.map((n) => -n), true) }, "turn"),
+        el("button.gv-small", { type: "button", onclick: () => put({ ...clip, planes: clip.planes.filter((_, n) => n !== at) }, true) }, "remove")));
+    });
+    const facing = el("button.gv-small", { type: "button", title: "A plane through the target that faces you", onclick: () => {
+      const { forward } = axes(app.camera), target = app.toBox(app.camera.target);
+      const now = clip && clip.frame === "box" ? clip : { kind: "Clip", frame: "box", planes: [], boxes: [], without: [] };
+      put({ ...now, planes: [...now.planes, [...forward, -dot(forward, target)]] }, true);
+    } }, "add a plane that faces me");
+    const rest = clip ? this.controls.fields(clip, put, { only: ["caps", "cap_opacity", "cap_light"] }) : [];
+    return [crop, ...planes, el("div.gv-row", {}, el("span.gv-name", {}, "planes"), facing), ...rest];
+  }
+
+  parameters() {
+    const { app } = this;
+    return Object.entries(app.parameters ?? {}).map(([name, told]) =>
+      this.controls.row(name, told, told.value, (value, rest) => { if (rest) app.link.send("set", { name, value }); }));
+  }
+
+  camera() {
+    const { app } = this;
+    const others = Object.keys(app.clients).map(Number).filter((one) => one !== app.number);
+    const rows = this.controls.fields({ kind: "Eye", ...app.camera }, ({ kind, ...camera }, rest) => { app.look(camera, !rest); });
+    if (!others.length) return rows;
+    const all = [null, ...others];
+    const pick = el("select", { onchange: () => app.link.send("follow", { client: all[pick.selectedIndex] }) },
+      ...all.map((one) => el("option", {}, one === null ? "nobody" : `page ${one}`)));
+    pick.selectedIndex = Math.max(0, all.indexOf(app.clients[app.number]));
+    return [...rows, el("label.gv-row", {}, el("span.gv-name", {}, `follow (this is page ${app.number})`), pick)];
+  }
+
+  memory() {
+    const { app } = this;
+    if (!app.engine) return [];
+    const told = app.schema.EngineOptions.fields;
+    return Object.entries(app.engine).map(([name, value]) => {
+      const known = name.endsWith("pool") ? { type: "text" } : told[name];
+      return this.controls.row(name, { ...known, text: told[name].text }, value, (one) => {
+        app.engine[name] = one;
+        app.link.send("resize", { engine: { [name]: one } });
+      });
+    });
+  }
+}
+
+const words = (kind) => kind.replace(/([a-z])([A-Z])/g, (_, a, b) => `${a} ${b.toLowerCase()}`);

@@ -1,0 +1,209 @@
+// The canvas: pictures as they come, and over them axes, scale bar, box and handles of the crop box.
+import { axes, halfHeight, projected } from "./camera.js";
+import { el } from "./dom.js";
+import { short } from "./vectors.js";
+
+const COLORS = ["#ff7a6b", "#8fd460", "#6fb1ff"];  // x, y, z
+const UNITS = {
+  meter: "m", decimeter: "dm", centimeter: "cm", millimeter: "mm", micrometer: "µm", nanometer: "nm",
+  angstrom: "Å", picometer: "pm", kilometer: "km", inch: "in", foot: "ft",
+};
+const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
+const REACH = 12;  // pixels from which a handle is taken
+
+/** Corner n of a box: bit 0 is x, bit 1 y, bit 2 z. */
+const corner = (box, n) => [0, 1, 2].map((axis) => box[(n >> axis) & 1][axis]);
+
+export class PictureView {
+  constructor(app) {
+    this.app = app;
+    this.canvas = el("canvas.gv-picture");
+    this.over = el("canvas.gv-over");
+    this.element = el("div.gv-stage", { tabIndex: 0 }, this.canvas, this.over);
+    this.camera = null;
+    this.handles = [];
+    this.drawing = Promise.resolve();
+    this.latencies = [];
+    new ResizeObserver(() => this.resized()).observe(this.element);
+  }
+
+  resized() {
+    const ratio = Math.min(window.devicePixelRatio || 1, 2);
+    const { width, height } = this.element.getBoundingClientRect();
+    if (width < 16 || height < 16) return;
+    this.width = width;
+    this.height = height;
+    const size = [Math.round(width * ratio), Math.round(height * ratio)];
+    [this.over.width, this.over.height] = size;
+    this.ratio = ratio;
+    clearTimeout(this.timer);
+    this.timer = setTimeout(() => this.hello(), 60);
+    this.overlay();
+  }
+
+  hello() {
+    if (!this.width) return;
+    const most = 4096 / Math.max(this.over.width, this.over.height, 4096);
+    const [width, height] = [this.over.width, this.over.height].map((n) => Math.max(16, Math.round(n * most)));
+    this.app.link.send("hello", { width, height });
+  }
+
+  /** Draws a picture, then tells that it is drawn. */
+  take({ head, bytes }) {
+    this.drawing = this.drawing.then(async () => {
+      try {
+        const image = await createImageBitmap(new Blob([bytes], { type: "image/jpeg" }));
+        const { canvas } = this;
+        if (canvas.width !== this.over.width || canvas.height !== this.over.height) {
+          [canvas.width, canvas.height] = [this.over.width, this.over.height];
+        }
+        const context = canvas.getContext("2d", { alpha: false });
+        context.imageSmoothingQuality = "high";
+        context.drawImage(image, 0, 0, canvas.width, canvas.height);
+        image.close();
+      } finally {
+        this.app.link.send("ack", { number: head.number });
+      }
+      if (head.sent) {
+        this.latencies.push(performance.now() - head.sent);
+        if (this.latencies.length > 500) this.latencies.shift();
+      }
+      this.camera = head.camera;
+      this.head = head;
+      this.overlay();
+      this.element.dispatchEvent(new CustomEvent("drawn", { detail: head }));
+    });
+  }
+
+  /** A place of the picture in half heights from its middle, as pixels. */
+  pixel({ x, y }) {
+    return [this.over.width / 2 + (x * this.over.height) / 2, this.over.height / 2 + (y * this.over.height) / 2];
+  }
+
+  overlay() {
+    const { app } = this, camera = app.camera ?? this.camera;
+    const context = this.over.getContext("2d");
+    context.clearRect(0, 0, this.over.width, this.over.height);
+    this.handles = [];
+    if (!camera || !app.box || camera.model === "fisheye" || camera.model === "panorama") return;
+    context.lineCap = "round";
+    if (app.shown.box) this.edges(context, camera, app.box, "rgba(255,255,255,.28)", 1);
+    const crop = app.cropBox();
+    if (crop) {
+      this.edges(context, camera, crop, "rgba(242,181,107,.75)", 1.5);
+      this.cropHandles(context, camera, crop);
+    }
+    if (app.shown.axes) this.gizmo(context, camera);
+    if (app.shown.scale) this.scaleBar(context, camera);
+  }
+
+  edges(context, camera, box, color, width) {
+    context.strokeStyle = color;
+    context.lineWidth = width * this.ratio;
+    context.beginPath();
+    for (const [a, b] of EDGES) {
+      const [from, to] = [a, b].map((n) => projected(camera, corner(box, n)));
+      if (!from || !to) continue;
+      context.moveTo(...this.pixel(from));
+      context.lineTo(...this.pixel(to));
+    }
+    context.stroke();
+  }
+
+  cropHandles(context, camera, crop) {
+    const centre = [0, 1, 2].map((axis) => (crop[0][axis] + crop[1][axis]) / 2);
+    for (const axis of [0, 1, 2]) {
+      for (const side of [0, 1]) {
+        const place = [...centre];
+        place[axis] = crop[side][axis];
+        const found = projected(camera, place);
+        if (!found) continue;
+        const further = [...place];
+        further[axis] += (largestSide(this.app.box)) * 0.01;
+        const beyond = projected(camera, further);
+        if (!beyond) continue;
+        const at = this.pixel(found), next = this.pixel(beyond);
+        const step = [next[0] - at[0], next[1] - at[1]];
+        this.handles.push({ axis, side, at, step, unit: largestSide(this.app.box) * 0.01 });
+        context.beginPath();
+        context.arc(...at, 6 * this.ratio, 0, 2 * Math.PI);
+        context.fillStyle = COLORS[axis];
+        context.fill();
+        context.lineWidth = 2 * this.ratio;
+        context.strokeStyle = "rgba(10,12,16,.9)";
+        context.stroke();
+      }
+    }
+  }
+
+  /** The handle at a place in CSS pixels, or undefined. */
+  handleAt(x, y) {
+    const near = ({ at }) => Math.hypot(at[0] - x * this.ratio, at[1] - y * this.ratio) < REACH * this.ratio;
+    return this.handles.find(near);
+  }
+
+  gizmo(context, camera) {
+    const { right, up, forward } = axes(camera), size = 30 * this.ratio;
+    const middle = [52 * this.ratio, this.over.height - 56 * this.ratio];
+    this.ends = [];
+    const order = [0, 1, 2].map((axis) => ({ axis, x: right[axis], y: -up[axis], z: forward[axis] })).sort((a, b) => b.z - a.z);
+    for (const { axis, x, y, z } of order) {
+      const end = [middle[0] + x * size, middle[1] + y * size];
+      context.globalAlpha = z > 0.3 ? 0.55 : 1;
+      context.strokeStyle = context.fillStyle = COLORS[axis];
+      context.lineWidth = 2.2 * this.ratio;
+      context.beginPath();
+      context.moveTo(...middle);
+      context.lineTo(...end);
+      context.stroke();
+      context.font = `600 ${12 * this.ratio}px system-ui, sans-serif`;
+      context.textAlign = "center";
+      context.textBaseline = "middle";
+      const letter = [middle[0] + x * size * 1.38, middle[1] + y * size * 1.38];
+      context.fillText("xyz"[axis], ...letter);
+      this.ends.push({ axis, at: letter, side: 1 });
+    }
+    context.globalAlpha = 1;
+  }
+
+  /** The axis whose letter is at a place in CSS pixels, or undefined. */
+  axisAt(x, y) {
+    const near = ({ at }) => Math.hypot(at[0] - x * this.ratio, at[1] - y * this.ratio) < REACH * this.ratio;
+    return this.app.shown.axes ? this.ends?.find(near) : undefined;
+  }
+
+  scaleBar(context, camera) {
+    const pixel = (2 * halfHeight(camera)) / this.over.height;
+    const wanted = 130 * this.ratio * pixel;
+    const power = 10 ** Math.floor(Math.log10(wanted));
+    const size = [5, 2, 1].map((n) => n * power).find((n) => n <= wanted) ?? power;
+    const span = size / pixel, y = this.over.height - 26 * this.ratio;
+    const middle = this.over.width / 2, [a, b] = [middle - span / 2, middle + span / 2];
+    const text = `${short(size)} ${UNITS[this.app.unit] ?? ""}`.trim();
+    const draw = () => {
+      context.beginPath();
+      context.moveTo(a, y - 4 * this.ratio);
+      context.lineTo(a, y);
+      context.lineTo(b, y);
+      context.lineTo(b, y - 4 * this.ratio);
+      context.stroke();
+    };
+    context.strokeStyle = "rgba(0,0,0,.55)";
+    context.lineWidth = 4 * this.ratio;
+    draw();
+    context.strokeStyle = "rgba(255,255,255,.88)";
+    context.lineWidth = 1.5 * this.ratio;
+    draw();
+    context.font = `500 ${12 * this.ratio}px system-ui, sans-serif`;
+    context.textAlign = "center";
+    context.textBaseline = "bottom";
+    context.strokeStyle = "rgba(0,0,0,.55)";
+    context.lineWidth = 3 * this.ratio;
+    context.strokeText(text, middle, y - 5 * this.ratio);
+    context.fillStyle = "rgba(255,255,255,.92)";
+    context.fillText(text, middle, y - 5 * this.ratio);
+  }
+}
+
+/** The largest side of a box. */
+export const largestSide = (box) => Math.max(...[0, 1, 2].map((axis) => box[1][axis] - box[0][axis]));

@@ -1,0 +1,101 @@
+"""`Parameters`: what of a scene itself can be changed while it is looked at: the numbers of a
+producer's `nn.Parameter`s, and the fields of a dataclass from which a script makes its scene.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, get_type_hints
+
+import torch
+
+from ..producers import Producer
+from .scene import Scene
+from .schema import decode, describe, encode
+
+_MOST = 16  # numbers of a parameter that gets controls
+
+
+class Parameters:
+    """Names, values, and how they are set.
+
+    Attributes:
+        record: The dataclass object from which the producer is made, or None.
+    """
+
+    def __init__(
+        self, producer: Producer, record: Any = None, make: Callable[[Any], Producer] | None = None
+    ) -> None:
+        """Takes a producer, and what it was made of, if there was such a record."""
+        self._producer, self.record, self._make = producer, record, make
+
+    @classmethod
+    def of_function(cls, make: Callable[[Any], Producer]) -> Parameters:
+        """Takes a function of one argument, a dataclass whose fields all have defaults.
+
+        Raises:
+            ValueError: It takes something else, or gives no producer.
+        """
+        hints, names = get_type_hints(make), [*inspect.signature(make).parameters]
+        kind = hints.get(names[0]) if len(names) == 1 else None
+        if not (isinstance(kind, type) and is_dataclass(kind)):
+            raise ValueError("view: a function must take one argument, annotated with a dataclass")
+        record = kind()
+        producer = make(record)
+        if not isinstance(producer, Producer):
+            raise ValueError(f"view: {make.__name__} must give a Producer, got {producer!r:.80}")
+        return cls(producer, record, make)
+
+    @property
+    def producer(self) -> Producer:
+        """The producer as it is now."""
+        return self._producer
+
+    def describe(self) -> dict[str, Any] | None:
+        """Returns for each name its value and what control it gets; None where there is none."""
+        told: dict[str, Any] = {}
+        if self.record is not None:
+            hints = get_type_hints(type(self.record))
+            for field in fields(self.record):
+                one = describe(hints[field.name])
+                if "range" in field.metadata:
+                    one["range"] = list(field.metadata["range"])
+                told[field.name] = {**one, "value": encode(getattr(self.record, field.name))}
+        for name, tensor in self._tensors().items():
+            kind = "number" if tensor.numel() == 1 else "numbers"
+            value = tensor.item() if tensor.numel() == 1 else tensor.flatten().tolist()
+            told[name] = {"type": kind, "value": value}
+        return told or None
+
+    def _tensors(self) -> dict[str, torch.nn.Parameter]:
+        found = self._producer.named_parameters()
+        return {n: p for n, p in found if p.is_floating_point() and p.numel() <= _MOST}
+
+    def set(self, name: str, value: Any, scene: Scene) -> None:
+        """Sets one, and lets the scene be made again.
+
+        Raises:
+            ValueError: There is no such parameter, or the value does not fit; then all stays.
+        """
+        tensors = self._tensors()
+        if name in tensors:
+            numbers = [value] if not isinstance(value, list) else value
+            given = decode(name, list[float], numbers)
+            if len(given) != tensors[name].numel():
+                raise ValueError(f"set: {name} has {tensors[name].numel()} numbers")
+            with torch.no_grad():
+                tensors[name].copy_(torch.tensor(given).view_as(tensors[name]))
+            self._producer.changed()
+            return
+        known = [] if self.record is None else [field.name for field in fields(self.record)]
+        if name not in known or self._make is None:
+            raise ValueError(f"set: there is no parameter {name!r:.60}")
+        hint = get_type_hints(type(self.record))[name]
+        before = getattr(self.record, name)
+        record = replace(self.record, **{name: decode(name, hint, value, before)})
+        producer = self._make(record)
+        scene.remake = lambda: producer
+        scene.resize()
+        self.record, self._producer = record, producer

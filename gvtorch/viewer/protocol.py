@@ -1,0 +1,179 @@
+"""The messages between a view and its pages, as records: what a page may send is decoded by the
+schema of the state, so a wrong one is refused with a line that says what was expected.
+
+A page gets texts, JSON objects with a `type`, and pictures: bytes that begin with the length of a
+JSON head (4 bytes, little endian), the head, then a JPEG. A page answers each picture with its
+number (`Ack`); until then no other one is sent to it.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from ..base import check
+from .schema import decode
+from .state import Eye
+
+MOST_BYTES = 1 << 20  # of a message from a page
+_SIDE = (16, 8192)  # pixels
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hello:
+    """The first message, and after each change of size: the size of the picture."""
+
+    width: int
+    height: int
+    rate: float = 25.0  # pictures a second that are wanted while something moves
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            check.whole("hello", name, getattr(self, name), low=_SIDE[0], high=_SIDE[1])
+        check.number("hello", "rate", self.rate, low=1, high=240)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Move:
+    """The camera, and whether it goes on moving."""
+
+    camera: Eye
+    moving: bool = False
+    sent: float = 0.0  # the page's clock; comes back with the picture
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ack:
+    """The picture of this number was drawn."""
+
+    number: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Change:
+    """Part of the state in place of what was there, as `ViewState.changed` takes it."""
+
+    state: dict[str, Any]
+    rest: bool = True  # false while a slider is dragged
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pick:
+    """Asks what is seen at a place of the picture, 0 to 1 from its upper left corner."""
+
+    x: float
+    y: float
+    purpose: str = ""  # comes back
+
+    def __post_init__(self) -> None:
+        check.number("pick", "x", self.x, low=0, high=1)
+        check.number("pick", "y", self.y, low=0, high=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Histogram:
+    """Asks how often values occur."""
+
+    in_view: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preset:
+    """Asks for a named transfer function over a window."""
+
+    name: str
+    low: float | None = None
+    high: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Resize:
+    """Makes the engine anew with other memory and budgets."""
+
+    engine: dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Set:
+    """Sets a parameter of the producer."""
+
+    name: str
+    value: Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class Follow:
+    """Follows another client's camera; None: stands for itself."""
+
+    client: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Monitor:
+    """Asks for figures of each frame, or no more."""
+
+    on: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Still:
+    """Asks for a picture of any size as a PNG."""
+
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            check.whole("still", name, getattr(self, name), low=_SIDE[0], high=16384)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Do:
+    """Something without arguments: look at the whole box, or ask again for what failed."""
+
+    what: Literal["fit", "retry"]
+
+
+Message = (
+    Hello | Move | Ack | Change | Pick | Histogram | Preset | Resize | Set | Follow | Monitor
+    | Still | Do
+)  # fmt: skip
+MESSAGES: dict[str, type[Any]] = {one.__name__.lower(): one for one in Message.__args__}
+
+
+def parse(text: str | bytes) -> Any:
+    """Returns the message that a page sent.
+
+    Raises:
+        ValueError: It is none, or out of its range.
+    """
+    if len(text) > MOST_BYTES:
+        raise ValueError(f"message: {len(text)} bytes, more than {MOST_BYTES}")
+    try:
+        content = json.loads(text, parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"message: not JSON: {error}") from None
+    if not isinstance(content, dict):
+        raise ValueError("message: must be an object with a type")
+    kind = MESSAGES.get(content["type"]) if isinstance(content.get("type"), str) else None
+    if kind is None:
+        raise ValueError(f"message: type must be one of {', '.join(MESSAGES)}")
+    given = {name: value for name, value in content.items() if name != "type"}
+    return decode(content["type"], kind, given)
+
+
+def _no_number(name: str) -> float:
+    raise ValueError(f"{name} is no number")
+
+
+def told(kind: str, **content: Any) -> str:
+    """Returns a text for a page."""
+    return json.dumps({"type": kind, **content})
+
+
+def with_picture(head: dict[str, Any], picture: bytes) -> bytes:
+    """Returns a picture for a page."""
+    text = json.dumps(head).encode()
+    return struct.pack("<I", len(text)) + text + picture

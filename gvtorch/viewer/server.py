@@ -1,0 +1,250 @@
+"""`Server`: a session's page over HTTP and one websocket, in a thread of its own (aiohttp).
+
+Only the package's own files of the page are served, by name. Who may speak: with a token in the
+address, from a page of this very server (Origin), under a name that is this machine's (Host), so
+that another site's page can't, though its name may be made to point here (DNS rebinding).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import ipaddress
+import secrets
+import socket
+import threading
+from collections.abc import Iterable
+from importlib import resources
+from typing import Any
+from urllib.parse import urlsplit
+
+from .protocol import MOST_BYTES
+from .session import Session
+
+_TYPES = {
+    ".html": "text/html",
+    ".js": "text/javascript",
+    ".css": "text/css",
+    ".svg": "image/svg+xml",
+}
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' blob: data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'self'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-cache",
+}
+_QUEUED = 4096  # texts that wait for a page, after which it is let go
+_LOCAL = ("localhost", "127.0.0.1", "::1")
+
+
+def page_files() -> dict[str, bytes]:
+    """Returns the files of the page by name."""
+    folder = resources.files(__package__) / "page"
+    return {one.name: one.read_bytes() for one in folder.iterdir() if one.is_file()}
+
+
+def aiohttp_web() -> Any:
+    """Loads the server's library.
+
+    Raises:
+        ImportError: It is not installed; the message tells how.
+    """
+    try:
+        import PIL  # noqa: F401
+        from aiohttp import web
+    except ImportError as error:
+        raise ImportError(f"view needs {error.name}: pip install 'gvtorch[view]'") from None
+    return web
+
+
+class Server:
+    """A session's page.
+
+    Attributes:
+        url: Where it is, with the token.
+        port: Its port.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        token: str | None = None,
+        allow: Iterable[str] = (),
+    ) -> None:
+        """Starts to serve.
+
+        Args:
+            session: What is shown.
+            host: Address to listen at.
+            port: 0: any that is free.
+            token: That pages must know; None: a new one, "" where nobody else can reach the host:
+                none.
+            allow: Further names under which pages may reach this machine.
+
+        Raises:
+            OSError: The port is taken, or the host is not this machine's.
+            ImportError: aiohttp is missing.
+        """
+        self._session, self._host = session, host
+        self.token = secrets.token_urlsafe(18) if token is None else token
+        if not self.token and host not in _LOCAL:
+            raise ValueError(f"view: a token is needed where others reach {host!r}")
+        self._allowed = {*_LOCAL, host, *allow}
+        if host not in _LOCAL:
+            self._allowed |= {socket.gethostname(), socket.getfqdn()}
+        self.port = port
+        started: list[BaseException | None] = []
+        ready = threading.Event()
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(
+            target=self._run, args=(started, ready), name="gvtorch view server", daemon=True
+        )
+        self._thread.start()
+        ready.wait()
+        if started[0] is not None:
+            raise started[0]
+
+    @property
+    def url(self) -> str:
+        """The page's address."""
+        anywhere = self._host in ("0.0.0.0", "::")
+        host = socket.gethostname() if anywhere else self._host
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{self.port}/" + (f"?token={self.token}" if self.token else "")
+
+    def close(self) -> None:
+        """Stops to serve."""
+        if self._loop.is_running():
+            self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join(timeout=10)
+
+    def _run(self, started: list[BaseException | None], ready: threading.Event) -> None:
+        asyncio.set_event_loop(self._loop)
+        try:
+            self._loop.run_until_complete(self._serve(started, ready))
+        except BaseException as error:
+            started.append(error)
+            ready.set()
+        finally:
+            self._loop.close()
+
+    async def _serve(self, started: list[BaseException | None], ready: threading.Event) -> None:
+        web = aiohttp_web()
+        self._stop = asyncio.Event()
+        runner = web.AppRunner(self.application(), access_log=None, shutdown_timeout=1.0)
+        await runner.setup()
+        try:
+            site = web.TCPSite(runner, self._host, self.port)
+            await site.start()
+            self.port = runner.addresses[0][1]
+            started.append(None)
+            ready.set()
+            await self._stop.wait()
+        finally:
+            await runner.cleanup()
+
+    def application(self) -> Any:
+        """Returns the aiohttp application."""
+        web = aiohttp_web()
+        self._web = web
+        self._files = page_files()
+
+        @web.middleware
+        async def guard(request: Any, handler: Any) -> Any:
+            return await self._guard(request, handler)
+
+        app = web.Application(middlewares=[guard])
+        app.router.add_get("/", self._page)
+        app.router.add_get("/ws", self._socket)
+        app.router.add_get("/{name}", self._page)
+        app.on_shutdown.append(self._let_go)
+        self._open: set[Any] = set()
+        return app
+
+    async def _let_go(self, _app: Any) -> None:
+        for one in list(self._open):
+            await one.close(code=1001, message=b"the view was closed")
+
+    def is_allowed(self, host: str | None) -> bool:
+        """Whether a page may reach this server under a name, as the Host header tells it."""
+        name = (urlsplit(f"//{host or ''}").hostname or "").rstrip(".")
+        if name in self._allowed:
+            return True
+        try:
+            ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        return self._host not in _LOCAL  # an address can't be rebound
+
+    async def _guard(self, request: Any, handler: Any) -> Any:
+        """Refuses foreign hosts, and adds the headers that keep a page to itself."""
+        web = self._web
+        try:
+            if not self.is_allowed(request.headers.get("Host")):
+                raise web.HTTPForbidden(text="This name is not the viewer's.")
+            answer = await handler(request)
+        except ValueError:
+            raise web.HTTPBadRequest(text="No such address.", headers=_HEADERS) from None
+        except web.HTTPException as error:
+            error.headers.update(_HEADERS)
+            raise
+        if not answer.prepared:
+            answer.headers.update(_HEADERS)
+        return answer
+
+    async def _page(self, request: Any) -> Any:
+        name = request.match_info.get("name", "index.html")
+        if name not in self._files:
+            raise self._web.HTTPNotFound(text="There is no such page.")
+        kind = _TYPES.get(f".{name.rpartition('.')[2]}", "application/octet-stream")
+        return self._web.Response(body=self._files[name], content_type=kind, charset="utf-8")
+
+    def _may_speak(self, request: Any) -> bool:
+        origin = request.headers.get("Origin")
+        own = origin is None or urlsplit(origin).netloc == request.headers.get("Host")
+        given = request.query.get("token", "")
+        return own and hmac.compare_digest(given.encode(), self.token.encode())
+
+    async def _socket(self, request: Any) -> Any:
+        web = self._web
+        if not self._may_speak(request):
+            raise web.HTTPForbidden(text="The address needs the token that the viewer told.")
+        ws = web.WebSocketResponse(max_msg_size=MOST_BYTES, heartbeat=30, compress=False)
+        await ws.prepare(request)
+        self._open.add(ws)
+        queue: asyncio.Queue[str | bytes | None] = asyncio.Queue()
+        loop = asyncio.get_running_loop()
+
+        def put(data: str | bytes) -> None:
+            if queue.qsize() < _QUEUED:
+                queue.put_nowait(data)
+            elif queue.qsize() == _QUEUED:
+                queue.put_nowait(None)  # it does not listen
+
+        def send(data: str | bytes) -> None:
+            if not loop.is_closed():
+                loop.call_soon_threadsafe(put, data)
+
+        async def pump() -> None:
+            while (data := await queue.get()) is not None:
+                await (ws.send_str(data) if isinstance(data, str) else ws.send_bytes(data))
+            await ws.close(code=1008, message=b"too slow")
+
+        client = self._session.join(send)
+        task = asyncio.ensure_future(pump())
+        try:
+            async for message in ws:
+                if message.type in (web.WSMsgType.TEXT, web.WSMsgType.BINARY):
+                    self._session.receive(client, message.data)
+        finally:
+            self._session.leave(client)
+            self._open.discard(ws)
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+        return ws

@@ -1,0 +1,446 @@
+"""`Session`: a scene, what is shown of it, and the pages that look. One thread owns the scene and
+renders for all pages in turn; whatever comes from the network is put into a queue that it empties
+between frames. It waits for no page: see `Client`.
+"""
+
+from __future__ import annotations
+
+import io
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from ..cameras import Camera
+from ..cameras.camera import Up, upward
+from ..engine import EngineOptions
+from ..pictures import Picture, Progressive
+from ..shaders import TransferFunction
+from ..shaders.presets import CT_PRESETS, PRESETS
+from . import protocol
+from .client import Client, Send
+from .parameters import Parameters
+from .protocol import parse
+from .scene import Scene
+from .schema import KINDS, decode, describe_kind, encode
+from .state import Development, Eye, ViewState
+
+_TICK = 0.02  # seconds between looks at whether a camera has come to rest
+_FIGURES = 0.25  # seconds between figures for monitors
+_ENGINE = ("brick_pool", "node_pool", "load_budget", "subdivide_budget", "time_budget", "loading")
+_COLOR_MAPS = (
+    "viridis",
+    "magma",
+    "inferno",
+    "plasma",
+    "cividis",
+    "turbo",
+    "coolwarm",
+    "bone",
+    "hot",
+)
+
+
+class Session:
+    """What pages look at.
+
+    Attributes:
+        state: What is shown; its camera is the one that new pages begin with.
+        clients: The pages, by number.
+        scene: What is looked at.
+    """
+
+    def __init__(
+        self, scene: Scene, state: ViewState, parameters: Parameters | None = None
+    ) -> None:
+        """Takes a scene, which only the session's thread uses from now on."""
+        self.scene, self.state, self.parameters = scene, state, parameters
+        self.clients: dict[int, Client] = {}
+        self.errors = 0  # pictures that failed
+        self._good = state  # the last state of which there was a picture
+        self._count, self._turn = 0, 0
+        self._tasks: deque[Callable[[], None]] = deque()
+        self._wake = threading.Condition()
+        self._closed = False
+        self._failed: tuple[str, ...] = ()
+        self._told_busy: Any = None
+        self._figures_at = 0.0
+        self._thread = threading.Thread(target=self._run, name="gvtorch view", daemon=True)
+        self._thread.start()
+
+    # From any thread.
+
+    def join(self, send: Send) -> Client:
+        """Adds a page; `send` sends it a text or bytes, from any thread, without waiting."""
+        with self._wake:
+            self._count += 1
+            assert self.state.camera is not None
+            client = Client(self._count, send, self.state.camera)
+        self.post(lambda: self._welcome(client))
+        return client
+
+    def leave(self, client: Client) -> None:
+        """Forgets a page."""
+        self.post(lambda: self._goodbye(client))
+
+    def receive(self, client: Client, text: str | bytes) -> None:
+        """Takes a message of a page; a wrong one is answered with a line."""
+        try:
+            message = parse(text)
+        except ValueError as error:
+            client.tell("refused", text=str(error))
+            return
+        if isinstance(message, protocol.Ack):
+            client.ack(message.number)
+            with self._wake:
+                self._wake.notify()
+            return
+        self.post(lambda: self._take(client, message))
+
+    def post(self, task: Callable[[], None]) -> None:
+        """Lets the thread that renders do something between two frames."""
+        with self._wake:
+            self._tasks.append(task)
+            self._wake.notify()
+
+    def ask(self, question: Callable[[], Any], timeout: float = 60.0) -> Any:
+        """Lets the thread that renders answer something; waits for it."""
+        done = threading.Event()
+        found: list[tuple[Any, Exception | None]] = []
+
+        def answer() -> None:
+            try:
+                found.append((question(), None))
+            except Exception as error:
+                found.append((None, error))
+            done.set()
+
+        self.post(answer)
+        if not done.wait(timeout):
+            raise TimeoutError("view: no answer")
+        value, error = found[0]
+        if error is not None:
+            raise error
+        return value
+
+    def close(self) -> None:
+        """Ends the thread and closes the scene."""
+        with self._wake:
+            if self._closed:
+                return
+            self._closed = True
+            self._wake.notify()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(timeout=30)
+
+    # The thread that renders.
+
+    def _run(self) -> None:
+        while self._step():
+            pass
+        self.scene.close()
+
+    def _step(self) -> bool:
+        """Does what was asked for, and draws one picture; False: the session is closed."""
+        with self._wake:
+            while not (self._closed or self._tasks or self._someone()):
+                waits = any(one.waits() for one in self.clients.values())
+                self._wake.wait(_TICK if waits else None)
+            if self._closed:
+                return False
+            tasks, self._tasks = self._tasks, deque()
+        for task in tasks:
+            try:
+                task()
+            except Exception as error:  # whatever it was, the view goes on
+                self._tell_all("error", text=f"{type(error).__name__}: {error}")
+        client = self._someone()
+        if client is not None:
+            self._draw(client)
+        return True
+
+    def _someone(self) -> Client | None:
+        """The next client that wants a picture."""
+        wanting = [number for number, one in self.clients.items() if one.wants()]
+        if not wanting:
+            return None
+        return self.clients[next((n for n in wanting if n > self._turn), wanting[0])]
+
+    def _draw(self, client: Client) -> None:
+        self._turn = client.number
+        try:
+            picture = client.draw(self.scene, self.state, self._is_newer)
+        except Exception as error:
+            self._fell(client, error)
+            return
+        if picture is None:
+            return
+        self._good = self.state
+        self._tell_busy(picture)
+        self._tell_failures()
+        if client.monitor and time.monotonic() - self._figures_at > _FIGURES:
+            self._figures_at = time.monotonic()
+            client.tell("figures", **self._figures(picture))
+
+    def _is_newer(self) -> bool:
+        return bool(self._tasks) or self._closed
+
+    def _fell(self, client: Client, error: Exception) -> None:
+        """A picture failed: tells why, and goes back to what could be drawn."""
+        self.errors += 1
+        self._tell_all("error", text=" ".join(str(error).split()) or type(error).__name__)
+        if self._good is not self.state:
+            self.state = self._good
+            self._tell_state(None)
+            for one in self.clients.values():
+                one.stir(True)
+        else:
+            client.rest_for(1.0)
+
+    def _tell_all(self, kind: str, **content: Any) -> None:
+        for one in self.clients.values():
+            one.tell(kind, **content)
+
+    def _tell_state(self, but: Client | None) -> None:
+        content = self.state.to_json()
+        for one in self.clients.values():
+            if one is not but:
+                one.tell("state", state=content)
+
+    def _tell_busy(self, picture: Picture) -> None:
+        stats = picture.stats
+        busy = {
+            "pending": getattr(stats, "pending", 0) + getattr(stats, "deferred", 0),
+            "misses": getattr(stats, "misses", 0),
+            "crowded": bool(getattr(stats, "capacity_exceeded", False)),
+        }
+        if busy != self._told_busy:
+            self._told_busy = busy
+            self._tell_all("busy", **busy)
+
+    def _tell_failures(self) -> None:
+        failed = tuple(self.scene.failures())
+        if failed == self._failed:
+            return
+        new = [one for one in failed if one not in self._failed]
+        self._failed = failed
+        engine = self.scene.engine
+        count = 0 if engine is None else len(engine.production.failures)
+        if new:
+            self._tell_all("failed", text=new[-1], count=count)
+
+    def _figures(self, picture: Picture) -> dict[str, Any]:
+        stats = picture.stats.as_dict()
+        names = ("milliseconds", "stages", "rays", "samples", "bricks_used", "tiles_used")
+        told = {name: stats[name] for name in names}
+        extra = ("requests", "misses", "produced", "evicted", "miss_rate", "pending", "failed")
+        told |= {name: stats[name] for name in extra if name in stats}
+        engine = self.scene.engine
+        if engine is not None:
+            report = engine.report().as_dict()
+            named = ("occupancy", "bricks_per_second", "hit_rate", "memory")
+            told["report"] = {name: report[name] for name in named}
+        return told
+
+    # What pages ask for.
+
+    def _welcome(self, client: Client) -> None:
+        self.clients[client.number] = client
+        box, info = self.scene.box.tolist(), self.scene.info
+        engine = self.scene.engine
+        client.tell(
+            "welcome",
+            client=client.number,
+            name=self.scene.name,
+            box=box,
+            unit=info.unit,
+            channels=[one.name for one in info.channels],
+            channel_names=self.scene.trees[0].channel_names,
+            state=self.state.to_json(),
+            schema=schema(),
+            presets=[*PRESETS, *CT_PRESETS, *_COLOR_MAPS],
+            engine=None
+            if engine is None or self.scene.remake is None
+            else {name: encode(getattr(engine.options, name)) for name in _ENGINE},
+            parameters=None if self.parameters is None else self.parameters.describe(),
+        )
+        self._tell_clients()
+
+    def _goodbye(self, client: Client) -> None:
+        self.clients.pop(client.number, None)
+        for one in self.clients.values():
+            if one.follows == client.number:
+                one.follows = None
+        self._tell_clients()
+
+    def _tell_clients(self) -> None:
+        follows = {one.number: one.follows for one in self.clients.values()}
+        self._tell_all("clients", clients=follows)
+
+    def _take(self, client: Client, message: Any) -> None:
+        """Does what a page's message says."""
+        if client.number not in self.clients:
+            return
+        try:
+            _TAKES[type(message)](self, client, message)
+        except (ValueError, OSError, ImportError, RuntimeError) as error:
+            client.tell("refused", text=" ".join(str(error).split()))
+            client.tell("state", state=self.state.to_json())
+
+    def _hello(self, client: Client, message: protocol.Hello) -> None:
+        client.resized(message.width, message.height, message.rate)
+
+    def _move(self, client: Client, message: protocol.Move) -> None:
+        self._place(client, message.camera, message.moving, message.sent)
+
+    def _place(self, client: Client, eye: Eye, moving: bool, sent: float = 0.0) -> None:
+        client.move(eye, moving, sent)
+        for other in self.clients.values():
+            if other.follows == client.number and other is not client:
+                other.move(eye, moving, 0.0)
+                other.tell("camera", camera=encode(eye))
+
+    def _change(self, client: Client, message: protocol.Change) -> None:
+        content = message.state
+        camera = content.pop("camera", None) if isinstance(content, dict) else None
+        state = self.state.changed(content)
+        if camera is not None:
+            self._place(client, decode("camera", Eye, camera, client.eye), not message.rest)
+            client.tell("camera", camera=encode(client.eye))
+        if not content:
+            return
+        self.state = state
+        self._tell_state(client if not message.rest else None)
+        for one in self.clients.values():
+            one.stir(message.rest)
+
+    def _pick(self, client: Client, message: protocol.Pick) -> None:
+        place = client.picked(message.x, message.y)
+        client.tell("picked", place=place, purpose=message.purpose)
+
+    def _histogram(self, client: Client, message: protocol.Histogram) -> None:
+        found = self.scene.histogram(self.state.component, message.in_view)
+        client.tell("histogram", in_view=message.in_view, **found)
+
+    def _preset(self, client: Client, message: protocol.Preset) -> None:
+        function = TransferFunction.preset(message.name, message.low, message.high)
+        client.tell("preset", name=message.name, function=encode(function))
+
+    def _resize(self, client: Client, message: protocol.Resize) -> None:
+        unknown = sorted(set(message.engine) - set(_ENGINE))
+        if unknown:
+            raise ValueError(
+                f"resize: {unknown[0]!r:.60} can't be set; known: {', '.join(_ENGINE)}"
+            )
+        if self.scene.engine is None:
+            raise ValueError("resize: the scene is resident")
+        options = decode("engine", EngineOptions, message.engine, self.scene.engine.options)
+        self.scene.resize(**{name: getattr(options, name) for name in message.engine})
+        self._stir()
+
+    def _stir(self) -> None:
+        for one in self.clients.values():
+            one.stir(True)
+
+    def _set(self, client: Client, message: protocol.Set) -> None:
+        if self.parameters is None:
+            raise ValueError("set: there are no parameters")
+        self.parameters.set(message.name, message.value, self.scene)
+        self._tell_all("parameters", parameters=self.parameters.describe())
+        self._stir()
+
+    def _follow(self, client: Client, message: protocol.Follow) -> None:
+        leader = self.clients.get(message.client or 0)
+        if message.client is not None and (leader is None or leader is client):
+            raise ValueError(f"follow: there is no client {message.client}")
+        client.follows = message.client
+        if leader is not None:
+            client.move(leader.eye, False, 0.0)
+            client.tell("camera", camera=encode(leader.eye))
+        self._tell_clients()
+
+    def _monitor(self, client: Client, message: protocol.Monitor) -> None:
+        client.monitor = message.on
+        if message.on and client.picture is not None:
+            client.tell("figures", **self._figures(client.picture))
+
+    def _still(self, client: Client, message: protocol.Still) -> None:
+        picture = self.still(client.eye, message.width, message.height)
+        client.send_file("picture.png", png(picture))
+
+    def _do(self, client: Client, message: protocol.Do) -> None:
+        if message.what == "retry":
+            self.scene.retry()
+            self._stir()
+        else:
+            eye = fitted(self.scene, client.eye, client.size)
+            self._place(client, eye, False)
+            client.tell("camera", camera=encode(eye))
+
+    def still(self, eye: Eye, width: int, height: int) -> Picture:
+        """Renders a whole picture: all that can be had, all samples."""
+        state, scene = self.state, self.scene
+        camera = eye.camera(width, height, scene.box)
+        if scene.engine is not None:
+            scene.engine.render(camera, state.shader, **state.settings())  # until all is there
+        made = Progressive(lambda one: scene.frame(one, state)).refine(
+            camera, state.develop.samples
+        )
+        return state.develop.develop(made)
+
+
+_TAKES: Mapping[type, Callable[[Session, Client, Any], None]] = {
+    protocol.Hello: Session._hello,
+    protocol.Move: Session._move,
+    protocol.Change: Session._change,
+    protocol.Pick: Session._pick,
+    protocol.Histogram: Session._histogram,
+    protocol.Preset: Session._preset,
+    protocol.Resize: Session._resize,
+    protocol.Set: Session._set,
+    protocol.Follow: Session._follow,
+    protocol.Monitor: Session._monitor,
+    protocol.Still: Session._still,
+    protocol.Do: Session._do,
+}
+
+
+def fitted(scene: Scene, like: Eye | None, size: tuple[int, int], up: Up | None = None) -> Eye:
+    """Returns from where the whole box is seen, in the direction of another camera."""
+    box = scene.box
+    width, height = (max(1, n) for n in size)
+    if like is None:
+        placed = Camera.orbit(30, 20, width=width, height=height, up=up or "+y", fit=True)
+        eye = Eye.of(placed, box)
+        return replace(eye, up=tuple(upward("view", up or "+y").tolist()))
+    forward = torch.tensor(like.target) - torch.tensor(like.eye)
+    centre, radius = box.mean(0), float((box[1] - box[0]).norm()) / 2
+    half = torch.deg2rad(torch.tensor(min(like.fov, 100.0))) / 2
+    narrow = min(1.0, width / height)
+    far = radius / max(1e-3, float(half.sin())) / narrow
+    place = centre - forward.double() / forward.norm() * far
+    return replace(like, eye=tuple(place.tolist()), target=tuple(centre.tolist()))
+
+
+def schema() -> dict[str, Any]:
+    """Returns what the page makes its controls of: each record's fields, by its name."""
+    kinds = {**KINDS, **{one.__name__: one for one in (Eye, Development, ViewState)}}
+    told = {name: describe_kind(kind) for name, kind in kinds.items()}
+    told["EngineOptions"] = describe_kind(EngineOptions)
+    told["EngineOptions"]["fields"] = {
+        name: one for name, one in told["EngineOptions"]["fields"].items() if name in _ENGINE
+    }
+    return told
+
+
+def png(picture: Picture) -> bytes:
+    """Returns a picture as a PNG file."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.fromarray(picture.to_srgb8().numpy()).save(out, "PNG")
+    return out.getvalue()

@@ -1,0 +1,194 @@
+"""`ViewState`: all that a view shows, as one JSON; `Eye`, its camera. `gvtorch view --state FILE`,
+`gvtorch render --state FILE` and the page read and write the same.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from ..cameras import Camera
+from ..cameras.models import MODELS, CameraModel, model_of
+from ..pictures import Picture, Progressive
+from ..pictures.tone import ToneCurve, checked_curve
+from ..shaders import Shader
+from ..tracing import RenderOptions
+from .schema import decode, encode
+
+Triple = tuple[float, float, float]
+Show = Literal["picture", "samples", "nodes", "lod", "age", "fill"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Eye:
+    """Where a camera stands, in world units.
+
+    Attributes:
+        eye: Its place.
+        target: What is in the middle of the picture; an orthographic camera shows as much as a
+            pinhole would at this distance.
+        up: What is up in the picture.
+        fov: Vertical field of view, degrees.
+        model: pinhole, ortho, fisheye or panorama.
+    """
+
+    eye: Triple
+    target: Triple
+    up: Triple = (0.0, 1.0, 0.0)
+    fov: float = 30.0
+    model: CameraModel = "pinhole"
+
+    def __post_init__(self) -> None:
+        for name in ("eye", "target", "up"):
+            object.__setattr__(self, name, check.triple("Eye", name, getattr(self, name)))
+        widest = model_of("Eye", self.model).widest
+        check.number("Eye", "fov", self.fov, low=0, high=widest, open_low=True)
+        if self.eye == self.target or not any(self.up):
+            raise ValueError("Eye: eye and target must differ, and up must not be zero")
+
+    def camera(self, width: int, height: int, box: Tensor) -> Camera:
+        """Returns the camera; an orthographic one stands before all of the (2, 3) box, whatever its
+        scale is.
+        """
+        made = Camera.look_at(self.eye, self.target, self.up, self.fov, width, height, self.model)
+        if MODELS[self.model].parallel:
+            corners = torch.cartesian_prod(*box.T.to(torch.float64))  # (8, 3)
+            rotation, move = made.viewmats[0, :3, :3], made.viewmats[0, :3, 3]
+            nearest = float((corners @ rotation.mT + move)[:, 2].min())
+            made.viewmats[0, 2, 3] += max(0.0, 0.02 * float((box[1] - box[0]).max()) - nearest)
+        return made
+
+    @classmethod
+    def of(cls, camera: Camera, box: Tensor) -> Self:
+        """Returns where one of `gv`'s cameras stands, given the scene's (2, 3) box; what it looks
+        at is the place of its axis nearest to the middle of the box.
+
+        Raises:
+            ValueError: It is a batch.
+        """
+        if camera.batched:
+            raise ValueError(f"view: camera must be one, got a batch of {len(camera)}")
+        placed = camera.placed(box)
+        rotation, move = placed.viewmats[0, :3, :3], placed.viewmats[0, :3, 3]
+        eye, forward = -(rotation.mT @ move), rotation[2]
+        far = float((box.mean(0) - eye) @ forward)
+        far = far if far > 0 else float((box[1] - box[0]).max())
+        model, focal = placed.model, float(placed.Ks[0, 1, 1])
+        half = 0.5 * placed.height / focal
+        if MODELS[model].parallel:
+            fov = 30.0
+            far = half / math.tan(math.radians(fov / 2))
+            eye = eye + forward * (float((box.mean(0) - eye) @ forward) - far)
+        else:
+            wide = model in ("fisheye", "panorama")
+            fov = math.degrees(2 * half if wide else 2 * math.atan(half))
+        target = eye + far * forward
+        lists = (tuple(part.tolist()) for part in (eye, target, -rotation[1]))
+        return cls(
+            **dict(zip(("eye", "target", "up"), lists, strict=True)), fov=round(fov, 9), model=model
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Development:
+    """How a picture at rest is developed.
+
+    Attributes:
+        samples: Rays a pixel of a picture at rest.
+        tone: Curve from the light of the scene to the display: none, reinhard or aces.
+        exposure: Stops: the light is multiplied by 2^exposure first.
+    """
+
+    samples: int = 16
+    tone: ToneCurve = "none"
+    exposure: float = 0.0
+
+    def __post_init__(self) -> None:
+        check.whole("Development", "samples", self.samples, low=1, high=4096)
+        checked_curve("Development", self.tone, self.exposure)
+
+    def develop(self, picture: Picture) -> Picture:
+        """Returns the picture with its light mapped to the display."""
+        if self.tone == "none" and self.exposure == 0:
+            return picture
+        return picture.tone_map(self.tone, exposure=self.exposure)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewState:
+    """All that a view shows.
+
+    Attributes:
+        shader: What turns values into colour.
+        options: Of the picture: step, level of detail, background, clip, lens, lighting, ...
+        develop: Samples, tone and exposure.
+        show: The picture, or in its place what each ray cost, see `gv.cost`.
+        component: Which number of a voxel is shown.
+        camera: Where the camera stands; None: from where the whole box is seen.
+    """
+
+    shader: Shader
+    options: RenderOptions = field(default_factory=RenderOptions)
+    develop: Development = field(default_factory=Development)
+    show: Show = "picture"
+    component: int = 0
+    camera: Eye | None = None
+
+    def __post_init__(self) -> None:
+        check.whole("ViewState", "component", self.component, low=0)
+        if self.component != self.options.component:
+            options = replace(self.options, component=self.component)
+            object.__setattr__(self, "options", options)
+
+    def settings(self) -> dict[str, Any]:
+        """Returns the fields of `RenderOptions` as keyword arguments."""
+        return dict(vars(self.options))
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns plain values."""
+        return encode(self)
+
+    def changed(self, content: Any) -> ViewState:
+        """Returns the state with what plain JSON tells in place of its own; what it leaves out, or
+        says is kept, stays.
+
+        Raises:
+            ValueError: It tells what is not there, or out of its range.
+        """
+        return decode("state", ViewState, content, self)
+
+    def save(self, path: str | Path) -> None:
+        """Writes a .json file."""
+        if Path(path).suffix != ".json":
+            raise ValueError(f"state: path must end in .json, got {str(path)!r}")
+        text = json.dumps(self.to_json(), indent=1)
+        Path(path).write_text(text + "\n", encoding="utf-8")
+
+    def read(self, path: str | Path) -> ViewState:
+        """Returns the state with what a .json file tells in place of its own.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: It holds something else; the message names it.
+        """
+        content = check.json_file("state", path)
+        try:
+            return self.changed(content)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+
+
+def picture_of(render: Any, state: ViewState, width: int, height: int, box: Tensor) -> Picture:
+    """Renders what a view shows at rest: all samples of its camera, developed. `render` makes a
+    `Picture` of a camera and has the state's shader and options.
+    """
+    assert state.camera is not None
+    camera = state.camera.camera(width, height, box)
+    return state.develop.develop(Progressive(render).refine(camera, state.develop.samples))

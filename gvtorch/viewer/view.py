@@ -1,0 +1,191 @@
+"""`view`: a page in which anything that gvtorch renders is turned, and looked into."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import webbrowser
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from typing import Any, Unpack
+
+from ..base import check
+from ..base.explicit import explicit
+from ..cameras import Camera
+from ..cameras.camera import Up
+from ..shaders import Shader
+from ..tracing import RenderOptions
+from ..tracing.options import RenderSettings, render_options
+from .parameters import Parameters
+from .scene import Scene, open_scene
+from .server import Server, aiohttp_web
+from .session import Session, fitted
+from .state import Eye, ViewState
+
+_SIZE = (16, 9)  # of the picture from where the whole box is seen at first
+
+
+class Viewer:
+    """A view that is served.
+
+    Attributes:
+        session: What is shown; see `Session`.
+        server: Its page.
+    """
+
+    def __init__(self, session: Session, server: Server) -> None:
+        """Takes both."""
+        self.session, self.server = session, server
+        self._closed = threading.Event()
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return self.server.url
+
+    @property
+    def state(self) -> ViewState:
+        """What is shown now; `gv.view(..., state=FILE)` takes what its `save` writes."""
+        return self.session.state
+
+    def wait(self) -> None:
+        """Waits until the view is closed, or Ctrl-C."""
+        try:
+            self._closed.wait()
+        except KeyboardInterrupt:
+            self.close()
+
+    def close(self) -> None:
+        """Ends the view; an engine that was handed in stays open."""
+        self.server.close()
+        self.session.close()
+        self._closed.set()
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"Viewer({self.url}, {len(self.session.clients)} pages)"
+
+
+@explicit(RenderOptions)
+def view(
+    what: Any,
+    shader: Shader | None = None,
+    camera: Camera | None = None,
+    *,
+    up: Up | None = None,
+    state: str | PathLike[str] | ViewState | None = None,
+    engine: Mapping[str, Any] | None = None,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    token: str | None = None,
+    allow: Iterable[str] = (),
+    browser: bool | None = None,
+    wait: bool | None = None,
+    **options: Unpack[RenderSettings],
+) -> Any:
+    """Opens a page in the browser that shows a scene, turns it, and edits how it looks. In a
+    notebook it is shown below the cell.
+
+    Args:
+        what: A path or URL, `Volume`, array, `Store`, `N3Tree`, `Producer` or several by name,
+            `Engine`, or a function from a dataclass to a producer, whose fields become controls.
+        shader: What turns values into colour; one that fits the data if left out.
+        camera: Where it stands at first; from where the whole box is seen if left out.
+        up: What is up for a camera that is left out, such as "+z".
+        state: What the page saved, or `Viewer.state`: in place of shader, camera and options.
+        engine: Fields of `EngineOptions`, where an engine is made.
+        host: Address to listen at. Other machines reach it at "0.0.0.0"; ssh -L PORT:localhost:PORT
+            is the safer way.
+        port: 0: any that is free.
+        token: That the page's address must hold; a new one if left out.
+        allow: Further names under which pages may reach this machine.
+        browser: Whether a browser is opened; if left out, where no notebook shows it.
+        wait: Whether to wait until Ctrl-C; if left out, in a script.
+        **options: Fields of `RenderOptions`.
+
+    Returns:
+        A `Viewer`, or in a notebook a widget.
+
+    Raises:
+        ValueError: There is nothing to look at, or an argument is out of its range.
+        FileNotFoundError: There is nothing at the path.
+        ImportError: `gvtorch[view]` is not installed.
+    """
+    aiohttp_web()
+    session = new_session(what, shader, camera, up=up, state=state, engine=engine, **options)
+    if _in_notebook() and wait is None and browser is None:
+        from .notebook import widget
+
+        return widget(session)
+    try:
+        server = Server(session, host=host, port=port, token=token, allow=allow)
+    except BaseException:
+        session.close()
+        raise
+    viewer = Viewer(session, server)
+    if browser or browser is None:
+        webbrowser.open(viewer.url)
+    if wait or (wait is None and not hasattr(sys, "ps1")):
+        print(f"{viewer.url}\nCtrl-C ends the view.", flush=True)
+        viewer.wait()
+    return viewer
+
+
+def new_session(
+    what: Any,
+    shader: Shader | None = None,
+    camera: Camera | None = None,
+    *,
+    up: Up | None = None,
+    state: str | PathLike[str] | ViewState | None = None,
+    engine: Mapping[str, Any] | None = None,
+    **options: Unpack[RenderSettings],
+) -> Session:
+    """Opens a scene and its session, without a page; see `view`."""
+    parameters, producer = None, what
+    if callable(what) and not hasattr(what, "fill"):
+        parameters = Parameters.of_function(what)
+        producer = parameters.producer
+    elif isinstance(what, Scene):
+        producer = None
+    scene = what if isinstance(what, Scene) else open_scene(producer, **(engine or {}))
+    try:
+        if parameters is None and scene.engine is not None and len(scene.engine.trees) == 1:
+            (one,) = scene.engine.trees.values()
+            parameters = Parameters(one.producer)
+        first = check_shader(scene, shader)
+        chosen = ViewState(
+            shader=first,
+            options=render_options("view", options),
+            component=options.get("component", 0),
+        )
+        if isinstance(state, ViewState):
+            chosen = state
+        elif state is not None:
+            chosen = chosen.read(Path(state))
+        if chosen.camera is None:
+            eye = fitted(scene, None, _SIZE, up) if camera is None else Eye.of(camera, scene.box)
+            chosen = replace(chosen, camera=eye)
+        return Session(scene, chosen, parameters)
+    except BaseException:
+        scene.close()
+        raise
+
+
+def check_shader(scene: Scene, shader: Any) -> Shader:
+    """Returns a user's shader, or one that fits."""
+    if shader is None:
+        return scene.first_shader()
+    return check.instance("view", "shader", shader, Shader)
+
+
+def _in_notebook() -> bool:
+    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+    return shell is not None and hasattr(shell, "kernel")

@@ -1,0 +1,116 @@
+"""A browser without a window: Chromium of the system, driven by playwright."""
+
+from __future__ import annotations
+
+import base64
+import importlib.util
+import shutil
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from .viewer import SOON
+
+_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+
+
+def absent() -> str:
+    """Why no browser can run here; nothing if it can."""
+    if importlib.util.find_spec("playwright") is None:
+        return "playwright is not installed"
+    return "" if executable() else f"none of {', '.join(_NAMES)} is on the path"
+
+
+def executable() -> str | None:
+    """Where Chromium is."""
+    return next(filter(None, map(shutil.which, _NAMES)), None)
+
+
+class Tab:
+    """A page in the browser, and all that it complained of or asked for."""
+
+    def __init__(self, browser: Any, url: str, **options: Any) -> None:
+        self.context = browser.new_context(viewport={"width": 1000, "height": 420}, **options)
+        self.page = self.context.new_page()
+        self.complaints: list[str] = []
+        self.requests: list[str] = []
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("console", self._said)
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.on("websocket", lambda socket: self.requests.append(socket.url))
+        self.page.goto(url)
+
+    def _said(self, message: Any) -> None:
+        own = "willReadFrequently" in message.text  # `pixels` does
+        if message.type in ("error", "warning") and not own:
+            self.complaints.append(message.text)
+
+    def app(self, script: str) -> Any:
+        """What an expression of the page's `app` is."""
+        return self.page.evaluate(
+            f"() => {{ const app = document.querySelector('.gv').app; return {script}; }}"
+        )
+
+    def until(self, wanted: str | Callable[[], Any], soon: float = SOON) -> Any:
+        """Waits until an expression of `app`, or a function, is true."""
+        end = time.monotonic() + soon
+        while True:
+            found = self.app(wanted) if isinstance(wanted, str) else wanted()
+            if found:
+                return found
+            assert time.monotonic() < end, f"it never came: {wanted}; {self.complaints}"
+            self.page.wait_for_timeout(30)
+
+    def final(self) -> np.ndarray:
+        """Waits for a picture at rest that shows what was asked for; (h, w, 3) uint8."""
+        self.until("!!app && !app.before && !app.asked && app.view.head?.final")
+        return self.pixels()
+
+    def pixels(self) -> np.ndarray:
+        """(h, w, 3) uint8 of the canvas."""
+        size, data = self.page.evaluate(
+            """() => {
+              const c = document.querySelector(".gv-picture");
+              const all = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
+              let text = "";
+              for (let n = 0; n < all.length; n += 8192) {
+                text += String.fromCharCode(...all.subarray(n, n + 8192));
+              }
+              return [[c.height, c.width], btoa(text)];
+            }"""
+        )
+        return np.frombuffer(base64.b64decode(data), np.uint8).reshape(*size, 4)[..., :3]
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float], **options: Any) -> None:
+        """Moves the pressed mouse in a few steps."""
+        mouse = self.page.mouse
+        mouse.move(*start)
+        mouse.down(**options)
+        mouse.move(*end, steps=6)
+        mouse.up(**options)
+
+    def open(self, section: str) -> None:
+        """Opens a section of the panel."""
+        found = self.page.locator(f"details:has(> summary:text-is('{section}'))")
+        if found.get_attribute("open") is None:
+            found.locator("summary").first.click()
+
+    def close(self) -> None:
+        self.context.close()
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    """The browser; a skip that the summary tells of where there is none."""
+    if reason := absent():
+        pytest.skip(f"browser: {reason}")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as library:
+        flags = ["--no-sandbox", "--disable-dev-shm-usage"]
+        browser = library.chromium.launch(executable_path=executable(), args=flags)
+        yield browser
+        browser.close()

@@ -1,0 +1,109 @@
+"""Pages without a browser: what a view sends, kept for tests to look at."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+import gvtorch as gv
+from gvtorch.viewer.session import Session
+
+SOON = 60.0  # seconds until something must have come, on the slowest machine
+
+
+class Page:
+    """Joins a session, keeps what comes, and answers pictures as a browser does."""
+
+    def __init__(self, session: Session, width: int = 64, height: int = 48, acks: bool = True):
+        self.session, self.acks = session, acks
+        self.told: list[dict[str, Any]] = []
+        self.pictures: list[tuple[dict[str, Any], bytes]] = []
+        self.files: dict[str, bytes] = {}
+        self._come = threading.Condition()
+        self.client = session.join(self._take)
+        self.send("hello", width=width, height=height)
+
+    def _take(self, data: str | bytes) -> None:
+        with self._come:
+            if isinstance(data, str):
+                self.told.append(json.loads(data))
+            else:
+                head, picture = split(data)
+                if "file" in head:
+                    self.files[head["file"]] = picture
+                else:
+                    self.pictures.append((head, picture))
+            self._come.notify_all()
+        if isinstance(data, bytes) and self.acks and "number" in head:
+            self.send("ack", number=head["number"])
+
+    def send(self, kind: str, **content: Any) -> None:
+        self.session.receive(self.client, json.dumps({"type": kind, **content}))
+
+    def until(self, wanted: Callable[[], Any], soon: float = SOON) -> Any:
+        """Waits until something is true, and returns it."""
+        end = time.monotonic() + soon
+        with self._come:
+            while not (found := wanted()):
+                left = end - time.monotonic()
+                assert left > 0, f"it never came; told {self.told[-3:]}"
+                self._come.wait(min(left, 0.2))
+        return found
+
+    def of(self, kind: str) -> list[dict[str, Any]]:
+        return [one for one in self.told if one["type"] == kind]
+
+    def next(self, kind: str, after: int | None = None) -> dict[str, Any]:
+        """The next text of a type, after so many."""
+        count = len(self.of(kind)) if after is None else after
+        self.until(lambda: len(self.of(kind)) > count)
+        return self.of(kind)[count]
+
+    def final(self, soon: float = SOON) -> tuple[dict[str, Any], np.ndarray]:
+        """The picture at rest: head and (h, w, 3) uint8."""
+        self.until(lambda: self.pictures and self.pictures[-1][0]["final"], soon)
+        head, data = self.pictures[-1]
+        return head, pixels(data)
+
+    def moved(
+        self, camera: dict[str, Any], moving: bool = False
+    ) -> tuple[dict[str, Any], np.ndarray]:
+        """Moves the camera and waits for the picture at rest from there."""
+        self.send("move", camera=camera, moving=moving)
+        eye = camera["eye"]
+        self.until(
+            lambda: self.pictures and np.allclose(self.pictures[-1][0]["camera"]["eye"], eye)
+        )
+        return self.final()
+
+    @property
+    def camera(self) -> dict[str, Any]:
+        self.until(lambda: self.of("welcome"))
+        return {n: v for n, v in self.of("welcome")[0]["state"]["camera"].items() if n != "kind"}
+
+
+def split(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The head of a picture's message, and the picture."""
+    (size,) = struct.unpack("<I", data[:4])
+    return json.loads(data[4 : 4 + size]), data[4 + size :]
+
+
+def pixels(data: bytes) -> np.ndarray:
+    """(h, w, 3) of a JPEG or PNG."""
+    from PIL import Image
+
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+
+
+def bright_ball(n: int = 40) -> gv.Volume:
+    """A ball beside the middle, so that turning it shows."""
+    z, y, x = np.mgrid[0:n, 0:n, 0:n].astype(np.float32) / n - 0.5
+    ball = np.clip(1 - 4 * np.sqrt((x - 0.15) ** 2 + y**2 + (z + 0.1) ** 2), 0, 1)
+    return gv.Volume((255 * ball).astype(np.uint8))

@@ -1,0 +1,348 @@
+"""The page in a real browser: what hands do to it, and what it asks of the world."""
+
+from __future__ import annotations
+
+import base64
+import json
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from helpers import gvtorch
+from helpers.browser import Tab, chromium  # noqa: F401
+from helpers.viewer import bright_ball, pixels
+
+import gvtorch as gv
+from gvtorch.viewer.notebook import module_text
+from gvtorch.viewer.server import page_files
+from gvtorch.viewer.state import Development
+from gvtorch.viewer.view import new_session
+
+pytestmark = pytest.mark.backend("browser")
+FUNCTION = gv.TransferFunction(
+    [(20, 0), (120, 0.3), (200, 0.6)], [(0, 1, 0.4, 0.1), (130, 0.2, 0.5, 1), (255, 1, 1, 1)]
+)
+STAGE = (340.0, 210.0)  # the middle of the picture, in the page
+
+
+#: What anywidget does: hands the module a model and an element.
+_MODEL = """async (text) => {
+  const url = URL.createObjectURL(new Blob([text], { type: "text/javascript" }));
+  const takers = [];
+  const view = (raw) => new DataView(Uint8Array.from(atob(raw), (c) => c.charCodeAt(0)).buffer);
+  window.give = (text, raw) => takers.forEach((take) => take({ text }, raw ? [view(raw)] : []));
+  const send = (content) => window.toPython(content);
+  const model = { get: () => 400, on: (_, take) => takers.push(take), send };
+  await (await import(url)).default.render({ model, el: document.getElementById("cell") });
+}"""
+
+
+@pytest.fixture
+def viewer():
+    state = gv.ViewState(shader=FUNCTION, develop=Development(samples=2))
+    with gv.view(bright_ball(), state=state, browser=False, wait=False) as made:
+        yield made
+
+
+@pytest.fixture
+def tab(chromium, viewer):  # noqa: F811
+    made = Tab(chromium, viewer.url)
+    made.until("app?.state")
+    made.final()
+    yield made
+    complaints = made.complaints
+    made.close()
+    assert not complaints
+
+
+def test_the_page_asks_for_nothing_outside(tab, viewer):
+    """Each of its modules, its style and one websocket, all of its own server."""
+    hosts = {urlsplit(url).netloc for url in tab.requests}
+    assert hosts == {f"127.0.0.1:{viewer.server.port}"}
+    asked = {urlsplit(url).path.lstrip("/") for url in tab.requests}
+    assert {
+        name for name in page_files() if name.endswith((".js", ".css"))
+    } <= asked and "ws" in asked
+    for name, content in page_files().items():
+        text = content.decode().replace("http://www.w3.org/2000/svg", "")
+        for outside in (
+            "://",
+            "//cdn",
+            "@import",
+            "eval(",
+            "innerHTML",
+            "new Function",
+        ):
+            assert outside not in text, (name, outside)
+        assert len(text.splitlines()) < 400, name
+    assert tab.pixels().std() > 5
+
+
+def test_the_canvas_shows_what_render_makes_of_the_saved_state(tab, tmp_path):
+    """A screenshot equals `gvtorch render --state` to what JPEG takes."""
+    tab.drag(STAGE, (400, 180))
+    tab.page.mouse.wheel(0, -200)
+    tab.page.wait_for_timeout(300)
+    seen = tab.final()
+    with tab.page.expect_download() as saved:
+        tab.page.get_by_label("Save all that is shown").click()
+    saved.value.save_as(tmp_path / "view.json")
+    assert json.loads((tmp_path / "view.json").read_text())["camera"] is not None
+    np.save(tmp_path / "ball.npy", bright_ball().data[..., 0].numpy())
+    size = f"{seen.shape[1]}x{seen.shape[0]}"
+    run = gvtorch(
+        *("render", tmp_path / "ball.npy", "-o", tmp_path / "a.png"),
+        *("--size", size, "--state", tmp_path / "view.json"),
+    )
+    assert run.returncode == 0, run.stderr
+    expected = pixels((tmp_path / "a.png").read_bytes()).astype(int)
+    assert expected.std() > 10 and np.abs(seen - expected).mean() < 0.5
+    assert np.abs(seen - expected).max() < 40
+
+
+def test_hands_turn_pan_zoom_and_fly(tab):
+    before, camera = tab.final(), tab.app("app.camera")
+
+    def after() -> tuple[np.ndarray, dict]:
+        tab.page.wait_for_timeout(250)
+        return tab.final(), tab.app("app.camera")
+
+    def far(one: dict) -> float:
+        return float(np.linalg.norm(np.subtract(one["eye"], one["target"])))
+
+    tab.drag(STAGE, (420, 230))
+    turned, there = after()
+    assert np.abs(turned.astype(int) - before).max() > 60
+    assert np.allclose(there["target"], camera["target"]) and abs(far(there) - far(camera)) < 1e-6
+    tab.drag(STAGE, (380, 210), button="right")
+    _, panned = after()
+    assert np.allclose(
+        np.subtract(panned["eye"], there["eye"]), np.subtract(panned["target"], there["target"])
+    )
+    # What was under the pointer stays there: 40 of 420 pixels, at the target's distance.
+    moved = np.linalg.norm(np.subtract(panned["target"], there["target"]))
+    assert abs(moved - 40 / 210 * far(there) * np.tan(np.radians(15))) < 1e-3 * moved
+    tab.page.mouse.move(300, 100)
+    tab.page.mouse.wheel(0, -250)
+    _, near = after()
+    assert far(near) < 0.8 * far(panned) and not np.allclose(near["target"], panned["target"])
+    tab.page.keyboard.down("w")
+    tab.page.wait_for_timeout(200)
+    tab.page.keyboard.up("w")
+    _, flown = after()
+    assert abs(far(flown) - far(near)) < 1e-6 and not np.allclose(flown["eye"], near["eye"])
+    tab.page.keyboard.press("f")
+    tab.until(lambda: far(tab.app("app.camera")) > 1.3 * far(near))
+    tab.page.keyboard.press("3")  # along +y
+    tab.page.wait_for_timeout(600)
+    _, above = after()
+    away = np.subtract(above["eye"], above["target"])
+    assert np.allclose(away / np.linalg.norm(away), (0, 1, 0), atol=1e-6)
+    tab.page.keyboard.press("o")
+    flat, ortho = after()
+    assert ortho["model"] == "ortho" and flat.std() > 5
+
+
+def test_a_double_click_looks_at_what_is_hit(tab):
+    rows, columns = np.nonzero(tab.final().max(-1) > 150)
+    scale = tab.app("app.view.ratio")
+    tab.page.mouse.dblclick(columns.mean() / scale, rows.mean() / scale)
+    tab.page.wait_for_timeout(700)
+    target = tab.app("app.camera.target")
+    centre = np.array([0.65, 0.5, 0.4]) * 40 - 0.5
+    assert 3 < np.linalg.norm(np.subtract(target, centre)) < 10
+    tab.final()
+
+
+def test_a_knot_is_dragged_added_removed_and_undone(tab, viewer):
+    before = tab.final()
+    box = tab.page.locator(".gv-tf").bounding_box()
+
+    def place(at: int) -> list[float]:
+        point = f"app.transfer().opacity[{at}]"
+        return tab.app(f"[app.panel.editor.x({point}[0]), app.panel.editor.y({point}[1])]")
+
+    x, y = place(1)
+    tab.drag((box["x"] + x, box["y"] + y), (box["x"] + x + 8, box["y"] + 15))
+    tab.until(lambda: np.abs(tab.final().astype(int) - before).max() > 30)
+    own = viewer.session.ask(viewer.state.shader.opacity.tolist)
+    assert own[1][1] > 0.8 and own[0] == [20, 0] and own[1][0] > 120
+    assert own == tab.app("app.transfer().opacity")
+    tab.page.mouse.click(box["x"] + x - 40, box["y"] + 100)
+    tab.until("app.transfer().opacity.length === 4")
+    x, y = place(1)
+    tab.page.mouse.click(box["x"] + x, box["y"] + y, button="right")
+    tab.until("app.transfer().opacity.length === 3")
+    for _ in range(3):
+        tab.page.get_by_label("Undo").click()
+    tab.until("app.transfer().opacity[1][0] === 120")
+    tab.until(lambda: np.abs(tab.final().astype(int) - before).max() <= 3)
+
+
+def test_the_window_is_dragged_in_the_picture_and_presets_apply(tab):
+    before = tab.app("app.transfer().opacity.map((p) => p[0])")
+    tab.page.keyboard.down("Alt")
+    tab.drag(STAGE, (340, 150))
+    tab.page.keyboard.up("Alt")
+    after = tab.app("app.transfer().opacity.map((p) => p[0])")
+    assert np.allclose(np.diff(after), np.diff(before), rtol=1e-6) and after[0] > before[0] + 5
+    tab.page.locator(".gv-bar select").select_option("viridis")
+    tab.until("app.transfer().color.length === 256")
+    assert tab.app("app.transfer().opacity.map((p) => p[0])") == after
+    tab.page.locator(".gv-bar select").select_option("hot")
+    tab.until("app.transfer().color.length === 4")
+    tab.final()
+
+
+def test_the_crop_box_is_moved_by_its_handles(tab, viewer):
+    before = tab.final()
+    tab.open("Clip")
+    tab.page.locator(".gv-row:has-text('crop box') input").check()
+    tab.until("app.view.handles.length === 6")
+    tab.final()
+    of_x = "app.view.handles.find((one) => one.axis === 0 && one.side === 1)"
+    handle = tab.app(f"[...{of_x}.at, ...{of_x}.step, app.view.ratio]")
+    x, y, dx, dy, ratio = handle
+    span = np.hypot(dx, dy)
+    tab.drag((x / ratio, y / ratio), ((x - 60 * dx / span) / ratio, (y - 60 * dy / span) / ratio))
+    tab.until(lambda: np.abs(tab.final().astype(int) - before).max() > 60)
+    clip = viewer.session.ask(lambda: viewer.state.options.clip)
+    assert clip.boxes[0][1][0] < 0.4 and clip.boxes[0][0] == [-0.5, -0.5, -0.5]
+    tab.page.get_by_text("add a plane that faces me").click()
+    tab.until("app.state.options.clip.planes.length === 1")
+    tab.page.locator(".gv-row:has-text('crop box') input").uncheck()
+    tab.until("app.state.options.clip.boxes.length === 0")
+    tab.final()
+
+
+def test_every_shader_and_section_has_controls_that_work(tab, viewer):
+    """Each shader that is offered draws; numbers, flags, colours and choices reach the server."""
+    for section in ("Light and lens", "Sampling", "Camera", "Memory", "Monitor"):
+        tab.open(section)
+    for name in ("Lit", "Isosurface", "Projection", "Gradient magnitude", "Pre integrated"):
+        tab.page.locator("details:has(> summary:text-is('Shader')) select").first.select_option(
+            name
+        )
+        kind = name.title().replace(" ", "") if " " in name else name
+        tab.until(lambda kind=kind: type(viewer.state.shader).__name__ == kind)
+        tab.page.wait_for_timeout(100)
+        assert tab.final().std() > 3, name
+    tab.page.locator("details:has(> summary:text-is('Shader')) select").first.select_option("Lit")
+    tab.until(lambda: type(viewer.state.shader).__name__ == "Lit")
+    row = tab.page.locator("label.gv-row:has-text('diffuse') input[type=number]")
+    row.fill("0.33")
+    row.press("Enter")
+    tab.until(lambda: viewer.state.shader.diffuse == 0.33)
+    tab.page.locator("label.gv-row:has-text('shadows') input").check()
+    tab.until(lambda: viewer.state.shader.shadows is True)
+    tab.page.locator("label.gv-row:has-text('lens') select").select_option("ThinLens")
+    tab.until(lambda: viewer.state.options.lens is not None)
+    tab.page.locator("label.gv-row:has-text('lighting') select").select_option("Lighting")
+    tab.until(lambda: viewer.state.options.lighting is not None)
+    tab.page.locator("div.gv-row:has-text('lights') button").first.click()
+    tab.until(lambda: len(viewer.state.options.lighting.lights or ()) == 1)
+    tab.until("app.monitor.frames.length > 0")
+    assert tab.page.locator(".gv-figures b").count() > 5
+    tab.final()
+    assert not tab.page.locator(".gv-note.gv-bad.gv-shown").count()
+
+
+def test_two_pages_and_one_that_follows(tab, chromium, viewer):  # noqa: F811
+    other = Tab(chromium, viewer.url)
+    try:
+        other.until("app?.state")
+        other.final()
+        tab.until("Object.keys(app.clients).length === 2")
+        other.open("Camera")
+        other.page.locator("label.gv-row:has-text('follow') select").select_option("page 1")
+        tab.drag(STAGE, (410, 240))
+        tab.page.wait_for_timeout(300)
+        eye = tab.app("app.camera.eye")
+        other.until(lambda: np.allclose(other.app("app.camera.eye"), eye))
+        assert np.array_equal(other.final(), tab.final())
+        assert not other.complaints
+    finally:
+        other.close()
+    tab.until("Object.keys(app.clients).length === 1")
+
+
+def test_fingers_turn_and_pinch(chromium, viewer):  # noqa: F811
+    tab = Tab(chromium, viewer.url, has_touch=True)
+    try:
+        tab.until("app?.state")
+        tab.final()
+        touch = tab.context.new_cdp_session(tab.page)
+
+        def send(kind: str, *places: tuple[float, float]) -> None:
+            points = [{"x": x, "y": y, "id": n} for n, (x, y) in enumerate(places)]
+            touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+        eye = tab.app("app.camera.eye")
+        send("touchStart", (150, 200))
+        for step in range(5):
+            send("touchMove", (150 + 10 * step, 200))
+        send("touchEnd")
+        tab.until(lambda: not np.allclose(tab.app("app.camera.eye"), eye))
+        far = "Math.hypot(...app.camera.eye.map((x, n) => x - app.camera.target[n]))"
+        before = tab.app(far)
+        send("touchStart", (150, 200), (200, 200))
+        for step in range(5):
+            send("touchMove", (150 - 10 * step, 200), (200 + 10 * step, 200))
+        send("touchEnd")
+        tab.until(lambda: tab.app(far) < 0.6 * before)
+        assert not tab.complaints
+    finally:
+        tab.close()
+
+
+def test_a_view_that_ends_is_told(chromium):  # noqa: F811
+    viewer = gv.view(bright_ball(), FUNCTION, browser=False, wait=False)
+    tab = Tab(chromium, viewer.url)
+    try:
+        tab.until("app?.state")
+        tab.final()
+        viewer.close()
+        tab.until("app.root.classList.contains('gv-lost')")
+        assert "The view was closed" in tab.page.locator(".gv-note").inner_text()
+    finally:
+        tab.close()
+        viewer.close()
+
+
+def test_the_notebook_mounts_the_same_page(chromium):  # noqa: F811
+    """The module that anywidget loads, with a model that hands messages to a session as the widget
+    does."""
+    session = new_session(bright_ball(), FUNCTION)
+    context = chromium.new_context(viewport={"width": 720, "height": 420})
+    page, clients, complaints, waiting = context.new_page(), [], [], []
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+
+    def take(_source, content):
+        if "joined" in content:
+            clients.append(session.join(waiting.append))
+        else:
+            session.receive(clients[0], content["text"])
+
+    try:
+        page.expose_binding("toPython", take)
+        page.set_content("<div id='cell' style='width: 700px'></div>")
+        page.add_style_tag(content=page_files()["style.css"].decode())
+        page.evaluate(
+            _MODEL,
+            module_text(),
+        )
+        for _ in range(600):
+            page.wait_for_timeout(20)
+            for data in [waiting.pop(0) for _ in range(len(waiting))]:
+                raw = None if isinstance(data, str) else base64.b64encode(data).decode()
+                page.evaluate(
+                    "([text, raw]) => give(text, raw)", [data if raw is None else None, raw]
+                )
+            if page.evaluate("() => document.querySelector('.gv')?.app.view.head?.final"):
+                break
+        assert page.evaluate("() => document.querySelector('.gv').app.view.head.final")
+        box = page.locator(".gv").bounding_box()
+        assert box["height"] == 400 and not complaints
+    finally:
+        context.close()
+        session.close()
