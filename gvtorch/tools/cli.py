@@ -1,5 +1,5 @@
-"""The command line: `gvtorch info`, `view`, `render`, `fly`, `slice`, `convert`, `voxelize`, `splat`,
-`filter` and `bench`.
+"""The command line: `gvtorch info`, `view`, `render`, `fly`, `slice`, `convert`, `voxelize`,
+`splat`, `filter` and `bench`.
 
 torch is imported inside the commands, so that `--help` answers at once. A mistake of the user ends
 in one line on standard error and status 2.
