@@ -1,0 +1,57 @@
+"""The tutorial's Python runs, page by page, as it stands there."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+from helpers import ROOT
+
+import gvtorch as gv
+
+FOLDER = ROOT / "docs" / "tutorial"
+PAGES = sorted(FOLDER.glob("*.md"))
+BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("page", [pytest.param(page, id=page.stem) for page in PAGES])
+def test_the_python_of_a_page_runs(page, tmp_path):
+    blocks = BLOCK.findall(page.read_text())
+    assert len(blocks) >= 2
+    script = tmp_path / "page.py"
+    script.write_text("\n".join(blocks))
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    environment = {**os.environ, "PYTHONPATH": os.environ.get("PYTHONPATH", str(ROOT))}
+    run = subprocess.run(
+        [sys.executable, "-W", "error::UserWarning", str(script)],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tmp_path,
+        env=environment,
+    )
+    assert run.returncode == 0, run.stderr
+    for name in re.findall(r'(?:save|Video)\("(\w+\.\w+)"', "".join(blocks)):
+        assert (tmp_path / name).stat().st_size > 500, name
+
+
+@pytest.mark.parametrize("page", [pytest.param(page, id=page.stem) for page in PAGES])
+def test_links_of_a_page_lead_somewhere(page):
+    links = re.findall(r"\]\(([^)#]+)", page.read_text())
+    assert links
+    for link in links:
+        assert (page.parent / link).exists(), link
+
+
+def test_links_from_other_programs_lead_somewhere():
+    text = (ROOT / "docs" / "coming_from.md").read_text()
+    for link in re.findall(r"\]\(([^)#]+)", text):
+        assert (ROOT / "docs" / link).exists(), link
+    for name in set(re.findall(r"gv\.([A-Za-z_0-9]+(?:\.[A-Za-z_]+)*)", text)):
+        found: object = gv
+        for part in name.split("."):
+            found = getattr(found, part)
