@@ -264,7 +264,9 @@ def main(settings: Settings) -> None:
 
 def eye_to_world(way: np.ndarray) -> np.ndarray:
     """(3,) unit vector in the world, of one to the right, up and away from the camera."""
-    camera = gv.Camera.orbit(30, 10, 1.3, width=3, height=3).placed(torch.tensor([[-1.0] * 3, [1.0] * 3], dtype=torch.float64))
+    camera = gv.Camera.orbit(30, 10, 1.3, width=3, height=3).placed(
+        torch.tensor([[-1.0] * 3, [1.0] * 3], dtype=torch.float64)
+    )
     ahead = camera.rays().direction[4].numpy()
     right = np.cross(ahead, (0.0, 1.0, 0.0))
     right /= np.linalg.norm(right)

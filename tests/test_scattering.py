@@ -78,7 +78,9 @@ def test_light_from_ahead_goes_on(backend):
     rays = rays_along(torch.tensor([[4.0, 4.0, -5.0]]).double(), (0, 0, 1), device=DEVICES[backend])
     light = []
     for way in ((0, 0, -1), (0, 0, 1)):  # against the eye, and with it
-        look = gv.Lit(transfer((1, 1, 1)), light=gv.DirectionalLight(way), octaves=1, anisotropy=0.6)
+        look = gv.Lit(
+            transfer((1, 1, 1)), light=gv.DirectionalLight(way), octaves=1, anisotropy=0.6
+        )
         light.append(float(Tracer(tree, look, gv.RenderOptions(backend=backend))(rays).color[0, 0]))
     assert light[0] > 5 * light[1] > 0
 
@@ -121,7 +123,7 @@ def test_what_is_refused():
             gv.Lit(transfer(), octaves=bad)
     with pytest.raises(ValueError, match="anisotropy"):
         gv.Lit(transfer(), octaves=1, anisotropy=1.0)
-    with pytest.raises(ValueError, match="octaves of scattering need a sun or a lamp"):
+    with pytest.raises(ValueError, match="octaves of scattering need a sun or lamp"):
         gv.trace(tree, rays, gv.Lit(transfer(), octaves=2))
     with pytest.raises(ValueError, match="for Lit and StoredColor"):
         gv.trace(tree, rays, gv.Isosurface(0.5, light=sun, octaves=2))

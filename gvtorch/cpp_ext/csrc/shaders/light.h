@@ -2,8 +2,8 @@
 // answers light. T is float, double or Floats (arithmetic.h).
 //
 // Sources: Blinn, "Models of light reflection for computer synthesized pictures", SIGGRAPH 1977; Wrenninge, Kulla,
-// Lundqvist, "Oz: the great and volumetric", SIGGRAPH 2013 talks; Henyey, Greenstein, "Diffuse radiation in the galaxy",
-// ApJ 93, 1941.
+// Lundqvist, "Oz: the great and volumetric", SIGGRAPH 2013 talks; Henyey, Greenstein, "Diffuse radiation in the
+// galaxy", ApJ 93, 1941.
 #pragma once
 
 #include "shaders/probe.h"
@@ -151,8 +151,8 @@ struct Light {
   }
 
   // Colour of a place in a medium, from the share of light that comes there straight: by one scattering, and by octaves
-  // that stand for more and more of them. Each takes half as much from light on its way as the one before, is weaker, more
-  // coloured and less directed.
+  // that stand for more and more of them. Each takes half as much from light on its way as the one before, is weaker,
+  // more coloured and less directed.
   GV_HD Row<T> scattered(Row<T> base, T cosine, T clear) const {
     const Parameters<T>& own = *parameters;
     const T albedo[3] = {base.red, base.green, base.blue};

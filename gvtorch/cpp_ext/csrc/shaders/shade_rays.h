@@ -175,7 +175,7 @@ struct ShadeRay : Walk<T> {
     GV_HD Eye enter(const Ray<T>& ray, const Visit<T>& visit, const Digits& digits) const {
       return Eye(kernel.channels, *sight, kernel.rays, ray, visit, digits);
     }
-    GV_HD bool uniform(const Eye& probe) const {  // shadows differ within it
+    GV_HD bool uniform(const Eye& probe) const {              // shadows differ within it
       if (kToLight && kernel.light.scatters()) return false;  // 1 - alpha of a long interval would round to 0
       return !kShadowed && probe.uniform() && !kernel.shades_each_place();
     }
