@@ -184,9 +184,7 @@ class LitShader(Shader):
         if self.shadowed_kind is None:
             raise ValueError(f"{where}: shadows per sample are for Lit and StoredColor")
         if self.octaves and isinstance(self.light, Headlight):
-            raise ValueError(
-                f"{where}: octaves of scattering need a sun or lamp, got a Headlight"
-            )
+            raise ValueError(f"{where}: octaves of scattering need a sun or lamp, got a Headlight")
         return given._replace(shader=shader_number(self.shadowed_kind))
 
     def unlit(self) -> Self:
