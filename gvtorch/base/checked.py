@@ -4,6 +4,7 @@ object is made, and when it is edited.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
@@ -61,9 +62,9 @@ def above(low: float) -> Check:
     )
 
 
-def whole(low: int) -> Check:
-    """A check for a whole number that is at least `low`."""
-    return lambda owner, name, value: check.whole(kind_of(owner), name, value, low=low)
+def whole(low: int, high: int = sys.maxsize) -> Check:
+    """A check for a whole number from `low` to `high`."""
+    return lambda owner, name, value: check.whole(kind_of(owner), name, value, low=low, high=high)
 
 
 def text(owner: Any, name: str, value: Any) -> str:

@@ -100,8 +100,8 @@ class LabelNumbers(NamedTuple):
 
 
 _Record = TypeVar("_Record")
-#: How many numbers each field of `ShadeParameters` takes, in order; the last two are not used.
-_WIDTHS = (3, 1, 3, 1, 1, 1, 1, 1, 4, 1, 1, 2)
+#: How many numbers each field of `ShadeParameters` takes, in order.
+_WIDTHS = (3, 1, 3, 1, 1, 1, 1, 1, 4, 1, 1, 1, 1)
 
 
 class ShadeParameters(NamedTuple):
@@ -118,12 +118,14 @@ class ShadeParameters(NamedTuple):
     own: Sequence[Number] | Tensor = ()  # the shader's own, up to four: a record above
     normal_scale: Number = 1.0  # a stored normal is number * scale + offset
     normal_offset: Number = 0.0
+    octaves: Number = 0.0  # of scattering; 0: a surface's light
+    anisotropy: Number = 0.0  # mean cosine of scattering
 
     def pack(self, dtype: torch.dtype, device: torch.device) -> Tensor:
         """Returns (5, 4) numbers; raises ValueError as the function `pack` does."""
         at = self._fields.index("own")
         own = (*self.own, *(0.0,) * (_WIDTHS[at] - len(self.own)))
-        return pack((*self[:at], *own, *self[at + 1 :], 0.0, 0.0), dtype, device).reshape(5, 4)
+        return pack((*self[:at], *own, *self[at + 1 :]), dtype, device).reshape(5, 4)
 
     def own_as(self, record: Callable[..., _Record]) -> _Record:
         """Returns the shader's own numbers by name, as one of the records above."""

@@ -81,8 +81,8 @@ class Lit(LitShader):
             in_the_way: What the cones of `Lighting` are blocked by, such as a `Filtered` of the
                 same function: these cones are wide, and means let through too much. None: the
                 transfer function.
-            **light: `normals`, `light`, `ambient`, `diffuse`, `specular` and `shininess` of
-                `LitShader`.
+            **light: `normals`, `light`, `ambient`, `diffuse`, `specular`, `shininess`, `octaves`
+                and `anisotropy` of `LitShader`.
         """
         super().__init__(**light)
         self.transfer, self.shadows, self.in_the_way = transfer, shadows, in_the_way
@@ -161,7 +161,7 @@ class StoredColor(LitShader):
             scale=scale,
             reference=reference,
             premultiplied=float(self.premultiplied or directional),
-            lit=self.lit or self.shadows,
+            lit=self.lit or self.shadows or self.octaves > 0,
         )
 
     def unlit(self) -> Self:
@@ -172,6 +172,7 @@ class StoredColor(LitShader):
     def blocker(self) -> StoredColor:
         bare = copy(self)
         bare.lit = bare.shadows = False
+        bare.octaves = 0
         return bare
 
     def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.checked import Check, Checked, kind_of
+from ..base.checked import Check, Checked, kind_of, whole
 from ..ops import ShadeArguments
 from ..ops.shading import LightKind, Number, ShadeParameters, Triple, shader_number
 from ..pool import N3Tree
@@ -113,7 +113,9 @@ class PointLight(Checked):
 Light = Headlight | DirectionalLight | PointLight
 
 
-_MATERIAL = ("ambient", "diffuse", "specular", "shininess")
+_MATERIAL = ("ambient", "diffuse", "specular", "shininess", "octaves", "anisotropy")
+#: Beyond, float32 can't tell the transmittances of thick clouds from 0 (see `Light.faintest`).
+MOST_OCTAVES = 5
 
 
 class LitShader(Shader):
@@ -130,7 +132,9 @@ class LitShader(Shader):
     shadowed_kind: str | None = None
     checks: ClassVar[Mapping[str, Check]] = {
         "light": lambda owner, name, value: check_light(f"{kind_of(owner)}: {name}", value),
-        **dict.fromkeys(_MATERIAL, a_number(low=0)),
+        **dict.fromkeys(_MATERIAL[:4], a_number(low=0)),
+        "octaves": whole(0, MOST_OCTAVES),
+        "anisotropy": a_number(low=-0.95, high=0.95),
     }
 
     def __init__(
@@ -142,6 +146,8 @@ class LitShader(Shader):
         diffuse: Number = 0.8,
         specular: Number = 0.3,
         shininess: Number = 40.0,
+        octaves: int = 0,
+        anisotropy: Number = 0.0,
     ) -> None:
         """Takes light and material.
 
@@ -153,13 +159,19 @@ class LitShader(Shader):
             diffuse: Factor of base colour, light and cosine.
             specular: Factor of the highlight.
             shininess: Exponent of the highlight.
+            octaves: Above 0, of `Lit` and `StoredColor`: a medium that scatters light, with its own
+                shadows, without normals and highlight. 1 counts light scattered once; each octave
+                more, up to 5, stands for about twice as many scatterings. The base colour is the
+                albedo, and the light's colour times `diffuse` its irradiance / 4 pi.
+            anisotropy: Mean cosine of scattering: 0 to all sides, towards 1 forwards, as clouds do.
 
         Raises:
-            ValueError: A number is negative or not finite.
+            ValueError: A number is not in its range.
         """
         self.normals, self.light = normals, Headlight() if light is None else light
         self.ambient, self.diffuse = ambient, diffuse
         self.specular, self.shininess = specular, shininess
+        self.octaves, self.anisotropy = octaves, anisotropy
 
     def material(self) -> ShadeParameters:
         """See `Shader`."""
@@ -168,16 +180,19 @@ class LitShader(Shader):
     def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
         """See `Shader`."""
         given = super().shading(where, tree)
-        if given is None or not self.shadows:
+        if given is None or not (self.shadows or self.octaves):
             return given
         if self.shadowed_kind is None:
             raise ValueError(f"{where}: shadows per sample are for Lit and StoredColor")
+        if self.octaves and isinstance(self.light, Headlight):
+            raise ValueError(f"{where}: octaves of scattering need a sun or lamp, got a Headlight")
         return given._replace(shader=shader_number(self.shadowed_kind))
 
     def unlit(self) -> Self:
         """See `Shader`."""
         bare = copy(self)
-        bare.ambient, bare.diffuse, bare.specular, bare.shadows = 1.0, 0.0, 0.0, False
+        bare.ambient, bare.diffuse, bare.specular = 1.0, 0.0, 0.0
+        bare.shadows, bare.octaves = False, 0
         return bare
 
 

@@ -28,6 +28,12 @@ SHADERS = {
     "colour with shadows": gv.StoredColor(
         "six", shadows=True, light=gv.DirectionalLight((1, -1, -1), angle=9.0)
     ),
+    "scattering with shadows": gv.Lit(
+        SHADER, octaves=4, anisotropy=0.6, light=gv.DirectionalLight((1, -1, -1), (1.0, 0.9, 0.8))
+    ),
+    "colour that scatters, with shadows": gv.StoredColor(
+        "rgba", octaves=2, anisotropy=-0.3, light=POINT
+    ),
     "six directions": gv.StoredColor("six", light=POINT, lit=True),
     "isosurface": gv.Isosurface(0.5, (0.9, 0.4, 0.2), light=POINT),
     "coloured isosurface": gv.Isosurface(0.4, SHADER, color_channel="rgba", color_component=1),

@@ -69,7 +69,10 @@ class Shade(Plain):
         """Adds an interval in the light."""
         t, seen = piece.middle, where & (rgba[:, 3] > 0)
         normal = self.light.normal_at(probe, t)
-        color = self.light.shade(rgba[:, :3], normal, t, partial(self.comes, t, seen))
+        at_eye = self.light.parameters.light_kind == LightKind.HEADLIGHT
+        shadowed = self.shadows is not None and not at_eye
+        share = partial(self.comes, self.shadows, t, seen) if shadowed else None
+        color = self.light.shade(rgba[:, :3], normal, t, share)
         color = torch.where(seen[:, None], color, rgba[:, :3])
         weight = self.sum.clear * rgba[:, 3]
         self.normal = torch.where(
@@ -77,13 +80,10 @@ class Shade(Plain):
         )
         self.sum.add(torch.cat((color, rgba[:, 3:]), 1), piece, where)
 
-    def comes(self, t: Tensor, seen: Tensor, facing: Tensor) -> Tensor:
+    def comes(self, shadows: Shadows, t: Tensor, seen: Tensor, facing: Tensor) -> Tensor:
         """(r,) share of the light that comes to places t (r,), where they are seen and face it."""
-        at_eye = self.light.parameters.light_kind == LightKind.HEADLIGHT
-        if self.shadows is None or at_eye:
-            return torch.ones_like(t)
         matter = replace(self, shadows=None)
-        return self.shadows.share(matter, t, *self.light.towards(t), seen & facing)
+        return shadows.share(matter, t, *self.light.towards(t), seen & facing, self.light)
 
     def done(self, walk: Walk) -> None:
         """After the last interval."""

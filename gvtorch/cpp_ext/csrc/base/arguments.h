@@ -144,9 +144,10 @@ struct Parameters {
   T light_kind;      // a LightKind
   T light_color[3], ambient;
   T diffuse, specular, shininess;
-  T light_width;  // of a cone to the light: its growth (directional), or the width at the light (point)
-  T own[4];       // the shader's own: its Own, see shaders.h
-  T normal_scale, normal_offset, unused[2];  // a stored normal is number * scale + offset
+  T light_width;                  // of a cone to the light: its growth (directional), or the width at the light (point)
+  T own[4];                       // the shader's own: its Own, see shaders.h
+  T normal_scale, normal_offset;  // a stored normal is number * scale + offset
+  T octaves, anisotropy;          // of light that is scattered several times; 0 octaves: a surface's
 };
 constexpr int32_t kParameters = sizeof(Parameters<float>) / sizeof(float);
 

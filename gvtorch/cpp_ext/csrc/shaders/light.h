@@ -1,7 +1,9 @@
 // What the fused shaders share: an interval of a ray or of each of a packet, the sums of a shader, and how a place
 // answers light. T is float, double or Floats (arithmetic.h).
 //
-// Source: Blinn, "Models of light reflection for computer synthesized pictures", SIGGRAPH 1977.
+// Sources: Blinn, "Models of light reflection for computer synthesized pictures", SIGGRAPH 1977; Wrenninge, Kulla,
+// Lundqvist, "Oz: the great and volumetric", SIGGRAPH 2013 talks; Henyey, Greenstein, "Diffuse radiation in the
+// galaxy", ApJ 93, 1941.
 #pragma once
 
 #include "shaders/probe.h"
@@ -71,17 +73,25 @@ GV_HD const Own& own_numbers(const Parameters<T>* parameters) {
   return *reinterpret_cast<const Own*>(parameters->own);
 }
 
-// Blinn-Phong, on both sides of a surface.
+// Each octave of scattering gives so much of the light of the one before it, and keeps so much of its direction: fitted
+// to path traced clouds (benchmarks/cloud_light.py).
+constexpr float kOctaveLight = 0.55f, kOctaveDirection = 0.6f;
+
+// Blinn-Phong, on both sides of a surface; or the light that a medium scatters.
 template <class T>
 struct Light {
   const Parameters<T>* parameters;
+
+  // A medium, whose places have no normal.
+  GV_HD bool scatters() const { return parameters->octaves > 0; }
 
   GV_HD LightKind kind() const { return static_cast<LightKind>(static_cast<int32_t>(parameters->light_kind)); }
 
   // The normal at distance t, towards the eye: stored, or the gradient's. Of a ray or of each of a packet.
   template <class Eye, class V = typename Eye::Number>
   GV_HD Vec3<V> normal(const Eye& probe, typename Eye::Number t) const {
-    Vec3<V> n;
+    Vec3<V> n{};
+    if (scatters()) return n;
     if (probe.channels.normal.given()) {
       for (int axis = 0; axis < 3; ++axis) {
         n[axis] =
@@ -126,6 +136,7 @@ struct Light {
     if constexpr (sizeof...(shadow) > 0) {
       if (facing > 0 && kind() != LightKind::kHeadlight) {
         const T share = (shadow(t, to_light, length, growth), ...);
+        if (scatters()) return scattered(base, dot(d, to_light), share);
         facing = facing * share;
         highlight = highlight * share;
       }
@@ -137,6 +148,38 @@ struct Light {
       return color * (own.ambient + diffuse * light) + specular * light;
     };
     return {lit(base.red, 0), lit(base.green, 1), lit(base.blue, 2), base.alpha};
+  }
+
+  // Colour of a place in a medium, from the share of light that comes there straight: by one scattering, and by octaves
+  // that stand for more and more of them. Each takes half as much from light on its way as the one before, is weaker,
+  // more coloured and less directed.
+  GV_HD Row<T> scattered(Row<T> base, T cosine, T clear) const {
+    const Parameters<T>& own = *parameters;
+    const T albedo[3] = {base.red, base.green, base.blue};
+    T weight[3] = {albedo[0], albedo[1], albedo[2]}, sum[3] = {};
+    T g = own.anisotropy;
+    for (T octave = 0; octave < own.octaves; octave = octave + 1) {
+      const T share = phase(g, cosine) * clear;
+      for (int i = 0; i < 3; ++i) {
+        sum[i] = sum[i] + weight[i] * share;
+        weight[i] = weight[i] * (albedo[i] * albedo[i]) * static_cast<T>(kOctaveLight);
+      }
+      g = g * static_cast<T>(kOctaveDirection);
+      clear = square_root(clear);
+    }
+    const auto lit = [&](int i) { return albedo[i] * own.ambient + own.diffuse * own.light_color[i] * sum[i]; };
+    return {lit(0), lit(1), lit(2), base.alpha};
+  }
+  // Henyey's and Greenstein's phase function, its mean over all directions 1.
+  GV_HD static T phase(T g, T cosine) {
+    const T square = g * g;
+    const T away = 1 + square - 2 * g * cosine;
+    return (1 - square) / (away * square_root(away));
+  }
+  // The transmittance below which light on its way is no longer followed: the last octave sees its root.
+  GV_HD T faintest(T stop_clear) const {
+    for (T octave = 1; octave < parameters->octaves; octave = octave + 1) stop_clear = stop_clear * stop_clear;
+    return stop_clear;
   }
 };
 

@@ -152,6 +152,7 @@ struct ShadeRay : Walk<T> {
   struct Visitor {
     static constexpr bool kSeesEmpty = Any::kSeesEmpty, kEnds = Any::kEnds;
     static constexpr bool kShadowed = kShadows && std::is_same_v<Any, Shader>;  // none on the way to a light
+    static constexpr bool kToLight = std::is_same_v<Any, Veil<T, Shader>>;
     const ShadeRay& kernel;
     const Any& shader;
     const Ray<T>* ray;
@@ -160,7 +161,10 @@ struct ShadeRay : Walk<T> {
     int32_t samples = 0;
 
     GV_HD bool& missed() { return sum.missed; }
-    GV_HD bool sees() const { return sum.clear > kernel.stop_clear; }
+    GV_HD bool sees() const {
+      if constexpr (kToLight) return sum.clear > sum.stop_clear;
+      return sum.clear > kernel.stop_clear;
+    }
     GV_HD bool more() const { return sees(); }
     template <class Node>
     GV_HD void finish(const Node&) const {}
@@ -171,7 +175,8 @@ struct ShadeRay : Walk<T> {
     GV_HD Eye enter(const Ray<T>& ray, const Visit<T>& visit, const Digits& digits) const {
       return Eye(kernel.channels, *sight, kernel.rays, ray, visit, digits);
     }
-    GV_HD bool uniform(const Eye& probe) const {  // shadows differ within it
+    GV_HD bool uniform(const Eye& probe) const {              // shadows differ within it
+      if (kToLight && kernel.light.scatters()) return false;  // 1 - alpha of a long interval would round to 0
       return !kShadowed && probe.uniform() && !kernel.shades_each_place();
     }
     GV_HD void region(const Eye& probe, T start, T end) {
@@ -265,6 +270,7 @@ struct ShadeRay : Walk<T> {
     at.go(true, at.count + 1);
     const Veil<T, Shader> veil{shader};
     typename Veil<T, Shader>::Sum sum;
+    sum.stop_clear = light.faintest(this->stop_clear);
     Visitor<Veil<T, Shader>> visitor{*this, veil, &beam, &sight, sum};
     this->template follow<Digits>(beam, at, visitor);
     samples += visitor.samples;

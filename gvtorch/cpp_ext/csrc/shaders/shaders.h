@@ -76,7 +76,8 @@ template <class T, class Shader>
 struct Veil {
   static constexpr bool kEnds = false, kSeesEmpty = false, kHidesAlike = Shader::kHidesAlike;
   struct Sum {
-    T clear = 1;  // transmittance
+    T clear = 1;     // transmittance
+    T stop_clear{};  // at which the way ends
     bool missed = false;
   };
   const Shader& shader;
