@@ -318,6 +318,21 @@ def test_wrong_targets_in_other_trees_are_named(forest, message):
         assert all(message in one for one in told) and (told or forest.tree is None)
 
 
+@pytest.mark.backend("cuda")
+def test_replays_are_left_to_the_host_while_there_are_aliases():
+    volume, view = world(), next(views())
+    with gv.Engine(Cells(volume, threshold=0.0), brick_size=4, device="cuda") as engine:
+        graph = engine.capture(view, LOOK)
+        for _ in range(200):
+            picture, stats = graph.replay(view)
+            if stats.settle().converged:
+                break
+        engine.validate()
+        assert stats.converged and len(engine.cache.aliases) == 63
+    tree = gv.N3Tree.from_volume(volume, 4, threshold=0.0, device="cuda")
+    assert torch.equal(picture.color, gv.render(tree, view, LOOK).color)
+
+
 def flight(seed: int, volume: gv.Volume, tree: gv.N3Tree, device: torch.device) -> tuple[bool, int]:
     """Flies once, with faults and renewals; returns whether its last picture was whole: then it is
     the resident one. And how many tiles and bricks were given away.
