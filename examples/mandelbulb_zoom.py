@@ -27,6 +27,7 @@ class Settings:
     size: int = 720
     film: Path = Path("mandelbulb_zoom.mp4")
     frames: int = 0
+    budget: int = 4096  # most bricks a frame
     device: str = "cpu"
 
 
@@ -61,6 +62,7 @@ def look(place: torch.Tensor, ways: torch.Tensor, level: float, width: int, heig
 def fly(engine: gv.Engine, route: tuple[torch.Tensor, torch.Tensor], settings: Settings) -> None:
     """Films the way from 2^-4 to 2^-30 of the box, and tells how long each frame took."""
     height, width, took = settings.size, settings.size * 16 // 9 // 2 * 2, []
+    engine.render(*look(*route, 4.0, width, height), **OPTIONS)  # where it begins
     with gv.Video(settings.film, width, height, fps=30) as film:
         for level in torch.linspace(4, 30, settings.frames).tolist():
             camera, stone = look(*route, level, width, height)
@@ -79,7 +81,7 @@ def main(settings: Settings) -> None:
     shape = gv.Mandelbulb(8, iterations=20, colors=COLORS)
     route, solid = plan(shape), gv.Solid(shape, normals=False)
     producer = gv.FieldProducer(solid, 2**33, box=((-BOX / 2,) * 3, (BOX / 2,) * 3))
-    limits = {"brick_pool": "512 MB", "time_budget": 10.0 if settings.frames else None}
+    limits = {"brick_pool": "512 MB", "load_budget": settings.budget}
     pictures, size = [], (settings.size * 16 // 27 + 1, settings.size // 2)
     with gv.Engine(producer, device=settings.device, **limits) as engine:
         if settings.frames:

@@ -9,7 +9,9 @@ from concurrent.futures import Future
 import pytest
 import torch
 from helpers import DEVICES
+from helpers.producers import Sponge
 from helpers.recorded import Frames
+from helpers.worlds import meets_menger
 
 import gvtorch as gv
 
@@ -237,6 +239,28 @@ def test_renewed_content_is_shared_again():
         assert torch.equal(picture.color, expected.color) and len(engine.cache.aliases) == 63
 
 
+@pytest.mark.backend("cpp")
+def test_a_sponge_of_one_tile_is_cut_as_whole_numbers_tell():
+    """Menger's, 3^19 cells a side: one tile and one brick, from 10^-8 of the box away."""
+    place = torch.tensor([0.25, 0.75, 0.25], dtype=torch.float64)
+    size = 3.0**-17  # of the cell in whose hole the eye stands
+    low = (place / size).floor() * size
+    eye, target = (low + size * torch.tensor(v) for v in ([0.5, 0.47, 0.52], [0.2, 0.85, 0.3]))
+    view = gv.Camera.look_at(tuple(eye.tolist()), tuple(target.tolist()), (0, 0, 1), 70, 16, 16)
+    rays, sponge = view.rays(), Sponge(19)
+    t = torch.tensor(
+        [meets_menger(o, d, 19) for o, d in zip(rays.origin, rays.direction, strict=True)]
+    )
+    shader = gv.TransferFunction.from_points([(0, 0), (20 / 27, 1)])
+    with gv.Engine(sponge, brick_size=4, node_pool="20 kB", brick_pool="20 kB") as engine:
+        picture = engine.render(view, shader)
+        engine.validate()
+        assert picture.stats.converged and sponge.classified == 1 + 27 and sponge.filled == 1
+    beside = (picture.depth.flatten().double() - t).abs() / (rays.cone[:, 1].double() * t)
+    print(beside.quantile(0.5), beside.quantile(0.75), beside.max())
+    assert (picture.depth < torch.inf).all() and beside.quantile(0.75) < 1
+
+
 class Forest(gv.Producer):
     """Cells of 32^3 voxels: each third is what another tree holds, others are half empty and half
     made of small copies.
@@ -316,6 +340,21 @@ def test_wrong_targets_in_other_trees_are_named(forest, message):
         engine.validate()
         told = [one.message for one in engine.failures]
         assert all(message in one for one in told) and (told or forest.tree is None)
+
+
+@pytest.mark.backend("cuda")
+def test_replays_are_left_to_the_host_while_there_are_aliases():
+    volume, view = world(), next(views())
+    with gv.Engine(Cells(volume, threshold=0.0), brick_size=4, device="cuda") as engine:
+        graph = engine.capture(view, LOOK)
+        for _ in range(200):
+            picture, stats = graph.replay(view)
+            if stats.settle().converged:
+                break
+        engine.validate()
+        assert stats.converged and len(engine.cache.aliases) == 63
+    tree = gv.N3Tree.from_volume(volume, 4, threshold=0.0, device="cuda")
+    assert torch.equal(picture.color, gv.render(tree, view, LOOK).color)
 
 
 def flight(seed: int, volume: gv.Volume, tree: gv.N3Tree, device: torch.device) -> tuple[bool, int]:

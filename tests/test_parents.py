@@ -138,6 +138,21 @@ def test_frames_that_serve_themselves_do_as_others(backend):
         assert stats.converged and torch.equal(hits.color, picture.color.reshape(-1, 3))
 
 
+@pytest.mark.backend("cuda")
+def test_a_graph_hands_over_what_parents_hold():
+    options = {"brick_size": 4, "device": "cuda", "brick_pool": "4 MB"}
+    with gv.Engine(Grown(64, box=BOX), **options) as engine:
+        expected = engine.render(view(), LOOK)
+    with gv.Engine(Grown(64, box=BOX), **options) as engine:
+        graph = engine.capture(view(), LOOK, batch=64)
+        for _ in range(300):
+            picture, stats = graph.replay(view())
+            if stats.settle().converged:
+                break
+        engine.validate()
+        assert stats.converged and torch.equal(picture.color, expected.color)
+
+
 @pytest.mark.backend("cpp")
 def test_children_of_what_can_t_be_made_are_named():
     producer = Grown(64, box=BOX)

@@ -87,6 +87,8 @@ def test_data_and_producers_tell_of_themselves_in_one_line(tmp_path):
             "Bricks(data={a: (3, 10, 10, 10, 1) uint8})",
         ),
         (gv.Producer((4, 5, 6)), "Producer(4x5x6 (x, y, z), N=2, value float32x1)"),
+        (gv.FromChildren(gv.Producer(8)), "FromChildren(8x8x8 (x, y, z), N=2, value float32x1)"),
+        (gv.OctaveProducer(gv.noise.SplineSum(), 8), "OctaveProducer(8x8x8 (x, y, z), N=2, value"),
         (
             gv.MeshProducer(meshes.box(), resolution=32),
             "MeshProducer(32x24x16 (x, y, z), N=2, coverage uint8x1)",

@@ -158,11 +158,8 @@ class FromChildren(Producer):
         place, row = grid.reshape(-1, 3).unique(dim=0, return_inverse=True)
         blocks = self._blocks(layout, torch.cat((place, torch.full_like(place[:, :1], depth)), 1))
         inner = (voxel % brick).numpy()
-        x, y, z = inner[:, 0], inner[:, 1], inner[:, 2]
-        at = (
-            *(row.view(grid.shape[:4]).numpy(), z[:, :, None, None]),
-            *(y[:, None, :, None], x[:, None, None]),
-        )
+        along = inner[:, 2, :, None, None], inner[:, 1, None, :, None], inner[:, 0, None, None]
+        at = (row.view(grid.shape[:4]).numpy(), *along)
         return {name: values[at] for name, values in blocks.items()}
 
     def _blocks(self, layout: Layout, loc: Tensor) -> Blocks:

@@ -26,6 +26,26 @@ class Ball(gv.Producer):
         return {"value": (1 - nodes.positions.norm(dim=-1)).clamp(min=0)}
 
 
+class Sponge(gv.Producer):
+    """The Menger sponge: 3^3 children, 7 of them holes, 20 the same as the whole. One tile."""
+
+    def __init__(self, levels=4):
+        super().__init__(4 * 3**levels, branching=3, box=((0, 0, 0), (1, 1, 1)))
+        self.classified = self.filled = 0
+
+    def classify(self, nodes):
+        self.classified += len(nodes)
+        middle = (nodes.loc[:, :3] % 3 == 1).sum(1)
+        whole = torch.where(nodes.depth == 0, gv.Region.DATA, gv.Region.ALIAS)
+        kind = torch.where((middle >= 2) & (nodes.depth > 0), gv.Region.EMPTY, whole)
+        return gv.Regions(kind=kind, alias=torch.zeros_like(nodes.loc))
+
+    def fill(self, nodes):
+        self.filled += len(nodes)
+        side = nodes.layout.brick_size + 2 * nodes.layout.border
+        return {"value": torch.full((len(nodes), side, side, side), 20 / 27)}
+
+
 class Held(gv.VolumeProducer):
     """Keeps its answers back until `go`, which gives them in an order of its own."""
 
