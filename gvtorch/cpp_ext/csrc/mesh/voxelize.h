@@ -233,6 +233,7 @@ struct VoxelizePack {
 
   static constexpr double kMargin = sizeof(T) == 4 ? 1e-2 : 1e-6;  // voxels, more than rounding moves a triangle
   static constexpr int32_t kPack = kTogether<T>;
+  static constexpr int kBlocksAtOnce = 4;  // triangles take 128 registers to a thread
 
   struct Cube {
     double low[3], voxel, inverse;
