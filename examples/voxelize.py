@@ -19,10 +19,10 @@ class Settings:
     """Renders a mesh by its voxels."""
 
     output: Path = Path("voxelize.png")
-    size: int = 480  # height of the picture
+    size: int = 360  # height of the picture
     mesh: Path | None = None  # a file in place of the knot
     texture: Path | None = None  # for that file
-    resolution: int = 512
+    resolution: int = 384
     device: str = "cpu"
 
 
@@ -40,9 +40,8 @@ def knot_on_plate() -> gv.Mesh:
     points = middle + radius * (np.cos(a) * up + np.sin(a) * side)
     hue = 0.05 + 0.75 * (0.5 + 0.5 * np.cos(t + np.array((0.0, 1.9, 3.6)))) ** 1.6
     rope = grid(points, hue * (0.35 + 0.65 * groove))
-    wide = np.linspace(0.5, 2.3, 13)
-    below, above = np.stack((wide, 0 * wide - 0.8), 1), np.stack((wide, 0 * wide - 0.67), 1)
-    profile = np.concatenate((above, below[::-1]))[None, ::-1]
+    wide = np.concatenate((np.linspace(0.5, 2.3, 13), np.linspace(2.3, 0.5, 13)))
+    profile = np.stack((wide, np.repeat((-0.8, -0.67), 13)), 1)[None]
     turn = np.concatenate((np.cos(t), 0 * t, np.sin(t)), -1)[::4]
     ring = grid(profile[..., :1] * turn + profile[..., 1:] * np.array((0, 1, 0)), PLATE)
     corners, colors = (np.concatenate(both) for both in zip(rope, ring, strict=True))

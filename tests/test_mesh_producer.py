@@ -132,6 +132,24 @@ def test_a_coarse_voxel_is_nearly_the_mean_below(world):
             assert apart.mean() < mean and apart.max() < most, (name, scale)
 
 
+def test_bricks_of_all_levels_are_made_together(world):
+    """As on a device, where nobody looks which are coarse: the bits of those made level by level,
+    in one call without a look at a value.
+    """
+    producer, layout, _ = world
+    assert producer.on_device
+    nodes = [all_nodes(layout, depth)[::7] for depth in (layout.depth, 1, layout.depth - 1, 0)]
+    loc = torch.cat([one.loc for one in nodes])
+    mixed = Nodes(loc[torch.randperm(len(loc), generator=torch.Generator().manual_seed(0))], layout)
+    expected = producer.fill(mixed).data
+    low = mixed.box[:, 0] - layout.border * mixed.voxel_size
+    voxel, coarse = mixed.voxel_size[:, 0], mixed.depth < layout.depth
+    assert 0 < coarse.sum() < len(loc)
+    found = producer.voxelizer.cubes(low, voxel, layout.side, coarse_k=coarse)
+    for name, values in expected.items():
+        assert torch.equal(found[name], values), name
+
+
 def test_the_volume_stays_from_level_to_level():
     """Of a solid, to a hundredth as far up as it is three voxels thick."""
     ball = meshes.sphere(4)

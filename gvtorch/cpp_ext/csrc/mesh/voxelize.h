@@ -213,13 +213,12 @@ GV_HD T box_share(Vec3<T> normal, T offset) {
 }
 
 // The boxes that are still to be looked at.
-template <class T>
 struct Waiting {
   int32_t box[kWaiting], floor[kWaiting];
-  T gap2[kWaiting];
+  double gap2[kWaiting];
   int32_t count = 0;
 
-  GV_HD void push(int32_t own, int32_t at, T gap) {
+  GV_HD void push(int32_t own, int32_t at, double gap) {
     box[count] = own;
     floor[count] = at;
     gap2[count] = gap;
@@ -232,14 +231,16 @@ template <class T>
 struct VoxelizePack {
   VoxelizeArgs a;
 
-  static constexpr T kMargin = static_cast<T>(sizeof(T) == 4 ? 1e-2 : 1e-9);  // more than rounding moves a triangle
+  static constexpr double kMargin = sizeof(T) == 4 ? 1e-2 : 1e-6;  // voxels, more than rounding moves a triangle
   static constexpr int32_t kPack = kTogether<T>;
+  static constexpr int kBlocksAtOnce = 4;  // triangles take 128 registers to a thread
 
   struct Cube {
-    double low[3], inverse;
+    double low[3], voxel, inverse;
     T step, reach;
 
     GV_HD T local(double value, int axis) const { return static_cast<T>((value - low[axis]) * inverse); }
+    GV_HD double world(T value, int axis) const { return low[axis] + static_cast<double>(value) * voxel; }
   };
 
   GV_HD int32_t packs() const { return (a.side + kPack - 1) / kPack; }
@@ -255,6 +256,7 @@ struct VoxelizePack {
     }
     const double inverse = 1 / voxel;
     const Cube own{{a.low_k3[3 * cube], a.low_k3[3 * cube + 1], a.low_k3[3 * cube + 2]},
+                   voxel,
                    inverse,
                    static_cast<T>(a.size_k3[3 * cube + 1] * inverse),
                    static_cast<T>(a.size_k3[3 * cube + 2] * inverse)};
@@ -278,24 +280,23 @@ struct VoxelizePack {
     for (int i = 0; i < 9; ++i) at[i] = cube.local(a.corner_f33[9 * number + i], i % 3);
     return Triangle<T>(at);
   }
-  // How far a box is from a place along an axis, 0 in it.
-  GV_HD T beside(const Cube& cube, int64_t box, int axis, T low, T high) const {
-    const T below = cube.local(a.box_n6[6 * box + axis], axis) - high;
-    const T above = low - cube.local(a.box_n6[6 * box + 3 + axis], axis);
-    return larger(larger(below, above), static_cast<T>(0));
+  // How far a box is from what lies between two places along an axis; world units, 0 in it.
+  GV_HD double beside(int64_t box, int axis, double low, double high) const {
+    const double below = a.box_n6[6 * box + axis] - high, above = low - a.box_n6[6 * box + 3 + axis];
+    return larger(larger(below, above), 0.0);
   }
 
   // Calls meet(triangle) for all triangles whose boxes are as near as `gap2(box)` says and `most()` allows, those of
   // nearer boxes first.
   template <class Gap, class Most, class Meet>
   GV_HD void descend(const Gap& gap2, const Most& most, const Meet& meet) const {
-    Waiting<T> waiting;
+    Waiting waiting;
     int32_t floor = a.floors, from = 0, to = a.first[a.floors] - a.first[a.floors - 1];
     while (true) {
       --floor;  // the boxes from..to of this floor
       const int32_t before = waiting.count;
       for (int32_t box = from; box < to; ++box) {
-        const T gap = gap2(a.first[floor] + box);
+        const double gap = gap2(a.first[floor] + box);
         if (!(gap <= most())) continue;
         int32_t at = waiting.count;  // the nearest of them lies on top
         waiting.push(box, floor, gap);
@@ -326,15 +327,16 @@ struct VoxelizePack {
 
   // Winding numbers of the voxels begin..end of a row: triangles ahead along x, those whose normals point ahead as 1.
   GV_HD void wind(const Cube& cube, int32_t begin, int32_t end, T y, T z, int32_t* winding) const {
-    const T x = place(cube, begin);
+    const double margin = kMargin * cube.voxel, x = cube.world(place(cube, begin), 0) - margin;
+    const double y0 = cube.world(y, 1) - margin, y1 = y0 + 2 * margin;
+    const double z0 = cube.world(z, 2) - margin, z1 = z0 + 2 * margin;
     descend(
-        [&](int64_t box) {
-          const T ahead = cube.local(a.box_n6[6 * box + 3], 0);
-          const bool passed =
-              !(ahead >= x - kMargin) || beside(cube, box, 1, y, y) > kMargin || beside(cube, box, 2, z, z) > kMargin;
-          return static_cast<T>(passed ? 1 : 0);
+        [&](int64_t number) {
+          const double* box = a.box_n6 + 6 * number;
+          const bool met = box[1] <= y1 && box[4] >= y0 && box[2] <= z1 && box[5] >= z0 && box[3] >= x;
+          return met ? 0.0 : 1.0;
         },
-        [] { return static_cast<T>(0); },
+        [] { return 0.0; },
         [&](int64_t number) {
           if (!a.solid_f[number]) return;
           Vec3<T> corner[3];
@@ -355,12 +357,16 @@ struct VoxelizePack {
       set_lane(x, lane, place(cube, begin + lane < end ? begin + lane : end - 1));
       set_lane(best, lane, cube.reach * cube.reach);
     }
-    const T low = place(cube, begin), high = place(cube, end - 1);
-    T limit = cube.reach + kMargin, limit2 = cube.reach >= 0 ? limit * limit : static_cast<T>(-1);
+    const double x0 = cube.world(place(cube, begin), 0), x1 = cube.world(place(cube, end - 1), 0);
+    const double y0 = cube.world(y, 1), z0 = cube.world(z, 2);
+    const auto within = [&](T gap) {
+      const double limit = (static_cast<double>(gap) + kMargin) * cube.voxel;
+      return limit * limit;
+    };
+    double limit2 = cube.reach >= 0 ? within(cube.reach) : -1;
     descend(
         [&](int64_t box) {
-          const T gx = beside(cube, box, 0, low, high), gy = beside(cube, box, 1, y, y),
-                  gz = beside(cube, box, 2, z, z);
+          const double gx = beside(box, 0, x0, x1), gy = beside(box, 1, y0, y0), gz = beside(box, 2, z0, z0);
           return gx * gx + gy * gy + gz * gz;
         },
         [&] { return limit2; },
@@ -373,8 +379,7 @@ struct VoxelizePack {
           best = select(nearer, gap2, best);
           T worst = lane_of(best, 0);
           for (int32_t lane = 1; lane < kOwn; ++lane) worst = larger(worst, lane_of(best, lane));
-          limit = square_root(worst) + kMargin;
-          limit2 = limit * limit;
+          limit2 = within(square_root(worst));
         });
     for (int32_t i = begin; i < end; ++i) {
       const int32_t nearest = lane_of(found, i - begin);
