@@ -69,9 +69,9 @@ def main(settings: Settings) -> None:
     producer = gv.PointProducer(place, values, EXTENT, radius=radii[:, 0], drawn=True)
     size = {"width": settings.size * 16 // 9, "height": settings.size}
     camera = gv.Camera.look_at((0.35, 1.25, 1.75), (0, -0.02, 0.03), (0.3, 1, 0), 36, **size)
-    with gv.Engine(producer, brick_pool="2 GB", device=settings.device) as engine:
+    with gv.Engine(producer, brick_pool="512 MB", device=settings.device) as engine:
         look, stars = gv.StoredColor("value", premultiplied=True), gv.point_layer(producer, camera)
-        picture = engine.render(camera, look, layer=stars)
+        picture = engine.render(camera, look, layer=stars, step=0.6)
     picture.tone_map("aces", exposure=0.5).save(settings.output)
     print(f"{settings.output}: {len(place):,} points, {picture.stats.bricks_used} bricks")
 

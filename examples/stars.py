@@ -65,7 +65,7 @@ def main(settings: Settings) -> None:
     with gv.Engine(producer, brick_pool="1 GB", device=settings.device) as engine:
         layer = gv.point_layer(producer, camera)
         look = gv.StoredColor("value", premultiplied=True)
-        picture = engine.render(camera, look, layer=layer, stop_alpha=1.0)
+        picture = engine.render(camera, look, layer=layer, step=1.0)
     picture.tone_map("aces", exposure=settings.exposure).save(settings.output)
     near = int((layer.alpha > 0).sum())
     print(f"{settings.output}: {len(points):,} stars; points are drawn in {near:,} pixels")
