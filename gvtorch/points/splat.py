@@ -14,7 +14,7 @@ from .sorted import SortedPoints
 from .table import Rows
 
 _CELL = 4  # voxels along a side of what is looked up at least
-_SHARES = 1 << 22  # numbers of wide points that are worked on together
+_SHARES = 1 << 21  # numbers of wide points that are worked on together
 
 
 class Cubes(NamedTuple):
@@ -76,9 +76,10 @@ def ranges(
         rows = points.points[level].rows
         most = peak(rows["radius"][row].astype(np.float64), points.grid.spacing_3)
         value = most[:, None] * rows["value"][row]
-        some[cube] = True
-        np.add.at(low, cube, np.minimum(value, 0))
-        np.add.at(high, cube, np.maximum(value, 0))
+        first = _begins(cube)
+        some[cube[first]] = True
+        low[cube[first]] += np.add.reduceat(np.minimum(value, 0), first)
+        high[cube[first]] += np.add.reduceat(np.maximum(value, 0), first)
     return some, low, high
 
 
@@ -94,6 +95,11 @@ def region(points: SortedPoints, low: tuple[int, ...], high: tuple[int, ...]) ->
         z, y, x = out[part].shape[:3]
         out[part] = cube[:z, :y, :x]
     return out
+
+
+def _begins(cube: np.ndarray) -> np.ndarray:
+    """Where rows of another cube begin."""
+    return np.flatnonzero(np.diff(cube, prepend=-1))
 
 
 def _finer(points: SortedPoints, level: int) -> tuple[Rows, int] | None:
@@ -115,19 +121,23 @@ def _widen(rows: Rows, found: _Found, some: np.ndarray, low: np.ndarray, high: n
         cube = cube[first]
         total = np.add.reduceat(rows["value"][found.row].astype(np.float64), first)
         least, most = np.minimum(total, 0), np.maximum(total, 0)
-    first = np.concatenate(([0], np.flatnonzero(cube[1:] != cube[:-1]) + 1))
+    first = _begins(cube)
     here = cube[first]
     some[here] = True
     low[here] = np.minimum.reduceat(least, first)
     high[here] = np.maximum.reduceat(most, first)
 
 
-def _in_cubes(points: SortedPoints, codes: np.ndarray, level: int, cubes: Cubes) -> _Found:
-    """The rows of a table, of codes of voxels of a level not above the cubes', that lie in them."""
+def _in_cubes(
+    points: SortedPoints, codes: np.ndarray, level: int, cubes: Cubes, *, least: int = _CELL
+) -> _Found:
+    """The rows of a table, of codes of voxels of a level not above the cubes', that lie in them;
+    looked up by cells of at least so many voxels along a side.
+    """
     grid, curve = points.grid, points.codes
     n = grid.branching
     size = n
-    while size * n <= max(_CELL, cubes.side // 8):
+    while size * n <= max(least, cubes.side // 8):
         size *= n
     along = (cubes.side + size - 2) // size + 1
     step = np.indices((along,) * 3).reshape(3, -1).T[:, ::-1]
@@ -172,7 +182,7 @@ def _wide(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[int, np.ndarray,
             reach = int(max(grid.extent)) // grid.branching**level + 1
         low = cubes.low_k3 // up - reach
         side = (cubes.side + up - 2) // up + 1 + 2 * reach
-        found = _in_cubes(points, rows["code"], 0, Cubes(low, side, level))
+        found = _in_cubes(points, rows["code"], 0, Cubes(low, side, level), least=1)
         place = rows["position"][found.row].astype(np.float64)
         radius = rows["radius"][found.row].astype(np.float64)[:, None]
         corner = grid.low + cubes.low_k3[found.cube] * size
@@ -183,23 +193,25 @@ def _wide(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[int, np.ndarray,
 
 
 def _add_wide(points: SortedPoints, cubes: Cubes, out: np.ndarray) -> None:
-    """Adds the points that are wider than the cubes' voxels, cube by cube."""
+    """Adds the points that are wider than the cubes' voxels: for each cube the product of what its
+    planes and its lines hold of them.
+    """
     scale = points.grid.branching ** (3 * cubes.level)
+    step = max(1, _SHARES // cubes.side**2)
     for level, cube, row in _wide(points, cubes):
         rows = points.points[level].rows
-        bounds = np.flatnonzero(np.diff(cube, prepend=-1, append=-1)).tolist()
-        step = max(1, _SHARES // cubes.side**2)
-        for start, stop in itertools.pairwise(bounds):
-            for begin in range(start, stop, step):
-                here = row[begin : min(stop, begin + step)]
-                place = rows["position"][here].astype(np.float64)
-                radius = rows["radius"][here].astype(np.float64)
-                edges = points.grid.edges(cubes.low_k3[cube[start], None], cubes.side, cubes.level)
-                x, y, z = (shares(edge, place[:, axis], radius) for axis, edge in enumerate(edges))
-                value = rows["value"][here].astype(np.float64) / scale
-                plane = (z[:, :, None] * y[:, None, :]).reshape(len(here), -1)
-                line = (x[:, :, None] * value[:, None, :]).reshape(len(here), -1)
-                out[cube[start]] += (plane.T @ line).reshape(out.shape[1:])
+        for begin in range(0, len(row), step):
+            here, own = row[begin : begin + step], cube[begin : begin + step]
+            place = rows["position"][here].astype(np.float64)
+            radius = rows["radius"][here].astype(np.float64)
+            edges = points.grid.edges(cubes.low_k3[own], cubes.side, cubes.level)
+            x, y, z = (shares(edge, place[:, axis], radius) for axis, edge in enumerate(edges))
+            value = rows["value"][here].astype(np.float64) / scale
+            plane = (z[:, :, None] * y[:, None, :]).reshape(len(here), -1)
+            line = (x[:, :, None] * value[:, None, :]).reshape(len(here), -1)
+            for start, stop in itertools.pairwise([*_begins(own).tolist(), len(own)]):
+                held = plane[start:stop].T @ line[start:stop]
+                out[own[start]] += held.reshape(out.shape[1:])
 
 
 def narrow_near(points: SortedPoints, center: np.ndarray, reach: float) -> np.ndarray:

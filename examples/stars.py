@@ -1,0 +1,75 @@
+"""The stars around the Sun: voxels that hold their light where they are far, points where they are
+near. They are those of a catalogue (positions in parsecs, luminosities, B-V), or made up.
+
+    python examples/stars.py --catalog hyg_stars.npz
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+import gvtorch as gv
+
+OPACITY, VIVID = 0.02, 1.5  # of a star in a voxel; colours to this power
+
+
+@dataclass
+class Settings:
+    """Renders the stars."""
+
+    output: Path = Path("stars.png")
+    catalog: Path | None = None
+    values: str = "luminosity_sun"
+    color_index: str = "color_index_bv"
+    exposure: float = -8.3
+    size: int = 720
+    extent: int = 1024
+    device: str = "cpu"
+
+
+def made_up(count: int = 60_000) -> tuple[gv.Points, np.ndarray]:
+    """Stars as far as they would be seen, the brighter the farther, and their B-V."""
+    random = np.random.default_rng(4)
+    luminosity = 0.5 * random.random(count) ** -0.9
+    away = np.minimum(90 * np.sqrt(luminosity), 900) * random.random(count) ** 0.5
+    way = random.standard_normal((count, 3)) * (1, 0.7, 0.4)
+    place = way * (away / np.linalg.norm(way, axis=1))[:, None]
+    return gv.Points(place, luminosity), random.normal(0.6, 0.4, count)
+
+
+def star_color(index: np.ndarray) -> np.ndarray:
+    """(n, 3) linear colours by B-V: the temperature by Ballesteros (2012), and Planck's law at the
+    wavelengths of red, green and blue, beside the Sun's.
+    """
+    at = np.clip(index, -0.35, 2.0)
+    kelvin = np.r_[5800, 4600 * (1 / (0.92 * at + 1.7) + 1 / (0.92 * at + 0.62))]
+    nanometers = np.array([610.0, 550.0, 465.0])
+    light = 1 / np.expm1(1.4388e7 / (nanometers * kelvin[:, None]))
+    color = light[1:] / light[0]
+    return (color / color.max(1, keepdims=True)) ** VIVID
+
+
+def main(settings: Settings) -> None:
+    """Makes the picture."""
+    if settings.catalog is None:
+        points, index = made_up()
+    else:
+        points = gv.read_points(settings.catalog, values=settings.values)
+        index = gv.PointFile(settings.catalog).columns[settings.color_index]
+    lit = gv.Points(points.positions, points.values, star_color(index)).lit(OPACITY)
+    producer = gv.PointProducer(lit, extent=settings.extent, drawn=True)
+    size = {"width": settings.size * 16 // 9, "height": settings.size}
+    camera = gv.Camera.look_at((300, -800, 420), (0, 0, 0), (0.5, 0, 1), 50, **size)
+    with gv.Engine(producer, brick_pool="1 GB", device=settings.device) as engine:
+        layer = gv.point_layer(producer, camera)
+        look = gv.StoredColor("value", premultiplied=True)
+        picture = engine.render(camera, look, layer=layer, step=1.0)
+    picture.tone_map("aces", exposure=settings.exposure).save(settings.output)
+    near = int((layer.alpha > 0).sum())
+    print(f"{settings.output}: {len(points):,} stars; points are drawn in {near:,} pixels")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings))
