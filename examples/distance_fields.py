@@ -50,7 +50,7 @@ def main(settings: Settings) -> None:
     paint = gv.StoredColor(
         "rgba", premultiplied=True, normals="normal", light=SUN, ambient=0.4, diffuse=0.9
     )
-    light = gv.Lighting(ambient=(0.65, 0.75, 0.9), occlusion=0.9, reach=0.1, frame="box", cones=4)
+    light = gv.Lighting(ambient=(0.65, 0.75, 0.9), occlusion=0.9, reach=0.1, frame="box", cones=3)
     with gv.Engine(producer, brick_pool="256 MB", device=settings.device) as engine:
         for part in (3, 1):
             size = {"width": settings.size * 16 // 9 // part, "height": settings.size // part}

@@ -50,7 +50,7 @@ def main(settings: Settings) -> None:
         mesh = gv.read_mesh(settings.mesh)
         low, high = mesh.bounds
         moved = (mesh.vertices - (low + high) / 2) * (2 / (high - low).max())
-        shape = gv.SampledDistance.of_mesh(replace(mesh, vertices=moved))
+        shape = gv.SampledDistance.of_mesh(replace(mesh, vertices=moved), reach=0.1)
     elif settings.volume is not None:
         shape = gv.SampledDistance(gv.read_volume(settings.volume))
     rough = {"thickness": 0.075, "frequency": 6, "gain": 0.55, "softness": 0.12}

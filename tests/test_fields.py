@@ -166,6 +166,53 @@ def test_nan_of_a_field_costs_its_bricks_alone(dtype):
         )
 
 
+class Bounded(Field):
+    """A field that tells whatever interval it is given."""
+
+    def __init__(self, interval, box=None):
+        super().__init__()
+        self.interval, self.corners = interval, box
+
+    def forward(self, points):
+        return points[..., 0]
+
+    def bounds(self, center, half):
+        return self.interval(center[:, 0])
+
+    def box(self):
+        return self.corners
+
+
+@pytest.mark.parametrize(
+    ("interval", "message"),
+    [
+        (lambda x: (x, x * math.nan), "'value' must be low <= high everywhere, and not NaN"),
+        (lambda x: (x + 1, x), "'value' must be low <= high everywhere, and not NaN"),
+        (lambda x: (x[:0], x[:0]), "'value' must be (8,) or (8, 1) each, got (0,)"),
+        (lambda x: (x, x, x), "'value' must be two tensors, low and high, got 3 items"),
+        (lambda x: x, "'value' must be two tensors, low and high, got Tensor"),
+        (lambda x: {"value": (0, 1)}, "'value' must be two tensors, low and high, got 2 items"),
+    ],
+)
+def test_bad_intervals_are_named(interval, message):
+    producer = gv.FieldProducer(Bounded(interval), 64, box=BOX)
+    with pytest.raises(ValueError) as caught:
+        producer.classify(nodes_of(producer, 1))
+    assert str(caught.value).startswith("Bounded.bounds: ") and message in str(caught.value)
+    with pytest.raises(gv.ProductionError, match=r"Bounded\.bounds: 'value' must be") as error:
+        gv.Engine(producer)
+    assert "\n" not in str(error.value)
+
+
+def test_what_is_unknown_is_no_error():
+    """Infinite intervals tell nothing, and boxes without end must be given another."""
+    unknown = gv.FieldProducer(Bounded(lambda x: (x - math.inf, x + math.inf)), 64, box=BOX)
+    assert (unknown.classify(nodes_of(unknown, 1)).kind == gv.Region.DATA).all()
+    for box in (torch.full((2, 3), math.nan), torch.tensor([[-math.inf] * 3, [1.0] * 3])):
+        with pytest.raises(ValueError, match="box must be given: the field does not tell where"):
+            gv.FieldProducer(Bounded(lambda x: None, box), 64)
+
+
 @pytest.mark.parametrize("colors", [False, True])
 def test_producers_of_fields_compile_whole(colors):
     """Nothing breaks the graph: neither gradients nor intervals ask the host."""

@@ -12,6 +12,7 @@ from ..base import check
 from .distance import Distance
 from .field import Field, Interval, length
 
+_POINT = 1e-30  # side of voxels of no size
 _DEEP = 4.0  # voxels below the surface from which on nothing but its colour is told
 
 
@@ -52,8 +53,8 @@ class Solid(Field):
 
     def forward(self, points: Tensor) -> Mapping[str, Tensor]:
         """The values of voxels of no size: 1 inside, 0 outside; normals by derivatives."""
-        size = torch.full_like(points[..., :1], 1e-30)
-        return self._voxels(points, size[..., 0], differences=False)
+        size = torch.full_like(points[..., 0], _POINT)
+        return self._voxels(points, size, differences=False)
 
     def filtered(self, points: Tensor, size: Tensor) -> Mapping[str, Tensor]:
         """Returns the channels of voxels with sides (..., 3); the largest counts. With a margin,
@@ -94,6 +95,10 @@ class Solid(Field):
         longest = length(ways)[..., None].clamp(min=1e-30)
         whole = {name: rows[:, inner, inner, inner] for name, rows in values.items()}
         return {**whole, "normal": ways / longest}
+
+    def bounds(self, center: Tensor, half: Tensor) -> Mapping[str, Interval]:
+        """Returns intervals for voxels of no size."""
+        return self.filtered_bounds(center, half, torch.full_like(center, _POINT))
 
     def filtered_bounds(self, center: Tensor, half: Tensor, size: Tensor) -> Mapping[str, Interval]:
         """Returns intervals for voxels of `size` (k, 3) and all smaller ones: where the surface is

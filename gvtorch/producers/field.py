@@ -223,20 +223,29 @@ class FieldProducer(Producer):
         if found is None:
             return {}
         by_channel = found if isinstance(found, Mapping) else {"value": found}
-        known = {}
-        for name, ends in by_channel.items():
-            if name not in self.channels:
-                continue
-            width = self.channels[name].width
-            shape = (len(center), width)
-            low, high = (e[:, None].expand(shape) if e.dim() == 1 else e for e in ends)
-            if low.shape != shape or high.shape != shape:
-                raise ValueError(
-                    f"{type(self.field).__name__}.bounds: {name!r} must be ({len(center)}, {width})"
-                    f" each, got {check.describe(low)} and {check.describe(high)}"
-                )
-            known[name] = (low, high)
-        return known
+        return {
+            name: self._interval(name, ends, len(center))
+            for name, ends in by_channel.items()
+            if name in self.channels
+        }
+
+    def _interval(self, name: str, ends: Any, count: int) -> Interval:
+        """What a field told of a channel, (k, c) each; ValueError if it is no interval."""
+        where, width = f"{type(self.field).__name__}.bounds", self.channels[name].width
+        if not isinstance(ends, tuple) or [isinstance(e, Tensor) for e in ends] != [True, True]:
+            got = f"{len(ends)} items" if isinstance(ends, tuple) else type(ends).__name__
+            raise ValueError(f"{where}: {name!r} must be two tensors, low and high, got {got}")
+        if any(tuple(e.shape) not in ((count,), (count, width)) for e in ends):
+            low, high = (check.describe(e) for e in ends)
+            raise ValueError(
+                f"{where}: {name!r} must be ({count},) or ({count}, {width}) each, "
+                f"got {low} and {high}"
+            )
+        low, high = (e[:, None].expand(-1, width) if e.dim() == 1 else e for e in ends)
+        looks = low.device.type == "cpu" and not torch.compiler.is_compiling()
+        if looks and not bool((low <= high).all()):
+            raise ValueError(f"{where}: {name!r} must be low <= high everywhere, and not NaN")
+        return low, high
 
     def _stored(self, name: str, values: Tensor) -> Tensor:
         """Values in a channel's dtype."""

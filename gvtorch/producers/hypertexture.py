@@ -192,8 +192,8 @@ class Hypertexture(Producer):
         for depth in nodes.depth.unique().tolist():
             here = (nodes.depth == depth).nonzero()[:, 0]
             count = _BATCH if device.type == "cpu" else len(here)
-            for rows, shape in alike(self.shape, nodes[here], 0, count):
-                made = self._made(nodes[here[rows]], self.level_of(depth), shape)
+            for rows, near in alike(self.shape, nodes[here], 0, count):
+                made = self._made(nodes[here[rows]], self.level_of(depth), near)
                 for name, values in made.items():
                     data[name][here[rows]] = values.to(data[name].dtype)
         return data

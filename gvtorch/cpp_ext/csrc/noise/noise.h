@@ -266,7 +266,7 @@ struct NoiseAt {
 
 // body(kind, axes), both constants.
 template <class Body>
-GV_HD void with_noise(const NoiseArgs& args, const Body& body) {
+void with_noise(const NoiseArgs& args, const Body& body) {
   const auto with_axes = [&](auto kind) {
     if (args.axes == 2) return body(kind, std::integral_constant<int, 2>{});
     return body(kind, std::integral_constant<int, 3>{});
