@@ -359,6 +359,7 @@ class Producer(torch.nn.Module):
             record them. They are then asked for batches of one size, which the root fills up.
         on_host: Whether they take places on the host (`Nodes.loc`), and give tensors there or
             futures soon: a captured frame then asks them while the device renders.
+        host_bytes: Host memory that it may fill while it is used.
         made_of: For coarse channels, what they are made of: shaders compare it with what they need.
         version: Number of the content, see `changed`.
         extent, spacing, origin, branching, channels, value_range, labels: See `__init__`.
@@ -369,6 +370,7 @@ class Producer(torch.nn.Module):
     patience: float | None = None
     on_device: bool = False
     on_host: bool = False
+    host_bytes: int = 0
     layout: Layout | None = None
 
     def __init__(
