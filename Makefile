@@ -1,6 +1,8 @@
 # make demo   sets up .venv, renders the bundled CT scan, prints where the picture lies
 # make test   sets up .venv, runs every test
 # make soak   random flights with faults (FRAMES=100000): pools in order, memory flat, pictures exact
+# make fuzz   broken input for long (MINUTES=60); what it finds is kept in tests/fuzz/found
+# make asan   the op tests and hostile calls with AddressSanitizer and UndefinedBehaviorSanitizer; make tsan: threads
 # make lint   ruff, mypy, clang-format
 # make bench  every workload on this machine, beside peers: docs/performance (ARGS=--quick: tiny sizes)
 # make wheel  one wheel for every Python >= 3.11, every torch >= 2.11 and every card, with a manylinux tag, in dist/
@@ -23,7 +25,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constr
 ARCHS_GIVEN := $(GVTORCH_CUDA_ARCHS)
 export GVTORCH_CUDA_ARCHS ?= $(or $(NATIVE),90)
 
-.PHONY: demo test soak lint format bench wheel clean
+.PHONY: demo test soak fuzz asan tsan lint format bench wheel clean
 .DELETE_ON_ERROR:
 
 # The scan as a store on disk, seen through a brick pool an eighth of its size in bricks.
@@ -42,6 +44,18 @@ test: $(VENV)/ready
 FRAMES ?= 100000
 soak: $(VENV)/ready
 	OMP_NUM_THREADS=1 GVTORCH_SOAK=$(FRAMES) $(BIN)/python -m pytest -s tests/test_soak.py
+
+MINUTES ?= 60
+fuzz: $(VENV)/ready
+	OMP_NUM_THREADS=1 GVTORCH_FUZZ=$(MINUTES) $(BIN)/python -m pytest -s tests/fuzz
+
+# The CPU library once more, watched, in a folder of its own. Python is not, so what it leaks does not count; torch's
+# threads are not, so that what ThreadSanitizer tells of libgomp and torch is left out (tests/fuzz/tsan.txt).
+WATCHED := tests/test_words.py tests/fuzz tests/test_cache_ops.py tests/test_packets.py tests/test_segments.py
+asan: $(VENV)/ready
+	$(BIN)/python tests/fuzz/sanitized.py address,undefined $(WATCHED) $(ARGS)
+tsan: $(VENV)/ready
+	$(BIN)/python tests/fuzz/sanitized.py thread tests/test_threads.py $(ARGS)
 
 lint: $(VENV)/ready
 	$(BIN)/ruff check .

@@ -8,11 +8,18 @@ ops.
 
 import ast
 import importlib
+import os
+import sys
 from pathlib import Path
 
 from .base.declared import declared_names
 
 __version__ = "0.1.0"
+
+#: How long OpenMP's threads spin before they sleep. By default they spin for milliseconds, and take
+#: the cores of those that they wait for where other programs run. Read when torch is loaded.
+if "torch" not in sys.modules and not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & set(os.environ):
+    os.environ["GOMP_SPINCOUNT"] = "2000"
 
 #: Public name -> the module that defines it; an empty text for a room.
 _HOME: dict[str, str] = {}

@@ -401,7 +401,7 @@ def test_report_tells_stages_rates_and_occupancy(blobs):
         (lambda v: engine(v, brick_pool="lots"), 'brick_pool must be bytes, as in "256 MB"'),
         (lambda v: engine(v, brick_pool=0), "brick_pool must be an int >= 1"),
         (lambda v: engine(v, brick_pool="4 kB"), "holds 1 slots of 4000 bytes, at least 2"),
-        (lambda v: engine(v, brick_pool="900 TB"), "GiB"),
+        (lambda v: engine(v, brick_pool="900 TB"), "GB free"),
         (lambda v: engine(v, node_pool="100 B"), "node_pool of 100 bytes holds 0 slots"),
         (lambda v: engine(v, brick_size=1), "brick_size must be an int >= 2"),
         (lambda v: engine(v, loading="fast"), "loading must be 'straight' or 'levels'"),

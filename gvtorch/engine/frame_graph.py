@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -30,9 +30,10 @@ class Steps(Protocol):
     device: torch.device
     frames: int
     cache: Cache
-    lock: AbstractContextManager[object]
     readbacks: Readbacks
 
+    @property
+    def lock(self) -> Any: ...
     @property
     def steady(self) -> bool: ...
     @property
@@ -104,7 +105,7 @@ class FrameGraph:
         with self._engine.lock:
             return self._replay(camera)
 
-    def _replay(self, camera: Camera | Rays) -> tuple[Picture, FrameStats]:
+    def _replay(self, camera: Camera) -> tuple[Picture, FrameStats]:
         """See `replay`."""
         engine, served = self._engine, self._served
         if engine.changed:

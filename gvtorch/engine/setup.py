@@ -13,6 +13,7 @@ from ..base.constants import ABSENT, CONSTANT, EMPTY, TERMINAL
 from ..base.volume import movable
 from ..cache import Cache, Scheduler
 from ..cache.write import write_slots
+from ..io.resources import amount, memory_free
 from ..ops import unlink
 from ..pool import BrickPool, Channel, N3Tree, NodePool
 from ..producers import Layout, Nodes, Producer, Region
@@ -22,14 +23,18 @@ from .host_frame import HostFrame
 from .production import Production, ProductionError
 from .request_batch import ProducedTree
 
+_TILE_BYTES = 16 + 4 * 3 + 1 + 4  # of a tile beside its nodes: NodePool's fields, the order of use
+_BRICK_BYTES = 4 * 3 + 1 + 4  # of a brick beside its voxels
+
 
 @dataclass(frozen=True, kw_only=True)
 class EngineOptions:
     """How the engine keeps its scene. `help(gv.Engine)` shows these texts.
 
     Attributes:
-        node_pool: Bytes of node words, constants and ranges; a number or a text as in "8 MB".
-        brick_pool: Bytes of voxels, likewise.
+        node_pool: Bytes of node words, constants and ranges; a number or a text as in "8 MB". What
+            is kept beside them (`Engine.memory`) is about 50 bytes a tile of 8 nodes.
+        brick_pool: Bytes of voxels, likewise; beside them 17 bytes a brick.
         device: Where the pools lie and rays are traced.
         brick_size: Voxels along a side of a brick, without the border.
         border: Voxels around a brick; from 1 on no seam shows.
@@ -119,16 +124,42 @@ def make_pools(
         average = brick + options.coarse_share * (whole - brick)
         coarse = max(roots + 1, int(options.coarse_share * size / average))
     beside = coarse * (whole - brick)
-    tiles = _slots("node_pool", options.node_pool, tile, roots + 1 + branching, device)
-    bricks = _slots("brick_pool", options.brick_pool, brick, max(roots, coarse) + 1, device, beside)
+    tiles = _slots("node_pool", options.node_pool, tile, roots + 1 + branching)
+    bricks = _slots("brick_pool", options.brick_pool, brick, max(roots, coarse) + 1, beside)
+    _check_memory(
+        producers, tiles, tiles * tile, bricks, bricks * brick + beside, branching, device
+    )
     nodes = NodePool(tiles, channels, branching=branching, device=device)
     shape = {"brick_size": options.brick_size, "border": options.border, "coarse": coarse}
     return nodes, BrickPool(bricks, channels, **shape, device=device)
 
 
-def _slots(
-    name: str, given: int | str, slot: int, least: int, device: torch.device, beside: int = 0
-) -> int:
+def _check_memory(
+    producers: Mapping[str, Producer],
+    tiles: int,
+    node_bytes: int,
+    bricks: int,
+    brick_bytes: int,
+    branching: int,
+    device: torch.device,
+) -> None:
+    """Raises ValueError if all that an engine will take is more than what is free."""
+    rest = tiles * (_TILE_BYTES + 4 * branching**3) + bricks * _BRICK_BYTES
+    caches = sum(producer.host_bytes for producer in producers.values())
+    parts = {"node_pool": node_bytes, "brick_pool": brick_bytes, "their bookkeeping": rest}
+    needs = [(device, parts), (torch.device("cpu"), {"host caches": caches})]
+    if device.type == "cpu":
+        needs = [(device, parts | {"host caches": caches})]
+    for place, taken in needs:
+        cuda = place.type == "cuda"
+        free = torch.cuda.mem_get_info(place)[0] if cuda else memory_free()
+        if sum(taken.values()) > free:
+            told = ", ".join(f"{name} {amount(size)}" for name, size in taken.items() if size)
+            total = amount(sum(taken.values()))
+            raise ValueError(f"Engine: {told} take {total}, {place} has {amount(free)} free")
+
+
+def _slots(name: str, given: int | str, slot: int, least: int, beside: int = 0) -> int:
     """Returns how many slots a pool's bytes hold; `beside` of them are for coarse channels."""
     size = check.nbytes("Engine", name, given)
     count = max(0, size - beside) // slot
@@ -138,7 +169,6 @@ def _slots(
             f"Engine: {name} of {size} bytes holds {count} slots of {slot} bytes{kinds}, "
             f"at least {least} are needed ({least * slot + beside} bytes)"
         )
-    check.memory("Engine", name, size, device)
     return count
 
 

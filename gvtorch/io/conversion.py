@@ -129,6 +129,7 @@ def convert(
     labels: bool = False,
     executor: Executor | None = None,
     workers: int | None = None,
+    memory: int | str | None = None,
     resume: bool = False,
     progress: Progress = no_progress,
     **options: Unpack[FormatSettings],
@@ -155,7 +156,10 @@ def convert(
             than 16 bits are counted off: all is read once before, to find which there are.
         executor: Runs the tasks, such as a dask client's `get_executor()`; the store's folder must
             be the same for all of its workers. A pool of processes if left out.
-        workers: Number of processes of that pool; one a core if left out.
+        workers: Number of processes of that pool; one a core if left out, fewer where memory is
+            short.
+        memory: Most bytes that all processes together take, as in "2 GB": fewer workers then. What
+            is free if left out.
         resume: Go on with a half-written store; one that is finished is given as it is.
         progress: Told ("converting", bytes done, bytes in all).
         **options: shape, dtype, key and axes, as of `read_volume`.
@@ -178,6 +182,8 @@ def convert(
     opened_source = _source(source, spacing, origin, time, oblique, labels, options)
     opened_source = _counted(opened_source, target, time, workers, progress)
     plan = _plan(source, opened_source, target, block, threshold, nan, time, workers)
+    if executor is None and (memory is not None or workers is None):
+        plan = _within(plan, memory)
     if not begun:
         _check_room(target, _estimate(plan))
     with _told_how_to_go_on(plan), unfinished.claimed(target, plan.settings, resume=begun) as work:
@@ -360,11 +366,7 @@ def _estimate(plan: _Plan) -> Estimate:
     below = _voxels(layout) - voxels
     plain, beside, seen, seconds = _sample(plan.task)
     share = (voxels + below) / seen
-    copies = _COPIES * (layout.shard + 2) ** 3 * layout.voxel_bytes
-    cube = min(1.0, math.prod(layout.extent) / layout.shard**3)
-    each = (_PROCESS if plan.uses_processes else 0) + int(copies * cube)
-    inner = source.inner if isinstance(source, IndexSource) else source
-    held = inner.data.nbytes if isinstance(inner, MemorySource) else 0
+    each, held = _task_bytes(plan)
     staged = held if plan.uses_processes else 0
     start = 3.0 * plan.uses_processes
     target = plan.target.absolute()
@@ -384,6 +386,31 @@ def _estimate(plan: _Plan) -> Estimate:
         disk_free=shutil.disk_usage(folder).free,
         memory_free=resources.memory_free() + held,
     )
+
+
+def _task_bytes(plan: _Plan) -> tuple[int, int]:
+    """Bytes of memory that a worker takes at most, and those of a source in memory."""
+    layout, source = plan.task.layout, plan.task.source
+    copies = _COPIES * (layout.shard + 2) ** 3 * layout.voxel_bytes
+    cube = min(1.0, math.prod(layout.extent) / layout.shard**3)
+    inner = source.inner if isinstance(source, IndexSource) else source
+    held = inner.data.nbytes if isinstance(inner, MemorySource) else 0
+    own = (_PROCESS if plan.uses_processes else 0) + 2 * inner.unpacked_bytes
+    return own + int(copies * cube), held
+
+
+def _within(plan: _Plan, memory: int | str | None) -> _Plan:
+    """Takes no more workers than fit into some bytes of memory; None: into what is free."""
+    each, held = _task_bytes(plan)
+    free = resources.memory_free() + held
+    limit = free if memory is None else check.nbytes("convert", "memory", memory)
+    fitting = (limit - _PROCESS - held) // each
+    if fitting < 1 and memory is not None:
+        raise ValueError(
+            f"{plan.target}: memory of {resources.amount(limit)} is too little: converting with "
+            f"one worker takes up to {resources.amount(_PROCESS + held + each)}"
+        )
+    return dataclasses.replace(plan, workers=max(1, min(plan.workers, fitting)))
 
 
 def _sample(task: shard.Conversion) -> tuple[int, int, int, float]:

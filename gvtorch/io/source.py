@@ -49,6 +49,7 @@ class VolumeSource(ABC):
     lost: tuple[str, ...] = ()  # what the file tells and this can't keep, a few words each
     time: int = 0  # the time point that is read
     whole: bool = False  # every read unpacks the whole file: one read of all is better
+    unpacked_bytes: int = 0  # of the largest piece that is unpacked as one
     # When (ns): tells sources of one path apart, for what is kept open between reads.
     opened: int = dataclasses.field(default_factory=time_ns)
 

@@ -67,11 +67,11 @@ def whole_file(path: Path) -> Iterator[Path]:
     """A place to write to, which takes the file's name once the block ends well."""
     try:
         handle, name = tempfile.mkstemp(suffix=path.suffix, dir=path.parent)
-        os.close(handle)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from None
     try:
         try:
+            os.close(handle)
             yield Path(name)
         except OSError as error:  # what stands there already stays
             if error.filename not in (None, name):

@@ -401,6 +401,7 @@ class Producer(torch.nn.Module):
         needs_parent: Whether `fill` is to be handed the bricks of the nodes' parents
             (`Nodes.parents`): a node whose parent has no brick then waits until it has. Engines on
             CUDA record this where the producer is `on_device`.
+        host_bytes: Host memory that it may fill while it is used.
         made_of: For coarse channels, what they are made of: shaders compare it with what they need.
         version: Number of the content, see `changed`.
         extent, spacing, origin, branching, channels, value_range, labels: See `__init__`.
@@ -412,6 +413,7 @@ class Producer(torch.nn.Module):
     on_device: bool = False
     on_host: bool = False
     needs_parent: bool = False
+    host_bytes: int = 0
     layout: Layout | None = None
 
     def __init__(

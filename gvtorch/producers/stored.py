@@ -192,12 +192,12 @@ class StoredProducer(Producer):
             labels={_CHANNEL: store.label_values} if store.info.labels else None,
         )
         self.store, self.timeout, self.made_of = store, seconds, made_of
-        self._limit, self._workers = limit, workers
+        self.host_bytes, self._workers = limit, workers
         self._begin()
 
     def _begin(self) -> None:
         """Makes what a process has for itself: its cache and its threads."""
-        self._cache, self._closed = HostCache(self._limit), threading.Event()
+        self._cache, self._closed = HostCache(self.host_bytes), threading.Event()
         self._threads = ThreadPoolExecutor(self._workers, thread_name_prefix="gvtorch-store")
         self._process = os.getpid()
 

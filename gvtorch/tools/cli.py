@@ -93,7 +93,9 @@ class Convert:
     threshold: Annotated[float | None, arg(metavar="VALUE")] = None
     """regions with no value above it are not kept as blocks"""
     workers: Annotated[int | None, arg(metavar="N")] = None
-    """processes; one a core if left out"""
+    """processes; one a core if left out, fewer where memory is short"""
+    memory: Annotated[str | None, arg(metavar="BYTES")] = None
+    """most that all processes together take, as in "2 GB"; what is free if left out"""
     scheduler: Annotated[str | None, arg(metavar="ADDRESS")] = None
     """of a dask cluster that shares this folder, as in tcp://host:8786"""
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -124,6 +126,7 @@ class Convert:
             store = convert(
                 *(self.path, self.store),
                 **common,
+                memory=self.memory,
                 executor=executor,
                 resume=self.resume,
                 progress=bar,

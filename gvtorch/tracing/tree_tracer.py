@@ -244,7 +244,8 @@ class TreeTracer(torch.nn.Module):
 
 def _check_words(tensors: Mapping[str, Any], prefix: str) -> None:
     """Raises ValueError where words lead out of the pools that come with them."""
-    given = [tensors.get(prefix + name) for name in ("child_tn", "brick_tn", "bricks_bzyxc")]
+    names = ("child_tn", "brick_tn", "bricks_bzyxc")
+    given: list[Any] = [tensors.get(prefix + name) for name in names]
     if not all(isinstance(one, Tensor) for one in given):
         return  # a part is loaded: kernels take such words for absent
     child, brick, bricks = given

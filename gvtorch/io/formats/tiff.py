@@ -131,9 +131,12 @@ def open_tiff(path: str, key: str | None = None) -> VolumeSource:
         first = len(shape) - len(inside)
         by_page = shape[first:] == inside and len(series.pages) == math.prod(shape[:first])
         by_page &= axes[first:].replace("-", "") in ("yx", "yxc") and "-" not in axes[first:]
+        frame = series.keyframe
+        piece = int(np.prod(frame.chunks)) if by_page else math.prod(shape)
         missing = sum(page is None for page in series.pages)
         if missing:
             lost.append(f"{missing} of {len(series.pages)} pages, which are not there")
+    told["unpacked_bytes"] = piece * series.dtype.itemsize
     return TiffSource(
         stored=series.dtype.str, whole=not by_page, series=number, lost=tuple(lost), **told
     )

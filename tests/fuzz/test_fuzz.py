@@ -1,0 +1,273 @@
+"""Broken input by the thousand: readers, metadata of stores, JSON of every kind, arguments of ops.
+
+Each input is made from a seed. In the tests a few run; `make fuzz MINUTES=60` goes on with seeds
+that no run had before. An input that breaks something is kept in `found` and tried in every run.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import random
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import gvtorch as gv
+from gvtorch.io import budget
+from gvtorch.ops.registry import FAKES
+
+# Libraries leave files open that they can't read.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
+)
+SECONDS = 60 * float(os.environ.get("GVTORCH_FUZZ", "0"))  # make fuzz
+FEW = 40  # inputs of each kind in a plain run
+FOUND = Path(__file__).parent / "found"
+SLOW = 10.0  # seconds of processor time that one input may take
+TOLD = (ValueError, OSError)  # how input is refused
+
+
+def broken(content: bytes, pick: random.Random) -> bytes:
+    """Cuts, changes, repeats and swaps bytes; numbers become others that are at the ends."""
+    made = bytearray(content)
+    for _ in range(pick.choice((1, 2, 8))):
+        at = pick.randrange(len(made)) if made else 0
+        how = pick.randrange(5)
+        if how == 0:
+            del made[at:]
+        elif how == 1:
+            made[at : at + 1] = bytes([pick.randrange(256)])
+        elif how == 2:
+            made[at : at + 4] = pick.choice((b"\xff" * 4, bytes(4), b"\x7f\xff\xff\xff", b"-1"))
+        elif how == 3:
+            made[at:at] = made[at : at + pick.randrange(64)]
+        else:
+            made[at : at + 3] = pick.choice((b"999999999", b"-1", b"1e999", b"nan", b"[[[", b"\0"))
+    return bytes(made)
+
+
+def try_all(kind: str, attempt: Callable[[random.Random], tuple[str, bytes]]) -> None:
+    """Runs `attempt` for seeds; it returns what went wrong, or "", and the input."""
+    end, seed = time.monotonic() + SECONDS / 6, 0
+    begin = random.randrange(10**9) if SECONDS else 0
+    while seed < FEW or time.monotonic() < end:
+        start = time.process_time()
+        wrong, content = attempt(random.Random(f"{kind} {begin + seed}"))
+        spent = time.process_time() - start
+        if wrong or spent > SLOW:
+            file = FOUND / f"{kind}-{begin + seed}"
+            if SECONDS:
+                file.write_bytes(content)
+            pytest.fail(f"{kind} {begin + seed}: {wrong or f'{spent:.1f} s'}")
+        seed += 1
+
+
+def outcome(call: Callable[[], Any], *told: type[BaseException]) -> str:
+    """What a call should not have done, or ""."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            call()
+    except (*TOLD, *told) as error:
+        return "" if "\n" not in str(error) or told else f"several lines: {error}"
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return ""
+
+
+@pytest.fixture(autouse=True)
+def short_budget(monkeypatch):
+    monkeypatch.setattr(budget, "SECONDS", 2.0)
+
+
+# --- readers
+
+
+def volumes(folder: Path) -> dict[str, bytes]:
+    """A small file of every format that can be written here."""
+    data = (np.arange(4 * 5 * 6).reshape(4, 5, 6) % 200).astype(np.uint8)
+    np.save(folder / "a.npy", data)
+    np.savez_compressed(folder / "a.npz", a=data)
+    (folder / "a_6x5x4_uint8.raw.gz").write_bytes(gzip.compress(data.tobytes()))
+    head = "NRRD0004\ntype: uchar\ndimension: 3\nsizes: 6 5 4\nencoding: {}\n\n"
+    (folder / "a.nrrd").write_bytes(head.format("raw").encode() + data.tobytes())
+    (folder / "b.nrrd").write_bytes(head.format("gzip").encode() + gzip.compress(data.tobytes()))
+    (folder / "a.mha").write_bytes(
+        b"ObjectType = Image\nNDims = 3\nDimSize = 6 5 4\nElementType = MET_UCHAR\n"
+        b"ElementDataFile = LOCAL\n" + data.tobytes()
+    )
+    import nibabel
+    import tifffile
+    from astropy.io import fits
+
+    tifffile.imwrite(folder / "a.tif", data, photometric="minisblack", compression="zlib")
+    axes = {"axes": "ZYX", "PhysicalSizeX": 1.5}
+    tifffile.imwrite(folder / "b.ome.tif", data, photometric="minisblack", metadata=axes)
+    tifffile.imwrite(folder / "c.tif", data, imagej=True)
+    nibabel.save(nibabel.Nifti1Image(data, np.eye(4)), folder / "a.nii.gz")
+    nibabel.save(nibabel.Nifti1Image(data, np.eye(4)), folder / "b.nii")
+    fits.PrimaryHDU(data).writeto(folder / "a.fits")
+    return {file.name: file.read_bytes() for file in sorted(folder.iterdir())}
+
+
+def test_readers(tmp_path_factory):
+    whole, folder = volumes(tmp_path_factory.mktemp("whole")), tmp_path_factory.mktemp("broken")
+
+    def attempt(pick: random.Random) -> tuple[str, bytes]:
+        name = pick.choice(sorted(whole))
+        content = broken(whole[name], pick)
+        (folder / name).write_bytes(content)
+        return outcome(lambda: gv.read_volume(folder / name, nan=0)), content
+
+    try_all("reader", attempt)
+
+
+# --- stores
+
+
+def test_metadata_of_stores(tmp_path):
+    target = tmp_path / "a.zarr"
+    gv.convert(gv.Volume(np.ones((9, 9, 9), np.uint8)), target, workers=1)
+    files = sorted(file for file in target.rglob("*") if file.is_file())
+    whole = {file: file.read_bytes() for file in files}
+
+    def attempt(pick: random.Random) -> tuple[str, bytes]:
+        file = pick.choice(files)
+        content = broken(whole[file], pick)
+        file.write_bytes(content)
+
+        def read() -> None:
+            store = gv.Store.open(target)
+            z, y, x = (min(9, n) for n in store.extent[::-1])
+            store.read_region(0, (0, 0, 0), (z, y, x))
+            store.read_blocks(0, np.zeros((1, 3), np.int64))
+
+        wrong = outcome(read)
+        file.write_bytes(whole[file])
+        return wrong, content
+
+    try_all("store", attempt)
+
+
+# --- JSON of every kind
+
+
+def value(pick: random.Random, depth: int = 0) -> Any:
+    """Any JSON value, with numbers at the ends."""
+    kind = pick.randrange(9 if depth < 4 else 6)
+    if kind < 6:
+        ends = (0, -1, 2**63, 10**400, 1e308, -1e-320, 0.5)
+        return (pick.choice(ends), "", "x" * 50, None, True, pick.random())[kind]
+    items = [value(pick, depth + 1) for _ in range(pick.randrange(4))]
+    return items if kind < 8 else {str(n): item for n, item in enumerate(items)}
+
+
+def changed(content: Any, pick: random.Random) -> Any:
+    """A value with one of its parts replaced."""
+    if isinstance(content, (dict, list)) and content and pick.random() < 0.8:
+        keys = sorted(content) if isinstance(content, dict) else list(range(len(content)))
+        made: Any = dict(content) if isinstance(content, dict) else list(content)
+        key = pick.choice(keys)
+        made[key] = changed(made[key], pick)
+        return made
+    return value(pick)
+
+
+def test_json_of_every_kind(tmp_path):
+    look = gv.TransferFunction.from_points([(0, 0), (1, 1)], [(0, 1, 1, 1)])
+    look.save(tmp_path / "tf.json")
+    kinds = dict.fromkeys(("tf.json", "presets.json"), gv.TransferFunction.from_file)
+    (tmp_path / "presets.json").write_text(
+        json.dumps([{"Name": "a", "ColorSpace": "RGB", "RGBPoints": [0, 0, 0, 0, 1, 1, 1, 1],
+                     "Points": [0, 0, 0.5, 0, 1, 1, 0.5, 0]}])
+    )  # fmt: skip
+    whole = {name: json.loads((tmp_path / name).read_text()) for name in kinds}
+
+    def attempt(pick: random.Random) -> tuple[str, bytes]:
+        name = pick.choice(sorted(kinds))
+        text = json.dumps(changed(whole[name], pick)).encode()
+        text = broken(text, pick) if pick.random() < 0.3 else text
+        file = tmp_path / f"broken_{name}"
+        file.write_bytes(text)
+        return outcome(lambda: kinds[name](file)), text
+
+    try_all("json", attempt)
+
+
+# --- arguments of ops
+
+
+def random_tensor(pick: random.Random) -> torch.Tensor:
+    kinds = (torch.int32, torch.int64, torch.bool, torch.uint8, torch.float32, torch.float64)
+    shape = [pick.choice((0, 1, 2, 3, 4, 8)) for _ in range(pick.randrange(6))]
+    dtype, seed = pick.choice(kinds), pick.randrange(2**31)
+    generator = torch.Generator().manual_seed(seed)
+    if dtype.is_floating_point:
+        made = torch.rand(shape, generator=generator, dtype=dtype) * pick.choice((1, 1e30, -5))
+        if made.numel() and pick.random() < 0.3:
+            made.view(-1)[0] = pick.choice((torch.nan, torch.inf, -torch.inf))
+        return made
+    ends = {torch.bool: (0, 2), torch.uint8: (0, 256)}.get(dtype, (-4, pick.choice((9, 2**31 - 1))))
+    return torch.randint(*ends, shape, generator=generator).to(dtype)
+
+
+def test_arguments_of_ops(blobs):
+    """Of an op called well, some arguments are replaced: it returns, or raises RuntimeError; what
+    it reads and writes is its own, which `make asan` watches.
+    """
+    from helpers.traces import SHADER, arguments, packed
+
+    tree = gv.N3Tree.from_volume(blobs, 4)
+    rays, given = arguments(tree, 4, SHADER)
+    request, order = tree.nodes.request_tn, torch.arange(8, dtype=torch.int32)
+    known: dict[str, tuple[Any, ...]] = {
+        "trace_rays": (*rays, *given),
+        "count_segments": (*rays, *given, None, 0, False),
+        "compact_requests": (request, 8),
+        "lru_partition": (order, order.clone(), torch.ones(1, dtype=torch.int32)),
+        "locate": (tree.nodes.loc_t4, torch.arange(8), 2, 8),
+        "cut_bricks": (torch.rand(8, 8, 8, 1), torch.zeros((2, 3), dtype=torch.int64), 4, 1),
+        "composite": (*packed(dtype=torch.float32), 0.01),
+    }
+    assert set(known) <= set(FAKES)
+
+    def attempt(pick: random.Random) -> tuple[str, bytes]:
+        name = pick.choice(sorted(known))
+        values = [v.clone() if isinstance(v, torch.Tensor) else v for v in known[name]]
+        for _ in range(pick.choice((1, 1, 2))):
+            at = pick.randrange(len(values))
+            if isinstance(values[at], torch.Tensor):
+                other = random_tensor(pick)
+                same = other.numel() and pick.random() < 0.6
+                if same:  # the right shape, with other content
+                    old = values[at]
+                    flat = other.flatten().repeat(-(-max(1, old.numel()) // other.numel()))
+                    other = flat[: old.numel()].view(old.shape).to(old.dtype)
+                values[at] = other
+            elif values[at] is not None:
+                small = (-1, 0, 1, 7, 0.0, float("nan"), 1e-9)
+                values[at] = (
+                    type(values[at])(pick.choice(small))
+                    if isinstance(values[at], float)
+                    else pick.choice((-1, 0, 1, 3, 2**62))
+                )
+        op = getattr(torch.ops.gvtorch, name)
+        return outcome(lambda: op(*values), RuntimeError, TypeError), repr(values).encode()
+
+    try_all("op", attempt)
+
+
+@pytest.mark.parametrize("file", sorted(FOUND.glob("reader-*")), ids=lambda file: file.name)
+def test_what_was_found_is_mended(file, tmp_path):
+    """Each name ends with the ending of the file that it was."""
+    copy = tmp_path / f"a{file.suffix}"
+    copy.write_bytes(file.read_bytes())
+    assert not outcome(lambda: gv.read_volume(copy, nan=0))
