@@ -27,6 +27,7 @@ FIGURES = {
     "first_hit": {"rays_per_second", "max_difference", "mean_difference", "times"},
     "bricks": {"samples_per_second", "tree_bytes", "brick_size", "border"},
     "opengl": {"host_ms", "same"},
+    "view": {"p95_ms", "pictures_per_second", "share", "first_ms", "rest_ms"},
     "frame": {"cache_share", "cache_ms", "stages", "frames", "bricks", "max_difference"},
     "shaders": {"times", "beside", "samples_per_second", "op_ms", "max_difference"},
     "lens": {"aperture", "bricks", "moved_bytes", "brick_bytes", "samples"},

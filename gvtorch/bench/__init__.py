@@ -19,6 +19,7 @@ WORKLOADS = {
     "shaders": "each shader beside the plain transfer function, resident and in the engine",
     "lens": "the engine through lenses: more blur, coarser levels, fewer bricks",
     "opengl": "pictures out of OpenGL and into it, in shared buffers and through the host",
+    "view": "a page of the viewer: pictures a second, and from the camera to the picture",
     "frame": "the engine: a steady frame and the cache's share of it, a cold start",
     "lru": "1 M slots ordered by use, beside torch.sort",
     "compact": "requests listed out of 8 M nodes, beside torch.nonzero",
@@ -46,7 +47,7 @@ _HOME = {
     **{"march": "march", "first_hit": "march", "bricks": "march", "frame": "frames"},
     **{"shaders": "shaders", "lens": "lens", "opengl": "exchange"},
     **{"stream": "frames", "lru": "cache", "compact": "cache", "produce": "produce"},
-    **{"noise": "noise", "voxelize": "voxelize"},
+    **{"noise": "noise", "voxelize": "voxelize", "view": "view"},
     **{"convert": "storage", "blocks": "storage"},
 }
 

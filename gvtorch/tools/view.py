@@ -20,16 +20,22 @@ if TYPE_CHECKING:
     from ..shaders import Shader
     from ..viewer.scene import Scene
 
-_PATH = f"""a volume: {volume_formats()}; or a Python file that sets scene (what gv.view takes) and
-perhaps shader, camera and options"""
 _NAMES = ("scene", "shader", "camera", "options")  # that a script may set
+
+
+def _path_help() -> str:
+    """What may be looked at; asked for by its own help alone, since formats load torch."""
+    script = (
+        "a Python file that sets scene (what gv.view takes) and perhaps shader, camera, options"
+    )
+    return f"a volume: {volume_formats()}; or {script}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class View:
     """Look at a volume or a store in the browser: turn it, and edit how it is shown."""
 
-    path: Positional[Annotated[str, arg(metavar="PATH|SCRIPT.py", help=_PATH)]]
+    path: Positional[Annotated[str, arg(metavar="PATH|SCRIPT.py", help=_path_help())]]
     state: Annotated[Path | None, arg(metavar="FILE.json")] = None
     """what the page saved: camera, shader and all that says how it is shown"""
     camera: Annotated[str | None, arg(metavar="CAMERA")] = None

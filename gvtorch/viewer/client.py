@@ -20,7 +20,8 @@ Send = Callable[[str | bytes], None]  # from any thread; does not block
 
 _REST = 0.18  # seconds without a move, after which a camera rests although nobody said so
 _EVERY = 0.3  # seconds between pictures of a camera at rest
-_DRAFT, _FINAL = 78, 94  # JPEG quality
+_DRAFT, _FINAL = 80, 94  # JPEG quality
+_LITTLE = 200_000  # pixels up to which the better one costs little
 _SMALLEST = 0.08  # of the resolution
 _STILL_FRAMES = 3  # frames in which nothing more came, after which nothing more is waited for
 
@@ -158,7 +159,8 @@ class Client:
         self._milliseconds += 0.4 * (measured - self._milliseconds)
         self._drawn, self._progressive = (self.eye, self.size), None
         self._settled, self._still = False, 0
-        self._show(picture, camera, state, _DRAFT, took, final=False)
+        quality = _FINAL if small[0] * small[1] <= _LITTLE else _DRAFT
+        self._show(picture, camera, state, quality, took, final=False)
         return picture
 
     def _refined(self, scene: Scene, state: ViewState, newer: Callable[[], bool]) -> Picture | None:

@@ -80,7 +80,8 @@ export class MonitorView {
   bars(names) {
     const { c, wide, tall } = this.surface(this.chart);
     const sums = this.frames.map((one) => one.milliseconds);
-    const most = Math.max(20, ...sums), step = wide / KEPT;
+    const usual = [...sums].sort((a, b) => a - b)[Math.floor(0.9 * (sums.length - 1))];
+    const most = Math.max(20, 1.3 * usual), step = wide / KEPT;
     this.frames.forEach((one, n) => {
       let y = tall;
       const x = wide - (this.frames.length - n) * step;

@@ -2,7 +2,7 @@
 import { el } from "./dom.js";
 import { clamp, hex, linear, short, toSrgb } from "./vectors.js";
 
-const [HEIGHT, STRIP, EDGE] = [128, 18, 10];  // CSS pixels
+const [HEIGHT, STRIP, EDGE, TOP] = [136, 18, 10, 24];  // CSS pixels
 const MOST = 40;  // corner points that are drawn
 const TAKEN = 9;  // pixels from which a point is taken
 
@@ -90,8 +90,8 @@ export class TransferEditor {
   get width() { return this.canvas.clientWidth - 2 * EDGE; }
   x(v) { return EDGE + ((v - this.span[0]) / (this.span[1] - this.span[0])) * this.width; }
   v(x) { return this.span[0] + ((x - EDGE) / this.width) * (this.span[1] - this.span[0]); }
-  y(alpha) { return EDGE + (1 - up(alpha)) * (HEIGHT - EDGE); }
-  alpha(y) { return clamp(down(clamp(1 - (y - EDGE) / (HEIGHT - EDGE), 0, 1)), 0, 1); }
+  y(alpha) { return TOP + (1 - up(alpha)) * (HEIGHT - TOP); }
+  alpha(y) { return clamp(down(clamp(1 - (y - TOP) / (HEIGHT - TOP), 0, 1)), 0, 1); }
 
   draw() {
     const { canvas } = this, wide = canvas.clientWidth;
@@ -114,7 +114,7 @@ export class TransferEditor {
     c.beginPath();
     c.moveTo(this.x(h.low), HEIGHT);
     h.counts.forEach((count, n) => {
-      const y = HEIGHT - (scale(count) / most) * (HEIGHT - EDGE - 4);
+      const y = HEIGHT - (scale(count) / most) * (HEIGHT - TOP);
       c.lineTo(this.x(h.low + n * bin), y);
       c.lineTo(this.x(h.low + (n + 1) * bin), y);
     });

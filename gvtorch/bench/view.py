@@ -1,0 +1,150 @@
+"""The viewer: pictures a second, and from a page's camera to its decoded picture: `view`."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+import math
+import statistics
+import struct
+import time
+from typing import Any
+
+from . import Unavailable
+from .record import Record, Timing
+from .scenes import Scene, aneurism, fog_dense
+
+_RATES = (25.0, 60.0)  # pictures a second that are wanted
+_HELD = 1 / 60  # seconds between camera messages, as of a hand that drags
+
+
+def view(record: Record) -> None:
+    """A page that turns a scan for some seconds over a websocket of this machine."""
+    try:
+        import aiohttp  # noqa: F401
+        import PIL  # noqa: F401
+    except ImportError as error:
+        raise Unavailable(f"view needs {error.name}: pip install 'gvtorch[view]'") from None
+    quick = record.settings.quick
+    try:
+        scene = aneurism(32 if quick else 256)
+    except FileNotFoundError:
+        scene = fog_dense(32 if quick else 256)
+        record.note("the scan comes with the source and is not here: fog takes its place")
+    sizes = ((48, 32),) if quick else ((960, 540), (1920, 1080))
+    for size in sizes:
+        for rate in _RATES[:1] if quick else _RATES:
+            case = f"{scene.name}, {size[0]}x{size[1]}, {rate:g} wanted"
+            if record.wants(case):
+                record.settings.tell(f"view: {case}")
+                _turn(record, case, scene, size, rate)
+    record.note(
+        "ms: from the camera's message to decoded pixels, of a page without a browser; p95 of the "
+        "same; share: of the pixels that were rendered while it moved; first: to the first picture "
+        "of a page, rest: until the first at full resolution"
+    )
+
+
+def _turn(record: Record, case: str, scene: Scene, size: tuple[int, int], rate: float) -> None:
+    from ..viewer.server import Server
+    from ..viewer.view import new_session
+
+    options: dict[str, Any] = {"device": record.settings.device}
+    session = new_session(scene.volume, scene.shader, scene.camera(*size), engine=options)
+    try:
+        server = Server(session)
+        try:
+            seconds = 0.5 if record.settings.quick else min(10.0, record.settings.seconds)
+            found = asyncio.run(_page(server.url, size, rate, seconds))
+        finally:
+            server.close()
+    finally:
+        session.close()
+    waited, first, rest, shares, lasted = found
+    ordered = sorted(waited)
+    timing = Timing(
+        median=statistics.median(ordered), low=ordered[0], high=ordered[-1], repeats=len(ordered)
+    )
+    record.add(
+        case,
+        "page",
+        timing,
+        p95_ms=ordered[math.ceil(0.95 * len(ordered)) - 1],
+        pictures_per_second=len(waited) / lasted,
+        share=statistics.median(shares),
+        first_ms=first,
+        rest_ms=rest,
+    )
+
+
+async def _page(url: str, size: tuple[int, int], rate: float, seconds: float) -> tuple[Any, ...]:
+    """Looks at a view as a page does: waits until it rests, then turns it. Returns milliseconds of
+    each picture, of the first one and of the first at full resolution, shares of the pixels, and
+    seconds.
+    """
+    import aiohttp
+    from PIL import Image
+
+    address, _, query = url.partition("?")
+    async with (
+        aiohttp.ClientSession() as client,
+        client.ws_connect(f"{address}ws?{query}", max_msg_size=0) as ws,
+    ):
+        welcome = json.loads(await ws.receive_str())
+        eye = {n: v for n, v in welcome["state"]["camera"].items() if n != "kind"}
+        start = time.perf_counter()
+        width, height = size
+        await ws.send_json({"type": "hello", "width": width, "height": height, "rate": rate})
+        await ws.send_json({"type": "change", "state": {"develop": {"samples": 1}}})
+
+        async def picture() -> tuple[dict[str, Any], tuple[int, int]]:
+            while True:
+                message = await ws.receive()
+                if message.type == aiohttp.WSMsgType.BINARY:
+                    break
+                if message.type != aiohttp.WSMsgType.TEXT:
+                    raise RuntimeError(f"view: the socket closed: {message}")
+            (length,) = struct.unpack("<I", message.data[:4])
+            head = json.loads(message.data[4 : 4 + length])
+            image = Image.open(io.BytesIO(message.data[4 + length :]))
+            image.load()
+            await ws.send_json({"type": "ack", "number": head["number"]})
+            return head, image.size
+
+        first = rest = 0.0
+        while True:
+            head, shown = await picture()
+            now = 1e3 * (time.perf_counter() - start)
+            first = first or now
+            rest = rest or (now if shown == size else 0.0)
+            if head["final"] and shown == size:
+                break
+        waited, shares = [], []
+        begun = time.perf_counter()
+
+        async def turn() -> None:
+            angle = 0.0
+            while (now := time.perf_counter()) < begun + seconds:
+                angle += 0.01
+                camera = {**eye, "eye": _around(eye, angle)}
+                sent = 1e3 * (now - begun) + 1e-3
+                await ws.send_json({"type": "move", "camera": camera, "moving": True, "sent": sent})
+                await asyncio.sleep(_HELD)
+
+        hand = asyncio.ensure_future(turn())
+        while time.perf_counter() < begun + seconds:
+            head, shown = await picture()
+            if head["sent"]:
+                waited.append(1e3 * (time.perf_counter() - begun) - head["sent"])
+                shares.append(shown[0] * shown[1] / (width * height))
+        await hand
+        return waited, first, rest, shares, time.perf_counter() - begun
+
+
+def _around(eye: dict[str, Any], angle: float) -> list[float]:
+    """The eye turned about +y through the target."""
+    x, y, z = (a - b for a, b in zip(eye["eye"], eye["target"], strict=True))
+    c, s = math.cos(angle), math.sin(angle)
+    turned = (c * x + s * z, y, c * z - s * x)
+    return [a + b for a, b in zip(turned, eye["target"], strict=True)]
