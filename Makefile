@@ -4,6 +4,7 @@
 # make fuzz   broken input for long (MINUTES=60); what it finds is kept in tests/fuzz/found
 # make asan   the op tests and hostile calls with AddressSanitizer and UndefinedBehaviorSanitizer; make tsan: threads
 # make lint   ruff, mypy, clang-format
+# make gallery  every picture of an example in docs/images, made again
 # make bench  every workload on this machine, beside peers: docs/performance (ARGS=--quick: tiny sizes)
 # make wheel  one wheel for every Python >= 3.11, every torch >= 2.11 and every card, with a manylinux tag, in dist/
 #
@@ -25,7 +26,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constr
 ARCHS_GIVEN := $(GVTORCH_CUDA_ARCHS)
 export GVTORCH_CUDA_ARCHS ?= $(or $(NATIVE),90)
 
-.PHONY: demo test soak fuzz asan tsan lint format bench wheel clean
+.PHONY: demo gallery test soak fuzz asan tsan lint format bench wheel clean
 .DELETE_ON_ERROR:
 
 # The scan as a store on disk, seen through a brick pool an eighth of its size in bricks.
@@ -37,6 +38,11 @@ demo: $(VENV)/ready
 	$(BIN)/gvtorch render out/stent.zarr --brick-pool "2.2 MB" --tf examples/data/stent.json \
 	  --camera look:-260,-340,190,63.5,63.5,127.5 --up 0,0,1 --background 0.02,0.02,0.03 -o out/demo.png
 	@echo "The picture: $(CURDIR)/out/demo.png"
+
+gallery: $(VENV)/ready
+	for name in $(basename $(notdir $(wildcard examples/*.py))); do \
+	  $(BIN)/python examples/$$name.py --output docs/images/$$name.png || exit; \
+	done
 
 test: $(VENV)/ready
 	OMP_NUM_THREADS=1 GVTORCH_REQUIRE=$(REQUIRE) $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal $(ARGS)
