@@ -9,7 +9,7 @@ import tyro
 
 import gvtorch as gv
 
-SUN = gv.DirectionalLight((-0.78, -0.48, 0.4), (1.9, 1.12, 0.58), angle=8.0)
+SUN = gv.DirectionalLight((-0.78, -0.48, 0.4), (1.9, 1.12, 0.58), angle=15.0)
 SKY = gv.Gradient((0.012, 0.04, 0.16), (0.5, 0.24, 0.17))
 PUFFS = ((-0.85, -0.2, 0.0, 0.45), (-0.3, 0.1, 0.1, 0.6), (0.35, 0.2, -0.1, 0.62),
          (0.9, -0.1, 0.05, 0.42), (0.1, -0.2, 0.35, 0.5))  # fmt: skip
@@ -24,7 +24,7 @@ class Settings:
     """a grid of density: .vdb, .nvdb or any volume"""
     output: Path = Path("cloud.png")
     size: int = 720
-    voxels: int = 192
+    voxels: int = 112
     """along the longest side of the cloud of noise"""
     device: str = "cpu"
 
@@ -59,7 +59,7 @@ def main(settings: Settings) -> None:
     look = gv.Lit(white, light=SUN, octaves=5, anisotropy=0.4, ambient=0.1, diffuse=1.0)
     size = {"width": settings.size * 16 // 9, "height": settings.size}
     camera = gv.Camera.orbit(18, -6, 1.02, fov=38, **size)
-    picture = gv.render(tree, camera, look, background=SKY, step=2)
+    picture = gv.render(tree, camera, look, background=SKY, step=3)
     picture.tone_map("aces", exposure=0.8).save(settings.output)
     print(f"{settings.output}: {picture.stats.milliseconds / 1000:.1f} s")
 
