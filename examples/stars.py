@@ -25,7 +25,7 @@ class Settings:
     color_index: str = "color_index_bv"
     exposure: float = -8.3
     size: int = 720
-    extent: int = 1024
+    extent: int = 384
     device: str = "cpu"
 
 
