@@ -23,9 +23,9 @@ class Settings:
     catalog: Path | None = None
     values: str = "luminosity_sun"
     color_index: str = "color_index_bv"
-    exposure: float = -8.3
+    exposure: float = -11.5
     size: int = 720
-    extent: int = 1024
+    extent: int = 384
     device: str = "cpu"
 
 
