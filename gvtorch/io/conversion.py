@@ -156,11 +156,9 @@ def convert(
             than 16 bits are counted off: all is read once before, to find which there are.
         executor: Runs the tasks, such as a dask client's `get_executor()`; the store's folder must
             be the same for all of its workers. A pool of processes if left out.
-        workers: Number of processes of that pool; one a core if left out, fewer where memory is
-            short.
-        memory: Most bytes that all processes together take, as in "2 GB": fewer workers then. What
-            is free if left out.
-        resume: Go on with a half-written store; one that is finished is given as it is.
+        workers: Number of processes of that pool; left out, one a core, as far as memory goes.
+        memory: Most bytes of all processes, as in "2 GB": fewer workers then. Left out, all free.
+        resume: Go on with a half-written store; a finished one is given as it is.
         progress: Told ("converting", bytes done, bytes in all).
         **options: shape, dtype, key and axes, as of `read_volume`.
 
@@ -179,9 +177,9 @@ def convert(
     if resume and unfinished.is_finished(target) and (whole := Store.open(target)).has_blocks:
         return whole
     begun = unfinished.is_begun(target, resume=resume)
-    opened_source = _source(source, spacing, origin, time, oblique, labels, options)
-    opened_source = _counted(opened_source, target, time, workers, progress)
-    plan = _plan(source, opened_source, target, block, threshold, nan, time, workers)
+    found = _source(source, spacing, origin, time, oblique, labels, options)
+    found = _counted(found, target, time, workers, progress)
+    plan = _plan(source, found, target, block, threshold, nan, time, workers)
     if executor is None and (memory is not None or workers is None):
         plan = _within(plan, memory)
     if not begun:
@@ -390,10 +388,10 @@ def _estimate(plan: _Plan) -> Estimate:
 
 def _task_bytes(plan: _Plan) -> tuple[int, int]:
     """Bytes of memory that a worker takes at most, and those of a source in memory."""
-    layout, source = plan.task.layout, plan.task.source
+    layout, inner = plan.task.layout, plan.task.source
     copies = _COPIES * (layout.shard + 2) ** 3 * layout.voxel_bytes
     cube = min(1.0, math.prod(layout.extent) / layout.shard**3)
-    inner = source.inner if isinstance(source, IndexSource) else source
+    inner = inner.inner if isinstance(inner, IndexSource) else inner
     held = inner.data.nbytes if isinstance(inner, MemorySource) else 0
     own = (_PROCESS if plan.uses_processes else 0) + 2 * inner.unpacked_bytes
     return own + int(copies * cube), held
@@ -406,9 +404,9 @@ def _within(plan: _Plan, memory: int | str | None) -> _Plan:
     limit = free if memory is None else check.nbytes("convert", "memory", memory)
     fitting = (limit - _PROCESS - held) // each
     if fitting < 1 and memory is not None:
+        given, least = (resources.amount(n) for n in (limit, _PROCESS + held + each))
         raise ValueError(
-            f"{plan.target}: memory of {resources.amount(limit)} is too little: converting with "
-            f"one worker takes up to {resources.amount(_PROCESS + held + each)}"
+            f"{plan.target}: memory of {given} is too little, one worker takes {least}"
         )
     return dataclasses.replace(plan, workers=max(1, min(plan.workers, fitting)))
 
@@ -496,9 +494,7 @@ def _told_how_to_go_on(plan: _Plan) -> Iterator[None]:
 
 
 def _staged(plan: _Plan, pool: Executor) -> _Plan:
-    """Writes what lies in memory, a volume or labels, to files, where other processes shall read
-    it.
-    """
+    """Writes what lies in memory to files, where other processes shall read it."""
     if isinstance(pool, ThreadPoolExecutor):
         return plan
     source = plan.task.source
@@ -589,9 +585,7 @@ def _run(
 
 
 def _value_range(task: shard.Conversion) -> list[list[float]]:
-    """Smallest and largest value of each channel, of all times: those of the one cell of the last
-    level.
-    """
+    """Smallest and largest value of each channel, of all times: of the last level's one cell."""
     deadline = Deadline(_OPEN_TIMEOUT)
     spec = task.layout.cells(task.layout.levels - 1)
     cells = deadline.wait(deadline.wait(opened(task.root, spec), "cells").read(), "cells")

@@ -283,7 +283,7 @@ class Store:
         data = self._levels.read(self._checked(level), low, high, deadline)
         if self.has_blocks:
             start, stop = boxes.clamp(low, high, self.layout.shape(level))
-            self._check_sums(self.layout.plain(level), start, stop, deadline)
+            self._sums.check_box(self.layout.plain(level), start, stop, deadline)
             inside = data[boxes.index(np.subtract(start, low).clip(0), data.shape[:3])]
             self._check_shards(self.layout.plain(level), inside, start, stop, deadline)
         return data
@@ -328,7 +328,7 @@ class Store:
     def _read_cells(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         future = self._cells[level][boxes.index(low, high)].read(order="C")
         data = deadline.wait(future, f"{self.location}: cells of level {level}")
-        self._check_sums(self.layout.cells(level), low, high, deadline)
+        self._sums.check_box(self.layout.cells(level), low, high, deadline)
         self._check_shards(self.layout.cells(level), data, low, high, deadline)
         return data
 
@@ -523,16 +523,6 @@ class Store:
             for _ in threads.map(read, _groups(zyx, side)):
                 pass
         return errors
-
-    def _check_sums(self, spec: dict[str, Any], low: Zyx, high: Zyx, deadline: Deadline) -> None:
-        """Raises StoreError if a shard that items `low` to `high` of an array, z y x, lie in is not
-        the one that was written.
-        """
-        per = spec["metadata"]["chunk_grid"]["configuration"]["chunk_shape"]
-        per = per[len(per) - 3 :] if "dimension_names" in spec["metadata"] else per[-5:-2]
-        ends = zip(low, high, per, strict=True)
-        for place in itertools.product(*(range(a // n, (b - 1) // n + 1) for a, b, n in ends)):
-            self._sums.check(spec, place, deadline)
 
     def _error(self, level: int, at: np.ndarray, error: Exception) -> str:
         z, y, x = at.tolist()
