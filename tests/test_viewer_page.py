@@ -346,3 +346,38 @@ def test_the_notebook_mounts_the_same_page(chromium):  # noqa: F811
     finally:
         context.close()
         session.close()
+
+
+def test_channels_and_labels_have_controls(chromium):  # noqa: F811
+    """Colour, window and switch of a channel; a scene of labels shows without a function."""
+    z, y, x = np.mgrid[0:16, 0:16, 0:16]
+    two = gv.Volume(np.stack((x * 16, y * 16), -1).astype(np.uint8))
+    shader = gv.Channels([gv.ChannelLook(window=(40.0, 250.0), color="red", name="tubulin"),
+                          gv.ChannelLook(window=(40.0, 250.0), color="green")])  # fmt: skip
+    state = gv.ViewState(shader=shader, develop=Development(samples=1))
+    with gv.view(two, state=state, browser=False, wait=False) as viewer:
+        tab = Tab(chromium, viewer.url)
+        tab.until("app?.state")
+        before = tab.final()
+        assert before[..., 0].max() > 150 and before[..., 1].max() > 150
+        first = tab.page.locator("div.gv-group:has(> .gv-strong:text-is('tubulin'))")
+        first.locator("label.gv-row:has-text('visible') input").uncheck()
+        tab.until(lambda: tab.final()[..., 0].max() < 60)
+        assert viewer.state.shader.looks[0].visible is False
+        low = first.locator("label.gv-row:has-text('window') input").first
+        low.fill("100")
+        low.press("Enter")
+        tab.until(lambda: viewer.state.shader.looks[0].window == (100, 250))
+        assert viewer.state.shader.looks[1].name == "" and not tab.complaints
+        tab.close()
+    labels = gv.Volume((z > 8).astype(np.uint8) + 1, labels=True)
+    with gv.view(labels, browser=False, wait=False) as viewer:
+        tab = Tab(chromium, viewer.url)
+        tab.until("app?.state")
+        assert tab.final().max() > 80 and not tab.page.locator(".gv-tf").count()
+        row = tab.page.locator("label.gv-row:has-text('ambient') input[type=number]")
+        row.fill("0.9")
+        row.press("Enter")
+        tab.until(lambda: viewer.state.shader.ambient == 0.9)
+        assert not tab.complaints
+        tab.close()

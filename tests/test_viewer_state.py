@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from gvtorch.viewer import schema
 from gvtorch.viewer.protocol import MESSAGES, parse
 from gvtorch.viewer.state import Development, Eye
 
+FUZZED = int(os.environ.get("GVTORCH_FUZZ", "4000"))
 HOT = gv.TransferFunction.preset("hot", 0, 255)
 SHADERS = (
     HOT,
@@ -251,3 +253,34 @@ def test_hostile_messages():
         with pytest.raises(ValueError, match=r"no number|must be finite"):
             parse(text)
     assert math.isfinite(parse('{"type": "pick", "x": 1, "y": 0}').x)
+
+
+def test_damaged_messages_are_refused_or_messages():
+    """Good messages with a few bytes changed, cut or doubled."""
+    rng = np.random.default_rng(11)
+    state = gv.ViewState(shader=SHADERS[1], options=OPTIONS, camera=EYE).to_json()
+    good = [
+        json.dumps({"type": "change", "state": state}),
+        json.dumps({"type": "move", "camera": state["camera"], "moving": True, "sent": 12.5}),
+        '{"type": "hello", "width": 640, "height": 480, "rate": 30}',
+        '{"type": "resize", "engine": {"brick_pool": "256 MB"}}',
+        '{"type": "set", "name": "radius", "value": 4.5}',
+    ]
+    letters = np.frombuffer(b'0123456789-+.eE"{}[]:, abkt\\nu\xff', np.uint8)
+    fine = 0
+    for number in range(FUZZED):
+        text = np.frombuffer(good[number % len(good)].encode(), np.uint8).copy()
+        for place in rng.integers(0, len(text), rng.integers(1, 4)):
+            text[place] = rng.choice(letters)
+        cut = rng.integers(0, len(text), 2)
+        parts = (text, text[: cut[0]], np.concatenate((text[: cut[0]], text[cut[1] :])))
+        damaged = parts[rng.choice(3, p=(0.8, 0.1, 0.1))].tobytes()
+        try:
+            message = parse(damaged)
+            changed = getattr(message, "state", None)
+            if changed is not None:
+                gv.ViewState(shader=HOT).changed(changed)
+            fine += 1
+        except ValueError as error:
+            assert str(error)
+    assert 0 < fine < FUZZED / 2

@@ -22,7 +22,7 @@ _REST = 0.18  # seconds without a move, after which a camera rests although nobo
 _EVERY = 0.3  # seconds between pictures of a camera at rest
 _DRAFT, _FINAL = 80, 94  # JPEG quality
 _LITTLE = 200_000  # pixels up to which the better one costs little
-_SMALLEST = 0.08  # of the resolution
+_SMALLEST = 0.1  # of the resolution
 _STILL_FRAMES = 3  # frames in which nothing more came, after which nothing more is waited for
 
 
@@ -53,7 +53,7 @@ class Client:
         self._progressive: Progressive | None = None
         self._settled, self._still, self._done = False, 0, False
         self._last_sent = self._not_before = 0.0
-        self._milliseconds = 2e-3 / 4  # of a pixel
+        self._milliseconds, self._fixed = 5e-4, 0.0  # of a pixel, and of a frame beside
         self.picture: Picture | None = None
         self._camera: Camera | None = None
         self._frames = 0
@@ -149,19 +149,27 @@ class Client:
     def _draft(self, scene: Scene, state: ViewState) -> Picture:
         width, height = self.size
         wanted = 1e3 / self.rate
-        scale = (wanted / (self._milliseconds * width * height)) ** 0.5
+        budget = max(wanted - self._fixed, wanted / 2)
+        scale = (budget / (self._milliseconds * width * height)) ** 0.5
         scale = min(1.0, max(_SMALLEST, scale))
         small = max(1, round(width * scale)), max(1, round(height * scale))
         camera, start = self.eye.camera(*small, scene.box), time.perf_counter()
         picture = scene.frame(camera, state)
         took = 1e3 * (time.perf_counter() - start)
-        measured = took / (small[0] * small[1])
-        self._milliseconds += 0.4 * (measured - self._milliseconds)
+        self._learn(picture, took, small[0] * small[1])
         self._drawn, self._progressive = (self.eye, self.size), None
         self._settled, self._still = False, 0
         quality = _FINAL if small[0] * small[1] <= _LITTLE else _DRAFT
         self._show(picture, camera, state, quality, took, final=False)
         return picture
+
+    def _learn(self, picture: Picture, took: float, pixels: int) -> None:
+        """Notes what a draft cost by the pixel, and what it would have cost however small."""
+        stages = picture.stats.stages
+        traced = sum(stages.get(name, 0.0) for name in ("rays", "trace")) or took
+        share = 0.4  # of the newest
+        self._milliseconds += share * (traced / pixels - self._milliseconds)
+        self._fixed += share * (max(0.0, took - traced) - self._fixed)
 
     def _refined(self, scene: Scene, state: ViewState, newer: Callable[[], bool]) -> Picture | None:
         def check(what: str, done: int, total: int) -> None:
