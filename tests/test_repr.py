@@ -47,7 +47,7 @@ def test_objects_tell_of_themselves_in_one_line(tree):
         (gv.Solid(gv.Mandelbulb()), "Solid(Mandelbulb)"),
         (gv.PointProducer(torch.rand(9, 3), extent=8), "PointProducer("),
         (gv.Points(torch.rand(9, 3), radius=1), "Points(9, values of 1, radius)"),
-        (gv.sort_points(gv.Points(torch.rand(9, 3)), 8), "SortedPoints(9, values of 1, 8x"),
+        (gv.sort_points(gv.Points(torch.rand(9, 3)), 8), "SortedPoints(9, values of 1, "),
         (gv.FieldProducer(gv.sdf.Sphere(), 64), "FieldProducer(64x64x64 (x, y, z), N=2, rgba fl"),
         (gv.Isosurface(torch.tensor(2.0)), "Isosurface(value=() float32, color=(0.8"),
         (gv.Projection("mean", GRAY), "Projection(transfer=TransferFunction("),
