@@ -59,7 +59,8 @@ def test_links_from_other_programs_lead_somewhere():
 
 def test_the_gallery_has_every_example_and_its_picture():
     text = (ROOT / "docs" / "gallery.md").read_text()
-    named = re.findall(r"!\[\]\(images/(\w+)\.png\) \| \[\1\.py\]\(\.\./examples/\1\.py\): \w", text)
+    row = r"!\[\]\(images/(\w+)\.png\) \| \[\1\.py\]\(\.\./examples/\1\.py\): \w"
+    named = re.findall(row, text)
     assert sorted(named) == sorted(path.stem for path in (ROOT / "examples").glob("*.py"))
     for name in named:
         assert (ROOT / "docs" / "images" / f"{name}.png").stat().st_size > 10_000, name
