@@ -70,8 +70,9 @@ class Shade(Plain):
         t, seen = piece.middle, where & (rgba[:, 3] > 0)
         normal = self.light.normal_at(probe, t)
         at_eye = self.light.parameters.light_kind == LightKind.HEADLIGHT
-        shadowed = self.shadows is not None and not at_eye
-        share = partial(self.comes, self.shadows, t, seen) if shadowed else None
+        share = None  # all of the light comes
+        if self.shadows is not None and not at_eye:
+            share = partial(self.comes, self.shadows, t, seen)
         color = self.light.shade(rgba[:, :3], normal, t, share)
         color = torch.where(seen[:, None], color, rgba[:, :3])
         weight = self.sum.clear * rgba[:, 3]
