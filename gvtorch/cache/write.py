@@ -203,9 +203,9 @@ def write_slots(cache: Cache, slot: Tensor, node: Tensor, data: Voxels | Sequenc
     unlink(nodes.brick_tn, pool.owner_b, pool.shared_b, slot_k)
     with pool.writing():
         if isinstance(data, Mapping):
-            arrived = {n: on_device(r, slot.device) for n, r in data.items()}
-            _fill_slots(cache, slot, arrived)
-            _narrow_ranges(cache, slot, node, arrived)
+            there = {n: on_device(r, slot.device) for n, r in data.items()}
+            _fill_slots(cache, slot, there)
+            _narrow_ranges(cache, slot, node, there)
         else:
             for chunk in data:
                 with chunk as arrived:

@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from ...base import check
-from . import lattice
+from ...ops.reference import noise as twin
 from .fractal import Octave, octaves_of
 
 _APART = 1e-6  # relative, by which a level's voxels may differ from an octave's cells
@@ -119,11 +119,11 @@ class SplineSum:
             if abs(side * one.frequency - 1) < 2 * _APART:
                 reach = torch.arange(values.shape[1], device=values.device)
                 x, y, z = (
-                    lattice.scramble((at[:, None] + reach).to(torch.int32), one.seed, axis)
-                    for axis, at in enumerate(low)
+                    twin.scramble((at[:, None] + reach).to(torch.int32), salt)
+                    for at, salt in zip(low, twin.salts(one.seed), strict=True)
                 )
-                bits = lattice.join(x[:, None], y[:, :, None])
-                bits = lattice.join(bits[:, None], z[:, :, None, None])
+                bits = twin.join(x[:, None], y[:, :, None])
+                bits = twin.join(bits[:, None], z[:, :, None, None])
                 values = values + bits.to(values.dtype) * (one.amplitude * 2.0**-31)
                 self.made += values.numel()
         return values
