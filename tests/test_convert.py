@@ -32,6 +32,8 @@ ELSEWHERE = {
     "HDF5",
     "MetaImage",
     "MRC",
+    "NanoVDB",
+    "OpenVDB",
     "VTK",
     "Zarr",
     "N5",
@@ -162,9 +164,11 @@ def test_values_that_are_not_finite(tmp_path):
 
 def test_nothing_is_overwritten(tmp_path, raw):
     convert(raw, tmp_path / "a.zarr")
-    for resume in (False, True):
-        with pytest.raises(FileExistsError, match="there is a store already"):
-            convert(raw, tmp_path / "a.zarr", resume=resume)
+    with pytest.raises(FileExistsError, match="there is a store already"):
+        convert(raw, tmp_path / "a.zarr")
+    before = {file: file.stat() for file in (tmp_path / "a.zarr").rglob("*")}
+    assert convert(raw, tmp_path / "a.zarr", resume=True).extent == (300, 20, 9)
+    assert before == {file: file.stat() for file in (tmp_path / "a.zarr").rglob("*")}
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     with pytest.raises(FileExistsError, match="exists and is no store"):

@@ -145,8 +145,9 @@ def test_intervals_of_fields_hold_in_random_boxes(name):
 
 def test_a_level_is_the_mean_of_the_one_below(name):
     """As far as filters tell what voxels hold of what is smaller than they are: of the variation of
-    a level a tenth, at the root a third.
+    a level a tenth, at the root a third. The Mandelbox is dust at every scale: a third everywhere.
     """
+    error = 0.3 if name == "mandelbox" else 0.03
     producer = PRODUCERS[name]()
     producer.prepare(Layout.of(producer, 8, 1, torch.device("cpu")))
     below = None
@@ -163,5 +164,5 @@ def test_a_level_is_the_mean_of_the_one_below(name):
             side = len(grid)
             mean = below[channel].view(side, 2, side, 2, side, 2, -1).mean((1, 3, 5))
             apart = (grid - mean).abs()
-            assert apart.mean() < (0.03 + 0.3 / count) * mean.std(), channel
+            assert apart.mean() < (error + 0.3 / count) * mean.std(), channel
         below = levels

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import runpy
+import tomllib
 
 import pytest
 from helpers import ROOT
@@ -35,3 +36,9 @@ def test_machine_code_is_compressed_as_drivers_read_it(build, tmp_path, monkeypa
     monkeypatch.setenv("GVTORCH_CUDA_ARCHS", "80;90")
     (call,) = build["commands"](tmp_path)[tmp_path / "libgvtorch_cuda.so"]
     assert sum(part.startswith("-gencode") for part in call) == 3
+
+
+def test_every_room_is_packed():
+    told = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    rooms = {path.parent.relative_to(ROOT) for path in (ROOT / "gvtorch").rglob("__init__.py")}
+    assert sorted(told) == sorted(".".join(room.parts) for room in rooms)
