@@ -75,7 +75,7 @@ GV_HD const Own& own_numbers(const Parameters<T>* parameters) {
 
 // Each octave of scattering gives so much of the light of the one before it, and keeps so much of its direction: fitted
 // to path traced clouds (benchmarks/cloud_light.py).
-constexpr double kOctaveLight = 0.55f, kOctaveDirection = 0.6f;
+constexpr double kOctaveLight = 0.55, kOctaveDirection = 0.6;
 
 // Blinn-Phong, on both sides of a surface; or the light that a medium scatters.
 template <class T>
