@@ -24,7 +24,7 @@ class Settings:
     """a grid of density: .vdb, .nvdb or any volume"""
     output: Path = Path("cloud.png")
     size: int = 720
-    voxels: int = 112
+    voxels: int = 288
     """along the longest side of the cloud of noise"""
     device: str = "cpu"
 
@@ -58,9 +58,9 @@ def main(settings: Settings) -> None:
     white = gv.TransferFunction(points, [(0.0, *albedo)], reference)
     look = gv.Lit(white, light=SUN, octaves=5, anisotropy=0.4, ambient=0.1, diffuse=1.0)
     size = {"width": settings.size * 16 // 9, "height": settings.size}
-    camera = gv.Camera.orbit(18, -6, 1.02, fov=38, **size)
-    picture = gv.render(tree, camera, look, background=SKY, step=3)
-    picture.tone_map("aces", exposure=0.8).save(settings.output)
+    camera = gv.Camera.orbit(18, -6, 1.15, fov=38, **size)
+    picture = gv.render(tree, camera, look, background=SKY, step=2)
+    picture.tone_map("aces", exposure=0.62).save(settings.output)
     print(f"{settings.output}: {picture.stats.milliseconds / 1000:.1f} s")
 
 
