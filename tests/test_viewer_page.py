@@ -259,7 +259,7 @@ def test_two_pages_and_one_that_follows(tab, chromium, viewer):  # noqa: F811
         tab.page.wait_for_timeout(300)
         eye = tab.app("app.camera.eye")
         other.until(lambda: np.allclose(other.app("app.camera.eye"), eye))
-        assert np.array_equal(other.final(), tab.final())
+        other.until(lambda: np.array_equal(other.final(), tab.final()))
         assert not other.complaints
     finally:
         other.close()
@@ -303,7 +303,8 @@ def test_a_view_that_ends_is_told(chromium):  # noqa: F811
         tab.final()
         viewer.close()
         tab.until("app.root.classList.contains('gv-lost')")
-        assert "The view was closed" in tab.page.locator(".gv-note").inner_text()
+        told = tab.page.locator(".gv-note").inner_text()  # a busy machine may not say goodbye
+        assert told.startswith(("The view was closed", "The view is gone"))
     finally:
         tab.close()
         viewer.close()
