@@ -124,6 +124,6 @@ from .pictures import (
 from . import opengl as opengl
 
 # Looking at a scene in the browser or a notebook.
-from .viewer import Viewer as Viewer, ViewState as ViewState, view as view
+from .viewer import Flight as Flight, Viewer as Viewer, ViewState as ViewState, view as view
 
 __version__: str

@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from tyro.conf import Positional, arg
 
 from ..base.declared import declared_names
 from ..io.ngff import is_zarr
-from .common import Bar, size, volume_formats
-from .look import first_orbit, parse_orbit, stance
+from .common import Bar, given, size, volume_formats
+from .look import first_orbit, parse_camera, parse_orbit, stance
 from .scene import Scene, SceneFlags
 
 if TYPE_CHECKING:
     from ..cameras.path import CameraPath
+    from ..pictures import Picture
+    from ..viewer.flight import Flight
+    from ..viewer.state import ViewState
 
 _FILMS = tuple(declared_names("pictures.video", "FILMS"))
+_OF_SHADER = ("tf", "window", "shader", "channel", "value")  # flags
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,15 +37,19 @@ class Fly:
     """a film, .mp4, or .gif or .webp, which loop; or a folder for 0000.png, 0001.png, ..."""
     flight: Annotated[str, arg(name="path", metavar="orbit|FILE.json")] = "orbit"
     """once around, or keys [{"eye": [x, y, z], "target": [x, y, z], "up": ..., "fov": ...}]"""
+    keys: Annotated[Path | None, arg(metavar="FILE.json")] = None
+    """key frames in place of --path: [{"time": seconds, "state": what gvtorch view saved}, ...],
+    between which camera, colours, clips and all other numbers run smoothly; a film that ends as it
+    begins loops"""
     turntable: Annotated[float | None, arg(metavar="SECONDS")] = None
     """an orbit that takes so long: instead of --frames"""
     frames: Annotated[int | None, arg(metavar="N")] = None
-    """number of pictures; 100 if left out, or one for each of --times"""
+    """number of pictures; if left out 100, one for each of --times, or as --keys tell"""
     times: Annotated[str | None, arg(metavar="all|A-B")] = None
     """a film over time: all time points, or those from A to B; the camera stands still where an
     orbit starts, unless --turntable or --path FILE.json move it"""
     fps: Annotated[int | None, arg(metavar="N")] = None
-    """pictures a second of a film or a turntable; 25 if left out"""
+    """pictures a second of a film, a turntable or keys; 25 if left out"""
     orbit: Annotated[str | None, arg(metavar="AZ,EL[,DIST]")] = None
     """where an orbit starts: degrees, and largest sides of the box; as of gvtorch render if left
     out, and all of the box in each picture"""
@@ -77,17 +86,14 @@ class Fly:
                 source = self.scene.source
                 source = source if moment is None else replace(source, time=moment)
                 with replace(self.scene, source=source).open(self.path, options, bar) as scene:
-                    path = self._path(scene, width, height)
+                    taken = self._taken(scene, options, width, height)
                     if numbers.start == 0 and film is not None:  # what is there can be read
                         stack.enter_context(film)
                     elif film is None:
                         self.output.mkdir(exist_ok=True)
                     for number in numbers:
                         bar("frames", number, frames)
-                        camera = path.camera(
-                            self._place(number, frames), width, height, look.camera_model
-                        )
-                        picture = scene.render(camera)
+                        picture = taken(self._place(number, frames))
                         told = picture.stats.as_dict()
                         coarse += not told.get("converged", True)
                         if lines is not None:
@@ -102,9 +108,45 @@ class Fly:
 
     def _place(self, number: int, frames: int) -> float:
         """Where on its path, 0 to 1, the camera of a picture is."""
-        if self.times is not None and self.turntable is None and self.flight == "orbit":
+        if self.keys is not None:
+            loops = self._flight().closed
+        elif self.times is not None and self.turntable is None and self.flight == "orbit":
             return 0.0
-        return number / max(1, frames - 1 + (self.flight == "orbit"))
+        else:
+            loops = self.flight == "orbit"
+        return number / max(1, frames - 1 + loops)
+
+    def _taken(
+        self, scene: Scene, options: dict[str, Any], width: int, height: int
+    ) -> Callable[[float], Picture]:
+        """What takes the picture at a place of the path, 0 to 1."""
+        look = self.scene.look
+        if self.keys is None:
+            path = self._path(scene, width, height)
+            return lambda at: scene.render(path.camera(at, width, height, look.camera_model))
+        from ..viewer.state import Eye
+
+        first = parse_camera(None, look, width, height, scene.space)
+        now = replace(scene.state(options), camera=Eye.of(first, scene.box))
+        flight = self._flight(now)
+
+        def picture(at: float) -> Picture:
+            state = flight.along(at)
+            assert state.camera is not None
+            return scene.picture(state, state.camera.camera(width, height, scene.box))
+
+        return picture
+
+    def _flight(self, now: ViewState | None = None) -> Flight:
+        """The keys; if no state is given that they begin with, to see that they are right."""
+        from ..shaders import TransferFunction
+        from ..viewer.flight import Flight
+        from ..viewer.state import Eye, ViewState
+
+        assert self.keys is not None
+        anywhere = Eye(eye=(0, 0, 1), target=(0, 0, 0))
+        any_state = ViewState(shader=TransferFunction([(0, 1)]), camera=anywhere)
+        return Flight.read(self.keys, any_state if now is None else now)
 
     def _parts(self, frames: int) -> list[tuple[int | None, range]]:
         """Time points, and the pictures that are taken of each; None: of whichever is read."""
@@ -141,6 +183,9 @@ class Fly:
         from ..base import check
 
         fps = check.whole("fly", "--fps", 25 if self.fps is None else self.fps, low=1, high=1000)
+        if self.keys is not None:
+            count = self._flight().count(fps) if self.frames is None else self.frames
+            return check.whole("fly", "--frames", count, low=1), fps
         if self.turntable is None:
             if self.fps is not None and self.output.suffix not in _FILMS:
                 raise ValueError("--fps is for a film or --turntable: pictures have no speed")
@@ -156,12 +201,32 @@ class Fly:
 
     def _check_path(self) -> None:
         """Raises what is wrong with the path before the volume is read."""
-        if self.flight != "orbit":
+        if self.keys is not None:
+            self._check_keys()
+        elif self.flight != "orbit":
             if self.orbit is not None:
                 raise ValueError("--orbit is for --path orbit, not for keys")
             self._keys()
         elif self.orbit is not None:
             parse_orbit("--orbit", self.orbit)
+
+    def _check_keys(self) -> None:
+        """Raises ValueError where a flag tells what the keys do."""
+        from ..base import check
+
+        assert self.keys is not None
+        path = self.flight if self.flight != "orbit" else None
+        paths = {"--path": path, "--orbit": self.orbit, "--turntable": self.turntable}
+        flags = [name for name, value in paths.items() if value]
+        first = check.json_file("key frames", self.keys)[0]["state"]
+        if isinstance(first, str):
+            first = check.json_file("state", self.keys.parent / first)
+        told = {"shader": _OF_SHADER, "camera": ("camera_model", "fov", "up")}
+        names = {name for part, those in told.items() if part in first for name in those}
+        names |= set(first.get("options", ()))
+        flags += [f for f in given(self.scene.look) if f[2:].replace("-", "_") in names]
+        if flags:
+            raise ValueError(f"--keys tells what {flags[0]} does: leave one out")
 
     def _keys(self) -> CameraPath:
         from ..cameras.path import CameraPath

@@ -71,13 +71,7 @@ class Render:
         """The scene as a saved state shows it, its camera, and this command with its flags."""
         if self.state is None:
             return scene, None, self
-        from ..tracing import RenderOptions
-        from ..viewer.state import ViewState
-
-        component = options["component"]
-        now = ViewState(
-            shader=scene.shader, options=RenderOptions(**options), component=component
-        ).read(self.state)
+        now = scene.state(options).read(self.state)
         own = {"shader": now.shader, **now.settings()}
         shown = replace(scene, render=partial(scene.render, **own), cost=partial(scene.cost, **own))
         return shown, now.camera, replace(self, show=now.show, develop=Develop(**vars(now.develop)))

@@ -21,10 +21,12 @@ from .streaming import Streaming, tell_failures
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from ..cameras import Camera
     from ..engine import Engine
     from ..pictures import Picture
     from ..shaders import Shader
     from ..tracing import Cost
+    from ..viewer.state import ViewState
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,20 @@ class Scene:
     space: str | None  # where x, y and z point
     values: tuple[float, float] | None  # the smallest and the largest, if known
     engine: Engine | None = None  # of a store
+
+    def state(self, options: dict[str, Any]) -> ViewState:
+        """What the flags say, as a state that has no camera."""
+        from ..tracing import RenderOptions
+        from ..viewer.state import ViewState
+
+        told = RenderOptions(**options)
+        return ViewState(shader=self.shader, options=told, component=told.component)
+
+    def picture(self, state: ViewState, camera: Camera) -> Picture:
+        """The picture of a state, or the cost that it shows, from a camera of its own."""
+        if state.show == "picture":
+            return state.taken(self.render, camera)
+        return self.cost(camera, shader=state.shader, **state.settings()).picture(state.show)
 
 
 @dataclass(frozen=True, kw_only=True)
