@@ -11,6 +11,7 @@ from .io.point_file import PointFile as PointFile, read_points as read_points
 from .io.point_source import splat as splat
 from .io.reading import read_volume as read_volume
 from .io.store import Store as Store
+from .io.surface import export_surface as export_surface, extract_surface as extract_surface
 from .io.window import window as window
 from .meshes.mesh import Material as Material, Mesh as Mesh
 from .points.points import Points as Points

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import errno
 import importlib
-import os
-import tempfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -21,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..base.whole_file import whole_file
 from .tone import finite, from_srgb, to_srgb
 
 if TYPE_CHECKING:
@@ -60,32 +59,6 @@ def write_image(path: Path, layers: Layers, *, transparent: bool, bits: int | No
             write_tiff(part, image.shape, image.dtype, [image], len(image))
         else:
             write_png(part, layers, transparent=transparent, bits=bits)
-
-
-@contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """A place to write to, which takes the file's name once the block ends well."""
-    try:
-        handle, name = tempfile.mkstemp(suffix=path.suffix, dir=path.parent)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(path)) from None
-    try:
-        try:
-            os.close(handle)
-            yield Path(name)
-        except OSError as error:  # what stands there already stays
-            if error.filename not in (None, name):
-                raise
-            text = error.strerror or str(error)
-            raise OSError(
-                error.errno or errno.EIO, f"can't be written: {text}", str(path)
-            ) from None
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(name, 0o666 & ~mask)
-        os.replace(name, path)
-    finally:
-        Path(name).unlink(missing_ok=True)
 
 
 @contextmanager

@@ -23,9 +23,10 @@ import torch
 from ..base import check
 from ..base.records import Rays, RenderStats
 from ..base.stage import Progress, no_progress
+from ..base.whole_file import whole_file
 from ..cameras.camera import Camera
 from ..cameras.custom import as_camera
-from .files import checked_path, stacked, tiff_pixels, whole_file, write_tiff
+from .files import checked_path, stacked, tiff_pixels, write_tiff
 from .picture import Picture
 
 _OF_CENTRES = ("depth", "nearest", "normal", "features", "label")  # the first frame's are kept

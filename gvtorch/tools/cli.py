@@ -1,5 +1,5 @@
-"""The command line: `gvtorch info`, `view`, `render`, `fly`, `slice`, `convert`, `voxelize`,
-`splat`, `filter` and `bench`.
+"""The command line: `gvtorch info`, `view`, `render`, `fly`, `slice`, `surface`, `convert`,
+`voxelize`, `splat`, `filter` and `bench`.
 
 torch is imported inside the commands, so that `--help` answers at once. A mistake of the user ends
 in one line on standard error and status 2.
@@ -30,6 +30,7 @@ from .fly import Fly
 from .render import Render
 from .slice import Slice
 from .splat import Splat
+from .surface import Surface
 from .view import View
 from .voxelize import Voxelize, cluster
 
@@ -254,7 +255,13 @@ def _sparkline(counts: list[int]) -> str:
 
 _COMMANDS: dict[str, Any] = {
     **{"info": Info, "view": View, "render": Render, "fly": Fly, "slice": Slice},
-    **{"convert": Convert, "voxelize": Voxelize, "splat": Splat, "filter": Filter},
+    **{
+        "surface": Surface,
+        "convert": Convert,
+        "voxelize": Voxelize,
+        "splat": Splat,
+        "filter": Filter,
+    },
     **{"bench": Bench},
 }
 
