@@ -114,8 +114,10 @@ from .engine import (
 # Pictures.
 from .pictures import (
     Backdrop as Backdrop,
+    ColorBar as ColorBar,
     Environment as Environment,
     Gradient as Gradient,
+    Overlay as Overlay,
     Picture as Picture,
     Progressive as Progressive,
     Video as Video,

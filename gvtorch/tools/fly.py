@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -15,10 +16,12 @@ from tyro.conf import Positional, arg
 from ..base.declared import declared_names
 from ..io.ngff import is_zarr
 from .common import Bar, given, size, volume_formats
+from .drawn import Drawn
 from .look import first_orbit, parse_camera, parse_orbit, stance
 from .scene import Scene, SceneFlags
 
 if TYPE_CHECKING:
+    from ..cameras import Camera
     from ..cameras.path import CameraPath
     from ..pictures import Picture
     from ..viewer.flight import Flight
@@ -56,6 +59,7 @@ class Fly:
     stats: Annotated[Path | None, arg(metavar="FILE.jsonl")] = None
     """what each picture cost, one JSON line a frame"""
     scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()
+    drawn: tyro.conf.OmitArgPrefixes[Drawn] = Drawn()
 
     def run(self) -> None:
         """Renders frame after frame."""
@@ -82,6 +86,7 @@ class Fly:
             if self.stats is not None:
                 lines = stack.enter_context(self.stats.open("w", encoding="utf-8"))
             coarse = 0
+            steps = math.inf if self._stands() else max(1, frames - 1 + self._loops())
             for moment, numbers in self._parts(frames):
                 source = self.scene.source
                 source = source if moment is None else replace(source, time=moment)
@@ -93,7 +98,7 @@ class Fly:
                         self.output.mkdir(exist_ok=True)
                     for number in numbers:
                         bar("frames", number, frames)
-                        picture = taken(self._place(number, frames))
+                        picture = taken(number / steps)
                         told = picture.stats.as_dict()
                         coarse += not told.get("converged", True)
                         if lines is not None:
@@ -106,34 +111,48 @@ class Fly:
         missing = f", {coarse} of them are not complete" if coarse else ""
         print(f"{self.output}: {frames} pictures{missing}")
 
-    def _place(self, number: int, frames: int) -> float:
-        """Where on its path, 0 to 1, the camera of a picture is."""
-        if self.keys is not None:
-            loops = self._flight().closed
-        elif self.times is not None and self.turntable is None and self.flight == "orbit":
-            return 0.0
-        else:
-            loops = self.flight == "orbit"
-        return number / max(1, frames - 1 + loops)
+    def _loops(self) -> bool:
+        """Whether the path ends where it begins, so that its last picture is left out."""
+        return self._flight().closed if self.keys is not None else self.flight == "orbit"
+
+    def _stands(self) -> bool:
+        """Whether the camera stands still: a film over time."""
+        moves = self.keys is not None or self.turntable is not None or self.flight != "orbit"
+        return self.times is not None and not moves
 
     def _taken(
         self, scene: Scene, options: dict[str, Any], width: int, height: int
     ) -> Callable[[float], Picture]:
         """What takes the picture at a place of the path, 0 to 1."""
-        look = self.scene.look
-        if self.keys is None:
-            path = self._path(scene, width, height)
-            return lambda at: scene.render(path.camera(at, width, height, look.camera_model))
         from ..viewer.state import Eye
 
+        look = self.scene.look
         first = parse_camera(None, look, width, height, scene.space)
         now = replace(scene.state(options), camera=Eye.of(first, scene.box))
-        flight = self._flight(now)
+        if self.keys is None:
+            path = self._path(scene, width, height)
+
+            def shot(at: float) -> tuple[ViewState, Camera, Picture]:
+                camera = path.camera(at, width, height, look.camera_model)
+                state = (
+                    replace(now, camera=Eye.of(camera, scene.box)) if self.drawn.given() else now
+                )
+                return state, camera, scene.render(camera)
+        else:
+            flight = self._flight(now)
+
+            def shot(at: float) -> tuple[ViewState, Camera, Picture]:
+                state = flight.along(at)
+                assert state.camera is not None
+                camera = state.camera.camera(width, height, scene.box)
+                return state, camera, scene.picture(state, camera)
 
         def picture(at: float) -> Picture:
-            state = flight.along(at)
+            state, camera, made = shot(at)
             assert state.camera is not None
-            return scene.picture(state, state.camera.camera(width, height, scene.box))
+            told = (state.shader, scene.info, state.component, camera, state.camera)
+            overlay = self.drawn.overlay(*told)
+            return made if overlay is None else overlay.over(made)
 
         return picture
 
