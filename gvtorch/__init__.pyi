@@ -66,7 +66,13 @@ from .producers import (
 
 # Cameras and rays.
 from .base.records import Hits as Hits, Rays as Rays
-from .cameras import Camera as Camera, CameraPath as CameraPath, CustomCamera as CustomCamera
+from .cameras import (
+    Camera as Camera,
+    CameraPath as CameraPath,
+    CustomCamera as CustomCamera,
+    read_cameras as read_cameras,
+    write_cameras as write_cameras,
+)
 
 # Shaders and lights.
 from .cpp_ext.user import CompileError as CompileError

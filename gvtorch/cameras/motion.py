@@ -21,6 +21,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from .rotations import quaternion_of
+
 _FASTEST = 2.0  # times the slower of the neighbouring intervals' speeds, at a key
 
 
@@ -123,20 +125,9 @@ def _flow(step: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _turn(rotation: Tensor) -> Tensor:
-    """Axis times angle (3,), 0 to pi, of a rotation; by its quaternion (Shepperd, 1978)."""
-    r = rotation
-    trace = float(r.trace())
-    squares = [1 + trace, *(1 + 2 * float(r[n, n]) - trace for n in range(3))]  # 4 w^2, 4 x^2, ...
-    largest = max(range(4), key=squares.__getitem__)
-    skew = [float(r[2, 1] - r[1, 2]), float(r[0, 2] - r[2, 0]), float(r[1, 0] - r[0, 1])]
-    if largest == 0:
-        q = [squares[0], *skew]
-    else:
-        i = largest - 1
-        q = [skew[i], *(float(r[i, n] + r[n, i]) for n in range(3))]
-        q[largest] = squares[largest]
-    sign = -1.0 if q[0] < 0 else 1.0
-    w, xyz = sign * q[0], sign * rotation.new_tensor(q[1:])
+    """Axis times angle (3,), 0 to pi, of a rotation."""
+    w, *rest = quaternion_of(rotation)
+    xyz = rotation.new_tensor(rest)
     length = float(xyz.norm())
     angle = 2 * math.atan2(length, w)
-    return xyz * (angle / length) if length > 0 else torch.zeros_like(xyz)
+    return xyz * (angle / length) if length > 0 else xyz

@@ -58,11 +58,14 @@ class Fly:
     out, and all of the box in each picture"""
     stats: Annotated[Path | None, arg(metavar="FILE.jsonl")] = None
     """what each picture cost, one JSON line a frame"""
+    cameras: Annotated[Path | None, arg(metavar="FOLDER|FILE.json")] = None
+    """writes where each picture was taken: a folder for COLMAP, or .json for Blender and NeRF"""
     scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()
     drawn: tyro.conf.OmitArgPrefixes[Drawn] = Drawn()
 
     def run(self) -> None:
         """Renders frame after frame."""
+        from ..cameras import write_cameras
         from ..pictures import Video
 
         look = self.scene.look
@@ -79,13 +82,14 @@ class Fly:
         if is_film and options["background"] is None:
             raise ValueError(f"--background transparent is for pictures, not {self.output.suffix}")
         self._check_path()
+        self._check_cameras()
         with ExitStack() as stack:
             bar = stack.enter_context(Bar())
             film = Video(self.output, width, height, fps=fps) if is_film else None
             lines = None
             if self.stats is not None:
                 lines = stack.enter_context(self.stats.open("w", encoding="utf-8"))
-            coarse = 0
+            coarse, cameras = 0, {}
             steps = math.inf if self._stands() else max(1, frames - 1 + self._loops())
             for moment, numbers in self._parts(frames):
                 source = self.scene.source
@@ -98,7 +102,7 @@ class Fly:
                         self.output.mkdir(exist_ok=True)
                     for number in numbers:
                         bar("frames", number, frames)
-                        picture = taken(number / steps)
+                        cameras[f"{number:04d}.png"], picture = taken(number / steps)
                         told = picture.stats.as_dict()
                         coarse += not told.get("converged", True)
                         if lines is not None:
@@ -108,6 +112,8 @@ class Fly:
                         else:
                             picture.save(self.output / f"{number:04d}.png")
             bar("frames", frames, frames)
+        if self.cameras is not None:
+            write_cameras(self.cameras, cameras)
         missing = f", {coarse} of them are not complete" if coarse else ""
         print(f"{self.output}: {frames} pictures{missing}")
 
@@ -122,7 +128,7 @@ class Fly:
 
     def _taken(
         self, scene: Scene, options: dict[str, Any], width: int, height: int
-    ) -> Callable[[float], Picture]:
+    ) -> Callable[[float], tuple[Camera, Picture]]:
         """What takes the picture at a place of the path, 0 to 1."""
         from ..viewer.state import Eye
 
@@ -147,12 +153,12 @@ class Fly:
                 camera = state.camera.camera(width, height, scene.box)
                 return state, camera, scene.picture(state, camera)
 
-        def picture(at: float) -> Picture:
+        def picture(at: float) -> tuple[Camera, Picture]:
             state, camera, made = shot(at)
             assert state.camera is not None
             told = (state.shader, scene.info, state.component, camera, state.camera)
             overlay = self.drawn.overlay(*told)
-            return made if overlay is None else overlay.over(made)
+            return camera, made if overlay is None else overlay.over(made)
 
         return picture
 
@@ -228,6 +234,22 @@ class Fly:
             self._keys()
         elif self.orbit is not None:
             parse_orbit("--orbit", self.orbit)
+
+    def _check_cameras(self) -> None:
+        """Raises what is wrong with the file of cameras before there are pictures."""
+        if self.cameras is None:
+            return
+        is_folder = not self.cameras.suffix and not self.cameras.is_file()
+        if not is_folder and self.cameras.suffix != ".json":
+            raise ValueError(f"--cameras must be a folder or end in .json, got {self.cameras}")
+        if not self.cameras.parent.is_dir():
+            raise FileNotFoundError(f"folder not found: {self.cameras.parent}")
+        models = [self.scene.look.camera_model]
+        if self.keys is not None:
+            models = [s.camera.model for _, s in self._flight().keys if s.camera is not None]
+        other = next((one for one in models if one not in ("pinhole", "fisheye")), None)
+        if other is not None:
+            raise ValueError(f"--cameras tells of pinhole and fisheye, not of {other}")
 
     def _check_keys(self) -> None:
         """Raises ValueError where a flag tells what the keys do."""

@@ -46,7 +46,8 @@ class Render:
     camera: Annotated[str | None, arg(metavar="CAMERA")] = None
     """orbit:AZIMUTH,ELEVATION (degrees; +x runs to the right at azimuth 0), from where the whole
     box is in the picture; orbit:AZIMUTH,ELEVATION,DISTANCE (largest sides of the box); or
-    look:ex,ey,ez,tx,ty,tz (world units); if left out orbit:30,20, of patients from the front"""
+    look:ex,ey,ez,tx,ty,tz (world units); file:PATH or file:PATH,NAME, of ParaView (.pvcc), Blender
+    or NeRF (.json) or COLMAP (a folder); if left out orbit:30,20, of patients from the front"""
     show: Literal["picture", "samples", "nodes", "lod", "age", "fill"] = "picture"
     """the picture, or what each ray cost: samples, nodes visited; or what it saw: depth of the
     nodes, age of the bricks in frames, share of their voxels that is not transparent"""
