@@ -203,7 +203,7 @@ def test_flights_tell_their_cameras_and_render_takes_them(small, tmp_path):
     flags = ("--size", "40x30", "--tf", "hot")
     for name in ("model", "t.json"):
         run = gvtorch("fly", small, "-o", tmp_path / "f", "--frames", "3", *flags,
-                      "--cameras", tmp_path / name)  # fmt: skip
+                      "--poses", tmp_path / name)  # fmt: skip
         assert run.returncode == 0, run.stderr
         place = f"file:{tmp_path / name},0001.png"
         run = gvtorch("render", small, "-o", tmp_path / "a.png", *flags, "--camera", place)
@@ -217,8 +217,8 @@ def test_flights_tell_their_cameras_and_render_takes_them(small, tmp_path):
         run = gvtorch("render", small, "-o", tmp_path / "b.png", "--camera", camera)
         assert run.returncode == 2 and message in run.stderr, run.stderr
     for more, message in (
-        (("--cameras", tmp_path / "a.txt"), "--cameras must be a folder or end in .json"),
-        (("--cameras", tmp_path / "m", "--camera-model", "ortho"), "not of ortho"),
+        (("--poses", tmp_path / "a.txt"), "--poses must be a folder or end in .json"),
+        (("--poses", tmp_path / "m", "--camera-model", "ortho"), "not of ortho"),
     ):
         run = gvtorch("fly", small, "-o", tmp_path / "g", "--frames", "1", *more)
         assert run.returncode == 2 and message in run.stderr and not (tmp_path / "g").exists()

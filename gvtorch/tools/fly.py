@@ -58,7 +58,7 @@ class Fly:
     out, and all of the box in each picture"""
     stats: Annotated[Path | None, arg(metavar="FILE.jsonl")] = None
     """what each picture cost, one JSON line a frame"""
-    cameras: Annotated[Path | None, arg(metavar="FOLDER|FILE.json")] = None
+    poses: Annotated[Path | None, arg(metavar="FOLDER|FILE.json")] = None
     """writes where each picture was taken: a folder for COLMAP, or .json for Blender and NeRF"""
     scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()
     drawn: tyro.conf.OmitArgPrefixes[Drawn] = Drawn()
@@ -82,7 +82,7 @@ class Fly:
         if is_film and options["background"] is None:
             raise ValueError(f"--background transparent is for pictures, not {self.output.suffix}")
         self._check_path()
-        self._check_cameras()
+        self._check_poses()
         with ExitStack() as stack:
             bar = stack.enter_context(Bar())
             film = Video(self.output, width, height, fps=fps) if is_film else None
@@ -112,8 +112,8 @@ class Fly:
                         else:
                             picture.save(self.output / f"{number:04d}.png")
             bar("frames", frames, frames)
-        if self.cameras is not None:
-            write_cameras(self.cameras, cameras)
+        if self.poses is not None:
+            write_cameras(self.poses, cameras)
         missing = f", {coarse} of them are not complete" if coarse else ""
         print(f"{self.output}: {frames} pictures{missing}")
 
@@ -235,21 +235,21 @@ class Fly:
         elif self.orbit is not None:
             parse_orbit("--orbit", self.orbit)
 
-    def _check_cameras(self) -> None:
+    def _check_poses(self) -> None:
         """Raises what is wrong with the file of cameras before there are pictures."""
-        if self.cameras is None:
+        if self.poses is None:
             return
-        is_folder = not self.cameras.suffix and not self.cameras.is_file()
-        if not is_folder and self.cameras.suffix != ".json":
-            raise ValueError(f"--cameras must be a folder or end in .json, got {self.cameras}")
-        if not self.cameras.parent.is_dir():
-            raise FileNotFoundError(f"folder not found: {self.cameras.parent}")
+        is_folder = not self.poses.suffix and not self.poses.is_file()
+        if not is_folder and self.poses.suffix != ".json":
+            raise ValueError(f"--poses must be a folder or end in .json, got {self.poses}")
+        if not self.poses.parent.is_dir():
+            raise FileNotFoundError(f"folder not found: {self.poses.parent}")
         models = [self.scene.look.camera_model]
         if self.keys is not None:
             models = [s.camera.model for _, s in self._flight().keys if s.camera is not None]
         other = next((one for one in models if one not in ("pinhole", "fisheye")), None)
         if other is not None:
-            raise ValueError(f"--cameras tells of pinhole and fisheye, not of {other}")
+            raise ValueError(f"--poses tells of pinhole and fisheye, not of {other}")
 
     def _check_keys(self) -> None:
         """Raises ValueError where a flag tells what the keys do."""
