@@ -109,6 +109,9 @@ from .tracing import (
     trace as trace,
 )
 
+# What takes how long.
+from .base.trace import Trace as Trace
+
 # Streaming a scene larger than memory.
 from .engine import (
     Engine as Engine,

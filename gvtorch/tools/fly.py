@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import IO, TYPE_CHECKING, Annotated, Any
 
 import tyro
 from tyro.conf import Positional, arg
@@ -23,7 +23,7 @@ from .scene import Scene, SceneFlags
 if TYPE_CHECKING:
     from ..cameras import Camera
     from ..cameras.path import CameraPath
-    from ..pictures import Picture
+    from ..pictures import Picture, Video
     from ..viewer.flight import Flight
     from ..viewer.state import ViewState
 
@@ -60,36 +60,34 @@ class Fly:
     """what each picture cost, one JSON line a frame"""
     poses: Annotated[Path | None, arg(metavar="FOLDER|FILE.json")] = None
     """writes where each picture was taken: a folder for COLMAP, or .json for Blender and NeRF"""
+    trace: Annotated[Path | None, arg(metavar="FILE.json")] = None
+    """when which stage of each frame ran, for ui.perfetto.dev"""
     scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()
     drawn: tyro.conf.OmitArgPrefixes[Drawn] = Drawn()
 
     def run(self) -> None:
         """Renders frame after frame."""
+        from ..base.stage import stage
+        from ..base.trace import Trace
         from ..cameras import write_cameras
         from ..pictures import Video
 
         look = self.scene.look
         width, height = size(look.size)
         frames, fps = self._length()
-        options, is_film = look.options(), self.output.suffix in _FILMS
-        if not self.output.parent.is_dir():
-            raise FileNotFoundError(f"folder not found: {self.output.parent}")
-        if self.output.suffix and not is_film:
-            kinds = ", ".join(_FILMS)
-            raise ValueError(
-                f"--output must be a folder or end in {kinds}, got {str(self.output)!r}"
-            )
-        if is_film and options["background"] is None:
-            raise ValueError(f"--background transparent is for pictures, not {self.output.suffix}")
+        options = look.options()
+        self._check_output(options)
         self._check_path()
         self._check_poses()
         with ExitStack() as stack:
+            if self.trace is not None:
+                stack.enter_context(Trace(self.trace, look.device()))
             bar = stack.enter_context(Bar())
+            is_film = self.output.suffix in _FILMS
             film = Video(self.output, width, height, fps=fps) if is_film else None
-            lines = None
+            kept = _Kept(self.output, film)
             if self.stats is not None:
-                lines = stack.enter_context(self.stats.open("w", encoding="utf-8"))
-            coarse, cameras = 0, {}
+                kept.lines = stack.enter_context(self.stats.open("w", encoding="utf-8"))
             steps = math.inf if self._stands() else max(1, frames - 1 + self._loops())
             for moment, numbers in self._parts(frames):
                 source = self.scene.source
@@ -102,20 +100,28 @@ class Fly:
                         self.output.mkdir(exist_ok=True)
                     for number in numbers:
                         bar("frames", number, frames)
-                        cameras[f"{number:04d}.png"], picture = taken(number / steps)
-                        told = picture.stats.as_dict()
-                        coarse += not told.get("converged", True)
-                        if lines is not None:
-                            lines.write(json.dumps({"picture": number, **told}) + "\n")
-                        if film is not None:
-                            film.add(picture)
-                        else:
-                            picture.save(self.output / f"{number:04d}.png")
+                        with stage("frame"):
+                            camera, picture = taken(number / steps)
+                        with stage("save"):
+                            kept.add(number, camera, picture)
             bar("frames", frames, frames)
         if self.poses is not None:
-            write_cameras(self.poses, cameras)
-        missing = f", {coarse} of them are not complete" if coarse else ""
+            write_cameras(self.poses, kept.cameras)
+        missing = f", {kept.coarse} of them are not complete" if kept.coarse else ""
         print(f"{self.output}: {frames} pictures{missing}")
+
+    def _check_output(self, options: dict[str, Any]) -> None:
+        """Raises what is wrong with the film or folder before the volume is read."""
+        is_film = self.output.suffix in _FILMS
+        if not self.output.parent.is_dir():
+            raise FileNotFoundError(f"folder not found: {self.output.parent}")
+        if self.output.suffix and not is_film:
+            kinds = ", ".join(_FILMS)
+            raise ValueError(
+                f"--output must be a folder or end in {kinds}, got {str(self.output)!r}"
+            )
+        if is_film and options["background"] is None:
+            raise ValueError(f"--background transparent is for pictures, not {self.output.suffix}")
 
     def _loops(self) -> bool:
         """Whether the path ends where it begins, so that its last picture is left out."""
@@ -291,3 +297,25 @@ class Fly:
             up=look.upward() or stance(scene.space)[0],
             fit=(width, height) if distance is None else None,
         )
+
+
+class _Kept:
+    """What there is of a flight's pictures: in a film or a folder, and figures in a file."""
+
+    def __init__(self, output: Path, film: Video | None) -> None:
+        self._output, self._film = output, film
+        self.lines: IO[str] | None = None
+        self.coarse = 0
+        self.cameras: dict[str, Camera] = {}
+
+    def add(self, number: int, camera: Camera, picture: Picture) -> None:
+        """Keeps a picture."""
+        name, told = f"{number:04d}.png", picture.stats.as_dict()
+        self.cameras[name] = camera
+        self.coarse += not told.get("converged", True)
+        if self.lines is not None:
+            self.lines.write(json.dumps({"picture": number, **told}) + "\n")
+        if self._film is not None:
+            self._film.add(picture)
+        else:
+            picture.save(self._output / name)
