@@ -194,25 +194,36 @@ def render_tiles(
             progress("rows", end, height)
 
     with whole_file(path) as part:
-        strips = pictures()
-        first = next(strips)
-        everything = itertools.chain((first,), strips)
-        if path.suffix == ".npy":
-            header = {"descr": "<f4", "fortran_order": False, "shape": (height, width, 6)}
-            with part.open("wb") as file:
-                np.lib.format.write_array_header_1_0(file, header)
-                for picture in everything:
-                    file.write(stacked(picture.layers()).astype("<f4").tobytes())
-        else:
-            pixels = (_pixels(picture, bits) for picture in everything)
-            kind = {8: np.uint8, 16: np.uint16, 32: np.float32}[bits]
-            shape = (height, width, 4 if first.transparent else 3)
-            if path.suffix == ".png":
-                write_png_rows(part, shape, bits, pixels)
-            else:
-                write_tiff(part, shape, np.dtype(kind), pixels, rows)
+        _write(part, path.suffix, pictures(), bits, (height, width), rows)
     assert stats is not None
     return stats
+
+
+def _write(
+    part: Path,
+    suffix: str,
+    strips: Iterator[Picture],
+    bits: int,
+    size: tuple[int, int],
+    rows: int,
+) -> None:
+    """Writes strips of so many rows, the last of what is left, as they come."""
+    first = next(strips)
+    everything = itertools.chain((first,), strips)
+    if suffix == ".npy":
+        header = {"descr": "<f4", "fortran_order": False, "shape": (*size, 6)}
+        with part.open("wb") as file:
+            np.lib.format.write_array_header_1_0(file, header)
+            for picture in everything:
+                file.write(stacked(picture.layers()).astype("<f4").tobytes())
+        return
+    pixels = (_pixels(picture, bits) for picture in everything)
+    shape = (*size, 4 if first.transparent else 3)
+    if suffix == ".png":
+        write_png_rows(part, shape, bits, pixels)
+    else:
+        kind = {8: np.uint8, 16: np.uint16, 32: np.float32}[bits]
+        write_tiff(part, shape, np.dtype(kind), pixels, rows)
 
 
 def strip_rows(limit: int, width: int, height: int) -> int:
