@@ -222,3 +222,26 @@ def test_flights_tell_their_cameras_and_render_takes_them(small, tmp_path):
     ):
         run = gvtorch("fly", small, "-o", tmp_path / "g", "--frames", "1", *more)
         assert run.returncode == 2 and message in run.stderr and not (tmp_path / "g").exists()
+
+
+@pytest.mark.parametrize("name", ["c.pvcc", "t.json", "model/cameras.txt", "model/images.txt"])
+def test_damaged_bytes_give_cameras_or_one_line(tmp_path, name):
+    gv.write_cameras(tmp_path / "c.pvcc", gv.Camera.look_at(EYE, TARGET, UP, 40, 64, 48))
+    for several in ("t.json", "model"):
+        gv.write_cameras(tmp_path / several, {"a.png": askew(), "b.png": askew("fisheye")})
+    file = tmp_path / name
+    whole, rng, refused = file.read_bytes(), np.random.default_rng(3), 0
+    letters = np.frombuffer(b'0123456789-+.eE"{}[]<>/: ,\n\xff', np.uint8)
+    for number in range(300):
+        damaged = np.frombuffer(whole, np.uint8).copy()
+        at = rng.integers(0, len(damaged), 1 + number % 4)
+        damaged[at] = rng.choice(letters, len(at))
+        cut = rng.integers(0, len(damaged)) if number % 3 == 0 else len(damaged)
+        file.write_bytes(damaged[:cut].tobytes())
+        path = tmp_path / "model" if name.startswith("model") else file
+        try:
+            assert gv.read_cameras(path, width=64, height=48)
+        except ValueError as error:
+            assert str(error).startswith(str(path)) and "\n" not in str(error), error
+            refused += 1
+    assert 20 < refused

@@ -311,9 +311,9 @@ def _read_colmap(path: Path, width: int | None, height: int | None) -> dict[str,
     cameras = {}
     for line in _lines(path / "images.txt", every=2):
         _, *numbers, lens, name = line.split(maxsplit=9)
-        quaternion, move = [float(n) for n in numbers[:4]], [float(n) for n in numbers[4:]]
+        pose = check.reals(f"image {name}", "pose", [float(n) for n in numbers], (7,))
         view = torch.eye(4, dtype=torch.float64)
-        view[:3, :3], view[:3, 3] = rotation_of(quaternion), torch.tensor(move, dtype=torch.float64)
+        view[:3, :3], view[:3, 3] = rotation_of(pose[:4].tolist()), pose[4:]
         model, told, size = lenses[lens]
         fx, fy = told.get("fx", told.get("f")), told.get("fy", told.get("f"))
         cameras[name] = _made(model, view, (fx, fy, told["cx"], told["cy"]), told, size)
