@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -280,6 +282,27 @@ def test_the_command(scan_store, tmp_path):
         run = gvtorch("surface", data, *flags)
         assert run.returncode == 2 and message in run.stderr, run.stderr
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.ply", "b.glb"]
+
+
+MEASURE = """
+import resource, numpy as np
+import gvtorch as gv
+z, y, x = (0.4 * np.ogrid[:160, :160, :160][n].astype(np.float32) for n in range(3))
+wave = np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
+volume = gv.Volume(wave)
+gv.export_surface(gv.Volume(wave[:70, :70, :70]), 0.1, "warm.ply")
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+size = gv.export_surface(volume, 0.1, "a.ply")
+print(size.triangles, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
+"""
+
+
+def test_memory_is_that_of_blocks_not_of_the_surface(tmp_path):
+    command = [sys.executable, "-c", MEASURE]
+    run = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
+    triangles, megabytes = map(float, run.stdout.split())
+    written = (tmp_path / "a.ply").stat().st_size / 2**20
+    assert triangles > 1.5e6 and written > 25 and megabytes < 0.5 * written, run.stdout
 
 
 def test_bfloat16_and_half_are_read():
