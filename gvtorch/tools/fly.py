@@ -50,7 +50,7 @@ class Fly:
     """number of pictures; if left out 100, one for each of --times, or as --keys tell"""
     times: Annotated[str | None, arg(metavar="all|A-B")] = None
     """a film over time: all time points, or those from A to B; the camera stands still where an
-    orbit starts, unless --turntable or --path FILE.json move it"""
+    orbit starts, unless --turntable, --path FILE.json or --keys move it"""
     fps: Annotated[int | None, arg(metavar="N")] = None
     """pictures a second of a film, a turntable or keys; 25 if left out"""
     orbit: Annotated[str | None, arg(metavar="AZ,EL[,DIST]")] = None
