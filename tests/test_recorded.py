@@ -13,6 +13,7 @@ import pytest
 import torch
 from helpers import DEVICES
 from helpers.recorded import Frames
+from helpers.waits import nobody_waits
 
 import gvtorch as gv
 from gvtorch.io.conversion import convert
@@ -286,13 +287,9 @@ def flown(
 ) -> tuple[Any, gv.Picture, gv.FrameStats]:
     """Replays a flight without a wait of the host, then its last view until it is whole."""
     graph = engine.capture(path[0], LOOK, batch=batch)
-    torch.cuda.synchronize()
-    torch.cuda.set_sync_debug_mode("error")
-    try:
+    with nobody_waits():
         for camera in path:
             picture, stats = graph.replay(camera)
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
     for _ in range(300):
         picture, stats = graph.replay(path[-1])
         time.sleep(0.002)
