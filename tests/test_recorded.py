@@ -4,6 +4,7 @@ CUDA as one graph, which the host never waits for.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from concurrent.futures import Future
@@ -16,6 +17,7 @@ from helpers.recorded import Frames
 from helpers.waits import nobody_waits
 
 import gvtorch as gv
+from gvtorch.engine import host_frame
 from gvtorch.io.conversion import convert
 
 COMPILED = [pytest.param(b, marks=pytest.mark.backend(b)) for b in ("cpp", "cuda")]
@@ -151,6 +153,42 @@ def test_what_was_asked_before_a_frame_of_the_host_is_dropped_however_late(blobs
         for _ in range(3):
             frames.frame()
             engine.validate()
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+@pytest.mark.parametrize("slow", [False, True])
+def test_a_busy_producer_is_asked_for_several_frames_at_once(blobs, backend, slow, monkeypatch):
+    class Later(gv.VolumeProducer):
+        late: list[tuple[Future, Any]] | None = None
+
+        def fill(self, nodes):
+            if self.late is None:
+                return super().fill(nodes)
+            self.late.append((Future(), super().fill(nodes)))
+            return self.late[-1][0]
+
+    monkeypatch.setattr(host_frame, "_SOON", 0.0 if slow else math.inf)
+    with gv.Engine(Later(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        engine.render(view(24), LOOK)
+        late = engine.trees["scene"].producer.late = []
+        frames, listed = Frames(engine, view(24), LOOK, 3), 0
+        for angle in (90, 180, 270):
+            frames.look_from(view(24, angle))
+            for _ in range(6):
+                listed += frames.frame()[1].requests["load"] > 0
+                frames.served._asker.submit(int).result()  # what it was told of is asked for
+        assert listed > 3
+        if slow:  # it is not waited for
+            assert len(late) > 3
+        else:
+            assert len(late) == 1
+            late[0][0].set_result(late[0][1])
+            frames.served._asker.submit(int).result()
+            assert len(late) == 2
+            assert len(late[1][1].data["value"]) > 2 * 3, "of more than two frames"
+        for _ in range(3):
+            frames.frame()
+        engine.validate()
 
 
 @pytest.mark.parametrize("backend", COMPILED)
