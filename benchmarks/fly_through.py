@@ -105,7 +105,9 @@ def write_volume(file: Path, side: int) -> None:
 
 def mandelbulb(side: int) -> gv.Producer:
     """The bulb of power 8, its colours by orbit traps."""
-    return gv.FieldProducer(gv.Solid(gv.Mandelbulb(8, iterations=6), normals=False), side)
+    colors = {"rgba": gv.Channel(torch.uint8, 4)}
+    solid = gv.Solid(gv.Mandelbulb(8, iterations=6), normals=False)
+    return gv.FieldProducer(solid, side, channels=colors)
 
 
 def flight(middle: float, half: float) -> CameraPath:
