@@ -11,6 +11,7 @@ from .io.point_file import PointFile as PointFile, read_points as read_points
 from .io.point_source import splat as splat
 from .io.reading import read_volume as read_volume
 from .io.store import Store as Store
+from .io.surface import export_surface as export_surface, extract_surface as extract_surface
 from .io.window import window as window
 from .meshes.mesh import Material as Material, Mesh as Mesh
 from .points.points import Points as Points
@@ -65,7 +66,13 @@ from .producers import (
 
 # Cameras and rays.
 from .base.records import Hits as Hits, Rays as Rays
-from .cameras import Camera as Camera, CameraPath as CameraPath, CustomCamera as CustomCamera
+from .cameras import (
+    Camera as Camera,
+    CameraPath as CameraPath,
+    CustomCamera as CustomCamera,
+    read_cameras as read_cameras,
+    write_cameras as write_cameras,
+)
 
 # Shaders and lights.
 from .cpp_ext.user import CompileError as CompileError
@@ -102,6 +109,9 @@ from .tracing import (
     trace as trace,
 )
 
+# What takes how long.
+from .base.trace import Trace as Trace
+
 # Streaming a scene larger than memory.
 from .engine import (
     Engine as Engine,
@@ -113,8 +123,10 @@ from .engine import (
 # Pictures.
 from .pictures import (
     Backdrop as Backdrop,
+    ColorBar as ColorBar,
     Environment as Environment,
     Gradient as Gradient,
+    Overlay as Overlay,
     Picture as Picture,
     Progressive as Progressive,
     Video as Video,
@@ -124,6 +136,6 @@ from .pictures import (
 from . import opengl as opengl
 
 # Looking at a scene in the browser or a notebook.
-from .viewer import Viewer as Viewer, ViewState as ViewState, view as view
+from .viewer import Flight as Flight, Viewer as Viewer, ViewState as ViewState, view as view
 
 __version__: str

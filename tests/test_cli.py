@@ -194,7 +194,7 @@ TF = '{"opacity": [[5, 0], [1, 1]]}'
         (lambda t, s: [s, "--camera", "look:0,0,1,0,0"], "--camera look must be 6 numbers"),
         (
             lambda t, s: [s, "--camera", "fish:1"],
-            "--camera must be orbit:AZ,EL, orbit:AZ,EL,DIST or look:",
+            "--camera must be orbit:AZ,EL, orbit:AZ,EL,DIST, look:ex,ey,ez,tx,ty,tz or file:PATH",
         ),
         (lambda t, s: [s, "--fov", "nan"], "fov must be finite"),
         (lambda t, s: [s, "--size", "0x5"], "--size must be WIDTHxHEIGHT"),

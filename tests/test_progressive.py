@@ -190,7 +190,14 @@ def test_strips_make_the_whole_picture(blobs, tmp_path, model, background):
         strips, image = (gv.read_image(tmp_path / f"{name}.tif") for name in "ab")
         assert strips.shape == (50, 40, 4 if behind is None else 3)
         torch.testing.assert_close(strips, image, atol=2 / 2 ** min(bits, 16), rtol=1e-5)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npy", "a.tif", "b.tif"]
+    for bits in (8, 16):
+        gv.render_tiles(render, camera, tmp_path / "a.png", bits=bits, memory=limit)
+        whole.save(tmp_path / "b.png", bits=bits)
+        strips, image = (gv.read_image(tmp_path / f"{name}.png") for name in "ab")
+        assert strips.shape == image.shape
+        torch.testing.assert_close(strips, image, atol=2 / 2**bits, rtol=1e-5)
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["a.npy", "a.png", "a.tif", "b.png", "b.tif"]
 
 
 @pytest.mark.backend("cpp")
@@ -248,7 +255,7 @@ print(peak() - before)
 
 
 @pytest.mark.backend("cpp")
-@pytest.mark.parametrize("name", ["a.tif", "a.npy"])
+@pytest.mark.parametrize("name", ["a.png", "a.tif", "a.npy"])
 def test_memory_is_bounded_whatever_the_size(tmp_path, name):
     """Of 2048^2 pixels the layers alone, once, take 100 MB."""
     command = [sys.executable, "-c", MEASURE, "2048", name]
@@ -279,7 +286,10 @@ def test_what_breaks_off_leaves_no_file(blobs, tmp_path):
         (lambda t, c: gv.Progressive(print).refine(c, 0), "samples must be an int >= 1, got 0"),
         (lambda t, c: gv.Progressive(print).frame(3), "camera must be a Camera, got int"),
         (lambda t, c: gv.render_tiles(3, c, t / "a.tif"), "render must be callable, got int"),
-        (lambda t, c: gv.render_tiles(print, c, t / "a.png"), "must end in .tif or .npy, got"),
+        (
+            lambda t, c: gv.render_tiles(print, c, t / "a.exr"),
+            "must end in .png, .tif or .npy, got",
+        ),
         (lambda t, c: gv.render_tiles(print, c, t / "b" / "a.tif"), "folder not found"),
         (lambda t, c: gv.render_tiles(print, c, t / "a.tif", bits=9), "8 or 16 or 32 bits, got 9"),
         (lambda t, c: gv.render_tiles(print, c, t / "a.tif", memory="x"), "memory must be bytes"),

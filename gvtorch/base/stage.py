@@ -1,4 +1,5 @@
-"""Names for the steps of a frame: `with stage("trace"):` feeds timer and profiler.
+"""Names for the steps of a frame: `with stage("trace"):` feeds timer, profiler, an open `Trace`
+(base/trace.py), and under NVIDIA's tools the NVTX ranges that these show.
 
 Times are differences of marks. On CUDA a mark is an event in the stream: taking one does not make
 the host wait, reading the time between two does.
@@ -6,11 +7,13 @@ the host wait, reading the time between two does.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import torch
 
@@ -55,26 +58,58 @@ class Timings:
         return total
 
 
+class Recorder(Protocol):
+    """What is told of all stages of all threads."""
+
+    def begin(self) -> Any:
+        """Notes that one begins; what it returns comes back at the end."""
+
+    def end(self, name: str, began: Any) -> None:
+        """Notes that it ends."""
+
+
 _NOTHING = nullcontext()
 _timings: ContextVar[Timings | None] = ContextVar("gvtorch_timings", default=None)
+_recorders: list[Recorder] = []
+#: Nsight Systems and Compute name their library in the first; the second asks for ranges by hand.
+_RANGES = torch.version.cuda is not None and bool(
+    {"NVTX_INJECTION64_PATH", "GVTORCH_NVTX"} & set(os.environ)
+)
 
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Names the step that the block does, for the open `collect_timings()` and torch's profiler;
-    costs nothing where neither is on.
+    """Names the step that the block does, for the open `collect_timings()`, torch's profiler and
+    whoever else listens; costs next to nothing where nobody does.
     """
-    timings = _timings.get()
+    timings, recorders = _timings.get(), tuple(_recorders)
     profiled = torch.autograd._profiler_enabled()
-    with torch.profiler.record_function(f"gvtorch.{name}") if profiled else _NOTHING:
-        if timings is None:
+    with (
+        torch.profiler.record_function(f"gvtorch.{name}") if profiled else _NOTHING,
+        torch.cuda.nvtx.range(f"gvtorch.{name}") if _RANGES else _NOTHING,
+    ):
+        if timings is None and not recorders:
             yield
             return
-        start = mark(timings.device)
+        began = [(one, one.begin()) for one in recorders]
+        start = None if timings is None else mark(timings.device)
         try:
             yield
         finally:
-            timings.spans.append((name, start, mark(timings.device)))
+            if timings is not None and start is not None:
+                timings.spans.append((name, start, mark(timings.device)))
+            for one, what in began:
+                one.end(name, what)
+
+
+@contextmanager
+def record_stages(recorder: Recorder) -> Iterator[None]:
+    """Tells a recorder of all stages, of all threads, while the block runs."""
+    _recorders.append(recorder)
+    try:
+        yield
+    finally:
+        _recorders.remove(recorder)
 
 
 @contextmanager

@@ -50,6 +50,15 @@ def time_unit(text: str | None) -> str | None:
     return _find(_TIME, text)[0]
 
 
+def unit_symbol(text: str | None) -> str:
+    """Returns how pictures write a unit of length, as in "\u00b5m"; what is unknown as it is."""
+    name = length_unit(text)
+    if name is None:
+        return text or ""
+    symbols = {"micrometer": "\u00b5m", "angstrom": "\u00c5"}
+    return symbols.get(name) or next(words.split()[0] for n, _, words in _LENGTHS if n == name)
+
+
 def spacing_of(
     sizes: Sequence[float | None], units: Sequence[str | None]
 ) -> tuple[tuple[float, float, float], str | None]:

@@ -355,6 +355,19 @@ class Camera:
             Ks[:, (0, 1), (0, 1)] /= scale
         return self._changed(viewmats=view, Ks=Ks, frame=Frame.WORLD, fitted=None)
 
+    def pixel_width(self, distance: float) -> float:
+        """Returns the world units that a pixel is wide: of a pinhole at a distance along its axis,
+        of an orthographic camera anywhere.
+
+        Raises:
+            ValueError: It is a fisheye or a panorama, a batch, or relative to a box.
+        """
+        where = "Camera.pixel_width"
+        if self.model not in ("pinhole", "ortho") or len(self) != 1 or self.frame is Frame.BOX:
+            raise ValueError(f"{where}: takes one pinhole or ortho camera in the world, got {self}")
+        distance = check.number(where, "distance", distance, low=0, open_low=True)
+        return (1.0 if self.model == "ortho" else distance) / float(self.Ks[0, 0, 0])
+
     def shifted(self, dx: float, dy: float, sample: int | None = None) -> Camera:
         """Returns the camera whose rays go through (dx, dy) pixels right of and below the centres
         of the pixels, as another `sample` of these if given.

@@ -2,14 +2,17 @@
 
 from .background import Backdrop, Environment, Gradient
 from .files import read_image
+from .overlay import ColorBar, Overlay
 from .picture import Picture
 from .progressive import Progressive, render_tiles
 from .video import Video
 
 __all__ = [
     "Backdrop",
+    "ColorBar",
     "Environment",
     "Gradient",
+    "Overlay",
     "Picture",
     "Progressive",
     "Video",

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import errno
 import importlib
-import os
-import tempfile
+import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -21,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..base.whole_file import whole_file
 from .tone import finite, from_srgb, to_srgb
 
 if TYPE_CHECKING:
@@ -60,32 +60,6 @@ def write_image(path: Path, layers: Layers, *, transparent: bool, bits: int | No
             write_tiff(part, image.shape, image.dtype, [image], len(image))
         else:
             write_png(part, layers, transparent=transparent, bits=bits)
-
-
-@contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """A place to write to, which takes the file's name once the block ends well."""
-    try:
-        handle, name = tempfile.mkstemp(suffix=path.suffix, dir=path.parent)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(path)) from None
-    try:
-        try:
-            os.close(handle)
-            yield Path(name)
-        except OSError as error:  # what stands there already stays
-            if error.filename not in (None, name):
-                raise
-            text = error.strerror or str(error)
-            raise OSError(
-                error.errno or errno.EIO, f"can't be written: {text}", str(path)
-            ) from None
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(name, 0o666 & ~mask)
-        os.replace(name, path)
-    finally:
-        Path(name).unlink(missing_ok=True)
 
 
 @contextmanager
@@ -146,6 +120,40 @@ def write_png(path: Path, layers: Layers, *, transparent: bool, bits: int = 8) -
     write = write_image_png_u8 if bits == 8 else write_image_png_u16
     with _told():
         write(str(path), image, "rgba" if transparent else "rgb")
+
+
+def write_png_rows(
+    path: Path, shape: tuple[int, ...], bits: int, strips: Iterable[np.ndarray]
+) -> None:
+    """Writes a PNG (h, w, c), c 3, or 4 with alpha, as its strips (rows, w, c) of uint8 or uint16
+    come; each row as it is, or less what stands to its left or above, whichever is smallest.
+    """
+    height, width, count = shape
+    apart = count * bits // 8  # bytes from pixel to pixel
+    packed = zlib.compressobj(6)
+    above = np.zeros((1, width * apart), np.uint8)
+    with path.open("wb") as file:
+
+        def chunk(kind: bytes, content: bytes) -> None:
+            check = zlib.crc32(kind + content)
+            file.write(struct.pack(">I", len(content)) + kind + content + struct.pack(">I", check))
+
+        file.write(b"\x89PNG\r\n\x1a\n")
+        kind = {3: 2, 4: 6}[count]
+        chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, kind, 0, 0, 0))
+        for strip in strips:
+            rows = strip.astype(f">u{bits // 8}").reshape(len(strip), -1).view(np.uint8)
+            left = rows.copy()
+            left[:, apart:] -= rows[:, :-apart]
+            ways = np.stack((rows, left, rows - np.concatenate((above, rows[:-1]))))
+            above = rows[-1:]
+            best = np.abs(ways.view(np.int8).astype(np.int16)).sum(2, dtype=np.int64).argmin(0)
+            lines = np.empty((len(rows), 1 + rows.shape[1]), np.uint8)
+            lines[:, 0], lines[:, 1:] = best, ways[best, np.arange(len(rows))]
+            if part := packed.compress(lines.tobytes()):
+                chunk(b"IDAT", part)
+        chunk(b"IDAT", packed.flush())
+        chunk(b"IEND", b"")
 
 
 def write_tiff(

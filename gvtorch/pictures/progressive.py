@@ -23,13 +23,16 @@ import torch
 from ..base import check
 from ..base.records import Rays, RenderStats
 from ..base.stage import Progress, no_progress
+from ..base.whole_file import whole_file
 from ..cameras.camera import Camera
 from ..cameras.custom import as_camera
-from .files import checked_path, stacked, tiff_pixels, whole_file, write_tiff
+from .files import checked_path, stacked, tiff_pixels, write_png_rows, write_tiff
+from .overlay import Overlay
 from .picture import Picture
 
 _OF_CENTRES = ("depth", "nearest", "normal", "features", "label")  # the first frame's are kept
 _PLASTIC = 1.32471795724474602596  # the real root of x^3 = x + 1
+STRIP = "256 MB"  # of a strip, if nothing else is asked for
 _PIXEL_BYTES = 400  # of a strip on its way: rays (80), hits twice, layers and their encoding
 _TILE = 4  # rows of the tiles in which rays are traced
 
@@ -142,11 +145,13 @@ def render_tiles(
     path: str | Path,
     *,
     bits: int | None = None,
-    memory: int | str = "256 MB",
+    memory: int | str = STRIP,
+    overlay: Overlay | None = None,
     progress: Progress = no_progress,
 ) -> RenderStats:
     """Renders a picture of any size and writes it as it comes.
 
+    - .png: sRGB of 8 or 16 bits.
     - .tif: BigTIFF, Deflate; sRGB of 8 or 16 bits, or linear float of 32.
     - .npy: (h, w, 6) float32: linear color, alpha, depth, samples.
 
@@ -156,7 +161,8 @@ def render_tiles(
             such as `tone_map`, must treat pixels one by one.
         camera: One camera; an orbit camera must be placed by what renders.
         path: The file; it appears when it is complete.
-        bits: Of a number; 8 for .tif if left out.
+        bits: Of a number; 8 for .png and .tif if left out.
+        overlay: What is drawn over the picture.
         memory: Most bytes that a strip, of at least one row, takes beside scene and libraries.
         progress: Told how many rows are done.
 
@@ -164,7 +170,8 @@ def render_tiles(
         Statistics of the last strip, with milliseconds, rays and samples of all.
 
     Raises:
-        ValueError: The path ends in neither, the camera is a batch, or an argument is out of range.
+        ValueError: The path ends in none of these, the camera is a batch, or an argument is out of
+            range.
         FileNotFoundError: The folder does not exist.
         ImportError: .tif without tifffile.
     """
@@ -172,7 +179,7 @@ def render_tiles(
     path, camera = Path(path), as_camera("render_tiles", camera)
     if len(camera) != 1:
         raise ValueError(f"render_tiles: camera must be one, got a batch of {len(camera)}")
-    bits = checked_path("render_tiles", path, bits, (".tif", ".npy"))
+    bits = checked_path("render_tiles", path, bits, (".png", ".tif", ".npy"))
     height, width = camera.height, camera.width
     rows = strip_rows(check.nbytes("render_tiles", "memory", memory), width, height)
     stats: RenderStats | None = None
@@ -183,26 +190,40 @@ def render_tiles(
             end = min(top + rows, height)
             picture = picture_of(camera.strip(top, end))
             stats = picture.stats if stats is None else picture.stats.after(stats)
-            yield picture
+            yield picture if overlay is None else overlay.over(picture, top)
             progress("rows", end, height)
 
     with whole_file(path) as part:
-        strips = pictures()
-        first = next(strips)
-        everything = itertools.chain((first,), strips)
-        if path.suffix == ".npy":
-            header = {"descr": "<f4", "fortran_order": False, "shape": (height, width, 6)}
-            with part.open("wb") as file:
-                np.lib.format.write_array_header_1_0(file, header)
-                for picture in everything:
-                    file.write(stacked(picture.layers()).astype("<f4").tobytes())
-        else:
-            pixels = (_pixels(picture, bits) for picture in everything)
-            kind = {8: np.uint8, 16: np.uint16, 32: np.float32}[bits]
-            shape = (height, width, 4 if first.transparent else 3)
-            write_tiff(part, shape, np.dtype(kind), pixels, rows)
+        _write(part, path.suffix, pictures(), bits, (height, width), rows)
     assert stats is not None
     return stats
+
+
+def _write(
+    part: Path,
+    suffix: str,
+    strips: Iterator[Picture],
+    bits: int,
+    size: tuple[int, int],
+    rows: int,
+) -> None:
+    """Writes strips of so many rows, the last of what is left, as they come."""
+    first = next(strips)
+    everything = itertools.chain((first,), strips)
+    if suffix == ".npy":
+        header = {"descr": "<f4", "fortran_order": False, "shape": (*size, 6)}
+        with part.open("wb") as file:
+            np.lib.format.write_array_header_1_0(file, header)
+            for picture in everything:
+                file.write(stacked(picture.layers()).astype("<f4").tobytes())
+        return
+    pixels = (_pixels(picture, bits) for picture in everything)
+    shape = (*size, 4 if first.transparent else 3)
+    if suffix == ".png":
+        write_png_rows(part, shape, bits, pixels)
+    else:
+        kind = {8: np.uint8, 16: np.uint16, 32: np.float32}[bits]
+        write_tiff(part, shape, np.dtype(kind), pixels, rows)
 
 
 def strip_rows(limit: int, width: int, height: int) -> int:

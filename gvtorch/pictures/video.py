@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..base import check
-from .files import whole_file
+from ..base.whole_file import whole_file
 from .picture import Picture
 
 FILMS = [".mp4", ".gif", ".webp"]

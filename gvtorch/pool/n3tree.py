@@ -300,15 +300,10 @@ class N3Tree:
             ValueError: There is no such channel, it is a coarse one, or not all of the tree is in
                 memory, as in an engine.
         """
-        name = self.channel_names[0] if channel is None else channel
-        if name not in self.bricks.channels or self.bricks.channels[name].coarse:
-            raise ValueError(
-                f"N3Tree.to_volume: the finest bricks have no channel {name!r}; "
-                f"the tree has {', '.join(self.channel_names)}"
-            )
+        name = self.fine_channel("N3Tree.to_volume", channel)
         z, y, x = reversed(self.extent)
         with self.turns.using("N3Tree.to_volume"):
-            data = self._levels().read(name, 0, (0, 0, 0), (z, y, x))
+            data = self.levels().read(name, 0, (0, 0, 0), (z, y, x))
         table = self.labels.get(name)
         if table is not None:
             data = table[data.to(torch.int64)]
@@ -353,7 +348,7 @@ class N3Tree:
         empty = {name: background(table) for name, table in tables.items()}
         told = filters, empty, self.spacing, self.threshold
         with self.turns.changing("N3Tree.refresh"):
-            self._levels().refresh(low[::-1], high[::-1], *told)
+            self.levels().refresh(low[::-1], high[::-1], *told)
             tile, child = divmod(self.root, self.nodes.nodes_per_tile)
             for name in fine:
                 held = self.nodes.ranges[name]
@@ -363,7 +358,20 @@ class N3Tree:
                 self.made_of[name] = {}
             self.bricks.in_order()
 
-    def _levels(self) -> BrickLevels:
+    def fine_channel(self, where: str, channel: str | None) -> str:
+        """Returns the name of a channel of the finest bricks, the first if none is named; raises
+        ValueError if there is no such channel.
+        """
+        name = self.channel_names[0] if channel is None else channel
+        if name not in self.bricks.channels or self.bricks.channels[name].coarse:
+            raise ValueError(
+                f"{where}: the finest bricks have no channel {name!r}; "
+                f"the tree has {', '.join(self.channel_names)}"
+            )
+        return name
+
+    def levels(self) -> BrickLevels:
+        """Returns what reads and writes voxels of a tree that is in memory as a whole."""
         return BrickLevels(
             nodes=self.nodes,
             bricks=self.bricks,

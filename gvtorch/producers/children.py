@@ -14,7 +14,7 @@ from ..base import check
 from ..pool.pyramid import coarser, from_numpy, to_numpy
 from ..pool.staging import on_device
 from .answer import checked_bricks, checked_regions
-from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
+from .producer import Bricks, Layout, Nodes, Producer, Region, Regions, grid_of
 
 _AT_ONCE = 64  # blocks of a level that are made together, out of N^3 times as many below
 
@@ -51,12 +51,7 @@ class FromChildren(Producer):
         if any(channel.coarse for channel in producer.channels.values()):
             raise ValueError(f"{where}: {type(producer).__name__} makes coarse channels itself")
         super().__init__(
-            producer.extent,
-            channels=producer.channels,
-            spacing=producer.spacing,
-            origin=producer.origin,
-            branching=producer.branching,
-            value_range=producer.value_range,
+            **grid_of(producer), channels=producer.channels, value_range=producer.value_range
         )
         self.producer, self.patience = producer, producer.patience
         self.levels = check.whole(where, "levels", levels, low=1, high=10)

@@ -18,7 +18,7 @@ from torch import Tensor
 from ..base import check
 from ..io.channels import channel_names
 from ..io.store import Store
-from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
+from .producer import Bricks, Layout, Nodes, Producer, Region, Regions, grid_of
 from .stored import StoredProducer
 
 
@@ -57,21 +57,13 @@ class JoinedProducer(Producer):
             labels |= {name: one.labels[own]} if own in one.labels else {}
         first = next(iter(producers.values()))
         for name, one in producers.items():
-            for what in ("extent", "spacing", "origin", "branching"):
-                if getattr(one, what) != getattr(first, what):
+            both = zip(grid_of(one).items(), grid_of(first).values(), strict=True)
+            for (what, its), wanted in both:
+                if its != wanted:
                     raise ValueError(
-                        f"{where}: {what} of {name!r} is {getattr(one, what)}, that of the first "
-                        f"{getattr(first, what)}"
+                        f"{where}: {what} of {name!r} is {its}, that of the first {wanted}"
                     )
-        super().__init__(
-            first.extent,
-            channels=channels,
-            spacing=first.spacing,
-            origin=first.origin,
-            branching=first.branching,
-            value_range=ranges,
-            labels=labels,
-        )
+        super().__init__(**grid_of(first), channels=channels, value_range=ranges, labels=labels)
         self.producers = torch.nn.ModuleDict(producers)
         self.on_host = all(one.on_host for one in producers.values())
         waits = [one.patience for one in producers.values() if one.patience is not None]

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Protocol, Self, TypedDict, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -551,3 +551,22 @@ class Producer(torch.nn.Module):
         extent = "x".join(str(n) for n in self.extent)
         channels = phrase(self.channels)
         return f"{type(self).__name__}({extent} (x, y, z), N={self.branching}, {channels})"
+
+
+class Grid(TypedDict):
+    """The voxels of the finest level, and N."""
+
+    extent: tuple[int, int, int]
+    spacing: tuple[float, float, float]
+    origin: tuple[float, float, float]
+    branching: int
+
+
+def grid_of(producer: Producer) -> Grid:
+    """Returns where a producer's content lies, as another of the same place takes it."""
+    return {
+        "extent": producer.extent,
+        "spacing": producer.spacing,
+        "origin": producer.origin,
+        "branching": producer.branching,
+    }

@@ -19,6 +19,7 @@ import torch
 from numpy.lib.stride_tricks import as_strided
 
 from ..base import check
+from ..base.stage import stage
 from ..io.store import Store
 from ..pool import Channel
 from ..pool.pyramid import NodeSummary
@@ -114,6 +115,12 @@ class _Cubes:
         return self.bricks * self.brick_size
 
 
+def _read_stage(work: Callable[[Nodes], Any], nodes: Nodes) -> Any:
+    """Does the work of a thread under its name."""
+    with stage("read"):
+        return work(nodes)
+
+
 class StoredProducer(Producer):
     """Streams a `gvtorch convert` store, or any OME-Zarr image. Its channel is "value". Pickled, it
     opens its store again in the other process."""
@@ -205,7 +212,7 @@ class StoredProducer(Producer):
         """Lets a thread work; threads that were made before a fork are not in the child."""
         if os.getpid() != self._process:
             self._begin()
-        return self._threads.submit(work, nodes)
+        return self._threads.submit(_read_stage, work, nodes)
 
     def __getstate__(self) -> dict[str, Any]:
         own = ("_cache", "_closed", "_threads", "_process")

@@ -1,5 +1,5 @@
-"""The command line: `gvtorch info`, `view`, `render`, `fly`, `slice`, `convert`, `voxelize`,
-`splat`, `filter` and `bench`.
+"""The command line: `gvtorch info`, `view`, `render`, `fly`, `slice`, `surface`, `convert`,
+`voxelize`, `splat`, `filter` and `bench`.
 
 torch is imported inside the commands, so that `--help` answers at once. A mistake of the user ends
 in one line on standard error and status 2.
@@ -27,11 +27,13 @@ from ..io.ngff import is_zarr
 from .bench import Bench
 from .common import Bar, ReadOptions, given, refuse_for_store, volume_formats
 from .fly import Fly
+from .making import Making, told_store
 from .render import Render
 from .slice import Slice
 from .splat import Splat
+from .surface import Surface
 from .view import View
-from .voxelize import Voxelize, cluster
+from .voxelize import Voxelize
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,57 +90,33 @@ class Convert:
     path: Positional[Annotated[str, arg(metavar="PATH", help=f"the volume: {volume_formats()}")]]
     store: Positional[Annotated[Path, arg(metavar="STORE.zarr")]]
     """the folder to make"""
-    block: Literal[32, 64] = 32
-    """voxels along a side of a block"""
     threshold: Annotated[float | None, arg(metavar="VALUE")] = None
     """regions with no value above it are not kept as blocks"""
-    workers: Annotated[int | None, arg(metavar="N")] = None
-    """processes; one a core if left out, fewer where memory is short"""
     memory: Annotated[str | None, arg(metavar="BYTES")] = None
     """most that all processes together take, as in "2 GB"; what is free if left out"""
-    scheduler: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """of a dask cluster that shares this folder, as in tcp://host:8786"""
-    resume: tyro.conf.FlagCreatePairsOff[bool] = False
-    """go on with a half-written store"""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
     """tell disk, memory and time, and write nothing"""
+    making: tyro.conf.OmitArgPrefixes[Making] = Making()
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     def run(self) -> None:
         """Converts, or tells what it would take."""
         from ..io.conversion import convert, estimate
-        from ..io.resources import amount
 
-        if self.scheduler is not None and self.workers is not None:
-            raise ValueError("--scheduler brings its own workers: leave --workers out")
-        common: dict[str, Any] = {
-            **self.source.options(),
-            "block": self.block,
-            "threshold": self.threshold,
-            "workers": self.workers,
-        }
+        self.making.check()
+        common: dict[str, Any] = {**self.source.options(), "threshold": self.threshold}
         if self.dry_run:
             del common["spacing"]
+            common |= {"block": self.making.block, "workers": self.making.workers}
             _print_table(_readable(estimate(self.path, self.store, **common).as_dict()))
             return
         start, finished = time.perf_counter(), (self.store / "zarr.json").exists()
-        with Bar(speed=True) as bar, cluster(self.scheduler) as executor:
-            store = convert(
-                *(self.path, self.store),
-                **common,
-                memory=self.memory,
-                executor=executor,
-                resume=self.resume,
-                progress=bar,
-            )
+        with self.making.working(speed=True) as work:
+            store = convert(self.path, self.store, **common, memory=self.memory, **work)
         if finished:  # --resume had nothing to do
             print(f"{self.store}: is finished already")
             return
-        seconds = time.perf_counter() - start
-        size = amount(store.describe()["disk bytes"])
-        extent = "x".join(str(n) for n in store.extent)
-        times = f" at {store.times} times" if store.times > 1 else ""
-        print(f"{self.store}: {extent}{times}, {store.levels} levels, {size} in {seconds:.1f} s")
+        print(told_store(self.store, [store], start))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -254,7 +232,13 @@ def _sparkline(counts: list[int]) -> str:
 
 _COMMANDS: dict[str, Any] = {
     **{"info": Info, "view": View, "render": Render, "fly": Fly, "slice": Slice},
-    **{"convert": Convert, "voxelize": Voxelize, "splat": Splat, "filter": Filter},
+    **{
+        "surface": Surface,
+        "convert": Convert,
+        "voxelize": Voxelize,
+        "splat": Splat,
+        "filter": Filter,
+    },
     **{"bench": Bench},
 }
 

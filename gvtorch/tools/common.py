@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, arg
 
+from ..io.ngff import is_zarr
+
 if TYPE_CHECKING:
     from ..base.volume import Volume
+    from ..io.store import Store
 
 
 def volume_formats() -> str:
@@ -126,6 +129,19 @@ def refuse_for_store(source: ReadOptions, *known: str) -> None:
     flags = [flag for flag in given(source) if flag not in ("--time", *known)]
     if flags:
         raise ValueError(f"{flags[0]} is for volume files; a store tells it itself")
+
+
+def open_data(path: str, source: ReadOptions, *, image: str | None, level: int) -> Volume | Store:
+    """Opens a store, or reads a volume; raises ValueError where a flag is for the other of both."""
+    from ..io.store import Store
+
+    if is_zarr(path):
+        refuse_for_store(source)
+        return Store.open(path, image=image, time=source.time or 0)
+    for flag, value in (("image", image), ("level", level)):
+        if value:
+            raise ValueError(f"--{flag} is for stores; make one: gvtorch convert {path} STORE.zarr")
+    return source.read(path)
 
 
 def numbers(name: str, text: str, count: int, kind: type) -> list[Any]:

@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import IO, TYPE_CHECKING, Annotated, Any
 
 import tyro
 from tyro.conf import Positional, arg
 
 from ..base.declared import declared_names
 from ..io.ngff import is_zarr
-from .common import Bar, size, volume_formats
-from .look import first_orbit, parse_orbit, stance
+from .common import Bar, given, size, volume_formats
+from .drawn import Drawn
+from .look import first_orbit, parse_camera, parse_orbit, stance
 from .scene import Scene, SceneFlags
 
 if TYPE_CHECKING:
+    from ..cameras import Camera
     from ..cameras.path import CameraPath
+    from ..pictures import Picture, Video
+    from ..viewer.flight import Flight
+    from ..viewer.state import ViewState
 
 _FILMS = tuple(declared_names("pictures.video", "FILMS"))
+_OF_SHADER = ("tf", "window", "shader", "channel", "value")  # flags
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,30 +40,79 @@ class Fly:
     """a film, .mp4, or .gif or .webp, which loop; or a folder for 0000.png, 0001.png, ..."""
     flight: Annotated[str, arg(name="path", metavar="orbit|FILE.json")] = "orbit"
     """once around, or keys [{"eye": [x, y, z], "target": [x, y, z], "up": ..., "fov": ...}]"""
+    keys: Annotated[Path | None, arg(metavar="FILE.json")] = None
+    """key frames in place of --path: [{"time": seconds, "state": what gvtorch view saved}, ...],
+    between which camera, colours, clips and all other numbers run smoothly; a film that ends as it
+    begins loops"""
     turntable: Annotated[float | None, arg(metavar="SECONDS")] = None
     """an orbit that takes so long: instead of --frames"""
     frames: Annotated[int | None, arg(metavar="N")] = None
-    """number of pictures; 100 if left out, or one for each of --times"""
+    """number of pictures; if left out 100, one for each of --times, or as --keys tell"""
     times: Annotated[str | None, arg(metavar="all|A-B")] = None
     """a film over time: all time points, or those from A to B; the camera stands still where an
     orbit starts, unless --turntable or --path FILE.json move it"""
     fps: Annotated[int | None, arg(metavar="N")] = None
-    """pictures a second of a film or a turntable; 25 if left out"""
+    """pictures a second of a film, a turntable or keys; 25 if left out"""
     orbit: Annotated[str | None, arg(metavar="AZ,EL[,DIST]")] = None
     """where an orbit starts: degrees, and largest sides of the box; as of gvtorch render if left
     out, and all of the box in each picture"""
     stats: Annotated[Path | None, arg(metavar="FILE.jsonl")] = None
     """what each picture cost, one JSON line a frame"""
+    poses: Annotated[Path | None, arg(metavar="FOLDER|FILE.json")] = None
+    """writes where each picture was taken: a folder for COLMAP, or .json for Blender and NeRF"""
+    trace: Annotated[Path | None, arg(metavar="FILE.json")] = None
+    """when which stage of each frame ran, for ui.perfetto.dev"""
     scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()
+    drawn: tyro.conf.OmitArgPrefixes[Drawn] = Drawn()
 
     def run(self) -> None:
         """Renders frame after frame."""
+        from ..base.stage import stage
+        from ..base.trace import Trace
+        from ..cameras import write_cameras
         from ..pictures import Video
 
         look = self.scene.look
         width, height = size(look.size)
         frames, fps = self._length()
-        options, is_film = look.options(), self.output.suffix in _FILMS
+        options = look.options()
+        self._check_output(options)
+        self._check_path()
+        self._check_poses()
+        with ExitStack() as stack:
+            if self.trace is not None:
+                stack.enter_context(Trace(self.trace, look.device()))
+            bar = stack.enter_context(Bar())
+            is_film = self.output.suffix in _FILMS
+            film = Video(self.output, width, height, fps=fps) if is_film else None
+            kept = _Kept(self.output, film)
+            if self.stats is not None:
+                kept.lines = stack.enter_context(self.stats.open("w", encoding="utf-8"))
+            steps = math.inf if self._stands() else max(1, frames - 1 + self._loops())
+            for moment, numbers in self._parts(frames):
+                source = self.scene.source
+                source = source if moment is None else replace(source, time=moment)
+                with replace(self.scene, source=source).open(self.path, options, bar) as scene:
+                    taken = self._taken(scene, options, width, height)
+                    if numbers.start == 0 and film is not None:  # what is there can be read
+                        stack.enter_context(film)
+                    elif film is None:
+                        self.output.mkdir(exist_ok=True)
+                    for number in numbers:
+                        bar("frames", number, frames)
+                        with stage("frame"):
+                            camera, picture = taken(number / steps)
+                        with stage("save"):
+                            kept.add(number, camera, picture)
+            bar("frames", frames, frames)
+        if self.poses is not None:
+            write_cameras(self.poses, kept.cameras)
+        missing = f", {kept.coarse} of them are not complete" if kept.coarse else ""
+        print(f"{self.output}: {frames} pictures{missing}")
+
+    def _check_output(self, options: dict[str, Any]) -> None:
+        """Raises what is wrong with the film or folder before the volume is read."""
+        is_film = self.output.suffix in _FILMS
         if not self.output.parent.is_dir():
             raise FileNotFoundError(f"folder not found: {self.output.parent}")
         if self.output.suffix and not is_film:
@@ -65,46 +122,62 @@ class Fly:
             )
         if is_film and options["background"] is None:
             raise ValueError(f"--background transparent is for pictures, not {self.output.suffix}")
-        self._check_path()
-        with ExitStack() as stack:
-            bar = stack.enter_context(Bar())
-            film = Video(self.output, width, height, fps=fps) if is_film else None
-            lines = None
-            if self.stats is not None:
-                lines = stack.enter_context(self.stats.open("w", encoding="utf-8"))
-            coarse = 0
-            for moment, numbers in self._parts(frames):
-                source = self.scene.source
-                source = source if moment is None else replace(source, time=moment)
-                with replace(self.scene, source=source).open(self.path, options, bar) as scene:
-                    path = self._path(scene, width, height)
-                    if numbers.start == 0 and film is not None:  # what is there can be read
-                        stack.enter_context(film)
-                    elif film is None:
-                        self.output.mkdir(exist_ok=True)
-                    for number in numbers:
-                        bar("frames", number, frames)
-                        camera = path.camera(
-                            self._place(number, frames), width, height, look.camera_model
-                        )
-                        picture = scene.render(camera)
-                        told = picture.stats.as_dict()
-                        coarse += not told.get("converged", True)
-                        if lines is not None:
-                            lines.write(json.dumps({"picture": number, **told}) + "\n")
-                        if film is not None:
-                            film.add(picture)
-                        else:
-                            picture.save(self.output / f"{number:04d}.png")
-            bar("frames", frames, frames)
-        missing = f", {coarse} of them are not complete" if coarse else ""
-        print(f"{self.output}: {frames} pictures{missing}")
 
-    def _place(self, number: int, frames: int) -> float:
-        """Where on its path, 0 to 1, the camera of a picture is."""
-        if self.times is not None and self.turntable is None and self.flight == "orbit":
-            return 0.0
-        return number / max(1, frames - 1 + (self.flight == "orbit"))
+    def _loops(self) -> bool:
+        """Whether the path ends where it begins, so that its last picture is left out."""
+        return self._flight().closed if self.keys is not None else self.flight == "orbit"
+
+    def _stands(self) -> bool:
+        """Whether the camera stands still: a film over time."""
+        moves = self.keys is not None or self.turntable is not None or self.flight != "orbit"
+        return self.times is not None and not moves
+
+    def _taken(
+        self, scene: Scene, options: dict[str, Any], width: int, height: int
+    ) -> Callable[[float], tuple[Camera, Picture]]:
+        """What takes the picture at a place of the path, 0 to 1."""
+        from ..viewer.state import Eye
+
+        look = self.scene.look
+        first = parse_camera(None, look, width, height, scene.space)
+        now = replace(scene.state(options), camera=Eye.of(first, scene.box))
+        if self.keys is None:
+            path = self._path(scene, width, height)
+
+            def shot(at: float) -> tuple[ViewState, Camera, Picture]:
+                camera = path.camera(at, width, height, look.camera_model)
+                state = (
+                    replace(now, camera=Eye.of(camera, scene.box)) if self.drawn.given() else now
+                )
+                return state, camera, scene.render(camera)
+        else:
+            flight = self._flight(now)
+
+            def shot(at: float) -> tuple[ViewState, Camera, Picture]:
+                state = flight.along(at)
+                assert state.camera is not None
+                camera = state.camera.camera(width, height, scene.box)
+                return state, camera, scene.picture(state, camera)
+
+        def picture(at: float) -> tuple[Camera, Picture]:
+            state, camera, made = shot(at)
+            assert state.camera is not None
+            told = (state.shader, scene.info, state.component, camera, state.camera)
+            overlay = self.drawn.overlay(*told)
+            return camera, made if overlay is None else overlay.over(made)
+
+        return picture
+
+    def _flight(self, now: ViewState | None = None) -> Flight:
+        """The keys; if no state is given that they begin with, to see that they are right."""
+        from ..shaders import TransferFunction
+        from ..viewer.flight import Flight
+        from ..viewer.state import Eye, ViewState
+
+        assert self.keys is not None
+        anywhere = Eye(eye=(0, 0, 1), target=(0, 0, 0))
+        any_state = ViewState(shader=TransferFunction([(0, 1)]), camera=anywhere)
+        return Flight.read(self.keys, any_state if now is None else now)
 
     def _parts(self, frames: int) -> list[tuple[int | None, range]]:
         """Time points, and the pictures that are taken of each; None: of whichever is read."""
@@ -141,6 +214,9 @@ class Fly:
         from ..base import check
 
         fps = check.whole("fly", "--fps", 25 if self.fps is None else self.fps, low=1, high=1000)
+        if self.keys is not None:
+            count = self._flight().count(fps) if self.frames is None else self.frames
+            return check.whole("fly", "--frames", count, low=1), fps
         if self.turntable is None:
             if self.fps is not None and self.output.suffix not in _FILMS:
                 raise ValueError("--fps is for a film or --turntable: pictures have no speed")
@@ -156,12 +232,48 @@ class Fly:
 
     def _check_path(self) -> None:
         """Raises what is wrong with the path before the volume is read."""
-        if self.flight != "orbit":
+        if self.keys is not None:
+            self._check_keys()
+        elif self.flight != "orbit":
             if self.orbit is not None:
                 raise ValueError("--orbit is for --path orbit, not for keys")
             self._keys()
         elif self.orbit is not None:
             parse_orbit("--orbit", self.orbit)
+
+    def _check_poses(self) -> None:
+        """Raises what is wrong with the file of cameras before there are pictures."""
+        if self.poses is None:
+            return
+        is_folder = not self.poses.suffix and not self.poses.is_file()
+        if not is_folder and self.poses.suffix != ".json":
+            raise ValueError(f"--poses must be a folder or end in .json, got {self.poses}")
+        if not self.poses.parent.is_dir():
+            raise FileNotFoundError(f"folder not found: {self.poses.parent}")
+        models = [self.scene.look.camera_model]
+        if self.keys is not None:
+            models = [s.camera.model for _, s in self._flight().keys if s.camera is not None]
+        other = next((one for one in models if one not in ("pinhole", "fisheye")), None)
+        if other is not None:
+            raise ValueError(f"--poses tells of pinhole and fisheye, not of {other}")
+
+    def _check_keys(self) -> None:
+        """Raises ValueError where a flag tells what the keys do."""
+        from ..base import check
+
+        assert self.keys is not None
+        path = self.flight if self.flight != "orbit" else None
+        paths = {"--path": path, "--orbit": self.orbit, "--turntable": self.turntable}
+        flags = [name for name, value in paths.items() if value]
+        first = check.json_file("key frames", self.keys)[0]["state"]
+        if isinstance(first, str):
+            first = check.json_file("state", self.keys.parent / first)
+        told = {"shader": _OF_SHADER, "camera": ("camera_model", "fov", "up")}
+        names = {name for part, those in told.items() if part in first for name in those}
+        names |= set(first.get("options", ()))
+        flags += [f for f in given(self.scene.look) if f[2:].replace("-", "_") in names]
+        if flags:
+            raise ValueError(f"--keys tells what {flags[0]} does: leave one out")
 
     def _keys(self) -> CameraPath:
         from ..cameras.path import CameraPath
@@ -185,3 +297,25 @@ class Fly:
             up=look.upward() or stance(scene.space)[0],
             fit=(width, height) if distance is None else None,
         )
+
+
+class _Kept:
+    """What there is of a flight's pictures: in a film or a folder, and figures in a file."""
+
+    def __init__(self, output: Path, film: Video | None) -> None:
+        self._output, self._film = output, film
+        self.lines: IO[str] | None = None
+        self.coarse = 0
+        self.cameras: dict[str, Camera] = {}
+
+    def add(self, number: int, camera: Camera, picture: Picture) -> None:
+        """Keeps a picture."""
+        name, told = f"{number:04d}.png", picture.stats.as_dict()
+        self.cameras[name] = camera
+        self.coarse += not told.get("converged", True)
+        if self.lines is not None:
+            self.lines.write(json.dumps({"picture": number, **told}) + "\n")
+        if self._film is not None:
+            self._film.add(picture)
+        else:
+            picture.save(self._output / name)

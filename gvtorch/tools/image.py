@@ -19,6 +19,15 @@ KINDS = (".png", ".exr", ".npy", ".npz", ".tif")
 STRIPS = (".npy", ".tif")  # written strip by strip: the picture may be larger than memory
 
 
+def in_strips(suffix: str, width: int, height: int) -> bool:
+    """Whether a picture is written strip by strip; PNG where it is larger than one."""
+    from ..base import check
+    from ..pictures.progressive import STRIP, strip_rows
+
+    rows = strip_rows(check.nbytes("render", "memory", STRIP), width, height)
+    return suffix in STRIPS or (suffix == ".png" and rows < height)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Develop:
     """How the picture is developed."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
@@ -241,11 +242,13 @@ def first_orbit(space: str | None) -> str:
 def parse_camera(
     text: str | None, look: Look, width: int, height: int, space: str | None = None
 ) -> Camera:
-    """Makes a camera from `orbit:AZ,EL`, `orbit:AZ,EL,DIST` or `look:ex,ey,ez,tx,ty,tz`; `space`
-    tells what is up, and where it stands, if they are left out.
+    """Makes a camera from `orbit:AZ,EL`, `orbit:AZ,EL,DIST`, `look:ex,ey,ez,tx,ty,tz`, or
+    `file:PATH` or `file:PATH,NAME`; `space` tells what is up, and where it stands, if they are left
+    out.
 
     Raises:
         ValueError: The text is none of these, or a number is out of its range.
+        FileNotFoundError: There is no such file.
     """
     from ..cameras import Camera
 
@@ -259,9 +262,31 @@ def parse_camera(
     if kind == "look":
         values = numbers("--camera look", rest, 6, float)
         return Camera.look_at(values[:3], values[3:], up, *shape)
+    if kind == "file":
+        return _camera_of_file(rest, look, width, height)
     raise ValueError(
-        f"--camera must be orbit:AZ,EL, orbit:AZ,EL,DIST or look:ex,ey,ez,tx,ty,tz, got {text!r}"
+        "--camera must be orbit:AZ,EL, orbit:AZ,EL,DIST, look:ex,ey,ez,tx,ty,tz or file:PATH, "
+        f"got {text!r}"
     )
+
+
+def _camera_of_file(text: str, look: Look, width: int, height: int) -> Camera:
+    """The camera of PATH, or the one of PATH,NAME."""
+    from ..cameras import read_cameras
+
+    for flag, value in (("--fov", look.fov), ("--up", look.up)):
+        if value is not None:
+            raise ValueError(f"--camera file: tells what {flag} does: leave one out")
+    path, comma, name = text.rpartition(",")
+    if not comma or Path(text).exists():
+        path, name = text, ""
+    cameras = read_cameras(path, width=width, height=height)
+    if not name and len(cameras) == 1:
+        return next(iter(cameras.values()))
+    if name not in cameras:
+        known = ", ".join(list(cameras)[:5]) + (", ..." if len(cameras) > 5 else "")
+        raise ValueError(f"--camera file:{path},NAME must name one of {known}, got {name!r}")
+    return cameras[name]
 
 
 def parse_clip(text: str) -> Clip:

@@ -21,10 +21,13 @@ from .streaming import Streaming, tell_failures
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from ..base.image_info import ImageInfo
+    from ..cameras import Camera
     from ..engine import Engine
     from ..pictures import Picture
     from ..shaders import Shader
     from ..tracing import Cost
+    from ..viewer.state import ViewState
 
 
 @dataclass(frozen=True)
@@ -36,9 +39,28 @@ class Scene:
     cost: Callable[..., Cost]
     box: Tensor  # (2, 3) float64 world
     extent: tuple[int, ...]  # (x, y, z) voxels
-    space: str | None  # where x, y and z point
+    info: ImageInfo
     values: tuple[float, float] | None  # the smallest and the largest, if known
     engine: Engine | None = None  # of a store
+
+    @property
+    def space(self) -> str | None:
+        """Where x, y and z point."""
+        return self.info.space
+
+    def state(self, options: dict[str, Any]) -> ViewState:
+        """What the flags say, as a state that has no camera."""
+        from ..tracing import RenderOptions
+        from ..viewer.state import ViewState
+
+        told = RenderOptions(**options)
+        return ViewState(shader=self.shader, options=told, component=told.component)
+
+    def picture(self, state: ViewState, camera: Camera) -> Picture:
+        """The picture of a state, or the cost that it shows, from a camera of its own."""
+        if state.show == "picture":
+            return state.taken(self.render, camera)
+        return self.cost(camera, shader=state.shader, **state.settings()).picture(state.show)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +116,7 @@ class SceneFlags:
             partial(cost, tree, shader=shader, **options),
             tree.box,
             volume.extent,
-            volume.info.space,
+            volume.info,
             volume.value_range,
         )
 
@@ -115,6 +137,6 @@ class SceneFlags:
                 partial(engine.render, shader=shader, mode=mode, max_frames=most, **options),
                 shader,
                 partial(cost, tree, shader=shader, **options),
-                *(tree.box, tree.extent, store.info.space, None, engine),
+                *(tree.box, tree.extent, store.info, None, engine),
             )
             tell_failures(engine)

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from tyro.conf import Positional, arg
 
-from ..io.ngff import is_zarr
 from .colors import chosen_transfer, parse_window
-from .common import Bar, ReadOptions, refuse_for_store, volume_formats
+from .common import Bar, ReadOptions, open_data, volume_formats
 from .image import KINDS
-
-if TYPE_CHECKING:
-    from ..base.volume import Volume
-    from ..io.store import Store
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +61,7 @@ class Slice:
             raise ValueError(f"--at must be one place, or three for --axis all, got {self.at!r}")
         with Bar() as bar:
             bar("reading", 0, 0)
-            data = self._open()
+            data = open_data(self.path, self.source, image=self.image, level=self.level)
             views = radiological_views(data.info.space) if self.up is None else {}
             span, colors = None, None
             if self.tf is None:
@@ -91,16 +86,3 @@ class Slice:
         names = [view.name for axis, view in views.items() if self.axis in (axis, "all")]
         shown = f", {' and '.join(names)}: right is on the left" if names else ""
         print(f"{self.output}: {width}x{height}{shown}")
-
-    def _open(self) -> Volume | Store:
-        from ..io.store import Store
-
-        if is_zarr(self.path):
-            refuse_for_store(self.source)
-            return Store.open(self.path, image=self.image, time=self.source.time or 0)
-        for flag, value in (("image", self.image), ("level", self.level)):
-            if value:
-                raise ValueError(
-                    f"--{flag} is for stores; make one: gvtorch convert {self.path} STORE.zarr"
-                )
-        return self.source.read(self.path)

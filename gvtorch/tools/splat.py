@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg
 
-from .common import Bar, numbers
-from .voxelize import cluster
+from .common import numbers
+from .making import Making, told_store
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,41 +41,24 @@ class Splat:
     """how far points reach: a column, or one number for all; if there is none, a voxel each"""
     memory: Annotated[str, arg(metavar="BYTES")] = "1 GB"
     """that sorting takes, roughly"""
-    block: Literal[32, 64] = 32
-    """voxels along a side of a block"""
-    workers: Annotated[int | None, arg(metavar="N")] = None
-    """processes; one a core if left out"""
-    scheduler: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """of a dask cluster that shares this folder, as in tcp://host:8786"""
-    resume: tyro.conf.FlagCreatePairsOff[bool] = False
-    """go on with a half-written store"""
+    making: tyro.conf.OmitArgPrefixes[Making] = Making()
 
     def run(self) -> None:
         """Adds them up."""
         from ..io.point_source import splat
-        from ..io.resources import amount
 
-        if self.scheduler is not None and self.workers is not None:
-            raise ValueError("--scheduler brings its own workers: leave --workers out")
         start = time.perf_counter()
-        with Bar() as bar, cluster(self.scheduler) as executor:
+        with self.making.working() as work:
             store = splat(
                 self.path,
                 self.output,
                 opacity=self.opacity,
                 channel=self.channels,
                 memory=self.memory,
-                block=self.block,
-                workers=self.workers,
-                executor=executor,
-                resume=self.resume,
-                progress=bar,
+                **work,
                 **self._places(),
             )
-        seconds = time.perf_counter() - start
-        size = amount(store.describe()["disk bytes"])
-        extent = "x".join(str(n) for n in store.extent)
-        print(f"{self.output}: {extent}, {store.levels} levels, {size} in {seconds:.1f} s")
+        print(told_store(self.output, [store], start))
 
     def _places(self) -> dict[str, Any]:
         """Extent, box and columns, those that are given."""

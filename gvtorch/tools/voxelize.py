@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import Positional, arg
 
-from .common import Bar
-
-if TYPE_CHECKING:
-    from concurrent.futures import Executor
+from .making import Making, told_store
 
 _ENDINGS = "OBJ, PLY, STL, glTF or OFF, also with .gz behind"
 
@@ -42,26 +37,16 @@ class Voxelize:
     solid: Literal["auto", "always", "never"] = "auto"
     """auto: what is closed is a solid, all else a sheet; always: holes are filled; never: all is a
     sheet"""
-    block: Literal[32, 64] = 32
-    """voxels along a side of a block"""
-    workers: Annotated[int | None, arg(metavar="N")] = None
-    """processes; one a core if left out"""
-    scheduler: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """of a dask cluster that shares this folder, as in tcp://host:8786"""
-    resume: tyro.conf.FlagCreatePairsOff[bool] = False
-    """go on with a half-written store"""
+    making: tyro.conf.OmitArgPrefixes[Making] = Making()
 
     def run(self) -> None:
         """Voxelizes."""
         from ..io.channels import channel_names
         from ..io.mesh_source import voxelize
-        from ..io.resources import amount
         from ..io.store import Store
 
-        if self.scheduler is not None and self.workers is not None:
-            raise ValueError("--scheduler brings its own workers: leave --workers out")
         start = time.perf_counter()
-        with Bar(speed=True) as bar, cluster(self.scheduler) as executor:
+        with self.making.working(speed=True) as work:
             store = voxelize(
                 *(self.path, self.output),
                 resolution=self.resolution,
@@ -70,29 +55,8 @@ class Voxelize:
                 thickness=self.thickness,
                 solid=self.solid,
                 texture=self.texture,
-                block=self.block,
-                workers=self.workers,
-                executor=executor,
-                resume=self.resume,
-                progress=bar,
+                **work,
             )
-        seconds = time.perf_counter() - start
         names = channel_names(self.output)
         stores = [Store.open(self.output, image=name) for name in names] or [store]
-        size = amount(sum(one.describe()["disk bytes"] for one in stores))
-        extent = "x".join(str(n) for n in store.extent)
-        print(f"{self.output}: {extent}, {store.levels} levels, {size} in {seconds:.1f} s")
-
-
-@contextlib.contextmanager
-def cluster(address: str | None) -> Iterator[Executor | None]:
-    """The executor of a dask cluster, or none."""
-    if address is None:
-        yield None
-        return
-    try:
-        from distributed import Client
-    except ImportError:
-        raise ImportError("--scheduler needs dask: pip install distributed") from None
-    with Client(address, timeout="20s") as client:
-        yield client.get_executor()
+        print(told_store(self.output, stores, start))

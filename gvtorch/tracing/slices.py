@@ -98,17 +98,7 @@ def slice_picture(
         colors = TransferFunction(*display_grays()).stretched(*ends)
     elif span is not None:
         raise ValueError(f"{where}: span is for grays; colors have values of their own")
-    views = {n: PlaneView("", up) for n, up in UP.items()}
-    if radiological:
-        if up is not None:
-            raise ValueError(f"{where}: radiological planes have an up of their own")
-        views = radiological_views(data.info.space)
-        if not views:
-            raise ValueError(f"{where}: the data does not tell where its axes point (info.space)")
-        if not letters:
-            views = {n: view._replace(letters="") for n, view in views.items()}
-    elif letters:
-        raise ValueError(f"{where}: letters are for radiological planes")
+    views = _views(data.info.space, up, radiological=radiological, letters=letters)
     if axis != "all":
         if isinstance(at, tuple):
             raise ValueError(f"{where}: at must be one place for axis {axis}, got {at!r}")
@@ -119,14 +109,39 @@ def slice_picture(
         raise ValueError(f"{where}: up is for one plane, not for axis 'all'")
     places = at if isinstance(at, tuple) else (at, at, at)
     pixel = min(plane.spacing.values()) / scale
-    x, y, z = (
-        plane.colored(n, place, views[n], pixel, colors)
-        for n, place in zip("xyz", places, strict=True)
+    return _picture(
+        _in_line(
+            *(
+                plane.colored(n, place, views[n], pixel, colors)
+                for n, place in zip("xyz", places, strict=True)
+            )
+        )
     )
+
+
+def _views(
+    space: str | None, up: str | None, *, radiological: bool, letters: bool
+) -> dict[str, PlaneView]:
+    """How the plane across each axis is looked at."""
+    where = "slice_picture"
+    if not radiological:
+        if letters:
+            raise ValueError(f"{where}: letters are for radiological planes")
+        return {n: PlaneView("", above) for n, above in UP.items()}
+    if up is not None:
+        raise ValueError(f"{where}: radiological planes have an up of their own")
+    views = radiological_views(space)
+    if not views:
+        raise ValueError(f"{where}: the data does not tell where its axes point (info.space)")
+    return views if letters else {n: one._replace(letters="") for n, one in views.items()}
+
+
+def _in_line(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """The planes across y and x above the one across z, side by side."""
     (top, left), (bottom, right) = y.shape[:2], (z.shape[0], x.shape[1])
     image = np.zeros((top + _GAP + bottom, left + _GAP + right, 3), np.float32)
     image[:top, :left], image[:top, left + _GAP :], image[top + _GAP :, :left] = y, x, z
-    return _picture(image)
+    return image
 
 
 class PlaneView(NamedTuple):

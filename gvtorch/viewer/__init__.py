@@ -5,6 +5,7 @@
 `ViewState`, which `schema` makes of the dataclasses of the other rooms.
 """
 
+from .flight import Flight as Flight
 from .state import Development as Development
 from .state import Eye as Eye
 from .state import ViewState as ViewState

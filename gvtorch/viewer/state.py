@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -16,10 +18,12 @@ from torch import Tensor
 from ..base import check
 from ..cameras import Camera
 from ..cameras.models import MODELS, CameraModel, model_of
+from ..engine import Engine
 from ..pictures import Picture, Progressive
 from ..pictures.tone import ToneCurve, checked_curve
+from ..pool import N3Tree
 from ..shaders import Shader
-from ..tracing import RenderOptions
+from ..tracing import RenderOptions, render
 from .schema import decode, encode
 
 Triple = tuple[float, float, float]
@@ -151,6 +155,28 @@ class ViewState:
         """Returns the fields of `RenderOptions` as keyword arguments."""
         return dict(vars(self.options))
 
+    def picture(self, what: N3Tree | Engine, width: int, height: int) -> Picture:
+        """Renders what a view shows at rest: all samples of its camera, developed.
+
+        Args:
+            what: A resident tree; or an engine, until nothing is missing.
+            width: Pixels.
+            height: Pixels.
+
+        Raises:
+            ValueError: The state has no camera, or shows costs: see `gv.cost`.
+        """
+        if self.camera is None or self.show != "picture":
+            lacks = "a camera" if self.camera is None else f"show='picture', not {self.show!r}"
+            raise ValueError(f"ViewState.picture: the state must have {lacks}")
+        drawn = what.render if isinstance(what, Engine) else partial(render, what)
+        return self.taken(drawn, self.camera.camera(width, height, what.box))
+
+    def taken(self, drawn: Callable[..., Picture], camera: Camera) -> Picture:
+        """Returns the picture at rest from another camera; `drawn` takes it, shader and options."""
+        shown = partial(drawn, shader=self.shader, **self.settings())
+        return self.develop.develop(Progressive(shown).refine(camera, self.develop.samples))
+
     def to_json(self) -> dict[str, Any]:
         """Returns plain values."""
         return encode(self)
@@ -183,12 +209,3 @@ class ViewState:
             return self.changed(content)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
-
-
-def picture_of(render: Any, state: ViewState, width: int, height: int, box: Tensor) -> Picture:
-    """Renders what a view shows at rest: all samples of its camera, developed. `render` makes a
-    `Picture` of a camera and has the state's shader and options.
-    """
-    assert state.camera is not None
-    camera = state.camera.camera(width, height, box)
-    return state.develop.develop(Progressive(render).refine(camera, state.develop.samples))

@@ -1,0 +1,36 @@
+"""`whole_file`: files that appear when they are whole."""
+
+from __future__ import annotations
+
+import errno
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A place to write to, which takes the file's name once the block ends well."""
+    try:
+        handle, name = tempfile.mkstemp(suffix=path.suffix, dir=path.parent)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from None
+    try:
+        try:
+            os.close(handle)
+            yield Path(name)
+        except OSError as error:  # what stands there already stays
+            if error.filename not in (None, name):
+                raise
+            text = error.strerror or str(error)
+            raise OSError(
+                error.errno or errno.EIO, f"can't be written: {text}", str(path)
+            ) from None
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(name, 0o666 & ~mask)
+        os.replace(name, path)
+    finally:
+        Path(name).unlink(missing_ok=True)

@@ -1,0 +1,356 @@
+"""`read_cameras`, `write_cameras`: cameras of other programs: ParaView's .pvcc, `transforms.json`
+as Blender's add-ons and NeRF data sets have it, and COLMAP's text models.
+
+| | axes of a camera | what is kept |
+|---|---|---|
+| .pvcc | view up, focal point | place, target, up, vertical angle or parallel scale; one camera |
+| .json | x right, y up, z back; camera to world | intrinsics in pixels, also of fisheyes |
+| folder | x right, y down, z forward; world to camera | intrinsics in pixels, also of fisheyes |
+
+Pixel centres lie at +0.5 in all of them, as here. How far from its axis a fisheye sees is in none.
+
+Sources: COLMAP documentation, "Output format"; Mildenhall et al., "NeRF", 2020, released data;
+ParaView, vtkSMCameraConfigurationWriter.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import xml.etree.ElementTree as xml
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..base import check
+from ..base.whole_file import whole_file
+from .camera import Camera, Frame
+from .rotations import quaternion_of, rotation_of
+
+_FLIP = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))  # y down to y up
+_PVCC = (
+    ("CameraPosition", 3),
+    ("CameraFocalPoint", 3),
+    ("CameraViewUp", 3),
+    ("CenterOfRotation", 3),
+    ("CameraViewAngle", 1),
+    ("CameraParallelScale", 1),
+    ("CameraParallelProjection", 1),
+)
+_DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_FISHEYE = "OPENCV_FISHEYE"
+#: COLMAP's models, by their parameters; those of distorted pinholes are read where all are 0.
+_COLMAP = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    _FISHEYE: ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+}
+
+
+def read_cameras(
+    path: str | Path, *, width: int | None = None, height: int | None = None
+) -> dict[str, Camera]:
+    """Reads cameras that another program wrote.
+
+    Args:
+        path: ParaView's .pvcc; a .json of frames with `transform_matrix`; or a folder with COLMAP's
+            cameras.txt and images.txt.
+        width: Pixels of a .pvcc, which does not tell; else what is read is scaled to it.
+        height: Likewise; both or none.
+
+    Returns:
+        Each camera, by the name of its picture, in the file's order; "camera" of a .pvcc.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is none of these, is damaged, or a lens is distorted as no model here is.
+    """
+    path = Path(path)
+    if (width is None) != (height is None):
+        raise ValueError("read_cameras: width and height go together")
+    if not path.exists():
+        raise FileNotFoundError(f"cameras not found: {path}")
+    read = _reader(path)
+    try:
+        cameras = read(path, width, height)
+    except (KeyError, IndexError, TypeError, ArithmeticError, xml.ParseError) as error:
+        told = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"{path}: can't be read as cameras: {told}") from None
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    if not cameras:
+        raise ValueError(f"{path}: has no cameras")
+    if width is None or height is None:
+        return cameras
+    return {name: _scaled(camera, width, height) for name, camera in cameras.items()}
+
+
+def _reader(path: Path) -> Callable[[Path, int | None, int | None], dict[str, Camera]]:
+    if path.is_dir():
+        return _read_colmap
+    known = {".pvcc": _read_pvcc, ".json": _read_transforms}
+    if path.suffix not in known:
+        raise ValueError(
+            f"read_cameras: path must end in .pvcc or .json or be a folder of COLMAP, got {path}"
+        )
+    return known[path.suffix]
+
+
+def write_cameras(
+    path: str | Path, cameras: Camera | Mapping[str, Camera], *, distance: float | None = None
+) -> None:
+    """Writes cameras for another program: see `read_cameras`.
+
+    Args:
+        path: .pvcc (of one camera), .json, or a folder for COLMAP's cameras.txt, images.txt and an
+            empty points3D.txt, which is made.
+        cameras: A camera, a batch, whose pictures are called 0000.png, 0001.png, ..., or each by
+            the name of its picture; in the world.
+        distance: World units to what a .pvcc turns around; 1 if left out.
+
+    Raises:
+        ValueError: The ending is another, a model can't be told in the file, or a camera is
+            relative to a box: call `placed(tree.box)` first.
+        FileNotFoundError: The folder around it does not exist.
+    """
+    path, where = Path(path), "write_cameras"
+    if isinstance(cameras, Camera):
+        cameras = {f"{n:04d}.png": cameras[n] for n in range(len(cameras))}
+    for name, camera in cameras.items():
+        check.instance(where, "cameras", camera, Camera)
+        if camera.frame is Frame.BOX or len(camera) != 1:
+            raise ValueError(f"{where}: {name!r} must be one camera in the world, got {camera}")
+        if not name or any(letter.isspace() for letter in name):
+            raise ValueError(f"{where}: names must have no blanks, got {name!r}")
+    if not cameras:
+        raise ValueError(f"{where}: there are no cameras")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{where}: folder not found: {path.parent}")
+    if path.suffix == ".pvcc":
+        far = check.number(where, "distance", distance or 1.0, low=0, open_low=True)
+        _write(path, _pvcc(cameras, far))
+    elif path.suffix == ".json":
+        _write(path, json.dumps(_transforms(cameras), indent=1) + "\n")
+    elif path.suffix == "" and (path.is_dir() or not path.exists()):
+        texts = _colmap(cameras)
+        path.mkdir(exist_ok=True)
+        for name, text in texts.items():
+            _write(path / name, text)
+    else:
+        raise ValueError(f"{where}: path must end in .pvcc or .json or be a folder, got {path}")
+
+
+def _write(path: Path, text: str) -> None:
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def _scaled(camera: Camera, width: int, height: int) -> Camera:
+    """The camera with pictures of another size; what was in them stays in them."""
+    Ks = camera.Ks[0].clone()
+    Ks[0] *= width / camera.width
+    Ks[1] *= height / camera.height
+    return _camera(camera.viewmats[0], Ks, width, height, camera)
+
+
+def _camera(
+    view: Tensor, Ks: Tensor, width: int, height: int, like: Camera | None = None
+) -> Camera:
+    bends = like is not None and like.distorted
+    return Camera(
+        view,
+        Ks,
+        width,
+        height,
+        model="pinhole" if like is None else like.model,
+        radial_coeffs=like.radial_coeffs[0] if like is not None and bends else None,
+    )
+
+
+# ParaView.
+
+
+def _read_pvcc(path: Path, width: int | None, height: int | None) -> dict[str, Camera]:
+    root = xml.fromstring(_text(path))
+    found: dict[str, list[float]] = {}
+    for one in root.iter("Property"):
+        values = [float(item.attrib["value"]) for item in one.iter("Element")]
+        found[one.attrib["name"]] = values
+    eye, target, up = (found[name][:3] for name, _ in _PVCC[:3])
+    if width is None or height is None:
+        raise ValueError("does not tell the size of the picture: give width and height")
+    if not found.get("CameraParallelProjection", [0])[0]:
+        fov = found["CameraViewAngle"][0]
+        return {"camera": Camera.look_at(eye, target, up, fov, width, height)}
+    camera = Camera.look_at(eye, target, up, 30.0, width, height, "ortho")
+    camera.Ks[:, (0, 1), (0, 1)] = 0.5 * height / found["CameraParallelScale"][0]
+    return {"camera": camera}
+
+
+def _pvcc(cameras: Mapping[str, Camera], distance: float) -> str:
+    if len(cameras) != 1:
+        raise ValueError(f"write_cameras: .pvcc holds one camera, got {len(cameras)}")
+    (camera,) = cameras.values()
+    middle = camera.Ks.new_tensor([camera.width / 2, camera.height / 2])
+    square = bool(torch.isclose(camera.Ks[0, 0, 0], camera.Ks[0, 1, 1], rtol=1e-9))
+    if camera.model not in ("pinhole", "ortho") or not square:
+        raise ValueError(
+            f"write_cameras: .pvcc holds pinhole and ortho, of square pixels: {camera}"
+        )
+    if not torch.allclose(camera.Ks[0, :2, 2], middle, atol=1e-6):
+        raise ValueError("write_cameras: .pvcc has its axis in the middle of the picture")
+    to_world = torch.linalg.inv(camera.viewmats[0])
+    eye, forward, up = to_world[:3, 3], to_world[:3, 2], -to_world[:3, 1]
+    target, half = eye + distance * forward, 0.5 * camera.height / float(camera.Ks[0, 1, 1])
+    is_ortho = camera.model == "ortho"
+    angle = 30.0 if is_ortho else math.degrees(2 * math.atan(half))
+    scale = half if is_ortho else half * distance
+    told = (eye, target, up, target, [angle], [scale], [int(is_ortho)])
+    root = xml.Element("PVCameraConfiguration", description="ParaView camera", version="1.0")
+    proxy = xml.SubElement(root, "Proxy", group="views", type="RenderView", id="1", servers="21")
+    for (name, count), values in zip(_PVCC, told, strict=True):
+        one = xml.SubElement(
+            proxy, "Property", name=name, id=f"1.{name}", number_of_elements=str(count)
+        )
+        numbers = values.tolist() if isinstance(values, Tensor) else values
+        for index, value in enumerate(numbers):
+            xml.SubElement(one, "Element", index=str(index), value=repr(value))
+    xml.indent(root)
+    return '<?xml version="1.0"?>\n' + xml.tostring(root, encoding="unicode") + "\n"
+
+
+# Blender and NeRF.
+
+
+def _read_transforms(path: Path, width: int | None, height: int | None) -> dict[str, Camera]:
+    content = check.json_file("cameras", path)
+    cameras = {}
+    for number, frame in enumerate(content["frames"]):
+        told = {**content, **frame}
+        pose = check.reals(f"frame {number}", "pose", told["transform_matrix"], (4, 4)) @ _FLIP
+        view = torch.eye(4, dtype=torch.float64)
+        view[:3, :3], view[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
+        x, y = (int(told.get(k) or size or 0) for k, size in (("w", width), ("h", height)))
+        if not x or not y:
+            raise ValueError("does not tell the size of the pictures: give width and height")
+        fx = told["fl_x"] if "fl_x" in told else 0.5 * x / math.tan(told["camera_angle_x"] / 2)
+        fy = told.get("fl_y", fx)
+        cx, cy = told.get("cx", x / 2), told.get("cy", y / 2)
+        name, model = (
+            told.get("file_path", f"{number:04d}.png"),
+            told.get("camera_model", "PINHOLE"),
+        )
+        cameras[str(name)] = _made(model, view, (fx, fy, cx, cy), told, (x, y))
+    return cameras
+
+
+def _made(
+    model: str, view: Tensor, lens: Any, told: Mapping[str, Any], size: tuple[int, int]
+) -> Camera:
+    """A camera of a model of COLMAP's; `lens` is fx, fy, cx, cy."""
+    fx, fy, cx, cy = lens
+    Ks = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    bends = [float(told.get(name) or 0) for name in ("k1", "k2", "k3", "k4")]
+    if model == _FISHEYE:
+        coefficients = bends if any(bends) else None
+        return Camera(view, Ks, *size, model="fisheye", radial_coeffs=coefficients)
+    if model not in _COLMAP:
+        raise ValueError(f"camera model {model} is not read; known: {', '.join(_COLMAP)}")
+    if any(told.get(name) for name in _DISTORTIONS):
+        raise ValueError(f"a lens of model {model} with distortion is not read: undistort first")
+    return Camera(view, Ks, *size)
+
+
+def _transforms(cameras: Mapping[str, Camera]) -> dict[str, Any]:
+    frames = []
+    for name, camera in cameras.items():
+        model, told = _lens(camera)
+        names = {"fx": "fl_x", "fy": "fl_y"}
+        frames.append(
+            {
+                "file_path": name,
+                "camera_model": model,
+                **{"w": camera.width, "h": camera.height},
+                **{names.get(key, key): value for key, value in told.items()},
+                "transform_matrix": (torch.linalg.inv(camera.viewmats[0]) @ _FLIP).tolist(),
+            }
+        )
+    return {"frames": frames}
+
+
+def _lens(camera: Camera) -> tuple[str, dict[str, float]]:
+    """Model and parameters as COLMAP has them."""
+    (fx, _, cx), (_, fy, cy), _ = camera.Ks[0].tolist()
+    told = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    if camera.model == "pinhole":
+        return "PINHOLE", told
+    if camera.model == "fisheye":
+        bends = camera.radial_coeffs[0].tolist()
+        return _FISHEYE, told | dict(zip(("k1", "k2", "k3", "k4"), bends, strict=True))
+    raise ValueError(f"write_cameras: pinhole and fisheye can be told, got {camera.model}")
+
+
+# COLMAP.
+
+
+def _read_colmap(path: Path, width: int | None, height: int | None) -> dict[str, Camera]:
+    del width, height
+    lenses: dict[str, tuple[str, dict[str, float], tuple[int, int]]] = {}
+    for line in _lines(path / "cameras.txt"):
+        number, model, x, y, *values = line.split()
+        if model not in _COLMAP:
+            raise ValueError(f"camera model {model} is not read; known: {', '.join(_COLMAP)}")
+        told = dict(zip(_COLMAP[model], map(float, values), strict=True))
+        lenses[number] = (model, told, (int(x), int(y)))
+    cameras = {}
+    for line in _lines(path / "images.txt", every=2):
+        _, *numbers, lens, name = line.split(maxsplit=9)
+        quaternion, move = [float(n) for n in numbers[:4]], [float(n) for n in numbers[4:]]
+        view = torch.eye(4, dtype=torch.float64)
+        view[:3, :3], view[:3, 3] = rotation_of(quaternion), torch.tensor(move, dtype=torch.float64)
+        model, told, size = lenses[lens]
+        fx, fy = told.get("fx", told.get("f")), told.get("fy", told.get("f"))
+        cameras[name] = _made(model, view, (fx, fy, told["cx"], told["cy"]), told, size)
+    return cameras
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise ValueError("is no text") from None
+
+
+def _lines(path: Path, every: int = 1) -> list[str]:
+    """Lines of a text that are no comments; of images.txt every other one: behind each stand the
+    points that were found in it, which may be none.
+    """
+    if not path.is_file():
+        raise ValueError(f"has no {path.name}")
+    lines = [line for line in _text(path).splitlines() if not line.startswith("#")]
+    return [line for line in lines[::every] if line.strip()]
+
+
+def _colmap(cameras: Mapping[str, Camera]) -> dict[str, str]:
+    lenses: dict[str, int] = {}
+    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then its points"]
+    for number, (name, camera) in enumerate(cameras.items(), 1):
+        model, told = _lens(camera)
+        size = (model, str(camera.width), str(camera.height))
+        lens = " ".join((*size, *(repr(value) for value in told.values())))
+        which = lenses.setdefault(lens, len(lenses) + 1)
+        pose = [*quaternion_of(camera.viewmats[0, :3, :3]), *camera.viewmats[0, :3, 3].tolist()]
+        images += [f"{number} {' '.join(map(repr, pose))} {which} {name}", ""]
+    told_lenses = [f"{number} {lens}" for lens, number in lenses.items()]
+    head = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS"
+    return {
+        "cameras.txt": "\n".join((head, *told_lenses)) + "\n",
+        "images.txt": "\n".join(images) + "\n",
+        "points3D.txt": "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK\n",
+    }

@@ -1,0 +1,133 @@
+"""`Motion`: poses of a camera along a smooth path, from key frames with times.
+
+A pose is a similarity of space: it turns, shifts and scales the axes of a camera that looks at the
+origin from distance 1. Between two keys it moves as a power of what leads from one to the other: an
+orbit stays a circle around its target, a zoom comes nearer by the same factor each second and ends
+at the target, a shift is straight. Several keys are joined by the cubic curve of the group, which
+passes through every key without a jump of velocity.
+
+Source: Kim, Kim and Shin, "A general construction scheme for unit quaternion curves with simple
+high order derivatives", SIGGRAPH 1995 (cumulative Bernstein basis), here in the group of
+similarities; its exponential: Eade, "Lie groups for 2D and 3D transformations", 2013.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from .rotations import quaternion_of
+
+_FASTEST = 2.0  # times the slower of the neighbouring intervals' speeds, at a key
+
+
+class Motion:
+    """Poses (4, 4) float64 by time."""
+
+    def __init__(self, times: Sequence[float], poses: Sequence[Tensor], closed: bool) -> None:
+        """Takes the keys.
+
+        Args:
+            times: Seconds, increasing.
+            poses: (4, 4) float64 each: a rotation times a positive scale, and a shift; the last row
+                is (0, 0, 0, 1).
+            closed: The last pose is the first, and the path runs on through it.
+        """
+        self._times, self._poses = list(times), list(poses)
+        spans = [b - a for a, b in pairwise(times)]
+        steps = [
+            logarithm(torch.linalg.solve(a, b)) / span
+            for (a, b), span in zip(pairwise(poses), spans, strict=True)
+        ]
+        pairs = zip(pairwise(steps), pairwise(spans), strict=True)
+        speeds = [_between(*both, *spent) for both, spent in pairs]
+        if closed and len(steps) > 1:
+            joint = _between(steps[-1], steps[0], spans[-1], spans[0])
+            speeds = [joint, *speeds, joint]
+        else:
+            speeds = [*steps[:1], *speeds, *steps[-1:]]
+        self._parts = []  # of each interval: three steps, whose product leads to the next key
+        for n, span in enumerate(spans):
+            first, last = speeds[n] * span / 3, speeds[n + 1] * span / 3
+            whole = torch.linalg.solve(poses[n], poses[n + 1])
+            middle = exponential(-first) @ whole @ exponential(-last)
+            self._parts.append((first, logarithm(middle), last))
+
+    def at(self, time: float) -> Tensor:
+        """Returns the pose at a time; the first before the first key, the last after the last."""
+        n = bisect_right(self._times, time) - 1
+        if n < 0 or n >= len(self._parts):
+            return self._poses[max(n, 0)]
+        s = (time - self._times[n]) / (self._times[n + 1] - self._times[n])
+        pose = self._poses[n]
+        shares = (1 - (1 - s) ** 3, s * s * (3 - 2 * s), s**3)
+        for share, step in zip(shares, self._parts[n], strict=True):
+            pose = pose @ exponential(share * step)
+        return pose
+
+
+def _between(before: Tensor, after: Tensor, span_before: float, span_after: float) -> Tensor:
+    """The velocity at a key: that of the parabola through it and its neighbours, slowed down where
+    an interval beside it is slow; so a camera that rests between two keys does rest.
+    """
+    speed = (span_after * before + span_before * after) / (span_before + span_after)
+    most = _FASTEST * min(float(before.norm()), float(after.norm()))
+    length = float(speed.norm())
+    return speed if length <= most else speed * (most / length)
+
+
+def exponential(step: Tensor) -> Tensor:
+    """Returns the pose (4, 4) to which a velocity (7,), held for 1, leads from the identity: growth
+    (1), turning (3), shift (3).
+    """
+    scaled, along = _flow(step)
+    pose = torch.eye(4, dtype=step.dtype)
+    pose[:3, :3], pose[:3, 3] = scaled, along @ step[4:]
+    return pose
+
+
+def logarithm(pose: Tensor) -> Tensor:
+    """Returns the velocity (7,) whose exponential is the pose; of its turns the shortest."""
+    scale = float(torch.linalg.det(pose[:3, :3])) ** (1 / 3)
+    step = pose.new_zeros(7)
+    step[0] = math.log(scale)
+    step[1:4] = _turn(pose[:3, :3] / scale)
+    step[4:] = torch.linalg.solve(_flow(step)[1], pose[:3, 3])
+    return step
+
+
+def _flow(step: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the scaled rotation (3, 3) to which growth and turning lead in the time 1, and its
+    integral over that time.
+    """
+    growth, angle = float(step[0]), float(step[1:4].norm())
+    x, y, z = (step[1:4] / angle if angle > 0 else step[1:4]).tolist()
+    across = step.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    powers = torch.stack((torch.eye(3, dtype=step.dtype), across, across @ across))
+    scale, rate = math.exp(growth), complex(growth, angle)
+    risen = complex(
+        math.expm1(growth) * math.cos(angle) - 2 * math.sin(angle / 2) ** 2,
+        scale * math.sin(angle),
+    )  # exp(rate) - 1, also where the rate is small
+    mean = risen / rate if rate else 1 + 0j
+    even = math.expm1(growth) / growth if growth else 1.0
+    turned = step.new_tensor([1, math.sin(angle), 2 * math.sin(angle / 2) ** 2])
+    summed = step.new_tensor([even, mean.imag, even - mean.real])
+    return (
+        scale * torch.tensordot(turned, powers, 1),
+        torch.tensordot(summed, powers, 1),
+    )
+
+
+def _turn(rotation: Tensor) -> Tensor:
+    """Axis times angle (3,), 0 to pi, of a rotation."""
+    w, *rest = quaternion_of(rotation)
+    xyz = rotation.new_tensor(rest)
+    length = float(xyz.norm())
+    angle = 2 * math.atan2(length, w)
+    return xyz * (angle / length) if length > 0 else xyz

@@ -1,0 +1,304 @@
+"""`extract_surface`, `export_surface`: where a volume, a store or a tree passes a value, as
+triangles; block by block, so that memory holds a block and the vertices on the faces of those
+beside it.
+
+A block's cells are made once, and its vertices on faces that it shares carry the number of their
+edge, so those of neighbours are the same vertex. Values between voxel centres are interpolated, and
+go on from the outermost centres to the faces of the box, as in pictures.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from ..base import check
+from ..base.stage import Progress, no_progress
+from ..base.volume import Volume
+from ..meshes.contour import contour, edge_of
+from ..meshes.mesh import Mesh
+from ..pool import N3Tree
+from .boxes import clamp, repeat_edges
+from .store import CELL, Store
+from .surface_file import SurfaceFile, check_surface_path
+
+_BLOCK = 64  # cells along a side
+Numbered = tuple[np.ndarray, np.ndarray]  # keys, increasing, and the vertices that they are
+
+
+class SurfaceSize(NamedTuple):
+    """How large a surface is."""
+
+    vertices: int
+    triangles: int
+
+
+def extract_surface(
+    what: Volume | Store | N3Tree,
+    value: float,
+    *,
+    level: int = 0,
+    component: int = 0,
+    channel: str | None = None,
+    caps: bool = True,
+    progress: Progress = no_progress,
+) -> Mesh:
+    """Returns the surface around values of at least `value`, or around one label, as triangles in
+    world units; see `export_surface` for one larger than memory.
+
+    Args:
+        what: A volume; a store, of which a block is read at a time; or a resident tree.
+        value: Of the surface; of labels: whose.
+        level: Of a store or a tree: 0 is the finest. A tree's and a store's coarse voxels are
+            means, so thin things go.
+        component: Which number of a voxel.
+        channel: Of a tree; the first if left out.
+        caps: Closes it where it leaves the box. Else it ends at the outermost voxel centres.
+        progress: Told how many blocks are done.
+
+    Returns:
+        Triangles, counter-clockwise seen from lower values; every edge belongs to two, but where an
+        open surface ends. Where a voxel is `value` exactly, some have no area.
+
+    Raises:
+        ValueError: The value is nowhere reached or nowhere not, an argument is out of its range, or
+            not all of the tree is in memory.
+        OSError: The store can't be read.
+
+    Source: see meshes/contour.py.
+    """
+    grid = _Grid(what, value, level, component, channel, caps)
+    parts = list(_parts(grid, progress))
+    places, faces = (np.concatenate(those) for those in zip(*parts, strict=True))
+    if not len(faces):
+        raise ValueError(grid.nothing())
+    return Mesh(vertices=places, faces=faces, name="surface")
+
+
+def export_surface(
+    what: Volume | Store | N3Tree,
+    value: float,
+    path: str | Path,
+    *,
+    level: int = 0,
+    component: int = 0,
+    channel: str | None = None,
+    caps: bool = True,
+    progress: Progress = no_progress,
+) -> SurfaceSize:
+    """Writes what `extract_surface` returns to a file, of any size, as it is made; the file appears
+    when it is whole.
+
+    Args:
+        path: .ply (binary), or .glb (glTF 2.0; below 4 GB).
+        what, value, level, component, channel, caps, progress: As of `extract_surface`.
+
+    Raises:
+        ValueError: The ending is another, there are more vertices than the file can hold, or see
+            `extract_surface`.
+        FileNotFoundError: The folder does not exist.
+    """
+    path = Path(path)
+    check_surface_path("export_surface", path)
+    grid = _Grid(what, value, level, component, channel, caps)
+    with SurfaceFile(path, grid.place(np.zeros((1, 3)))[0], float(grid.step.min())) as file:
+        for places, faces in _parts(grid, progress):
+            file.add(places, faces)
+        if not file.triangles:
+            raise ValueError(grid.nothing())
+    return SurfaceSize(file.vertices, file.triangles)
+
+
+class _Grid:
+    """Samples of one component and level, z y x. With caps there are two more layers around the
+    voxels: on the faces of the box, where the outermost values go on, and outside.
+    """
+
+    def __init__(
+        self,
+        what: Volume | Store | N3Tree,
+        value: float,
+        level: int,
+        component: int,
+        channel: str | None,
+        caps: bool,
+    ) -> None:
+        where = "extract_surface"
+        if not isinstance(what, (Volume, Store, N3Tree)):
+            kind = type(what).__name__
+            raise ValueError(f"{where}: what must be a Volume, Store or N3Tree, got {kind}")
+        self.what, self.more = what, 2 if caps else 0
+        self.label: int | None = None
+        self.value = check.number(where, "value", value)
+        branching = what.branching if isinstance(what, N3Tree) else 2
+        levels = what.levels if isinstance(what, Store) else 1
+        if isinstance(what, N3Tree):
+            levels = what.depth + 1
+            self._bricks, self._channel = what.levels(), what.fine_channel(where, channel)
+            width = what.bricks.channels[self._channel].width
+            known, labels = what.labels.get(self._channel), self._channel in what.labels
+        else:
+            if channel is not None:
+                raise ValueError(f"{where}: channel is for trees, got {channel!r}")
+            width = what.width if isinstance(what, Store) else what.data.shape[3]
+            known, labels = what.label_values, what.info.labels
+        self.level = check.whole(where, "level", level, low=0, high=levels - 1)
+        self.component = check.whole(where, "component", component, low=0, high=width - 1)
+        if labels:
+            self.label, self.value = _stored_label(self.value, known), 0.5
+        scale = branching**level
+        self.voxels = tuple(-(-n // scale) for n in what.extent[::-1])
+        self.samples = tuple(n + 2 * self.more for n in self.voxels)
+        spacing, origin = np.array(what.spacing[::-1]), np.array(what.origin[::-1])
+        self.step = spacing * scale
+        self._first = origin + spacing * (scale - 1) / 2  # of the first voxel's centre
+        ends = np.array(what.extent[::-1]) / scale - 0.5  # of the box
+        self._ends = np.clip(ends, np.array(self.voxels) - 1, None)
+
+    def place(self, at: np.ndarray) -> np.ndarray:
+        """Returns world places (k, 3) x y z of places z y x in samples."""
+        found = at - self.more
+        if self.more:
+            found = np.where(found < 0, -0.5 * np.clip(-found, 0, 1), found)
+            last = np.array(self.voxels) - 1
+            beyond = np.clip(found - last, 0, 1)
+            found = np.where(beyond > 0, last + beyond * (self._ends - last), found)
+        return (self._first + found * self.step)[:, ::-1]
+
+    def read(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
+        """Returns samples low to high, float64; outside they are -inf."""
+        begin, end = ([n - self.more for n in corner] for corner in (low, high))
+        start, stop = clamp(begin, end, self.voxels)
+        values = self._voxels(start, stop)[..., self.component, None]
+        values = repeat_edges(values, start, begin, end)[..., 0]
+        same = values == self.label if self.label is not None else values
+        samples = same.astype(np.float64)
+        samples[np.isnan(samples)] = -np.inf
+        for axis in range(3 if self.more else 0):
+            at = np.arange(low[axis], high[axis])
+            outside = (at == 0) | (at == self.samples[axis] - 1)
+            samples[(slice(None),) * axis + (outside,)] = -np.inf
+        return samples
+
+    def _voxels(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
+        """Voxels low to high, which are inside, (z, y, x, c)."""
+        if isinstance(self.what, Store):
+            return self.what.read_region(self.level, low, high)
+        if isinstance(self.what, N3Tree):
+            found = self._bricks.read(self._channel, self.level, tuple(low), tuple(high))
+        else:
+            found = self.what.data[tuple(map(slice, low, high))]
+        return (found.float() if found.dtype == torch.bfloat16 else found).numpy()
+
+    def crossed(self, low: Sequence[int], high: Sequence[int]) -> bool:
+        """Whether samples low to high may be on both sides, as far as is known without reading."""
+        store = self.what
+        outside = self.more and any(
+            a == 0 or b == n for a, b, n in zip(low, high, self.samples, strict=True)
+        )
+        if not isinstance(store, Store) or not store.has_blocks:
+            return True
+        begin, end = ([n - self.more for n in corner] for corner in (low, high))
+        start, stop = clamp(begin, end, self.voxels)
+        cells = store.read_cells(
+            self.level, [n // CELL for n in start], [-(-n // CELL) for n in stop]
+        )[..., self.component]
+        least, most = cells[..., 0].min(), cells[..., 1].max()
+        if self.label is not None:
+            return bool(least <= self.label <= most and (least < most or outside))
+        return bool(most >= self.value and (least < self.value or outside))
+
+    def nothing(self) -> str:
+        """What to say where there is no surface."""
+        what = f"value {self.value:g}" if self.label is None else "that label"
+        return f"extract_surface: the data has no surface at {what}"
+
+
+def _stored_label(label: float, known: torch.Tensor | None) -> int:
+    """The number that stands for a label."""
+    value = check.whole(
+        "extract_surface", "value of labels", int(label) if label % 1 == 0 else label, low=0
+    )
+    if known is None:
+        return value
+    found = (known == value).nonzero()
+    if not len(found):
+        raise ValueError(f"extract_surface: there is no label {value}")
+    return int(found[0, 0])
+
+
+def _parts(grid: _Grid, progress: Progress) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yields new vertices, (v, 3) world x y z, and triangles of all vertices so far."""
+    spans = [[(a, min(a + _BLOCK, n - 1)) for a in range(0, n - 1, _BLOCK)] for n in grid.samples]
+    counts = [len(those) for those in spans]
+    total, shared, vertices = int(np.prod(counts)), _Shared(), 0
+    blocks = itertools.product(*(enumerate(those) for those in spans))
+    for done, block in enumerate(blocks):
+        at, low, high = (
+            tuple(part) for part in zip(*((n, *span) for n, span in block), strict=True)
+        )
+        end = [b + 1 for b in high]
+        if grid.crossed(low, end):
+            made = contour(grid.read(low, end), grid.value, low, grid.samples)
+            number = shared.numbers(at, made.keys, vertices)
+            new = number >= vertices
+            vertices += int(new.sum())
+            shared.keep(at, high, edge_of(made.keys, grid.samples), made.keys, number)
+            if len(made.faces):
+                yield grid.place(made.places[new]), number[made.faces]
+        else:
+            shared.drop(at)
+        progress("surface", done + 1, total)
+    yield np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+
+
+class _Shared:
+    """Vertices on the far faces of blocks, until the blocks behind them come; blocks come along x,
+    then y, then z.
+    """
+
+    def __init__(self) -> None:
+        self._behind: dict[tuple[int, ...], Numbered] = {}  # axis, and place in the other two
+
+    def numbers(self, at: tuple[int, ...], keys: np.ndarray, count: int) -> np.ndarray:
+        """Returns the vertices that keys are: those that a block before has, else new ones."""
+        known = [
+            self._behind[place] for axis in range(3) if (place := _across(axis, at)) in self._behind
+        ]
+        number = np.full(len(keys), -1)
+        for names, numbers in known:
+            if len(names):
+                found = np.minimum(np.searchsorted(names, keys), len(names) - 1)
+                same = names[found] == keys
+                number[same] = numbers[found[same]]
+        new = number < 0
+        number[new] = count + np.arange(int(new.sum()))
+        return number
+
+    def keep(
+        self,
+        at: tuple[int, ...],
+        high: Sequence[int],
+        edges: tuple[np.ndarray, np.ndarray],
+        keys: np.ndarray,
+        number: np.ndarray,
+    ) -> None:
+        """Keeps the vertices on a block's far faces, instead of those that its near ones had."""
+        start, along = edges
+        for axis in range(3):  # z, y, x
+            on = (start[:, axis] == high[axis]) & (along != 2 - axis)
+            self._behind[_across(axis, at)] = (keys[on], number[on])
+
+    def drop(self, at: tuple[int, ...]) -> None:
+        """Forgets what lies before a block without a surface."""
+        for axis in range(3):
+            self._behind.pop(_across(axis, at), None)
+
+
+def _across(axis: int, at: tuple[int, ...]) -> tuple[int, ...]:
+    return (axis, *(n for other, n in enumerate(at) if other != axis))

@@ -1,0 +1,171 @@
+"""`SurfaceFile`: triangles that come part by part, to a PLY or binary glTF file.
+
+Vertices and triangles wait in files beside the one to be written, since both formats begin with
+their numbers; memory holds a part at a time.
+
+Sources: Turk, "The PLY polygon file format", 1994; glTF 2.0 specification (Khronos), sections 3.6
+and 4.4.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import struct
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import IO
+
+import numpy as np
+
+from ..base.whole_file import whole_file
+
+ENDINGS = (".ply", ".glb")
+_MOST = 2**31 - 1  # vertices that int32 counts
+_COPIED = 1 << 24  # bytes at a time
+_PAD = 4  # chunks of a .glb end at multiples of this
+
+
+def check_surface_path(where: str, path: Path) -> None:
+    """Raises ValueError unless a surface may be written there, FileNotFoundError if there is no
+    such folder.
+    """
+    if path.suffix not in ENDINGS:
+        raise ValueError(f"{where}: path must end in {' or '.join(ENDINGS)}, got {str(path)!r}")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{where}: folder not found: {path.parent}")
+
+
+class SurfaceFile:
+    """A file of triangles that appears when it is whole:
+
+    with SurfaceFile(path, origin, step) as file:
+        file.add(places, faces)
+
+    Attributes:
+        vertices: Number so far.
+        triangles: Likewise.
+    """
+
+    def __init__(self, path: Path, origin: np.ndarray, step: float) -> None:
+        """Opens it: a .ply holds world places, of float32 where that tells a thousandth of `step`
+        apart, else float64; a .glb holds float32 from the world place `origin`, where it puts them.
+        """
+        check_surface_path("surface", path)
+        self._path, self._origin = path, origin
+        self._glb, self._step = path.suffix == ".glb", step
+        self.vertices = self.triangles = 0
+        self._ends = np.array([[np.inf] * 3, [-np.inf] * 3])
+        self._stack = ExitStack()
+
+    def __enter__(self) -> SurfaceFile:
+        """Returns itself."""
+        self._part = self._stack.enter_context(whole_file(self._path))
+        self._places, self._faces = (
+            self._stack.enter_context(tempfile.TemporaryFile(dir=self._path.parent))
+            for _ in range(2)
+        )
+        return self
+
+    def add(self, places: np.ndarray, faces: np.ndarray) -> None:
+        """Appends vertices, (v, 3) float64 world x y z, and triangles, (f, 3) of all vertices."""
+        self.vertices += len(places)
+        self.triangles += len(faces)
+        if self.vertices > _MOST:
+            raise ValueError(f"{self._path}: more than {_MOST} vertices: take a coarser level")
+        if self._glb:
+            local = (places - self._origin).astype("<f4")
+            self._places.write(local.tobytes())
+            self._faces.write(faces.astype("<u4").tobytes())
+            places = local
+        else:
+            self._places.write(places.astype("<f8").tobytes())
+            rows = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
+            rows["count"], rows["corners"] = 3, faces
+            self._faces.write(rows.tobytes())
+        if len(places):
+            self._ends[0] = np.minimum(self._ends[0], places.min(0))
+            self._ends[1] = np.maximum(self._ends[1], places.max(0))
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Writes the file, or takes away what there is of it after a mistake."""
+        with self._stack:
+            if error is not None:
+                raise error
+            with self._part.open("wb") as file:
+                (self._write_glb if self._glb else self._write_ply)(file)
+
+    def _write_ply(self, file: IO[bytes]) -> None:
+        most = max(1.0, float(np.abs(self._ends).max())) if self.vertices else 1.0
+        wide = np.spacing(np.float32(most)) > self._step / 1000
+        kind = "double" if wide else "float"
+        lines = [
+            *("ply", "format binary_little_endian 1.0", f"element vertex {self.vertices}"),
+            *(f"property {kind} {axis}" for axis in "xyz"),
+            *(f"element face {self.triangles}", "property list uchar int vertex_indices"),
+            "end_header\n",
+        ]
+        file.write("\n".join(lines).encode())
+        self._places.seek(0)
+        while part := self._places.read(_COPIED):
+            file.write(part if wide else np.frombuffer(part, "<f8").astype("<f4").tobytes())
+        self._faces.seek(0)
+        shutil.copyfileobj(self._faces, file, _COPIED)
+
+    def _write_glb(self, file: IO[bytes]) -> None:
+        sizes = 12 * self.vertices, 12 * self.triangles
+        head = json.dumps(self._scene(*sizes), separators=(",", ":")).encode()
+        head += b" " * (-len(head) % _PAD)
+        total = 12 + 8 + len(head) + 8 + sum(sizes)
+        if total >= 2**32:
+            raise ValueError(f"{self._path}: .glb ends at 4 GB, {total / 1e9:.1f} GB came: .ply")
+        file.write(struct.pack("<4sII", b"glTF", 2, total))
+        file.write(struct.pack("<I4s", len(head), b"JSON") + head)
+        file.write(struct.pack("<I4s", sum(sizes), b"BIN\0"))
+        for part in (self._places, self._faces):
+            part.seek(0)
+            shutil.copyfileobj(part, file, _COPIED)
+
+    def _scene(self, places: int, faces: int) -> dict[str, object]:
+        """The JSON of a .glb, given the bytes of both parts."""
+        ends = {"min": self._ends[0].tolist(), "max": self._ends[1].tolist()}
+        return {
+            "asset": {"version": "2.0", "generator": "gvtorch"},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0, "translation": self._origin.tolist()}],
+            "meshes": [
+                {"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "material": 0}]}
+            ],
+            "materials": [
+                {
+                    "pbrMetallicRoughness": {
+                        "baseColorFactor": [0.8, 0.8, 0.8, 1],
+                        "metallicFactor": 0,
+                        "roughnessFactor": 0.6,
+                    }
+                }
+            ],
+            "buffers": [{"byteLength": places + faces}],
+            "bufferViews": [
+                {"buffer": 0, "byteOffset": 0, "byteLength": places, "target": 34962},
+                {"buffer": 0, "byteOffset": places, "byteLength": faces, "target": 34963},
+            ],
+            "accessors": [
+                {
+                    **{"bufferView": 0, "componentType": 5126, "count": self.vertices},
+                    **{"type": "VEC3", **ends},
+                },
+                {
+                    **{"bufferView": 1, "componentType": 5125, "count": 3 * self.triangles},
+                    "type": "SCALAR",
+                },
+            ],
+        }

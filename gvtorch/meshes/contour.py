@@ -1,0 +1,181 @@
+"""`contour`: the surface where a grid of samples passes a value, cell by cell (marching cubes).
+
+A cell has a sample at each of its 8 corners. A vertex lies on each edge whose ends are on different
+sides of the value; on each face lines join the vertices of its edges; the lines of all six faces
+make loops, and these are cut into triangles. Which lines a face has follows from its own four
+samples: where two inside corners are diagonal, each is cut off for itself. So the two cells at a
+face agree, and there are no cracks. All other edges of triangles lie within their cell. So each
+edge belongs to exactly two triangles, and the surface is a manifold, except where the grid ends.
+
+The tables are made here, from that rule.
+
+Source: Lorensen and Cline, "Marching cubes", SIGGRAPH 1987; Duerst, "Additional reference to
+marching cubes", 1988 (faces that can be joined in two ways).
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+#: Corner n of a cell lies at x = n & 1, y = n >> 1 & 1, z = n >> 2 & 1. Edges: axis, first corner.
+_EDGES = [(axis, n) for axis in range(3) for n in range(8) if not n >> axis & 1]
+_NUMBER = {edge: at for at, edge in enumerate(_EDGES)}
+_AXIS = np.array([axis for axis, _ in _EDGES])  # 0: x
+_AT = np.array([[n >> 2 & 1, n >> 1 & 1, n & 1] for _, n in _EDGES])  # z y x
+
+
+class Tables(NamedTuple):
+    """Triangles of each of the 256 kinds of cells: corner n is inside where bit n is set."""
+
+    triangles: np.ndarray  # (256,) how many
+    first: np.ndarray  # (256,) row of the first
+    edges: np.ndarray  # (t, 3) their corners, by edge
+
+
+class Contour(NamedTuple):
+    """A part of a surface."""
+
+    keys: np.ndarray  # (v,) int64, increasing: `key` of the edge on which each vertex lies
+    places: np.ndarray  # (v, 3) float64 z y x in samples
+    faces: np.ndarray  # (f, 3) vertices, counter-clockwise seen from where values are lower
+
+
+def contour(samples: np.ndarray, value: float, low: Sequence[int], grid: Sequence[int]) -> Contour:
+    """Returns the surface in the cells of a block of samples.
+
+    Args:
+        samples: (z, y, x) float64; -inf is outside, and the vertex beside it is at the other end.
+        value: Inside is where samples are at least this.
+        low: z y x of the block's first sample in the grid, in which keys and places count.
+        grid: Samples z y x of the grid.
+    """
+    inside = samples >= value
+    cells = tuple(n - 1 for n in samples.shape)
+    kind = np.zeros(cells, np.uint8)
+    for n in range(8):
+        at = tuple(
+            slice(n >> up & 1, (n >> up & 1) + c) for up, c in zip((2, 1, 0), cells, strict=True)
+        )
+        kind |= inside[at].view(np.uint8) << n
+    place = np.argwhere((kind != 0) & (kind != 255))  # (k, 3)
+    tables = _tables()
+    found = kind[tuple(place.T)]
+    count = tables.triangles[found]
+    cell = np.repeat(np.arange(len(place)), count)
+    within = np.arange(len(cell)) - np.repeat(np.cumsum(count) - count, count)
+    edge = tables.edges[np.repeat(tables.first[found], count) + within]  # (f, 3)
+    start = place[cell][:, None] + _AT[edge] + np.asarray(low)  # (f, 3, 3)
+    keys, faces = np.unique(key(start, _AXIS[edge], grid), return_inverse=True)
+    return Contour(keys, _places(samples, value, keys, low, grid), faces.reshape(-1, 3))
+
+
+def key(start: np.ndarray, axis: np.ndarray, grid: Sequence[int]) -> np.ndarray:
+    """Returns a number for each edge of a grid of samples (z y x): of its first sample (..., 3) and
+    its axis, 0 along x.
+    """
+    z, y, x = np.moveaxis(start, -1, 0)
+    return ((z * grid[1] + y) * grid[2] + x) * 3 + axis
+
+
+def edge_of(keys: np.ndarray, grid: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns first samples (k, 3) z y x and axes of keys (k,)."""
+    rest, axis = np.divmod(keys, 3)
+    return np.stack(np.unravel_index(rest, tuple(grid)), -1), axis
+
+
+def _places(
+    samples: np.ndarray, value: float, keys: np.ndarray, low: Sequence[int], grid: Sequence[int]
+) -> np.ndarray:
+    """(v, 3) where the value lies on each edge, by linear interpolation."""
+    start, axis = edge_of(keys, grid)
+    end = start.copy()
+    row, column = np.arange(len(keys)), 2 - axis
+    end[row, column] += 1
+    a, b = (samples[tuple((at - np.asarray(low)).T)] for at in (start, end))
+    with np.errstate(invalid="ignore"):
+        share = (value - a) / (b - a)
+    share = np.where(np.isneginf(b), 0.0, np.where(np.isneginf(a), 1.0, share))
+    places = start.astype(np.float64)
+    places[row, column] += share
+    return places
+
+
+@functools.cache
+def _tables() -> Tables:
+    triangles = [
+        [three for loop in _loops(kind) for three in _cut(tuple(loop))] for kind in range(256)
+    ]
+    count = np.array([len(those) for those in triangles])
+    edges = np.array([three for those in triangles for three in those])
+    return Tables(count, np.cumsum(count) - count, edges)
+
+
+def _loops(kind: int) -> list[list[int]]:
+    """The loops of edges around the inside corners of a cell."""
+    after: dict[int, int] = {}
+    for corners in _faces():
+        pairs = list(itertools.pairwise((*corners, corners[0])))
+        crossed = [(_edge(a, b), kind >> b & 1) for a, b in pairs if (kind >> a ^ kind >> b) & 1]
+        for n, (edge, enters) in enumerate(crossed):
+            if enters:  # from where the face's rim comes inside to where it next leaves
+                after[edge] = crossed[(n + 1) % len(crossed)][0]
+    loops = []
+    while after:
+        edge, follows = after.popitem()
+        loop = [edge]
+        while follows != edge:
+            loop.append(follows)
+            follows = after.pop(follows)
+        loops.append(loop)
+    return loops
+
+
+def _faces() -> list[tuple[int, ...]]:
+    """The corners of each face of a cell in turn, counter-clockwise seen from outside."""
+    faces = []
+    for axis, side in itertools.product(range(3), (0, 1)):
+        u, v = 1 << (axis + 1) % 3, 1 << (axis + 2) % 3
+        around = [0, u, u + v, v]
+        faces.append(tuple((side << axis) + n for n in (around if side else around[::-1])))
+    return faces
+
+
+def _edge(a: int, b: int) -> int:
+    return _NUMBER[(a ^ b).bit_length() - 1, min(a, b)]
+
+
+def _on_one_face(a: int, b: int) -> bool:
+    """Whether two edges of a cell lie on one of its faces."""
+    ends = [{n, n | 1 << axis} for axis, n in (_EDGES[a], _EDGES[b])]
+    return any(ends[0] | ends[1] <= set(corners) for corners in _faces())
+
+
+@functools.cache
+def _cut(loop: tuple[int, ...]) -> list[tuple[int, int, int]]:
+    """Cuts a loop into triangles whose other edges lie within the cell; the shortest of these."""
+    if len(loop) == 3:
+        return [(loop[0], loop[1], loop[2])]
+    best: list[tuple[int, int, int]] = []
+    for n in range(1, len(loop) - 1):
+        sides = ((loop[0], loop[n]), (loop[n], loop[-1]))
+        inner = [pair for pair, ends in zip(sides, (n > 1, n < len(loop) - 2), strict=True) if ends]
+        if any(_on_one_face(*pair) for pair in inner):
+            continue
+        parts = [_cut(part) for part in (loop[: n + 1], loop[n:]) if len(part) > 2]
+        made = [(loop[0], loop[n], loop[-1]), *itertools.chain(*parts)]
+        if all(parts) and (not best or _length(made) < _length(best)):
+            best = made
+    return best
+
+
+def _length(triangles: list[tuple[int, int, int]]) -> float:
+    """Of all edges, where vertices are in the middle of the cell's edges."""
+    middles = _AT.astype(np.float64)
+    middles[np.arange(12), 2 - _AXIS] = 0.5
+    corners = middles[np.array(triangles)]
+    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).sum())

@@ -1,0 +1,72 @@
+"""`Drawn`: what is drawn over a picture, as flags of `gvtorch render` and `gvtorch fly`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import FlagCreatePairsOff, arg
+
+from .common import given
+
+if TYPE_CHECKING:
+    from ..base.image_info import ImageInfo
+    from ..cameras import Camera
+    from ..pictures import ColorBar, Overlay
+    from ..shaders import Shader
+    from ..viewer.state import Eye
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn:
+    """What is drawn over the picture."""
+
+    bar: FlagCreatePairsOff[bool] = False
+    """the colours of values, as the transfer function has them"""
+    scale_bar: FlagCreatePairsOff[bool] = False
+    """a length; in perspective it holds at the distance of what is looked at, the middle of the box
+    unless --state or --keys tell another"""
+    annotate: Annotated[str | None, arg(metavar="TEXT")] = None
+    """lines, \\n between them"""
+
+    def given(self) -> list[str]:
+        """Flags that are not left out."""
+        return given(self)
+
+    def overlay(
+        self, shader: Shader, info: ImageInfo, component: int, camera: Camera, eye: Eye
+    ) -> Overlay | None:
+        """Returns what is drawn over pictures of a camera in the world, whose eye is told too;
+        None where that is nothing.
+
+        Raises:
+            ValueError: The shader has no transfer function, the camera no scale, or there is no
+                room.
+        """
+        from ..pictures import Overlay
+
+        if not self.given():
+            return None
+        return Overlay(
+            camera.width,
+            camera.height,
+            bar=_color_bar(shader, info, component) if self.bar else None,
+            pixel=camera.pixel_width(math.dist(eye.eye, eye.target)) if self.scale_bar else None,
+            unit=info.unit,
+            text=self.annotate,
+        )
+
+
+def _color_bar(shader: Shader, info: ImageInfo, component: int) -> ColorBar:
+    """The bar of a shader's transfer function."""
+    from ..pictures import ColorBar
+    from ..shaders import TransferFunction
+
+    transfer = shader if isinstance(shader, TransferFunction) else getattr(shader, "transfer", None)
+    if not isinstance(transfer, TransferFunction):
+        raise ValueError(f"--bar is for transfer functions, not for {type(shader).__name__}")
+    values = [*transfer.opacity[:, 0], *transfer.color[:, 0]]
+    told = [info.channels[component].name] if component < len(info.channels) else []
+    title = ", ".join(part for part in (*told, info.quantity) if part)
+    return ColorBar(colors=transfer, low=min(values), high=max(values), title=title)

@@ -1,0 +1,56 @@
+"""`gvtorch surface`: where a volume or a store passes a value, as triangles."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional, arg
+
+from .common import Bar, ReadOptions, open_data, volume_formats
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surface:
+    """Make triangles of the surface around values, or around a label; a store is read block by
+    block."""
+
+    path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {volume_formats()}")]]
+    output: Annotated[Path, arg(aliases=["-o"], metavar="OUT.ply|OUT.glb")]
+    """the mesh, in world units: PLY, or binary glTF"""
+    value: Annotated[float, arg(aliases=["--iso"], metavar="VALUE")]
+    """inside is where values are at least this; of labels: the one that is wrapped"""
+    level: Annotated[int, arg(metavar="N")] = 0
+    """stores: level of detail, 0 is the finest; each further one has a quarter of the triangles"""
+    caps: bool = True
+    """closed where it leaves the box; else it is open there"""
+    component: Annotated[int, arg(metavar="N")] = 0
+    """which number of a voxel"""
+    image: Annotated[str | None, arg(metavar="NAME")] = None
+    """stores: which image, where there are several"""
+    source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
+
+    def run(self) -> None:
+        """Reads, extracts, writes."""
+        from ..io.resources import amount
+        from ..io.surface import export_surface
+        from ..io.surface_file import check_surface_path
+
+        check_surface_path("--output", self.output)
+        start = time.perf_counter()
+        with Bar() as bar:
+            bar("reading", 0, 0)
+            data = open_data(self.path, self.source, image=self.image, level=self.level)
+            size = export_surface(
+                *(data, self.value, self.output),
+                level=self.level,
+                component=self.component,
+                caps=self.caps,
+                progress=bar,
+            )
+        seconds, written = time.perf_counter() - start, amount(self.output.stat().st_size)
+        counts = f"{size.triangles} triangles, {size.vertices} vertices"
+        print(f"{self.output}: {counts}, {written} in {seconds:.1f} s")

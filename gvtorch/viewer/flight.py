@@ -1,0 +1,307 @@
+"""`Flight`: a film's key frames, each a `ViewState` at a time, and the states between them.
+
+Numbers run along monotone cubics (base/smooth.py), so what is allowed at the keys is allowed
+between them: opacities, clips, lights, exposure, all that the state's JSON tells as numbers with a
+point. The camera moves as `cameras/motion.py` tells, its field of view like any number. The points
+of a transfer function slide where all keys have as many; else the function itself fades, point by
+point of all keys' points. Whatever else differs (names, switches, whole numbers, kinds of shaders,
+lists of other lengths) is that of the key before, until the next key.
+"""
+
+from __future__ import annotations
+
+import json
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..base import check
+from ..base.smooth import Smooth
+from ..cameras import Camera
+from ..cameras.motion import Motion
+from .state import Eye, ViewState
+
+Curve = Callable[[float], Any]
+#: Numbers that increase along an axis of theirs: they slide without meeting.
+_ORDERED = {
+    ("TransferFunction", "opacity"): (2, 0, slice(0, 1)),  # dimensions, axis, columns of the last
+    ("TransferFunction", "color"): (2, 0, slice(0, 1)),
+    ("ChannelLook", "window"): (1, 0, slice(None)),
+    ("Clip", "boxes"): (3, 1, slice(None)),
+    ("Clip", "without"): (3, 1, slice(None)),
+}
+
+
+class Flight:
+    """States by time, smooth between their keys.
+
+    Attributes:
+        keys: (seconds, state) of each key, in order; each state has a camera.
+        closed: Whether the last key shows what the first does, and there are others: then the
+            flight runs smoothly on from its end to its start, and a film of it loops.
+    """
+
+    def __init__(self, keys: Sequence[tuple[float, ViewState]]) -> None:
+        """Takes the keys.
+
+        Args:
+            keys: Seconds, increasing, and what is shown then.
+
+        Raises:
+            ValueError: There is no key, a time does not come after the one before, or a state has
+                no camera.
+        """
+        if not len(keys):
+            raise ValueError("Flight: at least one key is needed")
+        times = [check.number("Flight", f"time of key {n}", key[0]) for n, key in enumerate(keys)]
+        states = [check.instance("Flight", "state", key[1], ViewState) for key in keys]
+        for n, (one, other) in enumerate(pairwise(times), 1):
+            if other <= one:
+                raise ValueError(f"Flight: key {n} at {other:g} s must come after {one:g} s")
+        if any(state.camera is None for state in states):
+            n = next(n for n, state in enumerate(states) if state.camera is None)
+            raise ValueError(f"Flight: key {n} has no camera")
+        self.keys = list(zip(times, states, strict=True))
+        self._times, self._states = times, states
+        told = [state.changed(state.to_json()).to_json() for state in states]  # 1 becomes 1.0
+        self.closed = len(keys) > 2 and told[0] == told[-1]
+        looks = [{name: one[name] for name in one if name != "camera"} for one in told]
+        self._look = _curve(times, looks, self.closed)
+        eyes = [state.camera for state in states if state.camera is not None]
+        self._path = Motion(times, [_pose(eye) for eye in eyes], self.closed)
+        self._fov = Smooth(times, [np.array(eye.fov) for eye in eyes], self.closed)
+
+    @classmethod
+    def read(cls, path: str | Path, now: ViewState) -> Flight:
+        """Reads keys from a .json file: [{"time": seconds, "state": {...}}, ...]; a state may be
+        the name of its own file, from this file's folder on. What the first state leaves out is
+        that of `now`, what a later one leaves out that of the key before it.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: It holds something else; the message names file and key.
+        """
+        content = check.json_file("key frames", path)
+        if not isinstance(content, list) or not content:
+            raise ValueError(f'{path}: must be a list of keys {{"time": ..., "state": ...}}')
+        keys = []
+        for n, key in enumerate(content):
+            if not isinstance(key, dict) or set(key) != {"time", "state"}:
+                raise ValueError(f'{path}: key {n}: must be {{"time": ..., "state": ...}}')
+            told = key["state"]
+            try:
+                own = isinstance(told, str)
+                now = now.read(Path(path).parent / told) if own else now.changed(told)
+                keys.append((check.number("Flight", "time", key["time"]), now))
+            except ValueError as error:
+                raise ValueError(f"{path}: key {n}: {error}") from None
+        try:
+            return cls(keys)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+
+    def save(self, path: str | Path) -> None:
+        """Writes a .json file, as `read` takes it."""
+        if Path(path).suffix != ".json":
+            raise ValueError(f"Flight: path must end in .json, got {str(path)!r}")
+        content = [{"time": time, "state": state.to_json()} for time, state in self.keys]
+        Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+    @property
+    def seconds(self) -> float:
+        """How long it takes."""
+        return self._times[-1] - self._times[0]
+
+    def at(self, time: float) -> ViewState:
+        """Returns what is shown at a time, exactly the key's state at a key; the first before the
+        first key, the last after the last.
+
+        Raises:
+            ValueError: What lies between two keys can't be: a clip plane turns over, ...
+        """
+        time = check.number("Flight", "time", time)
+        n = bisect_right(self._times, time) - 1
+        if n < 0 or self._times[n] == time or n == len(self._times) - 1:
+            return self._states[max(n, 0)]
+        before = self._states[n].camera
+        assert before is not None
+        eye = _eye(self._path.at(time), float(self._fov.at(time)), before)
+        try:
+            state = self._states[n].changed(self._look(time))
+        except ValueError as error:
+            raise ValueError(f"Flight: at {time:g} s, after key {n}: {error}") from None
+        return replace(state, camera=eye)
+
+    def along(self, share: float) -> ViewState:
+        """Returns what is shown at a share of the time, 0 to 1."""
+        share = check.number("Flight", "share", share, low=0, high=1)
+        return self.at(self._times[-1] if share == 1 else self._times[0] + share * self.seconds)
+
+    def states(self, fps: float = 25, frames: int | None = None) -> Iterator[ViewState]:
+        """Yields the state of each picture of a film, from the first key to the last; of a closed
+        flight without the last, which is the first of the next round.
+
+        Args:
+            fps: Pictures a second.
+            frames: How many in all, evenly spaced, instead.
+        """
+        count = (
+            self.count(fps) if frames is None else check.whole("Flight", "frames", frames, low=1)
+        )
+        steps = max(1, count if self.closed else count - 1)
+        for n in range(count):
+            yield self.along(n / steps)
+
+    def count(self, fps: float = 25) -> int:
+        """Number of pictures of a film."""
+        fps = check.number("Flight", "fps", fps, low=0, open_low=True)
+        return max(1, round(self.seconds * fps) + (not self.closed))
+
+    def __len__(self) -> int:
+        """Number of keys."""
+        return len(self.keys)
+
+    def __repr__(self) -> str:
+        return f"Flight({len(self)} keys, {self.seconds:g} s{', closed' * self.closed})"
+
+
+def _pose(eye: Eye) -> Tensor:
+    """(4, 4): where a camera's axes (x right, y down, z forward) from its target, as long as it is
+    far from it, lie in the world.
+    """
+    view = Camera.look_at(eye.eye, eye.target, eye.up).viewmats[0]
+    target = torch.tensor(eye.target, dtype=torch.float64)
+    distance = (target - torch.tensor(eye.eye, dtype=torch.float64)).norm()
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3], pose[:3, 3] = distance * view[:3, :3].T, target
+    return pose
+
+
+def _eye(pose: Tensor, fov: float, before: Eye) -> Eye:
+    """The camera of a pose; of the model of the key before."""
+    down, forward, target = pose[:3, 1], pose[:3, 2], pose[:3, 3]
+    x, y, z = (tuple(part.tolist()) for part in (target - forward, target, -down / down.norm()))
+    return Eye(eye=x, target=y, up=z, fov=fov, model=before.model)
+
+
+def _curve(times: Sequence[float], values: Sequence[Any], closed: bool, place: Any = None) -> Curve:
+    """What plain JSON is at a time: smooth through keys in a row whose values have one form, else
+    that of the key before. `place` is the kind and the name of what has these values.
+    """
+    forms = [_form(value, place) for value in values]
+    starts = [0, *(n for n in range(1, len(forms)) if forms[n] != forms[n - 1]), len(forms)]
+    closed = closed and len(starts) == 2
+    runs = [
+        (times[a], times[b - 1], _smooth(times[a:b], values[a:b], closed, place))
+        for a, b in pairwise(starts)
+    ]
+    begins = [begin for begin, _, _ in runs]
+
+    def at(time: float) -> Any:
+        begin, end, curve = runs[max(0, bisect_right(begins, time) - 1)]
+        return curve(min(max(time, begin), end))
+
+    return at
+
+
+def _form(value: Any, place: Any) -> Any:
+    """What two values must share to have others between them."""
+    if isinstance(value, float):
+        return "number"
+    if isinstance(value, dict):
+        return ("kept",) if "kept" in value else (value.get("kind"), *sorted(value))
+    if isinstance(value, list):
+        if place in _ORDERED and place[0] == "TransferFunction":
+            return "points"
+        numbers = _numbers(value)
+        return ("list", len(value)) if numbers is None else ("numbers", numbers.shape)
+    return "other"
+
+
+def _numbers(value: Any) -> np.ndarray | None:
+    """A list of floats, or of lists of them, as an array; None where it is something else."""
+    flat = value if isinstance(value, list) else []
+    while flat and isinstance(flat[0], list):
+        flat = [item for part in flat if isinstance(part, list) for item in part]
+    if not flat or not all(isinstance(item, float) for item in flat):
+        return None
+    try:
+        return np.array(value, np.float64)
+    except ValueError:  # of different lengths
+        return None
+
+
+def _smooth(times: Sequence[float], values: Sequence[Any], closed: bool, place: Any) -> Curve:
+    """The curve through values of one form."""
+    first = values[0]
+    if isinstance(first, float):
+        return _number_curve(times, [np.array(value) for value in values], closed)
+    arrays = [found for value in values if (found := _numbers(value)) is not None]
+    if arrays:
+        if len({one.shape for one in arrays}) > 1:
+            arrays = _sampled(arrays)
+        return _number_curve(times, arrays, closed, place)
+    if isinstance(first, list):
+        items = [_curve(times, [v[n] for v in values], closed) for n in range(len(first))]
+        return partial(_each, items)
+    if isinstance(first, dict) and "kept" not in first:
+        return partial(
+            _fields,
+            {
+                name: _curve(times, [v[name] for v in values], closed, (first.get("kind"), name))
+                for name in first
+            },
+        )
+    return partial(_newest, times, values)
+
+
+def _each(curves: Sequence[Curve], time: float) -> list[Any]:
+    return [curve(time) for curve in curves]
+
+
+def _fields(curves: Mapping[str, Curve], time: float) -> dict[str, Any]:
+    return {name: curve(time) for name, curve in curves.items()}
+
+
+def _newest(times: Sequence[float], values: Sequence[Any], time: float) -> Any:
+    return values[max(0, bisect_right(times, time) - 1)]
+
+
+def _number_curve(
+    times: Sequence[float], arrays: Sequence[np.ndarray], closed: bool, place: Any = None
+) -> Curve:
+    """The curve through arrays of one shape; what must increase along an axis is kept as its first
+    number and the gaps, which stay positive.
+    """
+    dimensions, axis, columns = _ORDERED.get(place, (None, 0, slice(None)))
+    if arrays[0].ndim != dimensions:
+        smooth = Smooth(times, arrays, closed)
+        return lambda time: smooth.at(time).tolist()
+    before = [np.copy(one) for one in arrays]
+    for one in before:
+        one[..., columns] = np.diff(one[..., columns], axis=axis, prepend=0)
+    gaps = Smooth(times, before, closed)
+
+    def at(time: float) -> Any:
+        found = gaps.at(time).copy()
+        found[..., columns] = np.cumsum(found[..., columns], axis=axis)
+        return found.tolist()
+
+    return at
+
+
+def _sampled(functions: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Piecewise linear functions, rows (value, number, ...), at the values of all of them."""
+    values = np.unique(np.concatenate([one[:, 0] for one in functions]))
+    return [
+        np.stack([values, *(np.interp(values, one[:, 0], c) for c in one.T[1:])], 1)
+        for one in functions
+    ]

@@ -1,0 +1,315 @@
+"""Films of key frames: states between states, and the camera's way through its keys."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers import gvtorch
+from helpers.viewer import pixels
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import gvtorch as gv
+from gvtorch.cameras.motion import exponential, logarithm
+from gvtorch.viewer.state import Development, Eye
+
+HOT = gv.TransferFunction([(0, 0), (100, 0.5), (200, 1)], [(0, 1, 0, 0), (255, 0, 0, 1)])
+FRONT = Eye(eye=(0, 0, 5), target=(0, 0, 0))
+
+
+def orbit(degrees: float, distance: float = 5.0, target=(0.0, 0.0, 0.0)) -> Eye:
+    turn = math.radians(degrees)
+    x, y, z = target
+    return Eye(eye=(x + distance * math.sin(turn), y, z + distance * math.cos(turn)), target=target)
+
+
+def shown(camera: Eye = FRONT, shader: gv.Shader = HOT, **options) -> gv.ViewState:
+    return gv.ViewState(shader=shader, options=gv.RenderOptions(**options), camera=camera)
+
+
+def place(eye: Eye) -> np.ndarray:
+    view = eye.camera(2, 2, torch.zeros(2, 3)).viewmats[0]
+    return np.array([*eye.eye, *eye.target, *view.flatten().tolist(), eye.fov])
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.floats(-3, 3), min_size=7, max_size=7))
+def test_a_pose_is_the_exponential_of_its_logarithm(numbers):
+    """And powers of it are those of the matrix, by torch's own exponential."""
+    step = torch.tensor(numbers, dtype=torch.float64)
+    step[1:4] *= 0.95 * math.pi / max(float(step[1:4].norm()), 3.0)
+    pose = exponential(step)
+    assert torch.allclose(logarithm(pose), step, rtol=1e-9, atol=1e-9)
+    x, y, z = step[1:4].tolist()
+    flow = torch.zeros(4, 4, dtype=torch.float64)
+    flow[:3, :3] = flow.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    flow[(0, 1, 2), (0, 1, 2)] = step[0]
+    flow[:3, 3] = step[4:]
+    assert torch.allclose(pose, torch.linalg.matrix_exp(flow), rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("turn", [(math.pi, 0, 0), (0, math.pi, 0), (1e-9, 0, 0), (0, 0, 0)])
+def test_half_turns_and_none_have_a_logarithm(turn):
+    step = torch.tensor([0.0, *turn, 1.0, 2.0, 3.0], dtype=torch.float64)
+    again = exponential(logarithm(exponential(step)))
+    assert torch.allclose(again, exponential(step), atol=1e-12)
+
+
+def test_keys_are_exact_and_an_orbit_is_a_circle():
+    """Four keys of uneven times at one angular speed: the camera is where a turntable has it."""
+    times = (0.0, 1.0, 2.5, 4.0)
+    keys = [(time, shown(orbit(60 * time, 5.0, (3.0, 2.0, 1.0)))) for time in times]
+    flight = gv.Flight(keys)
+    for time, state in keys:
+        assert flight.at(time) is state
+    for time in np.linspace(0, 4, 23):
+        found = flight.at(time).camera
+        assert np.allclose(place(found), place(orbit(60 * time, 5.0, (3.0, 2.0, 1.0))), atol=1e-9)
+    assert flight.at(-1) is keys[0][1] and flight.at(9) is keys[-1][1]
+
+
+def test_a_zoom_comes_nearer_by_the_same_factor_and_ends_at_its_target():
+    """From 3 to 3e-9, and on the way there all the time."""
+    end = (0.3, 0.2, 0.1)
+    flight = gv.Flight([(0, shown(orbit(0, 3.0))), (9, shown(orbit(50, 3e-9, end)))])
+    for second in range(1, 9):
+        eye = flight.at(second).camera
+        assert math.isclose(math.dist(eye.eye, eye.target), 3 * 10.0**-second, rel_tol=1e-7)
+        assert math.dist(eye.target, end) < 0.2 * math.dist(eye.eye, eye.target)
+
+
+def test_no_velocity_jumps():
+    """Differences on both sides of a key agree, of the camera and of every number."""
+    clip = [gv.Clip(planes=[(1, 0, 0, d)], boxes=[((d, 0, 0), (d + 1, 2, 3))]) for d in range(5)]
+    cameras = [
+        Eye(eye=(0, 1, 9), target=(0, 0, 0)),
+        Eye(eye=(6, 3, 5), target=(1, 0, 0), fov=40),
+        Eye(eye=(5, -2, -1), target=(0, 2, 1), fov=20, up=(0.3, 1, 0)),
+        Eye(eye=(1, -2, -3), target=(0, 0, 0), fov=35),
+    ]
+    points = ([(0, 0), (9, 1)], [(5, 0.5), (30, 1)], [(7, 0), (40, 0.1)], [(8, 0.2), (41, 1)])
+    times = (0, 1.0, 2.5, 3.0)
+    flight = gv.Flight(
+        [
+            (t, shown(camera, gv.Lit(gv.TransferFunction(p), ambient=0.1 * t), clip=c, step=1 + t))
+            for t, camera, p, c in zip(times, cameras, points, clip, strict=False)
+        ]
+    )
+
+    def numbers(time: float) -> np.ndarray:
+        state = flight.at(time)
+        return np.array(
+            [
+                *place(state.camera),
+                *np.ravel(state.shader.transfer.opacity),
+                state.shader.ambient,
+                *np.ravel(state.options.clip.planes),
+                *np.ravel(state.options.clip.boxes),
+                state.options.step,
+            ]
+        )
+
+    tiny = 1e-5
+    fastest = max(abs(numbers(t + 0.01) - numbers(t)).max() / 0.01 for t in np.arange(0, 3, 0.01))
+    for key in times[1:-1]:
+        before = (numbers(key) - numbers(key - tiny)) / tiny
+        after = (numbers(key + tiny) - numbers(key)) / tiny
+        assert abs(before).max() > 0.1
+        assert abs(before - after).max() < 1e-3 * fastest, key
+    turning = [flight.at(t).camera for t in np.arange(0, 3, 0.01)]
+    assert all(math.dist(a.eye, b.eye) < 0.5 for a, b in itertools.pairwise(turning))
+
+
+def test_a_camera_rests_between_two_keys_of_one_place():
+    flight = gv.Flight(
+        [(0, shown(orbit(0))), (1, shown(orbit(40))), (2, shown(orbit(40))), (3, shown(orbit(90)))]
+    )
+    for time in np.linspace(1, 2, 9):
+        assert np.allclose(place(flight.at(time).camera), place(orbit(40)), atol=1e-12)
+
+
+def test_a_closed_flight_runs_on_through_its_ends():
+    keys = [(t, shown(orbit(120 * t, 5 + (t == 1)), step=1 + t % 3)) for t in range(4)]
+    keys[-1] = (3, keys[0][1])
+    flight = gv.Flight(keys)
+    assert flight.closed and flight.count(10) == 30
+    tiny = 1e-6
+    before = place(keys[0][1].camera) - place(flight.at(3 - tiny).camera)
+    after = place(flight.at(tiny).camera) - place(keys[0][1].camera)
+    assert abs(before - after).max() < 1e-4 * abs(after).max()
+    assert [round(s.camera.fov, 3) for s in flight.states(10)] == [30.0] * 30
+    opened = gv.Flight(keys[:-1])
+    assert not opened.closed and opened.count(10) == 21
+    assert [*opened.states(10)][-1] is keys[2][1]
+
+
+def test_points_of_a_function_slide_or_the_function_fades():
+    many = gv.TransferFunction([(0, 0.0), (50, 0.2), (80, 0.8), (200, 1)])
+    slid = gv.Flight(
+        [
+            (0, shown(shader=HOT)),
+            (2, shown(shader=gv.TransferFunction([(50, 0), (52, 1), (54, 1)]))),
+        ]
+    ).at(1)
+    assert np.allclose(slid.shader.opacity, [(25, 0), (76, 0.75), (127, 1)])
+    faded = gv.Flight([(0, shown(shader=HOT)), (2, shown(shader=many))]).at(0.5)
+    values = np.linspace(-10, 260, 99)
+    mixed = 0.75 * HOT(values)[:, 3] + 0.25 * many(values)[:, 3]
+    assert np.allclose(faded.shader(values)[:, 3], mixed, atol=1e-6)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_what_lies_between_states_is_a_state(data):
+    """Windows, boxes and points keep their order whatever the keys are."""
+    number = st.floats(-1e3, 1e3).map(lambda x: round(x, 3))
+    gap = st.floats(1e-3, 1e3).map(lambda x: round(x, 3) + 1e-3)
+    count = data.draw(st.integers(2, 5))
+    keys = []
+    for n in range(count):
+        low, wide = data.draw(number), data.draw(gap)
+        values = np.cumsum([data.draw(number), data.draw(gap), data.draw(gap)])
+        opacity = [(v, data.draw(st.floats(0, 1))) for v in values]
+        look = gv.ChannelLook(window=(low, low + wide), color=(0, 1, 0))
+        channels = gv.Channels([look, gv.TransferFunction(opacity)])
+        clip = gv.Clip(boxes=[((low, 0, 0), (low + wide, 1, 1))])
+        state = shown(orbit(data.draw(number)), channels, clip=clip)
+        keys.append((float(n), state))
+    flight = gv.Flight(keys)
+    for time in np.linspace(0, count - 1, 13):
+        assert isinstance(flight.at(time), gv.ViewState)
+
+
+def test_what_has_no_between_switches_at_its_key():
+    first = gv.ViewState(shader=HOT, camera=FRONT, develop=Development(samples=2))
+    second = gv.ViewState(
+        shader=gv.Isosurface(3.5),
+        options=gv.RenderOptions(lod="finest", clip=gv.Clip(planes=[(1, 0, 0, 1)])),
+        develop=Development(samples=8, tone="aces"),
+        camera=Eye(eye=(0, 0, 6), target=(0, 0, 0), model="fisheye"),
+        component=1,
+    )
+    flight = gv.Flight([(0, first), (1, second), (2, second)])
+    for time, state in ((0.999, first), (1, second), (1.5, second)):
+        found = flight.at(time)
+        assert type(found.shader) is type(state.shader)
+        assert found.develop == state.develop and found.component == state.component
+        assert (found.options.lod, found.options.clip is None) == (
+            *(state.options.lod, state.options.clip is None),
+        )
+        assert found.camera.model == state.camera.model
+    module = gv.ModuleShader(gv.TransferModule(HOT, 1.0))
+    kept = gv.Flight([(0, shown(shader=module)), (1, shown(orbit(30), shader=module))])
+    assert kept.at(0.5).shader is module
+
+
+def test_a_flight_comes_back_from_its_file(tmp_path):
+    """Keys that leave something out have what the key before has."""
+    keys = [(0, shown(step=0.25)), (1.5, shown(orbit(30))), (4, shown(orbit(80)))]
+    gv.Flight(keys).save(tmp_path / "keys.json")
+    again = gv.Flight.read(tmp_path / "keys.json", shown(shader=gv.Isosurface(1)))
+    for time in (0, 0.7, 1.5, 3.2):
+        assert again.at(time).to_json() == gv.Flight(keys).at(time).to_json()
+    content = [
+        {"time": 0, "state": {"options": {"step": 0.25}}},
+        {"time": 2, "state": {"camera": {"eye": [1, 0, 5], "target": [0, 0, 0]}}},
+        {"time": 3, "state": "views/a.json"},
+    ]
+    (tmp_path / "views").mkdir()
+    shown(orbit(70), gv.Isosurface(7)).save(tmp_path / "views" / "a.json")
+    (tmp_path / "some.json").write_text(json.dumps(content))
+    flight = gv.Flight.read(tmp_path / "some.json", shown())
+    assert flight.at(2).options.step == 0.25 and flight.at(0).camera == FRONT
+    assert flight.at(3).shader.value == 7 and flight.at(3).camera == orbit(70)
+    assert repr(flight) == "Flight(3 keys, 3 s)"
+
+
+BAD = (
+    ([], "must be a list of keys"),
+    ({}, "must be a list of keys"),
+    ([{"time": 0}], "key 0: must be"),
+    ([{"time": "soon", "state": {}}], "key 0: Flight: time must be a number"),
+    ([{"time": 0, "state": {"options": {"step": -1}}}], "key 0: render: step"),
+    ([{"time": 0, "state": "no.json"}], "state not found"),
+    ([{"time": 1, "state": {}}, {"time": 1, "state": {}}], "key 1 at 1 s must come after 1 s"),
+)
+
+
+@pytest.mark.parametrize(("content", "message"), BAD)
+def test_bad_files_of_keys_are_one_line(small, tmp_path, content, message):
+    (tmp_path / "k.json").write_text(json.dumps(content))
+    run = gvtorch("fly", small, "-o", tmp_path / "f", "--keys", tmp_path / "k.json")
+    assert run.returncode == 2 and message in run.stderr and len(run.stderr.splitlines()) == 1
+    assert not (tmp_path / "f").exists()
+
+
+def test_flags_that_the_keys_tell_are_refused(small, tmp_path):
+    state = {"camera": {"eye": [60, 20, 8], "target": [12, 10, 8]}, "options": {"step": 0.4}}
+    (tmp_path / "k.json").write_text(json.dumps([{"time": 0, "state": state}]))
+    for flags in (("--turntable", "2"), ("--orbit", "1,2"), ("--fov", "20"), ("--step", "1")):
+        run = gvtorch("fly", small, "-o", tmp_path / "f", "--keys", tmp_path / "k.json", *flags)
+        assert run.returncode == 2 and f"--keys tells what {flags[0]} does" in run.stderr
+    run = gvtorch("fly", small, "-o", tmp_path / "f", "--keys", tmp_path / "no.json")
+    assert run.returncode == 2 and "key frames not found" in run.stderr
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: gv.Flight([]), "at least one key"),
+        (lambda: gv.Flight([(0, gv.ViewState(shader=HOT))]), "key 0 has no camera"),
+        (lambda: gv.Flight([(0, 3)]), "state must be a ViewState"),
+        (lambda: gv.Flight([(0, shown())]).at(math.nan), "time must be finite"),
+        (lambda: [*gv.Flight([(0, shown())]).states(0)], "fps must be finite and > 0"),
+        (
+            lambda: gv.Flight(
+                [(n, shown(clip=gv.Clip(planes=[(1 - 2 * n, 0, 0, 0)]))) for n in (0, 1)]
+            ).at(0.5),
+            "at 0.5 s, after key 0",
+        ),
+    ],
+)
+def test_wrong_flights_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.backend("cpp")
+def test_a_film_of_keys_is_streamed_as_it_is_resident(scan_store, tmp_path):
+    """And each picture is the one that Python makes of the state between the keys."""
+    volume = gv.read_volume(scan_store.with_name("ball.npy"), spacing=(1, 1, 2))
+    tree = gv.N3Tree.from_volume(volume)
+    middle = tuple(tree.box.mean(0).tolist())
+    shaders = [gv.TransferFunction.preset("hot", low, 200) for low in (0, 90)]
+    keys = [
+        (n, gv.ViewState(
+            shader=gv.Lit(shaders[n]),
+            options=gv.RenderOptions(clip=gv.Clip(planes=[(1.0, 0, 0, -10.0 - 12 * n)])),
+            develop=Development(samples=2),
+            camera=orbit(200 + 50 * n, 180.0, middle),
+        ))
+        for n in (0, 1)
+    ]  # fmt: skip
+    flight = gv.Flight(keys)
+    flight.save(tmp_path / "k.json")
+    common = ("--keys", tmp_path / "k.json", "--fps", "2", "--size", "40x32")
+    for name, data, more in (("s", scan_store, ()), ("r", scan_store.with_name("ball.npy"),
+                                                     ("--spacing", "1,1,2"))):  # fmt: skip
+        run = gvtorch("fly", data, "-o", tmp_path / name, *common, *more)
+        assert run.returncode == 0 and "3 pictures" in run.stdout, run.stderr
+    for number, state in enumerate(flight.states(2)):
+        file = f"{number:04d}.png"
+        seen = pixels((tmp_path / "s" / file).read_bytes())
+        assert np.array_equal(seen, pixels((tmp_path / "r" / file).read_bytes()))
+        expected = state.picture(tree, 40, 32).to_srgb8().numpy()
+        assert np.array_equal(seen, expected) and seen.std() > 5
+    with gv.Engine(gv.StoredProducer(str(scan_store))) as engine:
+        again = flight.at(0.5).picture(engine, 40, 32).to_srgb8().numpy()
+    assert np.array_equal(again, pixels((tmp_path / "s" / "0001.png").read_bytes()))
+    with pytest.raises(ValueError, match="must have a camera"):
+        gv.ViewState(shader=HOT).picture(tree, 8, 8)

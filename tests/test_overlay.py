@@ -1,0 +1,194 @@
+"""What is drawn over pictures: colours, lengths, text, in strips as in whole; PNG row by row."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+import torch
+from helpers import gvtorch
+from helpers.viewer import pixels
+
+import gvtorch as gv
+from gvtorch.base.records import RenderStats
+from gvtorch.base.units import unit_symbol
+from gvtorch.pictures.files import write_png_rows
+from gvtorch.pictures.overlay import _round_below, _ticks
+
+pytest.importorskip("PIL")
+HOT = gv.TransferFunction.preset("hot", 0, 200)
+
+
+def black(width: int = 320, height: int = 240, light: float = 0.0) -> gv.Picture:
+    color = torch.full((height, width, 3), light)
+    one = torch.ones(height, width, 1)
+    return gv.Picture(
+        color=color, alpha=0 * one, depth=one, nearest=one, samples=one.int(), stats=RenderStats()
+    )
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("count", [3, 4])
+@pytest.mark.parametrize("rows", [1, 7, 64])
+def test_png_rows_come_back(tmp_path, bits, count, rows):
+    """As Pillow, or for 16 bits another decoder, reads them: noise, a gradient and one colour."""
+    from imagecodecs import png_decode
+
+    rng = np.random.default_rng(bits + count)
+    image = rng.integers(0, 2**bits, (50, 31, count)).astype(f"uint{bits}")
+    image[20:40] = np.linspace(0, 2**bits - 1, 31)[:, None]
+    image[40:] = 7
+    strips = (image[at : at + rows] for at in range(0, 50, rows))
+    write_png_rows(tmp_path / "a.png", image.shape, bits, strips)
+    content = (tmp_path / "a.png").read_bytes()
+    assert np.array_equal(png_decode(content), image)
+    if bits == 8:
+        from PIL import Image
+
+        with Image.open(io.BytesIO(content)) as read:
+            read.load()
+            assert np.array_equal(np.asarray(read), image)
+    flat = np.full((50, 31, count), 9, f"uint{bits}")
+    write_png_rows(tmp_path / "b.png", flat.shape, bits, [flat])
+    assert (tmp_path / "b.png").stat().st_size < 200 < len(content)
+
+
+def test_a_scale_bar_is_as_long_as_it_says():
+    """Its white line, in pixels, by the width of a pixel: 1, 2 or 5 times a power of ten."""
+    for pixel, unit, expected in ((0.11, "micrometer", 5.0), (0.3, None, 20.0), (7e-4, "mm", 0.05)):
+        drawn = gv.Overlay(320, 240, pixel=pixel, unit=unit).over(black()).color.numpy()
+        white = (drawn > 0.99).all(-1)
+        rows = np.flatnonzero(white.sum(1) > 0.5 * expected / pixel)
+        columns = np.flatnonzero(white[rows[0]])
+        assert abs((columns[-1] - columns[0] + 1) * pixel - expected) < 2.5 * pixel
+        assert columns[0] < 20 and rows[0] > 200, "at the lower left"
+    assert [unit_symbol(one) for one in ("micrometer", "mm", "ly", None)] == ["µm", "mm", "ly", ""]
+
+
+def test_a_pixel_is_as_wide_as_the_rays_are_apart():
+    for model in ("pinhole", "ortho"):
+        camera = gv.Camera.look_at((0, 0, 9), (0, 0, 1), width=65, height=33, model=model)
+        rays = camera.rays()
+        at = rays.origin + rays.direction * (8 / -rays.direction[:, 2:])
+        middle = at.view(33, 65, 3)[16]
+        wide = float(middle[40, 0] - middle[39, 0])
+        assert abs(camera.pixel_width(8.0) - wide) < 1e-9
+    for bad in (gv.Camera.orbit(), gv.Camera.look_at((0, 0, 9), (0, 0, 1), model="fisheye")):
+        with pytest.raises(ValueError, match="takes one pinhole or ortho camera in the world"):
+            bad.pixel_width(8.0)
+
+
+def test_a_colour_bar_has_the_colours_of_the_function():
+    bar = gv.ColorBar(colors=HOT, low=0, high=200, title="HU")
+    drawn = gv.Overlay(400, 300, bar=bar).over(black(400, 300))
+    shown = drawn.to_srgb8().numpy().astype(int)
+    frame = (shown == 255).all(-1)
+    right = 400 - 9 - 4  # within the bar, left of its margin
+    column = shown[:, right]
+    ends = np.flatnonzero(frame[:, right])
+    top, bottom = ends[0], ends[-1]
+    assert 0.4 * 300 < bottom - top < 0.55 * 300
+    rows = np.arange(top + 4, bottom - 3)
+    values = np.interp(rows, (top + 1, bottom - 1), (200, 0))
+    expected = gv.Picture(
+        **{**vars(black(1, len(rows))), "color": torch.from_numpy(HOT(values)[:, None, :3]).float()}
+    ).to_srgb8()
+    assert np.abs(column[rows] - expected.numpy()[:, 0]).max() < 8
+    assert (shown[:top, 300:] > 200).all(-1).any(), "the title"
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [(0, 1, 6), (140, 1500, 3), (-3, 3, 4), (0, 255, 6), (1e-9, 7e-9, 4), (1000, 1001, 6)],
+)
+def test_ticks_are_few_and_round(low, high, expected):
+    found = _ticks(low, high)
+    assert 3 <= len(found) <= 6 and low - 1e-9 * high <= found[0] and found[-1] <= high * (1 + 1e-9)
+    steps = np.diff(found)
+    assert np.allclose(steps, steps[0]) and np.isclose(_round_below(steps[0]), steps[0])
+    assert len(found) >= expected - 1
+
+
+def test_overlays_blend_in_linear_light_and_are_opaque_where_nothing_was():
+    drawn = gv.Overlay(320, 240, text="Mk").over(black(light=0.5))
+    assert drawn.color.max() > 0.75 and drawn.color.min() < 0.2, "white, with a dark rim"
+    same = drawn.color == 0.5
+    assert same.float().mean() > 0.95 and torch.equal(same.all(-1, keepdim=True), drawn.alpha == 0)
+    assert drawn.alpha.max() > 0.95
+    two = gv.Overlay(320, 240, text="Mk\nMk").over(black(light=0.5))
+    lines = [int((one.color != 0.5).sum()) for one in (drawn, two)]
+    assert abs(lines[1] - 2 * lines[0]) < 0.02 * lines[0]
+
+
+def test_strips_are_the_whole(tmp_path):
+    bar = gv.ColorBar(colors=HOT, low=0, high=200)
+    overlay = gv.Overlay(320, 240, bar=bar, pixel=0.2, text="one\ntwo")
+    whole = overlay.over(black(light=0.3)).color
+    for rows in (1, 17, 100):
+        strips = [
+            overlay.over(black(320, min(rows, 240 - at), 0.3), at).color
+            for at in range(0, 240, rows)
+        ]
+        assert torch.equal(torch.cat(strips), whole)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: gv.Overlay(40, 20, text="a long text"), "has no room"),
+        (lambda: gv.Overlay(320, 240, pixel=0), "pixel must be finite and > 0"),
+        (lambda: gv.ColorBar(colors=HOT, low=1, high=1), "high must be > low"),
+        (lambda: gv.Overlay(320, 240).over(black(300)), "must be 320 wide, got 300x240"),
+    ],
+)
+def test_wrong_overlays_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_letters_that_the_font_lacks_are_told():
+    with pytest.warns(UserWarning, match="the font of pictures has no 漢"):
+        gv.Overlay(320, 240, text="漢 a")
+
+
+@pytest.mark.backend("cpp")
+def test_render_and_fly_draw(scan_store, tmp_path, monkeypatch):
+    """In one piece, in strips, and in the pictures of a flight: the same pixels."""
+    flags = ("--size", "200x160", "--tf", "hot", "--bar", "--scale-bar", "--annotate", "ball")
+    still = (*flags, "--camera", "orbit:30,20,2")
+    run = gvtorch("render", scan_store, "-o", tmp_path / "a.png", *still)
+    assert run.returncode == 0, run.stderr
+    plain = gvtorch("render", scan_store, "-o", tmp_path / "p.png", *flags[:4], *still[-2:])
+    assert plain.returncode == 0
+    monkeypatch.setattr("gvtorch.pictures.progressive.STRIP", 200 * 400 * 12)
+    monkeypatch.setattr(gv.render_tiles, "__kwdefaults__",
+                        {**gv.render_tiles.__kwdefaults__, "memory": 200 * 400 * 12})  # fmt: skip
+    run = gvtorch("render", scan_store, "-o", tmp_path / "b.png", *still)
+    assert run.returncode == 0, run.stderr
+    run = gvtorch(
+        "fly", scan_store, "-o", tmp_path / "f", "--frames", "1", "--orbit", "30,20,2", *flags
+    )
+    assert run.returncode == 0, run.stderr
+    names = ("a.png", "b.png", "p.png", "f/0000.png")
+    whole, strips, without, flown = (pixels((tmp_path / name).read_bytes()) for name in names)
+    assert np.array_equal(whole, strips) and np.array_equal(whole, flown)
+    assert 300 < (whole != without).any(-1).sum() < 0.3 * whole[..., 0].size
+    for more, message in (
+        (("--shader", "isosurface", "--value", "9", "--bar"), "--bar is for transfer functions"),
+        (("--show", "samples", "--bar"), "--bar is for pictures"),
+        (("--camera-model", "fisheye", "--scale-bar"), "takes one pinhole or ortho camera"),
+    ):
+        run = gvtorch("render", scan_store, "-o", tmp_path / "c.png", "--size", "200x160", *more)
+        assert run.returncode == 2 and message in run.stderr, run.stderr
+    assert not (tmp_path / "c.png").exists()
+
+
+@pytest.mark.backend("cpp")
+def test_nothing_seen_is_told_of_strips_too(small, tmp_path):
+    run = gvtorch(
+        *("render", small, "-o", tmp_path / "a.png", "--size", "1024x720"),
+        *("--tf", "hot", "--window", "900,1000", "--step", "4"),
+    )
+    assert run.returncode == 0 and "nothing is seen: values range from" in run.stderr
+    assert pixels((tmp_path / "a.png").read_bytes()).shape == (720, 1024, 3)
