@@ -90,7 +90,8 @@ def test_every_field_of_a_dataclass_is_in_the_state():
         fields = {one.name for one in dataclasses.fields(kind)}
         assert set(schema.describe_kind(kind)["fields"]) == fields
     for owner, name in schema.SLIDERS:
-        kind = {"Eye": Eye, "Development": Development}.get(owner) or schema.KINDS[owner]
+        kind = {"ViewState": gv.ViewState, "Eye": Eye, "Development": Development}.get(owner)
+        kind = kind or schema.KINDS[owner]
         assert "range" in schema.describe_kind(kind)["fields"][name], (owner, name)
 
 

@@ -21,7 +21,6 @@ from .streaming import told
 if TYPE_CHECKING:
     from ..base.records import RenderStats
     from ..cameras import Camera
-    from ..viewer.state import Eye
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,30 +56,63 @@ class Render:
         self._check()
         parse_camera(self.camera, look, width, height)
         options = look.options()
-        with Bar() as bar, self.scene.open(self.path, options, bar) as opened:
-            scene, eye, taking = self._as_saved(opened, options)
-            camera = parse_camera(self.camera, look, width, height, scene.space)
-            camera = camera if eye is None else eye.camera(width, height, scene.box)
-            stats = taking._take(scene, camera, bar)
+        flags = self._at_saved_time()
+        with Bar() as bar, flags.open(self.path, options, bar) as opened:
+            if self.state is None:
+                camera = parse_camera(self.camera, look, width, height, opened.space)
+                stats = self._take(opened, camera, bar)
+            else:
+                stats = self._take_saved(opened, options, bar)
         if self.stats is not None:
-            content = {**stats.as_dict(), "extent": scene.extent}
+            content = {**stats.as_dict(), "extent": opened.extent}
             self.stats.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
         print(f"{self.output}: {width}x{height}, {told(stats)}")
 
-    def _as_saved(self, scene: Scene, options: dict[str, Any]) -> tuple[Scene, Eye | None, Render]:
-        """The scene as a saved state shows it, its camera, and this command with its flags."""
-        if self.state is None:
-            return scene, None, self
-        from ..tracing import RenderOptions
-        from ..viewer.state import ViewState
+    def _at_saved_time(self) -> SceneFlags:
+        """The flags of the scene, of the time point that a saved state tells."""
+        source = self.scene.source
+        if self.state is None or source.time is not None:
+            return self.scene
+        from ..viewer.state import saved_time
 
+        time = saved_time(self.state)
+        if time != int(time):
+            raise ValueError(f"{self.state}: time must be the number of a time point, got {time:g}")
+        return replace(self.scene, source=replace(source, time=int(time))) if time else self.scene
+
+    def _take_saved(self, scene: Scene, options: dict[str, Any], bar: Bar) -> RenderStats:
+        """Takes the picture of a saved state, as a page shows it."""
+        from ..tracing import RenderOptions
+        from ..viewer.slices import Planes, panes
+        from ..viewer.state import ViewState, blended
+
+        assert self.state is not None
         component = options["component"]
         now = ViewState(
             shader=scene.shader, options=RenderOptions(**options), component=component
         ).read(self.state)
         own = {"shader": now.shader, **now.settings()}
         shown = replace(scene, render=partial(scene.render, **own), cost=partial(scene.cost, **own))
-        return shown, now.camera, replace(self, show=now.show, develop=Develop(**vars(now.develop)))
+        taking = replace(self, show=now.show, develop=Develop(**vars(now.develop)))
+        width, height = size(self.scene.look.size)
+        part = (width, height) if now.slices is None else panes(width, height)["view"][2:]
+        if now.camera is None:
+            camera = parse_camera(None, self.scene.look, *part, scene.space)
+        else:
+            camera = now.camera.camera(*part, scene.box)
+        if now.slices is None and now.blend == 1:
+            return taking._take(shown, camera, bar)
+        picture = taking.develop.wrap(partial(shown.render, progress=bar))(camera)
+        whole = picture
+        if now.show != "picture":
+            whole = blended(picture, shown.cost(camera).picture(now.show), now.blend)
+        if now.slices is not None:
+            planes = Planes(scene.data, lambda problem: None)
+            whole = planes.composed(whole, now, width, height, wait=True).picture
+        whole.save(self.output, bits=self.bits)
+        if self.npz is not None:
+            picture.save(self.npz)
+        return picture.stats
 
     def _check_state(self) -> None:
         """Raises ValueError where a flag tells what a saved state does."""

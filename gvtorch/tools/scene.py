@@ -21,7 +21,9 @@ from .streaming import Streaming, tell_failures
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from ..base.volume import Volume
     from ..engine import Engine
+    from ..io.store import Store
     from ..pictures import Picture
     from ..shaders import Shader
     from ..tracing import Cost
@@ -38,6 +40,7 @@ class Scene:
     extent: tuple[int, ...]  # (x, y, z) voxels
     space: str | None  # where x, y and z point
     values: tuple[float, float] | None  # the smallest and the largest, if known
+    data: Volume | Store
     engine: Engine | None = None  # of a store
 
 
@@ -96,6 +99,7 @@ class SceneFlags:
             volume.extent,
             volume.info.space,
             volume.value_range,
+            volume,
         )
 
     @contextmanager
@@ -115,6 +119,6 @@ class SceneFlags:
                 partial(engine.render, shader=shader, mode=mode, max_frames=most, **options),
                 shader,
                 partial(cost, tree, shader=shader, **options),
-                *(tree.box, tree.extent, store.info.space, None, engine),
+                *(tree.box, tree.extent, store.info.space, None, store, engine),
             )
             tell_failures(engine)

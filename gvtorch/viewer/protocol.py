@@ -89,6 +89,24 @@ class Preset:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Read:
+    """Hands over the text of a file of transfer functions, of gvtorch or another program."""
+
+    file: str
+    text: str
+    name: str | None = None  # which, where it has several
+    low: float | None = None  # the values over which relative ones are laid
+    high: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nodes:
+    """Asks for boxes of the tree's nodes with each picture, or no more."""
+
+    on: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
 class Resize:
     """Makes the engine anew with other memory and budgets."""
 
@@ -137,8 +155,8 @@ class Do:
 
 
 Message = (
-    Hello | Move | Ack | Change | Pick | Histogram | Preset | Resize | Set | Follow | Monitor
-    | Still | Do
+    Hello | Move | Ack | Change | Pick | Histogram | Preset | Read | Nodes | Resize | Set | Follow
+    | Monitor | Still | Do
 )  # fmt: skip
 MESSAGES: dict[str, type[Any]] = {one.__name__.lower(): one for one in Message.__args__}
 

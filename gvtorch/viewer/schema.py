@@ -14,7 +14,7 @@ import inspect
 import itertools
 import math
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -92,6 +92,7 @@ SLIDERS: dict[tuple[str, str], tuple[float, float]] = {
     ("Clip", "cap_opacity"): (0.05, 1),
     ("Clip", "cap_light"): (0, 1),
     ("Eye", "fov"): (5, 120),
+    ("ViewState", "blend"): (0, 1),
     ("Development", "exposure"): (-5, 5),
     ("Development", "samples"): (1, 64),
 }
@@ -205,7 +206,7 @@ def _fits(hint: Any, content: Any) -> bool:
 def _decoded(where: str, hint: Any, content: Any, now: Any, depth: int) -> Any:
     origin = get_origin(hint)
     is_class = isinstance(hint, type) and origin is None and hint is not Any
-    if origin in (list, tuple, Sequence):
+    if origin in (list, tuple, Sequence, Iterable):
         made = _sequence(where, hint, content, now, depth)
     elif origin in (dict, Mapping):
         made = _mapping(where, hint, content, depth)

@@ -165,6 +165,7 @@ def new_session(
             shader=first,
             options=render_options("view", options),
             component=options.get("component", 0),
+            time=scene.time,
         )
         if isinstance(state, ViewState):
             chosen = state
@@ -173,6 +174,11 @@ def new_session(
         if chosen.camera is None:
             eye = fitted(scene, None, _SIZE, up) if camera is None else Eye.of(camera, scene.box)
             chosen = replace(chosen, camera=eye)
+        scene.check_time(chosen.time)
+        if chosen.time != scene.time and scene.reopen is not None:
+            scene.show_time(chosen.time, scene.reopen(int(chosen.time)))
+        elif chosen.time != scene.time:
+            scene.set_clocks(chosen.time)
         return Session(scene, chosen, parameters)
     except BaseException:
         scene.close()
