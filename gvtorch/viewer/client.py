@@ -15,7 +15,7 @@ from ..pictures import Picture, Progressive
 from .protocol import told, with_picture
 from .scene import Scene
 from .slices import Planes, panes
-from .state import Eye, ViewState
+from .state import Eye, ViewState, blended
 
 Send = Callable[[str | bytes], None]  # from any thread; does not block
 
@@ -203,6 +203,9 @@ class Client:
         if state.show != "picture":
             camera = self.eye.camera(max(1, width // 2), max(1, height // 2), scene.box)
             picture = scene.cost(camera, state, check)
+            if state.blend < 1:
+                below = state.develop.develop(scene.frame(camera, state, check))
+                picture = blended(below, picture, state.blend)
             self._done = True
             self._show(picture, camera, state, _FINAL, 1e3 * (time.perf_counter() - start))
             return picture

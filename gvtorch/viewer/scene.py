@@ -33,7 +33,7 @@ from ..shaders.labels import label_rows
 from ..shaders.presets import IN_HU
 from ..tracing import cost, render
 from .schema import MOST_ITEMS
-from .state import ViewState, blended
+from .state import ViewState
 
 BINS = 256  # of a histogram, at most
 _LOOKED_AT = 1 << 20  # values by which whole numbers are known
@@ -65,6 +65,10 @@ class Scene:
     reopen: Callable[[int], Volume | Store] | None = None
     time: float = 0.0
     _resident: Volume | None = field(default=None, repr=False)  # of a tree
+
+    def __post_init__(self) -> None:
+        if self.times == 1 and (clocks := self._clocks()):
+            self.time = clocks[0].time
 
     @property
     def box(self) -> Tensor:
@@ -102,10 +106,7 @@ class Scene:
         (tree,) = self.trees[:1]
         assert state.show != "picture"
         counted = cost(tree, camera, shader, progress=progress, **state.settings())
-        found = counted.picture(state.show)
-        if state.blend == 1:
-            return found
-        return blended(state.develop.develop(self.frame(camera, state)), found, state.blend)
+        return counted.picture(state.show)
 
     def voxels(self) -> Volume | Store:
         """Returns what planes are cut of.

@@ -33,7 +33,7 @@ from .protocol import parse
 from .scene import Scene
 from .schema import KINDS, decode, describe_kind, encode
 from .slices import Planes, panes
-from .state import Development, Eye, Slices, ViewState
+from .state import Development, Eye, Slices, ViewState, blended
 
 _TICK = 0.02  # seconds between looks at whether a camera has come to rest
 _FIGURES = 0.25  # seconds between figures for monitors
@@ -486,10 +486,9 @@ class Session:
         made = Progressive(lambda one: scene.frame(one, state)).refine(
             camera, state.develop.samples
         )
-        if state.show == "picture":
-            shown = state.develop.develop(made)
-        else:
-            shown = scene.cost(camera, state, no_progress)
+        shown = state.develop.develop(made)
+        if state.show != "picture":
+            shown = blended(shown, scene.cost(camera, state, no_progress), state.blend)
         if self._planes is None or state.slices is None:
             return shown
         return self._planes.composed(shown, state, *whole, wait=True).picture
