@@ -7,6 +7,7 @@ import warnings
 from pathlib import Path
 
 from ..shaders import TransferFunction
+from .schema import MOST_ITEMS
 
 _ENDINGS = (".vp.json", ".json", ".vp", ".xml")
 
@@ -38,5 +39,8 @@ def read_function(
             raise ValueError(str(error).replace(str(path), f"{file:.80}")) from None
     if function.relative and low is not None and high is not None:
         function = function.stretched(low, high)
+    most = max(len(function.opacity), len(function.color))
+    if most > MOST_ITEMS:
+        raise ValueError(f"{file:.80}: has {most} points, more than {MOST_ITEMS}")
     lost = [str(one.message).replace(str(path), f"{file:.80}") for one in told]
     return function, lost

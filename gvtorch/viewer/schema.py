@@ -39,6 +39,7 @@ from ..shaders import (
 from ..tracing import Clip, Lighting, RenderOptions, ThinLens
 
 MOST_ITEMS = 4096  # of a list
+_MOST_NUMBERS = 4 * MOST_ITEMS  # of an array: a transfer function has four in a row
 MOST_DEPTH = 16  # of objects in objects
 
 #: What JSON may name, by name.
@@ -125,8 +126,10 @@ def encode(value: Any) -> Any:
     if isinstance(value, Enum):
         value = value.value
     elif isinstance(value, (np.ndarray, np.generic, Tensor)):
-        many = value.numel() if isinstance(value, Tensor) else value.size
-        value = _kept(value) if many > MOST_ITEMS else value.tolist()
+        small = (
+            max(value.shape, default=0) <= MOST_ITEMS and math.prod(value.shape) <= _MOST_NUMBERS
+        )
+        value = value.tolist() if small else _kept(value)
     if isinstance(value, float):
         value = value if math.isfinite(value) else None
     elif isinstance(value, Mapping):

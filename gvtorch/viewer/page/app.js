@@ -207,7 +207,7 @@ export class App {
   transfer() {
     const { shader } = this.state;
     const found = shader.kind === "TransferFunction" ? shader : shader.transfer;
-    return found?.opacity ? found : null;
+    return Array.isArray(found?.opacity) && Array.isArray(found.color) ? found : null;
   }
 
   changeTransfer(f, rest) {

@@ -19,7 +19,7 @@ export class LabelTable {
 
   change(part, rest = true) {
     this.app.change({ shader: { ...this.shader, ...part } }, rest);
-    this.fill();
+    if (rest) this.fill();  // else a hand is still on a row
   }
 
   /** Colours that were chosen, by label. */
@@ -40,8 +40,8 @@ export class LabelTable {
     const button = (text, title, visible) => el("button.gv-small", { type: "button", title, onclick: () => this.change({ visible }) }, text);
     this.fill();
     return [
-      el("div.gv-row", {}, el("span.gv-name", {}, `${labels.count} labels`), this.filter,
-        el("span.gv-both", {}, button("all", "Show all but 0, the background", null), button("none", "Hide all", []))),
+      el("div.gv-row", {}, el("span.gv-name", {}, `${labels.count} labels`), el("span.gv-both", {}, this.filter,
+        button("all", "Show all but 0, the background", null), button("none", "Hide all", []))),
       this.body,
     ];
   }
