@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ from gvtorch.viewer import schema
 from gvtorch.viewer.protocol import MESSAGES, parse
 from gvtorch.viewer.state import Development, Eye
 
-FUZZED = int(os.environ.get("GVTORCH_FUZZ", "4000"))
+FUZZED = 4000
 HOT = gv.TransferFunction.preset("hot", 0, 255)
 SHADERS = (
     HOT,

@@ -50,6 +50,9 @@ class Ack:
 
     number: int
 
+    def __post_init__(self) -> None:
+        check.whole("ack", "number", self.number, low=0, high=2**53)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Change:

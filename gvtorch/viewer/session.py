@@ -303,7 +303,8 @@ class Session:
             _TAKES[type(message)](self, client, message)
         except (ValueError, OSError, ImportError, RuntimeError) as error:
             client.tell("refused", text=" ".join(str(error).split()))
-            client.tell("state", state=self.state.to_json())
+            if isinstance(message, protocol.Change):
+                client.tell("state", state=self.state.to_json())
 
     def _hello(self, client: Client, message: protocol.Hello) -> None:
         client.resized(message.width, message.height, message.rate)
