@@ -138,17 +138,23 @@ def view(
     return viewer
 
 
+class SessionSettings(RenderSettings, total=False):
+    """What says how a scene is shown at first; see `view`."""
+
+    up: Up | None
+    state: str | PathLike[str] | ViewState | None
+    engine: Mapping[str, Any] | None
+
+
 def new_session(
     what: Any,
     shader: Shader | None = None,
     camera: Camera | None = None,
-    *,
-    up: Up | None = None,
-    state: str | PathLike[str] | ViewState | None = None,
-    engine: Mapping[str, Any] | None = None,
-    **options: Unpack[RenderSettings],
+    **given: Unpack[SessionSettings],
 ) -> Session:
     """Opens a scene and its session, without a page; see `view`."""
+    up, state, engine = given.pop("up", None), given.pop("state", None), given.pop("engine", None)
+    options: Mapping[str, Any] = given
     parameters, producer = None, what
     if callable(what) and not hasattr(what, "fill"):
         parameters = Parameters.of_function(what)

@@ -114,7 +114,7 @@ export class Panel {
     const wanted = known.filter((kind) => app.offers(kind) || kind === shader.kind);
     const pick = el("select", { onchange: () => put(this.first(wanted[pick.selectedIndex], "shader"), true) }, ...wanted.map((kind) => el("option", {}, words(kind))));
     pick.selectedIndex = wanted.indexOf(shader.kind);
-    const rows = this.controls.fields(shader, put, { without: [...HIDDEN, ...(shader.kind === "TransferFunction" ? ["opacity", "color"] : ["channel", "normals", "color_channel", "color_component"])] });
+    const rows = this.controls.fields(shader, put, { without: [...HIDDEN, ...(shader.kind === "TransferFunction" ? ["opacity", "color"] : ["channel", "normals", "visible", "color_channel", "color_component"])] });
     return [el("label.gv-row", {}, el("span.gv-name", {}, "shader"), pick), ...rows];
   }
 
