@@ -104,7 +104,7 @@ def handle(tab: Tab, kind: str) -> tuple[float, float]:
 def test_a_plane_is_moved_and_tilted_by_its_handles(tab, viewer):
     before = tab.final()
     tab.open("Clip")
-    tab.page.get_by_text("add a plane that faces me").click()
+    tab.page.get_by_text("add one facing me").click()
     tab.until("app.state.options.clip?.planes.length === 1")
     faced = tab.app("app.state.options.clip.planes[0]")
     tab.drag((200, 330), (330, 330))  # turned, so that the plane is seen from the side

@@ -187,7 +187,7 @@ def test_the_crop_box_is_moved_by_its_handles(tab, viewer):
     tab.until(lambda: np.abs(tab.final().astype(int) - before).max() > 60)
     clip = viewer.session.ask(lambda: viewer.state.options.clip)
     assert clip.boxes[0][1][0] < 0.4 and clip.boxes[0][0] == [-0.5, -0.5, -0.5]
-    tab.page.get_by_text("add a plane that faces me").click()
+    tab.page.get_by_text("add one facing me").click()
     tab.until("app.state.options.clip.planes.length === 1")
     tab.page.locator(".gv-row:has-text('crop box') input").uncheck()
     tab.until("app.state.options.clip.boxes.length === 0")

@@ -116,9 +116,13 @@ class Scene:
         """
         if self.data is not None:
             return self.data
-        if self._resident is None:
-            if self.tree is None:
+        if self.tree is None:
+            trees = [] if self.engine is None else [*self.engine.trees.values()]
+            found = _voxels_of(trees[0].producer) if len(trees) == 1 else None
+            if found is None:
                 raise ValueError("slices: this scene has no voxels of its own to cut")
+            return found
+        if self._resident is None:
             self._resident = self.tree.to_volume()
         return self._resident
 
@@ -337,6 +341,15 @@ class Series:
         if isinstance(what, Store):
             return cls(what.times, what.at_time, float(what.time))
         return cls()
+
+
+def _voxels_of(producer: Producer) -> Volume | Store | None:
+    """The volume or store that a producer gives bricks of, or None."""
+    if isinstance(producer, StoredProducer):
+        return producer.store
+    if isinstance(producer, VolumeProducer):
+        return next(iter(producer.volumes.values()))
+    return None
 
 
 def _data_of(what: Any) -> Volume | Store:

@@ -62,7 +62,7 @@ export class Controls {
   number(told, value, set) {
     const whole = told.type === "whole";
     const read = (text) => (text === "" && told.optional ? null : whole ? Math.round(Number(text)) : Number(text));
-    const box = el("input.gv-number", { type: "number", step: "any", value: value ?? "", placeholder: told.optional ? "auto" : "" });
+    const box = el("input.gv-number", { type: "number", step: "any", value: typeof value === "number" ? Number(value.toPrecision(6)) : "", placeholder: told.optional ? "auto" : "" });
     box.onchange = () => {
       const found = read(box.value);
       if (found !== null && !Number.isFinite(found)) return;

@@ -146,7 +146,7 @@ export class Panel {
         el("button.gv-small", { type: "button", title: "Keep the other side", onclick: () => clip.setPlane(at, plane.map((n) => -n), true) }, "turn"),
         el("button.gv-small", { type: "button", onclick: () => clip.put({ ...now, planes: now.planes.filter((_, n) => n !== at) }, true) }, "remove"))),
     ]);
-    const facing = el("button.gv-small", { type: "button", title: "A plane through the target that faces you", onclick: () => clip.addPlane() }, "add a plane that faces me");
+    const facing = el("button.gv-small", { type: "button", title: "A plane through the target that faces you", onclick: () => clip.addPlane() }, "add one facing me");
     const rest = now ? this.controls.fields(now, (value, still) => clip.put(value, still), { only: ["caps", "cap_opacity", "cap_light"] }) : [];
     return [crop, ...planes, el("div.gv-row", {}, el("span.gv-name", {}, "planes"), facing), ...rest];
   }
