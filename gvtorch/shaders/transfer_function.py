@@ -134,8 +134,9 @@ class TransferFunction(Shader):
         cls, name: str, low: float | None = None, high: float | None = None
     ) -> TransferFunction:
         """Returns a named function, stretched over the values [low, high], as `gv.window` finds
-        them: gray, hot, vessels, bone, tissue, or any colour map of matplotlib. Those in Hounsfield
-        units, ct-bone, ct-soft, ct-lung, ct-vessels, keep their own values if none are given.
+        them: gray, hot, vessels, bone, tissue, mr, em, cloud, galaxy, or any colour map of
+        matplotlib. Those in Hounsfield units, ct-bone, ct-soft, ct-lung, ct-vessels, keep their own
+        values if none are given.
 
         Raises:
             ValueError: The name is unknown, or the preset needs values.
