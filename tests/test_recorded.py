@@ -18,6 +18,7 @@ from helpers.waits import nobody_waits
 
 import gvtorch as gv
 from gvtorch.engine import host_frame
+from gvtorch.engine.device_frame import DeviceFrame
 from gvtorch.io.conversion import convert
 
 COMPILED = [pytest.param(b, marks=pytest.mark.backend(b)) for b in ("cpp", "cuda")]
@@ -88,6 +89,32 @@ def test_they_come_to_the_picture_that_the_host_comes_to(backend, branching, kin
         assert made["tiles"] > 20 and (made["constant"] > 0) == kinds
     assert torch.equal(hits.color, expected.color.reshape(-1, 3))
     assert torch.equal(hits.depth, expected.depth.reshape(-1, 1))
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_joined_producers_are_recorded_where_all_are(backend):
+    """Two channels, of which one has EMPTY regions and one has none."""
+
+    def joined() -> gv.JoinedProducer:
+        return gv.JoinedProducer({"a": Ball(64), "b": Ball(64, kinds=True)})
+
+    options = {"brick_pool": "16 MB", "device": DEVICES[backend]}
+    with gv.Engine(joined(), **options) as served:
+        expected, other = (served.render(view(), LOOK, channel=name) for name in "ab")
+    with gv.Engine(joined(), **options) as own:
+        frames = Frames(own, view(), LOOK, 64)
+        assert isinstance(frames.served, DeviceFrame)
+        for _ in range(200):
+            hits, stats = frames.frame()
+            if stats.converged:
+                break
+        own.validate()
+        assert torch.equal(own.render(view(), LOOK, channel="b").color, other.color)
+    assert stats.converged and (expected.alpha > 0.5).any()
+    assert torch.equal(hits.color, expected.color.reshape(-1, 3))
+    cast = Ball(64)
+    cast.on_device = False
+    assert not gv.JoinedProducer({"a": Ball(64), "b": cast}).on_device
 
 
 def on_the_host(blobs, tmp_path, which: str) -> gv.Producer:
