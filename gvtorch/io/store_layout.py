@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
+from ..base.text_path import text_path
 from .http import file_url, is_http, read_http
 from .relay import named, through
 from .resources import cores
@@ -419,24 +420,15 @@ def context() -> Any:
 
 def kvstore(location: str | Path) -> Any:
     """Returns tensorstore's spec of a folder: a path, or a URL that it knows. Whatever a path is
-    made of, links and ".." too, stands for the folder that the system finds there.
-
-    Raises:
-        ValueError: The path can't be written as UTF-8.
+    made of, links and ".." too, stands for the folder that the system finds there; of one that is
+    no UTF-8, which tensorstore can't be told, a link to it is given.
     """
     text = str(location)
     if text.startswith("file://"):
         text = unquote(urlsplit(text).path)
     if re.match(r"[a-z0-9+]{2,}://", text):
         return text if text.endswith("/") or "?" in text else text + "/"
-    path = os.path.realpath(text)
-    try:
-        path.encode()
-    except UnicodeEncodeError:
-        raise ValueError(
-            f"{path.encode(errors='backslashreplace').decode()}: a store's path must be UTF-8; "
-            "rename it"
-        ) from None
+    path = text_path(os.path.realpath(text))
     return {"driver": "file", "path": f"{path.rstrip('/')}/"}
 
 

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..base.text_path import text_path
 from .tone import finite, from_srgb, to_srgb
 
 if TYPE_CHECKING:
@@ -65,6 +66,7 @@ def write_image(path: Path, layers: Layers, *, transparent: bool, bits: int | No
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """A place to write to, which takes the file's name once the block ends well."""
+    part = ""
     try:
         handle, name = tempfile.mkstemp(suffix=path.suffix, dir=path.parent)
     except OSError as error:
@@ -72,9 +74,10 @@ def whole_file(path: Path) -> Iterator[Path]:
     try:
         try:
             os.close(handle)
-            yield Path(name)
+            part = os.path.join(text_path(os.path.abspath(path.parent)), os.path.basename(name))
+            yield Path(part)
         except OSError as error:  # what stands there already stays
-            if error.filename not in (None, name):
+            if error.filename not in (None, name, part):
                 raise
             text = error.strerror or str(error)
             raise OSError(
