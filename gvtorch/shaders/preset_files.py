@@ -73,6 +73,8 @@ def read_points(path: str | Path, name: str | None) -> tuple[Pair, float | None,
         if name in found.keys() - maps or not maps:  # ParaView's lists may hold both kinds
             raise ValueError("holds colours of categories (IndexedColors), which are no function")
         return _of_paraview(file, _chosen(file, maps, name)), None, True
+    except OverflowError:
+        raise ValueError(f"{file}: holds a number that is too large") from None
     except (KeyError, TypeError, IndexError, ElementTree.ParseError, UnicodeDecodeError) as error:
         raise ValueError(f"{file}: no such file as its ending tells: {error!r}") from None
     except ValueError as error:
