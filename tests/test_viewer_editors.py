@@ -502,3 +502,31 @@ def test_named_presets_show_what_they_are_for(name):
         tree, gv.Camera.orbit(width=16, height=16), gv.TransferFunction.preset(name, 0, 255)
     )
     assert picture.color.std() > 0.02
+
+
+@pytest.mark.parametrize("kind", ["producer", "stored", "store"])
+def test_producers_that_hold_voxels_have_slices(kind, scan_store, tmp_path):
+    """Of a store, `gvtorch render --state` makes the page's own still."""
+    volume = bright_ball()
+    what = {
+        "producer": lambda: gv.VolumeProducer(volume),
+        "stored": lambda: gv.StoredProducer(scan_store),
+        "store": lambda: str(scan_store),
+    }[kind]()
+    state = gv.ViewState(shader=GRAY, slices=Slices(), develop=Development(samples=1))
+    session = new_session(what, state=state)
+    try:
+        still = session.ask(lambda: session.still(session.state.camera, 160, 120), 120)
+        parts = panes(160, 120)
+        image = still.to_srgb8().numpy()
+        assert all(cut_out(image, list(parts[name])).std() > 2 for name in ("x", "y", "z", "view"))
+        session.state.save(tmp_path / "view.json")
+    finally:
+        session.close()
+    if kind == "store":
+        run = gvtorch(
+            *("render", scan_store, "-o", tmp_path / "a.png", "--size", "160x120"),
+            *("--state", tmp_path / "view.json"),
+        )
+        assert run.returncode == 0, run.stderr
+        assert np.array_equal(pixels((tmp_path / "a.png").read_bytes()), image)

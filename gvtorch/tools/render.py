@@ -126,6 +126,7 @@ class Render:
         if now.slices is not None:
             planes = Planes(scene.data, lambda problem: None)
             whole = planes.composed(whole, now, width, height, wait=True).picture
+            planes.close()
         whole.save(self.output, bits=self.bits)
         if self.npz is not None:
             picture.save(self.npz)

@@ -6,9 +6,8 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cached_property, partial
-from threading import Lock
+from functools import cached_property
+from threading import Condition, Thread
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,11 +74,13 @@ class Planes:
         self.data, self._arrived = data, arrived
         self._made: OrderedDict[Any, np.ndarray] = OrderedDict()
         self._newest: dict[str, np.ndarray] = {}  # by axis
-        self._pending: dict[str, tuple[Any, Future]] = {}
         self._failed: dict[Any, str] = {}
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="gvtorch planes")
         self._windows: dict[int, tuple[float, float]] = {}
-        self._lock = Lock()  # of what was made
+        self._wanted: dict[str, tuple[Any, ViewState, float]] = {}  # by axis
+        self._reading: Any = None
+        self._closed = False
+        self._wake = Condition()
+        Thread(target=self._read, name="gvtorch planes", daemon=True).start()
 
     @cached_property
     def views(self) -> dict[str, PlaneView]:
@@ -188,39 +189,38 @@ class Planes:
         """(h, w, 3) of a plane, and whether it is the one that is wanted; else the one before."""
         key = (axis, self.index(axis, state), round(pixel, 9), self._look(state))
         if wait and key not in self._made:
-            self._keep(axis, key, self._cut(axis, state, pixel))
-        with self._lock:
+            self._keep(key, self._cut(axis, state, pixel))
+        with self._wake:
             made = self._made.get(key)
             if made is not None:
                 self._made.move_to_end(key)
                 self._newest[axis] = made
-                return made, True
-        if key in self._failed:
-            return self._newest.get(axis), True
-        waiting = self._pending.get(axis)
-        if waiting is not None and waiting[0] != key:
-            waiting[1].cancel()
-            waiting = None
-        if waiting is None:
-            future = self._thread.submit(self._cut, axis, state, pixel)
-            self._pending[axis] = key, future
-            future.add_done_callback(partial(self._came, axis, key))
-        return self._newest.get(axis), False
+            elif key not in self._failed and key != self._reading:
+                self._wanted[axis] = key, state, pixel
+                self._wake.notify()
+            return self._newest.get(axis), made is not None or key in self._failed
 
-    def _came(self, axis: str, key: Any, future: Future) -> None:
-        """Runs in the thread that reads, or where a plane that nobody wants now is let go."""
-        if future.cancelled():
-            return
-        error = future.exception()
-        if error is None:
-            self._keep(axis, key, future.result())
-            self._arrived("")
-        else:
-            self._failed[key] = " ".join(str(error).split())
-            self._arrived(f"a slice can't be read: {self._failed[key]}")
+    def _read(self) -> None:
+        """The thread that reads: of each axis the plane that was wanted last."""
+        while True:
+            with self._wake:
+                while not (self._wanted or self._closed):
+                    self._wake.wait()
+                if self._closed:
+                    return
+                axis, (key, state, pixel) = self._wanted.popitem()
+                self._reading = key
+            try:
+                self._keep(key, self._cut(axis, state, pixel))
+                problem = ""
+            except Exception as error:  # whatever it was, the view goes on
+                self._failed[key] = " ".join(str(error).split()) or type(error).__name__
+                problem = f"a slice can't be read: {self._failed[key]}"
+            self._reading = None
+            self._arrived(problem)
 
-    def _keep(self, axis: str, key: Any, image: np.ndarray) -> None:
-        with self._lock:
+    def _keep(self, key: Any, image: np.ndarray) -> None:
+        with self._wake:
             self._made[key] = image
             while len(self._made) > _KEPT:
                 self._made.popitem(last=False)
@@ -279,7 +279,9 @@ class Planes:
 
     def close(self) -> None:
         """Ends the thread; does not wait for what it reads."""
-        self._thread.shutdown(wait=False, cancel_futures=True)
+        with self._wake:
+            self._closed = True
+            self._wake.notify()
 
 
 def _colors_told(shader: Shader) -> Any:
