@@ -58,6 +58,14 @@ def test_slices_are_those_of_slice_picture_beside_the_picture(session):
         scale = layout[axis]["image"][2] / 40
         expected = gv.slice_picture(volume, axis, index, span=span, scale=scale).to_srgb8().numpy()
         assert np.array_equal(cut_out(still, layout[axis]["image"]), expected), axis
+    page.files.clear()
+    sliced(page, at=[25.0, 19.0, 15.0], colors="shader")
+    page.send("still", width=404, height=304)
+    page.until(lambda: page.files)
+    found = cut_out(pixels(page.files["picture.png"]), layout["z"]["image"])
+    scale = layout["z"]["image"][2] / 40
+    expected = gv.slice_picture(volume, "z", 15, colors=FUNCTION, scale=scale).to_srgb8().numpy()
+    assert np.array_equal(found, expected)
     width, height = layout["view"][2:]
     tree = gv.N3Tree.from_volume(volume)
     camera = session.state.camera.camera(width, height, tree.box)
@@ -459,6 +467,19 @@ def test_files_of_other_programs_are_read(session):
     told = page.next("preset", 2)
     assert told["name"] == "B" and told["function"]["opacity"][-1] == [9, 1]
     assert told["lost"] == ["presets.xml: not kept: shading, which --shader lit has (gv.Lit)"]
+
+
+def test_colours_are_saved_for_paraview(session):
+    page = Page(session)
+    page.final()
+    page.send("export", name="Two colours")
+    page.until(lambda: page.files)
+    (item,) = json.loads(page.files["paraview.json"])
+    assert item["Name"] == "Two colours" and item["ColorSpace"] == "RGB"
+    assert item["Points"] == [20, 0, 0.5, 0, 200, 0.6, 0.5, 0]
+    page.send("change", state={"shader": {"kind": "DistanceField"}})
+    page.send("export")
+    assert "no transfer function" in page.next("refused", 0)["text"]
 
 
 BOMB = "<!DOCTYPE a [" + "".join(

@@ -281,7 +281,7 @@ def choose(tab: Tab, path) -> None:
 
 def test_presets_of_files_and_of_ones_own(tab, viewer, tmp_path):
     choose(tab, ROOT / "tests" / "paraview_presets.json")
-    select = tab.page.locator(".gv-bar select")
+    select = tab.page.locator(".gv-bar select").first
     tab.until("app.presets.file?.names.length > 3")
     before = viewer.session.ask(viewer.state.shader.to_json)
     select.select_option("HSV")
@@ -299,6 +299,16 @@ def test_presets_of_files_and_of_ones_own(tab, viewer, tmp_path):
     select.select_option("MR-B")
     tab.until("app.transfer().opacity.at(-1)[0] === 9")
     name = tab.page.locator("input[placeholder='name']")
+    target = tab.page.locator("select[title='Where these colours are saved']")
+    for where, file in (("save file", "few.json"), ("ParaView", "paraview.json")):
+        target.select_option(where)
+        name.fill("few")
+        with tab.page.expect_download() as saved:
+            tab.page.get_by_title("Save these colours").click()
+        assert saved.value.suggested_filename == file
+        saved.value.save_as(tmp_path / file)
+        assert gv.TransferFunction.from_file(tmp_path / file).opacity[-1, 0] == 9
+    target.select_option("save mine")
     name.fill("my colours")
     name.press("Enter")
     tab.until("!!document.querySelector(\".gv-bar optgroup[label='mine']\")")
@@ -307,7 +317,7 @@ def test_presets_of_files_and_of_ones_own(tab, viewer, tmp_path):
     tab.page.reload()
     tab.until("app?.state")
     tab.final()
-    tab.page.locator(".gv-bar select").select_option("my colours")
+    tab.page.locator(".gv-bar select").first.select_option("my colours")
     tab.until("app.transfer().opacity.at(-1)[0] === 9")
     tab.page.get_by_text("forget").click()
     tab.until("!document.querySelector(\".gv-bar optgroup[label='mine']\")")

@@ -43,6 +43,7 @@ GOOD: dict[str, dict[str, Any]] = {
     "histogram": {"in_view": True},
     "preset": {"name": "gray", "low": 0, "high": 1},
     "read": {"file": "a.json", "text": "{}", "name": None, "low": 0, "high": 1},
+    "export": {"name": "mine"},
     "nodes": {"on": True},
     "resize": {"engine": {"brick_pool": "256 MB"}},
     "set": {"name": "radius", "value": 4.5},

@@ -165,10 +165,10 @@ def test_the_window_is_dragged_in_the_picture_and_presets_apply(tab):
     tab.page.keyboard.up("Alt")
     after = tab.app("app.transfer().opacity.map((p) => p[0])")
     assert np.allclose(np.diff(after), np.diff(before), rtol=1e-6) and after[0] > before[0] + 5
-    tab.page.locator(".gv-bar select").select_option("viridis")
+    tab.page.locator(".gv-bar select").first.select_option("viridis")
     tab.until("app.transfer().color.length === 256")
     assert tab.app("app.transfer().opacity.map((p) => p[0])") == after
-    tab.page.locator(".gv-bar select").select_option("hot")
+    tab.page.locator(".gv-bar select").first.select_option("hot")
     tab.until("app.transfer().color.length === 4")
     tab.final()
 

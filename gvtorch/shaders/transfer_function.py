@@ -18,7 +18,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ..base import check
 from ..base.checked import Check, above, kind_of, or_none
-from .preset_files import read_points
+from .preset_files import paraview_item, read_points
 from .presets import CT_PRESETS, Points, named
 from .shader import ColorTable, Sampling, Shader
 
@@ -175,6 +175,13 @@ class TransferFunction(Shader):
         """Returns the text that `from_json` reads."""
         content = {"opacity": self.opacity.tolist(), "color": self.color.tolist()}
         return json.dumps({**content, "reference": self.reference} if self.reference else content)
+
+    def to_paraview(self, name: str = "gvtorch") -> str:
+        """Returns the text of a preset of ParaView (.json), as its colour map editor imports it.
+        Its colours are sRGB, in which ours are not straight: points between follow them.
+        """
+        item = paraview_item(self.opacity, self.color)
+        return json.dumps([{"ColorSpace": "RGB", "Name": name, **item}])
 
     def __repr__(self) -> str:
         """Tells its corner points by number, and its values from first to last."""

@@ -103,6 +103,13 @@ class Read:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Export:
+    """Asks for the transfer function as ParaView's JSON."""
+
+    name: str = "gvtorch"  # by which ParaView lists it
+
+
+@dataclass(frozen=True, kw_only=True)
 class Nodes:
     """Asks for boxes of the tree's nodes with each picture, or no more."""
 
@@ -158,8 +165,8 @@ class Do:
 
 
 Message = (
-    Hello | Move | Ack | Change | Pick | Histogram | Preset | Read | Nodes | Resize | Set | Follow
-    | Monitor | Still | Do
+    Hello | Move | Ack | Change | Pick | Histogram | Preset | Read | Export | Nodes | Resize | Set
+    | Follow | Monitor | Still | Do
 )  # fmt: skip
 MESSAGES: dict[str, type[Any]] = {one.__name__.lower(): one for one in Message.__args__}
 

@@ -33,7 +33,7 @@ from .protocol import parse
 from .scene import Scene
 from .schema import KINDS, decode, describe_kind, encode
 from .slices import Planes, panes
-from .state import Development, Eye, Slices, ViewState, blended
+from .state import Development, Eye, Slices, ViewState, blended, transfer_of
 
 _TICK = 0.02  # seconds between looks at whether a camera has come to rest
 _FIGURES = 0.25  # seconds between figures for monitors
@@ -415,6 +415,13 @@ class Session:
         name = message.name or message.file
         client.tell("preset", name=name, function=encode(function), lost=lost)
 
+    def _export(self, client: Client, message: protocol.Export) -> None:
+        transfer = transfer_of(self.state.shader)
+        if transfer is None:
+            raise ValueError("export: there is no transfer function")
+        text = transfer.to_paraview(message.name)
+        client.send_file("paraview.json", text.encode())
+
     def _nodes(self, client: Client, message: protocol.Nodes) -> None:
         client.nodes = message.on
         self._tell_nodes(client)
@@ -503,6 +510,7 @@ _TAKES: Mapping[type, Callable[[Session, Client, Any], None]] = {
     protocol.Histogram: Session._histogram,
     protocol.Preset: Session._preset,
     protocol.Read: Session._read,
+    protocol.Export: Session._export,
     protocol.Nodes: Session._nodes,
     protocol.Resize: Session._resize,
     protocol.Set: Session._set,

@@ -18,10 +18,10 @@ from ..base.volume import Volume
 from ..io.store import Store
 from ..io.window import window
 from ..pictures import Picture
-from ..shaders import Labels, Shader, TransferFunction
+from ..shaders import Labels, Shader
 from ..tracing import slice_picture
 from ..tracing.slices import UP, PlaneView, radiological_views
-from .state import ViewState
+from .state import ViewState, transfer_of
 
 GAP = 4  # pixels between the four parts
 _KEPT = 48  # planes
@@ -270,8 +270,7 @@ class Planes:
             return shader if names is None else lambda values: shader(names.numpy()[values])
         if state.slices.colors == "gray":
             return None
-        transfer = getattr(state.shader, "transfer", state.shader)
-        return transfer if isinstance(transfer, TransferFunction) else None
+        return transfer_of(state.shader)
 
     def retry(self) -> None:
         """Lets planes that could not be read be asked for again."""
@@ -286,8 +285,8 @@ class Planes:
 
 def _colors_told(shader: Shader) -> Any:
     """What tells apart how shaders colour values."""
-    transfer = getattr(shader, "transfer", shader)
-    if isinstance(transfer, TransferFunction):
+    transfer = transfer_of(shader)
+    if transfer is not None:
         return transfer.to_json()
     return (shader.colors, shader.visible) if isinstance(shader, Labels) else None
 

@@ -22,7 +22,7 @@ from ..engine import Engine
 from ..pictures import Picture, Progressive
 from ..pictures.tone import ToneCurve, checked_curve
 from ..pool import N3Tree
-from ..shaders import Shader
+from ..shaders import Shader, TransferFunction
 from ..tracing import RenderOptions, render
 from .schema import decode, encode
 
@@ -248,6 +248,12 @@ class ViewState:
             return self.changed(content)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
+
+
+def transfer_of(shader: Shader) -> TransferFunction | None:
+    """Returns a shader's transfer function, which may be itself, or None."""
+    found = getattr(shader, "transfer", None) or shader
+    return found if isinstance(found, TransferFunction) else None
 
 
 def saved_time(path: str | Path) -> float:

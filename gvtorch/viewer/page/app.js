@@ -56,7 +56,7 @@ export class App {
     const on = (type, take) => this.link.on(type, take);
     on("welcome", (told) => this.welcome(told));
     on("picture", (picture) => this.view.take(picture));
-    on("file", ({ head, bytes }) => { keep(head.file, bytes, "image/png"); this.say(`${head.file} is saved`); });
+    on("file", ({ head, bytes }) => { keep(head.file, bytes, head.file.endsWith(".png") ? "image/png" : "application/json"); this.say(`${head.file} is saved`); });
     on("state", ({ state }) => this.take(state));
     on("camera", ({ camera }) => this.seat(camera));
     on("clients", ({ clients }) => { this.clients = clients; this.refresh(); });

@@ -21,7 +21,8 @@ export class Presets {
     this.app = app;
     this.builtIn = [];
     this.file = null;  // the last one that holds several: {name, names, text(name)}
-    this.name = el("input", { type: "text", placeholder: "name", maxLength: 60, onkeydown: (e) => { if (e.key === "Enter") this.keepOwn(); } });
+    this.name = el("input", { type: "text", placeholder: "name", maxLength: 60, onkeydown: (e) => { if (e.key === "Enter") this.save(); } });
+    this.target = el("select", { title: "Where these colours are saved" }, ...["save mine", "save file", "ParaView"].map((one) => el("option", {}, one)));
   }
 
   /** The values over which presets without values of their own are laid. */
@@ -52,14 +53,10 @@ export class Presets {
       pick,
       buttons: [
         iconButton("open", "Load a transfer function: of gvtorch or ParaView (JSON), or 3D Slicer (.vp, .vp.json, presets.xml)", () => openText(ENDINGS, (name, text) => this.open(name, text), (why) => this.app.say(why, true))),
-        iconButton("save", "Save the transfer function (JSON)", () => {
-          const { kind, ...content } = this.app.transfer();
-          keep("transfer.json", JSON.stringify(content), "application/json");
-        }),
       ],
-      mine: el("div.gv-row", {}, el("span.gv-name", {}, "save mine"), el("span.gv-both", {}, this.name,
-        el("button.gv-small", { type: "button", title: "Keep these colours in this browser", onclick: () => this.keepOwn() }, "save"),
-        own.includes(this.chosen) ? el("button.gv-small", { type: "button", title: `Forget ${this.chosen}`, onclick: () => this.forget() }, "forget") : null)),
+      mine: el("div.gv-bar", {}, this.target, this.name,
+        el("button.gv-small", { type: "button", title: "Save these colours", onclick: () => this.save() }, "save"),
+        own.includes(this.chosen) ? el("button.gv-small", { type: "button", title: `Forget ${this.chosen}`, onclick: () => this.forget() }, "forget") : null),
     };
   }
 
@@ -89,8 +86,14 @@ export class Presets {
     this.app.link.send("read", { file, text, name, ...this.span() });
   }
 
-  keepOwn() {
-    const name = this.name.value.trim(), { app } = this;
+  /** Keeps the colours in this browser, or as a file of gvtorch or ParaView. */
+  save() {
+    const name = this.name.value.trim(), { app } = this, target = this.target.selectedIndex;
+    if (target === 2) return app.link.send("export", name ? { name } : {});
+    if (target === 1) {
+      const { kind, ...content } = app.transfer();
+      return keep(`${name || "transfer"}.json`, JSON.stringify(content), "application/json");
+    }
     if (!name) return app.say("a name is needed", true);
     this.store({ ...ownFunctions(), [name]: app.transfer() }, `${name} is saved in this browser`);
     this.name.value = "";
