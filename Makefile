@@ -53,7 +53,7 @@ soak: $(VENV)/ready
 
 MINUTES ?= 60
 fuzz: $(VENV)/ready
-	OMP_NUM_THREADS=1 GVTORCH_FUZZ=$(MINUTES) $(BIN)/python -m pytest -s tests/fuzz
+	OMP_NUM_THREADS=1 GVTORCH_FUZZ=$(MINUTES) $(BIN)/python -m pytest -s tests/fuzz tests/test_viewer_messages.py
 
 # The CPU library once more, watched, in a folder of its own. Python is not, so what it leaks does not count; torch's
 # threads are not, so that what ThreadSanitizer tells of libgomp and torch is left out (tests/fuzz/tsan.txt).

@@ -7,8 +7,10 @@ The rate is bricks asked for over bricks asked for and bricks used, summed over 
 frame. Bricks of 8^3 and a border hold 1,000 bytes here, and 4,000 in the original: its 512 MB are
 128 MB here. How fast the camera moves decides: 1,200 frames are 20 s at 60 frames a second.
 
-With `--source formula` the solid is computed brick by brick on the device that renders. On CUDA
-each frame is one graph (`Engine.capture`), with `--no-graph` it is `Engine.frame`.
+With `--source formula` the solid is computed brick by brick on the device that renders, with
+`--source mandelbulb` it is the original's own scene, the bulb of power 8, whose voxels are 4 bytes
+as in the original. On CUDA each frame is one graph (`Engine.capture`), with `--no-graph` it is
+`Engine.frame`.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ class Settings:
     side: int = 1024
     frames: int = 1200
     size: tuple[int, int] = (512, 512)
-    source: Literal["store", "formula"] = "store"
+    source: Literal["store", "formula", "mandelbulb"] = "store"
     pools: tuple[str, ...] = ("512 MB", "128 MB", "32 MB", "8 MB")
     loading: str = "straight"
     workers: int = 4
@@ -101,23 +103,44 @@ def write_volume(file: Path, side: int) -> None:
             out.write(plane.tobytes())
 
 
-def flight(side: int) -> CameraPath:
-    """From afar to the surface, along it, into a hole, and out again."""
+def mandelbulb(side: int) -> gv.Producer:
+    """The bulb of power 8, its colours by orbit traps."""
+    colors = {"rgba": gv.Channel(torch.uint8, 4)}
+    solid = gv.Solid(gv.Mandelbulb(8, iterations=6), normals=False)
+    return gv.FieldProducer(solid, side, channels=colors)
+
+
+def flight(middle: float, half: float) -> CameraPath:
+    """From afar to the surface, along it, into a hole, and out again, around a solid whose box has
+    this middle and half this side.
+    """
     keys = [(0, 0.2, 3.4), (0.6, 0.3, 2.0), (0.9, 0.4, 1.3), (1.15, 0.5, 0.5), (1.2, 0.3, -0.4)]
     keys += [(0.9, -0.2, -0.8), (0.4, -0.5, -1.1), (-0.3, -0.4, -1.3), (-1.0, 0.2, -1.6)]
-    eyes = (np.array(keys) + 1) * side / 2
+    eyes = np.array(keys) * half + middle
     ahead = np.vstack((eyes[1:], eyes[-1:]))
-    targets = 0.5 * (side / 2) + 0.5 * ahead  # between the middle and the way
+    targets = 0.5 * middle + 0.5 * ahead  # between the middle and the way
     return CameraPath(eyes.tolist(), targets.tolist(), fov=[45.0] * len(keys))
 
 
-def scene(settings: Settings) -> tuple[gv.TransferFunction, list[gv.Camera]]:
+def scene(settings: Settings) -> tuple[gv.Shader, list[gv.Camera]]:
     """What is seen of the solid, and from where."""
-    opacity = [(100, 0), (140, 0.9)]
-    color = [(100, 0.3, 0.1, 0.05), (160, 0.9, 0.6, 0.3), (255, 1, 0.95, 0.8)]
-    path, places = flight(settings.side), np.linspace(0, 1, settings.frames)
-    cameras = [path.camera(float(t), *settings.size) for t in places]
-    return gv.TransferFunction.from_points(opacity, color, reference=4.0), cameras
+    if settings.source == "mandelbulb":
+        shader: gv.Shader = gv.StoredColor("rgba", premultiplied=True, lit=True)
+        path = flight(0.0, 1.1)
+    else:
+        opacity = [(100, 0), (140, 0.9)]
+        color = [(100, 0.3, 0.1, 0.05), (160, 0.9, 0.6, 0.3), (255, 1, 0.95, 0.8)]
+        shader = gv.TransferFunction.from_points(opacity, color, reference=4.0)
+        path = flight(settings.side / 2, settings.side / 2)
+    places = np.linspace(0, 1, settings.frames)
+    return shader, [path.camera(float(t), *settings.size) for t in places]
+
+
+def source(settings: Settings, store: Path) -> gv.Producer:
+    """What is flown through."""
+    if settings.source == "store":
+        return gv.StoredProducer(store, workers=settings.workers)
+    return mandelbulb(settings.side) if settings.source == "mandelbulb" else Worn(settings.side)
 
 
 def quantiles(times: list[float]) -> list[str]:
@@ -187,13 +210,7 @@ def main(settings: Settings) -> None:
         for column in ("median ms", "p99 ms", "frames / s", "bricks / s"):
             table.add_column(column, justify="right")
         for pool in settings.pools:
-            formula = settings.source == "formula"
-            producer = (
-                Worn(settings.side)
-                if formula
-                else gv.StoredProducer(store, workers=settings.workers)
-            )
-            table.add_row(*fly(producer, pool, settings, console))
+            table.add_row(*fly(source(settings, store), pool, settings, console))
         if settings.resident and settings.source == "store":
             table.add_row(*fly_resident(store, settings, console))
         Console().print(table)

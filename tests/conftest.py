@@ -14,9 +14,12 @@ import torch
 
 import gvtorch as gv
 from gvtorch.ops import available
+from gvtorch.viewer.state import Development
+from gvtorch.viewer.view import new_session
 
 pytest.register_assert_rewrite("helpers")
 from helpers import ABSENT, DATA, DEVICES, browser, gvtorch  # noqa: E402
+from helpers.viewer import BANDS, FUNCTION, bright_ball  # noqa: E402
 
 _REQUIRED = os.environ.get("GVTORCH_REQUIRE", "")
 _ran: Counter[str] = Counter()
@@ -120,6 +123,44 @@ def channels(blobs) -> dict[str, gv.Volume]:
         "normal": gv.Volume((normal * 255).round().to(torch.uint8), *place),
         "label": gv.Volume((value * 6).to(torch.int64) * 1000, *place, labels=True),
     }
+
+
+@pytest.fixture
+def session():
+    """A view of a ball, without a server."""
+    made = new_session(bright_ball(), FUNCTION, engine={"time_budget": None})
+    yield made
+    made.close()
+    assert not made._thread.is_alive()
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    """The browser; a skip that the summary tells of where there is none."""
+    if reason := browser.absent():
+        pytest.skip(f"browser: {reason}")
+    with browser.running() as found:
+        yield found
+
+
+@pytest.fixture
+def viewer():
+    """A view of a ball, served."""
+    state = gv.ViewState(shader=BANDS, develop=Development(samples=2))
+    with gv.view(bright_ball(), state=state, browser=False, wait=False) as made:
+        yield made
+
+
+@pytest.fixture
+def tab(chromium, viewer):
+    """Its page in the browser, which must not have complained in the end."""
+    made = browser.Tab(chromium, viewer.url)
+    made.until("app?.state")
+    made.final()
+    yield made
+    complaints = made.complaints
+    made.close()
+    assert not complaints
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -318,7 +318,7 @@ def test_a_forest_is_made_of_another_producers_tree(backend):
             owner = engine.cache.bricks.owner_b
             number = engine.cache.nodes.tree_t[owner[owner >= 0] // 8]
             assert 200 < (number == 0).sum() <= 1 + 8 + 64 + 512 and (number == 1).sum() == 1
-            plant._volumes["value"] = world(1, seed=7)
+            plant.volumes["value"] = world(1, seed=7)
             plant.prepare(engine.trees["plant"].layout)
             plant.changed()
 

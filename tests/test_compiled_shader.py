@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import DEVICES
-from helpers.compiled import HEADER, quick_compiler
+from helpers.compiled import ADD, HEADER, quick_compiler, write
 from helpers.pictures import assert_close_picture
 from helpers.rays import camera_rays, world_rays
 from helpers.shaders import POINT
@@ -245,23 +245,6 @@ def test_opcheck_and_memory_safety(tree, compiled, name, dtype):
 
 
 # --- the compiler and the cache
-
-
-def write(folder: Path, body: str, name: str = "own.h") -> Path:
-    """A header with a struct `Own` around `body`, without packets, which take twice as long."""
-    path = folder / name
-    path.write_text(
-        '#define GV_RAY_BY_RAY\n#include "user_shader.h"\n'
-        "template <class T>\nstruct Own : gv::UserShader<T> {\n"
-        f"  using gv::UserShader<T>::UserShader;\n{body}\n}};\n"
-    )
-    return path
-
-
-ADD = """
-  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
-    this->composite({COLOR, 0, 0, 1}, piece, sum);
-  }"""
 
 
 def built(folder: Path) -> list[str]:
@@ -567,13 +550,6 @@ def test_it_is_unpickled_in_another_process(tmp_path, monkeypatch):
     tracer.write_bytes(pickled.replace(shader.op.encode(), unknown.encode()))
     with pytest.raises(RuntimeError, match=r"TreeTracer: op x+ is not loaded: torch.ops.load_lib"):
         pickle.loads(tracer.read_bytes())
-
-
-@pytest.mark.skipif(compilers.find_nvcc() is None, reason="nvcc is not here")
-@pytest.mark.backend("cpp")
-def test_nvcc_compiles_it(cache):
-    library = user.compiled(user.ShaderSource.read(HEADER, "mine::Bands"), ("90",))
-    assert library.parent == cache / "shaders" and b"mine_Bands_" in library.read_bytes()
 
 
 @pytest.mark.backend("cpp")

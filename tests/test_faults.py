@@ -1,6 +1,6 @@
-"""Faults at every call: open, read, write, fsync and rename fail in turn while a volume is
-converted, streamed, and a picture is written. Nothing is lost, nothing hangs, and what went wrong
-is told in one line.
+"""Faults at every call: open, read, write, fsync, rename and asking for memory fail in turn while a
+volume is converted, streamed, rendered, and a picture is written. Nothing is lost, nothing hangs,
+and what went wrong is told in one line.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import errno
 import os
 import pathlib
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,66 +19,110 @@ import pytest
 import torch
 from helpers.pictures import GRAY
 from helpers.stores import assert_holds, noise
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import gvtorch as gv
 from gvtorch.io import conversion, shard
 from gvtorch.io.conversion import convert
+from gvtorch.io.level_reader import StoredArray
+from gvtorch.io.source import VolumeSource
 from gvtorch.io.store import Store
-from gvtorch.io.store_layout import WORK
+from gvtorch.io.store_layout import WORK, Deadline
 
 VIEW = gv.Camera.orbit(width=24, height=16)
+
+
+Calls = Sequence[tuple[Any, str]]
+ALLOCATIONS: Calls = [
+    (np, name)
+    for name in ("empty", "zeros", "full", "stack", "concatenate", "where", "repeat", "array",
+                 "ascontiguousarray", "moveaxis", "arange", "minimum", "maximum")
+]  # fmt: skip
+READS: Calls = [
+    *((Deadline, "wait"), (VolumeSource, "read_region"), (StoredArray, "read")),
+    *((pathlib.Path, "read_bytes"), (pathlib.Path, "read_text")),
+]
+
+
+def no_memory() -> Exception:
+    return MemoryError("Unable to allocate 1. GiB for an array")
 
 
 class Faults:
     """Lets the call of one number fail; counts them."""
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number: int, made: Callable[[], Exception] | None = None) -> None:
         self.number, self.calls = number, 0
+        self.made = made or (lambda: OSError(errno.EIO, "Input/output error"))
 
     def wrapped(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def call(*given: Any, **named: Any) -> Any:
             self.calls += 1
             if self.calls - 1 == self.number:
-                raise OSError(errno.EIO, "Input/output error")
+                raise self.made()
             return original(*given, **named)
 
         return call
 
 
+class Operations(TorchDispatchMode):
+    """Lets the tensor operation of one number find no memory; counts them."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number, self.calls = number, 0
+
+    def __torch_dispatch__(self, op: Any, types: Any, args: Any = (), named: Any = None) -> Any:
+        self.calls += 1
+        if self.calls - 1 == self.number:
+            raise RuntimeError("DefaultCPUAllocator: can't allocate memory")
+        return op(*args, **(named or {}))
+
+
+#: By which files of gvtorch's own are written: open, fsync, rename, remove.
+WRITES: Calls = [
+    *((pathlib.Path, "open"), (pathlib.Path, "replace"), (os, "fsync"), (pathlib.Path, "mkdir")),
+    *((shard, "write"), (shard, "finish"), (shard, "shard_files")),
+]
+
+
 @contextmanager
-def failing(number: int) -> Iterator[Faults]:
-    """The calls by which files of gvtorch's own are written: open, fsync, rename, remove."""
-    faults = Faults(number)
+def failing(
+    number: int, calls: Calls = WRITES, made: Callable[[], Exception] | None = None
+) -> Iterator[Faults]:
+    faults = Faults(number, made)
     with pytest.MonkeyPatch.context() as patch:
-        for owner, name in (
-            (pathlib.Path, "open"), (pathlib.Path, "replace"), (os, "fsync"),
-            (pathlib.Path, "mkdir"), (shard, "write"), (shard, "finish"), (shard, "shard_files"),
-        ):  # fmt: skip
+        for owner, name in calls:
             patch.setattr(owner, name, faults.wrapped(getattr(owner, name)))
         yield faults
 
 
-def test_a_conversion_goes_on_after_a_fault_at_any_call(tmp_path, monkeypatch):
+@pytest.mark.parametrize("kind", ["write", "read", "memory"])
+def test_a_conversion_goes_on_after_a_fault_at_any_call(tmp_path, monkeypatch, kind):
+    calls = {"write": WRITES, "read": READS, "memory": ALLOCATIONS}[kind]
+    made = no_memory if kind == "memory" else None
     data = noise((12, 14, 150, 1))
     raw = tmp_path / "a_150x14x12_uint8.raw"
     raw.write_bytes(data.tobytes())
     monkeypatch.setattr(conversion, "_check_room", lambda *_: None)
     monkeypatch.setattr(conversion, "_estimate", lambda _: None)
-    with failing(-1) as whole:
+    with failing(-1, calls) as whole:
         convert(raw, tmp_path / "whole.zarr", workers=1)
     broken = 0
     for number in (*range(6), *range(6, whole.calls, max(1, whole.calls // 10))):
         target = tmp_path / f"{number}.zarr"
         try:
-            with failing(number):
+            with failing(number, calls, made):
                 convert(raw, target, workers=1)
-        except OSError as error:
-            assert "\n" not in str(error)
+        except (OSError, ValueError, MemoryError) as error:
+            assert str(error) and "\n" not in str(error)
             broken += 1
             if target.exists() and not (target / "zarr.json").exists():
                 with pytest.raises((ValueError, OSError)):
                     Store.open(target)  # what is half-written is never opened
-        assert_holds(convert(raw, target, workers=1, resume=True), data)
+        if not (target / "zarr.json").exists():
+            convert(raw, target, workers=1, resume=True)
+        assert_holds(Store.open(target), data)
         assert not (target / WORK).exists()
         shutil.rmtree(target)
     assert whole.calls > 15 and broken > 8
@@ -119,24 +163,64 @@ def test_power_that_fails_before_any_file_is_on_disk(tmp_path):
             assert_holds(convert(raw, target, workers=1, resume=True), data)
 
 
-def test_reads_that_fail_cost_their_nodes_alone(tmp_path, monkeypatch):
+@pytest.mark.parametrize("kind", ["read", "memory"])
+def test_reads_that_fail_cost_their_nodes_alone(tmp_path, kind):
     data = noise((40, 40, 40, 1))
-    whole = gv.render(gv.N3Tree.from_volume(gv.Volume(data)), VIEW, GRAY)
-    assert whole.alpha.max() > 0
+    look = gv.TransferFunction.preset("gray", 0, 255)
+    resident = gv.render(gv.N3Tree.from_volume(gv.Volume(data)), VIEW, look)
+    assert resident.alpha.max() > 0
     store = convert(gv.Volume(data), tmp_path / "a.zarr", workers=1)
-    for number in (0, 2, 5):
-        with gv.Engine(gv.StoredProducer(Store.open(store.location)), patience=20) as engine:
-            look = gv.TransferFunction.preset("gray", 0, 255)
-            with pytest.MonkeyPatch.context() as patch:
-                faults = Faults(number)
-                for name in ("_read_stored", "_read_cells"):
-                    patch.setattr(Store, name, faults.wrapped(getattr(Store, name)))
-                picture = engine.render(VIEW, look)
-            assert torch.isfinite(picture.color).all()
+    calls = {"read": [*READS, (Store, "_read_stored"), (Store, "_read_cells")]}.get(kind)
+    failed = 0
+    for number in range(0, 40, 7):
+        producer = gv.StoredProducer(Store.open(store.location), workers=1)
+        with gv.Engine(producer, patience=20) as engine:
+            made = no_memory if kind == "memory" else None
+            with failing(number, calls or ALLOCATIONS, made) as faults:
+                try:
+                    picture = engine.render(VIEW, look)
+                    assert torch.isfinite(picture.color).all()
+                except (MemoryError, RuntimeError) as error:
+                    assert "\n" not in str(error)
+                    failed += 1
+            failed += len(engine.failures) > 0
+            assert faults.calls > 0
             engine.validate()
             engine.forget_failures()
             again = engine.render(VIEW, look)
             assert again.stats.converged and not engine.failures
+            assert torch.equal(again.color, resident.color)
+    assert failed > 2
+
+
+@pytest.mark.backend("cpp")
+def test_a_frame_that_finds_no_memory_leaves_the_pools_in_order(blobs):
+    """Each operation on tensors in turn; the next frames are those of an engine without a fault."""
+    pools: dict[str, Any] = {"brick_size": 4, "brick_pool": 150 * 6**3 * 4, "node_pool": 9600}
+    views = [gv.Camera.orbit(azimuth, 20, 0.8, None, 16, 12) for azimuth in (0, 90)]
+    tree = gv.N3Tree.from_volume(blobs, 4)
+    whole = [gv.render(tree, view, GRAY).color for view in views]
+    number, failed, step = 0, 0, 1
+    while True:
+        with gv.Engine(gv.VolumeProducer(blobs), **pools) as engine:
+            engine.render(views[0], GRAY)
+            operations = Operations(number)
+            try:
+                with operations:
+                    engine.render(views[1], GRAY)
+            except (RuntimeError, MemoryError) as error:
+                assert "memory" in str(error) and "\n" not in str(error)
+                failed += 1
+            engine.validate()
+            engine.forget_failures()
+            for view, color in zip(views, whole, strict=True):
+                assert torch.equal(engine.render(view, GRAY).color, color), number
+            engine.validate()
+        if operations.calls <= number:
+            break
+        step = max(step, operations.calls // 12)
+        number += step
+    assert failed > 8
 
 
 @pytest.mark.parametrize("kind", ["png", "exr", "npz", "tif"])
@@ -149,11 +233,11 @@ def test_a_picture_is_there_as_a_whole_or_as_it_was(tmp_path, kind):
     while True:
         faults = Faults(number)
         with pytest.MonkeyPatch.context() as patch:
-            for name in ("replace", "chmod", "close"):
-                patch.setattr(os, name, faults.wrapped(getattr(os, name)))
+            for owner, name in ((os, "replace"), (os, "chmod"), (os, "close"), *ALLOCATIONS):
+                patch.setattr(owner, name, faults.wrapped(getattr(owner, name)))
             try:
                 picture.save(file)
-            except OSError as error:
+            except (OSError, MemoryError) as error:
                 assert "\n" not in str(error)
         if faults.calls <= number:
             break

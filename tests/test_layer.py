@@ -14,6 +14,7 @@ from helpers import DEVICES, marcher
 from helpers.layers import BLUE, SOLID, ball, layer_of, screen, seam_error
 from helpers.pictures import GRAY, PARTS, assert_same_picture, camera
 from helpers.trees import on
+from helpers.waits import nobody_waits
 
 import gvtorch as gv
 from gvtorch.base import constants as config
@@ -283,14 +284,10 @@ def test_on_cuda_nobody_waits_and_a_graph_reads_the_layer(blobs, alpha):
         engine.render(view, GRAY)
         engine.render(view, GRAY, layer=layer)
         graph = engine.capture(view, GRAY, layer=layer)
-        torch.cuda.synchronize()
-        torch.cuda.set_sync_debug_mode("error")
-        try:
+        with nobody_waits():
             engine.frame(view, GRAY, layer=layer)
             depth += 5
             replayed, _ = graph.replay(view)
-        finally:
-            torch.cuda.set_sync_debug_mode("default")
         expected, _ = engine.frame(view, GRAY, layer=layer)
         assert_same_picture(replayed, expected)
         assert torch.equal(replayed.nearest, expected.nearest)

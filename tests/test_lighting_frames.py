@@ -10,6 +10,7 @@ import pytest
 import torch
 from helpers import DEVICES
 from helpers.shading import MATT, grid
+from helpers.waits import nobody_waits
 
 import gvtorch as gv
 
@@ -214,13 +215,9 @@ def test_on_cuda_nobody_waits_and_a_graph_is_the_frame(blobs, look):
         whole = engine.render(camera, shader, **given)
         engine.frame(camera, shader, **given)
         graph = engine.capture(camera, shader, **given)
-        torch.cuda.synchronize()
-        torch.cuda.set_sync_debug_mode("error")
-        try:
+        with nobody_waits():
             frame, _ = engine.frame(camera, shader, **given)
             replayed, _ = graph.replay(camera)
-        finally:
-            torch.cuda.set_sync_debug_mode("default")
         assert_same(frame, whole)
         assert_same(replayed, whole)
 

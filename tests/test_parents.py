@@ -254,6 +254,48 @@ def test_streamed_octaves_are_the_direct_sum_in_every_bit(backend):
     assert producer.at(torch.tensor([0.1, 0.2, 0.3]))["value"].shape == (1,)
 
 
+@pytest.mark.parametrize("backend", COMPILED)
+def test_recorded_frames_make_octaves(backend):
+    """Of nodes of all levels at once, without waiting, in the same bits."""
+    options = {"brick_size": 8, "brick_pool": "64 MB", "device": DEVICES[backend]}
+    with gv.Engine(gv.OctaveProducer(spline(), 256, box=BOX), **options) as engine:
+        expected = engine.render(view(32), LOOK)
+    producer = gv.OctaveProducer(spline(), 256, box=BOX)
+    producer._by_level = producer._at_every_level  # as on CUDA
+    with gv.Engine(producer, **options) as engine:
+        frames = Frames(engine, view(32), LOOK, 50)
+        for _ in range(200):
+            hits, stats = frames.frame()
+            if stats.converged:
+                break
+        engine.validate()
+    assert stats.converged and expected.stats.converged and expected.alpha.mean() > 0.1
+    assert torch.equal(hits.color, expected.color.reshape(-1, 3))
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("total", [spline(5, 64), gv.noise.OctaveSum(frequency=2.0, octaves=5)])
+def test_octaves_are_made_without_a_look_at_values(total):
+    """torch.compile finds nothing that waits; roots and children, with parents and without."""
+    producer = gv.OctaveProducer(total, 64, box=BOX)
+    layout = Layout.of(producer, 8, 1, torch.device("cpu"))
+    loc = torch.tensor([[0, 0, 0, 0], [1, 0, 1, 1], [3, 2, 0, 2], [5, 1, 7, 3], [4, 1, 7, 3]])
+    assert len(layout.reach) == 10  # kept from here on; a lock that can't be compiled is around it
+    random = torch.Generator().manual_seed(3)
+    shape = (len(loc), *(layout.side,) * 3, 1)
+    parents = {name: torch.rand(shape, generator=random) for name in producer.channels}
+
+    def made(loc):
+        return producer.fill(Nodes(loc, layout, parents=parents))
+
+    found = torch.compile(made, fullgraph=True, backend="eager")(loc)
+    for rows in ([0], [1, 2, 3, 4]):
+        given = {name: own[rows] for name, own in parents.items()} if rows[0] else None
+        expected = producer.fill(Nodes(loc[rows], layout, parents=given))
+        for name, values in expected.items():
+            assert torch.equal(found[name][rows], values)
+
+
 def test_bricks_agree_where_they_meet_in_every_bit():
     producer = gv.OctaveProducer(spline(), 256, box=BOX)
     layout = Layout.of(producer, 8, 1, torch.device("cpu"))

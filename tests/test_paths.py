@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import ROOT
 from helpers.stores import assert_holds, noise
 
 import gvtorch as gv
@@ -81,11 +82,77 @@ def test_up_a_folder_and_through_links(tmp_path, data, monkeypatch, capsys):
     capsys.readouterr()
 
 
-def test_a_name_that_is_no_text_is_one_line(tmp_path, data):
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("name", [b"\xff\xfe", b"a b?*#%41", b"new\nline", b"../in", b"link"])
+def test_every_command_takes_any_path(tmp_path, data, name, monkeypatch, capsys):
+    """Bytes that are no UTF-8, marks of shells and URLs, ".." and links, in folder and file."""
+    folder = tmp_path / os.fsdecode(b"in" if name.startswith(b"..") else name)
+    if name == b"link":
+        (tmp_path / "real").mkdir()
+        folder.symlink_to("real")
+    else:
+        folder.mkdir()
+    end = os.fsdecode(name.rpartition(b"/")[2])
+    place = folder / ".." / folder.name / end if b".." in name else folder / end
+
+    def file(ending: str) -> str:
+        return f"{place}{ending}"
+
+    np.save(file(".npy"), data)
+    np.savez(file(".npz"), position=np.random.default_rng(0).random((50, 3)))
+    Path(file(".obj")).write_text(TETRAHEDRON)
+    size, few = ["--size", "16x16"], ["--frames", "2"]
+    looked: list[str] = []
+    monkeypatch.setattr("gvtorch.viewer.view", lambda what, *_, **__: looked.append(what.name))
+    made = [".zarr", "v.zarr", "p.zarr", ".png", "t.png", ".exr", ".tif", "fly", ".mp4", ".gif"]
+    for command in (
+        ["convert", file(".npy"), file(".zarr")],
+        ["voxelize", file(".obj"), "-o", file("v.zarr"), "--resolution", "16"],
+        ["splat", file(".npz"), "-o", file("p.zarr"), "--extent", "16"],
+        *(["info", file(ending)] for ending in (".npy", ".zarr", "v.zarr", "p.zarr")),
+        *(["render", file(".zarr"), "-o", file(ending), *size] for ending in (".png", ".exr")),
+        ["render", file(".npy"), "-o", file(".tif"), *size],
+        *(["fly", file(".zarr"), "-o", file(to), *few, *size] for to in ("fly", ".mp4", ".gif")),
+        ["slice", file(".zarr"), "-o", file("t.png")],
+        ["view", file(".zarr"), "--no-browser"],
+        ["view", file(".npy"), "--no-browser"],
+    ):
+        main(command)
+    assert looked == [end, f"{end}.npy"]
+    assert_holds(Store.open(file(".zarr")), data)
+    given = [".npy", ".npz", ".obj"]
+    assert sorted(os.listdir(folder)) == sorted(f"{end}{ending}" for ending in (*given, *made))
+    assert sorted(os.listdir(tmp_path)) == sorted(
+        {folder.name} | ({"real"} & {*os.listdir(tmp_path)})
+    )
+    capsys.readouterr()
+
+
+def test_links_to_names_that_are_no_text_go_with_the_process(tmp_path, data):
+    """Its own process and its workers; what it prints goes to a terminal that knows no bytes."""
     bad = os.fsdecode(os.fsencode(tmp_path) + b"/\xff.zarr")
-    with pytest.raises(ValueError, match=r"a store's path must be UTF-8"):
-        convert(gv.Volume(data), bad)
-    assert not os.listdir(tmp_path)
+    np.save(tmp_path / "in.npy", data)
+    (tmp_path / "tmp").mkdir()
+    for command in (
+        ("convert", "in.npy", bad, "--workers", "2"),
+        ("info", bad),
+        ("info", bad + "x"),
+    ):
+        run = subprocess.run(
+            [sys.executable, "-m", "gvtorch", *command],
+            env=os.environ | {"TMPDIR": str(tmp_path / "tmp"), "PYTHONPATH": str(ROOT)},
+            cwd=tmp_path,
+            capture_output=True,
+            check=False,
+        )
+        missing = command[1].endswith("x")
+        assert run.returncode == (2 if missing else 0), run.stderr
+        assert run.stderr.count(b"\n") == 1 or not missing
+        assert b"Traceback" not in run.stderr and not os.listdir(tmp_path / "tmp")
+    assert_holds(Store.open(bad), data)
 
 
 # --- Ctrl-C

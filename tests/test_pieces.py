@@ -16,6 +16,7 @@ from helpers.rays import camera_rays
 from helpers.shaders import SHADERS
 from helpers.traces import SHADER, assert_equal, run
 from helpers.trees import forget
+from helpers.waits import nobody_waits
 
 import gvtorch as gv
 from gvtorch.tracing.composite import trace_pieces
@@ -217,14 +218,9 @@ def test_a_projection_in_pieces_is_streamed_and_waits_for_nobody(blobs, compiled
         engine.frame(camera, shader, **given)
         if compiled == "cuda":
             graph = engine.capture(camera, shader, **given)
-            torch.cuda.synchronize()
-            torch.cuda.set_sync_debug_mode("error")
-        try:
+        with nobody_waits(device=device):
             frame, _ = engine.frame(camera, shader, **given)
             again = graph.replay(camera)[0] if compiled == "cuda" else frame
-        finally:
-            if compiled == "cuda":
-                torch.cuda.set_sync_debug_mode("default")
     assert picture.stats.converged and whole.alpha.max() == 1
     for one in (picture, frame, again):
         for name in ("color", "alpha", "depth", "features"):

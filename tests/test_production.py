@@ -351,3 +351,38 @@ def test_loaded_bricks_narrow_the_ranges_of_nodes_without_children(dtype):
         told = torch.tensor(gv.Channel(dtype).limits, dtype=torch.float64)[:, None]
         assert (held & ~leaf).any() and (ranges[held & ~leaf] == told).all()
         assert torch.equal(engine.render(camera(64), shader).color, picture.color)
+
+
+class Clocked(Ball):
+    """Takes 6 ms a call and a hundredth of one for each node, on a clock of its own."""
+
+    def __init__(self):
+        super().__init__(64)
+        self.now, self.calls = 0.0, []
+
+    def answered(self, nodes, answer):
+        self.calls.append((type(answer), len(nodes)))
+        self.now += 1e-3 * (6 + 0.01 * len(nodes))
+        return answer
+
+    def classify(self, nodes):
+        return self.answered(nodes, super().classify(nodes))
+
+    def fill(self, nodes):
+        return self.answered(nodes, super().fill(nodes))
+
+
+def test_a_time_budget_does_not_stick_at_one_node_a_frame(monkeypatch):
+    """Where a call by itself takes more of a frame than production has, batches grow."""
+    producer = Clocked()
+    monkeypatch.setattr("gvtorch.engine.production.time.perf_counter", lambda: producer.now)
+    sizes = {**SIZE, "brick_pool": "16 MB", "node_pool": "2 MB"}
+    with gv.Engine(producer, time_budget=8.0, scout_rounds=0, **sizes) as engine:
+        for number in range(200):
+            _, stats = engine.frame(CORNER, GRAY)
+            if number > 3 and not sum(stats.requests.values()):
+                break
+    bricks = [n for kind, n in producer.calls if kind is dict]
+    assert stats.converged and sum(bricks) > 700
+    assert sum(n == 1 for n in bricks) < 5 and max(bricks) > 90
+    assert number < 20

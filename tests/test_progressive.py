@@ -12,6 +12,7 @@ import torch
 from helpers import DEVICES
 from helpers.pictures import GRAY
 from helpers.producers import Held
+from helpers.waits import nobody_waits
 
 import gvtorch as gv
 from gvtorch.pictures.progressive import jitter, strip_rows
@@ -151,12 +152,8 @@ def test_refining_on_cuda_waits_for_nobody(blobs):
         for render in (partial(engine.frame, shader=GRAY), graph.replay):
             progressive = gv.Progressive(render)
             progressive.refine(camera, 2)
-            torch.cuda.synchronize()
-            torch.cuda.set_sync_debug_mode("error")
-            try:
+            with nobody_waits():
                 picture = progressive.refine(camera, 12)
-            finally:
-                torch.cuda.set_sync_debug_mode("default")
             torch.testing.assert_close(picture.color, whole.color)
 
 

@@ -4,6 +4,7 @@ CUDA as one graph, which the host never waits for.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from concurrent.futures import Future
@@ -13,8 +14,11 @@ import pytest
 import torch
 from helpers import DEVICES
 from helpers.recorded import Frames
+from helpers.waits import nobody_waits
 
 import gvtorch as gv
+from gvtorch.engine import host_frame
+from gvtorch.engine.device_frame import DeviceFrame
 from gvtorch.io.conversion import convert
 
 COMPILED = [pytest.param(b, marks=pytest.mark.backend(b)) for b in ("cpp", "cuda")]
@@ -87,6 +91,32 @@ def test_they_come_to_the_picture_that_the_host_comes_to(backend, branching, kin
     assert torch.equal(hits.depth, expected.depth.reshape(-1, 1))
 
 
+@pytest.mark.parametrize("backend", COMPILED)
+def test_joined_producers_are_recorded_where_all_are(backend):
+    """Two channels, of which one has EMPTY regions and one has none."""
+
+    def joined() -> gv.JoinedProducer:
+        return gv.JoinedProducer({"a": Ball(64), "b": Ball(64, kinds=True)})
+
+    options = {"brick_pool": "16 MB", "device": DEVICES[backend]}
+    with gv.Engine(joined(), **options) as served:
+        expected, other = (served.render(view(), LOOK, channel=name) for name in "ab")
+    with gv.Engine(joined(), **options) as own:
+        frames = Frames(own, view(), LOOK, 64)
+        assert isinstance(frames.served, DeviceFrame)
+        for _ in range(200):
+            hits, stats = frames.frame()
+            if stats.converged:
+                break
+        own.validate()
+        assert torch.equal(own.render(view(), LOOK, channel="b").color, other.color)
+    assert stats.converged and (expected.alpha > 0.5).any()
+    assert torch.equal(hits.color, expected.color.reshape(-1, 3))
+    cast = Ball(64)
+    cast.on_device = False
+    assert not gv.JoinedProducer({"a": Ball(64), "b": cast}).on_device
+
+
 def on_the_host(blobs, tmp_path, which: str) -> gv.Producer:
     """A producer that answers from the host: at once, by rows of a table, or later."""
     if which == "store":
@@ -150,6 +180,42 @@ def test_what_was_asked_before_a_frame_of_the_host_is_dropped_however_late(blobs
         for _ in range(3):
             frames.frame()
             engine.validate()
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+@pytest.mark.parametrize("slow", [False, True])
+def test_a_busy_producer_is_asked_for_several_frames_at_once(blobs, backend, slow, monkeypatch):
+    class Later(gv.VolumeProducer):
+        late: list[tuple[Future, Any]] | None = None
+
+        def fill(self, nodes):
+            if self.late is None:
+                return super().fill(nodes)
+            self.late.append((Future(), super().fill(nodes)))
+            return self.late[-1][0]
+
+    monkeypatch.setattr(host_frame, "_SOON", 0.0 if slow else math.inf)
+    with gv.Engine(Later(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        engine.render(view(24), LOOK)
+        late = engine.trees["scene"].producer.late = []
+        frames, listed = Frames(engine, view(24), LOOK, 3), 0
+        for angle in (90, 180, 270):
+            frames.look_from(view(24, angle))
+            for _ in range(6):
+                listed += frames.frame()[1].requests["load"] > 0
+                frames.served._asker.submit(int).result()  # what it was told of is asked for
+        assert listed > 3
+        if slow:  # it is not waited for
+            assert len(late) > 3
+        else:
+            assert len(late) == 1
+            late[0][0].set_result(late[0][1])
+            frames.served._asker.submit(int).result()
+            assert len(late) == 2
+            assert len(late[1][1].data["value"]) > 2 * 3, "of more than two frames"
+        for _ in range(3):
+            frames.frame()
+        engine.validate()
 
 
 @pytest.mark.parametrize("backend", COMPILED)
@@ -286,13 +352,9 @@ def flown(
 ) -> tuple[Any, gv.Picture, gv.FrameStats]:
     """Replays a flight without a wait of the host, then its last view until it is whole."""
     graph = engine.capture(path[0], LOOK, batch=batch)
-    torch.cuda.synchronize()
-    torch.cuda.set_sync_debug_mode("error")
-    try:
+    with nobody_waits():
         for camera in path:
             picture, stats = graph.replay(camera)
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
     for _ in range(300):
         picture, stats = graph.replay(path[-1])
         time.sleep(0.002)

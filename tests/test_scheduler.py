@@ -76,6 +76,37 @@ def test_the_time_budget_learns_what_fits():
     assert len(scheduler.choose(asked, room)[0][LOAD]) >= 199, "half of the time is for bricks"
 
 
+def served_with(cost, frames: int, milliseconds: float = 8.0) -> list[int]:
+    """Bricks a frame where a batch of n takes cost(n) ms and rays always ask for more."""
+    scheduler, counts = Scheduler(milliseconds=milliseconds), []
+    asked, room = requests([0] * 4000, [1] * 4000), {LOAD: [5000], SUBDIVIDE: [5000]}
+    for _ in range(frames):
+        scheduler.begin()
+        counts.append(len(scheduler.choose(asked, room)[0][LOAD]))
+        scheduler.learn(LOAD, counts[-1], cost(counts[-1]))
+    return counts
+
+
+def test_a_call_s_own_cost_does_not_make_batches_small():
+    """A call of 6 ms and a hundredth for each brick, where bricks have 4 ms of a frame: one a frame
+    would take 6.01 ms, 200 take 8. A slow first call does not matter for long.
+    """
+    for first in (1.0, 100.0):
+        calls = iter([first] + [1.0] * 100)
+        counts = served_with(lambda n, calls=calls: next(calls) * (6 + 0.01 * n), 60)
+        assert sum(counts[15:]) / 45 > 150 and max(counts) <= 400
+
+
+def test_batches_are_as_large_as_the_time_allows():
+    """With a cost of one's own and without; slow bricks come one or two a frame."""
+    for own, each in ((0.0, 0.02), (1.0, 0.02), (0.0, 0.5), (2.0, 0.1)):
+        counts = served_with(lambda n, own=own, each=each: own + each * n, 60)
+        took = [own + each * n for n in counts[20:]]
+        assert sum(took) / 40 > 0.75 * 4 and max(took) <= 1.4 * 4 + each
+    slow = served_with(lambda n: 100.0 * n, 60)
+    assert sum(slow[5:]) <= 1.3 * 55 and max(slow[5:]) <= 2
+
+
 def test_each_kind_of_slot_serves_its_own_requests():
     """Where coarse bricks need slots of their own, the most wanted of each kind are served."""
     coarse = torch.tensor([True, False, True, False, True, False])

@@ -12,6 +12,7 @@ import pytest
 import torch
 from helpers import DEVICES
 from helpers.pictures import GRAY, camera
+from helpers.waits import nobody_waits
 
 import gvtorch as gv
 from gvtorch.base import constants as config
@@ -290,11 +291,8 @@ def test_the_host_waits_a_few_times_a_batch_whatever_its_size(device, where):
             batch, nodes = nodes[-size:], nodes[:-size]
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
-                torch.cuda.set_sync_debug_mode("warn")
-                try:
+                with nobody_waits("warn"):
                     stats = serve(engine, batch, config.REQUEST_LOAD)
-                finally:
-                    torch.cuda.set_sync_debug_mode("default")
             assert stats.produced["bricks"] == size
             counts.append(sum("synchroniz" in str(one.message) for one in caught))
         assert max(counts) <= 6, counts

@@ -11,6 +11,7 @@ import pytest
 import torch
 from helpers.pictures import GRAY, PARTS, VESSELS, assert_same_picture, camera
 from helpers.producers import Checked, Held, Late
+from helpers.waits import nobody_waits
 
 import gvtorch as gv
 from gvtorch.engine.stats import Readback
@@ -235,12 +236,8 @@ def test_a_steady_frame_on_cuda_waits_for_nobody(cuda, blobs, monitor, trees):
             assert expected[-1].stats.converged
         for view in views:  # what is loaded or uploaded once, is
             engine.frame(view, GRAY, background=background)
-        torch.cuda.synchronize()
-        torch.cuda.set_sync_debug_mode("error")
-        try:
+        with nobody_waits():
             frames = [engine.frame(view, GRAY, background=background) for view in views * 3]
-        finally:
-            torch.cuda.set_sync_debug_mode("default")
         for (picture, stats), whole in zip(frames, (expected[3:]) * 3, strict=True):
             assert stats.converged and stats.milliseconds > 0
             assert ("trace" in stats.stages) == monitor
@@ -261,14 +258,11 @@ def test_a_replayed_graph_on_cuda_is_the_frame(cuda, blobs, trees):
         graph = engine.capture(views[0], GRAY)
         torch.cuda.synchronize()
         assert engine.steady
-        torch.cuda.set_sync_debug_mode("error")
-        try:
+        with nobody_waits():
             replayed = []
             for view in views:
                 picture, stats = graph.replay(view)
                 replayed.append(({n: getattr(picture, n).clone() for n in PARTS}, stats))
-        finally:
-            torch.cuda.set_sync_debug_mode("default")
         for (parts, stats), (whole, known) in zip(replayed, expected, strict=True):
             assert all(torch.equal(parts[name], getattr(whole, name)) for name in PARTS)
             assert stats.converged and stats.milliseconds > 0 and "replay" in stats.stages

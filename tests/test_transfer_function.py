@@ -353,6 +353,18 @@ def test_presets_of_slicer(tmp_path):
         gv.TransferFunction.from_file(tmp_path / "presets.xml", "CT-Two")
 
 
+@pytest.mark.parametrize("name", ["hot", "viridis", "galaxy", "ct-vessels"])
+def test_what_is_saved_for_paraview_comes_back(tmp_path, name):
+    """Opacities as they are, colours to what an eye can't tell."""
+    function = gv.TransferFunction.preset(name, -100.0, 900.0)
+    (tmp_path / "a.json").write_text(function.to_paraview(name))
+    back = gv.TransferFunction.from_file(tmp_path / "a.json", name)
+    values = np.linspace(-100, 900, 3001)
+    found, expected = back(values), function(values)
+    np.testing.assert_allclose(found[:, 3], expected[:, 3], atol=2e-3)
+    assert np.abs(srgb(found[:, :3]) - srgb(expected[:, :3])).max() < 4e-3
+
+
 def vp_json(tmp_path, **told):
     color = [{"x": 0, "color": [0, 0.2, 1]}, {"x": 10, "color": [1, 0.4, 0.5]}]
     component = {
@@ -482,7 +494,7 @@ def test_bad_files_are_named(tmp_path, text, message):
 def test_missing_file_and_preset():
     with pytest.raises(FileNotFoundError, match=r"nowhere\.json"):
         gv.TransferFunction.from_json("nowhere.json")
-    with pytest.raises(ValueError, match="unknown preset 'lungs'; known: bone, ct-bone, ct-lung"):
+    with pytest.raises(ValueError, match="unknown preset 'lungs'; known: bone, cloud, ct-bone"):
         gv.TransferFunction.preset("lungs", 0, 1)
 
 

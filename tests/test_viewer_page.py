@@ -9,8 +9,8 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from helpers import gvtorch
-from helpers.browser import Tab, chromium  # noqa: F401
-from helpers.viewer import bright_ball, pixels
+from helpers.browser import Tab
+from helpers.viewer import BANDS, bright_ball, pixels
 
 import gvtorch as gv
 from gvtorch.viewer.notebook import module_text
@@ -19,9 +19,6 @@ from gvtorch.viewer.state import Development
 from gvtorch.viewer.view import new_session
 
 pytestmark = pytest.mark.backend("browser")
-FUNCTION = gv.TransferFunction(
-    [(20, 0), (120, 0.3), (200, 0.6)], [(0, 1, 0.4, 0.1), (130, 0.2, 0.5, 1), (255, 1, 1, 1)]
-)
 STAGE = (340.0, 210.0)  # the middle of the picture, in the page
 
 
@@ -35,24 +32,6 @@ _MODEL = """async (text) => {
   const model = { get: () => 400, on: (_, take) => takers.push(take), send };
   await (await import(url)).default.render({ model, el: document.getElementById("cell") });
 }"""
-
-
-@pytest.fixture
-def viewer():
-    state = gv.ViewState(shader=FUNCTION, develop=Development(samples=2))
-    with gv.view(bright_ball(), state=state, browser=False, wait=False) as made:
-        yield made
-
-
-@pytest.fixture
-def tab(chromium, viewer):  # noqa: F811
-    made = Tab(chromium, viewer.url)
-    made.until("app?.state")
-    made.final()
-    yield made
-    complaints = made.complaints
-    made.close()
-    assert not complaints
 
 
 def test_the_page_asks_for_nothing_outside(tab, viewer):
@@ -186,10 +165,10 @@ def test_the_window_is_dragged_in_the_picture_and_presets_apply(tab):
     tab.page.keyboard.up("Alt")
     after = tab.app("app.transfer().opacity.map((p) => p[0])")
     assert np.allclose(np.diff(after), np.diff(before), rtol=1e-6) and after[0] > before[0] + 5
-    tab.page.locator(".gv-bar select").select_option("viridis")
+    tab.page.locator(".gv-bar select").first.select_option("viridis")
     tab.until("app.transfer().color.length === 256")
     assert tab.app("app.transfer().opacity.map((p) => p[0])") == after
-    tab.page.locator(".gv-bar select").select_option("hot")
+    tab.page.locator(".gv-bar select").first.select_option("hot")
     tab.until("app.transfer().color.length === 4")
     tab.final()
 
@@ -208,7 +187,7 @@ def test_the_crop_box_is_moved_by_its_handles(tab, viewer):
     tab.until(lambda: np.abs(tab.final().astype(int) - before).max() > 60)
     clip = viewer.session.ask(lambda: viewer.state.options.clip)
     assert clip.boxes[0][1][0] < 0.4 and clip.boxes[0][0] == [-0.5, -0.5, -0.5]
-    tab.page.get_by_text("add a plane that faces me").click()
+    tab.page.get_by_text("add one facing me").click()
     tab.until("app.state.options.clip.planes.length === 1")
     tab.page.locator(".gv-row:has-text('crop box') input").uncheck()
     tab.until("app.state.options.clip.boxes.length === 0")
@@ -247,7 +226,7 @@ def test_every_shader_and_section_has_controls_that_work(tab, viewer):
     assert not tab.page.locator(".gv-note.gv-bad.gv-shown").count()
 
 
-def test_two_pages_and_one_that_follows(tab, chromium, viewer):  # noqa: F811
+def test_two_pages_and_one_that_follows(tab, chromium, viewer):
     other = Tab(chromium, viewer.url)
     try:
         other.until("app?.state")
@@ -266,7 +245,7 @@ def test_two_pages_and_one_that_follows(tab, chromium, viewer):  # noqa: F811
     tab.until("Object.keys(app.clients).length === 1")
 
 
-def test_fingers_turn_and_pinch(chromium, viewer):  # noqa: F811
+def test_fingers_turn_and_pinch(chromium, viewer):
     tab = Tab(chromium, viewer.url, has_touch=True)
     try:
         tab.until("app?.state")
@@ -295,8 +274,8 @@ def test_fingers_turn_and_pinch(chromium, viewer):  # noqa: F811
         tab.close()
 
 
-def test_a_view_that_ends_is_told(chromium):  # noqa: F811
-    viewer = gv.view(bright_ball(), FUNCTION, browser=False, wait=False)
+def test_a_view_that_ends_is_told(chromium):
+    viewer = gv.view(bright_ball(), BANDS, browser=False, wait=False)
     tab = Tab(chromium, viewer.url)
     try:
         tab.until("app?.state")
@@ -310,10 +289,10 @@ def test_a_view_that_ends_is_told(chromium):  # noqa: F811
         viewer.close()
 
 
-def test_the_notebook_mounts_the_same_page(chromium):  # noqa: F811
+def test_the_notebook_mounts_the_same_page(chromium):
     """The module that anywidget loads, with a model that hands messages to a session as the widget
     does."""
-    session = new_session(bright_ball(), FUNCTION)
+    session = new_session(bright_ball(), BANDS)
     context = chromium.new_context(viewport={"width": 720, "height": 420})
     page, clients, complaints, waiting = context.new_page(), [], [], []
     page.on("pageerror", lambda error: complaints.append(str(error)))
@@ -349,7 +328,7 @@ def test_the_notebook_mounts_the_same_page(chromium):  # noqa: F811
         session.close()
 
 
-def test_channels_and_labels_have_controls(chromium):  # noqa: F811
+def test_channels_and_labels_have_controls(chromium):
     """Colour, window and switch of a channel; a scene of labels shows without a function."""
     z, y, x = np.mgrid[0:16, 0:16, 0:16]
     two = gv.Volume(np.stack((x * 16, y * 16), -1).astype(np.uint8))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ from gvtorch.viewer import schema
 from gvtorch.viewer.protocol import MESSAGES, parse
 from gvtorch.viewer.state import Development, Eye
 
-FUZZED = int(os.environ.get("GVTORCH_FUZZ", "4000"))
+FUZZED = 4000
 HOT = gv.TransferFunction.preset("hot", 0, 255)
 SHADERS = (
     HOT,
@@ -90,7 +89,8 @@ def test_every_field_of_a_dataclass_is_in_the_state():
         fields = {one.name for one in dataclasses.fields(kind)}
         assert set(schema.describe_kind(kind)["fields"]) == fields
     for owner, name in schema.SLIDERS:
-        kind = {"Eye": Eye, "Development": Development}.get(owner) or schema.KINDS[owner]
+        kind = {"ViewState": gv.ViewState, "Eye": Eye, "Development": Development}.get(owner)
+        kind = kind or schema.KINDS[owner]
         assert "range" in schema.describe_kind(kind)["fields"][name], (owner, name)
 
 

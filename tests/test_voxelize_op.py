@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import io
 
+import numpy as np
 import pytest
 import torch
-from helpers import DEVICES
+from helpers import DEVICES, meshes
 
+import gvtorch as gv
 from gvtorch.meshes.hierarchy import Hierarchy
 from gvtorch.ops import voxelize
 from gvtorch.ops.reference.voxelize import box_share
@@ -35,9 +37,11 @@ def cubes(side: int = 8, device="cpu", each: int = 40):
     return (*(one.to(device) for one in arguments), side, 1.25)
 
 
-def known(given, detail: float = 0.0, weights: bool = True, wide: bool = False):
+def known(
+    given, detail: float = 0.0, shares: bool = True, weights: bool = True, wide: bool = False
+):
     """Arguments of the bare op."""
-    return (*given, detail, weights, wide)
+    return (*given, detail, shares, weights, wide)
 
 
 @pytest.mark.parametrize("side", [1, 3, 8, 10, 16, 20])
@@ -136,9 +140,77 @@ def test_a_plane_fills_its_exact_share(backend, solid):
         assert torch.equal(found[2][0].cpu() != 0, centres < 0)
 
 
+def filled(mesh: gv.Mesh, backend, side: int = 8, solid: bool = True, wide: bool = False):
+    """Shares of a cube of voxels of side 1 that begins at 0 (side, side, side)."""
+    faces = torch.from_numpy(mesh.corners)
+    hierarchy = Hierarchy(faces)
+    size = torch.tensor([[1.0, 1.0, 2.0]], dtype=torch.float64)
+    given = (faces[hierarchy.order].contiguous(), torch.full((len(faces),), solid), hierarchy.box)
+    given = (*given, torch.zeros(1, 3, dtype=torch.float64), size)
+    device = DEVICES[backend]
+    found = voxelize(*(one.to(device) for one in given), side, 1.0, wide=wide, backend=backend)
+    return found[3][0].cpu().double()
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_a_box_along_the_axes_fills_the_product_of_its_sides(backend, wide):
+    """Edges, corners and a box within a voxel; faces on those of voxels, where rounding decides
+    nothing.
+    """
+    at = torch.arange(8, dtype=torch.float64)
+    for low, high in (
+        ((1.3, 2.6, 0.25), (6.1, 6.2, 7.9)),
+        ((2, 2, 2), (5, 6, 4)),
+        ((2, 2.5, 3.25), (5, 6, 3.5)),
+        ((3.2, 3.3, 3.4), (3.9, 3.5, 3.8)),
+        ((-9, -9, -9), (4.5, 20, 20)),
+    ):
+        sides = [
+            ((at + 1).clamp(max=b) - at.clamp(min=a)).clamp(min=0)
+            for a, b in zip(low, high, strict=True)
+        ]
+        exact = sides[2][:, None, None] * sides[1][:, None] * sides[0]
+        found = filled(meshes.box(low, high), backend, wide=wide)
+        assert (found - exact).abs().max() < 2e-6
+
+
+def test_a_turned_box_fills_what_lies_in_its_six_planes(compiled):
+    """Counted at 32^3 places a voxel; where an edge or a corner passes, too."""
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(4))).Q.double()
+    half, middle = torch.tensor([3.1, 2.2, 0.4]).double(), torch.tensor([4.1, 3.9, 4.2]).double()
+    corners = torch.from_numpy(meshes.box(tuple(-half), tuple(half)).corners) @ turn + middle
+    if torch.linalg.det(turn) < 0:
+        corners = corners.flip(1)
+    at = (torch.arange(8 * 32).double() + 0.5) / 32
+    z, y, x = torch.meshgrid(at, at, at, indexing="ij")
+    local = (torch.stack((x, y, z), -1) - middle) @ turn.T
+    share = (local.abs() < half).all(-1).double().view(8, 32, 8, 32, 8, 32).mean((1, 3, 5))
+    found = filled(meshes.of_corners(corners.numpy()), compiled)
+    assert (found - share).abs().max() < 1 / 128
+    assert ((share > 0.02) & (share < 0.98)).sum() > 50
+    assert found.sum() == pytest.approx(float(8 * half.prod()), rel=1e-6)
+
+
+def test_the_volume_of_a_solid_is_kept_in_voxels_of_any_size(compiled):
+    """Of a ball of 8192 triangles, eight of them in a voxel or a thousand; of two that cross, a
+    voxel holds at most all of itself.
+    """
+    ball = meshes.of_corners(meshes.sphere(5).corners * 3.7 + 4.03)
+    for scale in (1, 0.5, 0.125):
+        small = meshes.of_corners(ball.corners * scale)
+        found = filled(small, compiled)
+        assert found.sum() == pytest.approx(meshes.volume(small), rel=1e-5)
+    across = meshes.of_corners(ball.corners + np.array((0.6, 0.3, 0.2)))
+    both = filled(meshes.joined(ball, across), compiled)
+    one, other = filled(ball, compiled), filled(across, compiled)
+    assert both.max() == 1 and (both - (one + other).clamp(max=1)).abs().max() < 1e-5
+    turned = meshes.of_corners(ball.corners[:, ::-1].copy())
+    assert (filled(turned, compiled) - one).abs().max() < 1e-5
+
+
 def test_opcheck(compiled):
     given = cubes(4, DEVICES[compiled])
-    for told in ({}, {"weights": False}, {"wide": True}):
+    for told in ({}, {"shares": False}, {"weights": False}, {"wide": True}):
         torch.library.opcheck(torch.ops.gvtorch.voxelize.default, known(given, **told))
 
 
@@ -151,7 +223,9 @@ class _Module(torch.nn.Module):
         low: torch.Tensor,
         size: torch.Tensor,
     ) -> torch.Tensor:
-        found = torch.ops.gvtorch.voxelize(corner, solid, box, low, size, 4, 1.0, 0.0, True, False)
+        found = torch.ops.gvtorch.voxelize(
+            corner, solid, box, low, size, 4, 1.0, 0.0, True, True, False
+        )
         return found[3]
 
 

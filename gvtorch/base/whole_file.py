@@ -9,10 +9,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from .text_path import text_path
+
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """A place to write to, which takes the file's name once the block ends well."""
+    part = ""
     try:
         handle, name = tempfile.mkstemp(suffix=path.suffix, dir=path.parent)
     except OSError as error:
@@ -20,9 +23,10 @@ def whole_file(path: Path) -> Iterator[Path]:
     try:
         try:
             os.close(handle)
-            yield Path(name)
+            part = os.path.join(text_path(os.path.abspath(path.parent)), os.path.basename(name))
+            yield Path(part)
         except OSError as error:  # what stands there already stays
-            if error.filename not in (None, name):
+            if error.filename not in (None, name, part):
                 raise
             text = error.strerror or str(error)
             raise OSError(

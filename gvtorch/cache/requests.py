@@ -24,11 +24,11 @@ from ..base.constants import (
 from ..ops import compact_requests
 from .aliases import by_target
 from .cache import Cache
+from .call_cost import CallCost
 
 #: The kinds of request by the names that statistics show.
 KINDS = {"load": REQUEST_LOAD, "subdivide": REQUEST_SUBDIVIDE}
 _LEARN_FROM = 64  # items: smaller batches tell more about overhead than about throughput
-_LEARN_RATE = 0.3  # weight of the newest frame
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -166,7 +166,7 @@ class Scheduler:
 
     Attributes:
         most: For each kind, most items a frame.
-        rate: For each kind, items a millisecond, learned from what production took; None at first.
+        cost: For each kind, what production takes, as it is learned.
         spent: For each kind, items that were asked for in this frame, which are off its budget.
     """
 
@@ -189,7 +189,7 @@ class Scheduler:
         """
         self.order, self.milliseconds = order, milliseconds
         self.most = {REQUEST_LOAD: loads, REQUEST_SUBDIVIDE: subdivisions}
-        self.rate: dict[int, float | None] = dict.fromkeys(self.most)
+        self.cost = {kind: CallCost() for kind in self.most}
         self._budget = dict(self.most)
         self.begin()
 
@@ -214,13 +214,11 @@ class Scheduler:
         return Choice(nodes, deferred, exceeded)
 
     def learn(self, kind: int, items: int, milliseconds: float) -> None:
-        """Learns the throughput from a batch that took `milliseconds`. Small ones tell little,
-        unless the budget itself made them small.
+        """Learns from a batch that took `milliseconds`. Small ones tell little, unless the budget
+        itself made them small.
         """
-        if items < min(_LEARN_FROM, self._budget[kind]) or milliseconds <= 0:
-            return
-        seen, known = items / milliseconds, self.rate[kind]
-        self.rate[kind] = seen if known is None else known + _LEARN_RATE * (seen - known)
+        if items >= min(_LEARN_FROM, self._budget[kind]) and milliseconds > 0:
+            self.cost[kind].learn(items, milliseconds)
 
     def _rank(self, requests: Requests) -> Tensor:
         """(k,) int64 rows by level, then by size on the screen, then by node, so that the order
@@ -234,8 +232,7 @@ class Scheduler:
         """How many items half of the time is enough for."""
         if self.milliseconds is None:
             return self.most[kind]
-        rate = self.rate[kind]
-        return _LEARN_FROM if rate is None else max(1, int(rate * 0.5 * self.milliseconds))
+        return self.cost[kind].fitting(0.5 * self.milliseconds, _LEARN_FROM)
 
     def __repr__(self) -> str:
         loads, tiles = self.most[REQUEST_LOAD], self.most[REQUEST_SUBDIVIDE]

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -391,16 +392,20 @@ class Camera:
         """
         if self.frame is not Frame.WORLD:
             raise ValueError("Camera.rays: an orbit camera has no place yet, call placed(tree.box)")
-        rotation, translation = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3]
-        focal, centre = self.Ks[:, (0, 1), (0, 1)], self.Ks[:, :2, 2] - 0.5
-        position = -(translation[:, None] @ rotation)[:, 0]  # -R^T t
-        zero = torch.zeros_like(focal[:, :1])
-        pixel = 1 / focal.min(1, keepdim=True).values
+        # Mostly NumPy: each call of torch lets go of the interpreter, and the frame would queue for
+        # it again and again behind the threads that read a store.
+        view, intrinsics = self.viewmats.numpy(), self.Ks.numpy()
+        rotation, translation = view[:, :3, :3], view[:, :3, 3]
+        focal, centre = intrinsics[:, (0, 1), (0, 1)], intrinsics[:, :2, 2] - 0.5
+        turned = torch.bmm(torch.from_numpy(translation[:, None]), torch.from_numpy(rotation))
+        position = -turned.numpy()[:, 0]  # -R^T t
+        pixel, zero = 1 / focal.min(1, keepdims=True), np.zeros((len(self), 1))
         cone = (pixel, zero) if MODELS[self.model].parallel else (zero, pixel)
         range_ = (zero, zero + math.inf)
-        bend = (self.radial_coeffs, self.max_angle[:, None])
-        parts = (rotation.flatten(1), position, focal, centre, *cone, *range_, *bend)
-        return upload(torch.cat((*parts, zero + self.sample), 1), torch.device(device))
+        bend = (self.radial_coeffs.numpy(), self.max_angle.numpy()[:, None])
+        parts = (rotation.reshape(-1, 9), position, focal, centre, *cone, *range_, *bend)
+        numbers = np.concatenate((*parts, zero + self.sample), 1)
+        return upload(torch.from_numpy(numbers), torch.device(device))
 
     def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:
         """Returns the rays through the pixel centres of whole rows, the first one and the one after

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -31,11 +32,16 @@ from .recorded import RecordedFrame
 from .request_batch import ProducedTree, RequestBatch, children_of
 from .stats import Collected, FrameStats
 
+_SOON = 0.02  # seconds after which a producer that has not answered yet is asked again
+
 
 class HostFrame(RecordedFrame):
     """Frames of an engine whose producers all answer from the host (`Producer.on_host`).
 
-    What a frame chose comes to the host with its counts (`ask`). Answers are checked by the thread
+    What a frame chose comes to the host with its counts (`ask`). A thread asks producers for all
+    that was chosen since it last asked, once they have answered that: a busy host is asked for the
+    nodes of several frames at once, so that it catches up. Where an answer takes longer than
+    `_SOON`, it asks without it: one slow read holds nothing up. Answers are checked by the thread
     that brings them, and posted; the next frame sends what has come, and writes it.
     """
 
@@ -58,6 +64,9 @@ class HostFrame(RecordedFrame):
         self.active = False  # whether frames have been rendered since then
         self._lock = threading.Lock()
         self._waiting: dict[Future, tuple[float, RequestBatch]] = {}  # until when
+        self._chosen: dict[int, list[Tensor]] = {kind: [] for kind in KINDS.values()}
+        self._last_asked = dict.fromkeys(KINDS.values(), -math.inf)  # seconds
+        self._going = False  # whether `_ask` is about to run
         self._asker = ThreadPoolExecutor(1, thread_name_prefix="gvtorch-ask")
 
     @property
@@ -74,6 +83,7 @@ class HostFrame(RecordedFrame):
         if stale:
             self._unused.zero_()
         self._give_up()
+        self._go_on()
         sent = [mail.send() for mail in self._mail]
         stats.pending, stats.failed = self.pending, len(self._production.failures)
         return any(sent)
@@ -86,6 +96,8 @@ class HostFrame(RecordedFrame):
         self._waiting.clear()
         with self._lock:  # what a thread works on now is posted before, and dropped, or not at all
             self.turn += 1
+            for chosen in self._chosen.values():
+                chosen.clear()
             for mail in self._mail:
                 mail.forget()
                 mail.sent = 0
@@ -162,17 +174,38 @@ class HostFrame(RecordedFrame):
         """Lets a thread ask producers for the nodes that a frame chose: (2 * batch * 6,) int64 on
         the host, of each kind rows of node, tree and place. Returns how many they are.
         """
-        total = int(np.count_nonzero(asked.numpy()[::6] >= 0))
-        if turn != self.turn or not total:
-            return 0
+        rows = asked.view(len(KINDS), -1, 6)
+        count = (rows.numpy()[..., 0] >= 0).sum(1).tolist()
         with self._lock:
-            self._asked += total
-        self._asker.submit(self._ask, turn, asked)
-        return total
+            if turn != self.turn:
+                return 0
+            self._asked += sum(count)
+            for kind, listed, k in zip(KINDS.values(), rows, count, strict=True):
+                if k:
+                    self._chosen[kind].append(listed[:k])
+        self._go_on()
+        return sum(count)
 
-    def _ask(self, turn: int, asked: Tensor) -> None:
-        for kind, listed in zip(KINDS.values(), asked.view(2, -1, 6), strict=True):
-            rows = listed[listed[:, 0] >= 0]
+    def _go_on(self) -> None:
+        """Lets the thread ask for what was chosen, if anything was."""
+        with self._lock:
+            if self._going or not any(self._chosen.values()):
+                return
+            self._going = True
+        with suppress(RuntimeError):  # it is closed
+            self._asker.submit(self._ask)
+
+    def _ask(self) -> None:
+        """Asks for what was chosen, of each kind that no producer is busy with."""
+        with self._lock:
+            self._going, turn, now = False, self.turn, time.monotonic()
+            busy = {batch.kind for _, batch in [*self._waiting.values()]}
+            free = [k for k in self._chosen if k not in busy or now > self._last_asked[k] + _SOON]
+            chosen = {kind: self._chosen[kind] for kind in free if self._chosen[kind]}
+            for kind in chosen:
+                self._chosen[kind], self._last_asked[kind] = [], now
+        for kind, lists in chosen.items():
+            rows = torch.cat(lists)
             for source in self.trees:
                 mine = rows[rows[:, 1] == source.tree.number]
                 if len(mine):
@@ -184,6 +217,7 @@ class HostFrame(RecordedFrame):
 
         def arrived(future: Future) -> None:
             there = self._waiting.pop(future, None) is not None  # else it was given up
+            self._go_on()
             if there and turn == self.turn:
                 self._settle(turn, batch, future.result)
 

@@ -17,12 +17,14 @@ import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
+from .http import file_limit, index_bytes
 from .ngff import read_json
 from .store_layout import Deadline, StoreError, StoreLayout, read_key
 
 LIST = "gvtorch/checksums.json"
 _LINE = 128  # bytes of a file's line in the list, at most
-_INDEX_ENTRY = 16  # bytes: where a chunk lies in its shard, and how long it is
 Files = dict[str, int | None]  # CRC-32 by a file's place in the store; None: there is none
 
 
@@ -39,7 +41,7 @@ def shard_files(
     found: Files = {}
     for spec in specs:
         name = file_of(spec, place)
-        content = read_key(root.get("path", "store"), root, name, deadline, part=_part(spec))
+        content = _read(root.get("path", "store"), root, spec, name, deadline)
         found[name] = None if content is None else zlib.crc32(content)
     return found
 
@@ -54,13 +56,15 @@ def file_of(spec: Mapping[str, Any], place: tuple[int, ...]) -> str:
     return "/".join(map(str, (spec["path"], "c", *at)))
 
 
-def _part(spec: Mapping[str, Any]) -> slice | None:
-    """What of a file its checksum is of; None: all."""
-    if spec["path"].startswith("gvtorch/cells"):
-        return None
-    shard = spec["metadata"]["chunk_grid"]["configuration"]["chunk_shape"]
-    chunk = spec["metadata"]["codecs"][0]["configuration"]["chunk_shape"]
-    return slice(-(_INDEX_ENTRY * (math.prod(shard) // math.prod(chunk)) + 4), None)
+def _read(where: str, root: Any, spec: Mapping[str, Any], name: str, deadline: Deadline) -> Any:
+    """What of a file its checksum is of; None: there is no such file."""
+    metadata = spec["metadata"]
+    shard = math.prod(metadata["chunk_grid"]["configuration"]["chunk_shape"])
+    chunk = math.prod(metadata["codecs"][0]["configuration"]["chunk_shape"])
+    whole = spec["path"].startswith("gvtorch/cells")
+    part = None if whole else slice(-index_bytes(shard, chunk), None)
+    most = file_limit(shard, chunk, np.dtype(metadata["data_type"]).itemsize)
+    return read_key(where, root, name, deadline, part, most)
 
 
 class Checksums:
@@ -86,7 +90,7 @@ class Checksums:
         wanted = self._files.get(name)
         where = f"{self._where}/{name}"
         if wanted is not None:  # what should not be there is never asked for
-            content = read_key(self._where, self._root, name, deadline, part=_part(spec))
+            content = _read(self._where, self._root, spec, name, deadline)
             if content is None:
                 return  # zeros come of it, and the store finds out why
             if zlib.crc32(content) != wanted:

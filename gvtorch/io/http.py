@@ -1,14 +1,52 @@
-"""`read_http`: a small file behind http or https, read within bounds of size and time whatever the
-server does: tensorstore takes what comes, without an end where there is none.
+"""`read_http`: a file behind http or https, or a part of it, read within bounds of size and time
+whatever the server does. Connections are kept and used again; proxies and redirections are left to
+urllib.
 """
 
 from __future__ import annotations
 
+import functools
+import http.client
+import os
+import re
+import ssl
+import threading
 import time
 import urllib.error
+import urllib.parse
 import urllib.request
+from typing import Any
 
+STALL = 20.0  # seconds without a byte that a server is given
+SLOWEST = 20_000  # bytes a second that it must send beyond these
+REFUSED = 30.0  # seconds for which a file that had no end is not asked for again
+_REASONS = 1000  # that are kept
+_NOT = (0.0, "")
+_refused: dict[str, tuple[float, str]] = {}  # by URL: until when, and why
+SMALL = 1 << 20  # bytes that any file may have
+_INDEX_ENTRY = 16  # bytes: where a chunk lies in its shard, and how long it is
+_CHECKSUM = 4  # bytes
 _PART = 1 << 16  # bytes
+_KEPT = 16  # idle connections to a server
+_AGENT = {"Accept-Encoding": "identity", "User-Agent": "gvtorch"}
+_MISSING = (404, 410)
+_ELSEWHERE = (301, 302, 303, 307, 308)
+
+
+class Endless(OSError):
+    """A server sends more than a file can have, or nothing."""
+
+
+class HttpStatus(OSError):
+    """The server answered with an error.
+
+    Attributes:
+        status: Its number, as 503.
+    """
+
+    def __init__(self, status: int, reason: str) -> None:
+        super().__init__(f"{status} {reason}")
+        self.status = status
 
 
 def is_http(root: object) -> bool:
@@ -16,46 +54,240 @@ def is_http(root: object) -> bool:
     return isinstance(root, str) and root.startswith(("http://", "https://"))
 
 
-def read_http(url: str, seconds: float, most: int, part: slice | None = None) -> bytes | None:
+def file_url(folder: str, name: str) -> str:
+    """URL of a file in a folder, whose URL may end in a query."""
+    base, mark, query = folder.partition("?")
+    return f"{base.rstrip('/')}/{name}{mark}{query}"
+
+
+def index_bytes(values: int, chunk: int) -> int:
+    """Bytes of the index of a shard of so many values, in chunks of so many."""
+    return _INDEX_ENTRY * (values // max(1, chunk)) + _CHECKSUM
+
+
+def file_limit(values: int, chunk: int, item: int) -> int:
+    """Bytes that a file of so many values of `item` bytes each may take, and its index: no codec
+    makes twice of what it packs.
+    """
+    return 2 * values * item + index_bytes(values, chunk) + SMALL
+
+
+def read_http(
+    url: str,
+    most: int,
+    part: slice | None = None,
+    *,
+    whole: int | None = None,
+    seconds: float = 1e9,
+) -> bytes | None:
     """Returns the content of a file, or a part of its bytes, which may count from its end; None if
     there is no such file.
 
+    Args:
+        url: Where it lies.
+        most: Bytes that come back, at most.
+        part: Which bytes.
+        whole: Bytes of the whole file, at most, which servers send that know no parts; None: most.
+        seconds: How long it may take.
+
     Raises:
         TimeoutError: It took longer.
-        ValueError: It is more than `most` bytes.
-        OSError: The server can't be reached, or answers with an error.
+        Endless: The server sends more, sends nothing for long, or hardly anything.
+        HttpStatus: It answers with an error.
+        OSError: It can't be reached, or breaks off.
     """
-    end = time.monotonic() + seconds
-    request = urllib.request.Request(url, headers={"Accept-Encoding": "identity"})
-    if part is not None:
-        first, last = part.start, part.stop
-        wanted = f"{first or 0}-{last - 1}" if last is not None else f"{first}-"
-        request.add_header("Range", f"bytes={wanted if (first or 0) >= 0 else first}")
+    if time.monotonic() < _refused.get(url, _NOT)[0]:
+        raise Endless(_refused[url][1])
     try:
-        answer = urllib.request.urlopen(request, timeout=max(1e-3, seconds))
+        return _in_time(url, most, part, most if whole is None else whole, seconds)
+    except OSError as error:
+        if not isinstance(error, TimeoutError):
+            until = time.monotonic() + (REFUSED if isinstance(error, Endless) else 0.0)
+            _refused[url] = until, str(error)
+            while len(_refused) > _REASONS:
+                _refused.pop(next(iter(_refused)), None)
+        raise
+
+
+def refused(url: str) -> str:
+    """Tells why a file could not be read the last time, or ""."""
+    return _refused.get(url, _NOT)[1]
+
+
+def _in_time(url: str, most: int, part: slice | None, whole: int, seconds: float) -> bytes | None:
+    slow = STALL + most / SLOWEST
+    end = time.monotonic() + min(seconds, slow)
+    try:
+        return _read(url, most, part, whole, end)
+    except TimeoutError:
+        if seconds < slow and time.monotonic() >= end:
+            raise
+        raise Endless("the server sends hardly anything") from None
+
+
+def _read(url: str, most: int, part: slice | None, whole: int, end: float) -> bytes | None:
+    headers = dict(_AGENT)
+    if part is not None:
+        first, last = part.start or 0, part.stop
+        wanted = f"{first}-{last - 1}" if last is not None else f"{first}-"
+        headers["Range"] = f"bytes={wanted if first >= 0 else first}"
+    patience = max(1e-3, min(end - time.monotonic(), STALL))
+    try:
+        connection, answer = _ask(url, headers, patience)
+    except TimeoutError:
+        raise
+    except HttpStatus as error:
+        if error.status in _MISSING:
+            return None
+        raise
+    except (OSError, http.client.HTTPException, ValueError) as error:
+        raise OSError(_reason(error)) from None
+    done = False
+    try:
+        if answer.status in _MISSING:
+            return None
+        if answer.status not in (200, 206):
+            raise HttpStatus(answer.status, answer.reason)
+        sent = re.match(r"bytes (\d+)-", answer.headers.get("Content-Range", ""))
+        if sent and part and (part.start or 0) >= 0 and int(sent[1]) != (part.start or 0):
+            raise OSError(f"another part came: {sent[0]}")
+        cut = part if answer.status == 200 else None
+        content = _content(answer, end, most, cut, whole)
+        done = answer.isclosed()
+        return content
+    finally:
+        if connection is not None and done and not answer.will_close:
+            _connections.give_back(url, connection)
+        else:
+            answer.close()
+            if connection is not None:
+                connection.close()
+
+
+def _content(
+    answer: http.client.HTTPResponse, end: float, most: int, cut: slice | None, whole: int
+) -> bytes:
+    """Reads to the end, or as far as `cut` needs; of a file that is cut, what lies before is not
+    kept.
+    """
+    content, begin = bytearray(), 0  # which starts at byte `begin`
+    first, last = (cut.start or 0, cut.stop) if cut is not None else (0, None)
+    limit = most if cut is None else whole
+    while last is None or begin + len(content) < last:
+        if time.monotonic() > end:
+            raise TimeoutError
+        try:
+            more = answer.read1(_PART)
+        except TimeoutError:
+            raise
+        except Exception as error:  # of http.client
+            raise OSError(_reason(error)) from None
+        if not more:
+            break
+        content += more
+        got = begin + len(content)
+        if got > limit and (last is None or got < last):
+            raise Endless(f"the server sends more than {limit} bytes")
+        useless = len(content) + first if first < 0 else min(first - begin, len(content))
+        if useless > _PART or (first > begin and useless > 0):
+            del content[:useless]
+            begin += useless
+    if answer.length and last is None:  # read1 ends quietly where a server breaks off
+        raise OSError(f"cut off: {answer.length} bytes are missing")
+    found = content[first:] if first < 0 else content[: None if last is None else last - begin]
+    if len(found) > most:
+        raise Endless(f"the server sends more than {most} bytes")
+    return bytes(found)
+
+
+def _ask(
+    url: str, headers: dict[str, str], seconds: float
+) -> tuple[http.client.HTTPConnection | None, http.client.HTTPResponse]:
+    """Sends a request; returns the connection, None if it is urllib's, and the answer's head."""
+    place = urllib.parse.urlsplit(url)
+    target = urllib.parse.quote(place.path or "/", safe="/%:@!$&'()*+,;=~")
+    target += f"?{place.query}" if place.query else ""
+    proxied = place.scheme in urllib.request.getproxies()
+    if proxied and not urllib.request.proxy_bypass(place.hostname or ""):
+        return None, _by_urllib(url, headers, seconds)
+    while True:
+        connection, used = _connections.take(url, seconds)
+        try:
+            connection.request("GET", target, headers=headers)
+            answer = connection.getresponse()
+        except (http.client.RemoteDisconnected, BrokenPipeError, ConnectionResetError):
+            connection.close()
+            if not used:
+                raise
+            continue  # the server had closed it meanwhile
+        except BaseException:
+            connection.close()
+            raise
+        if answer.status in _ELSEWHERE:
+            answer.close()
+            connection.close()
+            return None, _by_urllib(url, headers, seconds)
+        return connection, answer
+
+
+def _by_urllib(url: str, headers: dict[str, str], seconds: float) -> http.client.HTTPResponse:
+    request = urllib.request.Request(url, headers=headers)
+    try:
+        found: http.client.HTTPResponse = urllib.request.urlopen(request, timeout=seconds)
     except urllib.error.HTTPError as error:
         error.close()
-        if error.code in (404, 410):
-            return None
-        raise OSError(f"{error.code} {error.reason}") from None
+        raise HttpStatus(error.code, error.reason) from None
     except urllib.error.URLError as error:
         if isinstance(error.reason, TimeoutError):
             raise TimeoutError from None
         raise OSError(str(error.reason)) from None
-    with answer:
-        content, whole = bytearray(), part is not None and answer.status != 206
-        while True:
-            if time.monotonic() > end:
-                raise TimeoutError
-            try:
-                more = answer.read1(_PART)
-            except TimeoutError:
-                raise
-            except Exception as error:  # of http.client
-                raise OSError(" ".join(str(error).split()) or type(error).__name__) from None
-            if not more:
-                break
-            content += more
-            if len(content) > most:
-                raise ValueError(f"more than {most} bytes")
-    return bytes(content[part] if whole and part is not None else content)
+    return found
+
+
+class _Connections:
+    """Idle connections, by server, of this process."""
+
+    def __init__(self) -> None:
+        self._idle: dict[Any, list[http.client.HTTPConnection]] = {}
+        self._lock = threading.Lock()
+
+    @staticmethod
+    def _key(url: str) -> tuple[int, str, str]:
+        place = urllib.parse.urlsplit(url)
+        return os.getpid(), place.scheme, place.netloc
+
+    def take(self, url: str, seconds: float) -> tuple[http.client.HTTPConnection, bool]:
+        """Returns a connection, and whether it was used before."""
+        key = self._key(url)
+        with self._lock:
+            idle = self._idle.get(key)
+            if idle:
+                connection = idle.pop()
+                if connection.sock is not None:
+                    connection.sock.settimeout(seconds)
+                    return connection, True
+        if key[1] == "https":
+            safe = http.client.HTTPSConnection(key[2], timeout=seconds, context=_certificates())
+            return safe, False
+        return http.client.HTTPConnection(key[2], timeout=seconds), False
+
+    def give_back(self, url: str, connection: http.client.HTTPConnection) -> None:
+        """Keeps it for the next, unless there are many."""
+        with self._lock:
+            idle = self._idle.setdefault(self._key(url), [])
+            if len(idle) < _KEPT:
+                idle.append(connection)
+                return
+        connection.close()
+
+
+_connections = _Connections()
+
+
+@functools.cache
+def _certificates() -> ssl.SSLContext:
+    return ssl.create_default_context()
+
+
+def _reason(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

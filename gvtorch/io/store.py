@@ -179,6 +179,10 @@ class Store:
                 raise ValueError(f"{where}: damaged: gvtorch's metadata is not what was written")
         return self
 
+    def at_time(self, time: int) -> Store:
+        """Opens it again at another time point; raises as `open`."""
+        return Store.open(**{**self._asked, "time": time})
+
     def __reduce__(self) -> Any:
         return partial(Store.open, **self._asked), ()
 

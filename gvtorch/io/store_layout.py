@@ -31,7 +31,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
-from .http import is_http, read_http
+from ..base.text_path import text_path
+from .http import file_url, is_http, read_http
+from .relay import named, through
 from .resources import cores
 
 if TYPE_CHECKING:
@@ -381,7 +383,7 @@ class Deadline:
 def short(error: BaseException) -> str:
     """tensorstore's message in one line, without its annotations."""
     text = re.sub(r"\s*\[[a-z_]+(=| locations=).*", "", str(error), flags=re.DOTALL)
-    return " ".join(text.split())[:400] or type(error).__name__
+    return named(" ".join(text.split()))[:400] or type(error).__name__
 
 
 _process: int | None = None  # that uses tensorstore
@@ -418,32 +420,22 @@ def context() -> Any:
 
 def kvstore(location: str | Path) -> Any:
     """Returns tensorstore's spec of a folder: a path, or a URL that it knows. Whatever a path is
-    made of, links and ".." too, stands for the folder that the system finds there.
-
-    Raises:
-        ValueError: The path can't be written as UTF-8.
+    made of, links and ".." too, stands for the folder that the system finds there; of one that is
+    no UTF-8, which tensorstore can't be told, a link to it is given.
     """
     text = str(location)
     if text.startswith("file://"):
         text = unquote(urlsplit(text).path)
     if re.match(r"[a-z0-9+]{2,}://", text):
         return text if text.endswith("/") or "?" in text else text + "/"
-    path = os.path.realpath(text)
-    try:
-        path.encode()
-    except UnicodeEncodeError:
-        raise ValueError(
-            f"{path.encode(errors='backslashreplace').decode()}: a store's path must be UTF-8; "
-            "rename it"
-        ) from None
+    path = text_path(os.path.realpath(text))
     return {"driver": "file", "path": f"{path.rstrip('/')}/"}
 
 
 def child(root: Any, path: str) -> Any:
     """Spec of a folder inside a folder."""
     if isinstance(root, str):
-        base, mark, query = root.partition("?")
-        return f"{base.rstrip('/')}/{path}/{mark}{query}"
+        return file_url(root, f"{path}/")
     return {**root, "path": f"{root.get('path', '')}{path}/"}
 
 
@@ -456,19 +448,20 @@ def read_key(
     most: int = MOST_JSON,
 ) -> Any:
     """Returns the content of a file in a folder, or a part of its bytes, which may count from its
-    end; None if there is no such file. Behind http it is at most `most` bytes. Raises as
+    end; None if there is no such file. Behind http the file is at most `most` bytes. Raises as
     `Deadline.wait`, and ValueError if there can be no such folder.
     """
     import tensorstore as ts
 
     if is_http(root):
-        url = child(root, name)
-        url = f"{url.partition('?')[0].rstrip('/')}{url[url.find('?') :] if '?' in url else ''}"
+        url, size = file_url(root, name), most
+        if part is not None:
+            size = part.stop - (part.start or 0) if part.stop is not None else -part.start
         try:
-            return read_http(url, deadline.left, most, part)
+            return read_http(url, min(size, most), part, whole=most, seconds=deadline.left)
         except TimeoutError:
             raise deadline.over(f"{where}/{name}") from None
-        except (OSError, ValueError) as error:
+        except OSError as error:
             raise StoreError(f"{where}/{name}: {short(error)}") from None
     try:
         folder = deadline.wait(ts.KvStore.open(root, context=context()), where)
@@ -484,9 +477,16 @@ def opened(root: Any, spec: dict[str, Any], mode: str = "read") -> Any:
     `root` comes from `kvstore`, `spec` from `StoreLayout`; `mode` is "read", "write" or "create"
     (if it is not there).
     """
-    import tensorstore as ts
-
     left_out = {"read": ("path", "metadata", _KEEP), "write": ("path", "metadata")}
     store = {key: value for key, value in spec.items() if key not in left_out.get(mode, ("path",))}
-    store["kvstore"] = child(root, spec["path"])
-    return ts.open(store, context=context(), open=True, create=mode == "create")
+    return opened_at(child(root, spec["path"]), store, create=mode == "create")
+
+
+def opened_at(folder: Any, spec: dict[str, Any], *, create: bool = False) -> Any:
+    """Begins to open the array that a folder is; returns tensorstore's future."""
+    import tensorstore as ts
+
+    relayed = through(folder) if is_http(folder) else None
+    store = {**spec, "kvstore": relayed.spec if relayed else folder}
+    future = ts.open(store, context=context(), open=True, create=create)
+    return relayed.opens(future) if relayed else future

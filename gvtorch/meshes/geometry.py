@@ -25,7 +25,7 @@ class Cubes:
     distance: Tensor  # (k, z, y, x) float32 to the nearest place, world units; inf beyond the reach
     face: Tensor  # (k, z, y, x) int32 the nearest triangle, -1 beyond the reach
     inside: Tensor  # (k, z, y, x) bool
-    coverage: Tensor  # (k, z, y, x) float32, 0 to 1
+    coverage: Tensor  # (k, z, y, x) float32, 0 to 1; or of no cubes
     weight: Tensor  # (k, z, y, x, 3) of the nearest triangle's corners there; or of no cubes
 
 
@@ -82,7 +82,7 @@ class Geometry:
         for place in place_p3.to(self.corner).split(_POINTS):
             size = place.new_tensor((self.size, self.size, reach)).expand(len(place), 3)
             low = place - 0.5 * self.size
-            distance, _, winding, *_ = self._voxelize(low, size.contiguous(), 1, 0.0, wide=True)
+            distance, _, winding, *_ = self._voxelize(low, size.contiguous(), 1, wide=True)
             found.append((winding.view(-1), distance.view(-1) * self.size))
         if not found:
             none = self.corner.new_empty(0)
@@ -109,7 +109,7 @@ class Geometry:
         part = size_k / parts
         reach = (reach_k + _HALF_DIAGONAL * part) * (1 + 1e-3)  # more than float32 rounds
         size = torch.stack((part, part, reach), 1)
-        _, nearest, winding, *_ = self._voxelize(low_k3, size, parts, 0.0, wide=wide)
+        _, nearest, winding, *_ = self._voxelize(low_k3, size, parts, wide=wide)
         return nearest >= 0, winding != 0
 
     def is_narrow(self, voxel: float) -> bool:
@@ -123,6 +123,7 @@ class Geometry:
         side: int,
         thickness: float,
         *,
+        shares: bool,
         weights: bool,
         wide: bool,
     ) -> Cubes:
@@ -134,11 +135,12 @@ class Geometry:
                 next, and how far the nearest triangle may be; no side leaves a cube out.
             side: Voxels along a side of a cube.
             thickness: Of sheets, world units.
+            shares: Whether coverage is wanted.
             weights: Whether weights are wanted.
             wide: Whether it is worked out in float64.
         """
         distance, face, winding, coverage, weight = self._voxelize(
-            low_k3, size_k3, side, thickness, weights=weights, wide=wide
+            low_k3, size_k3, side, thickness, shares=shares, weights=weights, wide=wide
         )
         unit = size_k3[:, :1, None, None].to(distance.dtype)
         return Cubes(
@@ -154,14 +156,16 @@ class Geometry:
         low: Tensor,
         size: Tensor,
         side: int,
-        thickness: float,
+        thickness: float = 0.0,
         *,
         wide: bool,
+        shares: bool = False,
         weights: bool = False,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         return voxelize(
             *(self.corner, self.solid, self.hierarchy.box, low, size, side, thickness),
             detail=self.detail,
+            shares=shares,
             weights=weights,
             wide=wide,
         )

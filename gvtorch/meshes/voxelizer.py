@@ -115,6 +115,8 @@ class Voxelizer:
         self.device = torch.device(device)
         self.geometry = Geometry(mesh, self.device, solid=solid != "never")
         self._wide = not self.geometry.is_narrow(self.spacing)
+        # Shares of solids are exact in voxels of any size.
+        self._exact = {"coverage"} == {*channels} and bool(self.geometry.solid.all())
         places = torch.tensor(list(itertools.product(range(_FINER), repeat=3)))
         self._places = places.to(self.device, torch.float64)
         painted = {"color", "normal", "material"} & {*channels}
@@ -140,7 +142,8 @@ class Voxelizer:
             low_k3: (k, 3) float64 low corners, world units.
             voxel_k: (k,) float64 world sizes of their voxels.
             side: Voxels along a side of a cube.
-            coarse_k: (k,) bool, whose voxels are means of 2^3 places in each; of none if left out.
+            coarse_k: (k,) bool, whose voxels are means of 2^3 places in each, unless one place
+                tells as much; of none if left out.
 
         Returns:
             By channel (k, z, y, x, c) of its dtype.
@@ -234,7 +237,7 @@ class Voxelizer:
         """By channel (k, z, y, x, c) of cubes, means of places where they are coarse; labels are
         those of the last place.
         """
-        if coarse is None:
+        if coarse is None or self._exact:
             return self._look(low, voxel, voxel, side)
         own = torch.where(coarse, voxel / _FINER, voxel)
         used = coarse.view(-1, 1, 1, 1, 1)
@@ -257,7 +260,11 @@ class Voxelizer:
 
     def _look(self, low: Tensor, voxel: Tensor, step: Tensor, side: int) -> dict[str, Tensor]:
         size = torch.stack((voxel, step, self.reach(voxel)), 1)
-        told: dict[str, Any] = {"weights": self.paint is not None, "wide": self._wide}
+        told: dict[str, Any] = {
+            "shares": bool({"coverage", "color", "material"} & {*self.channels}),
+            "weights": self.paint is not None,
+            "wide": self._wide,
+        }
         return self._channels(self.geometry.cubes(low, size, side, self.thickness, **told))
 
     def _channels(self, found: Cubes) -> dict[str, Tensor]:

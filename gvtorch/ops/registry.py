@@ -174,13 +174,14 @@ def _cut_bricks(*, values_zyxc: Tensor, place_k3: Tensor, brick_size: int, borde
 
 
 def _voxelize(
-    *, low_k3: Tensor, side: int, weights: bool, wide: bool, **_: Any
+    *, low_k3: Tensor, side: int, shares: bool, weights: bool, wide: bool, **_: Any
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     cubes, cube = low_k3.shape[0], (side, side, side)
     real = low_k3.new_empty((cubes, *cube), dtype=torch.float64 if wide else torch.float32)
     whole = torch.empty_like(real, dtype=torch.int32)
+    share = real.new_empty((cubes if shares else 0, *cube))
     weight = real.new_empty((cubes if weights else 0, *cube, 3))
-    return real, whole, torch.empty_like(whole), torch.empty_like(real), weight
+    return real, whole, torch.empty_like(whole), share, weight
 
 
 FAKES: dict[str, Callable[..., Any]] = {

@@ -23,6 +23,7 @@ def voxelize(
     thickness: float,
     *,
     detail: float = 0.0,
+    shares: bool = True,
     weights: bool = False,
     wide: bool = False,
     backend: Backend = "auto",
@@ -31,8 +32,10 @@ def voxelize(
     around it, and what share of the voxel is filled. Nothing waits for the host, and no shape
     depends on values.
 
-    The surface is taken as a plane through each voxel, so shares are exact where it is one. On the
-    CPU, C++ and the twin agree in every bit of float32. In float32 a triangle that comes near a
+    Of a solid, the share is the volume of its triangles in the voxel: exact, to rounding, at edges
+    and corners and of any number of triangles; where solids overlap, their shares add up to 1 at
+    most. A sheet is taken as a plane through each voxel, whose share is exact where it is one. On
+    the CPU, C++ and the twin agree in every bit of float32. In float32 a triangle that comes near a
     cube should reach no farther than some thousand voxels away from it.
 
     Args:
@@ -48,6 +51,7 @@ def voxelize(
         side: Voxels along a side of a cube, at most 32.
         thickness: Of sheets, world units.
         detail: World size of a usual triangle: tells how to search, and changes no result.
+        shares: Whether shares are wanted.
         weights: Whether weights are wanted.
         wide: Whether it is worked out in float64.
         backend: auto, reference, cpp or cuda.
@@ -57,7 +61,7 @@ def voxelize(
         reach; nearest_kzyx int32 the triangle, the first of those that are equally near, -1 beyond
         the reach; winding_kzyx int32 winding number of the voxel's centre, not 0 inside of solids;
         coverage_kzyx the filled share, 0 to 1; weight_kzyx3 weights of the triangle's corners at
-        the nearest place, of no cubes unless they are wanted.
+        the nearest place. The last two are of no cubes unless they are wanted.
 
     Raises:
         ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.
@@ -82,8 +86,8 @@ def voxelize(
     detail = check.number(where, "detail", detail, low=0)
     arguments = (corner_f33, solid_f, box_n6, low_k3, size_k3, side, thickness)
     if choose_backend(backend, device) == "reference":
-        return twin.voxelize(*arguments, detail, weights, wide)
-    return torch.ops.gvtorch.voxelize(*arguments, detail, weights, wide)
+        return twin.voxelize(*arguments, detail, shares, weights, wide)
+    return torch.ops.gvtorch.voxelize(*arguments, detail, shares, weights, wide)
 
 
 def boxes_of(triangles: int) -> int:

@@ -66,6 +66,7 @@ class JoinedProducer(Producer):
         super().__init__(**grid_of(first), channels=channels, value_range=ranges, labels=labels)
         self.producers = torch.nn.ModuleDict(producers)
         self.on_host = all(one.on_host for one in producers.values())
+        self.on_device = all(one.on_device for one in producers.values())
         waits = [one.patience for one in producers.values() if one.patience is not None]
         self.patience = max(waits) if waits else None
 
@@ -80,12 +81,18 @@ class JoinedProducer(Producer):
     def classify(self, nodes: Nodes) -> Regions | Future:
         """Asks all."""
         answers = {name: one.classify(nodes) for name, one in self._each().items()}
-        return _when_all(answers, functools.partial(_joined_regions, nodes, self._each()))
+        join = functools.partial(_joined_regions, self._device(nodes), len(nodes), self._each())
+        return _when_all(answers, join)
 
     def fill(self, nodes: Nodes) -> Bricks | Future:
         """Asks all."""
         answers = {name: one.fill(nodes) for name, one in self._each().items()}
-        return _when_all(answers, functools.partial(_joined_bricks, self._each()))
+        join = functools.partial(_joined_bricks, self._device(nodes), self._each())
+        return _when_all(answers, join)
+
+    def _device(self, nodes: Nodes) -> torch.device:
+        """Where answers are joined."""
+        return nodes.loc.device if self.on_device else torch.device("cpu")
 
     def close(self) -> None:
         """Closes all."""
@@ -159,21 +166,26 @@ def _when_all(answers: Mapping[str, Any], join: Callable[[Mapping[str, Any]], An
     return found
 
 
-def _joined_kinds(kinds: Sequence[Tensor | None], count: int) -> Tensor:
-    """(k,) of regions that hold for all."""
-    data = torch.full((count,), int(Region.DATA))
-    given = torch.stack([data if kind is None else kind.to(torch.int64).cpu() for kind in kinds])
-    if bool((given == Region.ALIAS).any()):
+def _joined_kinds(kinds: Sequence[Tensor | None], count: int, device: torch.device) -> Tensor:
+    """(k,) of regions that hold for all; on CUDA, that of an alias is none that there is."""
+    data = torch.full((count,), int(Region.DATA), device=device)
+    told = [data if kind is None else kind.to(device, torch.int64) for kind in kinds]
+    given = torch.stack(told)
+    if device.type == "cpu" and bool((given == Region.ALIAS).any()):
         raise ValueError("JoinedProducer: producers must answer without alias")
     voxels = (given == Region.DATA) | (given == Region.DATA_MAX_DEPTH)
     deepest = (~voxels | (given == Region.DATA_MAX_DEPTH)).all(0)
     kind = torch.where(deepest, int(Region.DATA_MAX_DEPTH), int(Region.DATA))
     kind = torch.where(voxels.any(0), kind, int(Region.CONSTANT))
-    return torch.where((given == Region.EMPTY).all(0), int(Region.EMPTY), kind)
+    kind = torch.where((given == Region.EMPTY).all(0), int(Region.EMPTY), kind)
+    return torch.where((given == Region.ALIAS).any(0), -1, kind)
 
 
 def _joined_regions(
-    nodes: Nodes, producers: Mapping[str, Producer], answers: Mapping[str, Any]
+    device: torch.device,
+    count: int,
+    producers: Mapping[str, Producer],
+    answers: Mapping[str, Any],
 ) -> Regions:
     given = {
         name: one if isinstance(one, Regions) else Regions(kind=one)
@@ -182,14 +194,16 @@ def _joined_regions(
     constants, ranges = dict[str, Tensor](), dict[str, Tensor]()
     for name, one in given.items():
         ((own, channel),) = producers[name].channels.items()
-        zero = torch.zeros((len(nodes), channel.width), dtype=channel.dtype)
-        constants[name] = one.constants.get(own, zero).view(len(nodes), -1).to(channel.dtype)
+        zero = torch.zeros((count, channel.width), dtype=channel.dtype, device=device)
+        constants[name] = one.constants.get(own, zero).view(count, -1).to(channel.dtype)
         ranges |= {name: one.ranges[own]} if own in one.ranges else {}
-    kind = _joined_kinds([one.kind for one in given.values()], len(nodes))
+    kind = _joined_kinds([one.kind for one in given.values()], count, device)
     return Regions(kind=kind, constants=constants, ranges=ranges, errors=_errors(given))
 
 
-def _joined_bricks(producers: Mapping[str, Producer], answers: Mapping[str, Any]) -> Bricks:
+def _joined_bricks(
+    device: torch.device, producers: Mapping[str, Producer], answers: Mapping[str, Any]
+) -> Bricks:
     data, constants, given = dict[str, Any](), dict[str, Tensor](), dict[str, Bricks]()
     for name, one in answers.items():
         given[name] = one if isinstance(one, Bricks) else Bricks(data=one)
@@ -200,7 +214,7 @@ def _joined_bricks(producers: Mapping[str, Producer], answers: Mapping[str, Any]
     if all(one.kind is None for one in given.values()):
         return Bricks(data=data, errors=errors)
     counts = [len(one.kind) for one in given.values() if one.kind is not None]
-    kind = _joined_kinds([one.kind for one in given.values()], counts[0])
+    kind = _joined_kinds([one.kind for one in given.values()], counts[0], device)
     if len(constants) < len(given):  # some tell no constants: their voxels do
         kind = torch.where(kind == Region.CONSTANT, int(Region.DATA), kind)
     return replace(Bricks(data=data, errors=errors), kind=kind, constants=constants)

@@ -27,7 +27,7 @@ class OctaveProducer(Producer):
         values: What voxels are made of it by; None: they hold it.
     """
 
-    needs_parent = True
+    needs_parent = on_device = True
 
     def __init__(
         self,
@@ -45,7 +45,7 @@ class OctaveProducer(Producer):
             extent: Voxels of the finest level, one number or (x, y, z).
             box: World corners ((x, y, z), (x, y, z)), of voxels that are cubes.
             values: A function of the sum (k, z, y, x) in some nodes, and of these nodes, such as a
-                density: of the same shape.
+                density: of the same shape. On CUDA it is recorded: it may not wait for the host.
             value_range: Smallest and largest value, where they are known.
 
         Raises:
@@ -69,7 +69,13 @@ class OctaveProducer(Producer):
         self.total, self.values = total, values
 
     def fill(self, nodes: Nodes) -> dict[str, Tensor]:
-        """Adds the finest octaves, level by level."""
+        """Adds the finest octaves, level by level: on the CPU of the nodes of each, else of all
+        nodes at every level, for nothing may wait for how many there are of each.
+        """
+        looks = nodes.loc.device.type == "cpu" and not torch.compiler.is_compiling()
+        return self._by_level(nodes) if looks else self._at_every_level(nodes)
+
+    def _by_level(self, nodes: Nodes) -> dict[str, Tensor]:
         shape = (len(nodes), *(nodes.layout.side,) * 3)
         found = {name: torch.empty(shape, device=nodes.loc.device) for name in self._names}
         for depth in nodes.depth.unique().tolist():
@@ -77,6 +83,17 @@ class OctaveProducer(Producer):
             sums = self._sums(nodes[rows], depth)
             for name, values in zip(self._names, sums, strict=False):
                 found[name][rows] = values
+        return found
+
+    def _at_every_level(self, nodes: Nodes) -> dict[str, Tensor]:
+        shape = (len(nodes), *(nodes.layout.side,) * 3)
+        found = {name: torch.zeros(shape, device=nodes.loc.device) for name in self._names}
+        for depth in range(nodes.layout.depth + 1):
+            there = (nodes.depth == depth)[:, None, None, None]
+            alone = Nodes(nodes.loc, nodes.layout)  # a root has no parent
+            sums = self._sums(nodes if depth else alone, depth)
+            for name, values in zip(self._names, sums, strict=False):
+                found[name] = torch.where(there, values, found[name]).to(torch.float32)
         return found
 
     def _sums(self, nodes: Nodes, depth: int) -> tuple[Tensor, Tensor]:

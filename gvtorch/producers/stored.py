@@ -291,7 +291,7 @@ class StoredProducer(Producer):
         store, grid = self.store, self.store.cell_grid(level)
         out = np.zeros((len(at), 3, store.width), np.float32)
         errors: dict[int, str] = {}
-        tiles, which = np.unique(at // _TILE, axis=0, return_inverse=True)
+        tiles, parts = _grouped(at // _TILE)
         keys: list[Key] = [("cells", level, *tile) for tile in tiles.tolist()]
 
         def read(missing: list[Key]) -> dict[Key, Found]:
@@ -305,8 +305,7 @@ class StoredProducer(Producer):
                     found[key] = str(error)
             return found
 
-        for number, tile in enumerate(self._cache.get(keys, read)):
-            rows = np.flatnonzero(which.reshape(-1) == number)
+        for rows, tile in zip(parts, self._cache.get(keys, read), strict=True):
             if isinstance(tile, str):
                 errors.update(dict.fromkeys(rows.tolist(), tile))
             else:
@@ -353,9 +352,7 @@ class StoredProducer(Producer):
         group of cubes after the other; returns errors by row. After a timeout no more are read.
         """
         cubes = _Cubes.of(self.store, layout)
-        places, which = np.unique(zyx // cubes.bricks, axis=0, return_inverse=True)
-        order = np.argsort(which.reshape(-1), kind="stable")
-        starts = np.searchsorted(which.reshape(-1)[order], np.arange(len(places) + 1))
+        places, parts = _grouped(zyx // cubes.bricks)
         corner = zyx % cubes.bricks * cubes.brick_size + cubes.border - layout.border
         errors: dict[int, str] = {}
         late = ""
@@ -376,8 +373,9 @@ class StoredProducer(Producer):
         for begin in range(0, len(places), group):
             some = places[begin : begin + group].tolist()
             keys: list[Key] = [(channel, cubes, level, *at) for at in some]
-            for number, cube in enumerate(self._cache.get(keys, read), begin):
-                here = order[starts[number] : starts[number + 1]]
+            for here, cube in zip(
+                parts[begin : begin + group], self._cache.get(keys, read), strict=True
+            ):
                 if isinstance(cube, str):
                     errors.update(dict.fromkeys(rows[here].tolist(), cube))
                     continue
@@ -424,3 +422,12 @@ class StoredProducer(Producer):
         z, y, x = (corners[:, axis].clip(0, values.shape[axis] - 1) for axis in range(3))
         out[rows] = values[z[:, :, None, None], y[:, None, :, None], x[:, None, None, :]]
         return {}
+
+
+def _grouped(places: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Returns the different ones (m, 3) of places (k, 3), in order, and the rows of each."""
+    order = np.lexsort(places.T[::-1])
+    places = places[order]
+    others = np.flatnonzero((places[1:] != places[:-1]).any(1)) + 1
+    first = np.append(0, others)[: len(order)]
+    return places[first], np.split(order, others)[: len(order)]

@@ -22,7 +22,11 @@ _BATCH = 4096  # bricks cut from a level at a time
 
 
 class VolumeProducer(Producer):
-    """Cuts bricks out of the levels of a volume; the same bits as `N3Tree.from_volume`."""
+    """Cuts bricks out of the levels of a volume; the same bits as `N3Tree.from_volume`.
+
+    Attributes:
+        volumes: What it cuts, by channel.
+    """
 
     on_host = True
 
@@ -70,7 +74,7 @@ class VolumeProducer(Producer):
             labels=labels_by_channel(volumes),
         )
         threshold = checked_threshold("VolumeProducer", threshold, volumes)
-        self._volumes, self._threshold, self._hold = volumes, threshold, hold
+        self.volumes, self._threshold, self._hold = volumes, threshold, hold
         self._filtered = filtered
         self._levels: dict[str, list[Level]] = {}  # by channel, the root's first
         self._values: dict[str, list[Tensor]] = {}  # voxels of these levels, and coarse channels
@@ -80,11 +84,11 @@ class VolumeProducer(Producer):
     def prepare(self, layout: Layout) -> None:
         """Makes all levels, and all bricks if they are to be held."""
         cuts = (layout.branching, layout.brick_size, layout.border)
-        self._levels = levels_by_depth(self._volumes, layout.depth, *cuts)
+        self._levels = levels_by_depth(self.volumes, layout.depth, *cuts)
         self._values = {name: [one.values for one in own] for name, own in self._levels.items()}
         levels = next(iter(self._levels.values()))
         if self._filtered is not None:
-            first = next(iter(self._volumes.values()))
+            first = next(iter(self.volumes.values()))
             name = str(self._filtered.other)
             sizes = (layout.branching, layout.depth, layout.device, self.channels[name].width)
             self.made_of[name] = self._filtered.made_of

@@ -90,6 +90,13 @@ class Labels(LitShader):
             parts.append(f"opacity={self.opacity}")
         return f"Labels({', '.join(parts + ['lit=False'] * (not self.lit))})"
 
+    def __call__(self, labels: np.ndarray) -> np.ndarray:
+        """Returns (..., 4) linear RGB and opacity per reference length of labels, in float64."""
+        look = self._look()
+        known, at = np.unique(np.asarray(labels).astype(np.int64), return_inverse=True)
+        rows = np.column_stack((look.colors_of(known), look.opacities(known)))
+        return rows[at.reshape(np.shape(labels))]
+
     def own_numbers(self, tree: N3Tree) -> LabelNumbers:
         return LabelNumbers(lit=float(self.lit))
 

@@ -26,6 +26,7 @@ from .presets import RAMP, SAMPLES, Pair, Points, converted, linear
 _GRID = 2**14  # cells of the grid on which the points of files lie, which makes short tables
 _PARTS = 16  # of the way between two colours, at least
 _FEW = 2048  # parts in all which files of few colours may have
+_SRGB_PARTS = 32  # of the way from black to white, along which sRGB is taken as straight
 _BENT = 128  # parts of a curve of opacities
 _STRAIGHT, _SUDDEN = 0.01, 0.99  # sharpnesses of VTK's, below and above which nothing is bent
 _UNSATURATED = 0.05  # radians of Msh
@@ -73,6 +74,8 @@ def read_points(path: str | Path, name: str | None) -> tuple[Pair, float | None,
         if name in found.keys() - maps or not maps:  # ParaView's lists may hold both kinds
             raise ValueError("holds colours of categories (IndexedColors), which are no function")
         return _of_paraview(file, _chosen(file, maps, name)), None, True
+    except OverflowError:
+        raise ValueError(f"{file}: holds a number that is too large") from None
     except (KeyError, TypeError, IndexError, ElementTree.ParseError, UnicodeDecodeError) as error:
         raise ValueError(f"{file}: no such file as its ending tells: {error!r}") from None
     except ValueError as error:
@@ -159,6 +162,24 @@ def _of_paraview(file: Path, item: Mapping[str, Any]) -> Pair:
         low, high = nodes[0, 0], nodes[-1, 0]
         opacity = np.array([(low + v * (high - low), a) for v, a in RAMP])
     return _points(opacity, nodes, space, wrap=bool(item.get("HSVWrap", False)))
+
+
+def paraview_item(opacity: np.ndarray, color: np.ndarray) -> dict[str, list[float]]:
+    """Returns "RGBPoints" and "Points" of ParaView, of opacities (k, 2) and colours (m, 4)."""
+    nodes, ways = [color[0]], np.abs(np.diff(_encoded(color[:, 1:]), axis=0)).max(1)
+    for first, last, way in zip(color[:-1], color[1:], ways, strict=True):
+        parts = max(1, math.ceil(_SRGB_PARTS * way))
+        nodes += [first + at / parts * (last - first) for at in range(1, parts + 1)]
+    points = np.array(nodes)
+    points[:, 1:] = _encoded(points[:, 1:])
+    middles = np.broadcast_to((0.5, 0.0), (len(opacity), 2))  # midpoint and sharpness: straight
+    told = np.column_stack((opacity, middles))
+    return {"RGBPoints": points.ravel().tolist(), "Points": told.ravel().tolist()}
+
+
+def _encoded(light: np.ndarray) -> np.ndarray:
+    """sRGB of linear light."""
+    return converted("linear_rgb_to_rgb", light)
 
 
 def _opacities(nodes: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ..base import check
 from ..base.checked import Check, above, kind_of, or_none
-from .preset_files import read_points
+from .preset_files import paraview_item, read_points
 from .presets import CT_PRESETS, Points, named
 from .shader import ColorTable, Sampling, Shader
 
@@ -134,8 +134,9 @@ class TransferFunction(Shader):
         cls, name: str, low: float | None = None, high: float | None = None
     ) -> TransferFunction:
         """Returns a named function, stretched over the values [low, high], as `gv.window` finds
-        them: gray, hot, vessels, bone, tissue, or any colour map of matplotlib. Those in Hounsfield
-        units, ct-bone, ct-soft, ct-lung, ct-vessels, keep their own values if none are given.
+        them: gray, hot, vessels, bone, tissue, mr, em, cloud, galaxy, or any colour map of
+        matplotlib. Those in Hounsfield units, ct-bone, ct-soft, ct-lung, ct-vessels, keep their own
+        values if none are given.
 
         Raises:
             ValueError: The name is unknown, or the preset needs values.
@@ -174,6 +175,13 @@ class TransferFunction(Shader):
         """Returns the text that `from_json` reads."""
         content = {"opacity": self.opacity.tolist(), "color": self.color.tolist()}
         return json.dumps({**content, "reference": self.reference} if self.reference else content)
+
+    def to_paraview(self, name: str = "gvtorch") -> str:
+        """Returns the text of a preset of ParaView (.json), as its colour map editor imports it.
+        Its colours are sRGB, in which ours are not straight: points between follow them.
+        """
+        item = paraview_item(self.opacity, self.color)
+        return json.dumps([{"ColorSpace": "RGB", "Name": name, **item}])
 
     def __repr__(self) -> str:
         """Tells its corner points by number, and its values from first to last."""

@@ -280,6 +280,8 @@ def main(args: list[str] | None = None) -> None:
 
 
 def _run(args: list[str] | None) -> None:
+    if isinstance(sys.stdout, io.TextIOWrapper):  # names of files may hold what it can't write
+        sys.stdout.reconfigure(errors="backslashreplace")
     args = _joined(sys.argv[1:] if args is None else args)
     if args == ["--version"]:
         from .. import __version__

@@ -50,10 +50,10 @@ class Look:
     """direction that is up in the picture; if left out +z of patients, whose head is there, else
     +y"""
     tf: Annotated[str | None, arg(metavar="FILE|PRESET")] = None
-    """transfer function: gray, hot, vessels, bone or tissue; ct-bone, ct-soft, ct-lung or
-    ct-vessels (Hounsfield units); a colour map of matplotlib; a file of gvtorch, ParaView or 3D
-    Slicer (.json, .vp, .xml), or one preset of it, FILE:NAME; gray if left out, or the function of
-    a store's filtered colours"""
+    """transfer function: gray, hot, vessels, bone, tissue, mr, em, cloud or galaxy; ct-bone,
+    ct-soft, ct-lung or ct-vessels (Hounsfield units); a colour map of matplotlib; a file of
+    gvtorch, ParaView or 3D Slicer (.json, .vp, .xml), or one preset of it, FILE:NAME; gray if left
+    out, or the function of a store's filtered colours"""
     window: Annotated[str | None, arg(metavar="LO,HI")] = None
     """values that it is stretched over: LO,HI; P%,P%, percentiles; full, the range; or auto, by the
     histogram without its background, as for presets and colour maps if left out"""

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from tyro.conf import Positional, arg
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ..base.records import RenderStats
     from ..cameras import Camera
     from ..pictures import Overlay, Picture
-    from ..viewer.state import Eye
+    from ..viewer.state import Eye, ViewState
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,29 +62,75 @@ class Render:
         self._check()
         parse_camera(self.camera, look, width, height)
         options = look.options()
-        with Bar() as bar, self.scene.open(self.path, options, bar) as opened:
-            scene, eye, taking = self._as_saved(opened, options)
-            camera = parse_camera(self.camera, look, width, height, scene.space)
-            camera = camera if eye is None else eye.camera(width, height, scene.box)
-            stats = taking._take(scene, camera, taking._overlay(scene, camera, eye), bar)
+        flags = self._at_saved_time()
+        with Bar() as bar, flags.open(self.path, options, bar) as opened:
+            if self.state is None:
+                camera = parse_camera(self.camera, look, width, height, opened.space)
+                stats = self._take(opened, camera, self._overlay(opened, camera, None), bar)
+            else:
+                now = opened.state(options).read(self.state)
+                stats = self._take_saved(opened, now, width, height, bar)
         if self.stats is not None:
-            content = {**stats.as_dict(), "extent": scene.extent}
+            content = {**stats.as_dict(), "extent": opened.extent}
             self.stats.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
         print(f"{self.output}: {width}x{height}, {told(stats)}")
 
-    def _as_saved(self, scene: Scene, options: dict[str, Any]) -> tuple[Scene, Eye | None, Render]:
-        """The scene as a saved state shows it, its camera, and this command with its flags."""
-        if self.state is None:
-            return scene, None, self
-        now = scene.state(options).read(self.state)
+    def _at_saved_time(self) -> SceneFlags:
+        """The flags of the scene, of the time point that a saved state tells."""
+        source = self.scene.source
+        if self.state is None or source.time is not None:
+            return self.scene
+        from ..viewer.state import saved_time
+
+        time = saved_time(self.state)
+        if time != int(time):
+            raise ValueError(f"{self.state}: time must be the number of a time point, got {time:g}")
+        return replace(self.scene, source=replace(source, time=int(time))) if time else self.scene
+
+    def _take_saved(
+        self, opened: Scene, now: ViewState, width: int, height: int, bar: Bar
+    ) -> RenderStats:
+        """Takes the picture of a saved state, as a page shows it."""
         own = {"shader": now.shader, **now.settings()}
-        shown = replace(
-            scene,
-            shader=now.shader,
-            render=partial(scene.render, **own),
-            cost=partial(scene.cost, **own),
-        )
-        return shown, now.camera, replace(self, show=now.show, develop=Develop(**vars(now.develop)))
+        render, cost = partial(opened.render, **own), partial(opened.cost, **own)
+        scene = replace(opened, shader=now.shader, render=render, cost=cost)
+        taking = replace(self, show=now.show, develop=Develop(**vars(now.develop)))
+        if now.composed:
+            return taking._take_composed(scene, now, width, height, bar)
+        camera = self._saved_camera(scene, now, width, height)
+        return taking._take(scene, camera, taking._overlay(scene, camera, now.camera), bar)
+
+    def _saved_camera(self, scene: Scene, now: ViewState, width: int, height: int) -> Camera:
+        """The camera of a saved state, for a picture of this size."""
+        if now.camera is None:
+            return parse_camera(None, self.scene.look, width, height, scene.space)
+        return now.camera.camera(width, height, scene.box)
+
+    def _take_composed(
+        self, scene: Scene, now: ViewState, width: int, height: int, bar: Bar
+    ) -> RenderStats:
+        """Takes a picture with planes beside it or costs over it."""
+        from ..viewer.slices import Planes, panes
+        from ..viewer.state import blended
+
+        if self.drawn.given():
+            raise ValueError(
+                f"{self.drawn.given()[0]} is for a picture alone: {self.state} has slices or costs"
+            )
+        part = (width, height) if now.slices is None else panes(width, height)["view"][2:]
+        camera = self._saved_camera(scene, now, *part)
+        picture = self.develop.wrap(partial(scene.render, progress=bar))(camera)
+        whole = picture
+        if now.show != "picture":
+            whole = blended(picture, scene.cost(camera).picture(now.show), now.blend)
+        if now.slices is not None:
+            planes = Planes(scene.data, lambda problem: None)
+            whole = planes.composed(whole, now, width, height, wait=True).picture
+            planes.close()
+        whole.save(self.output, bits=self.bits)
+        if self.npz is not None:
+            picture.save(self.npz)
+        return picture.stats
 
     def _check_state(self) -> None:
         """Raises ValueError where a flag tells what a saved state does."""

@@ -22,8 +22,10 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from ..base.image_info import ImageInfo
+    from ..base.volume import Volume
     from ..cameras import Camera
     from ..engine import Engine
+    from ..io.store import Store
     from ..pictures import Picture
     from ..shaders import Shader
     from ..tracing import Cost
@@ -39,9 +41,14 @@ class Scene:
     cost: Callable[..., Cost]
     box: Tensor  # (2, 3) float64 world
     extent: tuple[int, ...]  # (x, y, z) voxels
-    info: ImageInfo
     values: tuple[float, float] | None  # the smallest and the largest, if known
+    data: Volume | Store
     engine: Engine | None = None  # of a store
+
+    @property
+    def info(self) -> ImageInfo:
+        """What is known of the image."""
+        return self.data.info
 
     @property
     def space(self) -> str | None:
@@ -116,8 +123,8 @@ class SceneFlags:
             partial(cost, tree, shader=shader, **options),
             tree.box,
             volume.extent,
-            volume.info,
             volume.value_range,
+            volume,
         )
 
     @contextmanager
@@ -137,6 +144,6 @@ class SceneFlags:
                 partial(engine.render, shader=shader, mode=mode, max_frames=most, **options),
                 shader,
                 partial(cost, tree, shader=shader, **options),
-                *(tree.box, tree.extent, store.info, None, engine),
+                *(tree.box, tree.extent, None, store, engine),
             )
             tell_failures(engine)

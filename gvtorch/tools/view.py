@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -86,36 +86,47 @@ class View:
 
     def _store(self) -> tuple[Scene, Shader]:
         from ..engine.engine import Engine
-        from ..viewer.scene import Scene
+        from ..io.store import Store
+        from ..viewer.scene import Scene, Series
 
         if self.scene.threshold is not None:
             raise ValueError("--threshold is for volumes; a store's is set by gvtorch convert")
         refuse_for_store(self.scene.source)
         look, streaming = self.scene.look, self.scene.streaming
-        store = streaming.store(self.path, self.scene.source.time)
+        store = streaming.store(self.path, self.scene.source.time or 0)
         producer, shader = streaming.content(store, look)
         engine = Engine(producer, **streaming.memory(look, store))
+        scene = Scene(store.name, engine, data=store, **vars(Series.of(store)))
 
         def remake() -> Any:
-            return streaming.content(store, look)[0]
+            assert isinstance(scene.data, Store)
+            return streaming.content(scene.data, look)[0]
 
-        return Scene(store.name, engine, data=store, remake=remake), shader
+        scene.remake = remake
+        return scene, shader
 
     def _volume(self) -> tuple[Scene, Shader]:
+        from ..base.volume import Volume
         from ..engine.engine import Engine
         from ..producers import VolumeProducer
         from ..shaders import Filtered
-        from ..viewer.scene import Scene
+        from ..viewer.scene import Scene, Series
 
-        look, volume = self.scene.look, self.scene.source.read(self.path)
+        source = replace(self.scene.source, time=self.scene.source.time or 0)
+        look, volume = self.scene.look, source.read(self.path)
         shader = look.chosen(volume)
         filtered = shader if isinstance(shader, Filtered) else None
 
-        def remake() -> Any:
-            return VolumeProducer(volume, threshold=self.scene.threshold, filtered=filtered)
+        series = Series.of(self.path, **source.options())
+        scene = Scene(volume.name, data=volume, **vars(series))
 
-        engine = Engine(remake(), **self.scene.streaming.memory(look, volume))
-        return Scene(volume.name, engine, data=volume, remake=remake), shader
+        def remake() -> Any:
+            assert isinstance(scene.data, Volume)
+            return VolumeProducer(scene.data, threshold=self.scene.threshold, filtered=filtered)
+
+        memory = self.scene.streaming.memory(look, volume)
+        scene.remake, scene.engine = remake, Engine(remake(), **memory)
+        return scene, shader
 
     def _run_script(self) -> tuple[Any, Shader | None, Camera | None, dict[str, Any]]:
         """What a script sets."""

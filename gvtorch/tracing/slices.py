@@ -7,6 +7,7 @@ of the plane are read.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +24,7 @@ from ..shaders.presets import display_grays
 from ..shaders.transfer_function import TransferFunction
 
 At = float | int | str
+Colors = Callable[[np.ndarray], np.ndarray]
 #: What is up in the picture of a plane across an axis: rows of a file run down, heads are up.
 UP = {"x": "+z", "y": "+z", "z": "-y"}
 #: Where an axis of the world points, as `ImageInfo.space` tells it, by its letter.
@@ -53,7 +55,7 @@ def slice_picture(
     at: At | tuple[At, At, At] = 0.5,
     *,
     span: tuple[float, float] | None = None,
-    colors: TransferFunction | None = None,
+    colors: Colors | None = None,
     component: int = 0,
     level: int = 0,
     scale: float = 1.0,
@@ -73,7 +75,8 @@ def slice_picture(
         span: The values that are black and white, in steps that look even on a display: a voxel of
             8 bits has the sRGB number of its value if that is (0, 255). What `window` finds, with
             the background, if left out.
-        colors: Instead of grays, the colours of values (not their opacity).
+        colors: Instead of grays, the colours of values (not their opacity): a transfer function,
+            `Labels`, or another function from values (...) to linear red, green, blue (..., 3).
         component: Which number of a voxel.
         level: Of a store: 0 is the finest.
         scale: Pixels along the shortest side of a voxel.
@@ -248,7 +251,7 @@ class _Plane:
         return part[..., self.component].squeeze(number)
 
     def colored(
-        self, axis: str, at: At, view: PlaneView, pixel: float, colors: TransferFunction
+        self, axis: str, at: At, view: PlaneView, pixel: float, colors: Colors
     ) -> np.ndarray:
         """(h, w, 3) float32 linear light of the plane, of pixels so wide in world units."""
         up = view.up

@@ -14,7 +14,8 @@ from ..cameras import Camera
 from ..pictures import Picture, Progressive
 from .protocol import told, with_picture
 from .scene import Scene
-from .state import Eye, ViewState
+from .slices import Planes, panes
+from .state import Eye, ViewState, blended
 
 Send = Callable[[str | bytes], None]  # from any thread; does not block
 
@@ -40,6 +41,7 @@ class Client:
         follows: The number of the client whose camera it takes, or None.
         picture: The last one.
         monitor: Whether it is told the figures of each frame.
+        nodes: Whether it is told the boxes of the nodes of each frame.
     """
 
     def __init__(self, number: int, send: Send, eye: Eye) -> None:
@@ -47,17 +49,21 @@ class Client:
         self.number, self._send = number, send
         self.eye, self.size, self.rate = eye, (0, 0), 25.0
         self.follows: int | None = None
-        self.monitor = False
+        self.monitor = self.nodes = False
         self._moving, self._moved, self._sent = False, 0.0, 0.0
         self._drawn: tuple[Any, ...] | None = None  # what the last picture showed
         self._progressive: Progressive | None = None
         self._settled, self._still, self._done = False, 0, False
         self._last_sent = self._not_before = 0.0
+        self._last: tuple[Picture, float, bool] | None = None  # developed, milliseconds, final
+        self._renew = False  # whether planes beside it have changed
         self._milliseconds, self._fixed = 5e-4, 0.0  # of a pixel, and of a frame beside
         self.picture: Picture | None = None
         self._camera: Camera | None = None
         self._frames = 0
         self._lock = Lock()
+        self._planes: Planes | None = None
+        self._time = 0.0  # of the scene
         self._in_flight: int | None = None
         self._waiting: tuple[int, bytes] | None = None
 
@@ -102,6 +108,10 @@ class Client:
         self.eye, self._moving, self._moved, self._sent = eye, moving, time.monotonic(), sent
         self._done = False
 
+    def renew(self) -> None:
+        """Notes that planes beside the picture have changed, but not the picture."""
+        self._renew = True
+
     def stir(self, resting: bool) -> None:
         """Notes that what is shown has changed."""
         self._progressive, self._done, self._drawn = None, False, None
@@ -125,29 +135,41 @@ class Client:
         """Whether there is something to be drawn now."""
         if not self.waits() or self.busy or time.monotonic() < self._not_before:
             return False
-        return self.resting or self._drawn != (self.eye, self.size)
+        return self.resting or self._renew or self._drawn != (self.eye, self.size)
 
     def waits(self) -> bool:
         """Whether it will want something without being told."""
-        return bool(self.size[0]) and not self._done
+        return bool(self.size[0]) and (self._renew or not self._done)
 
     def rest_for(self, seconds: float) -> None:
         """Draws nothing for a while, after a picture failed."""
         self._not_before = time.monotonic() + seconds
 
-    def draw(self, scene: Scene, state: ViewState, newer: Callable[[], bool]) -> Picture | None:
+    def draw(
+        self, scene: Scene, state: ViewState, newer: Callable[[], bool], planes: Planes | None
+    ) -> Picture | None:
         """Draws and sends the next picture: a coarse one while the camera moves, else one more
-        frame of the mean. Returns it, or None if `newer` said that it is out of date.
+        frame of the mean, with planes beside it if the state says so. Returns it, or None if
+        `newer` said that it is out of date, or if only the planes have changed.
         """
+        self._planes, self._time = planes if state.slices is not None else None, scene.time
         if self._drawn != (self.eye, self.size):
             return self._draft(scene, state)
+        if self._renew and self._last is not None and self._camera is not None:
+            picture, took, final = self._last
+            self._send_picture(picture, state, _FINAL, took, final)
+            return None
         try:
             return self._refined(scene, state, newer)
         except Interrupted:
             return None
 
+    def _part(self) -> tuple[int, int]:
+        """Pixels of the picture, without the planes beside it."""
+        return self.size if self._planes is None else panes(*self.size)["view"][2:]
+
     def _draft(self, scene: Scene, state: ViewState) -> Picture:
-        width, height = self.size
+        width, height = self._part()
         wanted = 1e3 / self.rate
         budget = max(wanted - self._fixed, wanted / 2)
         scale = (budget / (self._milliseconds * width * height)) ** 0.5
@@ -176,11 +198,14 @@ class Client:
             if done < total and newer():
                 raise Interrupted
 
-        width, height = self.size
+        width, height = self._part()
         camera, start = self.eye.camera(width, height, scene.box), time.perf_counter()
         if state.show != "picture":
             camera = self.eye.camera(max(1, width // 2), max(1, height // 2), scene.box)
             picture = scene.cost(camera, state, check)
+            if state.blend < 1:
+                below = state.develop.develop(scene.frame(camera, state, check))
+                picture = blended(below, picture, state.blend)
             self._done = True
             self._show(picture, camera, state, _FINAL, 1e3 * (time.perf_counter() - start))
             return picture
@@ -211,9 +236,20 @@ class Client:
         final: bool = True,
     ) -> None:
         self.picture, self._camera = picture, camera
+        shown = picture if state.show != "picture" and final else state.develop.develop(picture)
+        self._send_picture(shown, state, quality, took, final)
+
+    def _send_picture(
+        self, shown: Picture, state: ViewState, quality: int, took: float, final: bool
+    ) -> None:
+        """Sends a developed picture, with planes beside it if there are any."""
+        self._last, self._renew = (shown, took, final), False
         self._frames += 1
         self._last_sent = time.monotonic()
-        shown = picture if state.show != "picture" and final else state.develop.develop(picture)
+        missed, layout = shown.missed, None
+        if self._planes is not None:
+            shown, layout, complete = self._planes.composed(shown, state, *self.size)
+            final = final and complete
         data = jpeg(shown, quality)
         head = {
             "number": self._frames,
@@ -222,7 +258,9 @@ class Client:
             "milliseconds": round(took, 2),
             "samples": self._progressive.count if self._progressive is not None else 0,
             "final": final,
-            "missed": bool(picture.missed.any()) if picture.missed is not None else False,
+            "missed": bool(missed.any()) if missed is not None else False,
+            "layout": layout,
+            "time": self._time,
         }
         self._post(self._frames, with_picture(head, data))
 

@@ -50,6 +50,9 @@ class Ack:
 
     number: int
 
+    def __post_init__(self) -> None:
+        check.whole("ack", "number", self.number, low=0, high=2**53)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Change:
@@ -86,6 +89,31 @@ class Preset:
     name: str
     low: float | None = None
     high: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Read:
+    """Hands over the text of a file of transfer functions, of gvtorch or another program."""
+
+    file: str
+    text: str
+    name: str | None = None  # which, where it has several
+    low: float | None = None  # the values over which relative ones are laid
+    high: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Asks for the transfer function as ParaView's JSON."""
+
+    name: str = "gvtorch"  # by which ParaView lists it
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nodes:
+    """Asks for boxes of the tree's nodes with each picture, or no more."""
+
+    on: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,8 +165,8 @@ class Do:
 
 
 Message = (
-    Hello | Move | Ack | Change | Pick | Histogram | Preset | Resize | Set | Follow | Monitor
-    | Still | Do
+    Hello | Move | Ack | Change | Pick | Histogram | Preset | Read | Export | Nodes | Resize | Set
+    | Follow | Monitor | Still | Do
 )  # fmt: skip
 MESSAGES: dict[str, type[Any]] = {one.__name__.lower(): one for one in Message.__args__}
 

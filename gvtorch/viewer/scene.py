@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from os import PathLike, fspath
 from typing import Any
 
@@ -21,7 +21,7 @@ from ..base.volume import Volume
 from ..cameras import Camera
 from ..engine import Engine, EngineOptions, FrameStats
 from ..io.ngff import is_zarr
-from ..io.reading import read_volume
+from ..io.reading import open_source, read_volume
 from ..io.store import Store
 from ..io.window import looked_at, window
 from ..ops import available
@@ -29,12 +29,15 @@ from ..pictures import Picture
 from ..pool import N3Tree
 from ..producers import Producer, StoredProducer, VolumeProducer
 from ..shaders import Channels, Labels, Shader, TransferFunction
+from ..shaders.labels import label_rows
 from ..shaders.presets import IN_HU
 from ..tracing import cost, render
-from .state import ViewState
+from .schema import MOST_ITEMS
+from .state import ViewState, transfer_of
 
 BINS = 256  # of a histogram, at most
 _LOOKED_AT = 1 << 20  # values by which whole numbers are known
+EngineScene = Producer | Mapping[str, Producer]
 _BUDGET = 40.0  # milliseconds of production a frame, so that none takes long
 
 
@@ -47,14 +50,25 @@ class Scene:
         engine: That streams it, or None.
         tree: Resident, or None.
         data: The volume or store behind it, if known.
-        remake: Makes the producer again, where the engine is the view's own.
+        remake: Makes the producer again of `data`, where the engine is the view's own.
+        times: Time points of the series that `data` is one of.
+        reopen: Gives the data of another time point; from any thread.
+        time: What is shown: the number of a time point, or the time of the producers' clocks.
     """
 
     name: str
     engine: Engine | None = None
     tree: N3Tree | None = None
     data: Volume | Store | None = None
-    remake: Callable[[], Producer] | None = None
+    remake: Callable[[], EngineScene] | None = None
+    times: int = 1
+    reopen: Callable[[int], Volume | Store] | None = None
+    time: float = 0.0
+    _resident: Volume | None = field(default=None, repr=False)  # of a tree
+
+    def __post_init__(self) -> None:
+        if self.times == 1 and (clocks := self._clocks()):
+            self.time = clocks[0].time
 
     @property
     def box(self) -> Tensor:
@@ -88,10 +102,29 @@ class Scene:
 
     def cost(self, camera: Camera, state: ViewState, progress: Progress) -> Picture:
         """Renders what the last frame cost in false colours."""
-        shader = getattr(state.shader, "transfer", None) or state.shader
+        shader = transfer_of(state.shader) or state.shader
         (tree,) = self.trees[:1]
-        found = cost(tree, camera, shader, progress=progress, **state.settings())
-        return found.picture(state.show)  # type: ignore[arg-type]
+        assert state.show != "picture"
+        counted = cost(tree, camera, shader, progress=progress, **state.settings())
+        return counted.picture(state.show)
+
+    def voxels(self) -> Volume | Store:
+        """Returns what planes are cut of.
+
+        Raises:
+            ValueError: It has no voxels of its own, or they are not all in memory.
+        """
+        if self.data is not None:
+            return self.data
+        if self.tree is None:
+            trees = [] if self.engine is None else [*self.engine.trees.values()]
+            found = _voxels_of(trees[0].producer) if len(trees) == 1 else None
+            if found is None:
+                raise ValueError("slices: this scene has no voxels of its own to cut")
+            return found
+        if self._resident is None:
+            self._resident = self.tree.to_volume()
+        return self._resident
 
     def first_shader(self) -> Shader:
         """Returns a shader that shows something, where nobody named one."""
@@ -151,6 +184,64 @@ class Scene:
         found = found.float() if found.dtype == torch.bfloat16 else found
         values = found.cpu().numpy().ravel().astype(np.float32)
         return values[np.isfinite(values)]
+
+    def _clocks(self) -> list[Any]:
+        """Producers that have a time of their own (`FieldProducer.time`)."""
+        trees = () if self.engine is None else self.engine.trees.values()
+        return [one.producer for one in trees if hasattr(one.producer, "time")]
+
+    def describe_time(self) -> dict[str, Any] | None:
+        """Returns what a slider of time needs: how many time points, or None of a clock, and what
+        one step of a series is in the world; None where nothing changes with time.
+        """
+        if self.times > 1:
+            info = self.info
+            told = {"step": info.time_step, "origin": info.time_origin, "unit": info.time_unit}
+            return {"times": self.times, **told}
+        return {"times": None} if self._clocks() else None
+
+    def describe_labels(self) -> dict[str, Any] | None:
+        """Returns the first labels of the first channel and the colours that they have where
+        nobody tells, and how many there are; None where it has no labels.
+        """
+        tree = self.trees[0]
+        channel = tree.channel_names[0]
+        if channel not in tree.labels:
+            return None
+        if tree.labels[channel] is None and isinstance(self.data, Volume):
+            names = self.data.data[..., 0].unique().cpu().numpy().astype(np.int64)
+        else:
+            names = label_rows(tree, channel)[1]
+        first = names[:MOST_ITEMS]
+        colors = Labels()(first)[:, :3].round(4)
+        return {"names": first.tolist(), "colors": colors.tolist(), "count": len(names)}
+
+    def check_time(self, time: float) -> None:
+        """Raises ValueError where there is no such time."""
+        if self.times > 1:
+            if time != int(time) or not 0 <= time < self.times:
+                raise ValueError(
+                    f"state: time must be one of {self.times} time points, 0 to {self.times - 1}, "
+                    f"got {time:g}"
+                )
+        elif time != self.time and not self._clocks():
+            raise ValueError(f"state: nothing changes with time here, got time {time:g}")
+
+    def set_clocks(self, time: float) -> None:
+        """Sets the time of the producers that have one: they are made anew."""
+        for producer in self._clocks():
+            producer.time = time
+        self.time = time
+
+    def show_time(self, time: float, data: Volume | Store) -> None:
+        """Shows another time point of a series, which `reopen` gave."""
+        before, self.data = self.data, data
+        try:
+            self.resize()
+        except (ValueError, RuntimeError):
+            self.data = before
+            raise
+        self.time = time
 
     def failures(self) -> list[str]:
         """What could not be produced, the newest last."""
@@ -213,16 +304,52 @@ def open_scene(what: Any, **options: Any) -> Scene:
     if "device" not in options and not available()["cuda"]:
         options["device"] = "cuda"
     if isinstance(what, Mapping) and all(isinstance(one, Producer) for one in what.values()):
-        return Scene(", ".join(what), Engine(what, **options), remake=lambda: what)  # type: ignore
+        return Scene(", ".join(what), Engine(what, **options), remake=lambda: what)
     if isinstance(what, Producer):
         return Scene(repr(what), Engine(what, **options), remake=lambda: what)
-    data = _data_of(what)
+    data, series = _data_of(what), Series.of(what)
     options.setdefault("border", 2 if data.info.labels else EngineOptions.border)
+    scene = Scene(data.name, data=data, **vars(series))
 
     def remake() -> Producer:
-        return VolumeProducer(data) if isinstance(data, Volume) else StoredProducer(data)
+        now = scene.data
+        assert now is not None
+        return VolumeProducer(now) if isinstance(now, Volume) else StoredProducer(now)
 
-    return Scene(data.name, Engine(remake(), **options), data=data, remake=remake)
+    scene.remake, scene.engine = remake, Engine(remake(), **options)
+    return scene
+
+
+@dataclass(frozen=True)
+class Series:
+    """The time points that a volume or a store is one of."""
+
+    times: int = 1
+    reopen: Callable[[int], Volume | Store] | None = None
+    time: float = 0.0
+
+    @classmethod
+    def of(cls, what: Any, **options: Any) -> Series:
+        """Returns those of a path or a store; `options` as of `read_volume`."""
+        if isinstance(what, (str, PathLike)):
+            path, first = fspath(what), options.pop("time", None) or 0
+            if is_zarr(path):
+                return cls.of(Store.open(path, time=first))
+            header = {name: one for name, one in options.items() if name != "nan"}
+            times = open_source(path, **header).times
+            return cls(times, lambda time: read_volume(path, **options, time=time), float(first))
+        if isinstance(what, Store):
+            return cls(what.times, what.at_time, float(what.time))
+        return cls()
+
+
+def _voxels_of(producer: Producer) -> Volume | Store | None:
+    """The volume or store that a producer gives bricks of, or None."""
+    if isinstance(producer, StoredProducer):
+        return producer.store
+    if isinstance(producer, VolumeProducer):
+        return next(iter(producer.volumes.values()))
+    return None
 
 
 def _data_of(what: Any) -> Volume | Store:

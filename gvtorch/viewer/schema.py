@@ -14,7 +14,7 @@ import inspect
 import itertools
 import math
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -39,6 +39,7 @@ from ..shaders import (
 from ..tracing import Clip, Lighting, RenderOptions, ThinLens
 
 MOST_ITEMS = 4096  # of a list
+_MOST_NUMBERS = 4 * MOST_ITEMS  # of an array: a transfer function has four in a row
 MOST_DEPTH = 16  # of objects in objects
 
 #: What JSON may name, by name.
@@ -92,6 +93,7 @@ SLIDERS: dict[tuple[str, str], tuple[float, float]] = {
     ("Clip", "cap_opacity"): (0.05, 1),
     ("Clip", "cap_light"): (0, 1),
     ("Eye", "fov"): (5, 120),
+    ("ViewState", "blend"): (0, 1),
     ("Development", "exposure"): (-5, 5),
     ("Development", "samples"): (1, 64),
 }
@@ -124,8 +126,10 @@ def encode(value: Any) -> Any:
     if isinstance(value, Enum):
         value = value.value
     elif isinstance(value, (np.ndarray, np.generic, Tensor)):
-        many = value.numel() if isinstance(value, Tensor) else value.size
-        value = _kept(value) if many > MOST_ITEMS else value.tolist()
+        small = (
+            max(value.shape, default=0) <= MOST_ITEMS and math.prod(value.shape) <= _MOST_NUMBERS
+        )
+        value = value.tolist() if small else _kept(value)
     if isinstance(value, float):
         value = value if math.isfinite(value) else None
     elif isinstance(value, Mapping):
@@ -205,7 +209,7 @@ def _fits(hint: Any, content: Any) -> bool:
 def _decoded(where: str, hint: Any, content: Any, now: Any, depth: int) -> Any:
     origin = get_origin(hint)
     is_class = isinstance(hint, type) and origin is None and hint is not Any
-    if origin in (list, tuple, Sequence):
+    if origin in (list, tuple, Sequence, Iterable):
         made = _sequence(where, hint, content, now, depth)
     elif origin in (dict, Mapping):
         made = _mapping(where, hint, content, depth)

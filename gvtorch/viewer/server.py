@@ -14,7 +14,7 @@ import secrets
 import socket
 import threading
 from collections.abc import Iterable
-from importlib import resources
+from importlib import import_module, resources
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -53,7 +53,7 @@ def aiohttp_web() -> Any:
         ImportError: It is not installed; the message tells how.
     """
     try:
-        import PIL  # noqa: F401
+        import_module("PIL")
         from aiohttp import web
     except ImportError as error:
         raise ImportError(f"view needs {error.name}: pip install 'gvtorch[view]'") from None

@@ -15,19 +15,25 @@ from typing import Any
 
 import torch
 
+from ..base.stage import no_progress
+from ..base.volume import Volume
 from ..cameras import Camera
 from ..cameras.camera import Up, upward
 from ..engine import EngineOptions
+from ..io.store import Store
 from ..pictures import Picture, Progressive
 from ..shaders import TransferFunction
 from ..shaders.presets import CT_PRESETS, PRESETS
 from . import protocol
 from .client import Client, Send
+from .files import read_function
+from .nodes import node_boxes
 from .parameters import Parameters
 from .protocol import parse
 from .scene import Scene
 from .schema import KINDS, decode, describe_kind, encode
-from .state import Development, Eye, ViewState
+from .slices import Planes, panes
+from .state import Development, Eye, Slices, ViewState, blended, transfer_of
 
 _TICK = 0.02  # seconds between looks at whether a camera has come to rest
 _FIGURES = 0.25  # seconds between figures for monitors
@@ -69,6 +75,9 @@ class Session:
         self._failed: tuple[str, ...] = ()
         self._told_busy: Any = None
         self._figures_at = 0.0
+        self._planes: Planes | None = None
+        self._opening: float | None = None  # the time point that is read in a thread
+        self._open_planes(state)
         self._thread = threading.Thread(target=self._run, name="gvtorch view", daemon=True)
         self._thread.start()
 
@@ -142,6 +151,8 @@ class Session:
     def _run(self) -> None:
         while self._step():
             pass
+        if self._planes is not None:
+            self._planes.close()
         self.scene.close()
 
     def _step(self) -> bool:
@@ -173,13 +184,14 @@ class Session:
     def _draw(self, client: Client) -> None:
         self._turn = client.number
         try:
-            picture = client.draw(self.scene, self.state, self._is_newer)
+            picture = client.draw(self.scene, self.state, self._is_newer, self._planes)
         except Exception as error:
             self._fell(client, error)
             return
         if picture is None:
             return
         self._good = self.state
+        self._tell_nodes(client)
         self._tell_busy(picture)
         self._tell_failures()
         if client.monitor and time.monotonic() - self._figures_at > _FIGURES:
@@ -258,6 +270,8 @@ class Session:
             name=self.scene.name,
             box=box,
             unit=info.unit,
+            time=self.scene.describe_time(),
+            labels=self.scene.describe_labels(),
             channels=[one.name for one in info.channels],
             channel_names=self.scene.trees[0].channel_names,
             state=self.state.to_json(),
@@ -289,7 +303,8 @@ class Session:
             _TAKES[type(message)](self, client, message)
         except (ValueError, OSError, ImportError, RuntimeError) as error:
             client.tell("refused", text=" ".join(str(error).split()))
-            client.tell("state", state=self.state.to_json())
+            if isinstance(message, protocol.Change):
+                client.tell("state", state=self.state.to_json())
 
     def _hello(self, client: Client, message: protocol.Hello) -> None:
         client.resized(message.width, message.height, message.rate)
@@ -313,10 +328,74 @@ class Session:
             client.tell("camera", camera=encode(client.eye))
         if not content:
             return
-        self.state = state
+        self.scene.check_time(state.time)
+        self._open_planes(state)
+        before, self.state = self.state, state
         self._tell_state(client if not message.rest else None)
+        beside = state.slices is not None and before.slices is not None
+        if beside and replace(before, slices=state.slices) == state:
+            self._renew_planes()
+        else:
+            for one in self.clients.values():
+                one.stir(message.rest)
+        self._follow_time()
+
+    # Planes beside the picture, and time.
+
+    def _open_planes(self, state: ViewState) -> None:
+        """Makes what cuts planes, where a state shows some; raises ValueError where it can't be."""
+        if state.slices is not None and self._planes is None:
+            self._planes = Planes(self.scene.voxels(), self._plane_came)
+
+    def _plane_came(self, problem: str) -> None:
+        """From the thread that reads."""
+        if problem:
+            self.post(lambda: self._tell_all("error", text=problem))
+        self.post(self._renew_planes)
+
+    def _renew_planes(self) -> None:
         for one in self.clients.values():
-            one.stir(message.rest)
+            one.renew()
+
+    def _follow_time(self) -> None:
+        """Shows the time of the state: that of a clock at once, of a series when it is read."""
+        wanted = self.state.time
+        if wanted == self.scene.time or self._opening is not None:
+            return
+        if self.scene.reopen is None:
+            self.scene.set_clocks(wanted)
+            return
+        self._opening = wanted
+        read = threading.Thread(target=self._read_time, args=(wanted,), daemon=True)
+        read.start()
+
+    def _read_time(self, wanted: float) -> None:
+        """Runs in a thread of its own, so that pictures go on."""
+        assert self.scene.reopen is not None
+        try:
+            data = self.scene.reopen(int(wanted))
+        except Exception as error:  # whatever it was, the view goes on
+            text = f"time {wanted:g}: {' '.join(str(error).split()) or type(error).__name__}"
+            self.post(lambda: self._time_failed(text))
+        else:
+            self.post(lambda: self._time_came(wanted, data))
+
+    def _time_came(self, time: float, data: Volume | Store) -> None:
+        self._opening = None
+        self.scene.show_time(time, data)
+        if self._planes is not None:
+            self._planes.close()
+            self._planes = None
+            self._open_planes(self.state)
+        self._stir()
+        self._follow_time()
+
+    def _time_failed(self, text: str) -> None:
+        """Goes back to the time that is shown."""
+        self._opening = None
+        self.state = replace(self.state, time=self.scene.time)
+        self._tell_all("error", text=text)
+        self._tell_state(None)
 
     def _pick(self, client: Client, message: protocol.Pick) -> None:
         place = client.picked(message.x, message.y)
@@ -329,6 +408,27 @@ class Session:
     def _preset(self, client: Client, message: protocol.Preset) -> None:
         function = TransferFunction.preset(message.name, message.low, message.high)
         client.tell("preset", name=message.name, function=encode(function))
+
+    def _read(self, client: Client, message: protocol.Read) -> None:
+        given = message.file, message.text, message.name, message.low, message.high
+        function, lost = read_function(*given)
+        name = message.name or message.file
+        client.tell("preset", name=name, function=encode(function), lost=lost)
+
+    def _export(self, client: Client, message: protocol.Export) -> None:
+        transfer = transfer_of(self.state.shader)
+        if transfer is None:
+            raise ValueError("export: there is no transfer function")
+        text = transfer.to_paraview(message.name)
+        client.send_file("paraview.json", text.encode())
+
+    def _nodes(self, client: Client, message: protocol.Nodes) -> None:
+        client.nodes = message.on
+        self._tell_nodes(client)
+
+    def _tell_nodes(self, client: Client) -> None:
+        if client.nodes and client.picture is not None:
+            client.tell("nodes", **node_boxes(self.scene.trees[0], client.eye.eye))
 
     def _resize(self, client: Client, message: protocol.Resize) -> None:
         unknown = sorted(set(message.engine) - set(_ENGINE))
@@ -375,6 +475,8 @@ class Session:
     def _do(self, client: Client, message: protocol.Do) -> None:
         if message.what == "retry":
             self.scene.retry()
+            if self._planes is not None:
+                self._planes.retry()
             self._stir()
         else:
             eye = fitted(self.scene, client.eye, client.size)
@@ -383,14 +485,21 @@ class Session:
 
     def still(self, eye: Eye, width: int, height: int) -> Picture:
         """Renders a whole picture: all that can be had, all samples."""
-        state, scene = self.state, self.scene
+        state, scene, whole = self.state, self.scene, (width, height)
+        if state.slices is not None:
+            width, height = panes(*whole)["view"][2:]
         camera = eye.camera(width, height, scene.box)
         if scene.engine is not None:
             scene.engine.render(camera, state.shader, **state.settings())  # until all is there
         made = Progressive(lambda one: scene.frame(one, state)).refine(
             camera, state.develop.samples
         )
-        return state.develop.develop(made)
+        shown = state.develop.develop(made)
+        if state.show != "picture":
+            shown = blended(shown, scene.cost(camera, state, no_progress), state.blend)
+        if self._planes is None or state.slices is None:
+            return shown
+        return self._planes.composed(shown, state, *whole, wait=True).picture
 
 
 _TAKES: Mapping[type, Callable[[Session, Client, Any], None]] = {
@@ -400,6 +509,9 @@ _TAKES: Mapping[type, Callable[[Session, Client, Any], None]] = {
     protocol.Pick: Session._pick,
     protocol.Histogram: Session._histogram,
     protocol.Preset: Session._preset,
+    protocol.Read: Session._read,
+    protocol.Export: Session._export,
+    protocol.Nodes: Session._nodes,
     protocol.Resize: Session._resize,
     protocol.Set: Session._set,
     protocol.Follow: Session._follow,
@@ -428,7 +540,7 @@ def fitted(scene: Scene, like: Eye | None, size: tuple[int, int], up: Up | None 
 
 def schema() -> dict[str, Any]:
     """Returns what the page makes its controls of: each record's fields, by its name."""
-    kinds = {**KINDS, **{one.__name__: one for one in (Eye, Development, ViewState)}}
+    kinds = {**KINDS, **{one.__name__: one for one in (Eye, Development, Slices, ViewState)}}
     told = {name: describe_kind(kind) for name, kind in kinds.items()}
     told["EngineOptions"] = describe_kind(EngineOptions)
     told["EngineOptions"]["fields"] = {

@@ -22,7 +22,7 @@ from ..engine import Engine
 from ..pictures import Picture, Progressive
 from ..pictures.tone import ToneCurve, checked_curve
 from ..pool import N3Tree
-from ..shaders import Shader
+from ..shaders import Shader, TransferFunction
 from ..tracing import RenderOptions, render
 from .schema import decode, encode
 
@@ -126,6 +126,32 @@ class Development:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Slices:
+    """Three planes of voxels beside the picture, exact to the voxel (`gv.slice_picture`).
+
+    Attributes:
+        at: World place through which they go; the middle of the box if left out.
+        window: Values that are black and white; found if left out.
+        colors: Grays, or the colours of the shader (without its opacity). Labels always have
+            theirs.
+    """
+
+    at: Triple | None = None
+    window: tuple[float, float] | None = None
+    colors: Literal["gray", "shader"] = "gray"
+
+    def __post_init__(self) -> None:
+        if self.at is not None:
+            object.__setattr__(self, "at", check.triple("Slices", "at", self.at))
+        if self.window is not None:
+            low, high = (check.number("Slices", "window", one) for one in self.window)
+            if not low < high:
+                raise ValueError(
+                    f"Slices: window must be a low and a high value, got {low}, {high}"
+                )
+
+
+@dataclass(frozen=True, kw_only=True)
 class ViewState:
     """All that a view shows.
 
@@ -134,6 +160,9 @@ class ViewState:
         options: Of the picture: step, level of detail, background, clip, lens, lighting, ...
         develop: Samples, tone and exposure.
         show: The picture, or in its place what each ray cost, see `gv.cost`.
+        blend: Share of such a cost picture that lies over the picture; 1 shows it alone.
+        slices: Three planes beside the picture, or none.
+        time: Of a series the time point, from 0; of a producer with a clock its time.
         component: Which number of a voxel is shown.
         camera: Where the camera stands; None: from where the whole box is seen.
     """
@@ -142,14 +171,24 @@ class ViewState:
     options: RenderOptions = field(default_factory=RenderOptions)
     develop: Development = field(default_factory=Development)
     show: Show = "picture"
+    blend: float = 1.0
+    slices: Slices | None = None
+    time: float = 0.0
     component: int = 0
     camera: Eye | None = None
 
     def __post_init__(self) -> None:
         check.whole("ViewState", "component", self.component, low=0)
+        check.number("ViewState", "blend", self.blend, low=0, high=1)
+        check.number("ViewState", "time", self.time)
         if self.component != self.options.component:
             options = replace(self.options, component=self.component)
             object.__setattr__(self, "options", options)
+
+    @property
+    def composed(self) -> bool:
+        """Whether planes stand beside the picture, or costs lie over it."""
+        return self.slices is not None or (self.show != "picture" and self.blend < 1)
 
     def settings(self) -> dict[str, Any]:
         """Returns the fields of `RenderOptions` as keyword arguments."""
@@ -209,3 +248,29 @@ class ViewState:
             return self.changed(content)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
+
+
+def transfer_of(shader: Shader) -> TransferFunction | None:
+    """Returns a shader's transfer function, which may be itself, or None."""
+    found = getattr(shader, "transfer", None) or shader
+    return found if isinstance(found, TransferFunction) else None
+
+
+def saved_time(path: str | Path) -> float:
+    """Returns the time that a .json file of a state tells, 0 where it tells none.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It holds something else.
+    """
+    content = check.json_file("state", path)
+    told = content.get("time", 0.0) if isinstance(content, dict) else None
+    return check.number(f"{path}: state", "time", told)
+
+
+def blended(picture: Picture, cost: Picture, share: float) -> Picture:
+    """Returns a cost picture, or so much of it over the picture, both developed."""
+    if share == 1:
+        return cost
+    over = share * cost.alpha.to(picture.color)
+    return replace(cost, color=torch.lerp(picture.color, cost.color.to(picture.color), over))

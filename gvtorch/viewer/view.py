@@ -138,17 +138,23 @@ def view(
     return viewer
 
 
+class SessionSettings(RenderSettings, total=False):
+    """What says how a scene is shown at first; see `view`."""
+
+    up: Up | None
+    state: str | PathLike[str] | ViewState | None
+    engine: Mapping[str, Any] | None
+
+
 def new_session(
     what: Any,
     shader: Shader | None = None,
     camera: Camera | None = None,
-    *,
-    up: Up | None = None,
-    state: str | PathLike[str] | ViewState | None = None,
-    engine: Mapping[str, Any] | None = None,
-    **options: Unpack[RenderSettings],
+    **given: Unpack[SessionSettings],
 ) -> Session:
     """Opens a scene and its session, without a page; see `view`."""
+    up, state, engine = given.pop("up", None), given.pop("state", None), given.pop("engine", None)
+    options: Mapping[str, Any] = given
     parameters, producer = None, what
     if callable(what) and not hasattr(what, "fill"):
         parameters = Parameters.of_function(what)
@@ -165,6 +171,7 @@ def new_session(
             shader=first,
             options=render_options("view", options),
             component=options.get("component", 0),
+            time=scene.time,
         )
         if isinstance(state, ViewState):
             chosen = state
@@ -173,6 +180,11 @@ def new_session(
         if chosen.camera is None:
             eye = fitted(scene, None, _SIZE, up) if camera is None else Eye.of(camera, scene.box)
             chosen = replace(chosen, camera=eye)
+        scene.check_time(chosen.time)
+        if chosen.time != scene.time and scene.reopen is not None:
+            scene.show_time(chosen.time, scene.reopen(int(chosen.time)))
+        elif chosen.time != scene.time:
+            scene.set_clocks(chosen.time)
         return Session(scene, chosen, parameters)
     except BaseException:
         scene.close()

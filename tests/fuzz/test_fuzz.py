@@ -10,6 +10,7 @@ import gzip
 import json
 import os
 import random
+import resource
 import time
 import warnings
 from collections.abc import Callable
@@ -32,6 +33,7 @@ SECONDS = 60 * float(os.environ.get("GVTORCH_FUZZ", "0"))  # make fuzz
 FEW = 40  # inputs of each kind in a plain run
 FOUND = Path(__file__).parent / "found"
 SLOW = 10.0  # seconds of processor time that one input may take
+MEMORY = 2 * 10**9  # bytes that it may take
 TOLD = (ValueError, OSError)  # how input is refused
 
 
@@ -54,20 +56,36 @@ def broken(content: bytes, pick: random.Random) -> bytes:
     return bytes(made)
 
 
-def try_all(kind: str, attempt: Callable[[random.Random], tuple[str, bytes]]) -> None:
-    """Runs `attempt` for seeds; it returns what went wrong, or "", and the input."""
-    end, seed = time.monotonic() + SECONDS / 6, 0
+Attempt = Callable[[random.Random], tuple[str, bytes, str]]
+
+
+def first_fault(kind: str, attempt: Attempt) -> str:
+    """Runs `attempt` for seeds; it returns what went wrong, or "", the input, and its name. Returns
+    what went wrong first, or took too long or too much memory, or "". A signal ends the tests.
+    """
+    begun, seed = time.monotonic(), 0
     begin = random.randrange(10**9) if SECONDS else 0
-    while seed < FEW or time.monotonic() < end:
-        start = time.process_time()
-        wrong, content = attempt(random.Random(f"{kind} {begin + seed}"))
-        spent = time.process_time() - start
-        if wrong or spent > SLOW:
-            file = FOUND / f"{kind}-{begin + seed}"
+    while seed < FEW or time.monotonic() < begun + SECONDS / 4:
+        start, before = time.process_time(), most_memory()
+        wrong, content, name = attempt(random.Random(f"{kind} {begin + seed}"))
+        spent, more = time.process_time() - start, most_memory() - before
+        if spent > SLOW:
+            wrong = wrong or f"{spent:.1f} s"
+        if more > MEMORY:
+            wrong = wrong or f"{more / 1e9:.1f} GB"
+        if wrong:
             if SECONDS:
-                file.write_bytes(content)
-            pytest.fail(f"{kind} {begin + seed}: {wrong or f'{spent:.1f} s'}")
+                (FOUND / f"{kind}-{begin + seed}-{name}").write_bytes(content)
+            return f"{kind} {begin + seed}: {wrong}"
         seed += 1
+    rate = seed / (time.monotonic() - begun)
+    print(f"{kind}: {seed} inputs, {rate:.0f}/s, without a fault")
+    return ""
+
+
+def most_memory() -> int:
+    """The most bytes that this process ever held."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 def outcome(call: Callable[[], Any], *told: type[BaseException]) -> str:
@@ -119,27 +137,29 @@ def volumes(folder: Path) -> dict[str, bytes]:
 
 
 def test_readers(tmp_path_factory):
+    """A broken file is read, or refused in one line."""
     whole, folder = volumes(tmp_path_factory.mktemp("whole")), tmp_path_factory.mktemp("broken")
 
-    def attempt(pick: random.Random) -> tuple[str, bytes]:
+    def attempt(pick: random.Random) -> tuple[str, bytes, str]:
         name = pick.choice(sorted(whole))
         content = broken(whole[name], pick)
         (folder / name).write_bytes(content)
-        return outcome(lambda: gv.read_volume(folder / name, nan=0)), content
+        return outcome(lambda: gv.read_volume(folder / name, nan=0)), content, name
 
-    try_all("reader", attempt)
+    assert not first_fault("reader", attempt)
 
 
 # --- stores
 
 
 def test_metadata_of_stores(tmp_path):
+    """A store with a broken file is read, or refused in one line."""
     target = tmp_path / "a.zarr"
     gv.convert(gv.Volume(np.ones((9, 9, 9), np.uint8)), target, workers=1)
     files = sorted(file for file in target.rglob("*") if file.is_file())
     whole = {file: file.read_bytes() for file in files}
 
-    def attempt(pick: random.Random) -> tuple[str, bytes]:
+    def attempt(pick: random.Random) -> tuple[str, bytes, str]:
         file = pick.choice(files)
         content = broken(whole[file], pick)
         file.write_bytes(content)
@@ -152,9 +172,9 @@ def test_metadata_of_stores(tmp_path):
 
         wrong = outcome(read)
         file.write_bytes(whole[file])
-        return wrong, content
+        return wrong, content, file.name
 
-    try_all("store", attempt)
+    assert not first_fault("store", attempt)
 
 
 # --- JSON of every kind
@@ -182,6 +202,7 @@ def changed(content: Any, pick: random.Random) -> Any:
 
 
 def test_json_of_every_kind(tmp_path):
+    """Broken JSON is read, or refused in one line."""
     look = gv.TransferFunction.from_points([(0, 0), (1, 1)], [(0, 1, 1, 1)])
     look.save(tmp_path / "tf.json")
     kinds = dict.fromkeys(("tf.json", "presets.json"), gv.TransferFunction.from_file)
@@ -191,15 +212,15 @@ def test_json_of_every_kind(tmp_path):
     )  # fmt: skip
     whole = {name: json.loads((tmp_path / name).read_text()) for name in kinds}
 
-    def attempt(pick: random.Random) -> tuple[str, bytes]:
+    def attempt(pick: random.Random) -> tuple[str, bytes, str]:
         name = pick.choice(sorted(kinds))
         text = json.dumps(changed(whole[name], pick)).encode()
         text = broken(text, pick) if pick.random() < 0.3 else text
         file = tmp_path / f"broken_{name}"
         file.write_bytes(text)
-        return outcome(lambda: kinds[name](file)), text
+        return outcome(lambda: kinds[name](file)), text, name
 
-    try_all("json", attempt)
+    assert not first_fault("json", attempt)
 
 
 # --- arguments of ops
@@ -239,7 +260,7 @@ def test_arguments_of_ops(blobs):
     }
     assert set(known) <= set(FAKES)
 
-    def attempt(pick: random.Random) -> tuple[str, bytes]:
+    def attempt(pick: random.Random) -> tuple[str, bytes, str]:
         name = pick.choice(sorted(known))
         values = [v.clone() if isinstance(v, torch.Tensor) else v for v in known[name]]
         for _ in range(pick.choice((1, 1, 2))):
@@ -260,14 +281,22 @@ def test_arguments_of_ops(blobs):
                     else pick.choice((-1, 0, 1, 3, 2**62))
                 )
         op = getattr(torch.ops.gvtorch, name)
-        return outcome(lambda: op(*values), RuntimeError, TypeError), repr(values).encode()
+        told = outcome(lambda: op(*values), RuntimeError, TypeError)
+        return told, repr(values).encode(), name
 
-    try_all("op", attempt)
+    assert not first_fault("op", attempt)
 
 
-@pytest.mark.parametrize("file", sorted(FOUND.glob("reader-*")), ids=lambda file: file.name)
+FILES = sorted(file for file in FOUND.iterdir() if file.name.startswith(("reader-", "json-")))
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.name)
 def test_what_was_found_is_mended(file, tmp_path):
-    """Each name ends with the ending of the file that it was."""
-    copy = tmp_path / f"a{file.suffix}"
+    """Each is named by what it is, its seed, and the name that it had."""
+    kind, _, name = file.name.split("-", 2)
+    copy = tmp_path / name
     copy.write_bytes(file.read_bytes())
-    assert not outcome(lambda: gv.read_volume(copy, nan=0))
+    if kind == "json":
+        assert not outcome(lambda: gv.TransferFunction.from_file(copy))
+    else:
+        assert not outcome(lambda: gv.read_volume(copy, nan=0))

@@ -6,11 +6,11 @@ import base64
 import importlib.util
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-import pytest
 
 from .viewer import SOON
 
@@ -102,11 +102,9 @@ class Tab:
         self.context.close()
 
 
-@pytest.fixture(scope="module")
-def chromium():
-    """The browser; a skip that the summary tells of where there is none."""
-    if reason := absent():
-        pytest.skip(f"browser: {reason}")
+@contextmanager
+def running() -> Iterator[Any]:
+    """The browser."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as library:

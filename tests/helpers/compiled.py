@@ -17,3 +17,20 @@ def quick_compiler(folder: Path, *before: str) -> str:
     file.write_text("\n".join(("#!/bin/sh", *before, f'exec {real} "$@" -O0\n')))
     file.chmod(0o755)
     return str(file)
+
+
+def write(folder: Path, body: str, name: str = "own.h") -> Path:
+    """A header with a struct `Own` around `body`, without packets, which take twice as long."""
+    path = folder / name
+    path.write_text(
+        '#define GV_RAY_BY_RAY\n#include "user_shader.h"\n'
+        "template <class T>\nstruct Own : gv::UserShader<T> {\n"
+        f"  using gv::UserShader<T>::UserShader;\n{body}\n}};\n"
+    )
+    return path
+
+
+ADD = """
+  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
+    this->composite({COLOR, 0, 0, 1}, piece, sum);
+  }"""

@@ -7,6 +7,7 @@ import http.server
 import re
 import threading
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,14 @@ import numpy as np
 import gvtorch as gv
 from gvtorch.io.store import Store
 from gvtorch.pool.pyramid import round_to, volume_levels
+
+
+def read(path: Path, **options) -> tuple[gv.Volume, list[str]]:
+    """A volume, and the lines that reading it told."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        volume = gv.read_volume(path, **options)
+    return volume, [str(one.message) for one in told]
 
 
 def noise(shape: tuple[int, ...], dtype: str = "uint8", seed: int = 0) -> np.ndarray:

@@ -107,3 +107,17 @@ def bright_ball(n: int = 40) -> gv.Volume:
     z, y, x = np.mgrid[0:n, 0:n, 0:n].astype(np.float32) / n - 0.5
     ball = np.clip(1 - 4 * np.sqrt((x - 0.15) ** 2 + y**2 + (z + 0.1) ** 2), 0, 1)
     return gv.Volume((255 * ball).astype(np.uint8))
+
+
+FUNCTION = gv.TransferFunction([(20, 0), (200, 0.6)], [(0, 1, 0.4, 0.1), (255, 1, 1, 1)])
+BANDS = gv.TransferFunction(
+    [(20, 0), (120, 0.3), (200, 0.6)], [(0, 1, 0.4, 0.1), (130, 0.2, 0.5, 1), (255, 1, 1, 1)]
+)
+
+
+def turned(camera: dict, angle: float) -> dict:
+    """The camera turned around its target and +y."""
+    away = np.subtract(camera["eye"], camera["target"])
+    c, s = np.cos(angle), np.sin(angle)
+    away = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ away
+    return {**camera, "eye": (away + camera["target"]).tolist()}

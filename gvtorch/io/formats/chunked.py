@@ -22,7 +22,7 @@ from ...base.named_axes import ask_axes, even_steps, named_axes, place_named
 from ...base.units import spacing_of
 from ..ngff import parse_json
 from ..source import Index, VolumeSource
-from ..store_layout import Deadline, context, kvstore
+from ..store_layout import Deadline, kvstore, opened_at
 from .format import Format
 
 _TIMEOUT = 600.0  # seconds for one read
@@ -47,10 +47,8 @@ class ChunkedSource(VolumeSource):
 
 @functools.lru_cache(maxsize=8)
 def _array(driver: str, folder: str, _opened: int) -> Any:
-    import tensorstore as ts
-
-    spec = {"driver": driver, "kvstore": kvstore(folder)}
-    return Deadline(_OPEN_TIMEOUT).wait(ts.open(spec, context=context(), open=True), folder)
+    future = opened_at(kvstore(folder), {"driver": driver})
+    return Deadline(_OPEN_TIMEOUT).wait(future, folder)
 
 
 def _head(folder: str) -> tuple[str, dict[str, Any]] | None:

@@ -5,7 +5,8 @@ Sources: Ericson, "Real-Time Collision Detection", 2005, section 5.1.5 (closest 
     triangle); Jacobson, Kavan, Sorkine-Hornung, "Robust inside-outside segmentation using
     generalized winding numbers", SIGGRAPH 2013 (the number counted here along x); Scardovelli,
     Zaleski, "Analytical relations connecting linear interfaces and volume fractions in rectangular
-    grids", J. Comput. Phys. 164, 2000, section 2.
+    grids", J. Comput. Phys. 164, 2000, section 2; Sutherland, Hodgman, "Reentrant polygon
+    clipping", CACM 17, 1974 (triangles in a voxel).
 """
 
 from __future__ import annotations
@@ -17,6 +18,9 @@ from .exact import sqrt_exact
 
 FLAT = 1e-3  # least share of the normal's sum along an axis, see `box_share`
 TOUCH = 1e-6  # squared distance in voxels below which the triangle's own normal is taken
+BEYOND = 0.8661  # voxels, more than from a voxel's centre to its corner
+CORNERS = 16  # a clipped triangle has at most 9, more only where rounding dents it
+PARTS = 2.0**30  # of a voxel, in whole numbers of which volumes add up the same in any order
 _PAIRS = 1 << 20  # of place and triangle that are looked at together
 
 
@@ -29,6 +33,7 @@ def voxelize(
     side: int,
     thickness: float,
     detail: float,
+    shares: bool,
     weights: bool,
     wide: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -37,7 +42,8 @@ def voxelize(
     items, cube = len(low_k3), (side,) * 3
     distance = torch.full((items, *cube), torch.inf, dtype=real, device=low_k3.device)
     nearest = torch.full((items, *cube), -1, dtype=torch.int32, device=low_k3.device)
-    winding, coverage = torch.zeros_like(nearest), torch.zeros_like(distance)
+    winding = torch.zeros_like(nearest)
+    coverage = distance.new_zeros((items if shares else 0, *cube))
     weight = distance.new_zeros((items if weights else 0, *cube, 3))
     at = torch.arange(side, device=low_k3.device).to(real)
     for item in range(items):
@@ -50,14 +56,18 @@ def voxelize(
         z, y, x = torch.meshgrid(along, along, along, indexing="ij")
         places = torch.stack((x, y, z), -1).view(-1, 3)
         half = (0.5 * thickness * inverse).to(real)
-        flat = [one[item].view(-1) for one in (distance, nearest, winding, coverage)]
+        flat = [one[item].view(-1) for one in (distance, nearest, winding)]
         for begin in range(0, len(places), max(1, _PAIRS // len(corner))):
             part = slice(begin, begin + max(1, _PAIRS // len(corner)))
             gap, row, away = _nearest(places[part], corner, (reach * inverse).to(real))
             count = _ahead(places[part], corner, solid_f)
-            share = _coverage(gap, away, count, row, solid_f, half)
-            for out, values in zip(flat, (gap, row, count, share), strict=True):
+            for out, values in zip(flat, (gap, row, count), strict=True):
                 out[part] = values.to(out.dtype)
+            if shares:
+                share = _coverage(gap, away, count, row, solid_f, half)
+                cut = (row >= 0) & solid_f[row.clamp(min=0)] & (gap <= BEYOND)
+                filled = _filled(places[part][cut], corner[solid_f])
+                coverage[item].view(-1)[part] = share.masked_scatter(cut, filled)
             if weights:
                 found = _weights(places[part], corner[row.clamp(min=0)])
                 weight[item].view(-1, 3)[part] = torch.where(row[:, None] >= 0, found, 0)
@@ -179,19 +189,100 @@ def pierced(place: Tensor, corner: Tensor) -> tuple[Tensor, Tensor]:
 def _coverage(
     gap: Tensor, away: Tensor, winding: Tensor, row: Tensor, solid_f: Tensor, half: Tensor
 ) -> Tensor:
-    """Returns (p,) the share of each voxel that is filled, the surface taken as the plane at the
-    nearest place: inside of it, or where the nearest triangle bounds no solid, `half` of a
-    thickness to either side.
+    """Returns (p,) the share of each voxel that is filled where no solid's surface passes: all of
+    it inside, nothing outside; where the nearest triangle is a sheet's, `half` of a thickness to
+    either side of the plane at the nearest place.
     """
     inside = (winding != 0).to(gap.dtype)
-    near = row >= 0
-    gap = torch.where(near, gap, 0)
-    solid = solid_f[row.clamp(min=0)]
-    below = box_share(away, gap)
+    sheet = (row >= 0) & ~solid_f[row.clamp(min=0)]
+    gap = torch.where(sheet, gap, 0)
     layer = box_share(away, gap + half) - box_share(away, gap - half)
-    share = torch.where(solid, torch.where(winding != 0, below, 1 - below), layer)
-    share = torch.where(solid | (winding == 0), share, inside)
-    return torch.where(near, share, inside)
+    return torch.where(sheet & (winding == 0), layer, inside)
+
+
+def _filled(place_p3: Tensor, corner_f33: Tensor) -> Tensor:
+    """Returns (p,) the winding number's mean over voxels around places, 0 to 1 (of solids that
+    neither overlap nor are inside out next to others, the share that is filled): a triangle adds
+    what lies before it along x, which is signed as its normal points.
+    """
+    low_p3 = place_p3 - 0.5
+    least, most = corner_f33.amin(1), corner_f33.amax(1)
+    met = most[:, 0] > low_p3[:, None, 0]
+    for axis in (1, 2):
+        low = low_p3[:, None, axis]
+        met = met & (most[:, axis] > low) & (least[:, axis] < low + 1)
+    place, face = met.nonzero().unbind(1)
+    at = corner_f33.new_zeros(len(place), CORNERS, 3)
+    at[:, :3] = corner_f33[face]
+    count = torch.full_like(place, 3)
+    low = low_p3[place]
+    for axis in (1, 2):
+        at[..., axis] -= low[:, None, axis]
+        at, count = _clip(at, count, axis, 0, upper=True)
+        at, count = _clip(at, count, axis, 1, upper=False)
+    at[..., 0] -= low[:, None, 0]
+    ahead, corners = _clip(at, count, 0, 1, upper=True)
+    ahead[..., 0] = 1
+    volume = _before(ahead, corners)
+    within, corners = _clip(*_clip(at, count, 0, 0, upper=True), 0, 1, upper=False)
+    volume = volume + _before(within, corners)
+    parts = (volume.clamp(-1, 1) * PARTS).to(torch.int64)
+    total = torch.zeros(len(place_p3), dtype=torch.int64, device=place.device)
+    total = total.index_add(0, place, parts).abs().to(place_p3.dtype)
+    return (total * (1 / PARTS)).clamp(max=1)
+
+
+def _clip(
+    at: Tensor, count: Tensor, axis: int, limit: float, *, upper: bool
+) -> tuple[Tensor, Tensor]:
+    """Cuts polygons at a plane across an axis and keeps what is above it (or below). What lies in
+    the plane is above.
+
+    Args:
+        at: (q, CORNERS, 3) corners in order.
+        count: (q,) how many there are of each.
+        axis: The axis, and where the plane crosses it: `limit`.
+        limit: See there.
+        upper: Whether what is above is kept.
+
+    Returns:
+        The same of what is kept. An edge is cut at the same place whichever way it is gone along.
+    """
+    number = torch.arange(CORNERS, device=at.device)
+    behind = torch.where(number + 1 < count[:, None], number + 1, 0)
+    other = at.gather(1, behind[..., None].expand_as(at))
+    value, next_value = at[..., axis], other[..., axis]
+    inside, next_inside = value >= limit, next_value >= limit
+    if not upper:
+        inside, next_inside = value < limit, next_value < limit
+    real = number < count[:, None]
+    cut = real & (inside != next_inside)
+    swap = (value > next_value)[..., None]
+    first, second = torch.where(swap, other, at), torch.where(swap, at, other)
+    rise = second[..., axis] - first[..., axis]
+    share = (limit - first[..., axis]) / torch.where(cut, rise, 1)
+    crossing = first + share[..., None] * (second - first)
+    crossing[..., axis] = limit
+    kept = torch.stack((inside & real, cut), 2).flatten(1)
+    slot = kept.cumsum(1) - 1
+    slot = torch.where(kept & (slot < CORNERS), slot, CORNERS)  # one more for what is left out
+    both = torch.stack((at, crossing), 2).flatten(1, 2)
+    out = at.new_zeros(len(at), CORNERS + 1, 3)
+    out = out.scatter(1, slot[..., None].expand_as(both), both)[:, :CORNERS]
+    return out, kept.sum(1).clamp(max=CORNERS)
+
+
+def _before(at: Tensor, count: Tensor) -> Tensor:
+    """Returns (q,) the volume between polygons and the plane x = 0, below 0 where their normals
+    point against x.
+    """
+    a, total = at[:, 0], at.new_zeros(len(at))
+    for i in range(1, CORNERS - 1):
+        b, c = at[:, i], at[:, i + 1]
+        area = (b[:, 1] - a[:, 1]) * (c[:, 2] - a[:, 2]) - (b[:, 2] - a[:, 2]) * (c[:, 1] - a[:, 1])
+        own = area * (a[:, 0] + b[:, 0] + c[:, 0])
+        total = torch.where(i + 1 < count, total + own, total)
+    return total * (1 / 6)
 
 
 def box_share(normal_p3: Tensor, offset_p: Tensor) -> Tensor:

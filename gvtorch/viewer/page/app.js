@@ -1,11 +1,17 @@
 // The page: what it knows of the view, what it shows, and what it sends.
 import { between, distance, facing } from "./camera.js";
 import { el, iconButton, keep, openJson } from "./dom.js";
+import { ClipEditor } from "./clip.js";
+import { History } from "./history.js";
 import { Link } from "./link.js";
 import { MonitorView } from "./monitor.js";
 import { Panel } from "./panel.js";
-import { PictureView, largestSide } from "./picture.js";
+import { NodeBoxes } from "./nodes.js";
+import { PictureView } from "./picture.js";
 import { Pointer } from "./pointer.js";
+import { Presets } from "./presets.js";
+import { SlicesView } from "./slices.js";
+import { TimeBar } from "./times.js";
 import { domain, stretched } from "./transfer.js";
 import { clamp } from "./vectors.js";
 
@@ -16,7 +22,6 @@ const TOOLS = {
   window: "Window: drag right for a wider window, down for brighter (or hold Alt)",
 };
 const REST = 160;  // milliseconds after which a wheel or a key is at rest
-const UNDONE = 100;  // states that are kept
 
 /** Puts changes over a value: objects of one kind by their fields, all else whole. */
 function merged(now, change) {
@@ -31,27 +36,34 @@ export class App {
   constructor(root, connect) {
     this.root = root;
     this.tool = "orbit";
-    this.shown = { axes: true, scale: true, box: false };
-    this.undone = [];
+    this.shown = { axes: true, scale: true, box: false, nodes: false };
+    this.history = new History();
     this.clients = {};
     this.inView = false;
     this.link = new Link(connect);
     this.view = new PictureView(this);
+    this.clip = new ClipEditor(this);
+    this.slices = new SlicesView(this, this.view);
+    this.nodes = new NodeBoxes(this);
+    this.times = new TimeBar(this);
+    this.presets = new Presets(this);
     this.monitor = new MonitorView(this);
     this.pointer = new Pointer(this, this.view);
     this.progress = el("div.gv-progress");
     this.note = el("div.gv-note", { role: "status" });
     this.title = el("span.gv-title");
-    root.append(this.view.element, this.toolbar(), this.progress, this.note);
+    root.append(this.view.element, this.toolbar(), this.times.element, this.progress, this.note);
     const on = (type, take) => this.link.on(type, take);
     on("welcome", (told) => this.welcome(told));
     on("picture", (picture) => this.view.take(picture));
-    on("file", ({ head, bytes }) => { keep(head.file, bytes, "image/png"); this.say(`${head.file} is saved`); });
+    on("file", ({ head, bytes }) => { keep(head.file, bytes, head.file.endsWith(".png") ? "image/png" : "application/json"); this.say(`${head.file} is saved`); });
     on("state", ({ state }) => this.take(state));
     on("camera", ({ camera }) => this.seat(camera));
     on("clients", ({ clients }) => { this.clients = clients; this.refresh(); });
     on("histogram", (told) => this.panel?.editor.setHistogram(told));
-    on("preset", (told) => this.presetCame(told));
+    on("preset", (told) => this.presets.came(told));
+    on("nodes", (told) => this.nodes.take(told));
+    on("note", ({ text }) => this.say(text));
     on("picked", (told) => this.picked(told));
     on("parameters", ({ parameters }) => { this.parameters = parameters; this.refresh(); this.askHistogram(this.inView); });
     on("busy", (busy) => this.busy(busy));
@@ -60,7 +72,10 @@ export class App {
     on("error", ({ text }) => this.say(text, true));
     on("failed", ({ text, count }) => this.say(`${count} parts could not be loaded: ${text}`, true, () => this.link.send("do", { what: "retry" })));
     on("gone", ({ why }) => { this.say(why || "The view is gone; trying to reach it again …", true); this.root.classList.add("gv-lost"); });
-    this.view.element.addEventListener("drawn", () => this.monitor.drawn());
+    this.view.element.addEventListener("drawn", ({ detail }) => {
+      this.monitor.drawn();
+      this.times.drawn(detail);
+    });
   }
 
   toolbar() {
@@ -71,7 +86,9 @@ export class App {
     return el("nav.gv-top", {}, bar(...Object.values(this.buttons)),
       bar(iconButton("home", "The whole box (F)", () => this.link.send("do", { what: "fit" })),
         iconButton("ortho", "Orthographic or perspective (O); views along axes: 1 to 6, or a click on x, y, z", () => this.switchOrtho())),
+      bar(this.slicesButton = iconButton("slices", "Three slices beside the picture", () => this.slices.show(!this.state.slices))),
       bar(iconButton("undo", "Undo (Ctrl Z)", () => this.undo()),
+        iconButton("redo", "Redo (Ctrl Shift Z)", () => this.redo()),
         iconButton("camera", "Save the picture (PNG)", () => this.still()),
         iconButton("save", "Save all that is shown (JSON): gvtorch view --state, gvtorch render --state", () => keep("view.json", JSON.stringify({ ...this.state, camera: this.camera }, null, 1), "application/json")),
         iconButton("open", "Load what was saved (JSON)", () => openJson((state) => this.load(state), (why) => this.say(why, true)))),
@@ -87,9 +104,10 @@ export class App {
 
   welcome(told) {
     Object.assign(this, {
-      number: told.client, box: told.box, unit: told.unit, schema: told.schema, presets: told.presets,
+      number: told.client, box: told.box, unit: told.unit, schema: told.schema, time: told.time, labels: told.labels,
       channels: told.channels, channelNames: told.channel_names, engine: told.engine, parameters: told.parameters,
     });
+    this.presets.builtIn = told.presets;
     this.root.classList.remove("gv-lost");
     this.note.classList.remove("gv-shown");
     const { camera, ...state } = told.state;
@@ -106,11 +124,16 @@ export class App {
     this.lastTransfer = this.transfer() ?? { kind: "TransferFunction", opacity: [[0, 0], [1, 0.5]], color: [[0, 0, 0, 0], [1, 1, 1, 1]] };
     this.refresh();
     this.askHistogram(false);
+    if (this.shown.nodes) this.nodes.show(true);
     if (this.panel.open.has("Monitor")) this.watch(true);
   }
 
   refresh() {
-    if (this.panel && !this.panel.editor.dragged) this.panel.show();
+    if (!this.panel || this.panel.editor.dragged) return;
+    this.panel.show();
+    this.times.show();
+    this.root.classList.toggle("gv-sliced", !!this.state.slices);
+    this.slicesButton.classList.toggle("gv-on", !!this.state.slices);
   }
 
   // The state.
@@ -125,33 +148,57 @@ export class App {
 
   change(part, rest = true) {
     if (!this.before) this.before = this.state;
-    const shape = (one) => [one.shader.kind, one.options.clip?.planes.length, one.options.lens, one.options.lighting].map((x) => JSON.stringify(x)?.length);
+    const shape = (one) => [one.shader.kind, one.options.clip?.planes.length, one.options.lens, one.options.lighting, !one.slices, one.show].map((x) => JSON.stringify(x)?.length);
     const old = shape(this.state);
     this.state = merged(this.state, part);
     this.link.send("change", { state: part, rest });
     if (rest) {
-      this.undone = [...this.undone.slice(-UNDONE), this.before];
+      this.remember(this.before, this.state);
       this.before = null;
     }
     if (rest || shape(this.state).some((one, n) => one !== old[n])) this.refresh();
     this.view.overlay();
   }
 
-  undo() {
-    const last = this.undone.pop();
-    if (!last) return this.say("there is nothing to undo");
-    this.state = last;
-    this.link.send("change", { state: last, rest: true });
+  /** Notes an edit of the state, to be undone. */
+  remember(before, after) {
+    this.history.push(() => this.put(before), () => this.put(after));
+  }
+
+  /** Shows a whole state. */
+  put(state) {
+    this.state = state;
+    this.link.send("change", { state, rest: true });
     this.refresh();
     this.view.overlay();
   }
 
+  undo() {
+    if (!this.history.undo()) this.say("there is nothing to undo");
+  }
+
+  redo() {
+    if (!this.history.redo()) this.say("there is nothing to do again");
+  }
+
+  /** Sets a parameter of the scene, or the engine's memory. */
+  set(type, values, name, value, message) {
+    const before = type === "set" ? values[name].value : values[name];
+    const put = (one) => {
+      if (type === "resize") values[name] = one;
+      this.link.send(type, message(one));
+      this.refresh();
+    };
+    this.history.push(() => put(before), () => put(value));
+    put(value);
+  }
+
   load(state) {
-    const { camera, ...rest } = state;
-    this.undone.push(this.state);
+    const { camera, ...rest } = state, before = this.state;
     this.link.send("change", { state, rest: true });
     if (camera) this.seat(camera);
     this.state = merged(this.state, rest);
+    this.remember(before, this.state);
     this.refresh();
   }
 
@@ -160,7 +207,7 @@ export class App {
   transfer() {
     const { shader } = this.state;
     const found = shader.kind === "TransferFunction" ? shader : shader.transfer;
-    return found?.opacity ? found : null;
+    return Array.isArray(found?.opacity) && Array.isArray(found.color) ? found : null;
   }
 
   changeTransfer(f, rest) {
@@ -173,23 +220,6 @@ export class App {
   offers(kind) {
     const many = this.channelNames.length > 1;
     return { Features: many, StoredColor: this.state.shader.kind === "StoredColor", Labels: this.state.shader.kind === "Labels" }[kind] ?? this.state.shader.kind !== "Labels";
-  }
-
-  preset(name) {
-    if (!name) return;
-    const f = this.transfer(), h = this.panel.editor.histogram;
-    let [low, high] = f ? domain(f) : [h.low, h.high];
-    if (high <= low) [low, high] = [h.low, h.high];
-    this.link.send("preset", name.startsWith("ct-") ? { name } : { name, low, high });
-    this.wanted = name;
-  }
-
-  presetCame({ name, function: made }) {
-    const own = this.transfer();
-    const isMap = made.color.length > 100 && own;  // a colour map has no opacity of its own
-    this.changeTransfer(isMap ? { ...own, color: made.color } : made, true);
-    this.panel.editor.setHistogram(this.panel.editor.histogram);
-    this.say(name);
   }
 
   askHistogram(inView) {
@@ -211,43 +241,6 @@ export class App {
     if (f) this.changeTransfer(stretched(f, domain(f), move(domain(f))), false);
     else if (shader.looks) this.change({ shader: { ...shader, looks: shader.looks.map((one) => (one.window ? { ...one, window: move(one.window) } : one)) } }, false);
     else if ("value" in shader) this.change({ shader: { ...shader, value: shader.value - dy * (Math.abs(shader.value) + 1) } }, false);
-  }
-
-  // Clip.
-
-  toBox(place) {
-    const side = largestSide(this.box);
-    return place.map((one, axis) => (one - (this.box[0][axis] + this.box[1][axis]) / 2) / side);
-  }
-
-  /** The box of the clip in the world, or null. */
-  cropBox() {
-    const clip = this.state?.options.clip, found = clip?.boxes?.[0];
-    if (!found || found.length !== 2) return null;
-    if (clip.frame === "world") return found;
-    const side = largestSide(this.box);
-    return found.map((one) => one.map((x, axis) => x * side + (this.box[0][axis] + this.box[1][axis]) / 2));
-  }
-
-  changeClip(clip, rest) {
-    const empty = clip && !clip.planes?.length && !clip.boxes?.length && !clip.without?.length;
-    this.change({ options: { clip: empty ? null : clip } }, rest);
-  }
-
-  setCrop(on) {
-    const now = this.state.options.clip ?? { kind: "Clip", planes: [], boxes: [], without: [], frame: "box" };
-    const whole = this.box.map((one) => (now.frame === "world" ? one : this.toBox(one)));
-    this.changeClip({ ...now, boxes: on ? [whole] : [] }, true);
-  }
-
-  moveCrop(axis, side, by) {
-    const clip = this.state.options.clip, box = clip.boxes[0].map((one) => [...one]);
-    const scale = clip.frame === "world" ? 1 : 1 / largestSide(this.box);
-    const thin = largestSide(this.box) * 0.01 * scale;
-    const moved = box[side][axis] + by * scale;
-    const limit = this.box.map((one) => (clip.frame === "world" ? one : this.toBox(one))[axis]);
-    box[side][axis] = side ? clamp(moved, box[0][axis] + thin, limit[1]) : clamp(moved, limit[0], box[1][axis] - thin);
-    this.changeClip({ ...clip, boxes: [box] }, false);
   }
 
   settle() {
@@ -301,6 +294,16 @@ export class App {
 
   face(axis, side) {
     this.glide(facing(this.camera, axis, side, this.home.up));
+  }
+
+  /** Sets a field of the camera, which can be undone. */
+  changeCamera(camera, rest) {
+    this.cameraBefore ??= this.camera;
+    this.look(camera, !rest);
+    if (!rest) return;
+    const before = this.cameraBefore, put = (one) => { this.look(one, false); this.refresh(); };
+    this.cameraBefore = null;
+    this.history.push(() => put(before), () => put(camera));
   }
 
   switchOrtho() {

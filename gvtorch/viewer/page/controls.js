@@ -38,8 +38,8 @@ export class Controls {
     if (told.type === "flag") return el("input.gv-flag", { type: "checkbox", checked: !!value, onchange: (e) => set(e.target.checked, true) });
     if (told.type === "choice") return this.choice(told.choices, value, set, told.optional);
     if (told.type === "color") return this.color(value, set);
-    if (told.type === "triple") return this.numbers(value ?? [0, 0, 0], set);
-    if (told.type === "pair") return this.numbers(value ?? [0, 1], set);
+    if (told.type === "triple") return this.numbers(value ?? (told.optional ? Array(3).fill(null) : [0, 0, 0]), set);
+    if (told.type === "pair") return this.numbers(value ?? (told.optional ? [null, null] : [0, 1]), set);
     if (told.type === "numbers") return this.numbers(value, set);
     if (told.type === "text") return el("input", { type: "text", value: value ?? "", onchange: (e) => set(e.target.value || (told.optional ? null : ""), true) });
     return this.number(told, value, set);
@@ -62,7 +62,7 @@ export class Controls {
   number(told, value, set) {
     const whole = told.type === "whole";
     const read = (text) => (text === "" && told.optional ? null : whole ? Math.round(Number(text)) : Number(text));
-    const box = el("input.gv-number", { type: "number", step: "any", value: value ?? "", placeholder: told.optional ? "auto" : "" });
+    const box = el("input.gv-number", { type: "number", step: "any", value: typeof value === "number" ? Number(value.toPrecision(6)) : "", placeholder: told.optional ? "auto" : "" });
     box.onchange = () => {
       const found = read(box.value);
       if (found !== null && !Number.isFinite(found)) return;
@@ -83,10 +83,11 @@ export class Controls {
   numbers(value, set) {
     const now = [...value];
     return el("span.gv-triple", {}, ...now.map((one, at) => el("input.gv-number", {
-      type: "number", step: "any", value: Number(one.toPrecision(6)), title: LETTERS[at] ?? "",
+      type: "number", step: "any", value: one === null ? "" : Number(one.toPrecision(6)), placeholder: one === null ? "auto" : "", title: LETTERS[at] ?? "",
       onchange: (event) => {
-        now[at] = Number(event.target.value);
+        now[at] = event.target.value === "" ? null : Number(event.target.value);
         if (now.every(Number.isFinite)) set([...now], true);
+        else if (now.every((each) => each === null)) set(null, true);
       },
     })));
   }

@@ -34,6 +34,10 @@ export const ICONS = {
   home: "M4 9V4h5M20 9V4h-5M4 15v5h5M20 15v5h-5",
   ortho: "M4 8l8-4 8 4v8l-8 4-8-4zM4 8l8 4 8-4M12 12v8",
   camera: "M4 8h4l2-3h4l2 3h4v11H4zM12 16.5a3.5 3.5 0 1 0 0-7 3.5 3.5 0 0 0 0 7z",
+  redo: "M15 7l5 5-5 5M20 12H10a6 6 0 0 0-6 6",
+  slices: "M4 4h7v7H4zM13 4h7v7h-7zM4 13h7v7H4zM13 16.5l3.5-2 3.5 2v3l-3.5 2-3.5-2z",
+  play: "M8 5l11 7-11 7z",
+  stop: "M7 6v12M17 6v12",
   undo: "M9 7L4 12l5 5M4 12h10a6 6 0 0 1 6 6",
   save: "M12 4v11M8 11l4 4 4-4M4 20h16",
   open: "M12 15V4M8 8l4-4 4 4M4 20h16",
@@ -57,15 +61,18 @@ export function keep(name, content, type) {
   setTimeout(() => URL.revokeObjectURL(url), 10000);
 }
 
-/** Asks for a JSON file; gives its content to `take`. */
-export function openJson(take, fail) {
-  const input = el("input", { type: "file", accept: ".json,application/json" });
+/** Asks for a file; gives its name and text to `take`. */
+export function openText(accept, take, fail) {
+  const input = el("input", { type: "file", accept });
   input.onchange = async () => {
     try {
-      take(JSON.parse(await input.files[0].text()));
+      take(input.files[0].name, await input.files[0].text());
     } catch (error) {
       fail(`${input.files[0].name}: ${error.message}`);
     }
   };
   input.click();
 }
+
+/** Asks for a JSON file; gives its content to `take`. */
+export const openJson = (take, fail) => openText(".json,application/json", (_, text) => take(JSON.parse(text)), fail);

@@ -1,9 +1,9 @@
 // The panel: sections of controls for every part of the state.
 import { Controls } from "./controls.js";
 import { axes } from "./camera.js";
-import { el, iconButton, keep, openJson } from "./dom.js";
+import { el } from "./dom.js";
+import { LabelTable } from "./labels.js";
 import { TransferEditor, domain } from "./transfer.js";
-import { dot } from "./vectors.js";
 
 const HIDDEN = ["transfer", "kind", "camera", "looks"];
 
@@ -13,6 +13,7 @@ export class Panel {
     this.open = new Set(["Colours", "Shader", "Picture"]);
     this.controls = new Controls(app.schema, (kind, name) => this.first(kind, name));
     this.editor = new TransferEditor((f, rest) => app.changeTransfer(f, rest));
+    this.labels = new LabelTable(app, this.controls);
     this.body = el("div.gv-sections");
     this.element = el("aside.gv-panel", {}, this.body);
   }
@@ -57,10 +58,11 @@ export class Panel {
     const transfer = app.transfer();
     if (transfer) this.editor.set(transfer);
     const sections = [
-      this.section("Colours", transfer ? this.colours() : [], this.looks()),
+      this.section("Colours", transfer ? this.colours() : [], this.looks(), this.labels.rows()),
       this.section("Shader", this.shader()),
       this.section("Picture", this.controls.fields({ kind: "Development", ...state.develop }, put("develop")),
         this.controls.fields(state.options, put("options"), { only: ["background"] }), this.showing()),
+      this.section("Slices", this.slices()),
       this.section("Clip", this.clip()),
       this.section("Light and lens", this.controls.fields(state.options, put("options"), { only: ["lighting", "lens"] })),
       this.section("Sampling", this.controls.fields(state.options, put("options"), { only: ["step", "lod", "stop_alpha", "depth_alpha", "cone_scale"] })),
@@ -79,21 +81,15 @@ export class Panel {
 
   colours() {
     const { app, editor } = this;
-    const names = app.presets;
-    const pick = el("select", { title: "Colours by name; colour maps keep the opacity", onchange: () => app.preset(names[pick.selectedIndex - 1]) },
-      el("option", {}, "presets"), ...names.map((name) => el("option", {}, name)));
     const tick = (text, checked, onchange) => el("label.gv-tick", {}, el("input", { type: "checkbox", checked, onchange: (e) => onchange(e.target.checked) }), text);
+    const { pick, buttons, mine } = app.presets.rows();
     return [
       editor.element,
       el("div.gv-bar", {}, pick,
         tick("log", editor.log, (on) => { editor.log = on; editor.draw(); }),
         tick("in view", app.inView, (on) => app.askHistogram(on)),
-        el("span.gv-gap"),
-        iconButton("open", "Load a transfer function (JSON)", () => openJson((f) => app.changeTransfer({ kind: "TransferFunction", ...f }, true), (why) => app.say(why, true))),
-        iconButton("save", "Save the transfer function (JSON)", () => {
-          const { kind, ...content } = app.transfer();
-          keep("transfer.json", JSON.stringify(content), "application/json");
-        })),
+        el("span.gv-gap"), ...buttons),
+      mine,
     ];
   }
 
@@ -118,48 +114,55 @@ export class Panel {
     const wanted = known.filter((kind) => app.offers(kind) || kind === shader.kind);
     const pick = el("select", { onchange: () => put(this.first(wanted[pick.selectedIndex], "shader"), true) }, ...wanted.map((kind) => el("option", {}, words(kind))));
     pick.selectedIndex = wanted.indexOf(shader.kind);
-    const rows = this.controls.fields(shader, put, { without: [...HIDDEN, ...(shader.kind === "TransferFunction" ? ["opacity", "color"] : ["channel", "normals", "color_channel", "color_component"])] });
+    const rows = this.controls.fields(shader, put, { without: [...HIDDEN, ...(shader.kind === "TransferFunction" ? ["opacity", "color"] : ["channel", "normals", "visible", "color_channel", "color_component"])] });
     return [el("label.gv-row", {}, el("span.gv-name", {}, "shader"), pick), ...rows];
   }
 
   showing() {
     const { app } = this;
     const tick = (name, text) => el("label.gv-tick", {}, el("input", { type: "checkbox", checked: app.shown[name], onchange: (e) => { app.shown[name] = e.target.checked; app.view.overlay(); } }), text);
-    const rows = this.controls.fields({ kind: "ViewState", ...app.state }, (value, rest) => app.change({ show: value.show }, rest), { only: ["show"] });
-    return [...rows, el("div.gv-bar", {}, tick("axes", "axes"), tick("scale", "scale bar"), tick("box", "box"))];
+    const only = app.state.show === "picture" ? ["show"] : ["show", "blend"];
+    const rows = this.controls.fields({ kind: "ViewState", ...app.state }, ({ show, blend }, rest) => app.change({ show, blend }, rest), { only });
+    const nodes = el("label.gv-tick", { title: "Boxes of the tree's nodes whose bricks the picture shows" }, el("input", { type: "checkbox", checked: app.shown.nodes, onchange: (e) => { app.shown.nodes = e.target.checked; app.nodes.show(e.target.checked); } }), "nodes");
+    return [...rows, el("div.gv-bar", {}, tick("axes", "axes"), tick("scale", "scale bar"), tick("box", "box"), nodes)];
+  }
+
+  slices() {
+    const { app } = this, { slices } = app.state;
+    const on = el("label.gv-row", {}, el("span.gv-name", {}, "three slices"),
+      el("input.gv-flag", { type: "checkbox", checked: !!slices, onchange: (e) => app.slices.show(e.target.checked) }));
+    if (!slices) return [on];
+    return [on, ...this.controls.fields(slices, (value, rest) => app.change({ slices: value }, rest))];
   }
 
   clip() {
-    const { app } = this, clip = app.state.options.clip;
-    const put = (value, rest) => app.changeClip(value, rest);
+    const { app } = this, { clip } = app, now = clip.clip;
     const crop = el("label.gv-row", {}, el("span.gv-name", {}, "crop box"),
-      el("input.gv-flag", { type: "checkbox", checked: !!app.cropBox(), onchange: (e) => app.setCrop(e.target.checked) }));
-    const planes = (clip?.planes ?? []).map((plane, at) => {
-      const set = (value, rest) => put({ ...clip, planes: clip.planes.map((old, n) => (n === at ? value : old)) }, rest);
-      return el("div.gv-row", {}, el("span.gv-name", {}, `plane ${at + 1}`), el("span.gv-both", {},
-        this.controls.number({ type: "number", range: [-0.9, 0.9] }, plane[3], (d, rest) => set([...plane.slice(0, 3), d], rest)),
-        el("button.gv-small", { type: "button", title: "Keep the other side", onclick: () => set(plane.map((n) => -n), true) }, "turn"),
-        el("button.gv-small", { type: "button", onclick: () => put({ ...clip, planes: clip.planes.filter((_, n) => n !== at) }, true) }, "remove")));
-    });
-    const facing = el("button.gv-small", { type: "button", title: "A plane through the target that faces you", onclick: () => {
-      const { forward } = axes(app.camera), target = app.toBox(app.camera.target);
-      const now = clip && clip.frame === "box" ? clip : { kind: "Clip", frame: "box", planes: [], boxes: [], without: [] };
-      put({ ...now, planes: [...now.planes, [...forward, -dot(forward, target)]] }, true);
-    } }, "add a plane that faces me");
-    const rest = clip ? this.controls.fields(clip, put, { only: ["caps", "cap_opacity", "cap_light"] }) : [];
+      el("input.gv-flag", { type: "checkbox", checked: !!clip.cropBox(), onchange: (e) => clip.setCrop(e.target.checked) }));
+    const planes = (now?.planes ?? []).flatMap((plane, at) => [
+      el("div.gv-row", {}, el("span.gv-name", {}, `plane ${at + 1}`),
+        this.controls.number({ type: "number", range: [-0.9, 0.9] }, plane[3], (d, rest) => clip.setPlane(at, [...plane.slice(0, 3), d], rest))),
+      el("div.gv-row", {}, el("span.gv-name"), el("span.gv-both", {},
+        el("button.gv-small", { type: "button", title: "Keep the other side", onclick: () => clip.setPlane(at, plane.map((n) => -n), true) }, "turn"),
+        el("button.gv-small", { type: "button", onclick: () => clip.put({ ...now, planes: now.planes.filter((_, n) => n !== at) }, true) }, "remove"))),
+    ]);
+    const facing = el("button.gv-small", { type: "button", title: "A plane through the target that faces you", onclick: () => clip.addPlane() }, "add one facing me");
+    const rest = now ? this.controls.fields(now, (value, still) => clip.put(value, still), { only: ["caps", "cap_opacity", "cap_light"] }) : [];
     return [crop, ...planes, el("div.gv-row", {}, el("span.gv-name", {}, "planes"), facing), ...rest];
   }
 
   parameters() {
     const { app } = this;
     return Object.entries(app.parameters ?? {}).map(([name, told]) =>
-      this.controls.row(name, told, told.value, (value, rest) => { if (rest) app.link.send("set", { name, value }); }));
+      this.controls.row(name, told, told.value, (value, rest) => {
+        if (rest) app.set("set", app.parameters, name, value, (one) => ({ name, value: one }));
+      }));
   }
 
   camera() {
     const { app } = this;
     const others = Object.keys(app.clients).map(Number).filter((one) => one !== app.number);
-    const rows = this.controls.fields({ kind: "Eye", ...app.camera }, ({ kind, ...camera }, rest) => { app.look(camera, !rest); });
+    const rows = this.controls.fields({ kind: "Eye", ...app.camera }, ({ kind, ...camera }, rest) => app.changeCamera(camera, rest));
     if (!others.length) return rows;
     const all = [null, ...others];
     const pick = el("select", { onchange: () => app.link.send("follow", { client: all[pick.selectedIndex] }) },
@@ -174,9 +177,8 @@ export class Panel {
     const told = app.schema.EngineOptions.fields;
     return Object.entries(app.engine).map(([name, value]) => {
       const known = name.endsWith("pool") ? { type: "text" } : told[name];
-      return this.controls.row(name, { ...known, text: told[name].text }, value, (one) => {
-        app.engine[name] = one;
-        app.link.send("resize", { engine: { [name]: one } });
+      return this.controls.row(name, { ...known, text: told[name].text }, value, (one, rest) => {
+        if (rest) app.set("resize", app.engine, name, one, (now) => ({ engine: { [name]: now } }));
       });
     });
   }

@@ -1,18 +1,18 @@
-// The canvas: pictures as they come, and over them axes, scale bar, box and handles of the crop box.
+// The canvas: pictures as they come, and over them axes, scale bar, boxes and handles.
 import { axes, halfHeight, projected } from "./camera.js";
 import { el } from "./dom.js";
 import { short } from "./vectors.js";
 
-const COLORS = ["#ff7a6b", "#8fd460", "#6fb1ff"];  // x, y, z
+export const COLORS = ["#ff7a6b", "#8fd460", "#6fb1ff"];  // x, y, z
 const UNITS = {
   meter: "m", decimeter: "dm", centimeter: "cm", millimeter: "mm", micrometer: "µm", nanometer: "nm",
   angstrom: "Å", picometer: "pm", kilometer: "km", inch: "in", foot: "ft",
 };
-const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
+export const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
 const REACH = 12;  // pixels from which a handle is taken
 
 /** Corner n of a box: bit 0 is x, bit 1 y, bit 2 z. */
-const corner = (box, n) => [0, 1, 2].map((axis) => box[(n >> axis) & 1][axis]);
+export const corner = (box, n) => [0, 1, 2].map((axis) => box[(n >> axis) & 1][axis]);
 
 export class PictureView {
   constructor(app) {
@@ -75,9 +75,25 @@ export class PictureView {
     });
   }
 
+  /** Where the picture lies in the canvas, [left, top, width, height] in its pixels: beside planes, in a part of it. */
+  get part() {
+    return this.app.slices.layout?.view ?? [0, 0, this.over.width, this.over.height];
+  }
+
+  /** The same in CSS pixels. */
+  get area() {
+    const [left, top, width, height] = this.part.map((one) => one / this.ratio);
+    return { left, top, width, height };
+  }
+
+  get unit() {
+    return UNITS[this.app.unit] ?? "";
+  }
+
   /** A place of the picture in half heights from its middle, as pixels. */
   pixel({ x, y }) {
-    return [this.over.width / 2 + (x * this.over.height) / 2, this.over.height / 2 + (y * this.over.height) / 2];
+    const [left, top, width, height] = this.part;
+    return [left + width / 2 + (x * height) / 2, top + height / 2 + (y * height) / 2];
   }
 
   overlay() {
@@ -85,16 +101,20 @@ export class PictureView {
     const context = this.over.getContext("2d");
     context.clearRect(0, 0, this.over.width, this.over.height);
     this.handles = [];
-    if (!camera || !app.box || camera.model === "fisheye" || camera.model === "panorama") return;
+    if (!camera || !app.box) return;
     context.lineCap = "round";
+    app.slices.draw(context);
+    if (camera.model === "fisheye" || camera.model === "panorama") return;
+    context.save();
+    context.beginPath();
+    context.rect(...this.part);
+    context.clip();
+    app.nodes.draw(context, camera);
     if (app.shown.box) this.edges(context, camera, app.box, "rgba(255,255,255,.28)", 1);
-    const crop = app.cropBox();
-    if (crop) {
-      this.edges(context, camera, crop, "rgba(242,181,107,.75)", 1.5);
-      this.cropHandles(context, camera, crop);
-    }
+    this.handles = app.clip.draw(this, context, camera);
     if (app.shown.axes) this.gizmo(context, camera);
     if (app.shown.scale) this.scaleBar(context, camera);
+    context.restore();
   }
 
   edges(context, camera, box, color, width) {
@@ -110,41 +130,41 @@ export class PictureView {
     context.stroke();
   }
 
-  cropHandles(context, camera, crop) {
-    const centre = [0, 1, 2].map((axis) => (crop[0][axis] + crop[1][axis]) / 2);
-    for (const axis of [0, 1, 2]) {
-      for (const side of [0, 1]) {
-        const place = [...centre];
-        place[axis] = crop[side][axis];
-        const found = projected(camera, place);
-        if (!found) continue;
-        const further = [...place];
-        further[axis] += (largestSide(this.app.box)) * 0.01;
-        const beyond = projected(camera, further);
-        if (!beyond) continue;
-        const at = this.pixel(found), next = this.pixel(beyond);
-        const step = [next[0] - at[0], next[1] - at[1]];
-        this.handles.push({ axis, side, at, step, unit: largestSide(this.app.box) * 0.01 });
-        context.beginPath();
-        context.arc(...at, 6 * this.ratio, 0, 2 * Math.PI);
-        context.fillStyle = COLORS[axis];
-        context.fill();
-        context.lineWidth = 2 * this.ratio;
-        context.strokeStyle = "rgba(10,12,16,.9)";
-        context.stroke();
-      }
-    }
+  /** A handle. */
+  dot(context, at, color, size = 6) {
+    context.beginPath();
+    context.arc(...at, size * this.ratio, 0, 2 * Math.PI);
+    context.fillStyle = color;
+    context.fill();
+    context.lineWidth = 2 * this.ratio;
+    context.strokeStyle = "rgba(10,12,16,.9)";
+    context.stroke();
+  }
+
+  /** Text over the picture, told from anything behind it by a dark rim. */
+  label(context, text, x, y, align, color = "rgba(255,255,255,.92)") {
+    context.font = `500 ${12 * this.ratio}px system-ui, sans-serif`;
+    context.textAlign = align;
+    context.textBaseline = "bottom";
+    context.strokeStyle = "rgba(0,0,0,.55)";
+    context.lineWidth = 3 * this.ratio;
+    context.lineJoin = "round";
+    context.strokeText(text, x, y);
+    context.fillStyle = color;
+    context.fillText(text, x, y);
   }
 
   /** The handle at a place in CSS pixels, or undefined. */
   handleAt(x, y) {
-    const near = ({ at }) => Math.hypot(at[0] - x * this.ratio, at[1] - y * this.ratio) < REACH * this.ratio;
-    return this.handles.find(near);
+    const far = ({ at }) => Math.hypot(at[0] / this.ratio - x, at[1] / this.ratio - y);
+    const near = this.handles.filter((one) => far(one) < REACH);
+    return near.reduce((best, one) => (best && far(best) < far(one) ? best : one), undefined);  // of equal ones the uppermost
   }
 
   gizmo(context, camera) {
     const { right, up, forward } = axes(camera), size = 30 * this.ratio;
-    const middle = [52 * this.ratio, this.over.height - 56 * this.ratio];
+    const [left, top, , height] = this.part;
+    const middle = [left + 52 * this.ratio, top + height - 56 * this.ratio];
     this.ends = [];
     const order = [0, 1, 2].map((axis) => ({ axis, x: right[axis], y: -up[axis], z: forward[axis] })).sort((a, b) => b.z - a.z);
     for (const { axis, x, y, z } of order) {
@@ -173,13 +193,14 @@ export class PictureView {
   }
 
   scaleBar(context, camera) {
-    const pixel = (2 * halfHeight(camera)) / this.over.height;
+    const [left, top, width, height] = this.part;
+    const pixel = (2 * halfHeight(camera)) / height;
     const wanted = 130 * this.ratio * pixel;
     const power = 10 ** Math.floor(Math.log10(wanted));
     const size = [5, 2, 1].map((n) => n * power).find((n) => n <= wanted) ?? power;
-    const span = size / pixel, y = this.over.height - 26 * this.ratio;
-    const middle = this.over.width / 2, [a, b] = [middle - span / 2, middle + span / 2];
-    const text = `${short(size)} ${UNITS[this.app.unit] ?? ""}`.trim();
+    const span = size / pixel, y = top + height - (this.app.time ? 62 : 26) * this.ratio;
+    const middle = left + width / 2, [a, b] = [middle - span / 2, middle + span / 2];
+    const text = `${short(size)} ${this.unit}`.trim();
     const draw = () => {
       context.beginPath();
       context.moveTo(a, y - 4 * this.ratio);
@@ -194,14 +215,7 @@ export class PictureView {
     context.strokeStyle = "rgba(255,255,255,.88)";
     context.lineWidth = 1.5 * this.ratio;
     draw();
-    context.font = `500 ${12 * this.ratio}px system-ui, sans-serif`;
-    context.textAlign = "center";
-    context.textBaseline = "bottom";
-    context.strokeStyle = "rgba(0,0,0,.55)";
-    context.lineWidth = 3 * this.ratio;
-    context.strokeText(text, middle, y - 5 * this.ratio);
-    context.fillStyle = "rgba(255,255,255,.92)";
-    context.fillText(text, middle, y - 5 * this.ratio);
+    this.label(context, text, middle, y - 5 * this.ratio, "center");
   }
 }
 

@@ -1,4 +1,4 @@
-// What mouse, keys and fingers do: the camera, the window of values, and the handles of the crop box.
+// What mouse, keys and fingers do: the camera, the window of values, the handles of the clip, the place of slices.
 import { distance, halfHeight, looked, orbited, panned, shifted, under, zoomed, axes } from "./camera.js";
 import { add, clamp, times } from "./vectors.js";
 
@@ -33,8 +33,8 @@ export class Pointer {
 
   /** Half heights from the picture's middle. */
   middle([x, y]) {
-    const half = this.view.height / 2;
-    return [(x - this.view.width / 2) / half, (y - half) / half];
+    const { left, top, width, height } = this.view.area;
+    return [(x - left - width / 2) / (height / 2), (y - top - height / 2) / (height / 2)];
   }
 
   down(event) {
@@ -42,13 +42,15 @@ export class Pointer {
     this.stage.setPointerCapture(event.pointerId);
     const at = this.place(event);
     this.fingers.set(event.pointerId, at);
-    this.handle = this.view.handleAt(...at);
+    this.plane = event.button ? undefined : this.app.slices.axisAt(...at);
+    this.handle = this.plane ? undefined : this.view.handleAt(...at);
     this.travel = 0;
     if (this.fingers.size === 1) {
       const pan = event.button === 2 || event.button === 1 || event.shiftKey;
       this.tool = pan ? "pan" : event.altKey ? "window" : event.ctrlKey ? "fly" : this.app.tool;
     }
-    if (this.tool === "window") this.app.beginWindow();
+    if (this.plane) this.app.slices.pick(this.plane, ...at);
+    else if (this.tool === "window") this.app.beginWindow();
   }
 
   moved(event) {
@@ -56,7 +58,7 @@ export class Pointer {
     const at = this.place(event);
     if (!before) {
       const over = this.view.handleAt(...at) || this.view.axisAt(...at);
-      this.stage.style.cursor = over ? "pointer" : "";
+      this.stage.style.cursor = over ? "pointer" : this.app.slices.axisAt(...at) ? "crosshair" : "";
       return;
     }
     const [dx, dy] = [at[0] - before[0], at[1] - before[1]];
@@ -64,8 +66,9 @@ export class Pointer {
     if (this.fingers.size === 2) this.pinch(event.pointerId, at);
     this.fingers.set(event.pointerId, at);
     if (this.fingers.size !== 1 || !this.app.camera) return;
+    if (this.plane) return this.app.slices.pick(this.plane, ...at);
     if (this.handle) return this.drag(dx, dy);
-    const { app } = this, half = this.view.height / 2;
+    const { app } = this, half = this.view.area.height / 2;
     if (this.tool === "window") app.dragWindow(dx / this.view.width, dy / this.view.height);
     else if (this.tool === "pan") app.look(panned(app.camera, dx / half, dy / half), true);
     else if (this.tool === "fly") app.look(looked(app.camera, dx * TURN * 0.4, dy * TURN * 0.4), true);
@@ -77,7 +80,7 @@ export class Pointer {
     const before = this.fingers.get(id), { app } = this;
     const span = (a) => Math.max(10, Math.hypot(a[0] - other[0], a[1] - other[1]));
     const centre = this.middle([(at[0] + other[0]) / 2, (at[1] + other[1]) / 2]);
-    const half = this.view.height / 2;
+    const half = this.view.area.height / 2;
     const moved = panned(app.camera, (at[0] - before[0]) / 2 / half, (at[1] - before[1]) / 2 / half);
     app.look(zoomed(moved, span(before) / span(at), under(moved, ...centre)), true);
   }
@@ -90,19 +93,18 @@ export class Pointer {
       const axis = this.view.axisAt(...at);
       if (axis) this.app.face(axis.axis, event.shiftKey ? -1 : 1);
     }
-    if (this.handle) this.app.settle();
+    if (this.handle || this.plane) this.app.settle();
     else if (this.tool === "window") this.app.settle();
     else if (this.travel) this.app.rest();
-    this.handle = null;
+    this.handle = this.plane = null;
   }
 
-  /** Moves a face of the crop box with the pointer. */
+  /** Moves a handle with the pointer; what it moves is drawn anew, and with it the handle. */
   drag(dx, dy) {
-    const { step, unit, axis, side } = this.handle, { ratio } = this.view;
-    const along = step[0] ** 2 + step[1] ** 2;
-    if (along < 1e-6) return;
-    const moved = ((dx * step[0] + dy * step[1]) * ratio * unit) / along;
-    this.app.moveCrop(axis, side, moved);
+    const { ratio } = this.view, { kind, axis, side, n } = this.handle;
+    this.handle.drag(dx * ratio, dy * ratio);
+    const same = (one) => one.kind === kind && one.axis === axis && one.side === side && one.n === n;
+    this.handle = this.view.handles.find(same) ?? this.handle;
   }
 
   wheel(event) {
@@ -110,6 +112,8 @@ export class Pointer {
     const { app } = this;
     if (!app.camera) return;
     const lines = event.deltaMode ? event.deltaY * 30 : event.deltaY;
+    const plane = app.slices.axisAt(...this.place(event));
+    if (plane) return app.slices.wheel(plane, lines);
     if (app.tool === "fly" && !event.ctrlKey) {
       this.speed = clamp(this.speed * Math.exp(-lines * 0.002), 0.02, 50);
       app.say(`speed × ${this.speed.toPrecision(2)}`);
@@ -121,14 +125,16 @@ export class Pointer {
   }
 
   focus(event) {
-    const [x, y] = this.place(event);
-    this.app.link.send("pick", { x: clamp(x / this.view.width, 0, 1), y: clamp(y / this.view.height, 0, 1), purpose: "focus" });
+    const [x, y] = this.place(event), { left, top, width, height } = this.view.area;
+    if (this.app.slices.axisAt(x, y)) return;
+    this.app.link.send("pick", { x: clamp((x - left) / width, 0, 1), y: clamp((y - top) / height, 0, 1), purpose: "focus" });
   }
 
   key(event) {
     const key = event.key.toLowerCase(), { app } = this;
     if (event.ctrlKey || event.metaKey) {
-      if (key === "z") app.undo();
+      if (key === "z" && event.shiftKey) app.redo();
+      else if (key === "z") app.undo();
       return;
     }
     if (event.altKey || !app.camera) return;

@@ -29,7 +29,8 @@ using Native = __m128;
 #endif
 typedef float Floats __attribute__((vector_size(kLanes * 4)));
 typedef int32_t Ints __attribute__((vector_size(kLanes * 4)));
-using Mask = Ints;  // -1 or 0 in each lane
+typedef uint32_t Words __attribute__((vector_size(kLanes * 4)));  // sums and products wrap
+using Mask = Ints;                                                // -1 or 0 in each lane
 
 GV_HD Floats to_floats(Ints value) { return __builtin_convertvector(value, Floats); }
 GV_HD Ints truncated(Floats value) { return __builtin_convertvector(value, Ints); }
@@ -97,6 +98,16 @@ GV_HD Ints gather(const void* base, Ints offset) {
 #endif
 }
 GV_HD Ints pick(const int32_t* table, Ints index) { return gather(table, index << 2); }
+// Of words that other threads may store meanwhile: each is read whole.
+GV_HD Ints pick_shared(const int32_t* table, Ints index) {
+#if defined(__AVX2__)
+  return pick(table, index);
+#else
+  Ints word;
+  for (int lane = 0; lane < kLanes; ++lane) word[lane] = __atomic_load_n(table + index[lane], __ATOMIC_RELAXED);
+  return word;
+#endif
+}
 GV_HD Floats pick(const float* table, Ints index) { return (Floats)gather(table, index << 2); }
 
 // Four floats at each address base + offset (a multiple of 16 bytes), the first of all lanes in row[0], and so on: a

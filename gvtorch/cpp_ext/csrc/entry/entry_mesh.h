@@ -27,13 +27,14 @@ inline auto run(const VoxelizeOp& a) {
   GV_VOXELIZE(GV_TAKE)
   args.triangles = triangles;
   args.cubes = cubes;
-  const auto make = [&](auto*& pointer, ScalarType dtype) {
-    Tensor made = torch::stable::new_empty(a.corner_f33, {cubes, side, side, side}, dtype);
+  const auto make = [&](auto*& pointer, ScalarType dtype, bool wanted = true) {
+    Tensor made = torch::stable::new_empty(a.corner_f33, {wanted ? cubes : 0, side, side, side}, dtype);
     pointer = lay(made);
     return made;
   };
   Tensor distance_kzyx = make(args.distance_kzyx, real), nearest_kzyx = make(args.nearest_kzyx, ScalarType::Int);
-  Tensor winding_kzyx = make(args.winding_kzyx, ScalarType::Int), coverage_kzyx = make(args.coverage_kzyx, real);
+  Tensor winding_kzyx = make(args.winding_kzyx, ScalarType::Int),
+         coverage_kzyx = make(args.coverage_kzyx, real, a.shares);
   Tensor weight_kzyx3 = torch::stable::new_empty(a.corner_f33, {a.weights ? cubes : 0, side, side, side, 3}, real);
   args.weight_kzyx3 = lay(weight_kzyx3);
   voxelize(a.corner_f33, args);

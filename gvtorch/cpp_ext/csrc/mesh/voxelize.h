@@ -13,8 +13,9 @@ constexpr int32_t kMostVoxels = 32;  // along a side of a cube
 constexpr int32_t kArity = 8;        // boxes in a box
 constexpr int32_t kMostFloors = 12;  // levels of boxes: of 2^33 triangles
 constexpr int32_t kWaiting = (kArity - 1) * kMostFloors + kArity;
-constexpr double kFlat = 1e-3, kTouch = 1e-6;
-constexpr double kCoarse = 2;  // triangles along a side of a voxel from which on each voxel goes down alone
+constexpr double kFlat = 1e-3, kTouch = 1e-6, kBeyond = 0.8661, kParts = 1 << 30;
+constexpr int32_t kCorners = 16;  // of a clipped triangle
+constexpr double kCoarse = 2;     // triangles along a side of a voxel from which on each voxel goes down alone
 
 // triangles, boxes, cubes
 #define GV_VOXELIZE(X)                \
@@ -26,6 +27,7 @@ constexpr double kCoarse = 2;  // triangles along a side of a voxel from which o
   X(Int, side, kMostVoxels + 1)       \
   X(Float, thickness, kAny)           \
   X(Float, detail, kAny)              \
+  X(Bool, shares, kAny)               \
   X(Bool, weights, kAny)              \
   X(Bool, wide, kAny)
 
@@ -175,6 +177,53 @@ GV_HD Pierced<T> pierced(T y, T z, const Vec3<T>* corner) {
   return {height / total, positive[0] ? 1 : -1};
 }
 
+// A triangle that is cut at the sides of voxels.
+template <class T>
+struct Polygon {
+  Vec3<T> at[kCorners];
+  int32_t count = 0;
+
+  GV_HD void push(Vec3<T> corner) {
+    if (count < kCorners) at[count++] = corner;
+  }
+  // Whether all of it is above `limit` along an axis, or below it. What lies in the plane is above.
+  GV_HD bool within(int axis, T limit, bool upper) const {
+    for (int32_t i = 0; i < count; ++i) {
+      if ((at[i][axis] >= limit) != upper) return false;
+    }
+    return true;
+  }
+  // The part that is.
+  GV_HD Polygon clip(int axis, T limit, bool upper) const {
+    if (within(axis, limit, upper)) return *this;
+    Polygon kept;
+    for (int32_t i = 0; i < count; ++i) {
+      const Vec3<T> one = at[i], other = at[i + 1 < count ? i + 1 : 0];
+      const bool inside = (one[axis] >= limit) == upper, next = (other[axis] >= limit) == upper;
+      if (inside) kept.push(one);
+      if (inside == next) continue;
+      const bool swap = one[axis] > other[axis];
+      const Vec3<T> first = swap ? other : one, second = swap ? one : other;
+      const T share = (limit - first[axis]) / (second[axis] - first[axis]);
+      Vec3<T> crossing{first.x + share * (second.x - first.x), first.y + share * (second.y - first.y),
+                       first.z + share * (second.z - first.z)};
+      crossing[axis] = limit;
+      kept.push(crossing);
+    }
+    return kept;
+  }
+  // The volume before it, from x = 0 on.
+  GV_HD T before() const {
+    T total{};
+    for (int32_t i = 1; i + 1 < count; ++i) {
+      const Vec3<T>&a = at[0], &b = at[i], &c = at[i + 1];
+      const T area = (b.y - a.y) * (c.z - a.z) - (b.z - a.z) * (c.y - a.y);
+      total += area * (a.x + b.x + c.x);
+    }
+    return total * static_cast<T>(1.0 / 6);
+  }
+};
+
 // The share of a voxel below a plane. Scardovelli and Zaleski 2000.
 template <class T>
 GV_HD T box_share(Vec3<T> normal, T offset) {
@@ -270,6 +319,7 @@ struct VoxelizePack {
     } else {
       look<Together<T>>(own, row, begin, end, y, z, winding);
     }
+    if (a.shares) fill(own, row, begin, end, y, z);
   }
 
   static GV_HD T infinite() { return static_cast<T>(bit_cast<float>(0x7f800000)); }
@@ -346,6 +396,79 @@ struct VoxelizePack {
         });
   }
 
+  // Writes the coverage of those of the voxels begin..end of a row through which a solid's surface may pass: the mean
+  // of the winding number. A triangle adds what lies before it along x, signed as its normal points.
+  GV_HD void fill(const Cube& cube, int64_t row, int32_t begin, int32_t end, T y, T z) const {
+    const T* distance = static_cast<const T*>(a.distance_kzyx) + row * a.side;
+    const int32_t* nearest = a.nearest_kzyx + row * a.side;
+    const auto wanted = [&](int32_t i) {
+      return nearest[i] >= 0 && a.solid_f[nearest[i]] && distance[i] <= static_cast<T>(kBeyond);
+    };
+    while (begin < end && !wanted(begin)) ++begin;
+    while (begin < end && !wanted(end - 1)) --end;
+    if (begin == end) return;
+    const auto half = static_cast<T>(0.5);
+    const Vec3<T> low{place(cube, begin) - half, y - half, z - half};
+    const double margin = kMargin * cube.voxel, x = cube.world(low.x, 0) - margin;
+    const double y0 = cube.world(low.y, 1) - margin, y1 = y0 + cube.voxel + 2 * margin;
+    const double z0 = cube.world(low.z, 2) - margin, z1 = z0 + cube.voxel + 2 * margin;
+    int64_t parts[kPack] = {};
+    descend(
+        [&](int64_t number) {
+          const double* box = a.box_n6 + 6 * number;
+          const bool met = box[1] <= y1 && box[4] >= y0 && box[2] <= z1 && box[5] >= z0 && box[3] >= x;
+          return met ? 0.0 : 1.0;
+        },
+        [] { return 0.0; },
+        [&](int64_t number) {
+          if (!a.solid_f[number]) return;
+          Polygon<T> whole;
+          for (int i = 0; i < 3; ++i) {
+            const double* at = a.corner_f33 + 9 * number + 3 * i;
+            whole.push({cube.local(at[0], 0), cube.local(at[1], 1), cube.local(at[2], 2)});
+          }
+          const Polygon<T> column = in_column(whole, low);
+          if (column.count == 0) return;
+          for (int32_t i = begin; i < end; ++i) {
+            if (wanted(i)) parts[i - begin] += in_voxel(column, place(cube, i) - half, whole);
+          }
+        });
+    for (int32_t i = begin; i < end; ++i) {
+      if (!wanted(i)) continue;
+      const int64_t sum = parts[i - begin];
+      const T share = static_cast<T>(sum < 0 ? -sum : sum) * static_cast<T>(1 / kParts);
+      static_cast<T*>(a.coverage_kzyx)[row * a.side + i] = smaller(share, static_cast<T>(1));
+    }
+  }
+
+  // A triangle within the sides across y and z of a row of voxels, from its low side; x stays.
+  GV_HD static Polygon<T> in_column(const Polygon<T>& whole, Vec3<T> low) {
+    Polygon<T> cut = whole;
+    for (int axis = 1; axis < 3; ++axis) {
+      const T p = whole.at[0][axis], q = whole.at[1][axis], r = whole.at[2][axis];
+      const bool met = larger(larger(p, q), r) > low[axis] && smaller(smaller(p, q), r) < low[axis] + 1;
+      if (!met) return {};
+    }
+    for (int axis = 1; axis < 3; ++axis) {
+      for (int32_t i = 0; i < cut.count; ++i) cut.at[i][axis] = cut.at[i][axis] - low[axis];
+      cut = cut.clip(axis, 0, true).clip(axis, 1, false);
+    }
+    return cut;
+  }
+
+  // The part of a voxel of a row that lies before a triangle, in parts of kParts.
+  GV_HD static int64_t in_voxel(const Polygon<T>& column, T low, const Polygon<T>& whole) {
+    if (!(larger(larger(whole.at[0].x, whole.at[1].x), whole.at[2].x) > low)) return 0;
+    Polygon<T> own = column;
+    for (int32_t i = 0; i < own.count; ++i) own.at[i].x = own.at[i].x - low;
+    Polygon<T> ahead = own.clip(0, 1, true);
+    for (int32_t i = 0; i < ahead.count; ++i) ahead.at[i].x = 1;
+    T volume = ahead.before();
+    if (!own.within(0, 1, true)) volume += own.clip(0, 0, true).clip(0, 1, false).before();
+    const T most = volume < 1 ? volume : static_cast<T>(1);
+    return static_cast<int64_t>((most > -1 ? most : static_cast<T>(-1)) * static_cast<T>(kParts));
+  }
+
   // Finds the nearest triangles of voxels begin..end of a row together, and writes what they hold.
   template <class F>
   GV_HD void look(const Cube& cube, int64_t row, int32_t begin, int32_t end, T y, T z, const int32_t* winding) const {
@@ -404,17 +527,14 @@ struct VoxelizePack {
     T share = full;
     Vec3<T> weight{};
     if (triangle != nullptr) {
-      const Vec3<T> away = triangle->away(here, gap2);
-      const T half = static_cast<T>(0.5 * a.thickness * inverse);
-      if (a.solid_f[nearest]) {
-        const T below = box_share(away, gap);
-        share = winding != 0 ? below : 1 - below;
-      } else if (winding == 0) {
+      if (a.shares && !a.solid_f[nearest] && winding == 0) {
+        const Vec3<T> away = triangle->away(here, gap2);
+        const T half = static_cast<T>(0.5 * a.thickness * inverse);
         share = box_share(away, gap + half) - box_share(away, gap - half);
       }
       if (a.weights) weight = triangle->weight(here);
     }
-    static_cast<T*>(a.coverage_kzyx)[at] = share;
+    if (a.shares) static_cast<T*>(a.coverage_kzyx)[at] = share;
     if (!a.weights) return;
     for (int i = 0; i < 3; ++i) static_cast<T*>(a.weight_kzyx3)[3 * at + i] = weight[i];
   }

@@ -406,7 +406,7 @@ struct PacketWalk {
 
   GV_HD void stamp(int32_t* stamps, Mask which, Ints index) const {
     if (!any(which)) return;
-    const Mask old = which & (pick(stamps, which ? index : Ints{}) != frame);
+    const Mask old = which & (pick_shared(stamps, which ? index : Ints{}) != frame);
     for_lanes(old, [&](int lane) { store_stamp(&stamps[index[lane]], frame); });
   }
 

@@ -215,6 +215,16 @@ struct Probe {
     return blended(t, [&](const Spot<T>& spot) { return read(channel, component, spot, spot.at(t)); });
   }
 
+  // Four numbers of a channel at distance t, from one on: the voxels around it are found once.
+  GV_HD Row<T> four_at(const ChannelView& channel, int32_t first, T t) const {
+    const Row<T> row = four_in(channel, first, fine, t);
+    if (!mixed) return row;
+    const Row<T> other = four_in(channel, first, coarse, t);
+    const T part = weight(t);
+    return {row.red + part * (other.red - row.red), row.green + part * (other.green - row.green),
+            row.blue + part * (other.blue - row.blue), row.alpha + part * (other.alpha - row.alpha)};
+  }
+
   // Several numbers of a channel at distance t, at most kMostNumbers.
   GV_HD void numbers_at(const ChannelView& channel, Components<T> components, int32_t count, T t, T* out) const {
     read(channel, components, count, fine, t, out);
@@ -281,6 +291,12 @@ struct Probe {
   }
 
  private:
+  GV_HD Row<T> four_in(const ChannelView& channel, int32_t first, const Spot<T>& spot, T t) const {
+    if (spot.brick >= 0) return four_of(true, channel, first, spot, t);
+    const int64_t row = static_cast<int64_t>(spot.node) * channel.width + first;
+    const auto read = [&](int32_t which) { return read_number<T>(channel.constant_tnc, channel.type, row + which); };
+    return {read(0), read(1), read(2), read(3)};
+  }
   GV_HD T read(const ChannelView& channel, int32_t component, const Spot<T>& spot, Vec3<T> at) const {
     if (spot.brick < 0) {
       return read_number<T>(channel.constant_tnc, channel.type,

@@ -31,11 +31,24 @@ void shade_each(const torch::stable::Tensor& like, int64_t nodes, Kernel kernel)
   for_each<Device>(like, kernel.order.count(), kernel);
 }
 
-// Rays with a fused shader; those of the plain function, filtered or not, with voxels of a known dtype.
+// Rays with a fused shader; those of the plain function, filtered or not, with voxels of a known dtype, and on CUDA
+// those that see the usual stored colours.
 template <class T>
 void shade_fused(const torch::stable::Tensor& like, const ShadeArgs& args) {
   const auto each = [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); };
   const bool plain = args.shader == kPlainShader;
+#ifdef __CUDACC__
+  if constexpr (std::is_same_v<T, float>) {
+    const auto colors = [&](auto voxel) {
+      with_digits<T>(args, [&](auto* digits) {
+        each(ShadeRay<T, StoredColor<T>, std::decay_t<decltype(*digits)>, false, decltype(voxel)>(args));
+      });
+    };
+    const bool stored = args.shader == static_cast<int32_t>(ShaderKind::kStoredColor);
+    if (stored && args.voxel == VoxelType::kUInt8) return colors(uint8_t{});
+    if (stored && args.voxel == VoxelType::kHalf) return colors(Half{});
+  }
+#endif
   if (!plain && args.shader != static_cast<int32_t>(ShaderKind::kFiltered)) return with_rays<T>(args, each);
   with_voxel(args.voxel, [&](auto voxel) {
     with_digits<T>(args, [&](auto* digits) {

@@ -36,8 +36,10 @@ struct ShadeRay : Walk<T> {
   using Walk<T>::tree;
   using Walk<T>::options;
   using Sum = typename Shader::Sum;
-  static constexpr int kBlocksAtOnce =
-      std::is_void_v<Voxel> || IsFiltered<Shader>::value ? 4 : 8;  // of CUDA: 128 or 64 registers, see for_each.h
+  // Reads of a known dtype are no calls; a short shader's loop may be there twice. See for_each.h for blocks at once:
+  // 128 or 64 registers a thread.
+  static constexpr bool kShort = !std::is_void_v<Voxel> && !Shader::kColored;
+  static constexpr int kBlocksAtOnce = kShort && !IsFiltered<Shader>::value ? 8 : 4;
   static constexpr bool kHidesAlike = HidesAlike<Shader>::value;
   Shader shader;
   Channels channels;
@@ -203,8 +205,6 @@ struct ShadeRay : Walk<T> {
    private:
     template <class Adds>
     GV_HD int32_t take(const Adds& adds, const Eye& probe, const Intervals<T>& at, int32_t alike, bool last) {
-      // Most shaders are too long to be there twice.
-      constexpr bool kShort = !std::is_void_v<Voxel>;
       if (kShort && last) return take_by(adds, [&](T t) { return probe.value(t); }, probe, at, 1, true);
       return probe.with_value(
           [&](const auto& value) { return take_by(adds, value, probe, at, alike, !kShort && last); });

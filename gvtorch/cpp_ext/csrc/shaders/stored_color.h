@@ -79,21 +79,30 @@ struct StoredColor : ShaderFacts {
     const MaskOf<V> shown = which && opacity > 0;
     if (!any(shown)) return;
     probe.narrow(shown);
-    V color[3];
-#ifdef __CUDA_ARCH__
-#pragma unroll 1
-#endif
-    for (int i = 0; i < 3; ++i) {
-      color[i] = seen(probe, i, piece.middle) * own().scale;
-      if (own().premultiplied > 0) color[i] = color[i] / opacity;
-    }
-    Row<V> row{color[0], color[1], color[2], stretch(opacity, piece.length / own().reference_length)};
+    const Row<V> stored = four_seen(probe, piece.middle);
+    const auto color = [&](V number) {
+      const V scaled = number * own().scale;
+      return own().premultiplied > 0 ? scaled / opacity : scaled;
+    };
+    Row<V> row{color(stored.red), color(stored.green), color(stored.blue),
+               stretch(opacity, piece.length / own().reference_length)};
     if (own().lit > 0) {
       const Vec3<V> n = light.normal(probe, piece.middle);
       row = light.shade(row, n, probe, piece.middle, shadow...);
       sum.add_normal(n, sum.clear * row.alpha, shown);
     }
     sum.add(row, piece.start, piece.length, sum.hit_clear, shown);
+  }
+  // All four; a packet reads no opacity, which it has.
+  template <class Eye, class V>
+  GV_HD static Row<V> four_seen(const Eye& probe, V t) {
+    const auto& channel = probe.channels.value;
+    if constexpr (kPacket<V>) {
+      return {probe.number_at(channel, 0, t), probe.number_at(channel, 1, t), probe.number_at(channel, 2, t), V{}};
+    } else {
+      const auto read = [&](int32_t behind) { return probe.four_at(channel, behind, t); };
+      return by_direction(true, probe.sight.direction, channel.width, read);
+    }
   }
   // One of the four numbers, as it is seen along the ray.
   template <class Eye, class V>

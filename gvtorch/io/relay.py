@@ -1,0 +1,181 @@
+"""`through`: a folder behind http(s) as tensorstore reads it, by way of a server in this process.
+
+tensorstore takes what a server sends, as long as it sends. So it asks this one, on 127.0.0.1 and
+behind a word that nobody else knows, which asks the other by `read_http`, and answers when it has
+all of a file or of a part of it: what is longer than a chunk can be, stalls or drips is refused.
+"""
+
+from __future__ import annotations
+
+import functools
+import hmac
+import http.server
+import math
+import os
+import re
+import secrets
+import threading
+from typing import Any
+
+from .http import SMALL, Endless, HttpStatus, file_limit, file_url, index_bytes, read_http, refused
+
+_JOINED = 1 << 27  # bytes of parts that tensorstore asks for together
+_METADATA = 1 << 24  # bytes
+_RETRIES = {"max_retries": 4, "initial_delay": "200ms", "max_delay": "1s"}
+_TOGETHER = 16  # requests that wait for one folder
+
+
+class Relayed:
+    """A folder with an array.
+
+    Attributes:
+        spec: What tensorstore opens in its place.
+    """
+
+    def __init__(self, url: str, base: str) -> None:
+        self.url = url
+        self.spec = {
+            "driver": "http",
+            "base_url": base,
+            # Of its own, so that a server that stalls keeps no other one's files waiting.
+            "http_request_concurrency": {"limit": _TOGETHER},
+            "http_request_retries": _RETRIES,
+        }
+        self._future: Any = None
+        self._limits = (_METADATA, _METADATA)
+
+    def opens(self, future: Any) -> Any:
+        """Takes and returns the future of the array that lies there."""
+        self._future = future
+        return future
+
+    def limits(self) -> tuple[int, int]:
+        """Bytes of a whole file, and of a part of one, at most."""
+        future = self._future
+        if future is not None and future.done():
+            try:
+                self._limits = limits_of(future.result())
+            except Exception:  # the array does not open, as its reader is told
+                pass
+            self._future = None
+        return self._limits
+
+    def read(self, name: str, part: slice | None) -> bytes | None:
+        """Returns a file, or a part of it; raises as `read_http`."""
+        whole, piece = self.limits()
+        most = whole
+        if part is not None:
+            most = -part.start if part.stop is None else part.stop - part.start
+            if not 0 < most <= min(piece, whole):
+                raise Endless(f"{most} bytes are asked for, more than a chunk has")
+        return read_http(file_url(self.url, name), most, part, whole=whole)
+
+
+def limits_of(array: Any) -> tuple[int, int]:
+    """Bytes that a file of one of tensorstore's arrays may take, and those that are asked of it at
+    a time.
+    """
+    item, layout = array.dtype.numpy_dtype.itemsize, array.chunk_layout
+    file, chunk = (math.prod(at.shape or (1,)) for at in (layout.write_chunk, layout.read_chunk))
+    index = index_bytes(file, chunk)
+    return file_limit(file, chunk, item), max(2 * chunk * item + SMALL + _JOINED, index)
+
+
+class _Server(http.server.ThreadingHTTPServer):
+    daemon_threads = True
+    request_queue_size = 128
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), _Handler)
+        self.word = secrets.token_urlsafe(16)
+        self.folders: list[Relayed] = []
+        self.lock = threading.Lock()
+        threading.Thread(target=self.serve_forever, daemon=True, name="gvtorch-relay").start()
+
+    def folder(self, url: str) -> Relayed:
+        """A place for a folder; the same for the same."""
+        with self.lock:
+            for found in self.folders:
+                if found.url == url:
+                    return found
+            base = f"http://127.0.0.1:{self.server_port}/{self.word}/{len(self.folders)}/"
+            self.folders.append(Relayed(url, base))
+            return self.folders[-1]
+
+    def handle_error(self, *_: object) -> None:
+        """Says nothing: tensorstore does not wait for what it gave up."""
+
+
+class _Handler(http.server.BaseHTTPRequestHandler):
+    server: _Server
+    protocol_version = "HTTP/1.1"  # connections stay
+    disable_nagle_algorithm = True
+
+    def do_GET(self) -> None:
+        asked = re.fullmatch(r"/([\w-]+)/(\d+)/(.+)", self.path, re.ASCII)
+        if asked is None or not hmac.compare_digest(asked[1], self.server.word):
+            self._answer(403, b"")
+            return
+        wanted = re.fullmatch(r"bytes=(\d*)-(\d*)", self.headers.get("Range", ""))
+        part = None
+        if wanted is not None:
+            first, last = wanted.groups()
+            part = slice(int(first), int(last) + 1) if first else slice(-int(last), None)
+        folder, name = self.server.folders[int(asked[2])], asked[3]
+        try:
+            content = folder.read(name, part)
+        except Endless:
+            self._answer(403, b"")
+        except HttpStatus as error:
+            self._answer(error.status, b"")
+        except OSError:  # tensorstore tries again for a while
+            self._answer(503, b"")
+        else:
+            if content is None:
+                self._answer(404, b"")
+            else:
+                self._answer(200 if part is None else 206, content, part)
+
+    def _answer(self, status: int, content: bytes, part: slice | None = None) -> None:
+        self.send_response(status)
+        self.send_header("Content-Length", str(len(content)))
+        if part is not None:
+            begin = part.start if part.start >= 0 else 0
+            self.send_header("Content-Range", f"bytes {begin}-{begin + len(content) - 1}/*")
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, *_: object) -> None:
+        """Says nothing."""
+
+
+@functools.cache
+def _server() -> _Server:
+    for name in ("no_proxy", "NO_PROXY"):  # of libcurl, which would ask a proxy for this machine
+        told = os.environ.get(name, "")
+        if any(key.lower().endswith("_proxy") for key in os.environ) and "127.0.0.1" not in told:
+            os.environ[name] = f"{told},127.0.0.1" if told else "127.0.0.1"
+    return _Server()
+
+
+_starting = threading.Lock()
+
+
+def through(url: str) -> Relayed:
+    """Returns the folder at a URL as tensorstore is to read it."""
+    with _starting:
+        return _server().folder(url)
+
+
+def named(text: str) -> str:
+    """Puts the URLs of their folders for those of this process; of a file that was refused, why."""
+    if not _server.cache_info().currsize:
+        return text
+    server = _server()
+    base = rf"http://127\.0\.0\.1:\d+/{re.escape(server.word)}/(\d+)/"
+    for found in re.finditer(rf"{base}(\S*): (?!.*{base})", text):
+        folder = server.folders[int(found[1])]
+        url = file_url(folder.url, found[2])
+        if reason := refused(url):
+            return f"{url}: {reason}"
+    return re.sub(base, lambda at: server.folders[int(at[1])].url, text)

@@ -1,0 +1,46 @@
+"""What a page hands over as a file: transfer functions of gvtorch, ParaView and 3D Slicer."""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+from pathlib import Path
+
+from ..shaders import TransferFunction
+from .schema import MOST_ITEMS
+
+_ENDINGS = (".vp.json", ".json", ".vp", ".xml")
+
+
+def read_function(
+    file: str, text: str, name: str | None, low: float | None, high: float | None
+) -> tuple[TransferFunction, list[str]]:
+    """Reads a transfer function of a file's text, and what of it is not kept.
+
+    Args:
+        file: Its name, whose ending tells what it is.
+        text: What it holds.
+        name: Which function, where it has several.
+        low, high: The values over which one is laid whose own are only relative, as ParaView's are.
+
+    Raises:
+        ValueError: It is no such file, or has no such function.
+    """
+    ending = next((one for one in _ENDINGS if file.lower().endswith(one)), None)
+    if ending is None:
+        raise ValueError(f"{file:.80}: must end in {', '.join(_ENDINGS)}")
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        path = Path(folder) / f"function{ending}"
+        path.write_text(text, encoding="utf-8")
+        try:
+            function = TransferFunction.from_file(path, name)
+        except ValueError as error:
+            raise ValueError(str(error).replace(str(path), f"{file:.80}")) from None
+    if function.relative and low is not None and high is not None:
+        function = function.stretched(low, high)
+    most = max(len(function.opacity), len(function.color))
+    if most > MOST_ITEMS:
+        raise ValueError(f"{file:.80}: has {most} points, more than {MOST_ITEMS}")
+    lost = [str(one.message).replace(str(path), f"{file:.80}") for one in told]
+    return function, lost

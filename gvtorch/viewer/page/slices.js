@@ -1,0 +1,88 @@
+// Three planes beside the picture: where they lie, what is drawn over them, and how hands move their place.
+import { COLORS } from "./picture.js";
+
+const AXES = ["x", "y", "z"];
+const STILL = 200;  // milliseconds after which a wheel is at rest
+
+export class SlicesView {
+  constructor(app, view) {
+    this.app = app;
+    this.view = view;
+  }
+
+  /** What the newest picture tells of its parts, or null where it is one picture alone. */
+  get layout() {
+    return this.app.state?.slices ? this.view.head?.layout ?? null : null;
+  }
+
+  /** The place through which the planes go, in the world. */
+  get place() {
+    return this.app.state.slices.at ?? this.layout.x.at;
+  }
+
+  /** The axis of the plane at a place in CSS pixels, or undefined. */
+  axisAt(x, y) {
+    const { layout } = this, { ratio } = this.view;
+    const inside = ([left, top, width, height]) => x * ratio >= left && x * ratio < left + width && y * ratio >= top && y * ratio < top + height;
+    return layout ? AXES.find((axis) => inside(layout[axis].pane)) : undefined;
+  }
+
+  show(on) {
+    const middle = [0, 1, 2].map((axis) => (this.app.box[0][axis] + this.app.box[1][axis]) / 2);
+    this.app.change({ slices: on ? { kind: "Slices", at: middle } : null });
+  }
+
+  moveTo(at, rest) {
+    this.app.change({ slices: { ...this.app.state.slices, at } }, rest);
+  }
+
+  /** Moves the place to what a plane shows at a place in CSS pixels. */
+  pick(axis, x, y) {
+    const { image: [left, top, width, height], columns, rows } = this.layout[axis];
+    const share = (one, from, size) => Math.min(1, Math.max(0, (one * this.view.ratio - from) / size));
+    const at = [...this.place];
+    const put = ([name, first, last], t) => { at[AXES.indexOf(name)] = first + t * (last - first); };
+    put(columns, share(x, left, width));
+    put(rows, share(y, top, height));
+    this.moveTo(at, false);
+  }
+
+  /** Goes to the next plane, a voxel further. */
+  wheel(axis, lines) {
+    const at = [...this.place], { step } = this.layout[axis], number = AXES.indexOf(axis), { box } = this.app;
+    const moved = at[number] - Math.sign(lines) * step;
+    at[number] = Math.min(box[1][number] - step / 2, Math.max(box[0][number] + step / 2, moved));
+    this.moveTo(at, false);
+    clearTimeout(this.timer);
+    this.timer = setTimeout(() => this.app.settle(), STILL);
+  }
+
+  draw(context) {
+    const { layout } = this, { ratio } = this.view;
+    if (!layout) return;
+    const place = this.place;
+    for (const axis of AXES) {
+      const { pane, image, columns, rows, name } = layout[axis];
+      const along = ([other, first, last], from, size) => from + ((place[AXES.indexOf(other)] - first) / (last - first)) * size;
+      const [x, y] = [along(columns, image[0], image[2]), along(rows, image[1], image[3])];
+      const line = (color, ...ends) => {
+        context.strokeStyle = COLORS[AXES.indexOf(color)];
+        context.globalAlpha = 0.75;
+        context.lineWidth = ratio;
+        context.beginPath();
+        context.moveTo(...ends.slice(0, 2));
+        context.lineTo(...ends.slice(2));
+        context.stroke();
+        context.globalAlpha = 1;
+      };
+      line(columns[0], x, image[1], x, image[1] + image[3]);  // where the plane across that axis cuts this one
+      line(rows[0], image[0], y, image[0] + image[2], y);
+      context.strokeStyle = COLORS[AXES.indexOf(axis)];
+      context.lineWidth = ratio;
+      context.strokeRect(pane[0] + 0.5, pane[1] + 0.5, pane[2] - 1, pane[3] - 1);
+      const number = Number(place[AXES.indexOf(axis)].toPrecision(5));
+      const unit = this.view.unit ? ` ${this.view.unit}` : "";
+      this.view.label(context, `${name}, ${axis} = ${number}${unit}`, pane[0] + 10 * ratio, pane[1] + pane[3] - 10 * ratio, "left");
+    }
+  }
+}

@@ -1,0 +1,28 @@
+"""What must not wait for the device."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+
+@contextmanager
+def nobody_waits(mode: str = "error", device: str = "cuda") -> Iterator[None]:
+    """Lets a wait of the host for a CUDA device be an error, or a warning, within the block; on
+    the CPU it does nothing.
+    """
+    if torch.device(device).type != "cuda":
+        yield
+        return
+    torch.cuda.synchronize()
+    try:
+        with warnings.catch_warnings():
+            # torch warns, once a process, that this mode is a prototype.
+            warnings.filterwarnings("ignore", "Synchronization debug mode")
+            torch.cuda.set_sync_debug_mode(mode)
+        yield
+    finally:
+        torch.cuda.set_sync_debug_mode("default")

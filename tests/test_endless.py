@@ -1,0 +1,270 @@
+"""Servers that never stop within a chunk, as fast as they can or a byte at a time, stall, break off
+or send another part than was asked for: that costs the nodes of that chunk, and no more memory than
+a chunk can take.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator
+from http import server as servers
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.stores import noise, write_foreign
+
+import gvtorch as gv
+from gvtorch.io import http, relay
+from gvtorch.io.conversion import convert
+from gvtorch.io.http import read_http
+from gvtorch.io.store import Store
+
+MEMORY = 300 << 20  # bytes that reading may take
+VIEW = gv.Camera.orbit(width=128, height=48)
+
+
+class Server(servers.ThreadingHTTPServer):
+    """Serves a folder, with byte ranges if `parts`; files whose paths match `bad` as `how` says."""
+
+    daemon_threads = True
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.folder, self.bad, self.how, self.parts, self.over = folder, "", "", True, False
+        self.shift = 0
+
+    def handle_error(self, *_: object) -> None:
+        pass  # readers go away
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server_port}"
+
+
+class Handler(servers.BaseHTTPRequestHandler):
+    server: Server
+    protocol_version = "HTTP/1.1"
+
+    def do_GET(self) -> None:
+        server, file = self.server, self.server.folder / self.path.strip("/")
+        if not file.is_file():
+            self.send_error(404)
+            return
+        if server.bad and re.search(server.bad, self.path):
+            with contextlib.suppress(OSError):
+                self.misbehave(file.read_bytes())
+            self.close_connection = True
+            return
+        content = file.read_bytes()
+        wanted = re.fullmatch(r"bytes=(\d*)-(\d*)", self.headers.get("Range", ""))
+        status = 200
+        if wanted is not None and server.parts:
+            first, last = wanted.groups()
+            start = int(first) if first else max(0, len(content) - int(last))
+            size = len(content)
+            content = content[start : int(last) + 1 if first and last else None]
+            status = 206
+        self.send_response(status)
+        if status == 206:
+            start += server.shift
+            self.send_header("Content-Range", f"bytes {start}-{start + len(content) - 1}/{size}")
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
+
+    def misbehave(self, content: bytes) -> None:
+        server, how = self.server, self.server.how
+        if how == "error":
+            self.send_error(403)
+            return
+        self.send_response(206 if how.startswith("part") and "Range" in self.headers else 200)
+        if how == "break":
+            self.send_header("Content-Length", "1000000")
+        self.end_headers()
+        self.wfile.write(content[:100])
+        while not server.over and how != "break":
+            if how.endswith("fast"):
+                self.wfile.write(b"[" * (1 << 20))
+            elif how == "slow":
+                self.wfile.write(b"[")
+            if not how.endswith("fast"):
+                time.sleep(0.02)
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def server(tmp_path, monkeypatch) -> Iterator[Server]:
+    monkeypatch.setattr(http, "STALL", 3.0)
+    monkeypatch.setattr(http, "SLOWEST", 10**7)
+    monkeypatch.setattr(http, "REFUSED", 60.0)
+    with Server(tmp_path) as found:
+        thread = threading.Thread(target=found.serve_forever)
+        thread.start()
+        yield found
+        found.over = True
+        found.shutdown()
+        thread.join()
+
+
+def mended(server: Server, read: Callable[[], Any]) -> Any:
+    """What a read gives when the server is well again, and is not remembered as what it was."""
+    server.bad = ""
+    for _ in range(40):
+        http._refused.clear()
+        try:
+            return read()
+        except OSError:
+            time.sleep(0.5)  # of requests that are on their way
+    return read()
+
+
+def resident() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+@contextlib.contextmanager
+def little_memory() -> Iterator[None]:
+    """The process stays small meanwhile."""
+    before, most, over = resident(), [0], threading.Event()
+
+    def look() -> None:
+        while not over.wait(0.005):
+            most[0] = max(most[0], resident())
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+    assert most[0] - before < MEMORY
+
+
+@pytest.fixture(scope="module")
+def data() -> np.ndarray:
+    return noise((40, 40, 300, 1))
+
+
+REASONS = {
+    "fast": r"more than \d+ bytes",
+    "part fast": r"more than \d+ bytes",
+    "slow": "sends hardly anything",
+    "stall": "sends hardly anything",
+    "break": "cut off",
+    "error": "403",
+}
+
+
+@pytest.mark.parametrize("how", REASONS)
+def test_a_chunk_without_an_end_costs_its_nodes(server, tmp_path, data, how):
+    convert(gv.Volume(data), tmp_path / "a.zarr", workers=1)
+    store = Store.open(f"{server.url}/a.zarr")
+    server.bad, server.how = r"blocks/0/c/0/0/1/", how
+    places = np.array(list(np.ndindex(*store.block_grid(0))))
+    with little_memory():
+        blocks, errors = store.read_blocks(0, places, timeout=60.0)
+    bad = np.flatnonzero(places[:, 2] * 32 >= 256).tolist()
+    assert sorted(errors) == bad
+    for text in errors.values():
+        assert re.search(REASONS[how], text) and "\n" not in text, text
+        assert "a.zarr" in text and str(relay._server().server_port) not in text
+    assert not mended(server, lambda: store.read_blocks(0, places)[1])
+    assert np.array_equal(blocks[0, 1:33, 1:33, 1:33], data[:32, :32, :32])
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("how", ["fast", "slow"])
+def test_a_picture_of_such_a_store_is_made_of_the_rest(server, tmp_path, data, how):
+    convert(gv.Volume(data), tmp_path / "a.zarr", workers=1)
+    server.bad, server.how = r"blocks/[1-3]/c/", how
+    look = gv.TransferFunction.preset("gray", 0, 255)
+    with little_memory(), gv.Engine(gv.StoredProducer(f"{server.url}/a.zarr")) as engine:
+        picture = engine.render(VIEW, look)
+        assert torch.isfinite(picture.color).all() and engine.failures
+        assert all(re.search(REASONS[how], failure.message) for failure in engine.failures)
+        mended(server, lambda: None)
+        engine.forget_failures()
+        whole = engine.render(VIEW, look)
+        assert whole.stats.converged and not engine.failures
+    resident = gv.render(gv.N3Tree.from_volume(gv.Volume(data)), VIEW, look)
+    assert torch.equal(whole.color, resident.color) and whole.alpha.max() > 0
+
+
+@pytest.mark.parametrize("kind", ["v2", "v3", "sharded", "n5"])
+@pytest.mark.parametrize("how", ["fast", "stall"])
+def test_chunks_and_indices_of_other_writers(server, tmp_path, data, kind, how):
+    values = data[..., :100, 0]
+    if kind == "n5":
+        import tensorstore as ts
+
+        spec = {"driver": "n5", "kvstore": {"driver": "file", "path": f"{tmp_path}/a.n5/"}}
+        ts.open(spec, create=True, dtype=ts.uint8, shape=values.shape).result()[...] = values
+        source = f"{server.url}/a.n5"
+
+        def read() -> np.ndarray:
+            return gv.read_volume(source, axes="zyx").data[..., 0].numpy()
+    else:
+        version = 2 if kind == "v2" else 3
+        arrays = [values], "zyx", [[1.0, 1.0, 1.0]]
+        write_foreign(tmp_path / "a.zarr", *arrays, version=version, sharded=kind == "sharded")
+        store = Store.open(f"{server.url}/a.zarr")
+
+        def read() -> np.ndarray:
+            return store.read_region(0, (0, 0, 0), values.shape)[..., 0]
+
+    expected = values if kind != "n5" else None
+    good = read()
+    assert good.size == values.size and (expected is None or np.array_equal(good, expected))
+    server.bad, server.how = r"\d[/.]\d[/.]\d$", how
+    with little_memory(), pytest.raises(OSError, match=REASONS[how]):
+        read()
+    server.parts = False  # a server that sends all of a file in any case
+    assert np.array_equal(mended(server, read), good)
+
+
+def test_parts_of_files_that_never_end(server, tmp_path):
+    content = bytes(range(256)) * 1000
+    (tmp_path / "a").write_bytes(content)
+    url = f"{server.url}/a"
+    for server.parts in (True, False):
+        for part in (slice(0, 1), slice(5, 70_000), slice(200_000, 200_010), slice(-20, None)):
+            wanted = content[part]
+            assert read_http(url, len(wanted), part, whole=len(content)) == wanted
+    with pytest.raises(OSError, match="more than 255999 bytes"):
+        read_http(url, 20, slice(-20, None), whole=len(content) - 1)
+    http._refused.clear()
+    server.parts, server.shift = True, 1
+    with pytest.raises(OSError, match="another part came: bytes 6-"):
+        read_http(url, 5, slice(5, 10))
+    server.bad, server.how = "a", "fast"
+    http._refused.clear()
+    assert read_http(url, 90, slice(0, 90), whole=1000) == content[:90]
+    for part in (None, slice(-20, None), slice(10**7, 10**7 + 5)):
+        http._refused.clear()
+        with pytest.raises(OSError, match=r"more than 1\d* bytes"):
+            read_http(url, 10**6, part, whole=10**6)
+    server.how = "slow"
+    http._refused.clear()
+    with pytest.raises(TimeoutError):
+        read_http(url, 10**6, seconds=0.3)
+    assert read_http(f"{server.url}/none", 9) is None
+
+
+def test_nobody_else_reads_by_the_relay(server, tmp_path):
+    (tmp_path / "a").write_bytes(b"mine")
+    spec = relay.through(f"{server.url}/").spec
+    assert read_http(f"{spec['base_url']}a", 9) == b"mine"
+    port = relay._server().server_port
+    for path in ("", "0/a", "x/0/a", f"{relay._server().word}/999999/a"):
+        with pytest.raises(OSError):
+            read_http(f"http://127.0.0.1:{port}/{path}", 9)

@@ -1,0 +1,63 @@
+"""Users' shaders by nvcc, which needs no card to compile: what is kept, what counts as changed, and
+that no name of a user comes to the shell to which nvcc hands its arguments.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+from helpers.compiled import ADD, HEADER, write
+
+from gvtorch.cpp_ext import compilers, user
+
+pytestmark = pytest.mark.skipif(compilers.find_nvcc() is None, reason="nvcc is not here")
+ARCHS = ("90",)
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch) -> Path:
+    """A cache of its own, and an nvcc that does not optimise."""
+    nvcc = tmp_path / "nvcc"
+    nvcc.write_text(f'#!/bin/sh\nexec {compilers.find_nvcc()} "$@" -O0 -Xptxas=-O0\n')
+    nvcc.chmod(0o755)
+    monkeypatch.setenv("NVCC", str(nvcc))
+    monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "shaders"
+
+
+def test_nvcc_compiles_it(cache):
+    library = user.compiled(user.ShaderSource.read(HEADER, "mine::Bands"), ARCHS)
+    assert library.parent == cache and b"mine_Bands_" in library.read_bytes()
+
+
+def test_what_only_cuda_includes_counts_and_no_name_comes_to_a_shell(tmp_path, cache, monkeypatch):
+    """A file that is included by a macro, and in the code for CUDA alone."""
+    folder = tmp_path / "a b;touch $(touch beside)`touch beside`"
+    folder.mkdir()
+    header = write(folder, ADD.replace("COLOR", "kColor"), "own $(touch here);'\".h")
+    part = folder / "part.h"
+    part.write_text("constexpr float kColor = 0.5f;\n")
+    ways = '#ifdef __CUDACC__\n#define PART "part.h"\n#include PART\n#else\n'
+    header.write_text(f"{ways}constexpr float kColor = 0.25f;\n#endif\n" + header.read_text())
+    monkeypatch.chdir(tmp_path)
+    before = user.ShaderSource.read(header, "Own")
+    library = user.compiled(before, ARCHS)
+    after = user.ShaderSource.read(header, "Own")
+    assert json.loads(after.more.read_text()) == [str(part)]
+    assert after.digest != before.digest and after.op in library.name
+    assert sorted(os.listdir(cache)) == sorted([library.name, after.more.name])
+    assert user.compiled(after, ARCHS) == library, "it is kept"
+    part.write_text("constexpr float kColor = 0.75f;\n")
+    assert user.ShaderSource.read(header, "Own").digest not in (before.digest, after.digest)
+    assert not [file for file in tmp_path.rglob("*") if file.name in ("beside", "here")]
+
+
+def test_what_nvcc_says_names_the_file(tmp_path, cache):
+    header = write(tmp_path, "  int broken = nothing;")
+    with pytest.raises(user.CompileError, match="did not compile for CUDA") as caught:
+        user.compiled(user.ShaderSource.read(header, "Own"), ARCHS)
+    assert f"{header}" in str(caught.value) and "nothing" in str(caught.value)
+    assert os.listdir(cache) == []

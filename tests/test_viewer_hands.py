@@ -1,0 +1,367 @@
+"""The page's editors in a real browser: slices, planes, labels, time, node boxes, presets, undo."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from helpers import ROOT
+from helpers.browser import Tab
+from helpers.labels import cells
+from helpers.stores import noise
+from helpers.viewer import BANDS
+
+import gvtorch as gv
+from gvtorch.io.conversion import convert
+from gvtorch.viewer.state import Development
+
+pytestmark = pytest.mark.backend("browser")
+
+
+def differs(one: np.ndarray, other: np.ndarray) -> int:
+    return int(np.abs(one.astype(int) - other).max()) if one.shape == other.shape else 255
+
+
+def middle(tab: Tab, axis: str, x: float = 0.5, y: float = 0.5) -> tuple[float, float]:
+    """A place in the picture of a plane, in the page."""
+    left, top, width, height = tab.app(f"app.slices.layout.{axis}.image")
+    box, ratio = tab.page.locator(".gv-stage").bounding_box(), tab.app("app.view.ratio")
+    return (box["x"] + (left + x * width) / ratio, box["y"] + (top + y * height) / ratio)
+
+
+def with_slices(tab: Tab) -> np.ndarray:
+    tab.page.get_by_label("Three slices beside").click()
+    tab.until("!!app.slices.layout && app.view.head.final")
+    tab.page.wait_for_timeout(300)
+    return tab.final()
+
+
+def test_slices_are_moved_by_click_drag_and_wheel(tab, viewer):
+    alone = tab.final()
+    before = with_slices(tab)
+    assert differs(before, alone) > 60
+    place = viewer.session.ask(lambda: viewer.state.slices.at)
+    assert np.allclose(place, 19.5)
+    tab.page.mouse.click(*middle(tab, "z", 0.65, 0.25))  # x to the right, y down
+    tab.until(lambda: viewer.state.slices.at != place)
+    tab.final()
+    x, y, z = viewer.session.ask(lambda: viewer.state.slices.at)
+    assert abs(x - 25.5) < 0.5 and abs(y - 9.5) < 0.5 and z == 19.5
+    tab.page.mouse.move(*middle(tab, "z"))
+    for _ in range(4):
+        tab.page.mouse.wheel(0, 100)
+        tab.page.wait_for_timeout(30)
+    tab.until(lambda: viewer.state.slices.at[2] == 15.5)
+    tab.until("!app.before")
+    scrolled = tab.final()
+    left, top, width, height = tab.app("app.slices.layout.z.image")
+    part = np.s_[top : top + height, left : left + width]
+    assert differs(scrolled[part], before[part]) > 30
+    tab.drag(middle(tab, "x", 0.2, 0.2), middle(tab, "x", 0.8, 0.4))  # y to the right, z up
+    tab.until(lambda: abs(viewer.state.slices.at[1] - 31.5) < 0.6)
+    assert abs(viewer.state.slices.at[2] - 23.5) < 0.6
+    camera, steps = tab.app("app.camera.eye"), tab.app("app.history.done.length")
+    assert 4 <= steps <= 7  # on a busy machine the wheel rests in between
+    for _ in range(steps - 1):  # all but that there are slices
+        tab.page.get_by_label("Undo").click()
+    tab.until("app.state.slices.at.every((one) => one === 19.5)")
+    tab.page.get_by_label("Redo").click()
+    tab.until(lambda: abs(viewer.state.slices.at[0] - 25.5) < 0.5)
+    # The picture in its part is turned as before; the planes stay.
+    area = tab.app("app.view.area")
+    box = tab.page.locator(".gv-stage").bounding_box()
+    start = (box["x"] + area["left"] + area["width"] / 2, box["y"] + area["top"] + 60)
+    tab.drag(start, (start[0] + 40, start[1] + 10))
+    tab.until(lambda: not np.allclose(tab.app("app.camera.eye"), camera))
+    tab.page.get_by_label("Three slices beside").click()
+    tab.until("!app.view.head.layout && app.view.head.final")
+    assert viewer.state.slices is None
+
+
+def test_a_double_click_beside_planes_looks_at_what_is_hit(tab):
+    seen = with_slices(tab).max(-1)
+    left, top, width, height = tab.app("app.view.part")
+    rows, columns = np.nonzero(seen[top : top + height, left : left + width] > 150)
+    box, ratio = tab.page.locator(".gv-stage").bounding_box(), tab.app("app.view.ratio")
+    tab.page.mouse.dblclick(
+        box["x"] + (left + columns.mean()) / ratio, box["y"] + (top + rows.mean()) / ratio
+    )
+    tab.page.wait_for_timeout(700)
+    centre = np.array([0.65, 0.5, 0.4]) * 40 - 0.5
+    assert 3 < np.linalg.norm(np.subtract(tab.app("app.camera.target"), centre)) < 10
+
+
+def handle(tab: Tab, kind: str) -> tuple[float, float]:
+    """Where a handle is in the page."""
+    x, y, ratio = tab.app(
+        f"[...app.view.handles.find((h) => h.kind === '{kind}').at, app.view.ratio]"
+    )
+    box = tab.page.locator(".gv-stage").bounding_box()
+    return (box["x"] + x / ratio, box["y"] + y / ratio)
+
+
+def test_a_plane_is_moved_and_tilted_by_its_handles(tab, viewer):
+    before = tab.final()
+    tab.open("Clip")
+    tab.page.get_by_text("add one facing me").click()
+    tab.until("app.state.options.clip?.planes.length === 1")
+    faced = tab.app("app.state.options.clip.planes[0]")
+    tab.drag((200, 330), (330, 330))  # turned, so that the plane is seen from the side
+    tab.page.wait_for_timeout(250)
+    tab.until(lambda: differs(tab.final(), before) > 60)
+    cut = tab.final()
+    x, y = handle(tab, "plane")
+    dx, dy = tab.app("app.view.handles.find((h) => h.kind === 'plane').step")
+    span = np.hypot(dx, dy)
+    tab.drag((x, y), (x + 25 * dx / span, y + 25 * dy / span))
+    tab.until(lambda: viewer.state.options.clip.planes[0][3] != faced[3])
+    moved = viewer.session.ask(lambda: list(viewer.state.options.clip.planes[0]))
+    assert np.allclose(moved[:3], faced[:3]) and moved[3] > faced[3] + 0.02
+    assert differs(tab.final(), cut) > 30
+    # The handle followed the pointer.
+    assert np.allclose(handle(tab, "plane"), (x + 25 * dx / span, y + 25 * dy / span), atol=3)
+    anchor, (x, y) = handle(tab, "plane"), handle(tab, "tilt")
+    tab.drag((x, y), (x, y - 30))
+    tab.until(lambda: not np.allclose(viewer.state.options.clip.planes[0][:3], faced[:3]))
+    tilted = viewer.session.ask(lambda: list(viewer.state.options.clip.planes[0]))
+    assert abs(np.linalg.norm(tilted[:3]) - 1) < 1e-9 and np.dot(tilted[:3], faced[:3]) < 0.99
+    assert handle(tab, "tilt")[1] < y - 8 and np.allclose(handle(tab, "plane"), anchor, atol=40)
+    for _ in range(3):
+        tab.page.get_by_label("Undo").click()
+    tab.until("app.state.options.clip === null")
+
+
+def test_labels_are_coloured_and_hidden_by_their_table(chromium):
+    data = cells((24, 24, 24), 30, seed=2, dtype=np.uint8)
+    state = gv.ViewState(shader=gv.Labels(lit=False), develop=Development(samples=1))
+    with gv.view(gv.Volume(data, labels=True), state=state, browser=False, wait=False) as viewer:
+        tab = Tab(chromium, viewer.url)
+        tab.until("app?.state")
+        before = tab.final()
+        assert tab.page.locator(".gv-label").count() == 30
+        tab.page.locator("input[placeholder='find a label']").fill("17")
+        row = tab.page.locator(".gv-label:has-text('17')")
+        tab.until(lambda: tab.page.locator(".gv-label").count() == 1)
+        row.get_by_text("only").click()
+        tab.until(lambda: viewer.state.shader.visible == [17])
+        tab.until(lambda: differs(tab.final(), before) > 60)
+        assert (tab.final().max(-1) > 30).sum() > 10
+        row.locator("input[type=color]").evaluate(
+            "(e) => { e.value = '#ff0000'; e.dispatchEvent(new Event('input'));"
+            " e.dispatchEvent(new Event('change')); }"
+        )
+        tab.until(lambda: viewer.state.shader.colors == {17: [1, 0, 0]})
+        tab.until(lambda: tab.final()[..., 0].max() > 200 and tab.final()[..., 1].max() < 60)
+        tab.page.get_by_role("button", name="all", exact=True).click()
+        tab.until(lambda: viewer.state.shader.visible is None)
+        row.locator("input[type=checkbox]").uncheck()
+        tab.until(lambda: viewer.state.shader.visible == [n for n in range(1, 30) if n != 17])
+        for _ in range(4):
+            tab.page.get_by_label("Undo").click()
+        tab.until(lambda: viewer.state.shader.visible is None)
+        tab.until(lambda: differs(tab.final(), before) <= 3)
+        assert viewer.state.shader.colors is None and not tab.complaints
+        tab.close()
+
+
+@pytest.fixture(scope="module")
+def beat(tmp_path_factory) -> str:
+    folder = tmp_path_factory.mktemp("times")
+    data = np.stack([noise((20, 24, 28, 1), seed=n)[..., 0] // (3 - n) for n in range(3)])
+    np.save(folder / "beat.npy", data)
+    convert(folder / "beat.npy", folder / "beat.zarr", axes="tzyx")
+    return str(folder / "beat.zarr")
+
+
+def test_time_is_slid_and_played(chromium, beat):
+    state = gv.ViewState(shader=BANDS, develop=Development(samples=1))
+    with gv.view(beat, state=state, browser=False, wait=False) as viewer:
+        tab = Tab(chromium, viewer.url)
+        tab.until("app?.state")
+        before = tab.final()
+        assert "1 of 3" in tab.page.locator(".gv-time").inner_text()
+        tab.page.locator(".gv-time input").evaluate(
+            "(e) => { e.value = 2; e.dispatchEvent(new Event('input'));"
+            " e.dispatchEvent(new Event('change')); }"
+        )
+        tab.until("app.view.head.time === 2 && app.view.head.final")
+        assert differs(tab.final(), before) > 20 and viewer.state.time == 2
+        tab.page.get_by_label("Undo").click()
+        tab.until("app.view.head.time === 0 && app.view.head.final")
+        assert differs(tab.final(), before) <= 3
+        tab.page.get_by_role("button", name="Play").click()
+        for time in (1, 2, 0):
+            tab.until(f"app.view.head.time === {time}")
+        tab.page.get_by_role("button", name="Stop").click()
+        tab.until("!app.times.playing && !app.before")
+        assert not tab.complaints
+        tab.close()
+
+
+class Grown(torch.nn.Module):
+    """A ball whose radius is the time."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("time", torch.tensor(3.0))
+
+    def forward(self, points):
+        return (points.norm(dim=-1, keepdim=True) < self.time).float()
+
+
+def test_a_clock_has_a_slider(chromium):
+    producer = gv.FieldProducer(Grown(), 32, box=((-10, -10, -10), (10, 10, 10)))
+    function = gv.TransferFunction([(0.4, 0), (0.6, 1)])
+    with gv.view(producer, function, browser=False, wait=False) as viewer:
+        tab = Tab(chromium, viewer.url)
+        tab.until("app?.state")
+        before = (tab.final() > 100).sum()
+        tab.page.locator(".gv-time input").evaluate(
+            "(e) => { e.value = 8; e.dispatchEvent(new Event('change')); }"
+        )
+        tab.until("app.view.head.time === 8 && app.view.head.final")
+        assert (tab.final() > 100).sum() > 3 * before and producer.time == 8
+        assert not tab.complaints
+        tab.close()
+
+
+def strokes(tab: Tab) -> np.ndarray:
+    """(h, w) alpha of what is drawn over the picture."""
+    found = tab.page.evaluate(
+        """() => { const c = document.querySelector(".gv-over");
+        return [...c.getContext("2d").getImageData(0, 0, c.width, c.height).data]; }"""
+    )
+    return np.array(found, np.uint8).reshape(420, -1, 4)[..., 3]
+
+
+def test_node_boxes_are_drawn_over_the_picture(tab):
+    before = (strokes(tab) > 0).sum()
+    tab.page.locator(".gv-tick:has-text('nodes') input").check()
+    tab.until("app.nodes.told?.boxes.length > 0")
+    drawn = (strokes(tab) > 0).sum()
+    assert drawn > before + 2000
+    told, box = tab.app("app.nodes.told"), np.array(tab.app("app.box"))
+    ends = np.array(tab.app("app.nodes.told.boxes.map((_, n) => app.nodes.box(n))"))
+    assert (ends[:, 0] >= box[0] - 1e-6).all() and (ends[:, 1] <= box[1] + 1e-6).all()
+    assert (ends[:, 1] > ends[:, 0]).all() and told["count"] == len(ends)
+    tab.drag((340, 210), (400, 230))
+    tab.page.wait_for_timeout(300)
+    tab.final()
+    tab.page.locator(".gv-tick:has-text('nodes') input").uncheck()
+    tab.page.wait_for_timeout(100)
+    assert (strokes(tab) > 0).sum() < before + 1000
+
+
+def test_costs_lie_over_the_picture(tab, viewer):
+    before = tab.final()
+    tab.page.locator("label.gv-row:has-text('show') select").select_option("samples")
+    tab.until(lambda: viewer.state.show == "samples")
+    tab.until(lambda: differs(tab.final(), before) > 60)
+    whole = tab.final()
+    row = tab.page.locator("label.gv-row:has-text('blend') input[type=number]")
+    row.fill("0.5")
+    row.press("Enter")
+    tab.until(lambda: viewer.state.blend == 0.5)
+    tab.until(lambda: differs(tab.final(), whole) > 20)
+    assert differs(tab.final(), before) > 20
+    tab.page.get_by_label("Undo").click()
+    tab.page.get_by_label("Undo").click()
+    tab.until(lambda: viewer.state.show == "picture")
+    tab.until(lambda: differs(tab.final(), before) <= 3)
+
+
+def choose(tab: Tab, path) -> None:
+    """Loads a file of a transfer function."""
+    with tab.page.expect_file_chooser() as chooser:
+        tab.page.get_by_label("Load a transfer function").click()
+    chooser.value.set_files(path)
+
+
+def test_presets_of_files_and_of_ones_own(tab, viewer, tmp_path):
+    choose(tab, ROOT / "tests" / "paraview_presets.json")
+    select = tab.page.locator(".gv-bar select").first
+    tab.until("app.presets.file?.names.length > 3")
+    before = viewer.session.ask(viewer.state.shader.to_json)
+    select.select_option("HSV")
+    tab.until(lambda: viewer.session.ask(viewer.state.shader.to_json) != before)
+    expected = gv.TransferFunction.from_file(ROOT / "tests" / "paraview_presets.json", "HSV")
+    found = viewer.session.ask(viewer.state.shader.color.tolist)
+    assert expected.relative and len(found) == len(expected.color) > 1000
+    ends = expected.stretched(0, 255)  # those of the function before
+    assert np.allclose(found, ends.color, atol=1e-9)
+    attributes = 'scalarOpacity="4 0 0 9 1" colorTransfer="8 0 1 0 0 9 0 0 1"'
+    both = "".join(f'<VolumeProperty name="{name}" {attributes}/>' for name in ("CT-A", "MR-B"))
+    (tmp_path / "presets.xml").write_text(f"<MRML>{both}</MRML>")
+    choose(tab, tmp_path / "presets.xml")
+    tab.until("app.presets.file.names.length === 2")
+    select.select_option("MR-B")
+    tab.until("app.transfer().opacity.at(-1)[0] === 9")
+    name = tab.page.locator("input[placeholder='name']")
+    target = tab.page.locator("select[title='Where these colours are saved']")
+    for where, file in (("save file", "few.json"), ("ParaView", "paraview.json")):
+        target.select_option(where)
+        name.fill("few")
+        with tab.page.expect_download() as saved:
+            tab.page.get_by_title("Save these colours").click()
+        assert saved.value.suggested_filename == file
+        saved.value.save_as(tmp_path / file)
+        assert gv.TransferFunction.from_file(tmp_path / file).opacity[-1, 0] == 9
+    target.select_option("save mine")
+    name.fill("my colours")
+    name.press("Enter")
+    tab.until("!!document.querySelector(\".gv-bar optgroup[label='mine']\")")
+    select.select_option("galaxy")
+    tab.until("app.transfer().opacity.length === 6")
+    tab.page.reload()
+    tab.until("app?.state")
+    tab.final()
+    tab.page.locator(".gv-bar select").first.select_option("my colours")
+    tab.until("app.transfer().opacity.at(-1)[0] === 9")
+    tab.page.get_by_text("forget").click()
+    tab.until("!document.querySelector(\".gv-bar optgroup[label='mine']\")")
+    (tmp_path / "bad.json").write_text('{"opacity": [[1, 0], [0, 1]]}')
+    choose(tab, tmp_path / "bad.json")
+    note = tab.page.locator(".gv-note.gv-bad")
+    tab.until(lambda: "bad.json" in note.inner_text() if note.count() else False)
+    assert tab.app("app.transfer().opacity.at(-1)[0]") == 9
+
+
+def test_every_edit_is_undone_and_done_again(tab, viewer, tmp_path):
+    """Of the state, the camera's fields, memory, and a state that was loaded."""
+    first = viewer.session.ask(viewer.state.to_json)
+    for section in ("Sampling", "Camera", "Memory"):
+        tab.open(section)
+
+    def fill(name: str, value: str) -> None:
+        row = tab.page.locator(f"label.gv-row:has(> .gv-name:text-is('{name}')) input")
+        row.last.fill(value)
+        row.last.press("Enter")
+
+    fill("step", "0.8")
+    fill("fov", "41")
+    fill("brick pool", "2 MB")
+    options = viewer.session.scene.engine
+    tab.until(lambda: viewer.session.scene.engine.options.brick_pool == "2 MB")
+    was = options.options.brick_pool
+    state = {**first, "develop": {**first["develop"], "exposure": 1.5}}
+    (tmp_path / "view.json").write_text(json.dumps({**state, "camera": None}))
+    with tab.page.expect_file_chooser() as chooser:
+        tab.page.get_by_label("Load what was saved").click()
+    chooser.value.set_files(tmp_path / "view.json")
+    tab.until(lambda: viewer.state.develop.exposure == 1.5)
+    tab.page.get_by_label("Undo").click()
+    tab.until(lambda: viewer.state.develop.exposure == 0 and viewer.state.options.step == 0.8)
+    tab.page.get_by_label("Undo").click()
+    tab.until(lambda: viewer.session.scene.engine.options.brick_pool == was)
+    tab.page.get_by_label("Undo").click()
+    tab.until("app.camera.fov === 30")
+    tab.page.get_by_label("Undo").click()
+    tab.until(lambda: viewer.state.options.step == first["options"]["step"])
+    for _ in range(4):
+        tab.page.get_by_label("Redo").click()
+    tab.until(lambda: viewer.state.develop.exposure == 1.5)
+    tab.until("app.camera.fov === 41")
+    tab.until(lambda: viewer.session.scene.engine.options.brick_pool == "2 MB")
+    tab.final()
