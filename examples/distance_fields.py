@@ -1,6 +1,6 @@
 """A lantern out of distance fields: shapes united, cut, hollowed, twisted and blended.
 
-512^3 voxels, of which only those near the surface are made: the rest is proven empty or full.
+400^3 voxels, of which only those near the surface are made: the rest is proven empty or full.
 """
 
 from dataclasses import dataclass
@@ -39,8 +39,8 @@ class Settings:
     """Renders the lantern."""
 
     output: Path = Path("distance_fields.png")
-    size: int = 720
-    extent: int = 512
+    size: int = 540
+    extent: int = 400
     device: str = "cpu"
 
 

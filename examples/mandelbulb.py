@@ -21,7 +21,7 @@ class Settings:
 
     output: Path = Path("mandelbulb.png")
     fractal: str = "bulb"
-    size: int = 720
+    size: int = 480
     extent: int = 512
     device: str = "cpu"
 

@@ -12,11 +12,10 @@ import tyro
 import gvtorch as gv
 
 BOX = 2.4  # world units along a side
-PLACES = (1.0, 6.0, 12.0, 18.0, 24.0, 29.0)  # of the six pictures: 2^-n of the box away
+PLACES = (1.0, 6.0, 10.0, 15.0, 20.0, 24.0)  # of the six pictures: 2^-n of the box away
 WAY = torch.nn.functional.normalize(torch.tensor([0.5, 0.32, 0.81]).double(), dim=0)
 COLORS = ((1.0, 0.8, 0.45), (0.75, 0.22, 0.12), (0.1, 0.18, 0.35))  # of three orbit traps
 HAZE = torch.tensor([0.30, 0.36, 0.46])
-OPTIONS = {"cone_scale": 2.4}
 
 
 @dataclass
@@ -24,7 +23,8 @@ class Settings:
     """Writes six places of the flight, side by side, and a film if it has frames."""
 
     output: Path = Path("mandelbulb_zoom.png")
-    size: int = 720
+    size: int = 320
+    cone_scale: float = 1.4  # pixels that a voxel is wide: below 1 it is as sharp as it gets
     film: Path = Path("mandelbulb_zoom.mp4")
     frames: int = 0
     budget: int = 4096  # most bricks a frame
@@ -62,12 +62,13 @@ def look(place: torch.Tensor, ways: torch.Tensor, level: float, width: int, heig
 def fly(engine: gv.Engine, route: tuple[torch.Tensor, torch.Tensor], settings: Settings) -> None:
     """Films the way from 2^-4 to 2^-30 of the box, and tells how long each frame took."""
     height, width, took = settings.size, settings.size * 16 // 9 // 2 * 2, []
-    engine.render(*look(*route, 4.0, width, height), **OPTIONS)  # where it begins
+    options = {"cone_scale": settings.cone_scale}
+    engine.render(*look(*route, 4.0, width, height), **options)  # where it begins
     with gv.Video(settings.film, width, height, fps=30) as film:
         for level in torch.linspace(4, 30, settings.frames).tolist():
             camera, stone = look(*route, level, width, height)
             began = time.perf_counter()
-            picture, stats = engine.frame(camera, stone, **OPTIONS)
+            picture, stats = engine.frame(camera, stone, **options)
             misses = stats.misses  # waits for the device
             took.append(1e3 * (time.perf_counter() - began))
             film.add(picture)
@@ -82,17 +83,18 @@ def main(settings: Settings) -> None:
     route, solid = plan(shape), gv.Solid(shape, normals=False)
     producer = gv.FieldProducer(solid, 2**33, box=((-BOX / 2,) * 3, (BOX / 2,) * 3))
     limits = {"brick_pool": "512 MB", "load_budget": settings.budget}
+    options = {"cone_scale": settings.cone_scale}
     pictures, size = [], (settings.size * 16 // 27 + 1, settings.size // 2)
     with gv.Engine(producer, device=settings.device, **limits) as engine:
         if settings.frames:
             fly(engine, route, settings)
         for level in PLACES:
             camera, stone = look(*route, level, *size)
-            found = engine.render(camera, stone, **OPTIONS)  # without light: less is traced again
+            found = engine.render(camera, stone, **options)  # without light: less is traced again
             print(f"2^-{level:g} of the box: {found.stats}", flush=True)
             light = gv.Lighting(shadows=0, occlusion=1.0, reach=0.1 * BOX * 0.5**level)
-            lit = engine.frame(camera, stone, lighting=light, **OPTIONS)[0].to("cpu")
-            clear = lit.alpha * torch.exp(-0.5 * lit.depth / (BOX * 0.5**level))
+            lit = engine.frame(camera, stone, lighting=light, **options)[0].to("cpu")
+            clear = lit.alpha * torch.exp(-0.15 * lit.depth / (BOX * 0.5**level))
             pictures.append(replace(lit, color=1.15 * clear * lit.color + (1 - clear) * HAZE))
     both = {}
     for name in ("color", "alpha"):

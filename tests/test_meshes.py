@@ -169,7 +169,7 @@ def test_the_search_misses_no_triangle(reach, detail):
     geometry.detail = detail
     low = torch.from_numpy(places(mesh, 40, 3))
     size = torch.tensor([0.1, 0.1, reach], dtype=torch.float64).expand(40, 3).contiguous()
-    found = geometry.cubes(low, size, 8, 0.0, weights=True, wide=False)
+    found = geometry.cubes(low, size, 8, 0.0, shares=False, weights=True, wide=False)
     z, y, x = torch.meshgrid(*[torch.arange(8) * 0.1 + 0.05] * 3, indexing="ij")
     place = (low[:, None] + torch.stack((x, y, z), -1).view(-1, 3)).view(-1, 3)
     exact = torch.cat([distance_to(geometry.corner, part).amin(1) for part in place.split(2000)])

@@ -172,3 +172,26 @@ def test_what_does_not_matter_is_not_asked():
     assert Counted.asked == 0 and isinstance(near.shape, sdf.SmoothUnion)
     gv.Solid(shape).filtered(torch.zeros(7, 3), torch.ones(7, 3))
     assert Counted.asked > 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    "shape",
+    [
+        gv.Mandelbulb(8, iterations=6),
+        gv.Mandelbulb(7, iterations=12),
+        gv.Julia((-0.2, 0.5, 0.3), 2, iterations=12),
+        gv.Mandelbox(2.0, iterations=12),
+    ],
+    ids=lambda shape: f"{type(shape).__name__} {shape.iterations}",
+)
+def test_orbits_that_escaped_are_left_out_without_a_trace(shape, dtype, monkeypatch):
+    """Value and colour in the same bits as if all went on, and whichever points come together."""
+    points = random_points(3001, 2.4).to(dtype)
+    value, color = shape.surface(points)
+    assert torch.equal(shape(points), value) and (value > 0).any() and (value < 0).any()
+    assert torch.equal(shape.surface(points[7:1000])[1], color[7:1000])
+    assert shape(points[0]).shape == () and torch.equal(shape(points[0]), value[0])
+    monkeypatch.setattr(type(shape.iteration), "rounds_alike", False)
+    for one, other in zip(shape.surface(points), (value, color), strict=True):
+        assert torch.equal(one, other)

@@ -38,6 +38,7 @@ class Iteration(nn.Module):
     """One step of an orbit, without the constant that is added. Points are (3, ...)."""
 
     logarithmic: bool = True  # |z| grows as a power; else by a factor
+    rounds_alike: bool = False  # it takes + - * /, roots and comparisons alone
 
     def forward(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Returns f(z) and (...,) how far it takes neighbours apart, by unit of their distance."""
@@ -54,6 +55,8 @@ class Iteration(nn.Module):
 class Power(Iteration):
     """z^n in spherical coordinates: |z|^n, and both angles n times."""
 
+    rounds_alike = True
+
     def __init__(self, power: int) -> None:
         """Takes n."""
         super().__init__()
@@ -69,7 +72,7 @@ class Power(Iteration):
         cosine, sine = _power(x / away, y / away, self.power)
         height, width = _power(up, away, self.power)
         raised = torch.stack((width * cosine, width * sine, height))
-        return raised, self.power * radius ** (self.power - 1)
+        return raised, self.power * _product(radius, self.power - 1)
 
     def ranges(self, z: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Along radius and meridian n r^(n-1), along the circle of latitude that times
@@ -91,7 +94,7 @@ class Fold(Iteration):
     of radius 1/2 and 1, and all is scaled.
     """
 
-    logarithmic = False
+    logarithmic, rounds_alike = False, True
 
     def __init__(self, scale: float) -> None:
         """Takes the scale; its size must be more than 1."""
@@ -109,7 +112,7 @@ class Fold(Iteration):
 
     def forward(self, z: Tensor) -> tuple[Tensor, Tensor]:
         folded = 2 * z.clamp(-1, 1) - z
-        grown = 1 / (folded * folded).sum(0).clamp(0.25, 1.0)
+        grown = 1 / _squared(folded).clamp(0.25, 1.0)
         return folded * (grown * self.scale), grown * abs(self.scale)
 
     def ranges(self, z: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -176,23 +179,41 @@ class Fractal(Distance):
         """Distance, and how near the orbit came to the origin and to a plane of two axes, (...,)
         each.
         """
-        z = points.movedim(-1, 0).contiguous()
-        shape = (3,) + (1,) * (z.dim() - 1)
-        constant = self.constant.to(z).view(shape) if self.julia else z
-        apart, radius = torch.ones_like(z[0]), length(points)
-        near, plane = radius, z.abs().amin(0)
-        add = 0.0 if self.julia else 1.0
+        z = points.movedim(-1, 0).reshape(3, -1).contiguous()
+        constant = self.constant.to(z)[:, None] if self.julia else z
+        radius = length(points).flatten()
+        state = [torch.ones_like(radius), radius, *([radius, z.abs().amin(0)] if traps else [])]
+        whole, rows = state, None
+        looks = points.device.type == "cpu" and self.iteration.rounds_alike
+        looks = looks and not (points.requires_grad or torch.compiler.is_compiling())
         for _ in range(self.iterations):
-            alive = radius <= self.bailout
-            after, grown = self.iteration(z)
-            z = torch.where(alive, after + constant, z)
-            apart = torch.where(alive, grown * apart + add, apart)
-            radius = (z * z).sum(0).sqrt()
-            if traps:
-                near = torch.minimum(near, radius)
-                plane = torch.minimum(plane, z.abs().amin(0))
+            alive = state[1] <= self.bailout
+            if looks and 4 * int(alive.sum()) < 3 * len(alive):  # go on with those that are
+                kept, whole = alive.nonzero()[:, 0], _with(whole, rows, state)
+                rows = kept if rows is None else rows[kept]
+                z, constant = z[:, kept], constant if self.julia else constant[:, kept]
+                state, alive = [one[kept] for one in state], alive[kept]
+            z, state = self._step(z, constant, alive, state)
+        lead = points.shape[:-1]
+        apart, radius, *trapped = (one.view(lead) for one in _with(whole, rows, state))
         found = torch.where(radius <= self.bailout, -_INSIDE, self._estimate(radius, apart))
+        near, plane = trapped or (radius, radius)
         return found, near, plane
+
+    def _step(
+        self, z: Tensor, constant: Tensor, alive: Tensor, state: list[Tensor]
+    ) -> tuple[Tensor, list[Tensor]]:
+        """One step of those that are alive: z, how far neighbours are apart, the radius, and what
+        traps tell, if there are any.
+        """
+        after, grown = self.iteration(z)
+        z = torch.where(alive, after + constant, z)
+        apart = torch.where(alive, grown * state[0] + (0.0 if self.julia else 1.0), state[0])
+        radius = _squared(z).sqrt()
+        if len(state) == 2:
+            return z, [apart, radius]
+        near, plane = torch.minimum(state[2], radius), torch.minimum(state[3], z.abs().amin(0))
+        return z, [apart, radius, near, plane]
 
     def _estimate(self, radius: Tensor, apart: Tensor) -> Tensor:
         """A distance, of an orbit that has got to a radius while neighbours came apart."""
@@ -296,6 +317,27 @@ class Mandelbox(Fractal):
         """
         side = torch.tensor((-self._side, self._side), dtype=torch.float64)
         return side.to(self.colors_33.device)[:, None].expand(2, 3)
+
+
+def _with(whole: list[Tensor], rows: Tensor | None, part: list[Tensor]) -> list[Tensor]:
+    """Returns (n,) tensors in which some rows are those of others; None: all are."""
+    if rows is None:
+        return part
+    return [one.index_copy(0, rows, own) for one, own in zip(whole, part, strict=True)]
+
+
+def _squared(z: Tensor) -> Tensor:
+    """Returns (...,) squared lengths of (3, ...) vectors."""
+    x, y, up = z.unbind(0)
+    return x * x + y * y + up * up
+
+
+def _product(value: Tensor, n: int) -> Tensor:
+    """A number n times itself, n >= 1, by squares and products."""
+    if n == 1:
+        return value
+    root = _product(value, n // 2)
+    return root * root * value if n % 2 else root * root
 
 
 def _power(real: Tensor, imaginary: Tensor, n: int) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,7 @@ import functools
 import json
 import shutil
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
@@ -202,6 +202,8 @@ def _words(
     words += ["--box", ",".join(f"{n!r}" for end in box for n in end)] if box else []
     for name, given in names.items():
         if given is not None:
-            plain = isinstance(given, (str, float, int))
-            words += [f"--{name}", str(given) if plain else ",".join(given)]  # type: ignore[arg-type]
+            several = [str(given)]
+            if isinstance(given, Iterable) and not isinstance(given, str):
+                several = [str(one) for one in given]
+            words += [f"--{name}", ",".join(several)]
     return tuple(words)

@@ -386,14 +386,14 @@ def short(error: BaseException) -> str:
     return named(" ".join(text.split()))[:400] or type(error).__name__
 
 
-_process: int | None = None  # that uses tensorstore
+_users: set[int] = set()  # processes that use tensorstore: this one, one that it was forked from
 
 
 def check_process() -> None:
     """Raises StoreError in a process that was forked from one that had used tensorstore, which has
     lost its threads and would end the process.
     """
-    if _process not in (None, os.getpid()):
+    if _users - {os.getpid()}:
         raise StoreError(
             "stores can't be read in a process that was forked after one was opened: open the "
             "first one in the workers, or start these by 'spawn' or 'forkserver' "
@@ -406,8 +406,7 @@ def context() -> Any:
     """tensorstore's resources: no cache (the pools and their host cache are it), few threads."""
     import tensorstore as ts
 
-    global _process  # noqa: PLW0603
-    _process = os.getpid()
+    _users.add(os.getpid())
     return ts.Context(
         {
             "cache_pool": {"total_bytes_limit": 0},

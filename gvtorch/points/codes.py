@@ -4,8 +4,6 @@ which a point that is wider than a voxel is shared among several.
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 
 _MOST = 2**62  # codes of an int64
@@ -29,6 +27,7 @@ class Codes:
                 f"points: an extent of {side} has more voxels than a 64-bit number tells apart; "
                 "take a smaller one"
             )
+        self._places: dict[int, np.ndarray] = {}  # by side; a producer asks for one or two
         self._low = branching ** -(-self.digits // 2)
         at = np.arange(self._low)
         self._spread = np.zeros(self._low, np.int64)
@@ -45,13 +44,14 @@ class Codes:
             code += self._spread[high] * self._low**3
         return code
 
-    @functools.lru_cache(maxsize=8)  # noqa: B019, a producer has one
     def places(self, side: int) -> np.ndarray:
         """Returns (side^3, 3) x, y, z of the codes from 0 on; `side` is a power of N."""
-        at = np.indices((side,) * 3).reshape(3, -1).T
-        found = np.empty_like(at)
-        found[self.of(at)] = at
-        return found
+        if side not in self._places:
+            at = np.indices((side,) * 3).reshape(3, -1).T
+            found = np.empty_like(at)
+            found[self.of(at)] = at
+            self._places[side] = found
+        return self._places[side]
 
 
 def shares(edge: np.ndarray, center: np.ndarray, radius: np.ndarray) -> np.ndarray:

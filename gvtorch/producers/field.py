@@ -16,6 +16,7 @@ from ..pool import Channel
 from .producer import Bricks, Nodes, Producer, Region, Regions
 
 _BATCH = 64  # bricks that are made at a time on the CPU, whose caches then hold what is between
+_FEW = 12  # bricks: fewer at a time cost as much as parts of a field that do not matter in some
 _MARGIN = 1 / 32  # voxels by which boxes are taken wider, so that rounded places lie in them
 _ROUNDED = 2.0**-18  # relative width by which intervals are, for values are rounded too
 
@@ -268,8 +269,9 @@ def cache_field(
 def alike(
     field: nn.Module, nodes: Nodes, beyond: float, count: int
 ) -> Iterator[tuple[Tensor, nn.Module]]:
-    """Yields rows of at most so many nodes in which the same parts of a field matter, and these
-    parts, up to `beyond` voxels behind the brick's border. Waits for the device.
+    """Yields rows of at most so many nodes in which the same parts of a field matter, or nearly so
+    where these are few, and these parts, up to `beyond` voxels behind the brick's border. Waits for
+    the device.
     """
     if not isinstance(field, Field):
         yield from ((rows, field) for rows in torch.arange(len(nodes)).split(count))
@@ -277,7 +279,13 @@ def alike(
     center, layout = nodes.center, nodes.layout
     half = nodes.voxel_size * (0.5 * layout.brick_size + layout.border + beyond)
     _, kind = field.alike(center, half).unique(return_inverse=True)
+    groups: list[Tensor] = []
     for group in kind.argsort(stable=True).split(kind.bincount().tolist()):
+        if groups and len(groups[-1]) < _FEW:
+            groups[-1] = torch.cat((groups[-1], group))
+        else:
+            groups.append(group)
+    for group in groups:
         near = field.near(center[group], half[group])
         yield from ((rows, near) for rows in group.split(count))
 

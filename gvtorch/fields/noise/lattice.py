@@ -23,13 +23,14 @@ def as_points(where: str, points: Points) -> Tensor:
     Raises:
         ValueError: They are not that.
     """
-    whole = isinstance(points, Tensor)
-    axes = () if whole else tuple(points)
-    n = points.shape[-1] if isinstance(points, Tensor) and points.dim() else len(axes)
+    axes = (points,) if isinstance(points, Tensor) else tuple(points)
+    n = len(axes)
+    if isinstance(points, Tensor):
+        n = points.shape[-1] if points.dim() else 0
     if not 2 <= n <= 3 or not all(isinstance(one, Tensor) for one in axes):
         got = check.describe(points) if isinstance(points, Tensor) else f"{n} items"
         raise ValueError(f"{where}: points must be (..., n) or n tensors, n = 2 or 3, got {got}")
-    kinds = {one.dtype for one in axes} or {points.dtype}  # type: ignore[union-attr]
+    kinds = {one.dtype for one in axes}
     if len(kinds) > 1 or not kinds <= {torch.float32, torch.float64}:
         got = ", ".join(sorted(str(kind).removeprefix("torch.") for kind in kinds))
         raise ValueError(f"{where}: points must be float32 or float64, got {got}")
