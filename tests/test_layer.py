@@ -282,7 +282,9 @@ def test_on_cuda_nobody_waits_and_a_graph_reads_the_layer(blobs, alpha):
         depth = screen(view, middle(blobs), (0, 0, 1)).to(engine.device)
         layer = layer_of(depth, None if alpha is None else torch.full_like(depth, alpha))
         engine.render(view, GRAY)
-        engine.render(view, GRAY, layer=layer)
+        for move in (5, -5):  # what rays that begin there need is loaded, too
+            depth += move
+            engine.render(view, GRAY, layer=layer)
         graph = engine.capture(view, GRAY, layer=layer)
         with nobody_waits():
             engine.frame(view, GRAY, layer=layer)

@@ -20,6 +20,11 @@ template <class Shader>
 struct IsFiltered<Shader, std::void_t<decltype(Shader::kFiltered)>> : std::bool_constant<Shader::kFiltered> {};
 
 template <class Shader, class = void>
+struct IsColored : std::false_type {};
+template <class Shader>
+struct IsColored<Shader, std::void_t<decltype(Shader::kColored)>> : std::bool_constant<Shader::kColored> {};
+
+template <class Shader, class = void>
 struct ReadsAll : std::false_type {};
 template <class Shader>
 struct ReadsAll<Shader, std::void_t<decltype(Shader::kReadsAll)>> : std::bool_constant<Shader::kReadsAll> {};
@@ -38,7 +43,7 @@ struct ShadeRay : Walk<T> {
   using Sum = typename Shader::Sum;
   // Reads of a known dtype are no calls; a short shader's loop may be there twice. See for_each.h for blocks at once:
   // 128 or 64 registers a thread.
-  static constexpr bool kShort = !std::is_void_v<Voxel> && !Shader::kColored;
+  static constexpr bool kShort = !std::is_void_v<Voxel> && !IsColored<Shader>::value;
   static constexpr int kBlocksAtOnce = kShort && !IsFiltered<Shader>::value ? 8 : 4;
   static constexpr bool kHidesAlike = HidesAlike<Shader>::value;
   Shader shader;
