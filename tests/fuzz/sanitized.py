@@ -19,7 +19,7 @@ import sys
 from pathlib import Path
 from unittest import mock
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).resolve().parents[2]
 UNDEFINED = (
     *("bounds", "shift", "signed-integer-overflow", "integer-divide-by-zero", "bool", "enum"),
     *("return", "unreachable"),
