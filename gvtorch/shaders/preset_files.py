@@ -233,6 +233,8 @@ def _points(
     """Opacity and linear colour on one grid, from sRGB nodes, which may have a midpoint and a
     sharpness too.
     """
+    if not len(nodes) or not len(opacity):
+        raise ValueError("holds no points")
     nodes = nodes[np.argsort(nodes[:, 0], kind="stable")]
     if not (np.isfinite(opacity).all() and np.isfinite(nodes).all()):
         raise ValueError("its numbers must be finite")

@@ -56,12 +56,13 @@ def broken(content: bytes, pick: random.Random) -> bytes:
     return bytes(made)
 
 
-Attempt = Callable[[random.Random], tuple[str, bytes, str]]
+Attempt = Callable[[random.Random], tuple[str, Callable[[], bytes], str]]
 
 
 def first_fault(kind: str, attempt: Attempt) -> str:
-    """Runs `attempt` for seeds; it returns what went wrong, or "", the input, and its name. Returns
-    what went wrong first, or took too long or too much memory, or "". A signal ends the tests.
+    """Runs `attempt` for seeds; it returns what went wrong, or "", what gives the input, and the
+    input's name. Returns what went wrong first, or took too long or too much memory, or "". A
+    signal ends the tests.
     """
     begun, seed = time.monotonic(), 0
     begin = random.randrange(10**9) if SECONDS else 0
@@ -75,7 +76,7 @@ def first_fault(kind: str, attempt: Attempt) -> str:
             wrong = wrong or f"{more / 1e9:.1f} GB"
         if wrong:
             if SECONDS:
-                (FOUND / f"{kind}-{begin + seed}-{name}").write_bytes(content)
+                (FOUND / f"{kind}-{begin + seed}-{name}").write_bytes(content())
             return f"{kind} {begin + seed}: {wrong}"
         seed += 1
     rate = seed / (time.monotonic() - begun)
@@ -140,11 +141,11 @@ def test_readers(tmp_path_factory):
     """A broken file is read, or refused in one line."""
     whole, folder = volumes(tmp_path_factory.mktemp("whole")), tmp_path_factory.mktemp("broken")
 
-    def attempt(pick: random.Random) -> tuple[str, bytes, str]:
+    def attempt(pick: random.Random) -> tuple[str, Callable[[], bytes], str]:
         name = pick.choice(sorted(whole))
         content = broken(whole[name], pick)
         (folder / name).write_bytes(content)
-        return outcome(lambda: gv.read_volume(folder / name, nan=0)), content, name
+        return outcome(lambda: gv.read_volume(folder / name, nan=0)), lambda: content, name
 
     assert not first_fault("reader", attempt)
 
@@ -159,7 +160,7 @@ def test_metadata_of_stores(tmp_path):
     files = sorted(file for file in target.rglob("*") if file.is_file())
     whole = {file: file.read_bytes() for file in files}
 
-    def attempt(pick: random.Random) -> tuple[str, bytes, str]:
+    def attempt(pick: random.Random) -> tuple[str, Callable[[], bytes], str]:
         file = pick.choice(files)
         content = broken(whole[file], pick)
         file.write_bytes(content)
@@ -172,7 +173,7 @@ def test_metadata_of_stores(tmp_path):
 
         wrong = outcome(read)
         file.write_bytes(whole[file])
-        return wrong, content, file.name
+        return wrong, lambda: content, file.name
 
     assert not first_fault("store", attempt)
 
@@ -212,13 +213,13 @@ def test_json_of_every_kind(tmp_path):
     )  # fmt: skip
     whole = {name: json.loads((tmp_path / name).read_text()) for name in kinds}
 
-    def attempt(pick: random.Random) -> tuple[str, bytes, str]:
+    def attempt(pick: random.Random) -> tuple[str, Callable[[], bytes], str]:
         name = pick.choice(sorted(kinds))
         text = json.dumps(changed(whole[name], pick)).encode()
         text = broken(text, pick) if pick.random() < 0.3 else text
         file = tmp_path / f"broken_{name}"
         file.write_bytes(text)
-        return outcome(lambda: kinds[name](file)), text, name
+        return outcome(lambda: kinds[name](file)), lambda: text, name
 
     assert not first_fault("json", attempt)
 
@@ -260,7 +261,7 @@ def test_arguments_of_ops(blobs):
     }
     assert set(known) <= set(FAKES)
 
-    def attempt(pick: random.Random) -> tuple[str, bytes, str]:
+    def attempt(pick: random.Random) -> tuple[str, Callable[[], bytes], str]:
         name = pick.choice(sorted(known))
         values = [v.clone() if isinstance(v, torch.Tensor) else v for v in known[name]]
         for _ in range(pick.choice((1, 1, 2))):
@@ -282,7 +283,7 @@ def test_arguments_of_ops(blobs):
                 )
         op = getattr(torch.ops.gvtorch, name)
         told = outcome(lambda: op(*values), RuntimeError, TypeError)
-        return told, repr(values).encode(), name
+        return told, lambda: repr(values).encode(), name
 
     assert not first_fault("op", attempt)
 

@@ -25,6 +25,7 @@ template <class T>
 struct LanesOf {
   using Real = T;
   using Int = int32_t;
+  using Word = uint32_t;  // sums wrap
   using Index = int64_t;  // into a table
   using Mask = bool;
   using Pointer = T*;
@@ -101,6 +102,7 @@ template <>
 struct LanesOf<Floats> {
   using Real = float;
   using Int = Ints;
+  using Word = Words;
   using Index = Ints;
   using Mask = Ints;
   using Pointer = LanePointers;
@@ -148,6 +150,8 @@ using RealOf = typename LanesOf<T>::Real;
 template <class T>
 using IntOf = typename LanesOf<T>::Int;
 template <class T>
+using WordOf = typename LanesOf<T>::Word;
+template <class T>
 using MaskOf = typename LanesOf<T>::Mask;
 template <class T>
 GV_HD MaskOf<T> all_lanes() {
@@ -156,11 +160,12 @@ GV_HD MaskOf<T> all_lanes() {
 template <class T>
 constexpr bool kPacket = LanesOf<T>::kPacket;
 
-// floor of a value that fits an int32. Without SSE4.1 (the baseline of x86-64) std::floor is a call.
+// floor of a value that fits an int32; lanes that are not asked for may hold any. Without SSE4.1 (the baseline of
+// x86-64) std::floor is a call.
 template <class T>
 GV_HD IntOf<T> floor_int(T value) {
   const IntOf<T> whole = truncated(value);
-  return select(to_real<T>(whole) > value, whole - 1, whole);
+  return select(to_real<T>(whole) > value, bit_cast<IntOf<T>>(bit_cast<WordOf<T>>(whole) - 1u), whole);
 }
 
 // Base-2 logarithm of a positive, normal float.
@@ -203,7 +208,7 @@ GV_HD T exp2_exact(T value) {
   const auto whole = floor_int(x + 0.5f);
   const T f = x - to_real<T>(whole);
   const T series = exp2_slope(f) * f + 1.0f;
-  return select(normal, series * bit_cast<T>((whole + 127) << 23), T{});
+  return select(normal, series * bit_cast<T>((bit_cast<WordOf<T>>(whole) + 127u) << 23), T{});
 }
 
 GV_HD double log2_exact(double value) { return ::log2(value); }
