@@ -46,8 +46,8 @@ class Settings:
     source: Literal["store", "formula", "mandelbulb"] = "store"
     pools: tuple[str, ...] = ("512 MB", "128 MB", "32 MB", "8 MB")
     loading: str = "straight"
-    workers: int = 4
-    """threads that read the store"""
+    workers: int = 2
+    """threads that read the store: on one's own disk more of them only wait for one another"""
     graph: bool = True
     """on CUDA: each frame is one graph"""
     device: str = "cpu"

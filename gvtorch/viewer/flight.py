@@ -35,6 +35,7 @@ _ORDERED = {
     ("TransferFunction", "opacity"): (2, 0, slice(0, 1)),  # dimensions, axis, columns of the last
     ("TransferFunction", "color"): (2, 0, slice(0, 1)),
     ("ChannelLook", "window"): (1, 0, slice(None)),
+    ("Slices", "window"): (1, 0, slice(None)),
     ("Clip", "boxes"): (3, 1, slice(None)),
     ("Clip", "without"): (3, 1, slice(None)),
 }
