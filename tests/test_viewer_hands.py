@@ -339,12 +339,11 @@ def test_every_edit_is_undone_and_done_again(tab, viewer, tmp_path):
         row.last.fill(value)
         row.last.press("Enter")
 
+    was = viewer.session.ask(lambda: viewer.session.scene.engine.options.brick_pool)
     fill("step", "0.8")
     fill("fov", "41")
     fill("brick pool", "2 MB")
-    options = viewer.session.scene.engine
     tab.until(lambda: viewer.session.scene.engine.options.brick_pool == "2 MB")
-    was = options.options.brick_pool
     state = {**first, "develop": {**first["develop"], "exposure": 1.5}}
     (tmp_path / "view.json").write_text(json.dumps({**state, "camera": None}))
     with tab.page.expect_file_chooser() as chooser:
@@ -365,3 +364,42 @@ def test_every_edit_is_undone_and_done_again(tab, viewer, tmp_path):
     tab.until("app.camera.fov === 41")
     tab.until(lambda: viewer.session.scene.engine.options.brick_pool == "2 MB")
     tab.final()
+
+
+def test_views_become_the_keys_of_a_film(tab, viewer, tmp_path):
+    """What `gvtorch fly --keys` reads; keys are shown, moved, taken away, undone and loaded."""
+    tab.open("Film")
+    tab.page.get_by_text("add this view").click()
+    first = tab.app("app.camera")
+    tab.drag((200, 330), (330, 360))
+    tab.until(lambda: tab.app("app.camera.eye") != first["eye"])
+    second = tab.app("app.camera")
+    tab.page.get_by_text("add this view").click()
+    times = tab.page.locator("input[title='Seconds']")
+    times.nth(1).fill("3.5")
+    times.nth(1).press("Enter")
+    tab.until("app.film.keys[1].time === 3.5")
+    with tab.page.expect_download() as saved:
+        tab.page.get_by_label("Save the keys").click()
+    assert saved.value.suggested_filename == "keys.json"
+    saved.value.save_as(tmp_path / "keys.json")
+    flight = gv.Flight.read(tmp_path / "keys.json", viewer.session.ask(lambda: viewer.state))
+    assert len(flight) == 2 and flight.seconds == 3.5
+    for time, camera in ((0, first), (3.5, second)):
+        assert np.allclose(flight.at(time).camera.eye, camera["eye"])
+    tab.page.get_by_title("Show this key").first.click()
+    tab.until(lambda: tab.app("app.camera.eye") == first["eye"])
+    times.nth(1).fill("0")  # the first has it
+    times.nth(1).press("Enter")
+    tab.until("!!document.querySelector('.gv-note.gv-bad')")
+    assert times.nth(1).input_value() == "3.5"
+    tab.page.get_by_title("Remove this key").first.click()
+    tab.until("app.film.keys.length === 1 && app.film.keys[0].time === 3.5")
+    tab.page.get_by_label("Undo").click()
+    tab.until("app.film.keys.length === 2")
+    (tmp_path / "bad.json").write_text('[{"time": 0}]')
+    for file, count in (("bad.json", 2), ("keys.json", 2)):
+        with tab.page.expect_file_chooser() as chooser:
+            tab.page.get_by_label("Load keys").click()
+        chooser.value.set_files(tmp_path / file)
+        tab.until(f"app.film.keys.length === {count}")

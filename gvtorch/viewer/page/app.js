@@ -2,6 +2,7 @@
 import { between, distance, facing } from "./camera.js";
 import { el, iconButton, keep, openJson } from "./dom.js";
 import { ClipEditor } from "./clip.js";
+import { Film } from "./film.js";
 import { History } from "./history.js";
 import { Link } from "./link.js";
 import { MonitorView } from "./monitor.js";
@@ -46,6 +47,7 @@ export class App {
     this.slices = new SlicesView(this, this.view);
     this.nodes = new NodeBoxes(this);
     this.times = new TimeBar(this);
+    this.film = new Film(this);
     this.presets = new Presets(this);
     this.monitor = new MonitorView(this);
     this.pointer = new Pointer(this, this.view);

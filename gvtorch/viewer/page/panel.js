@@ -68,6 +68,7 @@ export class Panel {
       this.section("Sampling", this.controls.fields(state.options, put("options"), { only: ["step", "lod", "stop_alpha", "depth_alpha", "cone_scale"] })),
       this.section("Scene", this.parameters()),
       this.section("Camera", this.camera()),
+      this.section("Film", app.film.rows()),
       this.section("Memory", this.memory()),
       this.section("Monitor", app.monitor.element),
     ];

@@ -1,0 +1,54 @@
+// Key frames: what this page shows, each at a time, as `gvtorch fly --keys` takes them.
+import { el, iconButton, keep, openJson } from "./dom.js";
+
+const APART = 2;  // seconds from a key to the next
+
+export class Film {
+  constructor(app) {
+    this.app = app;
+    this.keys = [];  // {time, state}, by time
+  }
+
+  /** Rows of the panel. */
+  rows() {
+    const keys = this.keys.map((key, at) => {
+      const time = el("input", { type: "number", min: 0, step: 0.5, value: key.time, title: "Seconds", onchange: () => this.move(at, time.valueAsNumber) });
+      const button = (text, title, onclick) => el("button.gv-small", { type: "button", title, onclick }, text);
+      return el("div.gv-row", {}, el("span.gv-name", {}, `key ${at + 1}`), el("span.gv-both", {}, time,
+        button("show", "Show this key", () => this.app.load(key.state)),
+        button("remove", "Remove this key", () => this.put(this.keys.filter((one) => one !== key)))));
+    });
+    return [...keys, el("div.gv-bar", {},
+      el("button.gv-small", { type: "button", title: "What is shown now, after the last key", onclick: () => this.add() }, "add this view"),
+      el("span.gv-gap"),
+      this.keys.length ? iconButton("save", "Save the keys (JSON): gvtorch fly --keys", () => keep("keys.json", JSON.stringify(this.keys, null, 1), "application/json")) : null,
+      iconButton("open", "Load keys that were saved (JSON)", () => openJson((keys) => this.load(keys), (why) => this.app.say(why, true))))];
+  }
+
+  add() {
+    const time = this.keys.length ? this.keys.at(-1).time + APART : 0;
+    this.put([...this.keys, { time, state: { ...this.app.state, camera: this.app.camera } }]);
+  }
+
+  /** Gives a key another time. */
+  move(at, time) {
+    if (Number.isFinite(time) && !this.keys.some((key, n) => n !== at && key.time === time)) {
+      return this.put(this.keys.map((key, n) => (n === at ? { ...key, time } : key)));
+    }
+    this.app.say("each key has a time of its own", true);
+    this.app.refresh();
+  }
+
+  load(keys) {
+    const whole = (key) => Number.isFinite(key?.time) && key.state?.camera && key.state.shader;
+    if (Array.isArray(keys) && keys.length && keys.every(whole) && new Set(keys.map((key) => key.time)).size === keys.length) return this.put(keys);
+    this.app.say("these are no keys: each must have a time of its own, in seconds, and a whole state", true);
+  }
+
+  put(keys) {
+    const before = this.keys, after = [...keys].sort((a, b) => a.time - b.time);
+    const set = (one) => { this.keys = one; this.app.refresh(); };
+    this.app.history.push(() => set(before), () => set(after));
+    set(after);
+  }
+}
