@@ -45,7 +45,8 @@ gallery: $(VENV)/ready
 	done
 
 test: $(VENV)/ready
-	OMP_NUM_THREADS=1 GVTORCH_REQUIRE=$(REQUIRE) $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal $(ARGS)
+	OMP_NUM_THREADS=1 GVTORCH_REQUIRE=$(REQUIRE) $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal \
+	  --durations 20 --durations-min 5 $(ARGS)
 
 FRAMES ?= 100000
 soak: $(VENV)/ready
