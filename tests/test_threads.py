@@ -84,6 +84,7 @@ def test_captured_frames_answer_while_another_thread_renders(blobs):
                     frames.frame()
 
         at_once(look, 2)
+        assert engine.frames >= 30
         engine.validate()
 
 

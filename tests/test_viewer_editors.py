@@ -13,7 +13,7 @@ from helpers import ROOT, gvtorch
 from helpers.labels import cells
 from helpers.pictures import GRAY
 from helpers.stores import noise
-from helpers.viewer import FUNCTION, SOON, Page, bright_ball, pixels, turned
+from helpers.viewer import FUNCTION, SOON, Grown, Page, bright_ball, pixels, turned
 
 import gvtorch as gv
 from gvtorch.io.conversion import convert
@@ -331,17 +331,6 @@ def test_a_time_point_that_can_not_be_read_is_told_and_the_one_before_stays(beat
         page.until(lambda: page.pictures[-1][0]["time"] == 2 and page.pictures[-1][0]["final"])
     finally:
         session.close()
-
-
-class Grown(torch.nn.Module):
-    """A ball whose radius is the time."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.register_buffer("time", torch.tensor(3.0))
-
-    def forward(self, points):
-        return (points.norm(dim=-1, keepdim=True) < self.time).float()
 
 
 def test_a_clock_of_a_producer_is_set():

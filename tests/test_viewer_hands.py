@@ -6,12 +6,11 @@ import json
 
 import numpy as np
 import pytest
-import torch
 from helpers import ROOT
 from helpers.browser import Tab
 from helpers.labels import cells
 from helpers.stores import noise
-from helpers.viewer import BANDS
+from helpers.viewer import BANDS, Grown
 
 import gvtorch as gv
 from gvtorch.io.conversion import convert
@@ -198,17 +197,6 @@ def test_time_is_slid_and_played(chromium, beat):
         tab.until("!app.times.playing && !app.before")
         assert not tab.complaints
         tab.close()
-
-
-class Grown(torch.nn.Module):
-    """A ball whose radius is the time."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.register_buffer("time", torch.tensor(3.0))
-
-    def forward(self, points):
-        return (points.norm(dim=-1, keepdim=True) < self.time).float()
 
 
 def test_a_clock_has_a_slider(chromium):

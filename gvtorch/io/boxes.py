@@ -38,3 +38,12 @@ def to_zyxc(data: np.ndarray, axes: str, order: str = "zyxc") -> np.ndarray:
     missing = "".join(axis for axis in order if axis not in axes)
     letters = missing + axes
     return data[(None,) * len(missing)].transpose([letters.index(axis) for axis in order])
+
+
+def grouped(places: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Returns the different ones (m, 3) of places (k, 3), in order, and the rows of each."""
+    order = np.lexsort(places.T[::-1])
+    places = places[order]
+    others = np.flatnonzero((places[1:] != places[:-1]).any(1)) + 1
+    first = np.append(0, others)[: len(order)]
+    return places[first], np.split(order, others)[: len(order)]

@@ -24,7 +24,7 @@ from ..base import check
 from ..base.labels import background
 from ..pool.downsample import pool_majority, pool_mean
 from . import boxes
-from .boxes import Zyx
+from .boxes import Zyx, grouped
 from .checksums import Checksums, sum_of
 from .level_reader import LevelReader, Pool, open_arrays
 from .ngff import MultiscaleImage, find_image, read_json
@@ -584,11 +584,7 @@ def _blank(out: np.ndarray) -> list[int]:
 def _groups(zyx: np.ndarray, side: int) -> list[np.ndarray]:
     """Indices of blocks to be read together."""
     groups = []
-    _, which = np.unique(zyx // _GROUP, axis=0, return_inverse=True)
-    order = np.argsort(which.reshape(-1), kind="stable")
-    for index in np.split(order, np.flatnonzero(np.diff(which.reshape(-1)[order])) + 1):
-        if not len(index):
-            continue
+    for index in grouped(zyx // _GROUP)[1]:
         span = (zyx[index].max(0) - zyx[index].min(0) + 1) * (side - 2 * BORDER) + 2 * BORDER
         if math.prod(span.tolist()) <= 2 * len(index) * side**3:
             groups.append(index)

@@ -20,6 +20,7 @@ from numpy.lib.stride_tricks import as_strided
 
 from ..base import check
 from ..base.stage import stage
+from ..io.boxes import grouped
 from ..io.store import Store
 from ..pool import Channel
 from ..pool.pyramid import NodeSummary
@@ -291,7 +292,7 @@ class StoredProducer(Producer):
         store, grid = self.store, self.store.cell_grid(level)
         out = np.zeros((len(at), 3, store.width), np.float32)
         errors: dict[int, str] = {}
-        tiles, parts = _grouped(at // _TILE)
+        tiles, parts = grouped(at // _TILE)
         keys: list[Key] = [("cells", level, *tile) for tile in tiles.tolist()]
 
         def read(missing: list[Key]) -> dict[Key, Found]:
@@ -352,7 +353,7 @@ class StoredProducer(Producer):
         group of cubes after the other; returns errors by row. After a timeout no more are read.
         """
         cubes = _Cubes.of(self.store, layout)
-        places, parts = _grouped(zyx // cubes.bricks)
+        places, parts = grouped(zyx // cubes.bricks)
         corner = zyx % cubes.bricks * cubes.brick_size + cubes.border - layout.border
         errors: dict[int, str] = {}
         late = ""
@@ -422,12 +423,3 @@ class StoredProducer(Producer):
         z, y, x = (corners[:, axis].clip(0, values.shape[axis] - 1) for axis in range(3))
         out[rows] = values[z[:, :, None, None], y[:, None, :, None], x[:, None, None, :]]
         return {}
-
-
-def _grouped(places: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Returns the different ones (m, 3) of places (k, 3), in order, and the rows of each."""
-    order = np.lexsort(places.T[::-1])
-    places = places[order]
-    others = np.flatnonzero((places[1:] != places[:-1]).any(1)) + 1
-    first = np.append(0, others)[: len(order)]
-    return places[first], np.split(order, others)[: len(order)]

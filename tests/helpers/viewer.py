@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import torch
 
 import gvtorch as gv
 from gvtorch.viewer.session import Session
@@ -121,3 +122,14 @@ def turned(camera: dict, angle: float) -> dict:
     c, s = np.cos(angle), np.sin(angle)
     away = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ away
     return {**camera, "eye": (away + camera["target"]).tolist()}
+
+
+class Grown(torch.nn.Module):
+    """A ball whose radius is the time."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("time", torch.tensor(3.0))
+
+    def forward(self, points):
+        return (points.norm(dim=-1, keepdim=True) < self.time).float()

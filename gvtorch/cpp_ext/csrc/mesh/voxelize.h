@@ -375,11 +375,9 @@ struct VoxelizePack {
     }
   }
 
-  // Winding numbers of the voxels begin..end of a row: triangles ahead along x, those whose normals point ahead as 1.
-  GV_HD void wind(const Cube& cube, int32_t begin, int32_t end, T y, T z, int32_t* winding) const {
-    const double margin = kMargin * cube.voxel, x = cube.world(place(cube, begin), 0) - margin;
-    const double y0 = cube.world(y, 1) - margin, y1 = y0 + 2 * margin;
-    const double z0 = cube.world(z, 2) - margin, z1 = z0 + 2 * margin;
+  // Meets the triangles of solids whose boxes reach into a beam along x, from x on.
+  template <class Meet>
+  GV_HD void ahead(double x, double y0, double y1, double z0, double z1, const Meet& meet) const {
     descend(
         [&](int64_t number) {
           const double* box = a.box_n6 + 6 * number;
@@ -388,12 +386,21 @@ struct VoxelizePack {
         },
         [] { return 0.0; },
         [&](int64_t number) {
-          if (!a.solid_f[number]) return;
-          Vec3<T> corner[3];
-          for (int i = 0; i < 9; ++i) corner[i / 3][i % 3] = cube.local(a.corner_f33[9 * number + i], i % 3);
-          const Pierced<T> along = pierced(y, z, corner);
-          for (int32_t i = begin; i < end; ++i) winding[i - begin] += along.way * (along.at > place(cube, i));
+          if (a.solid_f[number]) meet(number);
         });
+  }
+
+  // Winding numbers of the voxels begin..end of a row: triangles ahead along x, those whose normals point ahead as 1.
+  GV_HD void wind(const Cube& cube, int32_t begin, int32_t end, T y, T z, int32_t* winding) const {
+    const double margin = kMargin * cube.voxel, x = cube.world(place(cube, begin), 0) - margin;
+    const double y0 = cube.world(y, 1) - margin, y1 = y0 + 2 * margin;
+    const double z0 = cube.world(z, 2) - margin, z1 = z0 + 2 * margin;
+    ahead(x, y0, y1, z0, z1, [&](int64_t number) {
+      Vec3<T> corner[3];
+      for (int i = 0; i < 9; ++i) corner[i / 3][i % 3] = cube.local(a.corner_f33[9 * number + i], i % 3);
+      const Pierced<T> along = pierced(y, z, corner);
+      for (int32_t i = begin; i < end; ++i) winding[i - begin] += along.way * (along.at > place(cube, i));
+    });
   }
 
   // Writes the coverage of those of the voxels begin..end of a row through which a solid's surface may pass: the mean
@@ -413,26 +420,18 @@ struct VoxelizePack {
     const double y0 = cube.world(low.y, 1) - margin, y1 = y0 + cube.voxel + 2 * margin;
     const double z0 = cube.world(low.z, 2) - margin, z1 = z0 + cube.voxel + 2 * margin;
     int64_t parts[kPack] = {};
-    descend(
-        [&](int64_t number) {
-          const double* box = a.box_n6 + 6 * number;
-          const bool met = box[1] <= y1 && box[4] >= y0 && box[2] <= z1 && box[5] >= z0 && box[3] >= x;
-          return met ? 0.0 : 1.0;
-        },
-        [] { return 0.0; },
-        [&](int64_t number) {
-          if (!a.solid_f[number]) return;
-          Polygon<T> whole;
-          for (int i = 0; i < 3; ++i) {
-            const double* at = a.corner_f33 + 9 * number + 3 * i;
-            whole.push({cube.local(at[0], 0), cube.local(at[1], 1), cube.local(at[2], 2)});
-          }
-          const Polygon<T> column = in_column(whole, low);
-          if (column.count == 0) return;
-          for (int32_t i = begin; i < end; ++i) {
-            if (wanted(i)) parts[i - begin] += in_voxel(column, place(cube, i) - half, whole);
-          }
-        });
+    ahead(x, y0, y1, z0, z1, [&](int64_t number) {
+      Polygon<T> whole;
+      for (int i = 0; i < 3; ++i) {
+        const double* at = a.corner_f33 + 9 * number + 3 * i;
+        whole.push({cube.local(at[0], 0), cube.local(at[1], 1), cube.local(at[2], 2)});
+      }
+      const Polygon<T> column = in_column(whole, low);
+      if (column.count == 0) return;
+      for (int32_t i = begin; i < end; ++i) {
+        if (wanted(i)) parts[i - begin] += in_voxel(column, place(cube, i) - half, whole);
+      }
+    });
     for (int32_t i = begin; i < end; ++i) {
       if (!wanted(i)) continue;
       const int64_t sum = parts[i - begin];
