@@ -496,6 +496,29 @@ def test_what_is_included_otherwise_counts_as_well(tmp_path):
 
 
 @pytest.mark.backend("cpp")
+def test_what_another_process_has_noted_meanwhile_is_no_change(tmp_path, monkeypatch):
+    """Two that compile at once: one has told of a file before the other is through."""
+    header = write(tmp_path, ADD)
+    part = tmp_path / "part.h"
+    part.write_text("")
+    monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path / "cache"))
+    before = user.ShaderSource.read(header, "Own")
+    compiler = tmp_path / "c++"
+    note = f"echo '[\"{part}\"]' > {before.more}\necho > shader.so"
+    compiler.write_text(f"#!/bin/sh\n{note}\n")
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+    library = user.compiled(before, ())
+    after = user.ShaderSource.read(header, "Own")
+    assert after.op != before.op and after.op in library.name
+    assert before.op in user.compiled(before, (), before.op).name, "one that is loaded keeps its op"
+    part.write_text("int changed;")
+    assert before.unchanged(), "which knew nothing of it"
+    with pytest.raises(RuntimeError, match=r"own.h has changed: make the shader anew"):
+        after.unchanged()
+
+
+@pytest.mark.backend("cpp")
 def test_no_name_of_a_user_comes_to_a_shell(tmp_path, monkeypatch):
     """nvcc hands its arguments to a shell; a compiler here does so as well."""
     real, compiler = shutil.which(compilers.find_cxx()[0]), tmp_path / "c++"

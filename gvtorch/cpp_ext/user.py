@@ -63,6 +63,7 @@ class ShaderSource:
     digest: str
     known: tuple[Path, ...]  # the header, and what its lines include
     more: Path  # where the other files that it is compiled from are noted
+    noted: tuple[tuple[Path, bytes], ...]  # those files, each with its digest
 
     @staticmethod
     def read(header: Path, name: str) -> ShaderSource:
@@ -82,21 +83,27 @@ class ShaderSource:
             digest.update(os.fsencode(os.path.relpath(file, header.parent)) + b"\0")
             digest.update(hashlib.sha256(known[file]).digest())
         more = _folder() / f"{name.replace('::', '_')}_{digest.hexdigest()[:16]}.more"
+        noted = []
         for file in _noted(more):
-            digest.update(os.fsencode(file) + b"\0")
-            digest.update(hashlib.sha256(file.read_bytes()).digest() if file.is_file() else b"none")
-        return ShaderSource(header, name, digest.hexdigest(), tuple(known), more)
+            own = hashlib.sha256(file.read_bytes()).digest() if file.is_file() else b"none"
+            digest.update(os.fsencode(file) + b"\0" + own)
+            noted.append((file, own))
+        return ShaderSource(header, name, digest.hexdigest(), tuple(known), more, tuple(noted))
 
     @property
     def op(self) -> str:
         """Name of the op, in the namespace gvtorch_user."""
         return f"{self.name.replace('::', '_')}_{self.digest[:16]}"
 
-    def require_unchanged(self) -> None:
-        """Raises RuntimeError if the code has changed since it was read."""
-        header = self.header
-        if not header.is_file() or self.read(header, self.name).digest != self.digest:
-            raise RuntimeError(f"CompiledShader: {header} has changed: make the shader anew")
+    def unchanged(self) -> ShaderSource:
+        """Returns the code as it is read now, in which a compiler may have noted more files. Raises
+        RuntimeError if one that was read has changed since.
+        """
+        if self.header.is_file():
+            now = self.read(self.header, self.name)
+            if now.more == self.more and set(self.noted) <= set(now.noted):
+                return now
+        raise RuntimeError(f"CompiledShader: {self.header} has changed: make the shader anew")
 
 
 @dataclass(frozen=True)
@@ -146,7 +153,7 @@ def load_cuda(shader: UserShader) -> None:
     """
     if (shader.op, "cuda") in _libraries:
         return
-    shader.require_unchanged()
+    shader.unchanged()
     devices = range(torch.cuda.device_count())
     found = {"".join(map(str, torch.cuda.get_device_capability(device))) for device in devices}
     _loaded(shader, sorted(found))
@@ -173,7 +180,7 @@ def _loaded(source: ShaderSource, archs: Sequence[str]) -> Path:
     key = (source.op, "cuda" if archs else "cpu")
     with _lock:
         if key not in _libraries:
-            library = compiled(source, archs)
+            library = compiled(source, archs, source.op)
             checked = _opened(library)
             try:
                 with (
@@ -188,11 +195,12 @@ def _loaded(source: ShaderSource, archs: Sequence[str]) -> Path:
         return _libraries[key]
 
 
-def compiled(source: ShaderSource, archs: Sequence[str]) -> Path:
+def compiled(source: ShaderSource, archs: Sequence[str], op: str | None = None) -> Path:
     """Returns the path of a library in the cache, after compiling it if it is not there. `archs`
-    are CUDA compute capabilities, as in ("90",); none for the CPU.
+    are CUDA compute capabilities, as in ("90",); none for the CPU. `op` is the name of its op where
+    one is loaded already, else its source's.
     """
-    header, name, op = source.header, source.name, source.op
+    header, name, asked, op = source.header, source.name, op, op or source.op
     kind, for_whom = ("cuda", "CUDA") if archs else ("cpu", "the CPU")
     command, flags = _compiler(archs)
     tools = [command, compilers.find_cxx()] if archs else [command]  # nvcc calls the C++ compiler
@@ -231,9 +239,10 @@ def compiled(source: ShaderSource, archs: Sequence[str]) -> Path:
             raise CompileError(
                 f"{header}: {name} did not compile for {for_whom} with: {shlex.join(call)}\n{said}"
             )
-        source.require_unchanged()
-        if _note(source, Path(folder)):  # its digest is another one now, and so is its op
-            return compiled(ShaderSource.read(header, name), archs)
+        _note(source.unchanged(), Path(folder))
+        now = source.unchanged()
+        if now.digest != source.digest:  # this compiler, or that of another process, told of more
+            return compiled(now, archs, asked)
         with target.open("ab") as file:
             file.write(hashlib.sha256(target.read_bytes()).digest())
         target.chmod(0o644)
@@ -241,31 +250,29 @@ def compiled(source: ShaderSource, archs: Sequence[str]) -> Path:
     return library
 
 
-def _note(source: ShaderSource, folder: Path) -> bool:
-    """Notes the files that a compiler has read and the source does not know; returns whether there
-    are any. Those of gvtorch, of torch and of the system are no user's.
+def _note(source: ShaderSource, folder: Path) -> None:
+    """Notes the files that a compiler has read and the source does not know. Those of gvtorch, of
+    torch and of the system are no user's.
     """
     try:
         told = (folder / "shader.d").read_text(errors="surrogateescape")
     except OSError:
-        return False  # a compiler that does not tell
+        return  # a compiler that does not tell
     words = re.findall(r"(?:[^\s\\]|\\.)+", told.partition(":")[2].replace("\\\n", " "))
     names = (re.sub(r"\\(.)", r"\1", word).replace("$$", "$") for word in words)
     read = {(folder / name).resolve() for name in names}
     torch_root = Path(torch.__file__).resolve().parent
     ours = (SOURCES.resolve(), torch_root, Path("/usr"), folder.resolve())
-    noted = set(_noted(source.more))
+    noted = {file for file, _ in source.noted}
     more = {
         file
         for file in read - noted - {known.resolve() for known in source.known}
         if not any(file.is_relative_to(root) for root in ours)
     }
-    if not more:
-        return False
-    draft = folder / "more"
-    draft.write_text(json.dumps(sorted(map(str, more | noted))))
-    draft.replace(source.more)
-    return True
+    if more:
+        draft = folder / "more"
+        draft.write_text(json.dumps(sorted(map(str, more | noted))))
+        draft.replace(source.more)
 
 
 def _noted(more: Path) -> list[Path]:
