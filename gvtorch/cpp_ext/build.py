@@ -92,22 +92,26 @@ def commands(output: Path) -> dict[Path, list[list[str]]]:
 
 
 def compile_libraries(output: Path) -> list[Path]:
-    """Compiles what is missing or older than its sources or flags; returns the libraries."""
+    """Compiles what is missing or older than its sources or flags, side by side; returns the
+    libraries.
+    """
     sources = sorted(path for path in (FOLDER / "csrc").rglob("*") if path.is_file())
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
     output.mkdir(parents=True, exist_ok=True)
-    libraries = []
-    for library, calls in commands(output).items():
-        stamp = library.with_suffix(".stamp")
-        state = digest + " " + " ; ".join(shlex.join(call) for call in calls)
-        if not (library.exists() and stamp.exists() and stamp.read_text() == state):
-            *parts, last = calls
-            with ThreadPoolExecutor(os.cpu_count()) as pool:
+    calls = commands(output)
+    with ThreadPoolExecutor(os.cpu_count()) as pool, ThreadPoolExecutor(len(calls)) as linkers:
+
+        def make(library: Path) -> None:
+            stamp = library.with_suffix(".stamp")
+            state = digest + " " + " ; ".join(shlex.join(call) for call in calls[library])
+            if not (library.exists() and stamp.exists() and stamp.read_text() == state):
+                *parts, last = calls[library]
                 list(pool.map(_run, parts))
-            _run([*last, "-o", str(library)])
-            stamp.write_text(state)
-        libraries.append(library)
-    return libraries
+                _run([*last, "-o", str(library)])
+                stamp.write_text(state)
+
+        list(linkers.map(make, calls))
+    return list(calls)
 
 
 def _run(call: list[str]) -> None:
