@@ -125,7 +125,8 @@ def flight(middle: float, half: float) -> CameraPath:
 def scene(settings: Settings) -> tuple[gv.Shader, list[gv.Camera]]:
     """What is seen of the solid, and from where."""
     if settings.source == "mandelbulb":
-        shader: gv.Shader = gv.StoredColor("rgba", premultiplied=True, lit=True)
+        shader: gv.Shader = gv.Isosurface(127.5, None, color_channel="rgba", premultiplied=True)
+        shader.channel, shader.component = "rgba", 3  # the surface is where the opacity is a half
         path = flight(0.0, 1.1)
     else:
         opacity = [(100, 0), (140, 0.9)]

@@ -23,7 +23,7 @@ WORKLOADS = {
     "frame": "the engine: a steady frame and the cache's share of it, a cold start",
     "lru": "1 M slots ordered by use, beside torch.sort",
     "compact": "requests listed out of 8 M nodes, beside torch.nonzero",
-    "produce": "10^3-voxel bricks made by a torch producer, eager and compiled",
+    "produce": "10^3-voxel bricks made by the producers of the library, eager and compiled",
     "noise": "noise at points, beside its twin, NumPy and libraries of noise",
     "stream": "10^3-voxel bricks from host memory into the pool, beside a plain copy",
     "convert": "a volume file to a store",

@@ -519,14 +519,14 @@ class Producer(torch.nn.Module):
         depth = torch.full_like(place[:, :1], layout.depth)
         node = torch.cat(((place / layout.brick_size).floor(), depth), 1).to(torch.int64)
         loc, row = node.unique(dim=0, return_inverse=True)
-        bricks_of = self._filled(loc, layout)
+        bricks_of = self.bricks_at(loc, layout)
         inner = place - node[:, :3] * layout.brick_size + layout.border
         found = {}
         for name, bricks in bricks_of.items():
             found[name] = _between(bricks, row, inner).view(*points.shape[:-1], -1)
         return found
 
-    def _filled(self, loc: Tensor, layout: Layout) -> dict[str, Tensor]:
+    def bricks_at(self, loc: Tensor, layout: Layout) -> dict[str, Tensor]:
         """For each channel (k, z, y, x, c) the bricks of nodes of one level at places (k, 4); what
         these need of their parents is made first. ValueError where one can't be made.
         """
@@ -534,7 +534,7 @@ class Producer(torch.nn.Module):
         if self.needs_parent and bool((loc[:, 3] > 0).all()):
             above = torch.cat((loc[:, :3] // layout.branching, loc[:, 3:] - 1), 1)
             above, row = above.unique(dim=0, return_inverse=True)
-            made = self._filled(above, layout)
+            made = self.bricks_at(above, layout)
             parents = {name: bricks[row] for name, bricks in made.items()}
         answer: Any = self.fill(Nodes(loc, layout, parents=parents))
         answer = answer.result() if isinstance(answer, Future) else answer
