@@ -48,6 +48,10 @@ class Settings:
     loading: str = "straight"
     workers: int = 2
     """threads that read the store: on one's own disk more of them only wait for one another"""
+    batch: int = 512
+    """on CUDA: most bricks that a frame makes"""
+    compiled: bool = False
+    """the producer by torch.compile"""
     graph: bool = True
     """on CUDA: each frame is one graph"""
     device: str = "cpu"
@@ -168,7 +172,7 @@ def fly(producer: gv.Producer, pool: str, settings: Settings, console: Console) 
     with gv.Engine(producer, device=settings.device, **options) as engine:
         engine.render(cameras[0], shader)  # the flight begins with what its first view needs
         if engine.device.type == "cuda" and settings.graph:
-            draw = engine.capture(cameras[0], shader).replay
+            draw = engine.capture(cameras[0], shader, batch=settings.batch).replay
         else:
             draw = partial(engine.frame, shader=shader)
         start = time.perf_counter()
@@ -211,7 +215,10 @@ def main(settings: Settings) -> None:
         for column in ("median ms", "p99 ms", "frames / s", "bricks / s"):
             table.add_column(column, justify="right")
         for pool in settings.pools:
-            table.add_row(*fly(source(settings, store), pool, settings, console))
+            producer = source(settings, store)
+            if settings.compiled:
+                producer.fill = torch.compile(producer.fill, dynamic=True)
+            table.add_row(*fly(producer, pool, settings, console))
         if settings.resident and settings.source == "store":
             table.add_row(*fly_resident(store, settings, console))
         Console().print(table)

@@ -58,15 +58,15 @@ def voxelize(record: Record) -> None:
 
 def _volume(grid: Voxelizer) -> float:
     """Makes all finest voxels, part by part; their volume."""
-    total = 0.0
+    total = torch.zeros((), dtype=torch.int64, device=grid.device)
     x, y, z = grid.extent
     for k in range(0, z, _PART):
         for j in range(0, y, _PART):
             for i in range(0, x, _PART):
                 high = min(k + _PART, z), min(j + _PART, y), min(i + _PART, x)
                 part = grid.region((k, j, i), high)["coverage"]
-                total += int(part.sum(dtype=torch.int64)) / 255
-    return total * grid.spacing**3
+                total += part.sum(dtype=torch.int64)
+    return float(total) / 255 * grid.spacing**3
 
 
 def _store(record: Record, case: str, mesh: Mesh, side: int) -> None:

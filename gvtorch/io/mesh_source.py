@@ -133,7 +133,7 @@ class MeshSource(VolumeSource):
         """Makes the box `low` to `high`, (z, y, x), as (z, y, x, c)."""
         with _LOCK:  # the first thread builds the hierarchy
             grid = _voxelizer(self)
-        return grid.region(low, high)[self.channel].numpy()
+        return grid.region(low, high)[self.channel].cpu().numpy()
 
 
 @functools.lru_cache(maxsize=2)
