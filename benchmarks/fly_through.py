@@ -51,7 +51,7 @@ class Settings:
     batch: int = 512
     """on CUDA: most bricks that a frame makes"""
     compiled: bool = False
-    """the producer by torch.compile"""
+    """bricks are made by torch.compile, in batches that are full"""
     graph: bool = True
     """on CUDA: each frame is one graph"""
     device: str = "cpu"
@@ -148,6 +148,12 @@ def source(settings: Settings, store: Path) -> gv.Producer:
     return mandelbulb(settings.side) if settings.source == "mandelbulb" else Worn(settings.side)
 
 
+def compile_batches(producer: gv.Producer, batch: int) -> None:
+    """Compiles what makes bricks in batches of this size; others are made as ever."""
+    eager, quick = producer.fill, torch.compile(producer.fill, dynamic=False)
+    producer.fill = lambda nodes: (quick if len(nodes) == batch else eager)(nodes)
+
+
 def quantiles(times: list[float]) -> list[str]:
     """Median and 99th percentile of milliseconds."""
     return [f"{sorted(times)[math.ceil(q * len(times)) - 1]:.2f}" for q in (0.5, 0.99)]
@@ -217,7 +223,7 @@ def main(settings: Settings) -> None:
         for pool in settings.pools:
             producer = source(settings, store)
             if settings.compiled:
-                producer.fill = torch.compile(producer.fill, dynamic=True)
+                compile_batches(producer, settings.batch)
             table.add_row(*fly(producer, pool, settings, console))
         if settings.resident and settings.source == "store":
             table.add_row(*fly_resident(store, settings, console))

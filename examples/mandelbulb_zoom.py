@@ -24,7 +24,7 @@ class Settings:
 
     output: Path = Path("mandelbulb_zoom.png")
     size: int = 320
-    cone_scale: float = 1.4  # pixels that a voxel is wide: below 1 it is as sharp as it gets
+    cone_scale: float = 2.0  # pixels that a voxel is wide: below 1 it is as sharp as it gets
     film: Path = Path("mandelbulb_zoom.mp4")
     frames: int = 0
     budget: int = 4096  # most bricks a frame
@@ -104,7 +104,7 @@ def main(settings: Settings) -> None:
             found = engine.render(camera, stone, **options)  # without light: less is traced again
             print(f"2^-{level:g} of the box: {found.stats}", flush=True)
             light = gv.Lighting(shadows=0, occlusion=1.0, reach=0.1 * BOX * 0.5**level)
-            lit = engine.frame(camera, stone, lighting=light, **options)[0].to("cpu")
+            lit = engine.render(camera, stone, lighting=light, **options).to("cpu")
         clear = lit.alpha * torch.exp(-0.15 * lit.depth / (BOX * 0.5**level))
         pictures.append(replace(lit, color=1.15 * clear * lit.color + (1 - clear) * HAZE))
     both = {}

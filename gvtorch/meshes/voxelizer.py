@@ -157,7 +157,9 @@ class Voxelizer:
                 parts[name].append(_stored(name, values))
         empty = (0, side, side, side)
         return {
-            name: torch.cat(own) if own else torch.empty((*empty, width), dtype=dtype)
+            name: torch.cat(own)
+            if own
+            else torch.empty((*empty, width), dtype=dtype, device=self.device)
             for (name, own), (dtype, width) in zip(
                 parts.items(), (CHANNELS[name] for name in self.channels), strict=True
             )
