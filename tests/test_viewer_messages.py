@@ -49,6 +49,7 @@ GOOD: dict[str, dict[str, Any]] = {
     "follow": {"client": 1},
     "monitor": {"on": True},
     "still": {"width": 64, "height": 48},
+    "surface": {"value": 0.5, "format": "ply", "level": 0},
     "do": {"what": "fit"},
 }
 #: What each type never is.
