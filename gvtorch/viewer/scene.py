@@ -108,8 +108,8 @@ class Scene:
         counted = cost(tree, camera, shader, progress=progress, **state.settings())
         return counted.picture(state.show)
 
-    def voxels(self) -> Volume | Store:
-        """Returns what planes are cut of.
+    def voxels(self, purpose: str) -> Volume | Store:
+        """Returns what planes are cut of, and surfaces made of.
 
         Raises:
             ValueError: It has no voxels of its own, or they are not all in memory.
@@ -120,7 +120,7 @@ class Scene:
             trees = [] if self.engine is None else [*self.engine.trees.values()]
             found = _voxels_of(trees[0].producer) if len(trees) == 1 else None
             if found is None:
-                raise ValueError("slices: this scene has no voxels of its own to cut")
+                raise ValueError(f"{purpose}: this scene has no voxels of its own")
             return found
         if self._resident is None:
             self._resident = self.tree.to_volume()

@@ -26,6 +26,7 @@ from ..shaders import TransferFunction
 from ..shaders.presets import CT_PRESETS, PRESETS
 from . import protocol
 from .client import Client, Send
+from .export import SurfaceExport
 from .files import read_function
 from .nodes import node_boxes
 from .parameters import Parameters
@@ -76,6 +77,7 @@ class Session:
         self._told_busy: Any = None
         self._figures_at = 0.0
         self._planes: Planes | None = None
+        self._export: SurfaceExport | None = None
         self._opening: float | None = None  # the time point that is read in a thread
         self._open_planes(state)
         self._thread = threading.Thread(target=self._run, name="gvtorch view", daemon=True)
@@ -286,6 +288,8 @@ class Session:
 
     def _goodbye(self, client: Client) -> None:
         self.clients.pop(client.number, None)
+        if self._export is not None and self._export.serves(client):
+            self._export.end()
         for one in self.clients.values():
             if one.follows == client.number:
                 one.follows = None
@@ -345,7 +349,7 @@ class Session:
     def _open_planes(self, state: ViewState) -> None:
         """Makes what cuts planes, where a state shows some; raises ValueError where it can't be."""
         if state.slices is not None and self._planes is None:
-            self._planes = Planes(self.scene.voxels(), self._plane_came)
+            self._planes = Planes(self.scene.voxels("slices"), self._plane_came)
 
     def _plane_came(self, problem: str) -> None:
         """From the thread that reads."""
@@ -415,7 +419,7 @@ class Session:
         name = message.name or message.file
         client.tell("preset", name=name, function=encode(function), lost=lost)
 
-    def _export(self, client: Client, message: protocol.Export) -> None:
+    def _write_function(self, client: Client, message: protocol.Export) -> None:
         transfer = transfer_of(self.state.shader)
         if transfer is None:
             raise ValueError("export: there is no transfer function")
@@ -472,6 +476,12 @@ class Session:
         picture = self.still(client.eye, message.width, message.height)
         client.send_file("picture.png", png(picture))
 
+    def _surface(self, client: Client, message: protocol.Surface) -> None:
+        if self._export is not None and self._export.busy:
+            raise ValueError("surface: one is being made already")
+        data = self.scene.voxels("surface")
+        self._export = SurfaceExport(client, message, data, self.state.component)
+
     def _do(self, client: Client, message: protocol.Do) -> None:
         if message.what == "retry":
             self.scene.retry()
@@ -510,13 +520,14 @@ _TAKES: Mapping[type, Callable[[Session, Client, Any], None]] = {
     protocol.Histogram: Session._histogram,
     protocol.Preset: Session._preset,
     protocol.Read: Session._read,
-    protocol.Export: Session._export,
+    protocol.Export: Session._write_function,
     protocol.Nodes: Session._nodes,
     protocol.Resize: Session._resize,
     protocol.Set: Session._set,
     protocol.Follow: Session._follow,
     protocol.Monitor: Session._monitor,
     protocol.Still: Session._still,
+    protocol.Surface: Session._surface,
     protocol.Do: Session._do,
 }
 

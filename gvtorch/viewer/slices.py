@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ..base.volume import Volume
+from ..io.http import ask_again
 from ..io.store import Store
 from ..io.window import window
 from ..pictures import Picture
@@ -274,6 +275,7 @@ class Planes:
 
     def retry(self) -> None:
         """Lets planes that could not be read be asked for again."""
+        ask_again()
         self._failed.clear()
 
     def close(self) -> None:
