@@ -184,15 +184,7 @@ def convert(
         plan = _within(plan, memory)
     if not begun:
         _check_room(target, _estimate(plan))
-    with _told_how_to_go_on(plan), unfinished.claimed(target, plan.settings, resume=begun) as work:
-        if plan.labels is not None:
-            write_labels(target / WORK / _LABELS, plan.labels)
-        with _executor(executor, plan) as pool:
-            _write_levels(_staged(plan, pool), work, pool, progress)
-        if plan.labels is not None:
-            _write_label_array(plan.task, plan.labels)
-        layout = dataclasses.replace(plan.task.layout, value_range=_value_range(plan.task))
-        work.finish(layout, plan.task.source.info, plan.settings)
+    _write_store(plan, begun, executor, progress)
     return Store.open(target)
 
 
@@ -451,6 +443,20 @@ def _check_room(target: Path, needs: Estimate) -> None:
 
 
 # --- the work
+
+
+def _write_store(plan: _Plan, begun: bool, executor: Executor | None, progress: Progress) -> None:
+    """Writes what is not there yet: levels, labels, and last the metadata that make it a store."""
+    task, settings = plan.task, plan.settings
+    with _told_how_to_go_on(plan), unfinished.claimed(plan.target, settings, resume=begun) as work:
+        if plan.labels is not None:
+            write_labels(plan.target / WORK / _LABELS, plan.labels)
+        with _executor(executor, plan) as pool:
+            _write_levels(_staged(plan, pool), work, pool, progress)
+        if plan.labels is not None:
+            _write_label_array(task, plan.labels)
+        layout = dataclasses.replace(task.layout, value_range=_value_range(task))
+        work.finish(layout, task.source.info, settings)
 
 
 def _executor(given: Executor | None, plan: _Plan) -> AbstractContextManager[Executor]:

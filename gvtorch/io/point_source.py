@@ -42,6 +42,26 @@ class SplatSource(VolumeSource):
     marks: tuple[Any, ...]  # what is the same while the points and settings are
     words: tuple[str, ...]  # of the command line
 
+    @classmethod
+    def of(cls, folder: Path, channel: str, **told: Any) -> SplatSource:
+        """The sorted points of a folder as a volume; `told` are path, marks and words."""
+        _opened.cache_clear()  # other points may have been there
+        found = _opened(str(folder))
+        x, y, z = found.grid.extent
+        dx, dy, dz = found.grid.spacing_3.tolist()
+        names = _COLORS if channel == "color" else ()
+        channels = tuple(ChannelInfo(name=name) for name in names)
+        return cls(
+            shape=(z, y, x, found.width),
+            axes="zyxc",
+            stored="float32",
+            spacing=(dx, dy, dz),
+            origin=found.grid.origin,
+            info=ImageInfo(channels=channels, quantity=channel),
+            folder=str(folder),
+            **told,
+        )
+
     def fingerprint(self) -> list[Any]:
         """The points, and what is made of them."""
         return list(self.marks)
@@ -129,25 +149,15 @@ def splat(
         source = _Lit(source, check.number("splat", "opacity", opacity, low=0, high=1))
     folder = target / WORK / "points"
     _sort(source, folder, marks, begun, extent=extent, box=box, memory=memory, progress=progress)
-    _opened.cache_clear()
-    found = _opened(str(folder))
-    grid = found.grid
-    x, y, z = grid.extent
-    channels = tuple(ChannelInfo(name=name) for name in _COLORS) if channel == "color" else ()
-    dx, dy, dz = grid.spacing_3.tolist()
+    volume = SplatSource.of(
+        folder,
+        channel,
+        path="points" if isinstance(points, Points) else str(points),
+        marks=tuple(marks),
+        words=_words(extent, channel, opacity, box, names),
+    )
     return convert(
-        SplatSource(
-            path="points" if isinstance(points, Points) else str(points),
-            shape=(z, y, x, found.width),
-            axes="zyxc",
-            stored="float32",
-            spacing=(dx, dy, dz),
-            origin=grid.origin,
-            info=ImageInfo(channels=channels, quantity=channel),
-            folder=str(folder),
-            marks=tuple(marks),
-            words=_words(extent, channel, opacity, box, names),
-        ),
+        volume,
         target,
         block=block,
         executor=executor,

@@ -6,7 +6,6 @@ import itertools
 from abc import ABC, abstractmethod
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -65,19 +64,12 @@ class Video:
     def __enter__(self) -> Video:
         """Returns itself."""
         self._film.open(self._stack.enter_context(whole_file(self._path)))
+        self._stack.push(lambda kind, *_: self._film.close(whole=kind is None))
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: Any) -> None:
         """Finishes the file, or takes it away after a mistake."""
-        with self._stack:
-            self._film.close(whole=kind is None)
-            if error is not None:
-                raise error
+        self._stack.__exit__(*error)
 
     def __repr__(self) -> str:
         return f"Video({str(self._path)!r}, {self._size[0]}x{self._size[1]})"
