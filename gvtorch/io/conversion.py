@@ -548,8 +548,7 @@ def _write_levels(
             raise ValueError(
                 f"{plan.settings['source']}: {bad} values are NaN or infinite (of "
                 f"{layout.times * math.prod(layout.extent) * layout.width}); pass nan=VALUE "
-                "(--nan VALUE) to "
-                "replace them"
+                "(--nan VALUE) to replace them"
             )
         for which in ("low", "high"):  # the bounds below are not needed any more
             folder = plan.target / WORK / which / str(level - 1)

@@ -17,6 +17,8 @@ import urllib.parse
 import urllib.request
 from typing import Any
 
+from ..base.messages import one_line
+
 STALL = 20.0  # seconds without a byte that a server is given
 SLOWEST = 20_000  # bytes a second that it must send beyond these
 REFUSED = 30.0  # seconds for which a file that had no end is not asked for again
@@ -141,7 +143,7 @@ def _read(url: str, most: int, part: slice | None, whole: int, end: float) -> by
             return None
         raise
     except (OSError, http.client.HTTPException, ValueError) as error:
-        raise OSError(_reason(error)) from None
+        raise OSError(one_line(error)) from None
     done = False
     try:
         if answer.status in _MISSING:
@@ -181,7 +183,7 @@ def _content(
         except TimeoutError:
             raise
         except Exception as error:  # of http.client
-            raise OSError(_reason(error)) from None
+            raise OSError(one_line(error)) from None
         if not more:
             break
         content += more
@@ -287,7 +289,3 @@ _connections = _Connections()
 @functools.cache
 def _certificates() -> ssl.SSLContext:
     return ssl.create_default_context()
-
-
-def _reason(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from ..base import check
-from ..base.image_info import ChannelInfo, ImageInfo
+from ..base.image_info import PREMULTIPLIED, ImageInfo
 from ..base.stage import Progress, no_progress
 from ..meshes.holes import Solid, check_solid, prepared, told_of_holes
 from ..meshes.mesh import Material, Mesh
@@ -33,7 +33,6 @@ from .source import VolumeSource
 from .store import Store
 from .unfinished import fingerprint
 
-_COLORS = ("red", "green", "blue", "opacity")
 _LOCK = threading.Lock()
 
 
@@ -85,7 +84,7 @@ class MeshSource(VolumeSource):
         for channel in names:
             dtype, width = CHANNELS[channel]
             x, y, z = made.extent
-            colors = tuple(ChannelInfo(name=n) for n in _COLORS) if channel == "color" else ()
+            colors = PREMULTIPLIED if channel == "color" else ()
             found[channel] = cls(
                 path=name,
                 shape=(z, y, x, width),

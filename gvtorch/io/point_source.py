@@ -17,7 +17,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from ..base import check
-from ..base.image_info import ChannelInfo, ImageInfo
+from ..base.image_info import PREMULTIPLIED, ImageInfo
 from ..base.stage import Progress, no_progress
 from ..points.points import Points
 from ..points.sorted import PointSource, SortedPoints, sort_points
@@ -30,7 +30,6 @@ from .store_layout import WORK
 from .unfinished import fingerprint, is_begun, write_json
 
 CHANNELS = ("value", "color")
-_COLORS = ("red", "green", "blue", "opacity")
 _MADE_OF = "made_of.json"
 
 
@@ -49,8 +48,7 @@ class SplatSource(VolumeSource):
         found = _opened(str(folder))
         x, y, z = found.grid.extent
         dx, dy, dz = found.grid.spacing_3.tolist()
-        names = _COLORS if channel == "color" else ()
-        channels = tuple(ChannelInfo(name=name) for name in names)
+        channels = PREMULTIPLIED if channel == "color" else ()
         return cls(
             shape=(z, y, x, found.width),
             axes="zyxc",

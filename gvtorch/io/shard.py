@@ -159,11 +159,16 @@ def _blocks(layout: StoreLayout, values: np.ndarray, needed: np.ndarray) -> np.n
     wanted = pool_max(needed[..., None], layout.block // CELL)[..., 0]
     if not wanted.any():
         return None
+    blocks = np.zeros((*wanted.shape, *[layout.stored] * 3, layout.width), values.dtype)
+    blocks[wanted] = bordered(layout, values)[wanted]
+    return blocks
+
+
+def bordered(layout: StoreLayout, values: np.ndarray) -> np.ndarray:
+    """Returns a view (gz, gy, gx, s, s, s, c) of a cube (z, y, x, c) with its border as blocks."""
     every, side = slice(None, None, layout.block), layout.stored
     view = sliding_window_view(values, (side, side, side), (0, 1, 2))[every, every, every]
-    blocks = np.zeros((*wanted.shape, side, side, side, layout.width), values.dtype)
-    blocks[wanted] = np.moveaxis(view, 3, 6)[wanted]
-    return blocks
+    return np.moveaxis(view, 3, 6)
 
 
 def write(

@@ -325,7 +325,7 @@ class CoarseChannel:
             whole = isinstance(own, dict) and isinstance(own.get("made_of"), dict)
             if not (
                 whole
-                and re.fullmatch(r"[\w-]{1,64}", name, re.ASCII)
+                and is_name(name)
                 and own.get("version") == VERSION
                 and _is_whole(own.get("width"), 1, 2**12)
                 and _is_whole(own.get("generation"), 0, 2**31)
@@ -333,6 +333,11 @@ class CoarseChannel:
                 raise ValueError(f"{where}: damaged: gvtorch/coarse tells {own!r} of {name!r}")
             found[name] = cls(**{field.name: own[field.name] for field in dataclasses.fields(cls)})
         return found
+
+
+def is_name(value: Any) -> bool:
+    """Whether this may name a channel: 1 to 64 letters, digits, "-" and "_"."""
+    return isinstance(value, str) and re.fullmatch(r"[\w-]{1,64}", value, re.ASCII) is not None
 
 
 def _is_list(value: Any, size: Any) -> bool:

@@ -10,10 +10,9 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from ..base import check
-from ..base.volume import Volume
+from ..base.volume import Volume, to_numpy
 from ..pool.downsample import pool_mean
 from .boxes import Zyx
 from .store import Store
@@ -53,8 +52,7 @@ def window(
         low, high = (check.number("window", "percent", p, low=0, high=100) for p in percent)
         if low >= high:
             raise ValueError(f"window: percent must be a low and a high one, got {percent}")
-    width = data.width if isinstance(data, Store) else data.data.shape[3]
-    check.whole("window", "component", component, low=0, high=width - 1)
+    check.whole("window", "component", component, low=0, high=data.width - 1)
     values = looked_at(data)[..., component].ravel()
     if percent is not None:
         return _span(*np.percentile(values, percent))
@@ -100,8 +98,7 @@ def _span(low: float, high: float) -> tuple[float, float]:
 def looked_at(data: Volume | Store) -> np.ndarray:
     """Values (..., c) that stand for all."""
     if isinstance(data, Volume):
-        bfloat = data.data.dtype == torch.bfloat16  # which NumPy has not
-        values = (data.data.float() if bfloat else data.data).numpy()
+        values = to_numpy(data.data)
         while values[..., 0].size > _MOST:
             values = pool_mean(values, 2)
         return values

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..base import check
+from ..base.messages import need_library
 from ..base.whole_file import whole_file
 from .picture import Picture
 
@@ -97,11 +98,8 @@ class _Film(ABC):
 
 class _Mp4(_Film):
     def __init__(self, suffix: str, width: int, height: int, fps: int) -> None:
-        try:
-            import av
-        except ImportError:
-            raise ImportError(f"{suffix} needs PyAV: pip install 'gvtorch[video]'") from None
-        self._av, self._size, self._fps = av, (width, height), fps
+        self._av = need_library(suffix, "av", "PyAV", "video")
+        self._size, self._fps = (width, height), fps
 
     def open(self, part: Path) -> None:
         self._file = self._av.open(str(part), "w")
@@ -125,11 +123,8 @@ class _Mp4(_Film):
 class _Loop(_Film):
     def __init__(self, suffix: str, width: int, height: int, fps: int) -> None:
         del width, height
-        try:
-            from PIL import Image
-        except ImportError:
-            raise ImportError(f"{suffix} needs Pillow: pip install 'gvtorch[video]'") from None
-        self._image, self._suffix, self._fps = Image, suffix, fps
+        self._image = need_library(suffix, "PIL.Image", "Pillow", "video")
+        self._suffix, self._fps = suffix, fps
         self._frames: list[Any] = []
 
     def open(self, part: Path) -> None:

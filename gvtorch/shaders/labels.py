@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.srgb import from_srgb
 from ..ops.shading import LabelNumbers
 from ..pool import N3Tree
-from .colors import distinct_colors, from_srgb, linear_color
+from .colors import distinct_colors, linear_color
 from .lights import LitShader
 from .shader import ColorTable, Sampling
 
