@@ -20,7 +20,7 @@ from typing import Any
 from ..base.messages import one_line
 
 STALL = 20.0  # seconds without a byte that a server is given
-SLOWEST = 20_000  # bytes a second that it must send beyond these
+SLOWEST = 20_000  # bytes a second that a server must send after its first STALL seconds
 REFUSED = 30.0  # seconds for which a file that had no end is not asked for again
 _REASONS = 1000  # that are kept
 _NOT = (0.0, "")

@@ -129,7 +129,7 @@ def _check_claims(path: Path, ending: str, content: bytes) -> None:
 
 
 class _Beside:
-    """What trimesh asks for the files that a mesh names: those in its own folder, and below it."""
+    """Gives trimesh the files that a mesh names, from the mesh's own folder and those below it."""
 
     def __init__(self, path: Path) -> None:
         self._folder, self.missing = path.absolute().parent, ""
@@ -169,7 +169,7 @@ def _parts(trimesh: Any, loaded: Any) -> list[Any]:
 
 def _joined(path: Path, ending: str, parts: list[Any], mapped: bool) -> Mesh:
     """Joins trimesh's meshes. OBJ and PLY tell colours as they are shown, glTF linear ones.
-    Not `mapped`: no image came, and where there are texture coordinates, trimesh made one up.
+    If not `mapped`, no image was read: one that trimesh tells of was made up by it.
     """
     vertices, faces, colors, uvs, numbers = [], [], [], [], []
     materials: list[Material] = []
@@ -229,7 +229,7 @@ def _colors(part: Any, faces: np.ndarray, ending: str) -> np.ndarray | None:
 
 
 def _material(path: Path, material: Any, ending: str, mapped: bool) -> Material:
-    """One of ours out of trimesh's; grey where there is none."""
+    """Turns trimesh's material into ours; white if there is none."""
     if material is None:
         return Material(color=(1.0, 1.0, 1.0, 1.0))
     gltf = ending in ("gltf", "glb")

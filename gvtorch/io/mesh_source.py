@@ -45,7 +45,7 @@ class MeshSource(VolumeSource):
     band: float
     thickness: float
     solid: Solid
-    marks: tuple[Any, ...]  # what is the same while the mesh is
+    marks: tuple[Any, ...]  # identify mesh and settings: equal while these are unchanged
     words: tuple[str, ...] = ()  # of the command line beside these
     several: bool = False  # whether its store holds other channels, too
     mesh: Mesh | None = dataclasses.field(default=None, repr=False)  # with its holes filled
@@ -152,7 +152,7 @@ def _voxelizer(source: MeshSource) -> Voxelizer:
 
 
 def _as_it_is(solid: Solid) -> Solid:
-    """What is asked of a mesh whose holes are filled already."""
+    """`solid` for a mesh whose holes are filled already."""
     return "auto" if solid == "always" else solid
 
 

@@ -38,7 +38,7 @@ class SplatSource(VolumeSource):
     """Sorted points in finest voxels."""
 
     folder: str
-    marks: tuple[Any, ...]  # what is the same while the points and settings are
+    marks: tuple[Any, ...]  # identify points and settings: equal while these are unchanged
     words: tuple[str, ...]  # of the command line
 
     @classmethod
@@ -186,7 +186,7 @@ def _sort(source: PointSource, folder: Path, marks: list[Any], begun: bool, **op
 
 
 def _marks(points: str | Path | Points) -> list[Any]:
-    """What is the same while points are."""
+    """Values that identify points: equal while these are unchanged."""
     if not isinstance(points, Points):
         return fingerprint(points)
     total = 0

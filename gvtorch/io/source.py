@@ -102,7 +102,7 @@ class VolumeSource(ABC):
         return self
 
     def fingerprint(self) -> list[Any] | None:
-        """Returns what is the same while the content is; None: the path tells."""
+        """Returns values that are equal while the content is; None: those of the path's files."""
         return None
 
     def command(self, store: str) -> tuple[str, ...]:

@@ -195,7 +195,9 @@ class _Grid:
         return to_numpy(found)
 
     def crossed(self, low: Sequence[int], high: Sequence[int]) -> bool:
-        """Whether samples low to high may be on both sides, as far as is known without reading."""
+        """Whether samples low to high may lie on both sides of the level, as the cells of
+        a store tell, without reading voxels.
+        """
         store = self.what
         outside = self.more and any(
             a == 0 or b == n for a, b, n in zip(low, high, self.samples, strict=True)

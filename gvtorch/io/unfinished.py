@@ -124,8 +124,8 @@ def claimed(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator
 
 @contextmanager
 def _claimed_folder(target: Path) -> Iterator[None]:
-    """Holds the lock of a target; a folder that this made and nothing was written into goes again.
-    The process before may have removed the folder with the lock that this one was waiting for.
+    """Holds the lock of a target. At the end a folder is removed that this made and that is still
+    empty. While it waits, the process before may remove the folder and the lock: it tries again.
     """
     folder, made = target / WORK, not target.exists()
     while True:

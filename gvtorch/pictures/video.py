@@ -123,7 +123,10 @@ class _Mp4(_Film):
 class _Loop(_Film):
     def __init__(self, suffix: str, width: int, height: int, fps: int) -> None:
         del width, height
-        self._image = need_library(suffix, "PIL.Image", "Pillow", "video")
+        need_library(suffix, "PIL", "Pillow", "video")
+        from PIL import Image
+
+        self._image: Any = Image
         self._suffix, self._fps = suffix, fps
         self._frames: list[Any] = []
 

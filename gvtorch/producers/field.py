@@ -16,7 +16,7 @@ from ..pool import Channel
 from .producer import Bricks, Nodes, Producer, Region, Regions
 
 _BATCH = 64  # bricks that are made at a time on the CPU, whose caches then hold what is between
-_FEW = 12  # bricks: fewer at a time cost as much as parts of a field that do not matter in some
+_FEW = 12  # bricks: smaller groups cost more than they save by leaving out parts of a field
 _MARGIN = 1 / 32  # voxels by which boxes are taken wider, so that rounded places lie in them
 _ROUNDED = 2.0**-18  # relative width by which intervals are, for values are rounded too
 
@@ -261,9 +261,9 @@ def cache_field(
 def alike(
     field: nn.Module, nodes: Nodes, beyond: float, count: int
 ) -> Iterator[tuple[Tensor, nn.Module]]:
-    """Yields rows of at most so many nodes in which the same parts of a field matter, or nearly so
-    where these are few, and these parts, up to `beyond` voxels behind the brick's border. Waits for
-    the device.
+    """Groups nodes in which the same parts of a field matter, up to `beyond` voxels behind the
+    brick's border. Yields rows of at most `count` nodes, with the field of these parts alone; small
+    groups are joined. Waits for the device.
     """
     if not isinstance(field, Field):
         yield from ((rows, field) for rows in torch.arange(len(nodes)).split(count))

@@ -45,9 +45,9 @@ class Hypertexture(Producer):
     it and all after it add, brick by brick; the voxels' bits are the same with and without it. And
     regions are never made where the distance proves that.
 
-    A voxel is the mean over its cube, to a good approximation: an octave counts by as much as its
-    mean follows it, and what is lost in the mean, of noise and of the distance, makes the step from
-    0 to 1 wider: the smoothstep is replaced by the one that has the variance of them all.
+    A voxel is about the mean over its cube. Each octave has the weight that is left of it in this
+    mean. What the mean takes away, of noise and of the distance, makes the step from 0 to 1 wider:
+    in place of the smoothstep stands one with the variance of all these together.
 
     Channels are "density", and "distance" if asked for: that of the shape, in world units, by which
     a transfer function may colour (`Isosurface(0.5, colors, color_channel="distance")`).

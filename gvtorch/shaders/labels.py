@@ -248,7 +248,9 @@ class _Look:
 
 
 def _put(rows: np.ndarray, labels: np.ndarray, told: Mapping[int, Any]) -> None:
-    """Writes what is told of some labels into the rows of those that there are."""
+    """Writes the values `told` of labels into the rows of these; labels that have no row are left
+    out.
+    """
     if not told:
         return
     wanted = np.fromiter(told, np.int64, len(told))

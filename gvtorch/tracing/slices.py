@@ -91,24 +91,18 @@ def slice_picture(
     elif span is not None:
         raise ValueError(f"{where}: span is for grays; colors have values of their own")
     views = _views(data.info.space, up, radiological=radiological, letters=letters)
-    if axis != "all":
-        if isinstance(at, tuple):
-            raise ValueError(f"{where}: at must be one place for axis {axis}, got {at!r}")
-        pixel = min(plane.spacing[n] for n in "xyz" if n != axis) / scale
-        view = views[axis] if up is None else PlaneView("", up)
-        return _picture(plane.colored(axis, at, view, pixel, colors))
-    if up is not None:
-        raise ValueError(f"{where}: up is for one plane, not for axis 'all'")
-    places = at if isinstance(at, tuple) else (at, at, at)
-    pixel = min(plane.spacing.values()) / scale
-    return _picture(
-        _in_line(
-            *(
-                plane.colored(n, place, views[n], pixel, colors)
-                for n, place in zip("xyz", places, strict=True)
-            )
-        )
-    )
+    if axis == "all":
+        if up is not None:
+            raise ValueError(f"{where}: up is for one plane, not for axis 'all'")
+        places = dict(zip("xyz", at if isinstance(at, tuple) else (at, at, at), strict=True))
+        pixel = min(plane.spacing.values()) / scale
+        shown = (plane.colored(n, places[n], views[n], pixel, colors) for n in "xyz")
+        return _picture(_in_line(*shown))
+    if isinstance(at, tuple):
+        raise ValueError(f"{where}: at must be one place for axis {axis}, got {at!r}")
+    pixel = min(plane.spacing[n] for n in "xyz" if n != axis) / scale
+    view = views[axis] if up is None else PlaneView("", up)
+    return _picture(plane.colored(axis, at, view, pixel, colors))
 
 
 def _views(

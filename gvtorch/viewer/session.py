@@ -203,7 +203,7 @@ class Session:
         return bool(self._tasks) or self._closed
 
     def _fell(self, client: Client, error: Exception) -> None:
-        """A picture failed: tells why, and goes back to what could be drawn."""
+        """After a picture that failed: tells why, and returns to the last state that was drawn."""
         self.errors += 1
         self._tell_all("error", text=one_line(error))
         if self._good is not self.state:
