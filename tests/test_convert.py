@@ -20,7 +20,7 @@ from helpers import run
 from helpers.stores import assert_holds, noise, write_foreign
 
 import gvtorch as gv
-from gvtorch.io import conversion, shard
+from gvtorch.io import conversion, conversion_plan, shard
 from gvtorch.io.conversion import convert, estimate
 from gvtorch.io.formats import FORMATS, find_format
 from gvtorch.io.reading import open_source
@@ -340,7 +340,7 @@ def test_kill_9_and_resume(tmp_path, raw, data, monkeypatch):
 
 
 def test_processes_write_the_same(tmp_path, data, raw, monkeypatch):
-    monkeypatch.setattr(conversion, "_FEW", 1)
+    monkeypatch.setattr(conversion_plan, "_FEW", 1)
     seen: list[tuple[int, int]] = []
     store = convert(
         raw,
