@@ -18,7 +18,8 @@ from helpers.traces import run
 from helpers.trees import on
 
 import gvtorch as gv
-from gvtorch.shaders.colors import distinct_colors, from_srgb, linear_color
+from gvtorch.base.srgb import from_srgb
+from gvtorch.shaders.colors import distinct_colors, linear_color
 
 ORIGIN = (2.0, -1.0, 0.5)
 RED, GREEN, BLUE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)

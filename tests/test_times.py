@@ -15,7 +15,7 @@ from helpers.stores import assert_holds, noise, write_foreign
 
 import gvtorch as gv
 from gvtorch.base.image_info import ChannelInfo, ImageInfo
-from gvtorch.io import conversion, shard
+from gvtorch.io import conversion_plan, shard
 from gvtorch.io.conversion import convert, estimate
 from gvtorch.io.store import Store
 
@@ -203,7 +203,7 @@ def test_resume_goes_on_in_the_middle_of_times(tmp_path, npy, data, monkeypatch)
 
 
 def test_processes_convert_times(tmp_path, data, monkeypatch):
-    monkeypatch.setattr(conversion, "_FEW", 1)
+    monkeypatch.setattr(conversion_plan, "_FEW", 1)
     path = save_nifti(tmp_path / "a.nii.gz", data)  # staged, so that all processes read it
     told = estimate(path, tmp_path / "a.zarr", workers=2)
     assert told.tasks == 18 and told.source_bytes == data.nbytes

@@ -19,8 +19,10 @@ import urllib.parse
 import urllib.request
 from typing import Any
 
+from ..base.messages import one_line
+
 STALL = 20.0  # seconds without a byte that a server is given
-SLOWEST = 20_000  # bytes a second that it must send beyond these
+SLOWEST = 20_000  # bytes a second that a server must send after its first STALL seconds
 REFUSED = 30.0  # seconds for which a file that had no end is not asked for again
 _REASONS = 1000  # that are kept
 _NOT = (0.0, "")
@@ -148,7 +150,7 @@ def _read(url: str, most: int, part: slice | None, whole: int, end: float) -> by
             return None
         raise
     except (OSError, http.client.HTTPException, ValueError) as error:
-        raise OSError(_reason(error)) from None
+        raise OSError(one_line(error)) from None
     done = False
     try:
         if answer.status in _MISSING:
@@ -202,7 +204,7 @@ def _content(
         except TimeoutError:
             raise
         except Exception as error:  # of http.client
-            raise OSError(_reason(error)) from None
+            raise OSError(one_line(error)) from None
         if not more:
             break
         if connection is not None:
@@ -340,7 +342,3 @@ _connections = _Connections()
 @functools.cache
 def _certificates() -> ssl.SSLContext:
     return ssl.create_default_context()
-
-
-def _reason(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

@@ -166,8 +166,8 @@ class Voxelizer:
         }
 
     def constants(self, inside_k: Tensor) -> dict[str, Tensor]:
-        """Returns by channel (k, c) what voxels hold, inside or outside, that are far from all
-        triangles.
+        """Returns by channel (k, c) the values of voxels far from all triangles, inside the mesh or
+        outside.
         """
         shape = (len(inside_k), 1, 1, 1)
         inside = inside_k.view(shape)

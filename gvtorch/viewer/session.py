@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+from ..base.messages import one_line
 from ..base.stage import no_progress
 from ..base.volume import Volume
 from ..cameras import Camera
@@ -204,14 +205,13 @@ class Session:
         return bool(self._tasks) or self._closed
 
     def _fell(self, client: Client, error: Exception) -> None:
-        """A picture failed: tells why, and goes back to what could be drawn."""
+        """After a picture that failed: tells why, and returns to the last state that was drawn."""
         self.errors += 1
-        self._tell_all("error", text=" ".join(str(error).split()) or type(error).__name__)
+        self._tell_all("error", text=one_line(error))
         if self._good is not self.state:
             self.state = self._good
             self._tell_state(None)
-            for one in self.clients.values():
-                one.stir(True)
+            self._stir()
         else:
             client.rest_for(1.0)
 
@@ -306,7 +306,7 @@ class Session:
         try:
             _TAKES[type(message)](self, client, message)
         except (ValueError, OSError, ImportError, RuntimeError) as error:
-            client.tell("refused", text=" ".join(str(error).split()))
+            client.tell("refused", text=one_line(error))
             if isinstance(message, protocol.Change):
                 client.tell("state", state=self.state.to_json())
 
@@ -340,8 +340,7 @@ class Session:
         if beside and replace(before, slices=state.slices) == state:
             self._renew_planes()
         else:
-            for one in self.clients.values():
-                one.stir(message.rest)
+            self._stir(message.rest)
         self._follow_time()
 
     # Planes beside the picture, and time.
@@ -379,7 +378,7 @@ class Session:
         try:
             data = self.scene.reopen(int(wanted))
         except Exception as error:  # whatever it was, the view goes on
-            text = f"time {wanted:g}: {' '.join(str(error).split()) or type(error).__name__}"
+            text = f"time {wanted:g}: {one_line(error)}"
             self.post(lambda: self._time_failed(text))
         else:
             self.post(lambda: self._time_came(wanted, data))
@@ -446,9 +445,9 @@ class Session:
         self.scene.resize(**{name: getattr(options, name) for name in message.engine})
         self._stir()
 
-    def _stir(self) -> None:
+    def _stir(self, resting: bool = True) -> None:
         for one in self.clients.values():
-            one.stir(True)
+            one.stir(resting)
 
     def _set(self, client: Client, message: protocol.Set) -> None:
         if self.parameters is None:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..base.messages import one_line
 from ..base.volume import Volume
 from ..io.http import ask_again
 from ..io.store import Store
@@ -215,7 +216,7 @@ class Planes:
                 self._keep(key, self._cut(axis, state, pixel))
                 problem = ""
             except Exception as error:  # whatever it was, the view goes on
-                self._failed[key] = " ".join(str(error).split()) or type(error).__name__
+                self._failed[key] = one_line(error)
                 problem = f"a slice can't be read: {self._failed[key]}"
             self._reading = None
             self._arrived(problem)
