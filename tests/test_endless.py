@@ -13,8 +13,10 @@ import time
 from collections.abc import Callable, Iterator
 from http import server as servers
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import google_crc32c
 import numpy as np
 import pytest
 import torch
@@ -230,6 +232,54 @@ def test_chunks_and_indices_of_other_writers(server, tmp_path, data, kind, how):
         read()
     server.parts = False  # a server that sends all of a file in any case
     assert np.array_equal(mended(server, read), good)
+
+
+@pytest.mark.parametrize("how", ["fast", "index", "stall", "metadata"])
+def test_buckets_are_read_within_bounds(tmp_path, data, how, monkeypatch):
+    import tensorstore as ts
+
+    from gvtorch.io.store_layout import context
+
+    stalls = pytest.MonkeyPatch()
+    sharded, url = how == "index", f"memory://endless-{how}/"
+    values = data[..., :100, 0]
+    arrays = [values], "zyx", [[1.0, 1.0, 1.0]]
+    folder = write_foreign(tmp_path / "a.zarr", *arrays, sharded=sharded)
+    root = ts.KvStore.open(url, context=context()).result()
+    for file in folder.rglob("*"):
+        if file.is_file():
+            root[str(file.relative_to(folder))] = file.read_bytes()
+    store = Store.open(url)
+
+    def read() -> np.ndarray:
+        return store.read_region(0, (0, 0, 0), values.shape)[..., 0]
+
+    assert np.array_equal(read(), values)
+    name = "zarr.json" if how == "metadata" else f"s0/c/0/0/{0 if sharded else 1}"
+    good = bytes(root[name])
+    if how == "stall":
+        _promise, future = ts.Promise.new()
+        never = SimpleNamespace(read=lambda *_, **__: future)
+        for known in relay._server().folders:
+            stalls.setitem(vars(known), "_bucket", never)
+        monkeypatch.setattr(relay, "STALL", 0.2)
+        monkeypatch.setattr(relay, "SLOWEST", 10**9)
+    elif how == "index":  # the first chunk is said to be huge
+        index = bytearray(good)
+        index[-(16 * 64 + 4) : -(16 * 64 - 12)] = np.array([0, 1 << 40], "<u8").tobytes()
+        root[name] = (
+            bytes(index[:-4]) + google_crc32c.Checksum(bytes(index[-1028:-4])).digest()[::-1]
+        )
+    else:
+        root[name] = bytes(100_000_000)
+    reason = {"stall": "hardly anything", "index": "asked for"}.get(how, r"more than \d+ bytes")
+    with little_memory(), pytest.raises(OSError, match=reason) as told:
+        Store.open(url) if how == "metadata" else read()
+    assert url in str(told.value) and "\n" not in str(told.value)
+    root[name] = good
+    stalls.undo()
+    http._refused.clear()
+    assert np.array_equal(read(), values)
 
 
 def test_parts_of_files_that_never_end(server, tmp_path):

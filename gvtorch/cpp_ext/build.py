@@ -66,15 +66,16 @@ def commands(output: Path) -> dict[Path, list[list[str]]]:
     include, link = compilers.torch_flags()
     cxx = [*compilers.find_cxx(), *compilers.CXX_FLAGS, f"-I{source}", "-Wall", "-Wextra"]
     x86 = platform.machine().lower() in ("x86_64", "amd64")
-    parts = {"cpu": (["-DGV_X86"] if x86 else []) + include}
+    own = (["-DGV_X86"] if x86 else []) + include
+    parts = dict.fromkeys(("cpu_rays", "cpu_segments", "cpu"), own)
     for name, flags in compilers.INSTRUCTION_SETS.items():
         if x86 or name == "baseline":
-            parts[f"packet_{name}"] = [f"-DGV_NAMESPACE={name}", *flags]
+            parts[f"packet.{name}"] = [f"-DGV_NAMESPACE={name}", *flags]
     objects = [str(output / f"{name}.o") for name in parts]
     calls = {
         output / "libgvtorch_cpu.so": [
             *(
-                [*cxx, *flags, "-c", str(source / f"{name.split('_')[0]}.cpp"), "-o", target]
+                [*cxx, *flags, "-c", str(source / f"{name.split('.')[0]}.cpp"), "-o", target]
                 for (name, flags), target in zip(parts.items(), objects, strict=True)
             ),
             [*compilers.find_cxx(), *objects, "-Wl,--no-as-needed", *link, "-pthread"],

@@ -107,11 +107,15 @@ def read_http(
         return _in_time(url, most, part, most if whole is None else whole, seconds)
     except OSError as error:
         if not isinstance(error, TimeoutError):
-            until = time.monotonic() + (REFUSED if isinstance(error, Endless) else 0.0)
-            _refused[url] = until, str(error)
-            while len(_refused) > _REASONS:
-                _refused.pop(next(iter(_refused)), None)
+            keep_reason(url, error, REFUSED if isinstance(error, Endless) else 0.0)
         raise
+
+
+def keep_reason(url: str, error: OSError, seconds: float = 0.0) -> None:
+    """Keeps why a file can't be read; for so many seconds `read_http` does not ask for it."""
+    _refused[url] = time.monotonic() + seconds, str(error)
+    while len(_refused) > _REASONS:
+        _refused.pop(next(iter(_refused)), None)
 
 
 def refused(url: str) -> str:

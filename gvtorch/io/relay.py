@@ -1,8 +1,9 @@
-"""`through`: a folder behind http(s) as tensorstore reads it, by way of a server in this process.
+"""`through`: a folder behind a URL as tensorstore reads it, by way of a server in this process.
 
 tensorstore takes what a server sends, as long as it sends. So it asks this one, on 127.0.0.1 and
-behind a word that nobody else knows, which asks the other by `read_http`, and answers when it has
-all of a file or of a part of it: what is longer than a chunk can be, stalls or drips is refused.
+behind a word that nobody else knows, which asks the other by `read_http`, or, where it is s3:// or
+gs://, by `read_within`, and answers when it has all of a file or of a part of it: what is longer
+than a chunk can be, stalls or drips is refused.
 """
 
 from __future__ import annotations
@@ -15,9 +16,24 @@ import os
 import re
 import secrets
 import threading
+import urllib.parse
+from collections.abc import Callable
 from typing import Any
 
-from .http import SMALL, Endless, HttpStatus, file_limit, file_url, index_bytes, read_http, refused
+from .http import (
+    SLOWEST,
+    SMALL,
+    STALL,
+    Endless,
+    HttpStatus,
+    file_limit,
+    file_url,
+    index_bytes,
+    is_http,
+    keep_reason,
+    read_http,
+    refused,
+)
 
 _JOINED = 1 << 27  # bytes of parts that tensorstore asks for together
 _METADATA = 1 << 24  # bytes
@@ -32,8 +48,8 @@ class Relayed:
         spec: What tensorstore opens in its place.
     """
 
-    def __init__(self, url: str, base: str) -> None:
-        self.url = url
+    def __init__(self, url: str, base: str, context: Any) -> None:
+        self.url, self._context = url, context
         self.spec = {
             "driver": "http",
             "base_url": base,
@@ -63,12 +79,58 @@ class Relayed:
     def read(self, name: str, part: slice | None) -> bytes | None:
         """Returns a file, or a part of it; raises as `read_http`."""
         whole, piece = self.limits()
-        most = whole
-        if part is not None:
-            most = -part.start if part.stop is None else part.stop - part.start
-            if not 0 < most <= min(piece, whole):
-                raise Endless(f"{most} bytes are asked for, more than a chunk has")
-        return read_http(file_url(self.url, name), most, part, whole=whole)
+        url, most = file_url(self.url, name), whole
+        try:
+            if part is not None:
+                most = -part.start if part.stop is None else part.stop - part.start
+                if not 0 < most <= min(piece, whole):
+                    raise Endless(f"{most} bytes are asked for, more than a chunk has")
+            if not is_http(url):
+                return self._read_bucket(urllib.parse.unquote(name), part, most)
+        except OSError as error:
+            keep_reason(url, error)
+            raise
+        return read_http(url, most, part, whole=whole)
+
+    def _read_bucket(self, name: str, part: slice | None, most: int) -> bytes | None:
+        seconds = STALL + most / SLOWEST
+        try:
+            return read_within(self._bucket, name, part, most, lambda f: f.result(timeout=seconds))
+        except TimeoutError:
+            raise Endless("the server sends hardly anything") from None
+        except OSError:
+            raise
+        except Exception as error:  # tensorstore raises what its status maps to
+            raise OSError(" ".join(str(error).split())) from None
+
+    @functools.cached_property
+    def _bucket(self) -> Any:
+        import tensorstore as ts
+
+        return ts.KvStore.open(self.url, context=self._context).result(timeout=STALL)
+
+
+def read_within(
+    folder: Any, name: str, part: slice | None, most: int, wait: Callable[[Any], Any]
+) -> bytes | None:
+    """Returns the content of a file in one of tensorstore's folders, or a part of it, None if there
+    is no such file. Of a whole one the byte after `most` is asked for first: there is none.
+
+    Raises:
+        Endless: There is.
+        Exception: What `wait` raises, which returns a future's result.
+    """
+    if part is None:
+        try:
+            if wait(folder.read(name, byte_range=slice(most, most + 1))).state != "value":
+                return None
+        except Exception as error:
+            if "OUT_OF_RANGE" not in str(error):
+                raise
+        else:
+            raise Endless(f"the file is more than {most} bytes")
+    found = wait(folder.read(name, byte_range=part))
+    return bytes(found.value) if found.state == "value" else None
 
 
 def limits_of(array: Any) -> tuple[int, int]:
@@ -90,14 +152,14 @@ class _Server(http.server.ThreadingHTTPServer):
         self.lock = threading.Lock()
         threading.Thread(target=self.serve_forever, daemon=True, name="gvtorch-relay").start()
 
-    def folder(self, url: str) -> Relayed:
+    def folder(self, url: str, context: Any) -> Relayed:
         """A place for a folder; the same for the same."""
         with self.lock:
             for found in self.folders:
                 if found.url == url:
                     return found
             base = f"http://127.0.0.1:{self.server_port}/{self.word}/{len(self.folders)}/"
-            self.folders.append(Relayed(url, base))
+            self.folders.append(Relayed(url, base, context))
             return self.folders[-1]
 
     def handle_error(self, *_: object) -> None:
@@ -159,10 +221,10 @@ def _server() -> _Server:
 _starting = threading.Lock()
 
 
-def through(url: str) -> Relayed:
-    """Returns the folder at a URL as tensorstore is to read it."""
+def through(url: str, context: Any = None) -> Relayed:
+    """Returns the folder at a URL as tensorstore is to read it, `context` tensorstore's own."""
     with _starting:
-        return _server().folder(url)
+        return _server().folder(url, context)
 
 
 def named(text: str) -> str:

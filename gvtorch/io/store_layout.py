@@ -33,8 +33,8 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
 from ..base.text_path import text_path
-from .http import file_url, is_http, read_http
-from .relay import named, through
+from .http import Endless, file_url, is_http, read_http
+from .relay import named, read_within, through
 from .resources import cores
 
 if TYPE_CHECKING:
@@ -463,7 +463,7 @@ def read_key(
     most: int = MOST_JSON,
 ) -> Any:
     """Returns the content of a file in a folder, or a part of its bytes, which may count from its
-    end; None if there is no such file. Behind http the file is at most `most` bytes. Raises as
+    end; None if there is no such file. It is at most `most` bytes. Raises as
     `Deadline.wait`, and ValueError if there can be no such folder.
     """
     import tensorstore as ts
@@ -482,8 +482,12 @@ def read_key(
         folder = deadline.wait(ts.KvStore.open(root, context=context()), where)
     except StoreError as error:
         raise ValueError(f"{where}: not a store: {error}") from None
-    found = deadline.wait(folder.read(name, byte_range=part), f"{where}/{name}")
-    return found.value if found.state == "value" else None
+    try:
+        return read_within(
+            folder, name, part, most, lambda future: deadline.wait(future, f"{where}/{name}")
+        )
+    except Endless as error:
+        raise StoreError(f"{where}/{name}: {error}") from None
 
 
 def opened(root: Any, spec: dict[str, Any], mode: str = "read") -> Any:
@@ -501,7 +505,7 @@ def opened_at(folder: Any, spec: dict[str, Any], *, create: bool = False) -> Any
     """Begins to open the array that a folder is; returns tensorstore's future."""
     import tensorstore as ts
 
-    relayed = through(folder) if is_http(folder) else None
+    relayed = through(folder, context()) if isinstance(folder, str) else None
     store = {**spec, "kvstore": relayed.spec if relayed else folder}
     future = ts.open(store, context=context(), open=True, create=create)
     return relayed.opens(future) if relayed else future

@@ -1,67 +1,19 @@
-// The CPU library: defines the ops (entry.h) and runs every functor on torch's threads.
+// The CPU library: defines the ops (entry.h) and runs every functor on torch's threads. The ops of rays are implemented
+// in cpu_rays.cpp, those of segments in cpu_segments.cpp, so that they compile side by side.
 
 #include <algorithm>
 #include <cstdint>
-#include <cstdlib>
-#include <string_view>
 #include <vector>
 
 #include "entry/entry_cache.h"
 #include "entry/entry_mesh.h"
 #include "entry/entry_noise.h"
-#include "entry/entry_segments.h"
-#include "packets/chunks.h"
-#include "packets/trace_chunks.h"
+#include "packets/processor.h"
 
 namespace gvtorch {
 
-// packet.cpp, compiled once for each instruction set.
-namespace baseline {
-extern const Chunks chunks;
-}  // namespace baseline
-#ifdef GV_X86
-namespace avx2 {
-extern const Chunks chunks;
-}  // namespace avx2
-namespace avx512 {
-extern const Chunks chunks;
-}  // namespace avx512
-#endif
-
-struct Processor {
-  const char* name;
-  const Chunks& chunks;
-};
-
-// The widest instructions that this processor has; GVTORCH_CPU=baseline, avx2 or avx512 asks for fewer.
-inline Processor find_processor() {
-#ifdef GV_X86
-  const char* named = std::getenv("GVTORCH_CPU");
-  const std::string_view asked = named == nullptr ? "avx512" : named;
-  __builtin_cpu_init();
-  const bool wide = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("f16c");
-  if (asked == "avx512" && wide && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-      __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl")) {
-    return {"avx512", avx512::chunks};
-  }
-  if ((asked == "avx512" || asked == "avx2") && wide) return {"avx2", avx2::chunks};
-#endif
-  return {"baseline", baseline::chunks};
-}
-
-inline const Processor& processor() {
-  static const Processor found = find_processor();
-  return found;
-}
-
 // A user's shader is compiled for the same (cpp_ext/user.py).
 extern "C" __attribute__((visibility("default"))) const char* gvtorch_instructions() { return processor().name; }
-
-void FusedShaders::run(const Tensor& like, ShadeArgs args, bool wide) {
-  if (wide) return shade_fused<double>(like, args);
-  if (!(args.shader == kPlainShader ? packs(args) : shades(args))) return shade_fused<float>(like, args);
-  trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) { processor().chunks.shade(args, begin, end); });
-}
 
 void voxelize(const Tensor& like, const VoxelizeArgs& args) {
   constexpr int64_t kRows = 16;  // at a time
@@ -124,8 +76,6 @@ STABLE_TORCH_LIBRARY(gvtorch, library) {
 }
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) {
-  gvtorch::implement(library, gvtorch::RayOps{});
-  gvtorch::implement(library, gvtorch::SegmentOps{});
   gvtorch::implement(library, gvtorch::CacheOps{});
   gvtorch::implement(library, gvtorch::MeshOps{});
   gvtorch::implement(library, gvtorch::NoiseOps{});

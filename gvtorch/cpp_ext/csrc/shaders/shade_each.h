@@ -31,33 +31,37 @@ void shade_each(const torch::stable::Tensor& like, int64_t nodes, Kernel kernel)
   for_each<Device>(like, kernel.order.count(), kernel);
 }
 
-// Rays with a fused shader; those of the plain function, filtered or not, with voxels of a known dtype, and on CUDA
-// those that see the usual stored colours.
+// Rays with a fused shader. On CUDA the voxels' dtype is compiled in for the plain function, filtered or not, and for
+// the usual stored colours; on the CPU, where packets take nearly all rays, for the plain function in float32 alone.
 template <class T>
 void shade_fused(const torch::stable::Tensor& like, const ShadeArgs& args) {
   const auto each = [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); };
-  const bool plain = args.shader == kPlainShader;
-#ifdef __CUDACC__
-  if constexpr (std::is_same_v<T, float>) {
-    const auto colors = [&](auto voxel) {
-      with_digits<T>(args, [&](auto* digits) {
-        each(ShadeRay<T, StoredColor<T>, std::decay_t<decltype(*digits)>, false, decltype(voxel)>(args));
-      });
-    };
-    const bool stored = args.shader == static_cast<int32_t>(ShaderKind::kStoredColor);
-    if (stored && args.voxel == VoxelType::kUInt8) return colors(uint8_t{});
-    if (stored && args.voxel == VoxelType::kHalf) return colors(Half{});
-  }
-#endif
-  if (!plain && args.shader != static_cast<int32_t>(ShaderKind::kFiltered)) return with_rays<T>(args, each);
-  with_voxel(args.voxel, [&](auto voxel) {
+  const auto typed = [&](auto shader, auto voxel) {
+    using Shader = typename decltype(shader)::Shader;
     with_digits<T>(args, [&](auto* digits) {
-      using Voxel = decltype(voxel);
-      using Digits = std::decay_t<decltype(*digits)>;
-      plain ? each(ShadeRay<T, Plain<T>, Digits, false, Voxel>(args))
-            : each(ShadeRay<T, Filtered<T>, Digits, false, Voxel>(args));
+      each(ShadeRay<T, Shader, std::decay_t<decltype(*digits)>, false, decltype(voxel)>(args));
     });
-  });
+  };
+#ifdef __CUDACC__
+  const auto is = [&](ShaderKind kind) { return args.shader == static_cast<int32_t>(kind); };
+  if (is(ShaderKind::kFiltered)) {
+    return with_voxel(args.voxel, [&](auto voxel) { typed(ShaderType<Filtered<T>, false>{}, voxel); });
+  }
+  if constexpr (std::is_same_v<T, float>) {
+    const ShaderType<StoredColor<T>, false> colors;
+    if (is(ShaderKind::kStoredColor) && args.voxel == VoxelType::kUInt8) return typed(colors, uint8_t{});
+    if (is(ShaderKind::kStoredColor) && args.voxel == VoxelType::kHalf) return typed(colors, Half{});
+  }
+  constexpr bool kTyped = true;
+#else
+  constexpr bool kTyped = std::is_same_v<T, float>;
+#endif
+  if constexpr (kTyped) {
+    if (args.shader == kPlainShader) {
+      return with_voxel(args.voxel, [&](auto voxel) { typed(ShaderType<Plain<T>, false>{}, voxel); });
+    }
+  }
+  with_rays<T>(args, each);
 }
 
 }  // namespace gvtorch

@@ -1,0 +1,18 @@
+// The ops of rays on the CPU: in packets where those can, else ray by ray.
+
+#include "entry/entry.h"
+#include "packets/processor.h"
+#include "packets/trace_chunks.h"
+#include "shaders/shade_each.h"
+
+namespace gvtorch {
+
+void FusedShaders::run(const Tensor& like, ShadeArgs args, bool wide) {
+  if (wide) return shade_fused<double>(like, args);
+  if (!(args.shader == kPlainShader ? packs(args) : shades(args))) return shade_fused<float>(like, args);
+  trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) { processor().chunks.shade(args, begin, end); });
+}
+
+}  // namespace gvtorch
+
+STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) { gvtorch::implement(library, gvtorch::RayOps{}); }

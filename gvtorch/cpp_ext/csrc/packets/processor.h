@@ -1,0 +1,50 @@
+// Which instruction set packets are traced by: chosen once, when the first are asked for.
+#pragma once
+
+#include <cstdlib>
+#include <string_view>
+
+#include "packets/chunks.h"
+
+namespace gvtorch {
+
+// packet.cpp, compiled once for each instruction set.
+namespace baseline {
+extern const Chunks chunks;
+}  // namespace baseline
+#ifdef GV_X86
+namespace avx2 {
+extern const Chunks chunks;
+}  // namespace avx2
+namespace avx512 {
+extern const Chunks chunks;
+}  // namespace avx512
+#endif
+
+struct Processor {
+  const char* name;
+  const Chunks& chunks;
+};
+
+// The widest instructions that this processor has; GVTORCH_CPU=baseline, avx2 or avx512 asks for fewer.
+inline Processor find_processor() {
+#ifdef GV_X86
+  const char* named = std::getenv("GVTORCH_CPU");
+  const std::string_view asked = named == nullptr ? "avx512" : named;
+  __builtin_cpu_init();
+  const bool wide = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("f16c");
+  if (asked == "avx512" && wide && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+      __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl")) {
+    return {"avx512", avx512::chunks};
+  }
+  if ((asked == "avx512" || asked == "avx2") && wide) return {"avx2", avx2::chunks};
+#endif
+  return {"baseline", baseline::chunks};
+}
+
+inline const Processor& processor() {
+  static const Processor found = find_processor();
+  return found;
+}
+
+}  // namespace gvtorch
