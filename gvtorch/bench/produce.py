@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import closing
-from typing import NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -49,18 +49,10 @@ def ripples(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     return (127.5 + 127.5 * torch.sin(40 * radius)).to(torch.uint8)[..., None]
 
 
-class ManyNodes(NamedTuple):
-    """What a producer is asked for at once."""
-
-    producer: Producer
-    nodes: Nodes
-
-
 def library() -> dict[str, Producer]:
     """One of each kind, about a box of 2 units, by name."""
     bulb = Solid(Mandelbulb(8, iterations=6), normals=False)
     ball, lace = sdf.Sphere(0.9), sdf.Shell(sdf.Gyroid(0.46), 0.035)
-    lump = {"thickness": 0.1, "frequency": 4.0, "octaves": 6}
     octaves = noise.SplineSum(frequency=4.0, octaves=8)
     generator = torch.Generator().manual_seed(5)
     points = torch.randn((1_000_000, 3), generator=generator).double()
@@ -70,7 +62,7 @@ def library() -> dict[str, Producer]:
         "distance field": FieldProducer(Solid(lace & ball), _SIDE),
         "noise of 6 octaves": FieldProducer(_Clouds(), _SIDE, box=_BOX, samples=1),
         "octaves by level": OctaveProducer(octaves, _SIDE, box=_BOX),
-        "hypertexture": Hypertexture(ball, _SIDE, **lump),
+        "hypertexture": Hypertexture(ball, _SIDE, thickness=0.1, frequency=4.0, octaves=6),
         "mesh of 100,000 triangles": MeshProducer(bumps(100_000), resolution=1024),
         "1,000,000 points": PointProducer(points, extent=1024),
     }
@@ -92,16 +84,16 @@ def produce(record: Record) -> None:
         settings.tell(f"produce: {name}")
         most = {"cpu": 1 << 8, "cuda": 1 << 13}[settings.device.type] >> (4 * settings.quick)
         with closing(producer):
-            asked = some_nodes(producer.to(settings.device), most, settings.device)
+            nodes = some_nodes(producer.to(settings.device), most, settings.device)
             compiles = name == "rings" or not settings.quick
-            _both(record, f"{name}: {len(asked.nodes):,} bricks", asked, compiles)
+            _both(record, f"{name}: {len(nodes):,} bricks", producer, nodes, compiles)
     record.note(
         "max difference: of compiled numbers from eager ones, beside the largest. Places are made "
         "of nodes in float64, as producers do it."
     )
 
 
-def some_nodes(producer: Producer, most: int, device: torch.device) -> ManyNodes:
+def some_nodes(producer: Producer, most: int, device: torch.device) -> Nodes:
     """Random nodes of the finest level that have data, at most so many."""
     layout = Layout.of(producer, 8, 1, device)
     producer.prepare(layout)
@@ -112,7 +104,7 @@ def some_nodes(producer: Producer, most: int, device: torch.device) -> ManyNodes
         loc = torch.randint(0, side, (8 * most, 4), generator=generator)
         loc[:, 3] = layout.depth
         loc = loc.to(device)
-        regions = producer.classify(Nodes(loc, layout))
+        regions: Any = producer.classify(Nodes(loc, layout))
         kind = regions.kind if isinstance(regions, Regions) else regions
         found.append(loc[kind.to(device) == Region.DATA])
         if sum(map(len, found)) >= most:
@@ -122,16 +114,16 @@ def some_nodes(producer: Producer, most: int, device: torch.device) -> ManyNodes
     if producer.needs_parent:
         above = torch.cat((loc[:, :3] // layout.branching, loc[:, 3:] - 1), 1)
         parents = producer.bricks_at(above, layout)
-    return ManyNodes(producer, Nodes(loc, layout, parents=parents))
+    return Nodes(loc, layout, parents=parents)
 
 
-def _both(record: Record, case: str, asked: ManyNodes, compiles: bool) -> None:
+def _both(record: Record, case: str, producer: Producer, nodes: Nodes, compiles: bool) -> None:
     """Eager, then compiled, which takes a compiler many seconds."""
-    settings, (producer, nodes) = record.settings, asked
+    settings = record.settings
 
     def eager() -> Tensor:
-        answer = producer.fill(Nodes(nodes.loc, nodes.layout, parents=nodes.parents))
-        data = answer.data if isinstance(answer, Bricks) else answer
+        answer: Any = producer.fill(Nodes(nodes.loc, nodes.layout, parents=nodes.parents))
+        data: Any = answer.data if isinstance(answer, Bricks) else answer
         return torch.cat([rows.reshape(len(nodes), -1).float() for rows in data.values()], 1)
 
     expected = eager()
