@@ -19,6 +19,11 @@ def quick_compiler(folder: Path, *before: str) -> str:
     return str(file)
 
 
+def only_included(folder: Path) -> str:
+    """A compiler that writes what a real one would compile, and notes what that is made of."""
+    return quick_compiler(folder, 'set -- "$@" -E')
+
+
 def write(folder: Path, body: str, name: str = "own.h") -> Path:
     """A header with a struct `Own` around `body`, without packets, which take twice as long."""
     path = folder / name
