@@ -102,7 +102,7 @@ def test_colour_and_channel_of_a_surface_are_edited_one_after_the_other(blobs):
     tree = gv.N3Tree.from_volume(blobs)
     surface = gv.Isosurface(0.5)
     surface.color = GRAY
-    with pytest.raises(ValueError, match="a transfer function and color_channel belong together"):
+    with pytest.raises(ValueError, match="color=None and color_channel belong together"):
         gv.render(tree, camera(8), surface)
     surface.other = "value"
     expected = gv.render(tree, camera(8), gv.Isosurface(0.5, GRAY, color_channel="value"))
