@@ -4,7 +4,10 @@ little memory and time, and `convert` says what `read_volume` says.
 
 from __future__ import annotations
 
+import gzip
+import importlib
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -131,3 +134,31 @@ def test_nrrd_data_behind_lines_and_bytes(tmp_path, encoding, lines):
         + packed
     )
     assert np.array_equal(gv.read_volume(tmp_path / "a.nrrd").data[..., 0].numpy(), data)
+
+
+@pytest.mark.parametrize("kind", ["mesh", "points"])
+def test_meshes_and_points_unpack_to_no_more_than_free_memory(tmp_path, monkeypatch, kind):
+    if kind == "mesh":
+        file, read = tmp_path / "a.obj.gz", gv.read_mesh
+        file.write_bytes(gzip.compress(b"v 1 2 3\n" * 10**5))
+    else:
+        file, read = tmp_path / "a.npz", gv.read_points
+        np.savez_compressed(file, position=np.zeros((10**5, 3), np.float32))
+    assert file.stat().st_size < 10_000
+    module = importlib.import_module(f"gvtorch.io.{kind.rstrip('s')}_file")
+    monkeypatch.setattr(module, "memory_free", lambda: 10**6)
+    with pytest.raises(ValueError, match=r"unpacks to .*memory") as told:
+        read(file)
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("name", ["a.pvcc", "a.json", "a.ply", "a.obj.gz", "a.npz"])
+def test_a_pipe_is_no_file_of_cameras_meshes_or_points(tmp_path, name):
+    """Reading one would wait for ever."""
+    os.mkfifo(tmp_path / name)
+    readers = [gv.read_cameras, gv.CameraPath.from_json, gv.TransferFunction.from_file]
+    readers += [gv.read_mesh] * name.startswith(("a.ply", "a.obj"))
+    readers += [gv.read_points] * name.endswith(("ply", "npz"))
+    for read in readers:
+        with pytest.raises((FileNotFoundError, ValueError)):
+            read(tmp_path / name)

@@ -74,7 +74,7 @@ def read_cameras(
     path = Path(path)
     if (width is None) != (height is None):
         raise ValueError("read_cameras: width and height go together")
-    if not path.exists():
+    if not (path.is_file() or path.is_dir()):  # a pipe may never end
         raise FileNotFoundError(f"cameras not found: {path}")
     read = _reader(path)
     try:

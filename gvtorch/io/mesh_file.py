@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,12 @@ import numpy as np
 from ..base.messages import need_library, one_line
 from ..base.srgb import from_srgb
 from ..meshes.mesh import MOST_FACES, Material, Mesh
+from .resources import amount, memory_free
 
 #: Endings that are read, also with .gz behind them. Others of trimesh's need more than it, or
 #: unpickle what they find.
 ENDINGS = ("obj", "ply", "stl", "gltf", "glb", "off")
+_MEMORY_A_BYTE = 4  # of a file, at least, that reading it takes
 _FACE_BYTES = 1  # a triangle takes more bytes than this in any of them
 
 
@@ -97,10 +100,15 @@ def _ending(path: Path) -> tuple[str, bool]:
 def _content(path: Path, packed: bool) -> bytes:
     if not packed:
         return path.read_bytes()
+    most = memory_free() // _MEMORY_A_BYTE
     try:
-        return gzip.decompress(path.read_bytes())
-    except (OSError, EOFError) as error:
+        with gzip.open(path) as stream:
+            content = stream.read(most + 1)
+    except (OSError, EOFError, zlib.error) as error:
         raise ValueError(f"{path}: can't be unpacked: {error}") from None
+    if len(content) > most:
+        raise ValueError(f"{path}: unpacks to more than {amount(most)}, what free memory can take")
+    return content
 
 
 def _check_claims(path: Path, ending: str, content: bytes) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import warnings
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
@@ -18,6 +19,7 @@ import numpy as np
 from ..base.messages import need_library
 from ..base.srgb import from_srgb
 from ..points.points import Points
+from .resources import amount, memory_free
 from .source import told_as
 
 ENDINGS = ("npz", "ply", "fits", "fit", "fits.gz")
@@ -127,6 +129,10 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
 
 
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    with zipfile.ZipFile(path) as archive:
+        size, free = sum(one.file_size for one in archive.infolist()), memory_free()
+    if size > free:
+        raise ValueError(f"it unpacks to {amount(size)}, {amount(free)} of memory are free")
     with path.open("rb") as file, np.load(file, allow_pickle=False) as content:
         return dict(content)
 

@@ -20,10 +20,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.vdb import ZIP, Grid, VdbWriter, nano_file, nano_grid
 
 import gvtorch as gv
 from gvtorch.io import budget
 from gvtorch.ops.registry import FAKES
+from gvtorch.viewer.state import Eye
 
 # Libraries leave files open that they can't read.
 pytestmark = pytest.mark.filterwarnings(
@@ -110,8 +112,11 @@ def short_budget(monkeypatch):
 # --- readers
 
 
-def volumes(folder: Path) -> dict[str, bytes]:
-    """A small file of every format that can be written here."""
+Whole = dict[str, tuple[bytes, Callable[[Path], Any]]]  # what a file holds, and its reader
+
+
+def volumes(folder: Path) -> Whole:
+    """A small file of every format of volumes that can be written here."""
     data = (np.arange(4 * 5 * 6).reshape(4, 5, 6) % 200).astype(np.uint8)
     np.save(folder / "a.npy", data)
     np.savez_compressed(folder / "a.npz", a=data)
@@ -134,18 +139,76 @@ def volumes(folder: Path) -> dict[str, bytes]:
     nibabel.save(nibabel.Nifti1Image(data, np.eye(4)), folder / "a.nii.gz")
     nibabel.save(nibabel.Nifti1Image(data, np.eye(4)), folder / "b.nii")
     fits.PrimaryHDU(data).writeto(folder / "a.fits")
-    return {file.name: file.read_bytes() for file in sorted(folder.iterdir())}
+    rng = np.random.default_rng(0)
+    values, active = rng.integers(-9, 9, (512, 1)).astype(np.float32), rng.random(512) < 0.5
+    VdbWriter().write(folder / "a.vdb", Grid("float", 7, {(0, 0, 0): (values, active)}))
+    VdbWriter(packing=ZIP).write(folder / "b.vdb", Grid("float", 7, {(8, 0, 0): (values, active)}))
+    grid, (number, _) = nano_grid("float", rng)
+    nano_file(folder / "a.nvdb", ("density", number, grid))
+    nano_file(folder / "b.nvdb", ("density", number, grid), codec=1)
+    return read_by(folder, lambda file: gv.read_volume(file, nan=0))
+
+
+def read_by(folder: Path, read: Callable[[Path], Any]) -> Whole:
+    return {file.name: (file.read_bytes(), read) for file in sorted(folder.iterdir())}
+
+
+def meshes(folder: Path) -> Whole:
+    """Triangles, of every format that trimesh writes."""
+    import trimesh
+
+    mesh = trimesh.creation.box()
+    mesh.visual.vertex_colors = np.arange(32, dtype=np.uint8).reshape(8, 4)
+    for ending in ("obj", "ply", "stl", "glb", "off"):
+        mesh.export(folder / f"mesh.{ending}")
+    (folder / "packed.obj.gz").write_bytes(gzip.compress((folder / "mesh.obj").read_bytes()))
+    return read_by(folder, gv.read_mesh)
+
+
+def points(folder: Path) -> Whole:
+    place = np.random.default_rng(0).random((9, 3)).astype(np.float32)
+    np.savez_compressed(folder / "points.npz", position=place, mass=place[:, 0])
+    head = "ply\nformat {} 1.0\nelement vertex 9\n" + "".join(
+        f"property float {axis}\n" for axis in "xyz"
+    )
+    text = head.format("ascii") + "end_header\n" + "\n".join("1 2 3" for _ in place)
+    (folder / "text.ply").write_text(text)
+    binary = head.format("binary_little_endian") + "end_header\n"
+    (folder / "points.ply").write_bytes(binary.encode() + place.tobytes())
+    return read_by(folder, gv.read_points)
+
+
+def looks(folder: Path) -> Whole:
+    """Cameras, paths of cameras, states of a view, key frames."""
+    camera = gv.Camera.look_at((1, 2, 3), (0, 0, 0), width=8, height=6)
+    for name in ("cameras.json", "camera.pvcc"):
+        gv.write_cameras(folder / name, camera)
+    made = read_by(folder, gv.read_cameras)
+    keys = [{"eye": [n, 0, 5], "target": [0, 0, 0], "fov": 30} for n in range(3)]
+    made["path.json"] = (json.dumps(keys).encode(), gv.CameraPath.from_json)
+    look = gv.TransferFunction.preset("bone", 0, 1)
+    state = gv.ViewState(shader=gv.Lit(look), camera=Eye(eye=(0, 0, 5), target=(0, 0, 0)))
+    made["state.json"] = (json.dumps(state.to_json()).encode(), state.read)
+    frames = [{"time": n, "state": state.to_json()} for n in range(2)]
+    made["keys.json"] = (json.dumps(frames).encode(), lambda file: gv.Flight.read(file, state))
+    return made
 
 
 def test_readers(tmp_path_factory):
     """A broken file is read, or refused in one line."""
-    whole, folder = volumes(tmp_path_factory.mktemp("whole")), tmp_path_factory.mktemp("broken")
+    whole, folder = dict[str, Any](), tmp_path_factory.mktemp("broken")
+    for kind in (volumes, meshes, points, looks):
+        whole |= kind(tmp_path_factory.mktemp(kind.__name__))
 
     def attempt(pick: random.Random) -> tuple[str, Callable[[], bytes], str]:
         name = pick.choice(sorted(whole))
-        content = broken(whole[name], pick)
+        content, read = whole[name]
+        if name.endswith(".json") and pick.random() < 0.7:
+            content = json.dumps(changed(json.loads(content), pick)).encode()
+        else:
+            content = broken(content, pick)
         (folder / name).write_bytes(content)
-        return outcome(lambda: gv.read_volume(folder / name, nan=0)), lambda: content, name
+        return outcome(lambda: read(folder / name)), lambda: content, name
 
     assert not first_fault("reader", attempt)
 
