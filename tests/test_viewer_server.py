@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import sys
 import threading
 
 import aiohttp
@@ -231,7 +232,8 @@ def test_the_command(tmp_path, small, scan_store, monkeypatch):
 
 
 def test_a_missing_library_is_one_line(monkeypatch, small):
-    monkeypatch.setitem(__import__("sys").modules, "aiohttp", None)
+    for name in ("aiohttp", "aiohttp.web"):
+        monkeypatch.setitem(sys.modules, name, None)
     run = gvtorch("view", small, "--no-browser")
     assert run.returncode == 2 and "pip install 'gvtorch[view]'" in run.stderr
     assert len(run.stderr.splitlines()) == 1
