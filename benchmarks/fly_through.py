@@ -48,6 +48,10 @@ class Settings:
     loading: str = "straight"
     workers: int = 2
     """threads that read the store: on one's own disk more of them only wait for one another"""
+    batch: int = 512
+    """on CUDA: most bricks that a frame makes"""
+    compiled: bool = False
+    """bricks are made by torch.compile, in batches that are full"""
     graph: bool = True
     """on CUDA: each frame is one graph"""
     device: str = "cpu"
@@ -125,7 +129,8 @@ def flight(middle: float, half: float) -> CameraPath:
 def scene(settings: Settings) -> tuple[gv.Shader, list[gv.Camera]]:
     """What is seen of the solid, and from where."""
     if settings.source == "mandelbulb":
-        shader: gv.Shader = gv.StoredColor("rgba", premultiplied=True, lit=True)
+        shader: gv.Shader = gv.Isosurface(127.5, None, color_channel="rgba", premultiplied=True)
+        shader.channel, shader.component = "rgba", 3  # the surface is where the opacity is a half
         path = flight(0.0, 1.1)
     else:
         opacity = [(100, 0), (140, 0.9)]
@@ -141,6 +146,12 @@ def source(settings: Settings, store: Path) -> gv.Producer:
     if settings.source == "store":
         return gv.StoredProducer(store, workers=settings.workers)
     return mandelbulb(settings.side) if settings.source == "mandelbulb" else Worn(settings.side)
+
+
+def compile_batches(producer: gv.Producer, batch: int) -> None:
+    """Compiles what makes bricks in batches of this size; others are made as ever."""
+    eager, quick = producer.fill, torch.compile(producer.fill, dynamic=False)
+    producer.fill = lambda nodes: (quick if len(nodes) == batch else eager)(nodes)
 
 
 def quantiles(times: list[float]) -> list[str]:
@@ -167,7 +178,7 @@ def fly(producer: gv.Producer, pool: str, settings: Settings, console: Console) 
     with gv.Engine(producer, device=settings.device, **options) as engine:
         engine.render(cameras[0], shader)  # the flight begins with what its first view needs
         if engine.device.type == "cuda" and settings.graph:
-            draw = engine.capture(cameras[0], shader).replay
+            draw = engine.capture(cameras[0], shader, batch=settings.batch).replay
         else:
             draw = partial(engine.frame, shader=shader)
         start = time.perf_counter()
@@ -210,7 +221,10 @@ def main(settings: Settings) -> None:
         for column in ("median ms", "p99 ms", "frames / s", "bricks / s"):
             table.add_column(column, justify="right")
         for pool in settings.pools:
-            table.add_row(*fly(source(settings, store), pool, settings, console))
+            producer = source(settings, store)
+            if settings.compiled:
+                compile_batches(producer, settings.batch)
+            table.add_row(*fly(producer, pool, settings, console))
         if settings.resident and settings.source == "store":
             table.add_row(*fly_resident(store, settings, console))
         Console().print(table)

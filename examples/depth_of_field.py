@@ -39,9 +39,7 @@ def seen(volume: gv.Volume, function: gv.TransferFunction) -> gv.Volume:
     return gv.Volume(rgba.half(), spacing=volume.spacing, origin=volume.origin)
 
 
-def thin_lens(
-    tree: gv.N3Tree, camera: gv.Camera, shader: gv.StoredColor, aperture: float
-) -> torch.Tensor:
+def thin_lens(tree: gv.N3Tree, camera: gv.Camera, shader: gv.StoredColor, aperture: float):
     """(h, w, 3) mean colour of rays from all over the lens through each pixel's point in focus."""
     placed = camera.placed(tree.box)
     rays, side = placed.rays(tree.device), float((tree.box[1] - tree.box[0]).max())
@@ -66,11 +64,7 @@ def main(settings: Settings) -> None:
     for aperture in APERTURES:
         lens = gv.ThinLens(aperture=aperture, focus=FOCUS, frame="box")
         picture = gv.render(tree, camera, shader, lens=lens)
-        stats = picture.stats
-        print(
-            f"aperture {aperture:g}: {stats.samples} samples, {stats.bricks_used} bricks, "
-            f"{stats.milliseconds:.0f} ms"
-        )
+        print(f"aperture {aperture:g}: {picture.stats}")
         colors.append(picture.color)
     expected = thin_lens(tree, camera, shader, APERTURES[-1])
     planes = (one.movedim(-1, 0)[None].clamp(0, 1) for one in (colors[-1], expected))

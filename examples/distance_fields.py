@@ -39,7 +39,7 @@ class Settings:
     """Renders the lantern."""
 
     output: Path = Path("distance_fields.png")
-    size: int = 540
+    size: int = 720
     extent: int = 400
     device: str = "cpu"
 

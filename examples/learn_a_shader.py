@@ -1,9 +1,9 @@
 """Learns a transfer function from pictures: a module shader starts as a gray haze, and gradients
 through the renderer find the colours and opacities that made the pictures."""
 
-import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -13,7 +13,6 @@ import gvtorch as gv
 
 SCAN = Path(__file__).parent / "data" / "aneurism_256x256x256_uint8.raw.gz"
 ROWS, STEPS, RATE = 24, 60, 0.2
-TRAINING = {"step": 1.0}
 
 
 class Learned(torch.nn.Module):
@@ -54,33 +53,27 @@ def main(settings: Settings) -> None:
     shader = gv.ModuleShader(module)
     small = max(8, settings.size // 5)
     views = gv.Camera.orbit([0, 75, 150, 225], [10, -20, 30, -5], 1.6, 30, small, small)
-    pictures = [gv.render(tree, views[i], target, **TRAINING).color for i in range(len(views))]
+    pictures = [gv.render(tree, views[i], target, step=1.0).color for i in range(len(views))]
     optimizer = torch.optim.Adam(module.parameters(), lr=RATE)
     new = gv.Camera.orbit(40, 15, 1.5, 30, settings.size, settings.size)
-
-    def look() -> gv.Picture:
-        with torch.no_grad():
-            return gv.render(tree, new, shader)
-
+    look = torch.no_grad()(partial(gv.render, tree, new, shader))
     before, losses = look(), []
     for step in range(STEPS):
         at = step % len(views)
-        color = gv.render(tree, views[at], shader, **TRAINING).color
+        color = gv.render(tree, views[at], shader, step=1.0).color
         loss = (shown(color) - shown(pictures[at])).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         losses.append(float(loss.detach()))
-        if step % 10 == 0:
-            print(f"step {step:3d}  loss {losses[-1]:.5f}")
-    first, last = (sum(part) / len(part) for part in (losses[: len(views)], losses[-len(views) :]))
+    first, last = sum(losses[: len(views)]), sum(losses[-len(views) :])
     print(f"loss {first:.5f} -> {last:.5f}: {first / last:.0f} times less")
     after, aim = look(), gv.render(tree, new, target)
     error = float((after.color - aim.color).square().mean())
-    print(f"a new view: PSNR {-10 * math.log10(error):.1f} dB")
-    both = torch.cat([picture.color.cpu() for picture in (before, after, aim)], 1)
-    dataclasses.replace(aim, color=both).save(settings.output)
-    print(settings.output)
+    print(f"{settings.output}: a new view, PSNR {-10 * math.log10(error):.1f} dB")
+    replace(aim, color=torch.cat([one.color.cpu() for one in (before, after, aim)], 1)).save(
+        settings.output
+    )
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """Lighting by secondary cones. Above: a scan in its shader's own light, with soft shadows, and
-with ambient occlusion. Below: a room with a lamp: direct light, occluded ambient light, one
-bounce of light.
+with ambient occlusion. Below: a room with a lamp: direct light, occluded ambient light, one bounce.
 """
 
 import math
@@ -13,18 +12,15 @@ import tyro
 
 import gvtorch as gv
 
-DATA = Path(__file__).parent / "data"
 SUN = gv.DirectionalLight((-1.0, -1.2, -0.8), (1.25, 1.1, 0.9), angle=4)
-VESSELS = gv.Isosurface(
-    50, (0.85, 0.35, 0.25), light=SUN, ambient=0.5, diffuse=0.75, specular=0.2, shininess=30
-)
+SHINE = {"ambient": 0.5, "diffuse": 0.75, "specular": 0.2, "shininess": 30}
+VESSELS = gv.Isosurface(50, (0.85, 0.35, 0.25), light=SUN, **SHINE)
 SKY, EVENING = (0.75, 0.9, 1.15), (0.5, 0.56, 0.64)
 SIDE, WALL, SOFT = 96, 5.0, 3.0  # voxels: of the room, its walls, and the fade of surfaces
 WHITE, RED, GREEN, BRASS = (0.8, 0.8, 0.8), (0.8, 0.1, 0.06), (0.12, 0.55, 0.1), (0.85, 0.7, 0.45)
 LAMP = gv.PointLight((46.0, 82.0, 66.0), (1.0, 0.95, 0.85), radius=7.0)
-PAINT = gv.StoredColor(
-    "rgba", premultiplied=True, light=LAMP, ambient=1.0, diffuse=1.0, specular=0.0
-)
+MATT = {"ambient": 1.0, "diffuse": 1.0, "specular": 0.0}
+PAINT = gv.StoredColor("rgba", premultiplied=True, light=LAMP, **MATT)
 
 
 @dataclass
@@ -59,28 +55,24 @@ def room() -> gv.Volume:
 def main(settings: Settings) -> None:
     """Renders six pictures."""
     size = settings.size
-    scan = gv.read_volume(DATA / "aneurism_256x256x256_uint8.raw.gz")
+    scan = gv.read_volume(Path(__file__).parent / "data" / "aneurism_256x256x256_uint8.raw.gz")
     vessels = gv.N3Tree.from_volume(scan, device=settings.device)
     box = gv.N3Tree.from_volume({"rgba": room()}, device=settings.device)
     orbit = gv.Camera.orbit(30, 20, 1.25, 32, size, size)
     front = gv.Camera.look_at((48, 60, 250), (48, 46, 48), fov=28.5, width=size, height=size)
-    soft = gv.Lighting(ambient=SKY)
+    soft, lamp = gv.Lighting(ambient=SKY), gv.Lighting(ambient=(0, 0, 0))
     near = gv.Lighting(ambient=SKY, occlusion=0.85, reach=0.1, frame="box")
-    lamp = gv.Lighting(ambient=(0, 0, 0))
     dim = gv.Lighting(ambient=(0.3, 0.3, 0.3), occlusion=0.9)
     bounce = replace(dim, ambient=(0.1, 0.1, 0.1), indirect=1.0, reach=SIDE)
     images = []
-    for tree, camera, shader, lights in (
-        (vessels, orbit, VESSELS, (None, soft, near)),
-        (box, front, PAINT, (lamp, dim, bounce)),
-    ):
+    both = (vessels, orbit, VESSELS, (None, soft, near)), (box, front, PAINT, (lamp, dim, bounce))
+    for tree, camera, shader, lights in both:
         for lighting in lights:
             render = partial(gv.render, tree, shader=shader, lighting=lighting, background=EVENING)
             picture = gv.Progressive(render).refine(camera, settings.samples)
             images.append(picture.color)
-            print(f"{len(images)}: {picture.stats.milliseconds:.0f} ms a sample")
-    rows = [torch.cat(images[i : i + 3], dim=1) for i in (0, 3)]
-    replace(picture, color=torch.cat(rows)).save(settings.output)
+    rows = torch.cat([torch.cat(images[i : i + 3], dim=1) for i in (0, 3)])
+    replace(picture, color=rows).save(settings.output)
     print(settings.output)
 
 

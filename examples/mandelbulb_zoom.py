@@ -24,7 +24,7 @@ class Settings:
 
     output: Path = Path("mandelbulb_zoom.png")
     size: int = 320
-    cone_scale: float = 1.4  # pixels that a voxel is wide: below 1 it is as sharp as it gets
+    cone_scale: float = 2.0  # pixels that a voxel is wide: below 1 it is as sharp as it gets
     film: Path = Path("mandelbulb_zoom.mp4")
     frames: int = 0
     budget: int = 4096  # most bricks a frame
@@ -54,9 +54,21 @@ def look(place: torch.Tensor, ways: torch.Tensor, level: float, width: int, heig
     eye, up = place + BOX * 0.5**level * way / way.norm(), torch.tensor([0.0, 0.0, 1.0]).double()
     sun = -way - 0.9 * torch.nn.functional.normalize(torch.linalg.cross(way, up), dim=0) - 0.5 * up
     light = gv.DirectionalLight(tuple(sun.tolist()), (1.5, 1.25, 0.9), angle=4)
-    stone = gv.StoredColor("rgba", premultiplied=True, lit=True, light=light, ambient=0.35)
+    painted = {"color_channel": "rgba", "premultiplied": True, "light": light, "ambient": 0.35}
+    stone = gv.Isosurface(0.5, None, **painted)
+    stone.channel, stone.component = "rgba", 3  # where the opacity is a half
     size = {"fov": 60, "width": width, "height": height}
     return gv.Camera.look_at(tuple(eye.tolist()), tuple(place.tolist()), **size), stone
+
+
+def opened(shape: gv.Mandelbulb, settings: Settings) -> gv.Engine:
+    """An engine for it, with a pool of fixed size. Each iteration adds details an eighth as large:
+    those that are finer than pixels would be noise.
+    """
+    solid, box = gv.Solid(shape, normals=False), ((-BOX / 2,) * 3, (BOX / 2,) * 3)
+    producer = gv.FieldProducer(solid, 2**33, box=box)
+    limits = {"brick_pool": "512 MB", "load_budget": settings.budget}
+    return gv.Engine(producer, device=settings.device, **limits)
 
 
 def fly(engine: gv.Engine, route: tuple[torch.Tensor, torch.Tensor], settings: Settings) -> None:
@@ -79,23 +91,22 @@ def fly(engine: gv.Engine, route: tuple[torch.Tensor, torch.Tensor], settings: S
 
 def main(settings: Settings) -> None:
     """Flies there, then renders the six places."""
-    shape = gv.Mandelbulb(8, iterations=20, colors=COLORS)
-    route, solid = plan(shape), gv.Solid(shape, normals=False)
-    producer = gv.FieldProducer(solid, 2**33, box=((-BOX / 2,) * 3, (BOX / 2,) * 3))
-    limits = {"brick_pool": "512 MB", "load_budget": settings.budget}
-    options = {"cone_scale": settings.cone_scale}
-    pictures, size = [], (settings.size * 16 // 27 + 1, settings.size // 2)
-    with gv.Engine(producer, device=settings.device, **limits) as engine:
-        if settings.frames:
+    finest = gv.Mandelbulb(8, iterations=20, colors=COLORS)
+    route, options = plan(finest), {"cone_scale": settings.cone_scale}
+    if settings.frames:
+        with opened(finest, settings) as engine:
             fly(engine, route, settings)
-        for level in PLACES:
-            camera, stone = look(*route, level, *size)
+    pictures, size = [], (settings.size * 16 // 27 + 1, settings.size // 2)
+    for level in PLACES:
+        shape = gv.Mandelbulb(8, iterations=4 + int(level / 2), colors=COLORS)
+        camera, stone = look(*route, level, *size)
+        with opened(shape, settings) as engine:
             found = engine.render(camera, stone, **options)  # without light: less is traced again
             print(f"2^-{level:g} of the box: {found.stats}", flush=True)
             light = gv.Lighting(shadows=0, occlusion=1.0, reach=0.1 * BOX * 0.5**level)
-            lit = engine.frame(camera, stone, lighting=light, **options)[0].to("cpu")
-            clear = lit.alpha * torch.exp(-0.15 * lit.depth / (BOX * 0.5**level))
-            pictures.append(replace(lit, color=1.15 * clear * lit.color + (1 - clear) * HAZE))
+            lit = engine.render(camera, stone, lighting=light, **options).to("cpu")
+        clear = lit.alpha * torch.exp(-0.15 * lit.depth / (BOX * 0.5**level))
+        pictures.append(replace(lit, color=1.15 * clear * lit.color + (1 - clear) * HAZE))
     both = {}
     for name in ("color", "alpha"):
         tiles = [getattr(one, name) for one in pictures]

@@ -1,7 +1,6 @@
 """One scan, built-in shaders. First row: plain, lit, isosurface, maximum. Second: a thin
 shell by the plain function at step 1, pre-integrated at step 1, plain at step 0.02; the mean.
-Third: stored colours lit by stored normals, a distance field, the minimum within a slab, features
-(the stored normals as colours).
+Third: stored colours lit by stored normals, a distance field, the minimum in a slab, features.
 """
 
 from dataclasses import dataclass, replace
@@ -69,14 +68,11 @@ def main(settings: Settings) -> None:
         (gv.Projection("minimum", soft), {"clip": slab}),
         (gv.Features(transfer, "normal"), {}),
     )
-    images = []
-    for shader, options in looks:
-        picture = gv.render(tree, camera, shader, lod="finest", **options)
-        images.append(picture.color)
-    assert picture.features is not None
-    images[-1] = 0.5 * (picture.features / 127 + picture.alpha)  # -127 to 127 become 0 to 1
+    made = [gv.render(tree, camera, look, lod="finest", **options) for look, options in looks]
+    images, last = [picture.color for picture in made], made[-1]
+    images[-1] = 0.5 * (last.features / 127 + last.alpha)  # -127 to 127 become 0 to 1
     rows = [torch.cat(images[first : first + 4], dim=1) for first in range(0, len(images), 4)]
-    replace(picture, color=torch.cat(rows)).save(settings.output)
+    replace(last, color=torch.cat(rows)).save(settings.output)
     print(f"{settings.output}: {len(images)} pictures")
 
 

@@ -13,8 +13,9 @@ from helpers import DEVICES, ROOT, gvtorch
 
 import gvtorch as gv
 from gvtorch import bench
-from gvtorch.bench import peers, scenes, tables
+from gvtorch.bench import browser, peers, scenes, tables
 from gvtorch.bench import record as record_module
+from gvtorch.bench.peers import pages
 from gvtorch.bench.record import Record, Settings, clock
 from gvtorch.bench.shaders import LOOKS
 from gvtorch.tools.bench import Bench
@@ -229,3 +230,16 @@ def test_the_command_prints_json_and_plots_write_the_page(tmp_path):
     assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
     assert "| torch.sort |" in text and content["machine"]["name"] in text
     assert (tmp_path / "lru.png").exists() == (f"{tmp_path.name}/lru.png" in text)
+
+
+@pytest.mark.backend("browser")
+def test_a_hand_in_a_browser_sees_its_jump(chromium, viewer):
+    """Pictures while it drags, and after a jump of the pointer one that shows it."""
+    page = browser.Page(chromium, viewer.url, pages.PAGES["gvtorch"][1], (320, 200))
+    try:
+        shown = page.page.evaluate("() => document.querySelector('.gv-picture').clientWidth")
+        seen = page.drag(0.3, 1)
+    finally:
+        page.close()
+    assert shown == 320 and seen.rate > 0
+    assert len(seen.waited) == 1 and 0 < seen.waited[0] < 60e3

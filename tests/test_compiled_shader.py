@@ -400,17 +400,24 @@ def test_mistakes_have_one_clear_message(tree, tmp_path):
 
 
 @pytest.mark.backend("cpp")
-def test_a_damaged_library_is_compiled_again(tmp_path):
-    """Nothing, a part (which the loader dies of), and all but the last byte of it are left."""
-    header = write(tmp_path, ADD.replace("COLOR", "0.5"))
-    own = {"GVTORCH_CACHE": str(tmp_path / "cache"), "CXX": quick_compiler(tmp_path)}
-    assert in_processes(1, header, **own) == ["0.5"]
-    (library,) = (tmp_path / "cache" / "shaders").iterdir()
+def test_a_damaged_library_is_compiled_again(tmp_path, monkeypatch):
+    """Nothing, a part (which the loader dies of), and all but the last byte of it are left; of a
+    compiler that copies what it made once.
+    """
+    made = user.compiled(user.ShaderSource.read(HEADER, "mine::Plain"), ()).read_bytes()[:-32]
+    (tmp_path / "made.so").write_bytes(made)
+    compiler = tmp_path / "c++"
+    compiler.write_text(f"#!/bin/sh\ncp {tmp_path}/made.so shader.so\n")
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+    monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path / "cache"))
+    source = user.ShaderSource.read(write(tmp_path, ADD.replace("COLOR", "0.5")), "Own")
+    library = user.compiled(source, ())
     whole = library.read_bytes()
+    assert whole[:-32] == made and whole.startswith(b"\x7fELF")
     for left in (0, len(whole) // 2, -1):
         library.write_bytes(whole[:left])
-        assert in_processes(1, header, **own) == ["0.5"]
-        assert library.read_bytes()[:4] == b"\x7fELF" and library.stat().st_size == len(whole)
+        assert user.compiled(source, ()) == library and library.read_bytes() == whole
 
 
 @pytest.mark.backend("cpp")

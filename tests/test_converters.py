@@ -42,7 +42,7 @@ def test_a_converter_that_starts_at_the_same_time_leaves_a_finished_store_alone(
     tmp_path, raw, monkeypatch
 ):
     target, other = tmp_path / "a.zarr", noise(SHAPE, seed=1)
-    original, before = conversion._plan, {}
+    original, before = conversion.plan_of, {}
 
     def plan(*given):
         """The other one starts later and is done first."""
@@ -52,7 +52,7 @@ def test_a_converter_that_starts_at_the_same_time_leaves_a_finished_store_alone(
             before.update(listed(target))
         return original(*given)
 
-    monkeypatch.setattr(conversion, "_plan", plan)
+    monkeypatch.setattr(conversion, "plan_of", plan)
     with pytest.raises(FileExistsError, match="there is a store already"):
         convert(raw, target)
     del before["running"]
@@ -61,20 +61,20 @@ def test_a_converter_that_starts_at_the_same_time_leaves_a_finished_store_alone(
 
 
 def test_a_converter_does_not_take_over_what_another_has_begun(tmp_path, raw, data, monkeypatch):
-    target, original = tmp_path / "a.zarr", conversion._plan
+    target, original = tmp_path / "a.zarr", conversion.plan_of
 
     def plan(*given):
         with monkeypatch.context() as patch:
-            patch.setattr(conversion, "_plan", original)
+            patch.setattr(conversion, "plan_of", original)
             patch.setattr(shard, "write_shard", lambda *_: 1 / 0)
-            patch.setattr(conversion, "_check_room", lambda *_: None)
-            patch.setattr(conversion, "_estimate", lambda *_: None)
+            patch.setattr(conversion, "check_room", lambda *_: None)
+            patch.setattr(conversion, "estimate_of", lambda *_: None)
             with pytest.raises(ZeroDivisionError):
                 convert(raw, target, workers=1)
         return original(*given)
 
     with monkeypatch.context() as patch:
-        patch.setattr(conversion, "_plan", plan)
+        patch.setattr(conversion, "plan_of", plan)
         with pytest.raises(FileExistsError, match="half-written; --resume"):
             convert(raw, target)
     assert_holds(convert(raw, target, resume=True), data)

@@ -352,19 +352,19 @@ def test_pools_are_honoured_to_the_byte():
 
 @pytest.mark.backend("cpp")
 def test_a_wandering_camera_leaves_memory_flat(blobs):
-    """10,000 frames: nothing piles up, and the pools are in order at the end."""
+    """4,000 frames: nothing piles up, and the pools are in order at the end."""
     pick = random.Random(7)
     shader = gv.TransferFunction.preset("gray", 0, 1)
     options = {"brick_size": 4, "brick_pool": 60 * 6**3 * 4, "node_pool": 40 * 8 * 20}
     azimuth, distance, live, pages, evicted = 0.0, 1.0, [], [], 0
     with gv.Engine(gv.VolumeProducer(blobs), **options) as engine:
-        for number in range(10_000):
+        for number in range(4_000):
             azimuth += pick.gauss(0, 6)
             distance = min(3.0, max(0.2, distance * np.exp(pick.gauss(0, 0.05))))
             view = camera(4, azimuth=azimuth % 360 - 180, distance=distance)
             _, stats = engine.frame(view, shader)
             evicted += stats.evicted["bricks"]
-            if number % 3000 == 999:
+            if number % 1000 == 999:
                 engine.validate()
                 gc.collect()
                 live.append(sum(isinstance(one, torch.Tensor) for one in gc.get_objects()))
@@ -372,7 +372,7 @@ def test_a_wandering_camera_leaves_memory_flat(blobs):
         engine.validate()
         assert len(live) == 4 and max(live) - live[0] <= 8, live  # what others left may go
         assert (pages[-1] - pages[0]) * 4096 < 20e6, "resident memory is flat"
-        assert evicted > 1000 and len(engine.production.failures) == 0
+        assert evicted > 400 and len(engine.production.failures) == 0
 
 
 @pytest.mark.backend("cpp")

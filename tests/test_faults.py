@@ -104,8 +104,8 @@ def test_a_conversion_goes_on_after_a_fault_at_any_call(tmp_path, monkeypatch, k
     data = noise((12, 14, 150, 1))
     raw = tmp_path / "a_150x14x12_uint8.raw"
     raw.write_bytes(data.tobytes())
-    monkeypatch.setattr(conversion, "_check_room", lambda *_: None)
-    monkeypatch.setattr(conversion, "_estimate", lambda _: None)
+    monkeypatch.setattr(conversion, "check_room", lambda *_: None)
+    monkeypatch.setattr(conversion, "estimate_of", lambda _: None)
     with failing(-1, calls) as whole:
         convert(raw, tmp_path / "whole.zarr", workers=1)
     broken = 0

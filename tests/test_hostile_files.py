@@ -27,7 +27,7 @@ SECONDS = 8  # of processor time a file
 READER = """
 import json, resource, sys, time, warnings
 import gvtorch as gv
-from gvtorch.io import budget, conversion
+from gvtorch.io import budget, conversion_plan
 from gvtorch.io.reading import open_source
 warnings.simplefilter("ignore")
 budget.SECONDS, budget.SECONDS_A_BYTE = 0.3, 0
@@ -36,7 +36,7 @@ used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (used + memory, -1))
 
 def convert(path):
-    source = conversion._source(path, None, None, None, None, False, {})
+    source = conversion_plan.source_of(path, None, None, None, None, False, {})
     source.read_region((0, 0, 0), source.extent[::-1])
 
 for path in paths:

@@ -18,7 +18,8 @@ from helpers.traces import run
 from helpers.trees import on
 
 import gvtorch as gv
-from gvtorch.shaders.colors import distinct_colors, from_srgb, linear_color
+from gvtorch.base.srgb import from_srgb
+from gvtorch.shaders.colors import distinct_colors, linear_color
 
 ORIGIN = (2.0, -1.0, 0.5)
 RED, GREEN, BLUE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
@@ -242,14 +243,14 @@ def test_colours_of_few_labels_differ():
 
 
 @pytest.mark.parametrize(("border", "mean"), [(1, 13), (2, 6), (3, 4), (4, 4)])
-def test_normals_are_those_of_a_smooth_boundary(backend, border, mean):
+def test_normals_are_those_of_a_smooth_boundary(compiled, border, mean):
     """Of a ball of 14 voxels, whose voxels are cubes: the wider the border, the smoother."""
     grid = np.stack(np.meshgrid(*[np.arange(32.0)] * 3, indexing="ij"), -1)[..., ::-1]
     data = (np.linalg.norm(grid - 15.5, axis=-1) < 14).astype(np.int64) * WIDE
     volume = gv.Volume(data, labels=True)
-    tree = gv.N3Tree.from_volume(volume, 8, border, device=DEVICES[backend])
+    tree = gv.N3Tree.from_volume(volume, 8, border, device=DEVICES[compiled])
     rays = camera_rays(tree, 24, distance=1.5)
-    hits, _ = run(tree, backend, rays, gv.Labels(), lod="finest", step=0.1)
+    hits, _ = run(tree, compiled, rays, gv.Labels(), lod="finest", step=0.1)
     hit = hits["depth"][:, 0] < math.inf
     place = rays.origin + hits["depth"].double() * rays.direction
     outward = torch.nn.functional.normalize(place - 15.5, dim=1)[hit]

@@ -105,6 +105,20 @@ def test_kernel_headers_know_no_torch():
             assert "torch/" not in path.read_text() and "ATen" not in path.read_text(), path
 
 
+def test_nothing_else_runs_in_a_circle():
+    """Headers of C++, and the modules of the page, which a notebook gets as one."""
+    csrc, page = PACKAGE / "cpp_ext" / "csrc", PACKAGE / "viewer" / "page"
+    headers = {file: csrc for file in csrc.rglob("*.h")}
+    modules = {file: page for file in page.glob("*.js")}
+    for files, names in ((headers, r'^#include "([^"]+)"'), (modules, r'from "\./([^"]+)"')):
+        graph = {
+            file: {top / name for name in re.findall(names, file.read_text(), re.M)}
+            for file, top in files.items()
+        }
+        assert len(graph) > 15 and {*graph} >= set().union(*graph.values())
+        list(TopologicalSorter(graph).static_order())  # raises CycleError, which holds the circle
+
+
 def test_kernel_headers_include_only_downward():
     floors = [{"base"}, {"walk"}, {"cache", "mesh", "noise", "shaders"}, {"packets"}, {"entry"}]
     csrc = PACKAGE / "cpp_ext" / "csrc"

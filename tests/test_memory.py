@@ -62,8 +62,8 @@ def planned(monkeypatch, source, target, **options) -> int:
     def estimate(plan):
         plans.append(plan)
 
-    monkeypatch.setattr(conversion, "_estimate", estimate)
-    monkeypatch.setattr(conversion, "_check_room", stop)
+    monkeypatch.setattr(conversion, "estimate_of", estimate)
+    monkeypatch.setattr(conversion, "check_room", stop)
     with pytest.raises(ZeroDivisionError):
         gv.convert(source, target, **options)
     return plans[0].workers

@@ -128,8 +128,10 @@ def test_kinds_units_and_space_of_nrrd(tmp_path):
     assert np.array_equal(volume.data[..., 0].numpy(), data[..., 3].T) and not told
     assert volume.spacing == (0.5, 0.6, 0.7) and volume.info.unit == "millimeter"
     assert (volume.info.time_step, volume.info.time_unit) == (20, "millisecond")
-    nrrd.write(str(tmp_path / "u.nrrd"), data[0], {"space dimension": 3, "space units": ["a"] * 3})
-    assert "units of space a, a, a" in read(tmp_path / "u.nrrd")[1][0]
+    nrrd.write(
+        str(tmp_path / "u.nrrd"), data[0], {"space dimension": 3, "space units": ["furlong"] * 3}
+    )
+    assert "units of space furlong, furlong, furlong" in read(tmp_path / "u.nrrd")[1][0]
 
 
 def test_nrrd_without_kinds_is_asked_about(tmp_path):

@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -323,11 +324,10 @@ def test_the_command_line_tells_and_names_components(tmp_path, capsys):
         convert(volume, tmp_path / "b.zarr")
 
 
-def holders(value: object) -> list[tuple[object, object]]:
+def holders(value: Any) -> list[tuple[Any, Any]]:
     """Every place of a JSON value, as what holds it and where."""
-    found: list[tuple[object, object]] = []
-    places = value.items() if isinstance(value, dict) else enumerate(value)  # type: ignore[arg-type]
-    for key, inner in places:
+    found = []
+    for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
         found.append((value, key))
         if isinstance(inner, (dict, list)):
             found += holders(inner)
@@ -348,7 +348,7 @@ def test_metadata_broken_anywhere_is_one_line(tmp_path):
             for bad in (None, "\u2028\n", -1, [], {}, 1e400, True, [[]], "../.."):
                 content = json.loads(whole)
                 holder, key = holders(content)[number]
-                holder[key] = bad  # type: ignore[index]
+                holder[key] = bad
                 file.write_text(json.dumps(content))
                 try:
                     Store.open(folder).describe()

@@ -302,7 +302,7 @@ def test_bricks_agree_where_they_meet_in_every_bit():
     layout = Layout.of(producer, 8, 1, torch.device("cpu"))
     left = torch.tensor([[3, 7, 12, 5], [15, 0, 31, 5], [7, 7, 7, 5]])
     right = left + torch.tensor([1, 0, 0, 0])
-    one, other = (producer._filled(loc, layout)["value"][..., 0] for loc in (left, right))
+    one, other = (producer.bricks_at(loc, layout)["value"][..., 0] for loc in (left, right))
     assert torch.equal(one[..., 8:], other[..., :2])
 
 

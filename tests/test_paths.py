@@ -161,7 +161,7 @@ def test_links_to_names_that_are_no_text_go_with_the_process(tmp_path, data):
 INTERRUPTED = """
 import signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background ignore it
-from gvtorch.io import conversion, shard
+from gvtorch.io import conversion_plan, shard
 from gvtorch.tools.cli import main
 original = shard.write_shard
 def slow(task, level, place):
@@ -171,7 +171,7 @@ def slow(task, level, place):
 if WORKERS == 1:
     shard.write_shard = slow
 else:
-    conversion._FEW = 0
+    conversion_plan._FEW = 0
 if __name__ == "__main__":
     main(["convert", sys.argv[1], sys.argv[2], "--workers", str(WORKERS)])
 """

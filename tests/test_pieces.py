@@ -146,7 +146,7 @@ def test_a_wrong_share_is_one_clear_error(blobs, clear):
 def test_every_shader_is_cut_by_planes_and_boxes(channels, compiled, name):
     """A plane ends rays where the plane's own formula does, and several pieces are the twin's."""
     tree, shader = gv.N3Tree.from_volume(channels, 4), SHADERS[name]
-    rays = camera_rays(tree, 16, distance=1.3)
+    rays = camera_rays(tree, 10, distance=1.3)
     plane = (0.6, 0.0, -0.8, 8.0)
     normal = torch.tensor(plane[:3], dtype=torch.float64)
     height, rate = rays.origin @ normal + plane[3], rays.direction @ normal

@@ -49,8 +49,9 @@ def assert_same_fields(tree, backend, rays, shader, **options):
 @pytest.mark.parametrize("lod", ["finest", "auto"])
 @pytest.mark.parametrize("name", SHADERS)
 def test_compiled_equals_reference(tree, compiled, name, lod):
-    for distance in (1.3,) if "shadows" in name else (0.2, 1.3, 6.0):  # the twin takes its time
-        rays = camera_rays(tree, 16, distance=distance)
+    few = "shadows" in name or lod == "finest"  # the twin takes its time
+    for distance in (1.3,) if few else (0.2, 1.3, 6.0):
+        rays = camera_rays(tree, 10, distance=distance)
         found, actual, _ = assert_same_fields(tree, compiled, rays, SHADERS[name], lod=lod)
         if compiled == "cpp":
             for field in ("color", "alpha", "depth", "normal", "features"):
@@ -124,15 +125,35 @@ def test_what_ranges_hide_changes_no_bit(channels, name, threshold):
 
 @pytest.mark.parametrize("name", SHADERS)
 def test_rays_that_have_lost_light_bring_back_the_rest(tree, compiled, name):
+    """The twin's, too, which `test_pieces` compares."""
     rays = camera_rays(tree, 16, distance=1.6)
     dimmed = replace(rays, transmittance=torch.full((len(rays.origin),), 0.25))
-    for backend in ("reference", compiled):
-        options = gv.RenderOptions(stop_alpha=1.0, backend=backend)
-        tracer = Tracer(on(tree, DEVICES[compiled]), SHADERS[name], options)
-        full, rest = (tracer(some.to(DEVICES[compiled])) for some in (rays, dimmed))
-        torch.testing.assert_close(rest.color, 0.25 * full.color)
-        torch.testing.assert_close(1 - rest.alpha, 0.25 * (1 - full.alpha))
-        assert full.alpha.max() > 0.3
+    options = gv.RenderOptions(stop_alpha=1.0, backend=compiled)
+    tracer = Tracer(on(tree, DEVICES[compiled]), SHADERS[name], options)
+    full, rest = (tracer(some.to(DEVICES[compiled])) for some in (rays, dimmed))
+    torch.testing.assert_close(rest.color, 0.25 * full.color)
+    torch.testing.assert_close(1 - rest.alpha, 0.25 * (1 - full.alpha))
+    assert full.alpha.max() > 0.3
+
+
+def test_a_surface_has_the_colour_that_its_voxels_hold(tree, compiled):
+    """Each number beside a function that gives it as a grey; and multiplied by the opacity."""
+    rays, flat = camera_rays(tree, 16), {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0}
+    ramp = gv.TransferFunction.from_points([(0, 1)], [(0, 0, 0, 0), (255, 1, 1, 1)])
+    stored = gv.Isosurface(0.4, None, color_channel="rgba", **flat)
+    found, _ = run(tree, compiled, rays, stored)
+    for number in range(3):
+        grey = gv.Isosurface(0.4, ramp, color_channel="rgba", color_component=number, **flat)
+        by_function, _ = run(tree, compiled, rays, grey)
+        assert (found["color"][:, number] - by_function["color"][:, 0]).abs().max() < 2e-3
+    assert found["color"].std(0).min() > 0.05, "of many colours"
+    times, _ = run(tree, compiled, rays, gv.Isosurface(
+        0.4, None, color_channel="premultiplied", premultiplied=True, **flat
+    ))  # fmt: skip
+    apart = (times["color"] - found["color"]).abs()  # voxels count by their opacity there
+    assert apart.max() < 0.1 and apart.mean() < 0.01
+    with pytest.raises(ValueError, match="stored colour needs 4 numbers a voxel, 'normal' has 3"):
+        run(tree, compiled, rays, gv.Isosurface(0.4, None, color_channel="normal"))
 
 
 @pytest.mark.parametrize("name", ["lit", "stored colour"])

@@ -15,7 +15,7 @@ from helpers.stores import assert_holds, noise, write_foreign
 
 import gvtorch as gv
 from gvtorch.base.image_info import ChannelInfo, ImageInfo
-from gvtorch.io import conversion, shard
+from gvtorch.io import conversion_plan, shard
 from gvtorch.io.conversion import convert, estimate
 from gvtorch.io.store import Store
 
@@ -203,7 +203,7 @@ def test_resume_goes_on_in_the_middle_of_times(tmp_path, npy, data, monkeypatch)
 
 
 def test_processes_convert_times(tmp_path, data, monkeypatch):
-    monkeypatch.setattr(conversion, "_FEW", 1)
+    monkeypatch.setattr(conversion_plan, "_FEW", 1)
     path = save_nifti(tmp_path / "a.nii.gz", data)  # staged, so that all processes read it
     told = estimate(path, tmp_path / "a.zarr", workers=2)
     assert told.tasks == 18 and told.source_bytes == data.nbytes
@@ -346,3 +346,31 @@ def test_a_film_over_time(tmp_path, kind):
         assert run.returncode == 2 and message in run.stderr and not (tmp_path / "g").exists()
     both = gvtorch("fly", file, "-o", tmp_path / "g", *look, "--times", "all", "--time", 1)
     assert both.returncode == 2 and "leave one out" in both.stderr
+
+
+def test_keys_of_a_film_tell_the_time_point(tmp_path):
+    """The nearest to the time of the keys, which runs smoothly from one to the next."""
+    data = np.zeros((4, 6, 8, 10), np.uint8)
+    for moment, values in enumerate(data):
+        values[:, :, 2 * moment : 2 * moment + 2] = 200
+    np.save(tmp_path / "a.npy", data)
+    eye = {"eye": [4, 3, 40], "target": [4, 3, 3], "up": [0, 1, 0]}
+    look = ("--axes", "tzyx", "--size", "24x24", "--window", "0,200")
+    look = (*look, "--keys", tmp_path / "keys.json", "--frames", 5)
+
+    def fly(last: float, *more):
+        keys = [{"time": t, "state": {"time": last * t, "camera": eye}} for t in (0.0, 1.0)]
+        (tmp_path / "keys.json").write_text(json.dumps(keys))
+        return gvtorch("fly", tmp_path / "a.npy", "-o", tmp_path / "f", *look, *more)
+
+    assert fly(2).returncode == 0
+    played = [one.read_bytes() for one in sorted((tmp_path / "f").glob("*.png"))]
+    found = [played.index(one) for one in played]
+    assert len(found) == 5 and len(set(found)) == 3 and found == sorted(found)
+    for last, flags, message in (
+        (2, ("--time", 1), "--keys tells what --time does"),
+        (2, ("--times", "all"), "--keys tells what --times does"),
+        (9, (), "time must be from 0 to 3 of"),
+    ):
+        run = fly(last, *flags)
+        assert run.returncode == 2 and message in run.stderr and run.stderr.count("\n") == 1

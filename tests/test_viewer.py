@@ -13,6 +13,8 @@ from helpers.pictures import GRAY
 from helpers.viewer import FUNCTION, Page, bright_ball, pixels, turned
 
 import gvtorch as gv
+from gvtorch.io.surface import export_surface
+from gvtorch.viewer import export
 from gvtorch.viewer.client import jpeg
 from gvtorch.viewer.view import new_session
 
@@ -357,3 +359,25 @@ def test_a_thousand_moves_leave_nothing_behind(session):
     session.ask(lambda: None)
     gc.collect()
     assert client() is None
+
+
+def test_a_surface_is_handed_over_as_a_file(session, monkeypatch, tmp_path):
+    """That of `gvtorch surface`, told of while it is made; what can't be is one line."""
+    page = Page(session)
+    page.final()
+    monkeypatch.setattr(export, "_EVERY", 0.0)
+    expected = tmp_path / "a.ply"
+    export_surface(bright_ball(), 100.0, expected)
+    page.send("surface", value=100.0, format="ply")
+    page.until(lambda: "surface.ply" in page.files)
+    assert page.files["surface.ply"] == expected.read_bytes()
+    assert all(0 < one["done"] < one["total"] for one in page.of("exporting"))
+    page.until(lambda: session._export and not session._export.busy)
+    page.send("surface", value=1e6)
+    assert "1e+06" in page.next("refused", 0)["text"]
+    page.until(lambda: session._export and not session._export.busy)
+    monkeypatch.setattr(export, "_MOST", 100)
+    page.send("surface", value=100.0)
+    assert "gvtorch surface" in page.next("refused", 1)["text"]
+    assert [*page.files] == ["surface.ply"]
+    page.final()

@@ -49,6 +49,7 @@ GOOD: dict[str, dict[str, Any]] = {
     "follow": {"client": 1},
     "monitor": {"on": True},
     "still": {"width": 64, "height": 48},
+    "surface": {"value": 0.5, "format": "ply", "level": 0},
     "do": {"what": "fit"},
 }
 #: What each type never is.
@@ -229,7 +230,7 @@ class Stalling(Handler):
     def do_GET(self) -> None:
         if self.stalled and "Range" in self.headers:
             first, _, last = self.headers["Range"].removeprefix("bytes=").partition("-")
-            count = int(last) - int(first) + 1 if first and last else 1 << 10
+            count = int(last) - int(first) + 1 if first and last else int(last or 1 << 10)
             self.send_response(206)
             self.send_header("Content-Length", str(count))
             self.end_headers()
@@ -240,16 +241,23 @@ class Stalling(Handler):
         super().do_GET()
 
 
-def test_a_server_that_stops_in_the_middle_of_a_chunk_is_told_and_the_picture_goes_on(stored):
+@pytest.mark.parametrize("refused", [False, True])
+def test_a_server_that_stops_in_a_chunk_is_told_and_asked_again(stored, monkeypatch, refused):
+    """While a chunk is waited for, or after it was given up for half a minute."""
+    monkeypatch.setattr(
+        "gvtorch.io.http.REFUSED", 1e6
+    )  # so it would never be asked again by itself
+    monkeypatch.setattr(Stalling, "over", threading.Event())
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Stalling, directory=str(stored.parent)))
     server.daemon_threads = True
     threading.Thread(target=server.serve_forever, daemon=True).start()
     url = f"http://127.0.0.1:{server.server_port}/a.zarr"
-    producer = gv.StoredProducer(url, timeout=1.0)
+    producer = gv.StoredProducer(url, timeout=5.0 if refused else 1.2)
     session = new_session(producer, GRAY)
     try:
         page = Page(session, 48, 32)
         page.final()
+        monkeypatch.setattr("gvtorch.io.http.STALL", 0.2 if refused else 1e6)
         Stalling.stalls = True
         there = near(page, session)
         page.send("move", camera=there, moving=False)
@@ -259,6 +267,14 @@ def test_a_server_that_stops_in_the_middle_of_a_chunk_is_told_and_the_picture_go
         _, seen = page.final()
         assert seen.max() > 0
         goes_on(page, session)
+        monkeypatch.setattr("gvtorch.io.http.STALL", 20.0)
+        Stalling.stalls = False  # those that wait for it get nothing more
+        page.send("do", what="retry")
+        page.send("move", camera=there, moving=False)
+        (client,) = session.clients.values()
+        whole = session.ask(lambda: session.still(client.eye, 48, 32))
+        assert whole.stats.converged and whole.stats.failed == 0
+        assert not session.ask(session.scene.failures)
     finally:
         Stalling.stalls = False
         Stalling.over.set()

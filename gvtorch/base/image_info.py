@@ -31,6 +31,17 @@ class ChannelInfo:
         return ", ".join(words + ["not shown at first"] * (not self.active)) or "nothing told"
 
 
+_RGB = {"red": (1.0, 0.0, 0.0), "green": (0.0, 1.0, 0.0), "blue": (0.0, 0.0, 1.0)}
+#: Of light that is added up: premultiplied colour, and what it hides.
+PREMULTIPLIED = tuple(ChannelInfo(name=name) for name in ("red", "green", "blue", "opacity"))
+
+
+def color_channels(count: int = 3) -> tuple[ChannelInfo, ...]:
+    """Returns the channels of colours: red, green, blue, and whatever follows is alpha."""
+    colors = [ChannelInfo(name=name, color=color) for name, color in _RGB.items()]
+    return (*colors, *[ChannelInfo(name="alpha")] * (count - 3))
+
+
 def to_hex(color: Rgb) -> str:
     """Returns a colour as RRGGBB."""
     return "".join(f"{round(255 * min(max(part, 0.0), 1.0)):02x}" for part in color)

@@ -12,7 +12,6 @@ import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple
 
 import torch
@@ -73,12 +72,7 @@ class Trace:
         self._stack.enter_context(record_stages(self))
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         """Writes the file."""
         self._stack.close()
         with whole_file(self._path) as part, part.open("w", encoding="utf-8") as file:

@@ -50,6 +50,11 @@ def time_unit(text: str | None) -> str | None:
     return _find(_TIME, text)[0]
 
 
+def metres(name: str | None) -> float | None:
+    """Returns the length of a unit that `length_unit` names; None of any other name."""
+    return next((size for known, size, _ in _LENGTHS if known == name), None)
+
+
 def unit_symbol(text: str | None) -> str:
     """Returns how pictures write a unit of length, as in "\u00b5m"; what is unknown as it is."""
     name = length_unit(text)
@@ -57,6 +62,10 @@ def unit_symbol(text: str | None) -> str:
         return text or ""
     symbols = {"micrometer": "\u00b5m", "angstrom": "\u00c5"}
     return symbols.get(name) or next(words.split()[0] for n, _, words in _LENGTHS if n == name)
+
+
+#: What is told of files that know the width of pixels, and not how far slices are apart.
+NO_DEPTH = "how far slices are apart, which is not told: as far as pixels"
 
 
 def spacing_of(

@@ -136,6 +136,11 @@ class Volume:
         return (z, y, x, c)
 
     @property
+    def width(self) -> int:
+        """Numbers of a voxel."""
+        return int(self.data.shape[3])
+
+    @property
     def value_range(self) -> tuple[float, float]:
         """Smallest and largest value over all channels."""
         unordered = self.data.dtype == torch.uint16  # torch does not compare them
@@ -164,10 +169,9 @@ class Volume:
         where = "Volume.directional"
         if dtype not in (torch.float16, torch.bfloat16, torch.float32):
             raise ValueError(f"{where}: dtype must be float16, bfloat16 or float32, got {dtype}")
-        if self.data.shape[3] != 4:
+        if self.width != 4:
             raise ValueError(
-                f"{where}: needs red, green, blue and opacity, "
-                f"got {self.data.shape[3]} numbers a voxel"
+                f"{where}: needs red, green, blue and opacity, got {self.width} numbers a voxel"
             )
         rgba = self.data.to(torch.float32)
         if not self.data.is_floating_point():
@@ -186,7 +190,7 @@ class Volume:
         """Returns extent, dtype, place, range and a histogram of so many bins as plain values."""
         check.whole("Volume.describe", "bins", bins, low=1)
         low, high = self.value_range
-        values = (self.data.float() if self.data.dtype == torch.bfloat16 else self.data).numpy()
+        values = to_numpy(self.data)
         limits = (low, high) if high > low else (low, low + max(1.0, abs(low)))
         counts, total = np.zeros(bins, np.int64), 0.0
         for part in values:  # by z: float16 and float32 can't tell the bins of their full range
@@ -196,7 +200,7 @@ class Volume:
         return {
             "name": self.name,
             "extent": list(self.extent),
-            "channels": int(self.data.shape[3]),
+            "channels": self.width,
             "dtype": str(self.data.dtype).removeprefix("torch."),
             "spacing": list(self.spacing),
             "origin": list(self.origin),
@@ -223,9 +227,14 @@ class Volume:
         dtype = str(self.data.dtype).removeprefix("torch.")
         extent = "x".join(str(size) for size in self.extent)
         return (
-            f"Volume({self.name!r}, {extent} (x, y, z), {dtype}x{self.data.shape[3]}, "
+            f"Volume({self.name!r}, {extent} (x, y, z), {dtype}x{self.width}, "
             f"spacing={self.spacing})"
         )
+
+
+def to_numpy(values: Tensor) -> np.ndarray:
+    """Returns voxels as an array. NumPy has no bfloat16: float32 holds its values."""
+    return (values.float() if values.dtype == torch.bfloat16 else values).numpy()
 
 
 def movable(tensor: Tensor) -> Tensor:
@@ -240,8 +249,7 @@ def _as_labels(
 ) -> tuple[Tensor | np.ndarray, Tensor | None]:
     """Labels as bricks hold them, and what they stand for."""
     if isinstance(data, Tensor):
-        tensor = data.detach().cpu()
-        data = (tensor.float() if tensor.dtype == torch.bfloat16 else tensor).numpy()
+        data = to_numpy(data.detach().cpu())
     if not isinstance(data, np.ndarray) or data.ndim not in (3, 4) or not data.size:
         return data, None  # `_as_tensor` and `Volume` tell what is wrong
     if data.dtype.kind == "f" and nan is not None:

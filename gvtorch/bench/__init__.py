@@ -19,11 +19,11 @@ WORKLOADS = {
     "shaders": "each shader beside the plain transfer function, resident and in the engine",
     "lens": "the engine through lenses: more blur, coarser levels, fewer bricks",
     "opengl": "pictures out of OpenGL and into it, in shared buffers and through the host",
-    "view": "a page of the viewer: pictures a second, and from the camera to the picture",
+    "view": "a page of the viewer: pictures a second, from the hand to the picture; beside peers",
     "frame": "the engine: a steady frame and the cache's share of it, a cold start",
     "lru": "1 M slots ordered by use, beside torch.sort",
     "compact": "requests listed out of 8 M nodes, beside torch.nonzero",
-    "produce": "10^3-voxel bricks made by a torch producer, eager and compiled",
+    "produce": "10^3-voxel bricks made by the producers of the library, eager and compiled",
     "noise": "noise at points, beside its twin, NumPy and libraries of noise",
     "stream": "10^3-voxel bricks from host memory into the pool, beside a plain copy",
     "convert": "a volume file to a store",
@@ -42,6 +42,8 @@ PEERS = {
     "pyfastnoisesimd": "pyfastnoisesimd",
     "trimesh": "trimesh",
     "igl": "libigl",
+    "viser": "viser",
+    "trame": "trame-vtk",
 }
 _HOME = {
     **{"march": "march", "first_hit": "march", "bricks": "march", "frame": "frames"},

@@ -38,27 +38,7 @@ def convert(record: Record) -> None:
         return
     with tempfile.TemporaryDirectory() as name:
         raw, path = _raw(Path(name), side), Path(name) / "ball.zarr"
-        times: list[float] = []
-        most = 0
-        began = time.perf_counter()
-        while not times or (
-            len(times) < settings.repeats and time.perf_counter() - began < settings.seconds
-        ):
-            settings.tell(f"convert {case}: {len(times) + 1}")
-            shutil.rmtree(path, ignore_errors=True)
-            with Memory() as memory:
-                start = time.perf_counter()
-                convert_volume(raw, path)
-                times.append(1e3 * (time.perf_counter() - start))
-            most = max(most, memory.most)
-        timing = spread(times)
-        record.add(
-            *(case, "gvtorch", timing),
-            source_bytes_per_second=1e3 * side**3 / timing.median,
-            memory_bytes=most,
-            disk_bytes=Store.open(path).describe()["disk bytes"],
-        )
-    record.note("memory: the most that this process and its workers held together, not warmed up")
+        clock_store(record, case, path, lambda: convert_volume(raw, path), source_bytes=side**3)
 
 
 def blocks(record: Record) -> None:
@@ -159,6 +139,31 @@ def _gather(read: Callable[[tuple[slice, ...]], Any], zyx: np.ndarray, side: int
     low = np.maximum(zyx * _BLOCK - 1, 0)
     high = np.minimum((zyx + 1) * _BLOCK + 1, side)
     return [read(tuple(map(slice, a, b))) for a, b in zip(low.tolist(), high.tolist(), strict=True)]
+
+
+def clock_store(
+    record: Record, case: str, path: Path, make: Callable[[], Store], **amounts: int
+) -> None:
+    """Times how a store is made at a path, again and again, and takes a row with its memory and
+    disk, and with how much of each of the `amounts` that is in a second.
+    """
+    settings, times, most = record.settings, list[float](), 0
+    began = time.perf_counter()
+    while not times or (
+        len(times) < settings.repeats and time.perf_counter() - began < settings.seconds
+    ):
+        settings.tell(f"{case}: {len(times) + 1}")
+        shutil.rmtree(path, ignore_errors=True)
+        with Memory() as memory:
+            start = time.perf_counter()
+            store = make()
+            times.append(1e3 * (time.perf_counter() - start))
+        most = max(most, memory.most)
+    timing = spread(times)
+    speeds = {f"{name}_per_second": 1e3 * n / timing.median for name, n in amounts.items()}
+    disk = store.describe()["disk bytes"]
+    record.add(case, "gvtorch", timing, **speeds, memory_bytes=most, disk_bytes=disk)
+    record.note("memory: the most that this process and its workers held together, not warmed up")
 
 
 class Memory:

@@ -1,8 +1,9 @@
-"""The viewer: pictures a second, and from a page's camera to its decoded picture: `view`."""
+"""The viewer: pictures a second, and from the hand to the picture, beside peers: `view`."""
 
 from __future__ import annotations
 
 import asyncio
+import importlib.util
 import io
 import json
 import math
@@ -11,8 +12,11 @@ import struct
 import time
 from typing import Any
 
-from . import Unavailable
-from .record import Record, Timing
+import torch
+
+from . import PEERS, Unavailable, browser
+from .peers.pages import DIFFERS, NEEDS, PAGES, Site, served
+from .record import Record, spread
 from .scenes import Scene, aneurism, fog_dense
 
 _RATES = (25.0, 60.0)  # pictures a second that are wanted
@@ -44,6 +48,7 @@ def view(record: Record) -> None:
         "same; share: of the pixels that were rendered while it moved; first: to the first picture "
         "of a page, rest: until the first at full resolution"
     )
+    _beside(record, scene, sizes)
 
 
 def _turn(record: Record, case: str, scene: Scene, size: tuple[int, int], rate: float) -> None:
@@ -62,19 +67,67 @@ def _turn(record: Record, case: str, scene: Scene, size: tuple[int, int], rate: 
     finally:
         session.close()
     waited, first, rest, shares, lasted = found
-    ordered = sorted(waited)
-    timing = Timing(
-        median=statistics.median(ordered), low=ordered[0], high=ordered[-1], repeats=len(ordered)
-    )
     record.add(
         case,
         "page",
-        timing,
-        p95_ms=ordered[math.ceil(0.95 * len(ordered)) - 1],
+        spread(waited),
+        p95_ms=_p95(waited),
         pictures_per_second=len(waited) / lasted,
         share=statistics.median(shares),
         first_ms=first,
         rest_ms=rest,
+    )
+
+
+def _p95(times: list[float]) -> float:
+    return sorted(times)[math.ceil(0.95 * len(times)) - 1]
+
+
+def _beside(record: Record, scene: Scene, sizes: tuple[tuple[int, int], ...]) -> None:
+    """The pages of peers and ours in a browser, turned by the same hand."""
+    settings = record.settings
+    why = browser.absent()
+    for name, module in NEEDS.items():
+        if settings.peers is None or name in settings.peers:
+            here = importlib.util.find_spec(module) is not None
+            record.peers[name] = why or ("ran" if here else f"not installed ({PEERS[name]})")
+    shown = [one for one in PAGES if record.peers.get(one.split()[0]) == "ran"]
+    if why:
+        record.note(f"in a browser: left out, {why}")
+    if why or (settings.quick and not shown):
+        return
+    seconds, jumps = (0.5, 1) if settings.quick else (settings.seconds, 16)
+    from playwright.sync_api import Error
+
+    threads = torch.get_num_threads()
+    with browser.running() as chromium:
+        for size in ((960, 540),) if settings.quick else sizes:
+            case = f"{scene.name}, {size[0]}x{size[1]}, in a browser"
+            if not record.wants(case):
+                continue
+            side = scene.volume.extent[0]
+            site = Site(side=side, size=size, device=str(settings.device), threads=threads)
+            median = 0.0
+            for who in ("gvtorch", *shown):
+                settings.tell(f"view: {case}: {who}")
+                try:
+                    with served(who, site) as url:
+                        page = browser.Page(chromium, url, PAGES[who][1], size)
+                        seen = page.drag(seconds, jumps)
+                        page.close()
+                except (RuntimeError, Error) as error:
+                    record.note(f"{case}: {who}: {' '.join(str(error).split())[:120]}")
+                    continue
+                timing = spread(seen.waited)
+                median = median or timing.median
+                more = {} if who == "gvtorch" else {"times": timing.median / median}
+                rate = {"p95_ms": _p95(seen.waited), "pictures_per_second": seen.rate}
+                record.add(case, who, timing, **rate, **more)
+                record.note(f"{who}: {DIFFERS[who]}")
+    record.note(
+        "in a browser: ms from a jump of the pointer, after 0.4 s of dragging, to the first of the "
+        "browser's frames that shows it; pictures / s while it drags; Chromium without a window, "
+        "which draws and decodes on the same cores"
     )
 
 

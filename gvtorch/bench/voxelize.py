@@ -6,10 +6,9 @@ The mesh is made up: a sphere with bumps, of as many triangles as are asked for.
 
 from __future__ import annotations
 
+import functools
 import importlib.util
-import shutil
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,8 +19,8 @@ from ..io.mesh_source import voxelize as voxelize_store
 from ..meshes.mesh import Mesh
 from ..meshes.voxelizer import Voxelizer
 from . import PEERS
-from .record import Record, clock, spread
-from .storage import Memory
+from .record import Record, clock
+from .storage import clock_store
 
 _PART = 256  # voxels along a side of the regions that are asked for
 
@@ -58,42 +57,22 @@ def voxelize(record: Record) -> None:
 
 def _volume(grid: Voxelizer) -> float:
     """Makes all finest voxels, part by part; their volume."""
-    total = 0.0
+    total = torch.zeros((), dtype=torch.int64, device=grid.device)
     x, y, z = grid.extent
     for k in range(0, z, _PART):
         for j in range(0, y, _PART):
             for i in range(0, x, _PART):
                 high = min(k + _PART, z), min(j + _PART, y), min(i + _PART, x)
                 part = grid.region((k, j, i), high)["coverage"]
-                total += int(part.sum(dtype=torch.int64)) / 255
-    return total * grid.spacing**3
+                total += part.sum(dtype=torch.int64)
+    return float(total) / 255 * grid.spacing**3
 
 
 def _store(record: Record, case: str, mesh: Mesh, side: int) -> None:
-    settings = record.settings
-    times: list[float] = []
-    most = 0
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "mesh.zarr"
-        began = time.perf_counter()
-        while not times or (
-            len(times) < settings.repeats and time.perf_counter() - began < settings.seconds
-        ):
-            settings.tell(f"{case}: {len(times) + 1}")
-            shutil.rmtree(path, ignore_errors=True)
-            with Memory() as memory:
-                start = time.perf_counter()
-                store = voxelize_store(mesh, path, resolution=side)
-                times.append(1e3 * (time.perf_counter() - start))
-            most = max(most, memory.most)
-        timing = spread(times)
-        record.add(
-            *(case, "gvtorch", timing),
-            voxels_per_second=1e3 * side**3 / timing.median,
-            memory_bytes=most,
-            disk_bytes=store.describe()["disk bytes"],
-        )
-    record.note("memory: the most that this process and its workers held together, not warmed up")
+        make = functools.partial(voxelize_store, mesh, path, resolution=side)
+        clock_store(record, case, path, make, voxels=side**3)
 
 
 def _peers(record: Record, mesh: Mesh, side: int) -> None:

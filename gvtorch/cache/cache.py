@@ -44,9 +44,9 @@ class LRU:
         return torch.full((1,), self.unused, device=self.order.device)
 
     def give(self, wanted: Tensor, most: Tensor) -> Tensor:
-        """Gives the first `most` (1,) of the rows that want one (k,) bool a slot each, from the
-        front, and moves these to the back; the host does not wait. It tells of it in `unused` once
-        it knows how many they are.
+        """Gives a slot each, from the front, to the first `most` (1,) of the rows where `wanted`
+        (k,) bool, and moves these slots to the back. The host does not wait; once it knows how many
+        they are, it tells `unused`.
 
         Returns:
             (k,) int64 slots; -1 where a row gets none.

@@ -9,9 +9,8 @@ _LEAST = 0.02  # share of a call's time that its items take at least
 
 
 class CallCost:
-    """The time of a call with n items, own + n * each: a line fitted to the last calls, whose
-    weights fall from call to call. The first, which may load what all need, counts until there is
-    a second.
+    """The time of a call with n items as a line, own + n * each, fitted to the last calls; older
+    ones weigh less. The first, which may load what all need, is forgotten at the second.
 
     Attributes:
         largest: About as many items as a call had lately.
@@ -37,9 +36,9 @@ class CallCost:
         """Returns how many items a call of so many milliseconds has, at least 1, and at most twice
         as many as were tried; `unknown` where there was no call.
 
-        Where a call takes most of the time by itself, items get half of the time all the same: few
-        at a time would take longer. Where all calls were alike, some more are tried, or what a call
-        takes by itself would never be known.
+        If a call without items would take most of that time, items get half of it all the same, for
+        many small calls would take longer. If all calls had as many items, a few more are tried:
+        the line cannot be fitted otherwise.
         """
         if not self._weight:
             return unknown

@@ -83,9 +83,9 @@ class RequestList:
         return cls(node=node, word=word, count=torch.cat((count, *kinds)))
 
     def by_kind(self, cache: Cache, counts: Mapping[str, int]) -> dict[int, Requests]:
-        """Returns the requests of each kind, those of aliases at their targets. It has read back
-        the `counts`, how many there are of each kind, by name; the host waits only where there are
-        aliases.
+        """Returns the requests of each kind, those of aliases at their targets. `counts` are the
+        numbers of requests by the name of their kind, on the host already, which so waits only if
+        there are aliases.
         """
         asked = {}
         for name, kind in KINDS.items():

@@ -36,8 +36,9 @@ class DeviceFrame(RecordedFrame):
         self.serve()  # loads what is loaded at first use; nothing is asked for
 
     def begin(self, stale: bool, steady: bool, stats: FrameStats) -> bool:
-        """Tells before a frame whether it is to be served. `stale`: another one was rendered since
-        the last of these; `steady`: the newest of which the host knows missed nothing.
+        """Returns, before a frame, whether its requests are to be served. `stale`: another frame
+        was rendered since the last of these; `steady`: the newest that the host knows missed
+        nothing.
         """
         if stale:
             self._requests.zero_()  # what would be served is out of date: the rays ask again

@@ -25,6 +25,7 @@ from ..cache import Cache, RequestList, Scheduler
 from ..cache.requests import coarser_requests
 from ..cameras import Camera
 from ..cameras.custom import as_camera
+from ..io.http import ask_again
 from ..ops.trace import choose_backend
 from ..pictures import Picture
 from ..producers import Layout, Producer
@@ -539,7 +540,8 @@ class Engine:
 
     @_alone
     def forget_failures(self) -> None:
-        """Lets nodes that could not be produced be asked for again."""
+        """Lets nodes that could not be produced be asked for again, and servers for their parts."""
+        ask_again()
         self.production.failures.forget()
         self.production.restore_pending()
 

@@ -75,9 +75,9 @@ class HostFrame(RecordedFrame):
         return max(0, self._asked - self._done - sum(mail.sent for mail in self._mail))
 
     def begin(self, stale: bool, steady: bool, stats: FrameStats) -> bool:
-        """Sends what has come, before a frame, and tells whether there was anything: then it is to
-        be served. `stale`: another frame was rendered since the last of these, which tells no more
-        which slots are unused.
+        """Sends, before a frame, the bricks that have come, and returns whether there are any: then
+        the frame is to be served. `stale`: another frame was rendered since the last of these, so
+        the list of unused slots is out of date.
         """
         self.active = True
         if stale:

@@ -15,8 +15,8 @@ from .request_batch import ProducedTree
 
 
 def ready(cache: Cache, node: Tensor, depth: int) -> Tensor:
-    """Returns for (k,) int64 nodes of a tree of a depth, or -1, those or their nearest ancestors
-    whose parents have bricks or need none; the host does not wait.
+    """Returns in place of each of (k,) int64 nodes, or -1, its nearest ancestor, itself included,
+    whose parent has a brick or needs none. `depth` is that of the tree. The host does not wait.
     """
     words = cache.nodes.brick_tn.view(-1)
     for _ in range(depth):
@@ -27,8 +27,8 @@ def ready(cache: Cache, node: Tensor, depth: int) -> Tensor:
 
 
 def once(node: Tensor) -> Tensor:
-    """Returns nodes (k,) with -1 in the place of all but the first of those that are equal; the
-    host does not wait.
+    """Returns nodes (k,) with repeated ones replaced by -1, all but the first. The host does not
+    wait.
     """
     held, order = node.sort(stable=True)
     again = torch.zeros_like(held, dtype=torch.bool)
@@ -37,8 +37,8 @@ def once(node: Tensor) -> Tensor:
 
 
 def parent_bricks(cache: Cache, source: ProducedTree, node: Tensor) -> dict[str, Tensor]:
-    """Returns for each channel (k, z, y, x, c) the bricks of the parents of nodes (k,), which have
-    some, or one value; of a root its own. The host does not wait.
+    """Returns for each channel (k, z, y, x, c) the bricks of the parents of nodes (k,), of a root
+    its own; each of them has a brick or is of one value. The host does not wait.
     """
     parent = _parent(cache, node)
     parent = torch.where(parent >= 0, parent, node)
@@ -56,8 +56,9 @@ def parent_bricks(cache: Cache, source: ProducedTree, node: Tensor) -> dict[str,
 
 
 def unlink_lost(cache: Cache, node: Tensor) -> Tensor:
-    """Returns which of (k,) nodes hang in a tree, (k,) bool. Tiles of the others, which live below
-    aliases alone and know no parent, lose these: they are asked for where they belong.
+    """Returns (k,) bool, which of (k,) nodes can be reached from a root by known parents. The tiles
+    of the others are reached through aliases only: they are unlinked, so that rays ask for them
+    again where they belong.
     """
     tile = node // cache.nodes.nodes_per_tile
     hangs = (cache.nodes.parent_t[tile] >= 0) | (tile < len(cache.aliases.trees))

@@ -164,7 +164,7 @@ class Twist(Space):
         )
 
 
-class Repeat(Distance):
+class Repeat(Space):
     """A shape again and again along the axes. It must lie within its cell, which is `period` wide
     around the origin: then the nearest of the two cells next to a point along each axis is right.
     """
@@ -183,10 +183,8 @@ class Repeat(Distance):
         Raises:
             ValueError: The shape is not known to lie within its cell, or a number is no good.
         """
-        super().__init__()
+        super().__init__(shape)
         where = type(self).__name__
-        self.shape = check.instance(where, "shape", shape, Distance)
-        self.exact, self.smooth = shape.exact, shape.smooth
         self.vector("period", period)
         self._axes = [axis for axis in range(3) if float(self.period[axis]) != 0]
         if bool((self.period < 0).any()) or not self._axes:
@@ -228,25 +226,7 @@ class Repeat(Distance):
             value = torch.minimum(value, other)
         return value, color
 
-    def slope(self, center: Tensor, half: Tensor) -> Tensor:
-        """The shape's, anywhere within reach of a cell."""
-        return self.shape.slope(*self._reach(center, half))
-
-    def bounds(self, center: Tensor, half: Tensor) -> Interval:
-        """The slope, and what the shape tells of all places at which it is asked."""
-        known = self.shape.bounds(*self._reach(center, half))
-        return tighter(known, super().bounds(center, half))
-
-    def near(self, center: Tensor, half: Tensor) -> Distance:
-        return self.replaced(shape=self.shape.near(*self._reach(center, half)))
-
-    def alike(self, center: Tensor, half: Tensor) -> Tensor:
-        return self.shape.alike(*self._reach(center, half))
-
-    def colors(self, center: Tensor, half: Tensor) -> Interval:
-        return self.shape.colors(*self._reach(center, half))
-
-    def _reach(self, center: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
+    def over(self, center: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
         """Boxes (k, 3) that hold what `_cells` makes of the points of boxes."""
         low, high = center - half, center + half
         for axis in self._axes:

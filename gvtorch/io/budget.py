@@ -2,9 +2,9 @@
 long and into as much memory as it says; a header that takes more than its file can be worth is
 damaged.
 
-A thread looks after the one that reads. It counts processor time of that thread alone, so a busy
-machine makes no difference, and memory of the process, of which other threads may take a part: so
-memory counts only after a while, and far beyond what a file holds.
+A second thread watches the one that reads. It counts the processor time of that thread alone, so a
+busy machine makes no difference. Memory is that of the whole process, other threads included: so it
+is looked at only after a while, and the limit is far beyond what a file holds.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def header_budget(path: str) -> Iterator[None]:
 
 
 class _Watch:
-    """Looks after the thread that enters."""
+    """Watches the thread that enters, and raises in it once a limit is passed."""
 
     def __init__(self, seconds: float, most: int) -> None:
         self._seconds, self._most = seconds, most
@@ -84,10 +84,9 @@ class _Watch:
         threading.Thread(target=self._look, daemon=True, name="gvtorch-budget").start()
 
     def __exit__(self, *_error: object) -> None:
-        with (
-            self._lock
-        ):  # nothing is sent from now on; what was sent and has not come is taken back
-            self._ended = True
+        with self._lock:
+            self._ended = True  # no exception is sent from here on
+            # One that was sent and is not raised yet is withdrawn.
             ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._reader), None)
         self._over.set()
 

@@ -10,7 +10,6 @@ folder, as OME-Zarr lays several images (`bioformats2raw.layout`).
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,7 +21,7 @@ from .conversion import convert
 from .ngff import SEVERAL, parse_json, read_json
 from .source import VolumeSource
 from .store import Store
-from .store_layout import WORK, Deadline, kvstore
+from .store_layout import WORK, Deadline, is_name, kvstore
 
 _TIMEOUT = 20.0  # seconds
 
@@ -40,7 +39,7 @@ def channel_names(location: str | Path) -> tuple[str, ...]:
     named = attributes.get(SEVERAL) if isinstance(attributes, dict) else None
     if named is None:
         return ()
-    if not isinstance(named, list) or not named or not all(_plain(name) for name in named):
+    if not isinstance(named, list) or not named or not all(is_name(name) for name in named):
         raise ValueError(f"{where}: damaged: {SEVERAL} is {named!r}")
     return tuple(named)
 
@@ -116,12 +115,8 @@ def _check(sources: Mapping[str, VolumeSource]) -> None:
     if len(grids) != 1:
         raise ValueError(f"a store's channels must be of one grid, got {len(grids)}")
     for name in sources:
-        if not _plain(name):
+        if not is_name(name):
             raise ValueError(f"a channel's name is made of letters, digits, - and _, got {name!r}")
-
-
-def _plain(name: Any) -> bool:
-    return isinstance(name, str) and re.fullmatch(r"[\w-]{1,64}", name, re.ASCII) is not None
 
 
 def _begun(target: Path, resume: bool) -> bool:

@@ -12,7 +12,6 @@ import itertools
 import json
 import math
 import os
-import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -20,16 +19,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from ..base.stage import Progress, no_progress
 from . import boxes
 from .ngff import parse_json
 from .resources import amount
-from .shard import finish, write
+from .shard import bordered, finish, write
 from .store import Store
-from .store_layout import BORDER, WORK, CoarseChannel, Deadline, StoreLayout, opened
-from .unfinished import group, write_json
+from .store_layout import BORDER, WORK, CoarseChannel, Deadline, StoreLayout, is_name, opened
+from .unfinished import group, locked, write_json
 
 _OPEN_TIMEOUT = 60.0  # seconds
 _CUBE = 128  # voxels along a side of what is written at once
@@ -67,7 +65,7 @@ def make_channel(
             f"{store.location}: coarse channels are written into whole folders that gvtorch "
             "convert made"
         )
-    if not re.fullmatch(r"[\w-]{1,64}", str(name), re.ASCII) or name == "value":
+    if not is_name(name) or name == "value":
         raise ValueError(
             f"{name!r}: a coarse channel's name is made of letters, digits, - and _, not 'value'"
         )
@@ -79,7 +77,8 @@ def make_channel(
     folder.mkdir(parents=True, exist_ok=True)
     if store.times > 1 and not (folder.parent / "zarr.json").exists():
         write_json(folder.parent / "zarr.json", group({}))
-    with _alone(folder), _levels_in_files(store, wide) as levels:
+    other = f"{folder}: another process makes a coarse channel"
+    with locked(folder / ".lock", other), _levels_in_files(store, wide) as levels:
         fill(levels)
         known = _known(folder)
         before = known.get(name)
@@ -91,18 +90,6 @@ def make_channel(
         store.coarse = known
         if before is not None:
             shutil.rmtree(folder / before.folder(name), ignore_errors=True)
-
-
-@contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    import fcntl
-
-    with (folder / ".lock").open("a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise OSError(f"{folder}: another process makes a coarse channel") from None
-        yield
 
 
 def _known(folder: Path) -> dict[str, CoarseChannel]:
@@ -178,9 +165,7 @@ def _blocks(
     ]
     start, stop = boxes.clamp(begin, end, values.shape[:3])
     inside = boxes.repeat_edges(keep(values[boxes.index(start, stop)]), start, begin, end)
-    side, every = layout.stored, slice(None, None, layout.block)
-    view = sliding_window_view(inside, (side, side, side), (0, 1, 2))[every, every, every]
-    return np.ascontiguousarray(np.moveaxis(view, 3, 6))
+    return np.ascontiguousarray(bordered(layout, inside))
 
 
 def _voxels(size: Sequence[int]) -> int:

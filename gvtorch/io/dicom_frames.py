@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from ..base.image_info import ChannelInfo, ImageInfo
+from ..base.image_info import ChannelInfo, ImageInfo, color_channels
 
 Triple = tuple[float, float, float]
 _EVEN = 0.01  # of a step: how far slices may lie beside an even grid
-_RGB = (("red", (1.0, 0.0, 0.0)), ("green", (0.0, 1.0, 0.0)), ("blue", (0.0, 0.0, 1.0)))
 #: What may tell images of one place apart, the best first.
 _APART = (
     "TemporalPositionIndex",
@@ -72,9 +71,10 @@ def frames_of(header: Any, count: int) -> list[Frame]:
         if len(offsets) == count > 1 and frame.position and frame.orientation:  # of doses
             normal = np.cross(frame.orientation[:3], frame.orientation[3:])
             moved = np.add(frame.position, normal * (offsets[number] - offsets[0]))
-            frame = Frame(**{**vars(frame), "position": tuple(moved.tolist())})
+            x, y, z = moved.tolist()
+            frame = replace(frame, position=(x, y, z))
         elif count > 1 and not each:  # one place is told of all of them
-            frame = Frame(**{**vars(frame), "position": None})
+            frame = replace(frame, position=None)
         found.append(frame)
     return found
 
@@ -285,7 +285,7 @@ def image_info(header: Any, samples: int, times: Times) -> tuple[ImageInfo, list
     )
     channels: tuple[ChannelInfo, ...] = ()
     if samples == 3:
-        channels = tuple(ChannelInfo(name=name, color=color) for name, color in _RGB)
+        channels = color_channels()
     elif center and width and math.isfinite(center[0]) and width[0] >= 1:
         low = center[0] - 0.5 - (width[0] - 1) / 2
         channels = (ChannelInfo(window=(low, low + width[0] - 1)),) if width[0] > 1 else ()

@@ -5,10 +5,12 @@ urllib.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import http.client
 import os
 import re
+import socket
 import ssl
 import threading
 import time
@@ -17,8 +19,10 @@ import urllib.parse
 import urllib.request
 from typing import Any
 
+from ..base.messages import one_line
+
 STALL = 20.0  # seconds without a byte that a server is given
-SLOWEST = 20_000  # bytes a second that it must send beyond these
+SLOWEST = 20_000  # bytes a second that a server must send after its first STALL seconds
 REFUSED = 30.0  # seconds for which a file that had no end is not asked for again
 _REASONS = 1000  # that are kept
 _NOT = (0.0, "")
@@ -27,6 +31,7 @@ SMALL = 1 << 20  # bytes that any file may have
 _INDEX_ENTRY = 16  # bytes: where a chunk lies in its shard, and how long it is
 _CHECKSUM = 4  # bytes
 _PART = 1 << 16  # bytes
+_SILENT = 1.0  # seconds without a byte, after which `ask_again` gives a request up
 _KEPT = 16  # idle connections to a server
 _AGENT = {"Accept-Encoding": "identity", "User-Agent": "gvtorch"}
 _MISSING = (404, 410)
@@ -118,6 +123,14 @@ def refused(url: str) -> str:
     return _refused.get(url, _NOT)[1]
 
 
+def ask_again() -> None:
+    """Lets what could not be read be read at once, by whoever asks next: files that were refused
+    are asked for again, and what waits for a server that sends nothing breaks off.
+    """
+    _refused.clear()
+    _connections.break_off(time.monotonic() - _SILENT)
+
+
 def _in_time(url: str, most: int, part: slice | None, whole: int, seconds: float) -> bytes | None:
     slow = STALL + most / SLOWEST
     end = time.monotonic() + min(seconds, slow)
@@ -130,11 +143,7 @@ def _in_time(url: str, most: int, part: slice | None, whole: int, seconds: float
 
 
 def _read(url: str, most: int, part: slice | None, whole: int, end: float) -> bytes | None:
-    headers = dict(_AGENT)
-    if part is not None:
-        first, last = part.start or 0, part.stop
-        wanted = f"{first}-{last - 1}" if last is not None else f"{first}-"
-        headers["Range"] = f"bytes={wanted if first >= 0 else first}"
+    headers = dict(_AGENT) | ({} if part is None else {"Range": _range(part)})
     patience = max(1e-3, min(end - time.monotonic(), STALL))
     try:
         connection, answer = _ask(url, headers, patience)
@@ -145,7 +154,7 @@ def _read(url: str, most: int, part: slice | None, whole: int, end: float) -> by
             return None
         raise
     except (OSError, http.client.HTTPException, ValueError) as error:
-        raise OSError(_reason(error)) from None
+        raise OSError(one_line(error)) from None
     done = False
     try:
         if answer.status in _MISSING:
@@ -156,10 +165,12 @@ def _read(url: str, most: int, part: slice | None, whole: int, end: float) -> by
         if sent and part and (part.start or 0) >= 0 and int(sent[1]) != (part.start or 0):
             raise OSError(f"another part came: {sent[0]}")
         cut = part if answer.status == 200 else None
-        content = _content(answer, end, most, cut, whole)
+        content = _content(answer, end, most, cut, whole, connection)
         done = answer.isclosed()
         return content
     finally:
+        if connection is not None:
+            _connections.end(connection)
         if connection is not None and done and not answer.will_close:
             _connections.give_back(url, connection)
         else:
@@ -168,8 +179,20 @@ def _read(url: str, most: int, part: slice | None, whole: int, end: float) -> by
                 connection.close()
 
 
+def _range(part: slice) -> str:
+    """What a request says that asks for a part of a file."""
+    first, last = part.start or 0, part.stop
+    wanted = f"{first}-{last - 1}" if last is not None else f"{first}-"
+    return f"bytes={wanted if first >= 0 else first}"
+
+
 def _content(
-    answer: http.client.HTTPResponse, end: float, most: int, cut: slice | None, whole: int
+    answer: http.client.HTTPResponse,
+    end: float,
+    most: int,
+    cut: slice | None,
+    whole: int,
+    connection: http.client.HTTPConnection | None,
 ) -> bytes:
     """Reads to the end, or as far as `cut` needs; of a file that is cut, what lies before is not
     kept.
@@ -185,9 +208,11 @@ def _content(
         except TimeoutError:
             raise
         except Exception as error:  # of http.client
-            raise OSError(_reason(error)) from None
+            raise OSError(one_line(error)) from None
         if not more:
             break
+        if connection is not None:
+            _connections.heard(connection)
         content += more
         got = begin + len(content)
         if got > limit and (last is None or got < last):
@@ -218,16 +243,20 @@ def _ask(
         connection, used = _connections.take(url, seconds)
         try:
             connection.request("GET", target, headers=headers)
+            _connections.begin(connection)
             answer = connection.getresponse()
         except (http.client.RemoteDisconnected, BrokenPipeError, ConnectionResetError):
+            _connections.end(connection)
             connection.close()
             if not used:
                 raise
             continue  # the server had closed it meanwhile
         except BaseException:
+            _connections.end(connection)
             connection.close()
             raise
         if answer.status in _ELSEWHERE:
+            _connections.end(connection)
             answer.close()
             connection.close()
             return None, _by_urllib(url, headers, seconds)
@@ -249,10 +278,11 @@ def _by_urllib(url: str, headers: dict[str, str], seconds: float) -> http.client
 
 
 class _Connections:
-    """Idle connections, by server, of this process."""
+    """Idle connections, by server, of this process, and those that wait for an answer."""
 
     def __init__(self) -> None:
         self._idle: dict[Any, list[http.client.HTTPConnection]] = {}
+        self._waiting: dict[http.client.HTTPConnection, tuple[float, socket.socket]] = {}
         self._lock = threading.Lock()
 
     @staticmethod
@@ -275,6 +305,31 @@ class _Connections:
             return safe, False
         return http.client.HTTPConnection(key[2], timeout=seconds), False
 
+    def begin(self, connection: http.client.HTTPConnection) -> None:
+        """Notes that it waits for an answer."""
+        if connection.sock is not None:
+            with self._lock:
+                self._waiting[connection] = time.monotonic(), connection.sock
+
+    def heard(self, connection: http.client.HTTPConnection) -> None:
+        """Notes that something came."""
+        with self._lock:
+            if connection in self._waiting:
+                self._waiting[connection] = time.monotonic(), self._waiting[connection][1]
+
+    def end(self, connection: http.client.HTTPConnection) -> None:
+        """Notes that it does not wait any more."""
+        with self._lock:
+            self._waiting.pop(connection, None)
+
+    def break_off(self, before: float) -> None:
+        """Ends those that have heard nothing since a time; whoever waits for them gets an error."""
+        with self._lock:
+            silent = [sock for since, sock in self._waiting.values() if since < before]
+        for sock in silent:
+            with contextlib.suppress(OSError):
+                sock.shutdown(socket.SHUT_RDWR)
+
     def give_back(self, url: str, connection: http.client.HTTPConnection) -> None:
         """Keeps it for the next, unless there are many."""
         with self._lock:
@@ -291,7 +346,3 @@ _connections = _Connections()
 @functools.cache
 def _certificates() -> ssl.SSLContext:
     return ssl.create_default_context()
-
-
-def _reason(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

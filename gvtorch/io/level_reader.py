@@ -151,6 +151,7 @@ class LevelReader:
         the voxels of a level that has none.
         """
         self._layout, self._pool, self.width = layout, pool, stored[0].size("c")
+        self._finest = next(s for s in stored if max(s.factors) == 1)
         self._plans: list[tuple[StoredArray, list[int]] | None] = []
         cost = 1.0
         for level in range(layout.levels):
@@ -181,15 +182,11 @@ class LevelReader:
     @property
     def stored(self) -> np.dtype:
         """The dtype of the finest array."""
-        base, _ = self._plans[0] or (None, None)
-        assert base is not None
-        return base.array.dtype.numpy_dtype
+        return self._finest.array.dtype.numpy_dtype
 
     def read_stored(self, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         """Reads (z, y, x, c) finest voxels of this dtype, a box inside the volume."""
-        base, _ = self._plans[0] or (None, None)
-        assert base is not None
-        return base.read(low, high, deadline)
+        return self._finest.read(low, high, deadline)
 
     def _inside(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         plan = self._plans[level]

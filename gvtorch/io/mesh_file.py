@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from ..base.messages import need_library, one_line
+from ..base.srgb import from_srgb
 from ..meshes.mesh import MOST_FACES, Material, Mesh
 from .resources import amount, memory_free
 
@@ -44,10 +46,7 @@ def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
     ending, packed = _ending(path)
     if not path.is_file():
         raise FileNotFoundError(f"file not found: {path}")
-    try:
-        import trimesh
-    except ImportError:
-        raise ImportError(f"{path}: meshes need trimesh: pip install gvtorch[mesh]") from None
+    trimesh = need_library(f"{path}: a mesh", "trimesh", extra="mesh")
     content = _content(path, packed)
     _check_claims(path, ending, content)
     resolver: Any = _Beside(path)
@@ -61,7 +60,7 @@ def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
         )
         parts = _parts(trimesh, loaded)
     except Exception as error:  # a damaged file may raise anything
-        reason = resolver.missing or " ".join(str(error).split()) or type(error).__name__
+        reason = resolver.missing or one_line(error)
         raise ValueError(f"{path}: can't be read as {ending}: {reason}") from error
     if resolver.missing:
         raise ValueError(f"{path}: {resolver.missing}")
@@ -138,7 +137,7 @@ def _check_claims(path: Path, ending: str, content: bytes) -> None:
 
 
 class _Beside:
-    """What trimesh asks for the files that a mesh names: those in its own folder, and below it."""
+    """Gives trimesh the files that a mesh names, from the mesh's own folder and those below it."""
 
     def __init__(self, path: Path) -> None:
         self._folder, self.missing = path.absolute().parent, ""
@@ -178,7 +177,7 @@ def _parts(trimesh: Any, loaded: Any) -> list[Any]:
 
 def _joined(path: Path, ending: str, parts: list[Any], mapped: bool) -> Mesh:
     """Joins trimesh's meshes. OBJ and PLY tell colours as they are shown, glTF linear ones.
-    Not `mapped`: no image came, and where there are texture coordinates, trimesh made one up.
+    If not `mapped`, no image was read: one that trimesh tells of was made up by it.
     """
     vertices, faces, colors, uvs, numbers = [], [], [], [], []
     materials: list[Material] = []
@@ -233,12 +232,12 @@ def _colors(part: Any, faces: np.ndarray, ending: str) -> np.ndarray | None:
         told = np.concatenate((told, np.full_like(told[..., :1], 255)), -1)
     value = told.astype(np.float32) / (255 if told.dtype == np.uint8 else 1)
     if ending not in ("gltf", "glb"):
-        value[..., :3] = to_linear(value[..., :3])
+        value[..., :3] = from_srgb(value[..., :3])
     return value
 
 
 def _material(path: Path, material: Any, ending: str, mapped: bool) -> Material:
-    """One of ours out of trimesh's; grey where there is none."""
+    """Turns trimesh's material into ours; white if there is none."""
     if material is None:
         return Material(color=(1.0, 1.0, 1.0, 1.0))
     gltf = ending in ("gltf", "glb")
@@ -252,7 +251,7 @@ def _material(path: Path, material: Any, ending: str, mapped: bool) -> Material:
     if image is not None and not gltf:
         color = np.ones(4)  # its texture is all
     if not gltf:
-        color[:3] = to_linear(color[:3])
+        color[:3] = from_srgb(color[:3])
     texture = None
     if image is not None and mapped:
         try:
@@ -262,8 +261,3 @@ def _material(path: Path, material: Any, ending: str, mapped: bool) -> Material:
     red, green, blue, opacity = (float(n) for n in color)
     name = str(getattr(material, "name", "") or "")
     return Material(name=name, color=(red, green, blue, opacity), texture=texture)
-
-
-def to_linear(value: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB values, 0 to 1 (IEC 61966-2-1)."""
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)

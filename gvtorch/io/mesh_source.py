@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from ..base import check
-from ..base.image_info import ChannelInfo, ImageInfo
+from ..base.image_info import PREMULTIPLIED, ImageInfo
 from ..base.stage import Progress, no_progress
 from ..meshes.holes import Solid, check_solid, prepared, told_of_holes
 from ..meshes.mesh import Material, Mesh
@@ -33,7 +33,6 @@ from .source import VolumeSource
 from .store import Store
 from .unfinished import fingerprint
 
-_COLORS = ("red", "green", "blue", "opacity")
 _LOCK = threading.Lock()
 
 
@@ -46,7 +45,7 @@ class MeshSource(VolumeSource):
     band: float
     thickness: float
     solid: Solid
-    marks: tuple[Any, ...]  # what is the same while the mesh is
+    marks: tuple[Any, ...]  # identify mesh and settings: equal while these are unchanged
     words: tuple[str, ...] = ()  # of the command line beside these
     several: bool = False  # whether its store holds other channels, too
     mesh: Mesh | None = dataclasses.field(default=None, repr=False)  # with its holes filled
@@ -85,7 +84,7 @@ class MeshSource(VolumeSource):
         for channel in names:
             dtype, width = CHANNELS[channel]
             x, y, z = made.extent
-            colors = tuple(ChannelInfo(name=n) for n in _COLORS) if channel == "color" else ()
+            colors = PREMULTIPLIED if channel == "color" else ()
             found[channel] = cls(
                 path=name,
                 shape=(z, y, x, width),
@@ -133,7 +132,7 @@ class MeshSource(VolumeSource):
         """Makes the box `low` to `high`, (z, y, x), as (z, y, x, c)."""
         with _LOCK:  # the first thread builds the hierarchy
             grid = _voxelizer(self)
-        return grid.region(low, high)[self.channel].numpy()
+        return grid.region(low, high)[self.channel].cpu().numpy()
 
 
 @functools.lru_cache(maxsize=2)
@@ -153,7 +152,7 @@ def _voxelizer(source: MeshSource) -> Voxelizer:
 
 
 def _as_it_is(solid: Solid) -> Solid:
-    """What is asked of a mesh whose holes are filled already."""
+    """`solid` for a mesh whose holes are filled already."""
     return "auto" if solid == "always" else solid
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.image_info import ImageInfo
+from ..base.units import metres
 from .omero import forget_assumed, read_channels, write_channels
 from .remote import is_file_url
 from .store_layout import MOST_JSON, WORK, Deadline, StoreLayout, child, read_key
@@ -22,12 +23,6 @@ from .store_layout import MOST_JSON, WORK, Deadline, StoreLayout, child, read_ke
 SEVERAL = "gvtorch_channels"  # attribute that names the images of a store of several channels
 _MOST_LEVELS = 64
 _DEFAULT_AXES = "tczyx"  # of versions 0.1 and 0.2
-#: Lengths of a metre, to compare axes of different units.
-_METRES = {
-    **{"angstrom": 1e-10, "nanometer": 1e-9, "micrometer": 1e-6, "millimeter": 1e-3},
-    **{"centimeter": 1e-2, "decimeter": 1e-1, "meter": 1.0, "kilometer": 1e3},
-    **{"inch": 0.0254, "foot": 0.3048, "picometer": 1e-12},
-}
 
 
 @dataclass(frozen=True)
@@ -282,10 +277,9 @@ def _in_one_unit(units: dict[str, str], lost: list[str]) -> list[float]:
     one, factors = units.get("x"), []
     for axis in "zyx":
         other = units.get(axis)
-        known = one in _METRES and other in _METRES
-        ratio = _METRES[other] / _METRES[one] if known else 1.0  # type: ignore[index]
-        factors.append(float(f"{ratio:.12g}"))
-        if not known and other is not None and other != one:
+        size, wanted = metres(other), metres(one)
+        factors.append(float(f"{size / wanted:.12g}") if size and wanted else 1.0)
+        if not (size and wanted) and other is not None and other != one:
             lost.append(f"unit {other!r} of {axis}, where that of x is {one!r}")
     return factors
 

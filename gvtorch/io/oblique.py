@@ -25,7 +25,7 @@ from .source import Index, VolumeSource
 Oblique = Literal["resample", "keep"]
 
 _SLAB = 1 << 18  # voxels that are interpolated at a time
-_TIE = 2.0**-20  # voxels: what rounding may take a place beside where it belongs
+_TIE = 2.0**-20  # voxels by which rounding may shift a place
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,7 +195,7 @@ def _grid(affine: np.ndarray, inner: Sequence[int]) -> tuple[np.ndarray, ...]:
 
 
 def _pose(turn: np.ndarray, origin: np.ndarray) -> Rows | None:
-    """(4, 4) what turns own axes about the first voxel; None where they are sheared."""
+    """(4, 4) matrix that turns the axes about the first voxel; None if they are sheared."""
     if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-4:
         return None
     left, _, right = np.linalg.svd(turn)

@@ -45,13 +45,8 @@ class PackedSource(VolumeSource):
             data = data.astype(self.stored)
         else:
             need = count * np.dtype(self.stored).itemsize
-            data = np.frombuffer(unpack_zlib(self.file, self.offset, need), self.stored)
+            data = np.frombuffer(unpack(self.file, self.offset, need, "zlib"), self.stored)
         return data.reshape(self.shape, order="F" if self.fortran else "C")[index]
-
-
-def unpack_zlib(file: str, offset: int, need: int) -> bytes:
-    """Unpacks zlib or gzip data of a file, which must be of `need` bytes."""
-    return unpack(file, offset, need, "zlib")
 
 
 def unpack(file: str, offset: int, need: int, codec: str) -> bytes:

@@ -16,8 +16,9 @@ from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
+from ..base.messages import need_library
+from ..base.srgb import from_srgb
 from ..points.points import Points
-from .mesh_file import to_linear
 from .resources import amount, memory_free
 from .source import told_as
 
@@ -137,10 +138,7 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def _read_fits(path: Path) -> dict[str, np.ndarray]:
-    try:
-        from astropy.io import fits
-    except ImportError:
-        raise ImportError(f"{path}: FITS needs astropy: pip install gvtorch[io]") from None
+    fits = need_library(f"{path}: FITS", "astropy.io.fits", "astropy")
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*truncated.*")
         with path.open("rb") as file, fits.open(file, memmap=True) as units:
@@ -267,4 +265,4 @@ def _linear(colors: np.ndarray, kinds: set[Any]) -> np.ndarray:
     """Linear light of whole numbers, which are sRGB; of others themselves."""
     if not all(kind.kind in "iu" for kind in kinds):
         return colors
-    return to_linear(colors / max(np.iinfo(kind).max for kind in kinds))
+    return from_srgb(colors / max(np.iinfo(kind).max for kind in kinds))

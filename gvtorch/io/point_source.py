@@ -17,7 +17,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from ..base import check
-from ..base.image_info import ChannelInfo, ImageInfo
+from ..base.image_info import PREMULTIPLIED, ImageInfo
 from ..base.stage import Progress, no_progress
 from ..points.points import Points
 from ..points.sorted import PointSource, SortedPoints, sort_points
@@ -30,7 +30,6 @@ from .store_layout import WORK
 from .unfinished import fingerprint, is_begun, write_json
 
 CHANNELS = ("value", "color")
-_COLORS = ("red", "green", "blue", "opacity")
 _MADE_OF = "made_of.json"
 
 
@@ -39,8 +38,27 @@ class SplatSource(VolumeSource):
     """Sorted points in finest voxels."""
 
     folder: str
-    marks: tuple[Any, ...]  # what is the same while the points and settings are
+    marks: tuple[Any, ...]  # identify points and settings: equal while these are unchanged
     words: tuple[str, ...]  # of the command line
+
+    @classmethod
+    def of(cls, folder: Path, channel: str, **told: Any) -> SplatSource:
+        """The sorted points of a folder as a volume; `told` are path, marks and words."""
+        _opened.cache_clear()  # other points may have been there
+        found = _opened(str(folder))
+        x, y, z = found.grid.extent
+        dx, dy, dz = found.grid.spacing_3.tolist()
+        channels = PREMULTIPLIED if channel == "color" else ()
+        return cls(
+            shape=(z, y, x, found.width),
+            axes="zyxc",
+            stored="float32",
+            spacing=(dx, dy, dz),
+            origin=found.grid.origin,
+            info=ImageInfo(channels=channels, quantity=channel),
+            folder=str(folder),
+            **told,
+        )
 
     def fingerprint(self) -> list[Any]:
         """The points, and what is made of them."""
@@ -129,25 +147,15 @@ def splat(
         source = _Lit(source, check.number("splat", "opacity", opacity, low=0, high=1))
     folder = target / WORK / "points"
     _sort(source, folder, marks, begun, extent=extent, box=box, memory=memory, progress=progress)
-    _opened.cache_clear()
-    found = _opened(str(folder))
-    grid = found.grid
-    x, y, z = grid.extent
-    channels = tuple(ChannelInfo(name=name) for name in _COLORS) if channel == "color" else ()
-    dx, dy, dz = grid.spacing_3.tolist()
+    volume = SplatSource.of(
+        folder,
+        channel,
+        path="points" if isinstance(points, Points) else str(points),
+        marks=tuple(marks),
+        words=_words(extent, channel, opacity, box, names),
+    )
     return convert(
-        SplatSource(
-            path="points" if isinstance(points, Points) else str(points),
-            shape=(z, y, x, found.width),
-            axes="zyxc",
-            stored="float32",
-            spacing=(dx, dy, dz),
-            origin=grid.origin,
-            info=ImageInfo(channels=channels, quantity=channel),
-            folder=str(folder),
-            marks=tuple(marks),
-            words=_words(extent, channel, opacity, box, names),
-        ),
+        volume,
         target,
         block=block,
         executor=executor,
@@ -178,7 +186,7 @@ def _sort(source: PointSource, folder: Path, marks: list[Any], begun: bool, **op
 
 
 def _marks(points: str | Path | Points) -> list[Any]:
-    """What is the same while points are."""
+    """Values that identify points: equal while these are unchanged."""
     if not isinstance(points, Points):
         return fingerprint(points)
     total = 0

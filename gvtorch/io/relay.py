@@ -134,9 +134,7 @@ def read_within(
 
 
 def limits_of(array: Any) -> tuple[int, int]:
-    """Bytes that a file of one of tensorstore's arrays may take, and those that are asked of it at
-    a time.
-    """
+    """The most bytes that a file of one of tensorstore's arrays takes, and those of one request."""
     item, layout = array.dtype.numpy_dtype.itemsize, array.chunk_layout
     file, chunk = (math.prod(at.shape or (1,)) for at in (layout.write_chunk, layout.read_chunk))
     index = index_bytes(file, chunk)
@@ -230,7 +228,9 @@ def through(url: str, context: Any = None) -> Relayed:
 
 
 def named(text: str) -> str:
-    """Puts the URLs of their folders for those of this process; of a file that was refused, why."""
+    """Replaces the relay's addresses in a message by the URLs that they stand for; if a file was
+    refused, tells why.
+    """
     if not _server.cache_info().currsize:
         return text
     server = _server()

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import IO, Any
 from urllib.parse import unquote, urlsplit
 
+from ..base.messages import need_library, one_line
 from .resources import amount
 
 _TIMEOUT = 30.0  # seconds without a byte
@@ -158,8 +159,6 @@ def _open_http(url: str, known: Version) -> Answer | None:
 
 def _open_fsspec(url: str, known: Version) -> Answer | None:
     """The same for other schemes; what is public is read without credentials."""
-    from .formats.format import need_library
-
     scheme = urlsplit(url).scheme
     fsspec = need_library(f"{url}: reading {scheme}://", "fsspec", extra="remote")
     try:
@@ -243,5 +242,4 @@ def _evict(newest: Path) -> None:
 
 
 def _reason(error: Any) -> str:
-    reason: Any = getattr(error, "reason", None) or error
-    return " ".join(str(reason).split())[:300] or type(error).__name__
+    return one_line(getattr(error, "reason", None) or error)[:300]

@@ -23,6 +23,7 @@ from .store import needed_cells
 from .store_layout import BORDER, CELL, Deadline, StoreError, StoreLayout, opened, short
 
 _TIMEOUT = 3600.0  # seconds for one read of local data
+_OPEN_TIMEOUT = 60.0  # seconds
 _SLAB = 32  # planes of a level made at a time: two chunks of the level below
 
 Place = tuple[int, ...]  # z, y, x, or t, z, y, x where a store has several time points
@@ -159,11 +160,16 @@ def _blocks(layout: StoreLayout, values: np.ndarray, needed: np.ndarray) -> np.n
     wanted = pool_max(needed[..., None], layout.block // CELL)[..., 0]
     if not wanted.any():
         return None
+    blocks = np.zeros((*wanted.shape, *[layout.stored] * 3, layout.width), values.dtype)
+    blocks[wanted] = bordered(layout, values)[wanted]
+    return blocks
+
+
+def bordered(layout: StoreLayout, values: np.ndarray) -> np.ndarray:
+    """Returns a view (gz, gy, gx, s, s, s, c) of a cube (z, y, x, c) with its border as blocks."""
     every, side = slice(None, None, layout.block), layout.stored
     view = sliding_window_view(values, (side, side, side), (0, 1, 2))[every, every, every]
-    blocks = np.zeros((*wanted.shape, side, side, side, layout.width), values.dtype)
-    blocks[wanted] = np.moveaxis(view, 3, 6)[wanted]
-    return blocks
+    return np.moveaxis(view, 3, 6)
 
 
 def write(
@@ -190,3 +196,22 @@ def finish(begun: Any, where: str, then: str = "--resume (resume=True) goes on")
             text = f"the disk is full; with room again, {then}"
             raise OSError(errno.ENOSPC, text, where) from None
         raise StoreError(f"{where}: can't be written: {short(error)}") from None
+
+
+def create_arrays(conversion: Conversion, level: int) -> None:
+    """Creates the arrays of a level, empty."""
+    layout = conversion.layout
+    arrays = (layout.plain(level), layout.blocks(level), layout.cells(level))
+    for spec in (*arrays, *layout.bounds(level)):
+        _create(conversion.root, spec)
+
+
+def write_labels(conversion: Conversion, labels: np.ndarray) -> None:
+    """Writes the array of labels that were counted off."""
+    root, spec = conversion.root, conversion.layout.labels()
+    _create(root, spec)
+    finish(write(root, spec, [0], labels), root.get("path", "store"))
+
+
+def _create(root: dict[str, Any], spec: dict[str, Any]) -> None:
+    Deadline(_OPEN_TIMEOUT).wait(opened(root, spec, "create"), f"{root['path']}{spec['path']}")

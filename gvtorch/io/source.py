@@ -26,10 +26,13 @@ import numpy as np
 
 from ..base.image_info import ImageInfo
 from ..base.labels import check_narrowed
+from ..base.messages import one_line
 from . import boxes
 from .store_layout import value_dtype
 
 Index = tuple[slice, ...]
+#: (4, 4) of world axes that run left and posterior, to right and anterior ones.
+LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +102,7 @@ class VolumeSource(ABC):
         return self
 
     def fingerprint(self) -> list[Any] | None:
-        """Returns what is the same while the content is; None: the path tells."""
+        """Returns values that are equal while the content is; None: those of the path's files."""
         return None
 
     def command(self, store: str) -> tuple[str, ...]:
@@ -297,6 +300,6 @@ def told_as(
     except Exception as error:
         if isinstance(error, (ImportError, FileNotFoundError, *through)):
             raise
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = one_line(error)
         prefix = "" if reason.startswith(path) else f"{path}: {what}: "
         raise kind(prefix + reason) from error

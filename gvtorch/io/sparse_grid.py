@@ -10,7 +10,6 @@ Source: Museth, "VDB: High-resolution sparse volumes with dynamic topology", ACM
 
 from __future__ import annotations
 
-import importlib
 import threading
 import zlib
 from abc import ABC, abstractmethod
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from ..base.image_info import ChannelInfo, ImageInfo
+from ..base.messages import need_library
 from ..base.volume import check_extent
 from .source import Index, VolumeSource, place_axes
 
@@ -213,6 +213,11 @@ def choose(path: str, names: Sequence[str], key: str | None) -> tuple[int, tuple
     raise ValueError(f"{path}: has no grid {key!r}; it holds {listed}")
 
 
+def bits(data: Any, at: int, count: int) -> np.ndarray:
+    """Reads (count,) bool, bits of a mask from a byte on, the lowest of each byte first."""
+    return np.unpackbits(np.frombuffer(data, "u1", count // 8, at), bitorder="little").view(bool)
+
+
 def unpack(codec: str, packed: Any, need: int, most: int | None = None) -> bytes:
     """Unpacks a part that must be of `need` bytes, and of no more than `most`: "zip" (zlib) or
     "blosc".
@@ -225,12 +230,7 @@ def unpack(codec: str, packed: Any, need: int, most: int | None = None) -> bytes
         told = int.from_bytes(packed[4:8], "little"), int.from_bytes(packed[12:16], "little")
         if len(packed) < 16 or told != (need, len(packed)) or need > (most or need):
             raise ValueError(f"a packed part of {need} bytes expected, its head tells of {told[0]}")
-        try:
-            imagecodecs = importlib.import_module("imagecodecs")
-        except ImportError as error:
-            raise ImportError(
-                f"grids packed by Blosc need imagecodecs: pip install 'gvtorch[io]' ({error})"
-            ) from None
+        imagecodecs = need_library("what is packed by Blosc", "imagecodecs")
         found = bytes(imagecodecs.blosc_decode(bytes(packed), out=need))
     if len(found) != need:
         raise ValueError(f"a part of {need} bytes expected, {len(found)} found")

@@ -25,7 +25,7 @@ from ..base.labels import background
 from ..pool.downsample import pool_majority, pool_mean
 from . import boxes
 from .boxes import Zyx, grouped
-from .checksums import Checksums, sum_of
+from .checksums import Checksums, file_of, sum_of
 from .level_reader import LevelReader, Pool, open_arrays
 from .ngff import MultiscaleImage, find_image, read_json
 from .store_layout import (
@@ -494,9 +494,8 @@ class Store:
             corner = np.multiply(place, per) - low
             if key in self._seen or data[boxes.index(corner.clip(0), corner + per)].any():
                 continue
-            chunk = (0, *place) if first else (*place, *[0] * (len(shape) - 3))
-            name = "/".join(map(str, ("c", *moment, *chunk)))
-            if read_key(where, child(self.root, spec["path"]), name, deadline, slice(0, 1)) is None:
+            name = file_of(spec, (*moment, *place))
+            if read_key(self.location, self.root, name, deadline, slice(0, 1)) is None:
                 raise StoreError(f"{where}: shard {place} z y x: missing chunk")
             self._seen.add(key)
 

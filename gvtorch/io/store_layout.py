@@ -21,11 +21,12 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import math
 import os
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -120,6 +121,16 @@ class StoreLayout:
         """(z, y, x) number of shards of a level: one a task of the converter."""
         return self.grid(level, self.shard)
 
+    @property
+    def voxels(self) -> int:
+        """Voxels of all levels and times."""
+        return self.times * sum(math.prod(self.shape(level)) for level in range(self.levels))
+
+    def places(self, level: int) -> Iterator[tuple[int, ...]]:
+        """Places of all shards of a level: (z, y, x), or (t, z, y, x) of several time points."""
+        times = [self.times] if self.times > 1 else []
+        return itertools.product(*map(range, (*times, *self.shards(level))))
+
     def at_time(self, array: Any, time: int) -> Any:
         """One time point of an array of the store, without its axis of time."""
         return array[time] if self.times > 1 else array
@@ -184,8 +195,8 @@ class StoreLayout:
         )
 
     def bounds(self, level: int) -> list[dict[str, Any]]:
-        """Specs of the temporary arrays of smallest and largest finest values, where a level needs
-        them: the finest values are their own, and nothing is made of the last.
+        """Specs of the temporary arrays of the smallest and largest finest value below each voxel.
+        Level 0 needs none (its values are both), nor does the last (nothing is made of it).
         """
         needed = 0 < level < self.levels - 1
         paths = [f"{WORK}/{which}/{level}" for which in ("low", "high")]
@@ -325,7 +336,7 @@ class CoarseChannel:
             whole = isinstance(own, dict) and isinstance(own.get("made_of"), dict)
             if not (
                 whole
-                and re.fullmatch(r"[\w-]{1,64}", name, re.ASCII)
+                and is_name(name)
                 and own.get("version") == VERSION
                 and _is_whole(own.get("width"), 1, 2**12)
                 and _is_whole(own.get("generation"), 0, 2**31)
@@ -333,6 +344,11 @@ class CoarseChannel:
                 raise ValueError(f"{where}: damaged: gvtorch/coarse tells {own!r} of {name!r}")
             found[name] = cls(**{field.name: own[field.name] for field in dataclasses.fields(cls)})
         return found
+
+
+def is_name(value: Any) -> bool:
+    """Whether this may name a channel: 1 to 64 letters, digits, "-" and "_"."""
+    return isinstance(value, str) and re.fullmatch(r"[\w-]{1,64}", value, re.ASCII) is not None
 
 
 def _is_list(value: Any, size: Any) -> bool:
@@ -364,7 +380,7 @@ class Deadline:
         return max(0.0, self._end - time.monotonic())
 
     def over(self, where: str) -> TimeoutError:
-        """What is raised then."""
+        """Returns the error of a read that took too long."""
         return TimeoutError(f"{where}: no answer within {self.timeout:g} s")
 
     def wait(self, future: Any, where: str) -> Any:

@@ -19,7 +19,7 @@ import torch
 
 from ..base import check
 from ..base.stage import Progress, no_progress
-from ..base.volume import Volume
+from ..base.volume import Volume, to_numpy
 from ..meshes.contour import contour, edge_of
 from ..meshes.mesh import Mesh
 from ..pool import N3Tree
@@ -145,8 +145,7 @@ class _Grid:
         else:
             if channel is not None:
                 raise ValueError(f"{where}: channel is for trees, got {channel!r}")
-            width = what.width if isinstance(what, Store) else what.data.shape[3]
-            known, labels = what.label_values, what.info.labels
+            width, known, labels = what.width, what.label_values, what.info.labels
         self.level = check.whole(where, "level", level, low=0, high=levels - 1)
         self.component = check.whole(where, "component", component, low=0, high=width - 1)
         if labels:
@@ -193,10 +192,12 @@ class _Grid:
             found = self._bricks.read(self._channel, self.level, tuple(low), tuple(high))
         else:
             found = self.what.data[tuple(map(slice, low, high))]
-        return (found.float() if found.dtype == torch.bfloat16 else found).numpy()
+        return to_numpy(found)
 
     def crossed(self, low: Sequence[int], high: Sequence[int]) -> bool:
-        """Whether samples low to high may be on both sides, as far as is known without reading."""
+        """Whether samples low to high may lie on both sides of the level, as the cells of
+        a store tell, without reading voxels.
+        """
         store = self.what
         outside = self.more and any(
             a == 0 or b == n for a, b, n in zip(low, high, self.samples, strict=True)

@@ -15,8 +15,7 @@ import struct
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
@@ -67,6 +66,7 @@ class SurfaceFile:
             self._stack.enter_context(tempfile.TemporaryFile(dir=self._path.parent))
             for _ in range(2)
         )
+        self._stack.push(self._write)
         return self
 
     def add(self, places: np.ndarray, faces: np.ndarray) -> None:
@@ -89,16 +89,12 @@ class SurfaceFile:
             self._ends[0] = np.minimum(self._ends[0], places.min(0))
             self._ends[1] = np.maximum(self._ends[1], places.max(0))
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: Any) -> None:
         """Writes the file, or takes away what there is of it after a mistake."""
-        with self._stack:
-            if error is not None:
-                raise error
+        self._stack.__exit__(*error)
+
+    def _write(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
             with self._part.open("wb") as file:
                 (self._write_glb if self._glb else self._write_ply)(file)
 

@@ -16,14 +16,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ..base.image_info import ChannelInfo, ImageInfo, Rgb
-from ..base.units import spacing_of, time_unit
+from ..base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
+from ..base.units import NO_DEPTH, spacing_of, time_unit
 
 Told = tuple[ImageInfo, tuple[float, float, float], list[str]]  # info, spacing, what is not kept
 _MOST_XML = 1 << 28  # characters
 _MOST_PLANES = 1 << 16
 _MOST_LISTED = 1 << 22  # planes that a file may tell of
-RGB = (("red", (1.0, 0.0, 0.0)), ("green", (0.0, 1.0, 0.0)), ("blue", (0.0, 0.0, 1.0)))
 
 
 @contextmanager
@@ -89,19 +88,19 @@ def ome_info(xml: str, number: int, name: str, width: int) -> Told:
     pixels = None if image is None else _child(image, "Pixels")
     if image is None or pixels is None:
         return ImageInfo(), (1.0, 1.0, 1.0), ["OME-XML, which tells nothing of this image"]
-    sizes = [_number(pixels.get(f"PhysicalSize{axis}")) for axis in "XYZ"]
+    sizes = [finite_number(pixels.get(f"PhysicalSize{axis}")) for axis in "XYZ"]
     units = [pixels.get(f"PhysicalSize{axis}Unit", "\u00b5m") for axis in "XYZ"]
     spacing, unit = spacing_of(sizes, units)
     lost = []
-    if unit and sizes[2] is None and int(_number(pixels.get("SizeZ")) or 1) > 1:
-        lost.append("how far slices are apart, which is not told: as far as pixels")
-    step, of_time = _number(pixels.get("TimeIncrement")), pixels.get("TimeIncrementUnit", "s")
-    if step is None and int(_number(pixels.get("SizeT")) or 1) > 1:
+    if unit and sizes[2] is None and int(finite_number(pixels.get("SizeZ")) or 1) > 1:
+        lost.append(NO_DEPTH)
+    step, of_time = finite_number(pixels.get("TimeIncrement")), pixels.get("TimeIncrementUnit", "s")
+    if step is None and int(finite_number(pixels.get("SizeT")) or 1) > 1:
         step, of_time = _step_of_planes(pixels)
     channels = [_ome_channel(child) for child in pixels if _tag(child) == "Channel"]
     samples = [int(c.get("SamplesPerPixel", 1)) for c in pixels if _tag(c) == "Channel"]
     if samples == [3] and width == 3:
-        channels = [ChannelInfo(name=name, color=color) for name, color in RGB]
+        channels = [*color_channels()]
     if any(_tag(child) == "ROI" for child in root):
         lost.append("regions of interest (ROI)")
     info = ImageInfo(
@@ -114,7 +113,7 @@ def ome_info(xml: str, number: int, name: str, width: int) -> Told:
 
 
 def _ome_channel(element: Any) -> ChannelInfo:
-    code, color = _number(element.get("Color")), None
+    code, color = finite_number(element.get("Color")), None
     if code is not None:
         red, green, blue, _ = (int(code) % 2**32).to_bytes(4)
         color = (red / 255, green / 255, blue / 255)
@@ -126,7 +125,7 @@ def _step_of_planes(pixels: Any) -> tuple[float | None, str]:
     times: dict[int, float] = {}
     unit = "s"
     for plane in [child for child in pixels if _tag(child) == "Plane"][:_MOST_PLANES]:
-        at = _number(plane.get("DeltaT"))
+        at = finite_number(plane.get("DeltaT"))
         if at is not None and plane.get("TheZ", "0") == plane.get("TheC", "0") == "0":
             times[int(plane.get("TheT", 0))] = at
             unit = plane.get("DeltaTUnit", "s")
@@ -140,14 +139,14 @@ def _step_of_planes(pixels: Any) -> tuple[float | None, str]:
 def imagej_info(described: dict[str, Any], resolution: list[float | None], width: int) -> Told:
     """Reads ImageJ's metadata; `resolution` is the width and height of a pixel."""
     unit = str(described.get("unit", "")).replace("\\u00B5", "\u00b5").replace("\\u00b5", "\u00b5")
-    distance = _number(described.get("spacing"))
+    distance = finite_number(described.get("spacing"))
     known = bool(unit) or distance is not None
     sizes = [*(resolution if known else (None, None)), None if distance is None else abs(distance)]
     spacing, named = spacing_of(sizes, [unit] * 3)
     lost = []
     if unit and named is None and unit.lower() not in ("pixel", "pixels", "inch"):
         lost.append(f"the unit {unit!r}, which is unknown")
-    step = _number(described.get("finterval")) or None
+    step = finite_number(described.get("finterval")) or None
     ranges = [float(v) for v in described.get("Ranges", ())]
     if not ranges and {"min", "max"} <= set(described):
         ranges = [float(described["min"]), float(described["max"])] * width
@@ -183,7 +182,8 @@ def _child(element: Any, tag: str) -> Any:
     return next((child for child in element if _tag(child) == tag), None)
 
 
-def _number(text: Any) -> float | None:
+def finite_number(text: Any) -> float | None:
+    """Returns the number that a text tells; None if it is none, or not finite."""
     try:
         value = float(text)
     except (TypeError, ValueError):

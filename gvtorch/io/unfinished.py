@@ -105,7 +105,7 @@ def claimed(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator
         ValueError: Settings or source differ from those of the store to resume.
     """
     folder = target / WORK
-    with _locked(target):
+    with _claimed_folder(target):
         begun = is_begun(target, resume=resume)
         done = {}
         if begun:
@@ -123,20 +123,14 @@ def claimed(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator
 
 
 @contextmanager
-def _locked(target: Path) -> Iterator[None]:
-    """Holds the lock of a target; a folder that this made and nothing was written into goes again.
-    The process before may have removed the folder with the lock that this one was waiting for.
+def _claimed_folder(target: Path) -> Iterator[None]:
+    """Holds the lock of a target. At the end a folder is removed that this made and that is still
+    empty. While it waits, the process before may remove the folder and the lock: it tries again.
     """
-    import fcntl
-
     folder, made = target / WORK, not target.exists()
     while True:
         folder.mkdir(parents=True, exist_ok=True)
-        with (folder / _LOCK).open("a") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise OSError(f"{target}: another process is converting to it") from None
+        with locked(folder / _LOCK, f"{target}: another process is converting to it") as lock:
             try:
                 same = os.path.samestat(os.fstat(lock.fileno()), (folder / _LOCK).stat())
             except FileNotFoundError:
@@ -152,6 +146,19 @@ def _locked(target: Path) -> Iterator[None]:
                         with suppress(OSError):
                             target.rmdir()
             return
+
+
+@contextmanager
+def locked(file: Path, other: str) -> Iterator[IO[str]]:
+    """Opens a file that one process at a time may hold open; raises OSError(other) if one does."""
+    import fcntl
+
+    with file.open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise OSError(other) from None
+        yield lock
 
 
 def _compare(target: Path, settings: dict[str, Any]) -> None:

@@ -10,10 +10,9 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from ..base import check
-from ..base.volume import Volume
+from ..base.volume import Volume, to_numpy
 from ..pool.downsample import pool_mean
 from .boxes import Zyx
 from .store import Store
@@ -39,9 +38,10 @@ def window(
 
     Args:
         data: A volume, or a store, of which no more than that is read.
-        percent: Percentiles, as in (1, 99), of all values. If left out: from the end of the
-            background, where a quarter of the values or more are around one in the lower half, to
-            the 99th percentile of what lies above; else from the 1st to the 99th of all.
+        percent: Percentiles of all values, as in (1, 99). If left out, a background is looked for:
+            a quarter or more of the values, close together in the lower half. The window goes from
+            its end to the 99th percentile of what lies above; without one, from the 1st to the
+            99th percentile of all.
         component: Which number of a voxel.
         background: The low end is not that of the background but the 1st percentile of all, as
             pictures of slices need it.
@@ -53,8 +53,7 @@ def window(
         low, high = (check.number("window", "percent", p, low=0, high=100) for p in percent)
         if low >= high:
             raise ValueError(f"window: percent must be a low and a high one, got {percent}")
-    width = data.width if isinstance(data, Store) else data.data.shape[3]
-    check.whole("window", "component", component, low=0, high=width - 1)
+    check.whole("window", "component", component, low=0, high=data.width - 1)
     values = looked_at(data)[..., component].ravel()
     if percent is not None:
         return _span(*np.percentile(values, percent))
@@ -69,8 +68,8 @@ def window(
 def windows(
     data: Volume | Store, percent: tuple[float, float], components: Sequence[int]
 ) -> list[tuple[float, float]]:
-    """Returns what `window` returns of several components between the same percentiles, which are
-    right; up to the largest value where what is bright is rarer than that.
+    """Returns the `window` of several components, between the same percentiles (not checked). One
+    whose percentiles are the same value goes up to its largest value.
     """
     values, spans = looked_at(data), []
     for component in components:
@@ -80,8 +79,8 @@ def windows(
 
 
 def value_range(data: Volume | Store) -> tuple[float, float]:
-    """Returns the smallest and the largest value. Other people's images do not tell: of them as
-    much is read as for `window`, which blurs the extremes a little.
+    """Returns the smallest and the largest value. Images that were not written by gvtorch do not
+    tell them: of these a coarse level is read, as for `window`, whose extremes are a little less.
     """
     if isinstance(data, Volume):
         return data.value_range
@@ -98,10 +97,9 @@ def _span(low: float, high: float) -> tuple[float, float]:
 
 
 def looked_at(data: Volume | Store) -> np.ndarray:
-    """Values (..., c) that stand for all."""
+    """A sample of the values (..., c)."""
     if isinstance(data, Volume):
-        bfloat = data.data.dtype == torch.bfloat16  # which NumPy has not
-        values = (data.data.float() if bfloat else data.data).numpy()
+        values = to_numpy(data.data)
         while values[..., 0].size > _MOST:
             values = pool_mean(values, 2)
         return values

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..ops import voxelize
+from ..ops.voxelize import Voxelized, voxelize
 from .hierarchy import Hierarchy
 from .mesh import Mesh, solids
 
@@ -78,16 +78,16 @@ class Geometry:
 
     def _at(self, place_p3: Tensor, reach: float) -> tuple[Tensor, Tensor]:
         """(p,) winding numbers, and distances up to a reach: of voxels as large as the mesh."""
-        found = []
+        parts = []
         for place in place_p3.to(self.corner).split(_POINTS):
             size = place.new_tensor((self.size, self.size, reach)).expand(len(place), 3)
             low = place - 0.5 * self.size
-            distance, _, winding, *_ = self._voxelize(low, size.contiguous(), 1, wide=True)
-            found.append((winding.view(-1), distance.view(-1) * self.size))
-        if not found:
+            found = self._voxelize(low, size.contiguous(), 1, wide=True)
+            parts.append((found.winding.view(-1), found.distance.view(-1) * self.size))
+        if not parts:
             none = self.corner.new_empty(0)
             return none.to(torch.int32), none
-        winding, distance = (torch.cat(parts) for parts in zip(*found, strict=True))
+        winding, distance = (torch.cat(part) for part in zip(*parts, strict=True))
         return winding, distance
 
     def touched(
@@ -109,8 +109,8 @@ class Geometry:
         part = size_k / parts
         reach = (reach_k + _HALF_DIAGONAL * part) * (1 + 1e-3)  # more than float32 rounds
         size = torch.stack((part, part, reach), 1)
-        _, nearest, winding, *_ = self._voxelize(low_k3, size, parts, wide=wide)
-        return nearest >= 0, winding != 0
+        found = self._voxelize(low_k3, size, parts, wide=wide)
+        return found.nearest >= 0, found.winding != 0
 
     def is_narrow(self, voxel: float) -> bool:
         """Whether float32 will do for voxels of a size, and larger ones."""
@@ -139,16 +139,16 @@ class Geometry:
             weights: Whether weights are wanted.
             wide: Whether it is worked out in float64.
         """
-        distance, face, winding, coverage, weight = self._voxelize(
+        found = self._voxelize(
             low_k3, size_k3, side, thickness, shares=shares, weights=weights, wide=wide
         )
-        unit = size_k3[:, :1, None, None].to(distance.dtype)
+        world = found.distance * size_k3[:, :1, None, None].to(found.distance.dtype)
         return Cubes(
-            distance=torch.where(face >= 0, distance * unit, torch.inf).to(torch.float32),
-            face=face,
-            inside=winding != 0,
-            coverage=coverage.to(torch.float32),
-            weight=weight.to(torch.float32),
+            distance=torch.where(found.nearest >= 0, world, torch.inf).to(torch.float32),
+            face=found.nearest,
+            inside=found.winding != 0,
+            coverage=found.coverage.to(torch.float32),
+            weight=found.weight.to(torch.float32),
         )
 
     def _voxelize(
@@ -161,7 +161,7 @@ class Geometry:
         wide: bool,
         shares: bool = False,
         weights: bool = False,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    ) -> Voxelized:
         return voxelize(
             *(self.corner, self.solid, self.hierarchy.box, low, size, side, thickness),
             detail=self.detail,

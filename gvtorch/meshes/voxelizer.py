@@ -157,15 +157,17 @@ class Voxelizer:
                 parts[name].append(_stored(name, values))
         empty = (0, side, side, side)
         return {
-            name: torch.cat(own) if own else torch.empty((*empty, width), dtype=dtype)
+            name: torch.cat(own)
+            if own
+            else torch.empty((*empty, width), dtype=dtype, device=self.device)
             for (name, own), (dtype, width) in zip(
                 parts.items(), (CHANNELS[name] for name in self.channels), strict=True
             )
         }
 
     def constants(self, inside_k: Tensor) -> dict[str, Tensor]:
-        """Returns by channel (k, c) what voxels hold, inside or outside, that are far from all
-        triangles.
+        """Returns by channel (k, c) the values of voxels far from all triangles, inside the mesh or
+        outside.
         """
         shape = (len(inside_k), 1, 1, 1)
         inside = inside_k.view(shape)
@@ -183,31 +185,32 @@ class Voxelizer:
         """Makes the finest voxels of a box `low` to `high`, (z, y, x).
 
         Returns:
-            By channel (z, y, x, c) of its dtype, on the CPU.
+            By channel (z, y, x, c) of its dtype, on the device.
         """
-        block = _CUBE * _PARTS
-        first = torch.tensor([n // block for n in low])
+        block, device = _CUBE * _PARTS, self.device
+        first = torch.tensor([n // block for n in low], device=device)
         count = [-(-b // block) - n // block for n, b in zip(low, high, strict=True)]
-        blocks = torch.tensor(list(itertools.product(*map(range, count)))).view(-1, 3)
+        blocks = torch.cartesian_prod(*(torch.arange(n, device=device) for n in count)).view(-1, 3)
         world = self._corner((blocks + first) * block)
         voxel = world.new_full((len(world),), self.spacing)
         found = self.touched(world, block * voxel, voxel)
 
         def joined(values: Tensor) -> Tensor:  # (z, y, x) cubes
-            values = values.cpu().view(*count, _PARTS, _PARTS, _PARTS).permute(0, 3, 1, 4, 2, 5)
+            values = values.view(*count, _PARTS, _PARTS, _PARTS).permute(0, 3, 1, 4, 2, 5)
             return values.reshape([n * _PARTS for n in count])
 
         near, inside = map(joined, found)
         cubes = near.nonzero()
         at = (cubes + first * _PARTS) * _CUBE
         # Those behind the region's end are not asked for.
-        wanted = ((at + _CUBE > torch.tensor(low)) & (at < torch.tensor(high))).all(1)
+        begin, end = torch.tensor((tuple(low), tuple(high)), device=device)
+        wanted = ((at + _CUBE > begin) & (at < end)).all(1)
         out = self._blank(inside)
         for some in torch.stack((cubes, at), 1)[wanted].split(max(1, _BATCH // _CUBE**3)):
-            size = torch.full((len(some),), self.spacing, dtype=torch.float64, device=self.device)
+            size = torch.full((len(some),), self.spacing, dtype=torch.float64, device=device)
             for name, values in self.cubes(self._corner(some[:, 1]), size, _CUBE).items():
-                out[name][some[:, 0].unbind(1)] = values.cpu()
-        start = [n - int(a) * block for n, a in zip(low, first, strict=True)]
+                out[name][some[:, 0].unbind(1)] = values
+        start = [n % block for n in low]
         box = tuple(slice(s, s + b - a) for s, a, b in zip(start, low, high, strict=True))
         return {
             name: values.permute(0, 3, 1, 4, 2, 5, 6).flatten(0, 1).flatten(1, 2).flatten(2, 3)[box]
@@ -220,7 +223,7 @@ class Voxelizer:
         """
         both = self.constants(torch.tensor([False, True], device=self.device))
         return {
-            name: torch.where(inside[..., None], values[1].cpu(), values[0].cpu())[
+            name: torch.where(inside[..., None], values[1], values[0])[
                 ..., None, None, None, :
             ].repeat(1, 1, 1, _CUBE, _CUBE, _CUBE, 1)
             for name, values in both.items()
@@ -228,8 +231,8 @@ class Voxelizer:
 
     def _corner(self, zyx: Tensor) -> Tensor:
         """(k, 3) float64 world place of the low corner of voxels z, y, x."""
-        origin = torch.tensor(self.origin, dtype=torch.float64)
-        return (origin + (zyx.flip(1) - 0.5) * self.spacing).to(self.device)
+        origin = torch.tensor(self.origin, dtype=torch.float64, device=zyx.device)
+        return origin + (zyx.flip(1) - 0.5) * self.spacing
 
     def _make(
         self, low: Tensor, voxel: Tensor, side: int, coarse: Tensor | None

@@ -73,6 +73,8 @@ class IsosurfaceNumbers(NamedTuple):
 
     level: Number  # the value at the surface
     filled: float = 1.0  # 1: with what is not below the level; -1: with what is; 0: with nothing
+    scale: float = 0.0  # of the second channel's four numbers, the colour; 0: the table tells it
+    premultiplied: float = 0.0  # above 0: these are stored times the fourth
 
 
 class ProjectionNumbers(NamedTuple):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -11,6 +13,16 @@ from .registry import Backend, choose_backend
 
 MOST_VOXELS = 32  # along a side of a cube
 ARITY = 8  # boxes in a box
+
+
+class Voxelized(NamedTuple):
+    """What k cubes of side^3 voxels hold of a mesh; in float32, or float64 where `wide`."""
+
+    distance: Tensor  # (k, z, y, x) to the nearest place of the mesh, voxels; inf beyond the reach
+    nearest: Tensor  # (k, z, y, x) int32 triangle of it, the first of equally near; -1 beyond
+    winding: Tensor  # (k, z, y, x) int32 winding number of the voxel's centre, not 0 inside solids
+    coverage: Tensor  # (k, z, y, x) filled share, 0 to 1; of no cubes unless wanted
+    weight: Tensor  # (k, z, y, x, 3) of the triangle's corners there; of no cubes unless wanted
 
 
 def voxelize(
@@ -27,7 +39,7 @@ def voxelize(
     weights: bool = False,
     wide: bool = False,
     backend: Backend = "auto",
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> Voxelized:
     """Finds for each voxel of k cubes the nearest triangle of a mesh, how often the mesh winds
     around it, and what share of the voxel is filled. Nothing waits for the host, and no shape
     depends on values.
@@ -56,13 +68,6 @@ def voxelize(
         wide: Whether it is worked out in float64.
         backend: auto, reference, cpp or cuda.
 
-    Returns:
-        distance_kzyx (k, side, side, side) to the nearest place, in voxels, infinite beyond the
-        reach; nearest_kzyx int32 the triangle, the first of those that are equally near, -1 beyond
-        the reach; winding_kzyx int32 winding number of the voxel's centre, not 0 inside of solids;
-        coverage_kzyx the filled share, 0 to 1; weight_kzyx3 weights of the triangle's corners at
-        the nearest place. The last two are of no cubes unless they are wanted.
-
     Raises:
         ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.
     """
@@ -84,10 +89,10 @@ def voxelize(
     check.whole(where, "side", side, low=1, high=MOST_VOXELS)
     thickness = check.number(where, "thickness", thickness, low=0)
     detail = check.number(where, "detail", detail, low=0)
-    arguments = (corner_f33, solid_f, box_n6, low_k3, size_k3, side, thickness)
-    if choose_backend(backend, device) == "reference":
-        return twin.voxelize(*arguments, detail, shares, weights, wide)
-    return torch.ops.gvtorch.voxelize(*arguments, detail, shares, weights, wide)
+    plain = choose_backend(backend, device) == "reference"
+    op = twin.voxelize if plain else torch.ops.gvtorch.voxelize
+    mesh, cubes = (corner_f33, solid_f, box_n6), (low_k3, size_k3, side)
+    return Voxelized(*op(*mesh, *cubes, thickness, detail, shares, weights, wide))
 
 
 def boxes_of(triangles: int) -> int:

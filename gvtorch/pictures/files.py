@@ -8,7 +8,6 @@ introduction).
 from __future__ import annotations
 
 import errno
-import importlib
 import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator
@@ -20,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..base.messages import need_library, one_line
 from ..base.whole_file import whole_file
 from .tone import finite, from_srgb, to_srgb
 
@@ -70,7 +70,7 @@ def _told() -> Iterator[None]:
     except (OSError, MemoryError):
         raise
     except Exception as error:
-        text = " ".join(str(error).split()) or type(error).__name__
+        text = one_line(error)
         number = errno.ENOSPC if "No space left" in text else errno.EIO
         raise OSError(number, text) from None
 
@@ -166,7 +166,7 @@ def write_tiff(
     """Writes a BigTIFF (h, w, c), c 3, or 4 with alpha, as its strips (rows, w, c) come, the last
     of what rows are left.
     """
-    tifffile = _library("tifffile", ".tif")
+    tifffile = need_library(".tif", "tifffile", extra="image")
     kind = "assocalpha" if dtype.kind == "f" else "unassalpha"
     with tifffile.TiffWriter(path, bigtiff=True) as file:
         file.write(
@@ -181,16 +181,8 @@ def write_tiff(
         )
 
 
-def _library(name: str, ending: str) -> Any:
-    """Loads what only files with this ending need."""
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise ImportError(f"{ending} needs {name}: pip install 'gvtorch[image]'") from None
-
-
 def _write_exr(path: Path, layers: Layers, bits: int) -> None:
-    OpenEXR, layers = _library("OpenEXR", ".exr"), side_by_side(layers)
+    OpenEXR, layers = need_library(".exr", "OpenEXR", extra="image"), side_by_side(layers)
     kind = np.float16 if bits == 16 else np.float32
     light = np.concatenate((layers["color"], layers["alpha"]), -1)
     if bits == 16:
@@ -251,7 +243,7 @@ def _read_png(path: Path) -> np.ndarray:
 
 
 def _read_exr(path: Path) -> np.ndarray:
-    file = _library("OpenEXR", ".exr").File(str(path), separate_channels=True)
+    file = need_library(".exr", "OpenEXR", extra="image").File(str(path), separate_channels=True)
     channels = file.channels()
     names = "RGBA" if "A" in channels else "RGB"
     return np.stack([channels[name].pixels for name in names], -1)
@@ -261,5 +253,5 @@ _READERS: dict[str, Callable[[Path], np.ndarray]] = {
     ".png": _read_png,
     ".exr": _read_exr,
     ".npy": np.load,
-    ".tif": lambda path: _library("tifffile", ".tif").imread(path),
+    ".tif": lambda path: need_library(".tif", "tifffile", extra="image").imread(path),
 }

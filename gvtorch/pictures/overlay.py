@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.messages import need_library
 from ..base.units import unit_symbol
 from .picture import Picture
 from .tone import from_srgb, to_srgb
@@ -135,10 +136,9 @@ class _Pen:
     """Draws with Pillow, in letters of one size (pixels)."""
 
     def __init__(self, size: int) -> None:
-        try:
-            from PIL import Image, ImageDraw, ImageFont
-        except ImportError:
-            raise ImportError("Overlay: needs Pillow: pip install 'gvtorch[image]'") from None
+        need_library("Overlay", "PIL", "Pillow", "image")
+        from PIL import Image, ImageDraw, ImageFont
+
         self.size, self._image, self._draw = size, Image, ImageDraw
         self._font: Any = ImageFont.load_default(size)
         self._rim = max(1, round(size / 9))

@@ -6,12 +6,12 @@ import itertools
 from abc import ABC, abstractmethod
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 
 from ..base import check
+from ..base.messages import need_library
 from ..base.whole_file import whole_file
 from .picture import Picture
 
@@ -65,19 +65,12 @@ class Video:
     def __enter__(self) -> Video:
         """Returns itself."""
         self._film.open(self._stack.enter_context(whole_file(self._path)))
+        self._stack.push(lambda kind, *_: self._film.close(whole=kind is None))
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: Any) -> None:
         """Finishes the file, or takes it away after a mistake."""
-        with self._stack:
-            self._film.close(whole=kind is None)
-            if error is not None:
-                raise error
+        self._stack.__exit__(*error)
 
     def __repr__(self) -> str:
         return f"Video({str(self._path)!r}, {self._size[0]}x{self._size[1]})"
@@ -105,11 +98,8 @@ class _Film(ABC):
 
 class _Mp4(_Film):
     def __init__(self, suffix: str, width: int, height: int, fps: int) -> None:
-        try:
-            import av
-        except ImportError:
-            raise ImportError(f"{suffix} needs PyAV: pip install 'gvtorch[video]'") from None
-        self._av, self._size, self._fps = av, (width, height), fps
+        self._av = need_library(suffix, "av", "PyAV", "video")
+        self._size, self._fps = (width, height), fps
 
     def open(self, part: Path) -> None:
         self._file = self._av.open(str(part), "w")
@@ -133,11 +123,11 @@ class _Mp4(_Film):
 class _Loop(_Film):
     def __init__(self, suffix: str, width: int, height: int, fps: int) -> None:
         del width, height
-        try:
-            from PIL import Image
-        except ImportError:
-            raise ImportError(f"{suffix} needs Pillow: pip install 'gvtorch[video]'") from None
-        self._image, self._suffix, self._fps = Image, suffix, fps
+        need_library(suffix, "PIL", "Pillow", "video")
+        from PIL import Image
+
+        self._image: Any = Image
+        self._suffix, self._fps = suffix, fps
         self._frames: list[Any] = []
 
     def open(self, part: Path) -> None:

@@ -41,7 +41,7 @@ class Channel:
     @classmethod
     def of(cls, volume: Volume) -> Channel:
         """Returns the channel that holds a volume's voxels."""
-        return cls(volume.data.dtype, volume.data.shape[3])
+        return cls(volume.data.dtype, volume.width)
 
     @property
     def nbytes(self) -> int:

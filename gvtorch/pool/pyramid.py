@@ -18,7 +18,7 @@ from torch import Tensor
 from ..base.constants import CONSTANT, EMPTY, TERMINAL
 from ..base.labels import background
 from ..base.stage import Progress, no_progress
-from ..base.volume import Volume, movable
+from ..base.volume import Volume, movable, to_numpy
 from ..ops import cut_bricks
 from .downsample import (
     by_node,
@@ -139,11 +139,6 @@ def coarser(
     else:
         values = pool_mean(values, branching)
     return to_numpy(from_numpy(values, dtype)) if dtype == torch.bfloat16 else values
-
-
-def to_numpy(values: Tensor) -> np.ndarray:
-    """Returns voxels as an array. NumPy has no bfloat16: float32 holds its values."""
-    return (values.float() if values.dtype == torch.bfloat16 else values).numpy()
 
 
 def from_numpy(values: np.ndarray, dtype: torch.dtype) -> Tensor:

@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from ..base.constants import ABSENT, CONSTANT, EMPTY, TERMINAL
-from ..base.volume import movable
+from ..base.volume import movable, to_numpy
 from .downsample import by_node, extend, pool_max, pool_min, window
 from .pools import BrickPool, NodePool
-from .pyramid import NodeSummary, coarser, from_numpy, middle_of, to_numpy
+from .pyramid import NodeSummary, coarser, from_numpy, middle_of
 
 _BATCH = 4096  # bricks read or written at a time
 Place = tuple[int, ...]  # voxels or nodes of a level, z y x

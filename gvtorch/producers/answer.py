@@ -125,7 +125,7 @@ def _refuse_late(
     fields: Sequence[Mapping[str, Tensor | TableRows]],
     device: torch.device,
 ) -> None:
-    """Raises ValueError where an answer on the device has what the host would have to see to."""
+    """Raises ValueError where an answer that stays on the device needs work of the host."""
     if answer.alias is not None or answer.errors:
         raise ValueError(f"{where}: a producer that is on_device answers without alias and errors")
     for by_channel in fields:

@@ -4,17 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Future
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..base import check
-from ..pool.pyramid import coarser, from_numpy, to_numpy
+from ..base.volume import to_numpy
+from ..pool.pyramid import coarser, from_numpy
 from ..pool.staging import on_device
 from .answer import checked_bricks, checked_regions
-from .producer import Bricks, Layout, Nodes, Producer, Region, Regions, grid_of
+from .producer import (
+    Bricks,
+    Layout,
+    Nodes,
+    Producer,
+    Region,
+    Regions,
+    arrived,
+    by_depth,
+    grid_of,
+)
 
 _AT_ONCE = 64  # blocks of a level that are made together, out of N^3 times as many below
 
@@ -120,9 +130,7 @@ class FromChildren(Producer):
 
     def _asked(self, nodes: Nodes) -> Bricks:
         """The producer's answer, checked."""
-        answer: Any = self.producer.fill(nodes)
-        answer = answer.result() if isinstance(answer, Future) else answer
-        found = checked_bricks(answer, nodes, self.producer)
+        found = checked_bricks(arrived(self.producer.fill(nodes)), nodes, self.producer)
         if found.kind is not None and bool((found.kind == Region.ALIAS).any()):
             raise ValueError(f"{type(self).__name__}: bricks may be no aliases here")
         return found
@@ -132,8 +140,8 @@ class FromChildren(Producer):
         layout, loc = nodes.layout, nodes.loc.cpu()
         shape = (len(loc), *(layout.side,) * 3)
         found = {n: np.empty((*shape, c.width), _held(c.dtype)) for n, c in self.channels.items()}
-        for depth in loc[:, 3].unique().tolist():
-            for rows in (loc[:, 3] == depth).nonzero()[:, 0].split(_AT_ONCE):
+        for depth, here in by_depth(loc):
+            for rows in here.split(_AT_ONCE):
                 low = loc[rows, :3] * layout.brick_size - layout.border
                 for name, values in self._region(layout, depth, low, layout.side).items():
                     found[name][rows.numpy()] = values
@@ -175,9 +183,7 @@ class FromChildren(Producer):
     def _known_blocks(self, layout: Layout, loc: Tensor) -> Blocks:
         """The same, of nodes that are made: those of one value hold that."""
         nodes = Nodes(loc.to(layout.device), layout)
-        answer: Any = self.producer.classify(nodes)
-        answer = answer.result() if isinstance(answer, Future) else answer
-        regions = checked_regions(answer, nodes, self.producer)
+        regions = checked_regions(arrived(self.producer.classify(nodes)), nodes, self.producer)
         _raise_first(regions.errors)
         kind = regions.kind.cpu()
         if bool((kind == Region.ALIAS).any()):

@@ -16,7 +16,7 @@ from ..pool import Channel
 from .producer import Bricks, Nodes, Producer, Region, Regions
 
 _BATCH = 64  # bricks that are made at a time on the CPU, whose caches then hold what is between
-_FEW = 12  # bricks: fewer at a time cost as much as parts of a field that do not matter in some
+_FEW = 12  # bricks: smaller groups cost more than they save by leaving out parts of a field
 _MARGIN = 1 / 32  # voxels by which boxes are taken wider, so that rounded places lie in them
 _ROUNDED = 2.0**-18  # relative width by which intervals are, for values are rounded too
 
@@ -79,7 +79,7 @@ class FieldProducer(Producer):
         if box is None:
             extent, box = _cut_out(where, known, extent)
         elif isinstance(extent, int):
-            extent = _cubes(where, extent, box)
+            extent = cubic_extent(where, extent, box)
         given = _channels_of(where, field)
         dtypes: Mapping[str, torch.dtype] = getattr(field, "dtypes", {})
         own = {n: Channel(dtypes.get(n, torch.float32), width) for n, width in given.items()}
@@ -101,9 +101,7 @@ class FieldProducer(Producer):
         places = (torch.arange(self.samples, dtype=torch.float64) + 0.5) / self.samples - 0.5
         self.register_buffer("offsets", torch.cartesian_prod(places, places, places))
         self.threshold = self._thresholds(where, known, threshold)
-        reach = max(abs(float(end)) for corner in box for end in corner)
-        fine = reach <= 0.5 * DEEP_VOXELS * min(self.spacing)
-        self.dtype = dtype or (torch.float32 if fine else torch.float64)
+        self.dtype = dtype or dtype_of_places(box, self.spacing)
 
     def _thresholds(
         self, where: str, field: Field | None, threshold: float | Mapping[str, float] | None
@@ -196,25 +194,19 @@ class FieldProducer(Producer):
         where = type(self).__name__
         size = nodes.voxel_size.to(self.dtype)[:, None, None, None]
         if isinstance(field, Field) and field.prefiltered:
-            points = self._points(nodes.wider(field.margin))
+            points = nodes.wider(field.margin).points(self.dtype)
             found = _by_channel(where, field.filtered(points, size), points)
             if field.margin == 0:
                 return found
             side = nodes.layout.side
             like = points[:, :side, :side, :side]
             return _by_channel(where, field.finish(found, size[:, 0, 0, 0]), like)
-        points = self._points(nodes)
+        points = nodes.points(self.dtype)
         total: dict[str, Any] = {}
         for offset in self.offsets.to(size).unbind(0):
             values = _by_channel(where, field(points + size * offset), points)
             total = {name: total.get(name, 0) + value for name, value in values.items()}
         return {name: value / len(self.offsets) for name, value in total.items()}
-
-    def _points(self, nodes: Nodes) -> Tensor:
-        """(k, z, y, x, 3) world positions of the voxels, border included."""
-        if self.dtype == torch.float64:
-            return nodes.center[:, None, None, None] + nodes.local_positions
-        return nodes.positions
 
     def _bounds(self, center: Tensor, half: Tensor, size: Tensor) -> dict[str, Interval]:
         """For each channel of which anything is known, its interval, (k, c) each."""
@@ -269,9 +261,9 @@ def cache_field(
 def alike(
     field: nn.Module, nodes: Nodes, beyond: float, count: int
 ) -> Iterator[tuple[Tensor, nn.Module]]:
-    """Yields rows of at most so many nodes in which the same parts of a field matter, or nearly so
-    where these are few, and these parts, up to `beyond` voxels behind the brick's border. Waits for
-    the device.
+    """Groups nodes in which the same parts of a field matter, up to `beyond` voxels behind the
+    brick's border. Yields rows of at most `count` nodes, with the field of these parts alone; small
+    groups are joined. Waits for the device.
     """
     if not isinstance(field, Field):
         yield from ((rows, field) for rows in torch.arange(len(nodes)).split(count))
@@ -344,8 +336,16 @@ def _cut_out(where: str, field: Field | None, extent: int | Sequence[int]) -> tu
     return extent, ((middle - half).tolist(), (middle + half).tolist())
 
 
-def _cubes(where: str, extent: int, box: Sequence[Sequence[float]]) -> list[int]:
-    """Extent along x, y, z, so that voxels of a box are cubes or nearly so."""
+def dtype_of_places(box: Sequence[Sequence[float]], spacing: Sequence[float]) -> torch.dtype:
+    """Returns float32 where it tells the finest voxels of a box apart, else float64."""
+    reach = max(abs(float(end)) for corner in box for end in corner)
+    return torch.float32 if reach <= 0.5 * DEEP_VOXELS * min(spacing) else torch.float64
+
+
+def cubic_extent(where: str, extent: int, box: Sequence[Sequence[float]]) -> list[int]:
+    """Returns the extent along x, y, z of a box whose longest side has `extent` voxels, so that
+    these are cubes or nearly so.
+    """
     if len(box) != 2:
         raise ValueError(f"{where}: box must be two corners, got {box!r}")
     low, high = (check.triple(where, "box", corner) for corner in box)

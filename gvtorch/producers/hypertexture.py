@@ -15,12 +15,11 @@ import torch
 from torch import Tensor, nn
 
 from ..base import check
-from ..base.constants import DEEP_VOXELS
 from ..fields import Distance, noise
 from ..fields.noise.fractal import Octave, octaves_of
 from ..pool import Channel
-from .field import alike
-from .producer import Layout, Nodes, Producer, Region, Regions
+from .field import alike, cubic_extent, dtype_of_places
+from .producer import Layout, Nodes, Producer, Region, Regions, by_depth
 
 _BATCH = 64  # bricks that are made at a time on the CPU, whose caches then hold what is between
 _COARSEST = 1.5  # cells a voxel, from which on the mean tells nothing of the noise
@@ -46,9 +45,9 @@ class Hypertexture(Producer):
     it and all after it add, brick by brick; the voxels' bits are the same with and without it. And
     regions are never made where the distance proves that.
 
-    A voxel is the mean over its cube, to a good approximation: an octave counts by as much as its
-    mean follows it, and what is lost in the mean, of noise and of the distance, makes the step from
-    0 to 1 wider: the smoothstep is replaced by the one that has the variance of them all.
+    A voxel is about the mean over its cube. Each octave has the weight that is left of it in this
+    mean. What the mean takes away, of noise and of the distance, makes the step from 0 to 1 wider:
+    in place of the smoothstep stands one with the variance of all these together.
 
     Channels are "density", and "distance" if asked for: that of the shape, in world units, by which
     a transfer function may colour (`Isosurface(0.5, colors, color_channel="distance")`).
@@ -119,9 +118,7 @@ class Hypertexture(Producer):
             Octave(amplitude * one.amplitude, frequency * one.frequency, one.seed) for one in series
         ]
         self.wanted = self.made = 0
-        far = max(abs(float(end)) for corner in box for end in corner)
-        fine = far <= 0.5 * DEEP_VOXELS * min(self.spacing)
-        self.dtype = torch.float32 if fine else torch.float64
+        self.dtype = dtype_of_places(box, self.spacing)
         self._levels: list[Level] = []
         self._worn = torch.empty(0)
 
@@ -189,8 +186,7 @@ class Hypertexture(Producer):
             name: torch.empty(shape, dtype=channel.dtype, device=device)
             for name, channel in self.channels.items()
         }
-        for depth in nodes.depth.unique().tolist():
-            here = (nodes.depth == depth).nonzero()[:, 0]
+        for depth, here in by_depth(nodes.loc):
             count = _BATCH if device.type == "cpu" else len(here)
             for rows, near in alike(self.shape, nodes[here], 0, count):
                 made = self._made(nodes[here[rows]], self.level_of(depth), near)
@@ -200,10 +196,7 @@ class Hypertexture(Producer):
 
     def _made(self, nodes: Nodes, level: Level, shape: nn.Module) -> dict[str, Tensor]:
         """Channels (k, z, y, x, 1) of nodes of a level, of what of the shape matters there."""
-        if self.dtype == torch.float64:
-            points = nodes.center[:, None, None, None] + nodes.local_positions
-        else:
-            points = nodes.positions
+        points = nodes.points(self.dtype)
         distance = shape(points)
         total = distance * (-1 / self.thickness)
         active = torch.arange(len(nodes), device=total.device)
@@ -243,9 +236,4 @@ def _cut_out(
         if own is None or not bool(own.isfinite().all()):
             raise ValueError(f"{where}: box must be given: the shape does not tell where it ends")
         box = [(own[0] - reach).tolist(), (own[1] + reach).tolist()]
-    if not isinstance(extent, int):
-        return extent, box
-    check.whole(where, "extent", extent, low=1, high=2**40)
-    sides = [high - low for low, high in zip(*box, strict=True)]
-    check.triple(where, "sides of the box", sides, positive=True)
-    return [max(1, round(extent * side / max(sides))) for side in sides], box
+    return cubic_extent(where, extent, box) if isinstance(extent, int) else extent, box

@@ -18,7 +18,7 @@ from torch import Tensor
 from ..base import check
 from ..io.channels import channel_names
 from ..io.store import Store
-from .producer import Bricks, Layout, Nodes, Producer, Region, Regions, grid_of
+from .producer import Bricks, Layout, Nodes, Producer, Region, Regions, arrived, grid_of
 from .stored import StoredProducer
 
 
@@ -148,21 +148,19 @@ def _when_all(answers: Mapping[str, Any], join: Callable[[Mapping[str, Any]], An
     found.set_running_or_notify_cancel()
     left, lock = len(late), threading.Lock()
 
-    def arrived(_: Future) -> None:
+    def came(_: Future) -> None:
         nonlocal left
         with lock:
             left -= 1
             if left:
                 return
         try:
-            found.set_result(
-                join({n: a.result() if isinstance(a, Future) else a for n, a in answers.items()})
-            )
+            found.set_result(join({name: arrived(one) for name, one in answers.items()}))
         except BaseException as error:  # a read that failed or was cancelled
             found.set_exception(error)
 
     for one in late:
-        one.add_done_callback(arrived)
+        one.add_done_callback(came)
     return found
 
 

@@ -22,10 +22,10 @@ class MeshProducer(Producer):
     """Makes bricks of a mesh at any level, out of its triangles: nothing is made that is not looked
     at, so the resolution is free. What the finest voxels hold is what `gv.voxelize` writes.
 
-    Where a store's coarse voxels are means of those below, these are means of 2^3 places in each,
-    every one with a plane through it. Coverage and distance differ where several parts of the
-    surface lie in a voxel; colours and normals come of the surface within `band` voxels of each
-    level.
+    A store's coarse voxels are means of those below; these are means of 2^3 places in the voxel, at
+    each of which the nearest surface counts as a plane. So coverage and distance differ where
+    several parts of the surface lie in a voxel. Colours and normals are those of the surface within
+    `band` voxels of the level.
     """
 
     on_device = True

@@ -12,7 +12,7 @@ from torch import Tensor
 from ..base.constants import DEEP_VOXELS
 from ..fields.noise import OctaveSum, SplineSum
 from ..pool import Channel
-from .producer import Nodes, Producer
+from .producer import Nodes, Producer, by_depth
 
 
 class OctaveProducer(Producer):
@@ -78,8 +78,7 @@ class OctaveProducer(Producer):
     def _by_level(self, nodes: Nodes) -> dict[str, Tensor]:
         shape = (len(nodes), *(nodes.layout.side,) * 3)
         found = {name: torch.empty(shape, device=nodes.loc.device) for name in self._names}
-        for depth in nodes.depth.unique().tolist():
-            rows = (nodes.depth == depth).nonzero()[:, 0]
+        for depth, rows in by_depth(nodes.loc):
             sums = self._sums(nodes[rows], depth)
             for name, values in zip(self._names, sums, strict=False):
                 found[name][rows] = values

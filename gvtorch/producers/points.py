@@ -20,7 +20,7 @@ from ..points.points import Points
 from ..points.sorted import SortedPoints, sort_points
 from ..points.splat import Cubes, ranges, values
 from ..pool import Channel
-from .producer import Layout, Nodes, Producer, Region, Regions
+from .producer import Layout, Nodes, Producer, Region, Regions, by_depth
 
 _BATCH = 256  # bricks worked on at a time
 
@@ -125,9 +125,11 @@ class PointProducer(Producer):
 
 
 def _by_level(nodes: Nodes) -> Iterator[tuple[Tensor, Cubes]]:
-    """Which nodes are of a level, some of them at a time, and their bricks with border."""
+    """Yields rows of nodes of one level, a batch at a time, and the voxels of their bricks with
+    border.
+    """
     layout, loc = nodes.layout, nodes.loc.cpu()
-    for depth in loc[:, 3].unique().tolist():
-        for rows in (loc[:, 3] == depth).nonzero()[:, 0].split(_BATCH):
+    for depth, here in by_depth(loc):
+        for rows in here.split(_BATCH):
             low = loc[rows, :3].numpy() * layout.brick_size - layout.border
             yield rows, Cubes(np.ascontiguousarray(low), layout.side, layout.depth - depth)

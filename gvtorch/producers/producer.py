@@ -238,6 +238,12 @@ class Nodes:
         """(k, z, y, x, 3) float32, the same from the brick's `center` on: see `local_axes`."""
         return self._grid("local_positions", self._local)
 
+    def points(self, dtype: torch.dtype) -> Tensor:
+        """Returns `positions`, in float32 or, exact at any depth, in float64."""
+        if dtype == torch.float64:
+            return self.center[:, None, None, None] + self.local_positions
+        return self.positions
+
     def _grid(self, name: str, places: Tensor) -> Tensor:
         """(k, z, y, x, 3) of (k, 3, s) coordinates along each axis, kept under a name."""
         if name not in self._known:
@@ -274,6 +280,14 @@ class Nodes:
             f"Nodes({len(self)} on {self.loc.device}, "
             f"bricks of {layout.brick_size}^3+{layout.border}, tree depth {layout.depth})"
         )
+
+
+def by_depth(loc: Tensor) -> Iterator[tuple[int, Tensor]]:
+    """Yields each depth of nodes at places (k, 4), and which of them it has, (m,); waits for the
+    device.
+    """
+    for depth in loc[:, 3].unique().tolist():
+        yield depth, (loc[:, 3] == depth).nonzero()[:, 0]
 
 
 def _broadcast(places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -519,14 +533,14 @@ class Producer(torch.nn.Module):
         depth = torch.full_like(place[:, :1], layout.depth)
         node = torch.cat(((place / layout.brick_size).floor(), depth), 1).to(torch.int64)
         loc, row = node.unique(dim=0, return_inverse=True)
-        bricks_of = self._filled(loc, layout)
+        bricks_of = self.bricks_at(loc, layout)
         inner = place - node[:, :3] * layout.brick_size + layout.border
         found = {}
         for name, bricks in bricks_of.items():
             found[name] = _between(bricks, row, inner).view(*points.shape[:-1], -1)
         return found
 
-    def _filled(self, loc: Tensor, layout: Layout) -> dict[str, Tensor]:
+    def bricks_at(self, loc: Tensor, layout: Layout) -> dict[str, Tensor]:
         """For each channel (k, z, y, x, c) the bricks of nodes of one level at places (k, 4); what
         these need of their parents is made first. ValueError where one can't be made.
         """
@@ -534,10 +548,9 @@ class Producer(torch.nn.Module):
         if self.needs_parent and bool((loc[:, 3] > 0).all()):
             above = torch.cat((loc[:, :3] // layout.branching, loc[:, 3:] - 1), 1)
             above, row = above.unique(dim=0, return_inverse=True)
-            made = self._filled(above, layout)
+            made = self.bricks_at(above, layout)
             parents = {name: bricks[row] for name, bricks in made.items()}
-        answer: Any = self.fill(Nodes(loc, layout, parents=parents))
-        answer = answer.result() if isinstance(answer, Future) else answer
+        answer = arrived(self.fill(Nodes(loc, layout, parents=parents)))
         answer = answer if isinstance(answer, Bricks) else Bricks(data=answer)
         for message in answer.errors.values():
             raise ValueError(f"{type(self).__name__}.at: {message}")
@@ -551,6 +564,11 @@ class Producer(torch.nn.Module):
         extent = "x".join(str(n) for n in self.extent)
         channels = phrase(self.channels)
         return f"{type(self).__name__}({extent} (x, y, z), N={self.branching}, {channels})"
+
+
+def arrived(answer: Any) -> Any:
+    """Returns a producer's answer; waits for one that comes later."""
+    return answer.result() if isinstance(answer, Future) else answer
 
 
 class Grid(TypedDict):

@@ -116,6 +116,26 @@ class _Cubes:
         return self.bricks * self.brick_size
 
 
+def _coarse_channel(store: Store, filtered: CoarseColors) -> dict[str, Channel]:
+    """Returns the channel of a shader's filtered colours; raises ValueError if the store has others
+    or none.
+    """
+    check_filtered("StoredProducer", filtered)
+    if not store.all_channels:
+        raise ValueError(
+            f"{store.location}: filtered colours are of all channels: leave channels out"
+        )
+    name = str(filtered.other)
+    known = store.coarse.get(name)
+    if known is None or known.made_of != filtered.made_of:
+        what = "were made with another function or component" if known else "are not there"
+        raise ValueError(
+            f"{store.location}: filtered colours {name!r} {what}; "
+            "gvtorch filter (Filtered.add_to) makes them"
+        )
+    return {name: Channel(torch.float16, known.width, coarse=True)}
+
+
 def _read_stage(work: Callable[[Nodes], Any], nodes: Nodes) -> Any:
     """Does the work of a thread under its name."""
     with stage("read"):
@@ -165,41 +185,26 @@ class StoredProducer(Producer):
         seconds = check.number("StoredProducer", "timeout", timeout, low=0, open_low=True)
         if not isinstance(store, Store):
             store = Store.open(store, image=image, time=time, channels=channels)
-        value_range = {}
         if store.info.labels and store.dtype.is_floating_point and not store.has_blocks:
             raise ValueError(
                 f"{store.location}: labels of {store.stored} must be counted off first: "
                 f"gvtorch convert {store.location} STORE.zarr"
             )
+        value_range = {}
         if store.value_range is not None:
             lows, highs = zip(*store.value_range, strict=True)
             value_range[_CHANNEL] = (min(lows), max(highs))
-        kinds, made_of = {_CHANNEL: Channel(store.dtype, store.width)}, dict[str, Any]()
-        if filtered is not None:
-            check_filtered("StoredProducer", filtered)
-            if not store.all_channels:
-                raise ValueError(
-                    f"{store.location}: filtered colours are of all channels: leave channels out"
-                )
-            name = str(filtered.other)
-            known = store.coarse.get(name)
-            if known is None or known.made_of != filtered.made_of:
-                what = "were made with another function or component" if known else "are not there"
-                raise ValueError(
-                    f"{store.location}: filtered colours {name!r} {what}; "
-                    "gvtorch filter (Filtered.add_to) makes them"
-                )
-            made_of[name] = known.made_of
-            kinds[name] = Channel(torch.float16, known.width, coarse=True)
+        coarse = {} if filtered is None else _coarse_channel(store, filtered)
         super().__init__(
             store.extent,
-            channels=kinds,
+            channels={_CHANNEL: Channel(store.dtype, store.width), **coarse},
             spacing=store.spacing,
             origin=store.origin,
             value_range=value_range,
             labels={_CHANNEL: store.label_values} if store.info.labels else None,
         )
-        self.store, self.timeout, self.made_of = store, seconds, made_of
+        self.store, self.timeout = store, seconds
+        self.made_of = {name: store.coarse[name].made_of for name in coarse}
         self.host_bytes, self._workers = limit, workers
         self._begin()
 

@@ -16,7 +16,16 @@ from ..pool.pools import checked_threshold, labels_by_channel, volumes_by_channe
 from ..pool.pyramid import Level, NodeSummary, levels_by_depth
 from ..pool.staging import wide_rows
 from .answer import regions_of
-from .producer import Bricks, CoarseColors, Layout, Nodes, Producer, Regions, check_filtered
+from .producer import (
+    Bricks,
+    CoarseColors,
+    Layout,
+    Nodes,
+    Producer,
+    Regions,
+    by_depth,
+    check_filtered,
+)
 
 _BATCH = 4096  # bricks cut from a level at a time
 
@@ -59,7 +68,7 @@ class VolumeProducer(Producer):
         channels = {name: Channel.of(volume) for name, volume in volumes.items()}
         if filtered is not None:
             check_filtered("VolumeProducer", filtered)
-            name, last = str(filtered.other), first.data.shape[3] - 1
+            name, last = str(filtered.other), first.width - 1
             what = "component of filtered"
             check.whole("VolumeProducer", what, filtered.component, low=0, high=last)
             if name in channels:
@@ -141,8 +150,7 @@ class VolumeProducer(Producer):
 def _by_depth(nodes: Nodes) -> list[tuple[int, Tensor, Tensor]]:
     """Returns for each depth which of the nodes it has, (m,), and their z, y, x, (m, 3)."""
     loc = nodes.loc.cpu()
-    rows = [(at, (loc[:, 3] == at).nonzero()[:, 0]) for at in loc[:, 3].unique().tolist()]
-    return [(at, here, loc[here, :3].flip(1)) for at, here in rows]
+    return [(depth, here, loc[here, :3].flip(1)) for depth, here in by_depth(loc)]
 
 
 def _all_bricks(values: list[Tensor], levels: list[Level], layout: Layout) -> Tensor:

@@ -48,6 +48,7 @@ _PROJECTIONS |= {"max": "maximum", "min": "minimum"}
 # Of a `Solid`: rows of its table; width of its ramp in intervals, at which penumbras agree best;
 # and of a distance field's ramp in voxels at most.
 _ROWS, _RAMP, _WIDEST = 1025, 3.0, 16
+_OPAQUE = 1e-20  # a reference length by which the least opacity is whole
 
 
 class Lit(LitShader):
@@ -197,22 +198,26 @@ class Isosurface(LitShader):
 
     kind = "Isosurface"
     distance = False  # the value is a distance in world units, negative inside
-    color: Triple | TransferFunction
+    color: Triple | TransferFunction | None
     checks: ClassVar[Mapping[str, Check]] = {
         "value": a_number(),
         "color": lambda owner, name, value: (
-            value if isinstance(value, TransferFunction) else _COLOR(owner, name, value)
+            value
+            if value is None or isinstance(value, TransferFunction)
+            else _COLOR(owner, name, value)
         ),
         "filled": flag,
+        "premultiplied": flag,
     }
 
     def __init__(
         self,
         value: Number,
-        color: Triple | TransferFunction = (0.8, 0.8, 0.8),
+        color: Triple | TransferFunction | None = (0.8, 0.8, 0.8),
         *,
         color_channel: str | None = None,
         color_component: int = 0,
+        premultiplied: bool = False,
         filled: bool = True,
         **light: Any,
     ) -> None:
@@ -221,8 +226,10 @@ class Isosurface(LitShader):
         Args:
             value: The level, in data units.
             color: Linear red, green, blue, or a transfer function of the second channel's value.
-            color_channel: Name of the second channel, for a transfer function.
-            color_component: Which number of it.
+                None: as that channel holds it, in 4 numbers a voxel (see `StoredColor`).
+            color_channel: Name of the second channel, for a transfer function or None.
+            color_component: Which number of it, for a transfer function.
+            premultiplied: Whether colours are stored multiplied by their opacity.
             filled: False: a hollow shell, whose inner side a ray sees that begins within. So it is
                 where a `Clip` without caps cuts it.
             **light: As in `Lit`.
@@ -233,24 +240,37 @@ class Isosurface(LitShader):
         super().__init__(**light)
         self.value, self.color, self.filled = value, color, filled
         self.other, self.other_component = color_channel, color_component
+        self.premultiplied = premultiplied
         self._check_color()
 
     def _check_color(self) -> None:
-        if isinstance(self.color, TransferFunction) != (self.other is not None):
+        if (self.color is None or isinstance(self.color, TransferFunction)) == (self.other is None):
             kind = kind_of(self)
-            raise ValueError(f"{kind}: a transfer function and color_channel belong together")
+            raise ValueError(
+                f"{kind}: a transfer function or color=None and color_channel belong together"
+            )
 
     def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
         self._check_color()
+        if self.color is None:
+            width = tree.bricks.channels.get(str(self.other), Channel(width=4)).width
+            if width != 4:
+                raise ValueError(
+                    f"{where}: stored colour needs 4 numbers a voxel, {self.other!r} has {width}"
+                )
         return super().shading(where, tree)
 
     def table(self, sampling: Sampling) -> ColorTable:
         if isinstance(self.color, TransferFunction):
             return self.color.table(sampling)
-        return one_color(self.color, sampling)
+        return one_color((1.0, 1.0, 1.0) if self.color is None else self.color, sampling)
 
     def own_numbers(self, tree: N3Tree) -> IsosurfaceNumbers:
-        return IsosurfaceNumbers(self.value, (-1.0 if self.distance else 1.0) * self.filled)
+        scale = 0.0
+        if self.color is None:
+            scale = 1 / number_of_one(tree.bricks.channels[str(self.other)].dtype)
+        filled = (-1.0 if self.distance else 1.0) * self.filled
+        return IsosurfaceNumbers(self.value, filled, scale, float(self.premultiplied))
 
     def opened(self) -> Isosurface:
         hollow = copy(self)
@@ -258,7 +278,7 @@ class Isosurface(LitShader):
         return hollow
 
     def matter(self) -> Solid:
-        if isinstance(self.color, TransferFunction):
+        if self.color is None or isinstance(self.color, TransferFunction):
             raise ValueError("Isosurface: indirect light needs a surface of one colour")
         return Solid(self, self.color)
 
@@ -266,12 +286,17 @@ class Isosurface(LitShader):
         return Solid(self, None)
 
     def cut_surface(self) -> CutSurface:
-        value, colors = Projection("maximum", _WHITE), None
+        value = Projection("maximum", _WHITE)
         value.channel, value.component = self.channel, self.component
-        color = self.color
+        colors: Shader | None = None
+        color = (1.0, 1.0, 1.0) if self.color is None else self.color
         if isinstance(color, TransferFunction):
             colors, color = Projection("maximum", color), (1.0, 1.0, 1.0)
             colors.channel, colors.component = self.other, self.other_component
+        elif self.color is None:
+            colors = StoredColor(
+                str(self.other), reference=_OPAQUE, premultiplied=self.premultiplied
+            )
         return CutSurface(
             level=self.value, below=self.distance, value=value, color=color, colors=colors
         )
@@ -286,7 +311,7 @@ class DistanceField(Isosurface):
 
     def __init__(
         self,
-        color: Triple | TransferFunction = (0.8, 0.8, 0.8),
+        color: Triple | TransferFunction | None = (0.8, 0.8, 0.8),
         *,
         offset: Number = 0.0,
         **look: Any,

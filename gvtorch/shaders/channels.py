@@ -12,11 +12,11 @@ import torch
 
 from ..base import check
 from ..base.image_info import ChannelInfo
+from ..base.srgb import from_srgb
 from ..base.volume import Volume
 from ..io.store import Store
 from ..io.window import windows
 from ..ops.shading import Triple
-from .colors import from_srgb
 from .colors import linear_color as named_color
 from .shader import ColorTable, Sampling, Shader
 from .transfer_function import TransferFunction
@@ -179,7 +179,7 @@ class Channels(Shader):
         if not isinstance(image, Volume | Store):
             kind = type(image).__name__
             raise ValueError(f"Channels.of: image must be a Volume or a Store, got {kind}")
-        width = image.data.shape[3] if isinstance(image, Volume) else image.width
+        width = image.width
         chosen = range(width) if components is None else components
         if len(chosen) > MOST:
             raise ValueError(

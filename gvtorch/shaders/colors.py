@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..base import check
+from ..base.srgb import from_srgb
 
 #: Colours by name, as sRGB.
 NAMED = {
@@ -43,11 +44,6 @@ def linear_color(
     red, green, blue = (int(text[at : at + 2], 16) / 255 for at in (1, 3, 5))
     red, green, blue = from_srgb(np.array((red, green, blue))).tolist()
     return (red, green, blue)
-
-
-def from_srgb(color: np.ndarray) -> np.ndarray:
-    """Returns sRGB in [0, 1] as linear light (IEC 61966-2-1)."""
-    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
 
 
 def distinct_colors(numbers: np.ndarray) -> np.ndarray:

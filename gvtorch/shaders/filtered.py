@@ -107,8 +107,7 @@ class Filtered(Shader):
             ValueError: Tree and volume do not belong together, or an argument is out of its range.
         """
         check.instance("Filtered", "volume", volume, Volume)
-        last = volume.data.shape[3] - 1
-        check.whole("Filtered", "component", component, low=0, high=last)
+        check.whole("Filtered", "component", component, low=0, high=volume.width - 1)
         shader = cls(transfer, channel, component, directions=directions)
         if (volume.extent, volume.spacing) != (tree.extent, tree.spacing):
             raise ValueError(f"Filtered: tree and volume must be of one place: {tree}, {volume}")

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.srgb import from_srgb
 from ..ops.shading import LabelNumbers
 from ..pool import N3Tree
-from .colors import distinct_colors, from_srgb, linear_color
+from .colors import distinct_colors, linear_color
 from .lights import LitShader
 from .shader import ColorTable, Sampling
 
@@ -247,7 +248,9 @@ class _Look:
 
 
 def _put(rows: np.ndarray, labels: np.ndarray, told: Mapping[int, Any]) -> None:
-    """Writes what is told of some labels into the rows of those that there are."""
+    """Writes the values `told` of labels into the rows of these; labels that have no row are left
+    out.
+    """
     if not told:
         return
     wanted = np.fromiter(told, np.int64, len(told))

@@ -226,7 +226,7 @@ class Shader(Checked):
         return None
 
     def opened(self) -> Shader:
-        """Returns what a cut without a cap shows: the inside of a surface, too."""
+        """Returns the shader for a cut without a cap: it shows surfaces from inside, too."""
         return self
 
     def unlit(self) -> Shader:

@@ -23,6 +23,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from ..base.declared import did_you_mean
+from ..base.messages import one_line
 from ..io.ngff import is_zarr
 from .bench import Bench
 from .common import Bar, ReadOptions, given, refuse_for_store, volume_formats
@@ -314,17 +315,15 @@ def _run(args: list[str] | None) -> None:
     except BrokenPipeError:
         raise
     except (ValueError, OSError, ImportError, MemoryError) as error:
-        text = " ".join(str(error).split()) or type(error).__name__
-        print(f"gvtorch: error: {text}", file=sys.stderr)
+        print(f"gvtorch: error: {one_line(error)}", file=sys.stderr)
         sys.exit(2)
     except RuntimeError as error:
         if type(error).__name__ == "ProductionError":
-            print(f"gvtorch: error: {' '.join(str(error).split())}", file=sys.stderr)
+            print(f"gvtorch: error: {one_line(error)}", file=sys.stderr)
             sys.exit(2)
         if "alloc" not in str(error) and "memory" not in str(error):
             raise
-        text = " ".join(str(error).split())
-        print(f"gvtorch: error: not enough memory: {text}", file=sys.stderr)
+        print(f"gvtorch: error: not enough memory: {one_line(error)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt as stop:
         if str(stop):

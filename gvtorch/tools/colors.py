@@ -17,9 +17,7 @@ _ENDINGS = (".json", ".vp", ".xml")  # of files of transfer functions
 
 def check_component(data: Volume | Store, component: int) -> None:
     """Raises ValueError, which tells what there is, where voxels have no such number."""
-    from ..io.store import Store
-
-    width = data.width if isinstance(data, Store) else data.data.shape[3]
+    width = data.width
     if 0 <= component < width:
         return
     names = [channel.name for channel in data.info.channels]

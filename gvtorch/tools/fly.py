@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated, Any
 
@@ -42,8 +43,8 @@ class Fly:
     """once around, or keys [{"eye": [x, y, z], "target": [x, y, z], "up": ..., "fov": ...}]"""
     keys: Annotated[Path | None, arg(metavar="FILE.json")] = None
     """key frames in place of --path: [{"time": seconds, "state": what gvtorch view saved}, ...],
-    between which camera, colours, clips and all other numbers run smoothly; a film that ends as it
-    begins loops"""
+    between which camera, colours, clips and all other numbers run smoothly, and a series shows
+    the time point nearest to theirs; a film that ends as it begins loops"""
     turntable: Annotated[float | None, arg(metavar="SECONDS")] = None
     """an orbit that takes so long: instead of --frames"""
     frames: Annotated[int | None, arg(metavar="N")] = None
@@ -182,24 +183,45 @@ class Fly:
     def _parts(self, frames: int) -> list[tuple[int | None, range]]:
         """Time points, and the pictures that are taken of each; None: of whichever is read."""
         if self.times is None:
-            return [(None, range(frames))]
+            return [(None, range(frames))] if self.keys is None else self._parts_of_keys(frames)
         moments = self._moments()
         ends = [-(-number * frames // len(moments)) for number in range(len(moments) + 1)]
         return [(m, range(a, b)) for m, a, b in zip(moments, ends, ends[1:], strict=False) if a < b]
 
-    def _moments(self) -> range:
-        """The time points that `--times` names."""
+    def _parts_of_keys(self, frames: int) -> list[tuple[int | None, range]]:
+        """The same, where key frames tell the time: pictures in a row of one time point."""
+        flight = self._flight()
+        if all(state.time == 0 for _, state in flight.keys):
+            return [(None, range(frames))]
+        if self.scene.source.time is not None:
+            raise ValueError("--keys tells what --time does: leave one out")
+        steps = max(1, frames - 1 + flight.closed)
+        shown = [round(flight.along(n / steps).time) for n in range(frames)]
+        count = self._times_there()
+        if not 0 <= min(shown) <= max(shown) < count:
+            wrong = next(moment for moment in shown if not 0 <= moment < count)
+            raise ValueError(
+                f"{self.keys}: time must be from 0 to {count - 1} of {self.path}, got {wrong}"
+            )
+        starts = [n for n in range(frames) if n == 0 or shown[n] != shown[n - 1]]
+        return [(shown[a], range(a, b)) for a, b in pairwise((*starts, frames))]
+
+    def _times_there(self) -> int:
+        """How many time points the data have."""
         from ..io.reading import open_source
         from ..io.store import Store
 
+        if is_zarr(self.path):
+            return Store.open(self.path, image=self.scene.streaming.image).times
+        options = self.scene.source.options()
+        del options["nan"]
+        return open_source(self.path, **options).times
+
+    def _moments(self) -> range:
+        """The time points that `--times` names."""
         if self.scene.source.time is not None:
             raise ValueError("--times and --time both tell which: leave one out")
-        if is_zarr(self.path):
-            count = Store.open(self.path, image=self.scene.streaming.image).times
-        else:
-            options = self.scene.source.options()
-            del options["nan"]
-            count = open_source(self.path, **options).times
+        count = self._times_there()
         first, _, last = (self.times or "").partition("-")
         if self.times == "all":
             return range(count)
@@ -271,6 +293,8 @@ class Fly:
         told = {"shader": _OF_SHADER, "camera": ("camera_model", "fov", "up")}
         names = {name for part, those in told.items() if part in first for name in those}
         names |= set(first.get("options", ()))
+        if self.times is not None and any(state.time != 0 for _, state in self._flight().keys):
+            flags.append("--times")
         flags += [f for f in given(self.scene.look) if f[2:].replace("-", "_") in names]
         if flags:
             raise ValueError(f"--keys tells what {flags[0]} does: leave one out")

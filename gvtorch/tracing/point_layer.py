@@ -63,7 +63,7 @@ def point_layer(
     reach = finest * grid.branching / growth
     voxel_light = float(np.prod(grid.spacing_3)) / (reference or float(grid.spacing_3.min()))
     height, width = placed.height, placed.width
-    total = np.zeros((height * width, 5))  # light, opacity, light * distance
+    total = np.zeros((height * width, 5))  # of a pixel: light, opacity, light * distance
     found = narrow_near(points, eye, reach + grid.branching * 2 * finest)
     for begin in range(0, len(found), _BLOCK):
         rows = {n: one[found[begin : begin + _BLOCK]] for n, one in points.points[0].rows.items()}
@@ -81,6 +81,11 @@ def point_layer(
         x = K[0, 0] * seen[:, 0] / depth + K[0, 2]
         y = K[1, 1] * seen[:, 1] / depth + K[1, 2]
         _draw(total, (height, width), (x, y), size, np.c_[share[:, None] * value, away])
+    return _layer(total, (height, width))
+
+
+def _layer(total: np.ndarray, shape: tuple[int, int]) -> Layer:
+    """A layer of the sums of pixels (p, 5)."""
     light = total[:, :3]
     bright = light.sum(1)
     shown = (bright > 0) | (total[:, 3] > 0)
@@ -89,8 +94,7 @@ def point_layer(
     )
     alpha = np.where(shown, np.clip(1 - np.exp(-total[:, 3]), _LEAST, 1), 0)
     images = (
-        torch.from_numpy(one).to(torch.float32).view(height, width, -1)
-        for one in (light, mean, alpha)
+        torch.from_numpy(one).to(torch.float32).view(*shape, -1) for one in (light, mean, alpha)
     )
     return Layer(*images)
 

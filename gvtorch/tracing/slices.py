@@ -15,7 +15,8 @@ import torch
 
 from ..base import check
 from ..base.records import RenderStats
-from ..base.volume import Volume
+from ..base.units import length_unit, metres
+from ..base.volume import Volume, to_numpy
 from ..io.store import Store
 from ..io.window import window
 from ..pictures.letters import draw_letters
@@ -35,18 +36,6 @@ _OPPOSITE = {**dict(zip("RAS", "LPI", strict=True)), **dict(zip("LPI", "RAS", st
 _VIEWS = {"S": ("axial", "A", "R"), "A": ("coronal", "S", "R"), "R": ("sagittal", "S", "A")}
 _GAP = 4  # pixels between the three planes
 _MOST = 65536  # pixels along a side
-_UNITS = {
-    "nm": "nanometer",
-    "um": "micrometer",
-    "µm": "micrometer",
-    "mm": "millimeter",
-    "cm": "centimeter",
-    "m": "meter",
-}
-_METERS = {
-    **{"nanometer": 1e-9, "micrometer": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2},
-    **{"meter": 1.0, "angstrom": 1e-10},
-}
 
 
 def slice_picture(
@@ -102,24 +91,18 @@ def slice_picture(
     elif span is not None:
         raise ValueError(f"{where}: span is for grays; colors have values of their own")
     views = _views(data.info.space, up, radiological=radiological, letters=letters)
-    if axis != "all":
-        if isinstance(at, tuple):
-            raise ValueError(f"{where}: at must be one place for axis {axis}, got {at!r}")
-        pixel = min(plane.spacing[n] for n in "xyz" if n != axis) / scale
-        view = views[axis] if up is None else PlaneView("", up)
-        return _picture(plane.colored(axis, at, view, pixel, colors))
-    if up is not None:
-        raise ValueError(f"{where}: up is for one plane, not for axis 'all'")
-    places = at if isinstance(at, tuple) else (at, at, at)
-    pixel = min(plane.spacing.values()) / scale
-    return _picture(
-        _in_line(
-            *(
-                plane.colored(n, place, views[n], pixel, colors)
-                for n, place in zip("xyz", places, strict=True)
-            )
-        )
-    )
+    if axis == "all":
+        if up is not None:
+            raise ValueError(f"{where}: up is for one plane, not for axis 'all'")
+        places = dict(zip("xyz", at if isinstance(at, tuple) else (at, at, at), strict=True))
+        pixel = min(plane.spacing.values()) / scale
+        shown = (plane.colored(n, places[n], views[n], pixel, colors) for n in "xyz")
+        return _picture(_in_line(*shown))
+    if isinstance(at, tuple):
+        raise ValueError(f"{where}: at must be one place for axis {axis}, got {at!r}")
+    pixel = min(plane.spacing[n] for n in "xyz" if n != axis) / scale
+    view = views[axis] if up is None else PlaneView("", up)
+    return _picture(plane.colored(axis, at, view, pixel, colors))
 
 
 def _views(
@@ -185,8 +168,7 @@ class _Plane:
         where = "slice_picture"
         self.data, self.component = data, component
         stored = isinstance(data, Store)
-        width = data.width if isinstance(data, Store) else data.data.shape[3]
-        check.whole(where, "component", component, low=0, high=width - 1)
+        check.whole(where, "component", component, low=0, high=data.width - 1)
         self.level = check.whole(where, "level", level, low=0)
         if level and not stored:
             raise ValueError(f"{where}: level is for stores, a volume has one, got {level}")
@@ -217,16 +199,18 @@ class _Plane:
     def _place(self, axis: str, text: str) -> int:
         """Index of the voxel in which a place of the world lies, as in "12.5mm"."""
         found = re.fullmatch(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-zµ]+)", text)
-        if found is None or found[2] not in _UNITS:
+        unit = None if found is None else length_unit(found[2])
+        if found is None or unit is None:
             raise ValueError(
                 f"slice_picture: at must be a share such as 50%, the index of a voxel, or a place "
                 f"such as 12.5mm, got {text!r}"
             )
-        place, unit = float(found[1]), _UNITS[found[2]]
+        place = float(found[1])
         if self.unit is not None and unit != self.unit:
-            if self.unit not in _METERS:
+            size, own = metres(unit), metres(self.unit)
+            if size is None or own is None:
                 raise ValueError(f"slice_picture: the unit of the data is {self.unit}, got {text}")
-            place *= _METERS[unit] / _METERS[self.unit]
+            place *= size / own
         index = int(np.floor((place - self.origin[axis]) / self.step[axis] + 0.5))
         low, high = (
             self.origin[axis] + (n - 0.5) * self.step[axis] for n in (0, self.finest[axis])
@@ -246,8 +230,7 @@ class _Plane:
             part = self.data.read_region(self.level, low, high)
         else:
             box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-            found = self.data.data[box]
-            part = (found.float() if found.dtype == torch.bfloat16 else found).numpy()
+            part = to_numpy(self.data.data[box])
         return part[..., self.component].squeeze(number)
 
     def colored(

@@ -49,18 +49,7 @@ class Tracer:
         """
         check_shader("render", "shader", shader)
         choose_backend(options.backend, tree.device)
-        channel = shader.channel or options.channel or tree.channel_names[0]
-        if channel not in tree.bricks.bricks:
-            known = ", ".join(tree.channel_names)
-            raise ValueError(f"render: unknown channel {channel!r}; the tree has {known}")
-        if tree.bricks.channels[channel].coarse:
-            raise ValueError(f"render: only coarse bricks have channel {channel!r}")
-        other, first = tree.bricks.channels.get(str(shader.other)), tree.channel_names[0]
-        if other is not None and other.coarse and channel != first:
-            raise ValueError(
-                f"render: channel {shader.other!r} was made of {first!r}, not of {channel!r}"
-            )
-        _check_labels(tree, shader, channel)
+        channel = _channel_of(tree, shader, options)
         step = options.step * min(tree.spacing)
         _check_step(tree, step, options)
         tree.warn_if_edited("render", learned=isinstance(shader, ModuleShader))
@@ -160,6 +149,24 @@ class Tracer:
         parts = [vars(block(rays[at : at + size])) for at in range(0, count, size)]
         given = [name for name, field in parts[0].items() if field is not None]
         return Hits(**{name: torch.cat([part[name] for part in parts]) for name in given})
+
+
+def _channel_of(tree: N3Tree, shader: Shader, options: RenderOptions) -> str:
+    """Returns the channel whose values the shader turns into colour, once it is known to fit."""
+    first, channels = tree.channel_names[0], tree.bricks.channels
+    channel = shader.channel or options.channel or first
+    if channel not in channels:
+        known = ", ".join(tree.channel_names)
+        raise ValueError(f"render: unknown channel {channel!r}; the tree has {known}")
+    if channels[channel].coarse:
+        raise ValueError(f"render: only coarse bricks have channel {channel!r}")
+    other = channels.get(str(shader.other))
+    if other is not None and other.coarse and channel != first:
+        raise ValueError(
+            f"render: channel {shader.other!r} was made of {first!r}, not of {channel!r}"
+        )
+    _check_labels(tree, shader, channel)
+    return channel
 
 
 def _check_labels(tree: N3Tree, shader: Shader, channel: str) -> None:

@@ -22,9 +22,9 @@ Send = Callable[[str | bytes], None]  # from any thread; does not block
 _REST = 0.18  # seconds without a move, after which a camera rests although nobody said so
 _EVERY = 0.3  # seconds between pictures of a camera at rest
 _DRAFT, _FINAL = 80, 94  # JPEG quality
-_LITTLE = 200_000  # pixels up to which the better one costs little
+_LITTLE = 200_000  # pixels up to which the final quality costs little
 _SMALLEST = 0.1  # of the resolution
-_STILL_FRAMES = 3  # frames in which nothing more came, after which nothing more is waited for
+_STILL_FRAMES = 3  # frames without new data, after which a picture counts as finished
 
 
 class Interrupted(Exception):

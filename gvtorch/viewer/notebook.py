@@ -11,6 +11,7 @@ import json
 import re
 from typing import Any
 
+from ..base.messages import need_library
 from .client import Client
 from .server import page_files
 from .session import Session, png
@@ -65,12 +66,9 @@ def widget(session: Session, height: int = 560) -> Any:
     Raises:
         ImportError: anywidget is not installed.
     """
-    try:
-        import anywidget
-        import traitlets
-    except ImportError as error:
-        text = f"view needs {error.name} in a notebook: pip install 'gvtorch[notebook]'"
-        raise ImportError(text) from None
+    need_library("view in a notebook", "anywidget", extra="notebook")
+    import anywidget
+    import traitlets
 
     class ViewWidget(anywidget.AnyWidget):
         """A view below a cell; `session` is what it shows, `close_view` ends it."""

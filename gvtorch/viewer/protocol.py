@@ -158,6 +158,19 @@ class Still:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Surface:
+    """Asks for the surface around values, or around a label, as a file of triangles."""
+
+    value: float
+    format: Literal["ply", "glb"] = "glb"
+    level: int = 0  # of detail; 0 is the finest
+
+    def __post_init__(self) -> None:
+        check.number("surface", "value", self.value)
+        check.whole("surface", "level", self.level, low=0)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Do:
     """Something without arguments: look at the whole box, or ask again for what failed."""
 
@@ -166,7 +179,7 @@ class Do:
 
 Message = (
     Hello | Move | Ack | Change | Pick | Histogram | Preset | Read | Export | Nodes | Resize | Set
-    | Follow | Monitor | Still | Do
+    | Follow | Monitor | Still | Surface | Do
 )  # fmt: skip
 MESSAGES: dict[str, type[Any]] = {one.__name__.lower(): one for one in Message.__args__}
 

@@ -11,13 +11,12 @@ from os import PathLike, fspath
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from ..base.arrays import as_volume
 from ..base.image_info import ImageInfo
 from ..base.stage import Progress, no_progress
-from ..base.volume import Volume
+from ..base.volume import Volume, movable, to_numpy
 from ..cameras import Camera
 from ..engine import Engine, EngineOptions, FrameStats
 from ..io.ngff import is_zarr
@@ -108,8 +107,8 @@ class Scene:
         counted = cost(tree, camera, shader, progress=progress, **state.settings())
         return counted.picture(state.show)
 
-    def voxels(self) -> Volume | Store:
-        """Returns what planes are cut of.
+    def voxels(self, purpose: str) -> Volume | Store:
+        """Returns what planes are cut of, and surfaces made of.
 
         Raises:
             ValueError: It has no voxels of its own, or they are not all in memory.
@@ -120,7 +119,7 @@ class Scene:
             trees = [] if self.engine is None else [*self.engine.trees.values()]
             found = _voxels_of(trees[0].producer) if len(trees) == 1 else None
             if found is None:
-                raise ValueError("slices: this scene has no voxels of its own to cut")
+                raise ValueError(f"{purpose}: this scene has no voxels of its own")
             return found
         if self._resident is None:
             self._resident = self.tree.to_volume()
@@ -133,8 +132,7 @@ class Scene:
             return self._shader_of_tree()
         if data.info.labels:
             return Labels()
-        width = data.width if isinstance(data, Store) else data.data.shape[3]
-        if 1 < width <= 16 and len(data.info.channels) == width:
+        if 1 < data.width <= 16 and len(data.info.channels) == data.width:
             return Channels.of(data)
         if data.info.quantity == "HU":
             return TransferFunction.preset(IN_HU["bone"])
@@ -179,10 +177,8 @@ class Scene:
         if not len(used):
             return None
         inner = slice(bricks.border, bricks.border + bricks.brick_size)
-        raw = pool.view(torch.int16) if pool.dtype == torch.uint16 else pool
-        found = raw[used].view(pool.dtype)[:, inner, inner, inner, component]
-        found = found.float() if found.dtype == torch.bfloat16 else found
-        values = found.cpu().numpy().ravel().astype(np.float32)
+        found = movable(pool)[used].view(pool.dtype)[:, inner, inner, inner, component]
+        values = to_numpy(found.cpu()).ravel().astype(np.float32)
         return values[np.isfinite(values)]
 
     def _clocks(self) -> list[Any]:

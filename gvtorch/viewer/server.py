@@ -14,10 +14,11 @@ import secrets
 import socket
 import threading
 from collections.abc import Iterable
-from importlib import import_module, resources
+from importlib import resources
 from typing import Any
 from urllib.parse import urlsplit
 
+from ..base.messages import need_library
 from .protocol import MOST_BYTES
 from .session import Session
 
@@ -52,12 +53,8 @@ def aiohttp_web() -> Any:
     Raises:
         ImportError: It is not installed; the message tells how.
     """
-    try:
-        import_module("PIL")
-        from aiohttp import web
-    except ImportError as error:
-        raise ImportError(f"view needs {error.name}: pip install 'gvtorch[view]'") from None
-    return web
+    need_library("view", "PIL", "Pillow", "view")
+    return need_library("view", "aiohttp.web", "aiohttp", "view")
 
 
 class Server:

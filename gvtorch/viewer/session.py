@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+from ..base.messages import one_line
 from ..base.stage import no_progress
 from ..base.volume import Volume
 from ..cameras import Camera
@@ -26,6 +27,7 @@ from ..shaders import TransferFunction
 from ..shaders.presets import CT_PRESETS, PRESETS
 from . import protocol
 from .client import Client, Send
+from .export import SurfaceExport
 from .files import read_function
 from .nodes import node_boxes
 from .parameters import Parameters
@@ -76,6 +78,7 @@ class Session:
         self._told_busy: Any = None
         self._figures_at = 0.0
         self._planes: Planes | None = None
+        self._export: SurfaceExport | None = None
         self._opening: float | None = None  # the time point that is read in a thread
         self._open_planes(state)
         self._thread = threading.Thread(target=self._run, name="gvtorch view", daemon=True)
@@ -202,14 +205,13 @@ class Session:
         return bool(self._tasks) or self._closed
 
     def _fell(self, client: Client, error: Exception) -> None:
-        """A picture failed: tells why, and goes back to what could be drawn."""
+        """After a picture that failed: tells why, and returns to the last state that was drawn."""
         self.errors += 1
-        self._tell_all("error", text=" ".join(str(error).split()) or type(error).__name__)
+        self._tell_all("error", text=one_line(error))
         if self._good is not self.state:
             self.state = self._good
             self._tell_state(None)
-            for one in self.clients.values():
-                one.stir(True)
+            self._stir()
         else:
             client.rest_for(1.0)
 
@@ -286,6 +288,8 @@ class Session:
 
     def _goodbye(self, client: Client) -> None:
         self.clients.pop(client.number, None)
+        if self._export is not None and self._export.serves(client):
+            self._export.end()
         for one in self.clients.values():
             if one.follows == client.number:
                 one.follows = None
@@ -302,7 +306,7 @@ class Session:
         try:
             _TAKES[type(message)](self, client, message)
         except (ValueError, OSError, ImportError, RuntimeError) as error:
-            client.tell("refused", text=" ".join(str(error).split()))
+            client.tell("refused", text=one_line(error))
             if isinstance(message, protocol.Change):
                 client.tell("state", state=self.state.to_json())
 
@@ -336,8 +340,7 @@ class Session:
         if beside and replace(before, slices=state.slices) == state:
             self._renew_planes()
         else:
-            for one in self.clients.values():
-                one.stir(message.rest)
+            self._stir(message.rest)
         self._follow_time()
 
     # Planes beside the picture, and time.
@@ -345,7 +348,7 @@ class Session:
     def _open_planes(self, state: ViewState) -> None:
         """Makes what cuts planes, where a state shows some; raises ValueError where it can't be."""
         if state.slices is not None and self._planes is None:
-            self._planes = Planes(self.scene.voxels(), self._plane_came)
+            self._planes = Planes(self.scene.voxels("slices"), self._plane_came)
 
     def _plane_came(self, problem: str) -> None:
         """From the thread that reads."""
@@ -375,7 +378,7 @@ class Session:
         try:
             data = self.scene.reopen(int(wanted))
         except Exception as error:  # whatever it was, the view goes on
-            text = f"time {wanted:g}: {' '.join(str(error).split()) or type(error).__name__}"
+            text = f"time {wanted:g}: {one_line(error)}"
             self.post(lambda: self._time_failed(text))
         else:
             self.post(lambda: self._time_came(wanted, data))
@@ -415,7 +418,7 @@ class Session:
         name = message.name or message.file
         client.tell("preset", name=name, function=encode(function), lost=lost)
 
-    def _export(self, client: Client, message: protocol.Export) -> None:
+    def _write_function(self, client: Client, message: protocol.Export) -> None:
         transfer = transfer_of(self.state.shader)
         if transfer is None:
             raise ValueError("export: there is no transfer function")
@@ -442,9 +445,9 @@ class Session:
         self.scene.resize(**{name: getattr(options, name) for name in message.engine})
         self._stir()
 
-    def _stir(self) -> None:
+    def _stir(self, resting: bool = True) -> None:
         for one in self.clients.values():
-            one.stir(True)
+            one.stir(resting)
 
     def _set(self, client: Client, message: protocol.Set) -> None:
         if self.parameters is None:
@@ -471,6 +474,12 @@ class Session:
     def _still(self, client: Client, message: protocol.Still) -> None:
         picture = self.still(client.eye, message.width, message.height)
         client.send_file("picture.png", png(picture))
+
+    def _surface(self, client: Client, message: protocol.Surface) -> None:
+        if self._export is not None and self._export.busy:
+            raise ValueError("surface: one is being made already")
+        data = self.scene.voxels("surface")
+        self._export = SurfaceExport(client, message, data, self.state.component)
 
     def _do(self, client: Client, message: protocol.Do) -> None:
         if message.what == "retry":
@@ -510,13 +519,14 @@ _TAKES: Mapping[type, Callable[[Session, Client, Any], None]] = {
     protocol.Histogram: Session._histogram,
     protocol.Preset: Session._preset,
     protocol.Read: Session._read,
-    protocol.Export: Session._export,
+    protocol.Export: Session._write_function,
     protocol.Nodes: Session._nodes,
     protocol.Resize: Session._resize,
     protocol.Set: Session._set,
     protocol.Follow: Session._follow,
     protocol.Monitor: Session._monitor,
     protocol.Still: Session._still,
+    protocol.Surface: Session._surface,
     protocol.Do: Session._do,
 }
 

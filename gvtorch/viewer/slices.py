@@ -14,7 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..base.messages import one_line
 from ..base.volume import Volume
+from ..io.http import ask_again
 from ..io.store import Store
 from ..io.window import window
 from ..pictures import Picture
@@ -214,7 +216,7 @@ class Planes:
                 self._keep(key, self._cut(axis, state, pixel))
                 problem = ""
             except Exception as error:  # whatever it was, the view goes on
-                self._failed[key] = " ".join(str(error).split()) or type(error).__name__
+                self._failed[key] = one_line(error)
                 problem = f"a slice can't be read: {self._failed[key]}"
             self._reading = None
             self._arrived(problem)
@@ -274,6 +276,7 @@ class Planes:
 
     def retry(self) -> None:
         """Lets planes that could not be read be asked for again."""
+        ask_again()
         self._failed.clear()
 
     def close(self) -> None:

@@ -3,30 +3,17 @@
 from __future__ import annotations
 
 import base64
-import importlib.util
-import shutil
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from gvtorch.bench.browser import absent, executable, running
+
 from .viewer import SOON
 
-_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
-
-
-def absent() -> str:
-    """Why no browser can run here; nothing if it can."""
-    if importlib.util.find_spec("playwright") is None:
-        return "playwright is not installed"
-    return "" if executable() else f"none of {', '.join(_NAMES)} is on the path"
-
-
-def executable() -> str | None:
-    """Where Chromium is."""
-    return next(filter(None, map(shutil.which, _NAMES)), None)
+__all__ = ["Tab", "absent", "executable", "running"]
 
 
 class Tab:
@@ -100,15 +87,3 @@ class Tab:
 
     def close(self) -> None:
         self.context.close()
-
-
-@contextmanager
-def running() -> Iterator[Any]:
-    """The browser."""
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as library:
-        flags = ["--no-sandbox", "--disable-dev-shm-usage"]
-        browser = library.chromium.launch(executable_path=executable(), args=flags)
-        yield browser
-        browser.close()

@@ -77,13 +77,10 @@ def zeros(megabytes: int) -> bytes:
     return b"\x1f\x8b\x08\0\0\0\0\0\0\x03" + block * megabytes
 
 
-def write_all(folder: Path) -> list[Path]:
-    """Writes the files; returns their paths, and those of two pipes without an end."""
-    axes = [f"NAXIS{n}  = {10**7}" for n in (1, 2, 3)]
-    cube = ["BITPIX  = 8", "NAXIS   = 3", *(f"NAXIS{n}  = 4" for n in (1, 2, 3))]
-    flat = ["BITPIX  = 8", "NAXIS   = 1", f"NAXIS1  = {10**10}", "EXTEND  = T"]
+def tiff_files() -> dict[str, bytes]:
+    """By name, TIFFs whose tags, pages or descriptions tell of too much."""
     told = "ImageJ=1.53k\nimages={0}\nslices={0}\nhyperstack=true\n"
-    files: dict[str, bytes] = {
+    return {
         "cycle.tif": tiff(following=8),
         "ome_slices.tif": ome(10**9),
         "ome_times.tif": ome(10**6, 10**6),
@@ -117,6 +114,12 @@ def write_all(folder: Path) -> list[Path]:
         "lsm.tif": tiff([(34412, 1, 2**31, 8)]),
         "nih.tif": tiff([(43314, 1, 2**31, 8)]),
         "mm.tif": tiff([text('{"PropertyValues": []}'), (51123, 2, 2**31, 8)]),
+    }
+
+
+def nrrd_files() -> dict[str, bytes]:
+    """By name, NRRDs of sizes, skips and streams without an end."""
+    return {
         "lines.nrrd": nrrd(f"encoding: raw\nline skip: {HUGE}", bytes(64)),
         "bytes.nrrd": nrrd(f"encoding: raw\nbyte skip: {HUGE}", bytes(64)),
         "sizes.nrrd": nrrd("encoding: gzip", zeros(1), f"{10**6} {10**6} {10**6}"),
@@ -130,6 +133,15 @@ def write_all(folder: Path) -> list[Path]:
         "wide.nrrd": nrrd("encoding: raw", b"", f"{10**400} 4 4"),
         "list.nrrd": nrrd(f"encoding: raw\ndata file: %d.raw 1 {HUGE} 1", b""),
         "axes.nrrd": nrrd("encoding: raw", b"", "1 " * 10**5),
+    }
+
+
+def fits_files() -> dict[str, bytes]:
+    """By name, FITS files of too many axes or cards, and such as unpack without an end."""
+    axes = [f"NAXIS{n}  = {10**7}" for n in (1, 2, 3)]
+    cube = ["BITPIX  = 8", "NAXIS   = 3", *(f"NAXIS{n}  = 4" for n in (1, 2, 3))]
+    flat = ["BITPIX  = 8", "NAXIS   = 1", f"NAXIS1  = {10**10}", "EXTEND  = T"]
+    return {
         "cube.fits": fits(["BITPIX  = 8", "NAXIS   = 3", *axes]),
         "dims.fits": fits(
             ["BITPIX  = 8", "NAXIS   = 999", *(f"NAXIS{n:<3}= 1" for n in range(1, 1000))]
@@ -138,14 +150,16 @@ def write_all(folder: Path) -> list[Path]:
         "cards.fits": fits([f"COMMENT {n}" for n in range(20_000)] + cube, bytes(2880)),
         "bomb.fits.gz": gzip.compress(fits(cube, bytes(64))) + zeros(2500),
         "before.fits.gz": gzip.compress(fits(flat)) + zeros(3000),
-        "shape.npy": b"\x93NUMPY\x01\0v\0"
-        + b"{'descr': '|u1', 'fortran_order': False, 'shape': (1000000, 1000000, 1000000), }".ljust(
-            117
-        )
-        + b"\n",
-        "bomb_4x4x4_uint8.raw.gz": zeros(2500),
-        "wide_9000x9000x9000_uint8.raw.gz": zeros(1),
     }
+
+
+def write_all(folder: Path) -> list[Path]:
+    """Writes the files; returns their paths, and those of two pipes without an end."""
+    shape = b"{'descr': '|u1', 'fortran_order': False, 'shape': (1000000, 1000000, 1000000), }"
+    files = {**tiff_files(), **nrrd_files(), **fits_files()}
+    files["shape.npy"] = b"\x93NUMPY\x01\0v\0" + shape.ljust(117) + b"\n"
+    files["bomb_4x4x4_uint8.raw.gz"] = zeros(2500)
+    files["wide_9000x9000x9000_uint8.raw.gz"] = zeros(1)
     paths = []
     for name, content in files.items():
         path = folder / name

@@ -37,6 +37,9 @@ SHADERS = {
     "six directions": gv.StoredColor("six", light=POINT, lit=True),
     "isosurface": gv.Isosurface(0.5, (0.9, 0.4, 0.2), light=POINT),
     "coloured isosurface": gv.Isosurface(0.4, SHADER, color_channel="rgba", color_component=1),
+    "surface of stored colour": gv.Isosurface(
+        0.4, None, color_channel="premultiplied", premultiplied=True
+    ),
     "distance field": gv.DistanceField(offset=0.3, filled=False),  # of what is no distance
     "maximum": gv.Projection("maximum", SHADER),
     "minimum": gv.Projection("minimum", SHADER),

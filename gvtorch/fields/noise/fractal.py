@@ -7,7 +7,9 @@ Source: Perlin, "An image synthesizer", SIGGRAPH 1985 (turbulence); Musgrave, in
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
+import operator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -74,12 +76,9 @@ def fbm(
     Raises:
         ValueError: An argument is not that.
     """
-    total: Tensor | None = None
-    for amplitude, noise in _layers(
-        "noise.fbm", points, octaves, lacunarity, gain, basis, seed, period
-    ):
-        total = amplitude * noise if total is None else total + amplitude * noise
-    return check.instance("noise.fbm", "basis", total, Tensor)
+    where = "noise.fbm"
+    layers = _layers(where, points, octaves, lacunarity, gain, basis, seed, period)
+    return _sum(where, (amplitude * noise for amplitude, noise in layers))
 
 
 def turbulence(
@@ -95,13 +94,9 @@ def turbulence(
     """The sum of the absolute values of octaves: creases where they pass 0, as in flames and
     marble. Arguments, result and errors are those of `fbm`.
     """
-    total: Tensor | None = None
-    for amplitude, noise in _layers(
-        "noise.turbulence", points, octaves, lacunarity, gain, basis, seed, period
-    ):
-        part = amplitude * noise.abs()
-        total = part if total is None else total + part
-    return check.instance("noise.turbulence", "basis", total, Tensor)
+    where = "noise.turbulence"
+    layers = _layers(where, points, octaves, lacunarity, gain, basis, seed, period)
+    return _sum(where, (amplitude * noise.abs() for amplitude, noise in layers))
 
 
 def ridged(
@@ -130,14 +125,17 @@ def ridged(
     """
     where = "noise.ridged"
     check.number(where, "sharpness", sharpness, low=0)
-    total: Tensor | None = None
-    weight: Tensor | None = None
-    for amplitude, noise in _layers(where, points, octaves, lacunarity, gain, basis, seed, period):
-        crest = (1 - noise.abs()) * (1 - noise.abs())
-        crest = crest if weight is None else crest * weight
-        weight = (crest * sharpness).clamp(0, 1)
-        total = amplitude * crest if total is None else total + amplitude * crest
-    return check.instance(where, "basis", total, Tensor)
+
+    def crests() -> Iterator[Tensor]:
+        weight: Tensor | None = None
+        layers = _layers(where, points, octaves, lacunarity, gain, basis, seed, period)
+        for amplitude, noise in layers:
+            crest = (1 - noise.abs()) * (1 - noise.abs())
+            crest = crest if weight is None else crest * weight
+            weight = (crest * sharpness).clamp(0, 1)
+            yield amplitude * crest
+
+    return _sum(where, crests())
 
 
 def warp(
@@ -199,6 +197,11 @@ def fbm_bounds(
     high = sum(octave.amplitude for octave in series)
     slope = sum(octave.amplitude * octave.frequency for octave in series)
     return Bounds(one.low * high, one.high * high, one.slope * slope)
+
+
+def _sum(where: str, parts: Iterable[Tensor]) -> Tensor:
+    """Adds octaves up, one after another; raises ValueError if the basis gave no tensors."""
+    return check.instance(where, "basis", functools.reduce(operator.add, parts), Tensor)
 
 
 def _layers(

@@ -125,7 +125,8 @@ class SplineSum:
                 bits = twin.join(x[:, None], y[:, :, None])
                 bits = twin.join(bits[:, None], z[:, :, None, None])
                 values = values + bits.to(values.dtype) * (one.amplitude * 2.0**-31)
-                self.made += values.numel()
+                if not torch.compiler.is_compiling():  # each count would be compiled anew
+                    self.made += values.numel()
         return values
 
     def _numbers(self, size: int, side: float) -> int:

@@ -6,17 +6,16 @@ Source: ZISRAW (CZI) metadata of pylibCZIrw's documentation: Scaling, Channels, 
 from __future__ import annotations
 
 import itertools
-import math
 from dataclasses import dataclass
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
-from ...base.image_info import ChannelInfo, ImageInfo, Rgb
-from ...base.units import spacing_of
+from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
+from ...base.units import NO_DEPTH, spacing_of
 from ..source import Index, VolumeSource
-from ..tiff_info import RGB
+from ..tiff_info import finite_number
 from .format import Format
 
 _DTYPES = {
@@ -116,7 +115,7 @@ def _told(
     root = ElementTree.fromstring(xml)
     sizes: dict[str, float | None] = {}
     for item in root.iterfind(".//Scaling/Items/Distance"):
-        value = _number(item.findtext("Value"))
+        value = finite_number(item.findtext("Value"))
         sizes[item.get("Id", "")] = value * 1e6 if value else None
     spacing, unit = spacing_of([sizes.get(axis) for axis in "XYZ"], ["um"] * 3)
     shown = {item.get("Id"): item for item in root.iterfind(".//DisplaySetting/Channels/Channel")}
@@ -125,11 +124,13 @@ def _told(
         for item in root.iterfind(".//Information/Image/Dimensions/Channels/Channel")
     ]
     if colors == 3:
-        channels = [ChannelInfo(name=name, color=color) for name, color in RGB]
-    step = _number(root.findtext(".//Information/Image/Dimensions/T/Positions/Interval/Increment"))
+        channels = [*color_channels()]
+    step = finite_number(
+        root.findtext(".//Information/Image/Dimensions/T/Positions/Interval/Increment")
+    )
     lost = []
     if unit and sizes.get("Z") is None and int(root.findtext(".//Image/SizeZ") or 1) > 1:
-        lost.append("how far slices are apart, which is not told: as far as pixels")
+        lost.append(NO_DEPTH)
     info = ImageInfo(
         unit=unit,
         channels=tuple(channels) if len(channels) == width * colors else (),
@@ -149,17 +150,11 @@ def _channel(item: Any, shown: Any, stored: str) -> ChannelInfo:
         )
         color = (red, green, blue)
     window = None
-    ends = [_number(None if shown is None else shown.findtext(name)) for name in ("Low", "High")]
+    ends = [
+        finite_number(None if shown is None else shown.findtext(name)) for name in ("Low", "High")
+    ]
     if None not in ends and stored != "f4":
         most = float(np.iinfo(stored).max)
         low, high = (float(end or 0.0) * most for end in ends)
         window = (low, high) if low < high else None
     return ChannelInfo(name=item.get("Name") or "", color=color, window=window)
-
-
-def _number(text: str | None) -> float | None:
-    try:
-        value = float(text or "")
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None

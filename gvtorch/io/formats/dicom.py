@@ -25,7 +25,7 @@ from ...base.volume import check_extent
 from ..dicom_codecs import plugin_of
 from ..dicom_frames import Frame, frames_of, image_info, order_frames
 from ..ngff import is_zarr
-from ..source import Index, VolumeSource, place_axes
+from ..source import LPS_TO_RAS, Index, VolumeSource, place_axes
 from .format import Format
 
 _MOST_FILES = 200_000
@@ -33,7 +33,6 @@ _MOST_UNPACKED = 1 << 32  # bytes
 _ENDINGS = (".dcm", ".dicom", ".ima")
 _OTHERS = (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".bmp", ".txt", ".json")  # not looked into
 _DEFLATED = "1.2.840.10008.1.2.1.99"
-_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,7 +223,7 @@ def _source(path: str, headers: list[Any]) -> DicomSource:
         frames += frames_of(header, count)
     ordered, affine, lost, times = order_frames(path, frames)
     depth = len(ordered) // times.count
-    told = place_axes(path, _TO_RAS @ affine, (depth, rows, columns))
+    told = place_axes(path, LPS_TO_RAS @ affine, (depth, rows, columns))
     color = (samples,) if samples > 1 else ()
     told["axes"] = "t" + told["axes"] + "c" * len(color)
     info, more = image_info(first, samples, times)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
+from ...base.messages import need_library
 from ..source import VolumeSource
 
 Opener = TypeVar("Opener", bound=Callable[..., VolumeSource])
@@ -70,13 +70,3 @@ class Format:
         need_library(
             f"{path}: reading this format", self.library or __name__, self.package, self.extra
         )
-
-
-def need_library(what: str, library: str, package: str = "", extra: str = "io") -> Any:
-    """Returns a module; raises ImportError, with the pip command, if it is missing."""
-    try:
-        return importlib.import_module(library)
-    except ImportError as error:
-        raise ImportError(
-            f"{what} needs {package or library}: pip install 'gvtorch[{extra}]' ({error})"
-        ) from None

@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from ...base.image_info import ChannelInfo, ImageInfo
+from ...base.image_info import ImageInfo, color_channels
 from ...base.volume import check_extent
 from ..dicom_codecs import jpeg_size
 from ..ngff import is_zarr
 from ..resources import amount, memory_free
 from ..source import Index, VolumeSource
-from ..tiff_info import RGB, opened
+from ..tiff_info import opened
 from .format import Format
 
 _TIFF = (".tif", ".tiff")
@@ -91,9 +91,7 @@ def open_folder(path: str) -> SlicesSource:
         raise ValueError(f"{files[0]}: expected one slice (y, x) or (y, x, c), got {first.shape}")
     info = ImageInfo()
     if first.ndim == 3 and first.shape[2] in (3, 4):
-        channels = [ChannelInfo(name=name, color=color) for name, color in RGB]
-        channels += [ChannelInfo(name="alpha")] * (first.shape[2] - 3)
-        info = ImageInfo(channels=tuple(channels))
+        info = ImageInfo(channels=color_channels(first.shape[2]))
     return SlicesSource(
         path=path,
         shape=(len(files), *first.shape),

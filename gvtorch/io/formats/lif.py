@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb
-from ...base.units import spacing_of
+from ...base.units import NO_DEPTH, spacing_of
 from ..source import Index, VolumeSource
 from .format import Format
 
@@ -114,7 +114,7 @@ def _image(
         x, y, z = (1e6 * side for side in spacing)
         spacing, unit = (x, y, z), "micrometer"
     if unit and told.get("z", (1.0, None))[0] is None:
-        lost.append("how far slices are apart, which is not told: as far as pixels")
+        lost.append(NO_DEPTH)
     step = told.get("t", (None, None))[0]
     return LifSource(
         path=path,

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from ...base.image_info import ChannelInfo, ImageInfo
+from ...base.image_info import ImageInfo, color_channels
+from ...base.units import length_unit
 from ..budget import check_regular
 from ..packed import PackedSource
-from ..source import ArraySource, VolumeSource, place_axes
-from ..tiff_info import RGB
+from ..source import LPS_TO_RAS, ArraySource, VolumeSource, place_axes
 from .format import Format
 
 _TYPES = {
@@ -135,20 +135,19 @@ def _placed(
     affine[:space, :space] = (matrix * steps)[:space, :space]
     affine[:space, 3] = 0.0 if offset is None else offset[:space]
     spatial = (*shape[:3], 1)[:3]
-    place = place_axes(path, np.diag([-1.0, -1.0, 1.0, 1.0]) @ affine, spatial)
+    place = place_axes(path, LPS_TO_RAS @ affine, spatial)
     place["axes"] = "c" * (width > 1) + place["axes"][:space] + "t" * (rank == 4)
     return place
 
 
 def _info(header: dict[str, str], width: int, rank: int) -> ImageInfo:
     """What the header tells of the values."""
-    units = {"mm": "millimeter", "um": "micrometer", "cm": "centimeter", "m": "meter"}
     modality = header.get("Modality", "")
     color = width == 3 and header["ElementType"].startswith("MET_UCHAR")
     return ImageInfo(
-        unit=units.get(header.get("DistanceUnits", "mm").lower()),
+        unit=length_unit(header.get("DistanceUnits", "mm")),
         quantity="HU" if modality == "MET_MOD_CT" else None,
-        channels=tuple(ChannelInfo(name=n, color=c) for n, c in RGB) if color else (),
+        channels=color_channels() if color else (),
         space="right-anterior-superior",
         time_step=_time_step(header) if rank == 4 else None,
     )

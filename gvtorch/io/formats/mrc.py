@@ -6,44 +6,22 @@ Source: Cheng et al., "MRC2014: extensions to the MRC format header", J. Struct.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ...base.image_info import ImageInfo
-from ..source import ArraySource, Index, VolumeSource
+from ...base.messages import one_line
+from ..source import ArraySource
 from .format import Format
 
 _PACKED = (".gz", ".bz2")
 _DTYPES = {0: "i1", 1: "i2", 2: "f4", 6: "u2", 12: "f2"}
 
 
-@dataclass(frozen=True, kw_only=True)
-class MrcSource(VolumeSource):
-    """A packed map."""
-
-    offset: int
-    whole: bool = True
-
-    def read_stored(self, index: Index) -> np.ndarray:
-        """Unpacks all, no further than the header tells, and returns a part."""
-        import bz2
-        import gzip
-
-        opener: Any = gzip.open if self.path.lower().endswith(".gz") else bz2.open
-        need = int(np.prod(self.shape)) * np.dtype(self.stored).itemsize
-        with opener(self.path, "rb") as stream:
-            stream.seek(self.offset)
-            data = stream.read(need)
-        if len(data) != need:
-            raise ValueError(f"{self.path}: {need} bytes expected, {len(data)} found")
-        return np.frombuffer(data, self.stored).reshape(self.shape)[index]
-
-
 @Format("MRC", ".mrc", ".map", ".rec", ".ccp4", ".mrcs", ".st", ".mrc.gz", ".map.gz", ".mrc.bz2",
         ".map.bz2", library="mrcfile")  # fmt: skip
-def open_mrc(path: str) -> VolumeSource:
+def open_mrc(path: str) -> ArraySource:
     """Opens a map, in angstroms. A stack of maps is taken for times."""
     import mrcfile
 
@@ -54,7 +32,7 @@ def open_mrc(path: str) -> VolumeSource:
             if header is None:
                 raise ValueError("the header can't be read")
             found, order = header.copy(), header.mode.dtype.byteorder
-    lost = [" ".join(str(one.message).split()) for one in heard]
+    lost = [one_line(one.message) for one in heard]
     serious = [text for text in lost if "machine stamp" not in text and "Map ID" not in text]
     if serious:
         raise ValueError(serious[0])
@@ -74,20 +52,19 @@ def open_mrc(path: str) -> VolumeSource:
             raise ValueError(f"{path}: a stack of {sizes[0]} slices is no whole number of maps")
         sizes, letters = [sizes[0] // each, each, *sizes[1:]], "t" + letters
         lost.append(f"that its {sizes[0]} maps are no times")
-    told: dict[str, Any] = {
-        "path": path,
-        "shape": tuple(sizes),
-        "axes": letters,
-        "stored": np.dtype(("<" if order in "<=|" else ">") + kind).str,
-        "offset": 1024 + int(found["nsymbt"]),
-        "spacing": spacing,
-        "origin": origin,
-        "info": ImageInfo(unit=unit),
-        "lost": tuple(lost),
-    }
-    if path.lower().endswith(_PACKED):
-        return MrcSource(**told)
-    return ArraySource(file=path, **told)
+    return ArraySource(
+        path=path,
+        file=path,
+        shape=tuple(sizes),
+        axes=letters,
+        stored=np.dtype(("<" if order in "<=|" else ">") + kind).str,
+        offset=1024 + int(found["nsymbt"]),
+        whole=path.lower().endswith(_PACKED),
+        spacing=spacing,
+        origin=origin,
+        info=ImageInfo(unit=unit),
+        lost=tuple(lost),
+    )
 
 
 def _place(

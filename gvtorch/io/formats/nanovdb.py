@@ -19,7 +19,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..sparse_grid import COUNTS, VOXELS, SparseGrid, SparseSource, choose, describe, unpack
+from ..sparse_grid import (
+    COUNTS,
+    VOXELS,
+    SparseGrid,
+    SparseSource,
+    bits,
+    choose,
+    describe,
+    unpack,
+)
 from .format import Format
 
 _FILES = (b"NanoVDB0", b"NanoVDB2")
@@ -294,7 +303,7 @@ class NanoGrid(SparseGrid):
         width, item = len(self.background), self.dtype.itemsize
         at = place + self.layout.entries[level]
         values = np.ndarray((n**3, width), self.dtype, self.data, at, (self.layout.entry, item))
-        is_child = _mask(self.data, place + 32 + n**3 // 8, n**3)
+        is_child = bits(self.data, place + 32 + n**3 // 8, n**3)
         return values.reshape(n, n, n, width), ~is_child.reshape(n, n, n)
 
     def leaves(self, numbers: np.ndarray) -> np.ndarray:
@@ -307,17 +316,13 @@ class NanoGrid(SparseGrid):
         """(512, c) of a leaf."""
         begin = place + self.layout.values
         if self.kind in ("Mask", "bool"):
-            return _mask(self.data, begin, VOXELS)[:, None]
+            return bits(self.data, begin, VOXELS)[:, None]
         if self.kind in _BITS or self.kind == "FpN":
             low, step = np.frombuffer(self.data, "<f4", 2, place + 80)
-            bits = _BITS.get(self.kind) or 1 << (self.data[place + 15] >> 5)
-            return (_codes(self.data, begin, bits) * step + low)[:, None]
+            wide = _BITS.get(self.kind) or 1 << (self.data[place + 15] >> 5)
+            return (_codes(self.data, begin, wide) * step + low)[:, None]
         width = len(self.background)
         return np.frombuffer(self.data, self.dtype, VOXELS * width, begin).reshape(VOXELS, width)
-
-
-def _mask(data: Any, at: int, count: int) -> np.ndarray:
-    return np.unpackbits(np.frombuffer(data, "u1", count // 8, at), bitorder="little").view(bool)
 
 
 def _codes(data: Any, at: int, bits: int) -> np.ndarray:
@@ -337,7 +342,7 @@ def _children(
     """By node: bytes before each of its children, and their first voxels."""
     n, side = COUNTS[level], COUNTS[level + 1] * (8 if level == 0 else 1)
     for place, origin in zip(places.tolist(), origins, strict=True):
-        which = np.flatnonzero(_mask(data, place + 32 + n**3 // 8, n**3))
+        which = np.flatnonzero(bits(data, place + 32 + n**3 // 8, n**3))
         steps = np.ndarray((n**3,), "<i8", data, place + layout.entries[level], (layout.entry,))
         corner = np.stack(np.unravel_index(which, (n, n, n)), 1)
         yield place + steps[which], origin + corner * side

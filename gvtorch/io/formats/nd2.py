@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ...base.image_info import ChannelInfo, ImageInfo, Rgb
+from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
 from ...base.units import spacing_of
 from ..source import Index, VolumeSource
-from ..tiff_info import RGB
 from .format import Format
 
 
@@ -90,7 +89,7 @@ def _told(
             color = (shade.r / 255, shade.g / 255, shade.b / 255)
         channels.append(ChannelInfo(name=one.channel.name or "", color=color))
     if sizes.get("S", 1) == 3:
-        channels = [ChannelInfo(name=name, color=color) for name, color in RGB]
+        channels = [*color_channels()]
     step = next(
         (
             float(loop.parameters.periodMs)

@@ -12,14 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from ...base.image_info import ChannelInfo, ImageInfo
+from ...base.image_info import ChannelInfo, ImageInfo, color_channels
+from ...base.units import length_unit, time_unit
 from ..source import Index, VolumeSource, place_axes
 from .format import Format
 
-_LENGTHS = {"meter": "meter", "mm": "millimeter", "micron": "micrometer"}
-_TIMES = {"sec": "second", "msec": "millisecond", "usec": "microsecond"}
 _LABEL_INTENT = 1002
-_RGB = (("red", (1.0, 0.0, 0.0)), ("green", (0.0, 1.0, 0.0)), ("blue", (0.0, 0.0, 1.0)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +73,7 @@ def _info(image: Any, shape: tuple[int, ...]) -> tuple[ImageInfo, list[str]]:
     origin = 0.0
     if len(shape) > 3 and shape[3] > 1:
         step, origin = float(header["pixdim"][4]), float(header["toffset"])
-        if period not in (*_TIMES, "unknown"):
+        if time_unit(period) is None and period != "unknown":
             lost.append(f"the fourth axis counts {period}, and is taken for time")
         step = step if math.isfinite(step) and step > 0 else None
         origin = origin if math.isfinite(origin) else 0.0
@@ -89,16 +87,15 @@ def _info(image: Any, shape: tuple[int, ...]) -> tuple[ImageInfo, list[str]]:
     plain = ChannelInfo(window=window if all(map(math.isfinite, window)) else None)
     channels = [plain] * (shape[4] if len(shape) > 4 else 1) if window[0] < window[1] else []
     if image.dataobj.dtype.fields is not None:
-        channels = [ChannelInfo(name=name, color=color) for name, color in _RGB]
-        channels += [ChannelInfo(name="alpha")] * (shape[4] - 3)
+        channels = [*color_channels(shape[4])]
     info = ImageInfo(
-        unit=_LENGTHS.get(length),
+        unit=length_unit(length),
         channels=tuple(channels),
         labels=int(header["intent_code"]) == _LABEL_INTENT,
         space="right-anterior-superior",
         time_step=step,
         time_origin=origin,
-        time_unit=_TIMES.get(period) if step is not None else None,
+        time_unit=time_unit(period) if step is not None else None,
     )
     return info, lost
 

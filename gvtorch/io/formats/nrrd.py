@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from ...base.image_info import ChannelInfo, ImageInfo
+from ...base.image_info import ChannelInfo, ImageInfo, color_channels
 from ...base.named_axes import ask_axes
+from ...base.units import length_unit, time_unit
 from ..packed import PackedSource, unpack
 from ..source import ArraySource, Index, VolumeSource, place_axes
 from .format import Format
@@ -38,22 +39,9 @@ _ENCODINGS = {
     **dict.fromkeys(("bz2", "bzip2"), "bz2"),
 }
 _MOST_SKIPPED = 1 << 24  # bytes of what is unpacked
-_LENGTHS = {
-    **dict.fromkeys(("m", "meter", "metre"), "meter"),
-    **dict.fromkeys(("cm", "centimeter"), "centimeter"),
-    **dict.fromkeys(("mm", "millimeter", "millimetre"), "millimeter"),
-    **dict.fromkeys(("um", "µm", "μm", "micron", "microns", "micrometer"), "micrometer"),
-    **dict.fromkeys(("nm", "nanometer", "nanometre"), "nanometer"),
-}
-_TIMES = {
-    **dict.fromkeys(("s", "sec", "second", "seconds"), "second"),
-    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), "millisecond"),
-    **dict.fromkeys(("us", "µs", "usec", "microsecond"), "microsecond"),
-}
 _SPACES = {"ras": "right-anterior-superior", "las": "left-anterior-superior"}
 _SPACES["lps"] = "left-posterior-superior"
 _SPATIAL = ("domain", "space")
-_COLORS = (("red", (1.0, 0.0, 0.0)), ("green", (0.0, 1.0, 0.0)), ("blue", (0.0, 0.0, 1.0)))
 #: Fields of the format; others are key/value pairs of the file's writer.
 _FIELDS = {
     *("type", "dimension", "sizes", "encoding", "endian", "data file", "datafile", "block size"),
@@ -223,7 +211,7 @@ def _info(
     units = units if len(units) == len(letters) else [""] * len(letters)
     spatial = [str(unit) for unit in header.get("space units", ())][:3]
     spatial = spatial or [u for u, letter in zip(units, letters, strict=True) if letter == "s"]
-    known = {_LENGTHS.get(unit.lower().strip()) for unit in spatial}
+    known = {length_unit(unit) for unit in spatial}
     unit = known.pop() if len(known) == 1 else None
     if unit is None and any(spatial):
         lost.append(f"units of space {', '.join(spatial)}")
@@ -233,7 +221,7 @@ def _info(
         at = letters.index("t")
         steps = (*_directions(header, len(letters))[at, 3:], _spacings(header, len(letters))[at])
         step = next((float(one) for one in steps if np.isfinite(one) and one > 0), None)
-        period = _TIMES.get(units[at].lower().strip()) if step else None
+        period = time_unit(units[at]) if step else None
     space = str(header.get("space", "")).lower().removesuffix("-time")
     info = ImageInfo(
         unit=unit,
@@ -255,8 +243,7 @@ def _channels(
     at = letters.find("c")
     kind = kinds[at] if 0 <= at < len(kinds) else ""
     if kind in ("rgb-color", "rgba-color") and shape[at] == len(kind) - 6:
-        found = [ChannelInfo(name=name, color=color) for name, color in _COLORS]
-        return (*found, ChannelInfo(name="alpha"))[: shape[at]]
+        return color_channels(shape[at])
     if kind == "complex" and shape[at] == 2:
         return (ChannelInfo(name="real"), ChannelInfo(name="imaginary"))
     return ()

@@ -19,7 +19,17 @@ from typing import Any
 
 import numpy as np
 
-from ..sparse_grid import COUNTS, SIDES, VOXELS, SparseGrid, SparseSource, choose, describe, unpack
+from ..sparse_grid import (
+    COUNTS,
+    SIDES,
+    VOXELS,
+    SparseGrid,
+    SparseSource,
+    bits,
+    choose,
+    describe,
+    unpack,
+)
 from .format import Format
 
 _MAGIC = 0x56444220
@@ -80,6 +90,10 @@ class Cursor:
         """Reads an array."""
         dtype = np.dtype(dtype)
         return np.frombuffer(self.data, dtype, count, self.skip(count * dtype.itemsize))
+
+    def mask(self, count: int) -> np.ndarray:
+        """Reads (count,) bool."""
+        return bits(self.data, self.skip(count // 8), count)
 
     def text(self) -> str:
         """Reads a string."""
@@ -280,7 +294,7 @@ class _Packing:
             one = cursor.array(self.dtype, self.width)
         chosen = np.zeros(len(active), bool)
         if code in (3, 4, 5):
-            chosen = _mask(cursor.take(len(active) // 8))
+            chosen = cursor.mask(len(active))
         written = self._written(code, int(np.count_nonzero(active)), len(active))
         values = self._read(cursor, written)
         if written == len(active):
@@ -351,7 +365,7 @@ class VdbGrid(SparseGrid):
     def tiles(self, level: int, number: int) -> tuple[np.ndarray, np.ndarray]:
         n = COUNTS[level]
         cursor = Cursor(self.data, int(self.places[level][number]))
-        is_child, active = (_mask(cursor.take(n**3 // 8)) for _ in range(2))
+        is_child, active = (cursor.mask(n**3) for _ in range(2))
         if self.packing.masked:
             values = self.packing.values(cursor, active)
         else:  # those of tiles alone are written
@@ -363,12 +377,12 @@ class VdbGrid(SparseGrid):
         out = np.empty((len(numbers), VOXELS, self.packing.width), self.dtype)
         for at, place in enumerate(self.places[2][numbers].tolist()):
             cursor = Cursor(self.data, place)
-            active = _mask(cursor.take(VOXELS // 8))
+            active = cursor.mask(VOXELS)
             if self.kind == "mask":
                 out[at, :, 0] = active
             elif self.kind == "bool":
                 cursor.skip(12)
-                out[at, :, 0] = _mask(cursor.take(VOXELS // 8))
+                out[at, :, 0] = cursor.mask(VOXELS)
             else:
                 cursor.skip(0 if self.packing.masked else 13)
                 out[at] = self.packing.values(cursor, active)
@@ -412,7 +426,7 @@ class _Topology:
         cursor, n = self.cursor, COUNTS[level]
         self.origins[level].append(origin[None])
         self.places[level].append(cursor.at)
-        is_child, active = (_mask(cursor.take(n**3 // 8)) for _ in range(2))
+        is_child, active = (cursor.mask(n**3) for _ in range(2))
         which = np.flatnonzero(is_child)
         written = n**3 if self.packing.masked else n**3 - len(which)
         self.packing.skip(cursor, int(np.count_nonzero(active)), written)
@@ -442,7 +456,3 @@ class _Topology:
                     raise ValueError(f"a leaf has {buffers} buffers; expected 1")
                 self.packing.skip(cursor, count, VOXELS)
         return places
-
-
-def _mask(content: bytes) -> np.ndarray:
-    return np.unpackbits(np.frombuffer(content, "u1"), bitorder="little").view(bool)

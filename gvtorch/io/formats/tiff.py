@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from ...base.image_info import ChannelInfo, ImageInfo
+from ...base.image_info import ImageInfo, color_channels
 from ..source import ArraySource, Index, VolumeSource
-from ..tiff_info import RGB, Told, imagej_info, ome_info, opened
+from ..tiff_info import Told, imagej_info, ome_info, opened
 from .format import Format
 
 _JPEG = (6, 7, 34892, 33007)
@@ -180,13 +180,12 @@ def _told(file: Any, series: Any, number: int, axes: str, shape: Sequence[int]) 
         return ome_info(file.ome_metadata, number, series.name, width)
     kind = int(series.keyframe.photometric)
     colors = width in (3, 4) and kind in (2, 6)  # RGB, YCbCr
-    names = [ChannelInfo(name=name, color=color) for name, color in RGB] if colors else []
-    names += [ChannelInfo(name="alpha")] * (width - 3) if colors else []
+    channels = color_channels(width) if colors else ()
     lost = [_LOST[kind]] if kind in _LOST else []
     if series.kind == "imagej":
         info, spacing, more = imagej_info(file.imagej_metadata, _resolution(file), width)
-        return replace(info, channels=tuple(names)) if colors else info, spacing, [*more, *lost]
-    return ImageInfo(channels=tuple(names)), (1.0, 1.0, 1.0), lost
+        return replace(info, channels=channels) if colors else info, spacing, [*more, *lost]
+    return ImageInfo(channels=channels), (1.0, 1.0, 1.0), lost
 
 
 def _resolution(file: Any) -> list[float | None]:

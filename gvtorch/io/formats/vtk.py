@@ -85,32 +85,33 @@ class VtkSource(VolumeSource):
         if self.encoding == "base64":
             content = re.split(rb"[<\s]", content.strip(), maxsplit=1)[0]
         if not self.compressor:
-            first = _bytes(content, self.encoding, 0, size + need)
+            first = _bytes(content, self.encoding, size + need)
             told = int(np.frombuffer(first[:size], self.header)[0])
             if told != need or len(first) < size + need:
                 raise ValueError(f"{self.path}: {need} bytes expected, {told} found")
             return first[size : size + need]
-        blocks = int(np.frombuffer(_bytes(content, self.encoding, 0, size), self.header)[0])
+        blocks = int(np.frombuffer(_bytes(content, self.encoding, size), self.header)[0])
         if not 1 <= blocks <= len(content):
             raise ValueError(f"{self.path}: {blocks} blocks in {len(content)} bytes")
         heads = (3 + blocks) * size
-        table = np.frombuffer(_bytes(content, self.encoding, 0, heads), self.header).tolist()
+        table = np.frombuffer(_bytes(content, self.encoding, heads), self.header).tolist()
         block, last, packed = table[1], table[2], table[3:]
         sizes = [block] * (blocks - 1) + [last or block]
         if sum(sizes) != need or sum(packed) > len(content):
             raise ValueError(f"{self.path}: {need} bytes expected, {sum(sizes)} found")
         # The head and the blocks are of one stretch of base64 each.
         begin = heads if self.encoding == "raw" else -(-heads // 3) * 4
-        data, parts, at = _bytes(content[begin:], self.encoding, 0, sum(packed)), [], 0
+        data, parts, at = _bytes(content[begin:], self.encoding, sum(packed)), [], 0
         for here, unpacked in zip(packed, sizes, strict=True):
             parts.append(_unpack(self.compressor, data[at : at + here], unpacked))
             at += here
         return b"".join(parts)
 
 
-def _bytes(content: bytes, encoding: str, start: int, count: int) -> bytes:
+def _bytes(content: bytes, encoding: str, count: int) -> bytes:
+    """The first bytes of raw or base64 content."""
     if encoding == "raw":
-        return content[start : start + count]
+        return content[:count]
     return base64.b64decode(content[: -(-count // 3) * 4])[:count]
 
 

@@ -186,7 +186,7 @@ class Isosurface(Shade):
         super().__post_init__()
         nothing = torch.zeros_like(self.sum.clear)
         own = self.light.parameters.own_as(IsosurfaceNumbers)
-        self.level, self.filled = torch.as_tensor(own.level), own.filled
+        self.own, self.level, self.filled = own, torch.as_tensor(own.level), own.filled
         self.found = torch.zeros_like(nothing, dtype=torch.bool)
         self.before, self.before_end, self.share = nothing, nothing - INF, nothing
 
@@ -235,13 +235,20 @@ class Isosurface(Shade):
         probe = Probe(walk.at.beam, walk.visit, self.channel)
         normal = self.light.normal_at(probe, t)
         normal = torch.where((self.before_end < INF)[:, None], normal, 0.0)
-        value = self.level.expand_as(t)
-        if self.others:
-            value = probe.number(self.others[self.other_component], t)
-        row = self.transfer.look_up(value)
-        color = self.share[:, None] * self.light.shade(row[:, :3], normal, t)
+        color = self.share[:, None] * self.light.shade(self.color_at(probe, t), normal, t)
         self.sum.color = torch.where(self.found[:, None], color, 0.0)
         self.normal = torch.where(self.found[:, None], normal, 0.0)
+
+    def color_at(self, probe: Probe, t: Tensor) -> Tensor:
+        """(r, 3) of the surface, where it is t (r,) away."""
+        if self.own.scale > 0:
+            numbers = [probe.number(self.others[i], t) for i in range(4)]
+            rgba = torch.stack(numbers, 1) * self.own.scale
+            known = (rgba[:, 3:] > 0) & (self.own.premultiplied > 0)
+            return rgba[:, :3] / torch.where(known, rgba[:, 3:], 1.0)
+        if self.others:
+            return self.transfer.look_up(probe.number(self.others[self.other_component], t))[:, :3]
+        return self.transfer.look_up(self.level.expand_as(t))[:, :3]
 
 
 class Projection(Shade):

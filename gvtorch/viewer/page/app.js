@@ -22,6 +22,7 @@ const TOOLS = {
   fly: "Fly: drag to look around, W A S D Q E to move, wheel: speed",
   window: "Window: drag right for a wider window, down for brighter (or hold Alt)",
 };
+const TYPES = { png: "image/png", json: "application/json", glb: "model/gltf-binary" };
 const REST = 160;  // milliseconds after which a wheel or a key is at rest
 
 /** Puts changes over a value: objects of one kind by their fields, all else whole. */
@@ -37,6 +38,7 @@ export class App {
   constructor(root, connect) {
     this.root = root;
     this.tool = "orbit";
+    this.surfaceLevel = 0;
     this.shown = { axes: true, scale: true, box: false, nodes: false };
     this.history = new History();
     this.clients = {};
@@ -58,7 +60,7 @@ export class App {
     const on = (type, take) => this.link.on(type, take);
     on("welcome", (told) => this.welcome(told));
     on("picture", (picture) => this.view.take(picture));
-    on("file", ({ head, bytes }) => { keep(head.file, bytes, head.file.endsWith(".png") ? "image/png" : "application/json"); this.say(`${head.file} is saved`); });
+    on("file", ({ head, bytes }) => { keep(head.file, bytes, TYPES[head.file.split(".").at(-1)] ?? "application/octet-stream"); this.say(`${head.file} is saved`); });
     on("state", ({ state }) => this.take(state));
     on("camera", ({ camera }) => this.seat(camera));
     on("clients", ({ clients }) => { this.clients = clients; this.refresh(); });
@@ -70,6 +72,7 @@ export class App {
     on("parameters", ({ parameters }) => { this.parameters = parameters; this.refresh(); this.askHistogram(this.inView); });
     on("busy", (busy) => this.busy(busy));
     on("figures", (figures) => this.monitor.take(figures));
+    on("exporting", ({ done, total }) => this.say(`making the surface … ${Math.round((100 * done) / total)} %`, false, null, true));
     on("refused", ({ text }) => this.say(text, true));
     on("error", ({ text }) => this.say(text, true));
     on("failed", ({ text, count }) => this.say(`${count} parts could not be loaded: ${text}`, true, () => this.link.send("do", { what: "retry" })));
@@ -321,6 +324,11 @@ export class App {
     this.say(`at ${place.map((one) => Number(one.toPrecision(5))).join(", ")}; ${Number(distance(camera).toPrecision(3))} away`);
   }
 
+  surface(wanted) {
+    this.say("making the surface …", false, null, true);
+    this.link.send("surface", wanted);
+  }
+
   still() {
     this.say("rendering …");
     this.link.send("still", { width: this.view.over.width, height: this.view.over.height });
@@ -341,12 +349,12 @@ export class App {
     this.toldCrowded = crowded;
   }
 
-  say(text, bad = false, again = null) {
+  say(text, bad = false, again = null, stays = false) {
     clearTimeout(this.saying);
     this.note.replaceChildren(text, ...(again ? [el("button.gv-small", { type: "button", onclick: () => { again(); this.note.classList.remove("gv-shown"); } }, "try again")] : []));
     this.note.classList.toggle("gv-bad", bad);
     this.note.classList.add("gv-shown");
-    if (!again) this.saying = setTimeout(() => this.note.classList.remove("gv-shown"), bad ? 7000 : 2200);
+    if (!again && !stays) this.saying = setTimeout(() => this.note.classList.remove("gv-shown"), bad ? 7000 : 2200);
   }
 }
 

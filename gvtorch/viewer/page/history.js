@@ -16,18 +16,18 @@ export class History {
 
   /** Takes the last edit back; false: there is none. */
   undo() {
-    const last = this.done.pop();
-    if (!last) return false;
-    this.undone.push(last);
-    last.back();
-    return true;
+    return step(this.done, this.undone, "back");
   }
 
   redo() {
-    const last = this.undone.pop();
-    if (!last) return false;
-    this.done.push(last);
-    last.forth();
-    return true;
+    return step(this.undone, this.done, "forth");
   }
+}
+
+function step(from, to, way) {
+  const last = from.pop();
+  if (!last) return false;
+  to.push(last);
+  last[way]();
+  return true;
 }

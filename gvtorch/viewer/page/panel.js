@@ -116,7 +116,16 @@ export class Panel {
     const pick = el("select", { onchange: () => put(this.first(wanted[pick.selectedIndex], "shader"), true) }, ...wanted.map((kind) => el("option", {}, words(kind))));
     pick.selectedIndex = wanted.indexOf(shader.kind);
     const rows = this.controls.fields(shader, put, { without: [...HIDDEN, ...(shader.kind === "TransferFunction" ? ["opacity", "color"] : ["channel", "normals", "visible", "color_channel", "color_component"])] });
-    return [el("label.gv-row", {}, el("span.gv-name", {}, "shader"), pick), ...rows];
+    return [el("label.gv-row", {}, el("span.gv-name", {}, "shader"), pick), ...rows, this.surface()];
+  }
+
+  /** The surface that is shown, as a file. */
+  surface() {
+    const { app } = this, { value, kind } = app.state.shader;
+    if (kind !== "Isosurface") return null;
+    const level = el("input.gv-number", { type: "number", min: 0, step: 1, value: app.surfaceLevel, title: "Level of detail; 0 is the finest, each further one has a quarter of the triangles", onchange: () => { app.surfaceLevel = Math.max(0, Math.round(level.valueAsNumber) || 0); } });
+    const button = (text, format) => el("button.gv-small", { type: "button", title: `The whole surface at this value as a file, not cut: gvtorch surface`, onclick: () => app.surface({ value, format, level: app.surfaceLevel }) }, text);
+    return el("div.gv-row", {}, el("span.gv-name", {}, "save surface, level"), el("span.gv-both", {}, level, button("PLY", "ply"), button("glTF", "glb")));
   }
 
   showing() {

@@ -200,10 +200,13 @@ struct Isosurface : ShaderFacts {
 
   struct Own {
     T level;
-    T filled;  // 1: with what is not below the level; -1: with what is; 0: with nothing
+    T filled;         // 1: with what is not below the level; -1: with what is; 0: with nothing
+    T scale;          // of four numbers of the second channel, which are the colour; 0: the transfer function tells it
+    T premultiplied;  // 1: these are stored times the fourth
   };
-  GV_HD T iso() const { return own_numbers<Own>(light.parameters).level; }
-  GV_HD T filled() const { return own_numbers<Own>(light.parameters).filled; }
+  GV_HD const Own& own() const { return own_numbers<Own>(light.parameters); }
+  GV_HD T iso() const { return own().level; }
+  GV_HD T filled() const { return own().filled; }
   GV_HD bool hides(T low, T high, const Sum&) const {
     return (!(filled() < 0) && a_little_above(high) < iso()) || (!(filled() > 0) && a_little_below(low) >= iso());
   }
@@ -244,11 +247,21 @@ struct Isosurface : ShaderFacts {
     sum.before_end = select(passed, piece.end, sum.before_end);
     sum.before_end = select(begins, splat<V>(static_cast<T>(INFINITY)), sum.before_end);
   }
+  GV_HD Row<T> color_at(const Probe<T>& probe, T t) const {
+    const auto& other = probe.channels.other;
+    if (own().scale > 0) {
+      const Row<T> stored = probe.four_at(other, 0, t);
+      const T opacity = stored.alpha * own().scale;
+      const T whole = own().premultiplied > 0 && opacity > 0 ? opacity : 1;
+      return {stored.red * own().scale / whole, stored.green * own().scale / whole, stored.blue * own().scale / whole,
+              0};
+    }
+    return Transfer<T>(transfer).look_up(other.given() ? probe.number_at(other, color_component, t) : iso(), 0);
+  }
   GV_HD void surface(const Probe<T>& probe, Sum& sum) const {
     const T t = sum.depth;
     const Vec3<T> n = sum.before_end == static_cast<T>(INFINITY) ? Vec3<T>{0, 0, 0} : light.normal(probe, t);
-    const T value = probe.channels.other.given() ? probe.number_at(probe.channels.other, color_component, t) : iso();
-    const Row<T> row = light.shade(Transfer<T>(transfer).look_up(value, 0), n, probe, t);
+    const Row<T> row = light.shade(color_at(probe, t), n, probe, t);
     sum.red = sum.share * row.red;
     sum.green = sum.share * row.green;
     sum.blue = sum.share * row.blue;

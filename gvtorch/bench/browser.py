@@ -1,0 +1,199 @@
+"""A hand that drags in a browser, and what the browser shows meanwhile.
+
+The same for every page: playwright moves the mouse in a Chromium without a window, and in each of
+the browser's frames a script in the page keeps a thumbnail of the picture where it has changed. So
+times are those from a pointer event to pixels in the page, to one frame of the browser.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import math
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+_HELD = 1 / 60  # seconds between two moves of the mouse
+_QUIET = 3.0  # seconds without a change, after which a new page is at rest
+_PATIENCE = 60.0  # seconds until a page must rest
+_THUMB = (48, 27)
+
+#: Keeps [milliseconds, thumbnail] of each picture that differs from the one before, and the time of
+#: the last move. WebGL must keep what it drew until it is looked at.
+_PROBE = """
+(() => {
+  const open = HTMLCanvasElement.prototype.getContext;
+  HTMLCanvasElement.prototype.getContext = function (kind, options) {
+    const kept = kind.startsWith("webgl") ? { ...options, preserveDrawingBuffer: true } : options;
+    return open.call(this, kind, kept);
+  };
+  const probe = (window.gvProbe = { seen: [], moved: 0, on: false });
+  addEventListener("pointermove", () => { probe.moved = performance.now(); }, true);
+  const thumb = document.createElement("canvas");
+  [thumb.width, thumb.height] = SIZE;
+  const context = open.call(thumb, "2d", { willReadFrequently: true });
+  context.imageSmoothingEnabled = false;
+  let before = "";
+  const look = () => {
+    requestAnimationFrame(look);
+    if (!probe.on) return;
+    context.clearRect(0, 0, thumb.width, thumb.height);
+    for (const one of document.querySelectorAll(SELECTOR)) {
+      const { width, height } = one.getBoundingClientRect();
+      const small = width * height < 0.2 * innerWidth * innerHeight;
+      if (small || !(one.naturalWidth ?? one.width)) continue;
+      context.drawImage(one, 0, 0, thumb.width, thumb.height);
+    }
+    const found = context.getImageData(0, 0, thumb.width, thumb.height).data;
+    const green = Array.from({ length: found.length / 4 }, (_, n) => found[4 * n + 1]);
+    const text = green.join();
+    if (text !== before && new Set(green).size > 1) probe.seen.push([performance.now(), green]);
+    before = text;
+  };
+  requestAnimationFrame(look);
+})();
+"""
+
+
+def absent() -> str:
+    """Tells why no browser can run here; nothing if one can."""
+    if importlib.util.find_spec("playwright") is None:
+        return "playwright is not installed"
+    return "" if executable() else f"none of {', '.join(_NAMES)} is on the path"
+
+
+def executable() -> str | None:
+    """Returns where Chromium is."""
+    return next(filter(None, map(shutil.which, _NAMES)), None)
+
+
+@contextlib.contextmanager
+def running() -> Iterator[Any]:
+    """Runs the browser."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as library:
+        flags = ["--no-sandbox", "--disable-dev-shm-usage"]
+        browser = library.chromium.launch(executable_path=executable(), args=flags)
+        yield browser
+        browser.close()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seen:
+    """What a hand saw.
+
+    Attributes:
+        waited: Milliseconds from each jump of the pointer to the first picture that shows it.
+        rate: Pictures a second while it dragged.
+    """
+
+    waited: list[float]
+    rate: float
+
+
+class Page:
+    """A page whose picture has a size, and the hand in it."""
+
+    def __init__(self, browser: Any, url: str, selector: str, size: tuple[int, int]) -> None:
+        """Opens it, and waits until its picture is there and rests."""
+        self.size, self.quiet = size, _QUIET
+        window = {"width": max(size[0], 640), "height": max(size[1], 400)}
+        self.context = browser.new_context(viewport=window)
+        self.page = self.context.new_page()
+        given = {"SIZE": str(list(_THUMB)), "SELECTOR": repr(selector)}
+        script = _PROBE
+        for name, value in given.items():
+            script = script.replace(name, value)
+        self.page.add_init_script(script)
+        self.page.goto(url)
+        self._fit(selector)
+        self._watch(True)
+        self._rest()
+
+    def _fit(self, selector: str) -> None:
+        """Makes the window as large as the picture and what stands beside it."""
+        width, height = self.size
+        for _ in range(2):
+            box = self._largest(selector)
+            more = round(width - box["width"]), round(height - box["height"])
+            now = self.page.viewport_size
+            wanted = {"width": now["width"] + more[0], "height": now["height"] + more[1]}
+            self.page.set_viewport_size(wanted)
+        self.middle = box["x"] + width / 2, box["y"] + height / 2
+
+    def _largest(self, selector: str) -> Any:
+        """Waits for an element, and returns where the largest one lies."""
+        script = f"""() => [...document.querySelectorAll({selector!r})]
+            .map((one) => one.getBoundingClientRect().toJSON())
+            .sort((a, b) => b.width * b.height - a.width * a.height)
+            .find((one) => one.width > 0)"""
+        found = self.page.wait_for_function(script, timeout=1e3 * _PATIENCE).json_value()
+        self.page.wait_for_timeout(300)  # so that it has grown to its place
+        return self.page.evaluate(script) or found
+
+    def _watch(self, on: bool) -> None:
+        self.page.evaluate("on => { gvProbe.on = on; gvProbe.seen = gvProbe.seen.slice(-1); }", on)
+
+    def _rest(self, moved: float = 0.0) -> None:
+        """Waits until the picture has changed since a time, and then not for a while."""
+        end = time.monotonic() + _PATIENCE
+        last = "(gvProbe.seen.at(-1)?.[0] ?? Infinity)"
+        quiet = f"{last} > {moved} && performance.now() - {last} > {1e3 * self.quiet}"
+        while not self.page.evaluate(quiet):
+            if time.monotonic() > end:
+                raise RuntimeError("view: the picture does not come to rest")
+            self.page.wait_for_timeout(50)
+
+    def drag(self, seconds: float, jumps: int) -> Seen:
+        """Drags for a while, then some times for a short while with a jump at the end."""
+        (x, y), mouse = self.middle, self.page.mouse
+        mouse.move(x, y)
+        mouse.down()
+        self._watch(True)
+        self._swing(seconds)
+        rate = (self.page.evaluate("gvProbe.seen.length") - 1) / seconds
+        self.quiet = min(_QUIET, 0.6 + 4 / max(rate, 1.0))
+        waited = []
+        for _ in range(jumps):
+            self._watch(True)
+            self._swing(0.4)
+            waited.append(self._jump(x + 0.15 * self.size[0], y))
+        mouse.up()
+        return Seen(waited=waited, rate=rate)
+
+    def _swing(self, seconds: float) -> None:
+        """Moves the mouse a little to and fro, and ends in the middle."""
+        (x, y), start = self.middle, time.perf_counter()
+        count = max(2, round(seconds / _HELD))
+        for n in range(1, count + 1):
+            shift = 40 * math.sin(2 * math.pi * n * _HELD / 1.6) if n < count else 0
+            self.page.mouse.move(x + shift, y)
+            time.sleep(max(0.0, start + n * _HELD - time.perf_counter()))
+
+    def _jump(self, x: float, y: float) -> float:
+        """Moves the mouse at once, and returns after how many milliseconds a picture first was
+        nearer to the one at the end than to the one before.
+        """
+        self.page.mouse.move(x, y)
+        moved = self.page.evaluate("gvProbe.moved")
+        self._rest(moved)
+        seen = self.page.evaluate("gvProbe.seen")
+        thumbs = np.array([thumb for _, thumb in seen], float)
+        at = np.array([when for when, _ in seen])
+        before = thumbs[at <= moved][-1]
+        to_last, to_first = (np.abs(thumbs - one).mean(1) for one in (thumbs[-1], before))
+        shown = at[(at > moved) & (to_last < to_first)]
+        if not len(shown):
+            raise RuntimeError("view: the picture does not show where the pointer is")
+        return float(shown[0] - moved)
+
+    def close(self) -> None:
+        """Closes it."""
+        self.context.close()

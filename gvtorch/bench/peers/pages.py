@@ -1,0 +1,210 @@
+"""Pages that turn the bench's scan, each served by a process of its own: ours, viser's and trame's.
+
+Each function of `PAGES` takes a pipe, into which it puts the address of its page, and ends with its
+process. A peer is used as its own examples use it; `DIFFERS` tells what it does otherwise.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..scenes import Scene, aneurism, fog_dense
+
+_STARTS = 120.0  # seconds in which a page must be there
+
+
+@dataclass(frozen=True, kw_only=True)
+class Site:
+    """What is served.
+
+    Attributes:
+        side: Voxels a side of the scan.
+        size: (width, height) pixels of the picture.
+        device: Where gvtorch renders.
+        threads: How many threads the CPU has for it.
+        rate: Pictures a second that are wanted while the camera moves.
+    """
+
+    side: int
+    size: tuple[int, int]
+    device: str
+    threads: int
+    rate: float = 25.0
+
+    def scene(self) -> Scene:
+        """Returns the scan, or fog where it is not here."""
+        try:
+            return aneurism(self.side)
+        except FileNotFoundError:
+            return fog_dense(self.side)
+
+
+def gvtorch_page(site: Site, ready: Connection) -> None:
+    """Our viewer, as `gvtorch view` serves it."""
+    from ...viewer.server import Server
+    from ...viewer.view import new_session
+
+    scene = site.scene()
+    session = new_session(
+        scene.volume, scene.shader, scene.camera(*site.size), engine={"device": site.device}
+    )
+    develop = replace(session.state.develop, samples=1)  # so that it comes to rest soon
+    session.state = replace(session.state, develop=develop)
+    ready.send(Server(session).url)
+    threading.Event().wait()
+
+
+def _viser(site: Site, ready: Connection) -> tuple[Any, Scene]:
+    """Starts viser's server with the scene's camera and nothing else in the picture."""
+    import viser
+
+    scene = site.scene()
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    server.scene.world_axes.visible = False
+    view = scene.camera(*site.size).viewmats[0]
+    eye = -view[:3, :3].T @ view[:3, 3]
+    first = server.initial_camera
+    first.position, first.look_at = tuple(eye.tolist()), tuple(scene.box.mean(0).tolist())
+    first.up, first.fov = (0.0, 1.0, 0.0), float(np.radians(30))
+    ready.send(f"http://127.0.0.1:{server.get_port()}")
+    return server, scene
+
+
+def viser_pictures(site: Site, ready: Connection) -> None:
+    """viser's page with gvtorch's pictures behind it, each rendered whole where the page's camera
+    was last.
+    """
+    from ...cameras import Camera
+    from ...pool import N3Tree
+    from ...tracing import render
+
+    moved = threading.Event()
+    server, scene = _viser(site, ready)
+    tree = N3Tree.from_volume(scene.volume).to(site.device)
+
+    @server.on_client_connect
+    def _(client: Any) -> None:
+        client.camera.on_update(lambda _: moved.set())
+        moved.set()
+
+    while True:
+        moved.wait()
+        moved.clear()
+        for client in server.get_clients().values():
+            at = client.camera
+            camera = Camera.look_at(
+                at.position.tolist(),
+                at.look_at.tolist(),
+                at.up_direction.tolist(),
+                fov=float(np.degrees(at.fov)),
+                width=site.size[0],
+                height=site.size[1],
+            )
+            shown = render(tree, camera, scene.shader).to_srgb8()
+            client.scene.set_background_image(shown.cpu().numpy(), format="jpeg", jpeg_quality=80)
+
+
+def viser_mesh(site: Site, ready: Connection) -> None:
+    """viser's page that draws the scan's surface itself, by WebGL."""
+    from ...io.surface import extract_surface
+
+    server, scene = _viser(site, ready)
+    mesh = extract_surface(scene.volume, scene.surface)
+    server.scene.add_mesh_simple("/surface", mesh.vertices, mesh.faces, color=(220, 60, 40))
+    threading.Event().wait()
+
+
+def trame_page(site: Site, ready: Connection) -> None:
+    """trame's remote view of VTK's volume renderer on the CPU, which renders fewer pixels while an
+    interactor is at work.
+    """
+    from trame.app import get_server
+    from trame.ui.html import DivLayout
+    from trame.widgets.vtk import VtkRemoteView
+    from vtkmodules.vtkInteractionStyle import vtkInteractorStyleTrackballCamera
+    from vtkmodules.vtkRenderingCore import vtkRenderWindowInteractor
+
+    from .peer import Task
+    from .vtk_fixed_point import Marcher
+
+    scene, torch_device = site.scene(), torch.device("cpu")
+    camera = scene.camera(*site.size)
+    task = Task(scene=scene, camera=camera, rays=camera.rays(), stop_alpha=1.0, device=torch_device)
+    shown = Marcher(task)
+    shown.mapper.AutoAdjustSampleDistancesOn()
+    hand = vtkRenderWindowInteractor()
+    hand.SetRenderWindow(shown.window)
+    hand.SetInteractorStyle(vtkInteractorStyleTrackballCamera())
+    hand.SetDesiredUpdateRate(site.rate)
+    hand.Initialize()
+    server = get_server("bench")
+    with DivLayout(server):
+        VtkRemoteView(shown.window, style="position:absolute;inset:0")
+
+    @server.controller.add("on_server_ready")
+    def _(**_told: Any) -> None:
+        ready.send(f"http://127.0.0.1:{server.port}")
+
+    server.start(
+        port=0, host="127.0.0.1", open_browser=False, show_connection_info=False, timeout=0
+    )
+
+
+#: What must be installed for a page of a peer.
+NEEDS = {"viser": "viser", "trame": "trame_vtk"}
+#: What serves each page, and the element of the page that shows the picture.
+PAGES = {
+    "gvtorch": (gvtorch_page, "canvas.gv-picture"),
+    "viser": (viser_pictures, "canvas"),
+    "viser mesh": (viser_mesh, "canvas"),
+    "trame": (trame_page, "img, canvas"),
+}
+#: What a reader must know of each.
+DIFFERS = {
+    "gvtorch": "fewer pixels while the camera moves, for 25 pictures a second",
+    "viser": "has no volumes: gvtorch's pictures, whole, as the background of its page",
+    "viser mesh": "has no volumes: the scan's isosurface, drawn by the browser",
+    "trame": "VTK's vtkFixedPointVolumeRayCastMapper on the CPU, fewer rays while the camera "
+    "moves, for 25 pictures a second",
+}
+
+
+@contextlib.contextmanager
+def served(who: str, site: Site) -> Iterator[str]:
+    """Serves a page in a process, and yields its address.
+
+    Raises:
+        RuntimeError: It did not start.
+    """
+    context = get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_serve, args=(who, site, theirs), daemon=True)
+    process.start()
+    try:
+        end = time.monotonic() + _STARTS
+        while not ours.poll(0.2):
+            if not process.is_alive() or time.monotonic() > end:
+                raise RuntimeError(f"view: the page of {who} did not start")
+        yield ours.recv()
+    finally:
+        process.terminate()
+        process.join()
+
+
+def _serve(who: str, site: Site, ready: Connection) -> None:
+    torch.set_num_threads(site.threads)
+    logging.disable()  # a page that is closed is no news
+    with contextlib.redirect_stdout(io.StringIO()):
+        PAGES[who][0](site, ready)
