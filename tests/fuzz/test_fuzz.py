@@ -23,7 +23,7 @@ import torch
 from helpers.vdb import ZIP, Grid, VdbWriter, nano_file, nano_grid
 
 import gvtorch as gv
-from gvtorch.io import budget
+from gvtorch.io import budget, reading
 from gvtorch.ops.registry import FAKES
 from gvtorch.viewer.state import Eye
 
@@ -104,9 +104,13 @@ def outcome(call: Callable[[], Any], *told: type[BaseException]) -> str:
     return ""
 
 
+FREE = 2 * 10**8  # bytes: a sparse grid of a few kB may tell of any box, and is read if it fits
+
+
 @pytest.fixture(autouse=True)
 def short_budget(monkeypatch):
     monkeypatch.setattr(budget, "SECONDS", 2.0)
+    monkeypatch.setattr(reading, "memory_free", lambda: FREE)
 
 
 # --- readers
