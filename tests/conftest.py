@@ -33,6 +33,15 @@ def pytest_configure(config: pytest.Config) -> None:
     )
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests by hypothesis come first: in processes that had run thousands of others, Python 3.11's
+    interpreter was seen to loop for ever in hypothesis' own code, at its first instruction.
+    """
+    items.sort(
+        key=lambda item: not getattr(getattr(item, "obj", None), "is_hypothesis_test", False)
+    )
+
+
 @pytest.fixture(params=["reference", "cpp", "cuda"])
 def backend(request: pytest.FixtureRequest) -> str:
     """Every backend that can run here."""

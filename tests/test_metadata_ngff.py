@@ -73,7 +73,7 @@ def test_what_ngff_holds_comes_back(tmp_path, info, times, spacing, origin, dtyp
         expected = ImageInfo(**{**vars(info), "time_step": None, "time_unit": None})
         expected = ImageInfo(**{**vars(expected), "time_origin": 0.0})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gvtorch.io.conversion.open_source", lambda *_, **__: source)
+        patch.setattr("gvtorch.io.conversion_plan.open_source", lambda *_, **__: source)
         patch.setattr("gvtorch.io.unfinished.fingerprint", lambda _: [])
         store = convert("a", tmp_path / "a.zarr", workers=1)
     yaozarrs.validate_zarr_store(str(tmp_path / "a.zarr"))
