@@ -20,6 +20,7 @@ import urllib.parse
 from collections.abc import Callable
 from typing import Any
 
+from ..base.messages import one_line
 from .http import (
     SLOWEST,
     SMALL,
@@ -101,7 +102,7 @@ class Relayed:
         except OSError:
             raise
         except Exception as error:  # tensorstore raises what its status maps to
-            raise OSError(" ".join(str(error).split())) from None
+            raise OSError(one_line(error)) from None
 
     @functools.cached_property
     def _bucket(self) -> Any:

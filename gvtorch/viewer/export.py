@@ -9,6 +9,7 @@ import threading
 import time
 from pathlib import Path
 
+from ..base.messages import one_line
 from ..base.volume import Volume
 from ..io.resources import amount
 from ..io.store import Store
@@ -76,7 +77,7 @@ class SurfaceExport:
         except _Ended:
             pass
         except Exception as error:  # whatever it was, the view goes on
-            client.tell("refused", text=" ".join(str(error).split()) or type(error).__name__)
+            client.tell("refused", text=one_line(error))
 
     def _progress(self, _what: str, done: int, total: int) -> None:
         if self._ended:
