@@ -12,11 +12,12 @@ import torch
 from helpers import DEVICES
 from helpers.rays import camera_rays, world_rays
 from helpers.shaders import SHADERS
-from helpers.traces import SHADER, assert_equal, run
+from helpers.traces import SHADER, arguments, assert_equal, run
 from helpers.trees import on
 
 import gvtorch as gv
 from gvtorch.base.constants import ABSENT
+from gvtorch.ops import trace_rays
 
 FAR = (2**31 - 1, 2**30, 10**6)
 
@@ -47,6 +48,21 @@ def test_words_that_lead_out_of_the_pools_count_as_absent(blobs, backend, dtype,
     for mine, other in zip(actual, expected, strict=True):
         assert all(torch.equal(mine[name], other[name]) for name in other)
     assert actual[0]["missed"].any()
+
+
+@pytest.mark.parametrize("high", [1e6, -5.0, torch.nan])
+@pytest.mark.parametrize("branching", [2, 3])
+def test_a_scene_does_not_reach_out_of_its_root_cube(blobs, backend, branching, high):
+    """Rays that were led there would ask for nodes of no tile, an interval at a time."""
+    tree = gv.N3Tree.from_volume(blobs, 4, branching=branching, device=DEVICES[backend])
+    rays, given = arguments(tree, 4)
+    found = []
+    for corner in (high, 1.0 if high > 1 else 0.0):
+        place = given.place_33.clone()
+        place[2] = corner
+        hits = trace_rays(rays, given._replace(place_33=place), backend=backend)
+        found.append([*hits, tree.nodes.request_tn.clone()])
+    assert all(torch.equal(*each) for each in zip(*found, strict=True))
 
 
 @pytest.mark.parametrize("name", SHADERS)

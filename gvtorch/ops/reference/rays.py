@@ -49,6 +49,7 @@ class Beam(Rows):
     def enter(cls, rays: RayArguments, a: TraceArguments, real: torch.dtype) -> Beam:
         """Brings world rays into the tree in float64, then rounds them to `real`."""
         corner, size, high = a.place_33
+        high = high.nan_to_num(0.0).clamp(0, 1)  # never outside the root cube, whoever made it
         origin, direction = (rays.origin_r3 - corner) / size, rays.direction_r3 / size
         low_t, high_t = -origin / direction, (high - origin) / direction
         near = torch.full_like(origin[:, 0], -INF)

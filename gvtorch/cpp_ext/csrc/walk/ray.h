@@ -22,6 +22,11 @@ struct RayView {
   const double* clear_r = nullptr;  // transmittance with which a ray begins; null: 1
 
   GV_HD double clear(int64_t index) const { return clear_r == nullptr ? 1.0 : clear_r[index]; }
+  // The scene's high corner, never outside the root cube, whoever made the tensors: nodes are found by it.
+  GV_HD double high(int axis) const {
+    const double told = place_33[6 + axis];
+    return told > 0 ? smaller(told, 1.0) : 0.0;
+  }
 };
 
 // One ray in tree units (a distance along it stays a world length), begun where it enters the scene: float32 then
@@ -47,7 +52,7 @@ struct Ray {
       from[axis] = (rays.origin_r3[3 * index + axis] - rays.place_33[axis]) / size;
       along[axis] = rays.direction_r3[3 * index + axis] / size;
       const double low = -from[axis] / along[axis];
-      const double far = (rays.place_33[6 + axis] - from[axis]) / along[axis];
+      const double far = (rays.high(axis) - from[axis]) / along[axis];
       if (along[axis] != 0) near = larger(near, smaller(low, far));
     }
     const double shift = near > 0 && near < static_cast<double>(INFINITY) ? near : 0;
@@ -83,7 +88,7 @@ struct Ray {
       rest[axis] = rays.deep ? static_cast<T>(start[axis] - static_cast<double>(origin[axis])) : T{};
       inverse[axis] = 1 / direction[axis];
       inner[axis] = inner_of(rays, axis);
-      const double from = place(axis), to = rays.place_33[6 + axis];
+      const double from = place(axis), to = rays.high(axis);
       if (direction[axis] == 0) {
         if (!(from >= 0 && from <= to)) last = first;
         continue;
@@ -118,7 +123,7 @@ struct Ray {
     return place;
   }
   GV_HD static Real inner_of(const RayView& rays, int axis) {
-    return static_cast<Real>(rays.place_33[6 + axis]) * static_cast<Real>(0.9999999);
+    return static_cast<Real>(rays.high(axis)) * static_cast<Real>(0.9999999);
   }
 
   // Distance at which the ray leaves a box; face(axis, upper) tells how far its lower or upper face is from the origin.

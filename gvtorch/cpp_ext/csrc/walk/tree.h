@@ -117,7 +117,7 @@ struct Digits {
       : levels(levels), branching(tree.branching), max_depth(tree.max_depth) {
     const Vec3<double> place = ray.along(t, rays.deep);
     for (int axis = 0; axis < 3; ++axis) {
-      const double high = rays.deep ? rays.place_33[6 + axis] * (1 - 8.8817841970012523e-16)  // 2^-50
+      const double high = rays.deep ? rays.high(axis) * (1 - 8.8817841970012523e-16)  // 2^-50
                                     : static_cast<double>(ray.inner[axis]);
       origin[axis] = ray.place(axis);
       cell[axis] = whole(clamp(place[axis], 0.0, high) * levels.count[max_depth]);
