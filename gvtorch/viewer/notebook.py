@@ -33,10 +33,12 @@ export default {
     root.className = "gv";
     root.style.height = `${model.get("height")}px`;
     el.append(root);
-    const connect = (take) => {
+    const connect = (take, gone) => {
       model.on("msg:custom", (content, buffers) => {
-        take(buffers.length ? buffers[0] : content.text);
+        if (content.gone) gone(content.gone);
+        else take(buffers.length ? buffers[0] : content.text);
       });
+      model.on("comm_live_update", () => gone("The notebook's kernel has ended."));
       return (text) => model.send({ text });
     };
     mount(root, connect);
@@ -120,6 +122,7 @@ def widget(session: Session, height: int = 560) -> Any:
         def close_view(self) -> None:
             """Ends the view; an engine that was handed in stays open."""
             self.session.close()
+            self.send({"gone": "The view was closed."})
 
     return ViewWidget(session, height=height)
 

@@ -20,7 +20,8 @@ class Tab:
     """A page in the browser, and all that it complained of or asked for."""
 
     def __init__(self, browser: Any, url: str, **options: Any) -> None:
-        self.context = browser.new_context(viewport={"width": 1000, "height": 420}, **options)
+        options = {"viewport": {"width": 1000, "height": 420}, **options}
+        self.context = browser.new_context(**options)
         self.page = self.context.new_page()
         self.complaints: list[str] = []
         self.requests: list[str] = []
