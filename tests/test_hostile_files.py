@@ -4,10 +4,12 @@ little memory and time, and `convert` says what `read_volume` says.
 
 from __future__ import annotations
 
+import bz2
 import gzip
 import importlib
 import json
 import os
+import resource
 import subprocess
 import sys
 import threading
@@ -16,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.hostile import write_all
+from helpers import hostile
 
 import gvtorch as gv
 from gvtorch.io import budget, reading
@@ -57,7 +59,7 @@ HONEST = ("cards.fits", "tiles.tif")  # wasteful, and right
 
 
 def test_files_that_eat_a_machine_are_refused(tmp_path):
-    paths = write_all(tmp_path)
+    paths = hostile.write_all(tmp_path)
     run = subprocess.run(
         [sys.executable, "-X", "faulthandler", "-c", READER],
         input=json.dumps([[str(path) for path in paths], MEMORY]),
@@ -116,9 +118,6 @@ def test_what_is_larger_than_memory_is_told_before(tmp_path, monkeypatch):
 @pytest.mark.parametrize("encoding", ["gzip", "bzip2", "text", "raw"])
 @pytest.mark.parametrize("lines", [0, 2])
 def test_nrrd_data_behind_lines_and_bytes(tmp_path, encoding, lines):
-    import bz2
-    import gzip
-
     data = np.arange(24, dtype="<i2").reshape(2, 3, 4)
     words = " ".join(map(str, data.ravel())).encode()
     packed = {
@@ -150,6 +149,68 @@ def test_meshes_and_points_unpack_to_no_more_than_free_memory(tmp_path, monkeypa
     with pytest.raises(ValueError, match=r"unpacks to .*memory") as told:
         read(file)
     assert "\n" not in str(told.value)
+
+
+def fits_table(columns: list[str], rows: int, width: int, data: bytes) -> bytes:
+    """A FITS file of an empty image and a table, whose header tells what it is told to."""
+    cards = ["XTENSION= 'BINTABLE'", "BITPIX  = 8", "NAXIS   = 2", f"NAXIS1  = {width}"]
+    cards += [f"NAXIS2  = {rows}", "PCOUNT  = 0", "GCOUNT  = 1", f"TFIELDS = {len(columns)}"]
+    for at, kind in enumerate(columns, 1):
+        cards += [f"TTYPE{at}  = '{'xyzw'[at - 1]}'", f"TFORM{at}  = '{kind}'"]
+    head = "".join(card.ljust(80) for card in [*cards, "END"])
+    return hostile.fits(["BITPIX  = 8", "NAXIS   = 0"]) + head.ljust(2880).encode() + data
+
+
+@pytest.mark.parametrize("name", ["a.fits", "a.fits.gz", "a.fit"])
+def test_a_table_of_points_is_read_as_far_as_its_header_tells(tmp_path, name):
+    pytest.importorskip("astropy")
+    write = gzip.compress if name == "a.fits.gz" else bytes
+    rows = np.arange(30, dtype=">f4").reshape(10, 3)
+    honest = fits_table(["1E"] * 3, 10, 12, rows.tobytes().ljust(2880, b"\0"))
+    (tmp_path / name).write_bytes(write(honest))
+    assert np.array_equal(gv.read_points(tmp_path / name).positions, rows)
+    told = "its rows take 13194139533312" if name == "a.fits.gz" else "may have been truncated"
+    for count in (2**40, 2**62):
+        (tmp_path / name).write_bytes(write(fits_table(["1E"] * 3, count, 12, bytes(2880))))
+        with pytest.raises(ValueError, match=f"{told}|cannot fit 'int'") as error:
+            gv.read_points(tmp_path / name)
+        assert "\n" not in str(error.value)
+    lists = fits_table(["1E", "1E", "1E", "1PE(9)"], 1, 20, bytes(2880))
+    (tmp_path / name).write_bytes(write(lists))
+    assert len(gv.read_points(tmp_path / name)) == 1
+
+
+@pytest.mark.parametrize("what", ["bomb", "no end"])
+def test_a_packed_table_of_points_eats_no_memory(tmp_path, what, monkeypatch):
+    pytest.importorskip("astropy")
+    monkeypatch.setattr(budget, "SECONDS", 0.3)
+    monkeypatch.setattr(budget, "MEMORY", 10**8)
+    begin = hostile.fits(["BITPIX  = 8", "NAXIS   = 1", "NAXIS1  = 500000000000"])
+    if what == "no end":
+        begin = b"SIMPLE  =                    T".ljust(2880)
+    blank = gzip.compress(b" " * (1 << 24), 1)
+    (tmp_path / "a.fits.gz").write_bytes(gzip.compress(begin) + blank * 60)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(ValueError, match=r"a\.fits\.gz: ") as told:
+        gv.read_points(tmp_path / "a.fits.gz")
+    assert "\n" not in str(told.value)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 400_000
+
+
+def test_a_name_does_not_tell_how_fits_is_packed(tmp_path):
+    """Values of a packed file, once they were the packed bytes themselves."""
+    fits = pytest.importorskip("astropy.io.fits")
+    data = np.random.default_rng(0).integers(0, 255, (20, 20, 20), np.uint8)
+    fits.PrimaryHDU(data).writeto(tmp_path / "b.fits")
+    content = (tmp_path / "b.fits").read_bytes()
+    (tmp_path / "a.fits").write_bytes(gzip.compress(content))
+    (tmp_path / "b.fits.gz").write_bytes(content)
+    for name in ("a.fits", "b.fits.gz"):
+        assert np.array_equal(gv.read_volume(tmp_path / name).data[..., 0].numpy(), data)
+    for read in (gv.read_volume, gv.read_points):
+        (tmp_path / "c.fits").write_bytes(bz2.compress(content))
+        with pytest.raises(ValueError, match=r"c\.fits: is no FITS file"):
+            read(tmp_path / "c.fits")
 
 
 @pytest.mark.parametrize("name", ["a.pvcc", "a.json", "a.ply", "a.obj.gz", "a.npz"])
