@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from tyro.conf import Positional, arg
 
+from ..base.messages import printable
 from .common import Bar, given, size, volume_formats
 from .drawn import Drawn
 from .image import KINDS, STRIPS, Develop, in_strips
@@ -73,7 +74,7 @@ class Render:
         if self.stats is not None:
             content = {**stats.as_dict(), "extent": opened.extent}
             self.stats.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-        print(f"{self.output}: {width}x{height}, {told(stats)}")
+        print(f"{printable(self.output)}: {width}x{height}, {told(stats)}")
 
     def _at_saved_time(self) -> SceneFlags:
         """The flags of the scene, of the time point that a saved state tells."""
