@@ -4,6 +4,7 @@ little memory and time, and `convert` says what `read_volume` says.
 
 from __future__ import annotations
 
+import base64
 import bz2
 import gzip
 import importlib
@@ -223,3 +224,92 @@ def test_a_pipe_is_no_file_of_cameras_meshes_or_points(tmp_path, name):
     for read in readers:
         with pytest.raises((FileNotFoundError, ValueError)):
             read(tmp_path / name)
+
+
+def gltf(**other: object) -> dict[str, object]:
+    """A triangle in glTF, in which something is other."""
+    places = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
+    content = base64.b64encode(places + np.arange(3, dtype="<u4").tobytes()).decode()
+    own = {"uri": f"data:application/octet-stream;base64,{content}", "byteLength": 48}
+    return {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "material": 0}]}],
+        "buffers": [own],
+        "bufferViews": [VIEW, {"buffer": 0, "byteOffset": 36, "byteLength": 12}],
+        "accessors": [POSITIONS, {**POSITIONS, "bufferView": 1, "componentType": 5125}],
+        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        **other,
+    }
+
+
+VIEW = {"buffer": 0, "byteOffset": 0, "byteLength": 36}
+POSITIONS = {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}
+ACCESSORS = {
+    "billions": {**POSITIONS, "count": 10**9},
+    "without numbers": {k: v for k, v in POSITIONS.items() if k != "bufferView"} | {"count": 10**9},
+    "before": {**POSITIONS, "byteOffset": -36},
+    "less than none": {**POSITIONS, "count": -1},
+    "sparse": {**POSITIONS, "sparse": {"count": 1}},
+}
+
+
+@pytest.mark.parametrize("name", ACCESSORS)
+def test_what_a_gltf_tells_of_is_there(tmp_path, name):
+    """Trimesh makes zeros of numbers that it does not find: 24 GB, or another picture."""
+    pytest.importorskip("trimesh")
+    file = tmp_path / "a.gltf"
+    indices = {**POSITIONS, "bufferView": 1, "componentType": 5125, "type": "SCALAR"}
+    file.write_text(json.dumps(gltf(accessors=[POSITIONS, indices])))
+    assert len(gv.read_mesh(file).faces) == 1
+    file.write_text(json.dumps(gltf(accessors=[ACCESSORS[name], indices])))
+    with pytest.raises(ValueError, match=r"a\.gltf: can't be read as gltf: accessor 0 (has|is)"):
+        gv.read_mesh(file)
+    view = {**VIEW, "byteOffset": -12}
+    file.write_text(json.dumps(gltf(accessors=[POSITIONS, indices], bufferViews=[view, VIEW])))
+    with pytest.raises(ValueError, match=r"a part of a buffer lies before its begin"):
+        gv.read_mesh(file)
+
+
+@pytest.mark.filterwarnings("ignore:Image size")
+@pytest.mark.parametrize("kind", ["obj", "--texture"])
+def test_textures_that_eat_a_machine_are_refused(tmp_path, kind):
+    """160 kB of pixels that unpack to 676 MB, and more while they do; twenty of them."""
+    pytest.importorskip("trimesh")
+    (tmp_path / "a.png").write_bytes(hostile.png(13000, 13000))
+    names, texture = [f"m{n}" for n in range(20)], None
+    lines = [f"newmtl {name}\nmap_Kd a.png" for name in names]
+    if kind == "--texture":
+        lines, texture = [], tmp_path / "a.png"
+    (tmp_path / "a.mtl").write_text("\n".join(lines))
+    faces = "".join(f"usemtl {name}\nf 1/1 2/1 3/1\n" for name in names)
+    text = f"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\n{faces}"
+    (tmp_path / "a.obj").write_text(text)
+    with pytest.raises(ValueError, match=r"textures take .* GB of memory, at most") as told:
+        gv.read_mesh(tmp_path / "a.obj", texture=texture)
+    assert "\n" not in str(told.value)
+
+
+def test_a_mesh_reads_no_more_than_memory_takes(tmp_path, monkeypatch):
+    pytest.importorskip("trimesh")
+    module = importlib.import_module("gvtorch.io.mesh_file")
+    with (tmp_path / "a.bin").open("wb") as file:
+        file.truncate(10**7)
+    (tmp_path / "a.gltf").write_text(json.dumps(gltf(buffers=[{"uri": "a.bin"}])))
+    (tmp_path / "a.stl").write_bytes(bytes(10**7))
+    monkeypatch.setattr(module, "memory_free", lambda: 10**7)
+    with pytest.raises(ValueError, match=r"names a\.bin: takes 40\.0 MB of memory, 10\.0 MB are"):
+        gv.read_mesh(tmp_path / "a.gltf")
+    with pytest.raises(ValueError, match=r"a\.stl: takes 40\.0 MB of memory, 10\.0 MB are free"):
+        gv.read_mesh(tmp_path / "a.stl")
+
+
+def test_a_ply_of_fewer_than_no_rows_is_refused(tmp_path):
+    """Points once were the bytes of its header."""
+    names = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"element a -4\nproperty float b\nelement vertex 3\n{names}end_header\n"
+    file = tmp_path / "a.ply"
+    file.write_bytes(f"ply\nformat binary_little_endian 1.0\n{head}".encode() + bytes(36))
+    with pytest.raises(ValueError, match=r"a\.ply: .*it tells of -4 of a"):
+        gv.read_points(file)

@@ -179,6 +179,8 @@ def _read_ply(path: Path) -> dict[str, np.ndarray]:
         layout, elements = _ply_header(lines)
         skipped = 0
         for name, count, kinds in elements:
+            if count < 0:
+                raise ValueError(f"it tells of {count} of {name}")
             if name != "vertex":
                 if kinds is None or layout == "ascii":
                     raise ValueError(f"its vertices stand behind {name}")
