@@ -313,3 +313,43 @@ def test_a_ply_of_fewer_than_no_rows_is_refused(tmp_path):
     file.write_bytes(f"ply\nformat binary_little_endian 1.0\n{head}".encode() + bytes(36))
     with pytest.raises(ValueError, match=r"a\.ply: .*it tells of -4 of a"):
         gv.read_points(file)
+
+
+@pytest.mark.parametrize("kind", ["external", "virtual", "link", "soft link", "behind another"])
+def test_hdf5_reads_regular_files_beside_it(tmp_path, kind):
+    """A pipe has no end, and other folders are not a file's to name."""
+    h5py = pytest.importorskip("h5py")
+    data = np.arange(512, dtype=np.uint8).reshape(8, 8, 8)
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "raw").write_bytes(data.tobytes())
+    for name in ("in/other.h5", "far.h5"):
+        with h5py.File(tmp_path / name, "w") as file:
+            file["a"] = data
+
+    def write(file: Path, name: str) -> None:
+        with h5py.File(file, "w") as made:
+            if kind == "external":
+                made.create_dataset("a", data.shape, "u1", external=[(name, 0, 512)])
+            elif kind in ("virtual", "behind another"):
+                layout = h5py.VirtualLayout(data.shape, "u1")
+                layout[:] = h5py.VirtualSource(name, "a", data.shape)
+                made.create_virtual_dataset("a", layout)
+            else:
+                made["b" if kind == "soft link" else "a"] = h5py.ExternalLink(name, "/a")
+                if kind == "soft link":
+                    made["a"] = h5py.SoftLink("/b")
+
+    file = tmp_path / "in" / "a.h5"
+    beside = str(tmp_path / "in" / "raw") if kind == "external" else "other.h5"
+    write(file, beside)
+    assert np.array_equal(gv.read_volume(file, key="a", axes="zyx").data[..., 0].numpy(), data)
+    (tmp_path / "in" / "pipe.h5").symlink_to("../pipe")
+    os.mkfifo(tmp_path / "in" / "own")
+    for name in ("../pipe", "pipe.h5", "../far.h5", str(tmp_path / "in" / "own")):
+        write(file, str(tmp_path / "in" / name) if kind == "external" else name)
+        if kind == "behind another":
+            write(tmp_path / "in" / "other.h5", name)
+            write(file, "other.h5")
+        with pytest.raises(ValueError, match=r"lies in another folder|is no regular file"):
+            gv.read_volume(file, key="a", axes="zyx")
