@@ -177,3 +177,13 @@ def test_a_table_takes_what_looks_like_markup(capfd):
     cli._print_table({"channel info": {"0": "\\[/bold]", "1": "[/x]\x1b[2J"}, "name": "\\[/y]"})
     said = capfd.readouterr().out
     assert all(word in said for word in ("0: \\[/bold]", "1: [/x]\\x1b[2J", "\\[/y]"))
+
+
+def test_a_full_disk_leaves_saved_functions_as_they_were(tmp_path):
+    file, function = tmp_path / "a.json", gv.TransferFunction.from_points([(0, 0), (1, 1)])
+    function.save(file)
+    before = file.read_bytes()
+    longer = gv.TransferFunction.from_points([(n / 100, 0.5) for n in range(101)])
+    with full_disk(len(before)), pytest.raises(OSError, match=r"a\.json"):
+        longer.save(file)
+    assert file.read_bytes() == before and [*tmp_path.iterdir()] == [file]

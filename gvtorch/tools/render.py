@@ -14,6 +14,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from ..base.messages import printable
+from ..base.whole_file import write_whole
 from .common import Bar, given, size, volume_formats
 from .drawn import Drawn
 from .image import KINDS, STRIPS, Develop, in_strips
@@ -73,7 +74,7 @@ class Render:
                 stats = self._take_saved(opened, now, width, height, bar)
         if self.stats is not None:
             content = {**stats.as_dict(), "extent": opened.extent}
-            self.stats.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+            write_whole(self.stats, json.dumps(content, indent=2) + "\n")
         print(f"{printable(self.output)}: {width}x{height}, {told(stats)}")
 
     def _at_saved_time(self) -> SceneFlags:
