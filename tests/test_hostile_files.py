@@ -4,10 +4,13 @@ little memory and time, and `convert` says what `read_volume` says.
 
 from __future__ import annotations
 
+import base64
+import bz2
 import gzip
 import importlib
 import json
 import os
+import resource
 import subprocess
 import sys
 import threading
@@ -16,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.hostile import write_all
+from helpers import hostile
 
 import gvtorch as gv
 from gvtorch.io import budget, reading
@@ -57,7 +60,7 @@ HONEST = ("cards.fits", "tiles.tif")  # wasteful, and right
 
 
 def test_files_that_eat_a_machine_are_refused(tmp_path):
-    paths = write_all(tmp_path)
+    paths = hostile.write_all(tmp_path)
     run = subprocess.run(
         [sys.executable, "-X", "faulthandler", "-c", READER],
         input=json.dumps([[str(path) for path in paths], MEMORY]),
@@ -116,9 +119,6 @@ def test_what_is_larger_than_memory_is_told_before(tmp_path, monkeypatch):
 @pytest.mark.parametrize("encoding", ["gzip", "bzip2", "text", "raw"])
 @pytest.mark.parametrize("lines", [0, 2])
 def test_nrrd_data_behind_lines_and_bytes(tmp_path, encoding, lines):
-    import bz2
-    import gzip
-
     data = np.arange(24, dtype="<i2").reshape(2, 3, 4)
     words = " ".join(map(str, data.ravel())).encode()
     packed = {
@@ -152,6 +152,68 @@ def test_meshes_and_points_unpack_to_no_more_than_free_memory(tmp_path, monkeypa
     assert "\n" not in str(told.value)
 
 
+def fits_table(columns: list[str], rows: int, width: int, data: bytes) -> bytes:
+    """A FITS file of an empty image and a table, whose header tells what it is told to."""
+    cards = ["XTENSION= 'BINTABLE'", "BITPIX  = 8", "NAXIS   = 2", f"NAXIS1  = {width}"]
+    cards += [f"NAXIS2  = {rows}", "PCOUNT  = 0", "GCOUNT  = 1", f"TFIELDS = {len(columns)}"]
+    for at, kind in enumerate(columns, 1):
+        cards += [f"TTYPE{at}  = '{'xyzw'[at - 1]}'", f"TFORM{at}  = '{kind}'"]
+    head = "".join(card.ljust(80) for card in [*cards, "END"])
+    return hostile.fits(["BITPIX  = 8", "NAXIS   = 0"]) + head.ljust(2880).encode() + data
+
+
+@pytest.mark.parametrize("name", ["a.fits", "a.fits.gz", "a.fit"])
+def test_a_table_of_points_is_read_as_far_as_its_header_tells(tmp_path, name):
+    pytest.importorskip("astropy")
+    write = gzip.compress if name == "a.fits.gz" else bytes
+    rows = np.arange(30, dtype=">f4").reshape(10, 3)
+    honest = fits_table(["1E"] * 3, 10, 12, rows.tobytes().ljust(2880, b"\0"))
+    (tmp_path / name).write_bytes(write(honest))
+    assert np.array_equal(gv.read_points(tmp_path / name).positions, rows)
+    told = "its rows take 13194139533312" if name == "a.fits.gz" else "may have been truncated"
+    for count in (2**40, 2**62):
+        (tmp_path / name).write_bytes(write(fits_table(["1E"] * 3, count, 12, bytes(2880))))
+        with pytest.raises(ValueError, match=f"{told}|cannot fit 'int'") as error:
+            gv.read_points(tmp_path / name)
+        assert "\n" not in str(error.value)
+    lists = fits_table(["1E", "1E", "1E", "1PE(9)"], 1, 20, bytes(2880))
+    (tmp_path / name).write_bytes(write(lists))
+    assert len(gv.read_points(tmp_path / name)) == 1
+
+
+@pytest.mark.parametrize("what", ["bomb", "no end"])
+def test_a_packed_table_of_points_eats_no_memory(tmp_path, what, monkeypatch):
+    pytest.importorskip("astropy")
+    monkeypatch.setattr(budget, "SECONDS", 0.3)
+    monkeypatch.setattr(budget, "MEMORY", 10**8)
+    begin = hostile.fits(["BITPIX  = 8", "NAXIS   = 1", "NAXIS1  = 500000000000"])
+    if what == "no end":
+        begin = b"SIMPLE  =                    T".ljust(2880)
+    blank = gzip.compress(b" " * (1 << 24), 1)
+    (tmp_path / "a.fits.gz").write_bytes(gzip.compress(begin) + blank * 60)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(ValueError, match=r"a\.fits\.gz: ") as told:
+        gv.read_points(tmp_path / "a.fits.gz")
+    assert "\n" not in str(told.value)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 400_000
+
+
+def test_a_name_does_not_tell_how_fits_is_packed(tmp_path):
+    """Values of a packed file, once they were the packed bytes themselves."""
+    fits = pytest.importorskip("astropy.io.fits")
+    data = np.random.default_rng(0).integers(0, 255, (20, 20, 20), np.uint8)
+    fits.PrimaryHDU(data).writeto(tmp_path / "b.fits")
+    content = (tmp_path / "b.fits").read_bytes()
+    (tmp_path / "a.fits").write_bytes(gzip.compress(content))
+    (tmp_path / "b.fits.gz").write_bytes(content)
+    for name in ("a.fits", "b.fits.gz"):
+        assert np.array_equal(gv.read_volume(tmp_path / name).data[..., 0].numpy(), data)
+    for read in (gv.read_volume, gv.read_points):
+        (tmp_path / "c.fits").write_bytes(bz2.compress(content))
+        with pytest.raises(ValueError, match=r"c\.fits: is no FITS file"):
+            read(tmp_path / "c.fits")
+
+
 @pytest.mark.parametrize("name", ["a.pvcc", "a.json", "a.ply", "a.obj.gz", "a.npz"])
 def test_a_pipe_is_no_file_of_cameras_meshes_or_points(tmp_path, name):
     """Reading one would wait for ever."""
@@ -162,3 +224,132 @@ def test_a_pipe_is_no_file_of_cameras_meshes_or_points(tmp_path, name):
     for read in readers:
         with pytest.raises((FileNotFoundError, ValueError)):
             read(tmp_path / name)
+
+
+def gltf(**other: object) -> dict[str, object]:
+    """A triangle in glTF, in which something is other."""
+    places = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
+    content = base64.b64encode(places + np.arange(3, dtype="<u4").tobytes()).decode()
+    own = {"uri": f"data:application/octet-stream;base64,{content}", "byteLength": 48}
+    return {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "material": 0}]}],
+        "buffers": [own],
+        "bufferViews": [VIEW, {"buffer": 0, "byteOffset": 36, "byteLength": 12}],
+        "accessors": [POSITIONS, {**POSITIONS, "bufferView": 1, "componentType": 5125}],
+        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        **other,
+    }
+
+
+VIEW = {"buffer": 0, "byteOffset": 0, "byteLength": 36}
+POSITIONS = {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}
+ACCESSORS = {
+    "billions": {**POSITIONS, "count": 10**9},
+    "without numbers": {k: v for k, v in POSITIONS.items() if k != "bufferView"} | {"count": 10**9},
+    "before": {**POSITIONS, "byteOffset": -36},
+    "less than none": {**POSITIONS, "count": -1},
+    "sparse": {**POSITIONS, "sparse": {"count": 1}},
+}
+
+
+@pytest.mark.parametrize("name", ACCESSORS)
+def test_what_a_gltf_tells_of_is_there(tmp_path, name):
+    """Trimesh makes zeros of numbers that it does not find: 24 GB, or another picture."""
+    pytest.importorskip("trimesh")
+    file = tmp_path / "a.gltf"
+    indices = {**POSITIONS, "bufferView": 1, "componentType": 5125, "type": "SCALAR"}
+    file.write_text(json.dumps(gltf(accessors=[POSITIONS, indices])))
+    assert len(gv.read_mesh(file).faces) == 1
+    file.write_text(json.dumps(gltf(accessors=[ACCESSORS[name], indices])))
+    with pytest.raises(ValueError, match=r"a\.gltf: can't be read as gltf: accessor 0 (has|is)"):
+        gv.read_mesh(file)
+    view = {**VIEW, "byteOffset": -12}
+    file.write_text(json.dumps(gltf(accessors=[POSITIONS, indices], bufferViews=[view, VIEW])))
+    with pytest.raises(ValueError, match=r"a part of a buffer lies before its begin"):
+        gv.read_mesh(file)
+
+
+@pytest.mark.filterwarnings("ignore:Image size")
+@pytest.mark.parametrize("kind", ["obj", "--texture"])
+def test_textures_that_eat_a_machine_are_refused(tmp_path, kind):
+    """160 kB of pixels that unpack to 676 MB, and more while they do; twenty of them."""
+    pytest.importorskip("trimesh")
+    (tmp_path / "a.png").write_bytes(hostile.png(13000, 13000))
+    names, texture = [f"m{n}" for n in range(20)], None
+    lines = [f"newmtl {name}\nmap_Kd a.png" for name in names]
+    if kind == "--texture":
+        lines, texture = [], tmp_path / "a.png"
+    (tmp_path / "a.mtl").write_text("\n".join(lines))
+    faces = "".join(f"usemtl {name}\nf 1/1 2/1 3/1\n" for name in names)
+    text = f"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\n{faces}"
+    (tmp_path / "a.obj").write_text(text)
+    with pytest.raises(ValueError, match=r"textures take .* GB of memory, at most") as told:
+        gv.read_mesh(tmp_path / "a.obj", texture=texture)
+    assert "\n" not in str(told.value)
+
+
+def test_a_mesh_reads_no_more_than_memory_takes(tmp_path, monkeypatch):
+    pytest.importorskip("trimesh")
+    module = importlib.import_module("gvtorch.io.mesh_file")
+    with (tmp_path / "a.bin").open("wb") as file:
+        file.truncate(10**7)
+    (tmp_path / "a.gltf").write_text(json.dumps(gltf(buffers=[{"uri": "a.bin"}])))
+    (tmp_path / "a.stl").write_bytes(bytes(10**7))
+    monkeypatch.setattr(module, "memory_free", lambda: 10**7)
+    with pytest.raises(ValueError, match=r"names a\.bin: takes 40\.0 MB of memory, 10\.0 MB are"):
+        gv.read_mesh(tmp_path / "a.gltf")
+    with pytest.raises(ValueError, match=r"a\.stl: takes 40\.0 MB of memory, 10\.0 MB are free"):
+        gv.read_mesh(tmp_path / "a.stl")
+
+
+def test_a_ply_of_fewer_than_no_rows_is_refused(tmp_path):
+    """Points once were the bytes of its header."""
+    names = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"element a -4\nproperty float b\nelement vertex 3\n{names}end_header\n"
+    file = tmp_path / "a.ply"
+    file.write_bytes(f"ply\nformat binary_little_endian 1.0\n{head}".encode() + bytes(36))
+    with pytest.raises(ValueError, match=r"a\.ply: .*it tells of -4 of a"):
+        gv.read_points(file)
+
+
+@pytest.mark.parametrize("kind", ["external", "virtual", "link", "soft link", "behind another"])
+def test_hdf5_reads_regular_files_beside_it(tmp_path, kind):
+    """A pipe has no end, and other folders are not a file's to name."""
+    h5py = pytest.importorskip("h5py")
+    data = np.arange(512, dtype=np.uint8).reshape(8, 8, 8)
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "raw").write_bytes(data.tobytes())
+    for name in ("in/other.h5", "far.h5"):
+        with h5py.File(tmp_path / name, "w") as file:
+            file["a"] = data
+
+    def write(file: Path, name: str) -> None:
+        with h5py.File(file, "w") as made:
+            if kind == "external":
+                made.create_dataset("a", data.shape, "u1", external=[(name, 0, 512)])
+            elif kind in ("virtual", "behind another"):
+                layout = h5py.VirtualLayout(data.shape, "u1")
+                layout[:] = h5py.VirtualSource(name, "a", data.shape)
+                made.create_virtual_dataset("a", layout)
+            else:
+                made["b" if kind == "soft link" else "a"] = h5py.ExternalLink(name, "/a")
+                if kind == "soft link":
+                    made["a"] = h5py.SoftLink("/b")
+
+    file = tmp_path / "in" / "a.h5"
+    beside = str(tmp_path / "in" / "raw") if kind == "external" else "other.h5"
+    write(file, beside)
+    assert np.array_equal(gv.read_volume(file, key="a", axes="zyx").data[..., 0].numpy(), data)
+    (tmp_path / "in" / "pipe.h5").symlink_to("../pipe")
+    os.mkfifo(tmp_path / "in" / "own")
+    for name in ("../pipe", "pipe.h5", "../far.h5", str(tmp_path / "in" / "own")):
+        write(file, str(tmp_path / "in" / name) if kind == "external" else name)
+        if kind == "behind another":
+            write(tmp_path / "in" / "other.h5", name)
+            write(file, "other.h5")
+        with pytest.raises(ValueError, match=r"lies in another folder|is no regular file"):
+            gv.read_volume(file, key="a", axes="zyx")

@@ -148,3 +148,42 @@ def test_lights_take_arrays(picture):
         for color in ((0.5, 0.25, 1.0), np.array([0.5, 0.25, 1.0]))
     )
     assert torch.equal(made, expected)
+
+
+ESCAPES = "\x1b]0;name\x07\x1b[2J\x9b31m\nline \\[bold] [red]"
+
+
+def test_no_name_gives_commands_to_a_terminal(tmp_path, capfd):
+    """Names of files, and what stands in them, come from anyone."""
+    volume, store = tmp_path / f"{ESCAPES}.npy", tmp_path / f"{ESCAPES}.zarr"
+    np.save(volume, np.arange(512, dtype=np.uint16).reshape(8, 8, 8))
+    for name in ("a", ESCAPES):
+        np.savez(tmp_path / "two.npz", **{"a": np.zeros((4, 4, 4)), name: np.ones((4, 4, 4))})
+    cli.main(["info", str(volume)])
+    cli.main(["convert", str(volume), str(store), "--workers", "1"])
+    cli.main(["info", str(store)])
+    cli.main(["render", str(store), "-o", str(tmp_path / f"{ESCAPES}.png"), "--size", "8x8"])
+    for args in (["info", str(tmp_path / "two.npz")], ["render", str(volume), "--level", "1"]):
+        with pytest.raises(SystemExit):
+            cli.main([*args, "-o", "a.png"] if args[0] == "render" else args)
+    said = "".join(capfd.readouterr())
+    found = [char for char in said if ord(char) < 32 or 127 <= ord(char) < 160]
+    assert set(found) == {"\n"}, said
+    assert said.count("error: ") == 2 and said.splitlines()[-1].startswith("gvtorch: error: ")
+    assert "[bold]" in said and "[red]" in said
+
+
+def test_a_table_takes_what_looks_like_markup(capfd):
+    cli._print_table({"channel info": {"0": "\\[/bold]", "1": "[/x]\x1b[2J"}, "name": "\\[/y]"})
+    said = capfd.readouterr().out
+    assert all(word in said for word in ("0: \\[/bold]", "1: [/x]\\x1b[2J", "\\[/y]"))
+
+
+def test_a_full_disk_leaves_saved_functions_as_they_were(tmp_path):
+    file, function = tmp_path / "a.json", gv.TransferFunction.from_points([(0, 0), (1, 1)])
+    function.save(file)
+    before = file.read_bytes()
+    longer = gv.TransferFunction.from_points([(n / 100, 0.5) for n in range(101)])
+    with full_disk(len(before)), pytest.raises(OSError, match=r"a\.json"):
+        longer.save(file)
+    assert file.read_bytes() == before and [*tmp_path.iterdir()] == [file]

@@ -32,6 +32,12 @@ NAMES = [
     "[1]",
     "a:b&c;$d",
     "tab\t",
+    "back\\slash",
+    "a.__lock",
+    "-x",
+    "~",
+    "$HOME",
+    "esc\x1b[2J",
 ]
 
 
@@ -86,7 +92,9 @@ TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 
 
 
 @pytest.mark.backend("cpp")
-@pytest.mark.parametrize("name", [b"\xff\xfe", b"a b?*#%41", b"new\nline", b"../in", b"link"])
+@pytest.mark.parametrize(
+    "name", [b"\xff\xfe", b"back\\s", b"a b?*#%41", b"new\nline", b"../in", b"link"]
+)
 def test_every_command_takes_any_path(tmp_path, data, name, monkeypatch, capsys):
     """Bytes that are no UTF-8, marks of shells and URLs, ".." and links, in folder and file."""
     folder = tmp_path / os.fsdecode(b"in" if name.startswith(b"..") else name)

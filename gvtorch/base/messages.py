@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import importlib
+import re
 from typing import Any
+
+# What a terminal takes for a command, or for the end of a line, or writes from right to left.
+_CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
 
 
 def one_line(error: object) -> str:
-    """Returns what an error says, in one line; its type if it says nothing."""
-    return " ".join(str(error).split()) or type(error).__name__
+    """Returns what an error says, in one printable line; its type if it says nothing."""
+    return printable(" ".join(str(error).split())) or type(error).__name__
+
+
+def printable(text: object) -> str:
+    """Returns a text in which characters that a terminal obeys are told, as in "\\x1b": names of
+    files and what stands in them come from anyone.
+    """
+    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), str(text))
 
 
 def need_library(what: str, library: str, package: str = "", extra: str = "io") -> Any:

@@ -1,4 +1,4 @@
-"""`whole_file`: files that appear when they are whole."""
+"""`whole_file`, `write_whole`: files that appear when they are whole."""
 
 from __future__ import annotations
 
@@ -38,3 +38,9 @@ def whole_file(path: Path) -> Iterator[Path]:
         os.replace(name, path)
     finally:
         Path(name).unlink(missing_ok=True)
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Writes text; on a full disk what stands there already stays."""
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8")

@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import gzip
 import io
+import json
+import math
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -17,11 +19,14 @@ from ..base.messages import need_library, one_line
 from ..base.srgb import from_srgb
 from ..meshes.mesh import MOST_FACES, Material, Mesh
 from .resources import amount, memory_free
+from .source import told_as
 
 #: Endings that are read, also with .gz behind them. Others of trimesh's need more than it, or
 #: unpickle what they find.
 ENDINGS = ("obj", "ply", "stl", "gltf", "glb", "off")
 _MEMORY_A_BYTE = 4  # of a file, at least, that reading it takes
+_TEXTURES = 1500 * 10**6  # bytes that unpacking textures may take, of any file
+_TEXTURES_A_BYTE = 100  # and for each byte of it and of those that it names
 _FACE_BYTES = 1  # a triangle takes more bytes than this in any of them
 
 
@@ -58,6 +63,7 @@ def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
             process=False,
             allow_remote=False,
         )
+        _check_textures(_images(loaded), len(content) + resolver.size)
         parts = _parts(trimesh, loaded)
     except Exception as error:  # a damaged file may raise anything
         reason = resolver.missing or one_line(error)
@@ -81,6 +87,7 @@ def _textured(mesh: Mesh, texture: Path) -> Mesh:
 
     try:
         with Image.open(texture) as image:
+            _check_textures([image], texture.stat().st_size)
             pixels = np.asarray(image.convert("RGBA"), np.uint8)
     except (OSError, ValueError, SyntaxError) as error:
         raise ValueError(f"{texture}: can't be read as an image: {error}") from None
@@ -98,9 +105,10 @@ def _ending(path: Path) -> tuple[str, bool]:
 
 
 def _content(path: Path, packed: bool) -> bytes:
-    if not packed:
-        return path.read_bytes()
     most = memory_free() // _MEMORY_A_BYTE
+    if not packed:
+        _check_size(str(path), path.stat().st_size)
+        return path.read_bytes()
     try:
         with gzip.open(path) as stream:
             content = stream.read(most + 1)
@@ -111,11 +119,56 @@ def _content(path: Path, packed: bool) -> bytes:
     return content
 
 
+def _check_size(what: str, size: int) -> None:
+    if size * _MEMORY_A_BYTE > (free := memory_free()):
+        needs, has = amount(size * _MEMORY_A_BYTE), amount(free)
+        raise ValueError(f"{what}: takes {needs} of memory, {has} are free")
+
+
+def _images(loaded: Any) -> list[Any]:
+    """The textures of what trimesh read, which are not unpacked yet."""
+    parts = getattr(loaded, "geometry", {"": loaded}).values()
+    looks = (getattr(getattr(part, "visual", None), "material", None) for part in parts)
+    found = {id(one): one for one in looks}.values()
+    images = (getattr(one, "baseColorTexture", getattr(one, "image", None)) for one in found)
+    return [image for image in images if image is not None]
+
+
+def _check_textures(images: list[Any], size: int) -> None:
+    """Raises ValueError where images unpack to more than files of `size` bytes are worth."""
+    sizes = [4 * math.prod(image.size) for image in images]
+    takes = sum(sizes) + 2 * max(sizes, default=0)  # one after another
+    most = min(_TEXTURES + _TEXTURES_A_BYTE * size, memory_free())
+    if takes > most:
+        raise ValueError(f"its textures take {amount(takes)} of memory, at most {amount(most)}")
+
+
+def _check_gltf(ending: str, content: bytes) -> None:
+    """Raises ValueError for accessors that tell of more than is there, or whose numbers lie where
+    trimesh does not look, which then are zeros.
+    """
+    if ending == "glb":
+        content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
+    header = json.loads(content)
+    for view in header.get("bufferViews", ()):
+        if min(view.get("byteOffset", 0), view["byteLength"]) < 0:
+            raise ValueError("a part of a buffer lies before its begin")
+    for number, one in enumerate(header.get("accessors", ())):
+        if "bufferView" not in one or "sparse" in one:
+            raise ValueError(f"accessor {number} is sparse or packed by an extension")
+        length = header["bufferViews"][one["bufferView"]]["byteLength"]
+        if not 0 <= one["count"] <= length or one.get("byteOffset", 0) < 0:
+            raise ValueError(f"accessor {number} has {one['count']} values in {length} bytes")
+
+
 def _check_claims(path: Path, ending: str, content: bytes) -> None:
     """Raises ValueError where a header tells of more triangles than the file can hold, or than a
     mesh may have, before memory is asked for.
     """
     claimed = None
+    if ending in ("gltf", "glb"):
+        with told_as(ValueError, str(path), f"can't be read as {ending}"):
+            _check_gltf(ending, content)
     if ending == "stl" and len(content) >= 84 and not content[:5].lower() == b"solid":
         claimed = int.from_bytes(content[80:84], "little")
     if ending == "ply":
@@ -141,7 +194,7 @@ class _Beside:
 
     def __init__(self, path: Path) -> None:
         self._folder, self.missing = path.absolute().parent, ""
-        self.images = 0  # that were handed out
+        self.images = self.size = 0  # that were handed out, and bytes
 
     def get(self, name: str) -> bytes:
         """Returns a file's content."""
@@ -158,6 +211,12 @@ class _Beside:
                 self.missing = f"names {plain}, which {where}"
             raise FileNotFoundError(f"{plain} {where}")
         self.images += file.suffix.lower() not in (".mtl", ".bin")
+        self.size += file.stat().st_size
+        try:
+            _check_size(f"names {plain}", self.size)
+        except ValueError as error:
+            self.missing = str(error)
+            raise
         return file.read_bytes()
 
     def __getitem__(self, name: str) -> bytes:

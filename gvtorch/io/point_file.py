@@ -11,6 +11,7 @@ import math
 import warnings
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
@@ -19,6 +20,8 @@ import numpy as np
 from ..base.messages import need_library
 from ..base.srgb import from_srgb
 from ..points.points import Points
+from .budget import header_budget
+from .formats.fits import is_packed
 from .resources import amount, memory_free
 from .source import told_as
 
@@ -38,7 +41,9 @@ _PLY_TYPES = {
     **dict.fromkeys(("float", "float32"), "f4"),
     **dict.fromkeys(("double", "float64"), "f8"),
 }
+_FITS_TYPES = tuple("BIJKEDF")  # numbers, one or an array of them a row
 _MOST_HEADER = 65536  # bytes
+_MOST_PACKED = 1032  # bytes that gzip makes of one, at most
 
 
 class ColumnNames(TypedDict, total=False):
@@ -138,14 +143,29 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def _read_fits(path: Path) -> dict[str, np.ndarray]:
+    """Columns of numbers of the first table that has rows; those of lists are left out."""
     fits = need_library(f"{path}: FITS", "astropy.io.fits", "astropy")
+    packed = is_packed(str(path))
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*truncated.*")
-        with path.open("rb") as file, fits.open(file, memmap=True) as units:
-            for unit in units:
-                if isinstance(unit, fits.BinTableHDU | fits.TableHDU) and len(unit.data):
-                    return {name: np.asarray(unit.data[name]) for name in unit.columns.names}
-    raise ValueError("it has no table with rows")
+        with ExitStack() as stack:
+            file = stack.enter_context(path.open("rb"))
+            with header_budget(str(path)):
+                units = stack.enter_context(fits.open(file, memmap=not packed))
+                tables = (u for u in units if isinstance(u, fits.BinTableHDU | fits.TableHDU))
+                table = next((u for u in tables if u.header["NAXIS2"]), None)
+            if table is None:
+                raise ValueError("it has no table with rows")
+            begin, size = int(table.fileinfo()["datLoc"]), path.stat().st_size
+            most = min(size * _MOST_PACKED, memory_free()) if packed else size - begin
+            if table.size > most:
+                raise ValueError(f"its rows take {table.size} bytes, at most {most} can be there")
+            kinds = zip(table.columns.names, table.columns.formats, strict=True)
+            return {
+                name: np.asarray(table.data[name])
+                for name, kind in kinds
+                if kind.lstrip("0123456789")[:1] in _FITS_TYPES
+            }
 
 
 def _read_ply(path: Path) -> dict[str, np.ndarray]:
@@ -159,6 +179,8 @@ def _read_ply(path: Path) -> dict[str, np.ndarray]:
         layout, elements = _ply_header(lines)
         skipped = 0
         for name, count, kinds in elements:
+            if count < 0:
+                raise ValueError(f"it tells of {count} of {name}")
             if name != "vertex":
                 if kinds is None or layout == "ascii":
                     raise ValueError(f"its vertices stand behind {name}")

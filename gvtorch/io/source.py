@@ -301,5 +301,5 @@ def told_as(
         if isinstance(error, (ImportError, FileNotFoundError, *through)):
             raise
         reason = one_line(error)
-        prefix = "" if reason.startswith(path) else f"{path}: {what}: "
+        prefix = "" if reason.startswith(one_line(path)) else f"{path}: {what}: "
         raise kind(prefix + reason) from error

@@ -18,6 +18,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ..base import check
 from ..base.checked import Check, above, kind_of, or_none
+from ..base.whole_file import write_whole
 from .preset_files import paraview_item, read_points
 from .presets import CT_PRESETS, Points, named
 from .shader import ColorTable, Sampling, Shader
@@ -169,7 +170,7 @@ class TransferFunction(Shader):
         """
         if Path(path).suffix != ".json":
             raise ValueError(f"TransferFunction.save: path must end in .json, got {str(path)!r}")
-        Path(path).write_text(self.to_json() + "\n", encoding="utf-8")
+        write_whole(Path(path), self.to_json() + "\n")
 
     def to_json(self) -> str:
         """Returns the text that `from_json` reads."""

@@ -23,7 +23,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from ..base.declared import did_you_mean
-from ..base.messages import one_line
+from ..base.messages import one_line, printable
 from ..io.ngff import is_zarr
 from .bench import Bench
 from .common import Bar, ReadOptions, given, refuse_for_store, volume_formats
@@ -115,7 +115,7 @@ class Convert:
         with self.making.working(speed=True) as work:
             store = convert(self.path, self.store, **common, memory=self.memory, **work)
         if finished:  # --resume had nothing to do
-            print(f"{self.store}: is finished already")
+            print(f"{printable(self.store)}: is finished already")
             return
         print(told_store(self.store, [store], start))
 
@@ -161,7 +161,7 @@ class Filter:
                     progress=bar,
                 )
         added = amount(max(0, store.describe()["disk bytes"] - before))
-        print(f"{self.store}: {added} of colours in {time.perf_counter() - start:.1f} s")
+        print(f"{printable(self.store)}: {added} of colours in {time.perf_counter() - start:.1f} s")
 
 
 def installation() -> dict[str, Any]:
@@ -203,20 +203,21 @@ def _readable(content: dict[str, Any]) -> dict[str, Any]:
 def _print_table(content: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(show_header=False, box=None)
     for name, value in content.items():
         if name == "histogram":
             text = _sparkline(value)
         elif isinstance(value, dict):
-            text = "\n".join(f"{key}: {item}" for key, item in value.items())
+            text = "\n".join(printable(f"{key}: {item}") for key, item in value.items())
         elif isinstance(value, (list, tuple)):
             text = ", ".join(
-                f"{item:g}" if isinstance(item, float) else str(item) for item in value
+                f"{item:g}" if isinstance(item, float) else printable(item) for item in value
             )
         else:
-            text = f"{value:g}" if isinstance(value, float) else str(value)
-        table.add_row(f"[bold]{name}[/bold]", text.replace("[", "\\["))
+            text = f"{value:g}" if isinstance(value, float) else printable(value)
+        table.add_row(Text(name, "bold"), Text(text))
     Console().print(table)
 
 
@@ -308,7 +309,7 @@ def _run(args: list[str] | None) -> None:
             print(f"gvtorch: error: {_told(said.getvalue())}", file=sys.stderr)
         raise
     warnings.showwarning = lambda message, *_rest, **_more: print(
-        f"gvtorch: {message}", file=sys.stderr
+        f"gvtorch: {one_line(message)}", file=sys.stderr
     )
     try:
         command.run()
@@ -327,7 +328,7 @@ def _run(args: list[str] | None) -> None:
         sys.exit(2)
     except KeyboardInterrupt as stop:
         if str(stop):
-            print(f"gvtorch: {stop}", file=sys.stderr)
+            print(f"gvtorch: {printable(stop)}", file=sys.stderr)
         sys.exit(130)
 
 

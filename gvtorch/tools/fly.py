@@ -15,6 +15,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from ..base.declared import declared_names
+from ..base.messages import printable
 from ..io.ngff import is_zarr
 from .common import Bar, given, size, volume_formats
 from .drawn import Drawn
@@ -109,7 +110,7 @@ class Fly:
         if self.poses is not None:
             write_cameras(self.poses, kept.cameras)
         missing = f", {kept.coarse} of them are not complete" if kept.coarse else ""
-        print(f"{self.output}: {frames} pictures{missing}")
+        print(f"{printable(self.output)}: {frames} pictures{missing}")
 
     def _check_output(self, options: dict[str, Any]) -> None:
         """Raises what is wrong with the film or folder before the volume is read."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import arg
 
+from ..base.messages import printable
 from .common import Bar
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def told_store(output: Path, stores: list[Store], start: float) -> str:
     size = amount(sum(one.describe()["disk bytes"] for one in stores))
     extent = "x".join(str(n) for n in first.extent)
     times = f" at {first.times} times" if first.times > 1 else ""
-    return f"{output}: {extent}{times}, {first.levels} levels, {size} in {seconds:.1f} s"
+    return f"{printable(output)}: {extent}{times}, {first.levels} levels, {size} in {seconds:.1f} s"
 
 
 @contextlib.contextmanager

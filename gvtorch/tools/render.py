@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from tyro.conf import Positional, arg
 
+from ..base.messages import printable
+from ..base.whole_file import write_whole
 from .common import Bar, given, size, volume_formats
 from .drawn import Drawn
 from .image import KINDS, STRIPS, Develop, in_strips
@@ -72,8 +74,8 @@ class Render:
                 stats = self._take_saved(opened, now, width, height, bar)
         if self.stats is not None:
             content = {**stats.as_dict(), "extent": opened.extent}
-            self.stats.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-        print(f"{self.output}: {width}x{height}, {told(stats)}")
+            write_whole(self.stats, json.dumps(content, indent=2) + "\n")
+        print(f"{printable(self.output)}: {width}x{height}, {told(stats)}")
 
     def _at_saved_time(self) -> SceneFlags:
         """The flags of the scene, of the time point that a saved state tells."""

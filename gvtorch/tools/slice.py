@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg
 
+from ..base.messages import printable
 from .colors import chosen_transfer, parse_window
 from .common import Bar, ReadOptions, open_data, volume_formats
 from .image import KINDS
@@ -85,4 +86,4 @@ class Slice:
         picture.save(self.output, bits=self.bits)
         names = [view.name for axis, view in views.items() if self.axis in (axis, "all")]
         shown = f", {' and '.join(names)}: right is on the left" if names else ""
-        print(f"{self.output}: {width}x{height}{shown}")
+        print(f"{printable(self.output)}: {width}x{height}{shown}")

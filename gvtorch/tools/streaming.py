@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import arg
 
+from ..base.messages import one_line
 from .look import Look
 
 if TYPE_CHECKING:
@@ -139,6 +140,6 @@ def _shortfall(stats: FrameStats) -> str:
 
 def tell_failures(engine: Engine) -> None:
     for failure in engine.failures[:3]:
-        print(f"gvtorch: {failure}", file=sys.stderr)
+        print(f"gvtorch: {one_line(failure)}", file=sys.stderr)
     if len(engine.failures) > 3:
         print(f"gvtorch: {len(engine.production.failures)} nodes failed in all", file=sys.stderr)

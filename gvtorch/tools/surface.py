@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, arg
 
+from ..base.messages import printable
 from .common import Bar, ReadOptions, open_data, volume_formats
 
 
@@ -53,4 +54,4 @@ class Surface:
             )
         seconds, written = time.perf_counter() - start, amount(self.output.stat().st_size)
         counts = f"{size.triangles} triangles, {size.vertices} vertices"
-        print(f"{self.output}: {counts}, {written} in {seconds:.1f} s")
+        print(f"{printable(self.output)}: {counts}, {written} in {seconds:.1f} s")

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.smooth import Smooth
+from ..base.whole_file import write_whole
 from ..cameras import Camera
 from ..cameras.motion import Motion
 from .state import Eye, ViewState
@@ -114,7 +115,7 @@ class Flight:
         if Path(path).suffix != ".json":
             raise ValueError(f"Flight: path must end in .json, got {str(path)!r}")
         content = [{"time": time, "state": state.to_json()} for time, state in self.keys]
-        Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        write_whole(Path(path), json.dumps(content, indent=1) + "\n")
 
     @property
     def seconds(self) -> float:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.whole_file import write_whole
 from ..cameras import Camera
 from ..cameras.models import MODELS, CameraModel, model_of
 from ..engine import Engine
@@ -234,7 +235,7 @@ class ViewState:
         if Path(path).suffix != ".json":
             raise ValueError(f"state: path must end in .json, got {str(path)!r}")
         text = json.dumps(self.to_json(), indent=1)
-        Path(path).write_text(text + "\n", encoding="utf-8")
+        write_whole(Path(path), text + "\n")
 
     def read(self, path: str | Path) -> ViewState:
         """Returns the state with what a .json file tells in place of its own.

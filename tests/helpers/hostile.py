@@ -70,6 +70,18 @@ def fits(cards: Sequence[str], data: bytes = b"") -> bytes:
     return head.ljust(-(-len(head) // 2880) * 2880) + data
 
 
+def png(width: int, height: int) -> bytes:
+    """A black picture of any size, of bytes that tell as little of it."""
+
+    def part(kind: bytes, content: bytes) -> bytes:
+        check = zlib.crc32(kind + content).to_bytes(4, "big")
+        return len(content).to_bytes(4, "big") + kind + content + check
+
+    size = width.to_bytes(4, "big") + height.to_bytes(4, "big") + b"\x08\0\0\0\0"
+    pixels = zlib.compress(bytes((width + 1) * height), 1)
+    return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", size) + part(b"IDAT", pixels) + part(b"IEND", b"")
+
+
 def zeros(megabytes: int) -> bytes:
     """So many zeros as one stream of gzip, a thousandth as long; it has no end."""
     engine = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,12 +19,15 @@ import numpy as np
 from ...base.image_info import ChannelInfo, ImageInfo
 from ...base.named_axes import ask_axes, even_steps, letter_of, named_axes, place_named
 from ...base.units import spacing_of
+from ..budget import check_regular
 from ..source import Index, VolumeSource
 from .format import Format
 
 _ENDINGS = (".h5", ".hdf5", ".hdf", ".he5", ".h5ad", ".ilp", ".nc", ".nc4", ".cdf")
 _MOST_CHUNK = 1 << 31  # bytes
 _MOST_SETS = 100_000
+_MOST_LINKS = 16  # that lead one to another
+_MOST_PLACES = 1 << 24  # along an axis
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +62,10 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
 
     _check_kind(path)
     with h5py.File(path, "r") as file:
+        if key is not None:
+            _check_files(path, file, key)
         name = _choose(path, file, key)
+        _check_files(path, file, name)
         data = file[name]
         _check(path, name, data)
         shape = tuple(int(n) for n in data.shape)
@@ -90,6 +97,50 @@ def _check_kind(path: str) -> None:
                 f"{path}: is a NetCDF file of the classic kind; nccopy -k nc4 {path} NEW.nc makes "
                 "one of NetCDF 4, which can be read"
             )
+
+
+def _check_files(path: str, file: Any, name: str, left: int = _MOST_LINKS) -> None:
+    """Raises ValueError where what `name` leads to is kept in a file that is no regular one, which
+    may never end, or that lies elsewhere: links, virtual and external data sets name others.
+    """
+    import h5py
+
+    if not left:
+        raise ValueError(f"{path}: {name} leads through more than {_MOST_LINKS} links")
+    at = file["/"] if name.startswith("/") else file
+    for part in name.split("/"):
+        link = at.get(part, getlink=True) if part not in ("", ".") else None
+        if isinstance(link, h5py.ExternalLink):
+            _check_other(path, link.filename, link.path, left)
+        elif isinstance(link, h5py.SoftLink):
+            _check_files(path, at, link.path, left - 1)
+        at = at.get(part) if link is not None else at
+        if not isinstance(at, h5py.Group):
+            break
+    if isinstance(at, h5py.Dataset):
+        for other, *_ in at.external or ():
+            _check_other(path, other, None, left)
+        for source in at.virtual_sources() if at.is_virtual else ():
+            if source.file_name != ".":
+                _check_other(path, source.file_name, source.dset_name, left)
+
+
+def _check_other(path: str, other: str, name: str | None, left: int) -> None:
+    """Checks a file that is named, and what it names in turn. It lies beside the one that names it,
+    or below: HDF5 looks in its folder, or in that of the process.
+    """
+    import h5py
+
+    folder = os.path.realpath(os.path.dirname(path))
+    for place in {os.path.join(folder, other), os.path.abspath(other)}:
+        if not os.path.lexists(place):
+            continue
+        if os.path.commonpath([folder, os.path.realpath(place)]) != folder:
+            raise ValueError(f"{path}: names {other}, which lies in another folder")
+        check_regular(place)
+        if name is not None:
+            with h5py.File(place, "r") as file:
+                _check_files(place, file, name, left - 1)
 
 
 def _choose(path: str, file: Any, key: str | None) -> str:
@@ -159,6 +210,10 @@ def _axes(
         names[at] = kind if letter_of(kind) != "?" else names[at]
         units[at] = _text(told.get("units")) or None
         if _text(told.get("NAME")).startswith("This is a netCDF dimension but not"):
+            continue
+        if scale is not None:
+            _check_files(where, scale.file, scale.name or "/")
+        if shape[at] > _MOST_PLACES:
             continue
         if scale is not None and scale.shape == shape[at : at + 1] and scale.dtype.kind in "iuf":
             steps[at], even = even_steps(scale[()])
