@@ -2,7 +2,6 @@
 edges of the box, which voxels and ball hide. On an NVIDIA GPU no picture passes through the host.
 """
 
-import itertools
 import math
 import sys
 from dataclasses import replace
@@ -11,6 +10,7 @@ from pathlib import Path
 import torch
 import tyro
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 import gvtorch as gv
 
@@ -43,9 +43,9 @@ def ball() -> Tensor:
 
 def edges(box: Tensor) -> Tensor:
     """(24, 6) place and colour of the ends of the 12 edges of a (2, 3) box."""
-    corners = torch.tensor(list(itertools.product((0, 1), repeat=3)))
-    pairs = [(i, j) for i, j in itertools.combinations(range(8), 2) if (i ^ j) in (1, 2, 4)]
-    places = box[corners[torch.tensor(pairs).flatten()], torch.arange(3)].float()
+    pairs = torch.tensor([(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit])
+    axes = torch.arange(3)
+    places = box[pairs.flatten()[:, None] >> axes & 1, axes].float()
     return torch.cat((places, GOLD.expand_as(places)), 1)
 
 
@@ -56,7 +56,10 @@ def main(output: Path = Path("opengl_frame.png"), size: int = 720, device: str =
     projection, modelview = gv.opengl.matrices(camera, near=100, far=1000)
     tree = gv.N3Tree.from_volume(gv.read_volume(SCAN), device=device)
     shader = gv.Lit(gv.TransferFunction.from_json(SCAN.with_name("stent.json")), ambient=0.3)
-    context = moderngl.create_context(standalone=True, backend="egl")
+    try:
+        context = moderngl.create_context(standalone=True, backend="egl")
+    except Exception as error:
+        sys.exit(f"opengl_frame needs OpenGL: a GPU's driver with EGL, or Mesa's ({error})")
     image = context.texture((width, height), 4, dtype="f4")  # linear light
     frame = context.framebuffer(image, context.depth_renderbuffer((width, height)))
     program = context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
@@ -74,13 +77,11 @@ def main(output: Path = Path("opengl_frame.png"), size: int = 720, device: str =
     with gv.opengl.Exchange(width, height, device) as exchange:
         drawn, depth = exchange.read_color()[..., :3], exchange.read_depth()
         layer = gv.Layer(drawn, gv.opengl.ray_distance(depth, projection))
-        behind = gv.Backdrop(drawn)  # OpenGL's, also where it drew nothing
-        picture = gv.render(tree, camera, shader, layer=layer, background=behind)
+        picture = gv.render(tree, camera, shader, layer=layer, background=drawn)
         exchange.draw(picture.color, gv.opengl.window_depth(picture.nearest, projection))
         draw(edges(tree.box), moderngl.LINES)
         whole = exchange.read_color()[..., :3].movedim(-1, 0)
-    smooth = torch.nn.functional.avg_pool2d(whole, 2).movedim(0, -1)
-    replace(picture, color=smooth).save(output)
+    replace(picture, color=avg_pool2d(whole, 2).movedim(0, -1)).save(output)
     print(f"{output}: {exchange}")
 
 
