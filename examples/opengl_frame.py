@@ -2,7 +2,6 @@
 edges of the box, which voxels and ball hide. On an NVIDIA GPU no picture passes through the host.
 """
 
-import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +22,7 @@ SCAN = Path(__file__).parent / "data" / "stent_256x128x128_int16.npz"
 EYE, TARGET, UP = (-170.0, -290.0, 30.0), (62.0, 62.0, 128.0), (1.0, 0.3, 0.0)  # it lies
 BALL, RADIUS, TEAL, SIDES = (82.0, 46.0, 130.0), 30.0, (0.05, 0.55, 0.4), 192
 SUN, GOLD, NIGHT = torch.tensor([(0.6, -0.7, -0.3), (0.9, 0.5, 0.1), (0.01, 0.013, 0.022)])
+EDGES = torch.tensor([(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit])
 VERTEX = """#version 330
 uniform mat4 camera; in vec3 place, color; out vec3 tint;
 void main() { tint = color; gl_Position = camera * vec4(place, 1); }"""
@@ -33,20 +33,11 @@ void main() { result = vec4(tint, 1); }"""
 
 def ball() -> Tensor:
     """(k, 6) place and colour of a strip of triangles that winds from pole to pole."""
-    turn = torch.arange(-SIDES, SIDES**2 + 1)
-    turn = torch.stack((turn, turn + SIDES), 1).flatten() / SIDES
-    u, v = 2 * math.pi * turn, math.pi * (turn / SIDES).clamp(0, 1)
+    turn = (torch.arange(-SIDES, SIDES**2 + 1)[:, None] / SIDES + torch.arange(2)).flatten()
+    u, v = 2 * torch.pi * turn, torch.pi * (turn / SIDES).clamp(0, 1)
     normals = torch.stack((v.sin() * u.cos(), v.sin() * u.sin(), v.cos()), 1)
     light = 0.25 + 0.75 * (normals @ SUN).clamp(min=0)[:, None]
     return torch.cat((torch.tensor(BALL) + RADIUS * normals, light * torch.tensor(TEAL)), 1)
-
-
-def edges(box: Tensor) -> Tensor:
-    """(24, 6) place and colour of the ends of the 12 edges of a (2, 3) box."""
-    pairs = torch.tensor([(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit])
-    axes = torch.arange(3)
-    places = box[pairs.flatten()[:, None] >> axes & 1, axes].float()
-    return torch.cat((places, GOLD.expand_as(places)), 1)
 
 
 def main(output: Path = Path("opengl_frame.png"), size: int = 720, device: str = "cpu") -> None:
@@ -60,8 +51,7 @@ def main(output: Path = Path("opengl_frame.png"), size: int = 720, device: str =
         context = moderngl.create_context(standalone=True, backend="egl")
     except Exception as error:
         sys.exit(f"opengl_frame needs OpenGL: a GPU's driver with EGL, or Mesa's ({error})")
-    image = context.texture((width, height), 4, dtype="f4")  # linear light
-    frame = context.framebuffer(image, context.depth_renderbuffer((width, height)))
+    frame = context.simple_framebuffer((width, height), dtype="f4")  # linear light
     program = context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
     program["camera"].write((projection @ modelview).mT.float().contiguous().numpy())
 
@@ -79,7 +69,8 @@ def main(output: Path = Path("opengl_frame.png"), size: int = 720, device: str =
         layer = gv.Layer(drawn, gv.opengl.ray_distance(depth, projection))
         picture = gv.render(tree, camera, shader, layer=layer, background=drawn)
         exchange.draw(picture.color, gv.opengl.window_depth(picture.nearest, projection))
-        draw(edges(tree.box), moderngl.LINES)
+        places = tree.box[EDGES.flatten()[:, None] >> torch.arange(3) & 1, torch.arange(3)].float()
+        draw(torch.cat((places, GOLD.expand_as(places)), 1), moderngl.LINES)
         whole = exchange.read_color()[..., :3].movedim(-1, 0)
     replace(picture, color=avg_pool2d(whole, 2).movedim(0, -1)).save(output)
     print(f"{output}: {exchange}")
