@@ -4,6 +4,7 @@ The first two look at the stent from outside, the other two from between its wir
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -12,8 +13,8 @@ import tyro
 import gvtorch as gv
 
 DATA = Path(__file__).parent / "data"
-SKY = gv.Gradient((0.10, 0.14, 0.22), (0.01, 0.01, 0.015))
-OUTSIDE, AXIS = (-260.0, -340.0, 190.0), (63.5, 63.5, 127.5)
+SKY = gv.Gradient((0.06, 0.09, 0.15), (0.008, 0.008, 0.012))
+OUTSIDE, AXIS = (-140.0, -190.0, 250.0), (66.0, 60.0, 132.0)
 INSIDE, AHEAD, UP = (63.0, 62.0, 96.0), (63.0, 50.0, 150.0), (0.0, 0.0, 1.0)
 
 
@@ -22,31 +23,32 @@ class Settings:
     """Renders the bundled stent with four camera models."""
 
     output: Path = Path("cameras.png")
-    size: int = 250
+    size: int = 720
+    samples: int = 3
     device: str = "cpu"
 
 
 def main(settings: Settings) -> None:
-    """Renders all at the same height, side by side."""
+    """Pinhole; beside it an orthographic camera and a fisheye, above a panorama."""
     tree = gv.N3Tree.from_volume(
         gv.read_volume(DATA / "stent_256x128x128_int16.npz"), device=settings.device
     )
     shader = gv.TransferFunction.from_json(DATA / "stent.json")
-    size = settings.size
+    high, low = settings.size, settings.size * 4 // 9  # a panorama is twice as wide as high
+    rest = high - low
     views = [
-        gv.Camera.look_at(OUTSIDE, AXIS, UP, 32, size * 2 // 3, size),
-        gv.Camera.look_at(OUTSIDE, AXIS, UP, 32, size * 2 // 3, size, "ortho"),
-        gv.Camera.look_at(INSIDE, AHEAD, (0, 1, 0), 180, size, size, "fisheye"),
-        gv.Camera.look_at(INSIDE, AHEAD, (0, 1, 0), 180, size * 2, size, "panorama"),
+        gv.Camera.look_at(OUTSIDE, AXIS, UP, 42, 2 * low, high),
+        gv.Camera.look_at(OUTSIDE, AXIS, UP, 48, 2 * low - rest, rest, "ortho"),
+        gv.Camera.look_at(INSIDE, AHEAD, (0, 1, 0), 180, rest, rest, "fisheye"),
+        gv.Camera.look_at(INSIDE, AHEAD, (0, 1, 0), 180, 2 * low, low, "panorama"),
     ]
-    pictures = [gv.render(tree, view, shader, background=SKY) for view in views]
+    render = partial(gv.render, tree, shader=gv.Lit(shader), background=SKY)
+    pictures = [gv.Progressive(render).refine(view, settings.samples) for view in views]
     for view, picture in zip(views, pictures, strict=True):
         print(f"{view.model:9s} {picture.stats.samples:9d} samples")
-    whole = {
-        name: torch.cat([getattr(picture, name) for picture in pictures], 1)
-        for name in ("color", "alpha", "depth", "samples")
-    }
-    replace(pictures[0], **whole).save(settings.output)
+    pinhole, ortho, fisheye, panorama = (picture.color for picture in pictures)
+    right = torch.cat([torch.cat([ortho, fisheye], 1), panorama])
+    replace(pictures[0], color=torch.cat([pinhole, right], 1)).save(settings.output)
     print(settings.output)
 
 

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import torch
 import tyro
-from torch.nn.functional import interpolate
 
 import gvtorch as gv
 
-EXTENT = (64, 96, 160)  # z, y, x; y is up
-PUFFS = ((0.3, 0.35, 0.5, 0.42), (0.55, 0.5, 0.5, 0.55), (0.75, 0.35, 0.45, 0.38))  # x y z radius
-SUN = gv.DirectionalLight((0.8, -0.8, -0.45), (1.4, 1.2, 0.9), angle=4.0)
-SKY = gv.Gradient((0.08, 0.2, 0.5), (0.45, 0.55, 0.7))
+PUFFS = ((-0.35, -0.5, 0.0, 0.48), (0.38, -0.55, 0.15, 0.42), (0.05, -0.1, -0.05, 0.55),
+         (-0.15, 0.4, 0.05, 0.42), (0.15, 0.7, 0.0, 0.3))  # fmt: skip
+SUN = gv.DirectionalLight((0.8, -0.6, -0.35), (0.9, 0.75, 0.55), angle=10.0)
+SKY = gv.Gradient((0.03, 0.1, 0.32), (0.36, 0.46, 0.6))
 
 
 @dataclass
@@ -22,42 +21,39 @@ class Settings:
     """Renders the cloud twice."""
 
     output: Path = Path("clouds.png")
-    size: int = 300
+    size: int = 720
+    voxels: int = 192
     device: str = "cpu"
 
 
-def cloud() -> torch.Tensor:
-    """(z, y, x) density: round puffs, roughened by noise of five octaves."""
-    random = torch.Generator().manual_seed(4)
-    noise = torch.zeros((1, 1, *EXTENT))
-    for octave in range(5):
-        grid = [max(2, n * 2**octave // 24) for n in EXTENT]
-        points = torch.rand((1, 1, *grid), generator=random) - 0.5
-        noise += interpolate(points, EXTENT, mode="trilinear", align_corners=True) / 1.7**octave
-    axes = (torch.linspace(0, n / EXTENT[1], n) for n in EXTENT)
+def cloud(voxels: int) -> gv.Volume:
+    """Density of round puffs that noise makes rough, flat below."""
+    step = 2.4 / voxels
+    axes = [torch.arange(-half, half, step) for half in (0.8, 1.2, 1.0)]
     z, y, x = torch.meshgrid(*axes, indexing="ij")
-    wide, deep = EXTENT[2] / EXTENT[1], EXTENT[0] / EXTENT[1]
-    shape = torch.full(EXTENT, -1.0)
-    for cx, cy, cz, radius in PUFFS:
-        away = ((x - cx * wide) ** 2 + ((y - cy) * 1.3) ** 2 + (z - cz * deep) ** 2).sqrt()
-        shape = torch.maximum(shape, 1 - away / radius)
-    return (shape + 0.9 * noise[0, 0]).clamp(0, 1)
+    away = [
+        ((x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2).sqrt() / radius
+        for px, py, pz, radius in PUFFS
+    ]
+    shape = torch.minimum(1 - torch.stack(away).amin(0), 4 * (y + 0.85))
+    rough = gv.noise.fbm(3.5 * torch.stack((x, y, z), -1), octaves=5, gain=0.55, seed=5)
+    return gv.Volume((2 * (shape + 0.62 * rough)).clamp(0, 1), (step,) * 3)
 
 
 def main(settings: Settings) -> None:
     """Renders both pictures."""
-    density = cloud()
+    density = cloud(settings.voxels)
     # Normals of length 0: droplets scatter light to all sides.
-    none = torch.zeros((*density.shape, 3), dtype=torch.int8)
-    channels = {"density": gv.Volume(density), "none": gv.Volume(none)}
+    none = torch.zeros((*density.data.shape[:3], 3), dtype=torch.int8)
+    channels = {"density": density, "none": gv.Volume(none, density.spacing)}
     tree = gv.N3Tree.from_volume(channels, device=settings.device)
-    white = gv.TransferFunction.from_points([(0.02, 0), (0.5, 0.22)], [(0, 1, 1, 1)])
-    camera = gv.Camera.orbit(
-        10, -4, 1.35, fov=42, width=settings.size * 4 // 3, height=settings.size
-    )
-    look = {"normals": "none", "light": SUN, "ambient": 0.12, "diffuse": 1.0, "specular": 0.0}
+    opacity = [(0.02, 0), (1, 0.3)]
+    white = gv.TransferFunction.from_points(opacity, [(0, 1, 1, 1)], reference=0.02)
+    width = -(-settings.size * 8 // 9)  # a half of 16:9
+    camera = gv.Camera.orbit(10, -4, 1.4, fov=40, width=width, height=settings.size)
+    look = {"normals": "none", "light": SUN, "ambient": 0.3, "diffuse": 1.0, "specular": 0.0}
     pictures = [
-        gv.render(tree, camera, gv.Lit(white, shadows=shadows, **look), background=SKY)
+        gv.render(tree, camera, gv.Lit(white, shadows=shadows, **look), background=SKY, step=2)
         for shadows in (False, True)
     ]
     both = torch.cat([picture.color for picture in pictures], dim=1)

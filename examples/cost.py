@@ -3,6 +3,7 @@ bricks it saw, after a camera has turned around a streamed scan."""
 
 import dataclasses
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -20,22 +21,24 @@ class Settings:
     """Renders the bundled aneurism: the picture, samples and nodes; level, age and fill."""
 
     output: Path = Path("cost.png")
-    size: int = 200
+    size: int = 720
     device: str = "cpu"
 
 
 def main(settings: Settings) -> None:
     """Turns the camera, then draws the cost of the last frame."""
     volume = gv.read_volume(SCAN)
+    size = -(-settings.size * 16 // 27), settings.size // 2  # a third and a half of 16:9
     shader = gv.TransferFunction.preset("vessels", *volume.value_range)
     options = {"brick_pool": "32 MB", "load_budget": 400, "device": settings.device}
     with gv.Engine(gv.VolumeProducer(volume), **options) as engine:
         for frame in range(FRAMES):
             azimuth = 30 + DEGREES * frame
-            camera = gv.Camera.orbit(azimuth, 20, 0.75, 60, settings.size, settings.size)
-            picture, _ = engine.frame(camera, shader)
+            camera = gv.Camera.orbit(azimuth, 20, 1.15, 36, *size)
+            engine.frame(camera, shader)
         tree = engine.trees["scene"].tree
         cost = gv.cost(tree, camera, shader)
+        picture = gv.Progressive(partial(gv.render, tree, shader=shader)).refine(camera, 4)
     for name in IMAGES:
         image = getattr(cost, name).float()
         seen = image[~image.isnan()]

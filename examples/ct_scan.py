@@ -1,6 +1,7 @@
 """A CT scan from file to picture: read it, build the tree, render."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import tyro
@@ -8,12 +9,8 @@ import tyro
 import gvtorch as gv
 
 DATA = Path(__file__).parent / "data"
-EYE, TARGET, UP = (
-    (-260.0, -340.0, 190.0),
-    (63.5, 63.5, 127.5),
-    (0.0, 0.0, 1.0),
-)  # z is along the body
-BACKGROUND = (0.02, 0.02, 0.03)
+EYE, TARGET, UP = (-150.0, -200.0, 215.0), (58.0, 60.0, 150.0), (0.0, 0.0, 1.0)  # z: along the body
+SKY = gv.Gradient((0.035, 0.05, 0.085), (0.006, 0.007, 0.011))
 
 
 @dataclass
@@ -21,22 +18,23 @@ class Settings:
     """Renders the bundled stent."""
 
     output: Path = Path("ct_scan.png")
-    size: int = 512
+    size: int = 720
+    samples: int = 4
     device: str = "cpu"
 
 
 def main(settings: Settings) -> None:
-    """Renders one picture."""
+    """Renders one picture, with some rays a pixel."""
     volume = gv.read_volume(DATA / "stent_256x128x128_int16.npz")
     tree = gv.N3Tree.from_volume(volume, brick_size=8, device=settings.device)
     print(tree)
-    camera = gv.Camera.look_at(EYE, TARGET, UP, fov=30, width=settings.size, height=settings.size)
-    shader = gv.TransferFunction.from_json(DATA / "stent.json")
-    picture = gv.render(tree, camera, shader, background=BACKGROUND)
+    camera = gv.Camera.look_at(EYE, TARGET, UP, 25, settings.size * 16 // 9, settings.size)
+    look = gv.Lit(gv.TransferFunction.from_json(DATA / "stent.json"), ambient=0.3)
+    render = partial(gv.render, tree, shader=look, background=SKY)
+    picture = gv.Progressive(render).refine(camera, settings.samples)
     picture.save(settings.output)
-    print(
-        f"{settings.output}: {picture.stats.milliseconds:.0f} ms, {picture.stats.samples} samples"
-    )
+    stats = picture.stats
+    print(f"{settings.output}: {stats.milliseconds:.0f} ms, {stats.samples} samples")
 
 
 if __name__ == "__main__":

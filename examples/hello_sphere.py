@@ -1,6 +1,6 @@
-"""A sphere that is computed, not stored: a formula of your own, and its picture.
+"""A planet that is computed, not stored: a formula of your own, and its picture.
 
-65,536^3 voxels would take 1,100 TB; the picture needs a few MB of them.
+65,536^3 voxels would take 1,100 TB; the picture needs some 100 MB of them.
 """
 
 import torch
@@ -9,27 +9,32 @@ import tyro
 import gvtorch as gv
 
 BOX = ((-1, -1, -1), (1, 1, 1))
-BANDS = torch.tensor([6.0, 28.0, 4.0])
+SUN = gv.DirectionalLight((-0.9, -0.4, -0.8), (1.25, 1.15, 1.0))
+LOOK = {"premultiplied": True, "normals": "normal", "ambient": 0.003, "diffuse": 1, "specular": 0}
+EARTH, SAND, CREAM = torch.tensor([(0.3, 0.08, 0.03), (0.85, 0.5, 0.24), (0.95, 0.9, 0.8)])
+NIGHT = gv.Gradient((0.001, 0.001, 0.002), (0.003, 0.005, 0.012))
 
 
 class Bands(torch.nn.Module):
-    """Density 0.4 to 1, in bands."""
+    """Linear red, green and blue: bands that a noise bends."""
 
     def forward(self, points):
-        return 0.7 + 0.3 * (points * BANDS.to(points)).sum(-1).sin()
+        bend = gv.noise.fbm(gv.noise.warp(points * points.new_tensor([1.4, 4.2, 1.4])))
+        y = (points[..., 1] + 0.06 * bend)[..., None]
+        dark, light = 0.5 + 0.5 * (34 * y + 1).sin(), 0.5 + 0.5 * (11 * y + 1).cos()
+        return SAND.to(y).lerp(EARTH.to(y), dark**2).lerp(CREAM.to(y), light**2)
 
 
-def main(output: str = "hello_sphere.png", device: str = "cpu", size: int = 400) -> None:
-    """Renders the sphere."""
-    inside = gv.Solid(gv.sdf.Sphere(0.9), colors=False)
-    sphere = gv.FieldProducer(gv.mask(Bands(), inside), 65536, box=BOX, threshold=0)
-    engine = gv.Engine(sphere, device=device)
-    look = gv.TransferFunction.from_points(
-        [(0, 0), (0.4, 0.9)], [(0.4, 0.1, 0.2, 0.7), (1, 1, 0.8, 0.4)], reference=0.06
-    )
-    picture = engine.render(gv.Camera.orbit(distance=2, width=size, height=size), look)
-    picture.save(output)
-    print(f"{output}: {picture.stats.frames} frames, {picture.stats.bricks_used} bricks")
+def main(output: str = "hello_sphere.png", device: str = "cpu", size: int = 720) -> None:
+    """Renders the planet, with three rays a pixel."""
+    planet = gv.Painted(gv.sdf.Sphere(0.99), Bands())
+    producer = gv.FieldProducer(gv.Solid(planet), 65536, box=BOX)
+    engine = gv.Engine(producer, device=device, load_budget=4096)
+    look = gv.StoredColor("rgba", light=SUN, **LOOK)
+    camera = gv.Camera.look_at((0, 0.5, 3.2), (0.1, 0, 0), (-0.4, 1, 0), 38, size * 16 // 9, size)
+    mean = gv.Progressive(lambda view: engine.render(view, look, cone_scale=2, background=NIGHT))
+    mean.refine(camera, 3).save(output)
+    print(f"{output}: {engine}")
 
 
 tyro.cli(main)

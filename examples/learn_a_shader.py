@@ -8,11 +8,13 @@ from pathlib import Path
 
 import torch
 import tyro
+from torch.nn.functional import mse_loss
 
 import gvtorch as gv
 
 SCAN = Path(__file__).parent / "data" / "aneurism_256x256x256_uint8.raw.gz"
-ROWS, STEPS, RATE = 24, 60, 0.2
+ROWS, RATE, SHOWN = 24, 0.2, (5, 9, 15, 30, 120)  # a picture is made after so many steps
+SKY = gv.Gradient((0.002, 0.003, 0.006), (0.012, 0.016, 0.028))
 
 
 class Learned(torch.nn.Module):
@@ -27,53 +29,51 @@ class Learned(torch.nn.Module):
         place = (values / 255 * (ROWS - 1)).clamp(0, ROWS - 1)
         row = place.long().clamp(max=ROWS - 2)[:, 0]
         look = self.rows[row] + (place - row[:, None]) * (self.rows[row + 1] - self.rows[row])
-        extinction = torch.exp(look[:, 3:])
-        return look[:, :3].sigmoid(), 1 - torch.exp(-extinction * lengths)
+        return look[:, :3].sigmoid(), 1 - torch.exp(-look[:, 3:].exp() * lengths)
 
-
-def shown(color: torch.Tensor) -> torch.Tensor:
-    """Roughly display-encoded light, so that differences in the dark count."""
-    return (color + 1e-4).sqrt()
+    def transfer(self) -> gv.TransferFunction:
+        """What it has learned, for the compiled kernel."""
+        values = torch.linspace(0, 255, 256)[:, None]
+        color, opacity = (x.detach().cpu() for x in self(values.to(self.rows), None, None, 1.0))
+        points = [torch.cat((values, part), 1).tolist() for part in (opacity, color)]
+        return gv.TransferFunction.from_points(*points)
 
 
 @dataclass
 class Settings:
-    """Learns from views of the bundled aneurism; shows before, after and target of a new one."""
+    """Learns from views of the bundled aneurism; shows a new one as it is learned, and the aim."""
 
     output: Path = Path("learn_a_shader.png")
-    size: int = 160
+    size: int = 720
     device: str = "cpu"
 
 
 def main(settings: Settings) -> None:
-    """Learns, then renders a view that was not learned from."""
+    """Learns, and renders a view that is not learned from."""
     tree = gv.N3Tree.from_volume(gv.read_volume(SCAN), device=settings.device)
-    target = gv.TransferFunction.preset("vessels", 0, 255)
-    module = Learned().to(tree.device)
-    shader = gv.ModuleShader(module)
-    small = max(8, settings.size // 5)
+    target, module = gv.TransferFunction.preset("vessels", 0, 255), Learned().to(tree.device)
+    small = max(8, settings.size // 22)
     views = gv.Camera.orbit([0, 75, 150, 225], [10, -20, 30, -5], 1.6, 30, small, small)
-    pictures = [gv.render(tree, views[i], target, step=1.0).color for i in range(len(views))]
+    goals = gv.render(tree, views, target, step=1.0).color
     optimizer = torch.optim.Adam(module.parameters(), lr=RATE)
-    new = gv.Camera.orbit(40, 15, 1.5, 30, settings.size, settings.size)
-    look = torch.no_grad()(partial(gv.render, tree, new, shader))
-    before, losses = look(), []
-    for step in range(STEPS):
-        at = step % len(views)
+    new = gv.Camera.orbit(40, 15, 1.2, 30, -(-settings.size * 16 // 27), settings.size // 2)
+    pictures, render = [], partial(gv.render, tree, background=SKY)
+    for step in range(SHOWN[-1] + 1):
+        if step in SHOWN:
+            mean = gv.Progressive(partial(render, shader=module.transfer()))
+            pictures.append(mean.refine(new, 4))
+        at, shader = step % len(views), gv.ModuleShader(module)
         color = gv.render(tree, views[at], shader, step=1.0).color
-        loss = (shown(color) - shown(pictures[at])).square().mean()
+        loss = mse_loss((color + 1e-4).sqrt(), (goals[at] + 1e-4).sqrt())  # as displays show it
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        losses.append(float(loss.detach()))
-    first, last = sum(losses[: len(views)]), sum(losses[-len(views) :])
-    print(f"loss {first:.5f} -> {last:.5f}: {first / last:.0f} times less")
-    after, aim = look(), gv.render(tree, new, target)
-    error = float((after.color - aim.color).square().mean())
+    aim = gv.Progressive(partial(render, shader=target)).refine(new, 4)
+    error = float((pictures[-1].color - aim.color).square().mean())
     print(f"{settings.output}: a new view, PSNR {-10 * math.log10(error):.1f} dB")
-    replace(aim, color=torch.cat([one.color.cpu() for one in (before, after, aim)], 1)).save(
-        settings.output
-    )
+    tiles = [picture.color for picture in (*pictures, aim)]
+    rows = [torch.cat(tiles[first : first + 3], 1) for first in (0, 3)]
+    replace(aim, color=torch.cat(rows)).save(settings.output)
 
 
 if __name__ == "__main__":

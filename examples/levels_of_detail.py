@@ -1,31 +1,37 @@
 """Level of detail: the same scan from ever farther away, with the samples and bricks of each
-picture."""
+picture; and one picture of many of it, in an avenue that goes into the distance."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 import tyro
 
 import gvtorch as gv
 
 SCAN = Path(__file__).parent / "data" / "aneurism_256x256x256_uint8.raw.gz"
 DISTANCES = [1.2, 2.4, 4.8, 9.6]
+ROWS, APART = 10, 305.0  # voxels
+EYE, TARGET = (0.0, 175.0, 560.0), (0.0, 110.0, -300.0)
+SKY = gv.Gradient((0.004, 0.005, 0.01), (0.02, 0.028, 0.05))
 
 
 @dataclass
 class Settings:
-    """Renders the bundled aneurism at four distances, side by side."""
+    """Renders the bundled aneurism at four distances, and an avenue of it."""
 
     output: Path = Path("levels_of_detail.png")
-    size: int = 256
+    size: int = 720
+    samples: int = 2
     device: str = "cpu"
 
 
 def main(settings: Settings) -> None:
-    """Renders each camera alone for its figures, then all as a batch."""
+    """Renders each camera alone for its figures, then the avenue."""
     tree = gv.N3Tree.from_volume(gv.read_volume(SCAN), device=settings.device)
     shader = gv.TransferFunction.preset("vessels", *tree.value_range["value"])
-    cameras = gv.Camera.orbit(30, 20, DISTANCES, 30, settings.size, settings.size)
+    side = settings.size * 16 // 45
+    cameras = gv.Camera.orbit(30, 20, DISTANCES, 30, side, side)
     print("distance  lod      samples  bricks        ms")
     for index, distance in enumerate(DISTANCES):
         for lod in ("finest", "auto"):
@@ -34,7 +40,20 @@ def main(settings: Settings) -> None:
                 f"{distance:8g}  {lod:6s} {stats.samples:9d} {stats.bricks_used:7d} "
                 f"{stats.milliseconds:9.1f}"
             )
-    gv.render(tree, cameras, shader).save(settings.output)
+
+    def avenue(camera: gv.Camera) -> gv.Picture:
+        behind = SKY
+        for number in range(2 * ROWS)[::-1]:  # the farthest first: the next is drawn over it
+            row, column = number // 2, number % 2
+            pose = torch.eye(4, dtype=torch.float64)
+            pose[0, 3], pose[2, 3] = APART * (column - 1) + 25, -APART * row
+            picture = gv.render(tree, camera, shader, pose=pose, background=behind)
+            behind = picture.color
+        return picture
+
+    size = {"width": settings.size * 16 // 9, "height": settings.size}
+    camera = gv.Camera.look_at(EYE, TARGET, fov=36, **size)
+    gv.Progressive(avenue).refine(camera, settings.samples).save(settings.output)
     print(settings.output)
 
 

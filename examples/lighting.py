@@ -15,7 +15,7 @@ import gvtorch as gv
 SUN = gv.DirectionalLight((-1.0, -1.2, -0.8), (1.25, 1.1, 0.9), angle=4)
 SHINE = {"ambient": 0.5, "diffuse": 0.75, "specular": 0.2, "shininess": 30}
 VESSELS = gv.Isosurface(50, (0.85, 0.35, 0.25), light=SUN, **SHINE)
-SKY, EVENING = (0.75, 0.9, 1.15), (0.5, 0.56, 0.64)
+SKY, EVENING = (0.75, 0.9, 1.15), gv.Gradient((0.2, 0.25, 0.34), (0.03, 0.035, 0.05))
 SIDE, WALL, SOFT = 96, 5.0, 3.0  # voxels: of the room, its walls, and the fade of surfaces
 WHITE, RED, GREEN, BRASS = (0.8, 0.8, 0.8), (0.8, 0.1, 0.06), (0.12, 0.55, 0.1), (0.85, 0.7, 0.45)
 LAMP = gv.PointLight((46.0, 82.0, 66.0), (1.0, 0.95, 0.85), radius=7.0)
@@ -28,8 +28,8 @@ class Settings:
     """Renders the bundled aneurism and a small room."""
 
     output: Path = Path("lighting.png")
-    size: int = 240
-    samples: int = 4
+    size: int = 720
+    samples: int = 2
     device: str = "cpu"
 
 
@@ -54,15 +54,15 @@ def room() -> gv.Volume:
 
 def main(settings: Settings) -> None:
     """Renders six pictures."""
-    size = settings.size
+    size = -(-settings.size * 16 // 27), settings.size // 2  # a third and a half of 16:9
     scan = gv.read_volume(Path(__file__).parent / "data" / "aneurism_256x256x256_uint8.raw.gz")
     vessels = gv.N3Tree.from_volume(scan, device=settings.device)
     box = gv.N3Tree.from_volume({"rgba": room()}, device=settings.device)
-    orbit = gv.Camera.orbit(30, 20, 1.25, 32, size, size)
-    front = gv.Camera.look_at((48, 60, 250), (48, 46, 48), fov=28.5, width=size, height=size)
+    orbit = gv.Camera.orbit(30, 20, 1.15, 30, *size)
+    front = gv.Camera.look_at((48, 58, 250), (48, 38, 48), (0, 1, 0), 23, *size)
     soft, lamp = gv.Lighting(ambient=SKY), gv.Lighting(ambient=(0, 0, 0))
-    near = gv.Lighting(ambient=SKY, occlusion=0.85, reach=0.1, frame="box")
-    dim = gv.Lighting(ambient=(0.3, 0.3, 0.3), occlusion=0.9)
+    near = gv.Lighting(ambient=SKY, occlusion=0.85, reach=0.1, frame="box", cones=6)
+    dim = gv.Lighting(ambient=(0.3, 0.3, 0.3), occlusion=0.9, cones=10)
     bounce = replace(dim, ambient=(0.1, 0.1, 0.1), indirect=1.0, reach=SIDE)
     images = []
     both = (vessels, orbit, VESSELS, (None, soft, near)), (box, front, PAINT, (lamp, dim, bounce))

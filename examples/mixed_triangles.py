@@ -1,13 +1,9 @@
-"""Triangles and voxels in one picture: VTK's OpenGL draws rings and a disk that cross a scan.
-
-VTK takes our camera; its colours and depth buffer come back as a layer. They stay on the GPU if
-CUDA and OpenGL use the same one.
-"""
+"""Triangles and voxels in one picture: VTK's OpenGL draws rings and a disk that cross a scan. It
+takes our camera; its colours and depth buffer come back as a layer, on the GPU if both use it."""
 
 import math
 import sys
 from ctypes.util import find_library
-from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
@@ -22,95 +18,61 @@ except ImportError as error:
 if sys.platform == "linux" and not (find_library("EGL") or find_library("OSMesa")):
     sys.exit("mixed_triangles needs OpenGL: a GPU's driver with EGL, or Mesa's EGL or OSMesa")
 
-DATA = Path(__file__).parent / "data"
-EYE, TARGET, UP = (-260.0, -340.0, 190.0), (63.5, 63.5, 127.5), (0.0, 0.0, 1.0)
-BACKGROUND = (0.02, 0.02, 0.03)
-RINGS = [(74, 62, 180), (80, 58, 140), (76, 54, 100)]  # centres, around the vessel
-DISK = (64, 64, 58)
+SCAN = Path(__file__).parent / "data" / "stent_256x128x128_int16.npz"
+EYE, TARGET, UP = (-120.0, -300.0, -30.0), (68.0, 62.0, 126.0), (1.0, 0.3, 0.0)  # it lies
+SKY = gv.Gradient((0.05, 0.07, 0.11), (0.008, 0.009, 0.014))
+RINGS = [(82, 58, 205), (80, 60, 170), (79, 58, 135), (76, 54, 100)]  # centres, around the vessel
+DISK, BLUE, GREEN = (64, 64, 58), (0.3, 0.5, 0.9), (0.2, 0.75, 0.55)
 
 
-def actor(source, place, color) -> vtk.vtkActor:
-    """The triangles of a source, moved to a place."""
-    mapper, result = vtk.vtkPolyDataMapper(), vtk.vtkActor()
-    mapper.SetInputConnection(source.GetOutputPort())
-    mapper.ScalarVisibilityOff()
-    result.SetMapper(mapper)
-    result.SetPosition(*place)
-    result.GetProperty().SetColor(*color)
-    result.GetProperty().SetAmbient(0.35)
-    return result
-
-
-def rasterise(actors, camera: gv.Camera, near: float, far: float, device="cpu") -> gv.Layer:
-    """Draws triangles for the pixels of a camera in world units."""
+def rasterise(parts, camera: gv.Camera, near: float, far: float, device="cpu") -> gv.Layer:
+    """Draws (source, place, colour) for the pixels of a camera in world units."""
     vtk.vtkObject.GlobalWarningDisplayOff()  # else it warns of each display it did not find
     renderer, window = vtk.vtkRenderer(), vtk.vtkRenderWindow()
     window.SetOffScreenRendering(True)
     window.SetMultiSamples(0)  # a pixel has one depth
     window.SetSize(camera.width, camera.height)
     window.AddRenderer(renderer)
-    for each in actors:
-        renderer.AddActor(each)
+    for source, place, color in parts:
+        actor = vtk.vtkActor(mapper=vtk.vtkPolyDataMapper(scalar_visibility=False), position=place)
+        actor.mapper.SetInputConnection(source.GetOutputPort())
+        actor.property.color, actor.property.ambient, actor.property.specular = color, 0.25, 0.3
+        renderer.AddActor(actor)
     projection, modelview = gv.opengl.matrices(camera, near, far)
     _, up, back = modelview[:3, :3]
     place = -(modelview[:3, :3].T @ modelview[:3, 3])
-    view = renderer.GetActiveCamera()
+    view, matrix = renderer.GetActiveCamera(), vtk.vtkMatrix4x4()
     view.SetPosition(*place.tolist())
     view.SetFocalPoint(*(place - back).tolist())
     view.SetViewUp(*up.tolist())
-    view.SetClippingRange(near, far)
-    matrix = vtk.vtkMatrix4x4()
+    view.clipping_range = near, far
     matrix.DeepCopy(projection.flatten().tolist())
     view.SetExplicitProjectionTransformMatrix(matrix)
     view.UseExplicitProjectionTransformMatrixOn()
     window.Render()
-
     window.MakeCurrent()
-    frame = window.GetRenderFramebuffer()
-    frame.Bind(frame.GetReadMode())
+    window.GetRenderFramebuffer().Bind(window.GetRenderFramebuffer().GetReadMode())
     with gv.opengl.Exchange(camera.width, camera.height, device) as exchange:
         color, depth = exchange.read_color()[..., :3], exchange.read_depth()
-        print(exchange)
     linear = rgb_to_linear_rgb(color.movedim(-1, 0)).movedim(0, -1)
     return gv.Layer(linear, gv.opengl.ray_distance(depth, projection))
 
 
-@dataclass
-class Settings:
-    """Renders the bundled stent with rings around it."""
-
-    output: Path = Path("mixed_triangles.png")
-    size: int = 512
-    device: str = "cpu"
-
-
-def main(settings: Settings) -> None:
+def main(output: Path = Path("mixed_triangles.png"), size: int = 720, device: str = "cpu") -> None:
     """Draws the triangles, then the voxels in front of and around them."""
-    size, device = settings.size, settings.device
-    camera = gv.Camera.look_at(EYE, TARGET, UP, fov=30, width=size, height=size)
-    torus = vtk.vtkParametricTorus()
-    torus.SetRingRadius(34)
-    torus.SetCrossSectionRadius(3)
-    ring, disk = vtk.vtkParametricFunctionSource(), vtk.vtkDiskSource()
+    camera = gv.Camera.look_at(EYE, TARGET, UP, 22, size * 16 // 9, size)
+    torus = vtk.vtkParametricTorus(ring_radius=32, cross_section_radius=2.5)
+    ring = vtk.vtkParametricFunctionSource(u_resolution=200, v_resolution=40)
     ring.SetParametricFunction(torus)
-    ring.SetUResolution(200)
-    ring.SetVResolution(40)
-    disk.SetInnerRadius(0)
-    disk.SetOuterRadius(70)
-    disk.SetCircumferentialResolution(200)
-    actors = [actor(ring, place, (0.2, 0.75, 0.55)) for place in RINGS]
-    actors.append(actor(disk, DISK, (0.3, 0.5, 0.9)))
-    layer = rasterise(actors, camera, near=200, far=1000, device=device)
-
-    volume = gv.read_volume(DATA / "stent_256x128x128_int16.npz")
-    tree = gv.N3Tree.from_volume(volume, device=device)
-    shader = gv.TransferFunction.from_json(DATA / "stent.json")
-    picture = gv.render(tree, camera, shader, background=BACKGROUND, layer=layer)
-    picture.save(settings.output)
-    drawn = layer.depth < math.inf
-    before = drawn & (picture.depth < layer.depth)
-    print(f"{settings.output}: {drawn.sum()} pixels of triangles, voxels before {before.sum()}")
+    disk = vtk.vtkDiskSource(inner_radius=44, outer_radius=64, circumferential_resolution=200)
+    parts = [(disk, DISK, BLUE), *((ring, place, GREEN) for place in RINGS)]
+    layer = rasterise(parts, camera, near=100, far=1000, device=device)
+    tree = gv.N3Tree.from_volume(gv.read_volume(SCAN), device=device)
+    shader = gv.Lit(gv.TransferFunction.from_json(SCAN.with_name("stent.json")), ambient=0.3)
+    picture = gv.render(tree, camera, shader, background=SKY, layer=layer)
+    picture.save(output)
+    print(f"{output}: {(layer.depth < math.inf).sum()} pixels of triangles")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Settings))
+    tyro.cli(main)

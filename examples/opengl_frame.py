@@ -1,19 +1,15 @@
 """A frame drawn by OpenGL and gvtorch: OpenGL draws a ball, voxels join it, and OpenGL adds the
-edges of the box, which voxels and ball hide.
-
-On an NVIDIA GPU (`--device cuda`) no picture passes through the host.
+edges of the box, which voxels and ball hide. On an NVIDIA GPU no picture passes through the host.
 """
 
-import dataclasses
-import itertools
-import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 import tyro
-from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 import gvtorch as gv
 
@@ -22,68 +18,40 @@ try:
 except ImportError as error:
     sys.exit(f"opengl_frame needs moderngl: pip install moderngl ({error})")
 
-DATA = Path(__file__).parent / "data"
-EYE, TARGET, UP = (-260.0, -340.0, 190.0), (63.5, 63.5, 127.5), (0.0, 0.0, 1.0)
-BACKGROUND = (0.15, 0.15, 0.18)  # as the framebuffer stores it
-BALL, RADIUS, GREEN = (95.0, 50.0, 110.0), 32.0, (0.35, 0.9, 0.6)
-SUN, GOLD = (-0.5, -0.7, 0.5), (0.95, 0.8, 0.3)
+SCAN = Path(__file__).parent / "data" / "stent_256x128x128_int16.npz"
+EYE, TARGET, UP = (-170.0, -290.0, 30.0), (62.0, 62.0, 128.0), (1.0, 0.3, 0.0)  # it lies
+BALL, RADIUS, TEAL, SIDES = (82.0, 46.0, 130.0), 30.0, (0.05, 0.55, 0.4), 192
+SUN, GOLD, NIGHT = torch.tensor([(0.6, -0.7, -0.3), (0.9, 0.5, 0.1), (0.01, 0.013, 0.022)])
+EDGES = torch.tensor([(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit])
 VERTEX = """#version 330
-uniform mat4 camera;
-in vec3 place, color;
-out vec3 tint;
-void main() { tint = color; gl_Position = camera * vec4(place, 1); }
-"""
+uniform mat4 camera; in vec3 place, color; out vec3 tint;
+void main() { tint = color; gl_Position = camera * vec4(place, 1); }"""
 FRAGMENT = """#version 330
-in vec3 tint;
-out vec4 result;
-void main() { result = vec4(tint, 1); }
-"""
+in vec3 tint; out vec4 result;
+void main() { result = vec4(tint, 1); }"""
 
 
-def ball(sides: int = 96) -> Tensor:
-    """(k, 6) place and colour of triangle corners."""
-    v, u = torch.linspace(0, math.pi, sides + 1), torch.linspace(0, 2 * math.pi, 2 * sides + 1)
-    v, u = torch.meshgrid(v, u, indexing="ij")
-    normals = torch.stack((v.sin() * u.cos(), v.sin() * u.sin(), v.cos()), -1)
-    a, b, c, d = normals[:-1, :-1], normals[1:, :-1], normals[1:, 1:], normals[:-1, 1:]
-    normals = torch.stack((a, b, c, a, c, d), 2).reshape(-1, 3)
-    light = 0.45 + 0.55 * (normals @ torch.tensor(SUN)).clamp(min=0)
-    return torch.cat(
-        (torch.tensor(BALL) + RADIUS * normals, light[:, None] * torch.tensor(GREEN)), 1
-    )
+def ball() -> Tensor:
+    """(k, 6) place and colour of a strip of triangles that winds from pole to pole."""
+    turn = (torch.arange(-SIDES, SIDES**2 + 1)[:, None] / SIDES + torch.arange(2)).flatten()
+    u, v = 2 * torch.pi * turn, torch.pi * (turn / SIDES).clamp(0, 1)
+    normals = torch.stack((v.sin() * u.cos(), v.sin() * u.sin(), v.cos()), 1)
+    light = 0.25 + 0.75 * (normals @ SUN).clamp(min=0)[:, None]
+    return torch.cat((torch.tensor(BALL) + RADIUS * normals, light * torch.tensor(TEAL)), 1)
 
 
-def edges(box: Tensor) -> Tensor:
-    """(24, 6) place and colour of the ends of the 12 edges of a (2, 3) box."""
-    corners = torch.tensor(list(itertools.product((0, 1), repeat=3)))
-    pairs = [(i, j) for i, j in itertools.combinations(range(8), 2) if (i ^ j) in (1, 2, 4)]
-    ends = corners[torch.tensor(pairs).flatten()]
-    places = box[ends, torch.arange(3)].float()
-    return torch.cat((places, torch.tensor(GOLD).expand_as(places)), 1)
-
-
-@dataclasses.dataclass
-class Settings:
-    """Renders the bundled stent between what OpenGL draws."""
-
-    output: Path = Path("opengl_frame.png")
-    size: int = 512
-    device: str = "cpu"
-
-
-def main(settings: Settings) -> None:
-    """Draws with OpenGL, with voxels, and with OpenGL again."""
-    size, device = settings.size, settings.device
-    camera = gv.Camera.look_at(EYE, TARGET, UP, fov=36, width=size, height=size)
-    projection, modelview = gv.opengl.matrices(camera, near=200, far=1000)
-    volume = gv.read_volume(DATA / "stent_256x128x128_int16.npz")
-    tree = gv.N3Tree.from_volume(volume, device=device)
-    shader = gv.TransferFunction.from_json(DATA / "stent.json")
+def main(output: Path = Path("opengl_frame.png"), size: int = 720, device: str = "cpu") -> None:
+    """Draws with OpenGL, with voxels, and with OpenGL again; four pixels for each that is saved."""
+    width, height = size * 16 // 9 * 2, size * 2
+    camera = gv.Camera.look_at(EYE, TARGET, UP, 28, width, height)
+    projection, modelview = gv.opengl.matrices(camera, near=100, far=1000)
+    tree = gv.N3Tree.from_volume(gv.read_volume(SCAN), device=device)
+    shader = gv.Lit(gv.TransferFunction.from_json(SCAN.with_name("stent.json")), ambient=0.3)
     try:
         context = moderngl.create_context(standalone=True, backend="egl")
     except Exception as error:
         sys.exit(f"opengl_frame needs OpenGL: a GPU's driver with EGL, or Mesa's ({error})")
-    frame = context.simple_framebuffer((size, size))
+    frame = context.simple_framebuffer((width, height), dtype="f4")  # linear light
     program = context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
     program["camera"].write((projection @ modelview).mT.float().contiguous().numpy())
 
@@ -92,22 +60,21 @@ def main(settings: Settings) -> None:
         context.vertex_array(program, [(buffer, "3f 3f", "place", "color")]).render(mode)
 
     frame.use()
-    frame.clear(*BACKGROUND, 1.0)
+    frame.clear(*NIGHT, 1.0)
     context.enable_only(moderngl.DEPTH_TEST)
-    draw(ball(), moderngl.TRIANGLES)
-    with gv.opengl.Exchange(size, size, device) as exchange:
-        stored, depth = exchange.read_color()[..., :3], exchange.read_depth()
-        drawn = rgb_to_linear_rgb(stored.movedim(-1, 0)).movedim(0, -1)
+    context.line_width = 3.0
+    draw(ball(), moderngl.TRIANGLE_STRIP)
+    with gv.opengl.Exchange(width, height, device) as exchange:
+        drawn, depth = exchange.read_color()[..., :3], exchange.read_depth()
         layer = gv.Layer(drawn, gv.opengl.ray_distance(depth, projection))
-        background = gv.Backdrop(drawn)  # OpenGL's, also where it drew nothing
-        picture = gv.render(tree, camera, shader, layer=layer, background=background)
-        mixed = linear_rgb_to_rgb(picture.color.movedim(-1, 0)).movedim(0, -1)
-        exchange.draw(mixed, gv.opengl.window_depth(picture.nearest, projection))
-        draw(edges(tree.box), moderngl.LINES)
-        whole = rgb_to_linear_rgb(exchange.read_color()[..., :3].movedim(-1, 0)).movedim(0, -1)
-    dataclasses.replace(picture, color=whole).save(settings.output)
-    print(f"{settings.output}: {exchange}")
+        picture = gv.render(tree, camera, shader, layer=layer, background=drawn)
+        exchange.draw(picture.color, gv.opengl.window_depth(picture.nearest, projection))
+        places = tree.box[EDGES.flatten()[:, None] >> torch.arange(3) & 1, torch.arange(3)].float()
+        draw(torch.cat((places, GOLD.expand_as(places)), 1), moderngl.LINES)
+        whole = exchange.read_color()[..., :3].movedim(-1, 0)
+    replace(picture, color=avg_pool2d(whole, 2).movedim(0, -1)).save(output)
+    print(f"{output}: {exchange}")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Settings))
+    tyro.cli(main)

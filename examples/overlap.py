@@ -1,12 +1,9 @@
 """Two volumes in the same space: a CT scan, and a coarse map of uptake as from a PET scanner, which
 has voxels of another size, at another place and turned. They are composited by sample, so that each
-is seen through the other.
-
-The uptake is made up here: what is full of contrast agent, blurred.
+is seen through the other. The uptake is made up: what is full of contrast agent, blurred.
 """
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -27,15 +24,6 @@ UPTAKE = gv.TransferFunction(
     color=[(0.1, 0.4, 0.0, 0.3), (0.35, 0.9, 0.08, 0.05), (0.6, 1, 0.5, 0), (1, 1, 0.95, 0.5)],
     reference=1.0,
 )
-
-
-@dataclass
-class Settings:
-    """Renders the bundled scan and an uptake in it."""
-
-    output: Path = Path("overlap.png")
-    size: int = 1280
-    device: str = "cpu"
 
 
 def pose_about(middle: torch.Tensor) -> torch.Tensor:
@@ -68,24 +56,25 @@ def uptake_of(scan: gv.Volume) -> tuple[gv.Volume, torch.Tensor]:
     return gv.Volume(coarse / coarse.max(), spacing, first, name="uptake"), pose
 
 
-def main(settings: Settings) -> None:
+def main(output: Path = Path("overlap.png"), size: int = 1280, device: str = "cpu") -> None:
     """Renders both."""
     scan = gv.read_volume(SCAN)
     uptake, pose = uptake_of(scan)
     trees = {
-        "ct": gv.N3Tree.from_volume(scan, device=settings.device),
-        "uptake": gv.N3Tree.from_volume(uptake, device=settings.device),
+        "ct": gv.N3Tree.from_volume(scan, device=device),
+        "uptake": gv.N3Tree.from_volume(uptake, device=device),
     }
     sun = gv.DirectionalLight((1, 1.2, -0.8))
     shaders = {"ct": gv.Lit(BONE, light=sun), "uptake": UPTAKE}
-    size = (settings.size, max(9, settings.size * 9 // 16))
-    camera = gv.Camera.look_at((-270, -250, 150), (64, 62, 128), (0, 0, 1), 36, *size)
+    camera = gv.Camera.look_at(
+        (-270, -250, 150), (64, 62, 128), (0, 0, 1), 36, size, size * 9 // 16
+    )
     sky = gv.Gradient((0.05, 0.06, 0.08), (0.005, 0.005, 0.01))
     poses = {"uptake": pose}
     picture = gv.render(trees, camera, shaders, background=sky, pose=poses)
-    picture.save(settings.output)
-    print(f"{settings.output}: {picture.stats.samples / 1e6:.1f} M samples")
+    picture.save(output)
+    print(f"{output}: {picture.stats.samples / 1e6:.1f} M samples")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Settings))
+    tyro.cli(main)

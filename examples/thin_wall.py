@@ -3,6 +3,7 @@ wide as a pixel's. Above, coarse voxels are means; below, they hold six directio
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -11,8 +12,9 @@ import tyro
 import gvtorch as gv
 
 SIDE = 128  # voxels
-RED, GREEN = (0.8, 0.06, 0.04, 1.0), (0.05, 0.5, 0.1, 1.0)
+RED, GREEN = torch.tensor([(0.7, 0.05, 0.03, 1.0), (0.02, 0.4, 0.2, 1.0)])
 WIDER = (1, 8, 16, 32)  # times the pixel's cone
+SKY = gv.Gradient((0.3, 0.5, 0.8), (0.95, 0.85, 0.75))
 
 
 @dataclass
@@ -20,33 +22,34 @@ class Settings:
     """Renders the wall with cones of four widths, with and without directions."""
 
     output: Path = Path("thin_wall.png")
-    size: int = 180
+    size: int = 720
+    samples: int = 4
     device: str = "cpu"
 
 
 def wall() -> gv.Volume:
-    """Premultiplied colour and opacity of two sheets, one behind the other, with a window."""
+    """Premultiplied colour and opacity of two disks, one behind the other, with round windows."""
+    y, x = torch.meshgrid(*(torch.arange(SIDE) - (SIDE - 1) / 2,) * 2, indexing="ij")
+    away, turn = torch.hypot(x, y), torch.atan2(y, x)
+    petal = torch.remainder(turn, torch.pi / 4) - torch.pi / 8
+    petal = torch.hypot((away * petal.cos() - 36) / 1.5, away * petal.sin()) - 9.5
+    gap = torch.stack((away - 56, 12 - away, -petal)).amax(0)
+    share = (0.5 - gap / 1.5).clamp(0, 1)[..., None]  # edges are soft
     rgba = torch.zeros((SIDE, SIDE, SIDE, 4))  # z, y, x
-    middle, low, high = SIDE // 2 + 2, SIDE // 8, SIDE - SIDE // 8
-    for depth, color in ((middle, RED), (middle - 1, GREEN)):
-        rgba[depth, low:high, low:high] = torch.tensor(color)
-    window = slice(SIDE // 2, SIDE // 2 + SIDE // 5)
-    rgba[middle - 1 : middle + 1, window, window] = 0
+    rgba[SIDE // 2 + 2], rgba[SIDE // 2 + 1] = share * RED, share * GREEN
     return gv.Volume(rgba)
 
 
 def main(settings: Settings) -> None:
     """Renders the grid."""
-    volume = wall()
+    volume, rows = wall(), []
     shader = gv.StoredColor("value", premultiplied=True)
-    rows = []
+    camera = gv.Camera.orbit(38, 12, 1.72, 34, settings.size * 4 // 9, settings.size // 2)
     for levels in (volume, volume.directional(premultiplied=True)):
         tree = gv.N3Tree.from_volume(levels, device=settings.device)
-        camera = gv.Camera.orbit(35, 15, 2.0, width=settings.size, height=settings.size)
-        pictures = [
-            gv.render(tree, camera, shader, cone_scale=wider, background=(0.9, 0.95, 1.0))
-            for wider in WIDER
-        ]
+        render = partial(gv.render, tree, shader=shader, background=SKY)
+        means = [gv.Progressive(partial(render, cone_scale=wider)) for wider in WIDER]
+        pictures = [mean.refine(camera, settings.samples) for mean in means]
         rows.append(torch.cat([picture.color for picture in pictures], dim=1))
     replace(pictures[-1], color=torch.cat(rows)).save(settings.output)
     print(f"{settings.output}: cones of {WIDER} times the pixel's")

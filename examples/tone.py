@@ -1,5 +1,5 @@
 """From scene light to the display: a picture before a bright sky, clipped, with Reinhard's curve
-and with a filmic one; and a transparent PNG. All with 16 rays a pixel.
+and with a filmic one; and a transparent PNG. All with 8 rays a pixel.
 """
 
 from dataclasses import dataclass, replace
@@ -12,7 +12,8 @@ import tyro
 import gvtorch as gv
 
 SCAN = Path(__file__).parent / "data" / "aneurism_256x256x256_uint8.raw.gz"
-RAYS = 16
+SUN = gv.DirectionalLight((-0.6, -0.4, 0.45), (1.6, 1.2, 0.8))
+RAYS = 8
 
 
 @dataclass
@@ -20,36 +21,40 @@ class Settings:
     """Renders the bundled aneurism under an environment map brighter than a display."""
 
     output: Path = Path("tone.png")
-    size: int = 300
+    size: int = 720
     device: str = "cpu"
 
 
-def sky(height: int = 512) -> torch.Tensor:
-    """An equirectangular map: dusk, a sun twelve times as bright as white, and dark ground."""
+def sky(height: int = 768) -> torch.Tensor:
+    """An equirectangular map: dusk, a sun twelve times as bright as white, clouds, and the sea."""
     up = torch.linspace(1, -1, height)[:, None, None]
     across = torch.linspace(-1, 1, 2 * height)[None, :, None]
-    dusk = torch.tensor([0.9, 0.35, 0.12]) * (-9 * up.abs()).exp()
-    dusk = dusk + torch.tensor([0.05, 0.12, 0.35]) * up.clamp(min=0).sqrt()
-    away = (across + 0.01) ** 2 + (0.5 * (up - 0.12)) ** 2
-    glow = 12 * (-4000 * away).exp() + 1.2 * (-300 * away).exp()
-    ground = torch.tensor([0.06, 0.05, 0.04])
-    return torch.where(up > 0, dusk + glow * torch.tensor([1.0, 0.85, 0.6]), ground)
+    above = up.abs()  # the sea mirrors the sky
+    light = torch.tensor([1.1, 0.4, 0.12]) * (-7 * above).exp()
+    light = light + torch.tensor([0.06, 0.14, 0.4]) * above.sqrt()
+    away = (across + 0.01) ** 2 + (0.5 * (above - 0.12)) ** 2
+    glow = 12 * (-4000 * away).exp() + 1.5 * (-250 * away).exp()
+    place = torch.cat(torch.broadcast_tensors(14 * across, 60 * above, 0 * up), -1)
+    cloud = (1.4 * gv.noise.fbm(place, octaves=6) + 0.15).clamp(0, 1)[..., None]
+    lit = light * 0.35 + (0.35 * glow + 0.25 * (-6 * away).exp()) * torch.tensor([1.0, 0.4, 0.2])
+    light = (light + glow * torch.tensor([1.0, 0.85, 0.6])).lerp(lit, cloud)
+    ripples = 0.35 + 0.3 * gv.noise.fbm(place * torch.tensor([2.0, 9.0, 1.0]), octaves=4)
+    return torch.where(up > 0, light, light * ripples[..., None].clamp(min=0))
 
 
 def main(settings: Settings) -> None:
     """Renders once and tone-maps three times; then renders without a background."""
     tree = gv.N3Tree.from_volume(gv.read_volume(SCAN), device=settings.device)
     shader = gv.TransferFunction.preset("vessels", *tree.value_range["value"])
-    camera = gv.Camera.orbit(10, 3, 2.0, 40, settings.size, settings.size)
+    shader = gv.Lit(shader, light=SUN, ambient=0.16, specular=0.3)
+    width = -(-settings.size * 16 // 27)  # a third of 16:9
+    camera = gv.Camera.orbit(10, 3, 1.5, 52, width, settings.size)
     render = partial(gv.render, tree, shader=shader)
     behind = gv.Environment(sky())
     picture = gv.Progressive(partial(render, background=behind)).refine(camera, RAYS)
     curves = [picture.tone_map(curve) for curve in ("none", "reinhard", "aces")]
-    color = torch.stack([one.color for one in curves])
-    layers = {
-        name: getattr(picture, name).expand(3, -1, -1, -1) for name in ("alpha", "depth", "samples")
-    }
-    replace(picture, color=color, **layers).save(settings.output)
+    color = torch.cat([one.color for one in curves], dim=1)
+    replace(picture, color=color).save(settings.output)
     cut = settings.output.with_name(f"{settings.output.stem}_transparent.png")
     gv.Progressive(partial(render, background=None)).refine(camera, RAYS).save(cut, bits=16)
     print(f"{settings.output} and {cut}: {RAYS} rays a pixel")
