@@ -391,3 +391,42 @@ def test_views_become_the_keys_of_a_film(tab, viewer, tmp_path):
             tab.page.get_by_label("Load keys").click()
         chooser.value.set_files(tmp_path / file)
         tab.until(f"app.film.keys.length === {count}")
+
+
+def test_every_shader_becomes_every_other(tab):
+    """What they have in common is kept; what only shares a name is not."""
+    row = tab.page.locator("label.gv-row:has(> span:text-is('shader')) select")
+    names = row.locator("option").all_inner_texts()
+    assert len(names) > 6 and tab.app("app.state.shader.kind") == "TransferFunction"
+    knots = tab.app("app.state.shader.opacity")
+    for one in range(len(names)):
+        for other in range(one):
+            for chosen in (one, other):
+                row.select_option(label=names[chosen])
+                kind = "".join(word.capitalize() for word in names[chosen].split())
+                tab.until(f"app.state.shader.kind === '{kind}'")
+    assert tab.app("app.transfer()?.opacity ?? app.lastTransfer.opacity") == knots
+    tab.final()
+    assert not tab.page.locator(".gv-note.gv-bad").count() and not tab.complaints
+
+
+def test_a_surface_is_saved_by_its_buttons(tab, viewer, tmp_path):
+    """Both kinds of files; a level that there is none of is refused in one line."""
+    row = tab.page.locator("label.gv-row:has(> span:text-is('shader')) select")
+    row.select_option(label="Isosurface")
+    tab.until("app.state.shader.kind === 'Isosurface'")
+    level, counts = tab.page.get_by_title("Level of detail; 0 is the finest"), []
+    for button, name in (("PLY", "ply"), ("glTF", "glb")):
+        with tab.page.expect_download() as saved:
+            tab.page.get_by_role("button", name=button, exact=True).click()
+        file = tmp_path / f"surface.{name}"
+        assert saved.value.suggested_filename.endswith(f".{name}")
+        saved.value.save_as(file)
+        counts.append(len(gv.read_mesh(file).faces))
+    assert counts[0] == counts[1] > 1000
+    level.fill("99")
+    level.press("Tab")
+    tab.page.get_by_role("button", name="PLY", exact=True).click()
+    tab.until("!!document.querySelector('.gv-note.gv-bad')")
+    assert "level" in tab.page.locator(".gv-note.gv-bad").inner_text()
+    assert not tab.complaints

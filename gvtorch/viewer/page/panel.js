@@ -22,8 +22,9 @@ export class Panel {
   first(kind, name) {
     const { app } = this, now = app.state.shader;
     const told = this.controls.schema[kind].fields, made = { kind };
-    for (const field of Object.keys(told)) {
-      if (field in now && name === "shader") made[field] = now[field];
+    const old = (name === "shader" && this.controls.schema[now.kind]?.fields) || {};
+    for (const [field, one] of Object.entries(told)) {
+      if (field in now && old[field] && alike(one, old[field])) made[field] = now[field];
     }
     const transfer = app.transfer() ?? app.lastTransfer;
     const [low, high] = domain(transfer);
@@ -195,3 +196,8 @@ export class Panel {
 }
 
 const words = (kind) => kind.replace(/([a-z])([A-Z])/g, (_, a, b) => `${a} ${b.toLowerCase()}`);
+
+/** Whether two fields hold the same: a function's `color` is a list of knots, a surface's one colour. */
+function alike(one, other) {
+  return ["type", "items", "choices"].every((part) => JSON.stringify(one[part]) === JSON.stringify(other[part]));
+}
