@@ -232,6 +232,49 @@ def test_a_flight_comes_back_from_its_file(tmp_path):
     assert repr(flight) == "Flight(3 keys, 3 s)"
 
 
+@pytest.mark.parametrize("up", [(0.0, 1.0, 0.0), (1.0, 2.0, -0.5)])
+def test_a_turntable_goes_around_once(up):
+    """At any time it is the first camera turned by torch's own exponential, to 10^-5."""
+    first = Eye(eye=(1, 2, 5), target=(0.5, 0, 0), up=up, fov=20)
+    flight = gv.Flight.turntable(shown(first), 8)
+    assert flight.closed and flight.seconds == 8 and flight.at(8).camera == first
+    axis = torch.tensor(up, dtype=torch.float64)
+    x, y, z = (2 * math.pi * axis / axis.norm()).tolist()
+    spin = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    target = torch.tensor(first.target, dtype=torch.float64)
+    away = torch.tensor(first.eye, dtype=torch.float64) - target
+    for time in (0.0, 1.0, 2.77, 4.0, 7.9):
+        camera = flight.at(time).camera
+        expected = target + torch.linalg.matrix_exp(spin * time / 8) @ away
+        assert torch.allclose(torch.tensor(camera.eye, dtype=torch.float64), expected, atol=1e-5)
+        assert np.allclose(camera.target, first.target) and camera.fov == 20
+    with pytest.raises(ValueError, match="the state has no camera"):
+        gv.Flight.turntable(gv.ViewState(shader=HOT))
+
+
+@pytest.mark.backend("cpp")
+def test_a_saved_view_is_turned(small, tmp_path):
+    """Its first picture is the one that was saved; what the view tells no flag tells again."""
+    state = shown(Eye(eye=(60, 20, 8), target=(12, 10, 8), up=(0, 0, 1)), step=0.4)
+    state.save(tmp_path / "v.json")
+    saved, film = ("--state", tmp_path / "v.json", "--size", "40x30"), tmp_path / "f"
+    run = gvtorch("fly", small, "-o", film, *saved, "--turntable", "1", "--fps", "4")
+    assert run.returncode == 0 and "4 pictures" in run.stdout, run.stderr
+    run = gvtorch("render", small, "-o", tmp_path / "one.png", *saved)
+    assert run.returncode == 0, run.stderr
+    assert (film / "0000.png").read_bytes() == (tmp_path / "one.png").read_bytes()
+    pictures = [pixels(file.read_bytes()) for file in sorted(film.iterdir())]
+    assert len({one.tobytes() for one in pictures}) == 4 and all(one.std() > 5 for one in pictures)
+    for flags in (("--orbit", "1,2"), ("--fov", "20"), ("--step", "1"), ("--tf", "hot")):
+        run = gvtorch("fly", small, "-o", tmp_path / "no", *saved, *flags)
+        assert run.returncode == 2 and f"--state tells what {flags[0]} does" in run.stderr
+    for content in ("[]", "{", '{"shader": 7}'):
+        (tmp_path / "bad.json").write_text(content)
+        run = gvtorch("fly", small, "-o", tmp_path / "no", "--state", tmp_path / "bad.json")
+        assert run.returncode == 2 and len(run.stderr.splitlines()) == 1, run.stderr
+    assert not (tmp_path / "no").exists()
+
+
 BAD = (
     ([], "must be a list of keys"),
     ({}, "must be a list of keys"),

@@ -46,6 +46,8 @@ class Fly:
     """key frames in place of --path: [{"time": seconds, "state": what gvtorch view saved}, ...],
     between which camera, colours, clips and all other numbers run smoothly, and a series shows
     the time point nearest to theirs; a film that ends as it begins loops"""
+    state: Annotated[Path | None, arg(metavar="FILE.json")] = None
+    """once around in the look that gvtorch view saved, from its camera on"""
     turntable: Annotated[float | None, arg(metavar="SECONDS")] = None
     """an orbit that takes so long: instead of --frames"""
     frames: Annotated[int | None, arg(metavar="N")] = None
@@ -127,11 +129,16 @@ class Fly:
 
     def _loops(self) -> bool:
         """Whether the path ends where it begins, so that its last picture is left out."""
-        return self._flight().closed if self.keys is not None else self.flight == "orbit"
+        return self._flight().closed if self._saved is not None else self.flight == "orbit"
+
+    @property
+    def _saved(self) -> Path | None:
+        """The file of states that the flight goes through: key frames, or one, once around."""
+        return self.state if self.keys is None else self.keys
 
     def _stands(self) -> bool:
         """Whether the camera stands still: a film over time."""
-        moves = self.keys is not None or self.turntable is not None or self.flight != "orbit"
+        moves = self._saved is not None or self.turntable is not None or self.flight != "orbit"
         return self.times is not None and not moves
 
     def _taken(
@@ -143,7 +150,7 @@ class Fly:
         look = self.scene.look
         first = parse_camera(None, look, width, height, scene.space)
         now = replace(scene.state(options), camera=Eye.of(first, scene.box))
-        if self.keys is None:
+        if self._saved is None:
             path = self._path(scene, width, height)
 
             def shot(at: float) -> tuple[ViewState, Camera, Picture]:
@@ -171,20 +178,23 @@ class Fly:
         return picture
 
     def _flight(self, now: ViewState | None = None) -> Flight:
-        """The keys; if no state is given that they begin with, to see that they are right."""
+        """Its states; if none is given that they begin with, to see that they are right."""
         from ..shaders import TransferFunction
         from ..viewer.flight import Flight
         from ..viewer.state import Eye, ViewState
 
-        assert self.keys is not None
         anywhere = Eye(eye=(0, 0, 1), target=(0, 0, 0))
         any_state = ViewState(shader=TransferFunction([(0, 1)]), camera=anywhere)
-        return Flight.read(self.keys, any_state if now is None else now)
+        now = any_state if now is None else now
+        if self.keys is not None:
+            return Flight.read(self.keys, now)
+        assert self.state is not None
+        return Flight.turntable(now.read(self.state))
 
     def _parts(self, frames: int) -> list[tuple[int | None, range]]:
         """Time points, and the pictures that are taken of each; None: of whichever is read."""
         if self.times is None:
-            return [(None, range(frames))] if self.keys is None else self._parts_of_keys(frames)
+            return [(None, range(frames))] if self._saved is None else self._parts_of_keys(frames)
         moments = self._moments()
         ends = [-(-number * frames // len(moments)) for number in range(len(moments) + 1)]
         return [(m, range(a, b)) for m, a, b in zip(moments, ends, ends[1:], strict=False) if a < b]
@@ -195,14 +205,14 @@ class Fly:
         if all(state.time == 0 for _, state in flight.keys):
             return [(None, range(frames))]
         if self.scene.source.time is not None:
-            raise ValueError("--keys tells what --time does: leave one out")
+            raise ValueError(f"{self._flag} tells what --time does: leave one out")
         steps = max(1, frames - 1 + flight.closed)
         shown = [round(flight.along(n / steps).time) for n in range(frames)]
         count = self._times_there()
         if not 0 <= min(shown) <= max(shown) < count:
             wrong = next(moment for moment in shown if not 0 <= moment < count)
             raise ValueError(
-                f"{self.keys}: time must be from 0 to {count - 1} of {self.path}, got {wrong}"
+                f"{self._saved}: time must be from 0 to {count - 1} of {self.path}, got {wrong}"
             )
         starts = [n for n in range(frames) if n == 0 or shown[n] != shown[n - 1]]
         return [(shown[a], range(a, b)) for a, b in pairwise((*starts, frames))]
@@ -255,8 +265,8 @@ class Fly:
 
     def _check_path(self) -> None:
         """Raises what is wrong with the path before the volume is read."""
-        if self.keys is not None:
-            self._check_keys()
+        if self._saved is not None:
+            self._check_saved()
         elif self.flight != "orbit":
             if self.orbit is not None:
                 raise ValueError("--orbit is for --path orbit, not for keys")
@@ -274,23 +284,27 @@ class Fly:
         if not self.poses.parent.is_dir():
             raise FileNotFoundError(f"folder not found: {self.poses.parent}")
         models = [self.scene.look.camera_model]
-        if self.keys is not None:
+        if self._saved is not None:
             models = [s.camera.model for _, s in self._flight().keys if s.camera is not None]
         other = next((one for one in models if one not in ("pinhole", "fisheye")), None)
         if other is not None:
             raise ValueError(f"--poses tells of pinhole and fisheye, not of {other}")
 
-    def _check_keys(self) -> None:
-        """Raises ValueError where a flag tells what the keys do."""
+    def _check_saved(self) -> None:
+        """Raises ValueError where a flag tells what the states do."""
         from ..base import check
 
-        assert self.keys is not None
+        self._flight()  # what is wrong with it
         path = self.flight if self.flight != "orbit" else None
-        paths = {"--path": path, "--orbit": self.orbit, "--turntable": self.turntable}
+        paths: dict[str, Any] = {"--path": path, "--orbit": self.orbit}
+        if self.keys is None:
+            first = check.json_file("state", self._saved or "")
+        else:
+            paths |= {"--turntable": self.turntable, "--state": self.state}
+            first = check.json_file("key frames", self.keys)[0]["state"]
+            if isinstance(first, str):
+                first = check.json_file("state", self.keys.parent / first)
         flags = [name for name, value in paths.items() if value]
-        first = check.json_file("key frames", self.keys)[0]["state"]
-        if isinstance(first, str):
-            first = check.json_file("state", self.keys.parent / first)
         told = {"shader": _OF_SHADER, "camera": ("camera_model", "fov", "up")}
         names = {name for part, those in told.items() if part in first for name in those}
         names |= set(first.get("options", ()))
@@ -298,7 +312,11 @@ class Fly:
             flags.append("--times")
         flags += [f for f in given(self.scene.look) if f[2:].replace("-", "_") in names]
         if flags:
-            raise ValueError(f"--keys tells what {flags[0]} does: leave one out")
+            raise ValueError(f"{self._flag} tells what {flags[0]} does: leave one out")
+
+    @property
+    def _flag(self) -> str:
+        return "--state" if self.keys is None else "--keys"
 
     def _keys(self) -> CameraPath:
         from ..cameras.path import CameraPath

@@ -31,6 +31,7 @@ from ..cameras.motion import Motion
 from .state import Eye, ViewState
 
 Curve = Callable[[float], Any]
+_ROUND = 72  # keys of a turntable: between them it leaves the circle by 10^-6 of its radius
 #: Numbers that increase along an axis of theirs: they slide without meeting.
 _ORDERED = {
     ("TransferFunction", "opacity"): (2, 0, slice(0, 1)),  # dimensions, axis, columns of the last
@@ -109,6 +110,29 @@ class Flight:
             return cls(keys)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
+
+    @classmethod
+    def turntable(cls, state: ViewState, seconds: float = 10.0) -> Flight:
+        """Returns a flight once around what a state's camera looks at, about its own up; it ends
+        where it begins.
+
+        Raises:
+            ValueError: The state has no camera, or `seconds` is not positive.
+        """
+        check.instance("Flight", "state", state, ViewState)
+        seconds = check.number("Flight", "seconds", seconds, low=0, open_low=True)
+        if (eye := state.camera) is None:
+            raise ValueError("Flight: the state has no camera")
+        up, target = np.array(eye.up) / np.linalg.norm(eye.up), np.array(eye.target)
+        away = np.array(eye.eye) - target
+        keys = [(0.0, state)]
+        for n in range(1, _ROUND):  # Rodrigues' rotation of what lies across the axis
+            angle = 2 * np.pi * n / _ROUND
+            along = (up @ away) * up
+            turned = along + np.cos(angle) * (away - along) + np.sin(angle) * np.cross(up, away)
+            there = replace(eye, eye=tuple((target + turned).tolist()))
+            keys.append((seconds * n / _ROUND, replace(state, camera=there)))
+        return cls([*keys, (seconds, state)])
 
     def save(self, path: str | Path) -> None:
         """Writes a .json file, as `read` takes it."""
