@@ -18,11 +18,12 @@ from __future__ import annotations
 import math
 import tempfile
 import time
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -51,7 +52,7 @@ class Settings:
     batch: int = 512
     """on CUDA: most bricks that a frame makes"""
     compiled: bool = False
-    """bricks are made by torch.compile, in batches that are full"""
+    """torch.compile makes bricks and classifies nodes, in batches that are full"""
     graph: bool = True
     """on CUDA: each frame is one graph"""
     device: str = "cpu"
@@ -149,9 +150,16 @@ def source(settings: Settings, store: Path) -> gv.Producer:
 
 
 def compile_batches(producer: gv.Producer, batch: int) -> None:
-    """Compiles what makes bricks in batches of this size; others are made as ever."""
-    eager, quick = producer.fill, torch.compile(producer.fill, dynamic=False)
-    producer.fill = lambda nodes: (quick if len(nodes) == batch else eager)(nodes)
+    """Compiles what makes so many bricks, and what classifies the children of so many nodes; other
+    batches are made as ever.
+    """
+
+    def compiled(eager: Callable[[gv.Nodes], Any], size: int) -> Callable[[gv.Nodes], Any]:
+        quick = torch.compile(eager, dynamic=False)
+        return lambda nodes: (quick if len(nodes) == size else eager)(nodes)
+
+    producer.fill = compiled(producer.fill, batch)
+    producer.classify = compiled(producer.classify, producer.branching**3 * batch)
 
 
 def quantiles(times: list[float]) -> list[str]:

@@ -1,5 +1,5 @@
-"""Words that lead out of the pools: kernels take them for absent, and what brings them from outside
-is refused.
+"""Words that lead out of the pools, and numbers by which rays would leave the tree or never end:
+kernels take them for absent, and what brings words from outside is refused.
 """
 
 from __future__ import annotations
@@ -63,6 +63,15 @@ def test_a_scene_does_not_reach_out_of_its_root_cube(blobs, backend, branching, 
         hits = trace_rays(rays, given._replace(place_33=place), backend=backend)
         found.append([*hits, tree.nodes.request_tn.clone()])
     assert all(torch.equal(*each) for each in zip(*found, strict=True))
+
+
+def test_a_cone_that_is_no_number_ends_its_ray(blobs, backend):
+    """No node would answer for more than one of its intervals, of which there may be millions."""
+    tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[backend])
+    rays, given = arguments(tree, 4)
+    rays, given = rays._replace(cone_r2=rays.cone_r2 * torch.nan), given._replace(step=1e-4)
+    _, alpha, _, samples, missed = trace_rays(rays, given, backend=backend)
+    assert not (alpha.any() or samples.any() or missed.any())
 
 
 @pytest.mark.parametrize("name", SHADERS)

@@ -78,7 +78,7 @@ class Beam(Rows):
 
     def clipped(self) -> Beam:
         """The same with distances cut at the scene (slab test, Kay and Kajiya, 1986); what no face
-        bounds is closed.
+        bounds is closed, and a ray whose cone is NaN.
         """
         first, last = self.first, self.last
         for axis in range(3):
@@ -91,7 +91,8 @@ class Beam(Rows):
             last = torch.where(beside, first, last)
             first = torch.where(flat, first, larger(first, smaller(a, b)))
             last = torch.where(flat, last, smaller(last, larger(a, b)))
-        return replace(self, first=first, last=torch.where(last < INF, last, first))
+        is_cone = (self.cone_near == self.cone_near) & (self.cone_growth == self.cone_growth)
+        return replace(self, first=first, last=torch.where(is_cone & (last < INF), last, first))
 
     def cone(self, t: Tensor) -> Tensor:
         """(r,) world widths of the cones at distances t (r,)."""

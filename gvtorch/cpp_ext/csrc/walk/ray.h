@@ -81,7 +81,8 @@ struct Ray {
   }
 
   // Slab test (Kay and Kajiya, "Ray tracing complex scenes", 1986).
-  // A ray that no face bounds (no direction, NaN, infinite) is closed, so that no loop runs on for ever.
+  // A ray that no face bounds (no direction, NaN, infinite), or whose cone is NaN, is closed, so that no loop runs on
+  // for ever.
   GV_HD void begin(const RayView& rays, Vec3<double> start) {
     for (int axis = 0; axis < 3; ++axis) {
       origin[axis] = static_cast<T>(start[axis]);
@@ -98,7 +99,8 @@ struct Ray {
       first = larger(first, smaller(a, b));
       last = smaller(last, larger(a, b));
     }
-    if (!(last < static_cast<T>(INFINITY))) last = first;
+    const bool is_cone = cone_near == cone_near && cone_growth == cone_growth;
+    if (!is_cone || !(last < static_cast<T>(INFINITY))) last = first;
   }
 
   // Where the ray begins, as exactly as it is known.
