@@ -410,6 +410,32 @@ def test_every_shader_becomes_every_other(tab):
     assert not tab.page.locator(".gv-note.gv-bad").count() and not tab.complaints
 
 
+TOUCH = """() => {
+  for (const part of document.querySelectorAll(".gv-panel details")) part.open = true;
+  for (const box of document.querySelectorAll(".gv-panel input:not([type=file]), .gv-panel select"))
+    for (const what of ["input", "change"]) box.dispatchEvent(new Event(what, { bubbles: true }));
+}"""
+
+
+def test_every_control_of_every_shader_is_touched(tab, viewer):
+    """Each says again what it shows: no code of the page breaks; and a number that is typed where
+    there is no slider is taken.
+    """
+    row = tab.page.locator("label.gv-row:has(> span:text-is('shader')) select")
+    for name in row.locator("option").all_inner_texts():
+        row.select_option(label=name)
+        tab.until("!app.before")
+        tab.page.evaluate(TOUCH)
+        tab.page.wait_for_timeout(50)
+    assert not tab.complaints
+    row.select_option(label="Isosurface")
+    tab.until("app.state.shader.kind === 'Isosurface'")
+    value = tab.page.locator("label.gv-row:has(> span:text-is('value')) input").first
+    value.fill("123.5")
+    value.press("Enter")
+    tab.until(lambda: viewer.session.ask(lambda: viewer.state.shader).value == 123.5)
+
+
 def test_a_surface_is_saved_by_its_buttons(tab, viewer, tmp_path):
     """Both kinds of files; a level that there is none of is refused in one line."""
     row = tab.page.locator("label.gv-row:has(> span:text-is('shader')) select")

@@ -63,6 +63,7 @@ export class Controls {
     const whole = told.type === "whole";
     const read = (text) => (text === "" && told.optional ? null : whole ? Math.round(Number(text)) : Number(text));
     const box = el("input.gv-number", { type: "number", step: "any", value: typeof value === "number" ? Number(value.toPrecision(6)) : "", placeholder: told.optional ? "auto" : "" });
+    let slider = null;
     box.onchange = () => {
       const found = read(box.value);
       if (found !== null && !Number.isFinite(found)) return;
@@ -71,7 +72,7 @@ export class Controls {
     };
     if (!told.range) return box;
     const [low, high] = told.range;
-    const slider = el("input.gv-slider", { type: "range", min: low, max: high, step: whole ? 1 : (high - low) / 400, value: value ?? low });
+    slider = el("input.gv-slider", { type: "range", min: low, max: high, step: whole ? 1 : (high - low) / 400, value: value ?? low });
     slider.oninput = () => {
       box.value = whole ? slider.value : Number(Number(slider.value).toPrecision(4));
       set(read(slider.value), false);
