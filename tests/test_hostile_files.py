@@ -11,6 +11,7 @@ import importlib
 import json
 import os
 import resource
+import struct
 import subprocess
 import sys
 import threading
@@ -353,3 +354,69 @@ def test_hdf5_reads_regular_files_beside_it(tmp_path, kind):
             write(file, "other.h5")
         with pytest.raises(ValueError, match=r"lies in another folder|is no regular file"):
             gv.read_volume(file, key="a", axes="zyx")
+
+
+@pytest.mark.parametrize(
+    ("codec", "number"),
+    [
+        ("png", 34933), ("jpeg", 7), ("jpeg2k", 34712), ("jpegxr", 34934), ("jpegxl", 50002),
+        ("webp", 50001), ("lerc", 34887),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("tiled", [True, False])
+def test_a_picture_larger_than_its_tile_is_refused(tmp_path, codec, number, tiled):
+    """It was unpacked whole, and cropped to a strip."""
+    imagecodecs = pytest.importorskip("imagecodecs")
+    color = codec == "webp"
+    encode = getattr(imagecodecs, f"{codec}_encode")
+
+    def write(rows: int) -> Path:
+        packed = bytes(encode(np.full((rows, 16, 3)[: 2 + color], 7, np.uint8)))
+        place = [(322, 3, 1, 16), (323, 3, 1, 16), (324, 4, 1, 0), (325, 4, 1, len(packed))]
+        strip = [(278, 3, 1, 16), (279, 4, 1, len(packed))]
+        tags = [(256, 3, 1, 16), (257, 3, 1, 16), (259, 3, 1, number), (277, 3, 1, 1 + 2 * color)]
+        tags += [(262, 3, 1, 2)] * color + (place if tiled else strip)
+        head = hostile.tiff(tags, pixels=0)
+        at = head.index(struct.pack("<HHI", 324 if tiled else 273, 4, 1)) + 8
+        (tmp_path / "a.tif").write_bytes(
+            head[:at] + struct.pack("<I", len(head)) + head[at + 4 :] + packed
+        )
+        return tmp_path / "a.tif"
+
+    data = gv.read_volume(write(16)).data.numpy()
+    assert data.shape == (1, 16, 16, 3 if color else 1) and np.abs(data - 7.0).max() <= 1
+    with pytest.raises(ValueError, match="picture of 400 rows and 16 columns, more than its 16 an"):
+        gv.read_volume(write(400))
+
+
+@pytest.mark.parametrize("kind", ["mhd", "nhdr", "ome.tif"])
+def test_what_a_header_names_is_a_regular_file_beside_it(tmp_path, kind):
+    """A pipe has no end, and other folders are not a file's to name."""
+    data = np.arange(64, dtype=np.uint8).reshape(4, 4, 4)
+    (tmp_path / "in").mkdir()
+    for name in ("in/own.raw", "far.raw"):
+        (tmp_path / name).write_bytes(data.tobytes())
+    os.mkfifo(tmp_path / "in" / "pipe")
+    (tmp_path / "in" / "link").symlink_to("../far.raw")
+    file = tmp_path / "in" / f"a.{kind}"
+
+    def write(name: str) -> None:
+        if kind == "mhd":
+            text = "NDims = 3\nDimSize = 4 4 4\nElementType = MET_UCHAR\n"
+            text += f"ElementDataFile = {name}"
+        else:
+            text = "NRRD0004\ntype: uint8\ndimension: 3\nsizes: 4 4 4\nencoding: raw\n"
+            text += f"data file: {name}\n\n"
+        ids = (
+            '<TiffData IFD="0" FirstZ="{}" PlaneCount="1"><UUID FileName="{}">{}</UUID></TiffData>'
+        )
+        ifds = ids.format(0, file.name, 0) + ids.format(1, name.replace(".", "&#46;"), 1)
+        file.write_bytes(hostile.ome(2, 1, ifds) if kind == "ome.tif" else text.encode())
+
+    if kind != "ome.tif":
+        write("own.raw")
+        assert sorted(gv.read_volume(file).data.flatten().tolist()) == [*range(64)]
+    for name in ("../far.raw", "link", str(tmp_path / "far.raw"), "pipe"):
+        write(name)
+        with pytest.raises(ValueError, match=r"lies in another folder|is no regular file"):
+            gv.read_volume(file)

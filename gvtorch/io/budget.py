@@ -40,6 +40,18 @@ def check_regular(path: str | Path) -> None:
         raise ValueError(f"{path}: is no regular file")
 
 
+def check_beside(path: str, other: str) -> None:
+    """Raises ValueError for a file that `path` names and that lies neither in its folder nor below,
+    or is no regular file.
+    """
+    folder = os.path.realpath(os.path.dirname(path))
+    place = os.path.join(folder, other)
+    if os.path.commonpath([folder, os.path.realpath(place)]) != folder:
+        raise ValueError(f"{path}: names {other}, which lies in another folder")
+    if os.path.lexists(place):
+        check_regular(place)
+
+
 def check_files(source: object) -> None:
     """Raises ValueError if a source would read what is no regular file."""
     for file in (getattr(source, "file", None), *getattr(source, "files", ())):

@@ -2,16 +2,15 @@
 lossless), JPEG-LS, JPEG 2000 and its high-throughput kind. pydicom itself unpacks RLE.
 
 A frame's own header is compared with the file's before it is unpacked.
-Source: ISO/IEC 10918-1 (JPEG) and 15444-1 (JPEG 2000), markers SOF and SIZ; DICOM PS3.5, annex A.
+Source: DICOM PS3.5, annex A.
 """
 
 from __future__ import annotations
 
-import struct
 from typing import Any
 
-_JPEG_FRAMES = {*range(0xC0, 0xD0), 0xF7} - {0xC4, 0xC8, 0xCC}  # of JPEG and of JPEG-LS
-_BARE = {0x01, *range(0xD0, 0xD9)}  # markers without a length
+from .picture_size import jpeg2k_size, jpeg_size
+
 _CODECS = {
     "1.2.840.10008.1.2.4.50": "jpeg",
     "1.2.840.10008.1.2.4.51": "jpeg",
@@ -78,25 +77,3 @@ def decode_frame(packed: bytes, runner: Any) -> bytes:
     if size[2] > 1:
         runner.set_option("planar_configuration", 0)
     return np.ascontiguousarray(data).tobytes()
-
-
-def jpeg_size(packed: bytes) -> tuple[int, int, int] | None:
-    """(columns, rows, samples) that the header of a JPEG or JPEG-LS image tells."""
-    at = 2
-    while packed[:2] == b"\xff\xd8" and at + 9 < len(packed) and packed[at] == 0xFF:
-        marker = packed[at + 1]
-        if marker in _JPEG_FRAMES:
-            rows, columns, samples = struct.unpack_from(">HHB", packed, at + 5)
-            return (columns, rows, samples)
-        bare = marker in _BARE or marker == 0xFF
-        at += (1 if marker == 0xFF else 2) if bare else 2 + int.from_bytes(packed[at + 2 : at + 4])
-    return None
-
-
-def jpeg2k_size(packed: bytes) -> tuple[int, int, int] | None:
-    """(columns, rows, samples) that the header of a JPEG 2000 codestream tells."""
-    at = packed.find(b"\xff\x4f\xff\x51", 0, 4096)
-    if at < 0 or len(packed) < at + 42:
-        return None
-    right, low, left, high = struct.unpack_from(">4I", packed, at + 8)
-    return (right - left, low - high, int.from_bytes(packed[at + 40 : at + 42]))

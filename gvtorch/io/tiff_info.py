@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import logging
 import math
-import re
+import os
 import threading
-from collections.abc import Iterator
+import zlib
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 from xml.etree import ElementTree
@@ -18,8 +19,13 @@ import numpy as np
 
 from ..base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
 from ..base.units import NO_DEPTH, spacing_of, time_unit
+from .budget import check_beside
+from .picture_size import picture_size
 
 Told = tuple[ImageInfo, tuple[float, float, float], list[str]]  # info, spacing, what is not kept
+_JPEG = (6, 7, 34892, 33007)
+_LERC = 34887
+_PICTURES = (*_JPEG, _LERC, 22610, 33003, 33004, 33005, 34712, 34933, 34934, 50001, 50002, 52546)
 _MOST_XML = 1 << 28  # characters
 _MOST_PLANES = 1 << 16
 _MOST_LISTED = 1 << 22  # planes that a file may tell of
@@ -43,7 +49,11 @@ def opened(path: str) -> Iterator[tuple[Any, list[str]]]:
     try:
         with tifffile.TiffFile(path) as file:
             pages = len(file.pages)  # finds out where the chain of pages ends
-            _check_planes(path, file.pages.first.description if pages else "")
+            _check_told(path, file.pages.first.description if pages else "")
+            if file.is_micromanager:  # tifffile opens others of its data set
+                for name in os.listdir(os.path.dirname(os.path.abspath(path))):
+                    if name == "NDTiff.index" or "_MMStack" in name:
+                        check_beside(path, name)
             yield file, heard.warned
             if heard.damage:
                 raise ValueError(f"{path}: damaged: {heard.damage[0]}")
@@ -51,14 +61,75 @@ def opened(path: str) -> Iterator[tuple[Any, list[str]]]:
         log.removeHandler(heard)
 
 
-def _check_planes(path: str, text: str) -> None:
-    """Raises ValueError where OME-XML tells of more planes than a list of them can be made for."""
+def _check_told(path: str, text: str) -> None:
+    """Raises ValueError where OME-XML tells of more planes than a list of them can be made for, or
+    of files that are not beside it.
+    """
+    if not text[-10:].strip().endswith("OME>"):
+        return
+    if len(text) > _MOST_XML:
+        raise ValueError(f"{path}: {len(text)} characters of OME-XML are too many")
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError:
+        return  # which tifffile tells
     counts = dict[str, int]()
-    for name, number in re.findall(r'\b(Size[CZT]|PlaneCount)="(\d+)"', text[:_MOST_XML]):
-        counts[name] = max(counts.get(name, 1), int(number[:20]))
-    for total in (counts.pop("PlaneCount", 1), math.prod(counts.values())):
+    for element in root.iter():
+        if (other := element.get("FileName")) is not None:
+            check_beside(path, other)
+        for name in ("SizeC", "SizeZ", "SizeT", "PlaneCount"):
+            count = finite_number(element.get(name))
+            counts[name] = max(counts.get(name, 1), int(count or 1))
+    for total in (counts.pop("PlaneCount"), math.prod(counts.values())):
         if total > _MOST_LISTED:
             raise ValueError(f"{path}: tells of {total} planes, at most {_MOST_LISTED} are read")
+
+
+def check_pictures(pages: Iterable[Any]) -> None:
+    """Has pages compare the pictures in their tiles and strips with these, before one is unpacked:
+    tifffile unpacks all of it, and leaves out what is too much.
+    """
+    for page in pages:
+        frame = None if page is None else page.keyframe
+        if frame is not None and frame.compression in _PICTURES and "checked" not in vars(frame):
+            frame.checked, frame.decode = True, _checked(frame, frame.decode)
+
+
+def _checked(frame: Any, decode: Callable[..., Any]) -> Callable[..., Any]:
+    """Wraps what unpacks the pictures of a page; raises ValueError for one that does not fit."""
+    is_jpeg = frame.compression in _JPEG
+    wide, tall = frame.tilewidth, frame.tilelength
+    if not frame.is_tiled:
+        wide, tall = frame.imagewidth, min(frame.rowsperstrip, frame.imagelength)
+        tall += -tall % 16 if is_jpeg else 0  # whole blocks
+
+    most = 2 * wide * tall * frame.samplesperpixel * 8 + 4096  # bytes of LERC
+
+    def checked(packed: bytes | None, number: int, /, **more: Any) -> Any:
+        if packed and frame.compression == _LERC:
+            packed = _lerc(packed, most)
+        heads = [packed, more.get("jpegtables"), more.get("jpegheader")]
+        sizes = [size for head in heads if head and (size := picture_size(head)) is not None]
+        if packed and not sizes and not is_jpeg:
+            raise ValueError(f"tile {number} is no picture whose size can be read")
+        for columns, rows in sizes:
+            if columns > wide or rows > tall:
+                raise ValueError(
+                    f"tile {number} holds a picture of {rows} rows and {columns} columns, "
+                    f"more than its {tall} and {wide}"
+                )
+        return decode(packed, number, **more)
+
+    return checked
+
+
+def _lerc(packed: bytes, most: int) -> bytes:
+    """LERC that is packed once more, unpacked no further than `most` bytes."""
+    if packed[:4] == b"\x28\xb5\x2f\xfd":
+        import imagecodecs
+
+        return bytes(imagecodecs.zstd_decode(packed, out=most))
+    return zlib.decompressobj().decompress(packed, most) if packed[:1] == b"x" else packed
 
 
 class _Heard(logging.Handler):
@@ -79,8 +150,6 @@ class _Heard(logging.Handler):
 
 def ome_info(xml: str, number: int, name: str, width: int) -> Told:
     """Reads what OME-XML tells of an image, by its number among the images, or its name."""
-    if len(xml) > _MOST_XML:
-        raise ValueError(f"{len(xml)} characters of OME-XML are too many")
     root = ElementTree.fromstring(xml)
     images = [child for child in root.iter() if _tag(child) == "Image"]
     named = [image for image in images if image.get("Name") == name]

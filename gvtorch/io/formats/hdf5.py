@@ -19,7 +19,7 @@ import numpy as np
 from ...base.image_info import ChannelInfo, ImageInfo
 from ...base.named_axes import ask_axes, even_steps, letter_of, named_axes, place_named
 from ...base.units import spacing_of
-from ..budget import check_regular
+from ..budget import check_beside
 from ..source import Index, VolumeSource
 from .format import Format
 
@@ -135,9 +135,7 @@ def _check_other(path: str, other: str, name: str | None, left: int) -> None:
     for place in {os.path.join(folder, other), os.path.abspath(other)}:
         if not os.path.lexists(place):
             continue
-        if os.path.commonpath([folder, os.path.realpath(place)]) != folder:
-            raise ValueError(f"{path}: names {other}, which lies in another folder")
-        check_regular(place)
+        check_beside(path, place)
         if name is not None:
             with h5py.File(place, "r") as file:
                 _check_files(place, file, name, left - 1)

@@ -2,7 +2,7 @@
 natural order of their names.
 
 What an image's header tells is compared with the first one's before it is unpacked.
-Source: ISO/IEC 15948 (PNG), IHDR; ISO/IEC 10918-1 (JPEG), SOF; Microsoft, BITMAPINFOHEADER.
+Source: Microsoft, BITMAPINFOHEADER.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ import numpy as np
 
 from ...base.image_info import ImageInfo, color_channels
 from ...base.volume import check_extent
-from ..dicom_codecs import jpeg_size
 from ..ngff import is_zarr
+from ..picture_size import picture_size
 from ..resources import amount, memory_free
 from ..source import Index, VolumeSource
-from ..tiff_info import opened
+from ..tiff_info import check_pictures, opened
 from .format import Format
 
 _TIFF = (".tif", ".tiff")
@@ -107,6 +107,7 @@ def _image(file: str) -> np.ndarray:
     codec = _CODECS.get(Path(file).suffix.lower())
     if codec is None:
         with opened(file) as (tiff, _):
+            check_pictures(tiff.series[0].pages)
             return tiff.asarray()
     import imagecodecs
 
@@ -121,12 +122,10 @@ def _shape(file: str) -> tuple[Any, ...]:
             return tuple(tiff.series[0].shape)
     with open(file, "rb") as stream:
         head = stream.read(_HEAD)
-    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) >= 24:
-        columns, rows = struct.unpack_from(">II", head, 16)
-    elif head[:2] == b"BM" and len(head) >= 26:
+    if head[:2] == b"BM" and len(head) >= 26:
         columns, rows = map(abs, struct.unpack_from("<ii", head, 18))
-    elif (size := jpeg_size(head)) is not None:
-        columns, rows, _ = size
+    elif (size := picture_size(head)) is not None:
+        columns, rows = size
     else:
         raise ValueError(f"{file}: is no PNG, JPEG or BMP image")
     return (rows, columns)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...base.image_info import ImageInfo, color_channels
 from ..source import ArraySource, Index, VolumeSource
-from ..tiff_info import Told, imagej_info, ome_info, opened
+from ..tiff_info import Told, check_pictures, imagej_info, ome_info, opened
 from .format import Format
 
 _JPEG = (6, 7, 34892, 33007)
@@ -33,6 +33,7 @@ class TiffSource(VolumeSource):
         with opened(self.path) as (file, _):
             series = file.series[self.series]
             if self.whole:
+                check_pictures(series.pages)
                 return series.asarray()[index]
             first = len(self.shape) - len(_page_shape(series))
             data = np.empty([s.stop - s.start for s in index], self.stored)
@@ -52,6 +53,7 @@ def read_page(page: Any, keyframe: Any, index: Index) -> np.ndarray:
     Raises:
         ValueError: The file ends before.
     """
+    check_pictures([page, keyframe])
     planes, depth, length, width, samples = keyframe.shaped
     if planes != 1 or depth != 1 or len(page.dataoffsets) != math.prod(keyframe.chunked):
         return page.asarray()[index]

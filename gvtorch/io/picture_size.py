@@ -1,0 +1,148 @@
+"""`picture_size`: what the header of a packed image tells of its extent, before it is unpacked.
+
+Source: ISO/IEC 10918-1 (JPEG), markers SOF; 15444-1 (JPEG 2000), SIZ and boxes; 15948 (PNG), IHDR;
+29199-2 (JPEG XR), annex A and IMAGE_HEADER; 18181 (JPEG XL), SizeHeader; RFC 9649 (WebP); Esri's
+LERC, structs HeaderInfo of Lerc2 and CntZImage.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+
+_JPEG_FRAMES = {*range(0xC0, 0xD0), 0xF7} - {0xC4, 0xC8, 0xCC}  # of JPEG and of JPEG-LS
+_BARE = {0x01, *range(0xD0, 0xD9)}  # markers without a length
+_RATIOS = ((1, 1), (12, 10), (4, 3), (3, 2), (16, 9), (5, 4), (2, 1))  # of JPEG XL
+_MOST_LAYERS = 64  # numbers of a pixel of LERC
+_LONG = (9, 13, 18, 30)  # bits of a side
+
+
+def picture_size(packed: bytes) -> tuple[int, int] | None:
+    """(columns, rows) of an image: PNG, WebP, JPEG, JPEG-LS, JPEG 2000, JPEG XR, JPEG XL or LERC;
+    None where its header is none of these, or tells of a film.
+    """
+    for begin, read in _READERS.items():
+        if packed.startswith(begin):
+            try:
+                return read(packed)
+            except struct.error:
+                return None
+    found = jpeg_size(packed) or jpeg2k_size(packed)
+    return None if found is None else found[:2]
+
+
+def jpeg_size(packed: bytes) -> tuple[int, int, int] | None:
+    """(columns, rows, samples) that the header of a JPEG or JPEG-LS image tells."""
+    at = 2
+    while packed[:2] == b"\xff\xd8" and at + 9 < len(packed) and packed[at] == 0xFF:
+        marker = packed[at + 1]
+        if marker in _JPEG_FRAMES:
+            rows, columns, samples = struct.unpack_from(">HHB", packed, at + 5)
+            return (columns, rows, samples)
+        bare = marker in _BARE or marker == 0xFF
+        at += (1 if marker == 0xFF else 2) if bare else 2 + int.from_bytes(packed[at + 2 : at + 4])
+    return None
+
+
+def jpeg2k_size(packed: bytes) -> tuple[int, int, int] | None:
+    """(columns, rows, samples) that the header of JPEG 2000 tells: of a codestream, or of the first
+    in a file of boxes.
+    """
+    at = 0
+    if packed[4:8] == b"jP  ":
+        at = next((at for at, kind in _boxes(packed) if kind == b"jp2c"), len(packed))
+    if packed[at : at + 4] != b"\xff\x4f\xff\x51" or len(packed) < at + 42:
+        return None
+    right, low, left, high = struct.unpack_from(">4I", packed, at + 8)
+    return (right - left, low - high, int.from_bytes(packed[at + 40 : at + 42]))
+
+
+def _boxes(packed: bytes) -> Iterator[tuple[int, bytes]]:
+    """Where the content of each box begins, and its kind."""
+    at = 0
+    while at + 8 <= len(packed):
+        size, head = int.from_bytes(packed[at : at + 4]), 8
+        if size == 1:
+            size, head = int.from_bytes(packed[at + 8 : at + 16]), 16
+        yield at + head, packed[at + 4 : at + 8]
+        if size < head:  # 0: to the end
+            return
+        at += size
+
+
+def _png_size(packed: bytes) -> tuple[int, int] | None:
+    columns, rows = struct.unpack_from(">II", packed, 16)
+    return columns, rows
+
+
+def _webp_size(packed: bytes) -> tuple[int, int] | None:
+    kind = packed[8:16]
+    if kind == b"WEBPVP8 ":
+        columns, rows = struct.unpack_from("<HH", packed, 26)
+        return columns & 0x3FFF, rows & 0x3FFF
+    if kind == b"WEBPVP8L":
+        (bits,) = struct.unpack_from("<I", packed, 21)
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    if kind == b"WEBPVP8X" and len(packed) >= 30 and not packed[20] & 2:
+        columns, rows = packed[24:27], packed[27:30]
+        return int.from_bytes(columns, "little") + 1, int.from_bytes(rows, "little") + 1
+    return None
+
+
+def _lerc_size(packed: bytes) -> tuple[int, int] | None:
+    if packed[:1] == b"C":
+        rows, columns = struct.unpack_from("<II", packed, 18)
+        return columns, rows
+    (version,) = struct.unpack_from("<i", packed, 6)
+    rows, columns, layers = struct.unpack_from("<III", packed, 14 if version >= 3 else 10)
+    return (columns, rows) if version < 4 or layers <= _MOST_LAYERS else None
+
+
+def _jpegxr_size(packed: bytes) -> tuple[int, int] | None:
+    """What the codestream tells, to which the container points."""
+    (at,) = struct.unpack_from("<I", packed, 4)
+    (count,) = struct.unpack_from("<H", packed, at)
+    tags = (struct.unpack_from("<HHII", packed, at + 2 + 12 * n) for n in range(count))
+    start = next((value for tag, _, _, value in tags if tag == 0xBCC0), len(packed))
+    if packed[start : start + 8] != b"WMPHOTO\0":
+        return None
+    (short,) = struct.unpack_from("<B", packed, start + 10)
+    columns, rows = struct.unpack_from(">HH" if short & 0x80 else ">II", packed, start + 12)
+    return columns + 1, rows + 1
+
+
+def _jpegxl_size(packed: bytes) -> tuple[int, int] | None:
+    at = 0
+    if packed[4:8] == b"JXL ":
+        parts = ((at, kind) for at, kind in _boxes(packed) if kind in (b"jxlc", b"jxlp"))
+        at, kind = next(parts, (len(packed), b""))
+        at += 4 * (kind == b"jxlp")  # its number
+    if packed[at : at + 2] != b"\xff\x0a" or len(packed) < at + 12:
+        return None
+    bits = int.from_bytes(packed[at + 2 : at + 14], "little")
+
+    def take(count: int) -> int:
+        nonlocal bits
+        found, bits = bits & ((1 << count) - 1), bits >> count
+        return found
+
+    small = take(1)
+
+    def side() -> int:
+        return 8 * (take(5) + 1) if small else take(_LONG[take(2)]) + 1
+
+    rows = side()
+    ratio = take(3)
+    columns = side() if ratio == 0 else rows * _RATIOS[ratio - 1][0] // _RATIOS[ratio - 1][1]
+    return columns, rows
+
+
+_READERS: dict[bytes, Callable[[bytes], tuple[int, int] | None]] = {
+    b"\x89PNG\r\n\x1a\n": _png_size,
+    b"RIFF": _webp_size,
+    b"II\xbc": _jpegxr_size,
+    b"Lerc2 ": _lerc_size,
+    b"CntZImage ": _lerc_size,
+    b"\xff\x0a": _jpegxl_size,
+    b"\0\0\0\x0cJXL ": _jpegxl_size,
+}
