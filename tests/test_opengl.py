@@ -183,12 +183,14 @@ def vtk():
 
 
 def square(vtk, corners):
-    """Two triangles between three corners and the fourth that follows from them."""
+    """Two triangles between three corners and the fourth that follows from them: source, place and
+    colour.
+    """
     plane = vtk.vtk.vtkPlaneSource()
     plane.SetOrigin(*corners[0])
     plane.SetPoint1(*corners[1])
     plane.SetPoint2(*corners[2])
-    return vtk.actor(plane, (0, 0, 0), (0.1, 0.2, 0.9))
+    return plane, (0, 0, 0), (0.1, 0.2, 0.9)
 
 
 @pytest.mark.backend("opengl")
