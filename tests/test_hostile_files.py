@@ -420,3 +420,36 @@ def test_what_a_header_names_is_a_regular_file_beside_it(tmp_path, kind):
         write(name)
         with pytest.raises(ValueError, match=r"lies in another folder|is no regular file"):
             gv.read_volume(file)
+
+
+def test_a_small_packed_nifti_takes_no_memory(tmp_path):
+    """100 bytes once took two gigabytes before they were found to be too few."""
+    nibabel = pytest.importorskip("nibabel")
+    head = bytearray(nibabel.Nifti1Image(np.zeros((4, 4, 4), np.uint8), np.eye(4)).to_bytes())
+    struct.pack_into("<3h", head, 42, 2000, 2000, 500)
+    file = tmp_path / "a.nii.gz"
+    file.write_bytes(gzip.compress(bytes(head)))
+    with pytest.raises(ValueError, match=r"takes 2000000000 bytes, which \d+ can't unpack to"):
+        gv.read_volume(file)
+
+
+@pytest.mark.parametrize("kind", ["mha", "nrrd"])
+@pytest.mark.parametrize("number", [300, -1, 10**30])
+def test_text_holds_only_numbers_of_its_type(tmp_path, kind, number):
+    """300 was read as 44."""
+    heads = {
+        "mha": "NDims = 3\nDimSize = 4 4 4\nElementType = MET_UCHAR\nBinaryData = False\n"
+        "ElementDataFile = LOCAL\n",
+        "nrrd": "NRRD0004\ntype: uint8\ndimension: 3\nsizes: 4 4 4\nencoding: text\n\n",
+    }
+    file = tmp_path / f"a.{kind}"
+    file.write_text(heads[kind] + "0 " * 63 + str(number))
+    with pytest.raises(ValueError, match=r"holds numbers that uint8 does not"):
+        gv.read_volume(file)
+
+
+def test_nrrd_of_an_unknown_order_of_bytes_is_refused(tmp_path):
+    head = "NRRD0004\ntype: short\ndimension: 3\nsizes: 4 4 4\nencoding: raw\nendian: middle\n\n"
+    (tmp_path / "a.nrrd").write_bytes(head.encode() + bytes(128))
+    with pytest.raises(ValueError, match="endian 'middle' is neither little nor big"):
+        gv.read_volume(tmp_path / "a.nrrd")

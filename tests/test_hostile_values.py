@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,10 @@ from helpers import gvtorch
 from helpers.pictures import GRAY
 
 import gvtorch as gv
+from gvtorch import bench
+from gvtorch.bench import tables
 from gvtorch.tools import cli
+from gvtorch.tools.bench import Bench
 
 HUGE = 10**400
 VIEW = gv.Camera.orbit(width=8, height=8)
@@ -187,3 +191,23 @@ def test_a_full_disk_leaves_saved_functions_as_they_were(tmp_path):
     with full_disk(len(before)), pytest.raises(OSError, match=r"a\.json"):
         longer.save(file)
     assert file.read_bytes() == before and [*tmp_path.iterdir()] == [file]
+
+
+def test_a_full_disk_leaves_the_figures_of_a_flight_as_they_were(tmp_path, small):
+    stats = tmp_path / "s.jsonl"
+    stats.write_text("old")
+    flags = ("--size", "8x8", "--frames", "2", "--stats", stats)
+    with full_disk(600):
+        run = gvtorch("fly", small, "-o", tmp_path / "f", *flags)
+    assert run.returncode == 2 and run.stderr.count("\n") == 1 and "s.jsonl" in run.stderr
+    assert stats.read_text() == "old" and {p.name for p in tmp_path.iterdir()} == {"s.jsonl", "f"}
+
+
+def test_a_full_disk_leaves_the_figures_of_a_workload_as_they_were(tmp_path, monkeypatch):
+    content = {"workload": "w", "machine": "m", "peers": {}, "notes": ["x" * 1000]}
+    monkeypatch.setattr(bench, "run", lambda *_: SimpleNamespace(as_dict=lambda: content))
+    monkeypatch.setattr(tables, "file_name", lambda _: "a.json")
+    (tmp_path / "a.json").write_text("old")
+    with full_disk(500), pytest.raises(OSError, match=r"a\.json"):
+        Bench(name="march", output=tmp_path, json=True).run()
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("a.json", "old")]

@@ -42,7 +42,12 @@ class PackedSource(VolumeSource):
             data = np.array([float(w) if wide else int(w) for w in words])
             if self.codec == "shares":
                 data = np.rint(data * 255).clip(0, 255)
-            data = data.astype(self.stored)
+            kind = np.dtype(self.stored)
+            if not wide:
+                ends = np.iinfo(kind)
+                if data.dtype.kind not in "iu" or data.min() < ends.min or data.max() > ends.max:
+                    raise ValueError(f"{self.path}: holds numbers that {kind.name} does not")
+            data = data.astype(kind)
         else:
             need = count * np.dtype(self.stored).itemsize
             data = np.frombuffer(unpack(self.file, self.offset, need, "zlib"), self.stored)

@@ -9,13 +9,14 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from tyro.conf import Positional, arg
 
 from ..base.declared import declared_names
 from ..base.messages import printable
+from ..base.whole_file import write_whole
 from ..io.ngff import is_zarr
 from .common import Bar, given, size, volume_formats
 from .drawn import Drawn
@@ -90,8 +91,8 @@ class Fly:
             is_film = self.output.suffix in _FILMS
             film = Video(self.output, width, height, fps=fps) if is_film else None
             kept = _Kept(self.output, film)
-            if self.stats is not None:
-                kept.lines = stack.enter_context(self.stats.open("w", encoding="utf-8"))
+            if self.stats is not None:  # as a whole: a full disk leaves what was there
+                stack.callback(kept.tell, self.stats)
             steps = math.inf if self._stands() else max(1, frames - 1 + self._loops())
             for moment, numbers in self._parts(frames):
                 source = self.scene.source
@@ -119,6 +120,8 @@ class Fly:
         is_film = self.output.suffix in _FILMS
         if not self.output.parent.is_dir():
             raise FileNotFoundError(f"folder not found: {self.output.parent}")
+        if self.stats is not None and not self.stats.parent.is_dir():
+            raise FileNotFoundError(f"folder not found: {self.stats.parent}")
         if self.output.suffix and not is_film:
             kinds = ", ".join(_FILMS)
             raise ValueError(
@@ -347,7 +350,7 @@ class _Kept:
 
     def __init__(self, output: Path, film: Video | None) -> None:
         self._output, self._film = output, film
-        self.lines: IO[str] | None = None
+        self.lines: list[str] = []
         self.coarse = 0
         self.cameras: dict[str, Camera] = {}
 
@@ -356,9 +359,13 @@ class _Kept:
         name, told = f"{number:04d}.png", picture.stats.as_dict()
         self.cameras[name] = camera
         self.coarse += not told.get("converged", True)
-        if self.lines is not None:
-            self.lines.write(json.dumps({"picture": number, **told}) + "\n")
+        self.lines.append(json.dumps({"picture": number, **told}) + "\n")
         if self._film is not None:
             self._film.add(picture)
         else:
             picture.save(self._output / name)
+
+    def tell(self, stats: Path) -> None:
+        """Writes what the pictures cost, if there are any."""
+        if self.lines:
+            write_whole(stats, "".join(self.lines))

@@ -7,6 +7,7 @@ Source: "NIfTI-1 data format", nifti1.h (nifti.nimh.nih.gov), dim, xyzt_units, i
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,7 @@ from ..source import Index, VolumeSource, place_axes
 from .format import Format
 
 _LABEL_INTENT = 1002
+_MOST_PACKED = 1032  # times smaller than what it unpacks to: the most that DEFLATE packs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +38,10 @@ def open_nifti(path: str) -> NiftiSource:
     """Opens an image; its first voxel tells the dtype after scaling."""
     image = _load(path)
     shape = tuple(int(n) for n in image.shape)
+    packed = path.lower().endswith(".gz")
+    need, size = math.prod(shape) * image.dataobj.dtype.itemsize, os.stat(path).st_size
+    if packed and need > _MOST_PACKED * size:  # nibabel takes memory for all of it at once
+        raise ValueError(f"{path}: takes {need} bytes, which {size} can't unpack to")
     first = np.asanyarray(image.dataobj[(slice(0, 1),) * len(shape)])
     if first.dtype.fields is not None:  # colours, the numbers of a voxel side by side
         first = _components(first)
@@ -54,7 +60,7 @@ def open_nifti(path: str) -> NiftiSource:
         path=path,
         shape=shape,
         stored=first.dtype.str,
-        whole=path.lower().endswith(".gz"),
+        whole=packed,
         info=info,
         lost=tuple(lost),
         **told | {"axes": told["axes"] + "-" * len(shape[5:])},
