@@ -390,8 +390,10 @@ def test_a_picture_larger_than_its_tile_is_refused(tmp_path, codec, number, tile
 
 
 @pytest.mark.parametrize("kind", ["mhd", "nhdr", "ome.tif"])
-def test_what_a_header_names_is_a_regular_file_beside_it(tmp_path, kind):
-    """A pipe has no end, and other folders are not a file's to name."""
+def test_what_a_header_names_is_a_regular_file(tmp_path, kind):
+    """A pipe has no end. Headers of detached data may name any folder's: that is what they are for;
+    OME-XML names files of its own folder.
+    """
     data = np.arange(64, dtype=np.uint8).reshape(4, 4, 4)
     (tmp_path / "in").mkdir()
     for name in ("in/own.raw", "far.raw"):
@@ -418,6 +420,9 @@ def test_what_a_header_names_is_a_regular_file_beside_it(tmp_path, kind):
         assert sorted(gv.read_volume(file).data.flatten().tolist()) == [*range(64)]
     for name in ("../far.raw", "link", str(tmp_path / "far.raw"), "pipe"):
         write(name)
+        if kind != "ome.tif" and name != "pipe":
+            assert sorted(gv.read_volume(file).data.flatten().tolist()) == [*range(64)]
+            continue
         with pytest.raises(ValueError, match=r"lies in another folder|is no regular file"):
             gv.read_volume(file)
 
@@ -453,3 +458,23 @@ def test_nrrd_of_an_unknown_order_of_bytes_is_refused(tmp_path):
     (tmp_path / "a.nrrd").write_bytes(head.encode() + bytes(128))
     with pytest.raises(ValueError, match="endian 'middle' is neither little nor big"):
         gv.read_volume(tmp_path / "a.nrrd")
+
+
+def test_names_of_axes_lead_to_no_other_folder(tmp_path):
+    """Places along an axis are read from the array of its name beside, and only there."""
+    zarr = pytest.importorskip("zarr")
+    for folder, name, step in (("in", "z", 3), ("", "z", 5)):
+        along = zarr.create_array(tmp_path / folder / name, shape=(4,), dtype="f4")
+        along[:] = np.arange(4) * step
+    for name, spacing in (("z", 3), ("../z", 1), (str(tmp_path / "z"), 1)):
+        names = (name, "y", "x")
+        made = zarr.create_array(
+            tmp_path / "in" / "a",
+            shape=(4, 4, 4),
+            dtype="u1",
+            dimension_names=names,
+            overwrite=True,
+        )
+        made[:] = 1
+        volume = gv.read_volume(tmp_path / "in" / "a", axes="zyx")
+        assert volume.spacing == (1, 1, spacing), name

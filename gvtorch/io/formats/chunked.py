@@ -123,9 +123,12 @@ def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) 
         letters = named_axes(names, shape) if axes is None else None
         for at, name in enumerate(names):
             beside = Path(folder).parent / name
+            if beside.parent != Path(folder).parent or name == "..":
+                continue  # names of axes, not ways to other folders
             if name and beside != Path(folder) and (head := _head(str(beside))) is not None:
                 places = _array(head[0], str(beside), source.opened)
                 if places.shape == (shape[at],) and shape[at] < 1 << 24:
+                    _check_chunk(str(beside), places)
                     values = Deadline(_TIMEOUT).wait(places.read(), str(beside))
                     steps[at], even = even_steps(values)
                     units[at] = str(_attributes(str(beside)).get("units", "")) or None
@@ -182,10 +185,16 @@ def _source(path: str, driver: str, folder: str) -> tuple[ChunkedSource, tuple[i
     dtype, shape = array.dtype.numpy_dtype, tuple(int(n) for n in array.shape)
     if dtype.kind not in "biuf":
         raise ValueError(f"{path}: values must be real numbers, got dtype {array.dtype.name}")
-    chunk = math.prod(array.chunk_layout.read_chunk.shape or (1,)) * dtype.itemsize
+    _check_chunk(path, array)
+    return replace(source, shape=shape, stored=dtype.str), shape
+
+
+def _check_chunk(path: str, array: Any) -> None:
+    """Raises ValueError where one chunk would take too much memory."""
+    size = np.dtype(array.dtype.numpy_dtype).itemsize
+    chunk = math.prod(array.chunk_layout.read_chunk.shape or (1,)) * size
     if chunk > _MOST_CHUNK:
         raise ValueError(f"{path}: a chunk takes {chunk} bytes, more than {_MOST_CHUNK}")
-    return replace(source, shape=shape, stored=dtype.str), shape
 
 
 def _n5_place(

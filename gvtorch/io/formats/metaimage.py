@@ -16,7 +16,7 @@ import numpy as np
 
 from ...base.image_info import ImageInfo, color_channels
 from ...base.units import length_unit
-from ..budget import check_beside
+from ..budget import check_regular
 from ..packed import PackedSource
 from ..source import LPS_TO_RAS, ArraySource, VolumeSource, place_axes
 from .format import Format
@@ -76,8 +76,8 @@ def open_metaimage(path: str) -> VolumeSource:
     is_here = file.upper() == "LOCAL"
     data = path if is_here else str(Path(path).parent / file)
     offset = end if is_here else int(header.get("HeaderSize", 0))
-    if not is_here:
-        check_beside(path, file)
+    if not is_here and os.path.exists(data):
+        check_regular(data)
     if header.get("BinaryData", "True").lower() != "true":
         return PackedSource(file=data, offset=offset, codec="text", fortran=True, **told)
     if header.get("CompressedData", "False").lower() == "true":
