@@ -92,6 +92,7 @@ class Fly:
             film = Video(self.output, width, height, fps=fps) if is_film else None
             kept = _Kept(self.output, film)
             if self.stats is not None:  # as a whole: a full disk leaves what was there
+                kept.lines = []
                 stack.callback(kept.tell, self.stats)
             steps = math.inf if self._stands() else max(1, frames - 1 + self._loops())
             for moment, numbers in self._parts(frames):
@@ -301,7 +302,8 @@ class Fly:
         path = self.flight if self.flight != "orbit" else None
         paths: dict[str, Any] = {"--path": path, "--orbit": self.orbit}
         if self.keys is None:
-            first = check.json_file("state", self._saved or "")
+            assert self.state is not None
+            first = check.json_file("state", self.state)
         else:
             paths |= {"--turntable": self.turntable, "--state": self.state}
             first = check.json_file("key frames", self.keys)[0]["state"]
@@ -350,7 +352,7 @@ class _Kept:
 
     def __init__(self, output: Path, film: Video | None) -> None:
         self._output, self._film = output, film
-        self.lines: list[str] = []
+        self.lines: list[str] | None = None  # of JSON, if figures are wanted
         self.coarse = 0
         self.cameras: dict[str, Camera] = {}
 
@@ -359,7 +361,8 @@ class _Kept:
         name, told = f"{number:04d}.png", picture.stats.as_dict()
         self.cameras[name] = camera
         self.coarse += not told.get("converged", True)
-        self.lines.append(json.dumps({"picture": number, **told}) + "\n")
+        if self.lines is not None:
+            self.lines.append(json.dumps({"picture": number, **told}) + "\n")
         if self._film is not None:
             self._film.add(picture)
         else:

@@ -31,7 +31,7 @@ from ..cameras.motion import Motion
 from .state import Eye, ViewState
 
 Curve = Callable[[float], Any]
-_ROUND = 72  # keys of a turntable: between them it leaves the circle by 10^-6 of its radius
+_ROUND = 4  # keys of a turntable: between them the camera turns, so that the circle is exact
 #: Numbers that increase along an axis of theirs: they slide without meeting.
 _ORDERED = {
     ("TransferFunction", "opacity"): (2, 0, slice(0, 1)),  # dimensions, axis, columns of the last
