@@ -235,6 +235,9 @@ def _missing() -> list[str]:
         "moderngl",
         "aiohttp",
         "anywidget",
+        "h5py",
+        "jupyterlab",
+        "trimesh",
     )
     _ran["io"] = int(all(importlib.util.find_spec(name) for name in libraries))
     return [name for name in filter(None, _REQUIRED.split(",")) if not _ran[name]]

@@ -25,6 +25,7 @@ SECONDS = 5.0  # of processor time for any header
 SECONDS_A_BYTE = 5e-7  # and for each byte of its file
 MEMORY = 512 * 10**6  # bytes of memory for any header
 MEMORY_A_BYTE = 40  # and for each byte of its file
+MOST_PACKED = 1032  # bytes that DEFLATE makes of one, at most
 _PATIENCE = 0.5  # seconds of processor time before memory counts
 _LOOK = 0.05  # seconds
 

@@ -20,7 +20,7 @@ import numpy as np
 from ..base.messages import need_library
 from ..base.srgb import from_srgb
 from ..points.points import Points
-from .budget import header_budget
+from .budget import MOST_PACKED, header_budget
 from .formats.fits import is_packed
 from .resources import amount, memory_free
 from .source import told_as
@@ -43,7 +43,6 @@ _PLY_TYPES = {
 }
 _FITS_TYPES = tuple("BIJKEDF")  # numbers, one or an array of them a row
 _MOST_HEADER = 65536  # bytes
-_MOST_PACKED = 1032  # bytes that gzip makes of one, at most
 
 
 class ColumnNames(TypedDict, total=False):
@@ -157,7 +156,7 @@ def _read_fits(path: Path) -> dict[str, np.ndarray]:
             if table is None:
                 raise ValueError("it has no table with rows")
             begin, size = int(table.fileinfo()["datLoc"]), path.stat().st_size
-            most = min(size * _MOST_PACKED, memory_free()) if packed else size - begin
+            most = min(size * MOST_PACKED, memory_free()) if packed else size - begin
             if table.size > most:
                 raise ValueError(f"its rows take {table.size} bytes, at most {most} can be there")
             kinds = zip(table.columns.names, table.columns.formats, strict=True)

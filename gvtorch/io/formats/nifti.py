@@ -15,11 +15,11 @@ import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo, color_channels
 from ...base.units import length_unit, time_unit
+from ..budget import MOST_PACKED
 from ..source import Index, VolumeSource, place_axes
 from .format import Format
 
 _LABEL_INTENT = 1002
-_MOST_PACKED = 1032  # times smaller than what it unpacks to: the most that DEFLATE packs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,7 @@ def open_nifti(path: str) -> NiftiSource:
     shape = tuple(int(n) for n in image.shape)
     packed = path.lower().endswith(".gz")
     need, size = math.prod(shape) * image.dataobj.dtype.itemsize, os.stat(path).st_size
-    if packed and need > _MOST_PACKED * size:  # nibabel takes memory for all of it at once
+    if packed and need > MOST_PACKED * size:  # nibabel takes memory for all of it at once
         raise ValueError(f"{path}: takes {need} bytes, which {size} can't unpack to")
     first = np.asanyarray(image.dataobj[(slice(0, 1),) * len(shape)])
     if first.dtype.fields is not None:  # colours, the numbers of a voxel side by side
