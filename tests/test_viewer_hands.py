@@ -436,6 +436,90 @@ def test_every_control_of_every_shader_is_touched(tab, viewer):
     tab.until(lambda: viewer.session.ask(lambda: viewer.state.shader).value == 123.5)
 
 
+# Chooses every shader, then of each list what it offers (of others than the shader's: the last),
+# each from there anew; returns what was refused.
+CHOOSE = """async () => {
+  const app = document.querySelector(".gv").app, refused = [];
+  const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+  for (const type of ["refused", "error"]) {
+    app.link.on(type, ({ text }) => refused.push(`${doing}: ${text}`));
+  }
+  const settled = async () => {
+    const before = refused.length;
+    await pause(25);
+    while (refused.length === before && !app.view.head?.final) await pause(5);
+    await pause(10);
+  };
+  const lists = (names) => [...document.querySelectorAll(".gv-panel details")]
+    .filter((one) => names.includes(one.firstChild.textContent))
+    .flatMap((one) => { one.open = true; return [...one.querySelectorAll("select")]; });
+  const all = () => lists(["Shader", "Picture", "Light and lens", "Sampling"]);
+  const choose = async (list, n) => {
+    const row = list.closest(".gv-row").textContent;
+    doing = `${app.state.shader.kind}, ${row}: ${list.options[n].text}`;
+    list.selectedIndex = n;
+    list.dispatchEvent(new Event("change", { bubbles: true }));
+    await settled();
+  };
+  let doing = "";
+  for (let kind = 0; kind < lists(["Shader"])[0].options.length; kind++) {
+    await choose(lists(["Shader"])[0], kind);
+    const start = app.state;
+    for (let at = 1; at < all().length; at++) {
+      const own = at < lists(["Shader"]).length, count = all()[at].options.length;
+      for (let n = own ? 0 : count - 1; n < count && !all()[at].disabled; n++) {
+        await choose(all()[at], n);
+        app.put(start);
+        await settled();
+      }
+    }
+  }
+  return refused;
+}"""
+
+
+def test_nothing_is_offered_that_is_refused(chromium):
+    """Of a scene with a second channel, of which surfaces may have their colours."""
+    data = np.random.default_rng(1).random((12, 12, 12, 4), np.float32)
+    channels = {"value": gv.Volume(data[..., 0]), "stored": gv.Volume(data)}
+    state = gv.ViewState(
+        shader=gv.TransferFunction.preset("gray", 0, 1), develop=Development(samples=1)
+    )
+    with gv.view(gv.VolumeProducer(channels), state=state, browser=False, wait=False) as viewer:
+        tab = Tab(chromium, viewer.url, viewport={"width": 560, "height": 240})
+        tab.until("app?.state")
+        tab.final()
+        assert tab.page.evaluate(CHOOSE) == []
+        assert not tab.complaints
+        tab.close()
+
+
+def test_another_shader_leaves_out_what_it_does_not_take(tab, viewer):
+    """Lighting goes, in one line, and comes back when the choice is undone. A surface in a scene of
+    one channel can have no other's colours.
+    """
+    row = tab.page.locator("label.gv-row:has(> span:text-is('shader')) select")
+    row.select_option(label="Lit")
+    tab.open("Light and lens")
+    tab.page.locator("label.gv-row:has-text('lighting') select").select_option("Lighting")
+    tab.until(lambda: viewer.state.options.lighting is not None)
+    row.select_option(label="Projection")
+    tab.until(lambda: viewer.state.options.lighting is None)
+    assert "lighting needs normals" in tab.page.locator(".gv-note.gv-shown").inner_text()
+    for name in ("lighting", "lens"):
+        assert tab.page.locator(f"label.gv-row:has-text('{name}') select").is_disabled()
+    tab.page.get_by_label("Undo").click()
+    tab.until(lambda: viewer.state.options.lighting is not None)
+    tab.page.get_by_label("Redo").click()
+    tab.until(lambda: viewer.state.options.lighting is None)
+    row.select_option(label="Isosurface")
+    tab.until(lambda: isinstance(viewer.state.shader, gv.Isosurface))
+    tab.final()
+    colors = tab.page.locator("label.gv-row:has(> span:text-is('color')) option")
+    assert colors.all_inner_texts() == []
+    assert not tab.page.locator(".gv-note.gv-bad").count()
+
+
 def test_a_surface_is_saved_by_its_buttons(tab, viewer, tmp_path):
     """Both kinds of files; a level that there is none of is refused in one line."""
     row = tab.page.locator("label.gv-row:has(> span:text-is('shader')) select")

@@ -34,7 +34,7 @@ def around(tracer: Tracer, options: RenderOptions, box: Tensor) -> Trace:
         ValueError: The shader must see a ray in one go, and the options cut rays into pieces or
             draw caps; or it has no normals, and there is lighting.
     """
-    _check_whole(tracer.shader, options)
+    check_fits(tracer.shader, options)
     lens = options.lens and options.lens.placed(box)
     if options.lighting is None:
         return _clipped(tracer, options, box, lens)
@@ -60,8 +60,12 @@ def around(tracer: Tracer, options: RenderOptions, box: Tensor) -> Trace:
     )
 
 
-def _check_whole(shader: Shader, options: RenderOptions) -> None:
-    """Raises ValueError if the shader must see a ray in one go, and the options do not let it."""
+def check_fits(shader: Shader, options: RenderOptions) -> None:
+    """Raises ValueError if a shader does not take what the options ask for: see `around`."""
+    if options.lighting is not None:
+        shader.unlit()
+        if options.lighting.indirect:
+            shader.matter()
     clip, layer = options.clip, options.layer
     cuts = {
         "lens": options.lens is not None,

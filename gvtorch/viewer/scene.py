@@ -32,7 +32,7 @@ from ..shaders.labels import label_rows
 from ..shaders.presets import IN_HU
 from ..tracing import cost, render
 from .schema import MOST_ITEMS
-from .state import ViewState, transfer_of
+from .state import ViewState, costed
 
 BINS = 256  # of a histogram, at most
 _LOOKED_AT = 1 << 20  # values by which whole numbers are known
@@ -101,10 +101,10 @@ class Scene:
 
     def cost(self, camera: Camera, state: ViewState, progress: Progress) -> Picture:
         """Renders what the last frame cost in false colours."""
-        shader = transfer_of(state.shader) or state.shader
         (tree,) = self.trees[:1]
         assert state.show != "picture"
-        counted = cost(tree, camera, shader, progress=progress, **state.settings())
+        unlit = {**state.settings(), "lighting": None}
+        counted = cost(tree, camera, costed(state.shader), progress=progress, **unlit)
         return counted.picture(state.show)
 
     def voxels(self, purpose: str) -> Volume | Store:

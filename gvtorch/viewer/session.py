@@ -29,6 +29,7 @@ from . import protocol
 from .client import Client, Send
 from .export import SurfaceExport
 from .files import read_function
+from .fitting import trimmed, unfit
 from .nodes import node_boxes
 from .parameters import Parameters
 from .protocol import parse
@@ -220,10 +221,12 @@ class Session:
             one.tell(kind, **content)
 
     def _tell_state(self, but: Client | None) -> None:
-        content = self.state.to_json()
         for one in self.clients.values():
             if one is not but:
-                one.tell("state", state=content)
+                one.tell("state", **self._told_state())
+
+    def _told_state(self) -> dict[str, Any]:
+        return {"state": self.state.to_json(), "unfit": unfit(self.state)}
 
     def _tell_busy(self, picture: Picture) -> None:
         stats = picture.stats
@@ -275,8 +278,8 @@ class Session:
             time=self.scene.describe_time(),
             labels=self.scene.describe_labels(),
             channels=[one.name for one in info.channels],
-            channel_names=self.scene.trees[0].channel_names,
-            state=self.state.to_json(),
+            widths={name: one.width for name, one in self.scene.trees[0].bricks.channels.items()},
+            **self._told_state(),
             schema=schema(),
             presets=[*PRESETS, *CT_PRESETS, *_COLOR_MAPS],
             engine=None
@@ -308,7 +311,7 @@ class Session:
         except (ValueError, OSError, ImportError, RuntimeError) as error:
             client.tell("refused", text=one_line(error))
             if isinstance(message, protocol.Change):
-                client.tell("state", state=self.state.to_json())
+                client.tell("state", **self._told_state())
 
     def _hello(self, client: Client, message: protocol.Hello) -> None:
         client.resized(message.width, message.height, message.rate)
@@ -332,6 +335,10 @@ class Session:
             client.tell("camera", camera=encode(client.eye))
         if not content:
             return
+        if type(state.shader) is not type(self.state.shader):
+            state, left_out = trimmed(state)
+            for why in left_out:
+                client.tell("note", text=f"left out: {why}")
         self.scene.check_time(state.time)
         self._open_planes(state)
         before, self.state = self.state, state

@@ -257,6 +257,15 @@ def transfer_of(shader: Shader) -> TransferFunction | None:
     return found if isinstance(found, TransferFunction) else None
 
 
+def costed(shader: Shader) -> TransferFunction:
+    """Returns the transfer function whose costs are shown in a shader's place.
+
+    Raises:
+        ValueError: It has none.
+    """
+    return check.instance("cost", "shader", transfer_of(shader) or shader, TransferFunction)
+
+
 def saved_time(path: str | Path) -> float:
     """Returns the time that a .json file of a state tells, 0 where it tells none.
 

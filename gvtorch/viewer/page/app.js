@@ -61,7 +61,7 @@ export class App {
     on("welcome", (told) => this.welcome(told));
     on("picture", (picture) => this.view.take(picture));
     on("file", ({ head, bytes }) => { keep(head.file, bytes, TYPES[head.file.split(".").at(-1)] ?? "application/octet-stream"); this.say(`${head.file} is saved`); });
-    on("state", ({ state }) => this.take(state));
+    on("state", (told) => this.take(told));
     on("camera", ({ camera }) => this.seat(camera));
     on("clients", ({ clients }) => { this.clients = clients; this.refresh(); });
     on("histogram", (told) => this.panel?.editor.setHistogram(told));
@@ -110,13 +110,14 @@ export class App {
   welcome(told) {
     Object.assign(this, {
       number: told.client, box: told.box, unit: told.unit, schema: told.schema, time: told.time, labels: told.labels,
-      channels: told.channels, channelNames: told.channel_names, engine: told.engine, parameters: told.parameters,
+      channels: told.channels, widths: told.widths, engine: told.engine, parameters: told.parameters,
     });
     this.presets.builtIn = told.presets;
     this.root.classList.remove("gv-lost");
     this.note.classList.remove("gv-shown");
     const { camera, ...state } = told.state;
     this.state = state;
+    this.unfit = told.unfit;
     this.camera ??= camera;
     this.home = camera;
     this.title.textContent = told.name;
@@ -143,10 +144,11 @@ export class App {
 
   // The state.
 
-  take(state) {
+  take({ state, unfit }) {
     const { camera, ...rest } = state;
-    if (JSON.stringify(rest) === JSON.stringify(this.state)) return;
+    if (JSON.stringify([rest, unfit]) === JSON.stringify([this.state, this.unfit])) return;
     this.state = rest;
+    this.unfit = unfit;
     this.refresh();
     this.view.overlay();
   }
@@ -223,7 +225,7 @@ export class App {
 
   /** Whether a shader is of use here: those that need another channel, only where there is one. */
   offers(kind) {
-    const many = this.channelNames.length > 1;
+    const many = Object.keys(this.widths).length > 1;
     return { Features: many, StoredColor: this.state.shader.kind === "StoredColor", Labels: this.state.shader.kind === "Labels" }[kind] ?? this.state.shader.kind !== "Labels";
   }
 

@@ -6,10 +6,12 @@ const words = (name) => name.replaceAll("_", " ");
 const LETTERS = ["x", "y", "z"];
 
 export class Controls {
-  /** `schema`: fields by the name of their class; `first(kind)` gives a new object of it. */
-  constructor(schema, first) {
+  /** `schema`: fields by the name of their class; `first(kind)` gives a new object of it; `unfit()` why
+   * controls, `Class.field`, or choices of theirs, `Class.field=choice`, can't be used as things are. */
+  constructor(schema, first, unfit) {
     this.schema = schema;
     this.first = first;
+    this.unfit = unfit;
   }
 
   /** Rows for the fields of an object; `change(value, rest)` takes the whole object anew. */
@@ -22,14 +24,21 @@ export class Controls {
         now[name] = one;
         change({ ...now }, rest, name);
       };
-      return this.row(name, told[name], value[name], set);
+      const own = `${value.kind}.${name}`, why = this.unfit()[own];
+      const row = this.row(name, told[name], value[name], set, own);
+      if (row && why) {
+        row.title = why;
+        row.classList.add("gv-unfit");
+        for (const part of row.querySelectorAll("input, select, button")) part.disabled = true;
+      }
+      return row;
     }).filter(Boolean);
   }
 
-  row(name, told, value, set) {
+  row(name, told, value, set, own = name) {
     if (told.type === "kept" || (value && value.kept)) return null;
     if (told.type === "object" || told.type === "one of" || told.type === "list") {
-      return this.group(name, told, value, set);
+      return this.group(name, told, value, set, own);
     }
     return el("label.gv-row", { title: told.text ?? "" }, el("span.gv-name", {}, words(name)), this.simple(told, value, set));
   }
@@ -94,13 +103,14 @@ export class Controls {
   }
 
   /** An object, one of several kinds, or a list of objects, as a block of rows. */
-  group(name, told, value, set) {
+  group(name, told, value, set, own = name) {
     if (told.type === "list") return this.list(name, told, value, set);
     const kinds = (told.type === "one of" ? told.choices : [told]).filter((one) => one.type !== "list");
     const label = (one) => (one.type === "object" ? one.kind : one.type);
-    const options = told.optional ? [null, ...kinds] : kinds;
+    const fits = (one) => one === current || !this.unfit()[`${own}=${one ? label(one) : "none"}`];
     const kindOf = (one) => kinds.find((k) => (k.type === "object" ? k.kind === one?.kind : k.type === "color" ? Array.isArray(one) : typeof one === "string"));
     const current = value === null || value === undefined ? null : kindOf(value) ?? null;
+    const options = (told.optional ? [null, ...kinds] : kinds).filter(fits);
     const pick = el("select", { title: told.text ?? "" }, ...options.map((one) => el("option", {}, one ? words(label(one)) : "none")));
     pick.selectedIndex = Math.max(0, options.indexOf(current));
     pick.onchange = () => {
@@ -109,7 +119,7 @@ export class Controls {
     };
     const head = el("label.gv-row", { title: told.text ?? "" }, el("span.gv-name", {}, words(name)));
     if (current && current.type === "color") {
-      head.append(el("span.gv-both", {}, pick, this.color(value, set)));
+      head.append(options.length > 1 ? el("span.gv-both", {}, pick, this.color(value, set)) : this.color(value, set));
       return head;
     }
     head.append(pick);

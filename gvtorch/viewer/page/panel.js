@@ -11,7 +11,8 @@ export class Panel {
   constructor(app) {
     this.app = app;
     this.open = new Set(["Colours", "Shader", "Picture"]);
-    this.controls = new Controls(app.schema, (kind, name) => this.first(kind, name));
+    this.controls = new Controls(app.schema, (kind, name) => this.first(kind, name), () => ({ ...app.unfit, ...this.unfit }));
+    this.unfit = unfitColours(app.widths);
     this.editor = new TransferEditor((f, rest) => app.changeTransfer(f, rest));
     this.labels = new LabelTable(app, this.controls);
     this.body = el("div.gv-sections");
@@ -24,7 +25,7 @@ export class Panel {
     const told = this.controls.schema[kind].fields, made = { kind };
     const old = (name === "shader" && this.controls.schema[now.kind]?.fields) || {};
     for (const [field, one] of Object.entries(told)) {
-      if (field in now && old[field] && alike(one, old[field])) made[field] = now[field];
+      if (old[field] && alike(one, old[field]) && (one.optional || (now[field] ?? null) !== null)) made[field] = now[field];
     }
     const transfer = app.transfer() ?? app.lastTransfer;
     const [low, high] = domain(transfer);
@@ -32,7 +33,7 @@ export class Panel {
     const { forward } = axes(app.camera);
     const inBox = ["world", "box"].includes(told.frame?.default);
     const known = {
-      transfer, value: middle, which: "maximum", channel: app.channelNames[0],
+      transfer, value: middle, which: "maximum", channel: Object.keys(app.widths)[0],
       direction: forward.map((one) => Number(one.toFixed(3))), position: app.camera.eye,
       aperture: 0.05, focus: 2, frame: "box", top: [0.1, 0.13, 0.18], bottom: [0.01, 0.012, 0.016],
       looks: [{ kind: "ChannelLook", window: [low, high] }],
@@ -110,7 +111,8 @@ export class Panel {
   }
 
   shader() {
-    const { app } = this, { shader } = app.state, put = (value, rest) => app.change({ shader: value }, rest);
+    const { app } = this, { shader } = app.state;
+    const put = (value, rest, name) => app.change({ shader: name === "color" ? { ...value, color_channel: colorChannel(value, app.widths) } : value }, rest);
     const known = app.schema.ViewState.fields.shader.choices.map((one) => one.kind);
     if (shader.kept) return [el("div.gv-row", {}, el("span.gv-name", {}, "shader"), el("span.gv-dim", {}, shader.kept.split("(")[0]))];
     const wanted = known.filter((kind) => app.offers(kind) || kind === shader.kind);
@@ -196,6 +198,22 @@ export class Panel {
 }
 
 const words = (kind) => kind.replace(/([a-z])([A-Z])/g, (_, a, b) => `${a} ${b.toLowerCase()}`);
+
+/** The channel that a surface's colour is taken from: its own or else the last that will do. */
+function colorChannel({ color, color_channel }, widths) {
+  const names = Object.keys(widths).filter((name) => color !== null || widths[name] === 4);
+  return Array.isArray(color) ? null : names.find((name) => name === color_channel) ?? names.at(-1) ?? null;
+}
+
+/** What colours a surface can't have for want of channels. */
+function unfitColours(widths) {
+  const numbers = Object.values(widths), told = {};
+  for (const kind of ["Isosurface", "DistanceField"]) {
+    if (numbers.length < 2) told[`${kind}.color=TransferFunction`] = "a function needs a second channel";
+    if (!numbers.includes(4)) told[`${kind}.color=none`] = "stored colours need a channel of 4 numbers";
+  }
+  return told;
+}
 
 /** Whether two fields hold the same: a function's `color` is a list of knots, a surface's one colour. */
 function alike(one, other) {
