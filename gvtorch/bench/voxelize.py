@@ -22,7 +22,7 @@ from . import PEERS
 from .record import Record, clock
 from .storage import clock_store
 
-_PART = 256  # voxels along a side of the regions that are asked for
+_PART = 512  # voxels along a side of the regions that are asked for
 
 
 def voxelize(record: Record) -> None:

@@ -92,8 +92,9 @@ class Mesh:
     @property
     def bounds(self) -> np.ndarray:
         """(2, 3) float64 lowest and highest corner of the triangles."""
-        used = self.vertices[np.unique(self.faces)]
-        return np.stack((used.min(0), used.max(0)))
+        used = np.zeros(len(self.vertices), bool)
+        used[self.faces] = True
+        return np.stack((self.vertices[used].min(0), self.vertices[used].max(0)))
 
     @property
     def corners(self) -> np.ndarray:
@@ -195,6 +196,9 @@ def _closed(faces: np.ndarray, counted: np.ndarray) -> np.ndarray:
     own = np.flatnonzero(counted)
     if len(own):
         edge, _, _, balance = edges_of(faces[own])
+        if not balance.any():  # no need to tell parts apart
+            closed[own] = True
+            return closed
         face = np.repeat(np.arange(len(own)), 3)
         part = parts_of(face, edge, len(own), len(balance))
         closed[own] = ~np.isin(part, np.unique(part[face[balance[edge] != 0]]))

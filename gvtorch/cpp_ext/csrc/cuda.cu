@@ -14,10 +14,15 @@ void FusedShaders::run(const Tensor& like, ShadeArgs args, bool wide) {
   wide ? shade_fused<double>(like, args) : shade_fused<float>(like, args);
 }
 
+template <class T>
+void voxelize_each(const Tensor& like, const VoxelizeArgs& args) {
+  const int64_t rows = args.cubes * args.side * args.side;
+  for_each(like, rows, WindRow<T>{{args}});
+  for_each(like, rows * args.side, VoxelizePack<T>{args});
+}
+
 void voxelize(const Tensor& like, const VoxelizeArgs& args) {
-  const int64_t voxels = args.cubes * args.side * args.side * args.side;
-  if (args.wide) return for_each(like, voxels, VoxelizePack<double>{args});
-  for_each(like, voxels, VoxelizePack<float>{args});
+  args.wide ? voxelize_each<double>(like, args) : voxelize_each<float>(like, args);
 }
 
 void make_noise(const Tensor& like, const NoiseArgs& args, int64_t points) {

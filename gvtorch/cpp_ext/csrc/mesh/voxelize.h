@@ -275,7 +275,7 @@ struct Waiting {
   }
 };
 
-// An index is as many voxels of a row along x as are looked at together. T: in which it is computed.
+// An index is as many voxels of a row along x as are looked at together, after `wind`. T: in which it is computed.
 template <class T>
 struct VoxelizePack {
   VoxelizeArgs a;
@@ -298,32 +298,30 @@ struct VoxelizePack {
     const int64_t row = index / packs(), cube = row / (a.side * a.side);
     const int32_t begin = static_cast<int32_t>(index % packs()) * kPack;
     const int32_t end = begin + kPack < a.side ? begin + kPack : a.side;
-    const double voxel = a.size_k3[3 * cube];
-    if (!(voxel > 0)) {
+    if (!(a.size_k3[3 * cube] > 0)) {
       for (int32_t i = begin; i < end; ++i) write(row * a.side + i, {}, infinite(), -1, 0);
       return;
     }
-    const double inverse = 1 / voxel;
-    const Cube own{{a.low_k3[3 * cube], a.low_k3[3 * cube + 1], a.low_k3[3 * cube + 2]},
-                   voxel,
-                   inverse,
-                   static_cast<T>(a.size_k3[3 * cube + 1] * inverse),
-                   static_cast<T>(a.size_k3[3 * cube + 2] * inverse)};
-    const auto half = static_cast<T>(0.5);
-    const T y = static_cast<T>(row % a.side) * own.step + half,
-            z = static_cast<T>(row / a.side % a.side) * own.step + half;
-    int32_t winding[kPack] = {};
-    wind(own, begin, end, y, z, winding);
-    if (kPack == 1 || voxel > kCoarse * a.detail) {
-      for (int32_t i = begin; i < end; ++i) look<T>(own, row, i, i + 1, y, z, winding + (i - begin));
+    const Cube own = cube_at(cube);
+    const T y = place(own, row % a.side), z = place(own, row / a.side % a.side);
+    if (kPack == 1 || own.voxel > kCoarse * a.detail) {
+      for (int32_t i = begin; i < end; ++i) look<T>(own, row, i, i + 1, y, z);
     } else {
-      look<Together<T>>(own, row, begin, end, y, z, winding);
+      look<Together<T>>(own, row, begin, end, y, z);
     }
     if (a.shares) fill(own, row, begin, end, y, z);
   }
 
+  GV_HD Cube cube_at(int64_t cube) const {
+    const double *low = a.low_k3 + 3 * cube, *size = a.size_k3 + 3 * cube, inverse = 1 / size[0];
+    return {{low[0], low[1], low[2]},
+            size[0],
+            inverse,
+            static_cast<T>(size[1] * inverse),
+            static_cast<T>(size[2] * inverse)};
+  }
   static GV_HD T infinite() { return static_cast<T>(bit_cast<float>(0x7f800000)); }
-  static GV_HD T place(const Cube& cube, int32_t i) { return static_cast<T>(i) * cube.step + static_cast<T>(0.5); }
+  static GV_HD T place(const Cube& cube, int64_t i) { return static_cast<T>(i) * cube.step + static_cast<T>(0.5); }
 
   GV_HD Triangle<T> triangle(const Cube& cube, int64_t number) const {
     T at[9];
@@ -390,16 +388,24 @@ struct VoxelizePack {
         });
   }
 
-  // Winding numbers of the voxels begin..end of a row: triangles ahead along x, those whose normals point ahead as 1.
-  GV_HD void wind(const Cube& cube, int32_t begin, int32_t end, T y, T z, int32_t* winding) const {
-    const double margin = kMargin * cube.voxel, x = cube.world(place(cube, begin), 0) - margin;
+  // Writes the winding numbers of a row, which packs take: triangles ahead along x, those whose normals point ahead
+  // as 1.
+  GV_HD void wind(int64_t row) const {
+    const int64_t number = row / (a.side * a.side);
+    if (!(a.size_k3[3 * number] > 0)) return;
+    const Cube cube = cube_at(number);
+    const T y = place(cube, row % a.side), z = place(cube, row / a.side % a.side);
+    const double margin = kMargin * cube.voxel, x = cube.world(place(cube, 0), 0) - margin;
     const double y0 = cube.world(y, 1) - margin, y1 = y0 + 2 * margin;
     const double z0 = cube.world(z, 2) - margin, z1 = z0 + 2 * margin;
+    int32_t* winding = a.winding_kzyx + row * a.side;
+    for (int32_t i = 0; i < a.side; ++i) winding[i] = 0;
     ahead(x, y0, y1, z0, z1, [&](int64_t number) {
       Vec3<T> corner[3];
       for (int i = 0; i < 9; ++i) corner[i / 3][i % 3] = cube.local(a.corner_f33[9 * number + i], i % 3);
       const Pierced<T> along = pierced(y, z, corner);
-      for (int32_t i = begin; i < end; ++i) winding[i - begin] += along.way * (along.at > place(cube, i));
+      if (along.way == 0) return;
+      for (int32_t i = 0; i < a.side; ++i) winding[i] += along.way * (along.at > place(cube, i));
     });
   }
 
@@ -470,7 +476,7 @@ struct VoxelizePack {
 
   // Finds the nearest triangles of voxels begin..end of a row together, and writes what they hold.
   template <class F>
-  GV_HD void look(const Cube& cube, int64_t row, int32_t begin, int32_t end, T y, T z, const int32_t* winding) const {
+  GV_HD void look(const Cube& cube, int64_t row, int32_t begin, int32_t end, T y, T z) const {
     using I = typename LanesOf<F>::Int;
     constexpr int32_t kOwn = static_cast<int32_t>(sizeof(F) / sizeof(T));
     F x{}, best{};
@@ -508,11 +514,11 @@ struct VoxelizePack {
       const T gap2 = nearest < 0 ? infinite() : lane_of(best, i - begin);
       const int64_t at = row * a.side + i;
       if (nearest < 0) {
-        write(at, {}, gap2, nearest, winding[i - begin]);
+        write(at, {}, gap2, nearest, a.winding_kzyx[at]);
       } else {
         const Triangle<T> own = triangle(cube, nearest);
         const Vec3<T> here{lane_of(x, i - begin), y, z};
-        write(at, here, gap2, nearest, winding[i - begin], &own, cube.inverse);
+        write(at, here, gap2, nearest, a.winding_kzyx[at], &own, cube.inverse);
       }
     }
   }
@@ -537,6 +543,16 @@ struct VoxelizePack {
     if (!a.weights) return;
     for (int i = 0; i < 3; ++i) static_cast<T*>(a.weight_kzyx3)[3 * at + i] = weight[i];
   }
+};
+
+// An index is a row.
+template <class T>
+struct WindRow {
+  VoxelizePack<T> pack;
+
+  static constexpr int kBlocksAtOnce = VoxelizePack<T>::kBlocksAtOnce;
+
+  GV_HD void operator()(int64_t row) const { pack.wind(row); }
 };
 
 }  // namespace GV_NAMESPACE
