@@ -46,6 +46,8 @@ class Settings:
     size: tuple[int, int] = (512, 512)
     source: Literal["store", "formula", "mandelbulb"] = "store"
     pools: tuple[str, ...] = ("512 MB", "128 MB", "32 MB", "8 MB")
+    brick_size: int = 8
+    """voxels along a side of a brick"""
     loading: str = "straight"
     workers: int = 2
     """threads that read the store: on one's own disk more of them only wait for one another"""
@@ -183,6 +185,7 @@ def fly(producer: gv.Producer, pool: str, settings: Settings, console: Console) 
     all_stats = []
     shader, cameras = scene(settings)
     options = {"brick_pool": pool, "node_pool": "64 MB", "loading": settings.loading}
+    options["brick_size"] = settings.brick_size
     with gv.Engine(producer, device=settings.device, **options) as engine:
         engine.render(cameras[0], shader)  # the flight begins with what its first view needs
         if engine.device.type == "cuda" and settings.graph:
