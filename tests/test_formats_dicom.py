@@ -298,3 +298,35 @@ def test_broken_files_give_one_line(tmp_path, data):
     assert_told(tmp_path / "e.dcm", tmp_path / "one")
     folder = write_series(tmp_path / "ct", data, packed="JPEGLS")
     assert_told(folder, tmp_path / "many", least=10)
+
+
+@pytest.mark.parametrize("samples", [1, 3])
+@pytest.mark.parametrize("dtype", ["u1", "<u2"])
+def test_run_lengths_are_unpacked_no_further_than_the_frame(tmp_path, samples, dtype):
+    """Segments that go on, lie behind the end, or are too short."""
+    imagecodecs = pytest.importorskip("imagecodecs")
+    image = noise((5, 7, samples), np.dtype(dtype).name)
+    bits = 8 * image.dtype.itemsize
+    one = dataset(Rows=5, Columns=7, BitsAllocated=bits, BitsStored=bits, HighBit=bits - 1)
+    one.SamplesPerPixel, one.PlanarConfiguration = samples, 0
+    one.PhotometricInterpretation = "RGB" if samples == 3 else "MONOCHROME2"
+    one.PixelData = image.tobytes() + bytes(image.nbytes % 2)
+    one.compress("1.2.840.10008.1.2.5", encoding_plugin="pydicom")
+    one.save_as(tmp_path / "a.dcm", enforce_file_format=True)
+    volume = gv.read_volume(tmp_path / "a.dcm")
+    assert np.array_equal(volume.data.numpy()[0], image[::-1, ::-1])
+
+    planes = [
+        image[..., n].tobytes()[k :: bits // 8] for n in range(samples) for k in range(bits // 8)
+    ]
+    packed = [bytes(imagecodecs.packbits_encode(plane)) for plane in planes]
+    for first in (b"\x81\x07" * 100_000, packed[0][: len(packed[0]) // 2], None):
+        parts = [packed[0] if first is None else first, *packed[1:]]
+        starts = np.cumsum([64, *(len(part) for part in parts)])[:-1].tolist()
+        starts = [*starts[:-1], 10**9] if first is None else starts
+        head = np.array([len(parts), *starts, *[0] * (15 - len(parts))], "<u4").tobytes()
+        frame = head + b"".join(parts)
+        one.PixelData = pydicom.encaps.encapsulate([frame + bytes(len(frame) % 2)])
+        one.save_as(tmp_path / "b.dcm", enforce_file_format=True)
+        with pytest.raises(ValueError, match=r"b\.dcm"):
+            gv.read_volume(tmp_path / "b.dcm")

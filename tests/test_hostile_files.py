@@ -24,6 +24,7 @@ from helpers import hostile
 
 import gvtorch as gv
 from gvtorch.io import budget, reading
+from gvtorch.io.picture_size import picture_size
 
 MEMORY = 1500 << 20  # bytes of address space beyond what the libraries take
 SECONDS = 8  # of processor time a file
@@ -356,6 +357,21 @@ def test_hdf5_reads_regular_files_beside_it(tmp_path, kind):
             gv.read_volume(file, key="a", axes="zyx")
 
 
+def picture_in_tiff(
+    folder: Path, packed: bytes, number: int, *, color: bool = False, tiled: bool = True
+) -> Path:
+    """A TIFF of 16 x 16 whose only tile, or strip, is a packed picture."""
+    place = [(322, 3, 1, 16), (323, 3, 1, 16), (324, 4, 1, 0), (325, 4, 1, len(packed))]
+    strip = [(278, 3, 1, 16), (279, 4, 1, len(packed))]
+    tags = [(256, 3, 1, 16), (257, 3, 1, 16), (259, 3, 1, number), (277, 3, 1, 1 + 2 * color)]
+    tags += [(262, 3, 1, 2)] * color + (place if tiled else strip)
+    head = hostile.tiff(tags, pixels=0)
+    at = head.index(struct.pack("<HHI", 324 if tiled else 273, 4, 1)) + 8
+    head = head[:at] + struct.pack("<I", len(head)) + head[at + 4 :]
+    (folder / "a.tif").write_bytes(head + packed)
+    return folder / "a.tif"
+
+
 @pytest.mark.parametrize(
     ("codec", "number"),
     [
@@ -372,21 +388,84 @@ def test_a_picture_larger_than_its_tile_is_refused(tmp_path, codec, number, tile
 
     def write(rows: int) -> Path:
         packed = bytes(encode(np.full((rows, 16, 3)[: 2 + color], 7, np.uint8)))
-        place = [(322, 3, 1, 16), (323, 3, 1, 16), (324, 4, 1, 0), (325, 4, 1, len(packed))]
-        strip = [(278, 3, 1, 16), (279, 4, 1, len(packed))]
-        tags = [(256, 3, 1, 16), (257, 3, 1, 16), (259, 3, 1, number), (277, 3, 1, 1 + 2 * color)]
-        tags += [(262, 3, 1, 2)] * color + (place if tiled else strip)
-        head = hostile.tiff(tags, pixels=0)
-        at = head.index(struct.pack("<HHI", 324 if tiled else 273, 4, 1)) + 8
-        (tmp_path / "a.tif").write_bytes(
-            head[:at] + struct.pack("<I", len(head)) + head[at + 4 :] + packed
-        )
-        return tmp_path / "a.tif"
+        return picture_in_tiff(tmp_path, packed, number, color=color, tiled=tiled)
 
     data = gv.read_volume(write(16)).data.numpy()
     assert data.shape == (1, 16, 16, 3 if color else 1) and np.abs(data - 7.0).max() <= 1
     with pytest.raises(ValueError, match="picture of 400 rows and 16 columns, more than its 16 an"):
         gv.read_volume(write(400))
+
+
+def test_a_strip_of_jpeg_is_no_taller_than_it_says(tmp_path):
+    """By as much as whole blocks take; so many rows were left out in silence."""
+    imagecodecs = pytest.importorskip("imagecodecs")
+    packed = imagecodecs.jpeg_encode(np.full((24, 16), 7, np.uint8))
+    with pytest.raises(ValueError, match="picture of 24 rows and 16 columns, more than its 16 and"):
+        gv.read_volume(picture_in_tiff(tmp_path, packed, 7, tiled=False))
+
+
+def test_a_film_in_a_tile_is_refused(tmp_path):
+    """Its pictures would be unpacked one after the other, however many."""
+    imagecodecs = pytest.importorskip("imagecodecs")
+    film = np.arange(5 * 16 * 16, dtype=np.uint8).reshape(5, 16, 16)
+    for some, usual in ((film[:1], True), (film, False)):
+        for packed in (imagecodecs.jpegxl_encode(some), in_parts(imagecodecs.jpegxl_encode(some))):
+            assert imagecodecs.jpegxl_decode(packed).shape[-2:] == (16, 16)
+            assert picture_size(packed) == ((16, 16) if usual else None)
+            if not usual:
+                with pytest.raises(ValueError, match="tile 0 is no picture whose size can be read"):
+                    gv.read_volume(picture_in_tiff(tmp_path, packed, 50002))
+
+
+def in_parts(codestream: bytes) -> bytes:
+    """JPEG XL in boxes, the first of which ends within the header."""
+    if codestream[:2] != b"\xff\x0a":
+        return codestream
+    parts = (b"\0\0\0\0" + codestream[:5], b"\x80\0\0\x01" + codestream[5:])
+    boxes = [b"\0\0\0\x0cJXL \r\n\x87\n", b"\0\0\0\x14ftypjxl \0\0\0\0jxl "]
+    boxes += [struct.pack(">I", 8 + len(part)) + b"jxlp" + part for part in parts]
+    return b"".join(boxes)
+
+
+def test_forged_heads_of_pictures_tell_no_size():
+    """A second frame of JPEG, and boxes of JPEG 2000 that hide which codestream is unpacked."""
+    imagecodecs = pytest.importorskip("imagecodecs")
+    small, large = (np.zeros((n, n), np.uint8) for n in (16, 4000))
+    one, other = (imagecodecs.jpeg_encode(data) for data in (small, large))
+    frames = [data[(at := data.index(b"\xff\xc0")) : at + 13] for data in (one, other)]
+    assert picture_size(one) == (16, 16)
+    assert picture_size(one.replace(frames[0], b"".join(frames))) is None
+    one, other = (imagecodecs.jpeg2k_encode(data, codecformat="jp2") for data in (small, large))
+    codestream = other.index(b"jp2c") - 4
+    first = one.index(b"jp2c") - 4
+    assert picture_size(one) == (16, 16) and picture_size(other) == (4000, 4000)
+    # The size is that of the codestream, whatever the header before tells of it.
+    assert picture_size(one[:first] + other[codestream:]) == (4000, 4000)
+    # A box of 64 bits' length, and one without an end.
+    wide = struct.pack(">I4sQ", 1, b"free", 16 + 40) + one[first : first + 40]
+    assert picture_size(one[:first] + wide + other[codestream:]) == (4000, 4000)
+    endless = struct.pack(">I4s", 0, b"free") + one[first:]
+    assert picture_size(one[:first] + endless) is None
+
+
+@pytest.mark.parametrize("name", ["NDTiff.index", "a_MMStack_1.ome.tif"])
+def test_a_stack_of_micromanager_reads_its_own_folder(tmp_path, name):
+    """Its index names files, and files of a like name are opened."""
+    text = b'{"MajorVersion": 3}\0'
+    (tmp_path / "in").mkdir()
+    file = tmp_path / "in" / "a_MMStack.ome.tif"
+    file.write_bytes(hostile.tiff([(51123, 2, len(text), text)]))
+    with pytest.warns(UserWarning, match="failed to read summary"):
+        assert gv.read_volume(file).extent == (8, 8, 1)
+    os.mkfifo(tmp_path / "pipe")
+    if name == "NDTiff.index":
+        axes, other = b'{"z": 0}', b"../pipe"
+        entry = struct.pack("<I", len(axes)) + axes + struct.pack("<I", len(other)) + other
+        (tmp_path / "in" / name).write_bytes(entry + struct.pack("<IiiiiIii", 0, 8, 8, *[0] * 5))
+    else:
+        (tmp_path / "in" / name).symlink_to("../pipe")
+    with pytest.raises(ValueError, match="lies in another folder"):
+        gv.read_volume(file)
 
 
 @pytest.mark.parametrize("kind", ["mhd", "nhdr", "ome.tif"])

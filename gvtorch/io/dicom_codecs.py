@@ -1,7 +1,8 @@
-"""Packed DICOM frames through imagecodecs, as a decoding plugin of pydicom: JPEG (8, 12 bits and
-lossless), JPEG-LS, JPEG 2000 and its high-throughput kind. pydicom itself unpacks RLE.
+"""Packed DICOM frames through imagecodecs, as a decoding plugin of pydicom: RLE, JPEG (8, 12 bits
+and lossless), JPEG-LS, JPEG 2000 and its high-throughput kind.
 
-A frame's own header is compared with the file's before it is unpacked.
+A frame's own header is compared with the file's before it is unpacked; RLE, which has none, is
+unpacked no further than the file tells.
 Source: DICOM PS3.5, annex A.
 """
 
@@ -11,7 +12,9 @@ from typing import Any
 
 from .picture_size import jpeg2k_size, jpeg_size
 
+_RLE = "1.2.840.10008.1.2.5"
 _CODECS = {
+    _RLE: "dicomrle",
     "1.2.840.10008.1.2.4.50": "jpeg",
     "1.2.840.10008.1.2.4.51": "jpeg",
     "1.2.840.10008.1.2.4.57": "ljpeg",
@@ -57,6 +60,8 @@ def decode_frame(packed: bytes, runner: Any) -> bytes:
     import numpy as np
 
     codec = _CODECS[str(runner.transfer_syntax)]
+    if codec == "dicomrle":
+        return _unpacked_rle(packed, runner)
     wanted = (runner.columns, runner.rows, runner.samples_per_pixel)
     size = jpeg2k_size(packed) if codec == "jpeg2k" else jpeg_size(packed)
     if size != wanted:
@@ -77,3 +82,16 @@ def decode_frame(packed: bytes, runner: Any) -> bytes:
     if size[2] > 1:
         runner.set_option("planar_configuration", 0)
     return np.ascontiguousarray(data).tobytes()
+
+
+def _unpacked_rle(packed: bytes, runner: Any) -> bytes:
+    """Plane after plane, low bytes first."""
+    import imagecodecs
+
+    width = runner.bits_allocated // 8
+    size = runner.columns * runner.rows * runner.samples_per_pixel * width
+    data = bytes(imagecodecs.dicomrle_decode(packed, f"<u{width}", out=size))
+    if len(data) != size:
+        raise ValueError(f"a frame unpacks to {len(data)} bytes, not to {size}")
+    runner.set_option("planar_configuration", 1)
+    return data

@@ -11,10 +11,12 @@ import struct
 from collections.abc import Callable, Iterator
 
 _JPEG_FRAMES = {*range(0xC0, 0xD0), 0xF7} - {0xC4, 0xC8, 0xCC}  # of JPEG and of JPEG-LS
+_JPEG_SCAN = 0xDA
 _BARE = {0x01, *range(0xD0, 0xD9)}  # markers without a length
 _RATIOS = ((1, 1), (12, 10), (4, 3), (3, 2), (16, 9), (5, 4), (2, 1))  # of JPEG XL
 _MOST_LAYERS = 64  # numbers of a pixel of LERC
 _LONG = (9, 13, 18, 30)  # bits of a side
+_JXL_HEADER = 32  # bytes, more than what is read of one takes
 
 
 def picture_size(packed: bytes) -> tuple[int, int] | None:
@@ -32,16 +34,22 @@ def picture_size(packed: bytes) -> tuple[int, int] | None:
 
 
 def jpeg_size(packed: bytes) -> tuple[int, int, int] | None:
-    """(columns, rows, samples) that the header of a JPEG or JPEG-LS image tells."""
-    at = 2
+    """(columns, rows, samples) that the header of a JPEG or JPEG-LS image tells; None if it tells
+    of two.
+    """
+    at, found = 2, None
     while packed[:2] == b"\xff\xd8" and at + 9 < len(packed) and packed[at] == 0xFF:
         marker = packed[at + 1]
+        if marker == _JPEG_SCAN:
+            break
         if marker in _JPEG_FRAMES:
+            if found is not None:
+                return None
             rows, columns, samples = struct.unpack_from(">HHB", packed, at + 5)
-            return (columns, rows, samples)
+            found = (columns, rows, samples)
         bare = marker in _BARE or marker == 0xFF
         at += (1 if marker == 0xFF else 2) if bare else 2 + int.from_bytes(packed[at + 2 : at + 4])
-    return None
+    return found
 
 
 def jpeg2k_size(packed: bytes) -> tuple[int, int, int] | None:
@@ -50,22 +58,23 @@ def jpeg2k_size(packed: bytes) -> tuple[int, int, int] | None:
     """
     at = 0
     if packed[4:8] == b"jP  ":
-        at = next((at for at, kind in _boxes(packed) if kind == b"jp2c"), len(packed))
+        at = next((at for at, _, kind in _boxes(packed) if kind == b"jp2c"), len(packed))
     if packed[at : at + 4] != b"\xff\x4f\xff\x51" or len(packed) < at + 42:
         return None
     right, low, left, high = struct.unpack_from(">4I", packed, at + 8)
     return (right - left, low - high, int.from_bytes(packed[at + 40 : at + 42]))
 
 
-def _boxes(packed: bytes) -> Iterator[tuple[int, bytes]]:
-    """Where the content of each box begins, and its kind."""
+def _boxes(packed: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Where the content of each box begins and ends, and its kind."""
     at = 0
     while at + 8 <= len(packed):
         size, head = int.from_bytes(packed[at : at + 4]), 8
         if size == 1:
             size, head = int.from_bytes(packed[at + 8 : at + 16]), 16
-        yield at + head, packed[at + 4 : at + 8]
-        if size < head:  # 0: to the end
+        end = at + size if size >= head else len(packed)  # 0: to the end
+        yield at + head, end, packed[at + 4 : at + 8]
+        if size < head:
             return
         at += size
 
@@ -112,29 +121,40 @@ def _jpegxr_size(packed: bytes) -> tuple[int, int] | None:
 
 
 def _jpegxl_size(packed: bytes) -> tuple[int, int] | None:
-    at = 0
+    """None for films, and for what has a preview before its picture."""
     if packed[4:8] == b"JXL ":
-        parts = ((at, kind) for at, kind in _boxes(packed) if kind in (b"jxlc", b"jxlp"))
-        at, kind = next(parts, (len(packed), b""))
-        at += 4 * (kind == b"jxlp")  # its number
-    if packed[at : at + 2] != b"\xff\x0a" or len(packed) < at + 12:
+        packed = b"".join(_jpegxl_parts(packed))[:_JXL_HEADER]
+    if packed[:2] != b"\xff\x0a" or len(packed) < 14:
         return None
-    bits = int.from_bytes(packed[at + 2 : at + 14], "little")
+    bits = int.from_bytes(packed[2:_JXL_HEADER], "little")
 
     def take(count: int) -> int:
         nonlocal bits
         found, bits = bits & ((1 << count) - 1), bits >> count
         return found
 
-    small = take(1)
+    def size() -> tuple[int, int]:
+        small = take(1)
+        rows = 8 * (take(5) + 1) if small else take(_LONG[take(2)]) + 1
+        if ratio := take(3):
+            return rows * _RATIOS[ratio - 1][0] // _RATIOS[ratio - 1][1], rows
+        return 8 * (take(5) + 1) if small else take(_LONG[take(2)]) + 1, rows
 
-    def side() -> int:
-        return 8 * (take(5) + 1) if small else take(_LONG[take(2)]) + 1
+    told = size()
+    if not take(1) and take(1):  # not all as by default, and more than colours
+        take(3)  # how it is turned
+        if take(1):
+            size()  # in which it was meant to be shown
+        if take(2):  # a preview, a film
+            return None
+    return told
 
-    rows = side()
-    ratio = take(3)
-    columns = side() if ratio == 0 else rows * _RATIOS[ratio - 1][0] // _RATIOS[ratio - 1][1]
-    return columns, rows
+
+def _jpegxl_parts(packed: bytes) -> Iterator[bytes]:
+    """The codestream, of which each part but a whole one begins with its number."""
+    for begin, end, kind in _boxes(packed):
+        if kind in (b"jxlc", b"jxlp"):
+            yield packed[begin + 4 * (kind == b"jxlp") : end]
 
 
 _READERS: dict[bytes, Callable[[bytes], tuple[int, int] | None]] = {

@@ -54,6 +54,10 @@ def opened(path: str) -> Iterator[tuple[Any, list[str]]]:
                 for name in os.listdir(os.path.dirname(os.path.abspath(path))):
                     if name == "NDTiff.index" or "_MMStack" in name:
                         check_beside(path, name)
+                    if name == "NDTiff.index":
+                        index = os.path.join(os.path.dirname(path), name)
+                        for other in {entry[1] for entry in tifffile.read_ndtiff_index(index)}:
+                            check_beside(path, other)
             yield file, heard.warned
             if heard.damage:
                 raise ValueError(f"{path}: damaged: {heard.damage[0]}")
@@ -100,8 +104,9 @@ def _checked(frame: Any, decode: Callable[..., Any]) -> Callable[..., Any]:
     is_jpeg = frame.compression in _JPEG
     wide, tall = frame.tilewidth, frame.tilelength
     if not frame.is_tiled:
-        wide, tall = frame.imagewidth, min(frame.rowsperstrip, frame.imagelength)
-        tall += -tall % 16 if is_jpeg else 0  # whole blocks
+        wide, tall = frame.imagewidth, frame.imagelength
+        tall += -tall % 16 if is_jpeg else 0  # the last strip may hold whole blocks
+        tall = min(frame.rowsperstrip, tall)
 
     most = 2 * wide * tall * frame.samplesperpixel * 8 + 4096  # bytes of LERC
 
