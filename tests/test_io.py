@@ -5,6 +5,7 @@ from __future__ import annotations
 import bz2
 import gzip
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -98,6 +99,30 @@ def test_nifti_axes_come_out_along_the_world(tmp_path):
     volume = gv.read_volume(tmp_path / "b.nii")
     assert_is_grid(volume)
     assert volume.spacing == (2, 3, 4) and volume.origin == (10, 20, 30)
+
+
+@pytest.mark.parametrize("kind", ["nii.gz", "npy.gz", "npz"])
+def test_packed_files_take_memory_once(tmp_path, kind):
+    """Not as they are unpacked, and again as they are read."""
+    data = np.arange(100 * 200 * 200, dtype=np.int16).reshape(100, 200, 200)
+    file = tmp_path / f"a.{kind}"
+    if kind == "nii.gz":
+        nibabel = pytest.importorskip("nibabel")
+        nibabel.save(nibabel.Nifti1Image(data.T, np.eye(4)), file)
+    elif kind == "npz":
+        np.savez_compressed(file, data)
+    else:
+        with gzip.open(file, "wb") as stream:
+            np.save(stream, data)
+    gv.read_volume(file)  # imports
+    tracemalloc.start()
+    try:
+        volume = gv.read_volume(file)
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert np.array_equal(volume.data[..., 0].numpy(), data)
+    assert most < data.nbytes + 5_000_000
 
 
 def test_real_nifti():

@@ -31,6 +31,7 @@ from . import boxes
 from .store_layout import value_dtype
 
 Index = tuple[slice, ...]
+_PART = 1 << 20  # bytes that are unpacked at a time
 #: (4, 4) of world axes that run left and posterior, to right and anterior ones.
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -184,11 +185,15 @@ class ArraySource(VolumeSource):
                 self.file, np.dtype(self.stored), "r", self.offset, self.shape, order
             )
             return data[index]
+        content, size = np.empty(self._expected + self.exact, np.uint8), 0
         with open_unpacked(self.file, self.member) as stream:
             stream.read(self.offset)
-            content = stream.read(self._expected + self.exact)
-        self._check_size(len(content))
-        return np.frombuffer(content, self.stored).reshape(self.shape, order=order)[index]
+            while part := stream.read(min(_PART, len(content) - size)):
+                content[size : size + len(part)] = memoryview(part)
+                size += len(part)
+        self._check_size(size)
+        numbers = content[: self._expected].view(self.stored)
+        return numbers.reshape(self.shape, order=order)[index]
 
     @property
     def _expected(self) -> int:

@@ -16,7 +16,7 @@ import numpy as np
 from ...base.image_info import ChannelInfo, ImageInfo, color_channels
 from ...base.units import length_unit, time_unit
 from ..budget import MOST_PACKED
-from ..source import Index, VolumeSource, place_axes
+from ..source import ArraySource, Index, VolumeSource, place_axes
 from .format import Format
 
 _LABEL_INTENT = 1002
@@ -28,6 +28,11 @@ class NiftiSource(VolumeSource):
 
     def read_stored(self, index: Index) -> np.ndarray:
         data = _load(self.path).dataobj
+        if self.whole and data.dtype.str == self.stored and (data.slope, data.inter) == (1, 0):
+            # nibabel takes several times the memory.
+            told: dict[str, Any] = {"path": self.path, "axes": self.axes, "stored": self.stored}
+            told |= {"shape": data.shape, "offset": data.offset, "fortran": True, "whole": True}
+            return ArraySource(file=self.path, **told).read_stored(index)
         if data.dtype.fields is None:
             return np.asanyarray(data[index])
         return _components(np.asanyarray(data[index[: len(data.shape)]]))[..., index[-1]]
