@@ -5,8 +5,10 @@ from __future__ import annotations
 import gzip
 import json
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +31,25 @@ def test_a_process_of_its_own(small, tmp_path):
         command = [sys.executable, "-m", "gvtorch", "info", str(path)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == status and len(done.stderr.splitlines()) == said, done.stderr
+
+
+def test_ctrl_c_is_quiet_from_the_start(small):
+    """Most of a short command are imports, whose traceback was seen."""
+    for seconds in (0.15, 0.4, 0.9):
+        command = [
+            sys.executable,
+            "-m",
+            "gvtorch",
+            "render",
+            str(small),
+            "-o",
+            "/dev/null/none.png",
+        ]
+        running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        time.sleep(seconds)
+        running.send_signal(signal.SIGINT)
+        _, said = running.communicate(timeout=30)
+        assert (running.returncode, said) in ((-signal.SIGINT, ""), (130, ""))
 
 
 def test_help_does_not_import_torch():
