@@ -264,6 +264,22 @@ def test_other_vtk_files_are_named(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("told", "instead", "message"),
+    [
+        (b'offset="0"', b'offset="99999999999"', r"begins at \d+, the file has"),
+        (b"LittleEndian", b"MiddleEndian", "MiddleEndian"),
+    ],
+)
+def test_a_vti_that_tells_what_is_not_there(tmp_path, grid, told, instead, message):
+    file = write_vti(tmp_path / "a.vti", vtk_image(grid))
+    content = file.read_bytes()
+    assert told in content
+    file.write_bytes(content.replace(told, instead))
+    with pytest.raises(ValueError, match=message):
+        gv.read_volume(file)
+
+
+@pytest.mark.parametrize(
     ("mode", "packer"), [("Appended", "None"), ("Appended", "ZLib"), ("Binary", "ZLib")]
 )
 def test_broken_vti_gives_one_line(tmp_path, grid, mode, packer):

@@ -213,7 +213,7 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
     affine[:3, 3] = numbers["Origin"] + affine[:3, :3] @ low
     told = _told(path, [b - a + 1 for a, b in zip(low, high, strict=True)], affine, array,
                  names if key is None else names[:1])  # fmt: skip
-    order = "<" if root.get("byte_order", "LittleEndian") == "LittleEndian" else ">"
+    order = {"LittleEndian": "<", "BigEndian": ">"}[root.get("byte_order", "LittleEndian")]
     header = order + {"UInt32": "u4", "UInt64": "u8"}[root.get("header_type", "UInt32")]
     packer = {"": "", "vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma",
               "vtkLZ4DataCompressor": "lz4"}[root.get("compressor", "")]  # fmt: skip
@@ -230,6 +230,10 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
             data.check_file()
             return data
         length = end - offset
+        if length <= 0:
+            raise ValueError(
+                f"{path}: {array['name']} begins at {offset}, the file has {end} bytes"
+            )
     else:
         encoding = "ascii" if array["format"] == "ascii" else "base64"
         offset, length = _inline(path, content, array["number"])
