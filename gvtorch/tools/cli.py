@@ -12,9 +12,11 @@ import io
 import json
 import os
 import re
+import signal
 import sys
 import time
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -271,6 +273,21 @@ def _joined(args: list[str]) -> list[str]:
     return joined
 
 
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    """Ctrl-C raises while a command runs, where it ended the process at once (`__main__`), as it
+    does again while the process ends.
+    """
+    at_once = signal.getsignal(signal.SIGINT) is signal.SIG_DFL
+    if at_once:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        if at_once:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def main(args: list[str] | None = None) -> None:
     """Runs the command line and ends the process, quietly where nobody reads on (`| head`)."""
     try:
@@ -312,7 +329,8 @@ def _run(args: list[str] | None) -> None:
         f"gvtorch: {one_line(message)}", file=sys.stderr
     )
     try:
-        command.run()
+        with _interruptible():
+            command.run()
     except BrokenPipeError:
         raise
     except (ValueError, OSError, ImportError, MemoryError) as error:
