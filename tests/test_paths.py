@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import signal
@@ -19,6 +20,7 @@ import gvtorch as gv
 from gvtorch.io.conversion import convert
 from gvtorch.io.store import Store
 from gvtorch.io.store_layout import WORK
+from gvtorch.tools import cli
 from gvtorch.tools.cli import main
 
 NAMES = [
@@ -239,3 +241,21 @@ def test_ctrl_c_while_a_command_starts_says_nothing():
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=60)
         assert process.returncode in (-signal.SIGINT, 130) and not err
+
+
+def test_ctrl_c_within_an_import_that_swallows_it_comes_behind_it(tmp_path, monkeypatch):
+    """As numpy.f2py does, which a command imports by way of others."""
+    (tmp_path / "swallowing.py").write_text(
+        "import signal\n"
+        "try:\n    signal.raise_signal(signal.SIGINT)\nexcept BaseException:\n    pass\n"
+        "whole = True\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        with pytest.raises(KeyboardInterrupt), cli._interruptible():
+            assert importlib.import_module("swallowing").whole
+            time.sleep(5)
+            pytest.fail("it was swallowed")
+    finally:
+        signal.signal(signal.SIGINT, before)
