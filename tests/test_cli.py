@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import shlex
 import shutil
 import subprocess
 import sys
@@ -29,6 +30,19 @@ def test_a_process_of_its_own(small, tmp_path):
         command = [sys.executable, "-m", "gvtorch", "info", str(path)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == status and len(done.stderr.splitlines()) == said, done.stderr
+
+
+@pytest.mark.parametrize("stream", ["full", "out", "err"])
+def test_standard_output_that_is_full_or_closed(stream):
+    """A closed one leaves its number to the next file that is opened."""
+    end = {"full": ">/dev/full", "out": ">&-", "err": "2>&-"}[stream]
+    for word, good in (("--version", 0), ("none", 2)):
+        command = f"exec {shlex.quote(sys.executable)} -m gvtorch {word} {end}"
+        done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
+        assert done.returncode == (2 if stream == "full" else good)
+        lines = done.stderr.splitlines()
+        assert len(lines) == (done.returncode == 2 and stream != "err"), done.stderr
+        assert all(line.startswith("gvtorch: error: ") for line in lines)
 
 
 def test_help_does_not_import_torch():

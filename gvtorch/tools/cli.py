@@ -305,11 +305,16 @@ def _interrupt(_number: int, frame: FrameType | None) -> None:
 def main(args: list[str] | None = None) -> None:
     """Runs the command line and ends the process, quietly where nobody reads on (`| head`)."""
     try:
-        _run(args)
-        sys.stdout.flush()
-    except BrokenPipeError:
+        try:
+            _run(args)
+        finally:
+            sys.stdout.flush()
+    except OSError as error:  # of standard output: others are told by then
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        sys.exit(1)
+        if isinstance(error, BrokenPipeError):
+            sys.exit(1)
+        print(f"gvtorch: error: standard output: {error.strerror}", file=sys.stderr)
+        sys.exit(2)
 
 
 def _run(args: list[str] | None) -> None:
