@@ -11,7 +11,7 @@ def main() -> None:
     """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:  # closed: a file that is written would take its place
-            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 for as long as it runs
+            setattr(sys, name, open(os.devnull, mode))
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     from .tools.cli import main as run
