@@ -1,12 +1,17 @@
 """`python -m gvtorch`, and the script `gvtorch`."""
 
+import os
 import signal
+import sys
 
 
 def main() -> None:
     """Runs the command line. Until a command runs there is nothing to put in order, but seconds of
     imports to interrupt: Ctrl-C ends the process at once, without a word.
     """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:  # closed: a file that is written would take its place
+            setattr(sys, name, open(os.devnull, mode))
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     from .tools.cli import main as run

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import gzip
 import json
+import shlex
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -33,23 +32,17 @@ def test_a_process_of_its_own(small, tmp_path):
         assert done.returncode == status and len(done.stderr.splitlines()) == said, done.stderr
 
 
-def test_ctrl_c_is_quiet_from_the_start(small):
-    """Most of a short command are imports, whose traceback was seen."""
-    for seconds in (0.15, 0.4, 0.9):
-        command = [
-            sys.executable,
-            "-m",
-            "gvtorch",
-            "render",
-            str(small),
-            "-o",
-            "/dev/null/none.png",
-        ]
-        running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-        time.sleep(seconds)
-        running.send_signal(signal.SIGINT)
-        _, said = running.communicate(timeout=30)
-        assert (running.returncode, said) in ((-signal.SIGINT, ""), (130, ""))
+@pytest.mark.parametrize("stream", ["full", "out", "err"])
+def test_standard_output_that_is_full_or_closed(stream):
+    """A closed one leaves its number to the next file that is opened."""
+    end = {"full": ">/dev/full", "out": ">&-", "err": "2>&-"}[stream]
+    for word, good in (("--version", 0), ("none", 2)):
+        command = f"exec {shlex.quote(sys.executable)} -m gvtorch {word} {end}"
+        done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
+        assert done.returncode == (2 if stream == "full" else good)
+        lines = done.stderr.splitlines()
+        assert len(lines) == (done.returncode == 2 and stream != "err"), done.stderr
+        assert all(line.startswith("gvtorch: error: ") for line in lines)
 
 
 def test_help_does_not_import_torch():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import signal
@@ -19,6 +20,7 @@ import gvtorch as gv
 from gvtorch.io.conversion import convert
 from gvtorch.io.store import Store
 from gvtorch.io.store_layout import WORK
+from gvtorch.tools import cli
 from gvtorch.tools.cli import main
 
 NAMES = [
@@ -213,3 +215,47 @@ def test_ctrl_c_ends_in_one_line_that_tells_how_to_go_on(tmp_path, workers, dela
     assert_holds(convert(source, target, resume=True, workers=1), data)
     assert sorted(os.listdir(tmp_path)) == ["a.zarr", "my scan.npy", "script.py"]
     assert not [file for file in Path(target).rglob("*") if "__lock" in file.name]
+
+
+STARTING = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background ignore it
+from gvtorch.__main__ import main
+print(flush=True)
+main()
+"""
+
+
+def test_ctrl_c_while_a_command_starts_says_nothing():
+    """Most of a short command is imports: a few moments of the seconds before it does anything."""
+    for delay in (0.02, 0.1, 0.3):
+        process = subprocess.Popen(
+            [sys.executable, "-c", STARTING, "render", "none.npy", "-o", "none.png"],
+            stderr=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(delay)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+        assert process.returncode in (-signal.SIGINT, 130) and not err
+
+
+def test_ctrl_c_within_an_import_that_swallows_it_comes_behind_it(tmp_path, monkeypatch):
+    """As numpy.f2py does, which a command imports by way of others."""
+    (tmp_path / "swallowing.py").write_text(
+        "import signal\n"
+        "try:\n    signal.raise_signal(signal.SIGINT)\nexcept BaseException:\n    pass\n"
+        "whole = True\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        with pytest.raises(KeyboardInterrupt), cli._interruptible():
+            assert importlib.import_module("swallowing").whole
+            time.sleep(5)
+            pytest.fail("it was swallowed")
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -19,6 +19,7 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import Annotated, Any, Literal
 
 import tyro
@@ -280,7 +281,8 @@ def _interruptible() -> Iterator[None]:
     """
     at_once = signal.getsignal(signal.SIGINT) is signal.SIG_DFL
     if at_once:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+        signal.signal(signal.SIGINT, _interrupt)
     try:
         yield
     finally:
@@ -288,14 +290,31 @@ def _interruptible() -> Iterator[None]:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
+def _interrupt(_number: int, frame: FrameType | None) -> None:
+    """Raises KeyboardInterrupt; while a module is imported, of which some catch what they do not
+    expect and others are left half made, a moment later.
+    """
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            signal.setitimer(signal.ITIMER_REAL, 0.02)
+            return
+        frame = frame.f_back
+    raise KeyboardInterrupt
+
+
 def main(args: list[str] | None = None) -> None:
     """Runs the command line and ends the process, quietly where nobody reads on (`| head`)."""
     try:
-        _run(args)
-        sys.stdout.flush()
-    except BrokenPipeError:
+        try:
+            _run(args)
+        finally:
+            sys.stdout.flush()
+    except OSError as error:  # of standard output: others are told by then
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        sys.exit(1)
+        if isinstance(error, BrokenPipeError):
+            sys.exit(1)
+        print(f"gvtorch: error: standard output: {error.strerror}", file=sys.stderr)
+        sys.exit(2)
 
 
 def _run(args: list[str] | None) -> None:
