@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -294,3 +296,81 @@ def test_broken_vtk_gives_one_line(tmp_path, grid, kind):
     getattr(writer, f"SetFileTypeTo{kind}")()
     writer.Write()
     assert_told(tmp_path / "a.vtk", tmp_path / "broken", least=8)
+
+
+def vti_of_text(path, arrays: str, before: str = ""):
+    """A VTK image of 3 x 3 x 3 points whose numbers stand in the XML."""
+    extent = "0 2 0 2 0 2"
+    path.write_text(
+        f'<VTKFile type="ImageData"><ImageData WholeExtent="{extent}">{before}'
+        f'<Piece Extent="{extent}"><PointData>{arrays}</PointData></Piece></ImageData></VTKFile>'
+    )
+    return path
+
+
+NUMBERS = " ".join(map(str, range(27)))
+ARRAY = '<DataArray type="UInt8" Name="{}" format="ascii">{}</DataArray>'
+
+
+@pytest.mark.parametrize(
+    "before",
+    [
+        f"<FieldData>{ARRAY.format('TimeValue', '0')}</FieldData>",
+        f"<!-- {ARRAY.format('old', '7 ' * 27)} -->",
+    ],
+)
+def test_numbers_of_vtk_are_found_behind_others(tmp_path, before):
+    """ParaView writes the time before the image."""
+    path = vti_of_text(tmp_path / "a.vti", ARRAY.format("a>b", NUMBERS), before)
+    assert gv.read_volume(path).data.ravel().tolist() == list(range(27))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "told"),
+    [
+        (NUMBERS.replace("26", "300"), "numbers that uint8 does not"),
+        (NUMBERS.replace("26", "-1"), "numbers that uint8 does not"),
+        (NUMBERS.replace("26", "2_6"), "words that are no numbers"),
+        (NUMBERS + " 27", "27 numbers expected, got more"),
+        ("1", "27 numbers expected, got 1 bytes"),
+    ],
+)
+def test_words_of_vtk_that_are_other_numbers_are_refused(tmp_path, numbers, told):
+    """300 once was 44."""
+    with pytest.raises(ValueError, match=rf"a\.vti: .*{told}"):
+        gv.read_volume(vti_of_text(tmp_path / "a.vti", ARRAY.format("a", numbers)))
+
+
+def legacy_vtk(path, points: int, words: str, kind: str = "SCALARS a unsigned_char"):
+    head = "# vtk DataFile Version 3.0\na\nASCII\nDATASET STRUCTURED_POINTS\nDIMENSIONS 3 3 3\n"
+    path.write_text(f"{head}POINT_DATA {points}\n{kind} 1\n{words}\n")
+    return path
+
+
+def test_legacy_vtk_that_contradicts_itself_is_refused(tmp_path):
+    path = tmp_path / "a.vtk"
+    assert gv.read_volume(legacy_vtk(path, 27, NUMBERS)).data.ravel().tolist() == list(range(27))
+    with pytest.raises(ValueError, match="'POINT_DATA 99' of a grid that has 27"):
+        gv.read_volume(legacy_vtk(path, 99, NUMBERS))
+    with pytest.raises(ValueError, match="colours that are NaN or infinite"):
+        gv.read_volume(legacy_vtk(path, 27, "nan " * 27, "COLOR_SCALARS a"))
+
+
+@pytest.mark.parametrize("words", [b"<AppendedData ", b"<VTKFile><!--" + b"<DataArray "])
+def test_tags_of_vtk_that_never_end_take_no_time(tmp_path, words):
+    (tmp_path / "a.vti").write_bytes(b'<VTKFile type="ImageData">' + words * 200_000)
+    begin = time.process_time()
+    with pytest.raises(ValueError, match=r"a\.vti: "):
+        gv.read_volume(tmp_path / "a.vti")
+    assert time.process_time() - begin < 3
+
+
+def test_a_line_of_vtk_without_end_takes_no_memory(tmp_path):
+    with legacy_vtk(tmp_path / "a.vtk", 27, NUMBERS).open("r+b") as file:
+        file.truncate(1 << 29)  # a hole of zeros
+        file.seek(0, 2)
+        file.write(b"\n")
+    tracemalloc.start()
+    assert gv.read_volume(tmp_path / "a.vtk").extent == (3, 3, 3)
+    assert tracemalloc.get_traced_memory()[1] < 1 << 27
+    tracemalloc.stop()

@@ -5,6 +5,7 @@ than its header tells: what would unpack to more is damaged.
 from __future__ import annotations
 
 import math
+import os
 import zlib
 from bz2 import BZ2Decompressor
 from collections.abc import Iterator
@@ -16,7 +17,6 @@ import numpy as np
 from .source import Index, VolumeSource
 
 _READ = 1 << 20  # bytes
-_TEXT = 64  # characters of a number, at most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,25 +33,69 @@ class PackedSource(VolumeSource):
         """Unpacks all, and returns a part."""
         count = math.prod(self.shape)
         if self.codec != "zlib":
+            shares = self.codec == "shares"
             with open(self.file, "rb") as stream:
                 stream.seek(self.offset)
-                words = stream.read(count * _TEXT).split(maxsplit=count)[:count]
-            if len(words) != count:
-                raise ValueError(f"{self.path}: {count} numbers expected, got {len(words)}")
-            wide = np.dtype(self.stored).kind == "f" or self.codec == "shares"
-            data = np.array([float(w) if wide else int(w) for w in words])
-            if self.codec == "shares":
-                data = np.rint(data * 255).clip(0, 255)
-            kind = np.dtype(self.stored)
-            if not wide:
-                ends = np.iinfo(kind)
-                if data.dtype.kind not in "iu" or data.min() < ends.min or data.max() > ends.max:
-                    raise ValueError(f"{self.path}: holds numbers that {kind.name} does not")
-            data = data.astype(kind)
+                stored = "<f8" if shares else self.stored
+                data = text_numbers(self.path, stream, count, stored, exact=False)
+            if shares:
+                if not np.isfinite(data).all():
+                    raise ValueError(f"{self.path}: holds colours that are NaN or infinite")
+                data = np.rint(data * 255).clip(0, 255).astype(self.stored)
         else:
             need = count * np.dtype(self.stored).itemsize
             data = np.frombuffer(unpack(self.file, self.offset, need, "zlib"), self.stored)
         return data.reshape(self.shape, order="F" if self.fortran else "C")[index]
+
+
+def text_numbers(
+    path: str, stream: IO[bytes], count: int, stored: str, *, exact: bool
+) -> np.ndarray:
+    """Reads (count,) numbers of dtype `stored` that are written as words, a part of the text at a
+    time: all of them as objects of Python would take twenty times their place.
+
+    Raises:
+        ValueError: There are fewer, or more if it must be `exact`; a word is no number, or one that
+            `stored` does not hold.
+    """
+    kind, at = np.dtype(stored), stream.tell()
+    wide = kind.kind == "f"
+    size = stream.seek(0, os.SEEK_END) - at
+    stream.seek(at)
+    if count > size // 2 + 1:
+        raise ValueError(f"{path}: {count} numbers expected, got {size} bytes of text")
+    data, done = np.empty(count, kind), 0
+    for words in _words(stream):
+        if exact and len(words) > count - done:
+            raise ValueError(f"{path}: {count} numbers expected, got more")
+        del words[count - done :]
+        if b"_" in b"".join(words):  # which Python passes over
+            raise ValueError(f"{path}: holds words that are no numbers")
+        numbers: list[Any] = [float(word) if wide else int(word) for word in words]
+        if numbers and not wide:
+            ends = np.iinfo(kind)
+            if min(numbers) < ends.min or max(numbers) > ends.max:
+                raise ValueError(f"{path}: holds numbers that {kind.name} does not")
+        with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite
+            data[done : done + len(numbers)] = numbers
+        done += len(numbers)
+        if done == count and not exact:
+            break
+    if done < count:
+        raise ValueError(f"{path}: {count} numbers expected, got {done}")
+    return data
+
+
+def _words(stream: IO[bytes]) -> Iterator[list[bytes]]:
+    """The words of a text, a list for each part of it."""
+    text, rest = b" ", b""
+    while text:
+        text = stream.read(_READ)
+        words = (rest + text).split()
+        rest = words.pop() if words and text and not text[-1:].isspace() else b""
+        if len(rest) > _READ:
+            raise ValueError(f"a word of more than {_READ} bytes is no number")
+        yield words
 
 
 def unpack(file: str, offset: int, need: int, codec: str) -> bytes:

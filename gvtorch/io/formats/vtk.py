@@ -8,7 +8,7 @@ Source: "VTK File Formats" (VTK User's Guide, Kitware), simple legacy and XML fo
 from __future__ import annotations
 
 import base64
-import itertools
+import io
 import math
 import mmap
 import re
@@ -18,12 +18,13 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import unquote
 from xml.etree import ElementTree
+from xml.parsers import expat
 
 import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo
 from ...base.volume import check_extent
-from ..packed import PackedSource
+from ..packed import PackedSource, text_numbers
 from ..source import ArraySource, Index, VolumeSource, place_axes
 from .format import Format
 
@@ -51,6 +52,7 @@ _XML = {
 _MOST_HEADER = 1 << 22  # bytes
 _MOST_VALUES = 1 << 33
 _MOST_ARRAYS = 64
+_MOST_LINE = 4096  # bytes that are looked at
 _ARRAYS = ("SCALARS", "VECTORS", "COLOR_SCALARS")
 
 
@@ -72,11 +74,10 @@ class VtkSource(VolumeSource):
             file.seek(self.offset)
             content = file.read(self.length)
         if self.encoding == "ascii":
-            words = content.split()
-            if len(words) != count:
-                raise ValueError(f"{self.path}: {count} numbers expected, got {len(words)}")
-            numbers = [float(w) if dtype.kind == "f" else int(w) for w in words]
-            return np.array(numbers).astype(dtype).reshape(self.shape)[index]
+            text = io.BytesIO(content)
+            return text_numbers(self.path, text, count, self.stored, exact=True).reshape(
+                self.shape
+            )[index]
         data = self._unpacked(content, count * dtype.itemsize)
         return np.frombuffer(data, dtype).reshape(self.shape)[index]
 
@@ -97,8 +98,10 @@ class VtkSource(VolumeSource):
         table = np.frombuffer(_bytes(content, self.encoding, heads), self.header).tolist()
         block, last, packed = table[1], table[2], table[3:]
         sizes = [block] * (blocks - 1) + [last or block]
-        if sum(sizes) != need or sum(packed) > len(content):
+        if sum(sizes) != need:
             raise ValueError(f"{self.path}: {need} bytes expected, {sum(sizes)} found")
+        if sum(packed) > len(content):
+            raise ValueError(f"{self.path}: ends before its {sum(packed)} packed bytes")
         # The head and the blocks are of one stretch of base64 each.
         begin = heads if self.encoding == "raw" else -(-heads // 3) * 4
         data, parts, at = _bytes(content[begin:], self.encoding, sum(packed)), [], 0
@@ -181,13 +184,19 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
         content = file.read(_MOST_HEADER)
         file.seek(0, 2)
         end = file.tell()
-    appended = re.search(rb"<AppendedData\b[^>]*>\s*_", content)
+    # Looked for in one place: at many that never end it would take their number squared.
+    start = content.find(b"<AppendedData")
+    appended = (
+        re.compile(rb"<AppendedData\b[^>]*>\s*_").match(content, start) if start >= 0 else None
+    )
     inline = appended is None
     if inline and end > _MOST_HEADER:
         content = _read_all(path, end)
     text = content if inline else content[: appended.start()] + b"</VTKFile>"  # type: ignore[union-attr]
     root = ElementTree.fromstring(text)
     image = root.find("ImageData")
+    if root.get("type") == "ImageData" and image is None:
+        raise ValueError(f"{path}: has no ImageData in it")
     if root.tag != "VTKFile" or image is None:
         raise ValueError(f"{path}: is no ImageData, but {root.get('type', root.tag)!r}")
     pieces = image.findall("Piece")
@@ -197,7 +206,7 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
     if len(extent) != 6:
         raise ValueError(f"{path}: has no extent")
     low, high = extent[::2], extent[1::2]
-    arrays = _xml_arrays(pieces[0])
+    arrays = _xml_arrays(root, pieces[0])
     names = [array["name"] for array in arrays]
     array = arrays[_choose(path, names, key)]
     if array["kind"] not in _XML:
@@ -256,10 +265,10 @@ def _read_all(path: str, size: int) -> bytes:
         return file.read()
 
 
-def _xml_arrays(piece: Any) -> list[dict[str, Any]]:
+def _xml_arrays(root: Any, piece: Any) -> list[dict[str, Any]]:
     """The arrays of a piece: at points, then in cells; those that are marked as scalars first."""
     found: list[dict[str, Any]] = []
-    numbers = {id(item): at for at, item in enumerate(piece.iter("DataArray"))}
+    numbers = {id(item): at for at, item in enumerate(root.iter("DataArray"))}
     for kind in ("PointData", "CellData"):
         group = piece.find(kind)
         for item in [] if group is None else group.findall("DataArray"):
@@ -282,13 +291,30 @@ def _xml_arrays(piece: Any) -> list[dict[str, Any]]:
 
 
 def _inline(path: str, content: bytes, number: int) -> tuple[int, int]:
-    """Where the content of a DataArray begins, and its length."""
-    tags = re.finditer(rb"<DataArray\b[^>]*[^/]>", content)
-    tag = next(itertools.islice(tags, number, None), None)
-    stop = -1 if tag is None else content.find(b"<", tag.end())
-    if tag is None or stop < 0:
-        raise ValueError(f"{path}: ends within its numbers")
-    return tag.end(), stop - tag.end()
+    """Where the content of a DataArray begins, by its number in the file, and its length."""
+    found: list[list[int]] = []
+    parser = expat.ParserCreate()
+
+    def ended_tag(_text: str) -> None:
+        """What comes first behind a tag."""
+        parser.DefaultHandler = None
+        found[-1][0] = parser.CurrentByteIndex
+
+    def start(name: str, _attributes: dict[str, str]) -> None:
+        parser.DefaultHandler = None
+        if name == "DataArray":
+            found.append([0, 0])
+            parser.DefaultHandler = ended_tag
+
+    def end(name: str) -> None:
+        parser.DefaultHandler = None
+        if name == "DataArray" and not found[-1][1]:
+            found[-1][1] = parser.CurrentByteIndex
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.Parse(content, True)
+    begin, stop = found[number]
+    return (begin, stop - begin) if begin else (0, 0)
 
 
 # --- legacy
@@ -332,7 +358,7 @@ def _legacy_parts(
     arrays: list[dict[str, Any]] = []
     cells, in_field = False, 0
     while (end := content.find(b"\n", at)) >= 0 and len(arrays) < _MOST_ARRAYS:
-        words = content[at:end].decode("latin-1").split()
+        words = content[at : min(end, at + _MOST_LINE)].decode("latin-1").split()
         at = end + 1
         name = words[0].upper() if words else ""
         if name == "DIMENSIONS":
@@ -343,6 +369,9 @@ def _legacy_parts(
             affine[:3, 3] = [float(n) for n in words[1:4]]
         elif name in ("POINT_DATA", "CELL_DATA"):
             cells = name == "CELL_DATA"
+            count = math.prod(max(n - 1, 1) if cells else n for n in points)
+            if int(words[1]) != count:
+                raise ValueError(f"{path}: {' '.join(words)[:80]!r} of a grid that has {count}")
         elif name == "FIELD":
             in_field = int(words[2])
         elif name in _ARRAYS or (len(words) == 4 and words[3].lower() in _LEGACY and in_field > 0):
