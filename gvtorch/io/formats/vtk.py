@@ -194,19 +194,12 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
         content = _read_all(path, end)
     text = content if inline else content[: appended.start()] + b"</VTKFile>"  # type: ignore[union-attr]
     root = ElementTree.fromstring(text)
-    image = root.find("ImageData")
-    if root.get("type") == "ImageData" and image is None:
-        raise ValueError(f"{path}: has no ImageData in it")
-    if root.tag != "VTKFile" or image is None:
-        raise ValueError(f"{path}: is no ImageData, but {root.get('type', root.tag)!r}")
-    pieces = image.findall("Piece")
-    if len(pieces) != 1:
-        raise ValueError(f"{path}: has {len(pieces)} pieces; expected one")
-    extent = [int(n) for n in pieces[0].get("Extent", image.get("WholeExtent", "")).split()]
+    image, piece = _image_and_piece(path, root)
+    extent = [int(n) for n in piece.get("Extent", image.get("WholeExtent", "")).split()]
     if len(extent) != 6:
         raise ValueError(f"{path}: has no extent")
     low, high = extent[::2], extent[1::2]
-    arrays = _xml_arrays(root, pieces[0])
+    arrays = _xml_arrays(root, piece)
     names = [array["name"] for array in arrays]
     array = arrays[_choose(path, names, key)]
     if array["kind"] not in _XML:
@@ -255,6 +248,19 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
         length=length,
         **told,
     )
+
+
+def _image_and_piece(path: str, root: Any) -> tuple[Any, Any]:
+    """The ImageData of a file, and its only piece."""
+    image = root.find("ImageData")
+    if root.get("type") == "ImageData" and image is None:
+        raise ValueError(f"{path}: has no ImageData in it")
+    if root.tag != "VTKFile" or image is None:
+        raise ValueError(f"{path}: is no ImageData, but {root.get('type', root.tag)!r}")
+    pieces = image.findall("Piece")
+    if len(pieces) != 1:
+        raise ValueError(f"{path}: has {len(pieces)} pieces; expected one")
+    return image, pieces[0]
 
 
 def _read_all(path: str, size: int) -> bytes:
