@@ -373,8 +373,28 @@ def test_hostile_files_of_nanovdb(tmp_path):
 
     refused(path, b"NanoVDB2" + struct.pack("<I", 29 << 21) + good[12:], "of version 29")
     refused(path, b"NotVDB.." + good[8:], "expected NanoVDB of version 32")
-    refused(path, changed(736 + 24, "<I", 2**31), "buffer")
+    refused(path, changed(736 + 24, "<I", 2**31), "a root of")
     refused(path, changed(736 + 64 + 8, "<q", 2**40), "a node lies outside of the grid")
     first, second = struct.unpack_from("<q", content, 808)[0], 736 + 64 + 32 + 8
     refused(path, changed(second, "<q", first), "several places of the tree share a node")
     refused(path, changed(736, "<6i", *(0,) * 3, *(-9,) * 3), "has no active voxel")
+
+
+@pytest.mark.parametrize(
+    ("at", "content", "message"),
+    [
+        (736 + 24, struct.pack("<I", 10_000_000), "a root of 10000000 entries"),
+        (None, b"", "two entries of the root lie at one place"),
+    ],
+)
+def test_roots_of_nanovdb_hold_few_entries_each_at_its_place(tmp_path, at, content, message):
+    """Of millions at one place each part that was read looked at all."""
+    data, (number, _) = nano_grid("float", np.random.default_rng(3))
+    head = 736 + NANO["float"][1]
+    size = NANO["float"][3]
+    if at is None:  # the tile lies where the first upper node does
+        at, content = head + 2 * size, data[head : head + 8]
+    data = data[:at] + content + data[at + len(content) :]
+    file = nano_file(tmp_path / "a.nvdb", ("density", number, data))
+    with pytest.raises(ValueError, match=message):
+        gv.read_volume(file)

@@ -28,6 +28,7 @@ SIDES = (4096, 128, 8)  # voxels along a side of an upper node, a lower node and
 COUNTS = (32, 16, 8)  # entries along a side of each
 VOXELS = 512  # of a leaf
 MOST_INDEX = 2**31
+MOST_ROOTS = 1 << 20  # entries of a root
 _BATCH = 4096  # leaves
 _LOCK = threading.Lock()
 _QUANTITIES = {"level set": "signed distance", "fog volume": "density"}
@@ -42,6 +43,11 @@ class SparseGrid(ABC):
     origins: tuple[np.ndarray, np.ndarray, np.ndarray]  # (n, 3) int64 of uppers, lowers and leaves
     root_places: np.ndarray  # (t, 3) int64 of the root's tiles
     root_values: np.ndarray  # (t, c)
+
+    def __post_init__(self) -> None:
+        cells = np.concatenate((self.root_places, self.origins[0])) // SIDES[0] + (1 << 20)
+        if len(np.unique(cells @ np.array((1 << 42, 1 << 21, 1)))) < len(cells):
+            raise ValueError("two entries of the root lie at one place")
 
     @abstractmethod
     def tiles(self, level: int, number: int) -> tuple[np.ndarray, np.ndarray]:
@@ -59,7 +65,8 @@ class SparseGrid(ABC):
         start, stop = a // leaf * leaf, -(-b // leaf) * leaf  # whole leaves
         out = np.empty((*(stop - start), len(self.background)), self.dtype)
         out[:] = self.background
-        self._write(out, start, SIDES[0], self.root_places, self.root_values)
+        tiles = self._hits(self.root_places, SIDES[0], start, stop)
+        self._write(out, start, SIDES[0], self.root_places[tiles], self.root_values[tiles])
         for level in (0, 1):
             for number in self._hits(self.origins[level], SIDES[level], start, stop):
                 places, values = self._shown(level, number, start, stop)
@@ -129,6 +136,12 @@ def _blocks(out: np.ndarray) -> np.ndarray:
     """A box of whole leaves as (i, 8, j, 8, k, 8, c), without a copy."""
     i, j, k, c = out.shape
     return out.reshape(i // 8, 8, j // 8, 8, k // 8, 8, c)
+
+
+def check_roots(count: int) -> None:
+    """Raises ValueError for more entries of a root than are read."""
+    if count > MOST_ROOTS:
+        raise ValueError(f"a root of {count} entries, at most {MOST_ROOTS} are read")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,6 +25,7 @@ from ..sparse_grid import (
     SparseGrid,
     SparseSource,
     bits,
+    check_roots,
     choose,
     describe,
     unpack,
@@ -267,6 +268,7 @@ class NanoGrid(SparseGrid):
         """Finds the nodes."""
         layout = Layout.of(kind, dtype, width)
         (count,) = struct.unpack_from("<I", data, _ROOT + 24)
+        check_roots(count)
         fields = {
             "names": ["key", "child", "value"],
             "formats": ["<u8", "<i8", (dtype, (width,))],

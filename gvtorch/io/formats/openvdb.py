@@ -26,6 +26,7 @@ from ..sparse_grid import (
     SparseGrid,
     SparseSource,
     bits,
+    check_roots,
     choose,
     describe,
     unpack,
@@ -403,6 +404,7 @@ class _Topology:
         """
         cursor, packing = self.cursor, self.packing
         tiles, children = cursor.numbers("<2I")
+        check_roots(tiles + children)
         value = (packing.dtype, (packing.width,))
         table = cursor.array([("place", "<i4", (3,)), ("value", *value), ("on", "u1")], tiles)
         for _ in range(children):
