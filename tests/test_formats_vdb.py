@@ -8,6 +8,7 @@ import pickle
 import struct
 import subprocess
 import sys
+import tracemalloc
 import zlib
 
 import numpy as np
@@ -378,6 +379,30 @@ def test_hostile_files_of_nanovdb(tmp_path):
     first, second = struct.unpack_from("<q", content, 808)[0], 736 + 64 + 32 + 8
     refused(path, changed(second, "<q", first), "several places of the tree share a node")
     refused(path, changed(736, "<6i", *(0,) * 3, *(-9,) * 3), "has no active voxel")
+
+
+@pytest.mark.parametrize("compressor", ["lz4", "zstd", "blosclz"])
+def test_only_the_first_block_of_blosc_is_unpacked_for_a_head(tmp_path, compressor):
+    """A file of 33 KB took 2 GB: all its blocks lay at one place."""
+    content, (number, box) = nano_grid("float", np.random.default_rng(1))
+    large = content + bytes(64 << 20)
+    path = nano_file(tmp_path / "a.nvdb", ("a", number, large), codec=2, compressor=compressor)
+    tracemalloc.start()
+    open_source(path)
+    taken = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert path.stat().st_size < 2 << 20 and taken < 4 << 20
+    check(path, box)
+    good = path.read_bytes()
+    at = good.index(b"a\0") + 2 + 8  # behind the name and the part's length
+    for place, number, message in (
+        (8, 2**31 - 1, "blosc_decompress"),
+        (16, 2**31 - 1, "at byte 2147483647"),
+        (8, 100, "a block of 100 bytes"),
+    ):
+        bad = bytearray(good)
+        struct.pack_into("<I", bad, at + place, number)
+        refused(path, bytes(bad), message)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ Source: Museth, "VDB: High-resolution sparse volumes with dynamic topology", ACM
 
 from __future__ import annotations
 
+import struct
 import threading
 import zlib
 from abc import ABC, abstractmethod
@@ -30,6 +31,8 @@ VOXELS = 512  # of a leaf
 MOST_INDEX = 2**31
 MOST_ROOTS = 1 << 20  # entries of a root
 _BATCH = 4096  # leaves
+_MOST_BLOCK = 1 << 26  # bytes of a block of Blosc; writers of VDB make them of 256 KB
+_STORED = 2  # Blosc's flag of a part that is not packed
 _LOCK = threading.Lock()
 _QUANTITIES = {"level set": "signed distance", "fog volume": "density"}
 
@@ -248,3 +251,22 @@ def unpack(codec: str, packed: Any, need: int, most: int | None = None) -> bytes
     if len(found) != need:
         raise ValueError(f"a part of {need} bytes expected, {len(found)} found")
     return found
+
+
+def blosc_begin(packed: bytes, most: int) -> bytes:
+    """The first bytes, at least `most` if there are so many, of what Blosc packed: only its first
+    block is unpacked, as a part of its own. (Layout: README_CHUNK_FORMAT of c-blosc 1.)
+    """
+    size, block = struct.unpack_from("<2I", packed, 4)
+    most = min(most, size)
+    if packed[2] & _STORED:
+        return packed[16 : 16 + most]
+    block = min(block, size)
+    (start,) = struct.unpack_from("<I", packed, 16)
+    if not most <= block <= _MOST_BLOCK or not 20 <= start < len(packed):
+        raise ValueError(
+            f"a packed part begins with a block of {block} bytes at byte {start}; expected {most} "
+            f"to {_MOST_BLOCK} bytes, within {len(packed)}"
+        )
+    head = struct.pack("<3I", block, block, 20 + len(packed) - start)
+    return unpack("blosc", packed[:4] + head + struct.pack("<I", 20) + packed[start:], block)

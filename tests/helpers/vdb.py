@@ -314,7 +314,11 @@ def nano_grid(kind: str, rng: np.random.Generator, bits_of_leaf: int = 8) -> tup
 
 
 def nano_file(
-    path: Path, *grids: tuple[str, int, bytes], codec: int = 0, count_length: bool = True
+    path: Path,
+    *grids: tuple[str, int, bytes],
+    codec: int = 0,
+    count_length: bool = True,
+    compressor: str = "lz4",
 ) -> Path:
     """Writes grids (name, number of the type, content) into a segment of a `.nvdb` file."""
     heads, parts = b"", b""
@@ -327,7 +331,7 @@ def nano_file(
 
             half = len(content) // 2 // 8 * 8
             packed, *rest = (
-                imagecodecs.blosc_encode(part, compressor="lz4", typesize=4)
+                imagecodecs.blosc_encode(part, compressor=compressor, typesize=4)
                 for part in (content[:half], content[half:])
             )
             packed += struct.pack("<Q", len(rest[0])) + rest[0]

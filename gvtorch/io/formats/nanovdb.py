@@ -25,6 +25,7 @@ from ..sparse_grid import (
     SparseGrid,
     SparseSource,
     bits,
+    blosc_begin,
     check_roots,
     choose,
     describe,
@@ -185,9 +186,11 @@ def _content(path: str, head: Head, most: int = 0) -> Any:
                 if most:
                     return zlib.decompressobj().decompress(part, most)
                 return unpack("zip", part, head.size)
-            parts.append(
-                unpack("blosc", part, int.from_bytes(part[4:8], "little"), head.size - size)
-            )
+            if most:
+                parts.append(blosc_begin(part, most - size))
+            else:
+                told = int.from_bytes(part[4:8], "little")
+                parts.append(unpack("blosc", part, told, head.size - size))
             size += len(parts[-1])
         return b"".join(parts)
 
