@@ -223,9 +223,9 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 def _missing() -> list[str]:
     """What must run, and did not."""
     libraries = (
-        "nibabel nrrd tifffile imagecodecs astropy OpenEXR av PIL matplotlib distributed zarr yaozarrs "
-        "ome_zarr_models vtk moderngl aiohttp anywidget h5py jupyterlab trimesh pydicom pylibCZIrw nd2 "
-        "readlif mrcfile SimpleITK xarray fsspec tensorstore h5netcdf igl"
+        "nibabel nrrd tifffile imagecodecs astropy OpenEXR av PIL matplotlib distributed zarr "
+        "yaozarrs ome_zarr_models vtk moderngl aiohttp anywidget h5py jupyterlab trimesh pydicom "
+        "pylibCZIrw nd2 readlif mrcfile SimpleITK xarray fsspec tensorstore h5netcdf igl"
     ).split()
     _ran["io"] = int(all(importlib.util.find_spec(name) for name in libraries))
     return [name for name in filter(None, _REQUIRED.split(",")) if not _ran[name]]
