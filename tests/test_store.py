@@ -222,6 +222,11 @@ def test_a_corrupt_chunk_is_an_error_of_its_block_alone(damaged, data):
         ({"extent": [90, 45, 71]}, "metadata and level 0 differ"),
         ({"block": 33}, "damaged: gvtorch.block"),
         ({"value_range": [[0]]}, "damaged: gvtorch.value_range"),
+        ({"value_range": [[0, math.nan]]}, "damaged: gvtorch.value_range"),
+        ({"value_range": [[False, True]]}, "damaged: gvtorch.value_range"),
+        ({"value_range": [[2, 1]]}, "damaged: gvtorch.value_range"),
+        ({"threshold": math.inf}, "damaged: gvtorch.threshold"),
+        ({"threshold": 10**400}, "damaged: gvtorch.threshold"),
         ({"dtype": "float64"}, "damaged: gvtorch.dtype"),
     ],
 )

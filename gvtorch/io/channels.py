@@ -18,7 +18,7 @@ from typing import Any
 from ..base.stage import Progress, no_progress
 from . import unfinished
 from .conversion import convert
-from .ngff import SEVERAL, parse_json, read_json
+from .ngff import SEVERAL, read_json, read_json_file
 from .source import VolumeSource
 from .store import Store
 from .store_layout import WORK, Deadline, is_name, kvstore
@@ -76,7 +76,7 @@ def convert_channels(
     (target / WORK).mkdir(exist_ok=True)
     manifest = target / WORK / "channels.json"
     marks = json.loads(json.dumps({name: one.fingerprint() for name, one in sources.items()}))
-    if begun and parse_json(str(manifest), manifest.read_bytes()) != {"sources": marks}:
+    if begun and read_json_file(manifest) != {"sources": marks}:
         raise ValueError(
             f"{target}: was begun with another source, other channels or other settings; remove "
             "the store to begin again"

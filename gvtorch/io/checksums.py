@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from .http import file_limit, index_bytes
+from .chunk_files import file_limit, index_bytes
 from .ngff import read_json
 from .store_layout import Deadline, StoreError, StoreLayout, read_key
 

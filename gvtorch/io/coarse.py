@@ -22,7 +22,7 @@ import numpy as np
 
 from ..base.stage import Progress, no_progress
 from . import boxes
-from .ngff import parse_json
+from .ngff import read_json_file
 from .resources import amount
 from .shard import bordered, finish, write
 from .store import Store
@@ -97,7 +97,7 @@ def _known(folder: Path) -> dict[str, CoarseChannel]:
     file = folder / "zarr.json"
     if not file.exists():
         return {}
-    content = parse_json(str(file), file.read_bytes())
+    content = read_json_file(file)
     return CoarseChannel.parse(str(file), content.get("attributes"))
 
 

@@ -28,8 +28,6 @@ _REASONS = 1000  # that are kept
 _NOT = (0.0, "")
 _refused: dict[str, tuple[float, str]] = {}  # by URL: until when, and why
 SMALL = 1 << 20  # bytes that any file may have
-_INDEX_ENTRY = 16  # bytes: where a chunk lies in its shard, and how long it is
-_CHECKSUM = 4  # bytes
 _PART = 1 << 16  # bytes
 _SILENT = 1.0  # seconds without a byte, after which `ask_again` gives a request up
 _KEPT = 16  # idle connections to a server
@@ -63,18 +61,6 @@ def file_url(folder: str, name: str) -> str:
     """URL of a file in a folder, whose URL may end in a query."""
     base, mark, query = folder.partition("?")
     return f"{base.rstrip('/')}/{name}{mark}{query}"
-
-
-def index_bytes(values: int, chunk: int) -> int:
-    """Bytes of the index of a shard of so many values, in chunks of so many."""
-    return _INDEX_ENTRY * (values // max(1, chunk)) + _CHECKSUM
-
-
-def file_limit(values: int, chunk: int, item: int) -> int:
-    """Bytes that a file of so many values of `item` bytes each may take, and its index: no codec
-    makes twice of what it packs.
-    """
-    return 2 * values * item + index_bytes(values, chunk) + SMALL
 
 
 def read_http(

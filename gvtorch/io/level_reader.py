@@ -21,13 +21,13 @@ from ..base.labels import check_narrowed
 from ..pool.downsample import pool_mean
 from . import boxes
 from .boxes import Zyx
+from .chunk_files import ChunkFiles, begin_read, files_of
 from .ngff import ImageArray, MultiscaleImage, read_json
 from .store_layout import MOST_VOXELS, Deadline, StoreError, StoreLayout, child, opened, short
 
 Pool = Callable[[np.ndarray, int | Sequence[int]], np.ndarray]
 _TILE = 64  # voxels along a side of a tile that is made on demand
 _KEPT = 128 << 20  # bytes of such tiles
-_MOST_CHUNK = 2**31  # bytes of one chunk of a foreign array
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,7 @@ class StoredArray:
     """One array of a multiscale image, the time point chosen."""
 
     array: Any  # tensorstore.TensorStore
+    files: ChunkFiles
     axes: str  # letters among c, z, y, x in stored order
     factors: tuple[int, int, int]  # z y x, finest voxels along a side of one of its own
     where: str
@@ -48,7 +49,7 @@ class StoredArray:
         start, stop = boxes.clamp(low, high, [self.size(axis) for axis in "zyx"])
         inside = dict(zip("zyx", boxes.index(start, stop), strict=True))
         place = tuple(inside.get(axis, slice(None)) for axis in self.axes)
-        data = deadline.wait(self.array[place].read(order="C"), self.where)
+        data = deadline.wait(begin_read(self.array[place], self.files), self.where)
         return boxes.repeat_edges(boxes.to_zyxc(data, self.axes), start, low, high)
 
 
@@ -76,7 +77,7 @@ def open_arrays(
             array = deadline.wait(future, name)
         except StoreError as error:
             raise ValueError(f"{name}: can't be opened: {short(error)}") from None
-        _check_array(name, array, image.axes)
+        files = _check_array(name, array, image.axes)
         if not stored:
             chosen = _choose(where, array, image.axes, moment, channels)
             sizes = dict(zip(image.axes, map(int, array.shape), strict=True))
@@ -84,14 +85,14 @@ def open_arrays(
         # Singleton axes of an index array would move: oindex leaves every axis where it is.
         array = array.oindex[tuple(picked.get(axis, slice(None)) for axis in image.axes)]
         axes = image.axes.replace("t", "").replace("-", "")
-        found = StoredArray(array, axes, (1, 1, 1), name)
+        found = StoredArray(array, files, axes, (1, 1, 1), name)
         factors = _factors(stored[0], found, finest, scale) if stored else found.factors
         if factors is not None:
             stored.append(replace(found, factors=factors))
     return stored, chosen, sizes
 
 
-def _check_array(where: str, array: Any, axes: str) -> None:
+def _check_array(where: str, array: Any, axes: str) -> ChunkFiles:
     if array.rank != len(axes):
         raise ValueError(f"{where}: has {array.rank} axes, the metadata {len(axes)}: {axes}")
     voxels = math.prod(array.shape[axes.index(axis)] for axis in "zyx" if axis in axes)
@@ -99,10 +100,7 @@ def _check_array(where: str, array: Any, axes: str) -> None:
         raise ValueError(f"{where}: {voxels} voxels are more than the {MOST_VOXELS} of a store")
     if min(array.shape) < 1 or math.prod(array.shape) > MOST_VOXELS * 2**10:
         raise ValueError(f"{where}: extent {tuple(array.shape)} is empty or far too large")
-    chunk = math.prod(array.chunk_layout.read_chunk.shape or (1,))
-    chunk *= array.dtype.numpy_dtype.itemsize
-    if chunk > _MOST_CHUNK:
-        raise ValueError(f"{where}: a chunk takes {chunk} bytes, more than {_MOST_CHUNK}")
+    return files_of(where, array)
 
 
 def _choose(

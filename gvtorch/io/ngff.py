@@ -7,15 +7,17 @@ Source: OME-NGFF specification, versions 0.4 and 0.5 (multiscales).
 from __future__ import annotations
 
 import json
-import math
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from ..base import check
 from ..base.image_info import ImageInfo
 from ..base.units import metres
+from .chunk_files import check_file
+from .http import Endless
 from .omero import forget_assumed, read_channels, write_channels
 from .remote import is_file_url
 from .store_layout import MOST_JSON, WORK, Deadline, StoreLayout, child, read_key
@@ -119,6 +121,15 @@ def parse_json(where: str, content: bytes, most: int = MOST_JSON) -> dict[str, A
     if not isinstance(found, dict):
         raise ValueError(f"{where}: expected a JSON object, got {type(found).__name__}")
     return found
+
+
+def read_json_file(file: Path) -> dict[str, Any]:
+    """Reads a JSON object of a file on disk, as `parse_json`."""
+    try:
+        check_file(str(file), MOST_JSON)
+    except Endless as error:
+        raise ValueError(f"{file}: {error}") from None
+    return parse_json(str(file), file.read_bytes())
 
 
 def _attributes(where: str, root: Any, deadline: Deadline) -> dict[str, Any] | None:
@@ -318,9 +329,7 @@ def _transform(
                 lost.append(f"a transformation of type {kind!r}")
             continue
         values = item.get(kind)
-        plain = isinstance(values, list) and all(
-            isinstance(v, (int, float)) and math.isfinite(v) for v in values
-        )
+        plain = isinstance(values, list) and all(map(check.is_number, values))
         if not plain or len(values) != len(axes):
             raise ValueError(f"{where}: {kind} must be {len(axes)} numbers, got {values!r}")
         told[kind].update(zip(axes, map(float, values), strict=True))

@@ -5,12 +5,12 @@ Source: OME-NGFF specification, versions 0.4 and 0.5 ("omero" metadata).
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from ..base import check
 from ..base.image_info import ChannelInfo, Rgb, to_hex
 
 #: For viewers: of channels without a colour. A single one is white.
@@ -89,8 +89,7 @@ def _window(told: Any) -> tuple[float, float] | None:
     if not isinstance(told, dict):
         return None
     ends: list[Any] = [told.get("start", told.get("min")), told.get("end", told.get("max"))]
-    numbers = all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends)
-    if not numbers or not all(map(math.isfinite, ends)) or ends[0] > ends[1]:
+    if not all(map(check.is_number, ends)) or ends[0] > ends[1]:
         return None
     return (float(ends[0]), float(ends[1]))
 

@@ -11,25 +11,26 @@ from __future__ import annotations
 import functools
 import hmac
 import http.server
-import math
 import os
 import re
 import secrets
 import threading
 import urllib.parse
+from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from ..base.messages import one_line
+from .chunk_files import HEADS, ChunkFiles
 from .http import (
     SLOWEST,
     SMALL,
     STALL,
     Endless,
     HttpStatus,
-    file_limit,
     file_url,
-    index_bytes,
     is_http,
     keep_reason,
     read_http,
@@ -38,6 +39,7 @@ from .http import (
 
 _JOINED = 1 << 27  # bytes of parts that tensorstore asks for together
 _METADATA = 1 << 24  # bytes
+_INDEXES = 1 << 26  # bytes of shards' indexes that are kept of a folder
 _RETRIES = {"max_retries": 4, "initial_delay": "200ms", "max_delay": "1s"}
 _TOGETHER = 16  # requests that wait for one folder
 
@@ -59,39 +61,72 @@ class Relayed:
             "http_request_retries": _RETRIES,
         }
         self._future: Any = None
-        self._limits = (_METADATA, _METADATA)
+        self._files: ChunkFiles | None = None
+        self._indexes: OrderedDict[str, np.ndarray] = OrderedDict()
+        self._lock = threading.Lock()
 
     def opens(self, future: Any) -> Any:
         """Takes and returns the future of the array that lies there."""
         self._future = future
         return future
 
-    def limits(self) -> tuple[int, int]:
-        """Bytes of a whole file, and of a part of one, at most."""
+    @property
+    def files(self) -> ChunkFiles | None:
+        """What its chunks may be; None before the array is open."""
         future = self._future
         if future is not None and future.done():
-            try:
-                self._limits = limits_of(future.result())
-            except Exception:  # the array does not open, as its reader is told
-                pass
+            self._files = ChunkFiles.of(future.result()) if future.exception() is None else None
             self._future = None
-        return self._limits
+        return self._files
 
     def read(self, name: str, part: slice | None) -> bytes | None:
         """Returns a file, or a part of it; raises as `read_http`."""
-        whole, piece = self.limits()
-        url, most = file_url(self.url, name), whole
+        url = file_url(self.url, name)
         try:
-            if part is not None:
-                most = -part.start if part.stop is None else part.stop - part.start
-                if not 0 < most <= min(piece, whole):
-                    raise Endless(f"{most} bytes are asked for, more than a chunk has")
-            if not is_http(url):
-                return self._read_bucket(urllib.parse.unquote(name), part, most)
+            files = None if name.endswith(HEADS) else self.files
+            content = self._read(name, part, files)
+            if files is not None and content is not None:
+                self._look(name, part, content, files)
         except OSError as error:
             keep_reason(url, error)
             raise
-        return read_http(url, most, part, whole=whole)
+        return content
+
+    def _read(self, name: str, part: slice | None, files: ChunkFiles | None) -> bytes | None:
+        whole = piece = most = _METADATA
+        if files is not None:
+            whole = most = files.most
+            piece = max(2 * files.chunk_bytes + SMALL + _JOINED, files.index_bytes)
+        if part is not None:
+            most = -part.start if part.stop is None else part.stop - part.start
+            if not 0 < most <= min(piece, whole):
+                raise Endless(f"{most} bytes are asked for, more than a chunk has")
+        url = file_url(self.url, name)
+        if is_http(url):
+            return read_http(url, most, part, whole=whole)
+        return self._read_bucket(urllib.parse.unquote(name), part, most)
+
+    def _look(self, name: str, part: slice | None, content: bytes, files: ChunkFiles) -> None:
+        """Raises Endless if what came is not what chunks may be; keeps an index that came."""
+        if not files.index:
+            files.check_sent(part.start if part else 0, content, None)
+            return
+        place = files.index_part
+        if part is None:
+            index = files.entries(content[place])
+        elif part == place:
+            with self._lock:
+                self._indexes[name] = files.entries(content)
+                while len(self._indexes) * files.index_bytes > _INDEXES and len(self._indexes) > 1:
+                    self._indexes.popitem(last=False)
+            return
+        else:
+            with self._lock:
+                kept = self._indexes.get(name)
+            if kept is None:  # it was of too many files
+                kept = files.entries(self._read(name, place, files) or b"")
+            index = kept
+        files.check_sent(part.start if part else 0, content, index)
 
     def _read_bucket(self, name: str, part: slice | None, most: int) -> bytes | None:
         seconds = STALL + most / SLOWEST
@@ -132,14 +167,6 @@ def read_within(
             raise Endless(f"the file is more than {most} bytes")
     found = wait(folder.read(name, byte_range=part))
     return bytes(found.value) if found.state == "value" else None
-
-
-def limits_of(array: Any) -> tuple[int, int]:
-    """The most bytes that a file of one of tensorstore's arrays takes, and those of one request."""
-    item, layout = array.dtype.numpy_dtype.itemsize, array.chunk_layout
-    file, chunk = (math.prod(at.shape or (1,)) for at in (layout.write_chunk, layout.read_chunk))
-    index = index_bytes(file, chunk)
-    return file_limit(file, chunk, item), max(2 * chunk * item + SMALL + _JOINED, index)
 
 
 class _Server(http.server.ThreadingHTTPServer):

@@ -17,6 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ..pool.downsample import pool_max, pool_mean, pool_min, round_array, window
 from . import boxes
 from .checksums import Files, shard_files
+from .chunk_files import files_of
 from .level_reader import Pool, StoredArray
 from .source import VolumeSource
 from .store import needed_cells
@@ -120,8 +121,9 @@ def _from_below(
     # The finest values are their own smallest and largest.
     for spec in (layout.plain(level - 1), *layout.bounds(level - 1)):
         array = deadline.wait(opened(conversion.root, spec), spec["path"])
+        files = files_of(spec["path"], array)
         array = layout.at_time(array, time)
-        arrays.append(StoredArray(array, "czyx"[-array.rank :], (1, 1, 1), spec["path"]))
+        arrays.append(StoredArray(array, files, "czyx"[-array.rank :], (1, 1, 1), spec["path"]))
     start, stop = boxes.clamp(low, high, layout.shape(level))
     size = (*[b - a for a, b in zip(start, stop, strict=True)], layout.width)
     made = [np.empty(size, layout.dtype) for _ in pools]

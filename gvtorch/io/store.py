@@ -26,6 +26,7 @@ from ..pool.downsample import pool_majority, pool_mean
 from . import boxes
 from .boxes import Zyx, grouped
 from .checksums import Checksums, file_of, sum_of
+from .chunk_files import ChunkFiles, begin_read, files_of
 from .level_reader import LevelReader, Pool, open_arrays
 from .ngff import MultiscaleImage, find_image, read_json
 from .store_layout import (
@@ -48,6 +49,7 @@ _BATCH = 256  # blocks read at once; more only makes memory travel
 _AHEAD = 2 * _BATCH  # blocks on their way
 _GROUP = 4  # blocks along a side of a group that may be read as one region
 _READERS = 4  # threads that read such groups
+Chunked = tuple[Any, ChunkFiles]  # one of tensorstore's arrays, and its files
 
 
 class Store:
@@ -117,8 +119,8 @@ class Store:
         self.coarse: dict[str, CoarseChannel] = {}
         self.pool = pool
         self.label_values = None if label_values is None else torch.from_numpy(label_values)
-        self._blocks: list[Any] = []
-        self._cells: list[Any] = []
+        self._blocks: list[Chunked] = []
+        self._cells: list[Chunked] = []
         self._seen: set[tuple[Any, ...]] = set()
         self._sums = Checksums(location, self.root, layout, time)
 
@@ -196,7 +198,8 @@ class Store:
             wanted = spec["metadata"]
             if list(array.shape) != wanted["shape"] or array.dtype.name != wanted["data_type"]:
                 raise ValueError(f"{where}: damaged: {array.shape} {array.dtype.name}")
-            arrays.append(self.layout.at_time(array, self.time))
+            files = files_of(where, array)
+            arrays.append((self.layout.at_time(array, self.time), files))
         folder = child(self.root, self.coarse_folder)
         told = read_json(self.location, folder, "zarr.json", deadline)
         if told is not None:
@@ -330,7 +333,8 @@ class Store:
         return self._read_cells(level, low, high, Deadline(timeout))[..., self._channels]
 
     def _read_cells(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
-        future = self._cells[level][boxes.index(low, high)].read(order="C")
+        array, files = self._cells[level]
+        future = begin_read(array[boxes.index(low, high)], files)
         data = deadline.wait(future, f"{self.location}: cells of level {level}")
         self._sums.check_box(self.layout.cells(level), low, high, deadline)
         self._check_shards(self.layout.cells(level), data, low, high, deadline)
@@ -401,7 +405,8 @@ class Store:
             raise ValueError(f"{where}: damaged: {array.shape} {array.dtype.name}")
         out = np.empty((len(zyx), *array.shape[3:]), np.float16)
         order = np.lexsort(zyx.T[::-1])
-        errors = self._read_stored(array, level, zyx, order, out, deadline)
+        chunked = (array, files_of(where, array))
+        errors = self._read_stored(chunked, level, zyx, order, out, deadline)
         for row in _blank(out):  # also zeros are written
             try:
                 if row not in errors:
@@ -414,7 +419,7 @@ class Store:
 
     def _read_stored(
         self,
-        array: Any,
+        chunked: Chunked,
         level: int,
         zyx: np.ndarray,
         order: np.ndarray,
@@ -425,6 +430,7 @@ class Store:
         """Fills the rows `order` of `out` in batches, the next on its way meanwhile; those of a
         batch that fails one by one, to tell the good from the bad.
         """
+        array, files = chunked
         errors = dict[int, str]()
         running: deque[tuple[np.ndarray, Any]] = deque()
 
@@ -434,7 +440,7 @@ class Store:
                 out[rows] = deadline.wait(future, self.location)
             except StoreError as error:
                 if batch > 1:
-                    errors.update(self._read_stored(array, level, zyx, rows, out, deadline, 1))
+                    errors.update(self._read_stored(chunked, level, zyx, rows, out, deadline, 1))
                 else:
                     out[rows] = 0
                     errors[int(rows[0])] = self._error(level, zyx[rows[0]], error)
@@ -443,7 +449,7 @@ class Store:
             for start in range(0, len(order), batch):
                 rows = order[start : start + batch]
                 z, y, x = zyx[rows].T
-                running.append((rows, array[z, y, x].read(order="C")))
+                running.append((rows, begin_read(array[z, y, x], files)))
                 if len(running) * batch >= _AHEAD:
                     finish()
             while running:
@@ -543,7 +549,7 @@ def _read_labels(where: str, root: Any, layout: StoreLayout, deadline: Deadline)
     array = deadline.wait(opened(root, spec), name)
     if list(array.shape) != [layout.label_count] or array.dtype.name != "int64":
         raise ValueError(f"{name}: damaged: {array.shape} {array.dtype.name}")
-    labels: np.ndarray = deadline.wait(array.read(order="C"), name)
+    labels: np.ndarray = deadline.wait(begin_read(array, files_of(name, array)), name)
     if not (labels[1:] > labels[:-1]).all():
         raise ValueError(f"{name}: damaged: labels must rise")
     return labels

@@ -32,7 +32,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
+from ..base.check import is_number
 from ..base.text_path import text_path
+from .chunk_files import HEADS, check_file, failed
 from .http import Endless, file_url, is_http, read_http
 from .relay import named, read_within, through
 from .resources import cores
@@ -292,10 +294,10 @@ class StoreLayout:
             "border": own.get("border") == BORDER,
             "cell": own.get("cell") == CELL,
             "branching": own.get("branching") == 2,
-            "threshold": isinstance(own.get("threshold"), (int, float, type(None))),
+            "threshold": own.get("threshold") is None or is_number(own["threshold"]),
             "value_range": _is_list(ranges, own.get("channels"))
             and all(_is_list(pair, 2) for pair in ranges)
-            and all(isinstance(value, (int, float)) for pair in ranges for value in pair),
+            and all(is_number(low) and is_number(high) and low <= high for low, high in ranges),
         }
         for key, good in fits.items():
             if not good:
@@ -468,6 +470,11 @@ def read_key(
     """
     import tensorstore as ts
 
+    if isinstance(root, dict):
+        try:
+            check_file(f"{root['path']}{name}", most)
+        except Endless as error:
+            raise StoreError(f"{where}/{name}: {error}") from None
     if is_http(root):
         url, size = file_url(root, name), most
         if part is not None:
@@ -506,6 +513,12 @@ def opened_at(folder: Any, spec: dict[str, Any], *, create: bool = False) -> Any
     import tensorstore as ts
 
     relayed = through(folder, context()) if isinstance(folder, str) else None
+    if relayed is None:
+        for head in HEADS:
+            try:
+                check_file(f"{folder['path']}{head}", MOST_JSON)
+            except Endless as error:
+                return failed(Endless(f"{head}: {error}"))
     store = {**spec, "kvstore": relayed.spec if relayed else folder}
     future = ts.open(store, context=context(), open=True, create=create)
     return relayed.opens(future) if relayed else future

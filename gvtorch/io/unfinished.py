@@ -17,7 +17,7 @@ from typing import IO, Any, NamedTuple
 from ..base.image_info import ImageInfo
 from ..base.volume import Volume, movable
 from .checksums import LIST, Files, sum_of
-from .ngff import image_metadata, parse_json
+from .ngff import image_metadata, read_json_file
 from .store_layout import GROUPS, WORK, StoreLayout
 
 Task = tuple[int, ...]  # level, z, y, x, or level, t, z, y, x
@@ -163,7 +163,7 @@ def locked(file: Path, other: str) -> Iterator[IO[str]]:
 
 def _compare(target: Path, settings: dict[str, Any]) -> None:
     manifest = target / WORK / _MANIFEST
-    before = parse_json(str(manifest), manifest.read_bytes())
+    before = read_json_file(manifest)
     plain = json.loads(json.dumps(settings))
     if before.get("fingerprint") != plain["fingerprint"]:
         raise ValueError(

@@ -9,7 +9,6 @@ Source: Zarr specification, versions 2 and 3; N5 specification (github.com/saalf
 from __future__ import annotations
 
 import functools
-import math
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,17 +16,18 @@ from typing import Any
 
 import numpy as np
 
+from ...base.check import is_number
 from ...base.image_info import ImageInfo
 from ...base.named_axes import ask_axes, even_steps, named_axes, place_named
 from ...base.units import spacing_of
-from ..ngff import parse_json
+from ..chunk_files import ChunkFiles, begin_read, files_of
+from ..ngff import read_json_file
 from ..source import Index, VolumeSource
 from ..store_layout import Deadline, kvstore, opened_at
 from .format import Format
 
 _TIMEOUT = 600.0  # seconds for one read
 _OPEN_TIMEOUT = 20.0
-_MOST_CHUNK = 1 << 31  # bytes
 _MOST_FOLDERS = 10_000
 _HEADS = (("zarr3", "zarr.json"), ("zarr", ".zarray"), ("n5", "attributes.json"))
 
@@ -41,14 +41,15 @@ class ChunkedSource(VolumeSource):
 
     def read_stored(self, index: Index) -> np.ndarray:
         """Reads the chunks of a part."""
-        array = _array(self.driver, self.folder, self.opened)
-        return Deadline(_TIMEOUT).wait(array[index].read(order="C"), self.folder)
+        array, files = _array(self.driver, self.folder, self.opened)
+        return Deadline(_TIMEOUT).wait(begin_read(array[index], files), self.folder)
 
 
 @functools.lru_cache(maxsize=8)
-def _array(driver: str, folder: str, _opened: int) -> Any:
+def _array(driver: str, folder: str, _opened: int) -> tuple[Any, ChunkFiles]:
     future = opened_at(kvstore(folder), {"driver": driver})
-    return Deadline(_OPEN_TIMEOUT).wait(future, folder)
+    array = Deadline(_OPEN_TIMEOUT).wait(future, folder)
+    return array, files_of(folder, array)
 
 
 def _head(folder: str) -> tuple[str, dict[str, Any]] | None:
@@ -56,7 +57,7 @@ def _head(folder: str) -> tuple[str, dict[str, Any]] | None:
     for driver, name in _HEADS:
         file = Path(folder) / name
         if file.is_file():
-            told = parse_json(str(file), file.read_bytes())
+            told = read_json_file(file)
             is_array = {"zarr3": told.get("node_type") == "array", "n5": "dimensions" in told}
             return (driver, told) if is_array.get(driver, True) else None
     return None
@@ -67,7 +68,7 @@ def _attributes(folder: str) -> dict[str, Any]:
     for name, inner in (("zarr.json", "attributes"), (".zattrs", ""), ("attributes.json", "")):
         file = Path(folder) / name
         if file.is_file():
-            told = parse_json(str(file), file.read_bytes())
+            told = read_json_file(file)
             found = told.get(inner, {}) if inner else told
             return found if isinstance(found, dict) else {}
     return {}
@@ -126,10 +127,9 @@ def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) 
             if beside.parent != Path(folder).parent or name == "..":
                 continue  # names of axes, not ways to other folders
             if name and beside != Path(folder) and (head := _head(str(beside))) is not None:
-                places = _array(head[0], str(beside), source.opened)
+                places, files = _array(head[0], str(beside), source.opened)
                 if places.shape == (shape[at],) and shape[at] < 1 << 24:
-                    _check_chunk(str(beside), places)
-                    values = Deadline(_TIMEOUT).wait(places.read(), str(beside))
+                    values = Deadline(_TIMEOUT).wait(begin_read(places, files), str(beside))
                     steps[at], even = even_steps(values)
                     units[at] = str(_attributes(str(beside)).get("units", "")) or None
                     lost += [] if even else [f"that places along {name} are not evenly apart"]
@@ -181,20 +181,11 @@ def _choose(path: str, key: str | None) -> str:
 def _source(path: str, driver: str, folder: str) -> tuple[ChunkedSource, tuple[int, ...]]:
     """The array without its place."""
     source = ChunkedSource(path=path, shape=(), axes="", stored="u1", driver=driver, folder=folder)
-    array = _array(driver, folder, source.opened)
+    array, _ = _array(driver, folder, source.opened)
     dtype, shape = array.dtype.numpy_dtype, tuple(int(n) for n in array.shape)
     if dtype.kind not in "biuf":
         raise ValueError(f"{path}: values must be real numbers, got dtype {array.dtype.name}")
-    _check_chunk(path, array)
     return replace(source, shape=shape, stored=dtype.str), shape
-
-
-def _check_chunk(path: str, array: Any) -> None:
-    """Raises ValueError where one chunk would take too much memory."""
-    size = np.dtype(array.dtype.numpy_dtype).itemsize
-    chunk = math.prod(array.chunk_layout.read_chunk.shape or (1,)) * size
-    if chunk > _MOST_CHUNK:
-        raise ValueError(f"{path}: a chunk takes {chunk} bytes, more than {_MOST_CHUNK}")
 
 
 def _n5_place(
@@ -221,6 +212,5 @@ def _n5_place(
 
 
 def _numbers(values: Any, count: int, plain: float) -> list[float]:
-    good = isinstance(values, list) and len(values) == count
-    good = good and all(isinstance(v, (int, float)) and math.isfinite(v) for v in values)
+    good = isinstance(values, list) and len(values) == count and all(map(is_number, values))
     return [float(v) for v in values] if good else [plain] * count

@@ -1,0 +1,200 @@
+"""Files of chunks that are no such files: Blosc that would make gigabytes, files of any length,
+pipes, folders. Each costs its chunk alone, in one line.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.stores import noise, serving
+
+import gvtorch as gv
+from gvtorch.io import http, relay
+from gvtorch.io.chunk_files import HEADS, ChunkFiles, begin_read
+from gvtorch.io.store_layout import kvstore, opened_at
+
+ts = pytest.importorskip("tensorstore")
+
+SHAPE = (12, 9, 10)
+CHUNK = [4, 3, 5]
+SHARD = [8, 6, 10]
+LZ4 = {"cname": "lz4", "clevel": 5, "shuffle": "noshuffle", "blocksize": 0, "typesize": 2}
+BLOSC = {"name": "blosc", "configuration": LZ4}
+LITTLE = {"name": "bytes", "configuration": {"endian": "little"}}
+BIG = {"name": "bytes", "configuration": {"endian": "big"}}
+CRC = {"name": "crc32c"}
+TURN = {"name": "transpose", "configuration": {"order": [2, 0, 1]}}
+
+
+def zarr3(chunk: list[int], *codecs: dict[str, Any], **more: Any) -> dict[str, Any]:
+    grid = {"name": "regular", "configuration": {"chunk_shape": chunk}}
+    about = {"shape": list(SHAPE), "data_type": "uint16", "chunk_grid": grid, "codecs": codecs}
+    return {"driver": "zarr3", "metadata": {**about, **more}}
+
+
+def sharded(chunk: list[int], inner: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
+    told = {"chunk_shape": chunk, "codecs": inner, "index_codecs": [LITTLE, CRC], **more}
+    return {"name": "sharding_indexed", "configuration": told}
+
+
+def zarr2(**more: Any) -> dict[str, Any]:
+    packed = {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 0, "blocksize": 0}
+    about = {"shape": SHAPE, "chunks": CHUNK, "dtype": "<u2", "compressor": packed}
+    return {"driver": "zarr", "metadata": {**about, **more}}
+
+
+def n5() -> dict[str, Any]:
+    packed = {"type": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 0, "blocksize": 0}
+    about = {"dimensions": SHAPE, "blockSize": CHUNK, "dataType": "uint16"}
+    return {"driver": "n5", "metadata": {**about, "compression": packed}}
+
+
+KINDS = {  # and where the first chunk of a file that has one begins
+    "zarr2": (zarr2(), 0),
+    "zarr2 F, folders": (zarr2(order="F", dimension_separator="/"), 0),
+    "zarr3": (zarr3(CHUNK, LITTLE, BLOSC), 0),
+    "zarr3, names of zarr2": (zarr3(CHUNK, LITTLE, BLOSC, chunk_key_encoding={"name": "v2"}), 0),
+    "zarr3, turned, with sums": (zarr3(CHUNK, TURN, LITTLE, CRC, BLOSC, CRC), 0),
+    "shards": (zarr3(SHARD, sharded(CHUNK, [LITTLE, BLOSC, CRC])), 0),
+    "shards, turned inside": (zarr3(SHARD, sharded(CHUNK, [TURN, LITTLE, BLOSC])), 0),
+    "shards, turned": (zarr3(SHARD, TURN, sharded([5, 4, 3], [LITTLE, BLOSC])), 0),
+    "shards, index first": (
+        zarr3(SHARD, sharded(CHUNK, [LITTLE, BLOSC], index_location="start", index_codecs=[BIG])),
+        8 * 16,
+    ),
+    "n5": (n5(), 16),
+}
+
+
+@pytest.fixture(params=KINDS)
+def stored(request, tmp_path) -> Path:
+    """An array of every kind, empty."""
+    kind = KINDS[request.param][0]
+    spec = {**kind, "kvstore": {"driver": "file", "path": f"{tmp_path}/a/"}}
+    ts.open(spec, create=True).result()
+    return tmp_path / "a"
+
+
+def opened(place: str | Path, folder: Path) -> Any:
+    heads = {"zarr.json": "zarr3", ".zarray": "zarr", "attributes.json": "n5"}
+    driver = next(driver for name, driver in heads.items() if (folder / name).exists())
+    return opened_at(kvstore(place), {"driver": driver}).result()
+
+
+def read(view: Any) -> Any:
+    return begin_read(view, ChunkFiles.of(view))
+
+
+def box(place: tuple[int, ...]) -> tuple[slice, ...]:
+    return tuple(slice(a * n, (a + 1) * n) for a, n in zip(place, CHUNK, strict=True))
+
+
+def swell(folder: Path, at: int) -> Path:
+    """Lets the only chunk tell that it holds a gigabyte."""
+    (file,) = (path for path in folder.rglob("*") if path.is_file() and path.name not in HEADS)
+    content = bytearray(file.read_bytes())
+    assert 120 <= struct.unpack_from("<I", content, at + 4)[0] <= 124
+    struct.pack_into("<I", content, at + 4, 1 << 30)
+    file.write_bytes(content)
+    return file
+
+
+@pytest.mark.parametrize("remote", [False, True], ids=["disk", "http"])
+@pytest.mark.parametrize("place", [(0, 0, 0), (1, 2, 1), (2, 0, 1)])
+def test_a_chunk_that_swells_costs_itself(stored, request, place, remote, tmp_path):
+    kind = request.node.callspec.params["stored"]
+    array = opened(stored, stored)
+    array[box(place)].write(7).result()
+    assert (read(array).result() == 7).sum() == 60
+    file = swell(stored, KINDS[kind][1])
+    with serving(tmp_path) if remote else nullcontext(tmp_path) as root:
+        array = opened(f"{root}/a", stored)
+        lists = [range(cut.start, cut.stop) for cut in box(place)]
+        points = array.vindex[tuple([0, cut.start] for cut in box(place))]
+        for view in (array, array[box(place)], array.oindex[tuple(map(list, lists))], points):
+            with pytest.raises(Exception, match=r"Blosc|40[03]"):
+                read(view).result(timeout=30)
+        if remote:
+            assert "Blosc would make 1073741824 bytes of a chunk" in relay.named(
+                f'Error opening "a": {relay.through(f"{root}/a/").spec["base_url"]}'
+                f"{file.relative_to(stored)}: "
+            )
+        if kind == "shards, turned":  # a look at all chunks of a file
+            return
+        others = [other for other in np.ndindex(3, 3, 2) if other != place]
+        for other in others:
+            assert not read(array[box(other)]).result(timeout=30).any()
+        each = tuple((np.array(others) * CHUNK).T)
+        assert not read(array.vindex[each]).result(timeout=30).any()
+
+
+@pytest.mark.parametrize("what", ["pipe", "folder", "long", "device"])
+def test_what_is_no_file_of_a_chunk_is_told(stored, what):
+    array = opened(stored, stored)
+    array[box((0, 0, 0))].write(7).result()
+    (file,) = (path for path in stored.rglob("*") if path.is_file() and path.name not in HEADS)
+    file.unlink()
+    if what == "pipe":
+        os.mkfifo(file)
+    elif what == "folder":
+        file.mkdir()
+    elif what == "device":
+        file.symlink_to("/dev/zero")
+    else:
+        with file.open("wb") as out:
+            out.truncate(1 << 33)
+    wanted = "takes 8589934592 bytes, more than the" if what == "long" else "is no regular file"
+    with pytest.raises(http.Endless, match=f"{file.relative_to(stored)}: {wanted}"):
+        read(array).result(timeout=5)
+    assert not read(array[box((2, 2, 1))]).result().any()
+    head = next(stored / head for head in HEADS if (stored / head).exists())
+    head.unlink()
+    file.rename(head)
+    with pytest.raises(http.Endless, match=f"{head.name}: {wanted}"):
+        opened_at(kvstore(stored), {"driver": "n5"}).result(timeout=5)
+
+
+def test_blosc_inside_another_codec_is_refused(tmp_path):
+    packed = {"name": "gzip", "configuration": {"level": 5}}
+    place = {"driver": "file", "path": f"{tmp_path}/a/"}
+    spec = {**zarr3(CHUNK, LITTLE, BLOSC, packed), "kvstore": place}
+    ts.open(spec, create=True).result().write(1).result()
+    with pytest.raises(ValueError, match="a: Blosc lies inside gzip, where what it makes can't"):
+        gv.read_volume(tmp_path / "a", axes="zyx")
+
+
+def test_blocks_of_a_store_that_swell_cost_themselves(tmp_path):
+    """Each kind of array that `convert` writes."""
+    data = torch.from_numpy(noise((80, 70, 90), "float32"))[..., None]
+    store = gv.convert(data, tmp_path / "a.zarr", block=32)
+    blocks = np.argwhere(np.ones(store.block_grid(0)))
+    good, errors = store.read_blocks(0, blocks)
+    assert not errors
+    for kind, read in (
+        ("gvtorch/blocks/0", lambda: store.read_blocks(0, blocks)),
+        ("gvtorch/cells/1", lambda: store.read_cells(1, (0, 0, 0), (1, 1, 1))),
+        ("1", lambda: store.read_region(1, (0, 0, 0), (9, 9, 9))),
+    ):
+        files = ChunkFiles.of(opened(tmp_path / "a.zarr" / kind, tmp_path / "a.zarr" / kind))
+        (file,) = (f for f in (tmp_path / "a.zarr" / kind / "c").rglob("0") if f.is_file())
+        content = bytearray(file.read_bytes())
+        begin = int(files.entries(bytes(content[files.index_part])).min())
+        struct.pack_into("<I", content, begin + 4, (1 << 31) - 1)
+        file.write_bytes(content)
+        if kind == "gvtorch/blocks/0":
+            found, errors = read()
+            assert len(errors) == 1 and "Blosc would make 2147483647 bytes" in next(
+                iter(errors.values())
+            )
+            rest = np.delete(np.arange(len(blocks)), list(errors))
+            assert np.array_equal(found[rest], good[rest]) and not found[list(errors)].any()
+        else:
+            with pytest.raises(OSError, match="Blosc would make 2147483647 bytes of a chunk"):
+                read()
