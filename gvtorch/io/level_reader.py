@@ -132,7 +132,8 @@ def _factors(
     for axis, a, b in zip("zyx", fine.scale, coarse.scale, strict=True):
         big, small = first.size(axis), other.size(axis)
         # Where scales don't tell, sizes do; a last voxel that is not full may have been dropped.
-        for factor in (round(b / a), round(big / small)):
+        for ratio in (b / a, big / small):
+            factor = round(ratio) if math.isfinite(ratio) else 0
             if factor >= 1 and small in (-(-big // factor), big // factor):
                 found.append(factor)
                 break

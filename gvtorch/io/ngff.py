@@ -11,6 +11,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from reprlib import repr as brief
 from typing import Any
 
 from ..base import check
@@ -195,7 +196,7 @@ def _told_beside(found: MultiscaleImage, others: list[str]) -> MultiscaleImage:
     if not others:
         return found
     named = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
-    text = f"the images {named} beside {found.name!r} (key= or image= names one)"
+    text = f"the images {named} beside {brief(found.name)} (key= or image= names one)"
     return replace(found, lost=(*found.lost, text))
 
 
@@ -255,7 +256,7 @@ def _image(where: str, item: dict[str, Any], omero: Any) -> MultiscaleImage:
         path = dataset.get("path") if isinstance(dataset, dict) else None
         plain = isinstance(path, str) and path.isprintable() and ".." not in path
         if not isinstance(path, str) or not plain or not path or path.startswith("/"):
-            raise ValueError(f"{where}: a dataset needs a path inside the store, got {path!r}")
+            raise ValueError(f"{where}: a dataset needs a path inside the store, got {brief(path)}")
         scale, move = _transform(where, dataset.get("coordinateTransformations"), axes, lost)
         t, *zyx = (a * b for a, b in zip(scale, outer[0], strict=True))
         mt, *moves = (m * s + o for m, s, o in zip(move, *outer, strict=True))
@@ -291,7 +292,7 @@ def _in_one_unit(units: dict[str, str], lost: list[str]) -> list[float]:
         size, wanted = metres(other), metres(one)
         factors.append(float(f"{size / wanted:.12g}") if size and wanted else 1.0)
         if not (size and wanted) and other is not None and other != one:
-            lost.append(f"unit {other!r} of {axis}, where that of x is {one!r}")
+            lost.append(f"unit {brief(other)} of {axis}, where that of x is {one!r}")
     return factors
 
 
@@ -304,7 +305,7 @@ def _axes(where: str, axes: Any) -> tuple[str, dict[str, str], list[str]]:
         told = axis if isinstance(axis, dict) else {"name": axis}
         name, kind, unit = (told.get(key) for key in ("name", "type", "unit"))
         if not isinstance(name, str):
-            raise ValueError(f"{where}: axes must have names, got {name!r}")
+            raise ValueError(f"{where}: axes must have names, got {brief(name)}")
         letter = name.lower() if name.lower() in ("t", "c", "z", "y", "x") else None
         letter = letter or {"time": "t", "channel": "c"}.get(str(kind), "-")
         letters += letter
@@ -312,7 +313,7 @@ def _axes(where: str, axes: Any) -> tuple[str, dict[str, str], list[str]]:
             units[letter] = unit
     solid = letters.replace("-", "")
     if len(set(solid)) != len(solid) or not {"y", "x"} <= set(solid):
-        names = ", ".join(repr(a.get("name") if isinstance(a, dict) else a) for a in axes)
+        names = ", ".join(brief(a.get("name") if isinstance(a, dict) else a) for a in axes[:8])
         raise ValueError(f"{where}: axes must have y and x, each of them once, got {names}")
     return letters, units, lost
 
@@ -326,12 +327,12 @@ def _transform(
         kind = item.get("type") if isinstance(item, dict) else None
         if kind not in ("scale", "translation"):
             if kind != "identity":
-                lost.append(f"a transformation of type {kind!r}")
+                lost.append(f"a transformation of type {brief(kind)}")
             continue
         values = item.get(kind)
         plain = isinstance(values, list) and all(map(check.is_number, values))
         if not plain or len(values) != len(axes):
-            raise ValueError(f"{where}: {kind} must be {len(axes)} numbers, got {values!r}")
+            raise ValueError(f"{where}: {kind} must be {len(axes)} numbers, got {brief(values)}")
         told[kind].update(zip(axes, map(float, values), strict=True))
     scale, move = (tuple(told[kind][axis] for axis in "tzyx") for kind in told)
     if min(scale[1:]) <= 0:

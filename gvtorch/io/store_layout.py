@@ -29,6 +29,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from reprlib import repr as brief
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
@@ -277,7 +278,7 @@ class StoreLayout:
             raise ValueError(f"{where}: half-written or damaged: zarr.json does not say complete")
         if own.get("version") not in (VERSION, VERSION + 1):
             raise ValueError(
-                f"{where}: store version {own.get('version')!r}, this reads {VERSION} and "
+                f"{where}: store version {brief(own.get('version'))}, this reads {VERSION} and "
                 f"{VERSION + 1}"
             )
         times, count = own.get("times", 1), own.get("label_count")
@@ -301,7 +302,7 @@ class StoreLayout:
         }
         for key, good in fits.items():
             if not good:
-                raise ValueError(f"{where}: damaged: gvtorch.{key} is {own.get(key)!r}")
+                raise ValueError(f"{where}: damaged: gvtorch.{key} is {brief(own.get(key))}")
         told = {key: own[key] for key in ("dtype", "block", "value_range")}
         told |= {"times": times, "label_count": count, "files_sum": own.get("files_sum")}
         return cls(
@@ -343,7 +344,9 @@ class CoarseChannel:
                 and _is_whole(own.get("width"), 1, 2**12)
                 and _is_whole(own.get("generation"), 0, 2**31)
             ):
-                raise ValueError(f"{where}: damaged: gvtorch/coarse tells {own!r} of {name!r}")
+                raise ValueError(
+                    f"{where}: damaged: gvtorch/coarse tells {brief(own)} of {brief(name)}"
+                )
             found[name] = cls(**{field.name: own[field.name] for field in dataclasses.fields(cls)})
         return found
 

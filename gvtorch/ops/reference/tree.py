@@ -218,20 +218,12 @@ class Bricks:
         place = clamp(torch.stack([p + d if d else p for p, d in columns], 1), 0, side - 1)
         cell = smaller(torch.floor(place), torch.full_like(place, side - 2))
         wx, wy, wz = (place - cell).unbind(1)
-        x, y, z = cell.to(torch.int64).unbind(1)
-        brick = holder.brick.clamp(min=0)
-
-        def voxel(dx: int, dy: int, dz: int) -> Tensor:
-            found = self.bricks_bzyxc[brick, z + dz, y + dy, x + dx, self.component]
-            return found.to(real)
-
-        def row(dy: int, dz: int) -> Tensor:
-            left, right = voxel(0, dy, dz), voxel(1, dy, dz)
-            return left + wx * (right - left)
-
-        def plane(dz: int) -> Tensor:
-            low, high = row(0, dz), row(1, dz)
-            return low + wy * (high - low)
-
-        near, far = plane(0), plane(1)
+        both = torch.arange(2, device=t.device)[:, None]
+        x, y, z = (cell.to(torch.int64)[:, None] + both).unbind(2)
+        corners = (z[:, :, None, None], y[:, None, :, None], x[:, None, None, :])
+        brick = holder.brick.clamp(min=0)[:, None, None, None]
+        rows = self.bricks_bzyxc[(brick, *corners, self.component)].to(real)
+        left, right = rows.unbind(3)
+        low, high = (left + wx[:, None, None] * (right - left)).unbind(2)
+        near, far = (low + wy[:, None] * (high - low)).unbind(1)
         return torch.where(holder.brick >= 0, near + wz * (far - near), constant)
