@@ -40,6 +40,12 @@ def light_on(tree, rays, shader, backend, *, plain=None, **lighting) -> np.ndarr
     return gv.trace(tree, rays, shader, **options).color.cpu().double().numpy()
 
 
+@pytest.fixture
+def backend(compiled: str) -> str:
+    """What is compiled: the twin, compared in test_lighting_frames.py, takes minutes."""
+    return compiled
+
+
 # --- the material
 
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
-from helpers import shared
+from helpers import gvtorch, shared
 from helpers.damage import break_file
 
 import gvtorch as gv
@@ -22,11 +19,6 @@ MASS = RANDOM.uniform(0.1, 9, COUNT).astype(np.float32)
 RADIUS = RANDOM.uniform(0, 0.4, COUNT).astype(np.float32)
 RGB = RANDOM.integers(0, 256, (COUNT, 3)).astype(np.uint8)
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
-
-
-def gvtorch(*words) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "gvtorch", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def write_ply(path, layout="binary_little_endian"):

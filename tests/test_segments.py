@@ -95,7 +95,7 @@ def test_compiled_equals_reference_for_dtypes(blobs, compiled, voxel, dtype):
     assert result["values"].dtype == dtype and result["values"].max() > 50
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(
     share=st.floats(0, 1),
     seed=st.integers(0, 2**31),

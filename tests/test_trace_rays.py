@@ -302,7 +302,7 @@ def test_trace_checks_what_it_is_given(blobs):
             call()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(
     share=st.floats(0, 1),
     seed=st.integers(0, 2**31),

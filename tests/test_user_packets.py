@@ -4,10 +4,10 @@ instruction sets.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -66,43 +66,47 @@ def given(name: str, folder: Path | None = None) -> list[Tensor]:
     return [*found, *hits.values(), *marks.values()]
 
 
+OPTIMISED = ["lit", "ink"]  # as users have them here: 11 s each to compile
+
+
 def all_given() -> dict[str, list[Tensor]]:
-    return {name: given(name) for name in SHADERS}
-
-
-@pytest.fixture(scope="module")
-def of_instructions(tmp_path_factory) -> dict[str, dict[str, list[Tensor]]]:
-    """What each instruction set gives, by its name and the shader's; this process's own, as users
-    have it.
-    """
-    folder, runs = tmp_path_factory.mktemp("packets"), {}
-    for name in INSTRUCTIONS:
-        quick = {} if name == instructions() else {"CXX": quick_compiler(folder)}
-        runs[name] = start(all_given, folder, name, **quick)
-    return {name: result(run) for name, run in runs.items()}
-
-
-@pytest.fixture(scope="module")
-def one_by_one(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("alone")
-
-    @cache
-    def expected(name: str) -> list[Tensor]:
+    """Of the shaders that the environment names, compiled quickly but for some."""
+    found = {}
+    for name in os.environ["SHADERS"].split(";"):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setenv("CXX", quick_compiler(folder))
-            return given(name, folder)
+            if name not in os.environ["OPTIMISED"].split(";"):
+                patch.setenv("CXX", os.environ["QUICK"])
+            found[name] = given(name)
+    return found
 
-    return expected
+
+@pytest.fixture
+def quick(cache: Path) -> str:
+    """One for all tests and processes: what it compiled is kept."""
+    folder = cache.parent / "quick"
+    if not folder.exists():
+        made = cache.parent / f"quick-{os.getpid()}"
+        made.mkdir()
+        quick_compiler(made)
+        with contextlib.suppress(OSError):  # another process was first
+            made.rename(folder)
+    return str(folder / "c++")
 
 
 @pytest.mark.backend("cpp")
-@pytest.mark.parametrize("name", SHADERS)
 @pytest.mark.parametrize("set_", INSTRUCTIONS)
-def test_every_bit_is_that_of_rays_one_by_one(of_instructions, one_by_one, set_, name):
-    found = of_instructions[set_][name]
-    for one, other in zip(found, one_by_one(name), strict=True):
-        assert torch.equal(one.nan_to_num(7), other.nan_to_num(7))
-    assert sum(len(one.unique()) for one in found) > 1000, "the test must see something"
+def test_every_bit_is_that_of_rays_one_by_one(tmp_path, monkeypatch, quick, set_):
+    own = set_ == instructions()
+    names, optimised = (list(SHADERS), OPTIMISED) if own else (OPTIMISED, [])
+    told = {"SHADERS": ";".join(names), "OPTIMISED": ";".join(optimised), "QUICK": quick}
+    run = start(all_given, tmp_path, set_, **told)
+    monkeypatch.setenv("CXX", quick)
+    expected = {name: given(name, tmp_path) for name in names}
+    found = result(run)
+    for name, tensors in expected.items():
+        for one, other in zip(found[name], tensors, strict=True):
+            assert torch.equal(one.nan_to_num(7), other.nan_to_num(7)), name
+        assert sum(len(one.unique()) for one in tensors) > 1000, "the test must see something"
 
 
 @pytest.mark.backend("cpp")

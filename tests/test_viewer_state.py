@@ -192,10 +192,10 @@ JSON = st.recursive(
 )
 NAMES = sorted({name for kind in MESSAGES.values() for name in schema.arguments(kind)})
 NAMES += [*schema.KINDS, "kind", "kept", "eye", "shader", "options", "clip", "lens", "opacity"]
-NEAR = st.fixed_dictionaries(
-    {"type": st.sampled_from([*MESSAGES, "nothing"])},
-    optional={name: JSON for name in NAMES},
-) | st.dictionaries(st.sampled_from(NAMES), JSON, max_size=5)
+TYPE = st.fixed_dictionaries({"type": st.sampled_from([*MESSAGES, "nothing"])})
+NEAR = st.tuples(TYPE | st.just({}), st.dictionaries(st.sampled_from(NAMES), JSON, max_size=5)).map(
+    lambda parts: {**parts[1], **parts[0]}
+)
 
 
 def assert_message_or_line(text: str | bytes) -> None:
@@ -207,13 +207,13 @@ def assert_message_or_line(text: str | bytes) -> None:
     assert type(message) in MESSAGES.values()
 
 
-@settings(max_examples=3000, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=1500, deadline=None, suppress_health_check=list(HealthCheck))
 @given(NEAR.map(json.dumps) | st.text() | st.binary())
 def test_whatever_comes_is_a_message_or_a_line(text):
     assert_message_or_line(text)
 
 
-@settings(max_examples=2000, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=1000, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.data())
 def test_a_state_with_one_wrong_place_is_refused_or_another_state(data):
     """One number, name or object of a good state is replaced by anything."""
