@@ -133,6 +133,12 @@ def test_a_chunk_that_swells_costs_itself(stored, request, place, remote, tmp_pa
             assert not read(array[box(other)]).result(timeout=30).any()
         each = tuple((np.array(others) * CHUNK).T)
         assert not read(array.vindex[each]).result(timeout=30).any()
+        files = ChunkFiles.of(array)
+        assert files.are(CHUNK) and not files.are(SHARD) and bool(files.folder) != remote
+        if files.folder:
+            files.check(np.array(others))
+            with pytest.raises(http.Endless, match="Blosc would make"):
+                files.check(np.array([*others, place]))
 
 
 @pytest.mark.parametrize("what", ["pipe", "folder", "long", "device"])

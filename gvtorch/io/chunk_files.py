@@ -41,8 +41,8 @@ def file_limit(values: int, chunk: int, item: int) -> int:
     return 2 * values * item + index_bytes(values, chunk) + SMALL
 
 
-def check_file(path: str, most: int) -> bool:
-    """Tells whether there is a file. Links are followed.
+def check_file(path: str, most: int) -> int | None:
+    """Returns how long a file is; None if there is none. Links are followed.
 
     Raises:
         Endless: It is a folder, a pipe, a device, or longer than `most` bytes.
@@ -50,12 +50,12 @@ def check_file(path: str, most: int) -> bool:
     try:
         found = os.stat(path)
     except (OSError, ValueError):
-        return False  # tensorstore tells what is wrong, if it is
+        return None  # tensorstore tells what is wrong, if it is
     if not stat.S_ISREG(found.st_mode):
         raise Endless("is no regular file")
     if found.st_size > most:
         raise Endless(f"takes {found.st_size} bytes, more than the {most} that fit")
-    return True
+    return found.st_size
 
 
 def files_of(where: str, array: Any) -> ChunkFiles:
@@ -73,12 +73,14 @@ def files_of(where: str, array: Any) -> ChunkFiles:
     return files
 
 
-def begin_read(view: Any, files: ChunkFiles) -> Any:
+def begin_read(view: Any, files: ChunkFiles, chunks: np.ndarray | None = None) -> Any:
     """Begins to read one of tensorstore's arrays, or a part of one; returns the future of its
-    values, in the order of C. What a file may not be becomes the future's error.
+    values, in the order of C. What a file may not be becomes the future's error. Who knows the
+    places (n, axes) of its chunks, counted along the array's axes, may tell them.
     """
     try:
-        files.check(view.spec().transform)
+        if files.folder:
+            files.check(view.spec().transform if chunks is None else chunks)
     except Endless as error:
         return failed(error)
     return view.read(order="C")
@@ -160,6 +162,11 @@ class ChunkFiles:
         size = self.index_bytes
         return slice(0, size) if self.index == "start" else slice(-size, None)
 
+    def are(self, shape: Sequence[int]) -> bool:
+        """Whether each chunk is one item of this shape, and its place is known by its axes."""
+        before = len(self.chunk) - len(shape)
+        return self.chunk == (1,) * before + tuple(shape) and not self.transposed
+
     def entries(self, index: bytes) -> np.ndarray:
         """(n, 2) uint64 where chunks lie in a shard and how long they are, of its index or of some
         entries.
@@ -167,18 +174,20 @@ class ChunkFiles:
         found = np.frombuffer(index, f"{self.order}u8", len(index) // _ENTRY * 2)
         return found.astype(np.uint64).reshape(-1, 2)
 
-    def check(self, transform: Any) -> None:
-        """Looks at the files on disk that a part of the array lies in, `transform` tensorstore's
-        IndexTransform from the part to the array.
+    def check(self, part: Any) -> None:
+        """Looks at the files on disk that a part of the array lies in: places of chunks, or
+        tensorstore's IndexTransform from the part to the array.
 
         Raises:
             Endless: A file is no regular one, or too long, or Blosc would make too much of it.
         """
-        for place, chunks in self._files(transform) if self.folder else ():
+        found = self._listed(part) if isinstance(part, np.ndarray) else self._files(part)
+        for place, chunks in found:
             name = f"{self.begin}{self.separator.join(map(str, place))}"
             try:
-                if check_file(self.folder + name, self.most) and self.blosc:
-                    self._check_file(self.folder + name, chunks)
+                size = check_file(self.folder + name, self.most)
+                if size is not None and self.blosc:
+                    self._check_file(self.folder + name, size, chunks)
             except Endless as error:
                 raise Endless(f"{name}: {error}") from None
 
@@ -195,20 +204,39 @@ class ChunkFiles:
         starts = entries[(entries[:, 0] >= begin) & (entries[:, 0] <= max(last, 0)), 0].tolist()
         self._check_heads([content[at - begin : at - begin + _BLOSC] for at in starts])
 
-    def _files(self, transform: Any) -> Iterator[tuple[tuple[int, ...], np.ndarray]]:
-        """Places of the files, and in each the numbers of the chunks that are wanted."""
-        whole = self.transposed or not self.index
-        side = self.file if whole else self.chunk
-        count = [a // b for a, b in zip(self.file, side, strict=True)]
+    @cached_property
+    def _every(self) -> np.ndarray | None:
+        """The numbers of a file's chunks, where not those that are wanted are found."""
+        return np.arange(self.chunks) if self.transposed or not self.index else None
+
+    @cached_property
+    def _counts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Chunks of a file along its axes, and how their numbers go along each."""
+        count = [a // b for a, b in zip(self.file, self.chunk, strict=True)]
         strides = [math.prod(count[axis + 1 :]) for axis in range(len(count))]
+        if self._every is not None:  # files for chunks
+            count = [1] * len(count)
+        return np.array(count, np.int64), np.array(strides, np.int64)
+
+    def _listed(self, chunks: np.ndarray) -> Iterator[tuple[Sequence[int], np.ndarray]]:
+        """Places of files, and in each the numbers of the chunks at places."""
+        count, strides = self._counts
+        files = chunks // count
+        for place, numbers in _by_row(files, (chunks - files * count) @ strides):
+            yield place, numbers if self._every is None else self._every
+
+    def _files(self, transform: Any) -> Iterator[tuple[Sequence[int], np.ndarray]]:
+        """The same for a part."""
+        side = self.chunk if self._every is None else self.file
+        counts, strides = self._counts
+        count = counts.tolist()
         spans, listed, points = _places(transform, side)
         files = [
             range(span.start // n, (span.stop - 1) // n + 1)
             for span, n in zip(spans, count, strict=True)
         ]
-        per = np.array([count[axis] for axis in listed], np.int64)
-        rows = points // per
-        inner = (points - rows * per) @ np.array([strides[axis] for axis in listed], np.int64)
+        rows = points // counts[listed]
+        inner = (points - rows * counts[listed]) @ strides[listed]
         for group, numbers in _by_row(rows, inner):
             for axis, file in zip(listed, group, strict=True):
                 files[axis] = range(file, file + 1)
@@ -221,9 +249,9 @@ class ChunkFiles:
                     if high > 1:
                         along = strides[axis] * np.arange(low, high)
                         wanted = np.add.outer(wanted, along).ravel()
-                yield place, np.arange(self.chunks) if whole else wanted
+                yield place, wanted if self._every is None else self._every
 
-    def _check_file(self, path: str, chunks: np.ndarray) -> None:
+    def _check_file(self, path: str, size: int, chunks: np.ndarray) -> None:
         try:
             file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         except OSError:
@@ -236,7 +264,7 @@ class ChunkFiles:
             low, high = int(chunks.min()), int(chunks.max()) + 1
             at = _ENTRY * low
             if self.index == "end":
-                at += os.fstat(file).st_size - self.index_bytes
+                at += size - self.index_bytes
             if at < 0:
                 return  # cut, as tensorstore tells
             entries = self.entries(os.pread(file, _ENTRY * (high - low), at))

@@ -431,6 +431,10 @@ class Store:
         batch that fails one by one, to tell the good from the bad.
         """
         array, files = chunked
+        chunks = np.zeros((len(zyx), len(files.file)), np.int64)
+        first = len(files.file) - array.rank  # an axis of time
+        chunks[:, :first], chunks[:, first : first + 3] = self.time, zyx
+        known = files.are(array.shape[3:])
         errors = dict[int, str]()
         running: deque[tuple[np.ndarray, Any]] = deque()
 
@@ -449,7 +453,9 @@ class Store:
             for start in range(0, len(order), batch):
                 rows = order[start : start + batch]
                 z, y, x = zyx[rows].T
-                running.append((rows, begin_read(array[z, y, x], files)))
+                running.append(
+                    (rows, begin_read(array[z, y, x], files, chunks[rows] if known else None))
+                )
                 if len(running) * batch >= _AHEAD:
                     finish()
             while running:
