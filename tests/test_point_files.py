@@ -239,6 +239,7 @@ def test_mistakes_leave_nothing_behind(tmp_path):
         (("--values", "mess"), "has no column 'mess'"),
         (("--box", "1,2"), "--box must be 6 numbers"),
         (("--extent", "x"), "--extent must be 1 whole"),
+        (("--radius", 1e308), "box must be finite"),
         (("--extent", str(2**30)), "more voxels than a 64-bit number tells apart"),
         (("--channels", "color", "--opacity", 2), "opacity must be"),
     ):

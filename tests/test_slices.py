@@ -106,7 +106,8 @@ def test_colours_and_components():
         ({"level": 1}, "level is for stores"),
         ({"component": 1}, "component must be an int >= 0 and <= 0"),
         ({"scale": 0}, "scale must be finite and > 0"),
-        ({"scale": 1e5}, "pixels are more than 65536"),
+        ({"scale": 6e4}, "pixels are more than 65536"),
+        ({"scale": 1e308}, "scale must be finite and > 0 and <= 65536"),
         ({"span": (0, 1), "colors": gv.TransferFunction([(0, 1)])}, "span is for grays"),
     ],
 )

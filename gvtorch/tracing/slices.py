@@ -83,7 +83,7 @@ def slice_picture(
     where = "slice_picture"
     if axis not in ("x", "y", "z", "all"):
         raise ValueError(f"{where}: axis must be x, y, z or all, got {axis!r}")
-    scale = check.number(where, "scale", scale, low=0, open_low=True)
+    scale = check.number(where, "scale", scale, low=0, high=_MOST, open_low=True)
     plane = _Plane(data, component, level)
     if colors is None:
         ends = window(data, component=component, background=True) if span is None else span
