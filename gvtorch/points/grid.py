@@ -98,14 +98,14 @@ class Grid:
         return own
 
 
+@np.errstate(over="ignore")  # a box that is not finite is refused
 def _bounds(blocks: Iterable[Points]) -> list[list[float]]:
     """A box around all points, as far as they reach, and a little more."""
     low, high = np.full(3, math.inf), np.full(3, -math.inf)
     for block in blocks:
         reach = 0.0 if block.radius is None else block.radius[:, None]
-        with np.errstate(over="ignore"):  # a box that is not finite is refused
-            low = np.minimum(low, (block.positions - reach).min(0))
-            high = np.maximum(high, (block.positions + reach).max(0))
+        low = np.minimum(low, (block.positions - reach).min(0))
+        high = np.maximum(high, (block.positions + reach).max(0))
     middle = 0.5 * (low + high)
     longest = float((high - low).max())
     smallest = max(1e-6 * longest, 1e-9 * float(np.abs(middle).max())) or 1.0
