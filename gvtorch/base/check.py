@@ -246,12 +246,6 @@ def number(
     return result
 
 
-def is_number(value: Any) -> bool:
-    """Whether this is a number of JSON that a float holds: neither true nor infinite."""
-    plain = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return plain and -sys.float_info.max <= value <= sys.float_info.max
-
-
 def whole(where: str, name: str, value: Any, *, low: int, high: int = sys.maxsize) -> int:
     """Returns `value` as an int; raises ValueError unless it is a whole number in [low, high]."""
     plain = operator.index(value) if hasattr(value, "__index__") else None

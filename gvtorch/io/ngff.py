@@ -14,14 +14,12 @@ from pathlib import Path
 from reprlib import repr as brief
 from typing import Any
 
-from ..base import check
 from ..base.image_info import ImageInfo
 from ..base.units import metres
-from .chunk_files import check_file
 from .http import Endless
 from .omero import forget_assumed, read_channels, write_channels
 from .remote import is_file_url
-from .store_layout import MOST_JSON, WORK, Deadline, StoreLayout, child, read_key
+from .store_layout import MOST_JSON, WORK, Deadline, StoreLayout, child, is_number, read_key
 
 SEVERAL = "gvtorch_channels"  # attribute that names the images of a store of several channels
 _MOST_LEVELS = 64
@@ -126,6 +124,8 @@ def parse_json(where: str, content: bytes, most: int = MOST_JSON) -> dict[str, A
 
 def read_json_file(file: Path) -> dict[str, Any]:
     """Reads a JSON object of a file on disk, as `parse_json`."""
+    from .chunk_files import check_file  # NumPy: not when the program starts
+
     try:
         check_file(str(file), MOST_JSON)
     except Endless as error:
@@ -330,7 +330,7 @@ def _transform(
                 lost.append(f"a transformation of type {brief(kind)}")
             continue
         values = item.get(kind)
-        plain = isinstance(values, list) and all(map(check.is_number, values))
+        plain = isinstance(values, list) and all(map(is_number, values))
         if not plain or len(values) != len(axes):
             raise ValueError(f"{where}: {kind} must be {len(axes)} numbers, got {brief(values)}")
         told[kind].update(zip(axes, map(float, values), strict=True))

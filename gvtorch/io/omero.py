@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from ..base import check
 from ..base.image_info import ChannelInfo, Rgb, to_hex
+from .store_layout import is_number
 
 #: For viewers: of channels without a colour. A single one is white.
 _COLORS = ("00ff00", "ff00ff", "00ffff", "ffff00", "ff0000", "0000ff")
@@ -89,7 +89,7 @@ def _window(told: Any) -> tuple[float, float] | None:
     if not isinstance(told, dict):
         return None
     ends: list[Any] = [told.get("start", told.get("min")), told.get("end", told.get("max"))]
-    if not all(map(check.is_number, ends)) or ends[0] > ends[1]:
+    if not all(map(is_number, ends)) or ends[0] > ends[1]:
         return None
     return (float(ends[0]), float(ends[1]))
 

@@ -18,12 +18,9 @@ import threading
 import urllib.parse
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from ..base.messages import one_line
-from .chunk_files import HEADS, ChunkFiles
 from .http import (
     SLOWEST,
     SMALL,
@@ -36,6 +33,11 @@ from .http import (
     read_http,
     refused,
 )
+
+if TYPE_CHECKING:  # not when the program starts: `gvtorch --help` comes this way
+    import numpy as np
+
+    from .chunk_files import ChunkFiles
 
 _JOINED = 1 << 27  # bytes of parts that tensorstore asks for together
 _METADATA = 1 << 24  # bytes
@@ -73,6 +75,8 @@ class Relayed:
     @property
     def files(self) -> ChunkFiles | None:
         """What its chunks may be; None before the array is open."""
+        from .chunk_files import ChunkFiles
+
         future = self._future
         if future is not None and future.done():
             self._files = ChunkFiles.of(future.result()) if future.exception() is None else None
@@ -81,6 +85,8 @@ class Relayed:
 
     def read(self, name: str, part: slice | None) -> bytes | None:
         """Returns a file, or a part of it; raises as `read_http`."""
+        from .chunk_files import HEADS
+
         url = file_url(self.url, name)
         try:
             files = None if name.endswith(HEADS) else self.files

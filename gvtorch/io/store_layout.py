@@ -25,6 +25,7 @@ import itertools
 import math
 import os
 import re
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -33,9 +34,7 @@ from reprlib import repr as brief
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
-from ..base.check import is_number
 from ..base.text_path import text_path
-from .chunk_files import HEADS, check_file, failed
 from .http import Endless, file_url, is_http, read_http
 from .relay import named, read_within, through
 from .resources import cores
@@ -356,6 +355,12 @@ def is_name(value: Any) -> bool:
     return isinstance(value, str) and re.fullmatch(r"[\w-]{1,64}", value, re.ASCII) is not None
 
 
+def is_number(value: Any) -> bool:
+    """Whether this is a number of JSON that a float holds: neither true nor infinite."""
+    plain = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return plain and -sys.float_info.max <= value <= sys.float_info.max
+
+
 def _is_list(value: Any, size: Any) -> bool:
     return isinstance(value, list) and len(value) == size
 
@@ -474,6 +479,8 @@ def read_key(
     import tensorstore as ts
 
     if isinstance(root, dict):
+        from .chunk_files import check_file
+
         try:
             check_file(f"{root['path']}{name}", most)
         except Endless as error:
@@ -517,6 +524,8 @@ def opened_at(folder: Any, spec: dict[str, Any], *, create: bool = False) -> Any
 
     relayed = through(folder, context()) if isinstance(folder, str) else None
     if relayed is None:
+        from .chunk_files import HEADS, check_file, failed
+
         for head in HEADS:
             try:
                 check_file(f"{folder['path']}{head}", MOST_JSON)

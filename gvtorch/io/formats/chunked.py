@@ -16,14 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from ...base.check import is_number
 from ...base.image_info import ImageInfo
 from ...base.named_axes import ask_axes, even_steps, named_axes, place_named
 from ...base.units import spacing_of
 from ..chunk_files import ChunkFiles, begin_read, files_of
 from ..ngff import read_json_file
 from ..source import Index, VolumeSource
-from ..store_layout import Deadline, kvstore, opened_at
+from ..store_layout import Deadline, is_number, kvstore, opened_at
 from .format import Format
 
 _TIMEOUT = 600.0  # seconds for one read
