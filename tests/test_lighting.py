@@ -42,7 +42,7 @@ def light_on(tree, rays, shader, backend, *, plain=None, **lighting) -> np.ndarr
 
 @pytest.fixture
 def backend(compiled: str) -> str:
-    """What is compiled: the twin, compared in test_lighting_frames.py, takes minutes."""
+    """What is compiled: the twin, which is equal (test_lighting_frames.py), takes minutes."""
     return compiled
 
 
