@@ -29,9 +29,9 @@ _NOWHERE = 2**63  # and beyond: of chunks that are not there
 _BLOSC = 8  # bytes of its head; the last four tell what it makes
 
 
-def index_bytes(values: int, chunk: int) -> int:
+def index_bytes(values: int, chunk: int, *, summed: bool = True) -> int:
     """Bytes of the index of a shard of so many values, in chunks of so many."""
-    return _ENTRY * (values // max(1, chunk)) + _CHECKSUM
+    return _ENTRY * (values // max(1, chunk)) + _CHECKSUM * summed
 
 
 def file_limit(values: int, chunk: int, item: int) -> int:
@@ -42,7 +42,7 @@ def file_limit(values: int, chunk: int, item: int) -> int:
 
 
 def check_file(path: str, most: int) -> int | None:
-    """Returns how long a file is; None if there is none. Links are followed.
+    """Returns the bytes of a file; None if there is none. Links are followed.
 
     Raises:
         Endless: It is a folder, a pipe, a device, or longer than `most` bytes.
@@ -74,9 +74,17 @@ def files_of(where: str, array: Any) -> ChunkFiles:
 
 
 def begin_read(view: Any, files: ChunkFiles, chunks: np.ndarray | None = None) -> Any:
-    """Begins to read one of tensorstore's arrays, or a part of one; returns the future of its
-    values, in the order of C. What a file may not be becomes the future's error. Who knows the
-    places (n, axes) of its chunks, counted along the array's axes, may tell them.
+    """Begins to read an array, once its files on disk were looked at.
+
+    Args:
+        view: tensorstore's array, or a part of one.
+        files: Those of the whole array.
+        chunks: (n, axes) int64 places of the chunks that it needs, where they are known: numbers
+            of chunks along each axis of the whole array. Else tensorstore is asked, which is slow.
+
+    Returns:
+        tensorstore's future of the values, in the order of C; a failed one where a file is not
+        what it may be.
     """
     try:
         if files.folder:
@@ -97,18 +105,20 @@ def failed(error: Exception) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class ChunkFiles:
-    """The files of an array. "Chunk" is the inner one where files are shards."""
+    """What an array's metadata tells of its files: a chunk each, or shards, which hold an index and
+    many; "chunk" is then the inner one.
+    """
 
     folder: str  # path of the array; "" behind a URL, where the relay looks
     begin: str = ""  # of a file's name
-    separator: str
-    file: tuple[int, ...]  # values along its axes
-    chunk: tuple[int, ...]
+    separator: str  # of the numbers in a file's name
+    file: tuple[int, ...]  # values of a file along each axis
+    chunk: tuple[int, ...]  # and of a chunk
     item: int  # bytes of a value
     index: str = ""  # "start" or "end": where a shard's index lies; "": files are no shards
     order: str = "<"  # of the index's bytes
     summed: bool = True  # whether a checksum follows the index
-    transposed: bool = False  # a shard's axes
+    transposed: bool = False  # whether a shard's axes are in another order than the array's
     blosc: bool = False  # whether chunks begin with its head
     n5: bool = False  # its own head comes first
 
@@ -154,7 +164,7 @@ class ChunkFiles:
     @cached_property
     def index_bytes(self) -> int:
         """Bytes of a shard's index."""
-        return _ENTRY * self.chunks + _CHECKSUM * self.summed
+        return index_bytes(math.prod(self.file), math.prod(self.chunk), summed=self.summed)
 
     @property
     def index_part(self) -> slice:
@@ -162,10 +172,16 @@ class ChunkFiles:
         size = self.index_bytes
         return slice(0, size) if self.index == "start" else slice(-size, None)
 
-    def are(self, shape: Sequence[int]) -> bool:
-        """Whether each chunk is one item of this shape, and its place is known by its axes."""
+    def places(self, time: int, zyx: np.ndarray, shape: Sequence[int]) -> np.ndarray | None:
+        """Returns (n, axes) places of the chunks of items at places (n, 3), in an array
+        ([t,] z, y, x, *shape) that has an item of this shape in each chunk; None for any other.
+        """
         before = len(self.chunk) - len(shape)
-        return self.chunk == (1,) * before + tuple(shape) and not self.transposed
+        if self.transposed or before < 3 or self.chunk != (1,) * before + tuple(shape):
+            return None
+        found = np.zeros((len(zyx), len(self.chunk)), np.int64)
+        found[:, : before - 3], found[:, before - 3 : before] = time, zyx
+        return found
 
     def entries(self, index: bytes) -> np.ndarray:
         """(n, 2) uint64 where chunks lie in a shard and how long they are, of its index or of some
@@ -192,8 +208,13 @@ class ChunkFiles:
                 raise Endless(f"{name}: {error}") from None
 
     def check_sent(self, begin: int, content: bytes, entries: np.ndarray | None) -> None:
-        """Looks at bytes of a file from `begin` on; `entries` of its index, where it is a shard.
-        Raises as `check`.
+        """Looks at bytes that a server sent, those of a file from byte `begin` on. Raises as
+        `check`.
+
+        Args:
+            begin: 0 for the file's first byte.
+            content: The bytes.
+            entries: (n, 2) where the chunks lie in the file, if it is a shard.
         """
         if not self.blosc:
             return
@@ -206,12 +227,16 @@ class ChunkFiles:
 
     @cached_property
     def _every(self) -> np.ndarray | None:
-        """The numbers of a file's chunks, where not those that are wanted are found."""
+        """Numbers of all chunks of a file, where it is looked at as a whole: it has one, or which
+        are wanted can't be told.
+        """
         return np.arange(self.chunks) if self.transposed or not self.index else None
 
     @cached_property
     def _counts(self) -> tuple[np.ndarray, np.ndarray]:
-        """Chunks of a file along its axes, and how their numbers go along each."""
+        """(axes,) chunks of a file along each axis, and by how much a chunk's number in its file
+        grows along each; one chunk a file where it is looked at as a whole.
+        """
         count = [a // b for a, b in zip(self.file, self.chunk, strict=True)]
         strides = [math.prod(count[axis + 1 :]) for axis in range(len(count))]
         if self._every is not None:  # files for chunks
@@ -219,14 +244,14 @@ class ChunkFiles:
         return np.array(count, np.int64), np.array(strides, np.int64)
 
     def _listed(self, chunks: np.ndarray) -> Iterator[tuple[Sequence[int], np.ndarray]]:
-        """Places of files, and in each the numbers of the chunks at places."""
+        """Places of the files of chunks at places (n, axes), and in each the numbers of those."""
         count, strides = self._counts
         files = chunks // count
         for place, numbers in _by_row(files, (chunks - files * count) @ strides):
             yield place, numbers if self._every is None else self._every
 
     def _files(self, transform: Any) -> Iterator[tuple[Sequence[int], np.ndarray]]:
-        """The same for a part."""
+        """The same for a part of the array, of which tensorstore's IndexTransform tells."""
         side = self.chunk if self._every is None else self.file
         counts, strides = self._counts
         count = counts.tolist()
@@ -275,7 +300,7 @@ class ChunkFiles:
             os.close(file)
 
     def _head(self, content: bytes) -> int:
-        """Bytes before Blosc's head."""
+        """Bytes of a chunk before Blosc's head."""
         if not self.n5:
             return 0
         return 4 + 4 * len(self.file) + (4 if content[:2] != b"\0\0" else 0)
@@ -290,6 +315,7 @@ class ChunkFiles:
 
 
 def _of_zarr3(about: dict[str, Any]) -> dict[str, Any]:
+    """Fields of `ChunkFiles` out of an array's zarr.json."""
     file = tuple(about["chunk_grid"]["configuration"]["chunk_shape"])
     keys = about["chunk_key_encoding"]
     plain = keys["name"] == "default"
@@ -343,7 +369,7 @@ def _places(transform: Any, side: Sequence[int]) -> tuple[list[range], list[int]
 
 
 def _by_row(rows: np.ndarray, numbers: np.ndarray) -> Iterator[tuple[list[int], np.ndarray]]:
-    """Numbers by their row: (n, k) of whole numbers."""
+    """Yields each different row of `rows` (n, k) once, with the numbers (n,) that stand at it."""
     if (rows == rows[:1]).all():
         if len(rows):
             yield rows[0].tolist(), numbers

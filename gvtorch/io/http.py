@@ -37,7 +37,7 @@ _ELSEWHERE = (301, 302, 303, 307, 308)
 
 
 class Endless(OSError):
-    """A server sends more than a file can have, or nothing."""
+    """There is more than a file can have, or no end to wait for: a server that stalls, a pipe."""
 
 
 class HttpStatus(OSError):

@@ -92,6 +92,21 @@ def open_arrays(
     return stored, chosen, sizes
 
 
+def fitted(
+    image: MultiscaleImage, sizes: dict[str, int], chosen: slice | list[int]
+) -> MultiscaleImage:
+    """What the metadata tells of the channels that were chosen, if it fits the array."""
+    told, width, lost = image.info.channels, sizes.get("c", 1), list(image.lost)
+    if told and len(told) != width:
+        lost.append(f"what is told of {len(told)} channels, where there are {width}")
+        told = ()
+    if sizes.get("-", 1) > 1:
+        lost.append(f"an axis that is none of t, c, z, y, x: the first of {sizes['-']} is read")
+    if told and not isinstance(chosen, slice):
+        told = tuple(told[number] for number in chosen)
+    return replace(image, info=replace(image.info, channels=told), lost=tuple(lost))
+
+
 def _check_array(where: str, array: Any, axes: str) -> ChunkFiles:
     if array.rank != len(axes):
         raise ValueError(f"{where}: has {array.rank} axes, the metadata {len(axes)}: {axes}")

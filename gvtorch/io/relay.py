@@ -113,25 +113,23 @@ class Relayed:
         return self._read_bucket(urllib.parse.unquote(name), part, most)
 
     def _look(self, name: str, part: slice | None, content: bytes, files: ChunkFiles) -> None:
-        """Raises Endless if what came is not what chunks may be; keeps an index that came."""
-        if not files.index:
-            files.check_sent(part.start if part else 0, content, None)
-            return
-        place = files.index_part
-        if part is None:
-            index = files.entries(content[place])
-        elif part == place:
+        """Keeps a shard's index that came; raises Endless if anything else holds a chunk of which
+        Blosc would make too much.
+        """
+        place, index = files.index_part, None
+        if files.index and part == place:
             with self._lock:
                 self._indexes[name] = files.entries(content)
                 while len(self._indexes) * files.index_bytes > _INDEXES and len(self._indexes) > 1:
                     self._indexes.popitem(last=False)
             return
-        else:
+        if files.index and part is None:
+            index = files.entries(content[place])
+        elif files.index:
             with self._lock:
-                kept = self._indexes.get(name)
-            if kept is None:  # it was of too many files
-                kept = files.entries(self._read(name, place, files) or b"")
-            index = kept
+                index = self._indexes.get(name)
+            if index is None:  # it was of too many files
+                index = files.entries(self._read(name, place, files) or b"")
         files.check_sent(part.start if part else 0, content, index)
 
     def _read_bucket(self, name: str, part: slice | None, most: int) -> bytes | None:

@@ -12,7 +12,6 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from . import boxes
 from .boxes import Zyx, grouped
 from .checksums import Checksums, file_of, sum_of
 from .chunk_files import ChunkFiles, begin_read, files_of
-from .level_reader import LevelReader, Pool, open_arrays
+from .level_reader import LevelReader, Pool, fitted, open_arrays
 from .ngff import MultiscaleImage, find_image, read_json
 from .store_layout import (
     BORDER,
@@ -165,7 +164,7 @@ class Store:
         if found.info.labels:
             pool = partial(pool_majority, background=background(names))
         levels = LevelReader(stored, layout, pool)
-        found = _fitted(found, sizes, chosen)
+        found = fitted(found, sizes, chosen)
         self = cls(
             *(where, found, layout, levels, chosen),
             time=time,
@@ -431,10 +430,7 @@ class Store:
         batch that fails one by one, to tell the good from the bad.
         """
         array, files = chunked
-        chunks = np.zeros((len(zyx), len(files.file)), np.int64)
-        first = len(files.file) - array.rank  # an axis of time
-        chunks[:, :first], chunks[:, first : first + 3] = self.time, zyx
-        known = files.are(array.shape[3:])
+        chunks = files.places(self.time, zyx, array.shape[3:])
         errors = dict[int, str]()
         running: deque[tuple[np.ndarray, Any]] = deque()
 
@@ -453,9 +449,8 @@ class Store:
             for start in range(0, len(order), batch):
                 rows = order[start : start + batch]
                 z, y, x = zyx[rows].T
-                running.append(
-                    (rows, begin_read(array[z, y, x], files, chunks[rows] if known else None))
-                )
+                needed = None if chunks is None else chunks[rows]
+                running.append((rows, begin_read(array[z, y, x], files, needed)))
                 if len(running) * batch >= _AHEAD:
                     finish()
             while running:
@@ -559,21 +554,6 @@ def _read_labels(where: str, root: Any, layout: StoreLayout, deadline: Deadline)
     if not (labels[1:] > labels[:-1]).all():
         raise ValueError(f"{name}: damaged: labels must rise")
     return labels
-
-
-def _fitted(
-    image: MultiscaleImage, sizes: dict[str, int], chosen: slice | list[int]
-) -> MultiscaleImage:
-    """What the metadata tells of the channels that were chosen, if it fits the array."""
-    told, width, lost = image.info.channels, sizes.get("c", 1), list(image.lost)
-    if told and len(told) != width:
-        lost.append(f"what is told of {len(told)} channels, where there are {width}")
-        told = ()
-    if sizes.get("-", 1) > 1:
-        lost.append(f"an axis that is none of t, c, z, y, x: the first of {sizes['-']} is read")
-    if told and not isinstance(chosen, slice):
-        told = tuple(told[number] for number in chosen)
-    return replace(image, info=replace(image.info, channels=told), lost=tuple(lost))
 
 
 def needed_cells(cells: np.ndarray, threshold: float | None) -> np.ndarray:

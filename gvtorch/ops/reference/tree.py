@@ -222,8 +222,8 @@ class Bricks:
         x, y, z = (cell.to(torch.int64)[:, None] + both).unbind(2)
         corners = (z[:, :, None, None], y[:, None, :, None], x[:, None, None, :])
         brick = holder.brick.clamp(min=0)[:, None, None, None]
-        rows = self.bricks_bzyxc[(brick, *corners, self.component)].to(real)
-        left, right = rows.unbind(3)
+        value_rzyx = self.bricks_bzyxc[(brick, *corners, self.component)].to(real)  # (r, 2, 2, 2)
+        left, right = value_rzyx.unbind(3)
         low, high = (left + wx[:, None, None] * (right - left)).unbind(2)
         near, far = (low + wy[:, None] * (high - low)).unbind(1)
         return torch.where(holder.brick >= 0, near + wz * (far - near), constant)
