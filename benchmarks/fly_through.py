@@ -53,6 +53,8 @@ class Settings:
     """threads that read the store: on one's own disk more of them only wait for one another"""
     batch: int = 512
     """on CUDA: most bricks that a frame makes"""
+    look_ahead: float = 0
+    """on CUDA: how many frames ahead of the camera rays ask for bricks"""
     compiled: bool = False
     """torch.compile makes bricks and classifies nodes, in batches that are full"""
     graph: bool = True
@@ -189,7 +191,8 @@ def fly(producer: gv.Producer, pool: str, settings: Settings, console: Console) 
     with gv.Engine(producer, device=settings.device, **options) as engine:
         engine.render(cameras[0], shader)  # the flight begins with what its first view needs
         if engine.device.type == "cuda" and settings.graph:
-            draw = engine.capture(cameras[0], shader, batch=settings.batch).replay
+            ahead = {"batch": settings.batch, "look_ahead": settings.look_ahead}
+            draw = engine.capture(cameras[0], shader, **ahead).replay
         else:
             draw = partial(engine.frame, shader=shader)
         start = time.perf_counter()

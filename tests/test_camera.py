@@ -14,6 +14,7 @@ from kornia.geometry.depth import unproject_meshgrid
 
 import gvtorch as gv
 from gvtorch.base.volume import DIRECTIONS
+from gvtorch.cameras.custom import CustomCamera
 from gvtorch.tracing import pixels
 
 BOX = torch.tensor([[1.0, 2.0, 3.0], [5.0, 4.0, 4.0]], dtype=torch.float64)
@@ -250,6 +251,37 @@ def test_rays_are_those_of_kornia_to_rounding():
     rays = camera.rays()
     assert (rays.direction - expected).abs().max() <= 2**-51 and rays.width == 13
     assert torch.equal(rays.range, torch.tensor([[0, math.inf]]).double().expand(104, 2))
+
+
+AHEAD = {
+    "pinhole": gv.Camera.orbit([20, 70], [10, -30], 1.5, None, 15, 9),
+    "ortho": gv.Camera.orbit(20, 10, 1.5, None, 15, 9, "ortho"),
+    "fisheye": gv.Camera.orbit(20, 10, 0.6, 150, 15, 9, "fisheye"),
+    "panorama": gv.Camera.orbit(20, 10, 0.3, None, 15, 9, "panorama"),
+}
+
+
+@pytest.mark.parametrize("model", [*AHEAD, "custom"])
+def test_a_thinned_camera_looks_through_the_middle_of_its_pixels_ahead_of_the_motion(model):
+    box = torch.tensor([[0.0, 0, 0], [4, 2, 3]], dtype=torch.float64)
+    camera = AHEAD["pinhole" if model == "custom" else model].placed(box)
+    if model == "custom":
+        camera = CustomCamera(camera.rays(), 15, 9)
+    now = camera.numbers()
+    thin, middle = camera.thinned(3), slice(1, None, 3)
+    rays = thin.pixel_rays(camera.numbers_ahead(now, now, 4, 3), (0, len(camera) * 3))
+    whole, first = camera.rays(), slice(None, None, 3)
+    for name in ("origin", "direction", "cone", "range"):
+        every = getattr(whole, name).view(len(camera), 9, 15, -1)
+        which = first if model == "custom" else middle
+        part = every[:, which, which].reshape(-1, every.shape[-1])
+        torch.testing.assert_close(getattr(rays, name), part, rtol=1e-12, atol=1e-12)
+    move = slice(0, 3) if model == "custom" else slice(9, 12)
+    before = now.clone()
+    before[:, move] -= torch.tensor([0.25, -0.5, 1.0], dtype=torch.float64)
+    moved = camera.numbers_ahead(now, before, 4, 1)[:, move]
+    torch.testing.assert_close(moved, now[:, move] + torch.tensor([1.0, -2.0, 4.0]).double())
+    assert torch.equal(camera.numbers_ahead(now, -now, 4, 1)[:, move], now[:, move]), "a cut"
 
 
 def test_rows_are_counted_through_the_batch():

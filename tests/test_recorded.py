@@ -17,6 +17,7 @@ from helpers.recorded import Frames
 from helpers.waits import nobody_waits
 
 import gvtorch as gv
+from gvtorch.base.constants import REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUEST_SUBDIVIDE
 from gvtorch.engine import host_frame
 from gvtorch.engine.device_frame import DeviceFrame
 from gvtorch.io.conversion import convert
@@ -345,6 +346,59 @@ def test_what_the_host_would_have_to_see_to_is_refused():
         engine.trees["scene"].producer.__class__ = Named
         with pytest.raises(ValueError, match="without alias and errors"):
             frames.frame()
+
+
+def missed_on_a_flight(backend: str, look_ahead: float) -> tuple[int, gv.Hits, gv.FrameStats]:
+    """Nodes that a turning camera missed, and what its last view shows in the end."""
+    missed = 0
+    with gv.Engine(Ball(1024), brick_pool="64 MB", device=DEVICES[backend]) as engine:
+        engine.render(view(64, 0), LOOK)
+        frames = Frames(engine, view(64, 0), LOOK, 256, look_ahead)
+        for step in range(1, 25):
+            frames.look_from(view(64, 1.5 * step))
+            hits, stats = frames.frame()
+            missed += stats.misses
+            if step > 1:  # a motion is known
+                assert (stats.ahead > 0) == (look_ahead > 0), step
+        for _ in range(30):
+            hits, stats = frames.frame()
+            assert stats.ahead == 0, "it stands still"
+            if stats.converged:
+                break
+        engine.validate()
+        assert stats.converged
+        expected = engine.render(view(64, 1.5 * step), LOOK)
+    assert torch.equal(hits.color, expected.color.reshape(-1, 3))
+    return missed, hits, stats
+
+
+@pytest.mark.backend("cpp")
+def test_rays_ahead_of_a_moving_camera_ask_for_what_it_would_miss():
+    missed, hits, stats = missed_on_a_flight("cpp", 0)
+    fewer, same, own = missed_on_a_flight("cpp", 3)
+    assert fewer < missed / 2 and missed > 100
+    assert torch.equal(hits.color, same.color) and own.bricks_used == stats.bricks_used
+
+
+@pytest.mark.backend("cpp")
+def test_what_the_picture_misses_comes_before_what_the_next_ones_will():
+    """And is counted as without rays ahead."""
+    told = []
+    for look_ahead in (0, 5):
+        with gv.Engine(Ball(1024), brick_pool="64 MB") as engine:
+            frames = Frames(engine, view(64, 0), LOOK, 8, look_ahead)
+            for angle in (0, 0, 1, 3):
+                frames.look_from(view(64, angle))
+                _, stats = frames.frame()
+            told.append((stats.requests, stats.misses, stats.bricks_used, stats.tiles_used))
+            wanted = frames.served._requests[0, 0]
+            kinds = (REQUEST_LOAD, REQUEST_SUBDIVIDE)
+            chosen = torch.cat([frames.served.choose(kind) for kind in kinds])
+            assert (chosen >= 0).any() and (stats.ahead > 0) == (look_ahead > 0)
+            assert torch.isin(chosen[chosen >= 0], wanted.long()).all()
+            words = engine.cache.nodes.request_tn
+            assert not (words >> REQUEST_PENDING_SHIFT).any(), "nothing is on its way"
+    assert told[0] == told[1] and told[0][1] > 16
 
 
 class Unsaid(Ball):

@@ -135,6 +135,11 @@ class Cache:
             counts += [whole, locked + size - whole]
         return torch.cat((*counts, unused[1] if len(unused) > 1 else self._no_coarse))
 
+    def used(self) -> Tensor:
+        """(2,) int64 tiles and bricks used in the last picture; the host does not wait."""
+        stamps = (self.nodes.stamp_t, self.bricks.stamp_b)
+        return torch.stack([(stamp == self.frame_1).sum() for stamp in stamps])
+
     def make_room(self, tiles: int, bricks: int, coarse: int = 0) -> None:
         """Sets how many slots may be taken: those that the last picture did not use. `coarse` of
         the `bricks` are coarse slots.

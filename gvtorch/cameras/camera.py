@@ -22,6 +22,7 @@ from ..base import check
 from ..base.records import Rays
 from ..base.volume import DIRECTIONS
 from ..pool.staging import upload
+from .ahead import continued
 from .models import MODELS, CameraModel, Plane, last_rising_angle, model_of
 
 if TYPE_CHECKING:
@@ -406,6 +407,21 @@ class Camera:
         parts = (rotation.reshape(-1, 9), position, focal, centre, *cone, *range_, *bend)
         numbers = np.concatenate((*parts, zero + self.sample), 1)
         return upload(torch.from_numpy(numbers), torch.device(device))
+
+    def thinned(self, stride: int) -> Camera:
+        """Returns the camera of one ray for stride x stride pixels; see `numbers_ahead`."""
+        height, width = (-(-size // stride) for size in (self.height, self.width))
+        return self._changed(height=height, width=width, window=(0, height))
+
+    def numbers_ahead(self, now: Tensor, before: Tensor, frames: float, stride: int) -> Tensor:
+        """Returns the numbers of the camera `thinned` by a stride, some frames on, given what
+        `numbers` told of the last two frames; see `continued`. Each ray goes through the middle of
+        its pixels, and its cone is as wide as one of them.
+        """
+        moved = continued(now, before, frames, moving=12, axes=slice(0, 9))
+        focal, centre = moved[:, 12:14], moved[:, 14:16]
+        middle = (centre - (stride - 1) / 2) / stride
+        return torch.cat((moved[:, :12], focal / stride, middle, moved[:, 16:]), 1)
 
     def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:
         """Returns the rays through the pixel centres of whole rows, the first one and the one after

@@ -11,6 +11,7 @@ from torch.nn.functional import normalize
 from ..base.check import describe, instance, whole
 from ..base.records import Rays
 from ..pool.staging import upload
+from .ahead import continued
 from .camera import Camera, Frame
 
 
@@ -157,6 +158,21 @@ class CustomCamera(Camera):
     def numbers(self, device: torch.device | str = "cpu") -> Tensor:
         """Returns (r, 11) float64: origin, direction, cone, range and sample."""
         return upload(self._rays, torch.device(device))
+
+    def thinned(self, stride: int) -> Camera:
+        """Returns the camera of one ray for stride x stride pixels; see `numbers_ahead`."""
+        rays = self._pictures()[:, ::stride, ::stride]
+        height, width = rays.shape[1:3]
+        parts = {"height": height, "width": width, "window": (0, height)}
+        return self._changed(_rays=rays.reshape(-1, 11), **parts)
+
+    def numbers_ahead(self, now: Tensor, before: Tensor, frames: float, stride: int) -> Tensor:
+        """Returns the numbers of the camera `thinned` by a stride, some frames on, given what
+        `numbers` told of the last two frames; see `continued`.
+        """
+        shape = (-1, self.height, self.width, 11)
+        ends = [n.view(shape)[:, ::stride, ::stride].reshape(-1, 11) for n in (now, before)]
+        return continued(*ends, frames, moving=6, axes=slice(3, 6))
 
     def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:
         """Returns the rays of whole rows, from what `numbers` gave."""

@@ -5,7 +5,7 @@ out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from ..base.constants import CONSTANT, EMPTY, REQUEST_LOAD, REQUEST_SUBDIVIDE
-from ..base.records import Hits
 from ..cache import Cache, Scheduler
 from ..cache.write import Targets, put_bricks, put_tiles, put_uniform
 from ..producers import Region
@@ -21,7 +20,7 @@ from ..producers.answer import checked_bricks, checked_regions
 from .parents import once, parent_bricks, ready
 from .recorded import RecordedFrame
 from .request_batch import ProducedTree, RequestBatch, children_of
-from .stats import Collected, FrameStats
+from .stats import FrameStats
 
 
 class DeviceFrame(RecordedFrame):
@@ -32,7 +31,6 @@ class DeviceFrame(RecordedFrame):
     ) -> None:
         """See `RecordedFrame`."""
         super().__init__(cache, trees, scheduler, batch)
-        self._requests = torch.zeros((2, self._most), dtype=torch.int32, device=self._unused.device)
         self.serve()  # loads what is loaded at first use; nothing is asked for
 
     def begin(self, stale: bool, steady: bool, stats: FrameStats) -> bool:
@@ -44,20 +42,12 @@ class DeviceFrame(RecordedFrame):
             self._requests.zero_()  # what would be served is out of date: the rays ask again
         return not steady
 
-    def draw(self, trace: Callable[[], Hits]) -> tuple[Hits, Collected]:
-        """Traces, and collects what is asked for now."""
-        self.cache.frame_1.add_(1)
-        hits = trace()
-        requests, numbers = self.collect(hits)
-        self._requests.copy_(torch.stack((requests.node, requests.word)))
-        return hits, Collected(requests, numbers)
-
     def serve(self) -> None:
         """Answers the most wanted requests of the last frame."""
         made = {kind: self._unused.new_zeros(2) for kind in (REQUEST_SUBDIVIDE, REQUEST_LOAD)}
         constant, failed = self._unused.new_zeros(2).split(1)
         for kind, ask in ((REQUEST_LOAD, self._fill), (REQUEST_SUBDIVIDE, self._subdivide)):
-            chosen = self.choose(kind, *self._requests)
+            chosen = self.choose(kind)
             number, free = self.tree_of(chosen), self._unused[int(kind == REQUEST_LOAD)].view(1)
             for source in self.trees:
                 node = torch.where(number == source.tree.number, chosen, -1)

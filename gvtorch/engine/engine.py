@@ -476,6 +476,7 @@ class Engine:
         shader: Shaders,
         *,
         batch: int = 512,
+        look_ahead: float = 0,
         **options: Unpack[RenderSettings],
     ) -> FrameGraph:
         """Records a frame as a CUDA graph, for cameras of this number and size.
@@ -488,6 +489,9 @@ class Engine:
             camera: Cameras as those of the replays.
             shader: For all trees, or one for each; no `ModuleShader`.
             batch: Most bricks, and most node tiles, that a replay makes for each tree.
+            look_ahead: While the camera moves, a replay also asks for what its picture so many
+                frames on will miss, as far as the motion tells, by a sixteenth of the picture's
+                rays. This is served behind what the picture itself missed. 0: only what is missed.
             **options: Fields of `RenderOptions`.
 
         Raises:
@@ -510,13 +514,14 @@ class Engine:
         if view.options.layer is not None:
             view.options.layer.check_device("capture", self.device)
         check.whole("capture", "batch", batch, low=1, high=1 << 16)
+        check.number("capture", "look_ahead", look_ahead, low=0, high=1000)
         again = partial(self.frame, shader=shader, **options)
         again(camera)  # loads what is loaded at first use
         trees = [*self.trees.values()]
         served = make_recorded_frame(self.cache, trees, self.scheduler, batch, self.production)
         if isinstance(served, HostFrame):
             self.recorded.append(served)
-        return FrameGraph(self, view, served, again)
+        return FrameGraph(self, view, served, again, look_ahead)
 
     @property
     def steady(self) -> bool:

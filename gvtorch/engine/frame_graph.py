@@ -21,6 +21,7 @@ from ..tracing import RenderOptions
 from ..tracing.pixels import View
 from .device_frame import DeviceFrame
 from .host_frame import HostFrame
+from .look_ahead import LookAhead
 from .stats import Collected, FrameStats, Readbacks
 
 
@@ -66,22 +67,34 @@ class FrameGraph:
         view: View,
         served: DeviceFrame | HostFrame | None,
         again: Callable[[Camera | Rays], tuple[Picture, FrameStats]],
+        look_ahead: float = 0,
     ) -> None:
         """Records the frame; see `Engine.capture`. `again` renders one that the host serves."""
         self._engine, self._served, self._again = engine, served, again
         self._view = view = replace(view, numbers=view.numbers.clone())  # of a replay's camera
         self._number = -1  # of its last picture
-        self._serve, self._draw = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
+        self._ahead = LookAhead(view, look_ahead) if served and look_ahead else None
+        graphs = [torch.cuda.CUDAGraph() for _ in range(4)]
+        self._serve, self._draw, self._look, self._finish = graphs
         if served is not None:
             with _recorded(self._serve, engine.device):
                 served.serve()
         with _recorded(self._draw, engine.device):
-            if served is not None:
-                self._hits, self._collected = served.draw(view.hits)
-            else:
-                self._hits = view.hits()
-                self._collected = engine.collect_requests_and_use(self._hits.samples)
+            self._hits = view.hits() if served is None else served.draw(view.hits)
             self._picture = view.picture(self._hits, FrameStats())
+            if self._ahead is None:
+                self._collected = self._collect()
+        if served is not None and self._ahead is not None:
+            with _recorded(self._look, engine.device):
+                served.look(self._ahead.hits)
+            with _recorded(self._finish, engine.device):
+                self._collected = self._collect()
+
+    def _collect(self) -> Collected:
+        """Takes what the picture asked for, and counts."""
+        if self._served is None:
+            return self._engine.collect_requests_and_use(self._hits.samples)
+        return self._served.finish(self._hits)
 
     def replay(self, camera: Camera | Rays) -> tuple[Picture, FrameStats]:
         """Renders a frame; the host does not wait for the device.
@@ -117,24 +130,36 @@ class FrameGraph:
             # The host finds out which nodes fail, and names them; it asks for targets of aliases.
             return self._again(camera)
         with torch.cuda.device(engine.device), engine.new_frame(self._view.options) as stats:
+            stale = engine.frames != self._number
             if served is not None:
                 engine.release(but=served if isinstance(served, HostFrame) else None)
                 engine.readbacks.take_arrived()
-                stale = engine.frames != self._number
+                steady = engine.steady and not (self._ahead and self._ahead.moved)
                 with stage("serve"):
-                    if served.begin(stale, engine.steady, stats):
+                    if served.begin(stale, steady, stats):
                         self._serve.replay()
             engine.number_picture(on_device=served is None)
             self._number = engine.frames
-            self._view.numbers.copy_(camera.placed(self._view.box).numbers(engine.device))
-            with stage("replay"):
-                self._draw.replay()
+            self._draw_from(camera.placed(self._view.box), stale)
             collected = self._collected
             if isinstance(served, HostFrame):
                 collected = collected._replace(ask=partial(served.ask, served.turn))
             engine.read_back(stats, self._hits, collected)
         engine.readbacks.hold_back()
         return replace(self._picture, stats=stats), stats
+
+    def _draw_from(self, camera: Camera, stale: bool) -> None:
+        """Draws what a camera in the world sees; `stale`: other frames came since the last one."""
+        ahead, numbers = self._ahead, camera.numbers(self._engine.device)
+        if ahead is not None:
+            ahead.follow(camera, numbers, stale)
+        self._view.numbers.copy_(numbers)
+        with stage("replay"):
+            self._draw.replay()
+            if ahead is not None:
+                if ahead.moved:
+                    self._look.replay()
+                self._finish.replay()
 
     def __repr__(self) -> str:
         return f"FrameGraph({self._view.camera!r})"

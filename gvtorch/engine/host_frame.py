@@ -113,14 +113,12 @@ class HostFrame(RecordedFrame):
         for source, mail in zip(self.trees, self._mail, strict=True):
             self._write(source, mail)
 
-    def draw(self, trace: Callable[[], Hits]) -> tuple[Hits, Collected]:
-        """Traces, collects, and chooses what the host is asked for, which is marked as pending."""
-        self.cache.frame_1.add_(1)
-        hits = trace()
-        requests, numbers = self.collect(hits)
+    def finish(self, hits: Hits) -> Collected:
+        """And chooses what the host is asked for, which is marked as pending."""
+        collected = super().finish(hits)
         chosen, words = [], self.cache.nodes.request_tn.view(-1)
         for kind in KINDS.values():
-            node = self.choose(kind, requests.node, requests.word)
+            node = self.choose(kind)
             marked = words[node.clamp(min=0)] | kind << REQUEST_PENDING_SHIFT
             put_rows_of(words[:, None], node, marked[:, None])
             number = self.tree_of(node)
@@ -129,8 +127,8 @@ class HostFrame(RecordedFrame):
                 mine = (number == source.tree.number)[:, None]
                 loc = torch.where(mine, source.tree.loc(node), loc)
             chosen.append(torch.cat((node[:, None], number[:, None].to(torch.int64), loc), 1))
-        numbers = torch.cat((numbers, torch.stack(chosen).flatten()))
-        return hits, Collected(requests, numbers)
+        numbers = torch.cat((collected.numbers, torch.stack(chosen).flatten()))
+        return collected._replace(numbers=numbers)
 
     def _write(self, source: ProducedTree, mail: Mail) -> None:
         """Writes what was sent for one tree; what finds no slot may be asked for again."""

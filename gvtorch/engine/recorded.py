@@ -5,22 +5,30 @@ taken hold node -1.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
-from ..base.constants import REQUEST_LOAD, REQUEST_PRIORITY
+from ..base.constants import (
+    REQUEST_KINDS,
+    REQUEST_LOAD,
+    REQUEST_PENDING_SHIFT,
+    REQUEST_PRIORITY,
+)
 from ..base.records import Hits
 from ..cache import Cache, RequestList, Scheduler
+from ..cache.write import put_rows_of
 from .request_batch import ProducedTree
+from .stats import Collected
 
 _MOST_LISTED = 1 << 14  # nodes whose requests are sorted
+_AHEAD = 1 << 39  # added to the rank of what the next pictures will miss
 _LAST = 1 << 40  # the rank of what is not asked for
 
 
 class RecordedFrame:
-    """What both kinds share.
+    """What both kinds share. A frame is `draw`, then `look` where its camera moves, then `finish`.
 
     Attributes:
         batch: Most bricks, and most node tiles, that are chosen in a frame.
@@ -37,32 +45,66 @@ class RecordedFrame:
         self._coarse_first = scheduler.order == "coarse"
         self._most = min(_MOST_LISTED, cache.nodes.request_tn.numel())
         device = cache.frame_1.device
+        # What the last picture asked for, and what the next ones will: nodes and their words.
+        self._requests = torch.zeros((2, 2, self._most), dtype=torch.int32, device=device)
         self._unused = torch.zeros(2, dtype=torch.int64, device=device)  # tiles, bricks
         # Since the last frame: tiles and bricks that were made, nodes that need none, tiles and
         # bricks that were replaced, nodes that failed.
         self._made = self._unused.new_zeros(6)
 
-    def collect(self, hits: Hits) -> tuple[RequestList, Tensor]:
-        """Lists requests, brings slots into the order of use, and counts both and the samples."""
-        requests = RequestList.collect(self.cache, self._most)
+    def draw(self, trace: Callable[[], Hits]) -> Hits:
+        """Traces the picture, and lists what it asks for."""
+        self.cache.frame_1.add_(1)
+        hits = trace()
+        self._seen = self._list(0)
+        self._requests[1].zero_()
+        self._used = self.cache.used()
+        return hits
+
+    def look(self, trace: Callable[[], Hits]) -> None:
+        """Traces the rays of the next pictures; what they alone ask for is listed apart."""
+        words, node = self.cache.nodes.request_tn.view(-1, 1), self._seen.node.to(torch.int64)
+        before = words[node.clamp(min=0)]
+        listed = (self._seen.word & REQUEST_KINDS) << REQUEST_PENDING_SHIFT
+        put_rows_of(words, node, before | listed[:, None])  # else these would be listed again
+        trace()
+        self._list(1)
+        put_rows_of(words, node, before)
+
+    def _list(self, which: int) -> RequestList:
+        """Lists what is asked for by the picture (0) or by the next ones (1)."""
+        listed = RequestList.collect(self.cache, self._most)
+        self._requests[which].copy_(torch.stack((listed.node, listed.word)))
+        return listed
+
+    def finish(self, hits: Hits) -> Collected:
+        """Brings slots into the order of use and counts; what the picture used is counted apart
+        from what `look` used.
+        """
         use = self.cache.sort_by_use()
         self._unused.copy_(use[0:4:2])
+        use[1:4:2] = self._used
         samples = hits.samples.sum(dtype=torch.int64).view(1)
-        numbers = torch.cat((requests.count, use, samples, self._made))
+        ahead = (self._requests[1, 1] & REQUEST_KINDS).count_nonzero().view(1)
+        numbers = torch.cat((self._seen.count, use, samples, self._made, ahead))
         self._made.zero_()
-        return requests, numbers
+        return Collected(self._seen, numbers)
 
-    def choose(self, kind: int, node_k: Tensor, word_k: Tensor) -> Tensor:
-        """(batch,) int64 nodes of a list that are served first, as `Scheduler.choose` takes them,
-        at most as many as there are slots; -1 behind the last.
+    def choose(self, kind: int) -> Tensor:
+        """(batch,) int64 nodes of the lists that are served first, as `Scheduler.choose` takes
+        them, those that the picture asked for before the others, at most as many as there are
+        slots; -1 behind the last.
         """
         nodes = self.cache.nodes
+        node_k, word_k = self._requests.transpose(0, 1).flatten(1)
         asked = (word_k & kind) != 0
         node = node_k.clamp(min=0).to(torch.int64)
         depth = nodes.loc_t4[node // nodes.nodes_per_tile, 3].to(torch.int64)
         level = depth if self._coarse_first else -depth
         small = REQUEST_PRIORITY - (word_k & REQUEST_PRIORITY).to(torch.int64)
-        rank = torch.where(asked, level * (REQUEST_PRIORITY + 1) + small, _LAST)
+        rank = (level * (REQUEST_PRIORITY + 1) + small).view(2, -1)
+        rank = torch.stack((rank[0], rank[1] + _AHEAD)).flatten()
+        rank = torch.where(asked, rank, _LAST)
         row = rank.argsort(stable=True)[: self.batch]
         room = self._unused[int(kind == REQUEST_LOAD)]
         served = asked[row] & (torch.arange(len(row), device=row.device) < room)

@@ -21,7 +21,7 @@ from ..cache import KINDS, RequestList
 _AHEAD = 3  # most frames that the host may be ahead of the device
 #: Fields of `FrameStats` that are known when the device has finished the frame.
 _LATE = {"milliseconds", "stages", "samples", "tiles_used", "bricks_used"}
-_LATE |= {"requests", "misses", "overflow", "converged"}
+_LATE |= {"requests", "misses", "overflow", "converged", "ahead"}
 _settling = threading.RLock()  # one thread completes statistics, others wait for it
 
 
@@ -40,6 +40,7 @@ class FrameStats(RenderStats):
     misses: int = 0  # nodes that rays missed, those whose answer is pending included
     overflow: int = 0  # nodes with a request that the list had no place for
     converged: bool = False  # nothing that could be served was missing
+    ahead: int = 0  # nodes that the next pictures will miss; see `Engine.capture`
 
     frame: int = 0  # number of the frame, from 1
     frames: int = 1  # frames that this picture took
@@ -145,6 +146,7 @@ class Counts(NamedTuple):
     tiles_evicted: int = 0
     bricks_evicted: int = 0
     failed: int = 0
+    ahead: int = 0  # nodes that the picture did not miss, but will
 
     def by_kind(self) -> dict[str, int]:
         """Returns the number of requests by the name of their kind."""
@@ -155,7 +157,7 @@ class Collected(NamedTuple):
     """What a traced frame leaves on the device."""
 
     requests: RequestList
-    numbers: Tensor  # (11,) or (17,) int64 `Counts`, and behind these what `ask` takes
+    numbers: Tensor  # (11,) or (18,) int64 `Counts`, and behind these what `ask` takes
     ask: Callable[[Tensor], int] | None = None  # told on the host; how many nodes were asked for
 
 
@@ -209,7 +211,7 @@ class Readback:
             stats.produced[name] += getattr(counts, name)
         for name in stats.evicted:
             stats.evicted[name] += getattr(counts, f"{name}_evicted")
-        for name in ("misses", "tiles_used", "bricks_used", "samples"):
+        for name in ("misses", "tiles_used", "bricks_used", "samples", "ahead"):
             setattr(stats, name, getattr(counts, name))
 
 

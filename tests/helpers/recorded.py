@@ -6,15 +6,24 @@ from functools import partial
 
 import gvtorch as gv
 from gvtorch.engine.host_frame import HostFrame
+from gvtorch.engine.look_ahead import LookAhead
 from gvtorch.engine.setup import make_recorded_frame
 
 
 class Frames:
     """Frames of an engine, served on the device: without a graph, so that the CPU runs them."""
 
-    def __init__(self, engine: gv.Engine, camera: gv.Camera, look: gv.Shader, batch: int) -> None:
+    def __init__(
+        self,
+        engine: gv.Engine,
+        camera: gv.Camera,
+        look: gv.Shader,
+        batch: int,
+        look_ahead: float = 0,
+    ) -> None:
         self.engine, self.batch = engine, batch
-        self.look = look
+        self.view = engine.view("test", camera, look, {})
+        self.ahead = LookAhead(self.view, look_ahead) if look_ahead else None
         self.look_from(camera)
         trees = [*engine.trees.values()]
         made = make_recorded_frame(engine.cache, trees, engine.scheduler, batch, engine.production)
@@ -24,17 +33,26 @@ class Frames:
             engine.recorded.append(made)
 
     def look_from(self, camera: gv.Camera) -> None:
-        self.view = self.engine.view("test", camera, self.look, {})
+        self.camera = camera.placed(self.view.box)
 
     def frame(self) -> tuple[gv.Hits, gv.FrameStats]:
         with self.engine.new_frame(self.view.options) as stats:
             self.engine.release(but=self.served)
             self.engine.readbacks.take_arrived()
-            if self.served.begin(self.engine.frames != self.number, self.engine.steady, stats):
+            stale, ahead = self.engine.frames != self.number, self.ahead
+            steady = self.engine.steady and not (ahead and ahead.moved)
+            if self.served.begin(stale, steady, stats):
                 self.served.serve()
             self.engine.number_picture(on_device=False)
             self.number = self.engine.frames
-            hits, collected = self.served.draw(self.view.hits)
+            numbers = self.camera.numbers(self.engine.device)
+            if ahead is not None:
+                ahead.follow(self.camera, numbers, stale)
+            self.view.numbers.copy_(numbers)
+            hits = self.served.draw(self.view.hits)
+            if ahead is not None and ahead.moved:
+                self.served.look(ahead.hits)
+            collected = self.served.finish(hits)
             if isinstance(self.served, HostFrame):
                 collected = collected._replace(ask=partial(self.served.ask, self.served.turn))
             self.engine.read_back(stats, hits, collected)
