@@ -1,11 +1,14 @@
-"""Miss rate of a fly-through: a moving camera, one frame a picture, nothing fetched ahead.
+"""Miss rate of a fly-through: a moving camera, one frame a picture, and (on CUDA, if asked for)
+rays ahead of it.
 
 The protocol is that of the original's Mandelbulb flight; the volume is a made-up one of the same
 kind: a solid with holes at every scale, so that rays end at surfaces and new ones come into view.
 The rate is bricks asked for over bricks asked for and bricks used, summed over the flight;
-"unserved" is the share of nodes that were not there yet, those on their way counted again in each
-frame. Bricks of 8^3 and a border hold 1,000 bytes here, and 4,000 in the original: its 512 MB are
-128 MB here. How fast the camera moves decides: 1,200 frames are 20 s at 60 frames a second.
+"fitting" is the same over the frames whose view, with all that it asks for, is not larger than the
+pool, for what does not fit is asked for again in every frame; "unserved" is the share of nodes that
+were not there yet, those on their way counted again in each frame. Bricks of 8^3 and a border hold
+1,000 bytes here, and 4,000 in the original: its 512 MB are 128 MB here. How fast the camera moves
+decides: 1,200 frames are 20 s at 60 frames a second.
 
 With `--source formula` the solid is computed brick by brick on the device that renders, with
 `--source mandelbulb` it is the original's own scene, the bulb of power 8, whose voxels are 4 bytes
@@ -171,6 +174,18 @@ def quantiles(times: list[float]) -> list[str]:
     return [f"{sorted(times)[math.ceil(q * len(times)) - 1]:.2f}" for q in (0.5, 0.99)]
 
 
+def fits(stats: gv.FrameStats) -> bool:
+    """Whether the pool holds a frame's view with all that it asked for."""
+    return stats.bricks_used + stats.requests["load"] + stats.overflow < stats.bricks
+
+
+def miss_rate(all_stats: list[gv.FrameStats]) -> str:
+    """Bricks asked for over bricks asked for and used, over frames."""
+    asked = sum(stats.requests["load"] for stats in all_stats)
+    used = sum(stats.bricks_used for stats in all_stats)
+    return f"{asked / max(1, used + asked):.2%}"
+
+
 def fly_resident(store: Path, settings: Settings, console: Console) -> list[str]:
     """The same pictures of a tree that is all in memory; returns a row of the table."""
     tree = gv.N3Tree.from_volume(gv.read_volume(store), device=settings.device)
@@ -179,7 +194,7 @@ def fly_resident(store: Path, settings: Settings, console: Console) -> list[str]
     times = [picture.stats.milliseconds for picture in pictures]
     used = sum(picture.stats.bricks_used for picture in pictures)
     rate = f"{1e3 * len(times) / sum(times):,.0f}"
-    return ["resident", "", "", f"{used / len(times):,.0f}", *quantiles(times), rate, ""]
+    return ["resident", "", "", "", f"{used / len(times):,.0f}", *quantiles(times), rate, ""]
 
 
 def fly(producer: gv.Producer, pool: str, settings: Settings, console: Console) -> list[str]:
@@ -203,13 +218,11 @@ def fly(producer: gv.Producer, pool: str, settings: Settings, console: Console) 
         seconds = time.perf_counter() - start
         engine.validate()
     used, missed = (sum(getattr(s, n) for s in all_stats) for n in ("bricks_used", "misses"))
-    asked, made = (
-        sum(getattr(stats, field)[name] for stats in all_stats)
-        for field, name in (("requests", "load"), ("produced", "bricks"))
-    )
+    made = sum(stats.produced["bricks"] for stats in all_stats)
     times = [stats.milliseconds for stats in all_stats]
     return [
-        *(pool, f"{asked / (used + asked):.2%}", f"{missed / (used + missed):.2%}"),
+        *(pool, miss_rate(all_stats), miss_rate([s for s in all_stats if fits(s)])),
+        f"{missed / (used + missed):.2%}",
         f"{used / settings.frames:,.0f}",
         *quantiles(times),
         *(f"{settings.frames / seconds:,.0f}", f"{made / seconds:,.0f}"),
@@ -230,7 +243,7 @@ def main(settings: Settings) -> None:
             raw.unlink()
         width, height = settings.size
         table = Table(title=f"{settings.frames} frames of {width}x{height}, {settings.loading}")
-        for column in ("brick pool", "miss rate", "unserved", "bricks used a frame"):
+        for column in ("brick pool", "miss rate", "fitting", "unserved", "bricks used a frame"):
             table.add_column(column, justify="right")
         for column in ("median ms", "p99 ms", "frames / s", "bricks / s"):
             table.add_column(column, justify="right")

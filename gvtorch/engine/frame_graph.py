@@ -134,7 +134,7 @@ class FrameGraph:
             if served is not None:
                 engine.release(but=served if isinstance(served, HostFrame) else None)
                 engine.readbacks.take_arrived()
-                steady = engine.steady and not (self._ahead and self._ahead.moved)
+                steady = engine.steady and not (self._ahead and self._ahead.due)
                 with stage("serve"):
                     if served.begin(stale, steady, stats):
                         self._serve.replay()
@@ -157,7 +157,7 @@ class FrameGraph:
         with stage("replay"):
             self._draw.replay()
             if ahead is not None:
-                if ahead.moved:
+                if ahead.due:
                     self._look.replay()
                 self._finish.replay()
 

@@ -40,7 +40,7 @@ class Frames:
             self.engine.release(but=self.served)
             self.engine.readbacks.take_arrived()
             stale, ahead = self.engine.frames != self.number, self.ahead
-            steady = self.engine.steady and not (ahead and ahead.moved)
+            steady = self.engine.steady and not (ahead and ahead.due)
             if self.served.begin(stale, steady, stats):
                 self.served.serve()
             self.engine.number_picture(on_device=False)
@@ -50,7 +50,7 @@ class Frames:
                 ahead.follow(self.camera, numbers, stale)
             self.view.numbers.copy_(numbers)
             hits = self.served.draw(self.view.hits)
-            if ahead is not None and ahead.moved:
+            if ahead is not None and ahead.due:
                 self.served.look(ahead.hits)
             collected = self.served.finish(hits)
             if isinstance(self.served, HostFrame):
