@@ -74,7 +74,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def quick(cache: Path) -> str:
-    """A compiler that does not optimise, one for all tests and processes: what it compiled is kept."""
+    """A compiler that does not optimise, one for all processes: what it compiled is kept."""
     folder = cache.parent / "quick"
     if not folder.exists():
         made = cache.parent / f"quick-{os.getpid()}"

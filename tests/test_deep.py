@@ -180,7 +180,7 @@ def deep(request):
 def test_compiled_equals_reference(compiled, deep, look):
     tree, rays = deep
     for options in ({}, {"dtype": torch.float64}):
-        result, marks = assert_equal(tree, compiled, rays, LOOKS[look], **options)
+        result, marks, _ = assert_equal(tree, compiled, rays, LOOKS[look], **options)
         assert result["alpha"].max() > 0.9 and (marks["brick"] > 0).any()
 
 
@@ -188,7 +188,7 @@ def test_compiled_equals_reference(compiled, deep, look):
 def test_missing_nodes_give_equal_pictures_and_requests(compiled, deep, share):
     tree, rays = deep
     for seed in range(3):
-        _, marks = assert_equal(forget(tree, share, seed), compiled, rays, LIT.transfer)
+        _, marks, _ = assert_equal(forget(tree, share, seed), compiled, rays, LIT.transfer)
         assert marks["request"].any()
 
 

@@ -28,7 +28,7 @@ def test_compiled_equals_reference(blobs, compiled, brick_size, branching, lod):
     tree = gv.N3Tree.from_volume(blobs, brick_size, branching=branching)
     for distance in (0.2, 1.3, 6.0):
         rays = camera_rays(tree, distance=distance)
-        result, marks = assert_equal(tree, compiled, rays, lod=lod)
+        result, marks, _ = assert_equal(tree, compiled, rays, lod=lod)
         if distance > 1:
             assert result["alpha"].max() > 0.3, "the test must see something"
             assert (marks["brick"] == 1).any()
@@ -52,7 +52,7 @@ def test_every_channel_dtype(blobs, compiled, dtype):
     data = (blobs.data * 100).to(getattr(torch, dtype))
     tree = gv.N3Tree.from_volume(gv.Volume(data), 4)
     shader = gv.TransferFunction.from_points([(10, 0), (90, 0.8)], [(0, 0, 0, 1), (100, 1, 1, 0)])
-    result, _ = assert_equal(tree, compiled, camera_rays(tree), shader)
+    result, *_ = assert_equal(tree, compiled, camera_rays(tree), shader)
     assert result["alpha"].max() > 0.5
 
 
@@ -64,7 +64,7 @@ def test_second_channel_and_second_component(blobs, compiled):
     )
     rays = camera_rays(tree)
     assert run(tree, compiled, rays)[0]["alpha"].max() == 0
-    result, _ = assert_equal(tree, compiled, rays, channel="two", component=1)
+    result, *_ = assert_equal(tree, compiled, rays, channel="two", component=1)
     single, _ = run(gv.N3Tree.from_volume(blobs), compiled, rays)
     assert torch.equal(result["alpha"], single["alpha"])
 
