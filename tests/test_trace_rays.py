@@ -27,7 +27,7 @@ from gvtorch.tracing.tracer import Tracer
 def test_compiled_equals_reference(blobs, compiled, brick_size, branching, lod):
     tree = gv.N3Tree.from_volume(blobs, brick_size, branching=branching)
     for distance in (0.2, 1.3, 6.0):
-        rays = camera_rays(tree, 14, distance=distance)
+        rays = camera_rays(tree, 24 if distance > 2 else 14, distance=distance)
         result, marks, _ = assert_equal(tree, compiled, rays, lod=lod)
         if distance > 1:
             assert result["alpha"].max() > 0.3, "the test must see something"
