@@ -19,9 +19,9 @@ TORCH := $(shell sed -n 's/.*"\(torch==[0-9.]*\)".*/\1/p' pyproject.toml)
 NATIVE := $(shell nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u | tr -d . | paste -sd ';')
 # A development build compiles CUDA for the cards that are here; without one, for one architecture, to see it compile.
 # What must have run, or the tests have failed; OpenGL in software and the browser are the
-# system's (Debian: libegl1, libgl1-mesa-dri; chromium).
-REQUIRE := reference,cpp,io$(if $(shell ldconfig -p 2>/dev/null | grep libEGL.so.1),$(COMMA)opengl)
-REQUIRE := $(REQUIRE)$(if $(shell command -v chromium chromium-browser google-chrome),$(COMMA)browser)
+# system's (Debian: libegl1, libgl1-mesa-dri; chromium). With CI set, both must be there.
+REQUIRE := reference,cpp,io$(if $(CI)$(shell ldconfig -p 2>/dev/null | grep libEGL.so.1),$(COMMA)opengl)
+REQUIRE := $(REQUIRE)$(if $(CI)$(shell command -v chromium chromium-browser google-chrome),$(COMMA)browser)
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint .ci/constraints.txt
 ARCHS_GIVEN := $(GVTORCH_CUDA_ARCHS)
 export GVTORCH_CUDA_ARCHS ?= $(or $(NATIVE),90)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 from collections import Counter
@@ -19,6 +20,7 @@ from gvtorch.viewer.view import new_session
 
 pytest.register_assert_rewrite("helpers")
 from helpers import ABSENT, DATA, DEVICES, browser, gvtorch  # noqa: E402
+from helpers.compiled import quick_compiler  # noqa: E402
 from helpers.viewer import BANDS, FUNCTION, bright_ball  # noqa: E402
 
 _REQUIRED = os.environ.get("GVTORCH_REQUIRE", "")
@@ -68,6 +70,19 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
         patch.setenv("GVTORCH_CACHE", str(folder))
         yield folder
+
+
+@pytest.fixture(scope="session")
+def quick(cache: Path) -> str:
+    """A compiler that does not optimise, one for all processes: what it compiled is kept."""
+    folder = cache.parent / "quick"
+    if not folder.exists():
+        made = cache.parent / f"quick-{os.getpid()}"
+        made.mkdir()
+        quick_compiler(made)
+        with contextlib.suppress(OSError):  # another process was first
+            made.rename(folder)
+    return str(folder / "c++")
 
 
 @pytest.fixture(scope="session")

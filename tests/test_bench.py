@@ -52,7 +52,8 @@ def figures(value) -> list[float]:
 
 @pytest.mark.filterwarnings("default")  # of torch.compile's own making
 @pytest.mark.parametrize("name", bench.WORKLOADS)
-def test_a_workload_gives_finite_figures_as_json(name, compiled):
+def test_a_workload_gives_finite_figures_as_json(name, compiled, monkeypatch, quick):
+    monkeypatch.setenv("CXX", quick)
     device = torch.device(DEVICES[compiled])
     chosen = Settings(device=device, peers=("grid_sample", "zarr", "tensorstore"), **QUICK)
     content = json.loads(json.dumps(bench.run(name, chosen).as_dict(), allow_nan=False))

@@ -169,7 +169,7 @@ def test_every_dtype_and_width(compiled, dtype, width):
         rays = camera_rays(tree, 10, distance=distance)
         for mode in MODES:
             shader = gv.Channels(mixed, mode)
-            expected, _ = assert_equal(tree, compiled, rays, shader)
+            expected, *_ = assert_equal(tree, compiled, rays, shader)
             actual, _ = run(tree, compiled, rays, shader)
             for name in ("color", "alpha", "depth", "samples"):
                 assert torch.equal(actual[name], expected[name]), name

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import DEVICES
-from helpers.compiled import ADD, HEADER, only_included, quick_compiler, write
+from helpers import DEVICES, TESTS
+from helpers.compiled import ADD, HEADER, only_included, quick_compiler, users_shader, write
 from helpers.pictures import assert_close_picture
 from helpers.rays import camera_rays, world_rays
 from helpers.shaders import POINT
@@ -45,8 +45,14 @@ def tree(channels) -> gv.N3Tree:
     return gv.N3Tree.from_volume(channels, 4)
 
 
+@pytest.fixture(autouse=True)
+def no_optimising(monkeypatch, quick) -> None:
+    """Optimised code, as users have it, is compared to this in test_user_packets.py."""
+    monkeypatch.setenv("CXX", quick)
+
+
 def mine(name: str, **options) -> gv.CompiledShader:
-    return gv.CompiledShader(HEADER, f"mine::{name}", **options)
+    return users_shader(HEADER, f"mine::{name}", **options)
 
 
 def assert_same(compiled: str, actual: dict, expected: dict, names) -> None:
@@ -247,35 +253,38 @@ def test_opcheck_and_memory_safety(tree, compiled, name, dtype):
 # --- the compiler and the cache
 
 
+def made(header: Path) -> Path:
+    """The library, from the cache or anew; of a compiler that only includes, a text."""
+    return user.compiled(user.ShaderSource.read(header, "Own"), ())
+
+
 def built(folder: Path) -> list[str]:
     return sorted(file.name for file in folder.glob("shaders/*"))
 
 
+def red(shader: gv.CompiledShader) -> float:
+    """What it shows of a block of ones."""
+    tree = gv.N3Tree.from_volume(gv.Volume(torch.ones(8, 8, 8)), 8)
+    return float(gv.render(tree, gv.Camera.orbit(width=1, height=1), shader).color[0, 0, 0])
+
+
 def in_processes(
-    count: int, *headers: Path, make: str = "gv.CompiledShader(given, 'Own')", **environment: str
+    count: int, given: Path, make: str = "gv.CompiledShader(given, 'Own')"
 ) -> list[str]:
-    """Loads `Own` of all headers in processes at the same time; the red that each shows."""
+    """Loads `Own` of a header in processes at the same time; the red that each shows."""
     code = (
-        "import pickle, sys, torch, gvtorch as gv\n"
-        f"shaders = [{make} for given in sys.argv[1:]]\n"
-        "tree = gv.N3Tree.from_volume(gv.Volume(torch.ones(8, 8, 8)), 8)\n"
-        "camera = gv.Camera.orbit(width=1, height=1)\n"
-        "print(*(float(gv.render(tree, camera, shader).color[0, 0, 0]) for shader in shaders))\n"
+        f"import pickle, sys; sys.path.insert(0, {str(TESTS)!r})\n"
+        "import gvtorch as gv\n"
+        "from test_compiled_shader import red\n"
+        f"given = sys.argv[1]; print(red({make}))\n"
     )
-    runs = [
-        subprocess.Popen(
-            [sys.executable, "-c", code, *map(str, headers)],
-            stdout=subprocess.PIPE,
-            text=True,
-            env={**os.environ, **environment},
-        )
-        for _ in range(count)
-    ]
+    call = [sys.executable, "-c", code, str(given)]
+    runs = [subprocess.Popen(call, stdout=subprocess.PIPE, text=True) for _ in range(count)]
     return [run.communicate(timeout=300)[0].strip() for run in runs]
 
 
 @pytest.mark.backend("cpp")
-def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path):
+def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path, monkeypatch):
     """A compiler that counts its calls: two at once give one library, a third makes none; what
     changes the meaning makes another.
     """
@@ -286,7 +295,9 @@ def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path):
     header = write(tmp_path, body)
     header.write_text('#include "color.h"\n' + header.read_text())
     own = {"GVTORCH_CACHE": str(tmp_path / "cache"), "CXX": compiler}
-    assert in_processes(2, header, **own) == ["0.25", "0.25"]
+    for name, value in own.items():
+        monkeypatch.setenv(name, value)
+    assert in_processes(2, header) == ["0.25", "0.25"]
     calls = count.read_text()
     assert 1 <= calls.count("call") <= 2
     first = built(tmp_path / "cache")
@@ -295,11 +306,10 @@ def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path):
     moved.mkdir()
     for file in (header, tmp_path / "color.h"):
         shutil.copy(file, moved)
-    assert in_processes(1, moved / "own.h", **own) == ["0.25"]
+    assert red(gv.CompiledShader(moved / "own.h", "Own")) == 0.25
     assert count.read_text() == calls, "the same content is the same library"
     (tmp_path / "color.h").write_text("constexpr float kColor = 0.75f;\n")
-    both = in_processes(1, moved / "own.h", header, **own)
-    assert both == ["0.25 0.75"], "two structs of one name, in one process"
+    assert red(gv.CompiledShader(header, "Own")) == 0.75, "two structs of one name, in one process"
     assert len(built(tmp_path / "cache")) == 2
 
 
@@ -321,7 +331,6 @@ def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path):
 def test_the_compilers_words_are_shown_as_they_are(tmp_path, monkeypatch, body, name, message):
     own, header = tmp_path / "cache", write(tmp_path, body)
     monkeypatch.setenv("GVTORCH_CACHE", str(own))
-    monkeypatch.setenv("CXX", quick_compiler(tmp_path))
     with pytest.raises(gv.CompileError) as caught:
         gv.CompiledShader(header, name)
     first, *rest = str(caught.value).splitlines()
@@ -422,18 +431,16 @@ def test_a_damaged_library_is_compiled_again(tmp_path, monkeypatch):
 
 @pytest.mark.backend("cpp")
 def test_only_its_owner_writes_to_the_folder_of_libraries(tmp_path, monkeypatch):
-    header, cache = write(tmp_path, ADD.replace("COLOR", "0.5")), tmp_path / "cache"
-    own = {"GVTORCH_CACHE": str(cache), "CXX": quick_compiler(tmp_path)}
+    header, folder = write(tmp_path, ADD.replace("COLOR", "0.5")), tmp_path / "cache" / "shaders"
+    monkeypatch.setenv("GVTORCH_CACHE", str(folder.parent))
+    monkeypatch.setenv("CXX", only_included(tmp_path))
     old = os.umask(0)
     try:
-        assert in_processes(1, header, **own) == ["0.5"]
+        library = made(header)
     finally:
         os.umask(old)
-    folder = cache / "shaders"
-    (library,) = folder.iterdir()
+    assert [*folder.iterdir()] == [library]
     assert folder.stat().st_mode & 0o777 == 0o700 and library.stat().st_mode & 0o022 == 0
-    for name, value in own.items():
-        monkeypatch.setenv(name, value)
     for mode in (0o770, 0o707):
         folder.chmod(mode)
         with pytest.raises(RuntimeError, match=r"others may write to .*shaders; GVTORCH_CACHE"):
@@ -464,16 +471,11 @@ def test_what_the_loader_refuses_is_told_in_its_words(tmp_path, monkeypatch):
 def test_a_header_that_changes_meanwhile_is_not_kept(tmp_path, monkeypatch):
     """Else what it said last would be found under what it said first."""
     header = write(tmp_path, ADD.replace("COLOR", "0.5"))
-    monkeypatch.setenv("CXX", quick_compiler(tmp_path, f"echo '// more' >> {header}"))
+    monkeypatch.setenv("CXX", only_included(tmp_path, f"echo '// more' >> {header}"))
     monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path / "cache"))
     with pytest.raises(RuntimeError, match=r"own.h has changed: make the shader anew"):
         gv.CompiledShader(header, "Own")
     assert built(tmp_path / "cache") == []
-
-
-def compiled_text(header: Path) -> str:
-    """What a library would be made of, from the cache or anew."""
-    return user.compiled(user.ShaderSource.read(header, "Own"), ()).read_text(errors="replace")
 
 
 @pytest.mark.backend("cpp")
@@ -487,7 +489,7 @@ def test_folders_of_headers_that_the_environment_names_count(tmp_path, monkeypat
         folder.mkdir()
         (folder / "color.h").write_text(f"constexpr float kColor = {color}f;\n")
         monkeypatch.setenv("CPATH", str(folder))
-        assert f"kColor = {color}f;" in compiled_text(header)
+        assert f"kColor = {color}f;" in made(header).read_text(errors="replace")
 
 
 @pytest.mark.backend("cpp")
@@ -507,7 +509,7 @@ def test_what_is_included_otherwise_counts_as_well(tmp_path, monkeypatch):
         for name, value in values.items():
             text = f"constexpr float k{name.upper()} = {value}f;\n"
             (folders[name] / f"{name}.h").write_text(text)
-        found = compiled_text(header)
+        found = made(header).read_text(errors="replace")
         for name, value in values.items():
             assert f"k{name.upper()} = {value}f;" in found, (changed, name)
 
@@ -539,7 +541,7 @@ def test_what_another_process_has_noted_meanwhile_is_no_change(tmp_path, monkeyp
 def test_no_name_of_a_user_comes_to_a_shell(tmp_path, monkeypatch):
     """nvcc hands its arguments to a shell; a compiler here does so as well."""
     real, compiler = shutil.which(compilers.find_cxx()[0]), tmp_path / "c++"
-    compiler.write_text(f'#!/bin/sh\neval "{real} $* -O0"\n')
+    compiler.write_text(f'#!/bin/sh\neval "{real} $* -E"\n')
     compiler.chmod(0o755)
     folder = tmp_path / "a b;touch $(touch beside)`touch beside`"
     folder.mkdir()
@@ -549,10 +551,7 @@ def test_no_name_of_a_user_comes_to_a_shell(tmp_path, monkeypatch):
     monkeypatch.setenv("CXX", str(compiler))
     monkeypatch.setenv("GVTORCH_CACHE", str(folder / "cache"))
     monkeypatch.chdir(tmp_path)
-    shader = gv.CompiledShader(header, "Own")
-    tree = gv.N3Tree.from_volume(gv.Volume(torch.ones(8, 8, 8)), 8)
-    picture = gv.render(tree, gv.Camera.orbit(width=1, height=1), shader)
-    assert float(picture.color[0, 0, 0]) == 0.5
+    assert "kColor = 0.5f;" in made(header).read_text(errors="replace")
     assert not [file for file in tmp_path.rglob("*") if file.name in ("beside", "here")]
 
 
@@ -560,15 +559,14 @@ def test_no_name_of_a_user_comes_to_a_shell(tmp_path, monkeypatch):
 def test_folders_above_and_libraries_are_looked_at(tmp_path, monkeypatch):
     header = write(tmp_path, ADD.replace("COLOR", "0.5"))
     cache = tmp_path / "above" / "cache"
-    own = {"GVTORCH_CACHE": str(cache), "CXX": quick_compiler(tmp_path)}
-    for name, value in own.items():
-        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("GVTORCH_CACHE", str(cache))
+    monkeypatch.setenv("CXX", only_included(tmp_path))
     left = cache / "shaders" / "draft-killed"
     left.mkdir(parents=True)
     os.utime(left, (1, 1))
-    assert in_processes(1, header, **own) == ["0.5"]
+    library = made(header)
     assert not left.exists(), "what a killed compilation left is gone"
-    (library,) = (cache / "shaders").iterdir()
+    assert [*(cache / "shaders").iterdir()] == [library]
     for place in (library, cache.parent):
         mode = place.stat().st_mode
         place.chmod(0o777)
@@ -578,8 +576,7 @@ def test_folders_above_and_libraries_are_looked_at(tmp_path, monkeypatch):
 
 
 @pytest.mark.backend("cpp")
-def test_it_is_unpickled_in_another_process(tmp_path, monkeypatch):
-    monkeypatch.setenv("CXX", quick_compiler(tmp_path))
+def test_it_is_unpickled_in_another_process(tmp_path):
     shader = gv.CompiledShader(write(tmp_path, ADD.replace("COLOR", "0.5")), "Own")
     kept, tracer = tmp_path / "shader.pkl", tmp_path / "tracer.pkl"
     kept.write_bytes(pickle.dumps(shader))

@@ -105,7 +105,7 @@ class Handler(servers.BaseHTTPRequestHandler):
 
 @pytest.fixture
 def server(tmp_path, monkeypatch) -> Iterator[Server]:
-    monkeypatch.setattr(http, "STALL", 3.0)
+    monkeypatch.setattr(http, "STALL", 1.5)
     monkeypatch.setattr(http, "SLOWEST", 10**7)
     monkeypatch.setattr(http, "REFUSED", 60.0)
     with Server(tmp_path) as found:

@@ -254,7 +254,7 @@ def test_transforms(tmp_path):
         for voxel in ((0, 0, 0), (7, 0, 0), (1, 2, 3)):
             world = np.array((*voxel, 1)) @ turned
             x, y, z = np.rint((world[:3] - volume.origin) / spacing).astype(int)
-            assert volume.data[z, y, x, 0] == grid.at(voxel)[0]
+            assert volume.data[z, y, x, 0] == grid.dense(voxel, np.add(voxel, 1))[0, 0, 0, 0]
 
 
 @pytest.mark.parametrize("kind", NANO)

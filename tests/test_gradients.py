@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import DEVICES
-from helpers.compiled import HEADER
+from helpers.compiled import HEADER, users_shader
 from helpers.pictures import GRAY, camera
 
 import gvtorch as gv
@@ -142,8 +142,9 @@ def test_a_volume_tells_how_voxels_are_learned(blobs):
 
 
 @pytest.mark.backend("cpp")
-def test_a_compiled_shader_raises_too(tree):
-    shader = gv.CompiledShader(HEADER, "mine::Plain", transfer=GRAY)
+def test_a_compiled_shader_raises_too(tree, monkeypatch, quick):
+    monkeypatch.setenv("CXX", quick)
+    shader = users_shader(HEADER, "mine::Plain", transfer=GRAY)
     rays = rays_of(tree)
     with pytest.raises(RuntimeError, match=lost("cone_r2")):
         gv.trace(tree, replace(rays, cone=rays.cone.clone().requires_grad_()), shader)

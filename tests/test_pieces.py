@@ -44,7 +44,7 @@ def test_narrowing_cones_equal_the_reference(blobs, compiled, branching, near, e
     tree = gv.N3Tree.from_volume(blobs, 4, branching=branching)
     for distance in (0.3, 1.3):  # beyond `end` a cone is as one of width 0
         rays = narrowing(camera_rays(tree, distance=distance), near, end)
-        result, marks = assert_equal(tree, compiled, rays, dtype=dtype)
+        result, marks, _ = assert_equal(tree, compiled, rays, dtype=dtype)
     assert result["alpha"].max() > 0.2 and (marks["brick"] == 1).any()
 
 
@@ -52,7 +52,7 @@ def test_narrowing_cones_equal_the_reference(blobs, compiled, branching, near, e
 def test_narrowing_cones_ask_for_the_same(blobs, compiled, seed):
     tree = forget(gv.N3Tree.from_volume(blobs, 4), 0.5, seed)
     rays = narrowing(camera_rays(tree, distance=1.3), 12.0, 90.0)
-    result, marks = assert_equal(tree, compiled, rays)
+    result, marks, _ = assert_equal(tree, compiled, rays)
     assert marks["request"].any() and result["missed"].any()
 
 
@@ -119,7 +119,7 @@ def test_the_share_that_a_ray_begins_with_equals_the_reference(blobs, compiled, 
     generator = torch.Generator().manual_seed(5)
     clear = torch.rand(len(rays.origin), generator=generator, dtype=torch.float64)
     clear[::7], clear[1::7] = 0.0, 1.0
-    result, _ = assert_equal(
+    result, *_ = assert_equal(
         tree, compiled, dataclasses.replace(rays, transmittance=clear), dtype=dtype
     )
     closed = clear == 0
@@ -162,7 +162,7 @@ def test_every_shader_is_cut_by_planes_and_boxes(channels, compiled, name):
     assert (whole["color"] - clipped["color"]).abs().max() > 0.05
     caps = not isinstance(shader, gv.Projection)
     clip = dataclasses.replace(CLIPS["all"], caps=caps)
-    pieces, _ = assert_equal(tree, compiled, rays, shader, clip=clip)
+    pieces, *_ = assert_equal(tree, compiled, rays, shader, clip=clip)
     assert (whole["color"] - pieces["color"]).abs().max() > 0.05
 
 

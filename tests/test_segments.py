@@ -78,7 +78,7 @@ def assert_same_walk(tree, compiled, rays, *, hides=True, limit=0, by_node=False
 def test_compiled_equals_reference(blobs, compiled, brick_size, branching, lod, hides):
     tree = gv.N3Tree.from_volume(blobs, brick_size, branching=branching)
     for distance in (0.2, 1.3, 6.0):
-        rays = camera_rays(tree, distance=distance)
+        rays = camera_rays(tree, 24 if distance > 2 else 14, distance=distance)
         for limit in (0, 5) if distance == 1.3 else (0,):
             result = assert_same_walk(tree, compiled, rays, lod=lod, hides=hides, limit=limit)
             if distance > 1 and not limit:

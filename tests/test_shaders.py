@@ -32,18 +32,14 @@ GOLDEN = {
 
 
 @pytest.fixture(scope="module")
-def tree(channels) -> gv.N3Tree:
-    return gv.N3Tree.from_volume(channels, 4)
+def trees(channels) -> dict[int, gv.N3Tree]:
+    """By their branching."""
+    return {n: gv.N3Tree.from_volume(channels, 4, branching=n) for n in (2, 3)}
 
 
-def assert_same_fields(tree, backend, rays, shader, **options):
-    """Hits and marks of the twin and of a backend: integers exactly, floats to rounding."""
-    expected, marks = assert_equal(tree, backend, rays, shader, **options)
-    actual, _ = run(tree, backend, rays, shader, **options)
-    tolerance = 1e-5 if expected["color"].dtype == torch.float32 else 1e-12
-    for name in ("normal", "features"):
-        torch.testing.assert_close(actual[name], expected[name], rtol=tolerance, atol=tolerance)
-    return expected, actual, marks
+@pytest.fixture(scope="module")
+def tree(trees) -> gv.N3Tree:
+    return trees[2]
 
 
 @pytest.mark.parametrize("lod", ["finest", "auto"])
@@ -51,8 +47,8 @@ def assert_same_fields(tree, backend, rays, shader, **options):
 def test_compiled_equals_reference(tree, compiled, name, lod):
     few = "shadows" in name or lod == "finest"  # the twin takes its time
     for distance in (1.3,) if few else (0.2, 1.3, 6.0):
-        rays = camera_rays(tree, 10, distance=distance)
-        found, actual, _ = assert_same_fields(tree, compiled, rays, SHADERS[name], lod=lod)
+        rays = camera_rays(tree, 6 if few else 10, distance=distance)
+        found, _, actual = assert_equal(tree, compiled, rays, SHADERS[name], lod=lod)
         if compiled == "cpp":
             for field in ("color", "alpha", "depth", "normal", "features"):
                 assert torch.equal(actual[field], found[field]), field
@@ -60,14 +56,21 @@ def test_compiled_equals_reference(tree, compiled, name, lod):
             assert found["alpha"].max() > 0.3, "the test must see something"
 
 
-@pytest.mark.parametrize("branching", [2, 3])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("dtype", "branching", "step"),  # each pair of values
+    [
+        (torch.float32, 2, 0.4),
+        (torch.float32, 3, 2.3),
+        (torch.float64, 2, 2.3),
+        (torch.float64, 3, 0.4),
+    ],
+)
 @pytest.mark.parametrize("name", SHADERS)
-def test_compiled_equals_reference_for_steps_and_dtypes(channels, compiled, name, dtype, branching):
-    tree = gv.N3Tree.from_volume(channels, 4, branching=branching)
-    for step in (0.4, 2.3):
-        rays = camera_rays(tree, 10)
-        assert_same_fields(tree, compiled, rays, SHADERS[name], dtype=dtype, step=step)
+def test_compiled_equals_reference_for_steps_and_dtypes(
+    trees, compiled, name, dtype, branching, step
+):
+    tree = trees[branching]
+    assert_equal(tree, compiled, camera_rays(tree, 6), SHADERS[name], dtype=dtype, step=step)
 
 
 @pytest.mark.backend("cpp")
@@ -92,7 +95,7 @@ def test_every_channel_dtype(blobs, compiled, dtype):
     data = (blobs.data * 100).to(getattr(torch, dtype))
     tree = gv.N3Tree.from_volume(gv.Volume(data), 4)
     rays = camera_rays(tree, 12)
-    found, *_ = assert_same_fields(tree, compiled, rays, gv.Isosurface(50))
+    found, *_ = assert_equal(tree, compiled, rays, gv.Isosurface(50))
     assert found["alpha"].max() == 1 and found["normal"].norm(dim=1).max() > 0.99
 
 
@@ -100,8 +103,8 @@ def test_every_channel_dtype(blobs, compiled, dtype):
 def test_missing_nodes_give_equal_pictures_and_requests(tree, compiled, name):
     for seed, share in ((1, 0.3), (2, 0.7)):
         holes = forget(tree, share, seed)
-        rays = camera_rays(holes, 12, distance=1.4)
-        *_, marks = assert_same_fields(holes, compiled, rays, SHADERS[name])
+        rays = camera_rays(holes, 8, distance=1.4)
+        _, marks, _ = assert_equal(holes, compiled, rays, SHADERS[name])
         assert marks["request"].any()
 
 
@@ -173,7 +176,7 @@ def test_a_region_of_one_value_is_lit_as_bricks_are(compiled, name):
         tree = gv.N3Tree.from_volume({n: gv.Volume(data) for n, data in rough.items()}, 4)
         assert bool(tree.bricks.capacity) is (noise > 0)
         rays = camera_rays(tree, 12, distance=1.6)
-        _, actual, _ = assert_same_fields(tree, compiled, rays, shader, lod="finest")
+        *_, actual = assert_equal(tree, compiled, rays, shader, lod="finest")
         found.append(actual)
     assert found[0]["color"].max() > 0.05
     for field in ("color", "alpha", "normal"):
@@ -297,10 +300,11 @@ def test_script_compile_and_export(tree, compiled, name):
     assert all(torch.equal(a, b) for a, b in zip(program(*rays), plain, strict=True))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", SHADERS)
-def test_opcheck(tree, compiled, name, dtype):
+def test_opcheck(tree, compiled, name):
+    """In one dtype after the other; in both, test_op_contract.py checks the other op."""
     tree = on(tree, DEVICES[compiled])
+    dtype = (torch.float32, torch.float64)[[*SHADERS].index(name) % 2]
     rays, traced, shading, parameters = op_arguments(tree, SHADERS[name], dtype)
     op = torch.ops.gvtorch.shade_rays.default
     torch.library.opcheck(op, (*rays, *traced, *shading, parameters))

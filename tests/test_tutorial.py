@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
+import runpy
 
 import pytest
 from helpers import ROOT
@@ -19,22 +17,16 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("page", [pytest.param(page, id=page.stem) for page in PAGES])
-def test_the_python_of_a_page_runs(page, tmp_path):
+@pytest.mark.filterwarnings("default", "error::UserWarning")
+def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch):
+    """Within this process: each would import torch."""
     blocks = BLOCK.findall(page.read_text())
     assert len(blocks) >= 2
     script = tmp_path / "page.py"
     script.write_text("\n".join(blocks))
     (tmp_path / "examples").symlink_to(ROOT / "examples")
-    environment = {**os.environ, "PYTHONPATH": os.environ.get("PYTHONPATH", str(ROOT))}
-    run = subprocess.run(
-        [sys.executable, "-W", "error::UserWarning", str(script)],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=tmp_path,
-        env=environment,
-    )
-    assert run.returncode == 0, run.stderr
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(script), run_name="__main__")
     for name in re.findall(r'(?:save|Video)\("(\w+\.\w+)"', "".join(blocks)):
         assert (tmp_path / name).stat().st_size > 500, name
 

@@ -4,23 +4,20 @@ instruction sets.
 
 from __future__ import annotations
 
-import contextlib
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 from helpers import ROOT
-from helpers.compiled import HEADER, quick_compiler
+from helpers.compiled import ADD, HEADER, only_included, users_shader, write
 from helpers.packets import INSTRUCTIONS, LAMP, TRANSFER, cut, result, scene, shaded, start
 from helpers.rays import camera_rays
 from helpers.traces import run
 from torch import Tensor
 
 import gvtorch as gv
-from gvtorch.cpp_ext import instructions
+from gvtorch.cpp_ext import instructions, user
 
 INK = dict(steep=0.05, sharpness=2.0, wash=0.1, near=20.0, far=80.0, paper=0.9)
 SHADERS = {
@@ -50,7 +47,7 @@ def shader(name: str, folder: Path | None = None) -> gv.CompiledShader:
         alone = folder / header.name
         alone.write_text(f'#define GV_RAY_BY_RAY\n#include "{header}"\n')
         header = alone
-    return gv.CompiledShader(header, struct, **options)
+    return users_shader(header, struct, **options)
 
 
 def given(name: str, folder: Path | None = None) -> list[Tensor]:
@@ -80,19 +77,6 @@ def all_given() -> dict[str, list[Tensor]]:
     return found
 
 
-@pytest.fixture
-def quick(cache: Path) -> str:
-    """One for all tests and processes: what it compiled is kept."""
-    folder = cache.parent / "quick"
-    if not folder.exists():
-        made = cache.parent / f"quick-{os.getpid()}"
-        made.mkdir()
-        quick_compiler(made)
-        with contextlib.suppress(OSError):  # another process was first
-            made.rename(folder)
-    return str(folder / "c++")
-
-
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("set_", INSTRUCTIONS)
 def test_every_bit_is_that_of_rays_one_by_one(tmp_path, monkeypatch, quick, set_):
@@ -110,14 +94,14 @@ def test_every_bit_is_that_of_rays_one_by_one(tmp_path, monkeypatch, quick, set_
 
 
 @pytest.mark.backend("cpp")
-def test_packets_go_in_float32_and_rays_in_float64(tmp_path, monkeypatch):
+def test_packets_go_in_float32_and_rays_in_float64(tmp_path, monkeypatch, quick):
     """The library that users have holds the packet, the one of this file's other header does not;
     float64 is the same in both.
     """
-    own = shader("ends and surface")
+    own = shader("lit")
     assert b"PacketWalk" in own.libraries[0].read_bytes()
-    monkeypatch.setenv("CXX", quick_compiler(tmp_path))
-    alone = shader("ends and surface", tmp_path)
+    monkeypatch.setenv("CXX", quick)
+    alone = shader("lit", tmp_path)
     assert b"PacketWalk" not in alone.libraries[0].read_bytes()
     tree = scene()
     rays = cut(camera_rays(tree, 11, distance=1.5))
@@ -130,11 +114,12 @@ def test_packets_go_in_float32_and_rays_in_float64(tmp_path, monkeypatch):
 def test_a_folder_serves_several_instruction_sets(tmp_path, monkeypatch):
     """Each has a library of its own, of one op."""
     monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path))
-    monkeypatch.setenv("CXX", quick_compiler(tmp_path))
-    program = f"import gvtorch as gv; gv.CompiledShader({str(HEADER)!r}, 'mine::Plain')"
-    for name in ("baseline", instructions(), "baseline"):
-        environment = {**os.environ, "GVTORCH_CPU": name}
-        subprocess.run([sys.executable, "-c", program], env=environment, check=True)
-    names = [file.name for file in (tmp_path / "shaders").iterdir()]
-    assert len(names) == len({"baseline", instructions()})
-    assert len({name.rpartition("_cpu_")[0] for name in names}) == 1
+    monkeypatch.setenv("CXX", only_included(tmp_path))
+    source = user.ShaderSource.read(write(tmp_path, ADD), "Own")
+    made = []
+    for name in ("baseline", "avx512", "baseline"):
+        monkeypatch.setattr(user, "instructions", lambda name=name: name)
+        made.append(user.compiled(source, ()))
+    assert made[0] == made[2] != made[1] and {*made} == {*(tmp_path / "shaders").iterdir()}
+    assert all(library.name.startswith(f"{source.op}_cpu_") for library in made)
+    assert made[0].read_bytes() != made[1].read_bytes()

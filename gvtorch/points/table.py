@@ -70,8 +70,11 @@ class Table:
         elif not self._count:
             self._rows = {"code": np.empty(0, np.int64)}
         else:
+            # As plain arrays: cutting a memmap into parts takes ten times as long.
             self._rows = {
-                column: np.memmap(self.file(column), np.dtype(dtype), "r", 0, (self._count, *sizes))
+                column: np.asarray(
+                    np.memmap(self.file(column), np.dtype(dtype), "r", 0, (self._count, *sizes))
+                )
                 for column, (dtype, sizes) in self.kinds.items()
             }
         return self._rows

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
+import hashlib
+import os
 import shutil
 from pathlib import Path
 
+import gvtorch as gv
 from gvtorch.cpp_ext import compilers
 from helpers import TESTS
 
@@ -19,9 +23,18 @@ def quick_compiler(folder: Path, *before: str) -> str:
     return str(file)
 
 
-def only_included(folder: Path) -> str:
+def users_shader(header: Path, struct: str, **options) -> gv.CompiledShader:
+    """A user's shader: where several processes of tests want the same, one compiles it."""
+    what = "\0".join((os.environ.get("CXX", ""), struct, str(header), header.read_text()))
+    name = hashlib.sha256(what.encode()).hexdigest()
+    with Path(os.environ["GVTORCH_CACHE"]).with_name(f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        return gv.CompiledShader(header, struct, **options)
+
+
+def only_included(folder: Path, *before: str) -> str:
     """A compiler that writes what a real one would compile, and notes what that is made of."""
-    return quick_compiler(folder, 'set -- "$@" -E')
+    return quick_compiler(folder, *before, 'set -- "$@" -E')
 
 
 def write(folder: Path, body: str, name: str = "own.h") -> Path:

@@ -33,6 +33,9 @@ def run(tree, backend, rays, shader=SHADER, **options):
 
 
 def assert_equal(tree, backend, rays, shader=SHADER, **options):
+    """Hits and marks of the twin and of a backend: integers exactly, floats to rounding. Returns
+    the twin's, and the backend's hits.
+    """
     expected, expected_marks = run(tree, "reference", rays, shader, **options)
     actual, marks = run(tree, backend, rays, shader, **options)
     assert torch.equal(actual["samples"], expected["samples"])
@@ -40,12 +43,12 @@ def assert_equal(tree, backend, rays, shader=SHADER, **options):
     for name, mark in marks.items():
         assert torch.equal(mark, expected_marks[name]), name
     tolerance = 1e-5 if expected["color"].dtype == torch.float32 else 1e-12
-    for name in ("color", "alpha", "depth"):
+    for name in {"color", "alpha", "depth", "normal", "features"} & {*expected}:
         torch.testing.assert_close(actual[name], expected[name], rtol=tolerance, atol=tolerance)
     assert ("label" in actual) == shader.reads_labels
     if shader.reads_labels:
         assert torch.equal(actual["label"], expected["label"])
-    return expected, expected_marks
+    return expected, expected_marks, actual
 
 
 def changed(records: tuple, change: dict) -> list:

@@ -47,26 +47,26 @@ class Grid:
         return np.broadcast_to(np.asarray(value, self.dtype), (width,))
 
     def dense(self, low: Place, high: Place) -> np.ndarray:
-        """(i, j, k, c) of a box, voxel by voxel."""
+        """(i, j, k, c) of a box: tiles, and leaves over them."""
         out = np.empty((*np.subtract(high, low), len(self.value(0))), self.dtype)
-        for at in np.ndindex(out.shape[:3]):
-            out[at] = self.at(tuple(int(n) for n in np.add(at, low)))
-        return out
+        out[...] = self.value(self.background)
 
-    def at(self, voxel: Place) -> np.ndarray:
-        """(c,) of a voxel."""
-        corner = tuple(n // 8 * 8 for n in voxel)
-        if corner in self.leaves:
-            i, j, k = np.subtract(voxel, corner)
-            value = self.leaves[corner][0][i * 64 + j * 8 + k]
-            return value.astype("f2").astype(self.dtype) if self.half else value
-        for reach, tiles in zip(REACH, self.tiles, strict=True):
-            corner = tuple(n // reach * reach for n in voxel)
-            if corner in tiles:
-                value = self.value(tiles[corner])
-                inner = self.half and reach != 4096
-                return value.astype("f2").astype(self.dtype) if inner else value
-        return self.value(self.background)
+        def paint(corner: Place, block: np.ndarray, half: bool) -> None:
+            side = len(block)
+            first = np.maximum(np.subtract(low, corner), 0)
+            end = np.minimum(np.subtract(high, corner), side)
+            if (first < end).all():
+                part = block[tuple(map(slice, first, end))]
+                place = tuple(map(slice, first + corner - low, end + corner - low))
+                out[place] = part.astype("f2") if half else part
+
+        for reach, tiles in zip(REACH[::-1], self.tiles[::-1], strict=True):
+            for corner, value in tiles.items():
+                block = np.broadcast_to(self.value(value), (reach,) * 3 + out.shape[3:])
+                paint(corner, block, self.half and reach != 4096)
+        for corner, (values, _) in self.leaves.items():
+            paint(corner, values.reshape(8, 8, 8, -1), self.half)
+        return out
 
 
 def text(content: str) -> bytes:
