@@ -9,6 +9,7 @@ import struct
 import subprocess
 import sys
 import tracemalloc
+import warnings
 import zlib
 
 import numpy as np
@@ -349,6 +350,121 @@ def test_hostile_files_of_openvdb(tmp_path):
     refused(path, VdbWriter().write(path, lonely).read_bytes(), "shares the tree of 'other'")
     stream = VdbWriter().write(path, grid, places=False).read_bytes()
     refused(path, stream, "a stream that does not tell where its grids lie")
+
+
+def whole_leaf() -> tuple[np.ndarray, np.ndarray]:
+    return np.arange(512, dtype="f4")[:, None], np.ones(512, bool)
+
+
+@pytest.mark.parametrize("x", [1, -3, 4, 4095])
+def test_entries_of_a_root_lie_on_its_grid(tmp_path, x):
+    """Others were read into leaves beside their places."""
+    path = tmp_path / "a.vdb"
+    grid = Grid("float", 0.0, leaves={(4096, 0, 0): whole_leaf()})
+    good = VdbWriter().write(path, grid).read_bytes()
+    upper = struct.pack("<2I3i", 0, 1, 4096, 0, 0)
+    assert good.count(upper) == 1
+    content = good.replace(upper, struct.pack("<2I3i", 0, 1, 4096 + x, 0, 0))
+    refused(path, content, rf"root lies at \[{4096 + x}, 0, 0\]; expected multiples of 4096")
+    tile = Grid("float", 0.0, tiles=({(x, 0, 0): 2.0}, {}, {}))
+    refused(path, VdbWriter().write(path, tile).read_bytes(), rf"root lies at \[{x}, 0, 0\]")
+
+
+def test_a_shared_tree_is_of_the_same_kind(tmp_path):
+    """One of vectors was read from a tree of numbers, three voxels at a time."""
+    owner = Grid("float", 7, told=BOX, name="heat", leaves={(0, 0, 0): whole_leaf()})
+    for kind in ("vec3s", "double", "int32", "mask"):
+        path = tmp_path / f"{kind}.vdb"
+        VdbWriter().write(path, owner, Grid(kind, 0, told=BOX, name="other", parent="heat"))
+        with pytest.raises(
+            ValueError, match=f"'other' is a Tree_{kind}_5_4_3, the tree that it sh"
+        ):
+            open_source(path, key="other")
+    half = Grid("float", 0, told=BOX, name="half", parent="heat", half=True)
+    check(VdbWriter().write(path, owner, half), owner.dense(LOW, HIGH), key="half")
+
+
+def test_places_of_grids_and_leaves_are_in_order(tmp_path):
+    """Grids over one another, or leaves told elsewhere, gave other values without a word."""
+    path = tmp_path / "a.vdb"
+    two = [Grid("float", 7, name=n, leaves={(0, 0, 0): whole_leaf()}) for n in ("a", "b")]
+    good = VdbWriter(packing=0).write(path, *two).read_bytes()
+    second = good.index(b"\1\0\0\0b\x10\0\0\0Tree_float")
+    first = good.index(b"\1\0\0\0a\x10\0\0\0Tree_float")
+    places = [first + 29, second + 29]  # of three numbers each
+    told = [struct.unpack_from("<3q", good, place) for place in places]
+    assert told[0][2] == second and told[1][2] == len(good)
+
+    def changed(which: int, number: int, value: int) -> bytes:
+        out = bytearray(good)
+        struct.pack_into("<q", out, places[which] + 8 * number, value)
+        return bytes(out)
+
+    for which, number, value, reason in (
+        (1, 0, told[0][0], "from .* expected in this order"),  # the other's head
+        (0, 2, first, "expected in this order"),  # backwards, without an end
+        (0, 0, -1, "expected in this order"),
+        (1, 1, told[1][2] + 1, "expected in this order"),
+        (0, 1, told[0][1] + 4, r"leaves begin at \d+, the nodes above end at"),
+        (0, 1, told[0][1] - 4, r"leaves begin at \d+, the nodes above end at"),
+        (1, 2, told[1][1] + 100, f"ends at {told[1][1] + 100}, within"),  # within a leaf
+    ):
+        path.write_bytes(changed(which, number, value))
+        with pytest.raises(ValueError, match=reason):
+            gv.read_volume(path, key="ab"[which])
+
+
+def test_a_background_of_nan_is_no_voxel(tmp_path):
+    """All tiles were taken for others than the background: 4096^3 voxels for a leaf."""
+    grid = Grid(
+        "float", np.nan, leaves={(8, 0, 0): whole_leaf()}, tiles=({(4096, 0, 0): np.nan}, {}, {})
+    )
+    source = open_source(VdbWriter(packing=0).write(tmp_path / "a.vdb", grid))
+    assert source.low == (8, 0, 0) and source.extent == (8, 8, 8)
+    assert np.array_equal(
+        source.read_times(0, 1)[0].ravel(), np.arange(512).reshape(8, 8, 8).T.ravel()
+    )
+    volume = gv.read_volume(source.path, nan=-1)
+    assert float(volume.data.min()) == 0
+
+
+@pytest.mark.parametrize("number", [1e308, 1e200, np.inf, -np.inf, np.nan, 1e50, 1e20])
+def test_places_beyond_numbers_are_one_line(tmp_path, number):
+    """Numpy's warnings came before it; `info` took places that `render` refused."""
+    maps = {
+        "TranslationMap": struct.pack("<3d", number, 2, 3),
+        "ScaleMap": struct.pack("<15d", 1, number, 3, *(0,) * 12),
+        "ScaleTranslateMap": struct.pack("<18d", 1, 2, 3, *(number,) * 3, *(0,) * 12),
+        "AffineMap": struct.pack(
+            "<16d", number, number, 0, 0, *(0, 1, 0, 0), *(1, 0, 1, 0), 0, 0, 0, 1
+        ),
+    }
+    for name, content in maps.items():
+        if number < (1e100 if name == "AffineMap" else 1e60 if "Scale" in name else 0):
+            continue  # large, and told
+        grid = Grid("float", 0.0, leaves={(8, 0, 0): whole_leaf()}, map=(name, content))
+        path = VdbWriter().write(tmp_path / "a.vdb", grid)
+        reason = r"degenerate|must be finite|within|spacing must be"
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            refused(path, path.read_bytes(), reason)
+            with pytest.raises(ValueError, match=reason):
+                open_source(path)
+
+
+def test_long_names_and_keys_are_short_lines(tmp_path):
+    long = "x" * 100_000
+    path = tmp_path / "a.vdb"
+    values = {(0, 0, 0): whole_leaf()}
+    for told in ({"name": long}, {"map": (long, b"")}):
+        content = VdbWriter().write(path, Grid("float", 0.0, leaves=values, **told)).read_bytes()
+        refused(path, content, "a name of 100000 bytes")
+    many = [Grid("float", 0.0, name=f"{n}{long[:4000]}", leaves=values) for n in range(9)]
+    VdbWriter().write(path, *many)
+    for key in (long, "\u00b2", "9" * 5000, "9", "-1"):
+        with pytest.raises(ValueError, match="has no grid") as told:
+            open_source(path, key=key)
+        assert len(str(told.value)) < 2000 and str(path) in str(told.value)
 
 
 def test_nan_is_refused_or_replaced(tmp_path):

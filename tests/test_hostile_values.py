@@ -19,9 +19,12 @@ from helpers.pictures import GRAY
 
 import gvtorch as gv
 from gvtorch import bench
+from gvtorch.base.digits import whole_number
 from gvtorch.bench import tables
 from gvtorch.tools import cli
 from gvtorch.tools.bench import Bench
+from gvtorch.tools.channels import parse_channels
+from gvtorch.tools.common import size
 
 HUGE = 10**400
 VIEW = gv.Camera.orbit(width=8, height=8)
@@ -113,6 +116,86 @@ def test_numbers_out_of_range_have_one_clear_line(name):
     with pytest.raises(ValueError, match=r"must|greater") as caught:
         NUMBERS[name]()
     assert "\n" not in str(caught.value) and "ambiguous" not in str(caught.value)
+
+
+WRONG = (None, 3, "x", b"x", ["value"], {}, object(), torch.zeros(3), torch.tensor(0), np.zeros(3))
+CALLS = {
+    "slice": gv.slice_picture,
+    "colors": lambda one: gv.slice_picture(_volume(), colors=one),
+    "span": lambda one: gv.slice_picture(_volume(), span=one),
+    "place": lambda one: gv.slice_picture(_volume(), at=one),
+    "places": lambda one: gv.slice_picture(_volume(), at=(torch.zeros(3), one, one)),
+    "window": gv.window,
+    "percent": lambda one: gv.window(_volume(), one),
+    "points": gv.sort_points,
+    "info": lambda one: gv.Volume(torch.zeros(4, 4, 4), info=one),
+    "preset": gv.TransferFunction.preset,
+    "channels": lambda one: gv.Producer(4, channels=one),
+    "voxels": lambda one: gv.N3Tree.from_volume(_volume()).bricks[one],
+    "whole": lambda one: gv.Volume(torch.zeros(4, 4, 4)).describe(one),
+}
+FINE = {  # what each takes
+    **dict.fromkeys(("colors", "span", "percent", "info"), (type(None),)),
+    "place": (int, torch.Tensor),
+    "channels": (type(None), dict),
+    "whole": (int,),
+    "options": (type(None), str),
+}
+NAMED = {  # and None, the first channel
+    "options": lambda one: gv.RenderOptions(channel=one),
+    "shader": lambda one: gv.render(_tree(), VIEW, gv.Channels([gv.ChannelLook()], channel=one)),
+    "volume": lambda one: _tree().to_volume(one),
+    "tracer": lambda one: gv.TreeTracer(_tree(), GRAY, channel=one),
+    "surface": lambda one: gv.extract_surface(_tree(), 0.5, channel=one),
+}
+
+
+def _volume() -> gv.Volume:
+    return gv.Volume(torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(1)))
+
+
+def _tree() -> gv.N3Tree:
+    return gv.N3Tree.from_volume(_volume())
+
+
+@pytest.mark.parametrize("name", [*CALLS, *NAMED])
+def test_objects_of_a_wrong_class_have_one_clear_line(name):
+    """No AttributeError of the first use, and no "ambiguous" truth of tensors."""
+    call = {**CALLS, **NAMED}[name]
+    for wrong in WRONG:
+        if type(wrong) in FINE.get(name, (type(None),) if name in NAMED else ()):
+            continue
+        with pytest.raises(ValueError, match=r"must|channel|preset") as caught:
+            call(wrong)
+        text = str(caught.value)
+        assert "\n" not in text and "ambiguous" not in text and len(text) < 700, text
+
+
+def test_no_field_of_view_is_too_small_to_divide_by():
+    for fov in (5e-324, 1e-300, 0, -1, np.nan):
+        with pytest.raises(ValueError, match="fov must be finite"):
+            gv.Camera.look_at((9, 9, 9), (0, 0, 0), fov=fov)
+    assert gv.Camera.look_at((9, 9, 9), (0, 0, 0), fov=1e-12).Ks.isfinite().all()
+
+
+@pytest.mark.parametrize("text", ["\u00b2", "\u0663", "9" * 5000, "+1", "1_0", ""])
+def test_only_plain_digits_are_numbers_of_keys_and_flags(text):
+    assert whole_number(text) is None
+    assert whole_number("007") == 7
+    for flag in (f"{text}x8", f"8x{text}"):
+        with pytest.raises(ValueError, match="--size must be WIDTHxHEIGHT"):
+            size(flag)
+    with pytest.raises(ValueError, match="--channel must hold NUMBER"):
+        parse_channels(f"{text}:green", _volume())
+
+
+def test_numbers_without_an_end_are_told():
+    with pytest.raises(ValueError, match="must be an int >= 1, got a number of 16610 bits"):
+        _volume().describe(10**5000)
+    with pytest.raises(
+        ValueError, match=r"must be three numbers, got 30000: \(0, 0.* \.\.\. .*0\)$"
+    ):
+        gv.Volume(torch.zeros(4, 4, 4), spacing=(0,) * 30_000)
 
 
 @pytest.mark.parametrize("text", ["[" * 10**5, "1" * 5000, f'{{"opacity": [[{HUGE}, 0], [1, 1]]}}'])

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 Numbers = float | Sequence[float] | Tensor
 Up = str | Sequence[float] | Tensor  # a name of `DIRECTIONS` such as "+z", or (3,) world
+_NARROWEST = 1e-12  # degrees of a field of view
 _FILLED = 0.98  # of half the picture's width or height, which a box that fits takes
 
 
@@ -544,7 +545,7 @@ def _aimed(
     """Cameras that look through the middle of the picture; `distance` (...) is the target's."""
     kind = model_of(where, model)
     fov = kind.fov if fov is None else fov
-    check.number(where, "fov", fov, low=0, high=kind.widest, open_low=True)
+    check.number(where, "fov", fov, low=_NARROWEST, high=kind.widest)
     check.whole(where, "width", width, low=1, high=65536)
     check.whole(where, "height", height, low=1, high=65536)
     fx, fy = kind.focal(math.radians(fov), width, height)

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from ..base.digits import whole_number
 from ..base.image_info import ChannelInfo, ImageInfo
 from ..base.messages import need_library
 from ..base.volume import check_extent
@@ -48,7 +49,13 @@ class SparseGrid(ABC):
     root_values: np.ndarray  # (t, c)
 
     def __post_init__(self) -> None:
-        cells = np.concatenate((self.root_places, self.origins[0])) // SIDES[0] + (1 << 20)
+        places = np.concatenate((self.root_places, self.origins[0]))
+        off = places[(places % SIDES[0]).any(1)]
+        if len(off):
+            raise ValueError(
+                f"an entry of the root lies at {off[0].tolist()}; expected multiples of {SIDES[0]}"
+            )
+        cells = places // SIDES[0] + (1 << 20)
         if len(np.unique(cells @ np.array((1 << 42, 1 << 21, 1)))) < len(cells):
             raise ValueError("two entries of the root lie at one place")
 
@@ -112,7 +119,10 @@ class SparseGrid(ABC):
         return origin + (a + np.argwhere(chosen)) * side, values[index][chosen]
 
     def _differ(self, values: np.ndarray) -> np.ndarray:
-        return (values != self.background).any(-1)
+        differ = values != self.background
+        if self.dtype.kind == "f":
+            differ &= ~(np.isnan(values) & np.isnan(self.background))
+        return differ.any(-1)
 
     @staticmethod
     def _hits(origins: np.ndarray, side: int, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
@@ -193,7 +203,8 @@ def describe(
         raise ValueError(f"{path}: grid {name!r} has no active voxel")
     check_extent(path, size, most=1 << 62)
     shifted = affine.astype(np.float64)
-    shifted[:3, 3] += shifted[:3, :3] @ low
+    with np.errstate(over="ignore", invalid="ignore"):  # `place_axes` refuses what comes of it
+        shifted[:3, 3] += shifted[:3, :3] @ low
     shape = (*size, width) if width > 1 else tuple(size)
     names = [f"{name}.{'xyzw'[n]}" for n in range(width)] if width > 1 else [name]
     return {
@@ -224,8 +235,9 @@ def choose(path: str, names: Sequence[str], key: str | None) -> tuple[int, tuple
     key = key.removeprefix("/")  # of file.vdb:/density
     if key in names:
         return names.index(key), ()
-    if key.isdigit() and int(key) < len(names):
-        return int(key), ()
+    number = whole_number(key)
+    if number is not None and number < len(names):
+        return number, ()
     raise ValueError(f"{path}: has no grid {key!r}; it holds {listed}")
 
 

@@ -11,7 +11,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -31,6 +31,7 @@ _WITH_ENDS: Mapping[str, Fold] = {**_ADDED, "low": np.minimum.reduceat, "high": 
 _ALL_ADDED: Mapping[str, Fold] = dict.fromkeys(("value", "low", "high"), np.add.reduceat)
 
 
+@runtime_checkable
 class PointSource(Protocol):
     """What points come from: `Points`, or a file that is read in parts."""
 
@@ -150,6 +151,9 @@ def sort_points(
         OSError: The disk is full.
     """
     where, target = "sort_points", None if folder is None else Path(folder)
+    if not isinstance(points, PointSource):
+        kind = type(points).__name__
+        raise ValueError(f"{where}: points must be Points or a PointFile, got a {kind}")
     if target is not None and target.exists():
         raise FileExistsError(f"{target}: is there already; remove it or choose a new name")
     first = next(iter(points.blocks(1)))

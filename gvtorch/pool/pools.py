@@ -302,7 +302,7 @@ class BrickPool(_Pool):
 
     def __getitem__(self, channel: str) -> Tensor:
         """Returns the voxels of a channel, (b, z, y, x, c) with borders, to read or to edit."""
-        if channel not in self.bricks:
+        if check.instance("BrickPool", "channel", channel, str) not in self.bricks:
             known = ", ".join(self.bricks)
             raise ValueError(f"BrickPool: unknown channel {channel!r}; it has {known}")
         return self.bricks[channel]

@@ -90,7 +90,13 @@ class RenderOptions:
     __repr__ = check.brief
 
 
-_OBJECTS = {"clip": Clip, "layer": Layer, "lens": ThinLens, "lighting": Lighting}
+_OBJECTS: dict[str, type] = {
+    "channel": str,
+    "clip": Clip,
+    "layer": Layer,
+    "lens": ThinLens,
+    "lighting": Lighting,
+}
 
 
 class RenderSettings(TypedDict, total=False):

@@ -106,7 +106,10 @@ class VdbWriter:
             tree, leaves = (b"", b"") if grid.parent else self.tree(grid)
             at = len(out) + 24
             ends = at + len(head) + len(tree)
-            out += struct.pack("<3q", at, ends, ends + len(leaves)) + head + tree + leaves
+            begin = (
+                0 if grid.parent else ends
+            )  # of leaves; OpenVDB tells none where a tree is shared
+            out += struct.pack("<3q", at, begin, ends + len(leaves)) + head + tree + leaves
         path.write_bytes(out)
         return path
 
