@@ -132,7 +132,8 @@ def open_source(
         check.text(text, name, given.get(name))
     check.instance(text, "labels", labels, bool)
     with told_as(ValueError, text, f"can't be read as {kind}", StoreError, TimeoutError):
-        with header_budget(text):
+        # What lies beyond numbers is refused below, in a line: NumPy's warnings would come before it.
+        with header_budget(text), np.errstate(all="ignore"):
             source = opener(**given)
         check_files(source)
         if labels:
@@ -153,7 +154,8 @@ def open_source(
                 f"{text}: voxel axes are oblique, resampling finds their spacing: leave spacing "
                 "out, or keep the voxels as they are with oblique='keep' (--oblique keep)"
             )
-        source = straighten(source, oblique, place=origin)
+        with np.errstate(all="ignore"):
+            source = straighten(source, oblique, place=origin)
     if source.lost:
         told = " ".join("; ".join(source.lost).split())  # in one line, whatever the file says
         warnings.warn(f"{text}: not kept: {told}", stacklevel=2)

@@ -229,7 +229,6 @@ class MemorySource(VolumeSource):
         return data[boxes.index(low, high)]
 
 
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what is beyond numbers is refused
 def place_axes(
     path: str,
     affine: np.ndarray,

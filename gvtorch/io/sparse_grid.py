@@ -203,8 +203,7 @@ def describe(
         raise ValueError(f"{path}: grid {name!r} has no active voxel")
     check_extent(path, size, most=1 << 62)
     shifted = affine.astype(np.float64)
-    with np.errstate(over="ignore", invalid="ignore"):  # `place_axes` refuses what comes of it
-        shifted[:3, 3] += shifted[:3, :3] @ low
+    shifted[:3, 3] += shifted[:3, :3] @ low
     shape = (*size, width) if width > 1 else tuple(size)
     names = [f"{name}.{'xyzw'[n]}" for n in range(width)] if width > 1 else [name]
     return {
