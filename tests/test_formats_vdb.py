@@ -497,6 +497,47 @@ def test_hostile_files_of_nanovdb(tmp_path):
     refused(path, changed(736, "<6i", *(0,) * 3, *(-9,) * 3), "has no active voxel")
 
 
+def test_nodes_of_nanovdb_are_those_that_the_grid_tells_of(tmp_path):
+    """Each gave other values without a word: another type's, half of the tree, tiles nowhere."""
+    content, (number, _) = nano_grid("float", np.random.default_rng(1))
+    _, head, _, tile, _, size, entries, lower_size, *_ = NANO["float"]
+    path, root = tmp_path / "a.nvdb", 736 + head
+    (upper,) = struct.unpack_from("<q", content, root + 8)
+    leaf_at = root + 3 * tile + 2 * size + entries + 15 * 256 * 8  # in the first lower node
+    (leaf,) = struct.unpack_from("<q", content, leaf_at)
+    assert leaf == 2 * lower_size
+
+    def forged(at: int, layout: str, value: int, kind: int = number) -> bytes:
+        out = bytearray(content)
+        struct.pack_into(layout, out, at, value)
+        return nano_file(path, ("a", kind, bytes(out))).read_bytes()
+
+    refused(path, forged(0, "<B", content[0], NANO["int16"][0]), "of type 1, its file tells of 3")
+    for count in (0, 1):
+        refused(path, forged(736 + 24, "<I", count), "nodes, leaves first; it tells of")
+    for at in range(3):
+        refused(path, forged(672 + 32 + 4 * at, "<I", 9), "nodes, leaves first; it tells of")
+    (key,) = struct.unpack_from("<Q", content, root)
+    for bit in (20, 41, 62, 63):
+        refused(path, forged(root, "<Q", key | 1 << bit), "of no voxel's place")
+    for step in (1, 8, 16, -8):
+        refused(path, forged(root + 8, "<q", upper + step), "at no multiple of 32 bytes")
+    for step in (32, -32, 2112, -lower_size, -2 * lower_size):
+        refused(path, forged(leaf_at, "<q", leaf + step), "lie over each other")
+    refused(path, forged(root + 8, "<q", -736), "a node lies outside")
+
+
+def test_codes_that_are_no_numbers_are_voxels_that_are_none(tmp_path):
+    content, (number, _) = nano_grid("Fp8", np.random.default_rng(1))
+    out = bytearray(content)
+    at = len(content) - NANO["Fp8"][-1] + 80
+    out[at : at + 8] = np.float32([np.nan, np.inf]).tobytes()
+    path = nano_file(tmp_path / "a.nvdb", ("a", number, bytes(out)))
+    with pytest.raises(ValueError, match="holds 512 values that are NaN"):
+        gv.read_volume(path)
+    assert gv.read_volume(path, nan=0).data.isfinite().all()
+
+
 @pytest.mark.parametrize("compressor", ["lz4", "zstd", "blosclz"])
 def test_only_the_first_block_of_blosc_is_unpacked_for_a_head(tmp_path, compressor):
     """A file of 33 KB took 2 GB: all its blocks lay at one place."""

@@ -132,7 +132,7 @@ def open_source(
         check.text(text, name, given.get(name))
     check.instance(text, "labels", labels, bool)
     with told_as(ValueError, text, f"can't be read as {kind}", StoreError, TimeoutError):
-        # What lies beyond numbers is refused below, in a line: NumPy's warnings would come before it.
+        # What lies beyond numbers is refused below; NumPy's warnings would come before that line.
         with header_budget(text), np.errstate(all="ignore"):
             source = opener(**given)
         check_files(source)

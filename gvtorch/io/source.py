@@ -152,7 +152,8 @@ class VolumeSource(ABC):
             start, stop = spans.get(axis, (0, size))
             backwards = axis in self.flips
             index.append(slice(size - stop, size - start) if backwards else slice(start, stop))
-        data = self.read_stored(tuple(index))
+        with np.errstate(all="ignore"):  # what is no number is told, or replaced, as such
+            data = self.read_stored(tuple(index))
         data = data.squeeze(tuple(i for i, axis in enumerate(self.axes) if axis == "-"))
         data = boxes.to_zyxc(data, self.axes.replace("-", ""), "tzyxc")
         data = np.flip(data, tuple("tzyx".index(axis) for axis in self.flips))

@@ -274,6 +274,8 @@ def nano_grid(kind: str, rng: np.random.Generator, bits_of_leaf: int = 8) -> tup
     out = bytearray(at_leaf[1] + leaf)
     struct.pack_into("<QQII", out, 0, 0x314244566F6E614E, 0, 32 << 21 | 6 << 10, 0)
     struct.pack_into("<IIQ", out, 24, 0, 1, len(out))
+    struct.pack_into("<2I", out, 632, 2, number)
+    struct.pack_into("<3I", out, 672 + 32, 2, 2, 2)
     out[296 + 88 : 296 + 88 + 72] = np.diag((0.5, 0.25, 2.0)).tobytes()
     struct.pack_into("<3d", out, 528, 10, 20, 30)
     struct.pack_into("<4q", out, 672, at_leaf[0] - 672, at_lower[0] - 672, at_upper[0] - 672, 64)
