@@ -173,7 +173,7 @@ def test_objects_of_a_wrong_class_have_one_clear_line(name):
 
 def test_no_field_of_view_is_too_small_to_divide_by():
     for fov in (5e-324, 1e-300, 0, -1, np.nan):
-        with pytest.raises(ValueError, match="fov must be finite"):
+        with pytest.raises(ValueError, match="fov must be"):
             gv.Camera.look_at((9, 9, 9), (0, 0, 0), fov=fov)
     assert gv.Camera.look_at((9, 9, 9), (0, 0, 0), fov=1e-12).Ks.isfinite().all()
 

@@ -545,7 +545,9 @@ def _aimed(
     """Cameras that look through the middle of the picture; `distance` (...) is the target's."""
     kind = model_of(where, model)
     fov = kind.fov if fov is None else fov
-    check.number(where, "fov", fov, low=_NARROWEST, high=kind.widest)
+    check.number(where, "fov", fov, low=0, high=kind.widest, open_low=True)
+    if fov < _NARROWEST:
+        raise ValueError(f"{where}: fov must be at least {_NARROWEST:g} degrees, got {fov!r}")
     check.whole(where, "width", width, low=1, high=65536)
     check.whole(where, "height", height, low=1, high=65536)
     fx, fy = kind.focal(math.radians(fov), width, height)
