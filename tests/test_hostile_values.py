@@ -20,7 +20,9 @@ from helpers.pictures import GRAY
 import gvtorch as gv
 from gvtorch import bench
 from gvtorch.base.digits import whole_number
+from gvtorch.base.npy_file import save_npy
 from gvtorch.bench import tables
+from gvtorch.points.table import Table
 from gvtorch.tools import cli
 from gvtorch.tools.bench import Bench
 from gvtorch.tools.channels import parse_channels
@@ -284,6 +286,56 @@ def test_a_full_disk_leaves_the_figures_of_a_flight_as_they_were(tmp_path, small
         run = gvtorch("fly", small, "-o", tmp_path / "f", *flags)
     assert run.returncode == 2 and run.stderr.count("\n") == 1 and "s.jsonl" in run.stderr
     assert stats.read_text() == "old" and {p.name for p in tmp_path.iterdir()} == {"s.jsonl", "f"}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_disk_that_is_full_at_the_very_end_is_told(tmp_path, picture, kind):
+    """The last bytes of a .npy were lost without a word, and the old picture with them."""
+    file = tmp_path / f"a.{kind}"
+    picture.save(file)
+    whole = file.read_bytes()
+    file.write_bytes(b"old")
+    for missing in (1, 100, 1000, 4000, 5000):
+        with full_disk(len(whole) - missing), pytest.raises(OSError, match=r"a\.\w+"):
+            picture.save(file)
+        assert file.read_bytes() == b"old" and [*tmp_path.iterdir()] == [file]
+    with full_disk(len(whole)):
+        picture.save(file)
+    assert file.read_bytes() == whole or kind == "npz"  # which holds the time
+
+
+def test_points_and_arrays_on_a_disk_that_is_full_at_the_very_end_are_told(tmp_path):
+    values = np.arange(3000, dtype=np.float32)
+    for missing in (1, 100, 3000):
+        table, file = Table(tmp_path, "t"), tmp_path / "a.npy"
+        with full_disk(12_000 - missing), pytest.raises(OSError, match="can't be written"):
+            table.append({"code": values})
+        with full_disk(12_128 - missing), pytest.raises(OSError):
+            save_npy(file, values)
+        for left in tmp_path.iterdir():
+            left.unlink()
+    save_npy(file, values.reshape(30, 100)[:, ::2].T)
+    assert np.array_equal(np.load(file), values.reshape(30, 100)[:, ::2].T)
+
+
+@pytest.mark.parametrize("size", [0, 300, 3000, 9000])
+def test_a_full_disk_is_told_with_the_file_that_is_too_long(tmp_path, size):
+    """Of a store's own files, which nobody named, the error named none."""
+    rng = np.random.default_rng(1)
+    np.save(tmp_path / "a.npy", rng.integers(0, 256, (64, 64, 64), dtype=np.uint8))
+    np.savez(tmp_path / "p.npz", positions=rng.random((500, 3)))
+    gvtorch("convert", tmp_path / "a.npy", tmp_path / "s.zarr")
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    for words in (
+        ("convert", tmp_path / "a.npy", tmp_path / "new.zarr", "--workers", "1"),
+        ("splat", tmp_path / "p.npz", "-o", tmp_path / "more.zarr", "--resolution", "64"),
+        ("filter", tmp_path / "s.zarr"),
+    ):
+        with full_disk(size):
+            run = gvtorch(*words)
+        assert run.returncode == 2 and run.stderr.count("\n") == 1, run.stderr
+        assert str(tmp_path) in run.stderr, run.stderr
+    assert all(file.read_bytes() == content for file, content in before.items())
 
 
 def test_a_full_disk_leaves_the_figures_of_a_workload_as_they_were(tmp_path, monkeypatch):

@@ -214,6 +214,7 @@ def memory(where: str, what: str, nbytes: int, device: torch.device) -> None:
 
 _LEAST = 1e-60  # of positive numbers, so that their ratios and squares are numbers
 _MOST_VOXELS_AWAY = 2.0**50  # from the 0 of the world: places are told to an eighth voxel there
+_MOST_JSON = 1 << 26  # bytes of a user's file
 _UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30, "TIB": 2**40}
 
@@ -319,10 +320,12 @@ def json_file(what: str, path: str | Path) -> Any:
     file = Path(path)
     if not file.is_file():
         raise FileNotFoundError(f"{what} not found: {file}")
+    if file.stat().st_size > _MOST_JSON:
+        raise ValueError(f"{file}: not a {what}: it has more than {_MOST_JSON} bytes")
     try:
         return json.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{file}: not a JSON file: {error}") from None
+        raise ValueError(f"{file}: not a JSON file: {one_line(error)}") from None
 
 
 def reals(where: str, name: str, value: Any, shape: tuple[int, ...] | None = None) -> Tensor:

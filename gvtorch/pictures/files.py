@@ -8,6 +8,7 @@ introduction).
 from __future__ import annotations
 
 import errno
+import os
 import struct
 import zlib
 from collections.abc import Iterable, Iterator
@@ -20,12 +21,14 @@ import torch
 from torch import Tensor
 
 from ..base.messages import need_library, one_line
+from ..base.npy_file import save_npy
 from ..base.whole_file import whole_file
 from .tone import finite, to_srgb
 
 if TYPE_CHECKING:
     Layers = dict[str, np.ndarray]  # color (h, w, 3), alpha, depth, samples (h, w, 1)
 
+_PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 _BITS = {".png": (8, 16), ".tif": (8, 16, 32), ".exr": (32, 16), ".npy": (32,), ".npz": (32,)}
 
 
@@ -52,7 +55,7 @@ def write_image(path: Path, layers: Layers, *, transparent: bool, bits: int | No
         if path.suffix == ".npz":
             np.savez(part, **layers)  # type: ignore[arg-type]
         elif path.suffix == ".npy":
-            np.save(part, stacked(layers))
+            save_npy(part, stacked(layers))
         elif path.suffix == ".exr":
             _write_exr(part, layers, bits)
         elif path.suffix == ".tif":
@@ -120,6 +123,10 @@ def write_png(path: Path, layers: Layers, *, transparent: bool, bits: int = 8) -
     write = write_image_png_u8 if bits == 8 else write_image_png_u16
     with _told():
         write(str(path), image, "rgba" if transparent else "rgb")
+    with path.open("rb") as file:  # of the last bytes that find no place on disk it tells nothing
+        file.seek(-min(len(_PNG_END), path.stat().st_size), os.SEEK_END)
+        if file.read() != _PNG_END:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def write_png_rows(

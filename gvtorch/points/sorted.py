@@ -17,6 +17,7 @@ import numpy as np
 
 from ..base import check
 from ..base.stage import Progress, no_progress
+from ..base.whole_file import told_of
 from .codes import Codes, peak, shares
 from .grid import Grid
 from .points import Points
@@ -116,7 +117,8 @@ class SortedPoints:
         }
         grid = dataclasses.asdict(self.grid)
         meta = {"version": _VERSION, "width": self.width, "grid": grid, **told}
-        with (self.folder / _META).open("w", encoding="utf-8") as file:
+        place = self.folder / _META
+        with told_of(place), place.open("w", encoding="utf-8") as file:
             json.dump(meta, file)
             file.flush()
             os.fsync(file.fileno())

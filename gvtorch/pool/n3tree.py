@@ -365,7 +365,7 @@ class N3Tree:
         name = check.text(where, "channel", channel) or self.channel_names[0]
         if name not in self.bricks.channels or self.bricks.channels[name].coarse:
             raise ValueError(
-                f"{where}: the finest bricks have no channel {name!r}; "
+                f"{where}: the finest bricks have no channel {check.given(name)}; "
                 f"the tree has {', '.join(self.channel_names)}"
             )
         return name

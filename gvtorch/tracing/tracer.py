@@ -158,7 +158,7 @@ def _channel_of(tree: N3Tree, shader: Shader, options: RenderOptions) -> str:
     channel = check.text("render", "channel", shader.channel) or options.channel or first
     if channel not in channels:
         known = ", ".join(tree.channel_names)
-        raise ValueError(f"render: unknown channel {channel!r}; the tree has {known}")
+        raise ValueError(f"render: unknown channel {check.given(channel)}; the tree has {known}")
     if channels[channel].coarse:
         raise ValueError(f"render: only coarse bricks have channel {channel!r}")
     other = channels.get(str(shader.other))

@@ -143,7 +143,8 @@ def _load(path: str) -> tuple[Any, list[str]]:
     import nibabel
 
     nibabel.imageglobals.logger.addFilter(_HEARD)  # once, however often
-    _HEARD.lines.here = heard = []
+    heard: list[str] = []
+    _HEARD.lines.here = heard
     try:
         return nibabel.load(path), heard
     finally:
