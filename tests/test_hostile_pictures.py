@@ -163,7 +163,7 @@ def test_a_slice_that_is_cut_is_told_by_its_name(tmp_path, kind):
             assert str(file) in str(caught.value) and "\n" not in str(caught.value)
         file.write_bytes(whole[number])
     (tmp_path / f"s2.{kind}").write_bytes(encode(np.zeros((20, 40), np.uint8)))
-    with pytest.raises(ValueError, match=rf"s2\.{kind}: \(20, 40\) pixels differ from \(30, 40\)"):
+    with pytest.raises(ValueError, match=rf"s2\.{kind}: \(20, 40\) differs from \(30, 40\)"):
         gv.read_volume(tmp_path)
 
 

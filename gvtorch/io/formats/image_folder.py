@@ -44,18 +44,16 @@ class SlicesSource(VolumeSource):
         for at, file in enumerate(files):
             shape = _shape(file)
             if shape[:2] != self.shape[1:3]:
-                raise ValueError(
-                    f"{file}: {shape} pixels differ from {self.shape[1:]} of "
-                    f"{Path(self.files[0]).name}"
-                )
+                raise self._differs(file, shape)
             image = _image(file)
             if image.shape != self.shape[1:] or image.dtype != data.dtype:
-                raise ValueError(
-                    f"{file}: {image.shape} {image.dtype} differs from "
-                    f"{self.shape[1:]} {data.dtype} of {Path(self.files[0]).name}"
-                )
+                raise self._differs(file, f"{image.shape} {image.dtype}")
             data[at] = image[index[1:]]
         return data
+
+    def _differs(self, file: str, found: object) -> ValueError:
+        first = f"{self.shape[1:]} {np.dtype(self.stored)} of {Path(self.files[0]).name}"
+        return ValueError(f"{file}: {found} differs from {first}")
 
 
 def _slices(path: str) -> list[Path]:
