@@ -4,7 +4,12 @@ nothing lost.
 
 from __future__ import annotations
 
+import ctypes
 import resource
+import shutil
+import subprocess
+import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -266,6 +271,83 @@ def test_a_table_takes_what_looks_like_markup(capfd):
     cli._print_table({"channel info": {"0": "\\[/bold]", "1": "[/x]\x1b[2J"}, "name": "\\[/y]"})
     said = capfd.readouterr().out
     assert all(word in said for word in ("0: \\[/bold]", "1: [/x]\\x1b[2J", "\\[/y]"))
+
+
+@pytest.mark.parametrize("kind", ["png", "npy", "mp4", "json", "ply"])
+def test_no_link_that_was_planted_is_written_through(tmp_path, picture, monkeypatch, kind):
+    """Neither in the place of a draft, whose name somebody guessed, nor of the file itself."""
+    victim, file = tmp_path / "victim", tmp_path / f"a.{kind}"
+    victim.write_bytes(b"mine")
+
+    def film() -> None:
+        with gv.Video(file, 100, 80) as video:
+            video.add(picture)
+
+    write = {
+        "mp4": film,
+        "json": lambda: gv.TransferFunction.from_points([(0, 0), (1, 1)]).save(file),
+        "ply": lambda: gv.export_surface(_volume(), 0.5, file),
+    }.get(kind, lambda: picture.save(file))
+    names = [tmp_path / f"tmpguessed.{kind}", file, file.with_name(f".{file.name}.draft")]
+    for link in names:
+        link.symlink_to(victim)
+    monkeypatch.setattr(tempfile, "_name_sequence", iter(["guessed", *"abcdefgh"]))
+    write()
+    assert victim.read_bytes() == b"mine" and file.is_file() and not file.is_symlink()
+    assert {path.name for path in tmp_path.iterdir()} == {"victim", *(one.name for one in names)}
+
+
+def _as_anybody() -> None:
+    """Takes from root what lets it write into folders that may not be written."""
+    for right in (1, 2):  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH
+        ctypes.CDLL(None).prctl(24, right, 0, 0, 0)  # PR_CAPBSET_DROP
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="rights of root are Linux's")
+def test_a_folder_that_may_not_be_written_is_one_line_of_every_command(tmp_path, small):
+    np.savez(tmp_path / "p.npz", positions=np.random.default_rng(1).random((50, 3)))
+    (tmp_path / "m.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    gvtorch("convert", small, tmp_path / "s.zarr")
+    folder = tmp_path / "closed"
+    folder.mkdir()
+    shutil.copytree(tmp_path / "s.zarr", folder / "s.zarr")
+    for place in (*folder.rglob("*"), folder):
+        place.chmod(0o555 if place.is_dir() else 0o444)
+    size = ("--size", "16x16")
+    commands = [
+        ("render", small, "-o", folder / "a.png", *size),
+        ("slice", small, "-o", folder / "a.png"),
+        ("fly", small, "-o", folder / "a", "--frames", "2", *size),
+        ("fly", small, "-o", folder / "a.mp4", "--frames", "2", *size),
+        ("surface", small, "--iso", "0.5", "-o", folder / "a.ply"),
+        ("convert", small, folder / "a.zarr"),
+        ("voxelize", tmp_path / "m.obj", "-o", folder / "a.zarr", "--resolution", "8"),
+        ("splat", tmp_path / "p.npz", "-o", folder / "a.zarr", "--resolution", "8"),
+        ("filter", folder / "s.zarr"),
+    ]
+    before = sorted(folder.rglob("*"))
+    program = f"""
+import contextlib, io, sys
+from gvtorch.tools.cli import main
+for words in {[[str(word) for word in words] for words in commands]!r}:
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            main(words)
+        print(0)
+    except SystemExit as end:
+        print(end.code, said.getvalue().count("\\n"), said.getvalue().strip())
+"""
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True,
+                         preexec_fn=_as_anybody, timeout=300, check=False)  # fmt: skip
+    for place in (folder, *folder.rglob("*")):
+        place.chmod(0o755)
+    lines = run.stdout.splitlines()
+    assert run.returncode == 0 and len(lines) == len(commands), run.stdout + run.stderr
+    for words, line in zip(commands, lines, strict=True):
+        told = "2 1 gvtorch: error: [Errno 13] Permission denied: "
+        assert line.startswith(told) and str(folder) in line, (words, line)
+    assert sorted(folder.rglob("*")) == before
 
 
 def test_a_full_disk_leaves_saved_functions_as_they_were(tmp_path):

@@ -53,7 +53,8 @@ class Volume:
     """A dense grid. The centre of voxel (x, y, z) lies at index * spacing + origin in the world.
 
     The box runs from voxel face to voxel face, -0.5 to n - 0.5 in index units; between the
-    outermost centres and the box's faces the outermost values go on.
+    outermost centres and the box's faces the outermost values go on. Threads may share one that
+    none changes.
 
     Attributes:
         data: (z, y, x, c) tensor on the CPU, one of `CHANNEL_DTYPES`.

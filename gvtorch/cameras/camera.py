@@ -49,7 +49,8 @@ class Frame(Enum):
 
 
 class Camera:
-    """Cameras that share width, height and camera model.
+    """Cameras that share width, height and camera model. Threads may share them while none changes
+    them.
 
     Attributes:
         viewmats: (n, 4, 4) float64, world (or box) to camera.

@@ -25,7 +25,7 @@ from .thin_lens import ThinLens
 
 @dataclass(frozen=True, kw_only=True)
 class RenderOptions:
-    """How a picture is made. `help` of what renders shows these texts.
+    """How a picture is made. `help` of what renders shows these texts. Threads may share one.
 
     Attributes:
         step: Shortest interval, in voxels of the finest level, > 0.
