@@ -107,7 +107,7 @@ class SparseGrid(ABC):
         for end in ends:
             b[axis], part = end, [slice(None)] * 3
             part[axis] = slice(a[axis] - low[axis], end - low[axis])
-            out[tuple(part)] = self.fill(a, b)
+            out[tuple(part)] = self.fill(a.tolist(), b.tolist())
             a[axis] = end
         return out
 
