@@ -4,66 +4,36 @@ writes, and files that the tests write in every kind of numbers, packing and ver
 
 from __future__ import annotations
 
-import pickle
 import struct
 import subprocess
 import sys
-import tracemalloc
 import zlib
 
 import numpy as np
 import pytest
 from helpers import gvtorch, shared
 from helpers.damage import assert_told
-from helpers.vdb import ACTIVE, BLOSC, NANO, ZIP, Grid, VdbWriter, nano_file, nano_grid
+from helpers.vdb import (
+    ACTIVE,
+    BLOSC,
+    BOX,
+    HIGH,
+    LOW,
+    NANO,
+    ZIP,
+    Grid,
+    VdbWriter,
+    check,
+    leaf_values,
+    nano_file,
+    nano_grid,
+)
 
 import gvtorch as gv
 from gvtorch.io import conversion_plan
 from gvtorch.io.reading import open_source
 
 pytest.importorskip("imagecodecs")
-LOW, HIGH = (-20, -12, -4), (30, 20, 40)
-BOX = {
-    "file_bbox_min": ("vec3i", struct.pack("<3i", *LOW)),
-    "file_bbox_max": ("vec3i", struct.pack("<3i", *(n - 1 for n in HIGH))),
-}
-
-
-def leaf_values(grid: Grid, rng: np.random.Generator) -> None:
-    """Adds leaves whose inactive values are told in each of the seven ways, and tiles."""
-    width = len(grid.value(0))
-    back = grid.value(grid.background)
-    minus = ~back if grid.dtype.kind == "b" else -back
-    inactive = [[back], [minus], [back * 2], [minus, back], [back * 2, back],
-                [back * 2, back * 3], [back * 2, back * 3, back * 4], [back]]  # fmt: skip
-    for number, kinds in enumerate(inactive):
-        active = rng.random(512) < (0.3 if number < 7 else 1)
-        values = rng.integers(-50, 50, (512, width)).astype(grid.dtype)
-        if grid.dtype.kind == "b":
-            values = rng.random((512, 1)) < 0.5
-        which = np.arange(512) % len(kinds)
-        values[~active] = np.stack(kinds)[which[~active]]
-        if grid.kind == "mask":
-            values = active[:, None].copy()
-        place = ((number % 3 - 2) * 8, (number // 3 - 1) * 8, 8)
-        grid.leaves[place] = values, active
-    one = back.dtype.type(1) if grid.dtype.kind == "b" else (back * 5).astype(grid.dtype)
-    grid.tiles = ({}, {(128, 0, 0): one}, {(16, 8, 16): one, (16, 0, 16): one})
-
-
-def check(path, expected, **options) -> None:
-    """A grid is read as it was written, whole and in parts."""
-    source = open_source(path, **options)
-    found = source.read_times(0, 1)[0]
-    wanted = expected.transpose(2, 1, 0, 3)
-    assert found.shape == wanted.shape
-    assert np.array_equal(found, wanted.astype(found.dtype))
-    rng = np.random.default_rng(5)
-    for _ in range(20):
-        low = [int(rng.integers(0, n)) for n in found.shape[:3]]
-        high = [int(rng.integers(a, n)) + 1 for a, n in zip(low, found.shape[:3], strict=True)]
-        part = pickle.loads(pickle.dumps(source)).read_region(low, high)
-        assert np.array_equal(part, found[tuple(map(slice, low, high))])
 
 
 @pytest.mark.parametrize("name", ["wdas_cloud_sixteenth", "dragon_smoke"])
@@ -319,107 +289,3 @@ def test_broken_files_of_nanovdb(tmp_path, codec):
     content, (number, _) = nano_grid("float", np.random.default_rng(1))
     path = nano_file(tmp_path / "a.nvdb", ("a", number, content), codec=codec)
     assert_told(path, tmp_path, least=20)
-
-
-def refused(path, content: bytes, reason: str) -> None:
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match=reason) as told:
-        gv.read_volume(path)
-    assert "\n" not in str(told.value) and str(path) in str(told.value)
-
-
-def test_hostile_files_of_openvdb(tmp_path):
-    grid = Grid("float", 7, told=BOX)
-    leaf_values(grid, np.random.default_rng(3))
-    path = tmp_path / "a.vdb"
-    good = VdbWriter().write(path, grid).read_bytes()
-    refused(path, b"\0" * 100, "does not begin as VDB files do")
-    refused(path, good[:8] + struct.pack("<I", 219) + good[12:], "is of file version 219")
-    refused(path, good[:-700], "in a file of")
-    huge = {name: (kind, struct.pack("<3i", *(n,) * 3)) for (name, (kind, _)), n in
-            zip(BOX.items(), (-(2**31), 2**31 - 1), strict=True)}  # fmt: skip
-    refused(path, VdbWriter().write(path, Grid("float", 7, told=huge)).read_bytes(), "voxels")
-    refused(path, VdbWriter().write(path, Grid("float", 7)).read_bytes(), "the grid is empty")
-    frustum = Grid("float", 7, told=BOX, map=("NonlinearFrustumMap", b"\0" * 200))
-    refused(path, VdbWriter().write(path, frustum).read_bytes(), "NonlinearFrustumMap")
-    points = VdbWriter().write(path, grid).read_bytes()
-    points = points.replace(b"Tree_float_5_4_3", b"Tree_ptdat_5_4_3")
-    refused(path, points, "is a Tree_ptdat_5_4_3; known are")
-    lonely = Grid("float", 7, told=BOX, parent="other")
-    refused(path, VdbWriter().write(path, lonely).read_bytes(), "shares the tree of 'other'")
-    stream = VdbWriter().write(path, grid, places=False).read_bytes()
-    refused(path, stream, "a stream that does not tell where its grids lie")
-
-
-def test_nan_is_refused_or_replaced(tmp_path):
-    values = np.arange(512, dtype="f4")[:, None]
-    values[5] = np.nan
-    grid = Grid("float", 0.0, leaves={(0, 0, 0): (values, np.ones(512, bool))})
-    path = VdbWriter().write(tmp_path / "a.vdb", grid)
-    with pytest.raises(ValueError, match="NaN"):
-        gv.read_volume(path)
-    assert float(gv.read_volume(path, nan=0).data[5, 0, 0, 0]) == 0
-
-
-def test_hostile_files_of_nanovdb(tmp_path):
-    content, (number, _) = nano_grid("float", np.random.default_rng(1))
-    path = tmp_path / "a.nvdb"
-    good = nano_file(path, ("a", number, content)).read_bytes()
-    begin = len(good) - len(content)
-
-    def changed(at: int, layout: str, *numbers: int) -> bytes:
-        out = bytearray(good)
-        struct.pack_into(layout, out, begin + at, *numbers)
-        return bytes(out)
-
-    refused(path, b"NanoVDB2" + struct.pack("<I", 29 << 21) + good[12:], "of version 29")
-    refused(path, b"NotVDB.." + good[8:], "expected NanoVDB of version 32")
-    refused(path, changed(736 + 24, "<I", 2**31), "a root of")
-    refused(path, changed(736 + 64 + 8, "<q", 2**40), "a node lies outside of the grid")
-    first, second = struct.unpack_from("<q", content, 808)[0], 736 + 64 + 32 + 8
-    refused(path, changed(second, "<q", first), "several places of the tree share a node")
-    refused(path, changed(736, "<6i", *(0,) * 3, *(-9,) * 3), "has no active voxel")
-
-
-@pytest.mark.parametrize("compressor", ["lz4", "zstd", "blosclz"])
-def test_only_the_first_block_of_blosc_is_unpacked_for_a_head(tmp_path, compressor):
-    """A file of 33 KB took 2 GB: all its blocks lay at one place."""
-    content, (number, box) = nano_grid("float", np.random.default_rng(1))
-    large = content + bytes(64 << 20)
-    path = nano_file(tmp_path / "a.nvdb", ("a", number, large), codec=2, compressor=compressor)
-    tracemalloc.start()
-    open_source(path)
-    taken = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert path.stat().st_size < 2 << 20 and taken < 4 << 20
-    check(path, box)
-    good = path.read_bytes()
-    at = good.index(b"a\0") + 2 + 8  # behind the name and the part's length
-    for place, number, message in (
-        (8, 2**31 - 1, "blosc_decompress"),
-        (16, 2**31 - 1, "at byte 2147483647"),
-        (8, 100, "a block of 100 bytes"),
-    ):
-        bad = bytearray(good)
-        struct.pack_into("<I", bad, at + place, number)
-        refused(path, bytes(bad), message)
-
-
-@pytest.mark.parametrize(
-    ("at", "content", "message"),
-    [
-        (736 + 24, struct.pack("<I", 10_000_000), "a root of 10000000 entries"),
-        (None, b"", "two entries of the root lie at one place"),
-    ],
-)
-def test_roots_of_nanovdb_hold_few_entries_each_at_its_place(tmp_path, at, content, message):
-    """Of millions at one place each part that was read looked at all."""
-    data, (number, _) = nano_grid("float", np.random.default_rng(3))
-    head = 736 + NANO["float"][1]
-    size = NANO["float"][3]
-    if at is None:  # the tile lies where the first upper node does
-        at, content = head + 2 * size, data[head : head + 8]
-    data = data[:at] + content + data[at + len(content) :]
-    file = nano_file(tmp_path / "a.nvdb", ("density", number, data))
-    with pytest.raises(ValueError, match=message):
-        gv.read_volume(file)

@@ -4,7 +4,12 @@ nothing lost.
 
 from __future__ import annotations
 
+import ctypes
 import resource
+import shutil
+import subprocess
+import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,9 +24,14 @@ from helpers.pictures import GRAY
 
 import gvtorch as gv
 from gvtorch import bench
+from gvtorch.base.digits import whole_number
+from gvtorch.base.npy_file import save_npy
 from gvtorch.bench import tables
+from gvtorch.points.table import Table
 from gvtorch.tools import cli
 from gvtorch.tools.bench import Bench
+from gvtorch.tools.channels import parse_channels
+from gvtorch.tools.common import size
 
 HUGE = 10**400
 VIEW = gv.Camera.orbit(width=8, height=8)
@@ -115,6 +125,86 @@ def test_numbers_out_of_range_have_one_clear_line(name):
     assert "\n" not in str(caught.value) and "ambiguous" not in str(caught.value)
 
 
+WRONG = (None, 3, "x", b"x", ["value"], {}, object(), torch.zeros(3), torch.tensor(0), np.zeros(3))
+CALLS = {
+    "slice": gv.slice_picture,
+    "colors": lambda one: gv.slice_picture(_volume(), colors=one),
+    "span": lambda one: gv.slice_picture(_volume(), span=one),
+    "place": lambda one: gv.slice_picture(_volume(), at=one),
+    "places": lambda one: gv.slice_picture(_volume(), at=(torch.zeros(3), one, one)),
+    "window": gv.window,
+    "percent": lambda one: gv.window(_volume(), one),
+    "points": gv.sort_points,
+    "info": lambda one: gv.Volume(torch.zeros(4, 4, 4), info=one),
+    "preset": gv.TransferFunction.preset,
+    "channels": lambda one: gv.Producer(4, channels=one),
+    "voxels": lambda one: gv.N3Tree.from_volume(_volume()).bricks[one],
+    "whole": lambda one: gv.Volume(torch.zeros(4, 4, 4)).describe(one),
+}
+FINE = {  # what each takes
+    **dict.fromkeys(("colors", "span", "percent", "info"), (type(None),)),
+    "place": (int, torch.Tensor),
+    "channels": (type(None), dict),
+    "whole": (int,),
+    "options": (type(None), str),
+}
+NAMED = {  # and None, the first channel
+    "options": lambda one: gv.RenderOptions(channel=one),
+    "shader": lambda one: gv.render(_tree(), VIEW, gv.Channels([gv.ChannelLook()], channel=one)),
+    "volume": lambda one: _tree().to_volume(one),
+    "tracer": lambda one: gv.TreeTracer(_tree(), GRAY, channel=one),
+    "surface": lambda one: gv.extract_surface(_tree(), 0.5, channel=one),
+}
+
+
+def _volume() -> gv.Volume:
+    return gv.Volume(torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(1)))
+
+
+def _tree() -> gv.N3Tree:
+    return gv.N3Tree.from_volume(_volume())
+
+
+@pytest.mark.parametrize("name", [*CALLS, *NAMED])
+def test_objects_of_a_wrong_class_have_one_clear_line(name):
+    """No AttributeError of the first use, and no "ambiguous" truth of tensors."""
+    call = {**CALLS, **NAMED}[name]
+    for wrong in WRONG:
+        if type(wrong) in FINE.get(name, (type(None),) if name in NAMED else ()):
+            continue
+        with pytest.raises(ValueError, match=r"must|channel|preset") as caught:
+            call(wrong)
+        text = str(caught.value)
+        assert "\n" not in text and "ambiguous" not in text and len(text) < 700, text
+
+
+def test_no_field_of_view_is_too_small_to_divide_by():
+    for fov in (5e-324, 1e-300, 0, -1, np.nan):
+        with pytest.raises(ValueError, match="fov must be"):
+            gv.Camera.look_at((9, 9, 9), (0, 0, 0), fov=fov)
+    assert gv.Camera.look_at((9, 9, 9), (0, 0, 0), fov=1e-12).Ks.isfinite().all()
+
+
+@pytest.mark.parametrize("text", ["\u00b2", "\u0663", "9" * 5000, "+1", "1_0", ""])
+def test_only_plain_digits_are_numbers_of_keys_and_flags(text):
+    assert whole_number(text) is None
+    assert whole_number("007") == 7
+    for flag in (f"{text}x8", f"8x{text}"):
+        with pytest.raises(ValueError, match="--size must be WIDTHxHEIGHT"):
+            size(flag)
+    with pytest.raises(ValueError, match="--channel must hold NUMBER"):
+        parse_channels(f"{text}:green", _volume())
+
+
+def test_numbers_without_an_end_are_told():
+    with pytest.raises(ValueError, match="must be an int >= 1, got a number of 16610 bits"):
+        _volume().describe(10**5000)
+    with pytest.raises(
+        ValueError, match=r"must be three numbers, got 30000: \(0, 0.* \.\.\. .*0\)$"
+    ):
+        gv.Volume(torch.zeros(4, 4, 4), spacing=(0,) * 30_000)
+
+
 @pytest.mark.parametrize("text", ["[" * 10**5, "1" * 5000, f'{{"opacity": [[{HUGE}, 0], [1, 1]]}}'])
 def test_json_of_any_depth_and_length_is_told(tmp_path, small, text):
     file = tmp_path / "a.json"
@@ -183,6 +273,83 @@ def test_a_table_takes_what_looks_like_markup(capfd):
     assert all(word in said for word in ("0: \\[/bold]", "1: [/x]\\x1b[2J", "\\[/y]"))
 
 
+@pytest.mark.parametrize("kind", ["png", "npy", "mp4", "json", "ply"])
+def test_no_link_that_was_planted_is_written_through(tmp_path, picture, monkeypatch, kind):
+    """Neither in the place of a draft, whose name somebody guessed, nor of the file itself."""
+    victim, file = tmp_path / "victim", tmp_path / f"a.{kind}"
+    victim.write_bytes(b"mine")
+
+    def film() -> None:
+        with gv.Video(file, 100, 80) as video:
+            video.add(picture)
+
+    write = {
+        "mp4": film,
+        "json": lambda: gv.TransferFunction.from_points([(0, 0), (1, 1)]).save(file),
+        "ply": lambda: gv.export_surface(_volume(), 0.5, file),
+    }.get(kind, lambda: picture.save(file))
+    names = [tmp_path / f"tmpguessed.{kind}", file, file.with_name(f".{file.name}.draft")]
+    for link in names:
+        link.symlink_to(victim)
+    monkeypatch.setattr(tempfile, "_name_sequence", iter(["guessed", *"abcdefgh"]))
+    write()
+    assert victim.read_bytes() == b"mine" and file.is_file() and not file.is_symlink()
+    assert {path.name for path in tmp_path.iterdir()} == {"victim", *(one.name for one in names)}
+
+
+def _as_anybody() -> None:
+    """Takes from root what lets it write into folders that may not be written."""
+    for right in (1, 2):  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH
+        ctypes.CDLL(None).prctl(24, right, 0, 0, 0)  # PR_CAPBSET_DROP
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="rights of root are Linux's")
+def test_a_folder_that_may_not_be_written_is_one_line_of_every_command(tmp_path, small):
+    np.savez(tmp_path / "p.npz", positions=np.random.default_rng(1).random((50, 3)))
+    (tmp_path / "m.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    gvtorch("convert", small, tmp_path / "s.zarr")
+    folder = tmp_path / "closed"
+    folder.mkdir()
+    shutil.copytree(tmp_path / "s.zarr", folder / "s.zarr")
+    for place in (*folder.rglob("*"), folder):
+        place.chmod(0o555 if place.is_dir() else 0o444)
+    size = ("--size", "16x16")
+    commands = [
+        ("render", small, "-o", folder / "a.png", *size),
+        ("slice", small, "-o", folder / "a.png"),
+        ("fly", small, "-o", folder / "a", "--frames", "2", *size),
+        ("fly", small, "-o", folder / "a.mp4", "--frames", "2", *size),
+        ("surface", small, "--iso", "0.5", "-o", folder / "a.ply"),
+        ("convert", small, folder / "a.zarr"),
+        ("voxelize", tmp_path / "m.obj", "-o", folder / "a.zarr", "--resolution", "8"),
+        ("splat", tmp_path / "p.npz", "-o", folder / "a.zarr", "--resolution", "8"),
+        ("filter", folder / "s.zarr"),
+    ]
+    before = sorted(folder.rglob("*"))
+    program = f"""
+import contextlib, io, sys
+from gvtorch.tools.cli import main
+for words in {[[str(word) for word in words] for words in commands]!r}:
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            main(words)
+        print(0)
+    except SystemExit as end:
+        print(end.code, said.getvalue().count("\\n"), said.getvalue().strip())
+"""
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True,
+                         preexec_fn=_as_anybody, timeout=300, check=False)  # fmt: skip
+    for place in (folder, *folder.rglob("*")):
+        place.chmod(0o755)
+    lines = run.stdout.splitlines()
+    assert run.returncode == 0 and len(lines) == len(commands), run.stdout + run.stderr
+    for words, line in zip(commands, lines, strict=True):
+        told = "2 1 gvtorch: error: [Errno 13] Permission denied: "
+        assert line.startswith(told) and str(folder) in line, (words, line)
+    assert sorted(folder.rglob("*")) == before
+
+
 def test_a_full_disk_leaves_saved_functions_as_they_were(tmp_path):
     file, function = tmp_path / "a.json", gv.TransferFunction.from_points([(0, 0), (1, 1)])
     function.save(file)
@@ -201,6 +368,56 @@ def test_a_full_disk_leaves_the_figures_of_a_flight_as_they_were(tmp_path, small
         run = gvtorch("fly", small, "-o", tmp_path / "f", *flags)
     assert run.returncode == 2 and run.stderr.count("\n") == 1 and "s.jsonl" in run.stderr
     assert stats.read_text() == "old" and {p.name for p in tmp_path.iterdir()} == {"s.jsonl", "f"}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_disk_that_is_full_at_the_very_end_is_told(tmp_path, picture, kind):
+    """The last bytes of a .npy were lost without a word, and the old picture with them."""
+    file = tmp_path / f"a.{kind}"
+    picture.save(file)
+    whole = file.read_bytes()
+    file.write_bytes(b"old")
+    for missing in (1, 100, 1000, 4000, 5000):
+        with full_disk(len(whole) - missing), pytest.raises(OSError, match=r"a\.\w+"):
+            picture.save(file)
+        assert file.read_bytes() == b"old" and [*tmp_path.iterdir()] == [file]
+    with full_disk(len(whole)):
+        picture.save(file)
+    assert file.read_bytes() == whole or kind == "npz"  # which holds the time
+
+
+def test_points_and_arrays_on_a_disk_that_is_full_at_the_very_end_are_told(tmp_path):
+    values = np.arange(3000, dtype=np.float32)
+    for missing in (1, 100, 3000):
+        table, file = Table(tmp_path, "t"), tmp_path / "a.npy"
+        with full_disk(12_000 - missing), pytest.raises(OSError, match="can't be written"):
+            table.append({"code": values})
+        with full_disk(12_128 - missing), pytest.raises(OSError):
+            save_npy(file, values)
+        for left in tmp_path.iterdir():
+            left.unlink()
+    save_npy(file, values.reshape(30, 100)[:, ::2].T)
+    assert np.array_equal(np.load(file), values.reshape(30, 100)[:, ::2].T)
+
+
+@pytest.mark.parametrize("size", [0, 300, 3000, 9000])
+def test_a_full_disk_is_told_with_the_file_that_is_too_long(tmp_path, size):
+    """Of a store's own files, which nobody named, the error named none."""
+    rng = np.random.default_rng(1)
+    np.save(tmp_path / "a.npy", rng.integers(0, 256, (64, 64, 64), dtype=np.uint8))
+    np.savez(tmp_path / "p.npz", positions=rng.random((500, 3)))
+    gvtorch("convert", tmp_path / "a.npy", tmp_path / "s.zarr")
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    for words in (
+        ("convert", tmp_path / "a.npy", tmp_path / "new.zarr", "--workers", "1"),
+        ("splat", tmp_path / "p.npz", "-o", tmp_path / "more.zarr", "--resolution", "64"),
+        ("filter", tmp_path / "s.zarr"),
+    ):
+        with full_disk(size):
+            run = gvtorch(*words)
+        assert run.returncode == 2 and run.stderr.count("\n") == 1, run.stderr
+        assert str(tmp_path) in run.stderr, run.stderr
+    assert all(file.read_bytes() == content for file, content in before.items())
 
 
 def test_a_full_disk_leaves_the_figures_of_a_workload_as_they_were(tmp_path, monkeypatch):

@@ -126,13 +126,13 @@ def test_the_command(volume, store, tmp_path):
         )
         assert run.returncode == 0, run.stderr
         assert "10x28" in run.stdout
-        found = gv.pictures.files._read_png(out)[..., 0]
+        found = gv.pictures.read_files._read_png(out)[..., 0]
         assert np.array_equal(found, volume.data.numpy()[::-1, 3, :, 0].repeat(2, 0))
         run = gvtorch("slice", path, *flags, "--axis", "all", "--at", "1,50%,2", "-o", out)
         assert run.returncode == 0, run.stderr
         viridis = gvtorch("slice", path, *flags, "--tf", "viridis", "-o", tmp_path / "v.png")
         assert viridis.returncode == 0, viridis.stderr
-        colors = gv.pictures.files._read_png(tmp_path / "v.png")
+        colors = gv.pictures.read_files._read_png(tmp_path / "v.png")
         assert (colors.max((0, 1)) > 100).all() and (colors[..., 0] != colors[..., 1]).any()
 
 

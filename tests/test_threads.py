@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
+from helpers import ROOT
 from helpers.pictures import GRAY, assert_same_picture, camera
 from helpers.producers import Ball, Late
 from helpers.recorded import Frames
@@ -186,3 +187,13 @@ def test_trees_are_still_copied_and_pickled(blobs):
         assert torch.equal(other.nodes.child_tn, tree.nodes.child_tn)
         other.refresh()
         assert_same_picture(gv.render(other, camera(16), GRAY), gv.render(tree, camera(16), GRAY))
+
+
+def test_what_threads_may_do_with_an_object_is_told_where_it_is_described():
+    """And in the table of docs/robustness.md, a row an object."""
+    table = (ROOT / "docs" / "robustness.md").read_text(encoding="utf-8").split("## Processes")[0]
+    for kind in (gv.Engine, gv.N3Tree, gv.Store, gv.TreeTracer, gv.Camera, gv.Volume, gv.Producer,
+                 gv.Progressive, gv.Video):  # fmt: skip
+        assert "thread" in str(kind.__doc__).lower() and f"`{kind.__name__}`" in table, kind
+    for kind in (gv.Shader, gv.RenderOptions, gv.NodePool, gv.BrickPool):
+        assert "thread" in str(kind.__doc__).lower(), kind

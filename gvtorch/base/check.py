@@ -19,6 +19,8 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from .messages import one_line
+
 Kind = TypeVar("Kind")
 
 
@@ -48,6 +50,13 @@ def shown(value: Any) -> str:
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
     return repr(value)
+
+
+def given(value: Any) -> str:
+    """Returns what was given, as an error tells it: in a line that is not long."""
+    if isinstance(value, int) and value.bit_length() > 1000:
+        return f"a number of {value.bit_length()} bits"  # Python writes none of 4,300 digits
+    return one_line(shown(value), 200)
 
 
 def tensor(
@@ -115,11 +124,19 @@ def shape_of(name: str) -> str:
     return name.rpartition("_")[2].replace("bzyx", "bsss")
 
 
-def instance(where: str, name: str, value: Any, kind: type[Kind]) -> Kind:
-    """Returns `value`; raises ValueError unless it is of a class."""
-    if not isinstance(value, kind):
-        raise ValueError(f"{where}: {name} must be a {kind.__name__}, got {type(value).__name__}")
+def instance(where: str, name: str, value: Any, *kinds: type[Kind]) -> Kind:
+    """Returns `value`; raises ValueError unless it is of one of the classes."""
+    if not isinstance(value, kinds):
+        wanted = " or ".join(kind.__name__ for kind in kinds)
+        raise ValueError(f"{where}: {name} must be a {wanted}, got {type(value).__name__}")
     return value
+
+
+def text(where: str, name: str, value: Any) -> str | None:
+    """Returns `value`, a text or None; raises ValueError for anything else, which may not even be
+    compared (arrays) or looked up (lists).
+    """
+    return None if value is None else instance(where, name, value, str)
 
 
 def known(where: str, options: Mapping[str, Any], kind: type) -> None:
@@ -196,6 +213,8 @@ def memory(where: str, what: str, nbytes: int, device: torch.device) -> None:
 
 
 _LEAST = 1e-60  # of positive numbers, so that their ratios and squares are numbers
+_MOST_VOXELS_AWAY = 2.0**50  # from the 0 of the world: places are told to an eighth voxel there
+_MOST_JSON = 1 << 26  # bytes of a user's file
 _UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30, "TIB": 2**40}
 
@@ -208,7 +227,7 @@ def nbytes(where: str, name: str, value: Any) -> int:
         match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([A-Za-z]*)\s*", value)
         unit = _UNITS.get(match[2].upper()) if match else None
         if match is None or unit is None:
-            raise ValueError(f'{where}: {name} must be bytes, as in "256 MB", got {value!r}')
+            raise ValueError(f'{where}: {name} must be bytes, as in "256 MB", got {given(value)}')
         value = int(float(match[1]) * unit)
     return whole(where, name, value, low=1, high=2**62)
 
@@ -237,21 +256,24 @@ def number(
     try:
         result = float(value)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{where}: {name} must be a number, got {value!r}") from None
+        raise ValueError(f"{where}: {name} must be a number, got {given(value)}") from None
     inside = low < result <= high if open_low else low <= result <= high
     if not (math.isfinite(result) and inside):
         lower = f" and {'>' if open_low else '>='} {low:g}" if low > -math.inf else ""
         upper = f" and <= {high:g}" if high < math.inf else ""
-        raise ValueError(f"{where}: {name} must be finite{lower}{upper}, got {value!r}")
+        raise ValueError(f"{where}: {name} must be finite{lower}{upper}, got {given(value)}")
     return result
 
 
 def whole(where: str, name: str, value: Any, *, low: int, high: int = sys.maxsize) -> int:
     """Returns `value` as an int; raises ValueError unless it is a whole number in [low, high]."""
-    plain = operator.index(value) if hasattr(value, "__index__") else None
+    try:
+        plain = operator.index(value)
+    except (TypeError, RuntimeError):  # of tensors and arrays
+        plain = None
     if isinstance(value, bool) or plain is None or not low <= plain <= high:
         upper = f" and <= {high}" if high < sys.maxsize else ""
-        raise ValueError(f"{where}: {name} must be an int >= {low}{upper}, got {value!r}")
+        raise ValueError(f"{where}: {name} must be an int >= {low}{upper}, got {given(value)}")
     return plain
 
 
@@ -265,9 +287,9 @@ def triple(
     try:
         items = tuple(value)
     except TypeError:
-        raise ValueError(f"{where}: {name} must be three numbers, got {value!r}") from None
+        raise ValueError(f"{where}: {name} must be three numbers, got {given(value)}") from None
     if len(items) != 3:
-        raise ValueError(f"{where}: {name} must be three numbers, got {len(items)}: {value!r}")
+        raise ValueError(f"{where}: {name} must be three numbers, got {len(items)}: {given(value)}")
     x, y, z = (number(where, name, item) for item in items)
     if positive and min(x, y, z) <= 0:
         raise ValueError(f"{where}: {name} must be positive, got {(x, y, z)}")
@@ -276,15 +298,34 @@ def triple(
     return (x, y, z)
 
 
+def placed(
+    where: str, spacing: Any, origin: Any, extent: Sequence[int]
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Returns spacing and origin, (x, y, z) each, of a grid of so many voxels (x, y, z); raises
+    ValueError unless float64 tells its voxels apart where it lies.
+    """
+    steps = triple(where, "spacing", spacing, positive=True)
+    place = triple(where, "origin", origin)
+    for step, at, count in zip(steps, place, extent, strict=True):
+        if max(abs(at), abs(at + step * count)) > _MOST_VOXELS_AWAY * step:
+            raise ValueError(
+                f"{where}: origin must lie within {_MOST_VOXELS_AWAY:g} voxels of 0, got {place} "
+                f"with voxels of {steps}"
+            )
+    return steps, place
+
+
 def json_file(what: str, path: str | Path) -> Any:
     """Returns what a user's JSON file holds; FileNotFoundError or ValueError if it is none."""
     file = Path(path)
     if not file.is_file():
         raise FileNotFoundError(f"{what} not found: {file}")
+    if file.stat().st_size > _MOST_JSON:
+        raise ValueError(f"{file}: not a {what}: it has more than {_MOST_JSON} bytes")
     try:
         return json.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{file}: not a JSON file: {error}") from None
+        raise ValueError(f"{file}: not a JSON file: {one_line(error)}") from None
 
 
 def reals(where: str, name: str, value: Any, shape: tuple[int, ...] | None = None) -> Tensor:
@@ -295,10 +336,10 @@ def reals(where: str, name: str, value: Any, shape: tuple[int, ...] | None = Non
     try:
         numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
     except (TypeError, ValueError, RuntimeError, OverflowError):
-        raise ValueError(f"{where}: {name} must be numbers, got {value!r}") from None
+        raise ValueError(f"{where}: {name} must be numbers, got {given(value)}") from None
     if shape is not None and numbers.shape != shape:
         raise ValueError(f"{where}: {name} must be {shape} numbers, got {tuple(numbers.shape)}")
     if not bool(torch.isfinite(numbers).all()):
-        got = "NaN or infinity" if hasattr(value, "dtype") else repr(value)
+        got = "NaN or infinity" if hasattr(value, "dtype") else given(value)
         raise ValueError(f"{where}: {name} must be finite, got {got}")
     return numbers

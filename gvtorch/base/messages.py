@@ -10,9 +10,20 @@ from typing import Any
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
 
 
-def one_line(error: object) -> str:
-    """Returns what an error says, in one printable line; its type if it says nothing."""
-    return printable(" ".join(str(error).split())) or type(error).__name__
+_MOST = 1500  # characters of a line
+
+
+def one_line(error: object, most: int = _MOST) -> str:
+    """Returns what an error says, in one printable line; its type if it says nothing. Of a longer
+    line, in which a file or a user may tell anything, the middle is left out.
+    """
+    text = str(error)
+    text = text if len(text) <= 8 * most else f"{text[: 4 * most]} {text[-4 * most :]}"
+    line = printable(" ".join(text.split())) or type(error).__name__
+    if len(line) <= most:
+        return line
+    half = most // 2
+    return f"{line[:half]} ... {line[-half:]}"
 
 
 def printable(text: object) -> str:

@@ -53,7 +53,8 @@ class Volume:
     """A dense grid. The centre of voxel (x, y, z) lies at index * spacing + origin in the world.
 
     The box runs from voxel face to voxel face, -0.5 to n - 0.5 in index units; between the
-    outermost centres and the box's faces the outermost values go on.
+    outermost centres and the box's faces the outermost values go on. Threads may share one that
+    none changes.
 
     Attributes:
         data: (z, y, x, c) tensor on the CPU, one of `CHANNEL_DTYPES`.
@@ -95,8 +96,8 @@ class Volume:
         Raises:
             ValueError: data is empty, of another shape or dtype, has more than 2^31 voxels or
                 holds values that are not finite, or integers beyond 2^24 that float32 does not
-                keep apart; spacing is not positive. Or labels are no whole numbers, or more than
-                2^24.
+                keep apart; spacing is not positive, or the origin lies more than 2^50 voxels from
+                0. Or labels are no whole numbers, or more than 2^24.
             RuntimeError: data requires gradients, and they are recorded.
         """
         where = f"Volume {name!r}" if name != "volume" else "Volume"
@@ -106,7 +107,7 @@ class Volume:
                 'to learn voxels, let tree.bricks["value"] require gradients and render with a '
                 "gv.ModuleShader"
             )
-        info = ImageInfo() if info is None else info
+        info = ImageInfo() if info is None else check.instance(where, "info", info, ImageInfo)
         if labels or info.labels:
             info, self.filter = replace(info, labels=True), "majority"
             data, self.label_values = _as_labels(where, data, nan)
@@ -119,8 +120,7 @@ class Volume:
         check_extent(where, tensor.shape[:3], what="data")
         check_extent(where, tensor.shape, what="data with its channels")
         self.data = _finite(where, tensor.contiguous(), nan)
-        self.spacing = check.triple(where, "spacing", spacing, positive=True)
-        self.origin = check.triple(where, "origin", origin)
+        self.spacing, self.origin = check.placed(where, spacing, origin, self.extent)
         self.name, self.info = name, info
 
     @property

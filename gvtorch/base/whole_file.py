@@ -13,6 +13,18 @@ from .text_path import text_path
 
 
 @contextmanager
+def told_of(path: Path) -> Iterator[None]:
+    """Gives an OSError of writing that names no file, as of a full disk, the name of this one."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        text = f"can't be written: {error.strerror or error}"
+        raise OSError(error.errno or errno.EIO, text, str(path)) from None
+
+
+@contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """A place to write to, which takes the file's name once the block ends well."""
     part = ""

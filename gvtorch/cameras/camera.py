@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 Numbers = float | Sequence[float] | Tensor
 Up = str | Sequence[float] | Tensor  # a name of `DIRECTIONS` such as "+z", or (3,) world
+_NARROWEST = 1e-12  # degrees of a field of view
 _FILLED = 0.98  # of half the picture's width or height, which a box that fits takes
 
 
@@ -49,7 +50,8 @@ class Frame(Enum):
 
 
 class Camera:
-    """Cameras that share width, height and camera model.
+    """Cameras that share width, height and camera model. Threads may share them while none changes
+    them.
 
     Attributes:
         viewmats: (n, 4, 4) float64, world (or box) to camera.
@@ -561,6 +563,8 @@ def _aimed(
     kind = model_of(where, model)
     fov = kind.fov if fov is None else fov
     check.number(where, "fov", fov, low=0, high=kind.widest, open_low=True)
+    if fov < _NARROWEST:
+        raise ValueError(f"{where}: fov must be at least {_NARROWEST:g} degrees, got {fov!r}")
     check.whole(where, "width", width, low=1, high=65536)
     check.whole(where, "height", height, low=1, high=65536)
     fx, fy = kind.focal(math.radians(fov), width, height)

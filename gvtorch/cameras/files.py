@@ -26,6 +26,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.messages import one_line
 from ..base.whole_file import whole_file
 from .camera import Camera, Frame
 from .rotations import quaternion_of, rotation_of
@@ -81,9 +82,9 @@ def read_cameras(
         cameras = read(path, width, height)
     except (KeyError, IndexError, TypeError, ArithmeticError, xml.ParseError) as error:
         told = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-        raise ValueError(f"{path}: can't be read as cameras: {told}") from None
+        raise ValueError(f"{path}: can't be read as cameras: {one_line(told)}") from None
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise ValueError(f"{path}: {one_line(error)}") from None
     if not cameras:
         raise ValueError(f"{path}: has no cameras")
     if width is None or height is None:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.messages import one_line
 from .camera import Camera, Up, upward
 from .models import CameraModel, model_of
 
@@ -132,7 +133,7 @@ class CameraPath:
         try:
             return cls(*([key[name] for key in full] for name in ("eye", "target", "up", "fov")))
         except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+            raise ValueError(f"{path}: {one_line(error)}") from None
 
     def __repr__(self) -> str:
         return f"CameraPath({len(self._keys)} keys)"

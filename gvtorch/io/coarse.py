@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from ..base.stage import Progress, no_progress
+from ..base.whole_file import told_of
 from . import boxes
 from .ngff import read_json_file
 from .resources import amount
@@ -115,7 +116,8 @@ def _levels_in_files(store: Store, wide: int) -> Iterator[Sequence[np.ndarray]]:
 
 def _mapped(store: Store, folder: Path, level: int, wide: int) -> np.ndarray:
     shape, file = (*store.level_extent(level)[::-1], wide), folder / f"{level}.npy"
-    mapped = np.lib.format.open_memmap(file, mode="w+", dtype=np.float16, shape=shape)
+    with told_of(file):
+        mapped = np.lib.format.open_memmap(file, mode="w+", dtype=np.float16, shape=shape)
     with file.open("r+b") as place:  # writing to what has no place on disk would end the process
         try:
             os.posix_fallocate(place.fileno(), 0, file.stat().st_size)

@@ -25,10 +25,10 @@ from contextlib import AbstractContextManager, closing, contextmanager, nullcont
 from pathlib import Path
 from typing import Any, Unpack
 
-import numpy as np
-
+from ..base.npy_file import save_npy
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume
+from ..base.whole_file import told_of
 from . import resources, shard, unfinished
 from .conversion_plan import (
     LABELS,
@@ -207,7 +207,8 @@ def _in_file(plan: Plan, source: VolumeSource) -> VolumeSource:
     if not isinstance(source, MemorySource):
         return source.staged(plan.target / WORK)
     file = plan.target / WORK / "source.npy"
-    np.save(file, source.data)
+    with told_of(file):
+        save_npy(file, source.data)
     axes = "tzyxc"[-source.data.ndim :]
     return dataclasses.replace(open_source(file, axes=axes), info=source.info)
 

@@ -15,7 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from ..base.labels import NARROW, as_whole, distinct, index_dtype, indices
+from ..base.npy_file import write_npy
 from ..base.stage import Progress, no_progress
+from ..base.whole_file import told_of
 from .source import Index, MemorySource, VolumeSource
 
 _CUBE = 128  # voxels along a side of what is read at once
@@ -128,8 +130,8 @@ def _labels_of(
 def write_labels(file: Path, labels: np.ndarray) -> None:
     """Writes labels to a .npy file that is either there as a whole or not at all."""
     draft = file.with_name(f".{file.name}")
-    with draft.open("wb") as out:
-        np.save(out, labels)
+    with told_of(file), draft.open("wb") as out:
+        write_npy(out, labels)
         out.flush()
         os.fsync(out.fileno())
     draft.replace(file)

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from ..base import check
 from ..base.labels import check_narrowed
 from ..pool.downsample import pool_mean
 from . import boxes
@@ -127,7 +128,7 @@ def _choose(
         raise ValueError(no_time(where, moment, moments))
     if channels is None:
         return slice(None)
-    picked = list(channels)
+    picked = list(check.instance(where, "channels", channels, tuple, list, range))
     if not picked or not all(isinstance(c, int) and 0 <= c < width for c in picked):
         raise ValueError(f"{where}: has no channels {picked!r}; it has {width}, from 0")
     return picked if "c" in axes else slice(None)

@@ -161,6 +161,11 @@ def _check_gltf(ending: str, content: bytes) -> None:
             raise ValueError(f"accessor {number} has {one['count']} values in {length} bytes")
 
 
+def _count(word: bytes) -> int:
+    """What a header's word tells: 0 if it is no number; its first 19 digits are enough to know."""
+    return int(word.lstrip(b"0")[:19] or b"0") if word.isdigit() else 0
+
+
 def _check_claims(path: Path, ending: str, content: bytes) -> None:
     """Raises ValueError where a header tells of more triangles than the file can hold, or than a
     mesh may have, before memory is asked for.
@@ -175,10 +180,10 @@ def _check_claims(path: Path, ending: str, content: bytes) -> None:
         for line in content[:65536].partition(b"end_header")[0].splitlines():
             words = line.split()
             if words[:2] in ([b"element", b"face"], [b"element", b"vertex"]) and len(words) == 3:
-                claimed = max(claimed or 0, int(words[2]) if words[2].isdigit() else 0)
+                claimed = max(claimed or 0, _count(words[2]))
     if ending == "off":
         numbers = content[:4096].split()[1:3]
-        claimed = max((int(n) for n in numbers if n.isdigit()), default=None)
+        claimed = max((_count(n) for n in numbers if n.isdigit()), default=None)
     if claimed is None:
         return
     if claimed > len(content) // _FACE_BYTES:

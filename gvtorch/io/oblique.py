@@ -17,6 +17,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from ..base import check
 from ..base.image_info import Rows
 from ..pool.downsample import round_array
 from . import boxes
@@ -137,6 +138,7 @@ def straighten(
         ValueError: `oblique` is something else.
         OSError: The smallest value can't be read.
     """
+    check.text(source.path, "oblique", oblique)
     if oblique is not None and oblique not in get_args(Oblique):
         raise ValueError(f"{source.path}: oblique must be 'resample' or 'keep', got {oblique!r}")
     if source.oblique is None:

@@ -52,6 +52,17 @@ def jpeg_size(packed: bytes) -> tuple[int, int, int] | None:
     return found
 
 
+def jpeg_ends(packed: bytes) -> bool:
+    """Whether a JPEG has its end behind its first scan: of what is missing libraries make gray. In
+    a scan no other marker has the number of the end.
+    """
+    at = 2
+    while packed[at : at + 1] == b"\xff" and packed[at + 1 : at + 2] != bytes([_JPEG_SCAN]):
+        filling = packed[at + 1 : at + 2] == b"\xff"
+        at += 1 if filling else 2 + int.from_bytes(packed[at + 2 : at + 4])
+    return packed.find(b"\xff\xd9", at) >= 0
+
+
 def jpeg2k_size(packed: bytes) -> tuple[int, int, int] | None:
     """(columns, rows, samples) that the header of JPEG 2000 tells: of a codestream, or of the first
     in a file of boxes.

@@ -128,8 +128,12 @@ def open_source(
     check.known("read_volume", options, FormatSettings)
     given: dict[str, Any] = {name: v for name, v in options.items() if v is not None}
     text, kind, opener = _find(path, given)
+    for name in ("key", "axes"):
+        check.text(text, name, given.get(name))
+    check.instance(text, "labels", labels, bool)
     with told_as(ValueError, text, f"can't be read as {kind}", StoreError, TimeoutError):
-        with header_budget(text):
+        # What lies beyond numbers is refused below; NumPy's warnings would come before that line.
+        with header_budget(text), np.errstate(all="ignore"):
             source = opener(**given)
         check_files(source)
         if labels:
@@ -150,7 +154,8 @@ def open_source(
                 f"{text}: voxel axes are oblique, resampling finds their spacing: leave spacing "
                 "out, or keep the voxels as they are with oblique='keep' (--oblique keep)"
             )
-        source = straighten(source, oblique, place=origin)
+        with np.errstate(all="ignore"):
+            source = straighten(source, oblique, place=origin)
     if source.lost:
         told = " ".join("; ".join(source.lost).split())  # in one line, whatever the file says
         warnings.warn(f"{text}: not kept: {told}", stacklevel=2)
@@ -195,11 +200,8 @@ def placed(
     """Returns the source with the user's spacing and origin; None keeps those of the file."""
     steps = source.spacing if spacing is None else spacing
     place = source.origin if origin is None else origin
-    return dataclasses.replace(
-        source,
-        spacing=check.triple(where, "spacing", steps, positive=True),
-        origin=check.triple(where, "origin", place),
-    )
+    steps, place = check.placed(where, steps, place, source.extent)
+    return dataclasses.replace(source, spacing=steps, origin=place)
 
 
 def _mapped(source: VolumeSource) -> bool:

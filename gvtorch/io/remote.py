@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import IO, Any
 from urllib.parse import unquote, urlsplit
 
+from ..base.digits import whole_number
 from ..base.messages import need_library, one_line
 from .resources import amount
 
@@ -154,7 +155,7 @@ def _open_http(url: str, known: Version) -> Answer | None:
         raise OSError(f"{error.code} {error.reason}") from None
     length = answer.headers.get("Content-Length", "")
     version = {n: answer.headers[n] for n in ("ETag", "Last-Modified") if answer.headers.get(n)}
-    return answer, int(length) if length.isdigit() else None, version
+    return answer, whole_number(length), version
 
 
 def _open_fsspec(url: str, known: Version) -> Answer | None:

@@ -152,7 +152,8 @@ class VolumeSource(ABC):
             start, stop = spans.get(axis, (0, size))
             backwards = axis in self.flips
             index.append(slice(size - stop, size - start) if backwards else slice(start, stop))
-        data = self.read_stored(tuple(index))
+        with np.errstate(all="ignore"):  # what is no number is told, or replaced, as such
+            data = self.read_stored(tuple(index))
         data = data.squeeze(tuple(i for i, axis in enumerate(self.axes) if axis == "-"))
         data = boxes.to_zyxc(data, self.axes.replace("-", ""), "tzyxc")
         data = np.flip(data, tuple("tzyx".index(axis) for axis in self.flips))
@@ -254,8 +255,10 @@ def place_axes(
     matrix, origin = affine[:3, :3].astype(np.float64), affine[:3, 3].astype(np.float64)
     lengths = np.linalg.norm(matrix, axis=0)
     volume = np.linalg.det(matrix / np.where(lengths > 0, lengths, 1))
-    if not np.isfinite(affine).all() or (lengths == 0).any() or abs(volume) < 1e-6:
-        raise ValueError(f"{path}: the header's voxel axes are degenerate: {matrix.tolist()}")
+    finite = np.isfinite(affine).all() and np.isfinite(lengths).all()
+    if not finite or (lengths == 0).any() or abs(volume) < 1e-6:
+        told = affine[:3].tolist()
+        raise ValueError(f"{path}: the header's voxel axes are degenerate: {told}")
     letters = ["t" if axis == time else "c" for axis in range(len(shape))]
     spatial = [axis for axis in range(len(shape)) if axis not in (component, time)]
     world_axis = np.abs(matrix).argmax(axis=0)  # of each voxel axis

@@ -10,6 +10,7 @@ Source: Museth, "VDB: High-resolution sparse volumes with dynamic topology", ACM
 
 from __future__ import annotations
 
+import math
 import struct
 import threading
 import zlib
@@ -20,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from ..base.digits import whole_number
 from ..base.image_info import ChannelInfo, ImageInfo
 from ..base.messages import need_library
 from ..base.volume import check_extent
@@ -31,6 +33,7 @@ VOXELS = 512  # of a leaf
 MOST_INDEX = 2**31
 MOST_ROOTS = 1 << 20  # entries of a root
 _BATCH = 4096  # leaves
+_WHOLE = 1 << 22  # voxels of whole leaves around a box that is thinner than these
 _MOST_BLOCK = 1 << 26  # bytes of a block of Blosc; writers of VDB make them of 256 KB
 _STORED = 2  # Blosc's flag of a part that is not packed
 _LOCK = threading.Lock()
@@ -48,7 +51,13 @@ class SparseGrid(ABC):
     root_values: np.ndarray  # (t, c)
 
     def __post_init__(self) -> None:
-        cells = np.concatenate((self.root_places, self.origins[0])) // SIDES[0] + (1 << 20)
+        places = np.concatenate((self.root_places, self.origins[0]))
+        off = places[(places % SIDES[0]).any(1)]
+        if len(off):
+            raise ValueError(
+                f"an entry of the root lies at {off[0].tolist()}; expected multiples of {SIDES[0]}"
+            )
+        cells = places // SIDES[0] + (1 << 20)
         if len(np.unique(cells @ np.array((1 << 42, 1 << 21, 1)))) < len(cells):
             raise ValueError("two entries of the root lie at one place")
 
@@ -66,6 +75,9 @@ class SparseGrid(ABC):
         """Returns (i, j, k, c) values of a box."""
         leaf, a, b = SIDES[2], np.asarray(low), np.asarray(high)
         start, stop = a // leaf * leaf, -(-b // leaf) * leaf  # whole leaves
+        whole, axis = math.prod((stop - start).tolist()), int((b - a).argmax())
+        if whole > max(_WHOLE, 2 * math.prod((b - a).tolist())):  # of a thin box
+            return self._pieces(a, b, axis, whole // int((stop - start)[axis]))
         out = np.empty((*(stop - start), len(self.background)), self.dtype)
         out[:] = self.background
         tiles = self._hits(self.root_places, SIDES[0], start, stop)
@@ -81,6 +93,23 @@ class SparseGrid(ABC):
             i, j, k = ((self.origins[2][numbers] - start) // leaf).T
             blocks[i, :, j, :, k] = self.leaves(numbers).reshape(-1, 8, 8, 8, out.shape[3])
         return out[tuple(slice(x - s, y - s) for x, y, s in zip(a, b, start, strict=True))]
+
+    def _pieces(self, low: np.ndarray, high: np.ndarray, axis: int, across: int) -> np.ndarray:
+        """Fills a box piece by piece along an axis; so many voxels of whole leaves lie across."""
+        side = SIDES[2]
+        step = max(side, _WHOLE // across // side * side)
+        out = np.empty((*(high - low), len(self.background)), self.dtype)
+        ends = [
+            *range(int(low[axis]) // side * side + step, int(high[axis]), step),
+            int(high[axis]),
+        ]
+        a, b = low.copy(), high.copy()
+        for end in ends:
+            b[axis], part = end, [slice(None)] * 3
+            part[axis] = slice(a[axis] - low[axis], end - low[axis])
+            out[tuple(part)] = self.fill(a.tolist(), b.tolist())
+            a[axis] = end
+        return out
 
     def box(self) -> tuple[np.ndarray, np.ndarray]:
         """(3,) lowest voxel and (3,) what is behind the highest, of all leaves and all tiles that
@@ -112,7 +141,10 @@ class SparseGrid(ABC):
         return origin + (a + np.argwhere(chosen)) * side, values[index][chosen]
 
     def _differ(self, values: np.ndarray) -> np.ndarray:
-        return (values != self.background).any(-1)
+        differ = values != self.background
+        if self.dtype.kind == "f":
+            differ &= ~(np.isnan(values) & np.isnan(self.background))
+        return differ.any(-1)
 
     @staticmethod
     def _hits(origins: np.ndarray, side: int, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
@@ -224,8 +256,9 @@ def choose(path: str, names: Sequence[str], key: str | None) -> tuple[int, tuple
     key = key.removeprefix("/")  # of file.vdb:/density
     if key in names:
         return names.index(key), ()
-    if key.isdigit() and int(key) < len(names):
-        return int(key), ()
+    number = whole_number(key)
+    if number is not None and number < len(names):
+        return number, ()
     raise ValueError(f"{path}: has no grid {key!r}; it holds {listed}")
 
 

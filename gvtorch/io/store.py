@@ -100,8 +100,8 @@ class Store:
         """Takes what `open` found."""
         self.location, self.name = location, image.name
         self.info, self.lost, self.time, self.times = image.info, image.lost, time, times
-        self.spacing = image.scales[0].scale[::-1]
-        self.origin = image.scales[0].translation[::-1]
+        scale, place = image.scales[0].scale[::-1], image.scales[0].translation[::-1]
+        self.spacing, self.origin = check.placed(location, scale, place, layout.extent)
         self.extent, self.levels, self.block = layout.extent, layout.levels, layout.block
         self.border, self.cell, self.threshold = BORDER, CELL, layout.threshold
         self.dtype: torch.dtype = getattr(torch, layout.dtype)
@@ -146,6 +146,7 @@ class Store:
             OSError: It can't be read.
         """
         where, root, deadline = str(location), kvstore(location), Deadline(_OPEN_TIMEOUT)
+        check.text(where, "image", image)
         top = root
         root, found, own = find_image(where, root, image, deadline)
         if own and root != top:  # one of several channels, a store of its own

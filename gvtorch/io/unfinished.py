@@ -16,6 +16,7 @@ from typing import IO, Any, NamedTuple
 
 from ..base.image_info import ImageInfo
 from ..base.volume import Volume, movable
+from ..base.whole_file import told_of
 from .checksums import LIST, Files, sum_of
 from .ngff import image_metadata, read_json_file
 from .store_layout import GROUPS, WORK, StoreLayout
@@ -42,9 +43,10 @@ class UnfinishedStore:
     def note(self, done: Mapping[Task, Done]) -> None:
         """Writes down that tasks are done; on disk when this returns."""
         self.done |= done
-        self._journal.writelines(_line(*item) for item in done.items())
-        self._journal.flush()
-        os.fsync(self._journal.fileno())
+        with told_of(self._target / WORK / _JOURNAL):
+            self._journal.writelines(_line(*item) for item in done.items())
+            self._journal.flush()
+            os.fsync(self._journal.fileno())
 
     def finish(self, layout: StoreLayout, info: ImageInfo, settings: Mapping[str, Any]) -> None:
         """Writes the metadata, the root's last of all, and removes the hidden folder."""
@@ -115,9 +117,10 @@ def claimed(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator
             write_json(folder / _MANIFEST, settings)
         draft = folder / f".{_JOURNAL}.draft"
         with draft.open("w", encoding="utf-8") as journal:
-            journal.writelines(_line(*item) for item in done.items())
-            journal.flush()
-            os.fsync(journal.fileno())
+            with told_of(draft):
+                journal.writelines(_line(*item) for item in done.items())
+                journal.flush()
+                os.fsync(journal.fileno())
             rename(draft, folder / _JOURNAL)
             yield UnfinishedStore(target, journal, done)
 
@@ -212,7 +215,7 @@ def group(attributes: dict[str, Any]) -> dict[str, Any]:
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Writes a file that is either there as a whole or not at all."""
     draft = path.with_name(f".{path.name}.draft")
-    with draft.open("w", encoding="utf-8") as file:
+    with told_of(path), draft.open("w", encoding="utf-8") as file:
         json.dump(content, file, indent=1, allow_nan=False)
         file.flush()
         os.fsync(file.fileno())

@@ -49,7 +49,10 @@ def window(
     Raises:
         ValueError: There is no such component, or the percentiles are none, or out of order.
     """
+    check.instance("window", "data", data, Volume, Store)
     if percent is not None:
+        if not isinstance(percent, (tuple, list)) or len(percent) != 2:
+            raise ValueError(f"window: percent must be a low and a high one, got {percent!r}")
         low, high = (check.number("window", "percent", p, low=0, high=100) for p in percent)
         if low >= high:
             raise ValueError(f"window: percent must be a low and a high one, got {percent}")

@@ -1,10 +1,10 @@
 """Pictures: what a render gives, what stands behind it, how it is shown, refined and written."""
 
 from .background import Backdrop, Environment, Gradient
-from .files import read_image
 from .overlay import ColorBar, Overlay
 from .picture import Picture
 from .progressive import Progressive, render_tiles
+from .read_files import read_image
 from .video import Video
 
 __all__ = [

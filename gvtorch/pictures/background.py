@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..base import check
 from ..cameras.camera import Camera
-from .files import read_image
+from .read_files import read_image
 
 Color = tuple[float, float, float]
 _PIXELS_A_BLOCK = 1 << 20  # whose rays are in memory at once

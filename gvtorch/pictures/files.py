@@ -1,4 +1,4 @@
-"""Image files: layers of a picture to PNG, TIFF, EXR and NumPy, and images back as linear light.
+"""Image files: layers of a picture to PNG, TIFF, EXR and NumPy; back: read_files.py.
 
 PNG and integer TIFF hold sRGB and, where there is alpha, straight colour (PNG specification,
 section 12.3); EXR, NumPy and float TIFF hold linear light, premultiplied (OpenEXR technical
@@ -8,9 +8,10 @@ introduction).
 from __future__ import annotations
 
 import errno
+import os
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,12 +21,14 @@ import torch
 from torch import Tensor
 
 from ..base.messages import need_library, one_line
+from ..base.npy_file import save_npy
 from ..base.whole_file import whole_file
-from .tone import finite, from_srgb, to_srgb
+from .tone import finite, to_srgb
 
 if TYPE_CHECKING:
     Layers = dict[str, np.ndarray]  # color (h, w, 3), alpha, depth, samples (h, w, 1)
 
+_PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 _BITS = {".png": (8, 16), ".tif": (8, 16, 32), ".exr": (32, 16), ".npy": (32,), ".npz": (32,)}
 
 
@@ -52,7 +55,7 @@ def write_image(path: Path, layers: Layers, *, transparent: bool, bits: int | No
         if path.suffix == ".npz":
             np.savez(part, **layers)  # type: ignore[arg-type]
         elif path.suffix == ".npy":
-            np.save(part, stacked(layers))
+            save_npy(part, stacked(layers))
         elif path.suffix == ".exr":
             _write_exr(part, layers, bits)
         elif path.suffix == ".tif":
@@ -120,6 +123,10 @@ def write_png(path: Path, layers: Layers, *, transparent: bool, bits: int = 8) -
     write = write_image_png_u8 if bits == 8 else write_image_png_u16
     with _told():
         write(str(path), image, "rgba" if transparent else "rgb")
+    with path.open("rb") as file:  # of the last bytes that find no place on disk it tells nothing
+        file.seek(-min(len(_PNG_END), path.stat().st_size), os.SEEK_END)
+        if file.read() != _PNG_END:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def write_png_rows(
@@ -193,65 +200,3 @@ def _write_exr(path: Path, layers: Layers, bits: int) -> None:
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with _told():
         OpenEXR.File(header, channels).write(str(path))
-
-
-def read_image(path: str | Path) -> Tensor:
-    """Reads a PNG (8 or 16 bits, sRGB), EXR, TIFF or NPY as linear light.
-
-    Returns:
-        (h, w, c) float32; c is 3, or 4 with alpha: straight from PNG and integer TIFF, whose colour
-        is decoded from sRGB, else as the file has it.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The ending is unknown, or the file holds something else.
-        ImportError: The library for this kind of file is missing.
-    """
-    path = Path(path)
-    if path.suffix not in _READERS:
-        raise ValueError(f"read_image: path must end in {', '.join(_READERS)}, got {str(path)!r}")
-    if not path.is_file():
-        raise FileNotFoundError(f"image not found: {path}")
-    try:
-        pixels = _READERS[path.suffix](path)
-    except ImportError:
-        raise
-    except Exception as error:
-        raise ValueError(f"{path}: can't be read: {error}") from None
-    if pixels.ndim != 3 or pixels.shape[-1] < 3 or pixels.dtype.kind not in "uf":
-        raise ValueError(f"{path}: must hold (h, w, 3) numbers, got {pixels.shape} {pixels.dtype}")
-    pixels = pixels[..., :4]
-    if pixels.dtype.kind == "f":
-        return torch.from_numpy(pixels.astype(np.float32))
-    image = torch.from_numpy(pixels.astype(np.float64) / np.iinfo(pixels.dtype).max)
-    return torch.cat((from_srgb(image[..., :3]), image[..., 3:]), -1).float()
-
-
-def _read_png(path: Path) -> np.ndarray:
-    from kornia_rs.io import read_image_png_u8, read_image_png_u16
-
-    head = path.read_bytes()[:26]
-    if len(head) < 26 or head[:8] != b"\x89PNG\r\n\x1a\n":
-        raise ValueError("no PNG")
-    bits, kind = head[24], head[25]  # of the IHDR chunk
-    modes = {0: "mono", 2: "rgb", 6: "rgba"}
-    if bits not in (8, 16) or kind not in modes:
-        raise ValueError("a PNG must have 8 or 16 bits and no palette")
-    read = read_image_png_u8 if bits == 8 else read_image_png_u16
-    pixels = read(str(path), modes[kind])
-    return np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, -1) if kind == 0 else pixels
-
-
-def _read_exr(path: Path) -> np.ndarray:
-    file = need_library(".exr", "OpenEXR", extra="image").File(str(path), separate_channels=True)
-    channels = file.channels()
-    names = "RGBA" if "A" in channels else "RGB"
-    return np.stack([channels[name].pixels for name in names], -1)
-
-
-_READERS: dict[str, Callable[[Path], np.ndarray]] = {
-    ".png": _read_png,
-    ".exr": _read_exr,
-    ".npy": np.load,
-    ".tif": lambda path: need_library(".tif", "tifffile", extra="image").imread(path),
-}

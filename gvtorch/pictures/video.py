@@ -21,7 +21,7 @@ _OF_PALETTE = 16  # pictures from which the colours of a GIF are taken
 
 
 class Video:
-    """A film of pictures of one size that appears when it is whole:
+    """A film of pictures of one size that appears when it is whole, written by one thread:
 
     with gv.Video("turn.mp4", 640, 480, fps=25) as video:
         video.add(picture)

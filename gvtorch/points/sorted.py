@@ -11,12 +11,13 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from ..base import check
 from ..base.stage import Progress, no_progress
+from ..base.whole_file import told_of
 from .codes import Codes, peak, shares
 from .grid import Grid
 from .points import Points
@@ -31,6 +32,7 @@ _WITH_ENDS: Mapping[str, Fold] = {**_ADDED, "low": np.minimum.reduceat, "high": 
 _ALL_ADDED: Mapping[str, Fold] = dict.fromkeys(("value", "low", "high"), np.add.reduceat)
 
 
+@runtime_checkable
 class PointSource(Protocol):
     """What points come from: `Points`, or a file that is read in parts."""
 
@@ -115,7 +117,8 @@ class SortedPoints:
         }
         grid = dataclasses.asdict(self.grid)
         meta = {"version": _VERSION, "width": self.width, "grid": grid, **told}
-        with (self.folder / _META).open("w", encoding="utf-8") as file:
+        place = self.folder / _META
+        with told_of(place), place.open("w", encoding="utf-8") as file:
             json.dump(meta, file)
             file.flush()
             os.fsync(file.fileno())
@@ -150,6 +153,9 @@ def sort_points(
         OSError: The disk is full.
     """
     where, target = "sort_points", None if folder is None else Path(folder)
+    if not isinstance(points, PointSource):
+        kind = type(points).__name__
+        raise ValueError(f"{where}: points must be Points or a PointFile, got a {kind}")
     if target is not None and target.exists():
         raise FileExistsError(f"{target}: is there already; remove it or choose a new name")
     first = next(iter(points.blocks(1)))

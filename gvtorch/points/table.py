@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ..base.whole_file import told_of
+
 Rows = dict[str, np.ndarray]  # columns of equal length; "code" is int64
 Fold = Callable[[np.ndarray, np.ndarray], np.ndarray]  # as `np.add.reduceat`
 
@@ -54,8 +56,8 @@ class Table:
             return
         for column, values in rows.items():
             self.kinds[column] = (values.dtype.str, values.shape[1:])
-            with self.file(column).open("ab") as file:
-                np.ascontiguousarray(values).tofile(file)
+            with told_of(self.file(column)), self.file(column).open("ab") as file:
+                file.write(np.ascontiguousarray(values).data)  # see `write_npy`
 
     @property
     def rows(self) -> Rows:

@@ -362,10 +362,10 @@ class N3Tree:
         """Returns the name of a channel of the finest bricks, the first if none is named; raises
         ValueError if there is no such channel.
         """
-        name = self.channel_names[0] if channel is None else channel
+        name = check.text(where, "channel", channel) or self.channel_names[0]
         if name not in self.bricks.channels or self.bricks.channels[name].coarse:
             raise ValueError(
-                f"{where}: the finest bricks have no channel {name!r}; "
+                f"{where}: the finest bricks have no channel {check.given(name)}; "
                 f"the tree has {', '.join(self.channel_names)}"
             )
         return name

@@ -168,7 +168,7 @@ class NodePool(_Pool):
 
     Node index = tile * n + child, child = (z * branching + y) * branching + x. A fresh tile's nodes
     have neither children nor brick. Trees of several N may share a pool, whose tiles are then as
-    wide as the widest: n = largest N ** 3.
+    wide as the widest: n = largest N ** 3. Threads look at an engine's under `Engine.lock`.
 
     Attributes:
         branching: N of the widest tree.
@@ -240,7 +240,7 @@ class NodePool(_Pool):
 
 class BrickPool(_Pool):
     """Slots for `capacity` bricks of brick_size ** 3 voxels, with `border` voxels around each, in
-    any number of named, typed channels.
+    any number of named, typed channels. Threads look at an engine's under `Engine.lock`.
 
     Attributes:
         brick_size: Voxels along a side of a brick, without the border.
@@ -302,7 +302,7 @@ class BrickPool(_Pool):
 
     def __getitem__(self, channel: str) -> Tensor:
         """Returns the voxels of a channel, (b, z, y, x, c) with borders, to read or to edit."""
-        if channel not in self.bricks:
+        if check.instance("BrickPool", "channel", channel, str) not in self.bricks:
             known = ", ".join(self.bricks)
             raise ValueError(f"BrickPool: unknown channel {channel!r}; it has {known}")
         return self.bricks[channel]

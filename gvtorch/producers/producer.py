@@ -474,9 +474,11 @@ class Producer(torch.nn.Module):
             origin = [a + 0.5 * s for a, s in zip(low, spacing, strict=True)]
         if isinstance(spacing, (int, float)):
             spacing = (spacing,) * 3
-        self.spacing = check.triple(where, "spacing", spacing, positive=True)
-        self.origin = check.triple(where, "origin", origin)
+        self.spacing, self.origin = check.placed(where, spacing, origin, self.extent)
         self.branching = check.whole(where, "branching", branching, low=2, high=16)
+        if channels is not None and not isinstance(channels, Mapping):
+            kind = type(channels).__name__
+            raise ValueError(f"{where}: channels must be Channel objects by name, got a {kind}")
         self.channels = dict(channels) if channels is not None else {"value": Channel()}
         for name, channel in self.channels.items():
             if not isinstance(channel, Channel):

@@ -21,6 +21,7 @@ import numpy as np
 
 from ..base import check
 from ..base.declared import did_you_mean
+from ..base.messages import one_line
 from .presets import RAMP, SAMPLES, Pair, Points, converted, linear
 
 _GRID = 2**14  # cells of the grid on which the points of files lie, which makes short tables
@@ -33,6 +34,7 @@ _UNSATURATED = 0.05  # radians of Msh
 _APART = 0.33 * math.pi  # hues between which the way goes through white, as VTK has it
 
 
+@np.errstate(all="ignore")  # what is beyond numbers is refused
 def read_points(path: str | Path, name: str | None) -> tuple[Pair, float | None, bool]:
     """Reads a preset of ParaView (.json) or 3D Slicer (.vp, .vp.json, or one by its name of an .xml
     such as its presets.xml).
@@ -79,7 +81,7 @@ def read_points(path: str | Path, name: str | None) -> tuple[Pair, float | None,
     except (KeyError, TypeError, IndexError, ElementTree.ParseError, UnicodeDecodeError) as error:
         raise ValueError(f"{file}: no such file as its ending tells: {error!r}") from None
     except ValueError as error:
-        told = str(error)
+        told = one_line(error)
         raise ValueError(told if told.startswith(str(file)) else f"{file}: {told}") from None
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..base import check
 from ..base.declared import did_you_mean
 
 Points = Sequence[Sequence[float]]
@@ -103,7 +104,7 @@ def named(name: str) -> Pair:
     whose opacity is that of gray; raises ValueError where there is none.
     """
     known = {**PRESETS, **CT_PRESETS}
-    if name in known:
+    if check.instance("preset", "name", name, str) in known:
         return known[name]
     maps, hint = _colormaps()
     plain = name.removeprefix("matplotlib:")

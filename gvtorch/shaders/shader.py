@@ -76,6 +76,7 @@ class CutSurface:
 class Shader(Checked):
     """What turns the values along a ray into colour. Attributes may be edited: they are checked and
     converted as by the constructor, the next picture is made with them, and nothing is compiled.
+    Threads may share one while none edits it.
 
     Attributes:
         kind: Name of its C++ struct, which the op `shade_rays` runs; None: its table is all, and

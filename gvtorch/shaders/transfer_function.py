@@ -18,11 +18,13 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ..base import check
 from ..base.checked import Check, above, kind_of, or_none
+from ..base.messages import one_line
 from ..base.whole_file import write_whole
 from .preset_files import paraview_item, read_points
 from .presets import CT_PRESETS, Points, named
 from .shader import ColorTable, Sampling, Shader
 
+_LARGEST = 1e300  # values and lengths, so that their differences are numbers
 _KEPT = 8  # tables of a function
 # Cells of a table.
 _FEWEST_CELLS = 2**10
@@ -99,7 +101,7 @@ class TransferFunction(Shader):
         try:
             return cls.from_points(**content)
         except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+            raise ValueError(f"{path}: {one_line(error)}") from None
 
     @classmethod
     def from_file(cls, path: str | Path, name: str | None = None) -> TransferFunction:
@@ -126,7 +128,7 @@ class TransferFunction(Shader):
         try:
             function = cls(opacity, color, reference)
         except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+            raise ValueError(f"{path}: {one_line(error)}") from None
         function.relative = relative
         return function
 
@@ -206,8 +208,15 @@ class TransferFunction(Shader):
         return low, high, np.unique((values - low) / (high - low))  # some fall together
 
     def length(self, sampling: Sampling) -> float:
-        """Returns the length of the shortest interval in reference lengths."""
-        return sampling.step / (self.reference or sampling.smallest_spacing)
+        """Returns the length of the shortest interval in reference lengths; an endless one is as
+        long as numbers go, for what is clear stays so.
+        """
+        return min(sampling.step / (self.reference or sampling.smallest_spacing), _LARGEST)
+
+    def lengths(self, sampling: Sampling, levels: int) -> np.ndarray:
+        """Returns (levels,) lengths of intervals in reference lengths; see `length`."""
+        with np.errstate(over="ignore"):
+            return np.minimum(self.length(sampling) * 2.0 ** np.arange(levels), _LARGEST)
 
     def table(self, sampling: Sampling) -> ColorTable:
         """Returns the function as the kernel reads it: rows at even distances over a domain. The
@@ -253,7 +262,7 @@ class TransferFunction(Shader):
     def _make_table(self, sampling: Sampling) -> ColorTable:
         low, high, rows = self.rows()
         levels = sampling.fitting(len(rows))
-        lengths = self.length(sampling) * 2.0 ** np.arange(levels)
+        lengths = self.lengths(sampling, levels)
         with np.errstate(divide="ignore"):
             alpha = -np.expm1(lengths[:, None] * np.log1p(-rows[:, 3]))
         colors = np.broadcast_to(rows[:, :3], (levels, *rows[:, :3].shape))
@@ -284,7 +293,7 @@ def integrated_table(transfer: TransferFunction, sampling: Sampling) -> ColorTab
     weight = density / np.maximum(density.sum(1, keepdims=True), 1e-300)
     color = (weight[..., None] * inside[..., :3]).sum(1)
     rows = transfer(low + (high - low) * np.arange(cells + 1) / cells)
-    lengths = transfer.length(sampling) * 2.0 ** np.arange(sampling.fitting(len(rows) ** 2))
+    lengths = transfer.lengths(sampling, sampling.fitting(len(rows) ** 2))
     table = np.stack([_pairs(rows, thickness, color, length) for length in lengths])
     # Whatever reaches into a cell is asked for both its ends, so one of them may tell of it: not
     # the first or last row, which also stand for all that lies beyond the domain.
@@ -321,7 +330,7 @@ def _cells(places: np.ndarray) -> int | None:
     """A number of cells of [0, 1] fine enough for corners at these places; None: there is none."""
     exact = _common_cells(places, _MOST_CELLS, tolerance=1e-9)
     gap = float(np.diff(places, append=2.0).min())
-    dense = max(_FEWEST_SAMPLED, 2 ** math.ceil(math.log2(_CELLS_APART / gap)))
+    dense = max(_FEWEST_SAMPLED, 2 ** math.ceil(math.log2(_CELLS_APART / max(gap, 1e-9))))
     if exact and (exact <= _MANY_CELLS or dense > _MOST_CELLS):
         return exact * math.ceil(_FEWEST_CELLS / exact)
     return dense if dense <= _MOST_CELLS else None
@@ -355,10 +364,14 @@ def _points(where: str, name: str, points: Points, width: int) -> np.ndarray:
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{where}: {name} must be a list of points {names}") from None
     if array.ndim != 2 or array.shape[0] == 0 or array.shape[1] != width:
-        raise ValueError(f"{where}: {name} must be a list of points {names}, got {points!r}")
+        raise ValueError(
+            f"{where}: {name} must be a list of points {names}, got {check.given(points)}"
+        )
     points = array.tolist()
-    if not np.isfinite(array).all():
-        raise ValueError(f"{where}: {name} must be finite, got {points!r}")
+    if not (np.abs(array) <= _LARGEST).all():
+        raise ValueError(
+            f"{where}: {name} must be finite and at most {_LARGEST:g}, got {check.given(points)}"
+        )
     steps = np.diff(array[:, 0])
     if (steps <= 0).any():
         at = int(np.argmax(steps <= 0))
@@ -368,5 +381,5 @@ def _points(where: str, name: str, points: Points, width: int) -> np.ndarray:
             "(for a jump use two values close to each other)"
         )
     if (array[:, 1:] < 0).any() or (array[:, 1:] > 1).any():
-        raise ValueError(f"{where}: {name} numbers must lie in [0, 1], got {points!r}")
+        raise ValueError(f"{where}: {name} numbers must lie in [0, 1], got {check.given(points)}")
     return array

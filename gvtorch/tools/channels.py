@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from ..base.digits import whole_number
 from .common import numbers
 
 if TYPE_CHECKING:
@@ -29,17 +30,17 @@ def parse_channels(text: str | None, image: Volume | Store) -> Channels:
     wanted: dict[int, list[str]] = {}
     for item in items:
         name, *rest = item.split(":")
-        number = names.get(name, name)
+        number = whole_number(names.get(name, name))
         if item == "opacity":
             continue
-        if not number.isdigit() or len(rest) > 2:
+        if number is None or len(rest) > 2:
             raise ValueError(
                 "--channel must hold NUMBER:COLOR:LO,HI, or a name for the number, where what is "
                 f"left out or auto is the image's, or opacity; got {item!r}"
             )
-        if int(number) in wanted:
+        if number in wanted:
             raise ValueError(f"--channel names channel {number} twice")
-        wanted[int(number)] = rest
+        wanted[number] = rest
     if not wanted:
         raise ValueError("--channel opacity: name channels, too, as in 0;1;opacity")
     mode: Any = "opacity" if "opacity" in items else "additive"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, arg
 
+from ..base.digits import whole_number
 from ..io.ngff import is_zarr
 
 if TYPE_CHECKING:
@@ -166,7 +167,7 @@ def size(text: str) -> tuple[int, int]:
     Raises:
         ValueError: The text is something else.
     """
-    width, _, height = text.lower().partition("x")
-    if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
+    width, height = (whole_number(n) for n in text.lower().partition("x")[::2])
+    if not width or not height:
         raise ValueError(f"--size must be WIDTHxHEIGHT in pixels, got {text!r}")
-    return int(width), int(height)
+    return width, height

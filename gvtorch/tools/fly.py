@@ -15,6 +15,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from ..base.declared import declared_names
+from ..base.digits import whole_number
 from ..base.messages import printable
 from ..base.whole_file import write_whole
 from ..io.ngff import is_zarr
@@ -237,11 +238,11 @@ class Fly:
         if self.scene.source.time is not None:
             raise ValueError("--times and --time both tell which: leave one out")
         count = self._times_there()
-        first, _, last = (self.times or "").partition("-")
+        first, last = (whole_number(n) for n in (self.times or "").partition("-")[::2])
         if self.times == "all":
             return range(count)
-        if first.isdigit() and last.isdigit() and int(first) <= int(last) < count:
-            return range(int(first), int(last) + 1)
+        if first is not None and last is not None and first <= last < count:
+            return range(first, last + 1)
         raise ValueError(
             f"--times must be all or A-B, from 0 to {count - 1} of {self.path}, got {self.times!r}"
         )

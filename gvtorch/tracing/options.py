@@ -25,7 +25,7 @@ from .thin_lens import ThinLens
 
 @dataclass(frozen=True, kw_only=True)
 class RenderOptions:
-    """How a picture is made. `help` of what renders shows these texts.
+    """How a picture is made. `help` of what renders shows these texts. Threads may share one.
 
     Attributes:
         step: Shortest interval, in voxels of the finest level, > 0.
@@ -90,7 +90,13 @@ class RenderOptions:
     __repr__ = check.brief
 
 
-_OBJECTS = {"clip": Clip, "layer": Layer, "lens": ThinLens, "lighting": Lighting}
+_OBJECTS: dict[str, type] = {
+    "channel": str,
+    "clip": Clip,
+    "layer": Layer,
+    "lens": ThinLens,
+    "lighting": Lighting,
+}
 
 
 class RenderSettings(TypedDict, total=False):

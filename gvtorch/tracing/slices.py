@@ -83,13 +83,19 @@ def slice_picture(
     where = "slice_picture"
     if axis not in ("x", "y", "z", "all"):
         raise ValueError(f"{where}: axis must be x, y, z or all, got {axis!r}")
+    check.instance(where, "data", data, Volume, Store)
     scale = check.number(where, "scale", scale, low=0, high=_MOST, open_low=True)
     plane = _Plane(data, component, level)
     if colors is None:
         ends = window(data, component=component, background=True) if span is None else span
+        if not isinstance(ends, (tuple, list)) or len(ends) != 2:
+            raise ValueError(f"{where}: span must be the values of black and white, got {span!r}")
         colors = TransferFunction(*display_grays()).stretched(*ends)
     elif span is not None:
         raise ValueError(f"{where}: span is for grays; colors have values of their own")
+    elif not callable(colors) or isinstance(colors, type):
+        kind = type(colors).__name__
+        raise ValueError(f"{where}: colors must be a function of values or Labels, got a {kind}")
     views = _views(data.info.space, up, radiological=radiological, letters=letters)
     if axis == "all":
         if up is not None:

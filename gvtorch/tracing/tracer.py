@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
+from ..base import check
 from ..base.constants import MAX_INTERVALS
 from ..base.records import Hits, Rays
 from ..ops.trace import choose_backend
@@ -154,10 +155,10 @@ class Tracer:
 def _channel_of(tree: N3Tree, shader: Shader, options: RenderOptions) -> str:
     """Returns the channel whose values the shader turns into colour, once it is known to fit."""
     first, channels = tree.channel_names[0], tree.bricks.channels
-    channel = shader.channel or options.channel or first
+    channel = check.text("render", "channel", shader.channel) or options.channel or first
     if channel not in channels:
         known = ", ".join(tree.channel_names)
-        raise ValueError(f"render: unknown channel {channel!r}; the tree has {known}")
+        raise ValueError(f"render: unknown channel {check.given(channel)}; the tree has {known}")
     if channels[channel].coarse:
         raise ValueError(f"render: only coarse bricks have channel {channel!r}")
     other = channels.get(str(shader.other))

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.messages import one_line
 from ..base.smooth import Smooth
 from ..base.whole_file import write_whole
 from ..cameras import Camera
@@ -31,6 +32,7 @@ from ..cameras.motion import Motion
 from .state import Eye, ViewState
 
 Curve = Callable[[float], Any]
+_MOST_PICTURES = 2**31  # of a film
 _ROUND = 4  # keys of a turntable: between them the camera turns, so that the circle is exact
 #: Numbers that increase along an axis of theirs: they slide without meeting.
 _ORDERED = {
@@ -105,11 +107,11 @@ class Flight:
                 now = now.read(Path(path).parent / told) if own else now.changed(told)
                 keys.append((check.number("Flight", "time", key["time"]), now))
             except ValueError as error:
-                raise ValueError(f"{path}: key {n}: {error}") from None
+                raise ValueError(f"{path}: key {n}: {one_line(error)}") from None
         try:
             return cls(keys)
         except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+            raise ValueError(f"{path}: {one_line(error)}") from None
 
     @classmethod
     def turntable(cls, state: ViewState, seconds: float = 10.0) -> Flight:
@@ -163,7 +165,7 @@ class Flight:
         try:
             state = self._states[n].changed(self._look(time))
         except ValueError as error:
-            raise ValueError(f"Flight: at {time:g} s, after key {n}: {error}") from None
+            raise ValueError(f"Flight: at {time:g} s, after key {n}: {one_line(error)}") from None
         return replace(state, camera=eye)
 
     def along(self, share: float) -> ViewState:
@@ -189,6 +191,11 @@ class Flight:
     def count(self, fps: float = 25) -> int:
         """Number of pictures of a film."""
         fps = check.number("Flight", "fps", fps, low=0, open_low=True)
+        if self.seconds * fps > _MOST_PICTURES:
+            raise ValueError(
+                f"Flight: {self.seconds:g} s of {fps:g} pictures each are more than "
+                f"{_MOST_PICTURES} pictures"
+            )
         return max(1, round(self.seconds * fps) + (not self.closed))
 
     def __len__(self) -> int:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.messages import one_line
 from ..base.whole_file import write_whole
 from ..cameras import Camera
 from ..cameras.models import MODELS, CameraModel, model_of
@@ -248,7 +249,7 @@ class ViewState:
         try:
             return self.changed(content)
         except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+            raise ValueError(f"{path}: {one_line(error)}") from None
 
 
 def transfer_of(shader: Shader) -> TransferFunction | None:

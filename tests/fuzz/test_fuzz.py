@@ -169,6 +169,16 @@ def meshes(folder: Path) -> Whole:
     return read_by(folder, gv.read_mesh)
 
 
+def images(folder: Path) -> Whole:
+    """A picture in every format that is read again."""
+    tree = gv.N3Tree.from_volume(gv.Volume(np.arange(8, dtype=np.uint8).reshape(2, 2, 2)))
+    look = gv.TransferFunction.preset("hot", 0, 7)
+    made = gv.render(tree, gv.Camera.orbit(width=9, height=7), look)
+    for ending in ("png", "exr", "tif", "npy"):
+        made.save(folder / f"image.{ending}")
+    return read_by(folder, gv.read_image)
+
+
 def points(folder: Path) -> Whole:
     place = np.random.default_rng(0).random((9, 3)).astype(np.float32)
     np.savez_compressed(folder / "points.npz", position=place, mass=place[:, 0])
@@ -201,7 +211,7 @@ def looks(folder: Path) -> Whole:
 def test_readers(tmp_path_factory):
     """A broken file is read, or refused in one line."""
     whole, folder = dict[str, Any](), tmp_path_factory.mktemp("broken")
-    for kind in (volumes, meshes, points, looks):
+    for kind in (volumes, meshes, points, looks, images):
         whole |= kind(tmp_path_factory.mktemp(kind.__name__))
 
     def attempt(pick: random.Random) -> tuple[str, Callable[[], bytes], str]:

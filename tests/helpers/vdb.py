@@ -4,6 +4,7 @@ gvtorch/io/formats/openvdb.py and nanovdb.py.
 
 from __future__ import annotations
 
+import pickle
 import struct
 import zlib
 from dataclasses import dataclass, field
@@ -11,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from gvtorch.io.reading import open_source
 
 SIDE = {0: 32, 1: 16}  # entries along a side of an upper and of a lower node
 REACH = (4096, 128, 8)  # voxels along a side of what the root, an upper and a lower node hold
@@ -106,7 +109,10 @@ class VdbWriter:
             tree, leaves = (b"", b"") if grid.parent else self.tree(grid)
             at = len(out) + 24
             ends = at + len(head) + len(tree)
-            out += struct.pack("<3q", at, ends, ends + len(leaves)) + head + tree + leaves
+            begin = (
+                0 if grid.parent else ends
+            )  # of leaves; OpenVDB tells none where a tree is shared
+            out += struct.pack("<3q", at, begin, ends + len(leaves)) + head + tree + leaves
         path.write_bytes(out)
         return path
 
@@ -271,6 +277,8 @@ def nano_grid(kind: str, rng: np.random.Generator, bits_of_leaf: int = 8) -> tup
     out = bytearray(at_leaf[1] + leaf)
     struct.pack_into("<QQII", out, 0, 0x314244566F6E614E, 0, 32 << 21 | 6 << 10, 0)
     struct.pack_into("<IIQ", out, 24, 0, 1, len(out))
+    struct.pack_into("<2I", out, 632, 2, number)
+    struct.pack_into("<3I", out, 672 + 32, 2, 2, 2)
     out[296 + 88 : 296 + 88 + 72] = np.diag((0.5, 0.25, 2.0)).tobytes()
     struct.pack_into("<3d", out, 528, 10, 20, 30)
     struct.pack_into("<4q", out, 672, at_leaf[0] - 672, at_lower[0] - 672, at_upper[0] - 672, 64)
@@ -346,3 +354,47 @@ def nano_file(
     head = struct.pack("<8sIHH", b"NanoVDB2", 32 << 21 | 6 << 10, len(grids), codec)
     path.write_bytes(head + heads + parts)
     return path
+
+
+LOW, HIGH = (-20, -12, -4), (30, 20, 40)
+BOX = {
+    "file_bbox_min": ("vec3i", struct.pack("<3i", *LOW)),
+    "file_bbox_max": ("vec3i", struct.pack("<3i", *(n - 1 for n in HIGH))),
+}
+
+
+def leaf_values(grid: Grid, rng: np.random.Generator) -> None:
+    """Adds leaves whose inactive values are told in each of the seven ways, and tiles."""
+    width = len(grid.value(0))
+    back = grid.value(grid.background)
+    minus = ~back if grid.dtype.kind == "b" else -back
+    inactive = [[back], [minus], [back * 2], [minus, back], [back * 2, back],
+                [back * 2, back * 3], [back * 2, back * 3, back * 4], [back]]  # fmt: skip
+    for number, kinds in enumerate(inactive):
+        active = rng.random(512) < (0.3 if number < 7 else 1)
+        values = rng.integers(-50, 50, (512, width)).astype(grid.dtype)
+        if grid.dtype.kind == "b":
+            values = rng.random((512, 1)) < 0.5
+        which = np.arange(512) % len(kinds)
+        values[~active] = np.stack(kinds)[which[~active]]
+        if grid.kind == "mask":
+            values = active[:, None].copy()
+        place = ((number % 3 - 2) * 8, (number // 3 - 1) * 8, 8)
+        grid.leaves[place] = values, active
+    one = back.dtype.type(1) if grid.dtype.kind == "b" else (back * 5).astype(grid.dtype)
+    grid.tiles = ({}, {(128, 0, 0): one}, {(16, 8, 16): one, (16, 0, 16): one})
+
+
+def check(path, expected, **options) -> None:
+    """A grid is read as it was written, whole and in parts."""
+    source = open_source(path, **options)
+    found = source.read_times(0, 1)[0]
+    wanted = expected.transpose(2, 1, 0, 3)
+    assert found.shape == wanted.shape
+    assert np.array_equal(found, wanted.astype(found.dtype))
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        low = [int(rng.integers(0, n)) for n in found.shape[:3]]
+        high = [int(rng.integers(a, n)) + 1 for a, n in zip(low, found.shape[:3], strict=True)]
+        part = pickle.loads(pickle.dumps(source)).read_region(low, high)
+        assert np.array_equal(part, found[tuple(map(slice, low, high))])

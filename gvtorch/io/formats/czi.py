@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from ...base.digits import whole_number
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
 from ...base.units import NO_DEPTH, spacing_of
 from ..source import Index, VolumeSource
@@ -102,10 +103,11 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
 
 
 def _choose(path: str, scenes: list[int], key: str | None) -> int | None:
-    if key is not None and (not key.isdigit() or int(key) not in scenes):
+    scene = whole_number(key)
+    if key is not None and scene not in scenes:
         listed = ", ".join(map(str, scenes)) or "none"
         raise ValueError(f"{path}: has no scene {key!r}; it holds {listed}")
-    return int(key) if key is not None else scenes[0] if scenes else None
+    return scene if key is not None else scenes[0] if scenes else None
 
 
 def _told(

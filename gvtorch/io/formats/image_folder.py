@@ -19,9 +19,9 @@ import numpy as np
 from ...base.image_info import ImageInfo, color_channels
 from ...base.volume import check_extent
 from ..ngff import is_zarr
-from ..picture_size import picture_size
+from ..picture_size import jpeg_ends, picture_size
 from ..resources import amount, memory_free
-from ..source import Index, VolumeSource
+from ..source import Index, VolumeSource, told_as
 from ..tiff_info import check_pictures, opened
 from .format import Format
 
@@ -43,14 +43,17 @@ class SlicesSource(VolumeSource):
         data = np.empty((len(files), *[s.stop - s.start for s in index[1:]]), self.stored)
         for at, file in enumerate(files):
             shape = _shape(file)
-            image = _image(file) if shape[:2] == self.shape[1:3] else np.empty(shape, np.void)
+            if shape[:2] != self.shape[1:3]:
+                raise self._differs(file, shape)
+            image = _image(file)
             if image.shape != self.shape[1:] or image.dtype != data.dtype:
-                raise ValueError(
-                    f"{file}: {image.shape} {image.dtype} differs from "
-                    f"{self.shape[1:]} {data.dtype} of {Path(self.files[0]).name}"
-                )
+                raise self._differs(file, f"{image.shape} {image.dtype}")
             data[at] = image[index[1:]]
         return data
+
+    def _differs(self, file: str, found: object) -> ValueError:
+        first = f"{self.shape[1:]} {np.dtype(self.stored)} of {Path(self.files[0]).name}"
+        return ValueError(f"{file}: {found} differs from {first}")
 
 
 def _slices(path: str) -> list[Path]:
@@ -111,7 +114,11 @@ def _image(file: str) -> np.ndarray:
             return tiff.asarray()
     import imagecodecs
 
-    found = np.asarray(getattr(imagecodecs, f"{codec}_decode")(Path(file).read_bytes()))
+    packed = Path(file).read_bytes()
+    if codec == "jpeg8" and not jpeg_ends(packed):
+        raise ValueError(f"{file}: is cut: the picture has no end")
+    with told_as(ValueError, file, f"can't be read as {codec.rstrip('8').upper()}"):
+        found = np.asarray(getattr(imagecodecs, f"{codec}_decode")(packed))
     return found[..., 0] if found.ndim == 3 and found.shape[2] == 1 else found
 
 

@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from ...base.digits import whole_number
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb
 from ...base.units import NO_DEPTH, spacing_of
 from ..source import Index, VolumeSource
@@ -63,9 +64,9 @@ def open_lif(path: str, key: str | None = None) -> LifSource:
     if not found:
         raise ValueError(f"{path}: holds no image")
     names = [str(element.get("Name", "")) for element in found]
-    at = names.index(key) if key in names else int(key) if key and key.isdigit() else 0
+    at = names.index(key) if key in names else 0 if key is None else whole_number(key)
     listed = ", ".join(f"{number} {name!r}" for number, name in enumerate(names))
-    if (key is not None and key not in names and not key.isdigit()) or at >= len(found):
+    if at is None or at >= len(found):
         raise ValueError(f"{path}: has no image {key!r}; it holds {listed}")
     others = [f"{len(found) - 1} other images; key (--key) chooses among {listed}"]
     return _image(path, found[at], blocks, others if key is None and len(found) > 1 else [])

@@ -13,7 +13,7 @@ import mmap
 import os
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -38,7 +38,8 @@ _GRIDS = (b"NanoVDB0", b"NanoVDB1")
 _VERSION = 32
 _CODECS = {0: "none", 1: "zip", 2: "blosc"}
 _CLASSES = {1: "level set", 2: "fog volume", 3: "staggered"}
-_TREE, _ROOT = 672, 736  # bytes before the tree, and before the root
+_TYPE, _TREE, _ROOT = 636, 672, 736  # bytes before its type, before the tree and its root
+_COUNTS = _TREE + 32  # before the numbers of leaves, lower and upper nodes
 _META = struct.Struct("<4Q2I6d6i3d8I2HI")
 _MOST_GRIDS, _MOST_NAME = 4096, 4096
 _ALIGN = 32
@@ -111,7 +112,7 @@ def open_nanovdb(path: str, key: str | None = None) -> NanoSource:
             f"{path}: grid {head.name!r} holds {kind}, which is no grid of numbers here"
         )
     _, dtype, width = _TYPES[head.kind]
-    affine, low, high = _place(_content(path, head, _ROOT + 24))
+    affine, low, high = _place(_content(path, head, _ROOT + 24), head)
     kind = _CLASSES.get(head.grid_class, "")
     told = describe(path, head.name, kind, np.dtype(dtype), width, low, high, affine)
     return NanoSource(number=number, lost=lost, **told)
@@ -195,12 +196,15 @@ def _content(path: str, head: Head, most: int = 0) -> Any:
         return b"".join(parts)
 
 
-def _place(grid: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _place(grid: Any, head: Head) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(4, 4) from voxels to the world, and (3,) the first active voxel and what is behind the last
     one; as the grid's head and its root tell.
     """
     if len(grid) < _ROOT + 24 or bytes(grid[:8]) not in _GRIDS:
         raise ValueError("a grid does not begin as grids of NanoVDB do")
+    (kind,) = struct.unpack_from("<I", grid, _TYPE)
+    if kind != head.kind:
+        raise ValueError(f"grid {head.name!r} is of type {kind}, its file tells of {head.kind}")
     affine = np.eye(4)
     affine[:3, :3] = np.frombuffer(grid, "<f8", 9, 384).reshape(3, 3)
     affine[:3, 3] = np.frombuffer(grid, "<f8", 3, 528)
@@ -279,7 +283,10 @@ class NanoGrid(SparseGrid):
             "itemsize": layout.tile,
         }
         table = np.ndarray((count,), np.dtype(fields), data, _ROOT + layout.tiles)  # type: ignore[call-overload]
-        keys = table["key"][:, None] >> np.array((42, 21, 0), np.uint64) & np.uint64(2**21 - 1)
+        keys = table["key"][:, None] >> np.array((42, 21, 0), np.uint64)
+        keys[:, 1:] &= np.uint64(2**21 - 1)
+        if (keys >> np.uint64(20)).any():
+            raise ValueError("a key of the root is of no voxel's place")
         corners = (keys.astype(np.int64) << 44 >> 44) * 4096  # 20 bits, signed
         inner = table["child"] != 0
         found = [_checked(_ROOT + table["child"][inner], len(data), layout.entries[0])]
@@ -291,6 +298,15 @@ class NanoGrid(SparseGrid):
             places = np.concatenate([none[:, 0], *(part for part, _ in below)])
             origins.append(np.concatenate([none, *(corners for _, corners in below)]))
             found.append(_checked(places, len(data), least))
+        sizes = (
+            layout.entries[0] + COUNTS[0] ** 3 * layout.entry,
+            layout.entries[1] + COUNTS[1] ** 3 * layout.entry,
+            layout.leaf,
+        )
+        _check_apart(found, sizes)
+        counts, told = [len(places) for places in found], struct.unpack_from("<3I", data, _COUNTS)
+        if counts != [*told[::-1]]:
+            raise ValueError(f"the tree has {counts[::-1]} nodes, leaves first; it tells of {told}")
         return cls(
             dtype=np.dtype(dtype),
             background=np.ndarray((width,), dtype, data, _ROOT + _up(28, np.dtype(dtype).itemsize)),
@@ -357,6 +373,17 @@ def _checked(places: np.ndarray, size: int, least: int) -> np.ndarray:
     """Places of nodes, all of them different and with so many bytes behind."""
     if len(places) and not (places.min() >= _ROOT and places.max() <= size - least):
         raise ValueError(f"a node lies outside of the grid's {size} bytes")
+    if (places % _ALIGN).any():
+        raise ValueError(f"a node lies at no multiple of {_ALIGN} bytes")
     if len(np.unique(places)) != len(places):
         raise ValueError("several places of the tree share a node")
     return places
+
+
+def _check_apart(places: Sequence[np.ndarray], sizes: Sequence[int]) -> None:
+    """Raises ValueError where nodes lie over each other; by level: places, bytes of one."""
+    begin = np.concatenate(places)
+    order = np.argsort(begin)
+    end = begin + np.repeat(sizes, [len(part) for part in places])
+    if (end[order][:-1] > begin[order][1:]).any():
+        raise ValueError("nodes of the tree lie over each other")

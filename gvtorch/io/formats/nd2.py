@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ...base.digits import whole_number
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
 from ...base.units import spacing_of
 from ..source import Index, VolumeSource
@@ -53,7 +54,8 @@ def open_nd2(path: str, key: str | None = None) -> Nd2Source:
         if others:
             raise ValueError(f"{path}: has axes beside T, P, Z, C, Y, X: {others}")
         positions = int(sizes.get("P", 1))
-        if key is not None and not (key.isdigit() and int(key) < positions):
+        position = 0 if key is None else whole_number(key)
+        if position is None or position >= positions:
             raise ValueError(f"{path}: has no position {key!r}; it holds 0 to {positions - 1}")
         dtype = np.dtype(file.dtype).str
         info, spacing, lost = _told(file, sizes)
@@ -71,7 +73,7 @@ def open_nd2(path: str, key: str | None = None) -> Nd2Source:
         spacing=spacing,
         info=info,
         lost=tuple(lost),
-        position=int(key or 0),
+        position=position,
     )
 
 

@@ -6,8 +6,10 @@ Source: "NIfTI-1 data format", nifti1.h (nifti.nimh.nih.gov), dim, xyzt_units, i
 
 from __future__ import annotations
 
+import logging
 import math
 import os
+import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,7 +29,7 @@ class NiftiSource(VolumeSource):
     """A NIfTI image, its values scaled as the header tells."""
 
     def read_stored(self, index: Index) -> np.ndarray:
-        data = _load(self.path).dataobj
+        data = _load(self.path)[0].dataobj
         if self.whole and data.dtype.str == self.stored and (data.slope, data.inter) == (1, 0):
             # nibabel takes several times the memory.
             told: dict[str, Any] = {"path": self.path, "axes": self.axes, "stored": self.stored}
@@ -41,7 +43,7 @@ class NiftiSource(VolumeSource):
 @Format("NIfTI", ".nii", ".nii.gz", library="nibabel")
 def open_nifti(path: str) -> NiftiSource:
     """Opens an image; its first voxel tells the dtype after scaling."""
-    image = _load(path)
+    image, mended = _load(path)
     shape = tuple(int(n) for n in image.shape)
     packed = path.lower().endswith(".gz")
     need, size = math.prod(shape) * image.dataobj.dtype.itemsize, os.stat(path).st_size
@@ -67,7 +69,7 @@ def open_nifti(path: str) -> NiftiSource:
         stored=first.dtype.str,
         whole=packed,
         info=info,
-        lost=tuple(lost),
+        lost=(*mended, *lost),
         **told | {"axes": told["axes"] + "-" * len(shape[5:])},
     )
 
@@ -118,7 +120,32 @@ def _components(data: np.ndarray) -> np.ndarray:
     return parts[..., None, :] if parts.ndim == 4 else parts
 
 
-def _load(path: str) -> Any:
+class _Heard(logging.Filter):
+    """Keeps what nibabel tells of a header while one is read, which it would print."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines = threading.local()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether somebody else reads."""
+        lines: list[str] | None = getattr(self.lines, "here", None)
+        if lines is not None:
+            lines.append(record.getMessage())
+        return lines is None
+
+
+_HEARD = _Heard()
+
+
+def _load(path: str) -> tuple[Any, list[str]]:
+    """The image, and what nibabel mended in its header."""
     import nibabel
 
-    return nibabel.load(path)
+    nibabel.imageglobals.logger.addFilter(_HEARD)  # once, however often
+    heard: list[str] = []
+    _HEARD.lines.here = heard
+    try:
+        return nibabel.load(path), heard
+    finally:
+        _HEARD.lines.here = None

@@ -193,14 +193,14 @@ def _affine(header: dict[str, Any], letters: str) -> np.ndarray:
     directions = _directions(header, len(letters))[spatial, :3]
     spacings = _spacings(header, len(letters))[spatial]
     affine = np.eye(4)
-    if np.isfinite(directions).all():
+    if not np.isnan(directions).all():
         affine[:3, :3] = directions.T
-    elif np.isfinite(spacings).all():
-        affine[:3, :3] = np.diag(spacings)
+    elif not np.isnan(spacings).all():
+        affine[:3, :3] = np.diag(np.where(np.isnan(spacings), 1, spacings))
     origin = np.asarray(header.get("space origin", np.zeros(3)), dtype=np.float64)
-    if origin.shape in ((3,), (4,)) and np.isfinite(origin[:3]).all():
+    if origin.shape in ((3,), (4,)) and not np.isnan(origin[:3]).all():
         affine[:3, 3] = origin[:3]
-    return affine
+    return affine  # what is told and no number is refused by `place_axes`
 
 
 def _info(

@@ -36,7 +36,8 @@ from .format import Format
 _MAGIC = 0x56444220
 _VERSIONS = range(220, 225)
 _MASKED = 222  # the version from which on values are packed by masks, and grids tell their packing
-_MOST_GRIDS, _MOST_TOLD, _MOST_NAME = 4096, 65536, 1 << 20
+_MOST_GRIDS, _MOST_TOLD = 4096, 65536
+_MOST_NAME, _MOST_TEXT = 4096, 1 << 20  # bytes of a name, of what metadata are called
 _ZIP, _ACTIVE, _BLOSC = 1, 2, 4
 _TYPES: dict[str, tuple[str, int]] = {
     "float": ("<f4", 1),
@@ -61,16 +62,17 @@ _MAPS = {
 
 
 class Cursor:
-    """Reads a file's bytes from a place on."""
+    """Reads a file's bytes from a place on, up to another or their end."""
 
-    def __init__(self, data: Any, at: int = 0) -> None:
+    def __init__(self, data: Any, at: int = 0, end: int | None = None) -> None:
         self.data, self.at = data, at
+        self.end = len(data) if end is None else end
 
     def skip(self, count: int) -> int:
         """Goes on by so many bytes; returns where they begin."""
         begin = self.at
-        if count < 0 or begin + count > len(self.data):
-            raise ValueError(f"ends at {len(self.data)}, within {count} bytes from {begin} on")
+        if count < 0 or begin + count > self.end:
+            raise ValueError(f"ends at {self.end}, within {count} bytes from {begin} on")
         self.at = begin + count
         return begin
 
@@ -96,10 +98,10 @@ class Cursor:
         """Reads (count,) bool."""
         return bits(self.data, self.skip(count // 8), count)
 
-    def text(self) -> str:
+    def text(self, most: int = _MOST_NAME) -> str:
         """Reads a string."""
         length = self.number("<I")
-        if length > _MOST_NAME:
+        if length > most:
             raise ValueError(f"has a name of {length} bytes")
         return self.take(length).decode("utf-8", "replace")
 
@@ -110,7 +112,8 @@ class Cursor:
         if count > _MOST_TOLD:
             raise ValueError(f"has {count} metadata")
         for _ in range(count):
-            name, kind, size = self.text(), self.text(), self.number("<I")
+            name, kind = self.text(_MOST_TEXT), self.text(_MOST_TEXT)
+            size = self.number("<I")
             value = self.take(size)
             if kind == "string":
                 found[name] = value.decode("utf-8", "replace")
@@ -130,6 +133,7 @@ class Entry:
     parent: str  # whose tree it shares
     at: int  # where it begins
     leaves_at: int
+    end: int
     compression: int = 0
     told: dict[str, Any] = field(default_factory=dict)
     affine: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -166,6 +170,9 @@ def open_openvdb(path: str, key: str | None = None) -> VdbSource:
                 raise ValueError(f"grid {entry.name!r} shares the tree of {entry.parent!r}, "
                                  "which is not there")  # fmt: skip
             number = owners[0]
+            if _kind(entries[number]) != _kind(entry):
+                raise ValueError(f"grid {entry.name!r} is a {entry.tree}, the tree that it shares "
+                                 f"is a {entries[number].tree}")  # fmt: skip
         _read_head(data, entry, version)
     kind = _kind(entry)
     dtype, width = _TYPES[kind]
@@ -223,10 +230,15 @@ def _entries(data: Any) -> tuple[int, list[Entry]]:
     for _ in range(count):
         unique, tree, parent = cursor.text(), cursor.text(), cursor.text()
         at, leaves_at, end = cursor.numbers("<3q")
-        if not 0 <= at <= leaves_at <= end <= len(data):
-            raise ValueError(f"a grid from {at} to {end} in a file of {len(data)} bytes")
+        begin = cursor.at
+        ordered = at <= end if parent else at <= leaves_at <= end  # one that shares has no leaves
+        if not (begin <= at and ordered and end <= len(data)):
+            raise ValueError(
+                f"a grid from {at} to {end}, its leaves at {leaves_at}, in a file of {len(data)} "
+                f"bytes; expected in this order, from {begin} on"
+            )
         half = tree.endswith("_HalfFloat")
-        entry = Entry(unique, tree.removesuffix("_HalfFloat"), half, parent, at, leaves_at)
+        entry = Entry(unique, tree.removesuffix("_HalfFloat"), half, parent, at, leaves_at, end)
         entry.compression = _ZIP if packed else 0
         entries.append(entry)
         cursor.at = end  # what is told of the next one
@@ -235,7 +247,7 @@ def _entries(data: Any) -> tuple[int, list[Entry]]:
 
 def _read_head(data: Any, entry: Entry, version: int) -> None:
     """Adds what stands before a grid's tree: packing, metadata, transform."""
-    cursor = Cursor(data, entry.at)
+    cursor = Cursor(data, entry.at, entry.end)
     if version >= _MASKED:
         entry.compression = cursor.number("<I")
     entry.told = cursor.told()
@@ -346,21 +358,21 @@ class VdbGrid(SparseGrid):
         kind = _kind(entry)
         name, width = _TYPES[kind]
         dtype = np.dtype(name)
-        cursor = Cursor(data, entry.tree_at)
+        cursor = Cursor(data, entry.tree_at, entry.end)
         if (buffers := cursor.number("<I")) != 1:
             raise ValueError(f"grid {entry.name!r} has {buffers} buffers; expected 1")
         background = cursor.array(dtype, width)
         stored = np.dtype("<f2") if entry.half and dtype.kind == "f" else dtype
         compression = entry.compression
         packing = _Packing(stored, dtype, width, background, compression, version >= _MASKED)
-        topology = _Topology(cursor, packing)
+        topology = _Topology(cursor, packing).read(kind, entry.leaves_at)
         return cls(
             dtype=dtype,
             background=background,
             data=data,
             kind=kind,
             packing=packing,
-            **topology.read(Cursor(data, entry.leaves_at), kind),
+            **topology,
         )
 
     def tiles(self, level: int, number: int) -> tuple[np.ndarray, np.ndarray]:
@@ -398,9 +410,9 @@ class _Topology:
         self.origins: tuple[list[Any], ...] = ([], [], [])
         self.places: tuple[list[Any], ...] = ([], [], [])
 
-    def read(self, leaves: Cursor, kind: str) -> dict[str, Any]:
+    def read(self, kind: str, leaves_at: int) -> dict[str, Any]:
         """Returns `origins`, `places`, `root_places` and `root_values` of a `VdbGrid`; the values
-        of leaves begin at `leaves`.
+        of leaves follow, which is where the file tells that they begin.
         """
         cursor, packing = self.cursor, self.packing
         tiles, children = cursor.numbers("<2I")
@@ -411,7 +423,9 @@ class _Topology:
             self._node(0, np.array(cursor.numbers("<3i"), np.int64))
         counts, none = self.places[2], np.zeros((0, 3), np.int64)
         active = np.concatenate(counts) if counts else none[:, 0]
-        places = self._leaves(leaves, kind, active.tolist())
+        if cursor.at != leaves_at:
+            raise ValueError(f"leaves begin at {leaves_at}, the nodes above end at {cursor.at}")
+        places = self._leaves(kind, active.tolist())
         return {
             "origins": tuple(np.concatenate([none, *part]) for part in self.origins),
             "places": (
@@ -441,9 +455,9 @@ class _Topology:
         self.origins[2].append(corners)
         self.places[2].append(np.unpackbits(masks, axis=1).sum(1, dtype=np.int64))
 
-    def _leaves(self, cursor: Cursor, kind: str, active: list[int]) -> np.ndarray:
+    def _leaves(self, kind: str, active: list[int]) -> np.ndarray:
         """Where the values of each leaf begin; so many voxels of each are active."""
-        places = np.empty(len(active), np.int64)
+        cursor, places = self.cursor, np.empty(len(active), np.int64)
         for number, count in enumerate(active):
             places[number] = cursor.skip(VOXELS // 8)
             if kind == "mask":

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ...base.digits import whole_number
 from ...base.image_info import ImageInfo, color_channels
 from ..source import ArraySource, Index, VolumeSource
 from ..tiff_info import Told, check_pictures, imagej_info, ome_info, opened
@@ -150,8 +151,9 @@ def _choose(path: str, series: Sequence[Any], key: str | None) -> int:
     if key is None:
         return 0
     found = [at for at, one in enumerate(series) if key == one.name]
-    if not found and key.isdigit() and int(key) < len(series):
-        found = [int(key)]
+    number = whole_number(key)
+    if not found and number is not None and number < len(series):
+        found = [number]
     if not found:
         names = ", ".join(f"{at} {one.name!r}" for at, one in enumerate(series))
         raise ValueError(f"{path}: has no series {key!r}; it holds {names}")

@@ -1,0 +1,199 @@
+"""`read_image`: PNG, TIFF, EXR and NumPy files as linear light; how they are written: files.py.
+
+What a header tells is compared with the file and with free memory before anything is unpacked: the
+libraries take the memory, and one of them ends the process where it is not there.
+Source: ISO/IEC 15948 (PNG), IHDR; OpenEXR file layout (attributes, box2i, chlist).
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import struct
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..base.messages import need_library
+from ..io.budget import MOST_PACKED, check_regular, header_budget
+from ..io.picture_size import picture_size
+from ..io.resources import amount, memory_free
+from ..io.source import told_as
+from ..io.tiff_info import check_pictures, opened
+from .tone import from_srgb
+
+_EXR = b"\x76\x2f\x31\x01"
+_MOST_HEAD = 1 << 20  # bytes
+_LOCK = threading.Lock()
+_COPIES = 6  # of 8 bytes a number, what is read and the steps to linear light
+
+
+def read_image(path: str | Path) -> Tensor:
+    """Reads a PNG (8 or 16 bits, sRGB), EXR, TIFF or NPY as linear light.
+
+    Returns:
+        (h, w, c) float32; c is 3, or 4 with alpha: straight from PNG and integer TIFF, whose colour
+        is decoded from sRGB, else as the file has it.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The ending is unknown, the file holds something else, or takes more memory than
+            is free or than it can be worth.
+        ImportError: The library for this kind of file is missing.
+    """
+    path = Path(path)
+    if path.suffix not in _READERS:
+        raise ValueError(f"read_image: path must end in {', '.join(_READERS)}, got {str(path)!r}")
+    if not path.exists():
+        raise FileNotFoundError(f"image not found: {path}")
+    with told_as(ValueError, str(path), "can't be read"):
+        check_regular(path)
+        with header_budget(str(path)):
+            pixels = _READERS[path.suffix](path)
+    if pixels.ndim != 3 or pixels.shape[-1] < 3 or pixels.dtype.kind not in "uf" or not pixels.size:
+        raise ValueError(f"{path}: must hold (h, w, 3) numbers, got {pixels.shape} {pixels.dtype}")
+    pixels = pixels[..., :4]
+    if pixels.dtype.kind == "f":
+        with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite
+            return torch.from_numpy(pixels.astype(np.float32))
+    image = torch.from_numpy(pixels.astype(np.float64) / np.iinfo(pixels.dtype).max)
+    return torch.cat((from_srgb(image[..., :3]), image[..., 3:]), -1).float()
+
+
+def _check_size(path: Path, shape: tuple[int, ...], itemsize: int, worth: int = 0) -> None:
+    """Raises ValueError for numbers that do not fit into free memory, or that so many bytes can't
+    unpack to (0: any).
+    """
+    count = math.prod(shape)
+    if count < 1 or (worth and count * itemsize > worth):
+        size = path.stat().st_size
+        raise ValueError(f"tells of {shape} numbers, which {size} bytes can't unpack to")
+    if 8 * _COPIES * count > (free := memory_free()):
+        needed = amount(8 * _COPIES * count)
+        raise ValueError(f"{shape} numbers take {needed} of memory, {amount(free)} are free")
+
+
+def _read_png(path: Path) -> np.ndarray:
+    from kornia_rs.io import read_image_png_u8, read_image_png_u16
+
+    with path.open("rb") as file:
+        head = file.read(26)
+    size = picture_size(head)
+    if len(head) < 26 or head[:8] != b"\x89PNG\r\n\x1a\n" or size is None:
+        raise ValueError("no PNG")
+    bits, kind = head[24], head[25]  # of the IHDR chunk
+    modes = {0: ("mono", 1), 2: ("rgb", 3), 6: ("rgba", 4)}
+    if bits not in (8, 16) or kind not in modes:
+        raise ValueError("a PNG must have 8 or 16 bits and no palette")
+    mode, channels = modes[kind]
+    _check_size(path, (*size[::-1], channels), bits // 8, MOST_PACKED * path.stat().st_size)
+    read = read_image_png_u8 if bits == 8 else read_image_png_u16
+    pixels = read(str(path), mode)
+    return np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, -1) if kind == 0 else pixels
+
+
+def _read_exr(path: Path) -> np.ndarray:
+    library = need_library(".exr", "OpenEXR", extra="image")
+    _check_exr(path)
+    with _quiet():
+        parts = library.File(str(path), separate_channels=True).parts
+    if not parts:
+        raise ValueError("damaged: its pixels can't be read")
+    channels = parts[0].channels
+    names = "RGBA" if "A" in channels else "RGB"
+    missing = [name for name in names if name not in channels]
+    if missing:
+        known = ", ".join(map(repr, channels))
+        raise ValueError(f"has no channel {missing[0]!r}; it has {known}")
+    return np.stack([channels[name].pixels for name in names], -1)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """OpenEXR writes to both streams what is wrong with a file, which is told in a line anyhow."""
+    with _LOCK, redirect_stdout(io.StringIO()), ExitStack() as stack:
+        with suppress(OSError):  # no stream of errors
+            stream = os.dup(2)
+            stack.callback(os.close, stream)
+            nothing = os.open(os.devnull, os.O_WRONLY)
+            stack.callback(os.close, nothing)
+            os.dup2(nothing, 2)
+            stack.callback(os.dup2, stream, 2)
+        yield
+
+
+def _check_exr(path: Path) -> None:
+    """Raises ValueError where the header tells of several parts, which are not read, or of more
+    pixels than the file can be worth: it holds an offset for each 256 lines, and OpenEXR takes
+    memory for all of them.
+    """
+    with path.open("rb") as file:
+        head = file.read(_MOST_HEAD)
+    if head[:4] != _EXR or len(head) < 8:
+        raise ValueError("no EXR")
+    if head[5] & 0x18:
+        raise ValueError("has several parts or deep pixels; expected one picture")
+    told = dict(_attributes(head))
+    if "dataWindow" not in told or "channels" not in told:
+        raise ValueError("damaged: its header tells no extent or no channels")
+    left, low, right, high = struct.unpack("<4i", told["dataWindow"])
+    count = sum(1 for _ in _channels(told["channels"]))
+    lines, size = high - low + 1, path.stat().st_size
+    shape = (lines, right - left + 1, count)
+    if min(shape) < 1 or lines // 256 * 8 > size:
+        raise ValueError(f"damaged: tells of {shape} numbers in {size} bytes")
+    _check_size(path, shape, 1, MOST_PACKED * size * 4)
+
+
+def _attributes(head: bytes) -> Iterator[tuple[str, bytes]]:
+    """Names and values of an EXR's header."""
+    at = 8
+    while head[at : at + 1] not in (b"", b"\0"):
+        name = head[at : head.index(b"\0", at)]
+        at += len(name) + 1
+        at = head.index(b"\0", at) + 1  # the kind
+        (size,) = struct.unpack_from("<i", head, at)
+        if not 0 <= size <= len(head) - at - 4:
+            raise ValueError(f"damaged: an attribute of {size} bytes")
+        yield name.decode("latin-1"), head[at + 4 : at + 4 + size]
+        at += 4 + size
+
+
+def _channels(told: bytes) -> Iterator[str]:
+    """Names of an EXR's channels; each takes 16 bytes behind its name."""
+    at = 0
+    while told[at : at + 1] not in (b"", b"\0"):
+        end = told.index(b"\0", at)
+        yield told[at:end].decode("latin-1")
+        at = end + 17
+
+
+def _read_npy(path: Path) -> np.ndarray:
+    """Mapped: a file that is shorter than its header tells is found out before memory is taken."""
+    mapped = np.lib.format.open_memmap(path, mode="r")
+    _check_size(path, mapped.shape, mapped.itemsize)
+    return mapped
+
+
+def _read_tiff(path: Path) -> np.ndarray:
+    need_library(".tif", "tifffile", extra="image")
+    with opened(str(path)) as (file, _):
+        series = file.series[0]
+        most = MOST_PACKED * path.stat().st_size
+        _check_size(path, tuple(series.shape), series.dtype.itemsize, most)
+        check_pictures(series.pages)
+        return series.asarray()
+
+
+_READERS: dict[str, Callable[[Path], np.ndarray]] = {
+    ".png": _read_png,
+    ".exr": _read_exr,
+    ".npy": _read_npy,
+    ".tif": _read_tiff,
+}
