@@ -53,7 +53,8 @@ def test_compiled_equals_reference(blobs, compiled, surface, look, dtype):
     assert torch.equal(one.samples, two.samples)
     torch.testing.assert_close(one.color, two.color, rtol=0, atol=1e-5)
     if compiled == "cpp":  # every bit but the last of colours, which torch sums over cones
-        last = torch.finfo(dtype).eps
+        # In float64 log2 and exp2 are torch's, which rounds as the processor's vectors do.
+        last = torch.finfo(dtype).eps * (1 if dtype == torch.float32 else 4)
         torch.testing.assert_close(one.color, two.color, rtol=0, atol=last)
         for name in ("alpha", "depth", "normal", "missed"):
             assert torch.equal(getattr(one, name), getattr(two, name)), name
