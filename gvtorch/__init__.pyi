@@ -4,13 +4,13 @@
 from .base.arrays import as_volume as as_volume
 from .base.image_info import ChannelInfo as ChannelInfo, ImageInfo as ImageInfo
 from .base.volume import Volume as Volume
-from .io.conversion import convert as convert, estimate as estimate
+from .io.stores.conversion import convert as convert, estimate as estimate
 from .io.mesh_file import read_mesh as read_mesh
 from .io.mesh_source import voxelize as voxelize
 from .io.point_file import PointFile as PointFile, read_points as read_points
 from .io.point_source import splat as splat
 from .io.reading import read_volume as read_volume
-from .io.store import Store as Store
+from .io.stores.store import Store as Store
 from .io.surface import export_surface as export_surface, extract_surface as extract_surface
 from .io.window import window as window
 from .meshes.mesh import Material as Material, Mesh as Mesh

@@ -18,8 +18,8 @@ from helpers.stores import noise, serving
 
 import gvtorch as gv
 from gvtorch.io import http, relay
-from gvtorch.io.chunk_files import HEADS, ChunkFiles, begin_read
-from gvtorch.io.store_layout import kvstore, opened_at
+from gvtorch.io.stores.chunk_files import HEADS, ChunkFiles, begin_read
+from gvtorch.io.stores.store_layout import kvstore, opened_at
 
 ts = pytest.importorskip("tensorstore")
 

@@ -20,12 +20,12 @@ from helpers import run
 from helpers.stores import assert_holds, noise, write_foreign
 
 import gvtorch as gv
-from gvtorch.io import conversion, conversion_plan, shard
-from gvtorch.io.conversion import convert, estimate
 from gvtorch.io.formats import FORMATS, find_format
 from gvtorch.io.reading import open_source
-from gvtorch.io.store import Store
-from gvtorch.io.store_layout import WORK
+from gvtorch.io.stores import conversion, conversion_plan, shard
+from gvtorch.io.stores.conversion import convert, estimate
+from gvtorch.io.stores.store import Store
+from gvtorch.io.stores.store_layout import WORK
 
 ELSEWHERE = {
     "DICOM",
@@ -300,8 +300,8 @@ def test_a_full_disk_is_told_and_goes_on(tmp_path, raw, data, monkeypatch):
 
 KILLED = """
 import sys, time
-from gvtorch.io import shard
-from gvtorch.io.conversion import convert
+from gvtorch.io.stores import shard
+from gvtorch.io.stores.conversion import convert
 original = shard.write_shard
 def slow(job, level, place):
     result = original(job, level, place)

@@ -13,10 +13,10 @@ from helpers import gvtorch
 from helpers.stores import assert_holds, noise
 
 import gvtorch as gv
-from gvtorch.io import conversion, shard, unfinished
-from gvtorch.io.conversion import convert
-from gvtorch.io.store import Store
-from gvtorch.io.store_layout import WORK
+from gvtorch.io.stores import conversion, shard, unfinished
+from gvtorch.io.stores.conversion import convert
+from gvtorch.io.stores.store import Store
+from gvtorch.io.stores.store_layout import WORK
 
 SHAPE = (20, 30, 260, 1)  # two shards a row
 

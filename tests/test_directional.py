@@ -11,7 +11,7 @@ from helpers.rays import rays_along
 
 import gvtorch as gv
 from gvtorch.base.volume import DIRECTIONS
-from gvtorch.io.conversion import convert
+from gvtorch.io.stores.conversion import convert
 from gvtorch.pool.downsample import pool_directional
 from gvtorch.pool.pyramid import volume_levels
 

@@ -24,9 +24,9 @@ from helpers.stores import noise, write_foreign
 
 import gvtorch as gv
 from gvtorch.io import http, relay
-from gvtorch.io.conversion import convert
 from gvtorch.io.http import read_http
-from gvtorch.io.store import Store
+from gvtorch.io.stores.conversion import convert
+from gvtorch.io.stores.store import Store
 
 MEMORY = 300 << 20  # bytes that reading may take
 VIEW = gv.Camera.orbit(width=128, height=48)
@@ -238,7 +238,7 @@ def test_chunks_and_indices_of_other_writers(server, tmp_path, data, kind, how):
 def test_buckets_are_read_within_bounds(tmp_path, data, how, monkeypatch):
     import tensorstore as ts
 
-    from gvtorch.io.store_layout import context
+    from gvtorch.io.stores.store_layout import context
 
     stalls = pytest.MonkeyPatch()
     sharded, url = how == "index", f"memory://endless-{how}/"

@@ -22,12 +22,12 @@ from helpers.stores import assert_holds, noise
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import gvtorch as gv
-from gvtorch.io import conversion, shard
-from gvtorch.io.conversion import convert
-from gvtorch.io.level_reader import StoredArray
 from gvtorch.io.source import VolumeSource
-from gvtorch.io.store import Store
-from gvtorch.io.store_layout import WORK, Deadline
+from gvtorch.io.stores import conversion, shard
+from gvtorch.io.stores.conversion import convert
+from gvtorch.io.stores.level_reader import StoredArray
+from gvtorch.io.stores.store import Store
+from gvtorch.io.stores.store_layout import WORK, Deadline
 
 VIEW = gv.Camera.orbit(width=24, height=16)
 

@@ -13,7 +13,7 @@ import torch
 from helpers import gvtorch
 
 import gvtorch as gv
-from gvtorch.io.store_layout import WORK
+from gvtorch.io.stores.store_layout import WORK
 
 MISTY = gv.TransferFunction([(30, 0), (250, 0.08)], [(30, 1, 0.3, 0.1), (250, 1, 1, 1)])
 OPAQUE = gv.TransferFunction([(100, 0), (120, 0.9)], [(100, 1, 0.3, 0.1), (250, 1, 1, 1)])

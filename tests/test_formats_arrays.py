@@ -10,10 +10,10 @@ import torch
 from helpers.stores import noise
 
 import gvtorch as gv
-from gvtorch.io import conversion_plan
 from gvtorch.io.arrays import ObjectSource
-from gvtorch.io.conversion import convert
 from gvtorch.io.reading import open_source
+from gvtorch.io.stores import conversion_plan
+from gvtorch.io.stores.conversion import convert
 
 xarray = pytest.importorskip("xarray")
 dask = pytest.importorskip("dask.array")

@@ -14,8 +14,8 @@ from helpers.damage import assert_told
 from helpers.stores import noise
 
 import gvtorch as gv
-from gvtorch.io.conversion import convert
 from gvtorch.io.reading import open_source
+from gvtorch.io.stores.conversion import convert
 
 czi = pytest.importorskip("pylibCZIrw.czi")
 

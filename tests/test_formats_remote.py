@@ -16,8 +16,8 @@ from helpers.stores import noise
 
 import gvtorch as gv
 from gvtorch.io import remote
-from gvtorch.io.conversion import convert
-from gvtorch.io.store import Store
+from gvtorch.io.stores.conversion import convert
+from gvtorch.io.stores.store import Store
 
 
 class Server(ThreadingHTTPServer):
@@ -233,7 +233,7 @@ def test_a_server_without_an_end_is_given_up(pause, monkeypatch):
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Endless)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     monkeypatch.setattr(Endless, "pause", pause)
-    monkeypatch.setattr("gvtorch.io.store._OPEN_TIMEOUT", 1.0)
+    monkeypatch.setattr("gvtorch.io.stores.store._OPEN_TIMEOUT", 1.0)
     url = f"http://127.0.0.1:{server.server_port}/a.zarr"
     try:
         with pytest.raises(OSError, match=r"more than 16777216 bytes|no answer within 1 s"):

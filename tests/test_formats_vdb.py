@@ -30,8 +30,8 @@ from helpers.vdb import (
 )
 
 import gvtorch as gv
-from gvtorch.io import conversion_plan
 from gvtorch.io.reading import open_source
+from gvtorch.io.stores import conversion_plan
 
 pytest.importorskip("imagecodecs")
 

@@ -32,7 +32,8 @@ SECONDS = 8  # of processor time a file
 READER = """
 import json, resource, sys, time, warnings
 import gvtorch as gv
-from gvtorch.io import budget, conversion_plan
+from gvtorch.io import budget
+from gvtorch.io.stores import conversion_plan
 from gvtorch.io.reading import open_source
 warnings.simplefilter("ignore")
 budget.SECONDS, budget.SECONDS_A_BYTE = 0.3, 0

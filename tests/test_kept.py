@@ -16,7 +16,7 @@ from helpers import TESTS
 from helpers.stores import assert_holds
 
 import gvtorch as gv
-from gvtorch.io.store import Store
+from gvtorch.io.stores.store import Store
 
 KEPT = TESTS / "data" / "kept"
 Z, Y, X = np.mgrid[0:10, 0:11, 0:12]

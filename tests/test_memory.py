@@ -14,8 +14,8 @@ from helpers.stores import noise
 
 import gvtorch as gv
 from gvtorch.engine import setup
-from gvtorch.io import conversion
 from gvtorch.io.reading import open_source
+from gvtorch.io.stores import conversion
 
 
 @pytest.mark.parametrize("channels", ["value", "both"])

@@ -16,9 +16,9 @@ import torch
 from helpers import gvtorch, meshes
 
 import gvtorch as gv
-from gvtorch.io import shard
-from gvtorch.io.channels import channel_names
-from gvtorch.io.store_layout import WORK
+from gvtorch.io.stores import shard
+from gvtorch.io.stores.channels import channel_names
+from gvtorch.io.stores.store_layout import WORK
 from gvtorch.meshes.voxelizer import Voxelizer
 from gvtorch.producers import Layout, Nodes, Region
 

@@ -12,9 +12,9 @@ import torch
 from helpers import gvtorch, meshes, shared
 
 import gvtorch as gv
-from gvtorch.io import shard
 from gvtorch.io.mesh_source import MeshSource
-from gvtorch.io.store_layout import WORK
+from gvtorch.io.stores import shard
+from gvtorch.io.stores.store_layout import WORK
 from gvtorch.meshes.voxelizer import Voxelizer
 
 trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed")

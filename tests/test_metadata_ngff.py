@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 
 import gvtorch as gv
 from gvtorch.base.image_info import ChannelInfo, ImageInfo
-from gvtorch.io.conversion import convert
-from gvtorch.io.store import Store
+from gvtorch.io.stores.conversion import convert
+from gvtorch.io.stores.store import Store
 from gvtorch.tools.cli import main
 
 names = st.text(st.characters(codec="utf-8", exclude_categories=["Cs"]), max_size=12)
@@ -73,8 +73,8 @@ def test_what_ngff_holds_comes_back(tmp_path, info, times, spacing, origin, dtyp
         expected = ImageInfo(**{**vars(info), "time_step": None, "time_unit": None})
         expected = ImageInfo(**{**vars(expected), "time_origin": 0.0})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gvtorch.io.conversion_plan.open_source", lambda *_, **__: source)
-        patch.setattr("gvtorch.io.unfinished.fingerprint", lambda _: [])
+        patch.setattr("gvtorch.io.stores.conversion_plan.open_source", lambda *_, **__: source)
+        patch.setattr("gvtorch.io.stores.unfinished.fingerprint", lambda _: [])
         store = convert("a", tmp_path / "a.zarr", workers=1)
     yaozarrs.validate_zarr_store(str(tmp_path / "a.zarr"))
     for found in (store, convert(tmp_path / "a.zarr", tmp_path / "b.zarr", workers=1)):

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 import gvtorch as gv
 from gvtorch.base.image_info import ImageInfo
-from gvtorch.io.conversion import convert
 from gvtorch.io.oblique import straighten
 from gvtorch.io.reading import open_source
 from gvtorch.io.source import MemorySource, place_axes
+from gvtorch.io.stores.conversion import convert
 
 nibabel = pytest.importorskip("nibabel")
 SIZE = (14, 11, 9)  # voxels along the stored axes

@@ -17,9 +17,9 @@ from helpers import ROOT
 from helpers.stores import assert_holds, noise
 
 import gvtorch as gv
-from gvtorch.io.conversion import convert
-from gvtorch.io.store import Store
-from gvtorch.io.store_layout import WORK
+from gvtorch.io.stores.conversion import convert
+from gvtorch.io.stores.store import Store
+from gvtorch.io.stores.store_layout import WORK
 from gvtorch.tools import cli
 from gvtorch.tools.cli import main
 
@@ -171,7 +171,7 @@ def test_links_to_names_that_are_no_text_go_with_the_process(tmp_path, data):
 INTERRUPTED = """
 import signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background ignore it
-from gvtorch.io import conversion_plan, shard
+from gvtorch.io.stores import conversion_plan, shard
 from gvtorch.tools.cli import main
 original = shard.write_shard
 def slow(task, level, place):

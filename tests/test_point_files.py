@@ -8,8 +8,8 @@ from helpers import gvtorch, shared
 from helpers.damage import break_file
 
 import gvtorch as gv
-from gvtorch.io import shard
-from gvtorch.io.store_layout import WORK
+from gvtorch.io.stores import shard
+from gvtorch.io.stores.store_layout import WORK
 from gvtorch.points.splat import region
 
 RANDOM = np.random.default_rng(7)

@@ -20,7 +20,7 @@ from helpers.pictures import GRAY, assert_same_picture
 from helpers.stores import noise
 
 import gvtorch as gv
-from gvtorch.io.conversion import convert
+from gvtorch.io.stores.conversion import convert
 
 VIEW = gv.Camera.orbit(width=16, height=12)
 

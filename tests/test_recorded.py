@@ -20,7 +20,7 @@ import gvtorch as gv
 from gvtorch.base.constants import REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUEST_SUBDIVIDE
 from gvtorch.engine import host_frame
 from gvtorch.engine.device_frame import DeviceFrame
-from gvtorch.io.conversion import convert
+from gvtorch.io.stores.conversion import convert
 
 COMPILED = [pytest.param(b, marks=pytest.mark.backend(b)) for b in ("cpp", "cuda")]
 LOOK = gv.TransferFunction.from_points(

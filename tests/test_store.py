@@ -18,9 +18,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import gvtorch as gv
-from gvtorch.io.conversion import convert
-from gvtorch.io.level_reader import StoreError
-from gvtorch.io.store import Store
+from gvtorch.io.stores.conversion import convert
+from gvtorch.io.stores.level_reader import StoreError
+from gvtorch.io.stores.store import Store
 from gvtorch.pool.downsample import pool_mean
 
 DTYPES = ["uint8", "int8", "uint16", "int16", "float16", "float32"]
@@ -389,7 +389,7 @@ def test_levels_that_are_missing_are_made_once(tmp_path, monkeypatch):
     write_foreign(tmp_path, [data[..., 0]], "zyx", [[1.0] * 3])
     store = Store.open(tmp_path)
     assert_holds(store, data)
-    from gvtorch.io import level_reader
+    from gvtorch.io.stores import level_reader
 
     monkeypatch.setattr(level_reader, "pool_mean", lambda *_: pytest.fail("made again"))
     store.read_region(2, (0, 0, 0), (35, 3, 3))
@@ -431,7 +431,7 @@ def test_reads_end_in_time(served):
 
 
 def test_stores_in_memory_open_too():
-    from gvtorch.io.store_layout import context
+    from gvtorch.io.stores.store_layout import context
 
     root = ts.KvStore.open("memory://gvtorch-test/", context=context()).result()
     image = {"axes": ["z", "y", "x"], "datasets": [{"path": "0"}]}

@@ -17,8 +17,8 @@ from helpers.stores import Handler, serving
 import gvtorch as gv
 from gvtorch.bench.storage import Memory
 from gvtorch.engine import ProductionError
-from gvtorch.io.conversion import convert
-from gvtorch.io.store import Store
+from gvtorch.io.stores.conversion import convert
+from gvtorch.io.stores.store import Store
 from gvtorch.producers.stored import HostCache
 
 GRAY = gv.TransferFunction.preset("gray", 0, 255)

@@ -15,9 +15,9 @@ from helpers.stores import assert_holds, noise, write_foreign
 
 import gvtorch as gv
 from gvtorch.base.image_info import ChannelInfo, ImageInfo
-from gvtorch.io import conversion_plan, shard
-from gvtorch.io.conversion import convert, estimate
-from gvtorch.io.store import Store
+from gvtorch.io.stores import conversion_plan, shard
+from gvtorch.io.stores.conversion import convert, estimate
+from gvtorch.io.stores.store import Store
 
 TIMES = 3
 

@@ -16,7 +16,7 @@ from helpers.stores import noise
 from helpers.viewer import FUNCTION, SOON, Grown, Page, bright_ball, pixels, turned
 
 import gvtorch as gv
-from gvtorch.io.conversion import convert
+from gvtorch.io.stores.conversion import convert
 from gvtorch.viewer.nodes import node_boxes
 from gvtorch.viewer.slices import Planes, panes
 from gvtorch.viewer.state import Development, Eye, Slices

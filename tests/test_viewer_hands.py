@@ -13,7 +13,7 @@ from helpers.stores import noise
 from helpers.viewer import BANDS, Grown
 
 import gvtorch as gv
-from gvtorch.io.conversion import convert
+from gvtorch.io.stores.conversion import convert
 from gvtorch.viewer.state import Development
 
 pytestmark = pytest.mark.backend("browser")

@@ -24,7 +24,7 @@ from helpers.stores import Handler, noise
 from helpers.viewer import SOON, Page, turned
 
 import gvtorch as gv
-from gvtorch.io.conversion import convert
+from gvtorch.io.stores.conversion import convert
 from gvtorch.viewer import schema
 from gvtorch.viewer.protocol import MESSAGES
 from gvtorch.viewer.session import Session

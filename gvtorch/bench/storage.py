@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from ..io.conversion import convert as convert_volume
-from ..io.store import Store
+from ..io.stores.conversion import convert as convert_volume
+from ..io.stores.store import Store
 from . import PEERS
 from .record import Record, clock, spread
 

@@ -26,12 +26,12 @@ from ..base.stage import Progress, no_progress
 from ..meshes.holes import Solid, check_solid, prepared, told_of_holes
 from ..meshes.mesh import Material, Mesh
 from ..meshes.voxelizer import CHANNELS, Voxelizer, check_channels
-from .channels import convert_channels
-from .conversion import convert
 from .mesh_file import read_mesh
 from .source import VolumeSource
-from .store import Store
-from .unfinished import fingerprint
+from .stores.channels import convert_channels
+from .stores.conversion import convert
+from .stores.store import Store
+from .stores.unfinished import fingerprint
 
 _LOCK = threading.Lock()
 

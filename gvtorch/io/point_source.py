@@ -22,12 +22,12 @@ from ..base.stage import Progress, no_progress
 from ..points.points import Points
 from ..points.sorted import PointSource, SortedPoints, sort_points
 from ..points.splat import region
-from .conversion import convert
 from .point_file import ColumnNames, PointFile
 from .source import VolumeSource
-from .store import Store
-from .store_layout import WORK
-from .unfinished import fingerprint, is_begun, write_json
+from .stores.conversion import convert
+from .stores.store import Store
+from .stores.store_layout import WORK
+from .stores.unfinished import fingerprint, is_begun, write_json
 
 CHANNELS = ("value", "color")
 _MADE_OF = "made_of.json"

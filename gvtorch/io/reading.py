@@ -21,13 +21,13 @@ from ..base.volume import Volume, check_extent
 from .arrays import ObjectSource, as_source
 from .budget import check_files, check_regular, header_budget
 from .formats import FORMATS, find_format, split_path
-from .level_reader import no_time
-from .ngff import is_zarr
 from .oblique import Oblique, straighten
 from .remote import fetch, is_file_url, split_url
 from .resources import amount, memory_free
 from .source import ArraySource, MemorySource, VolumeSource, told_as
-from .store_layout import DTYPES, MOST_TIMES, MOST_VOXELS, StoreError
+from .stores.level_reader import no_time
+from .stores.ngff import is_zarr
+from .stores.store_layout import DTYPES, MOST_TIMES, MOST_VOXELS, StoreError
 
 _MOST_CHANNELS = 2**10
 

@@ -37,7 +37,7 @@ from .http import (
 if TYPE_CHECKING:  # not when the program starts: `gvtorch --help` comes this way
     import numpy as np
 
-    from .chunk_files import ChunkFiles
+    from .stores.chunk_files import ChunkFiles
 
 _JOINED = 1 << 27  # bytes of parts that tensorstore asks for together
 _METADATA = 1 << 24  # bytes
@@ -75,7 +75,7 @@ class Relayed:
     @property
     def files(self) -> ChunkFiles | None:
         """What its chunks may be; None before the array is open."""
-        from .chunk_files import ChunkFiles
+        from .stores.chunk_files import ChunkFiles
 
         future = self._future
         if future is not None and future.done():
@@ -85,7 +85,7 @@ class Relayed:
 
     def read(self, name: str, part: slice | None) -> bytes | None:
         """Returns a file, or a part of it; raises as `read_http`."""
-        from .chunk_files import HEADS
+        from .stores.chunk_files import HEADS
 
         url = file_url(self.url, name)
         try:

@@ -28,7 +28,7 @@ from ..base.image_info import ImageInfo
 from ..base.labels import check_narrowed
 from ..base.messages import one_line
 from . import boxes
-from .store_layout import value_dtype
+from .stores.store_layout import value_dtype
 
 Index = tuple[slice, ...]
 _PART = 1 << 20  # bytes that are unpacked at a time

@@ -24,7 +24,7 @@ from ..meshes.contour import contour, edge_of
 from ..meshes.mesh import Mesh
 from ..pool import N3Tree
 from .boxes import clamp, repeat_edges
-from .store import CELL, Store
+from .stores.store import CELL, Store
 from .surface_file import SurfaceFile, check_surface_path
 
 _BLOCK = 64  # cells along a side

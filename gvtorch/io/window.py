@@ -15,7 +15,7 @@ from ..base import check
 from ..base.volume import Volume, to_numpy
 from ..pool.downsample import pool_mean
 from .boxes import Zyx
-from .store import Store
+from .stores.store import Store
 
 _MOST = 2**22  # voxels that are looked at
 _BOXES = 4  # along each axis, of voxels that stand for all

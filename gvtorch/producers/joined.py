@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..io.channels import channel_names
-from ..io.store import Store
+from ..io.stores.channels import channel_names
+from ..io.stores.store import Store
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions, arrived, grid_of
 from .stored import StoredProducer
 

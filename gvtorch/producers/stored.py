@@ -21,7 +21,7 @@ from numpy.lib.stride_tricks import as_strided
 from ..base import check
 from ..base.stage import stage
 from ..io.boxes import grouped
-from ..io.store import Store
+from ..io.stores.store import Store
 from ..pool import Channel
 from ..pool.pyramid import NodeSummary
 from .answer import regions_of

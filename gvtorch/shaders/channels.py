@@ -14,7 +14,7 @@ from ..base import check
 from ..base.image_info import ChannelInfo
 from ..base.srgb import from_srgb
 from ..base.volume import Volume
-from ..io.store import Store
+from ..io.stores.store import Store
 from ..io.window import windows
 from ..ops.shading import Triple
 from .colors import linear_color as named_color

@@ -24,9 +24,9 @@ from ..base import check
 from ..base.checked import Check, instance_of, whole
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume
-from ..io.coarse import make_channel
-from ..io.store import Store
-from ..io.store_layout import CoarseChannel
+from ..io.stores.coarse import make_channel
+from ..io.stores.store import Store
+from ..io.stores.store_layout import CoarseChannel
 from ..ops import ShadeArguments, cut_bricks
 from ..ops.shading import FilteredNumbers
 from ..pool import Channel, N3Tree

@@ -27,7 +27,7 @@ from tyro.conf import Positional, arg
 
 from ..base.declared import did_you_mean
 from ..base.messages import one_line, printable
-from ..io.ngff import is_zarr
+from ..io.stores.ngff import is_zarr
 from .bench import Bench
 from .common import Bar, ReadOptions, given, refuse_for_store, volume_formats
 from .fly import Fly
@@ -58,7 +58,7 @@ class Info:
                 raise ValueError(f"{flags[0]} is for volume files: name one")
             content = installation()
         elif is_zarr(self.path):
-            from ..io.store import Store
+            from ..io.stores.store import Store
 
             refuse_for_store(self.source, "--key")
             store = Store.open(self.path, image=self.source.key, time=self.source.time or 0)
@@ -105,7 +105,7 @@ class Convert:
 
     def run(self) -> None:
         """Converts, or tells what it would take."""
-        from ..io.conversion import convert, estimate
+        from ..io.stores.conversion import convert, estimate
 
         self.making.check()
         common: dict[str, Any] = {**self.source.options(), "threshold": self.threshold}
@@ -144,7 +144,7 @@ class Filter:
     def run(self) -> None:
         """Adds the colours."""
         from ..io.resources import amount
-        from ..io.store import Store
+        from ..io.stores.store import Store
         from ..ops import available
         from ..shaders import Filtered
         from .colors import chosen_transfer

@@ -9,7 +9,7 @@ from .common import numbers
 
 if TYPE_CHECKING:
     from ..base.volume import Volume
-    from ..io.store import Store
+    from ..io.stores.store import Store
     from ..shaders import TransferFunction
 
 _ENDINGS = (".json", ".vp", ".xml")  # of files of transfer functions

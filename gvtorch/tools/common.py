@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import FlagCreatePairsOff, arg
 
 from ..base.digits import whole_number
-from ..io.ngff import is_zarr
+from ..io.stores.ngff import is_zarr
 
 if TYPE_CHECKING:
     from ..base.volume import Volume
-    from ..io.store import Store
+    from ..io.stores.store import Store
 
 
 def volume_formats() -> str:
@@ -134,7 +134,7 @@ def refuse_for_store(source: ReadOptions, *known: str) -> None:
 
 def open_data(path: str, source: ReadOptions, *, image: str | None, level: int) -> Volume | Store:
     """Opens a store, or reads a volume; raises ValueError where a flag is for the other of both."""
-    from ..io.store import Store
+    from ..io.stores.store import Store
 
     if is_zarr(path):
         refuse_for_store(source)

@@ -18,7 +18,7 @@ from ..base.declared import declared_names
 from ..base.digits import whole_number
 from ..base.messages import printable
 from ..base.whole_file import write_whole
-from ..io.ngff import is_zarr
+from ..io.stores.ngff import is_zarr
 from .common import Bar, given, size, volume_formats
 from .drawn import Drawn
 from .look import first_orbit, parse_camera, parse_orbit, stance
@@ -225,7 +225,7 @@ class Fly:
     def _times_there(self) -> int:
         """How many time points the data have."""
         from ..io.reading import open_source
-        from ..io.store import Store
+        from ..io.stores.store import Store
 
         if is_zarr(self.path):
             return Store.open(self.path, image=self.scene.streaming.image).times

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..cameras import Camera
     from ..cameras.camera import Up
     from ..cameras.models import CameraModel
-    from ..io.store import Store
+    from ..io.stores.store import Store
     from ..shaders import Channels, Labels, Shader, StoredColor
     from ..tracing import Clip, ThinLens
 

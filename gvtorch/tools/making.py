@@ -18,7 +18,7 @@ from .common import Bar
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from ..io.store import Store
+    from ..io.stores.store import Store
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from tyro.conf import arg
 
-from ..io.ngff import is_zarr
+from ..io.stores.ngff import is_zarr
 from .common import Bar, ReadOptions, given, refuse_for_store
 from .look import Look
 from .streaming import Streaming, tell_failures
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ..base.volume import Volume
     from ..cameras import Camera
     from ..engine import Engine
-    from ..io.store import Store
+    from ..io.stores.store import Store
     from ..pictures import Picture
     from ..shaders import Shader
     from ..tracing import Cost

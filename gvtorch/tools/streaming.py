@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..base.records import RenderStats
     from ..base.volume import Volume
     from ..engine import Engine, FrameStats
-    from ..io.store import Store
+    from ..io.stores.store import Store
     from ..producers import Producer
     from ..shaders import Shader
 
@@ -47,8 +47,8 @@ class Streaming:
 
     def store(self, path: str, time: int | None) -> Store:
         """Opens a store at a time point; tells which, where nobody did."""
-        from ..io.channels import channel_names
-        from ..io.store import Store
+        from ..io.stores.channels import channel_names
+        from ..io.stores.store import Store
 
         names = channel_names(path) if self.image is None else ()
         image = "color" if "color" in names else self.image
@@ -65,7 +65,7 @@ class Streaming:
         """The channels of a mesh that are drawn as they are: color, and normal, by which it is lit;
         none where something else is asked for.
         """
-        from ..io.channels import channel_names
+        from ..io.stores.channels import channel_names
 
         if look.shader not in ("plain", "colors") or look.tf is not None:
             return ()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from tyro.conf import Positional, arg
 
-from ..io.ngff import is_zarr
+from ..io.stores.ngff import is_zarr
 from .common import Bar, given, refuse_for_store, volume_formats
 from .look import parse_camera
 from .scene import SceneFlags
@@ -86,7 +86,7 @@ class View:
 
     def _store(self) -> tuple[Scene, Shader]:
         from ..engine.engine import Engine
-        from ..io.store import Store
+        from ..io.stores.store import Store
         from ..viewer.scene import Scene, Series
 
         if self.scene.threshold is not None:

@@ -41,9 +41,9 @@ class Voxelize:
 
     def run(self) -> None:
         """Voxelizes."""
-        from ..io.channels import channel_names
         from ..io.mesh_source import voxelize
-        from ..io.store import Store
+        from ..io.stores.channels import channel_names
+        from ..io.stores.store import Store
 
         start = time.perf_counter()
         with self.making.working(speed=True) as work:

@@ -17,7 +17,7 @@ from ..base import check
 from ..base.records import RenderStats
 from ..base.units import length_unit, metres
 from ..base.volume import Volume, to_numpy
-from ..io.store import Store
+from ..io.stores.store import Store
 from ..io.window import window
 from ..pictures.letters import draw_letters
 from ..pictures.picture import Picture

@@ -12,7 +12,7 @@ from pathlib import Path
 from ..base.messages import one_line
 from ..base.volume import Volume
 from ..io.resources import amount
-from ..io.store import Store
+from ..io.stores.store import Store
 from ..io.surface import export_surface
 from .client import Client
 from .protocol import Surface

@@ -19,9 +19,9 @@ from ..base.stage import Progress, no_progress
 from ..base.volume import Volume, movable, to_numpy
 from ..cameras import Camera
 from ..engine import Engine, EngineOptions, FrameStats
-from ..io.ngff import is_zarr
 from ..io.reading import open_source, read_volume
-from ..io.store import Store
+from ..io.stores.ngff import is_zarr
+from ..io.stores.store import Store
 from ..io.window import looked_at, window
 from ..ops import available
 from ..pictures import Picture

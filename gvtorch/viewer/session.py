@@ -21,7 +21,7 @@ from ..base.volume import Volume
 from ..cameras import Camera
 from ..cameras.camera import Up, upward
 from ..engine import EngineOptions
-from ..io.store import Store
+from ..io.stores.store import Store
 from ..pictures import Picture, Progressive
 from ..shaders import TransferFunction
 from ..shaders.presets import CT_PRESETS, PRESETS

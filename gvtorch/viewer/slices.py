@@ -17,7 +17,7 @@ from torch import Tensor
 from ..base.messages import one_line
 from ..base.volume import Volume
 from ..io.http import ask_again
-from ..io.store import Store
+from ..io.stores.store import Store
 from ..io.window import window
 from ..pictures import Picture
 from ..shaders import Labels, Shader

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import gvtorch as gv
-from gvtorch.io.store import Store
+from gvtorch.io.stores.store import Store
 from gvtorch.pool.pyramid import round_to, volume_levels
 
 

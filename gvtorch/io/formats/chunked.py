@@ -19,10 +19,10 @@ import numpy as np
 from ...base.image_info import ImageInfo
 from ...base.named_axes import ask_axes, even_steps, named_axes, place_named
 from ...base.units import spacing_of
-from ..chunk_files import ChunkFiles, begin_read, files_of
-from ..ngff import read_json_file
 from ..source import Index, VolumeSource
-from ..store_layout import Deadline, is_number, kvstore, opened_at
+from ..stores.chunk_files import ChunkFiles, begin_read, files_of
+from ..stores.ngff import read_json_file
+from ..stores.store_layout import Deadline, is_number, kvstore, opened_at
 from .format import Format
 
 _TIMEOUT = 600.0  # seconds for one read

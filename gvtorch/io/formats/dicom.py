@@ -24,8 +24,8 @@ import numpy as np
 from ...base.volume import check_extent
 from ..dicom_codecs import plugin_of
 from ..dicom_frames import Frame, frames_of, image_info, order_frames
-from ..ngff import is_zarr
 from ..source import LPS_TO_RAS, Index, VolumeSource, place_axes
+from ..stores.ngff import is_zarr
 from .format import Format
 
 _MOST_FILES = 200_000

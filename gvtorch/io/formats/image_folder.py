@@ -18,10 +18,10 @@ import numpy as np
 
 from ...base.image_info import ImageInfo, color_channels
 from ...base.volume import check_extent
-from ..ngff import is_zarr
 from ..picture_size import jpeg_ends, picture_size
 from ..resources import amount, memory_free
 from ..source import Index, VolumeSource, told_as
+from ..stores.ngff import is_zarr
 from ..tiff_info import check_pictures, opened
 from .format import Format
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ..ngff import is_zarr
 from ..source import Index, VolumeSource
+from ..stores.ngff import is_zarr
 from .format import Format
 
 _TIMEOUT = 600.0  # seconds for one read
@@ -32,7 +32,7 @@ class OmeZarrSource(VolumeSource):
 
 @functools.lru_cache(maxsize=4)
 def _store(path: str, key: str | None, _opened: int, time: int) -> Any:
-    from ..store import Store
+    from ..stores.store import Store
 
     return Store.open(path, image=key, time=time)
 
@@ -40,7 +40,7 @@ def _store(path: str, key: str | None, _opened: int, time: int) -> Any:
 @Format("OME-Zarr", ".zarr", matches=is_zarr, options=("key",))
 def open_ome_zarr(path: str, key: str | None = None) -> OmeZarrSource:
     """Opens an image, the first one if `key` names none, with all times and channels."""
-    from ..store import Store
+    from ..stores.store import Store
 
     store = Store.open(path, image=key)
     x, y, z = store.extent

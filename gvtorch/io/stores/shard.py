@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ..pool.downsample import pool_max, pool_mean, pool_min, round_array, window
-from . import boxes
+from ...pool.downsample import pool_max, pool_mean, pool_min, round_array, window
+from .. import boxes
+from ..source import VolumeSource
 from .checksums import Files, shard_files
 from .chunk_files import files_of
 from .level_reader import Pool, StoredArray
-from .source import VolumeSource
 from .store import needed_cells
 from .store_layout import BORDER, CELL, Deadline, StoreError, StoreLayout, opened, short
 

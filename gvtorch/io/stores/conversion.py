@@ -25,11 +25,16 @@ from contextlib import AbstractContextManager, closing, contextmanager, nullcont
 from pathlib import Path
 from typing import Any, Unpack
 
-from ..base.npy_file import save_npy
-from ..base.stage import Progress, no_progress
-from ..base.volume import Volume
-from ..base.whole_file import told_of
-from . import resources, shard, unfinished
+from ...base.npy_file import save_npy
+from ...base.stage import Progress, no_progress
+from ...base.volume import Volume
+from ...base.whole_file import told_of
+from .. import resources
+from ..label_source import IndexSource, write_labels
+from ..oblique import Oblique
+from ..reading import FormatSettings, open_source
+from ..source import MemorySource, VolumeSource
+from . import shard, unfinished
 from .conversion_plan import (
     LABELS,
     Estimate,
@@ -41,10 +46,6 @@ from .conversion_plan import (
     source_of,
     within,
 )
-from .label_source import IndexSource, write_labels
-from .oblique import Oblique
-from .reading import FormatSettings, open_source
-from .source import MemorySource, VolumeSource
 from .store import Store
 from .store_layout import WORK, Deadline, opened
 from .unfinished import Done

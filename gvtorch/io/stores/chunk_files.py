@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from .http import SMALL, Endless
+from ..http import SMALL, Endless
 
 HEADS = ("zarr.json", ".zarray", "attributes.json")  # files of an array that are no chunks
 _MOST_CHUNK = 1 << 31  # bytes

@@ -14,9 +14,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-from ..base.image_info import ImageInfo
-from ..base.volume import Volume, movable
-from ..base.whole_file import told_of
+from ...base.image_info import ImageInfo
+from ...base.volume import Volume, movable
+from ...base.whole_file import told_of
 from .checksums import LIST, Files, sum_of
 from .ngff import image_metadata, read_json_file
 from .store_layout import GROUPS, WORK, StoreLayout

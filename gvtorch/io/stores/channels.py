@@ -15,11 +15,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..base.stage import Progress, no_progress
+from ...base.stage import Progress, no_progress
+from ..source import VolumeSource
 from . import unfinished
 from .conversion import convert
 from .ngff import SEVERAL, read_json, read_json_file
-from .source import VolumeSource
 from .store import Store
 from .store_layout import WORK, Deadline, is_name, kvstore
 

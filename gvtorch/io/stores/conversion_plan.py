@@ -15,17 +15,18 @@ from typing import Any
 
 import numpy as np
 
-from ..base import check
-from ..base.labels import background
-from ..base.stage import Progress
-from ..base.volume import Volume
-from ..pool.downsample import pool_majority, pool_mean
-from . import resources, shard, unfinished
-from .label_source import IndexSource, counted_source
+from ...base import check
+from ...base.labels import background
+from ...base.stage import Progress
+from ...base.volume import Volume
+from ...pool.downsample import pool_majority, pool_mean
+from .. import resources
+from ..label_source import IndexSource, counted_source
+from ..oblique import Oblique
+from ..reading import FormatSettings, open_source, placed, read_whole
+from ..source import MemorySource, VolumeSource
+from . import shard, unfinished
 from .level_reader import Pool, no_time
-from .oblique import Oblique
-from .reading import FormatSettings, open_source, placed, read_whole
-from .source import MemorySource, VolumeSource
 from .store_layout import BLOCKS, DTYPES, WORK, StoreLayout, context, kvstore
 
 _FEW = 4  # tasks of level 0 up to which processes are not worth their start

@@ -34,10 +34,10 @@ from reprlib import repr as brief
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
-from ..base.text_path import text_path
-from .http import Endless, file_url, is_http, read_http
-from .relay import named, read_within, through
-from .resources import cores
+from ...base.text_path import text_path
+from ..http import Endless, file_url, is_http, read_http
+from ..relay import named, read_within, through
+from ..resources import cores
 
 if TYPE_CHECKING:
     import numpy as np  # not when the program starts: `gvtorch --help` comes this way

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from ..base.image_info import ChannelInfo, Rgb, to_hex
+from ...base.image_info import ChannelInfo, Rgb, to_hex
 from .store_layout import is_number
 
 #: For viewers: of channels without a colour. A single one is white.

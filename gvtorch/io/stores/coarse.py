@@ -20,11 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.stage import Progress, no_progress
-from ..base.whole_file import told_of
-from . import boxes
+from ...base.stage import Progress, no_progress
+from ...base.whole_file import told_of
+from .. import boxes
+from ..resources import amount
 from .ngff import read_json_file
-from .resources import amount
 from .shard import bordered, finish, write
 from .store import Store
 from .store_layout import BORDER, WORK, CoarseChannel, Deadline, StoreLayout, is_name, opened

@@ -14,11 +14,11 @@ from pathlib import Path
 from reprlib import repr as brief
 from typing import Any
 
-from ..base.image_info import ImageInfo
-from ..base.units import metres
-from .http import Endless
+from ...base.image_info import ImageInfo
+from ...base.units import metres
+from ..http import Endless
+from ..remote import is_file_url
 from .omero import forget_assumed, read_channels, write_channels
-from .remote import is_file_url
 from .store_layout import MOST_JSON, WORK, Deadline, StoreLayout, child, is_number, read_key
 
 SEVERAL = "gvtorch_channels"  # attribute that names the images of a store of several channels
