@@ -375,13 +375,20 @@ class Filtered(Shade):
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
         fine, coarse = probe.answer.fine, probe.answer.coarse
         stored = self.stored(fine) | self.stored(coarse)
-        rgba = self.rgba(piece, probe)
-        self.sum.add(rgba, piece, where & ~stored)
+        self.add_near(piece, probe, where & ~stored)
         if not (where & stored).any():
             return
-        rgba = probe.blend(piece.middle, lambda holder: self.look(piece, probe, holder))
-        self.sum.add_light(self.sum.clear[:, None] * rgba[:, :3], where & stored)
-        self.sum.absorb(rgba[:, 3], piece, where & stored)
+        found = probe.blend(piece.middle, lambda holder: self.look(piece, probe, holder))
+        self.add_found(found, piece, where & stored)
+
+    def add_near(self, piece: Piece, probe: Probe, where: Tensor) -> None:
+        """Adds an interval where no node has colours."""
+        self.sum.add(self.rgba(piece, probe), piece, where)
+
+    def add_found(self, found: Tensor, piece: Piece, where: Tensor) -> None:
+        """Adds an interval of what `look` tells."""
+        self.sum.add_light(self.sum.clear[:, None] * found[:, :3], where)
+        self.sum.absorb(found[:, 3], piece, where)
 
     def stored(self, holder: Holder) -> Tensor:
         """(r,) bool: the node's brick has colours."""
@@ -390,24 +397,68 @@ class Filtered(Shade):
 
     def look(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
         """(r, 4) premultiplied colours and alphas of intervals, as one of the nodes shows them."""
-        t, stored = piece.middle, self.stored(holder)
-        value = self.channel.sample(holder, probe.beam, t)
-        row = self.transfer.interval(value, piece)
+        row = self.row(piece, probe, holder)
         row = torch.cat((row[:, :3] * row[:, 3:], row[:, 3:]), 1)
-        known = replace(holder, brick=torch.where(stored, holder.brick, EMPTY))
+        seen, alpha, part = self.seen(4, piece, probe, holder)
+        colors = torch.stack([*(one * part for one in seen[:3]), alpha], 1)
+        colors = torch.where((part > 0)[:, None], colors, 0.0)
+        return torch.where(self.stored(holder)[:, None], colors, row)
+
+    def row(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
+        """(r, 4) what the function makes of a node's values."""
+        value = self.channel.sample(holder, probe.beam, piece.middle)
+        return self.transfer.interval(value, piece)
+
+    def seen(
+        self, one: int, piece: Piece, probe: Probe, holder: Holder
+    ) -> tuple[list[Tensor], Tensor, Tensor]:
+        """The numbers (r,) of a node's voxels, as rays see them; alphas (r,) of intervals, and
+        over those of a voxel.
+        """
+        t, along = piece.middle, self.light.along
+        brick = torch.where(self.stored(holder), holder.brick, EMPTY)
+        known = replace(holder, brick=brick)
 
         def number(component: int) -> Tensor:
             return self.others[component].sample(known, probe.beam, t)
 
-        along, width = self.light.along, len(self.others)
-        seen = [_by_direction(along, width, i, number) for i in range(4)]
+        seen = [_by_direction(along, len(self.others), i, number, one) for i in range(one)]
         whole = clamp(seen[3], 0, 1)
         side = self.light.parameters.own_as(FilteredNumbers).side
         alpha = stretch(whole, piece.length * holder.scale / side)
         part = alpha / torch.where(whole > 0, whole, 1.0)
-        colors = torch.stack([*(one * part for one in seen[:3]), alpha], 1)
-        colors = torch.where((whole > 0)[:, None], colors, 0.0)
-        return torch.where(stored[:, None], colors, row)
+        return seen, alpha, torch.where(whole > 0, part, 0.0)
+
+
+class FilteredLit(Filtered):
+    """The lit transfer function, and colours with the moments of normals."""
+
+    def add_near(self, piece: Piece, probe: Probe, where: Tensor) -> None:
+        self.lit(self.rgba(piece, probe), piece, probe, where)
+
+    def add_found(self, found: Tensor, piece: Piece, where: Tensor) -> None:
+        clear, seen = self.sum.clear[:, None], where & (found[:, 3] > 0)
+        normal = self.normal + clear * found[:, 4:]
+        self.normal = torch.where(seen[:, None], normal, self.normal)
+        super().add_found(found, piece, where)
+
+    def look(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
+        """(r, 7) as of `Filtered`, lit, and normals by alpha."""
+        t, light, stored = piece.middle, self.light, self.stored(holder)
+        row = self.row(piece, probe, holder)
+        normal = light.to_eye(probe.slope(holder, t, light.cube))
+        color, alpha = light.shade(row[:, :3], normal, t), row[:, 3:]
+        near = torch.cat((color * alpha, alpha, normal * alpha), 1)
+        near = torch.where(alpha > 0, near, 0.0)
+        seen, alpha, part = self.seen(10, piece, probe, holder)
+        whole = clamp(seen[3], 0, 1)
+        some = part > 0
+        over = torch.stack(seen, 1) / torch.where(some, whole, 1.0)[:, None]
+        color, back = light.shade_rough(over[:, :3], over[:, 4:], t)
+        alpha = alpha[:, None]
+        far = torch.cat((color * alpha, alpha, unit(back) * alpha), 1)
+        far = torch.where(some[:, None], far, 0.0)
+        return torch.where(stored[:, None], far, near)
 
 
 class ChannelMix(Shade):
@@ -428,14 +479,16 @@ class ChannelMix(Shade):
         self.sum.absorb(rgba[:, 3], piece, where)
 
 
-def _by_direction(along: Tensor, width: int, number: int, read: Callable[[int], Tensor]) -> Tensor:
-    """(r,) one of the four numbers of a voxel, as it is seen along rays (r, 3): of three
-    directions, where a channel holds 24 numbers; `read` gives one of them.
+def _by_direction(
+    along: Tensor, width: int, number: int, read: Callable[[int], Tensor], one: int = 4
+) -> Tensor:
+    """(r,) one of the numbers of a voxel, as it is seen along rays (r, 3): of three directions,
+    where a channel holds six times `one` numbers; `read` gives one of them.
     """
-    if width == 4:
+    if width == one:
         return read(number)
     side = [
-        torch.where(d < 0, read(8 * axis + 4 + number), read(8 * axis + number))
+        torch.where(d < 0, read((2 * axis + 1) * one + number), read(2 * axis * one + number))
         for axis, d in enumerate(along.unbind(1))
     ]
     x, y, _ = (along * along).unbind(1)
@@ -456,6 +509,7 @@ TWINS: dict[str, type[Shade]] = {
     "Filtered": Filtered,
     "ChannelMix": ChannelMix,
     "Labels": Labels,
+    "FilteredLit": FilteredLit,
 }
 
 
