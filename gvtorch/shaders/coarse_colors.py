@@ -1,6 +1,6 @@
 """What a transfer function makes of the finest voxels, for each voxel of the coarse levels: columns
-of them along each axis, coloured and composited, and of the columns the mean. For matter that is lit
-so are the second moments of the normals, which tell which way surfaces face and how rough they are.
+of them along each axis, coloured and composited, and of the columns the mean. For lit matter so are
+the second moments of the normals, which tell which way surfaces face and how rough they are.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from .shader import ColorTable
 
 _TILE_VOXELS = {"cpu": 1 << 17, "cuda": 1 << 20}  # whose columns are worked out at a time
 _LEAST = 0.001  # weight of a column that no light comes to
+_FAINT = 32  # over which the moments of its normals count; as in csrc/shaders/light.h
 _DIRECTIONS = 6
-#: Numbers of a voxel as seen along a direction: premultiplied colour and alpha; then, of lit matter,
-#: the mean products xx xy xz yy yz zz of the components of its normals, premultiplied.
+#: Numbers of a voxel as seen along a direction: premultiplied colour and alpha; then, of lit
+#: matter, the mean products xx xy xz yy yz zz of the components of its normals, premultiplied.
 PLAIN, LIT = 4, 10
 
 
@@ -245,8 +246,8 @@ class _Columns:
 
 def _surfaces(color: Tensor, alpha: Tensor, light: Tensor, step: int) -> Tensor:
     """Returns the moments of intervals (c - 3, n, a, b), weighted with light. To what lies within
-    solid matter no light comes, but places between it and the surface are seen, and places that
-    other directions see: there it is as the last interval before to which light comes.
+    solid matter no light comes, but places between it and the surface are seen: there it is as the
+    last interval before to which light comes, and counts little beside what other directions see.
     """
     index = torch.arange(len(alpha), device=alpha.device)[:, None, None]
     comes = light > 2 * _LEAST
@@ -256,6 +257,7 @@ def _surfaces(color: Tensor, alpha: Tensor, light: Tensor, step: int) -> Tensor:
         place = torch.where(comes, index, len(alpha) - 1).flip(0).cummin(0).values.flip(0)
     thick = alpha.gather(0, place)
     part = light * torch.where(thick > 0, alpha / torch.where(thick > 0, thick, 1.0), 0.0)
+    part = torch.where(comes, part, part / _FAINT)
     return color[3:].gather(1, place.expand_as(color[3:])) * part
 
 

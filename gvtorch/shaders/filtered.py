@@ -221,9 +221,9 @@ class Filtered(Shader):
         told = opened.coarse[channel]
         names = ("opacity", "color", "reference", "component")
         lit = told.made_of.get("normals") is True
-        known = sorted((*names, "normals") if lit else names)
+        wanted = sorted((*names, "normals") if lit else names)
         numbers = LIT if lit else PLAIN
-        if sorted(told.made_of) != known or told.width not in (numbers, 6 * numbers):
+        if sorted(told.made_of) != wanted or told.width not in (numbers, 6 * numbers):
             raise ValueError(f"{opened.location}: damaged: {channel!r} holds no filtered colours")
         opacity, color, reference, component = (told.made_of[name] for name in names)
         try:
@@ -312,7 +312,7 @@ class Filtered(Shader):
     def material(self) -> ShadeParameters:
         return self.transfer.material()
 
-    def unlit(self) -> Filtered:
+    def unlit(self) -> Shader:
         if not isinstance(self.transfer, Lit):
             return super().unlit()
         bare = copy(self)
@@ -320,7 +320,6 @@ class Filtered(Shader):
         return bare
 
     def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
-        self.transfer = self.transfer  # a Lit may have been edited
         if tree.made_of.get(str(self.other), self.made_of) != self.made_of:
             raise ValueError(
                 f"{where}: the colours {self.other!r} were made of another function or component, "

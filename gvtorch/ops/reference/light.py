@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..shading import LightKind, ShadeParameters
-from .exact import clamp, divide, dot, larger, power, sqrt_exact, unit
+from .exact import clamp, divide, dot, larger, power, smaller, sqrt_exact, unit
 from .march import Piece, Plain, Probe, Visitor, Walk
 from .rays import INF, Intervals, split
 from .tree import Bricks
@@ -23,6 +23,8 @@ from .tree import Bricks
 #: Each octave of scattering gives so much of the light of the one before it, and keeps so much of
 #: its direction: fitted to path traced clouds (benchmarks/cloud_light.py).
 OCTAVE_LIGHT, OCTAVE_DIRECTION = 0.55, 0.6
+#: By how much the moments of normals may be lessened where no light comes: see `coarse_colors`.
+FAINT = 32
 
 
 @dataclass
@@ -104,20 +106,30 @@ class Light:
         light = torch.as_tensor(p.light_color)
         return base * (p.ambient + diffuse * light) + specular * light
 
-    def shade_rough(self, base: Tensor, moments: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        """(r, 3) colours in the light of base colours (r, 3) of rough surfaces, and (r, 3) vectors
-        along their normals, 0 where there is none. The mean products of the components of their
-        normals (r, 6), xx xy xz yy yz zz, add up to the share of places that have a normal; the
-        others are lit as if they faced the light.
+    def shade_rough(
+        self, base: Tensor, moments: Tensor, front: Tensor | None, t: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Lights rough surfaces, of which only the moments of their normals are known.
 
-        Of a cosine with the light, as it is on the side that the eye sees, the moments tell mean
-        and deviation; it is taken to be evenly spread, as it is for the normals of a ball.
-        Highlights: Toksvig, "Mipmapping normal maps", 2005, for a spread that is the same to all
-        sides of a main normal.
+        Of a cosine with the light, as it is on the side that the eye sees, they tell mean and
+        deviation; it is taken to be evenly spread, as it is for the normals of a ball. Highlights:
+        Toksvig, "Mipmapping normal maps", 2005, for a spread that is the same to all sides of a
+        main normal.
+
+        Args:
+            base: (r, 3) base colours.
+            moments: (r, 6) mean products xx xy xz yy yz zz of the components of the normals; where
+                their trace is 0, places are lit as if they faced the light.
+            front: (r, 3) mean normals of what is seen from one side alone, in the same measure:
+                what light comes from behind does not show. None: both sides are seen.
+            t: (r,) distances.
+
+        Returns:
+            (r, 3) colours in the light, and (r, 3) vectors along the normals, towards the eye.
         """
         zero, d, shininess = torch.zeros_like(t), self.along, self.parameters.shininess
         total = moments[:, 0] + moments[:, 3] + moments[:, 5]
-        share = clamp(total, 0, 1)
+        share = clamp(FAINT * total, 0, 1)
         xx, xy, xz, yy, yz, zz = (moments / torch.where(total > 0, total, 1.0)[:, None]).unbind(1)
 
         def times(v: Tensor) -> Tensor:
@@ -129,7 +141,11 @@ class Light:
         to_light, _, _ = self.towards(t)
         back = -times(d)
         seen = sqrt_exact(larger(zero, -dot(d, back)))
-        mean = (0.8 + 0.2 * square) * dot(to_light, back) / torch.where(seen > 0, seen, 1.0)
+        known = 0.8 + 0.2 * square  # the mean of a size over its root mean square
+        mean = known * dot(to_light, back) / torch.where(seen > 0, seen, 1.0)
+        if front is not None:
+            outside = known * dot(to_light, front) / torch.where(total > 0, total, 1.0)
+            mean = smaller(mean, outside)
         variance = larger(zero, dot(to_light, times(to_light)) - mean * mean)
         wide = sqrt_exact(3 * variance)  # half of what it is spread over
         above = clamp(mean + wide, 0, 2 * wide)

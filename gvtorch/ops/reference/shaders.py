@@ -35,6 +35,7 @@ from .rays import INF
 from .tree import Bricks, Holder
 
 _BISECTIONS = 4
+LIT = 10  # numbers of filtered colours with moments of normals, seen along a direction
 
 
 @dataclass
@@ -399,7 +400,8 @@ class Filtered(Shade):
         """(r, 4) premultiplied colours and alphas of intervals, as one of the nodes shows them."""
         row = self.row(piece, probe, holder)
         row = torch.cat((row[:, :3] * row[:, 3:], row[:, 3:]), 1)
-        seen, alpha, part = self.seen(4, piece, probe, holder)
+        read = self.reader(piece, probe, holder)
+        seen, alpha, part = self.seen(4, read, piece, holder)
         colors = torch.stack([*(one * part for one in seen[:3]), alpha], 1)
         colors = torch.where((part > 0)[:, None], colors, 0.0)
         return torch.where(self.stored(holder)[:, None], colors, row)
@@ -409,20 +411,20 @@ class Filtered(Shade):
         value = self.channel.sample(holder, probe.beam, piece.middle)
         return self.transfer.interval(value, piece)
 
-    def seen(
-        self, one: int, piece: Piece, probe: Probe, holder: Holder
-    ) -> tuple[list[Tensor], Tensor, Tensor]:
-        """The numbers (r,) of a node's voxels, as rays see them; alphas (r,) of intervals, and
-        over those of a voxel.
-        """
-        t, along = piece.middle, self.light.along
+    def reader(self, piece: Piece, probe: Probe, holder: Holder) -> Callable[[int], Tensor]:
+        """What reads a number (r,) of the colours that a node has."""
         brick = torch.where(self.stored(holder), holder.brick, EMPTY)
         known = replace(holder, brick=brick)
+        return lambda number: self.others[number].sample(known, probe.beam, piece.middle)
 
-        def number(component: int) -> Tensor:
-            return self.others[component].sample(known, probe.beam, t)
-
-        seen = [_by_direction(along, len(self.others), i, number, one) for i in range(one)]
+    def seen(
+        self, one: int, read: Callable[[int], Tensor], piece: Piece, holder: Holder
+    ) -> tuple[list[Tensor], Tensor, Tensor]:
+        """Colour and alpha (r,) of a node's voxels, of `one` numbers a direction, as rays see them;
+        alphas (r,) of intervals, and these over those of a voxel.
+        """
+        width = len(self.others)
+        seen = [_by_direction(self.light.along, width, i, read, one) for i in range(4)]
         whole = clamp(seen[3], 0, 1)
         side = self.light.parameters.own_as(FilteredNumbers).side
         alpha = stretch(whole, piece.length * holder.scale / side)
@@ -444,21 +446,43 @@ class FilteredLit(Filtered):
 
     def look(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
         """(r, 7) as of `Filtered`, lit, and normals by alpha."""
-        t, light, stored = piece.middle, self.light, self.stored(holder)
+        t, light = piece.middle, self.light
         row = self.row(piece, probe, holder)
         normal = light.to_eye(probe.slope(holder, t, light.cube))
         color, alpha = light.shade(row[:, :3], normal, t), row[:, 3:]
         near = torch.cat((color * alpha, alpha, normal * alpha), 1)
         near = torch.where(alpha > 0, near, 0.0)
-        seen, alpha, part = self.seen(10, piece, probe, holder)
-        whole = clamp(seen[3], 0, 1)
-        some = part > 0
-        over = torch.stack(seen, 1) / torch.where(some, whole, 1.0)[:, None]
-        color, back = light.shade_rough(over[:, :3], over[:, 4:], t)
-        alpha = alpha[:, None]
-        far = torch.cat((color * alpha, alpha, unit(back) * alpha), 1)
-        far = torch.where(some[:, None], far, 0.0)
-        return torch.where(stored[:, None], far, near)
+
+        read = self.reader(piece, probe, holder)
+        seen, long, part = self.seen(LIT, read, piece, holder)
+        shown, alpha = (part > 0)[:, None], long[:, None]
+        whole = torch.where(part > 0, clamp(seen[3], 0, 1), 1.0)[:, None]
+        moments, front = self.moments(read)
+        front = None if front is None else front / whole
+        base = torch.stack(seen[:3], 1) / whole
+        color, normal = light.shade_rough(base, moments / whole, front, t)
+        far = torch.cat((color * alpha, alpha, unit(normal) * alpha), 1)
+        far = torch.where(shown, far, 0.0)
+        return torch.where(self.stored(holder)[:, None], far, near)
+
+    def moments(self, read: Callable[[int], Tensor]) -> tuple[Tensor, Tensor | None]:
+        """(r, 6) moments of the normals that rays see; where six directions are known also (r, 3)
+        the mean of these normals, each turned to the side from which its direction sees it.
+        """
+        if len(self.others) == LIT:
+            return torch.stack([read(i) for i in range(4, LIT)], 1), None
+        mean = front = torch.zeros_like(self.light.along[:, :1])
+        for axis, d in enumerate(self.light.along.unbind(1)):
+            back, first = d < 0, 2 * axis * LIT
+            m = [torch.where(back, read(first + LIT + i), read(first + i)) for i in range(4, LIT)]
+            column = [m[i] for i in ((0, 1, 2), (1, 3, 4), (2, 4, 5))[axis]]
+            weight, total, own = d * d, m[0] + m[3] + m[5], column[axis]
+            some = (total > 0) & (own > 0)
+            scale = sqrt_exact(torch.where(some, total, 0.0) / torch.where(some, own, 1.0)) * weight
+            turned = torch.where(back, scale, -scale)[:, None]
+            mean = mean + weight[:, None] * torch.stack(m, 1)
+            front = front + turned * torch.stack(column, 1)
+        return mean, front
 
 
 class ChannelMix(Shade):

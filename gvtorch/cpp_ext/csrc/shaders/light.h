@@ -77,6 +77,9 @@ GV_HD const Own& own_numbers(const Parameters<T>* parameters) {
 // to path traced clouds (benchmarks/cloud_light.py).
 constexpr double kOctaveLight = 0.55, kOctaveDirection = 0.6;
 
+// By how much the moments of normals may be lessened where no light comes: see shaders/coarse_colors.py.
+constexpr double kFaint = 32;
+
 // Blinn-Phong, on both sides of a surface; or the light that a medium scatters.
 template <class T>
 struct Light {
@@ -173,32 +176,38 @@ struct Light {
     return {lit(base.red, 0), lit(base.green, 1), lit(base.blue, 2), base.alpha};
   }
 
-  // Colour of rough surfaces in the light, and a vector along their normals. The mean products of the components of the
-  // normals add up to the share of places that have one; the others are lit as if they faced the light.
-  //
-  // Of a cosine with the light, as it is on the side that the eye sees, the moments tell mean and deviation; it is
-  // taken to be evenly spread, as it is for the normals of a ball. Highlights: Toksvig, "Mipmapping normal maps", 2005,
-  // for a spread that is the same to all sides of a main normal.
+  // Mean products of the components of normals.
   struct Moments {
     T xx, xy, xz, yy, yz, zz;
 
+    GV_HD T trace() const { return xx + yy + zz; }
     GV_HD Vec3<T> times(const Vec3<T>& v) const {
       return {xx * v.x + xy * v.y + xz * v.z, xy * v.x + yy * v.y + yz * v.z, xz * v.x + yz * v.y + zz * v.z};
     }
   };
-  GV_HD Row<T> shade_rough(const Row<T>& base, Moments m, const Probe<T>& probe, T t, Vec3<T>& normal) const {
+  // Colour of rough surfaces in the light, of which only the moments of their normals are known, and a vector along the
+  // normals, towards the eye. Where the trace is 0, places are lit as if they faced the light. `front`: the mean normal
+  // of what is seen from one side alone, in the same measure; what light comes from behind does not show.
+  //
+  // Of a cosine with the light, as it is on the side that the eye sees, the moments tell mean and deviation; it is
+  // taken to be evenly spread, as it is for the normals of a ball. Highlights: Toksvig, "Mipmapping normal maps", 2005,
+  // for a spread that is the same to all sides of a main normal.
+  GV_HD Row<T> shade_rough(const Row<T>& base, Moments m, bool sided, const Vec3<T>& front, const Probe<T>& probe, T t,
+                           Vec3<T>& normal) const {
     const T zero = 0, one = 1, shininess = parameters->shininess;
     const Vec3<T> d = probe.sight.direction;
-    const T total = m.xx + m.yy + m.zz;
-    const T share = clamp(total, zero, one), whole = total > 0 ? total : one;
+    const T total = m.trace();
+    const T share = clamp(static_cast<T>(kFaint) * total, zero, one), whole = total > 0 ? total : one;
     m = {m.xx / whole, m.xy / whole, m.xz / whole, m.yy / whole, m.yz / whole, m.zz / whole};
     const T square = m.xx * m.xx + m.yy * m.yy + m.zz * m.zz + 2 * (m.xy * m.xy + m.xz * m.xz + m.yz * m.yz);
     const Vec3<T> to_light = towards(probe, t).direction;
     normal = m.times(d);
     for (int axis = 0; axis < 3; ++axis) normal[axis] = -normal[axis];
     const T seen = square_root(larger(zero, -dot(d, normal)));
-    const T mean =
-        (static_cast<T>(0.8) + static_cast<T>(0.2) * square) * dot(to_light, normal) / (seen > 0 ? seen : one);
+    // The mean of a size over its root mean square.
+    const T known = static_cast<T>(0.8) + static_cast<T>(0.2) * square;
+    T mean = known * dot(to_light, normal) / (seen > 0 ? seen : one);
+    if (sided) mean = smaller(mean, known * dot(to_light, front) / whole);
     const T wide = square_root(3 * larger(zero, dot(to_light, m.times(to_light)) - mean * mean));
     const T above = clamp(mean + wide, zero, 2 * wide);
     const T facing = above * above / (wide > 0 ? 4 * wide : one) + larger(zero, mean - wide);

@@ -150,24 +150,51 @@ struct FilteredLit : Lit<T> {
   }
   GV_HD Look far(const Piece<T>& piece, const Probe<T>& probe, const Spot<T>& spot) const {
     const T t = piece.middle;
-    const auto seen = [&](int32_t number) {
-      const ChannelView& colors = probe.channels.other;
-      return by_direction(
-          true, probe.sight.direction, colors.width,
-          [&](int32_t first) { return probe.four_of(true, colors, first + number, spot, t); }, kFiltered);
-    };
-    const Row<T> color = seen(0);
+    const ChannelView& colors = probe.channels.other;
+    const auto read = [&](int32_t first) { return probe.four_of(true, colors, first, spot, t); };
+    const Row<T> color = by_direction(true, probe.sight.direction, colors.width, read, kFiltered);
     const T whole = clamp(color.alpha, static_cast<T>(0), static_cast<T>(1));
     const T side = own_numbers<Own>(this->light.parameters).side;
     const T alpha = stretch(whole, piece.length * probe.scale_of(spot) / side);
     if (!(whole > 0) || !(alpha / whole > 0)) return {};
-    const Row<T> a = seen(4), b = seen(6);
-    const typename Light<T>::Moments m{a.red / whole,   a.green / whole, a.blue / whole,
-                                       a.alpha / whole, b.blue / whole,  b.alpha / whole};
+    const bool sided = colors.width != kFiltered;
+    Vec3<T> front{}, n;
+    Moments m = sided ? seen(read, probe.sight.direction, front) : moments(read, 0);
+    m = {m.xx / whole, m.xy / whole, m.xz / whole, m.yy / whole, m.yz / whole, m.zz / whole};
+    front = {front.x / whole, front.y / whole, front.z / whole};
     const Row<T> base{color.red / whole, color.green / whole, color.blue / whole, alpha};
-    Vec3<T> n;
-    const Row<T> row = this->light.shade_rough(base, m, probe, t, n);
+    const Row<T> row = this->light.shade_rough(base, m, sided, front, probe, t, n);
     return times_alpha(row, unit(n));
+  }
+  using Moments = typename Light<T>::Moments;
+  template <class Read>
+  GV_HD static Moments moments(const Read& read, int32_t first) {
+    const Row<T> a = read(first + 4), b = read(first + 6);
+    return {a.red, a.green, a.blue, a.alpha, b.blue, b.alpha};
+  }
+  // The moments of what is seen along direction d, and the mean of these normals, each turned to the side from which
+  // its direction sees it.
+  template <class Read>
+  GV_HD static Moments seen(const Read& read, const Vec3<T>& d, Vec3<T>& front) {
+    Moments sum{};
+#ifdef __CUDA_ARCH__
+#pragma unroll 1
+#endif
+    for (int axis = 0; axis < 3; ++axis) {
+      const bool back = d[axis] < 0;
+      const Moments m = moments(read, (2 * axis + (back ? 1 : 0)) * kFiltered);
+      const Vec3<T> column = axis == 0   ? Vec3<T>{m.xx, m.xy, m.xz}
+                             : axis == 1 ? Vec3<T>{m.xy, m.yy, m.yz}
+                                         : Vec3<T>{m.xz, m.yz, m.zz};
+      const T weight = d[axis] * d[axis], total = m.trace(), own = column[axis];
+      T scale = 0;
+      if (total > 0 && own > 0) scale = square_root(total / own) * weight;
+      if (!back) scale = -scale;
+      sum = {sum.xx + weight * m.xx, sum.xy + weight * m.xy, sum.xz + weight * m.xz,
+             sum.yy + weight * m.yy, sum.yz + weight * m.yz, sum.zz + weight * m.zz};
+      front = {front.x + scale * column.x, front.y + scale * column.y, front.z + scale * column.z};
+    }
+    return sum;
   }
   GV_HD static Look times_alpha(const Row<T>& row, const Vec3<T>& n) {
     const T a = row.alpha;
