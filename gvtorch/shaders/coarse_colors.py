@@ -316,12 +316,16 @@ def _pooled(values: Tensor, block: int) -> Tensor:
 
 
 def mean_of_directions(colors: Tensor) -> Tensor:
-    """Returns (..., n) of (..., 6 * n), of the same dtype."""
+    """Returns (..., n) of (..., 6 * n), of the same dtype. Their moments are over _FAINT: light comes
+    to all of such matter, and the trace then tells which share of it has a normal.
+    """
     first, *others = colors.split(colors.shape[-1] // _DIRECTIONS, -1)
     total = first.float()
     for one in others:
         total += one
-    return (total / _DIRECTIONS).to(colors.dtype)
+    mean = total / _DIRECTIONS
+    mean[..., PLAIN:] /= _FAINT
+    return mean.to(colors.dtype)
 
 
 def _of_length(colors: Tensor, lengths: float) -> Tensor:
