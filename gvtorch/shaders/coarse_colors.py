@@ -316,8 +316,8 @@ def _pooled(values: Tensor, block: int) -> Tensor:
 
 
 def mean_of_directions(colors: Tensor) -> Tensor:
-    """Returns (..., n) of (..., 6 * n), of the same dtype. Their moments are over _FAINT: light comes
-    to all of such matter, and the trace then tells which share of it has a normal.
+    """Returns (..., n) of (..., 6 * n), of the same dtype. Their moments are over _FAINT: light
+    comes to all of such matter, and the trace then tells which share of it has a normal.
     """
     first, *others = colors.split(colors.shape[-1] // _DIRECTIONS, -1)
     total = first.float()
