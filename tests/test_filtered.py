@@ -4,10 +4,9 @@ picture is that of 256 rays a pixel.
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
+from helpers.afar import compare, matter, picture, rays, walls
 from helpers.packets import INSTRUCTIONS, result, start
 from helpers.rays import camera_rays
 from helpers.traces import SHADER, assert_equal, run
@@ -18,16 +17,6 @@ import gvtorch as gv
 MISTY = gv.TransferFunction(
     [(0.2, 0), (0.5, 0.02), (0.9, 0.08)], [(0.2, 1, 0.3, 0.1), (1, 1, 1, 1)]
 )
-
-
-def matter(branching: int = 2, spacing=(1.0, 1.0, 1.0)) -> gv.Volume:
-    """Rough and smooth matter, between a region of zeros and one of another single value."""
-    generator = torch.Generator().manual_seed(4)
-    coarse = torch.rand((1, 1, 12, 12, 12), generator=generator)
-    value = torch.nn.functional.interpolate(coarse, size=(37, 33, 41), mode="trilinear")[0, 0]
-    value = value + 0.2 * torch.rand(value.shape, generator=generator)
-    value[:14], value[:, 24:, :20] = 0.0, 0.35
-    return gv.Volume(value, spacing)
 
 
 def filtered(transfer: gv.TransferFunction, **options) -> tuple[gv.N3Tree, gv.Filtered]:
@@ -84,62 +73,6 @@ def test_close_by_it_is_the_transfer_function():
     near, plain = (gv.trace(tree, rays, one, lod="finest") for one in (shader, SHADER))
     for field in ("color", "alpha", "depth", "samples"):
         assert torch.equal(getattr(near, field), getattr(plain, field)), field
-
-
-def rays(origin: torch.Tensor, direction: torch.Tensor, cone: torch.Tensor) -> gv.Rays:
-    limits = torch.tensor([[0.0, 1e9]], dtype=torch.float64).expand(len(origin), 2)
-    columns = (one.contiguous() for one in (origin, direction, cone, limits))
-    return gv.Rays(**dict(zip(("origin", "direction", "cone", "range"), columns, strict=True)))
-
-
-def parallel(tree: gv.N3Tree, way: tuple[float, float, float], pixel: float, parts: int) -> gv.Rays:
-    """Rays of an orthographic picture through a whole tree, parts^2 a pixel, wide ones if it is
-    one.
-    """
-    forward = torch.nn.functional.normalize(torch.tensor(way, dtype=torch.float64), dim=0)
-    right = torch.nn.functional.normalize(
-        torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]).double(), forward), dim=0
-    )
-    up = torch.linalg.cross(forward, right)
-    reach = float((tree.box[1] - tree.box[0]).norm()) / 2
-    count = math.ceil(2 * reach / pixel)
-    at = ((torch.arange(count * parts, dtype=torch.float64) + 0.5) / parts - count / 2) * pixel
-    y, x = torch.meshgrid(at + 0.37, at + 0.61, indexing="ij")
-    origin = tree.box.mean(0) + x.reshape(-1, 1) * right + y.reshape(-1, 1) * up
-    origin = origin - 2 * reach * forward
-    cone = torch.zeros(len(origin), 2, dtype=torch.float64)
-    if parts == 1:
-        cone[:, 0] = pixel
-    return rays(origin, forward.expand(len(origin), 3), cone)
-
-
-def picture(tree: gv.N3Tree, shader: gv.Shader, way, pixel: float, parts: int = 1) -> torch.Tensor:
-    """(h, w, 4) means over the rays of each pixel."""
-    given = parallel(tree, way, pixel, parts)
-    hits = gv.trace(tree, given, shader, lod="finest" if parts > 1 else "auto")
-    side = math.isqrt(len(given.origin)) // parts
-    colors = torch.cat((hits.color, hits.alpha), 1).double()
-    return colors.reshape(side, parts, side, parts, 4).mean((1, 3))
-
-
-def compare(found: torch.Tensor, truth: torch.Tensor) -> tuple[float, float]:
-    """Light over the truth's, and PSNR over pixels that show something."""
-    shown = (truth[..., 3] > 1e-3) | (found[..., 3] > 1e-3)
-    error = float((found - truth)[..., :3][shown].square().mean())
-    return float(found[..., :3].mean() / truth[..., :3].mean()), -10 * math.log10(error)
-
-
-def walls() -> gv.Volume:
-    """Walls one and a half voxels thick, upright and slanted, threads, and a ball of noise."""
-    n = 96
-    z, y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float32),) * 3, indexing="ij")
-    inside = (x > 15) & (x < 60) & (y > 15) & (y < 80) & (z > 15) & (z < 80)
-    value = (1.25 - (0.6 * x + 0.2 * y + 0.7746 * z - 50).abs()).clamp(0, 1) * inside
-    flat = (1.25 - (x - 72.6).abs()).clamp(0, 1) * ((z > 20) & (z < 75) & (y > 50) & (y < 85))
-    thread = (1.6 - torch.hypot(x - 65 + 0.2 * (z - 48), y - 25)).clamp(0, 1) * ((z > 8) & (z < 85))
-    noise = torch.rand(x.shape, generator=torch.Generator().manual_seed(1))
-    ball = noise * ((x - 30) ** 2 + (y - 66) ** 2 + (z - 70) ** 2 < 18**2)
-    return gv.Volume(torch.stack((value, flat, thread, ball)).amax(0))
 
 
 @pytest.mark.backend("cpp")

@@ -33,6 +33,7 @@ SHADER_KINDS = (
     "Filtered",
     "ChannelMix",
     "Labels",
+    "FilteredLit",
 )
 
 

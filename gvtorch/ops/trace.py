@@ -120,7 +120,8 @@ def check_shade(
     device, shape = rays.origin_r3.device, "k" if own else "54"
     parameters = ("parameter_54", parameter_54, shape, arguments.table_lm4.dtype)
     check.tensors(where, device, [parameters])
-    others, some = 0, "e" if kind == "Filtered" else "b"  # colours of the pool's first bricks
+    one = {"Filtered": 4, "FilteredLit": 10}.get(kind, 0)  # numbers seen along a direction
+    others, some = 0, "e" if one else "b"  # colours of the pool's first bricks
     for name, bricks, constants, slots, width in (
         ("normal", shading.normal_bzyxc, shading.normal_tnc, "b", "3"),
         ("other", shading.other_bzyxc, shading.other_tnc, some, "d"),
@@ -140,8 +141,9 @@ def check_shade(
         )
     if kind == "Features" and not others:
         raise ValueError(f"{where}: features need other_bzyxc")
-    if kind == "Filtered" and others not in (4, 24):
-        raise ValueError(f"{where}: filtered colours need an other_bzyxc of 4 or 24 numbers")
+    if one and others not in (one, 6 * one):
+        wanted = f"{one} or {6 * one} numbers"
+        raise ValueError(f"{where}: filtered colours need an other_bzyxc of {wanted}")
     given = {"Features": others, "Projection": 1, "Labels": 1}.get(kind, 0)
     if own:
         check.whole(where, "features", shading.features, low=0)

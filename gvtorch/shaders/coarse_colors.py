@@ -1,5 +1,6 @@
 """What a transfer function makes of the finest voxels, for each voxel of the coarse levels: columns
-of them along each axis, coloured and composited, and of the columns the mean.
+of them along each axis, coloured and composited, and of the columns the mean. For lit matter so are
+the second moments of the normals, which tell which way surfaces face and how rough they are.
 """
 
 from __future__ import annotations
@@ -19,7 +20,11 @@ from .shader import ColorTable
 
 _TILE_VOXELS = {"cpu": 1 << 17, "cuda": 1 << 20}  # whose columns are worked out at a time
 _LEAST = 0.001  # weight of a column that no light comes to
+_FAINT = 32  # over which the moments of its normals count; as in csrc/shaders/light.h
 _DIRECTIONS = 6
+#: Numbers of a voxel as seen along a direction: premultiplied colour and alpha; then, of lit
+#: matter, the mean products xx xy xz yy yz zz of the components of its normals, premultiplied.
+PLAIN, LIT = 4, 10
 
 
 class Field(Protocol):
@@ -56,7 +61,7 @@ class VolumeField:
 def write_colors(
     field: Field,
     tables: Sequence[ColorTable],
-    shares: Sequence[float],
+    spacing: tuple[float, float, float],
     branching: int,
     out: Sequence[Tensor],
     progress: Progress,
@@ -67,20 +72,24 @@ def write_colors(
         field: The finest voxels.
         tables: For each axis x, y, z the colours of intervals of half a voxel, on the device that
             works.
-        shares: For each axis, the length that an alpha is stored for, in voxels along this axis.
+        spacing: Size of a voxel along x, y, z.
         branching: N.
-        out: For each coarse level, the finest of them first, (z, y, x, 24) float16: premultiplied
-            colour and alpha of its voxels as seen along +x -x +y -y +z -z.
+        out: For each coarse level, the finest of them first, (z, y, x, 6 * n) float16: n numbers,
+            PLAIN or LIT, of its voxels as seen along +x -x +y -y +z -z, for a length of the
+            smallest spacing.
         progress: Told ("filtered", voxels done, voxels in all).
     """
     done, total = 0, 3 * math.prod(field.shape)
-    for axis, (table, share) in enumerate(zip(tables, shares, strict=True)):
-        along = 2 - axis
-        for level, a, b, sums in _see_along(field, along, table, branching, len(out)):
-            means = (sums[:, :4] / sums[:, 4:]).flatten(0, 1).movedim(0, 3)
+    width = 2 * out[0].shape[-1] // _DIRECTIONS if out else 0
+    for axis, table in enumerate(tables):
+        along, share = 2 - axis, min(spacing) / spacing[axis]
+        sizes = [spacing[2 - a] for a in (along, *(a for a in range(3) if a != along))]
+        painter = _Painter(table, sizes if width == 2 * LIT else None, along)
+        for level, a, b, sums in _see_along(field, along, painter, branching, len(out)):
+            means = (sums[:, :-1] / sums[:, -1:]).flatten(0, 1).movedim(0, 3)
             colors = _of_length(means, share).to(torch.float16)
             _, high, wide, _ = colors.shape
-            columns = out[level].movedim(along, 0)[..., 8 * axis : 8 * axis + 8]
+            columns = out[level].movedim(along, 0)[..., width * axis : width * (axis + 1)]
             columns[:, a : a + high, b : b + wide] = colors
             if level == 0:
                 done += field.shape[along] * high * wide * branching**2
@@ -90,15 +99,15 @@ def write_colors(
 def _see_along(
     field: Field,
     along: int,
-    table: ColorTable,
+    painter: _Painter,
     branching: int,
     levels: int,
 ) -> Iterator[tuple[int, int, int, Tensor]]:
     """Yields what is seen along an axis of the field: a coarse level, two places across, and of the
-    voxels that begin there the weighted sums (2, 5, n, a, b), forwards and backwards: premultiplied
-    colour, alpha and weight. Each voxel comes once.
+    voxels that begin there the weighted sums (2, c + 1, n, a, b), forwards and backwards: c numbers
+    (see `LIT`) and weight. Each voxel comes once.
     """
-    device = table.table_lm4.device
+    device = painter.table.table_lm4.device
     length = field.shape[along]
     sides = [axis for axis in range(3) if axis != along]
     across = [field.shape[axis] for axis in sides]
@@ -108,19 +117,20 @@ def _see_along(
     whole = [branching ** (level + 1) for level in range(levels)]  # finest voxels along a side
     coarse = {  # sums of columns of a tile, where a voxel is wider than a tile
         level: torch.zeros(
-            (2, 5, -(-length // side), *(-(-n // tile) for n in across)), device=device
+            (2, painter.width + 1, -(-length // side), *(-(-n // tile) for n in across)),
+            device=device,
         )
         for level, side in enumerate(whole)
         if side > tile
     }
     for a, b, part in _parts(field, along, tile):
         values = part.to(device).to(torch.float32)
-        empty = not _shows(values, table)
+        empty = not _shows(values, painter.table)
         if empty:  # as few intervals as make a voxel of the first level
             high, wide = (2 * n - 4 for n in part.shape[1:])
-            columns = _Columns.empty((2 * branching, high, wide), device)
+            columns = _Columns.empty(painter.width - 1, (2 * branching, high, wide), device)
         else:
-            columns = _colored(_finer(values), table)
+            columns = painter.colored(values)
         columns = columns.joined(2)
         for level, side in enumerate(whole):
             if not empty or level == 0:
@@ -163,20 +173,25 @@ def _shows(part: Tensor, table: ColorTable) -> bool:
     return rows[1] > (rows[0] if first > 0 else 0)
 
 
-def _finer(part: Tensor) -> Tensor:
+def _finer(part: Tensor, slope: int | None = None) -> Tensor:
     """Samples (n, a + 2, b + 2) values, with neighbours on the sides, twice as finely: returns
-    (2n, 2a, 2b), a quarter of a voxel on either side of the centres.
+    (2n, 2a, 2b), a quarter of a voxel on either side of the centres. Or, there, their differences
+    along an axis, from half a voxel before to half a voxel behind.
     """
     last = len(part) - 1
     index = torch.arange(last + 1, device=part.device)
     before, behind = (part[(index + step).clamp(0, last)] for step in (-1, 1))
-    part = _between(part, before, behind, 0)
-    part = _between(part[:, 1:-1], part[:, :-2], part[:, 2:], 1)
-    return _between(part[:, :, 1:-1], part[:, :, :-2], part[:, :, 2:], 2)
+    part = _between(part, before, behind, 0, slope)
+    part = _between(part[:, 1:-1], part[:, :-2], part[:, 2:], 1, slope)
+    return _between(part[:, :, 1:-1], part[:, :, :-2], part[:, :, 2:], 2, slope)
 
 
-def _between(here: Tensor, before: Tensor, behind: Tensor, axis: int) -> Tensor:
-    sides = (0.75 * here + 0.25 * before, 0.75 * here + 0.25 * behind)
+def _between(here: Tensor, before: Tensor, behind: Tensor, axis: int, slope: int | None) -> Tensor:
+    if axis == slope:
+        rise, fall = behind - here, here - before
+        sides = (0.25 * rise + 0.75 * fall, 0.75 * rise + 0.25 * fall)
+    else:
+        sides = (0.75 * here + 0.25 * before, 0.75 * here + 0.25 * behind)
     return torch.stack(sides, axis + 1).flatten(axis, axis + 1)
 
 
@@ -184,14 +199,14 @@ def _between(here: Tensor, before: Tensor, behind: Tensor, axis: int) -> Tensor:
 class _Columns:
     """Intervals of columns along the first axis of (n, a, b)."""
 
-    front: Tensor  # (3, n, a, b) premultiplied colour as seen from the front
-    back: Tensor  # (3, n, a, b) and from behind
+    front: Tensor  # (c, n, a, b) premultiplied colour, and moments, as seen from the front
+    back: Tensor  # (c, n, a, b) and from behind
     clear: Tensor  # (n, a, b) transmittance
 
     @classmethod
-    def empty(cls, shape: tuple[int, ...], device: torch.device) -> _Columns:
+    def empty(cls, numbers: int, shape: tuple[int, ...], device: torch.device) -> _Columns:
         """Returns intervals of nothing."""
-        color = torch.zeros((3, *shape), device=device)
+        color = torch.zeros((numbers, *shape), device=device)
         return cls(color, color, torch.ones(shape, device=device))
 
     def joined(self, count: int) -> _Columns:
@@ -212,30 +227,80 @@ class _Columns:
         return _Columns(ahead, behind, passes)
 
     def weighted(self) -> Tensor:
-        """Returns (2, 5, n, a, b) colour, alpha and 1, from both sides, times the light that the
-        interval before lets through.
+        """Returns (2, c + 2, n, a, b) colour, alpha, moments and 1, from both sides, times the
+        light that the interval before lets through.
         """
         whole = torch.ones_like(self.clear[:1])
         before = torch.cat((whole, self.clear[:-1])) + _LEAST
         behind = torch.cat((self.clear[1:], whole)) + _LEAST
         alpha = 1 - self.clear
         sides = [
-            torch.cat((color * light, (alpha * light)[None], light[None]))
+            [color[:3] * light, (alpha * light)[None], light[None]]
             for color, light in ((self.front, before), (self.back, behind))
         ]
-        return torch.stack(sides)
+        if len(self.front) > 3:
+            sides[0].insert(2, _surfaces(self.front, alpha, before, 1))
+            sides[1].insert(2, _surfaces(self.back, alpha, behind, -1))
+        return torch.stack([torch.cat(side) for side in sides])
 
 
-def _colored(values: Tensor, table: ColorTable) -> _Columns:
-    """Returns what one interval of each value shows."""
-    low, high = table.domain_2
-    rows = table.table_lm4[0]
-    place = ((values - low) * ((len(rows) - 1) / (high - low))).clamp(0, len(rows) - 1)
-    row = place.to(torch.int64).clamp(max=len(rows) - 2)
-    part = place - row
-    numbers = [torch.lerp(one[row], one[row + 1], part) for one in rows.T.contiguous()]
-    color = torch.stack([one * numbers[3] for one in numbers[:3]])
-    return _Columns(color, color, 1 - numbers[3])
+def _surfaces(color: Tensor, alpha: Tensor, light: Tensor, step: int) -> Tensor:
+    """Returns the moments of intervals (c - 3, n, a, b), weighted with light. To what lies within
+    solid matter no light comes, but places between it and the surface are seen: there it is as the
+    last interval before to which light comes, and counts little beside what other directions see.
+    """
+    index = torch.arange(len(alpha), device=alpha.device)[:, None, None]
+    comes = light > 2 * _LEAST
+    if step > 0:
+        place = torch.where(comes, index, 0).cummax(0).values
+    else:
+        place = torch.where(comes, index, len(alpha) - 1).flip(0).cummin(0).values.flip(0)
+    thick = alpha.gather(0, place)
+    part = light * torch.where(thick > 0, alpha / torch.where(thick > 0, thick, 1.0), 0.0)
+    part = torch.where(comes, part, part / _FAINT)
+    return color[3:].gather(1, place.expand_as(color[3:])) * part
+
+
+@dataclass(frozen=True)
+class _Painter:
+    """Makes intervals of values."""
+
+    table: ColorTable
+    sizes: Sequence[float] | None  # of a voxel along each axis of the values, if normals count
+    along: int  # the field's axis that comes first
+
+    @property
+    def width(self) -> int:
+        """Numbers of an interval: see `LIT`."""
+        return PLAIN if self.sizes is None else LIT
+
+    def colored(self, part: Tensor) -> _Columns:
+        """Returns what intervals of half a voxel show of (n, a + 2, b + 2) values, with neighbours
+        on the sides.
+        """
+        values = _finer(part)
+        low, high = self.table.domain_2
+        rows = self.table.table_lm4[0]
+        place = ((values - low) * ((len(rows) - 1) / (high - low))).clamp(0, len(rows) - 1)
+        row = place.to(torch.int64).clamp(max=len(rows) - 2)
+        part_of = place - row
+        numbers = [torch.lerp(one[row], one[row + 1], part_of) for one in rows.T.contiguous()]
+        color = [one * numbers[3] for one in numbers[:3]]
+        if self.sizes is not None:
+            color += [one * numbers[3] for one in self.moments(part, self.sizes)]
+        seen = torch.stack(color)
+        return _Columns(seen, seen, 1 - numbers[3])
+
+    def moments(self, part: Tensor, sizes: Sequence[float]) -> list[Tensor]:
+        """Returns the products of the components of unit normals; 0 where there is no gradient."""
+        slopes = [_finer(part, axis) / sizes[axis] for axis in range(3)]
+        most = torch.stack([one.abs() for one in slopes]).amax(0)
+        scaled = [one / torch.where(most > 0, most, 1.0) for one in slopes]
+        square = scaled[0] * scaled[0] + scaled[1] * scaled[1] + scaled[2] * scaled[2]
+        share = 1 / torch.where(square > 0, square, 1.0)
+        others = [axis for axis in range(3) if axis != self.along]
+        z, y, x = (scaled[[self.along, *others].index(axis)] for axis in range(3))
+        return [a * b * share for a, b in ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))]
 
 
 def _pooled(values: Tensor, block: int) -> Tensor:
@@ -251,20 +316,24 @@ def _pooled(values: Tensor, block: int) -> Tensor:
 
 
 def mean_of_directions(colors: Tensor) -> Tensor:
-    """Returns (..., 4) of (..., 24), of the same dtype."""
-    first, *others = colors.split(4, -1)
+    """Returns (..., n) of (..., 6 * n), of the same dtype. Their moments are over _FAINT: light
+    comes to all of such matter, and the trace then tells which share of it has a normal.
+    """
+    first, *others = colors.split(colors.shape[-1] // _DIRECTIONS, -1)
     total = first.float()
     for one in others:
         total += one
-    return (total / _DIRECTIONS).to(colors.dtype)
+    mean = total / _DIRECTIONS
+    mean[..., PLAIN:] /= _FAINT
+    return mean.to(colors.dtype)
 
 
 def _of_length(colors: Tensor, lengths: float) -> Tensor:
-    """Returns colours (..., 8) of homogeneous matter over other lengths."""
+    """Returns numbers (..., 2 * n) of homogeneous matter over other lengths."""
     if lengths == 1:
         return colors
-    pairs = colors.unflatten(-1, (2, 4))
-    alpha = pairs[..., 3:]
+    pairs = colors.unflatten(-1, (2, -1))
+    alpha = pairs[..., 3:4]
     changed = 1 - (1 - alpha).clamp(min=1e-30) ** lengths
     scale = changed / torch.where(alpha > 0, alpha, 1.0)
-    return torch.cat((pairs[..., :3] * scale, changed), -1).flatten(-2)
+    return torch.cat((pairs[..., :3] * scale, changed, pairs[..., 4:] * scale), -1).flatten(-2)

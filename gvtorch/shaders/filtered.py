@@ -1,18 +1,23 @@
-"""`Filtered`: the transfer function, right from afar too.
+"""`Filtered`: the transfer function, lit or not, right from afar too.
 
 The function of a mean is not the mean of the function, and a mean forgets what stands behind what.
 So each voxel of a coarse level holds what the function makes of the finest voxels below it, seen
 along the axes: for each column of them its colour and alpha, and of the columns the mean, weighted
-with the light that came through the voxel before. Cracks stay open, and walls closed.
+with the light that came through the voxel before. Cracks stay open, and walls closed. Where matter
+is lit, so are the second moments of its normals: they have no sign, as light has none that falls on
+both sides of a surface, and they tell how rough a surface is. Light and material stay free.
 
 Source: Crassin et al., "Interactive indirect illumination using voxel cone tracing", CGF 2011
 (voxels by direction); Younesy, Möller, Carr, "Improving the quality of multi-resolution volume
-rendering", EuroVis 2006 (why). The weight is ours; docs/picture.md measures what it gives.
+rendering", EuroVis 2006 (why); Olano, Baker, "LEAN mapping", I3D 2010, and Heitz, Dupuy, Crassin,
+Dachsbacher, "The SGGX microflake distribution", SIGGRAPH 2015 (moments of normals). The weight and
+the sums over moments are ours; docs/picture.md measures what they give.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -21,16 +26,17 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.checked import Check, instance_of, whole
+from ..base.checked import Check, kind_of, whole
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume
 from ..io.stores.coarse import make_channel
 from ..io.stores.store import Store
 from ..io.stores.store_layout import CoarseChannel
 from ..ops import ShadeArguments, cut_bricks
-from ..ops.shading import FilteredNumbers
+from ..ops.shading import FilteredNumbers, ShadeParameters
 from ..pool import Channel, N3Tree
-from .coarse_colors import Field, VolumeField, mean_of_directions, write_colors
+from .built_in import Lit
+from .coarse_colors import LIT, PLAIN, Field, VolumeField, mean_of_directions, write_colors
 from .shader import Sampling, Shader
 from .transfer_function import TransferFunction
 
@@ -39,26 +45,39 @@ _TIMEOUT = 3600.0  # seconds for one read of local data
 _BATCH = 4096  # bricks cut at a time
 
 
+def _to_filter(owner: Any, name: str, value: Any) -> TransferFunction | Lit:
+    """Checks what is to be filtered."""
+    where = kind_of(owner)
+    if not isinstance(value, TransferFunction | Lit):
+        got = type(value).__name__
+        raise ValueError(f"{where}: {name} must be a TransferFunction or a Lit, got {got}")
+    if isinstance(value, Lit) and (value.normals or value.shadows or value.octaves):
+        raise ValueError(
+            f"{where}: a Lit must take its normals from the gradient, without shadows per sample "
+            "and octaves of scattering"
+        )
+    return value
+
+
 class Filtered(Shader):
     """The transfer function, and for coarse bricks the colours that it makes of the finest voxels
     below them, a channel of their own. Near by it draws as the transfer function does; from afar
     it shows about what many rays a pixel would. `Filtered.of` makes both.
 
+    Or the transfer function as `Lit` shows it: then coarse bricks tell of the normals, too, and
+    highlights widen. Light and material may be edited at any time.
+
     Levels are chosen 1.6 times as fine as for other shaders, whose wide cones have to filter.
     """
 
-    kind = "Filtered"
     reads_coarse = True
     finer = 1.6  # a fine voxel is at least five eighths of an interval
-    transfer: TransferFunction
-    checks: ClassVar[Mapping[str, Check]] = {
-        "transfer": instance_of(TransferFunction),
-        "component": whole(0),
-    }
+    transfer: TransferFunction | Lit
+    checks: ClassVar[Mapping[str, Check]] = {"transfer": _to_filter, "component": whole(0)}
 
     def __init__(
         self,
-        transfer: TransferFunction,
+        transfer: TransferFunction | Lit,
         channel: str = "filtered",
         component: int = 0,
         *,
@@ -67,8 +86,8 @@ class Filtered(Shader):
         """Tells the transfer function, and where its colours lie.
 
         Args:
-            transfer: The transfer function. Where colours were made of another one, or it is
-                edited, tracing raises ValueError: they have to be made anew.
+            transfer: The transfer function, or a `Lit` with one. Where colours were made of
+                another one, or it is edited, tracing raises ValueError: they have to be made anew.
             channel: Name of the channel that holds the colours.
             component: Which number of a voxel the function takes.
             directions: Whether colours are made for each of six directions, or their mean, which
@@ -82,7 +101,7 @@ class Filtered(Shader):
         cls,
         tree: N3Tree,
         volume: Volume,
-        transfer: TransferFunction,
+        transfer: TransferFunction | Lit,
         *,
         channel: str = "filtered",
         component: int = 0,
@@ -90,15 +109,15 @@ class Filtered(Shader):
         progress: Progress = no_progress,
     ) -> Self:
         """Works the colours out on the device of a resident tree, and keeps them as a channel of
-        it: (b, z, y, x, 4 or 24) float16 for its first b bricks, those above the finest level.
-        Premultiplied linear colour, and the alpha of a voxel. What a tree's threshold made EMPTY
-        counts here as it is. Working takes 14 to 25 bytes a finest voxel on the device, the
-        channel included.
+        it: (b, z, y, x, n or 6 * n) float16 for its first b bricks, those above the finest level.
+        n is 4: premultiplied linear colour, and the alpha of a voxel; of lit matter 10: also the
+        moments of its normals. What a tree's threshold made EMPTY counts here as it is. Working
+        takes 14 to 25 bytes a finest voxel on the device, the channel included; lit, twice that.
 
         Args:
             tree: What `N3Tree.from_volume` made of the volume.
             volume: The volume.
-            transfer: The transfer function.
+            transfer: The transfer function, or a `Lit`.
             channel: Name of the channel, which replaces one of this name.
             component, directions: See `Filtered`.
             progress: Told ("filtered", voxels done, voxels in all).
@@ -138,7 +157,7 @@ class Filtered(Shader):
     def add_to(
         cls,
         store: Store | str | Path,
-        transfer: TransferFunction,
+        transfer: TransferFunction | Lit,
         *,
         channel: str = "filtered",
         component: int = 0,
@@ -148,12 +167,12 @@ class Filtered(Shader):
     ) -> Self:
         """Works the colours out for a store, out of core, and writes them into it as a coarse
         channel, which `StoredProducer(store, filtered=shader)` streams. The store's own voxels are
-        read and stay as they are. While they are made, files of 7 bytes a finest voxel lie in the
-        store's folder; the colours themselves compress well.
+        read and stay as they are. While they are made, files of 7 bytes a finest voxel (lit, 17)
+        lie in the store's folder; the colours themselves compress well.
 
         Args:
             store: A store that `convert` made, in a folder.
-            transfer: The transfer function.
+            transfer: The transfer function, or a `Lit`.
             channel: Name of the colours; those of this name are replaced.
             component, directions: See `Filtered`.
             device: Where the work is done.
@@ -168,6 +187,7 @@ class Filtered(Shader):
         shader = cls(transfer, channel, component, directions=directions)
         place = check.device("Filtered", device)
         kind, made_of = shader.colors(opened.spacing), shader.made_of
+        wide = 6 * shader.numbers
 
         def fill(levels: Sequence[np.ndarray]) -> None:
             out = [torch.from_numpy(level) for level in levels]
@@ -175,17 +195,18 @@ class Filtered(Shader):
             shader.write(field, opened.spacing, 2, out, place, progress)
 
         def keep(colors: np.ndarray) -> np.ndarray:
-            return (
-                colors if kind.width == 24 else mean_of_directions(torch.from_numpy(colors)).numpy()
-            )
+            if kind.width == wide:
+                return colors
+            return mean_of_directions(torch.from_numpy(colors)).numpy()
 
         told = CoarseChannel(width=kind.width, made_of=made_of)
-        make_channel(opened, channel, told, 24, fill, keep, progress)
+        make_channel(opened, channel, told, wide, fill, keep, progress)
         return shader
 
     @classmethod
     def stored(cls, store: Store | str | Path, channel: str = "filtered") -> Self:
-        """Returns the shader whose colours a store holds, with the function they were made with.
+        """Returns the shader whose colours a store holds, with the function they were made with; in
+        a `Lit` with a headlight, where they tell of normals.
 
         Raises:
             ValueError: The store has no such colours, or they are damaged.
@@ -199,7 +220,10 @@ class Filtered(Shader):
             )
         told = opened.coarse[channel]
         names = ("opacity", "color", "reference", "component")
-        if sorted(told.made_of) != sorted(names) or told.width not in (4, 24):
+        lit = told.made_of.get("normals") is True
+        wanted = sorted((*names, "normals") if lit else names)
+        numbers = LIT if lit else PLAIN
+        if sorted(told.made_of) != wanted or told.width not in (numbers, 6 * numbers):
             raise ValueError(f"{opened.location}: damaged: {channel!r} holds no filtered colours")
         opacity, color, reference, component = (told.made_of[name] for name in names)
         try:
@@ -207,17 +231,35 @@ class Filtered(Shader):
             check.whole("Filtered", "component", component, low=0, high=opened.width - 1)
         except ValueError as error:
             raise ValueError(f"{opened.location}: damaged: {channel!r}: {error}") from None
-        return cls(transfer, channel, component, directions=told.width == 24)
+        shown = Lit(transfer) if lit else transfer
+        return cls(shown, channel, component, directions=told.width != numbers)
+
+    @property
+    def kind(self) -> str:  # type: ignore[override]
+        """See `Shader`."""
+        return "Filtered" if self.numbers == PLAIN else "FilteredLit"
+
+    @property
+    def function(self) -> TransferFunction:
+        """The transfer function itself."""
+        return self.transfer.transfer if isinstance(self.transfer, Lit) else self.transfer
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers tell what is seen of a voxel along one direction."""
+        return LIT if isinstance(self.transfer, Lit) else PLAIN
 
     @property
     def made_of(self) -> dict[str, Any]:
         """What the colours depend on, as JSON."""
-        return {
-            "opacity": self.transfer.opacity.tolist(),
-            "color": self.transfer.color.tolist(),
-            "reference": self.transfer.reference,
+        function = self.function
+        told = {
+            "opacity": function.opacity.tolist(),
+            "color": function.color.tolist(),
+            "reference": function.reference,
             "component": self.component,
         }
+        return told if self.numbers == PLAIN else {**told, "normals": True}
 
     def colors(self, spacing: tuple[float, float, float]) -> Channel:
         """Returns the channel that holds the colours of voxels of this size."""
@@ -225,7 +267,7 @@ class Filtered(Shader):
         if directions is None:
             table = self.transfer.table(_sampling(min(spacing), min(spacing), torch.device("cpu")))
             directions = float(table.table_lm4[0, :, 3].max()) > _OPAQUE
-        return Channel(torch.float16, 24 if directions else 4, coarse=True)
+        return Channel(torch.float16, self.numbers * (6 if directions else 1), coarse=True)
 
     def levels(
         self,
@@ -237,15 +279,16 @@ class Filtered(Shader):
         progress: Progress = no_progress,
     ) -> Iterator[Tensor]:
         """Yields the colours of a volume's coarse levels, (z, y, x, width) float16 on the CPU, the
-        finest of them first, worked out on a device; see `of`. The width is 4 or 24.
+        finest of them first, worked out on a device; see `of`. The width is that of `colors`.
         """
         field = VolumeField(volume, self.component or 0)
         sides = [branching ** (level + 1) for level in range(depth)]
         shapes = [[-(-n // side) for n in field.shape] for side in sides]
-        out = [torch.empty((*n, 24), dtype=torch.float16, device=device) for n in shapes]
+        wide = 6 * self.numbers
+        out = [torch.empty((*n, wide), dtype=torch.float16, device=device) for n in shapes]
         self.write(field, volume.spacing, branching, out, device, progress)
         for colors in out:
-            yield (colors if width == 24 else mean_of_directions(colors)).cpu()
+            yield (colors if width == wide else mean_of_directions(colors)).cpu()
 
     def write(
         self,
@@ -261,10 +304,20 @@ class Filtered(Shader):
         """
         smallest = min(spacing)
         tables = [self.transfer.table(_sampling(smallest, side / 2, device)) for side in spacing]
-        write_colors(field, tables, [smallest / side for side in spacing], branching, out, progress)
+        write_colors(field, tables, spacing, branching, out, progress)
 
     def own_numbers(self, tree: N3Tree) -> FilteredNumbers:
         return FilteredNumbers(min(tree.spacing) * tree.side)
+
+    def material(self) -> ShadeParameters:
+        return self.transfer.material()
+
+    def unlit(self) -> Shader:
+        if not isinstance(self.transfer, Lit):
+            return super().unlit()
+        bare = copy(self)
+        bare.transfer = self.transfer.unlit()
+        return bare
 
     def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
         if tree.made_of.get(str(self.other), self.made_of) != self.made_of:
@@ -272,11 +325,12 @@ class Filtered(Shader):
                 f"{where}: the colours {self.other!r} were made of another function or component, "
                 "or it was edited: make them anew (Filtered.of, Filtered.add_to, or a new producer)"
             )
-        known = tree.bricks.channels.get(str(self.other), Channel(width=4))
-        if known.width not in (4, 24):
+        one = self.numbers
+        known = tree.bricks.channels.get(str(self.other), Channel(width=one))
+        if known.width not in (one, 6 * one):
             raise ValueError(
-                f"{where}: filtered colours need 4 numbers a voxel, or 24 for six directions, "
-                f"{self.other!r} has {known.width}"
+                f"{where}: filtered colours need {one} numbers a voxel, or {6 * one} for six "
+                f"directions, {self.other!r} has {known.width}"
             )
         return super().shading(where, tree)
 

@@ -135,6 +135,8 @@ class Filter:
     """values that it is stretched over, as of gvtorch render"""
     component: Annotated[int, arg(metavar="N")] = 0
     """which number of a voxel is shown"""
+    lit: bool = False
+    """colours and normals, for --shader filtered-lit"""
     directions: Literal["auto", "six", "one"] = "auto"
     """colours for each of six directions, or their mean; auto: six where a voxel may hide a fifth
     of what is behind"""
@@ -146,7 +148,7 @@ class Filter:
         from ..io.resources import amount
         from ..io.stores.store import Store
         from ..ops import available
-        from ..shaders import Filtered
+        from ..shaders import Filtered, Lit
         from .colors import chosen_transfer
 
         on_cuda = self.backend == "cuda" or (self.backend is None and not available()["cuda"])
@@ -157,7 +159,7 @@ class Filter:
             for moment in range(store.times):
                 Filtered.add_to(
                     store if moment == 0 else Store.open(self.store, time=moment),
-                    transfer,
+                    Lit(transfer) if self.lit else transfer,
                     component=self.component,
                     directions={"auto": None, "six": True, "one": False}[self.directions],
                     device="cuda" if on_cuda else "cpu",

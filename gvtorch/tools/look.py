@@ -30,7 +30,10 @@ if TYPE_CHECKING:
 else:
     CameraModel = str  # checked by the camera, since its module would load torch
     ShaderName = Literal[
-        (*declared_names("shaders.built_in", "BY_NAME"), "filtered", "channels", "labels", "colors")
+        (
+            *declared_names("shaders.built_in", "BY_NAME"),
+            *("filtered", "filtered-lit", "channels", "labels", "colors"),
+        )
     ]
 
 _WHOLE = ("isosurface", "maximum", "minimum", "mean")  # see one value, or a whole ray
@@ -59,6 +62,7 @@ class Look:
     histogram without its background, as for presets and colour maps if left out"""
     shader: ShaderName = "plain"
     """what is made of the values; filtered: plain, but right from afar (stores: gvtorch filter);
+    filtered-lit: lit, but right from afar (gvtorch filter --lit);
     channels: all numbers of a voxel, each in its colour and window as the file tells, else found;
     labels: each in its colour, also if left out where there are labels; colors: those of a mesh,
     lit where its normals are stored beside them, also if left out"""
@@ -175,7 +179,7 @@ class Look:
         """Returns the shader asked for, its transfer function read, or spanned over the data; of
         labels, theirs.
         """
-        from ..shaders import Filtered, TransferFunction
+        from ..shaders import Filtered, Lit, TransferFunction
         from ..shaders.built_in import BY_NAME
 
         if self.shader == "channels":
@@ -196,8 +200,9 @@ class Look:
             return BY_NAME[self.shader](TransferFunction([(0, 1)]), self.value or 0.0)
         _tell_of_others(data, self.component)
         transfer = chosen_transfer(self.tf, self.window, data, self.component)
-        if self.shader == "filtered":  # its colours are made with the tree
-            return Filtered(transfer, component=self.component)
+        if self.shader in ("filtered", "filtered-lit"):  # its colours are made with the tree
+            shown = Lit(transfer) if self.shader == "filtered-lit" else transfer
+            return Filtered(shown, component=self.component)
         return BY_NAME[self.shader](transfer, 0.0)
 
 

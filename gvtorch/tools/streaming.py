@@ -84,7 +84,14 @@ class Streaming:
         shader = look.stored_colors(store, names) if names else look.chosen(store)
         filtered = shader if isinstance(shader, Filtered) else None
         if filtered is not None and look.tf is None:
-            shader = filtered = Filtered.stored(store)
+            stored = Filtered.stored(store)
+            if stored.kind != filtered.kind:
+                wanted = "--shader filtered" + "-lit" * (stored.kind == "FilteredLit")
+                raise ValueError(
+                    f"{store.location}: its filtered colours are for {wanted}; "
+                    "gvtorch filter, with --lit or without, makes others"
+                )
+            shader = filtered = stored
         if filtered is not None and filtered.component != look.component:
             raise ValueError(f"--component must be that of the colours, {filtered.component}")
         if len(names) > 1:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..base.records import Hits, Rays
 from ..ops.shading import pack
+from ..shaders.filtered import Filtered
 from ..shaders.lights import LitShader
 from ..shaders.shader import CutSurface, Shader
 from .clip import Clipped
@@ -40,7 +41,8 @@ def around(tracer: Tracer, options: RenderOptions, box: Tensor) -> Trace:
         return _clipped(tracer, options, box, lens)
     shader = tracer.shader
     unlit = _clipped(tracer.seeing(shader.unlit(), options), options, box, lens)
-    assert isinstance(shader, LitShader)  # others raise
+    lit = shader.transfer if isinstance(shader, Filtered) else shader
+    assert isinstance(lit, LitShader)  # others raise
     lights = options.lighting.lights
     cones = replace(options, lod="auto")
     matter = None
@@ -52,7 +54,7 @@ def around(tracer: Tracer, options: RenderOptions, box: Tensor) -> Trace:
         blocker=_clipped(tracer.seeing(shader.blocker(), cones), options, box),
         matter=matter,
         lighting=options.lighting.placed(box),
-        lights=(shader.light,) if lights is None else lights,
+        lights=(lit.light,) if lights is None else lights,
         material=shader.material(),
         voxel=max(tracer.tree.spacing),
         cone_scale=options.cone_scale,

@@ -139,7 +139,8 @@ def overlaps(trees: Sequence[TreeTrace]) -> bool:
 def _shows(one: TreeTrace) -> bool:
     """False where a tree is hidden by a transfer function without any opacity."""
     shader = one.tracer.shader  # what surfaces and others take of a function is its colour alone
-    transfer = shader.transfer if isinstance(shader, Lit | Filtered) else shader
+    transfer = shader.transfer if isinstance(shader, Lit) else shader
+    transfer = shader.function if isinstance(shader, Filtered) else transfer
     return not isinstance(transfer, TransferFunction) or bool(transfer.opacity[:, 1].any())
 
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..shading import LightKind, ShadeParameters
-from .exact import dot, larger, power, sqrt_exact, unit
+from .exact import clamp, divide, dot, larger, power, smaller, sqrt_exact, unit
 from .march import Piece, Plain, Probe, Visitor, Walk
 from .rays import INF, Intervals, split
 from .tree import Bricks
@@ -23,6 +23,8 @@ from .tree import Bricks
 #: Each octave of scattering gives so much of the light of the one before it, and keeps so much of
 #: its direction: fitted to path traced clouds (benchmarks/cloud_light.py).
 OCTAVE_LIGHT, OCTAVE_DIRECTION = 0.55, 0.6
+#: By how much the moments of normals may be lessened where no light comes: see `coarse_colors`.
+FAINT = 32
 
 
 @dataclass
@@ -50,7 +52,11 @@ class Light:
             normal = torch.stack(columns, 1) * p.normal_scale + p.normal_offset
         else:
             normal = probe.gradient(t, self.cube)
-        normal = unit(normal)
+        return self.to_eye(normal)
+
+    def to_eye(self, way: Tensor) -> Tensor:
+        """(r, 3) normals towards the eye, of vectors of any length."""
+        normal = unit(way)
         return torch.where((dot(normal, self.along) > 0)[:, None], -normal, normal)
 
     def towards(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -78,22 +84,84 @@ class Light:
         """(r, 3) colours in the light of base colours (r, 3). `share` gives the share of light that
         comes to those places that face the light, (r,) bool; None: all comes to all.
         """
-        p, zero = self.parameters, torch.zeros_like(t)
+        zero = torch.zeros_like(t)
         to_light, _, _ = self.towards(t)
         bare = ~(dot(normal, normal) > 0)
         facing = torch.where(bare, 1.0, larger(zero, dot(normal, to_light)))
         half = unit(to_light - self.along)
-        highlight = power(larger(zero, dot(normal, half)), p.shininess)
+        highlight = power(larger(zero, dot(normal, half)), self.parameters.shininess)
         highlight = torch.where((facing > 0) & ~bare, highlight, zero)
         if share is not None:
             comes = share(facing > 0)
             if self.scatters:
                 return self.scattered(base, dot(self.along, to_light), comes)
             facing, highlight = facing * comes, highlight * comes
+        return self.lit(base, facing, highlight)
+
+    def lit(self, base: Tensor, facing: Tensor, highlight: Tensor) -> Tensor:
+        """(r, 3) colours of base colours (r, 3), by how much they face the light and shine (r,)."""
+        p = self.parameters
         diffuse = (p.diffuse * facing)[:, None]
         specular = (p.specular * highlight)[:, None]
         light = torch.as_tensor(p.light_color)
         return base * (p.ambient + diffuse * light) + specular * light
+
+    def shade_rough(
+        self, base: Tensor, moments: Tensor, front: Tensor | None, t: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Lights rough surfaces, of which only the moments of their normals are known.
+
+        Of a cosine with the light, as it is on the side that the eye sees, they tell mean and
+        deviation; it is taken to be evenly spread, as it is for the normals of a ball. Highlights:
+        Toksvig, "Mipmapping normal maps", 2005, for a spread that is the same to all sides of a
+        main normal.
+
+        Args:
+            base: (r, 3) base colours.
+            moments: (r, 6) mean products xx xy xz yy yz zz of the components of the normals; where
+                their trace is 0, places are lit as if they faced the light.
+            front: (r, 3) mean normals of what is seen from one side alone, in the same measure:
+                what light comes from behind does not show. None: both sides are seen.
+            t: (r,) distances.
+
+        Returns:
+            (r, 3) colours in the light, and (r, 3) vectors along the normals, towards the eye.
+        """
+        zero, d, shininess = torch.zeros_like(t), self.along, self.parameters.shininess
+        total = moments[:, 0] + moments[:, 3] + moments[:, 5]
+        share = clamp(FAINT * total, 0, 1)
+        xx, xy, xz, yy, yz, zz = (moments / torch.where(total > 0, total, 1.0)[:, None]).unbind(1)
+
+        def times(v: Tensor) -> Tensor:
+            x, y, z = v.unbind(1)
+            rows = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
+            return torch.stack([a * x + b * y + c * z for a, b, c in rows], 1)
+
+        square = xx * xx + yy * yy + zz * zz + 2 * (xy * xy + xz * xz + yz * yz)
+        to_light, _, _ = self.towards(t)
+        back = -times(d)
+        seen = sqrt_exact(larger(zero, -dot(d, back)))
+        known = 0.8 + 0.2 * square  # the mean of a size over its root mean square
+        mean = known * dot(to_light, back) / torch.where(seen > 0, seen, 1.0)
+        if front is not None:
+            outside = known * dot(to_light, front) / torch.where(total > 0, total, 1.0)
+            mean = smaller(mean, outside)
+        variance = larger(zero, dot(to_light, times(to_light)) - mean * mean)
+        wide = sqrt_exact(3 * variance)  # half of what it is spread over
+        above = clamp(mean + wide, 0, 2 * wide)
+        part = above * above / torch.where(wide > 0, 4 * wide, 1.0)
+        facing = part + larger(zero, mean - wide)
+
+        half = unit(to_light - d)
+        even = sqrt_exact(clamp(1.5 * square - 0.5, 0, 1))  # 0: a ball's normals, 1: one normal
+        spread = divide(1 - even, 3.0, even)
+        little = 0.9 * (spread * spread)  # where no normal is the main one
+        along = dot(half, times(half)) - spread + divide(little, 3.0, little)
+        dull = divide(shininess, 1 + shininess * spread, spread)
+        bright = divide(1 + dull, 1 + shininess, dull)
+        highlight = bright * power(clamp(along / (even + little), 0, 1), dull * 0.5)
+        highlight = torch.where(facing > 0, highlight, zero)
+        return self.lit(base, 1 - share + share * facing, share * highlight), back
 
     def scattered(self, base: Tensor, cosine: Tensor, clear: Tensor) -> Tensor:
         """(r, 3) colours of places in a medium, from the share of light that comes there straight:

@@ -15,7 +15,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Self
 
 import torch
@@ -89,14 +88,16 @@ class Probe:
         """(r, 3) gradients of the value per world unit, from half a voxel to each side; `cube` (3,)
         is the world size of the root cube.
         """
-        channel = self.channel
+        return self.blend(t, lambda holder: self.slope(holder, t, cube))
 
-        def slope(axis: int, holder: Holder) -> Tensor:
+    def slope(self, holder: Holder, t: Tensor, cube: Tensor) -> Tensor:
+        """(r, 3) gradients as one of the nodes tells them; see `gradient`."""
+        slopes = []
+        for axis in range(3):
             shifts = [[way if a == axis else 0.0 for a in range(3)] for way in (-0.5, 0.5)]
-            low, high = (channel.sample(holder, self.beam, t, shift) for shift in shifts)
-            return (high - low) * (holder.scale / cube[axis])
-
-        return torch.stack([self.blend(t, partial(slope, axis)) for axis in range(3)], 1)
+            low, high = (self.channel.sample(holder, self.beam, t, shift) for shift in shifts)
+            slopes.append((high - low) * (holder.scale / cube[axis]))
+        return torch.stack(slopes, 1)
 
     def blend(self, t: Tensor, ask: Callable[[Holder], Tensor]) -> Tensor:
         """(r,) or (r, c): what the node says and what its parent says, whose weight grows from 0

@@ -35,6 +35,7 @@ from .rays import INF
 from .tree import Bricks, Holder
 
 _BISECTIONS = 4
+LIT = 10  # numbers of filtered colours with moments of normals, seen along a direction
 
 
 @dataclass
@@ -375,13 +376,20 @@ class Filtered(Shade):
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
         fine, coarse = probe.answer.fine, probe.answer.coarse
         stored = self.stored(fine) | self.stored(coarse)
-        rgba = self.rgba(piece, probe)
-        self.sum.add(rgba, piece, where & ~stored)
+        self.add_near(piece, probe, where & ~stored)
         if not (where & stored).any():
             return
-        rgba = probe.blend(piece.middle, lambda holder: self.look(piece, probe, holder))
-        self.sum.add_light(self.sum.clear[:, None] * rgba[:, :3], where & stored)
-        self.sum.absorb(rgba[:, 3], piece, where & stored)
+        found = probe.blend(piece.middle, lambda holder: self.look(piece, probe, holder))
+        self.add_found(found, piece, where & stored)
+
+    def add_near(self, piece: Piece, probe: Probe, where: Tensor) -> None:
+        """Adds an interval where no node has colours."""
+        self.sum.add(self.rgba(piece, probe), piece, where)
+
+    def add_found(self, found: Tensor, piece: Piece, where: Tensor) -> None:
+        """Adds an interval of what `look` tells."""
+        self.sum.add_light(self.sum.clear[:, None] * found[:, :3], where)
+        self.sum.absorb(found[:, 3], piece, where)
 
     def stored(self, holder: Holder) -> Tensor:
         """(r,) bool: the node's brick has colours."""
@@ -390,24 +398,91 @@ class Filtered(Shade):
 
     def look(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
         """(r, 4) premultiplied colours and alphas of intervals, as one of the nodes shows them."""
-        t, stored = piece.middle, self.stored(holder)
-        value = self.channel.sample(holder, probe.beam, t)
-        row = self.transfer.interval(value, piece)
+        row = self.row(piece, probe, holder)
         row = torch.cat((row[:, :3] * row[:, 3:], row[:, 3:]), 1)
-        known = replace(holder, brick=torch.where(stored, holder.brick, EMPTY))
+        read = self.reader(piece, probe, holder)
+        seen, alpha, part = self.seen(4, read, piece, holder)
+        colors = torch.stack([*(one * part for one in seen[:3]), alpha], 1)
+        colors = torch.where((part > 0)[:, None], colors, 0.0)
+        return torch.where(self.stored(holder)[:, None], colors, row)
 
-        def number(component: int) -> Tensor:
-            return self.others[component].sample(known, probe.beam, t)
+    def row(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
+        """(r, 4) what the function makes of a node's values."""
+        value = self.channel.sample(holder, probe.beam, piece.middle)
+        return self.transfer.interval(value, piece)
 
-        along, width = self.light.along, len(self.others)
-        seen = [_by_direction(along, width, i, number) for i in range(4)]
+    def reader(self, piece: Piece, probe: Probe, holder: Holder) -> Callable[[int], Tensor]:
+        """What reads a number (r,) of the colours that a node has."""
+        brick = torch.where(self.stored(holder), holder.brick, EMPTY)
+        known = replace(holder, brick=brick)
+        return lambda number: self.others[number].sample(known, probe.beam, piece.middle)
+
+    def seen(
+        self, one: int, read: Callable[[int], Tensor], piece: Piece, holder: Holder
+    ) -> tuple[list[Tensor], Tensor, Tensor]:
+        """Colour and alpha (r,) of a node's voxels, of `one` numbers a direction, as rays see them;
+        alphas (r,) of intervals, and these over those of a voxel.
+        """
+        width = len(self.others)
+        seen = [_by_direction(self.light.along, width, i, read, one) for i in range(4)]
         whole = clamp(seen[3], 0, 1)
         side = self.light.parameters.own_as(FilteredNumbers).side
         alpha = stretch(whole, piece.length * holder.scale / side)
         part = alpha / torch.where(whole > 0, whole, 1.0)
-        colors = torch.stack([*(one * part for one in seen[:3]), alpha], 1)
-        colors = torch.where((whole > 0)[:, None], colors, 0.0)
-        return torch.where(stored[:, None], colors, row)
+        return seen, alpha, torch.where(whole > 0, part, 0.0)
+
+
+class FilteredLit(Filtered):
+    """The lit transfer function, and colours with the moments of normals."""
+
+    def add_near(self, piece: Piece, probe: Probe, where: Tensor) -> None:
+        self.lit(self.rgba(piece, probe), piece, probe, where)
+
+    def add_found(self, found: Tensor, piece: Piece, where: Tensor) -> None:
+        clear, seen = self.sum.clear[:, None], where & (found[:, 3] > 0)
+        normal = self.normal + clear * found[:, 4:]
+        self.normal = torch.where(seen[:, None], normal, self.normal)
+        super().add_found(found, piece, where)
+
+    def look(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
+        """(r, 7) as of `Filtered`, lit, and normals by alpha."""
+        t, light = piece.middle, self.light
+        row = self.row(piece, probe, holder)
+        normal = light.to_eye(probe.slope(holder, t, light.cube))
+        color, alpha = light.shade(row[:, :3], normal, t), row[:, 3:]
+        near = torch.cat((color * alpha, alpha, normal * alpha), 1)
+        near = torch.where(alpha > 0, near, 0.0)
+
+        read = self.reader(piece, probe, holder)
+        seen, long, part = self.seen(LIT, read, piece, holder)
+        shown, alpha = (part > 0)[:, None], long[:, None]
+        whole = torch.where(part > 0, clamp(seen[3], 0, 1), 1.0)[:, None]
+        moments, front = self.moments(read)
+        front = None if front is None else front / whole
+        base = torch.stack(seen[:3], 1) / whole
+        color, normal = light.shade_rough(base, moments / whole, front, t)
+        far = torch.cat((color * alpha, alpha, unit(normal) * alpha), 1)
+        far = torch.where(shown, far, 0.0)
+        return torch.where(self.stored(holder)[:, None], far, near)
+
+    def moments(self, read: Callable[[int], Tensor]) -> tuple[Tensor, Tensor | None]:
+        """(r, 6) moments of the normals that rays see; where six directions are known also (r, 3)
+        the mean of these normals, each turned to the side from which its direction sees it.
+        """
+        if len(self.others) == LIT:
+            return torch.stack([read(i) for i in range(4, LIT)], 1), None
+        mean = front = torch.zeros_like(self.light.along[:, :1])
+        for axis, d in enumerate(self.light.along.unbind(1)):
+            back, first = d < 0, 2 * axis * LIT
+            m = [torch.where(back, read(first + LIT + i), read(first + i)) for i in range(4, LIT)]
+            column = [m[i] for i in ((0, 1, 2), (1, 3, 4), (2, 4, 5))[axis]]
+            weight, total, own = d * d, m[0] + m[3] + m[5], column[axis]
+            some = (total > 0) & (own > 0)
+            scale = sqrt_exact(torch.where(some, total, 0.0) / torch.where(some, own, 1.0)) * weight
+            turned = torch.where(back, scale, -scale)[:, None]
+            mean = mean + weight[:, None] * torch.stack(m, 1)
+            front = front + turned * torch.stack(column, 1)
+        return mean, front
 
 
 class ChannelMix(Shade):
@@ -428,14 +503,16 @@ class ChannelMix(Shade):
         self.sum.absorb(rgba[:, 3], piece, where)
 
 
-def _by_direction(along: Tensor, width: int, number: int, read: Callable[[int], Tensor]) -> Tensor:
-    """(r,) one of the four numbers of a voxel, as it is seen along rays (r, 3): of three
-    directions, where a channel holds 24 numbers; `read` gives one of them.
+def _by_direction(
+    along: Tensor, width: int, number: int, read: Callable[[int], Tensor], one: int = 4
+) -> Tensor:
+    """(r,) one of the numbers of a voxel, as it is seen along rays (r, 3): of three directions,
+    where a channel holds six times `one` numbers; `read` gives one of them.
     """
-    if width == 4:
+    if width == one:
         return read(number)
     side = [
-        torch.where(d < 0, read(8 * axis + 4 + number), read(8 * axis + number))
+        torch.where(d < 0, read((2 * axis + 1) * one + number), read(2 * axis * one + number))
         for axis, d in enumerate(along.unbind(1))
     ]
     x, y, _ = (along * along).unbind(1)
@@ -456,6 +533,7 @@ TWINS: dict[str, type[Shade]] = {
     "Filtered": Filtered,
     "ChannelMix": ChannelMix,
     "Labels": Labels,
+    "FilteredLit": FilteredLit,
 }
 
 

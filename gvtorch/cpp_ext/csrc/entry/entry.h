@@ -280,7 +280,7 @@ struct FusedShaders {
   }
   static bool filtered(int64_t shader) {
     return with_shader<float>(static_cast<int32_t>(shader),
-                              [](auto type) { return decltype(type)::Shader::kFiltered; });
+                              [](auto type) { return decltype(type)::Shader::kFiltered > 0; });
   }
   static void check(const ShadeArgs& args) {
     with_shader<float>(args.shader, [&](auto type) {
@@ -289,8 +289,9 @@ struct FusedShaders {
       STD_TORCH_CHECK(!by_other || args.other_channels > 0, "gvtorch: other_bzyxc is missing");
       const bool colored = (args.channels == 4 || args.channels == 4 * kDirections) && args.component == 3;
       STD_TORCH_CHECK(!Shader::kColored || colored, "gvtorch: bricks_bzyxc must hold red, green, blue and opacity");
-      const bool sided = args.other_channels == 4 || args.other_channels == 4 * kDirections;
-      STD_TORCH_CHECK(!Shader::kFiltered || sided, "gvtorch: other_bzyxc must hold red, green, blue and opacity");
+      constexpr int32_t kSeen = Shader::kFiltered;
+      const bool sided = args.other_channels == kSeen || args.other_channels == kSeen * kDirections;
+      STD_TORCH_CHECK(kSeen == 0 || sided, "gvtorch: other_bzyxc must hold filtered colours");
       STD_TORCH_CHECK(args.features == (by_other ? args.other_channels : Shader::kFeatures),
                       "gvtorch: features is not what the shader gives");
     });

@@ -77,6 +77,9 @@ GV_HD const Own& own_numbers(const Parameters<T>* parameters) {
 // to path traced clouds (benchmarks/cloud_light.py).
 constexpr double kOctaveLight = 0.55, kOctaveDirection = 0.6;
 
+// By how much the moments of normals may be lessened where no light comes: see shaders/coarse_colors.py.
+constexpr double kFaint = 32;
+
 // Blinn-Phong, on both sides of a surface; or the light that a medium scatters.
 template <class T>
 struct Light {
@@ -100,10 +103,40 @@ struct Light {
     } else {
       n = probe.gradient(t);
     }
+    return to_eye(n, probe.sight.direction);
+  }
+  // The normal along a vector of any length, towards the eye that looks along d.
+  template <class V>
+  GV_HD static Vec3<V> to_eye(Vec3<V> n, const Vec3<V>& d) {
     n = unit(n);
-    const MaskOf<V> away = dot(n, probe.sight.direction) > 0;
+    const MaskOf<V> away = dot(n, d) > 0;
     for (int axis = 0; axis < 3; ++axis) n[axis] = select(away, -n[axis], n[axis]);
     return n;
+  }
+  // The way to the light, how long it is, and how much cones to the light grow per unit of length.
+  template <class V>
+  struct Way {
+    Vec3<V> direction;
+    V length, growth;
+  };
+  template <class Eye, class V = typename Eye::Number>
+  GV_HD Way<V> towards(const Eye& probe, typename Eye::Number t) const {
+    const Parameters<T>& own = *parameters;
+    const Vec3<V> d = probe.sight.direction;
+    Way<V> way{{-d.x, -d.y, -d.z}, splat<V>(static_cast<T>(INFINITY)), splat<V>(own.light_width)};
+    if (kind() == LightKind::kDirectional) {
+      for (int axis = 0; axis < 3; ++axis) way.direction[axis] = splat<V>(-own.light_place[axis]);
+      way.direction = unit(way.direction);
+    }
+    if (kind() == LightKind::kPoint) {
+      const Vec3<V> place = probe.sight.at(t);
+      Vec3<V> straight;
+      for (int axis = 0; axis < 3; ++axis) straight[axis] = own.light_place[axis] - place[axis];
+      way.direction = unit(straight);
+      way.length = square_root(dot(straight, straight));
+      way.growth = way.growth / way.length;
+    }
+    return way;
   }
   // Colour of a place in the light. Where there is no normal, it is lit as if it faced the light, without a highlight.
   template <class Eye, class V = typename Eye::Number, class... Shadow>
@@ -111,20 +144,7 @@ struct Light {
                      typename Eye::Number t, const Shadow&... shadow) const {
     const Parameters<T>& own = *parameters;
     const Vec3<V> d = probe.sight.direction;
-    Vec3<V> to_light{-d.x, -d.y, -d.z};
-    V length = splat<V>(static_cast<T>(INFINITY)), growth = splat<V>(own.light_width);
-    if (kind() == LightKind::kDirectional) {
-      for (int axis = 0; axis < 3; ++axis) to_light[axis] = splat<V>(-own.light_place[axis]);
-      to_light = unit(to_light);
-    }
-    if (kind() == LightKind::kPoint) {
-      const Vec3<V> place = probe.sight.at(t);
-      Vec3<V> way;
-      for (int axis = 0; axis < 3; ++axis) way[axis] = own.light_place[axis] - place[axis];
-      to_light = unit(way);
-      length = square_root(dot(way, way));
-      growth = growth / length;
-    }
+    const auto [to_light, length, growth] = towards(probe, t);
     V facing = splat<V>(static_cast<T>(1)), highlight{};
     const MaskOf<V> turned = dot(n, n) > 0;
     if (any(turned)) {
@@ -141,6 +161,12 @@ struct Light {
         highlight = highlight * share;
       }
     }
+    return lit(base, facing, highlight);
+  }
+  // A base colour by how much it faces the light, and shines.
+  template <class V>
+  GV_HD Row<V> lit(const Row<V>& base, V facing, V highlight) const {
+    const Parameters<T>& own = *parameters;
     const V diffuse = own.diffuse * facing;
     const V specular = own.specular * highlight;
     const auto lit = [&](V color, int which) {
@@ -148,6 +174,55 @@ struct Light {
       return color * (own.ambient + diffuse * light) + specular * light;
     };
     return {lit(base.red, 0), lit(base.green, 1), lit(base.blue, 2), base.alpha};
+  }
+
+  // Mean products of the components of normals.
+  struct Moments {
+    T xx, xy, xz, yy, yz, zz;
+
+    GV_HD T trace() const { return xx + yy + zz; }
+    GV_HD Vec3<T> times(const Vec3<T>& v) const {
+      return {xx * v.x + xy * v.y + xz * v.z, xy * v.x + yy * v.y + yz * v.z, xz * v.x + yz * v.y + zz * v.z};
+    }
+  };
+  // Colour of rough surfaces in the light, of which only the moments of their normals are known, and a vector along the
+  // normals, towards the eye. Where the trace is 0, places are lit as if they faced the light. `front`: the mean normal
+  // of what is seen from one side alone, in the same measure; what light comes from behind does not show.
+  //
+  // Of a cosine with the light, as it is on the side that the eye sees, the moments tell mean and deviation; it is
+  // taken to be evenly spread, as it is for the normals of a ball. Highlights: Toksvig, "Mipmapping normal maps", 2005,
+  // for a spread that is the same to all sides of a main normal.
+  GV_HD Row<T> shade_rough(const Row<T>& base, Moments m, bool sided, const Vec3<T>& front, const Probe<T>& probe, T t,
+                           Vec3<T>& normal) const {
+    const T zero = 0, one = 1, shininess = parameters->shininess;
+    const Vec3<T> d = probe.sight.direction;
+    const T total = m.trace();
+    const T share = clamp(static_cast<T>(kFaint) * total, zero, one), whole = total > 0 ? total : one;
+    m = {m.xx / whole, m.xy / whole, m.xz / whole, m.yy / whole, m.yz / whole, m.zz / whole};
+    const T square = m.xx * m.xx + m.yy * m.yy + m.zz * m.zz + 2 * (m.xy * m.xy + m.xz * m.xz + m.yz * m.yz);
+    const Vec3<T> to_light = towards(probe, t).direction;
+    normal = m.times(d);
+    for (int axis = 0; axis < 3; ++axis) normal[axis] = -normal[axis];
+    const T seen = square_root(larger(zero, -dot(d, normal)));
+    // The mean of a size over its root mean square.
+    const T known = static_cast<T>(0.8) + static_cast<T>(0.2) * square;
+    T mean = known * dot(to_light, normal) / (seen > 0 ? seen : one);
+    if (sided) mean = smaller(mean, known * dot(to_light, front) / whole);
+    const T wide = square_root(3 * larger(zero, dot(to_light, m.times(to_light)) - mean * mean));
+    const T above = clamp(mean + wide, zero, 2 * wide);
+    const T facing = above * above / (wide > 0 ? 4 * wide : one) + larger(zero, mean - wide);
+
+    const Vec3<T> half = unit(Vec3<T>{to_light.x - d.x, to_light.y - d.y, to_light.z - d.z});
+    const T even = square_root(clamp(static_cast<T>(1.5) * square - static_cast<T>(0.5), zero, one));
+    const T spread = (1 - even) / 3;
+    const T little = static_cast<T>(0.9) * (spread * spread);
+    const T along = dot(half, m.times(half)) - spread + little / 3;
+    const T dull = shininess / (1 + shininess * spread);
+    const T bright = (1 + dull) / (1 + shininess);
+    T highlight = 0;
+    if (facing > 0)
+      highlight = bright * power_of(clamp(along / (even + little), zero, one), dull * static_cast<T>(0.5));
+    return lit(base, 1 - share + share * facing, share * highlight);
   }
 
   // Colour of a place in a medium, from the share of light that comes there straight: by one scattering, and by octaves

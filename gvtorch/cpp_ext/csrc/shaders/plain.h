@@ -11,7 +11,8 @@ struct ShaderFacts {
   static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
   static constexpr bool kIntegrates = false;  // its table is (l, m, m, 4)
   static constexpr bool kColored = false;     // its channel holds red, green, blue and opacity, once or by direction
-  static constexpr bool kFiltered = false;    // its second channel holds such numbers, of the pool's first bricks
+  static constexpr int32_t kFiltered = 0;     // above 0: so many numbers, or six times so many, of its second channel
+                                              // tell of the pool's first bricks
   static constexpr bool kReadsAll = false;    // it reads what it needs, and a piece has no value
   static constexpr int32_t kFeatures = 0;     // numbers of sum.feature_c
   static constexpr int32_t kAsOther = -1;     // for kFeatures: as many as the second channel holds

@@ -252,10 +252,28 @@ struct Probe {
     return slope;
   }
 
-  // What one of the two nodes, fine or coarse, says of the value, and its brick of four numbers of another channel; how
-  // large it is, and how much the coarse one counts.
+  // What one of the two nodes, fine or coarse, says of the value and of its gradient, and its brick of four numbers of
+  // another channel; how large it is, and how much the coarse one counts.
   GV_HD T value_of(const Spot<T>& spot, T t) const {
     return read(channels.value, channels.component, spot, spot.at(t));
+  }
+  GV_HD Vec3<T> differences(const Spot<T>& spot, T t) const {
+    Vec3<T> slope{0, 0, 0};
+    if (spot.brick < 0) return slope;
+    const Vec3<T> at = spot.at(t);
+#ifdef __CUDA_ARCH__
+#pragma unroll 1
+#endif
+    for (int axis = 0; axis < 3; ++axis) {
+      T ends[2];
+      for (int end = 0; end < 2; ++end) {
+        Vec3<T> beside = at;
+        beside[axis] = at[axis] + (end == 0 ? static_cast<T>(-0.5) : static_cast<T>(0.5));
+        ends[end] = read(channels.value, channels.component, spot, beside);
+      }
+      slope[axis] = (ends[1] - ends[0]) * (spot.scale / cube[axis]);
+    }
+    return slope;
   }
   GV_HD Row<T> four_of(bool, const ChannelView& channel, int32_t component, const Spot<T>& spot, T t) const {
     const int64_t first = first_of(channel, component, spot);
@@ -315,24 +333,6 @@ struct Probe {
     for (int32_t i = 0; i < count; ++i) {
       out[i] = read_number<T>(channel.constant_tnc, channel.type, row + components[i]);
     }
-  }
-  GV_HD Vec3<T> differences(const Spot<T>& spot, T t) const {
-    Vec3<T> slope{0, 0, 0};
-    if (spot.brick < 0) return slope;
-    const Vec3<T> at = spot.at(t);
-#ifdef __CUDA_ARCH__
-#pragma unroll 1
-#endif
-    for (int axis = 0; axis < 3; ++axis) {
-      T ends[2];
-      for (int end = 0; end < 2; ++end) {
-        Vec3<T> beside = at;
-        beside[axis] = at[axis] + (end == 0 ? static_cast<T>(-0.5) : static_cast<T>(0.5));
-        ends[end] = read(channels.value, channels.component, spot, beside);
-      }
-      slope[axis] = (ends[1] - ends[0]) * (spot.scale / cube[axis]);
-    }
-    return slope;
   }
   GV_HD bool same(const ChannelView& channel) const {
     if (!channel.given()) return true;

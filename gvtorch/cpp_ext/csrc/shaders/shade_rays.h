@@ -17,7 +17,7 @@ inline namespace GV_NAMESPACE {
 template <class Shader, class = void>
 struct IsFiltered : std::false_type {};
 template <class Shader>
-struct IsFiltered<Shader, std::void_t<decltype(Shader::kFiltered)>> : std::bool_constant<Shader::kFiltered> {};
+struct IsFiltered<Shader, std::void_t<decltype(Shader::kFiltered)>> : std::bool_constant<(Shader::kFiltered > 0)> {};
 
 template <class Shader, class = void>
 struct IsColored : std::false_type {};

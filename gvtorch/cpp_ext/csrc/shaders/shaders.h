@@ -71,6 +71,137 @@ struct Lit : Plain<T> {
   }
 };
 
+// The lit transfer function, right from afar too: as Filtered, whose numbers are followed by the mean products xx xy xz
+// yy yz zz of the components of the normals below a voxel, times its alpha.
+template <class T>
+struct FilteredLit : Lit<T> {
+  static constexpr int32_t kFiltered = 10;
+  template <class V>
+  using SumOf = ShadeSum<V>;
+  using Own = typename Filtered<T>::Own;
+  int32_t bricks;  // that the second channel has
+
+  explicit FilteredLit(const ShadeArgs& args) : Lit<T>(args), bricks(args.other_bricks) {}
+
+  GV_HD const Lit<T>& plain() const { return *this; }
+  template <class Eye>
+  GV_HD auto stored(const Eye& probe) const {
+    return any_stored(probe, bricks);
+  }
+  template <class V, class Eye>
+  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
+    const MaskOf<V> seen = which && stored(probe), others = which && !seen;
+    if (any(seen)) {
+      Row<V> row{};
+      Vec3<V> normal{};
+      probe.each(seen, [&](int lane, const Probe<T>& own) {
+        const T start = lane_of(piece.start, lane), middle = lane_of(piece.middle, lane);
+        const Piece<T> one{start,
+                           lane_of(piece.end, lane),
+                           lane_of(piece.length, lane),
+                           middle,
+                           lane_of(piece.level, lane),
+                           T{},
+                           T{},
+                           T{},
+                           piece.odd};
+        const Look found = look(one, own);
+        set_lane(row.red, lane, found.row.red);
+        set_lane(row.green, lane, found.row.green);
+        set_lane(row.blue, lane, found.row.blue);
+        set_lane(row.alpha, lane, found.row.alpha);
+        for (int axis = 0; axis < 3; ++axis) set_lane(normal[axis], lane, found.normal[axis]);
+      });
+      sum.add_normal(normal, sum.clear, seen && row.alpha > 0);
+      sum.add_light(row, sum.clear, seen);
+      sum.absorb(row.alpha, piece.start, piece.length, sum.hit_clear, seen);
+    }
+    if (any(others)) Lit<T>::add(others, piece, probe, sum);
+  }
+
+ private:
+  struct Look {
+    Row<T> row;      // premultiplied colour in the light, and alpha
+    Vec3<T> normal;  // times alpha
+  };
+  GV_HD Look look(const Piece<T>& piece, const Probe<T>& probe) const {
+    Look found = look(piece, probe, probe.fine);
+    if (!probe.mixed) return found;
+    const Look coarse = look(piece, probe, probe.coarse);
+    const T weight = probe.weight(piece.middle);
+    const auto mix = [&](T& a, T b) { a = a + weight * (b - a); };
+    mix(found.row.red, coarse.row.red);
+    mix(found.row.green, coarse.row.green);
+    mix(found.row.blue, coarse.row.blue);
+    mix(found.row.alpha, coarse.row.alpha);
+    for (int axis = 0; axis < 3; ++axis) mix(found.normal[axis], coarse.normal[axis]);
+    return found;
+  }
+  // What one of the nodes shows.
+  GV_HD Look look(const Piece<T>& piece, const Probe<T>& probe, const Spot<T>& spot) const {
+    return spot.among(bricks) ? far(piece, probe, spot) : near(piece, probe, spot);
+  }
+  GV_HD Look near(const Piece<T>& piece, const Probe<T>& probe, const Spot<T>& spot) const {
+    const T t = piece.middle;
+    const Row<T> row = look_up(Transfer<T>(this->transfer), probe.value_of(spot, t), piece, this->step);
+    if (!(row.alpha > 0)) return {};
+    const Vec3<T> n = this->light.to_eye(probe.differences(spot, t), probe.sight.direction);
+    return times_alpha(this->light.shade(row, n, probe, t), n);
+  }
+  GV_HD Look far(const Piece<T>& piece, const Probe<T>& probe, const Spot<T>& spot) const {
+    const T t = piece.middle;
+    const ChannelView& colors = probe.channels.other;
+    const auto read = [&](int32_t first) { return probe.four_of(true, colors, first, spot, t); };
+    const Row<T> color = by_direction(true, probe.sight.direction, colors.width, read, kFiltered);
+    const T whole = clamp(color.alpha, static_cast<T>(0), static_cast<T>(1));
+    const T side = own_numbers<Own>(this->light.parameters).side;
+    const T alpha = stretch(whole, piece.length * probe.scale_of(spot) / side);
+    if (!(whole > 0) || !(alpha / whole > 0)) return {};
+    const bool sided = colors.width != kFiltered;
+    Vec3<T> front{}, n;
+    Moments m = sided ? seen(read, probe.sight.direction, front) : moments(read, 0);
+    m = {m.xx / whole, m.xy / whole, m.xz / whole, m.yy / whole, m.yz / whole, m.zz / whole};
+    front = {front.x / whole, front.y / whole, front.z / whole};
+    const Row<T> base{color.red / whole, color.green / whole, color.blue / whole, alpha};
+    const Row<T> row = this->light.shade_rough(base, m, sided, front, probe, t, n);
+    return times_alpha(row, unit(n));
+  }
+  using Moments = typename Light<T>::Moments;
+  template <class Read>
+  GV_HD static Moments moments(const Read& read, int32_t first) {
+    const Row<T> a = read(first + 4), b = read(first + 6);
+    return {a.red, a.green, a.blue, a.alpha, b.blue, b.alpha};
+  }
+  // The moments of what is seen along direction d, and the mean of these normals, each turned to the side from which
+  // its direction sees it.
+  template <class Read>
+  GV_HD static Moments seen(const Read& read, const Vec3<T>& d, Vec3<T>& front) {
+    Moments sum{};
+#ifdef __CUDA_ARCH__
+#pragma unroll 1
+#endif
+    for (int axis = 0; axis < 3; ++axis) {
+      const bool back = d[axis] < 0;
+      const Moments m = moments(read, (2 * axis + (back ? 1 : 0)) * kFiltered);
+      const Vec3<T> column = axis == 0   ? Vec3<T>{m.xx, m.xy, m.xz}
+                             : axis == 1 ? Vec3<T>{m.xy, m.yy, m.yz}
+                                         : Vec3<T>{m.xz, m.yz, m.zz};
+      const T weight = d[axis] * d[axis], total = m.trace(), own = column[axis];
+      T scale = 0;
+      if (total > 0 && own > 0) scale = square_root(total / own) * weight;
+      if (!back) scale = -scale;
+      sum = {sum.xx + weight * m.xx, sum.xy + weight * m.xy, sum.xz + weight * m.xz,
+             sum.yy + weight * m.yy, sum.yz + weight * m.yz, sum.zz + weight * m.zz};
+      front = {front.x + scale * column.x, front.y + scale * column.y, front.z + scale * column.z};
+    }
+    return sum;
+  }
+  GV_HD static Look times_alpha(const Row<T>& row, const Vec3<T>& n) {
+    const T a = row.alpha;
+    return {{row.red * a, row.green * a, row.blue * a, a}, {n.x * a, n.y * a, n.z * a}};
+  }
+};
+
 // What a shader takes from the light that goes through: the shader of rays that go to a light.
 template <class T, class Shader>
 struct Veil {
@@ -408,7 +539,8 @@ struct GradientMagnitude : Plain<T> {
   X(GradientMagnitude, GradientMagnitude, false) \
   X(Filtered, Filtered, false)                   \
   X(ChannelMix, ChannelMix, false)               \
-  X(Labels, Labels, false)
+  X(Labels, Labels, false)                       \
+  X(FilteredLit, FilteredLit, false)
 
 #define GV_KIND(kind, Shader, shadows) k##kind,
 enum class ShaderKind : int32_t { GV_SHADERS(GV_KIND) kCount };

@@ -19,17 +19,18 @@ GV_HD Row<V> combined(const Row<V>& a, const Row<V>& b, const F& f) {
 }
 
 // A voxel's number, or four of them, as seen along direction d; read(k) gives the number k places behind the first, or
-// the four that begin there. A channel may hold them for each of six directions (Crassin et al., "Interactive indirect
-// illumination using voxel cone tracing", CGF 2011): then the three that d goes along are read, weighted by the squares
-// of d, whose sum is 1. Where all six are equal, the result has the bits of one.
+// the four that begin there. A channel may hold `one` numbers for each of six directions (Crassin et al., "Interactive
+// indirect illumination using voxel cone tracing", CGF 2011): then the three that d goes along are read, weighted by
+// the squares of d, whose sum is 1. Where all six are equal, the result has the bits of one.
 template <class V, class Read>
-GV_HD auto by_direction(MaskOf<V> which, const Vec3<V>& d, int32_t width, const Read& read) {
-  if (width == 4) return read(0);
+GV_HD auto by_direction(MaskOf<V> which, const Vec3<V>& d, int32_t width, const Read& read, int32_t one = 4) {
+  if (width == one) return read(0);
   const auto side = [&](int axis) {
     const MaskOf<V> back = which && d[axis] < 0, ahead = which && !back;
-    if (!any(back)) return read(8 * axis);
-    if (!any(ahead)) return read(8 * axis + 4);
-    return combined(read(8 * axis + 4), read(8 * axis), [&](V a, V b) { return select(back, a, b); });
+    const int32_t first = 2 * one * axis;
+    if (!any(back)) return read(first);
+    if (!any(ahead)) return read(first + one);
+    return combined(read(first + one), read(first), [&](V a, V b) { return select(back, a, b); });
   };
   const auto z = side(2);
   auto seen = z;
@@ -118,13 +119,19 @@ struct StoredColor : ShaderFacts {
   GV_HD void done(Sum&) const {}
 };
 
+// A node that answers is one of the pool's first bricks.
+template <class Eye>
+GV_HD auto any_stored(const Eye& probe, int32_t bricks) {
+  return probe.fine.among(bricks) || (probe.mixed && probe.coarse.among(bricks));
+}
+
 // The transfer function, right from afar too: a second channel, which the first bricks of the pool have, holds what the
 // function makes of the finest voxels below each of theirs: premultiplied colour and alpha of an interval as long as
 // the voxel, once or by direction, as StoredColor reads them. Other bricks, and nodes without one, are seen through the
 // function as ever; where two levels blend, their colours do.
 template <class T>
 struct Filtered : Plain<T> {
-  static constexpr bool kFiltered = true;
+  static constexpr int32_t kFiltered = 4;
   template <class V>
   using SumOf = ShadeSum<V>;
   struct Own {
@@ -137,10 +144,9 @@ struct Filtered : Plain<T> {
       : Plain<T>(args), parameters(static_cast<const Parameters<T>*>(args.parameter_54)), bricks(args.other_bricks) {}
 
   GV_HD const Plain<T>& plain() const { return *this; }
-  // A node that answers has colours.
   template <class Eye>
   GV_HD auto stored(const Eye& probe) const {
-    return probe.fine.among(bricks) || (probe.mixed && probe.coarse.among(bricks));
+    return any_stored(probe, bricks);
   }
   template <class V, class Eye>
   GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {

@@ -1,0 +1,258 @@
+"""`Filtered` of a `Lit`: lit matter from afar. Every backend gives the twin's bits, the picture is
+that of many rays a pixel, and light and material stay free.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers import ROOT, gvtorch
+from helpers.afar import compare, matter, picture
+from helpers.packets import INSTRUCTIONS, result, start
+from helpers.rays import camera_rays
+from helpers.traces import SHADER, assert_equal, run
+from helpers.trees import forget
+
+import gvtorch as gv
+
+SUN = gv.DirectionalLight((-1.0, -0.5, 0.3), (1.0, 0.9, 0.8))
+LAMP = gv.PointLight((0.0, 40.0, 60.0), (1.0, 0.9, 0.8))
+FIELDS = ("color", "alpha", "depth", "normal")
+
+
+def filtered(look: gv.Lit, branching: int = 2, **options) -> tuple[gv.N3Tree, gv.Filtered]:
+    volume = matter()
+    tree = gv.N3Tree.from_volume(volume, 4, branching=branching, threshold=0.0)
+    return tree, gv.Filtered.of(tree, volume, look, **options)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("branching", [2, 3])
+@pytest.mark.parametrize("directions", [True, False])
+def test_compiled_equals_reference(compiled, directions, branching, dtype):
+    tree, shader = filtered(gv.Lit(SHADER), branching, directions=directions)
+    assert tree.bricks.channels["filtered"].width == (60 if directions else 10)
+    for light, distance, step in (
+        (gv.Headlight(), 0.3, 0.5),
+        (SUN, 1.3, 0.4),
+        (LAMP, 1.3, 0.9),
+        (LAMP, 5.0, 2.3),
+    ):
+        shader.transfer = gv.Lit(SHADER, light=light, specular=0.9, shininess=25.0)
+        rays = camera_rays(tree, 14, distance=distance)
+        for which in (tree, forget(tree, 0.3, 5)):
+            options = {"dtype": dtype, "step": step}
+            found, _ = assert_equal(which, compiled, rays, shader, **options)
+            if compiled == "cpp" and dtype == torch.float32:
+                actual, _ = run(which, compiled, rays, shader, **options)
+                for field in FIELDS:
+                    assert torch.equal(actual[field], found[field]), (light, field)
+        if distance == 1.3:
+            assert found["alpha"].max() > 0.3, "the test must see something"
+
+
+def all_shaded() -> list[torch.Tensor]:
+    return shaded("cpp")
+
+
+def shaded(backend: str) -> list[torch.Tensor]:
+    found = []
+    for directions in (True, False):
+        tree, shader = filtered(gv.Lit(SHADER, light=LAMP), directions=directions)
+        for size, distance in ((21, 1.5), (9, 1.5), (13, 4.0)):
+            result, marks = run(tree, backend, camera_rays(tree, size, distance=distance), shader)
+            found += [*result.values(), *marks.values()]
+    return found
+
+
+@pytest.mark.backend("cpp")
+def test_every_bit_is_the_same_for_all_instruction_sets(tmp_path):
+    expected = shaded("reference")
+    for found in map(result, [start(all_shaded, tmp_path, name) for name in INSTRUCTIONS]):
+        for one, other in zip(found, expected, strict=True):
+            assert torch.equal(one.nan_to_num(7), other.nan_to_num(7))
+
+
+@pytest.mark.backend("cpp")
+def test_close_by_it_is_the_lit_transfer_function():
+    look = gv.Lit(SHADER, light=SUN)
+    tree, shader = filtered(look)
+    rays = camera_rays(tree, 17)
+    near, lit = (gv.trace(tree, rays, one, lod="finest") for one in (shader, look))
+    for field in (*FIELDS, "samples"):
+        assert torch.equal(getattr(near, field), getattr(lit, field)), field
+
+
+#: Scan, what is shown of it, voxels a pixel, light; then the least PSNR and the most that the mean
+#: light may be beside the truth's.
+CASES = [
+    ("stent", "translucent", 2.0, gv.Headlight(), 40, 0.05),
+    ("stent", "translucent", 8.0, SUN, 40, 0.08),
+    ("stent", "opaque", 2.0, SUN, 26, 0.17),
+    ("stent", "opaque", 8.0, gv.Headlight(), 29, 0.17),
+    ("aneurism", "translucent", 2.0, SUN, 35, 0.05),
+    ("aneurism", "translucent", 8.0, gv.Headlight(), 30, 0.08),
+    ("aneurism", "opaque", 8.0, SUN, 29, 0.15),
+]
+SCANS = {
+    "stent": ("stent_256x128x128_int16.npz", (140, 900, 0.1), (380, 430)),
+    "aneurism": ("aneurism_256x256x256_uint8.raw.gz", (20, 255, 0.15), (60, 70)),
+}
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize(("scan", "look", "pixel", "light", "least", "beside"), CASES)
+def test_from_afar_it_shows_what_many_fine_rays_show(scan, look, pixel, light, least, beside):
+    file, (low, high, most), (clear, solid) = SCANS[scan]
+    whole = gv.read_volume(ROOT / "examples" / "data" / file)
+    z, y, x = (max(0, size // 2 - 48) for size in whole.data.shape[:3])
+    volume = gv.Volume(whole.data[z : z + 96, y : y + 96, x : x + 96].contiguous(), whole.spacing)
+    color = [(clear, 0.8, 0.4, 0.25), (2 * solid, 1, 0.9, 0.7)]
+    opacity = [(low, 0), (high, most)] if look == "translucent" else [(clear, 0), (solid, 0.95)]
+    lit = gv.Lit(gv.TransferFunction(opacity, color), light=light)
+    tree = gv.N3Tree.from_volume(volume)
+    shader = gv.Filtered.of(tree, volume, lit)
+    way = (0.37, 0.23, 1.0)
+    truth = picture(tree, lit, way, pixel, 12)
+    share, psnr = compare(picture(tree, shader, way, pixel), truth)
+    means, before = compare(picture(tree, lit, way, pixel), truth)
+    one, alone = compare(picture(tree, lit, way, pixel, 1, "finest"), truth)
+    print(f"{share:.3f} {psnr:.1f} dB; means {means:.3f} {before:.1f}; one {one:.3f} {alone:.1f}")
+    assert psnr > least and psnr > before + 5 and psnr > alone
+    assert abs(share - 1) < beside
+
+
+@pytest.mark.backend("cpp")
+def test_highlights_of_rough_matter_widen():
+    """A ball of rough matter: a highlight of as much light as that of many fine rays, and no
+    sharper.
+    """
+    n = 96
+    z, y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float32),) * 3, indexing="ij")
+    radius = torch.sqrt((x - 47.5) ** 2 + (y - 47.5) ** 2 + (z - 47.5) ** 2)
+    generator = torch.Generator().manual_seed(3)
+    rough = torch.nn.functional.avg_pool3d(
+        torch.rand((1, 1, n + 2, n + 2, n + 2), generator=generator), 3, 1
+    )[0, 0]
+    volume = gv.Volume((0.5 + (38 - radius) / 8 + 1.2 * (rough - 0.5)).clamp(0, 1))
+    shine = {"ambient": 0.0, "diffuse": 0.0, "specular": 1.0, "shininess": 60.0}
+    look = gv.Lit(gv.TransferFunction([(0.4, 0), (0.5, 0.95)]), **shine)
+    tree = gv.N3Tree.from_volume(volume)
+    shader = gv.Filtered.of(tree, volume, look)
+    truth = picture(tree, look, (0.37, 0.23, 1.0), 8.0, 16)[..., 0]
+    smooth = picture(tree, look, (0.37, 0.23, 1.0), 8.0)[..., 0]
+    found = picture(tree, shader, (0.37, 0.23, 1.0), 8.0)[..., 0]
+    print(*(f"{float(one.sum()):.3f} {float(one.max()):.3f}" for one in (truth, found, smooth)))
+    assert 0.6 < float(found.sum() / truth.sum()) < 1.6
+    assert float(found.max()) < 1.6 * float(truth.max()) < float(smooth.max())
+
+
+@pytest.mark.parametrize("directions", [True, False])
+def test_streamed_equals_resident(compiled, directions):
+    device = "cuda" if compiled == "cuda" else "cpu"
+    volume, look = matter(), gv.Lit(SHADER, light=SUN)
+    tree = gv.N3Tree.from_volume(volume, 4, device=device)
+    resident = gv.Filtered.of(tree, volume, look, directions=directions)
+    for size in (8_000_000, 400_000):
+        shader = gv.Filtered(look, directions=directions)
+        producer = gv.VolumeProducer(volume, filtered=shader)
+        with gv.Engine(producer, brick_size=4, brick_pool=size, device=device) as engine:
+            for distance in (1.5, 4.0, 10.0):
+                camera = gv.Camera.orbit(width=40, height=30, distance=distance)
+                found, expected = engine.render(camera, shader), gv.render(tree, camera, resident)
+                assert found.stats.converged and found.alpha.max() > 0.1
+                for field in FIELDS:
+                    assert torch.equal(getattr(found, field), getattr(expected, field)), field
+            engine.validate()
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("most", [0.05, 0.9])
+def test_streamed_from_disk_equals_resident(tmp_path, most):
+    volume = gv.Volume((200 * matter().data).to(torch.uint8))
+    look = gv.Lit(gv.TransferFunction([(30, 0), (120, most)]))
+    gv.convert(volume, tmp_path / "a.zarr")
+    gv.Filtered.add_to(tmp_path / "a.zarr", look)
+    own = gv.Filtered.stored(tmp_path / "a.zarr")
+    assert isinstance(own.transfer, gv.Lit) and own.made_of["normals"]
+    own.transfer.light = look.light = SUN
+    tree = gv.N3Tree.from_volume(volume, 8)
+    resident = gv.Filtered.of(tree, volume, look)
+    with gv.Engine(gv.StoredProducer(tmp_path / "a.zarr", filtered=own), brick_size=8) as engine:
+        for distance in (1.0, 4.0, 12.0):
+            camera = gv.Camera.orbit(width=32, height=24, distance=distance)
+            found, expected = engine.render(camera, own), gv.render(tree, camera, resident)
+            assert found.stats.converged and not engine.failures
+            for field in FIELDS:
+                assert torch.equal(getattr(found, field), getattr(expected, field)), field
+
+
+@pytest.mark.backend("cpp")
+def test_light_and_material_are_edited_without_making_colours_anew():
+    tree, shader = filtered(gv.Lit(SHADER))
+    rays = camera_rays(tree, 12, distance=4.0)
+    before = gv.trace(tree, rays, shader).color
+    assert isinstance(shader.transfer, gv.Lit)
+    shader.transfer.light, shader.transfer.ambient = LAMP, 0.7
+    after = gv.trace(tree, rays, shader).color
+    _, fresh = filtered(gv.Lit(SHADER, light=LAMP, ambient=0.7))
+    assert not torch.equal(after, before)
+    assert torch.equal(after, gv.trace(tree, rays, fresh).color)
+
+
+@pytest.mark.backend("cpp")
+def test_unlit_it_shows_the_filtered_colours_and_lighting_lights_them():
+    tree, shader = filtered(gv.Lit(SHADER))
+    plain_tree = gv.N3Tree.from_volume(matter(), 4, threshold=0.0)
+    plain = gv.Filtered.of(plain_tree, matter(), SHADER)
+    rays = camera_rays(tree, 12, distance=4.0)
+    bare, expected = gv.trace(tree, rays, shader.unlit()), gv.trace(plain_tree, rays, plain)
+    torch.testing.assert_close(bare.color, expected.color, rtol=1e-4, atol=1e-5)
+    camera = gv.Camera.orbit(width=20, height=20, distance=4.0)
+    lighting = gv.Lighting(lights=[SUN], occlusion=0.5)
+    lit = gv.render(tree, camera, shader, lighting=lighting)
+    assert lit.color.max() > 0.05 and not torch.equal(
+        lit.color, gv.render(tree, camera, shader).color
+    )
+    with pytest.raises(ValueError, match="lighting needs normals"):
+        gv.render(plain_tree, camera, plain, lighting=lighting)
+
+
+def test_mistakes_are_told(tmp_path):
+    volume = matter()
+    tree = gv.N3Tree.from_volume(volume, 4)
+    with pytest.raises(ValueError, match="must be a TransferFunction or a Lit, got Isosurface"):
+        gv.Filtered(gv.Isosurface(0.5))
+    for look in (
+        gv.Lit(SHADER, normals="normal"),
+        gv.Lit(SHADER, shadows=True),
+        gv.Lit(SHADER, light=SUN, octaves=2),
+    ):
+        with pytest.raises(ValueError, match="a Lit must take its normals from the gradient"):
+            gv.Filtered.of(tree, volume, look)
+    rays = camera_rays(tree, 3)
+    plain = gv.Filtered.of(tree, volume, SHADER)
+    with pytest.raises(ValueError, match="made of another function or component"):
+        gv.trace(tree, rays, gv.Filtered(gv.Lit(SHADER)))
+    lit = gv.Filtered.of(tree, volume, gv.Lit(SHADER))
+    with pytest.raises(ValueError, match="made of another function or component"):
+        gv.trace(tree, rays, plain)
+    lit.transfer.shadows = True
+    with pytest.raises(ValueError, match="without shadows per sample"):
+        gv.trace(tree, rays, lit)
+    with pytest.raises(ValueError, match="filtered colours need 10 numbers a voxel, or 60"):
+        gv.trace(tree, rays, gv.Filtered(gv.Lit(SHADER), "value"))
+
+
+@pytest.mark.backend("cpp")
+def test_the_command_line(tmp_path):
+    gv.convert(gv.Volume((200 * matter().data).to(torch.uint8)), tmp_path / "a.zarr")
+    far = ("--size", "24x16", "--camera", "orbit:20,10,9", "-o", tmp_path / "a.npy")
+    done = gvtorch("filter", tmp_path / "a.zarr", "--tf", "hot", "--lit")
+    assert done.returncode == 0, done.stderr
+    for given in ((), ("--tf", "hot")):
+        shader = ("--shader", "filtered-lit", *given)
+        done = gvtorch("render", tmp_path / "a.zarr", *shader, *far)
+        assert done.returncode == 0, done.stderr
+    done = gvtorch("render", tmp_path / "a.zarr", "--shader", "filtered", *far)
+    assert done.returncode == 2 and "are for --shader filtered-lit" in done.stderr
