@@ -393,7 +393,8 @@ def test_a_kind_has_a_struct_a_twin_and_a_class():
     classes = [*own, *(getattr(gv, name) for name in built_in.__all__)]
     for kind in SHADER_KINDS:
         assert f"struct {kind} " in structs or kind.startswith("Shadowed"), kind
-        assert any(kind in (one.kind, getattr(one, "shadowed_kind", "")) for one in classes), kind
+        names = ("kind", "shadowed_kind", "lit_kind")
+        assert any(kind in [getattr(one, name, "") for name in names] for one in classes), kind
     with pytest.raises(ValueError, match=r"shader: kind must be Lit, .*, got 'Lamp'"):
         shader_number("Lamp")
 

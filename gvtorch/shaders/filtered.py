@@ -33,7 +33,7 @@ from ..io.stores.coarse import make_channel
 from ..io.stores.store import Store
 from ..io.stores.store_layout import CoarseChannel
 from ..ops import ShadeArguments, cut_bricks
-from ..ops.shading import FilteredNumbers, ShadeParameters
+from ..ops.shading import FilteredNumbers, ShadeParameters, shader_number
 from ..pool import Channel, N3Tree
 from .built_in import Lit
 from .coarse_colors import LIT, PLAIN, Field, VolumeField, mean_of_directions, write_colors
@@ -70,6 +70,8 @@ class Filtered(Shader):
     Levels are chosen 1.6 times as fine as for other shaders, whose wide cones have to filter.
     """
 
+    kind = "Filtered"
+    lit_kind = "FilteredLit"  # of a `Lit`
     reads_coarse = True
     finer = 1.6  # a fine voxel is at least five eighths of an interval
     transfer: TransferFunction | Lit
@@ -235,11 +237,6 @@ class Filtered(Shader):
         return cls(shown, channel, component, directions=told.width != numbers)
 
     @property
-    def kind(self) -> str:  # type: ignore[override]
-        """See `Shader`."""
-        return "Filtered" if self.numbers == PLAIN else "FilteredLit"
-
-    @property
     def function(self) -> TransferFunction:
         """The transfer function itself."""
         return self.transfer.transfer if isinstance(self.transfer, Lit) else self.transfer
@@ -332,7 +329,10 @@ class Filtered(Shader):
                 f"{where}: filtered colours need {one} numbers a voxel, or {6 * one} for six "
                 f"directions, {self.other!r} has {known.width}"
             )
-        return super().shading(where, tree)
+        given = super().shading(where, tree)
+        if given is None or self.numbers == PLAIN:
+            return given
+        return given._replace(shader=shader_number(self.lit_kind))
 
 
 class _StoreField:

@@ -78,15 +78,15 @@ class Streaming:
     def content(self, store: Store, look: Look) -> tuple[Producer, Shader]:
         """Returns what streams a store, and the shader."""
         from ..producers import StoredChannels, StoredProducer
-        from ..shaders import Filtered
+        from ..shaders import Filtered, Lit
 
         names = self._drawn(store, look)
         shader = look.stored_colors(store, names) if names else look.chosen(store)
         filtered = shader if isinstance(shader, Filtered) else None
         if filtered is not None and look.tf is None:
             stored = Filtered.stored(store)
-            if stored.kind != filtered.kind:
-                wanted = "--shader filtered" + "-lit" * (stored.kind == "FilteredLit")
+            if stored.numbers != filtered.numbers:
+                wanted = "--shader filtered" + "-lit" * isinstance(stored.transfer, Lit)
                 raise ValueError(
                     f"{store.location}: its filtered colours are for {wanted}; "
                     "gvtorch filter, with --lit or without, makes others"
