@@ -170,9 +170,12 @@ class CustomCamera(Camera):
         """Returns the numbers of the camera `thinned` by a stride, some frames on, given what
         `numbers` told of the last two frames; see `continued`.
         """
-        shape = (-1, self.height, self.width, 11)
-        ends = [n.view(shape)[:, ::stride, ::stride].reshape(-1, 11) for n in (now, before)]
-        return continued(*ends, frames, moving=6, axes=slice(3, 6))
+
+        def some(numbers: Tensor) -> Tensor:
+            pictures = numbers.view(-1, self.height, self.width, 11)
+            return pictures[:, ::stride, ::stride].reshape(-1, 11)
+
+        return continued(some(now), some(before), frames, moving=6, axes=slice(3, 6))
 
     def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:
         """Returns the rays of whole rows, from what `numbers` gave."""
