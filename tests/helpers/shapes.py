@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 
 import numpy as np
 import torch
@@ -233,8 +232,8 @@ def random_points(count, side=4.0, seed=0):
     return side * (torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.5)
 
 
-#: How many boxes bounds are tried in; ten times as many with GVTORCH_SOAK=1.
-BOXES = 200_000 if os.environ.get("GVTORCH_SOAK") else 20_000
+#: How many boxes bounds are tried in.
+BOXES = 100_000
 
 
 def random_boxes(count, seed=1):
