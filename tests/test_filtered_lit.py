@@ -141,7 +141,6 @@ def test_highlights_of_rough_matter_widen():
     truth = picture(tree, look, (0.37, 0.23, 1.0), 8.0, 16)[..., 0]
     smooth = picture(tree, look, (0.37, 0.23, 1.0), 8.0)[..., 0]
     found = picture(tree, shader, (0.37, 0.23, 1.0), 8.0)[..., 0]
-    print(*(f"{float(one.sum()):.3f} {float(one.max()):.3f}" for one in (truth, found, smooth)))
     assert 0.6 < float(found.sum() / truth.sum()) < 1.6
     assert float(found.max()) < 1.6 * float(truth.max()) < float(smooth.max())
 
