@@ -7,6 +7,8 @@
 #include <immintrin.h>
 #endif
 
+#include <type_traits>
+
 #include "base/hd.h"
 
 namespace gvtorch {
@@ -179,6 +181,20 @@ template <>
 struct Unpack<float> {
   GV_HD static Floats low(Ints word) { return (Floats)word; }
 };
+
+// Four voxels that lie side by side, as numbers.
+typedef float Four __attribute__((vector_size(16)));
+template <class Voxel>
+GV_HD Four four_numbers(const char* first) {
+  Voxel voxel[4];
+  memcpy(voxel, first, sizeof(voxel));
+#if defined(__F16C__)
+  if constexpr (std::is_same_v<Voxel, Half>) {
+    return (Four)_mm_cvtph_ps(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(first)));
+  }
+#endif
+  return Four{number<float>(voxel[0]), number<float>(voxel[1]), number<float>(voxel[2]), number<float>(voxel[3])};
+}
 
 }  // namespace GV_NAMESPACE
 }  // namespace gvtorch

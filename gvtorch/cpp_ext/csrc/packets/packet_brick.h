@@ -71,34 +71,30 @@ GV_HD Floats trilinear(const PacketPool& pool, Ints brick, const Vec3<Floats>& a
   });
 }
 
-// Four numbers of each voxel, `shift` bytes behind the first; a voxel is whole words.
-template <class Voxel, bool kFar>
-GV_CALL Row<Floats> read_packet_four(const PacketPool& any, int64_t shift, Ints brick, Floats x, Floats y, Floats z) {
-  constexpr int32_t kBytes = sizeof(Voxel);
-  PacketPool pool = any;
-  pool.first = static_cast<const char*>(pool.first) + shift;
-  const int32_t step_x = pool.channels * kBytes, step_y = step_x * pool.side, step_z = step_y * pool.side;
+// Four numbers of each voxel, `shift` bytes behind the first, lane by lane: they lie side by side.
+template <class Voxel>
+GV_CALL Row<Floats> read_packet_four(const PacketPool& pool, int64_t shift, Mask which, Ints brick, Floats x, Floats y,
+                                     Floats z) {
+  const int64_t step_x = pool.channels * static_cast<int64_t>(sizeof(Voxel));
+  const int64_t step_y = step_x * pool.side, step_z = step_y * pool.side;
   const Eight<Floats> eight(Vec3<Floats>{x, y, z}, pool.side);
-  const Ints corner =
-      truncated(eight.cell[2] * static_cast<float>(step_z) + eight.cell[1] * static_cast<float>(step_y) +
-                eight.cell[0] * static_cast<float>(step_x));
-  const Ints slot = kFar ? brick : brick * static_cast<int32_t>(pool.stride);
-  Ints words[8][kBytes];
-  for (int which = 0; which < 8; ++which) {
-    const Ints first = corner + ((which & 1) * step_x + (which >> 1 & 1) * step_y + (which >> 2) * step_z);
-    for (int word = 0; word < kBytes; ++word) words[which][word] = load_words<kFar>(pool, slot, first + 4 * word);
-  }
-  const auto number_of = [&](int which, int number) {
-    const int32_t at = number * kBytes;
-    return Unpack<Voxel>::low(words[which][at / 4] >> (8 * (at % 4)));
-  };
-  const auto blend = [&](int number) {
-    return eight.blend([&](int y, int z, Floats& left, Floats& right) {
-      left = number_of(2 * y + 4 * z, number);
-      right = number_of(1 + 2 * y + 4 * z, number);
+  const Ints cell = truncated(
+      (eight.cell[2] * static_cast<float>(pool.side) + eight.cell[1]) * static_cast<float>(pool.side) + eight.cell[0]);
+  const char* const first = static_cast<const char*>(pool.first) + shift;
+  float numbers[kLanes][4] = {};
+  for_lanes(which, [&](int lane) {
+    const char* const corner = first + brick[lane] * pool.stride + cell[lane] * step_x;
+    const float weight[3] = {eight.weight[0][lane], eight.weight[1][lane], eight.weight[2][lane]};
+    const Four found = blend_eight<Four>(weight, [&](int y, int z, Four& left, Four& right) {
+      const char* const pair = corner + (z * step_z + y * step_y);
+      left = four_numbers<Voxel>(pair);
+      right = four_numbers<Voxel>(pair + step_x);
     });
-  };
-  return {blend(0), blend(1), blend(2), blend(3)};
+    memcpy(numbers[lane], &found, sizeof(found));
+  });
+  Floats row[4];
+  load_rows(numbers, lane_numbers() << 4, row);
+  return {row[0], row[1], row[2], row[3]};
 }
 
 // Several numbers of each voxel. A word holds up to four of them, and of narrow voxels those of the next one along x.
@@ -163,7 +159,7 @@ struct PacketChannel : ChannelView {
   int64_t bytes;  // of a number
   decltype(&read_packet<float, false>) reader;
   decltype(&read_rise<float, false>) rise_reader;
-  decltype(&read_packet_four<float, false>) four_reader;
+  decltype(&read_packet_four<float>) four_reader;
   decltype(&read_packet_numbers<float, false>) numbers_reader;
 
   PacketChannel(const ChannelView& channel, int32_t side, int64_t bricks)
@@ -173,15 +169,15 @@ struct PacketChannel : ChannelView {
       bytes = sizeof(Voxel);
       reader = pool.far(bricks) ? &read_packet<Voxel, true> : &read_packet<Voxel, false>;
       rise_reader = pool.far(bricks) ? &read_rise<Voxel, true> : &read_rise<Voxel, false>;
-      four_reader = pool.far(bricks) ? &read_packet_four<Voxel, true> : &read_packet_four<Voxel, false>;
+      four_reader = &read_packet_four<Voxel>;
       numbers_reader = pool.far(bricks) ? &read_packet_numbers<Voxel, true> : &read_packet_numbers<Voxel, false>;
     });
   }
   GV_HD Floats read(int32_t component, Ints brick, const Vec3<Floats>& at) const {
     return reader(pool, component * bytes, brick, at.x, at.y, at.z);
   }
-  GV_HD Row<Floats> four(int32_t component, Ints brick, const Vec3<Floats>& at) const {
-    return four_reader(pool, component * bytes, brick, at.x, at.y, at.z);
+  GV_HD Row<Floats> four(Mask which, int32_t component, Ints brick, const Vec3<Floats>& at) const {
+    return four_reader(pool, component * bytes, which, brick, at.x, at.y, at.z);
   }
   GV_HD void numbers(Components<float> components, int32_t count, Ints brick, const Vec3<Floats>& at,
                      Floats* out) const {

@@ -153,10 +153,11 @@ struct PacketWalk {
   GV_HD Floats value_of(const PacketBrick& brick, Floats t) const { return value_in(brick, t); }
   GV_HD Row<Floats> four_of(Mask which, const PacketChannel& channel, int32_t component, const PacketBrick& brick,
                             Floats t) const {
-    return channel.four(component, which ? brick.brick : Ints{}, brick.at(t));
+    return channel.four(which, component, brick.brick, brick.at(t));
   }
-  GV_HD Floats scale_of(const PacketBrick& brick) const {
-    return pick(walk.levels.scale, &brick == &fine ? fine_depth : coarse_depth);
+  GV_HD Floats scale_of(const PacketBrick& brick) const { return pick(walk.levels.scale, depth_of(brick)); }
+  GV_HD Vec3<Floats> differences(const PacketBrick& brick, Floats t) const {
+    return differences(brick, depth_of(brick), t);
   }
   GV_HD Floats weight(Floats t) const { return clamp((at.cone(t) - voxel) * blend_scale, 0.0f, 1.0f); }
 
@@ -445,6 +446,7 @@ struct PacketWalk {
   GV_HD float constant_of(int lane, Ints depth) const {
     return channels.value.constant(kernel.channels.component, node_of(lane, depth));
   }
+  GV_HD Ints depth_of(const PacketBrick& brick) const { return &brick == &fine ? fine_depth : coarse_depth; }
   GV_HD int32_t node_of(int lane, Ints depth) const { return path_node[depth[lane]][lane] & INT32_MAX; }
 
   // Begins the run of intervals that are alike; lanes that need care are done with the node at once.

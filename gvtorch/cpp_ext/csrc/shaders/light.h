@@ -59,8 +59,8 @@ GV_HD Row<V> look_up(const Transfer<T>& transfer, V value, const Piece<V>& piece
 }
 
 // x^power for x in [0, 1].
-template <class T>
-GV_HD T power_of(T x, RealOf<T> power) {
+template <class T, class Power>
+GV_HD T power_of(T x, Power power) {
   const MaskOf<T> positive = x > static_cast<RealOf<T>>(1.1754944e-38f);
   if (!any(positive)) return T{};
   return select(positive, exp2_exact(log2_exact(x) * power), T{});
@@ -79,6 +79,22 @@ constexpr double kOctaveLight = 0.55, kOctaveDirection = 0.6;
 
 // By how much the moments of normals may be lessened where no light comes: see shaders/coarse_colors.py.
 constexpr double kFaint = 32;
+
+// Mean products of the components of normals.
+template <class T>
+struct Moments {
+  T xx, xy, xz, yy, yz, zz;
+
+  GV_HD T trace() const { return xx + yy + zz; }
+  GV_HD Vec3<T> times(const Vec3<T>& v) const {
+    return {xx * v.x + xy * v.y + xz * v.z, xy * v.x + yy * v.y + yz * v.z, xz * v.x + yz * v.y + zz * v.z};
+  }
+};
+// f(a, b) of each number.
+template <class T, class F>
+GV_HD Moments<T> combined(const Moments<T>& a, const Moments<T>& b, const F& f) {
+  return {f(a.xx, b.xx), f(a.xy, b.xy), f(a.xz, b.xz), f(a.yy, b.yy), f(a.yz, b.yz), f(a.zz, b.zz)};
+}
 
 // Blinn-Phong, on both sides of a surface; or the light that a medium scatters.
 template <class T>
@@ -176,15 +192,6 @@ struct Light {
     return {lit(base.red, 0), lit(base.green, 1), lit(base.blue, 2), base.alpha};
   }
 
-  // Mean products of the components of normals.
-  struct Moments {
-    T xx, xy, xz, yy, yz, zz;
-
-    GV_HD T trace() const { return xx + yy + zz; }
-    GV_HD Vec3<T> times(const Vec3<T>& v) const {
-      return {xx * v.x + xy * v.y + xz * v.z, xy * v.x + yy * v.y + yz * v.z, xz * v.x + yz * v.y + zz * v.z};
-    }
-  };
   // Colour of rough surfaces in the light, of which only the moments of their normals are known, and a vector along the
   // normals, towards the eye. Where the trace is 0, places are lit as if they faced the light. `front`: the mean normal
   // of what is seen from one side alone, in the same measure; what light comes from behind does not show.
@@ -192,37 +199,41 @@ struct Light {
   // Of a cosine with the light, as it is on the side that the eye sees, the moments tell mean and deviation; it is
   // taken to be evenly spread, as it is for the normals of a ball. Highlights: Toksvig, "Mipmapping normal maps", 2005,
   // for a spread that is the same to all sides of a main normal.
-  GV_HD Row<T> shade_rough(const Row<T>& base, Moments m, bool sided, const Vec3<T>& front, const Probe<T>& probe, T t,
-                           Vec3<T>& normal) const {
-    const T zero = 0, one = 1, shininess = parameters->shininess;
-    const Vec3<T> d = probe.sight.direction;
-    const T total = m.trace();
-    const T share = clamp(static_cast<T>(kFaint) * total, zero, one), whole = total > 0 ? total : one;
+  template <class Eye, class V>
+  GV_HD Row<V> shade_rough(const Row<V>& base, Moments<V> m, bool sided, const Vec3<V>& front, const Eye& probe, V t,
+                           Vec3<V>& normal) const {
+    const T zero = 0, one = 1, two = 2, three = 3, shininess = parameters->shininess;
+    const Vec3<V> d = probe.sight.direction;
+    const V total = m.trace(), unity = splat<V>(one);
+    const V share = clamp(static_cast<T>(kFaint) * total, zero, one), whole = select(total > 0, total, unity);
     m = {m.xx / whole, m.xy / whole, m.xz / whole, m.yy / whole, m.yz / whole, m.zz / whole};
-    const T square = m.xx * m.xx + m.yy * m.yy + m.zz * m.zz + 2 * (m.xy * m.xy + m.xz * m.xz + m.yz * m.yz);
-    const Vec3<T> to_light = towards(probe, t).direction;
+    const V square = m.xx * m.xx + m.yy * m.yy + m.zz * m.zz + two * (m.xy * m.xy + m.xz * m.xz + m.yz * m.yz);
+    const Vec3<V> to_light = towards(probe, t).direction;
     normal = m.times(d);
     for (int axis = 0; axis < 3; ++axis) normal[axis] = -normal[axis];
-    const T seen = square_root(larger(zero, -dot(d, normal)));
+    const V seen = square_root(larger(V{}, -dot(d, normal)));
     // The mean of a size over its root mean square.
-    const T known = static_cast<T>(0.8) + static_cast<T>(0.2) * square;
-    T mean = known * dot(to_light, normal) / (seen > 0 ? seen : one);
+    const V known = static_cast<T>(0.8) + static_cast<T>(0.2) * square;
+    V mean = known * dot(to_light, normal) / select(seen > 0, seen, unity);
     if (sided) mean = smaller(mean, known * dot(to_light, front) / whole);
-    const T wide = square_root(3 * larger(zero, dot(to_light, m.times(to_light)) - mean * mean));
-    const T above = clamp(mean + wide, zero, 2 * wide);
-    const T facing = above * above / (wide > 0 ? 4 * wide : one) + larger(zero, mean - wide);
+    const V wide = square_root(three * larger(V{}, dot(to_light, m.times(to_light)) - mean * mean));
+    const V above = clamp(mean + wide, V{}, two * wide);
+    const V facing = above * above / select(wide > 0, two * two * wide, unity) + larger(V{}, mean - wide);
 
-    const Vec3<T> half = unit(Vec3<T>{to_light.x - d.x, to_light.y - d.y, to_light.z - d.z});
-    const T even = square_root(clamp(static_cast<T>(1.5) * square - static_cast<T>(0.5), zero, one));
-    const T spread = (1 - even) / 3;
-    const T little = static_cast<T>(0.9) * (spread * spread);
-    const T along = dot(half, m.times(half)) - spread + little / 3;
-    const T dull = shininess / (1 + shininess * spread);
-    const T bright = (1 + dull) / (1 + shininess);
-    T highlight = 0;
-    if (facing > 0)
-      highlight = bright * power_of(clamp(along / (even + little), zero, one), dull * static_cast<T>(0.5));
-    return lit(base, 1 - share + share * facing, share * highlight);
+    const Vec3<V> half = unit(Vec3<V>{to_light.x - d.x, to_light.y - d.y, to_light.z - d.z});
+    const V even = square_root(clamp(static_cast<T>(1.5) * square - static_cast<T>(0.5), zero, one));
+    const V spread = (one - even) / three;
+    const V little = static_cast<T>(0.9) * (spread * spread);
+    const V along = dot(half, m.times(half)) - spread + little / three;
+    const V dull = shininess / (one + shininess * spread);
+    const V bright = (one + dull) / (one + shininess);
+    V highlight{};
+    const MaskOf<V> faces = facing > 0;
+    if (any(faces)) {
+      const V cosine = clamp(along / (even + little), zero, one);
+      highlight = select(faces, bright * power_of(cosine, dull * static_cast<T>(0.5)), highlight);
+    }
+    return lit(base, one - share + share * facing, share * highlight);
   }
 
   // Colour of a place in a medium, from the share of light that comes there straight: by one scattering, and by octaves

@@ -91,114 +91,111 @@ struct FilteredLit : Lit<T> {
   template <class V, class Eye>
   GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
     const MaskOf<V> seen = which && stored(probe), others = which && !seen;
-    if (any(seen)) {
-      Row<V> row{};
-      Vec3<V> normal{};
-      probe.each(seen, [&](int lane, const Probe<T>& own) {
-        const T start = lane_of(piece.start, lane), middle = lane_of(piece.middle, lane);
-        const Piece<T> one{start,
-                           lane_of(piece.end, lane),
-                           lane_of(piece.length, lane),
-                           middle,
-                           lane_of(piece.level, lane),
-                           T{},
-                           T{},
-                           T{},
-                           piece.odd};
-        const Look found = look(one, own);
-        set_lane(row.red, lane, found.row.red);
-        set_lane(row.green, lane, found.row.green);
-        set_lane(row.blue, lane, found.row.blue);
-        set_lane(row.alpha, lane, found.row.alpha);
-        for (int axis = 0; axis < 3; ++axis) set_lane(normal[axis], lane, found.normal[axis]);
-      });
-      sum.add_normal(normal, sum.clear, seen && row.alpha > 0);
-      sum.add_light(row, sum.clear, seen);
-      sum.absorb(row.alpha, piece.start, piece.length, sum.hit_clear, seen);
-    }
     if (any(others)) Lit<T>::add(others, piece, probe, sum);
+    if (!any(seen)) return;
+    Look<V> found = look(seen, piece, probe, probe.fine);
+    const MaskOf<V> mixed = seen && probe.mixed;
+    if (any(mixed)) {
+      const Look<V> coarse = look(mixed, piece, probe, probe.coarse);
+      const V weight = probe.weight(piece.middle);
+      found.join(coarse, [&](V a, V b) { return select(mixed, a + weight * (b - a), a); });
+    }
+    sum.add_normal(found.normal, sum.clear, seen && found.row.alpha > 0);
+    sum.add_light(found.row, sum.clear, seen);
+    sum.absorb(found.row.alpha, piece.start, piece.length, sum.hit_clear, seen);
   }
 
  private:
+  template <class V>
   struct Look {
-    Row<T> row;      // premultiplied colour in the light, and alpha
-    Vec3<T> normal;  // times alpha
+    Row<V> row{};      // premultiplied colour in the light, and alpha
+    Vec3<V> normal{};  // times alpha
+
+    template <class F>
+    GV_HD void join(const Look& other, const F& f) {
+      row = combined(row, other.row, f);
+      for (int axis = 0; axis < 3; ++axis) normal[axis] = f(normal[axis], other.normal[axis]);
+    }
   };
-  GV_HD Look look(const Piece<T>& piece, const Probe<T>& probe) const {
-    Look found = look(piece, probe, probe.fine);
-    if (!probe.mixed) return found;
-    const Look coarse = look(piece, probe, probe.coarse);
-    const T weight = probe.weight(piece.middle);
-    const auto mix = [&](T& a, T b) { a = a + weight * (b - a); };
-    mix(found.row.red, coarse.row.red);
-    mix(found.row.green, coarse.row.green);
-    mix(found.row.blue, coarse.row.blue);
-    mix(found.row.alpha, coarse.row.alpha);
-    for (int axis = 0; axis < 3; ++axis) mix(found.normal[axis], coarse.normal[axis]);
+  // What one of the nodes shows; nothing in other lanes.
+  template <class V, class Eye, class Node>
+  GV_HD Look<V> look(MaskOf<V> which, const Piece<V>& piece, Eye& probe, const Node& node) const {
+    const MaskOf<V> colored = which && node.among(bricks), others = which && !colored;
+    Look<V> found;
+    if (any(others)) found = near(others, piece, probe, node);
+    if (any(colored)) found.join(far(colored, piece, probe, node), [&](V a, V b) { return select(colored, b, a); });
     return found;
   }
-  // What one of the nodes shows.
-  GV_HD Look look(const Piece<T>& piece, const Probe<T>& probe, const Spot<T>& spot) const {
-    return spot.among(bricks) ? far(piece, probe, spot) : near(piece, probe, spot);
+  template <class V, class Eye, class Node>
+  GV_HD Look<V> near(MaskOf<V> which, const Piece<V>& piece, Eye& probe, const Node& node) const {
+    const V t = piece.middle;
+    const Row<V> row = look_up(Transfer<T>(this->transfer), probe.value_of(node, t), piece, this->step, which);
+    const MaskOf<V> shown = which && row.alpha > 0;
+    if (!any(shown)) return {};
+    probe.narrow(shown);
+    const Vec3<V> n = this->light.to_eye(probe.differences(node, t), probe.sight.direction);
+    return times_alpha(shown, this->light.shade(row, n, probe, t), n);
   }
-  GV_HD Look near(const Piece<T>& piece, const Probe<T>& probe, const Spot<T>& spot) const {
-    const T t = piece.middle;
-    const Row<T> row = look_up(Transfer<T>(this->transfer), probe.value_of(spot, t), piece, this->step);
-    if (!(row.alpha > 0)) return {};
-    const Vec3<T> n = this->light.to_eye(probe.differences(spot, t), probe.sight.direction);
-    return times_alpha(this->light.shade(row, n, probe, t), n);
-  }
-  GV_HD Look far(const Piece<T>& piece, const Probe<T>& probe, const Spot<T>& spot) const {
-    const T t = piece.middle;
-    const ChannelView& colors = probe.channels.other;
-    const auto read = [&](int32_t first) { return probe.four_of(true, colors, first, spot, t); };
-    const Row<T> color = by_direction(true, probe.sight.direction, colors.width, read, kFiltered);
-    const T whole = clamp(color.alpha, static_cast<T>(0), static_cast<T>(1));
-    const T side = own_numbers<Own>(this->light.parameters).side;
-    const T alpha = stretch(whole, piece.length * probe.scale_of(spot) / side);
-    if (!(whole > 0) || !(alpha / whole > 0)) return {};
+  template <class V, class Eye, class Node>
+  GV_HD Look<V> far(MaskOf<V> which, const Piece<V>& piece, Eye& probe, const Node& node) const {
+    const V t = piece.middle;
+    probe.narrow(which);
+    const auto& colors = probe.channels.other;
+    const Vec3<V> d = probe.sight.direction;
+    const auto read = [&](MaskOf<V> some, int32_t first) { return probe.four_of(some, colors, first, node, t); };
+    const Row<V> color = by_direction(which, d, colors.width, read, kFiltered);
+    const V whole = clamp(color.alpha, static_cast<T>(0), static_cast<T>(1));
+    const V alpha = stretch(whole, piece.length * probe.scale_of(node) / own_numbers<Own>(this->light.parameters).side);
+    const MaskOf<V> shown = which && whole > 0 && alpha / whole > 0;
+    if (!any(shown)) return {};
     const bool sided = colors.width != kFiltered;
-    Vec3<T> front{}, n;
-    Moments m = sided ? seen(read, probe.sight.direction, front) : moments(read, 0);
+    Vec3<V> front{}, n;
+    Moments<V> m = sided ? seen(shown, read, d, front) : moments(shown, read, 0);
     m = {m.xx / whole, m.xy / whole, m.xz / whole, m.yy / whole, m.yz / whole, m.zz / whole};
     front = {front.x / whole, front.y / whole, front.z / whole};
-    const Row<T> base{color.red / whole, color.green / whole, color.blue / whole, alpha};
-    const Row<T> row = this->light.shade_rough(base, m, sided, front, probe, t, n);
-    return times_alpha(row, unit(n));
+    const Row<V> base{color.red / whole, color.green / whole, color.blue / whole, alpha};
+    const Row<V> row = this->light.shade_rough(base, m, sided, front, probe, t, n);
+    return times_alpha(shown, row, unit(n));
   }
-  using Moments = typename Light<T>::Moments;
-  template <class Read>
-  GV_HD static Moments moments(const Read& read, int32_t first) {
-    const Row<T> a = read(first + 4), b = read(first + 6);
-    return {a.red, a.green, a.blue, a.alpha, b.blue, b.alpha};
+  template <class Which, class Read>
+  GV_HD static auto moments(Which which, const Read& read, int32_t first) {
+    const auto a = read(which, first + 4), b = read(which, first + 6);
+    return Moments<decltype(a.red + b.red)>{a.red, a.green, a.blue, a.alpha, b.blue, b.alpha};
   }
   // The moments of what is seen along direction d, and the mean of these normals, each turned to the side from which
   // its direction sees it.
-  template <class Read>
-  GV_HD static Moments seen(const Read& read, const Vec3<T>& d, Vec3<T>& front) {
-    Moments sum{};
+  template <class V, class Read>
+  GV_HD static Moments<V> seen(MaskOf<V> which, const Read& read, const Vec3<V>& d, Vec3<V>& front) {
+    Moments<V> sum{};
 #ifdef __CUDA_ARCH__
 #pragma unroll 1
 #endif
     for (int axis = 0; axis < 3; ++axis) {
-      const bool back = d[axis] < 0;
-      const Moments m = moments(read, (2 * axis + (back ? 1 : 0)) * kFiltered);
-      const Vec3<T> column = axis == 0   ? Vec3<T>{m.xx, m.xy, m.xz}
-                             : axis == 1 ? Vec3<T>{m.xy, m.yy, m.yz}
-                                         : Vec3<T>{m.xz, m.yz, m.zz};
-      const T weight = d[axis] * d[axis], total = m.trace(), own = column[axis];
-      T scale = 0;
-      if (total > 0 && own > 0) scale = square_root(total / own) * weight;
-      if (!back) scale = -scale;
-      sum = {sum.xx + weight * m.xx, sum.xy + weight * m.xy, sum.xz + weight * m.xz,
-             sum.yy + weight * m.yy, sum.yz + weight * m.yz, sum.zz + weight * m.zz};
+      const MaskOf<V> back = which && d[axis] < 0, ahead = which && !back;
+      const int32_t first = 2 * kFiltered * axis;
+      Moments<V> m = any(ahead) ? moments(ahead, read, first) : moments(back, read, first + kFiltered);
+      if (any(ahead) && any(back)) {
+        const Moments<V> there = moments(back, read, first + kFiltered);
+        m = combined(there, m, [&](V a, V b) { return select(back, a, b); });
+      }
+      const Vec3<V> column = axis == 0   ? Vec3<V>{m.xx, m.xy, m.xz}
+                             : axis == 1 ? Vec3<V>{m.xy, m.yy, m.yz}
+                                         : Vec3<V>{m.xz, m.yz, m.zz};
+      const V weight = d[axis] * d[axis], total = m.trace(), own = column[axis];
+      V scale{};
+      const MaskOf<V> some = which && total > 0 && own > 0;
+      if (any(some)) scale = select(some, square_root(total / own) * weight, scale);
+      scale = select(back, scale, -scale);
+      sum = combined(sum, m, [&](V a, V b) { return a + weight * b; });
       front = {front.x + scale * column.x, front.y + scale * column.y, front.z + scale * column.z};
     }
     return sum;
   }
-  GV_HD static Look times_alpha(const Row<T>& row, const Vec3<T>& n) {
-    const T a = row.alpha;
-    return {{row.red * a, row.green * a, row.blue * a, a}, {n.x * a, n.y * a, n.z * a}};
+  template <class V>
+  GV_HD static Look<V> times_alpha(MaskOf<V> which, const Row<V>& row, const Vec3<V>& n) {
+    const V a = select(which, row.alpha, V{});
+    const auto of = [&](V number) { return select(which, number * a, V{}); };
+    return {{of(row.red), of(row.green), of(row.blue), a}, {of(n.x), of(n.y), of(n.z)}};
   }
 };
 

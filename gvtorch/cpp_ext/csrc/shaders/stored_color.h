@@ -18,19 +18,20 @@ GV_HD Row<V> combined(const Row<V>& a, const Row<V>& b, const F& f) {
   return {f(a.red, b.red), f(a.green, b.green), f(a.blue, b.blue), f(a.alpha, b.alpha)};
 }
 
-// A voxel's number, or four of them, as seen along direction d; read(k) gives the number k places behind the first, or
-// the four that begin there. A channel may hold `one` numbers for each of six directions (Crassin et al., "Interactive
-// indirect illumination using voxel cone tracing", CGF 2011): then the three that d goes along are read, weighted by
-// the squares of d, whose sum is 1. Where all six are equal, the result has the bits of one.
+// A voxel's number, or four of them, as seen along direction d; read(which, k) gives lanes the number k places behind
+// the first, or the four that begin there. A channel may hold `one` numbers for each of six directions (Crassin et al.,
+// "Interactive indirect illumination using voxel cone tracing", CGF 2011): then the three that d goes along are read,
+// weighted by the squares of d, whose sum is 1. Where all six are equal, the result has the bits of one.
 template <class V, class Read>
 GV_HD auto by_direction(MaskOf<V> which, const Vec3<V>& d, int32_t width, const Read& read, int32_t one = 4) {
-  if (width == one) return read(0);
+  if (width == one) return read(which, 0);
   const auto side = [&](int axis) {
     const MaskOf<V> back = which && d[axis] < 0, ahead = which && !back;
     const int32_t first = 2 * one * axis;
-    if (!any(back)) return read(first);
-    if (!any(ahead)) return read(first + one);
-    return combined(read(first + one), read(first), [&](V a, V b) { return select(back, a, b); });
+    if (!any(back)) return read(ahead, first);
+    if (!any(ahead)) return read(back, first + one);
+    const auto there = read(back, first + one), here = read(ahead, first);
+    return combined(there, here, [&](V a, V b) { return select(back, a, b); });
   };
   const auto z = side(2);
   auto seen = z;
@@ -101,7 +102,7 @@ struct StoredColor : ShaderFacts {
     if constexpr (kPacket<V>) {
       return {probe.number_at(channel, 0, t), probe.number_at(channel, 1, t), probe.number_at(channel, 2, t), V{}};
     } else {
-      const auto read = [&](int32_t behind) { return probe.four_at(channel, behind, t); };
+      const auto read = [&](bool, int32_t behind) { return probe.four_at(channel, behind, t); };
       return by_direction(true, probe.sight.direction, channel.width, read);
     }
   }
@@ -112,7 +113,7 @@ struct StoredColor : ShaderFacts {
     if constexpr (kPacket<V>) {
       return probe.number_at(channel, number, t);
     } else {
-      const auto read = [&](int32_t behind) { return probe.number_at(channel, number + behind, t); };
+      const auto read = [&](bool, int32_t behind) { return probe.number_at(channel, number + behind, t); };
       return by_direction(true, probe.sight.direction, channel.width, read);
     }
   }
@@ -179,8 +180,8 @@ struct Filtered : Plain<T> {
     probe.narrow(colored);
     const auto& colors = probe.channels.other;
     const Vec3<V> d = probe.sight.direction;
-    const Row<V> seen = by_direction(colored, d, colors.width,
-                                     [&](int32_t first) { return probe.four_of(colored, colors, first, node, t); });
+    const auto read = [&](MaskOf<V> some, int32_t first) { return probe.four_of(some, colors, first, node, t); };
+    const Row<V> seen = by_direction(colored, d, colors.width, read);
     const V whole = clamp(seen.alpha, static_cast<T>(0), static_cast<T>(1));
     const V alpha = stretch(whole, piece.length * probe.scale_of(node) / own_numbers<Own>(parameters).side);
     const V part = alpha / whole;

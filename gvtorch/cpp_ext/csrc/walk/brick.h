@@ -77,6 +77,22 @@ GV_HD Floats voxel_below(Floats place, int32_t side) {
 }
 #endif
 
+// Eight values by the weights of the upper ones along each axis; pair(y, z) gives those of two neighbours along x.
+template <class V, class T, class Pair>
+GV_HD V blend_eight(const T* weight_3, const Pair& pair) {
+  V plane[2];
+  for (int z = 0; z < 2; ++z) {
+    V row[2];
+    for (int y = 0; y < 2; ++y) {
+      V left, right;
+      pair(y, z, left, right);
+      row[y] = left + weight_3[0] * (right - left);
+    }
+    plane[z] = row[0] + weight_3[1] * (row[1] - row[0]);
+  }
+  return plane[0] + weight_3[2] * (plane[1] - plane[0]);
+}
+
 // The eight voxels around a place of a brick, in voxels from the centre of its first one; a place beyond the last is
 // clamped.
 template <class T>
@@ -92,20 +108,9 @@ struct Eight {
       weight[axis] = place - static_cast<T>(cell[axis]);
     }
   }
-  // Their values, blended; pair(y, z) gives those of two neighbours along x.
   template <class Pair>
   GV_HD T blend(const Pair& pair) const {
-    T plane[2];
-    for (int z = 0; z < 2; ++z) {
-      T row[2];
-      for (int y = 0; y < 2; ++y) {
-        T left, right;
-        pair(y, z, left, right);
-        row[y] = left + weight[0] * (right - left);
-      }
-      plane[z] = row[0] + weight[1] * (row[1] - row[0]);
-    }
-    return plane[0] + weight[2] * (plane[1] - plane[0]);
+    return blend_eight<T>(weight, pair);
   }
 };
 
