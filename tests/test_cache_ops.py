@@ -17,12 +17,16 @@ fixed = settings(
     max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 words = st.integers(0, 31).flatmap(
-    lambda kinds: st.sampled_from([0, 1, 77, 0xFFFF]).map(lambda p: (kinds % 16) << 16 | p)
+    lambda kinds: st.sampled_from([0, 1, 77, 0x7FF]).map(lambda p: (kinds % 16) << 11 | p)
 )
 
 
 def int32(values, device="cpu") -> torch.Tensor:
     return torch.tensor(values, dtype=torch.int32, device=device)
+
+
+def requests(values, device="cpu") -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.int16, device=device).view(-1, 8)
 
 
 @fixed
@@ -31,7 +35,7 @@ def test_compact_requests_lists_open_requests_and_keeps_pending_ones(
     backend, request_words, capacity
 ):
     count = len(request_words) // 8 * 8
-    request = int32(request_words[:count], DEVICES[backend]).view(-1, 8)
+    request = requests(request_words[:count], DEVICES[backend])
     node, word, counts = ops.compact_requests(request, capacity, backend=backend)
     expected = []
     for index, before in enumerate(request_words[:count]):
@@ -119,7 +123,7 @@ def test_link_writes_pointers_and_takes_requests_back(backend, data, tiles):
     chosen = data.draw(st.lists(st.integers(0, nodes - 1), unique=True, max_size=nodes))
     values = data.draw(st.lists(st.integers(-3, 99), min_size=len(chosen), max_size=len(chosen)))
     kind = data.draw(st.sampled_from([LOAD, SUBDIVIDE]))
-    a, b = (int32(w, device).view(-1, 8) for w in (pointer, request))
+    a, b = int32(pointer, device).view(-1, 8), requests(request, device)
     node_k, word_k = int32([*chosen, -1], device), int32([*values, 5], device)
     ops.link(a, b, node_k, word_k, kind, backend=backend)
     for node, value in zip(chosen, values, strict=True):
@@ -137,7 +141,7 @@ def test_link_bricks_gives_nodes_slots_of_their_own(backend, data, slots):
     request = data.draw(st.lists(words, min_size=nodes, max_size=nodes))
     brick = [-1] * nodes
     before = {"owner": [7] * slots, "stamp": [3] * slots, "born": [2] * slots}
-    there = [int32(w, device).view(-1, 8) for w in (brick, request)]
+    there = [int32(brick, device).view(-1, 8), requests(request, device)]
     there += [int32(w, device) for w in before.values()]
     there.append(torch.ones(slots, dtype=torch.bool, device=device))
     node_k = torch.tensor([*chosen, -1, nodes], device=device)
@@ -166,7 +170,7 @@ def test_link_tiles_writes_tiles_and_hangs_them_below_nodes(backend, data, tiles
         return torch.randint(-3, 50, shape, dtype=torch.int32, generator=generator)
 
     request = data.draw(st.lists(words, min_size=tiles * per_tile, max_size=tiles * per_tile))
-    pool = [draw(tiles, per_tile), draw(tiles, per_tile), int32(request).view(-1, per_tile)]
+    pool = [draw(tiles, per_tile), draw(tiles, per_tile), requests(request)]
     pool += [draw(tiles, 4), draw(tiles), draw(tiles), draw(tiles)]
     pool.append(torch.ones(tiles, dtype=torch.bool))
     made = [draw(len(asking), width), draw(len(asking), width), torch.tensor(asking).long()]
@@ -262,8 +266,8 @@ def test_nodes_tell_their_places_and_what_they_lack(backend, data, branching, ti
 
 def test_kernels_equal_twins_on_a_large_pool(compiled):
     device, generator = DEVICES[compiled], torch.Generator().manual_seed(3)
-    request = torch.randint(0, 1 << 20, (200_000, 8), generator=generator, dtype=torch.int32)
-    request *= torch.randint(0, 2, request.shape, generator=generator, dtype=torch.int32)
+    request = torch.randint(0, 1 << 15, (200_000, 8), generator=generator, dtype=torch.int16)
+    request *= torch.randint(0, 2, request.shape, generator=generator, dtype=torch.int16)
     there = request.clone().to(device)
     expected = ops.compact_requests(request, 300_000, backend="reference")
     actual = ops.compact_requests(there, 300_000, backend=compiled)
@@ -295,21 +299,22 @@ def test_kernels_equal_twins_on_a_large_pool(compiled):
 
 def test_cache_ops_pass_opcheck(compiled):
     device = DEVICES[compiled]
-    request = int32([[1 << 16, 0, 3 << 16, 9 << 16]], device)
+    words = int32([[5, 0, 2, -3]], device)
+    request = torch.tensor([[1 << 11, 0, 3 << 11, 9 << 11]], dtype=torch.int16, device=device)
     table, frame = torch.ops.gvtorch, int32([1], device)
     place = torch.zeros((1, 4), dtype=torch.int64, device=device)
     row, none = torch.zeros_like(frame).long(), torch.zeros_like(frame)
     for op, arguments in (
         (table.compact_requests, (request, 3)),
         (table.lru_partition, (int32([2, 0, 1], device), int32([1, 0, 1], device), frame)),
-        (table.unlink, (request, frame.clone(), frame.bool(), int32([0, -1], device))),
-        (table.orphan, (request, frame.clone(), int32([0, -1], device))),
-        (table.link, (request, request.clone(), frame, frame, LOAD)),
+        (table.unlink, (words, frame.clone(), frame.bool(), int32([0, -1], device))),
+        (table.orphan, (words, frame.clone(), int32([0, -1], device))),
+        (table.link, (words, request, frame, frame, LOAD)),
         (
             table.link_bricks,
             (
+                words,
                 request,
-                request.clone(),
                 *[frame.clone() for _ in range(3)],
                 frame.bool(),
                 row,
@@ -320,18 +325,18 @@ def test_cache_ops_pass_opcheck(compiled):
         (
             table.link_tiles,
             (
-                *[request.clone() for _ in range(4)],
+                *(words.clone(), words.clone(), request, words.clone()),
                 *[frame.clone() for _ in range(3)],
                 frame.bool(),
-                *(request, request, row, place, row, none),
+                *(words, words, row, place, row, none),
                 *(1, frame),
             ),
         ),
         (table.put_rows, (request.view(torch.uint8), row, request.view(torch.uint8).clone())),
-        (table.locate, (request, frame.long(), 2, 4)),
+        (table.locate, (words, frame.long(), 2, 4)),
         (
             table.lacking,
-            (*(request, request, frame, frame, frame.bool(), frame.long(), place), 1, 0, 2),
+            (*(words, words, frame, frame, frame.bool(), frame.long(), place), 1, 0, 2),
         ),
     ):
         torch.library.opcheck(op.default, arguments)
@@ -340,15 +345,15 @@ def test_cache_ops_pass_opcheck(compiled):
 def test_nothing_to_do(backend):
     device = DEVICES[backend]
     none, frame = int32([], device), int32([1], device)
-    request = torch.zeros((1, 8), dtype=torch.int32, device=device)
+    request, words = requests([0] * 8, device), int32([0] * 8, device).view(1, 8)
     assert ops.compact_requests(request, 4, backend=backend)[2].tolist() == [0, 0, 0]
     assert int(ops.lru_partition(none, none, frame, backend=backend)[1]) == 0
-    ops.unlink(request, none, none.bool(), none, backend=backend)
-    ops.orphan(request, none, none, backend=backend)
-    ops.link(request, request.clone(), none, none, LOAD, backend=backend)
+    ops.unlink(words, none, none.bool(), none, backend=backend)
+    ops.orphan(words, none, none, backend=backend)
+    ops.link(words, request, none, none, LOAD, backend=backend)
     places = torch.zeros((1, 4), dtype=torch.int32, device=device)
     loc = ops.locate(places, none.long(), 2, 8, backend=backend)
-    pool = request, places, frame, frame, frame.bool()
+    pool = words, places, frame, frame, frame.bool()
     lacks = ops.lacking(*pool, none.long(), loc, 0, 0, 2, backend=backend)
     assert loc.shape == (0, 4) and lacks.shape == (0,)
     assert not request.any()
@@ -357,20 +362,20 @@ def test_nothing_to_do(backend):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda w: ops.compact_requests(w.float(), 4), "request_tn must be (t, n) int32"),
-        (lambda w: ops.compact_requests(w.T, 4), "request_tn must be contiguous"),
-        (lambda w: ops.compact_requests(w, 0), "capacity must be an int >= 1"),
+        (lambda w: ops.compact_requests(w.float(), 4), "request_tn must be (t, n) int16"),
+        (lambda w: ops.compact_requests(w.short().T, 4), "request_tn must be contiguous"),
+        (lambda w: ops.compact_requests(w.short(), 0), "capacity must be an int >= 1"),
         (lambda w: ops.lru_partition(w, w[0], w[0, :1]), "order_k must be (k,)"),
         (lambda w: ops.unlink(w, w[0], w[0, :3] > 0, w[0]), "shared_s must be (8,) bool"),
         (lambda w: ops.orphan(w, w[0], w), "tile_k must be (k,)"),
-        (lambda w: ops.link(w, w, w[0], w[0, :2], LOAD), "word_k must be (8,)"),
+        (lambda w: ops.link(w, w.short(), w[0], w[0, :2], LOAD), "word_k must be (8,)"),
         (
-            lambda w: ops.link_bricks(w, w, *[w[0]] * 3, w[0], w[0].long(), w[0], w[0, :1]),
+            lambda w: ops.link_bricks(w, w.short(), *[w[0]] * 3, w[0], w[0].long(), w[0], w[0, :1]),
             "shared_b must be (8,) bool",
         ),
         (
             lambda w: ops.link_tiles(
-                *[w] * 3,
+                *(w, w, w.short()),
                 w[:, :4].clone(),
                 *[w[:, 0].clone()] * 3,
                 w[:, 0] > 0,
@@ -395,8 +400,8 @@ def test_nothing_to_do(backend):
             lambda w: ops.lacking(w, w[:, :4].clone(), *[w[0]] * 3, w[0].long(), w, 0, 0, 2),
             "parent_t must be (4,) int32",
         ),
-        (lambda w: ops.link(w, w, w[0], w[0], 3), "kind must be REQUEST_LOAD"),
-        (lambda w: ops.link(w, w, w[0], w[0], LOAD, backend="gpu"), "backend must be auto"),
+        (lambda w: ops.link(w, w.short(), w[0], w[0], 3), "kind must be REQUEST_LOAD"),
+        (lambda w: ops.link(w, w.short(), w[0], w[0], LOAD, backend="gpu"), "backend must be auto"),
     ],
 )
 def test_bad_arguments_are_named(call, message):

@@ -65,6 +65,7 @@ import gvtorch as gv
 FILE = Path(__file__).with_name("golden_scenes.json")
 GROUP = 10  # scenes a test
 ABSENT = -1  # in `brick_tn` and `child_tn`
+PRIORITY = 0x7FF  # bits of request words
 PICTURE = ("color", "alpha", "depth", "nearest", "normal", "features")
 Found = dict[str, list[Any]]
 
@@ -97,8 +98,16 @@ def traced(s: Settings, backend: str) -> Found:
     picture = gv.render(tree, camera, shader, backend=backend, **options)
     found = _parts(s, picture)
     used = [picture.stats.samples, picture.stats.tiles_used, picture.stats.bricks_used]
-    found["counts"] += [*used, nodes.request_tn, nodes.stamp_t, bricks.stamp_b]
+    found["counts"] += [*used, _wide(nodes.request_tn), nodes.stamp_t, bricks.stamp_b]
     return found
+
+
+def _wide(request_tn: torch.Tensor) -> torch.Tensor:
+    """Request words as hashes have them: int32, priorities of 16 bits."""
+    words = request_tn.to(torch.int32)
+    priority = words & PRIORITY
+    top = torch.where(priority == PRIORITY, 0xFFFF, priority)
+    return ((words - priority) << 5) | top
 
 
 def _parts(s: Settings, *pictures: gv.Picture) -> Found:

@@ -32,7 +32,7 @@ def test_the_bookkeeping_is_what_was_counted(blobs, channels, branching, monkeyp
     monkeypatch.undo()
 
     def count(producers, tiles, node_bytes, bricks, brick_bytes, branching, device):
-        rest = tiles * (setup._TILE_BYTES + 4 * branching**3) + bricks * setup._BRICK_BYTES
+        rest = tiles * (setup._TILE_BYTES + 2 * branching**3) + bricks * setup._BRICK_BYTES
         counted.append({"node_pool": node_bytes, "brick_pool": brick_bytes, "bookkeeping": rest})
         original(producers, tiles, node_bytes, bricks, brick_bytes, branching, device)
 

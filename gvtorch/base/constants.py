@@ -38,10 +38,11 @@ TERMINAL = -2
 EMPTY = -2
 CONSTANT = -3
 
-#: Request words, see cpp_ext/csrc/base/hd.h: kind bits above a priority of 16 bits.
-REQUEST_PRIORITY = 0xFFFF
-REQUEST_LOAD = 1 << 16
-REQUEST_SUBDIVIDE = 1 << 17
+#: Request words, see cpp_ext/csrc/base/hd.h: kind bits above a priority of 11 bits. With
+#: the pending bits they take 15 bits of an int16, which is never negative.
+REQUEST_PRIORITY = 0x7FF
+REQUEST_LOAD = 1 << 11
+REQUEST_SUBDIVIDE = 1 << 12
 REQUEST_KINDS = REQUEST_LOAD | REQUEST_SUBDIVIDE
 #: Kinds shifted by this are pending: asked for, not here yet, see cpp_ext/csrc/cache/cache.h.
 REQUEST_PENDING_SHIFT = 2

@@ -209,7 +209,7 @@ class Aliases:
         above = torch.where(pending & REQUEST_SUBDIVIDE << REQUEST_PENDING_SHIFT != 0, -1, 0)
         pending = torch.where(rows.exact, pending, above & REQUEST_KINDS << REQUEST_PENDING_SHIFT)
         words[rows.node] &= ~(REQUEST_KINDS << REQUEST_PENDING_SHIFT)
-        words[rows.node] |= pending.to(torch.int32)
+        words[rows.node] |= pending.to(words.dtype)
 
     def _paths(self) -> tuple[Tensor, Tensor]:
         """(p,) tiles of aliases, and (p,) the tiles on the way to their targets."""

@@ -169,7 +169,7 @@ class Cache:
         """
         words, bit = self.nodes.request_tn.view(-1), kind << REQUEST_PENDING_SHIFT
         if isinstance(pending, Tensor):
-            words[node] = words[node] | torch.where(pending, bit, 0).to(torch.int32)
+            words[node] = words[node] | torch.where(pending, bit, 0).to(words.dtype)
         else:
             words[node] = words[node] | bit if pending else words[node] & ~bit
 

@@ -144,7 +144,7 @@ def _check_memory(
     device: torch.device,
 ) -> None:
     """Raises ValueError if all that an engine will take is more than what is free."""
-    rest = tiles * (_TILE_BYTES + 4 * branching**3) + bricks * _BRICK_BYTES
+    rest = tiles * (_TILE_BYTES + 2 * branching**3) + bricks * _BRICK_BYTES
     caches = sum(producer.host_bytes for producer in producers.values())
     parts = {"node_pool": node_bytes, "brick_pool": brick_bytes, "their bookkeeping": rest}
     needs = [(device, parts), (torch.device("cpu"), {"host caches": caches})]

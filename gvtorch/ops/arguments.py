@@ -66,7 +66,7 @@ class TraceArguments(NamedTuple):
     range_tn2c: Tensor  # same dtype: smallest and largest value in reach of a node's brick: a node
     # that shows nothing is neither entered, sampled nor requested
     component: int  # which of the c values the transfer function reads
-    # The node pool; words are int32.
+    # The node pool; words are int32, requests int16.
     child_tn: Tensor  # tile of a node's children, or ABSENT, TERMINAL
     brick_tn: Tensor  # a node's brick slot, or ABSENT, EMPTY, CONSTANT
     request_tn: Tensor  # request words; written: what rays missed

@@ -27,7 +27,7 @@ from ..base.constants import (
     TERMINAL,
 )
 from ..base.volume import movable
-from .registry import Backend, Bytes, Flags, Longs, Words, choose_backend, op
+from .registry import Backend, Bytes, Flags, Longs, Requests, Words, choose_backend, op
 
 Count = Annotated[int, range(2**31)]
 Positive = Annotated[int, range(1, 2**31)]
@@ -36,7 +36,7 @@ Branching = Annotated[int, range(2, 2**15)]  # N of a tree
 
 @op()
 def compact_requests(
-    request_tn: Words, capacity: Positive, *, backend: Backend = "auto"
+    request_tn: Requests, capacity: Positive, *, backend: Backend = "auto"
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Lists requests, at most `capacity`, and clears their words, the pending bits excepted; kinds
     that are pending are not listed.
@@ -136,7 +136,7 @@ def _check_kind(*, kind: int, **_: Any) -> None:
 @op(_check_kind)
 def link(
     pointer_tn: Words,  # child or brick words
-    request_tn: Words,
+    request_tn: Requests,
     node_k: Words,  # node indices, each once; -1 names none
     word_k: Words,  # what their words become
     kind: int,  # REQUEST_LOAD for brick words, REQUEST_SUBDIVIDE for child words
@@ -156,7 +156,7 @@ def link(
 @op()
 def link_bricks(
     brick_tn: Words,
-    request_tn: Words,
+    request_tn: Requests,
     owner_b: Words,
     stamp_b: Words,
     born_b: Words,
@@ -191,7 +191,7 @@ def _check_width(*, child_tn: Tensor, child_jw: Tensor, **_: Any) -> None:
 def link_tiles(
     child_tn: Words,
     brick_tn: Words,
-    request_tn: Words,
+    request_tn: Requests,
     loc_t4: Words,
     parent_t: Words,
     tree_t: Words,

@@ -19,6 +19,7 @@ from ..base import check
 Backend = Literal["auto", "reference", "cpp", "cuda"]
 Words = Annotated[Tensor, torch.int32]
 Longs = Annotated[Tensor, torch.int64]
+Requests = Annotated[Tensor, torch.int16]
 Flags = Annotated[Tensor, torch.bool]
 Bytes = Annotated[Tensor, torch.uint8]
 _Twin = TypeVar("_Twin", bound=Callable[..., Any])
@@ -54,7 +55,7 @@ def op(also: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
     the twin, as its argument `backend` says: auto, reference, cpp or cuda.
 
     Tensors must be contiguous, on one device, and of the shape that their name ends with (of any,
-    if it has no such end) and the dtype of Words, Longs, Flags or Bytes; numbers inside their
+    if it has no such end) and the dtype of Words, Longs, Requests, Flags or Bytes; numbers inside their
     range. Else the op raises ValueError.
 
     Args:
@@ -70,7 +71,7 @@ def op(also: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
         places = {name: place for place, name in enumerate(names)}
         tensors = [
             (places[name], name, check.shape_of(name) if "_" in name else "", dtype)
-            for dtype in (torch.int32, torch.int64, torch.bool, torch.uint8)
+            for dtype in (torch.int32, torch.int64, torch.int16, torch.bool, torch.uint8)
             for name, mark in marks.items()
             if mark == dtype
         ]
@@ -194,8 +195,8 @@ FAKES: dict[str, Callable[..., Any]] = {
     "composite": _composite,
     "composite_backward": _composite_backward,
     "compact_requests": lambda *, request_tn, capacity: (
-        request_tn.new_empty((capacity,)),
-        request_tn.new_empty((capacity,)),
+        request_tn.new_empty((capacity,), dtype=torch.int32),
+        request_tn.new_empty((capacity,), dtype=torch.int32),
         request_tn.new_empty((3,), dtype=torch.int64),
     ),
     "lru_partition": lambda *, order_k, **_: (

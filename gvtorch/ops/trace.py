@@ -87,7 +87,8 @@ def check_trace(
         *_fields(arguments, arguments.bricks_bzyxc.dtype, "range_tn2c"),
         ("table_lm4", table, table_shape, table.dtype),
         *_fields(arguments, table.dtype, "domain_2"),
-        *_fields(arguments, torch.int32, "child_tn brick_tn request_tn stamp_t stamp_b"),
+        *_fields(arguments, torch.int32, "child_tn brick_tn stamp_t stamp_b"),
+        *_fields(arguments, torch.int16, "request_tn"),
         *_fields(arguments, torch.int32, "opaque_m frame_1"),
     ]
     sizes = check_rays(where, rays) | check_channel(where, arguments, device)

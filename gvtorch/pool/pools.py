@@ -175,7 +175,7 @@ class NodePool(_Pool):
         channels: What each voxel holds, by name.
         child_tn: (t, n) int32 tile of the node's children, or ABSENT (not loaded), TERMINAL (none).
         brick_tn: (t, n) int32 slot of the node's brick, or ABSENT, EMPTY, CONSTANT.
-        request_tn: (t, n) int32 what rays have requested since the words were last cleared.
+        request_tn: (t, n) int16 what rays have requested since the words were last cleared.
         loc_t4: (t, 4) int32 x, y, z of the tile's parent node at its own depth, and the depth of
             the tile's nodes; node x at that depth = loc x * N + child x.
         parent_t: (t,) int32 index of the node whose children this tile holds, -1 for a root tile.
@@ -215,7 +215,8 @@ class NodePool(_Pool):
             return torch.full((capacity, *shape), value, dtype=torch.int32, device=device)
 
         self.child_tn, self.brick_tn = words(ABSENT, n), words(ABSENT, n)
-        self.request_tn, self.loc_t4 = words(0, n), words(0, 4)
+        self.request_tn = torch.zeros((capacity, n), dtype=torch.int16, device=device)
+        self.loc_t4 = words(0, 4)
         self.parent_t, self.tree_t, self.stamp_t = words(-1), words(0), words(-1)
         self.shared_t = torch.zeros((capacity,), dtype=torch.bool, device=device)
         self.constants: dict[str, Tensor] = {}

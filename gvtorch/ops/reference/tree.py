@@ -150,14 +150,14 @@ class Tree:
 
     def request(self, node: Tensor, depth: Tensor, cone: Tensor, kind: int) -> None:
         """Joins requests into the request words: kinds by OR, priorities, widths of one voxel on
-        the screen in sixteenths of a pixel, by maximum.
+        the screen in sixteenths of a pixel, up to 128 pixels, by maximum.
         """
         voxel = self.levels.voxel_d[depth]
         priority = torch.where(cone > 0, voxel / cone * 16, REQUEST_PRIORITY)
         priority = torch.where(priority < REQUEST_PRIORITY, priority, REQUEST_PRIORITY)
         asked, inverse = torch.unique(node, return_inverse=True)
-        most = torch.zeros_like(asked, dtype=torch.int32)
-        most.scatter_reduce_(0, inverse, priority.to(torch.int32), "amax")
+        most = torch.zeros_like(asked, dtype=torch.int16)
+        most.scatter_reduce_(0, inverse, priority.to(torch.int16), "amax")
         word = self.request_n[asked]
         kinds = (word & ~REQUEST_PRIORITY) | kind
         self.request_n[asked] = kinds | torch.maximum(word & REQUEST_PRIORITY, most)

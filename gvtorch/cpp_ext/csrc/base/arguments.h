@@ -51,6 +51,8 @@ using MaybeVoxels = TensorOf<AnyVoxel, 0, true>;  // each of a dtype of its own
 template <char kAlias>
 using Written = TensorOf<int32_t, kAlias>;
 template <char kAlias>
+using Requests = TensorOf<int16_t, kAlias>;
+template <char kAlias>
 using WrittenFlags = TensorOf<bool, kAlias>;
 template <char kAlias>
 using WrittenBytes = TensorOf<uint8_t, kAlias>;
@@ -93,7 +95,7 @@ using Bool = NumberOf<bool>;
   X(Int, component, channels)                 \
   X(Words, child_tn, nodes)                   \
   X(Words, brick_tn, nodes)                   \
-  X(Written<'a'>, request_tn, nodes)          \
+  X(Requests<'a'>, request_tn, nodes)         \
   X(Written<'b'>, stamp_t, tiles)             \
   X(Written<'c'>, stamp_b, bricks)            \
   X(Words, frame_1, 1)                        \

@@ -92,29 +92,31 @@ GV_HD void store_byte(uint8_t* byte, uint8_t value) {
 #endif
 }
 
-// Joins a request into a request word: kind bits (above kPriorityMask) by OR, priority by maximum. Commutative, so
-// the word does not depend on the order of the rays.
-constexpr int32_t kPriorityMask = 0xffff;
-constexpr int32_t kLoad = 1 << 16;
-constexpr int32_t kSubdivide = 1 << 17;
+// Joins a request into a request word, which is never negative: kind bits (above kPriorityMask) by OR, priority by
+// maximum. Commutative, so the word does not depend on the order of the rays.
+constexpr int32_t kPriorityMask = 0x7ff;
+constexpr int32_t kLoad = 1 << 11;
+constexpr int32_t kSubdivide = 1 << 12;
 
-GV_HD int32_t join_request(int32_t word, int32_t request) {
+template <class Word>
+GV_HD Word join_request(Word word, int32_t request) {
   const int32_t kinds = (word | request) & ~kPriorityMask;
   const int32_t before = word & kPriorityMask, now = request & kPriorityMask;
-  return kinds | (now > before ? now : before);
+  return static_cast<Word>(kinds | (now > before ? now : before));
 }
 
-GV_HD void post_request(int32_t* word, int32_t request) {
+GV_HD void post_request(int16_t* word, int32_t request) {
 #ifdef __CUDA_ARCH__
-  int32_t seen = *reinterpret_cast<volatile int32_t*>(word);
-  for (int32_t joined = join_request(seen, request); joined != seen; joined = join_request(seen, request)) {
-    const int32_t before = atomicCAS(word, seen, joined);
+  auto* bits = reinterpret_cast<unsigned short*>(word);
+  auto seen = *reinterpret_cast<volatile unsigned short*>(bits);
+  for (auto joined = join_request(seen, request); joined != seen; joined = join_request(seen, request)) {
+    const auto before = atomicCAS(bits, seen, joined);
     if (before == seen) return;
     seen = before;
   }
 #else
-  int32_t seen = __atomic_load_n(word, __ATOMIC_RELAXED);
-  for (int32_t joined = join_request(seen, request); joined != seen; joined = join_request(seen, request)) {
+  int16_t seen = __atomic_load_n(word, __ATOMIC_RELAXED);
+  for (int16_t joined = join_request(seen, request); joined != seen; joined = join_request(seen, request)) {
     if (__atomic_compare_exchange_n(word, &seen, joined, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) return;
   }
 #endif

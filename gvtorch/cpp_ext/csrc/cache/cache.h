@@ -44,7 +44,7 @@ constexpr int32_t kPending = kKinds << kPendingShift;
 
 GV_HD int32_t open_kinds(int32_t word) { return word & kKinds & ~(word >> kPendingShift); }
 
-#define GV_COMPACT_REQUESTS(X) X(Written<'a'>, request_tn, kAny) X(Int, capacity, kAny)
+#define GV_COMPACT_REQUESTS(X) X(Requests<'a'>, request_tn, kAny) X(Int, capacity, kAny)
 
 // Lists requests and clears them; what a full list has no place for is only counted.
 struct ListRequests {
@@ -186,11 +186,11 @@ struct ClearOwner {
   }
 };
 
-#define GV_LINK(X)                   \
-  X(Written<'a'>, pointer_tn, kAny)  \
-  X(Written<'b'>, request_tn, nodes) \
-  X(Words, node_k, kAny)             \
-  X(Words, word_k, count)            \
+#define GV_LINK(X)                    \
+  X(Written<'a'>, pointer_tn, kAny)   \
+  X(Requests<'b'>, request_tn, nodes) \
+  X(Words, node_k, kAny)              \
+  X(Words, word_k, count)             \
   X(Int, kind, kAny)
 
 // node_k names each node once; -1 is a place that is not taken.
@@ -208,7 +208,7 @@ struct WritePointer {
 
 #define GV_LINK_BRICKS(X)               \
   X(Written<'a'>, brick_tn, kAny)       \
-  X(Written<'b'>, request_tn, nodes)    \
+  X(Requests<'b'>, request_tn, nodes)   \
   X(Written<'c'>, owner_b, kAny)        \
   X(Written<'d'>, stamp_b, slots)       \
   X(Written<'e'>, born_b, slots)        \
@@ -235,22 +235,22 @@ struct LinkBrick {
   }
 };
 
-#define GV_LINK_TILES(X)                       \
-  X(Written<'a'>, child_tn, tiles* per_tile)   \
-  X(Written<'b'>, brick_tn, tiles* per_tile)   \
-  X(Written<'c'>, request_tn, tiles* per_tile) \
-  X(Written<'d'>, loc_t4, 4 * tiles)           \
-  X(Written<'e'>, parent_t, tiles)             \
-  X(Written<'f'>, tree_t, tiles)               \
-  X(Written<'g'>, stamp_t, tiles)              \
-  X(WrittenFlags<'h'>, shared_t, tiles)        \
-  X(Words, child_jw, rows* width)              \
-  X(Words, brick_jw, rows* width)              \
-  X(Longs, node_j, rows)                       \
-  X(Longs, loc_j4, 4 * rows)                   \
-  X(Longs, row_k, kAny)                        \
-  X(Words, tile_k, count)                      \
-  X(Int, tree, kAny)                           \
+#define GV_LINK_TILES(X)                        \
+  X(Written<'a'>, child_tn, tiles* per_tile)    \
+  X(Written<'b'>, brick_tn, tiles* per_tile)    \
+  X(Requests<'c'>, request_tn, tiles* per_tile) \
+  X(Written<'d'>, loc_t4, 4 * tiles)            \
+  X(Written<'e'>, parent_t, tiles)              \
+  X(Written<'f'>, tree_t, tiles)                \
+  X(Written<'g'>, stamp_t, tiles)               \
+  X(WrittenFlags<'h'>, shared_t, tiles)         \
+  X(Words, child_jw, rows* width)               \
+  X(Words, brick_jw, rows* width)               \
+  X(Longs, node_j, rows)                        \
+  X(Longs, loc_j4, 4 * rows)                    \
+  X(Longs, row_k, kAny)                         \
+  X(Words, tile_k, count)                       \
+  X(Int, tree, kAny)                            \
   X(Words, frame_1, 1)
 
 // Writes tiles and hangs them below nodes: an index is a word of a tile. Words beyond those of the tree are TERMINAL

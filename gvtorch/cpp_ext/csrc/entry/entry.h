@@ -106,11 +106,13 @@ struct Like {
   const Tensor& tensor;  // on whose device all lie
   ScalarType real = ScalarType::Float;
   ScalarType voxel = ScalarType::Float;
+  ScalarType request = ScalarType::Short;
 
   template <class T>
   ScalarType dtype() const {
     if constexpr (std::is_same_v<T, kinds::AnyReal>) return real;
     if constexpr (std::is_same_v<T, kinds::AnyVoxel>) return voxel;
+    if constexpr (std::is_same_v<T, int16_t>) return request;
     if constexpr (!std::is_class_v<T>) return CppTypeToScalarType<T>::value;
   }
 };
@@ -219,7 +221,10 @@ template <class Op>
 ShadeArgs take_walk(const Op& a, bool integrates = false) {
   ShadeArgs args{};
   args.shader = kPlainShader;
-  const Like like{a.origin_r3, a.table_lm4.scalar_type(), a.bricks_bzyxc.scalar_type()};
+  // Programs that version 0.1 exported bring requests of 32 bits, which nobody reads.
+  const bool unread = a.request_tn.scalar_type() == ScalarType::Int;
+  const Like like{a.origin_r3, a.table_lm4.scalar_type(), a.bricks_bzyxc.scalar_type(),
+                  unread ? ScalarType::Int : ScalarType::Short};
   STD_TORCH_CHECK(a.child_tn.dim() == 2, "gvtorch: child_tn must be (t, n)");
   const int64_t tiles = a.child_tn.size(0), nodes = a.child_tn.numel();
   take_channel(args, a, like, nodes);
@@ -229,6 +234,7 @@ ShadeArgs take_walk(const Op& a, bool integrates = false) {
   const int64_t levels = a.table_lm4.size(0), rows = a.table_lm4.size(1);
   const int64_t table = 4 * levels * rows * (integrates ? rows : 1);
   GV_WALK(GV_TAKE)
+  if (unread) args.request_tn = nullptr;
   STD_TORCH_CHECK(a.child_tn.size(1) >= a.branching * a.branching * a.branching, "gvtorch: child_tn has too few nodes");
   STD_TORCH_CHECK(a.width == 0 || args.rays % a.width == 0, "gvtorch: rays are no rows of this width");
   STD_TORCH_CHECK(levels <= INT32_MAX && rows <= INT32_MAX, "gvtorch: table_lm4 is too large");

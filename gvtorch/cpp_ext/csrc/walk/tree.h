@@ -7,7 +7,7 @@
 //
 //   child_tn    >= 0 tile of its children | kAbsent: not made yet | kTerminal: nothing finer exists
 //   brick_tn    >= 0 brick slot | kAbsent: not loaded yet | kEmpty | kConstant: one value, see constant_tnc
-//   request_tn  what rays ask for, see post_request in hd.h
+//   request_tn  what rays ask for, see post_request in hd.h; null where nobody reads it
 //
 // Tree units: the root is the cube [0,1]^3. float32 tells the corners of nodes where N is a power of two and the root
 // is at most kMostShallow voxels wide; other trees are *deep*: places in them are float64. A descent that restarts from
@@ -56,7 +56,7 @@ struct Levels {
 struct TreeView {
   const int32_t* child_tn;
   const int32_t* brick_tn;
-  int32_t* request_tn;
+  int16_t* request_tn;
   int32_t* stamp_t;
   int32_t root, root_tile;
   int32_t branching;  // N

@@ -195,10 +195,11 @@ struct Walk {
     return absent || deeper || above;
   }
 
-  // Priority: how wide one voxel of the node is on the screen, in sixteenths of a pixel.
+  // Priority: how wide one voxel of the node is on the screen, in sixteenths of a pixel, up to 128 pixels.
   GV_HD void request(int32_t node, int32_t depth, T cone, int32_t kind) const {
     const T most = static_cast<T>(kPriorityMask);
     const T priority = cone > 0 ? smaller(levels.voxel[depth] / cone * 16, most) : most;
+    if (tree.request_tn == nullptr) return;
     post_request(&tree.request_tn[node], kind | static_cast<int32_t>(priority));
   }
 
