@@ -21,6 +21,7 @@ from gvtorch.base.constants import REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUEST_
 from gvtorch.engine import host_frame
 from gvtorch.engine.device_frame import DeviceFrame
 from gvtorch.io.stores.conversion import convert
+from gvtorch.pool import mapped
 
 COMPILED = [pytest.param(b, marks=pytest.mark.backend(b)) for b in ("cpp", "cuda")]
 LOOK = gv.TransferFunction.from_points(
@@ -90,6 +91,26 @@ def test_they_come_to_the_picture_that_the_host_comes_to(backend, branching, kin
         assert made["tiles"] > 20 and (made["constant"] > 0) == kinds
     assert torch.equal(hits.color, expected.color.reshape(-1, 3))
     assert torch.equal(hits.depth, expected.depth.reshape(-1, 1))
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_a_volume_that_the_device_reads_in_place_is_recorded(backend, monkeypatch):
+    monkeypatch.setattr(mapped, "_SMALL", 100_000)  # bytes: the voxels are more
+    values = torch.rand((48, 52, 44, 2), generator=torch.Generator().manual_seed(2))
+    volume = gv.Volume(values, (1, 1.5, 1), (-20, 3, 4))
+    tree = gv.N3Tree.from_volume(volume, device=DEVICES[backend])
+    expected = gv.render(tree, view(), LOOK, backend=backend)
+    options = {"brick_pool": "8 MB", "device": DEVICES[backend]}
+    with gv.Engine(gv.VolumeProducer(volume, hold="mapped"), **options) as engine:
+        frames = Frames(engine, view(), LOOK, 64)
+        assert isinstance(frames.served, DeviceFrame)
+        for _ in range(200):
+            hits, stats = frames.frame()
+            if stats.converged:
+                break
+        assert stats.converged and expected.alpha.max() > 0.5
+        engine.validate()
+    assert torch.equal(hits.color, expected.color.reshape(-1, 3))
 
 
 @pytest.mark.parametrize("backend", COMPILED)
@@ -437,6 +458,17 @@ def test_a_flight_through_a_store_does_not_wait(blobs, tmp_path, look_ahead):
     options = {"brick_size": 4, "brick_pool": "4 MB", "device": "cuda"}
     with gv.Engine(on_the_host(blobs, tmp_path / "one", "store"), **options) as engine:
         _, picture, _, _ = flown(engine, PATH, 64, look_ahead)
+        assert torch.equal(engine.render(PATH[-1], LOOK).color, picture.color)
+
+
+@pytest.mark.backend("cuda")
+def test_a_flight_through_a_volume_read_in_place_does_not_wait(monkeypatch):
+    monkeypatch.setattr(mapped, "_SMALL", 100_000)  # bytes: the voxels are more
+    values = torch.rand((128,) * 3, generator=torch.Generator().manual_seed(2))
+    options = {"brick_pool": "20 MB", "device": "cuda"}
+    with gv.Engine(gv.VolumeProducer(gv.Volume(values), hold="mapped"), **options) as engine:
+        _, picture, _, missed = flown(engine, PATH, 64)
+        assert missed > 100
         assert torch.equal(engine.render(PATH[-1], LOOK).color, picture.color)
 
 

@@ -341,7 +341,7 @@ def test_a_producer_that_never_answers_stalls_no_frame(device):
 
 
 @pytest.mark.parametrize("backend", ["cpp", "cuda"])
-@pytest.mark.parametrize("hold", ["voxels", "bricks"])
+@pytest.mark.parametrize("hold", ["voxels", "bricks", "mapped"])
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.float32])
 def test_bricks_cut_ahead_give_the_picture_of_the_volume(blobs, backend, hold, dtype):
     if available()[backend]:

@@ -356,7 +356,7 @@ def test_level_by_level_asks_for_a_brick_before_its_children(blobs, backend):
     for by_level in (True, False):
         tree.nodes.request_tn.zero_()
         Tracer(tree, SHADER, gv.RenderOptions(backend=backend), by_level=by_level)(rays)
-        kinds[by_level] = int(tree.nodes.request_tn.view(-1)[tree.root])  & config.REQUEST_KINDS
+        kinds[by_level] = int(tree.nodes.request_tn.view(-1)[tree.root]) & config.REQUEST_KINDS
     both = config.REQUEST_KINDS
     assert kinds == {True: config.REQUEST_LOAD, False: both}, "nothing answers for the root"
     tree.nodes.request_tn.zero_()

@@ -52,7 +52,7 @@ def compact(record: Record) -> None:
     if not record.wants(case):
         return
     some = torch.randperm(nodes, generator=torch.Generator().manual_seed(2))[:_REQUESTS]
-    words = torch.zeros(nodes, dtype=torch.int32)
+    words = torch.zeros(nodes, dtype=torch.int16)
     words[some] = REQUEST_LOAD | 77
     words = words.view(-1, 8).to(settings.device)
     count = 16 if settings.device.type == "cuda" else 4

@@ -7,7 +7,8 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, Literal
 
 import torch
 
@@ -24,6 +25,7 @@ from .scenes import Scene, aneurism, fog_dense, worn
 CACHE = ("requests", "lru", "schedule", "produce", "write", "count")
 _MOST = 1000  # frames until something must have converged
 _POOLS = {"node_pool": "16 MB", "brick_pool": "384 MB"}  # hold all of 512^3 uint8
+_Way = Callable[[Engine], Callable[[], list[Any]]]  # what is not timed gives what is
 _QUICK = {"node_pool": "1 MB", "brick_pool": "2 MB"}
 
 
@@ -127,7 +129,8 @@ def _converge(engine: Engine, camera: Camera, shader: TransferFunction) -> torch
 
 def _cold(record: Record, scene: Scene, size: tuple[int, int], budget: int) -> None:
     """From an engine that holds the root alone to a picture that misses nothing: frame after frame,
-    each of them whole, and by `Engine.render`, which shows the last one alone.
+    each of them whole, and by `Engine.render`, which shows the last one alone; on CUDA by a graph
+    as well, of a volume that the device reads in place.
     """
     settings, camera = record.settings, scene.camera(*size)
     side = scene.volume.extent[0]
@@ -142,24 +145,42 @@ def _cold(record: Record, scene: Scene, size: tuple[int, int], budget: int) -> N
     def picture(engine: Engine) -> list[Any]:
         return [engine.render(camera, scene.shader, max_frames=_MOST).stats]
 
-    ways: dict[str, Callable[[Engine], list[Any]]] = {
-        "gvtorch, frames": frames,
-        "gvtorch, render": picture,
+    def recorded(engine: Engine) -> Callable[[], list[Any]]:
+        graph = engine.capture(camera, scene.shader, batch=budget)
+        for tree in engine.trees.values():
+            tree.producer.changed()  # all that was made goes
+
+        def replays() -> list[FrameStats]:
+            all_stats: list[FrameStats] = []
+            while len(all_stats) < _MOST:
+                all_stats.append(graph.replay(camera)[1])
+                if all_stats[-1].settle().converged:
+                    break
+            return all_stats
+
+        return replays
+
+    ways: dict[str, tuple[Literal["voxels", "mapped"], _Way]] = {
+        "gvtorch, frames": ("voxels", lambda engine: partial(frames, engine)),
+        "gvtorch, render": ("voxels", lambda engine: partial(picture, engine)),
     }
-    for name, way in ways.items():
+    if settings.device.type == "cuda":
+        ways["gvtorch, mapped, captured"] = ("mapped", recorded)
+    for name, (hold, ready) in ways.items():
         times, began, all_stats = [], time.perf_counter(), list[Any]()
         for number in range(settings.repeats + 1):
             settings.tell(f"{case}, {name}: {number}")
             options: dict[str, Any] = {**(_QUICK if settings.quick else _POOLS)}
             options |= {"load_budget": budget, "subdivide_budget": budget}
-            producer = VolumeProducer(scene.volume)
+            producer = VolumeProducer(scene.volume, hold=hold)
             with Engine(producer, monitor=False, device=settings.device, **options) as engine:
+                run, before = ready(engine), engine.frames
                 synchronize(settings.device)
                 start = time.perf_counter()
-                all_stats = way(engine)
+                all_stats = run()
                 synchronize(settings.device)
                 times.append(1e3 * (time.perf_counter() - start))
-                passes = engine.frames
+                passes = engine.frames - before
             if number and time.perf_counter() - began > settings.seconds:
                 break
         if not all_stats[-1].converged:

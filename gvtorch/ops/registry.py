@@ -55,8 +55,8 @@ def op(also: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
     the twin, as its argument `backend` says: auto, reference, cpp or cuda.
 
     Tensors must be contiguous, on one device, and of the shape that their name ends with (of any,
-    if it has no such end) and the dtype of Words, Longs, Requests, Flags or Bytes; numbers inside their
-    range. Else the op raises ValueError.
+    if it has no such end) and the dtype of Words, Longs, Requests, Flags or Bytes; numbers inside
+    their range. Else the op raises ValueError.
 
     Args:
         also: One more check, which gets the arguments by name.

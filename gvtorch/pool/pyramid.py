@@ -50,7 +50,7 @@ class NodeSummary:
     def is_empty(self, threshold: float | None) -> Tensor:
         """Returns (...) bool, whether no finest value in reach is above the threshold."""
         if threshold is None:
-            return torch.zeros(self.high.shape[:-1], dtype=torch.bool)
+            return torch.zeros_like(self.high[..., 0], dtype=torch.bool)
         return (self.high <= threshold).all(-1)
 
     def constants(self, dtype: torch.dtype) -> Tensor:

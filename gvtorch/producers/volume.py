@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.volume import Volume
+from ..base.volume import Volume, movable
 from ..ops import cut_bricks
 from ..pool import BrickTable, Channel
+from ..pool.mapped import mapped
 from ..pool.pools import checked_threshold, labels_by_channel, volumes_by_channel
 from ..pool.pyramid import Level, NodeSummary, levels_by_depth
 from ..pool.staging import wide_rows
@@ -37,14 +38,12 @@ class VolumeProducer(Producer):
         volumes: What it cuts, by channel.
     """
 
-    on_host = True
-
     def __init__(
         self,
         volume: Volume | Mapping[str, Volume],
         *,
         threshold: float | None = None,
-        hold: Literal["voxels", "bricks"] = "voxels",
+        hold: Literal["voxels", "bricks", "mapped"] = "voxels",
         filtered: CoarseColors | None = None,
     ) -> None:
         """Takes a volume, which becomes channel "value", or one for each channel.
@@ -54,15 +53,18 @@ class VolumeProducer(Producer):
             threshold: Regions with no value above it are EMPTY; None keeps every value.
             hold: What is held in memory. "voxels": all levels, 8 / 7 of the volume. "bricks": all
                 bricks of all levels, with their borders, as well (2.2 times the volume for 8^3 and
-                a border of 1); answers then come many times as fast.
+                a border of 1); answers then come many times as fast. "mapped": all levels, in host
+                memory that the engine's CUDA device reads in place: it cuts bricks by itself, the
+                host has no part in it, and `Engine.capture` records it.
             filtered: A `Filtered` shader: coarse bricks hold colours for it as well, made of the
                 first channel; to be rendered with this shader.
 
         Raises:
             ValueError: Channels differ in extent, spacing or origin, or `hold` is unknown.
         """
-        if hold not in ("voxels", "bricks"):
-            raise ValueError(f"VolumeProducer: hold must be 'voxels' or 'bricks', got {hold!r}")
+        if hold not in ("voxels", "bricks", "mapped"):
+            known = "'voxels', 'bricks' or 'mapped'"
+            raise ValueError(f"VolumeProducer: hold must be {known}, got {hold!r}")
         volumes = volumes_by_channel("VolumeProducer", volume)
         first = next(iter(volumes.values()))
         channels = {name: Channel.of(volume) for name, volume in volumes.items()}
@@ -85,47 +87,63 @@ class VolumeProducer(Producer):
         threshold = checked_threshold("VolumeProducer", threshold, volumes)
         self.volumes, self._threshold, self._hold = volumes, threshold, hold
         self._filtered = filtered
-        self._levels: dict[str, list[Level]] = {}  # by channel, the root's first
-        self._values: dict[str, list[Tensor]] = {}  # voxels of these levels, and coarse channels
+        self.on_device, self.on_host = hold == "mapped", hold != "mapped"
+        self._values: dict[str, list[Tensor]] = {}  # by channel, of each level, the root's first
         self._tables: dict[str, BrickTable] = {}  # by channel, depth after depth, in order z, y, x
-        self._grids: Tensor | None = None  # (d, 4) of each depth: bricks along x, y, z; first row
+        self._voxels: dict[str, Tensor] = {}  # by channel (v, c), in the same order
+        self._nodes: dict[str, Tensor] = {}  # by channel (n, 3, c): low, high, mean, likewise
+        self._grids = torch.empty(0)  # (d, 4) of each depth: first node, nodes along z, y, x
+        self._sizes = torch.empty(0)  # (d, 4) of each depth: first voxel, voxels along z, y, x
 
     def prepare(self, layout: Layout) -> None:
         """Makes all levels, and all bricks if they are to be held."""
         cuts = (layout.branching, layout.brick_size, layout.border)
-        self._levels = levels_by_depth(self.volumes, layout.depth, *cuts)
-        self._values = {name: [one.values for one in own] for name, own in self._levels.items()}
-        levels = next(iter(self._levels.values()))
+        by_channel = levels_by_depth(self.volumes, layout.depth, *cuts)
+        values = {name: [one.values for one in levels] for name, levels in by_channel.items()}
+        levels = next(iter(by_channel.values()))
         if self._filtered is not None:
             first = next(iter(self.volumes.values()))
             name = str(self._filtered.other)
             sizes = (layout.branching, layout.depth, layout.device, self.channels[name].width)
             self.made_of[name] = self._filtered.made_of
-            self._values[name] = [*self._filtered.levels(first, *sizes)][::-1]
+            values[name] = [*self._filtered.levels(first, *sizes)][::-1]
+        summaries = {name: torch.cat([*map(_rows_of, own)]) for name, own in by_channel.items()}
+        self._grids = _numbered([level.grid for level in levels])
         if self._hold == "bricks":
-            for name, values in self._values.items():
-                if values:  # a tree of one brick has no coarse ones
-                    self._tables[name] = BrickTable(_all_bricks(values, levels, layout))
-            grids = torch.tensor([level.grid[::-1] for level in levels])
-            count = grids.prod(1, keepdim=True)
-            self._grids = torch.cat((grids, count.cumsum(0) - count), 1)
+            for name, own in values.items():
+                if own:  # a tree of one brick has no coarse ones
+                    self._tables[name] = BrickTable(_all_bricks(own, levels, layout))
+        if self._hold != "mapped":
+            self._values, self._nodes = values, summaries
+            return
+        there = layout.device
+        self._grids = self._grids.to(there)
+        self._sizes = _numbered([level.values.shape[:3] for level in levels]).to(there)
+        self._nodes = {name: mapped(rows, there) for name, rows in summaries.items()}
+        while values:  # one by one, for each is copied
+            name, own = values.popitem()
+            rows = [movable(level).flatten(0, 2) for level in own]
+            self._voxels[name] = mapped(torch.cat(rows), there)
 
     def classify(self, nodes: Nodes) -> Regions:
         """CONSTANT where all finest voxels in reach are equal, EMPTY where none is above the
         threshold.
         """
-        found = {name: self._summary(nodes, levels) for name, levels in self._levels.items()}
+        row = self._row(nodes)
+        found = {name: NodeSummary(*rows[row].unbind(1)) for name, rows in self._nodes.items()}
         return regions_of(found, self.channels, self._threshold)
 
     def fill(self, nodes: Nodes) -> Bricks:
         """Cuts the bricks, or names their rows where they are held."""
         layout, data = nodes.layout, {}
         held = {name: c for name, c in self.channels.items() if nodes.coarse or not c.coarse}
-        if self._grids is not None:
-            x, y, z, level = nodes.loc.cpu().unbind(1)
-            wide, high, _, first = self._grids[level].unbind(1)
-            row = first + (z * high + y) * wide + x
+        if self._hold == "bricks":
+            row = self._row(nodes)
             return Bricks(data={name: self._tables[name][row] for name in held})
+        if self._hold == "mapped":
+            voxel = self._voxel(nodes)
+            data = {name: self._voxels[name][voxel].view(c.dtype) for name, c in held.items()}
+            return Bricks(data=data)
         for name, channel in held.items():
             shape = (len(nodes), *(layout.side,) * 3, channel.width)
             bricks = data[name] = torch.empty(shape, dtype=channel.dtype)
@@ -136,15 +154,42 @@ class VolumeProducer(Producer):
                 rows[here] = found
         return Bricks(data=data)
 
-    def _summary(self, nodes: Nodes, levels: list[Level]) -> NodeSummary:
-        """Returns what nodes hold; nodes beyond the volume hold what the nearest at its face do."""
-        result = torch.empty((3, len(nodes), levels[0].values.shape[3]))
-        for depth, here, zyx in _by_depth(nodes):
-            summary, grid = levels[depth].nodes, torch.tensor(levels[depth].grid)
-            at = zyx.minimum(grid - 1).unbind(1)
-            for rows, values in zip(result, (summary.low, summary.high, summary.mean), strict=True):
-                rows[here] = values[at]
-        return NodeSummary(*result)
+    def _row(self, nodes: Nodes) -> Tensor:
+        """(k,) int64 which node of all levels; beyond the volume the nearest at its face."""
+        loc = nodes.loc.to(self._grids.device)
+        first, high, deep, wide = self._grids[loc[:, 3]].unbind(1)
+        z, y, x = (at.minimum(n - 1) for at, n in zip(_zyx(loc), (high, deep, wide), strict=True))
+        return first + (z * deep + y) * wide + x
+
+    def _voxel(self, nodes: Nodes) -> Tensor:
+        """(k, s, s, s) int64 which voxels of all levels, as `cut_bricks` cuts them."""
+        layout, loc = nodes.layout, nodes.loc.to(self._sizes.device)
+        first, *sizes = self._sizes[loc[:, 3], :, None, None, None].unbind(1)
+        reach = torch.arange(layout.side, device=loc.device) - layout.border
+        at = []
+        for axis, (node, size) in enumerate(zip(_zyx(loc), sizes, strict=True)):
+            along = reach.view([-1 if other == axis else 1 for other in range(3)])
+            place = node[:, None, None, None] * layout.brick_size + along
+            at.append(place.clamp(min=0).minimum(size - 1))
+        z, y, x = at
+        return first + (z * sizes[1] + y) * sizes[2] + x
+
+
+def _zyx(loc: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    return loc[:, 2], loc[:, 1], loc[:, 0]
+
+
+def _rows_of(level: Level) -> Tensor:
+    """(n, 3, c) low, high and mean of the nodes of a level."""
+    own = level.nodes
+    return torch.stack((own.low, own.high, own.mean), 3).flatten(0, 2)
+
+
+def _numbered(sizes: Sequence[Sequence[int]]) -> Tensor:
+    """(d, 4) int64 of grids (z, y, x), one behind the other: the first entry, then the sizes."""
+    grids = torch.tensor([[*size] for size in sizes])
+    count = grids.prod(1, keepdim=True)
+    return torch.cat((count.cumsum(0) - count, grids), 1)
 
 
 def _by_depth(nodes: Nodes) -> list[tuple[int, Tensor, Tensor]]:

@@ -305,7 +305,8 @@ def test_json_of_every_kind(tmp_path):
 
 
 def random_tensor(pick: random.Random) -> torch.Tensor:
-    kinds = (torch.int32, torch.int64, torch.bool, torch.uint8, torch.float32, torch.float64)
+    whole = (torch.int16, torch.int32, torch.int64, torch.bool, torch.uint8)
+    kinds = (*whole, torch.float32, torch.float64)
     shape = [pick.choice((0, 1, 2, 3, 4, 8)) for _ in range(pick.randrange(6))]
     dtype, seed = pick.choice(kinds), pick.randrange(2**31)
     generator = torch.Generator().manual_seed(seed)
