@@ -80,6 +80,6 @@ def compact(record: Record) -> None:
         rate = 1e3 * words.nbytes / timing.median
         record.add(case, who, timing, words_bytes_per_second=rate, **more)
     record.note(
-        "words bytes / s: the request words, 4 bytes a node, over the time; torch.nonzero lists "
+        "words bytes / s: the request words, 2 bytes a node, over the time; torch.nonzero lists "
         "nodes and clears no words, and waits for the count"
     )
