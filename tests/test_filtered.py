@@ -155,9 +155,17 @@ def test_a_tree_of_one_brick_has_no_colours():
     rays = camera_rays(tree, 9, distance=5.0)
     found, plain = (gv.trace(tree, rays, one) for one in (shader, SHADER))
     assert torch.equal(found.color, plain.color) and plain.alpha.max() > 0
+    for hold in ("voxels", "bricks", "mapped"):
+        streamed = gv.Filtered(SHADER)
+        producer = gv.VolumeProducer(volume, hold=hold, filtered=streamed)
+        with gv.Engine(producer, brick_size=4) as engine:
+            view = gv.Camera.orbit(width=9, height=9)
+            assert torch.equal(
+                engine.render(view, streamed).color, gv.render(tree, view, SHADER).color
+            ), hold
 
 
-@pytest.mark.parametrize("hold", ["voxels", "bricks"])
+@pytest.mark.parametrize("hold", ["voxels", "bricks", "mapped"])
 @pytest.mark.parametrize("directions", [True, False])
 def test_streamed_equals_resident(compiled, directions, hold):
     """From pools that hold all, and from pools with room for a part of the bricks."""

@@ -122,8 +122,9 @@ class VolumeProducer(Producer):
         self._nodes = {name: mapped(rows, there) for name, rows in summaries.items()}
         while values:  # one by one, for each is copied
             name, own = values.popitem()
-            rows = [movable(level).flatten(0, 2) for level in own]
-            self._voxels[name] = mapped(torch.cat(rows), there)
+            if own:  # see above
+                rows = [movable(level).flatten(0, 2) for level in own]
+                self._voxels[name] = mapped(torch.cat(rows), there)
 
     def classify(self, nodes: Nodes) -> Regions:
         """CONSTANT where all finest voxels in reach are equal, EMPTY where none is above the
