@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import json
 import sys
 import threading
+import weakref
 
 import aiohttp
 import numpy as np
 import pytest
 from helpers import ROOT, gvtorch
-from helpers.viewer import FUNCTION, SOON, bright_ball, pixels, split
+from helpers.viewer import FUNCTION, SOON, Page, bright_ball, pixels, split
 from yarl import URL
 
 import gvtorch as gv
 from gvtorch.viewer.server import Server, page_files
+from gvtorch.viewer.view import new_session
 
 pytestmark = pytest.mark.backend("cpp")
 
@@ -260,3 +263,21 @@ def test_the_widget_joins_leaves_and_has_a_png(session):
     bundle = shown[0] if isinstance(shown, tuple) else shown
     still = pixels(bundle["image/png"])
     assert still.shape == (540, 960, 3) and still.max() > 100
+
+
+def test_a_closed_view_lets_go_of_its_pools_at_once():
+    """They may fill a GPU: they do not wait until Python looks for circles."""
+    gc.collect()
+    gc.disable()
+    try:
+        session = new_session(bright_ball(), FUNCTION)
+        engine = weakref.ref(session.scene.engine)
+        page, server = Page(session), Server(session)
+        page.until(lambda: any(head["final"] for head, _ in page.pictures))
+        with_socket(server, first_pictures)
+        server.close()
+        session.close()
+        del page, server, session
+        assert engine() is None
+    finally:
+        gc.enable()

@@ -31,6 +31,10 @@ class Interrupted(Exception):
     """Something newer is to be shown."""
 
 
+def _nobody(_: str | bytes) -> None:
+    """Is told what nobody hears."""
+
+
 class Client:
     """A page.
 
@@ -66,6 +70,10 @@ class Client:
         self._time = 0.0  # of the scene
         self._in_flight: int | None = None
         self._waiting: tuple[int, bytes] | None = None
+
+    def end(self) -> None:
+        """Lets go of the page and of the scene: whoever kept one would keep the other."""
+        self._send, self._progressive = _nobody, None
 
     # The network's side.
 

@@ -96,6 +96,6 @@ class Parameters:
         before = getattr(self.record, name)
         record = replace(self.record, **{name: decode(name, hint, value, before)})
         producer = self._make(record)
-        scene.remake = lambda: producer
+        scene.remake = lambda _: producer
         scene.resize()
         self.record, self._producer = record, producer

@@ -49,7 +49,7 @@ class Scene:
         engine: That streams it, or None.
         tree: Resident, or None.
         data: The volume or store behind it, if known.
-        remake: Makes the producer again of `data`, where the engine is the view's own.
+        remake: Makes the producer again, of `data`, where the engine is the view's own.
         times: Time points of the series that `data` is one of.
         reopen: Gives the data of another time point; from any thread.
         time: What is shown: the number of a time point, or the time of the producers' clocks.
@@ -59,7 +59,7 @@ class Scene:
     engine: Engine | None = None
     tree: N3Tree | None = None
     data: Volume | Store | None = None
-    remake: Callable[[], EngineScene] | None = None
+    remake: Callable[[Volume | Store | None], EngineScene] | None = None
     times: int = 1
     reopen: Callable[[int], Volume | Store] | None = None
     time: float = 0.0
@@ -261,9 +261,9 @@ class Scene:
         wanted = replace(before, **options)
         self.engine.close()
         try:
-            self.engine = Engine(self.remake(), **vars(wanted))
+            self.engine = Engine(self.remake(self.data), **vars(wanted))
         except (ValueError, RuntimeError):
-            self.engine = Engine(self.remake(), **vars(before))
+            self.engine = Engine(self.remake(self.data), **vars(before))
             raise
 
     def settled(self, picture: Picture) -> bool:
@@ -300,20 +300,19 @@ def open_scene(what: Any, **options: Any) -> Scene:
     if "device" not in options and not available()["cuda"]:
         options["device"] = "cuda"
     if isinstance(what, Mapping) and all(isinstance(one, Producer) for one in what.values()):
-        return Scene(", ".join(what), Engine(what, **options), remake=lambda: what)
+        return Scene(", ".join(what), Engine(what, **options), remake=lambda _: what)
     if isinstance(what, Producer):
-        return Scene(repr(what), Engine(what, **options), remake=lambda: what)
+        return Scene(repr(what), Engine(what, **options), remake=lambda _: what)
     data, series = _data_of(what), Series.of(what)
     options.setdefault("border", 2 if data.info.labels else EngineOptions.border)
-    scene = Scene(data.name, data=data, **vars(series))
+    engine = Engine(_producer_of(data), **options)
+    return Scene(data.name, engine, data=data, remake=_producer_of, **vars(series))
 
-    def remake() -> Producer:
-        now = scene.data
-        assert now is not None
-        return VolumeProducer(now) if isinstance(now, Volume) else StoredProducer(now)
 
-    scene.remake, scene.engine = remake, Engine(remake(), **options)
-    return scene
+def _producer_of(data: Volume | Store | None) -> Producer:
+    """Makes the producer of what is looked at."""
+    assert data is not None
+    return VolumeProducer(data) if isinstance(data, Volume) else StoredProducer(data)
 
 
 @dataclass(frozen=True)

@@ -130,6 +130,7 @@ class Server:
             ready.set()
         finally:
             self._loop.close()
+            del self._session  # aiohttp's own circles would keep it, and its pools, for a while
 
     async def _serve(self, started: list[BaseException | None], ready: threading.Event) -> None:
         web = aiohttp_web()

@@ -115,8 +115,10 @@ class Session:
         self.post(lambda: self._take(client, message))
 
     def post(self, task: Callable[[], None]) -> None:
-        """Lets the thread that renders do something between two frames."""
+        """Lets the thread that renders do something between two frames; nothing once it is closed."""
         with self._wake:
+            if self._closed:
+                return
             self._tasks.append(task)
             self._wake.notify()
 
@@ -157,6 +159,10 @@ class Session:
             pass
         if self._planes is not None:
             self._planes.close()
+        for client in self.clients.values():
+            client.end()
+        self.clients.clear()
+        self._tasks.clear()
         self.scene.close()
 
     def _step(self) -> bool:
@@ -291,6 +297,7 @@ class Session:
 
     def _goodbye(self, client: Client) -> None:
         self.clients.pop(client.number, None)
+        client.end()
         if self._export is not None and self._export.serves(client):
             self._export.end()
         for one in self.clients.values():
