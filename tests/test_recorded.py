@@ -20,6 +20,7 @@ import gvtorch as gv
 from gvtorch.base.constants import REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUEST_SUBDIVIDE
 from gvtorch.engine import host_frame
 from gvtorch.engine.device_frame import DeviceFrame
+from gvtorch.engine.recorded import DEEPER
 from gvtorch.io.stores.conversion import convert
 from gvtorch.pool import mapped
 
@@ -79,7 +80,8 @@ def test_they_come_to_the_picture_that_the_host_comes_to(backend, branching, kin
         made = {"tiles": 0, "bricks": 0, "constant": 0}
         for _ in range(400):
             hits, stats = frames.frame()
-            assert stats.produced["tiles"] <= batch and stats.produced["bricks"] <= batch
+            assert stats.produced["bricks"] <= batch
+            assert stats.produced["tiles"] <= batch * (1 + DEEPER)
             made = {name: made[name] + stats.produced[name] for name in made}
             if stats.converged:
                 break
@@ -414,12 +416,38 @@ def test_what_the_picture_misses_comes_before_what_the_next_ones_will():
             told.append((stats.requests, stats.misses, stats.bricks_used, stats.tiles_used))
             wanted = frames.served._requests[0, 0]
             kinds = (REQUEST_LOAD, REQUEST_SUBDIVIDE)
-            chosen = torch.cat([frames.served.choose(kind) for kind in kinds])
+            chosen = torch.cat([frames.served.choose(kind).node for kind in kinds])
             assert (chosen >= 0).any() and (stats.ahead > 0) == (look_ahead > 0)
             assert torch.isin(chosen[chosen >= 0], wanted.long()).all()
             words = engine.cache.nodes.request_tn
             assert not (words >> REQUEST_PENDING_SHIFT).any(), "nothing is on its way"
     assert told[0] == told[1] and told[0][1] > 16
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+@pytest.mark.parametrize("branching, loading", [(2, "straight"), (3, "straight"), (2, "levels")])
+def test_a_tree_deepens_by_many_levels_a_frame(backend, branching, loading):
+    """Where rays want it so: a look at the ball's depths from afar does not, nor a last level."""
+    device = DEVICES[backend]
+    options = {"brick_pool": "64 MB", "loading": loading, "device": device}
+    with gv.Engine(Ball(1024, branching), **options) as engine:
+        frames, depth = Frames(engine, view(64), LOOK, 4096), []
+        for _ in range(60):
+            _, stats = frames.frame()
+            there = engine.cache.nodes.parent_t >= 0
+            depth.append(int(engine.cache.nodes.loc_t4[there, 3].max()) if there.any() else 0)
+            if stats.converged:
+                break
+        engine.validate()
+        assert stats.converged
+        seen = stats.tiles_used
+        made = int((engine.cache.nodes.parent_t >= 0).sum())
+    deepest = depth[-1]
+    reached = depth.index(deepest)
+    if loading == "levels":
+        assert reached >= deepest, "a level needs its bricks first"
+    else:
+        assert deepest > 3 and reached <= 2 < deepest and made < 3 * seen
 
 
 class Unsaid(Ball):
@@ -486,7 +514,7 @@ def test_a_flight_is_replayed_without_the_host():
         assert stats.settle().converged and torch.equal(picture.color, shown)
     with gv.Engine(Ball(1024), brick_pool="64 MB", device="cuda") as engine:
         _, picture, _, left = flown(engine, PATH, 256, look_ahead=6)
-        assert torch.equal(picture.color, shown) and left < missed / 2
+        assert torch.equal(picture.color, shown) and left < 0.8 * missed
     with gv.Engine(Unsaid(1024), brick_pool="64 MB", device="cuda") as engine:
         expected = engine.render(PATH[-1], LOOK)
         graph = engine.capture(PATH[-1], LOOK)

@@ -9,6 +9,7 @@ import json
 import sys
 import threading
 import weakref
+from functools import partial
 
 import aiohttp
 import numpy as np
@@ -265,6 +266,10 @@ def test_the_widget_joins_leaves_and_has_a_png(session):
     assert still.shape == (540, 960, 3) and still.max() > 100
 
 
+def seen_whole(page: Page) -> bool:
+    return any(head["final"] for head, _ in page.pictures)
+
+
 def test_a_closed_view_lets_go_of_its_pools_at_once():
     """They may fill a GPU: they do not wait until Python looks for circles."""
     gc.collect()
@@ -273,7 +278,7 @@ def test_a_closed_view_lets_go_of_its_pools_at_once():
         session = new_session(bright_ball(), FUNCTION)
         engine = weakref.ref(session.scene.engine)
         page, server = Page(session), Server(session)
-        page.until(lambda: any(head["final"] for head, _ in page.pictures))
+        page.until(partial(seen_whole, page))
         with_socket(server, first_pictures)
         server.close()
         session.close()

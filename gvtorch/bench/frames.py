@@ -148,7 +148,8 @@ def _cold(record: Record, scene: Scene, size: tuple[int, int], budget: int) -> N
     def recorded(engine: Engine) -> Callable[[], list[Any]]:
         graph = engine.capture(camera, scene.shader, batch=budget)
         for tree in engine.trees.values():
-            tree.producer.changed()  # all that was made goes
+            tree.producer.changed()
+        engine.renew()  # all that was made goes, but the root
 
         def replays() -> list[FrameStats]:
             all_stats: list[FrameStats] = []

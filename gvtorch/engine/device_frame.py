@@ -12,26 +12,35 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..base.constants import CONSTANT, EMPTY, REQUEST_LOAD, REQUEST_SUBDIVIDE
+from ..base.constants import ABSENT, CONSTANT, EMPTY, REQUEST_LOAD, REQUEST_SUBDIVIDE
 from ..cache import Cache, Scheduler
-from ..cache.write import Targets, put_bricks, put_tiles, put_uniform
+from ..cache.write import Put, Targets, put_bricks, put_rows_of, put_tiles, put_uniform
 from ..producers import Region
 from ..producers.answer import checked_bricks, checked_regions
 from .parents import once, parent_bricks, ready
-from .recorded import RecordedFrame
+from .recorded import PIXEL, RecordedFrame
 from .request_batch import ProducedTree, RequestBatch, children_of
-from .stats import FrameStats
+from .stats import FrameStats, Readbacks
 
 
 class DeviceFrame(RecordedFrame):
     """Frames of an engine whose producers all answer on the device (`Producer.on_device`)."""
 
     def __init__(
-        self, cache: Cache, trees: Sequence[ProducedTree], scheduler: Scheduler, batch: int
+        self,
+        cache: Cache,
+        trees: Sequence[ProducedTree],
+        scheduler: Scheduler,
+        batch: int,
+        by_level: bool,
     ) -> None:
-        """See `RecordedFrame`."""
+        """See `RecordedFrame`. `by_level`: levels are loaded one by one."""
         super().__init__(cache, trees, scheduler, batch)
+        self._by_level = by_level
+        # What was made last and is to be subdivided in turn: nodes and their priorities.
+        self._below = self._unused.new_zeros((batch, 2)) - 1
         self.serve()  # loads what is loaded at first use; nothing is asked for
+        self.deepen()
 
     def begin(self, stale: bool, steady: bool, stats: FrameStats) -> bool:
         """Returns, before a frame, whether its requests are to be served. `stale`: another frame
@@ -44,27 +53,63 @@ class DeviceFrame(RecordedFrame):
 
     def serve(self) -> None:
         """Answers the most wanted requests of the last frame."""
-        made = {kind: self._unused.new_zeros(2) for kind in (REQUEST_SUBDIVIDE, REQUEST_LOAD)}
-        constant, failed = self._unused.new_zeros(2).split(1)
-        for kind, ask in ((REQUEST_LOAD, self._fill), (REQUEST_SUBDIVIDE, self._subdivide)):
-            chosen = self.choose(kind)
-            number, free = self.tree_of(chosen), self._unused[int(kind == REQUEST_LOAD)].view(1)
-            for source in self.trees:
-                node = torch.where(number == source.tree.number, chosen, -1)
-                if kind == REQUEST_LOAD and source.producer.needs_parent:
-                    node = once(ready(self.cache, node, source.layout.depth))
-                counts, bare, bad = ask(source, node, free)
-                made[kind], free = made[kind] + counts, free - counts[:1]
-                constant, failed = constant + bare, failed + bad
-        tiles, bricks = made.values()
-        self._made += torch.cat((tiles[:1], bricks[:1], constant, tiles[1:], bricks[1:], failed))
+        self._load(self.choose(REQUEST_LOAD).node)
+        self._subdivide(*self.choose(REQUEST_SUBDIVIDE))
+
+    def deepen(self) -> None:
+        """Subdivides what has just been made and what rays will want finer, as the priority of the
+        nodes above tells: there is a level less that must be asked for.
+        """
+        self._subdivide(*self._below.unbind(1))
+
+    def deeper(self, readbacks: Readbacks) -> int:
+        """Returns what subdivisions wanted in the mean when the host last knew; 0 where each level
+        needs its bricks first.
+        """
+        return 0 if self._by_level else readbacks.deeper
+
+    def _load(self, chosen: Tensor) -> None:
+        """Loads nodes (batch,)."""
+        number, free = self.tree_of(chosen), self._unused[1:]
+        for source in self.trees:
+            node = torch.where(number == source.tree.number, chosen, -1)
+            if source.producer.needs_parent:
+                node = once(ready(self.cache, node, source.layout.depth))
+            put, bare, failed = self._fill(source, node, free)
+            free -= put[1:2]
+            self._made[1:2] += put[1:2]
+            self._made[2:3] += bare
+            self._made[4:5] += put[2:]
+            self._made[5:] += failed
+
+    def _subdivide(self, chosen: Tensor, priority: Tensor) -> None:
+        """Subdivides nodes (batch,), and notes which of their children are to be subdivided, too,
+        those of the first nodes first.
+        """
+        pool, number, free = self.cache.nodes, self.tree_of(chosen), self._unused[:1]
+        slot, wide = torch.full_like(chosen, -1), torch.zeros_like(chosen)
+        child = torch.arange(pool.nodes_per_tile, device=chosen.device)
+        for source in self.trees:
+            mine = (number == source.tree.number) & (chosen >= 0)
+            put, failed = self._classify(source, torch.where(mine, chosen, -1), free)
+            free -= put.counts[1:2]
+            self._made[:1] += put.counts[1:2]
+            self._made[3:4] += put.counts[2:]
+            self._made[5:] += failed
+            slot = torch.where(mine, put.slot, slot)
+            wide = torch.where(mine, priority // source.layout.branching, wide)
+        split = (slot[:, None] >= 0) & (pool.child_tn[slot.clamp(min=0)] == ABSENT)
+        split = (split & (wide[:, None] >= PIXEL)).flatten()
+        place = torch.where(split, split.cumsum(0) - 1, self.batch)
+        node = slot[:, None] * pool.nodes_per_tile + child
+        rows = torch.stack((node, wide[:, None].expand_as(node)), 2).flatten(0, 1)
+        self._below.fill_(-1)
+        put_rows_of(self._below, torch.where(place < self.batch, place, -1), rows)
 
     def _fill(
         self, source: ProducedTree, node: Tensor, free: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Loads nodes (k,): how many got bricks and how many of these replaced others (2,), how
-        many need none (1,), how many failed (1,).
-        """
+        """Loads nodes (k,): (3,) counts of `Put`, how many need none (1,), how many failed (1,)."""
         batch = self._asked(source, REQUEST_LOAD, node)
         bricks = checked_bricks(batch.ask(), batch.nodes, source.producer, look=False)
         good = _finite([bricks.data, bricks.constants], len(node), node.device)
@@ -77,12 +122,10 @@ class DeviceFrame(RecordedFrame):
             targets = _only(batch.targets, node, bare)
             constant = put_uniform(self.cache, targets, word, bricks.constants).view(1)
         put = put_bricks(self.cache, _only(batch.targets, node, data), bricks.data, free)
-        return put.counts[1:], constant, ((node >= 0) & ~good).sum().view(1)
+        return put.counts, constant, ((node >= 0) & ~good).sum().view(1)
 
-    def _subdivide(
-        self, source: ProducedTree, node: Tensor, free: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Subdivides nodes (k,); see `_fill`."""
+    def _classify(self, source: ProducedTree, node: Tensor, free: Tensor) -> tuple[Put, Tensor]:
+        """Subdivides nodes (k,): what became of them, and how many failed (1,)."""
         batch = self._asked(source, REQUEST_SUBDIVIDE, node)
         regions = checked_regions(batch.ask(), batch.nodes, source.producer, look=False)
         count = len(regions.kind)
@@ -91,7 +134,7 @@ class DeviceFrame(RecordedFrame):
         good = good.view(len(node), -1).all(1)
         children = children_of(batch, regions, self.cache)
         put = put_tiles(self.cache, _only(batch.targets, node, good), children, free)
-        return put.counts[1:], torch.zeros_like(node[:1]), ((node >= 0) & ~good).sum().view(1)
+        return put, ((node >= 0) & ~good).sum().view(1)
 
     def _asked(self, source: ProducedTree, kind: int, node: Tensor) -> RequestBatch:
         """What a producer is asked of nodes (k,); the root where the index is -1."""

@@ -198,9 +198,9 @@ class Engine:
     def _tracers(self, shaders: Shaders, options: RenderOptions, box: Tensor) -> list[TreeTrace]:
         """What traces rays through each tree of a scene, given its (2, 3) box."""
         scene = {name: (one.tree, one.producer.channels) for name, one in self.trees.items()}
-        by_level = self.options.loading == "levels"
+        by_level, frame_1 = self._by_level, self.cache.frame_1
         return tree_traces(
-            *("frame", scene, shaders, options, box), by_level=by_level, frame_1=self.cache.frame_1
+            "frame", scene, shaders, options, box, by_level=by_level, frame_1=frame_1
         )
 
     @contextmanager
@@ -488,7 +488,8 @@ class Engine:
         Args:
             camera: Cameras as those of the replays.
             shader: For all trees, or one for each; no `ModuleShader`.
-            batch: Most bricks, and most node tiles, that a replay makes for each tree.
+            batch: Most bricks that a replay makes, and most node tiles of each level. Where
+                producers are `on_device`, a replay may deepen the tree by several levels.
             look_ahead: While the camera moves, a replay also asks for what its picture so many
                 frames on will miss, as far as the motion tells, by a sixteenth of the picture's
                 rays. This is served behind what the picture itself missed. 0: only what is missed.
@@ -518,10 +519,16 @@ class Engine:
         again = partial(self.frame, shader=shader, **options)
         again(camera)  # loads what is loaded at first use
         trees = [*self.trees.values()]
-        served = make_recorded_frame(self.cache, trees, self.scheduler, batch, self.production)
+        served = make_recorded_frame(
+            self.cache, trees, self.scheduler, batch, self.production, self._by_level
+        )
         if isinstance(served, HostFrame):
             self.recorded.append(served)
         return FrameGraph(self, view, served, again, look_ahead)
+
+    @property
+    def _by_level(self) -> bool:
+        return self.options.loading == "levels"
 
     @property
     def steady(self) -> bool:

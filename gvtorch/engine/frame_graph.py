@@ -74,11 +74,14 @@ class FrameGraph:
         self._view = view = replace(view, numbers=view.numbers.clone())  # of a replay's camera
         self._number = -1  # of its last picture
         self._ahead = LookAhead(view, look_ahead) if served and look_ahead else None
-        graphs = [torch.cuda.CUDAGraph() for _ in range(4)]
-        self._serve, self._draw, self._look, self._finish = graphs
+        graphs = [torch.cuda.CUDAGraph() for _ in range(5)]
+        self._serve, self._deepen, self._draw, self._look, self._finish = graphs
         if served is not None:
             with _recorded(self._serve, engine.device):
                 served.serve()
+        if isinstance(served, DeviceFrame):
+            with _recorded(self._deepen, engine.device):
+                served.deepen()
         with _recorded(self._draw, engine.device):
             self._hits = view.hits() if served is None else served.draw(view.hits)
             self._picture = view.picture(self._hits, FrameStats())
@@ -138,6 +141,8 @@ class FrameGraph:
                 with stage("serve"):
                     if served.begin(stale, steady, stats):
                         self._serve.replay()
+                        for _ in range(served.deeper(engine.readbacks)):
+                            self._deepen.replay()
             engine.number_picture(on_device=served is None)
             self._number = engine.frames
             self._draw_from(camera.placed(self._view.box), stale)

@@ -118,7 +118,7 @@ class HostFrame(RecordedFrame):
         collected = super().finish(hits)
         chosen, words = [], self.cache.nodes.request_tn.view(-1)
         for kind in KINDS.values():
-            node = self.choose(kind)
+            node = self.choose(kind).node
             marked = words[node.clamp(min=0)] | kind << REQUEST_PENDING_SHIFT
             put_rows_of(words[:, None], node, marked[:, None])
             number = self.tree_of(node)

@@ -6,6 +6,7 @@ taken hold node -1.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,16 +16,26 @@ from ..base.constants import (
     REQUEST_LOAD,
     REQUEST_PENDING_SHIFT,
     REQUEST_PRIORITY,
+    REQUEST_SUBDIVIDE,
 )
 from ..base.records import Hits
 from ..cache import Cache, RequestList, Scheduler
 from ..cache.write import put_rows_of
 from .request_batch import ProducedTree
-from .stats import Collected
+from .stats import Collected, Readbacks
 
 _MOST_LISTED = 1 << 14  # nodes whose requests are sorted
-_AHEAD = 1 << 39  # added to the rank of what the next pictures will miss
-_LAST = 1 << 40  # the rank of what is not asked for
+_AHEAD = 1 << 20  # added to the rank of what the next pictures will miss
+_LAST = 1 << 30  # the rank of what is not asked for
+PIXEL = 16  # the priority of a node whose voxels are a pixel wide: wider ones are to be subdivided
+DEEPER = 2  # levels below the first by which a tree deepens in a frame at most
+
+
+class Chosen(NamedTuple):
+    """The nodes that are served first."""
+
+    node: Tensor  # (batch,) int64, -1 behind the last
+    priority: Tensor  # (batch,) int32 width of one of its voxels on the screen, 1/16 pixel
 
 
 class RecordedFrame:
@@ -45,6 +56,9 @@ class RecordedFrame:
         self._coarse_first = scheduler.order == "coarse"
         self._most = min(_MOST_LISTED, cache.nodes.request_tn.numel())
         device = cache.frame_1.device
+        # Priorities from which a subdivision wants one level below the first, two, ...
+        n = max(source.layout.branching for source in trees)
+        self._widths = PIXEL * n ** torch.arange(1, DEEPER + 1, device=device)
         # What the last picture asked for, and what the next ones will: nodes and their words.
         self._requests = torch.zeros((2, 2, self._most), dtype=torch.int32, device=device)
         self._unused = torch.zeros(2, dtype=torch.int64, device=device)  # tiles, bricks
@@ -77,6 +91,10 @@ class RecordedFrame:
         self._requests[which].copy_(torch.stack((listed.node, listed.word)))
         return listed
 
+    def deeper(self, readbacks: Readbacks) -> int:
+        """Returns how often `DeviceFrame.deepen` is to follow `serve`."""
+        return 0
+
     def finish(self, hits: Hits) -> Collected:
         """Brings slots into the order of use and counts; what the picture used is counted apart
         from what `look` used.
@@ -86,29 +104,34 @@ class RecordedFrame:
         use[1:4:2] = self._used
         samples = hits.samples.sum(dtype=torch.int64).view(1)
         ahead = (self._requests[1, 1] & REQUEST_KINDS).count_nonzero().view(1)
-        numbers = torch.cat((self._seen.count, use, samples, self._made, ahead))
+        numbers = torch.cat((self._seen.count, use, samples, self._made, ahead, self._levels()))
         self._made.zero_()
         return Collected(self._seen, numbers)
 
-    def choose(self, kind: int) -> Tensor:
-        """(batch,) int64 nodes of the lists that are served first, as `Scheduler.choose` takes
-        them, those that the picture asked for before the others, at most as many as there are
-        slots; -1 behind the last.
+    def _levels(self) -> Tensor:
+        """(1,) int64 levels that are wanted below the first by what is to be subdivided, summed."""
+        word = self._requests[:, 1].flatten()
+        wide = torch.where((word & REQUEST_SUBDIVIDE) != 0, word & REQUEST_PRIORITY, 0)
+        return (wide >= self._widths[:, None]).sum().view(1)
+
+    def choose(self, kind: int) -> Chosen:
+        """Returns what is served first of the lists, as `Scheduler.choose` takes them: what the
+        picture asked for before the rest, and at most as much as there are slots.
         """
         nodes = self.cache.nodes
         node_k, word_k = self._requests.transpose(0, 1).flatten(1)
         asked = (word_k & kind) != 0
         node = node_k.clamp(min=0).to(torch.int64)
-        depth = nodes.loc_t4[node // nodes.nodes_per_tile, 3].to(torch.int64)
+        depth = nodes.loc_t4[node // nodes.nodes_per_tile, 3].to(torch.int32)
         level = depth if self._coarse_first else -depth
-        small = REQUEST_PRIORITY - (word_k & REQUEST_PRIORITY).to(torch.int64)
+        small = REQUEST_PRIORITY - (word_k & REQUEST_PRIORITY)
         rank = (level * (REQUEST_PRIORITY + 1) + small).view(2, -1)
         rank = torch.stack((rank[0], rank[1] + _AHEAD)).flatten()
         rank = torch.where(asked, rank, _LAST)
         row = rank.argsort(stable=True)[: self.batch]
         room = self._unused[int(kind == REQUEST_LOAD)]
         served = asked[row] & (torch.arange(len(row), device=row.device) < room)
-        return torch.where(served, node[row], -1)
+        return Chosen(torch.where(served, node[row], -1), word_k[row] & REQUEST_PRIORITY)
 
     def tree_of(self, node: Tensor) -> Tensor:
         """(k,) int32 numbers of the trees of nodes (k,); of any where the index is -1."""

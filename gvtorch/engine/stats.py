@@ -147,6 +147,7 @@ class Counts(NamedTuple):
     bricks_evicted: int = 0
     failed: int = 0
     ahead: int = 0  # nodes that the picture did not miss, but will
+    levels: int = 0  # that all that is to be subdivided wants below the first
 
     def by_kind(self) -> dict[str, int]:
         """Returns the number of requests by the name of their kind."""
@@ -157,7 +158,7 @@ class Collected(NamedTuple):
     """What a traced frame leaves on the device."""
 
     requests: RequestList
-    numbers: Tensor  # (11,) or (18,) int64 `Counts`, and behind these what `ask` takes
+    numbers: Tensor  # (11,) or (19,) int64 `Counts`, and behind these what `ask` takes
     ask: Callable[[Tensor], int] | None = None  # told on the host; how many nodes were asked for
 
 
@@ -219,7 +220,9 @@ class Readbacks(deque[Readback]):
     """The frames whose counts are on their way, oldest first."""
 
     _steady = False
-    failed = False  # whether a node failed in the newest frame read back, on the device
+    # Of the newest frame read back, on the device:
+    failed = False  # whether a node failed
+    deeper = 0  # how many levels below the first a subdivision wants in the mean
 
     def catch_up(self, wait: bool) -> Readback | None:
         """Takes all frames whose counts are here. Waits for those of the others if `wait` is true,
@@ -258,7 +261,9 @@ class Readbacks(deque[Readback]):
             for later in self:
                 later.pending = True
         self._steady = readback.converged()
-        self.failed = readback.wait().failed > 0
+        counts = readback.wait()
+        self.failed = counts.failed > 0
+        self.deeper = round(counts.levels / max(1, counts.subdivide))
         readback.stats.settle()
         return readback
 

@@ -17,6 +17,7 @@ from .scene import SceneFlags
 
 if TYPE_CHECKING:
     from ..cameras import Camera
+    from ..producers import Producer
     from ..shaders import Shader
     from ..viewer.scene import Scene
 
@@ -86,7 +87,6 @@ class View:
 
     def _store(self) -> tuple[Scene, Shader]:
         from ..engine.engine import Engine
-        from ..io.stores.store import Store
         from ..viewer.scene import Scene, Series
 
         if self.scene.threshold is not None:
@@ -96,17 +96,14 @@ class View:
         store = streaming.store(self.path, self.scene.source.time or 0)
         producer, shader = streaming.content(store, look)
         engine = Engine(producer, **streaming.memory(look, store))
-        scene = Scene(store.name, engine, data=store, **vars(Series.of(store)))
 
-        def remake() -> Any:
-            assert isinstance(scene.data, Store)
-            return streaming.content(scene.data, look)[0]
+        def remake(data: Any) -> Producer:
+            return streaming.content(data, look)[0]
 
-        scene.remake = remake
-        return scene, shader
+        series = vars(Series.of(store))
+        return Scene(store.name, engine, data=store, remake=remake, **series), shader
 
     def _volume(self) -> tuple[Scene, Shader]:
-        from ..base.volume import Volume
         from ..engine.engine import Engine
         from ..producers import VolumeProducer
         from ..shaders import Filtered
@@ -117,16 +114,12 @@ class View:
         shader = look.chosen(volume)
         filtered = shader if isinstance(shader, Filtered) else None
 
-        series = Series.of(self.path, **source.options())
-        scene = Scene(volume.name, data=volume, **vars(series))
+        def make(data: Any) -> Producer:
+            return VolumeProducer(data, threshold=self.scene.threshold, filtered=filtered)
 
-        def remake() -> Any:
-            assert isinstance(scene.data, Volume)
-            return VolumeProducer(scene.data, threshold=self.scene.threshold, filtered=filtered)
-
-        memory = self.scene.streaming.memory(look, volume)
-        scene.remake, scene.engine = remake, Engine(remake(), **memory)
-        return scene, shader
+        engine = Engine(make(volume), **self.scene.streaming.memory(look, volume))
+        series = vars(Series.of(self.path, **source.options()))
+        return Scene(volume.name, engine, data=volume, remake=make, **series), shader
 
     def _run_script(self) -> tuple[Any, Shader | None, Camera | None, dict[str, Any]]:
         """What a script sets."""

@@ -115,7 +115,7 @@ class Session:
         self.post(lambda: self._take(client, message))
 
     def post(self, task: Callable[[], None]) -> None:
-        """Lets the thread that renders do something between two frames; nothing once it is closed."""
+        """Lets the thread that renders do something between two frames; not once it is closed."""
         with self._wake:
             if self._closed:
                 return

@@ -26,7 +26,10 @@ class Frames:
         self.ahead = LookAhead(self.view, look_ahead) if look_ahead else None
         self.look_from(camera)
         trees = [*engine.trees.values()]
-        made = make_recorded_frame(engine.cache, trees, engine.scheduler, batch, engine.production)
+        by_level = engine.options.loading == "levels"
+        made = make_recorded_frame(
+            engine.cache, trees, engine.scheduler, batch, engine.production, by_level
+        )
         assert made is not None
         self.served, self.number = made, -1
         if isinstance(made, HostFrame):
@@ -43,6 +46,8 @@ class Frames:
             steady = self.engine.steady and not (ahead and ahead.due)
             if self.served.begin(stale, steady, stats):
                 self.served.serve()
+                for _ in range(self.served.deeper(self.engine.readbacks)):
+                    self.served.deepen()
             self.engine.number_picture(on_device=False)
             self.number = self.engine.frames
             numbers = self.camera.numbers(self.engine.device)
