@@ -88,7 +88,7 @@ struct WalkRay {
       ++visits;
       return true;
     }
-    GV_HD bool hides(int32_t node) const { return walk.kernel.hides(node); }
+    GV_HD NodeWords words(int32_t node) const { return walk.kernel.words(node); }
     GV_HD Segment<T> enter(const Ray<T>&, const Visit<T>& visit, const Digits&) const {
       Segment<T> segment;
       segment.fine = visit.fine;

@@ -6,28 +6,27 @@
 
 namespace gvtorch {
 
-// Gives a ShadeRay a byte for each node, in which it is kept what is hidden from all rays: see kUnknown in walk.h. They
-// live as long as what is returned.
+// Gives a ShadeRay a place for each node, in which it is kept what is hidden from all rays: see kUnknown in walk.h.
+// They live as long as what is returned.
 template <class Device, class Kernel>
 torch::stable::Tensor hide_nodes(const torch::stable::Tensor& like, int64_t nodes, Kernel& kernel) {
-  torch::stable::Tensor hidden_tn;
+  torch::stable::Tensor places;
   if constexpr (Kernel::kHidesAlike) {
-    constexpr auto kByte = torch::headeronly::ScalarType::Byte;
 #ifdef __CUDACC__
-    hidden_tn = torch::stable::new_empty(like, {nodes}, kByte);
-    kernel.hidden_tn = static_cast<uint8_t*>(hidden_tn.mutable_data_ptr());
+    places = torch::stable::new_empty(like, {nodes}, torch::headeronly::ScalarType::Long);
+    kernel.words_tn = static_cast<NodeWords*>(places.mutable_data_ptr());
     for_each<Device>(like, nodes, HideShaded<Kernel>{kernel});
 #else
-    hidden_tn = torch::stable::new_zeros(like, {nodes}, kByte);
-    kernel.hidden_tn = static_cast<uint8_t*>(hidden_tn.mutable_data_ptr());
+    places = torch::stable::new_zeros(like, {nodes}, torch::headeronly::ScalarType::Byte);
+    kernel.hidden_tn = static_cast<uint8_t*>(places.mutable_data_ptr());
 #endif
   }
-  return hidden_tn;
+  return places;
 }
 
 template <class Device, class Kernel>
 void shade_each(const torch::stable::Tensor& like, int64_t nodes, Kernel kernel) {
-  const torch::stable::Tensor hidden_tn = hide_nodes<Device>(like, nodes, kernel);
+  const torch::stable::Tensor places = hide_nodes<Device>(like, nodes, kernel);
   for_each<Device>(like, kernel.order.count(), kernel);
 }
 

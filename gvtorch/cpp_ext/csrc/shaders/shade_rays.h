@@ -50,7 +50,9 @@ struct ShadeRay : Walk<T> {
   Channels channels;
   Light<T> light;
   const void* range_tn2c;
-  uint8_t* hidden_tn;  // of a shader with kHidesAlike, see shade_each.h
+  // Of a shader with kHidesAlike, see shade_each.h:
+  uint8_t* hidden_tn;             // on the CPU
+  NodeWords* words_tn = nullptr;  // on a GPU
   int32_t lengths, features, directions;
   T *normal_r3, *features_rc;
 
@@ -119,16 +121,19 @@ struct ShadeRay : Walk<T> {
   }
 
   // The same for all rays: looked at once.
-  GV_HD bool hides(int32_t node) const {
-#ifdef __CUDA_ARCH__
-    return hidden_tn[node] == kHidden;
-#else
+  bool hides(int32_t node) const {
     uint8_t known = load_byte(&hidden_tn[node]);
     if (known == kUnknown) {
       known = hides(shader, node, Sum()) ? kHidden : kShown;
       store_byte(&hidden_tn[node], known);
     }
     return known == kHidden;
+  }
+  GV_HD NodeWords words(int32_t node) const {
+#ifdef __CUDA_ARCH__
+    return words_tn[node];
+#else
+    return tree.words_of(node, hides(node));
 #endif
   }
 
@@ -136,9 +141,9 @@ struct ShadeRay : Walk<T> {
   GV_HD void surface(const Ray<T>& ray, const Sight<T>& sight, Sum& sum) const {
     Digits digits(tree, this->levels, this->rays, ray, sum.depth);
     int32_t wanted = 0;
-    const auto hides = [](int32_t) { return false; };
+    const auto words = [&](int32_t node) { return tree.words_of(node, false); };
     const T cone = ray.cone_near + ray.cone_growth * sum.depth;
-    const Visit<T> visit = this->find(ray, digits, cone, hides, wanted, sum.missed);
+    const Visit<T> visit = this->find(ray, digits, cone, words, wanted, sum.missed);
     shader.surface(Probe<T>(channels, sight, this->rays, ray, visit, digits), sum);
   }
 
@@ -175,9 +180,9 @@ struct ShadeRay : Walk<T> {
     GV_HD bool more() const { return sees(); }
     template <class Node>
     GV_HD void finish(const Node&) const {}
-    GV_HD bool hides(int32_t node) const {
-      if constexpr (HidesAlike<Any>::value) return kernel.hides(node);
-      return kernel.hides(shader, node, sum);
+    GV_HD NodeWords words(int32_t node) const {
+      if constexpr (HidesAlike<Any>::value) return kernel.words(node);
+      return kernel.tree.words_of(node, kernel.hides(shader, node, sum));
     }
     GV_HD Eye enter(const Ray<T>& ray, const Visit<T>& visit, const Digits& digits) const {
       return Eye(kernel.channels, *sight, kernel.rays, ray, visit, digits);
@@ -289,9 +294,9 @@ template <class Kernel>
 struct HideShaded {
   Kernel kernel;
 
-  GV_HD void operator()(int64_t node) const {
-    const bool hidden = kernel.hides(kernel.shader, static_cast<int32_t>(node), typename Kernel::Sum());
-    kernel.hidden_tn[node] = hidden ? kHidden : kShown;
+  GV_HD void operator()(int64_t index) const {
+    const auto node = static_cast<int32_t>(index);
+    kernel.words_tn[node] = kernel.tree.words_of(node, kernel.hides(kernel.shader, node, typename Kernel::Sum()));
   }
 };
 

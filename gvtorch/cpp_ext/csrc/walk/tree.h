@@ -27,6 +27,7 @@ constexpr int32_t kAbsent = -1;
 constexpr int32_t kTerminal = -2;
 constexpr int32_t kEmpty = -2;
 constexpr int32_t kConstant = -3;
+constexpr int32_t kConcealed = -3;  // in the place of a tile: nothing in the node or below it is seen
 constexpr int32_t kMostLevels = 63;
 constexpr double kMostShallow = 1 << 18;
 constexpr double kMostNodes = 1LL << 50;  // along a side of the root cube: float64 counts them
@@ -53,6 +54,11 @@ struct Levels {
   }
 };
 
+// The words of a node that a ray reads, in one load.
+struct alignas(8) NodeWords {
+  int32_t brick, tile;
+};
+
 struct TreeView {
   const int32_t* child_tn;
   const int32_t* brick_tn;
@@ -69,6 +75,9 @@ struct TreeView {
   // out of the pools.
   GV_HD int32_t tile_of(int32_t node) const { return within(child_tn[node], tiles); }
   GV_HD int32_t brick_of(int32_t node) const { return within(brick_tn[node], bricks); }
+  GV_HD NodeWords words_of(int32_t node, bool hidden) const {
+    return {brick_of(node), hidden ? kConcealed : tile_of(node)};
+  }
   GV_HD static int32_t within(int32_t word, int32_t count) { return word < count ? word : kAbsent; }
 };
 
@@ -182,18 +191,19 @@ void with_digits(const TraceArgs& args, const Body& body) {
 }
 
 // Descends to `wanted` depth, or as far as tiles exist and something is seen; stamps every tile on the way.
-// The coarse holder is looked for where two levels blend.
-template <class Number, class Hides>
+// The coarse holder is looked for where two levels blend. words_of(node) tells its NodeWords.
+template <class Number, class Words>
 GV_HD Place descend(const TreeView& tree, Number& digits, int32_t wanted, bool blend, int32_t frame,
-                    const Hides& hides) {
+                    const Words& words_of) {
   Place place;
   place.node = tree.root;
   int32_t own_tile = tree.root_tile;  // of the node
   for (;;) {
     store_stamp(&tree.stamp_t[own_tile], frame);
-    place.brick = tree.brick_of(place.node);
-    place.tile = tree.tile_of(place.node);
-    place.hidden = hides(place.node);
+    const NodeWords words = words_of(place.node);
+    place.brick = words.brick;
+    place.tile = words.tile;
+    place.hidden = words.tile == kConcealed;
     if (place.brick != kAbsent) {
       if (blend && place.depth < wanted) place.coarse = {place.node, place.brick, place.depth};
       place.fine = {place.node, place.brick, place.depth};

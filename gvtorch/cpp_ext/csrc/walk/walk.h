@@ -28,8 +28,8 @@ struct HitView {
   bool* missed_r;
 };
 
-// Which nodes show nothing: looked at once, on a GPU before the rays are traced, where many threads would each do it
-// again; on the CPU, where most nodes are never visited, when the first ray comes.
+// Which nodes show nothing: looked at once, when the first ray comes, on the CPU, where most nodes are never visited.
+// On a GPU, where many threads would each do it again, before the rays are traced: see NodeWords.
 constexpr uint8_t kUnknown = 0, kShown = 1, kHidden = 2;
 
 // Rays of a picture are taken in tiles of 8 x 4 pixels, which share bricks; others in order.
@@ -104,7 +104,7 @@ struct Walk {
   //   kSeesEmpty                       EMPTY nodes count
   //   missed()                         a bool&: something that is seen was not there
   //   more()                           the ray goes on to another node
-  //   hides(node)                      nothing in the node is seen
+  //   words(node)                      its NodeWords, concealed where nothing in the node is seen
   //   enter(ray, visit, digits)        what the visitor has to know of a visit, `node` below
   //   uniform(node)                    the visit may be taken as one interval
   //   region(node, start, end)         takes it so
@@ -123,8 +123,8 @@ struct Walk {
   GV_HD void visit(const Ray<T>& ray, Intervals<T>& at, Visitor& visitor, int32_t& wanted) const {
     const T middle = at.middle();
     Digits digits(tree, levels, rays, ray, middle);
-    const auto hides = [&](int32_t node) { return visitor.hides(node); };
-    Visit<T> visit = find(ray, digits, at.cone(middle), hides, wanted, visitor.missed());
+    const auto words = [&](int32_t node) { return visitor.words(node); };
+    Visit<T> visit = find(ray, digits, at.cone(middle), words, wanted, visitor.missed());
     visit.seen = middle;
     const bool empty = !Visitor::kSeesEmpty && visit.fine.brick == kEmpty && visit.coarse.brick == kEmpty;
     if (visit.hidden || visit.fine.node < 0 || empty) return at.leave(true, visit);
@@ -152,8 +152,8 @@ struct Walk {
 
   // Finds the node in which an interval's middle lies; marks what is used and what is missing. `wanted` is the depth
   // that the visit before wanted.
-  template <class Digits, class Hides>
-  GV_HD Visit<T> find(const Ray<T>& ray, Digits& digits, T cone, const Hides& hides, int32_t& wanted,
+  template <class Digits, class Words>
+  GV_HD Visit<T> find(const Ray<T>& ray, Digits& digits, T cone, const Words& words, int32_t& wanted,
                       bool& missed) const {
     // Level of detail: the first depth whose voxel fits into the cone.
     const T infinity = static_cast<T>(INFINITY);
@@ -168,7 +168,7 @@ struct Walk {
     visit.cone_low = reached ? visit.voxel : -infinity;
     visit.cone_high = reached ? visit.above : visit.voxel;
 
-    const Place place = descend(tree, digits, wanted, blend, *frame_1, hides);
+    const Place place = descend(tree, digits, wanted, blend, *frame_1, words);
     visit.exit = ray.leave([&](int axis, bool upper) { return digits.face(axis, place.depth, upper); });
     visit.hidden = place.hidden && (place.depth < wanted || !blend);
     if (!visit.hidden && mark_missing(place, wanted, blend, cone)) missed = true;
