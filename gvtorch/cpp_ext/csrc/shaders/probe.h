@@ -244,12 +244,7 @@ struct Probe {
       if (known->at == t) return known->gradient;
     }
 #endif
-    Vec3<T> slope = differences(fine, t);
-    if (!mixed) return slope;
-    const Vec3<T> other = differences(coarse, t);
-    const T part = weight(t);
-    for (int axis = 0; axis < 3; ++axis) slope[axis] = slope[axis] + part * (other[axis] - slope[axis]);
-    return slope;
+    return blended_slope(t, [&](const Spot<T>& spot) { return differences(spot, t); });
   }
 
   // What one of the two nodes, fine or coarse, says of the value and of its gradient, and its brick of four numbers of
@@ -260,18 +255,12 @@ struct Probe {
   GV_HD Vec3<T> differences(const Spot<T>& spot, T t) const {
     Vec3<T> slope{0, 0, 0};
     if (spot.brick < 0) return slope;
-    const Vec3<T> at = spot.at(t);
 #ifdef __CUDA_ARCH__
 #pragma unroll 1
 #endif
     for (int axis = 0; axis < 3; ++axis) {
-      T ends[2];
-      for (int end = 0; end < 2; ++end) {
-        Vec3<T> beside = at;
-        beside[axis] = at[axis] + (end == 0 ? static_cast<T>(-0.5) : static_cast<T>(0.5));
-        ends[end] = read(channels.value, channels.component, spot, beside);
-      }
-      slope[axis] = (ends[1] - ends[0]) * (spot.scale / cube[axis]);
+      slope[axis] =
+          difference(spot, t, axis, [&](Vec3<T> at) { return read(channels.value, channels.component, spot, at); });
     }
     return slope;
   }
@@ -296,6 +285,25 @@ struct Probe {
   }
 
  protected:
+  // The difference along an axis, of values told by read(at).
+  template <class Read>
+  GV_HD T difference(const Spot<T>& spot, T t, int axis, const Read& read) const {
+    Vec3<T> below = spot.at(t), above = below;
+    below[axis] = below[axis] + static_cast<T>(-0.5);
+    above[axis] = above[axis] + static_cast<T>(0.5);
+    const T low = read(below), high = read(above);
+    return (high - low) * (spot.scale / cube[axis]);
+  }
+  // A gradient that both levels have, told by slope_in(spot).
+  template <class Slope>
+  GV_HD Vec3<T> blended_slope(T t, const Slope& slope_in) const {
+    Vec3<T> slope = slope_in(fine);
+    if (!mixed) return slope;
+    const Vec3<T> other = slope_in(coarse);
+    const T part = weight(t);
+    for (int axis = 0; axis < 3; ++axis) slope[axis] = slope[axis] + part * (other[axis] - slope[axis]);
+    return slope;
+  }
   // A number that both levels have, told by read(spot).
   template <class Read>
   GV_HD T blended(T t, const Read& read) const {
@@ -360,6 +368,19 @@ struct TypedProbe : Probe<T> {
     const auto* constants = static_cast<const Voxel*>(channel.constant_tnc);
     if (spot.brick >= 0) return trilinear(first(spot), this->channels.side, channel.width, spot.at(t));
     return number<T>(constants[static_cast<int64_t>(spot.node) * channel.width + this->channels.component]);
+  }
+  GV_HD Vec3<T> gradient(T t) const {
+    return this->blended_slope(t, [&](const Spot<T>& spot) { return differences(spot, t); });
+  }
+  GV_HD Vec3<T> differences(const Spot<T>& spot, T t) const {
+    Vec3<T> slope{0, 0, 0};
+    if (spot.brick < 0) return slope;
+    const Voxel* voxels = first(spot);
+    const int32_t side = this->channels.side, width = this->channels.value.width;
+    for (int axis = 0; axis < 3; ++axis) {
+      slope[axis] = this->difference(spot, t, axis, [&](Vec3<T> at) { return trilinear(voxels, side, width, at); });
+    }
+    return slope;
   }
   template <class Body>
   GV_HD int32_t with_value(const Body& body) const {

@@ -30,8 +30,9 @@ void shade_each(const torch::stable::Tensor& like, int64_t nodes, Kernel kernel)
   for_each<Device>(like, kernel.order.count(), kernel);
 }
 
-// Rays with a fused shader. On CUDA the voxels' dtype is compiled in for the plain function, filtered or not, and for
-// the usual stored colours; on the CPU, where packets take nearly all rays, for the plain function in float32 alone.
+// Rays with a fused shader. On CUDA the voxels' dtype is compiled in for the plain function, filtered or not, and where
+// it is usual for stored colours, lit matter and surfaces; on the CPU, where packets take nearly all rays, for the
+// plain function in float32 alone.
 template <class T>
 void shade_fused(const torch::stable::Tensor& like, const ShadeArgs& args) {
   const auto each = [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); };
@@ -50,6 +51,19 @@ void shade_fused(const torch::stable::Tensor& like, const ShadeArgs& args) {
     const ShaderType<StoredColor<T>, false> colors;
     if (is(ShaderKind::kStoredColor) && args.voxel == VoxelType::kUInt8) return typed(colors, uint8_t{});
     if (is(ShaderKind::kStoredColor) && args.voxel == VoxelType::kHalf) return typed(colors, Half{});
+    if (digit_bits_of(args) > 0) {
+      const auto shallow = [&](auto shader, auto voxel) {
+        using Shader = typename decltype(shader)::Shader;
+        each(ShadeRay<T, Shader, BitDigits, false, decltype(voxel)>(args));
+      };
+      const ShaderType<Lit<T>, false> lit;
+      const ShaderType<Isosurface<T>, false> surface;
+      const bool is_lit = is(ShaderKind::kLit);
+      if (is_lit && args.voxel == VoxelType::kUInt8) return shallow(lit, uint8_t{});
+      if (is_lit && args.voxel == VoxelType::kInt16) return shallow(lit, int16_t{});
+      if (is_lit && args.voxel == VoxelType::kUInt16) return shallow(lit, uint16_t{});
+      if (is(ShaderKind::kIsosurface) && args.voxel == VoxelType::kUInt8) return shallow(surface, uint8_t{});
+    }
   }
   constexpr bool kTyped = true;
 #else

@@ -41,9 +41,10 @@ struct ShadeRay : Walk<T> {
   using Walk<T>::tree;
   using Walk<T>::options;
   using Sum = typename Shader::Sum;
-  // Reads of a known dtype are no calls; a short shader's loop may be there twice. See for_each.h for blocks at once:
-  // 128 or 64 registers a thread.
-  static constexpr bool kShort = !std::is_void_v<Voxel> && !IsColored<Shader>::value;
+  // Reads of a known dtype are no calls; a short shader's loop may be there several times. See for_each.h for blocks at
+  // once: 128 or 64 registers a thread.
+  static constexpr bool kShort =
+      !std::is_void_v<Voxel> && std::is_base_of_v<Plain<T>, Shader> && !std::is_base_of_v<Lit<T>, Shader>;
   static constexpr int kBlocksAtOnce = kShort && !IsFiltered<Shader>::value ? 8 : 4;
   static constexpr bool kHidesAlike = HidesAlike<Shader>::value;
   Shader shader;
@@ -215,9 +216,8 @@ struct ShadeRay : Walk<T> {
    private:
     template <class Adds>
     GV_HD int32_t take(const Adds& adds, const Eye& probe, const Intervals<T>& at, int32_t alike, bool last) {
-      if (kShort && last) return take_by(adds, [&](T t) { return probe.value(t); }, probe, at, 1, true);
-      return probe.with_value(
-          [&](const auto& value) { return take_by(adds, value, probe, at, alike, !kShort && last); });
+      if (!kShort || last) return take_by(adds, [&](T t) { return probe.value(t); }, probe, at, alike, last);
+      return probe.with_value([&](const auto& value) { return take_by(adds, value, probe, at, alike, false); });
     }
     template <class Adds, class Value>
     GV_HD int32_t take_by(const Adds& adds, const Value& value, const Eye& probe, const Intervals<T>& at, int32_t alike,
