@@ -97,6 +97,10 @@ def test_every_channel_dtype(blobs, compiled, dtype):
     rays = camera_rays(tree, 12)
     found, *_ = assert_equal(tree, compiled, rays, gv.Isosurface(50))
     assert found["alpha"].max() == 1 and found["normal"].norm(dim=1).max() > 0.99
+    function = gv.TransferFunction([(20, 0), (80, 0.7)], [(20, 1, 0.5, 0.1), (80, 1, 1, 1)])
+    for lod in ("finest", "auto"):
+        found, *_ = assert_equal(tree, compiled, rays, gv.Lit(function), lod=lod)
+        assert found["alpha"].max() > 0.7 and found["normal"].norm(dim=1).max() > 0.9
 
 
 @pytest.mark.parametrize("name", SHADERS)

@@ -134,6 +134,8 @@ class Session:
                 found.append((None, error))
             done.set()
 
+        if self._closed:
+            raise RuntimeError("view: it is closed")
         self.post(answer)
         if not done.wait(timeout):
             raise TimeoutError("view: no answer")
