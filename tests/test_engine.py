@@ -187,7 +187,7 @@ def test_scouts_save_frames(aneurism, compiled, loading):
                     total[name] += number
             assert_same_picture(picture, whole)
             assert total["load"] == total["bricks"] + total["constant"]
-            assert total["subdivide"] == total["tiles"], "each was asked for once"
+            assert total["subdivide"] <= total["tiles"], "some were made before they were asked for"
             frames.append(engine.frames)
             bricks.append(total["bricks"])
     assert frames[2] < frames[1] < frames[0] and frames[2] <= 0.6 * frames[0]
@@ -281,8 +281,8 @@ def test_modes(blobs):
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4) as engine:
         once = engine.render(camera(), shader, "interactive")
         assert once.stats.frames == 1 and not once.stats.converged
-        four = engine.render(camera(), shader, "balanced", productions=3)
-        assert four.stats.frames == 3 and engine.frames == 4
+        three = engine.render(camera(), shader, "balanced", productions=2)
+        assert three.stats.frames == 2 and engine.frames == 3
         done = engine.render(camera(), shader, "converge")
         assert done.stats.converged
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4) as engine:

@@ -18,9 +18,9 @@ from helpers.waits import nobody_waits
 
 import gvtorch as gv
 from gvtorch.base.constants import REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUEST_SUBDIVIDE
+from gvtorch.cache.requests import DEEPER
 from gvtorch.engine import host_frame
 from gvtorch.engine.device_frame import DeviceFrame
-from gvtorch.engine.recorded import DEEPER
 from gvtorch.io.stores.conversion import convert
 from gvtorch.pool import mapped
 

@@ -28,6 +28,9 @@ from .call_cost import CallCost
 
 #: The kinds of request by the names that statistics show.
 KINDS = {"load": REQUEST_LOAD, "subdivide": REQUEST_SUBDIVIDE}
+#: Levels below the first by which a tree deepens in a frame at most.
+DEEPER = 2
+_PIXEL = 16  # the priority of a node whose voxels are a pixel wide: wider ones are to be subdivided
 _LEARN_FROM = 64  # items: smaller batches tell more about overhead than about throughput
 
 
@@ -61,6 +64,32 @@ class Requests:
         return rank[_fits(self.coarse[rank], room)]
 
 
+def levels_wanted(priority: Tensor, branching: int) -> Tensor:
+    """() int64 levels that subdivisions of these priorities want below the first, summed, as far as
+    a frame makes them.
+    """
+    widths = [_PIXEL * branching**level for level in range(1, DEEPER + 1)]
+    return torch.stack([(priority >= width).sum() for width in widths]).sum()
+
+
+def below(
+    cache: Cache, tile: Tensor, priority: Tensor, free: Tensor | int
+) -> tuple[Tensor, Tensor]:
+    """Which of the nodes of tiles (k,), -1 for none, rays will want subdivided, as their `priority`
+    (k,) tells: where they hold data and their voxels are wider than a pixel. None, if all of these
+    would take more than half of the `free` tiles: where room is scarce, what rays ask for has it.
+
+    Returns:
+        (k, n) int64 nodes, and which of them, bool.
+    """
+    pool, there = cache.nodes, tile.clamp(min=0)
+    child = torch.arange(pool.nodes_per_tile, device=tile.device)
+    wide = (tile >= 0) & (priority >= _PIXEL)
+    node = there[:, None] * pool.nodes_per_tile + child
+    split = wide[:, None] & (pool.child_tn[there] == ABSENT)
+    return node, split & (2 * split.sum() <= free)
+
+
 #: `Requests` for each of REQUEST_LOAD and REQUEST_SUBDIVIDE.
 RequestsByKind = Mapping[int, Requests]
 
@@ -92,8 +121,26 @@ class RequestList:
             row = torch.nonzero_static((self.word & kind).ne(0), size=counts[name])[:, 0]
             node, priority = self.node[row].to(torch.int64), self.word[row] & REQUEST_PRIORITY
             asked[kind] = node, priority
-        asked = by_target(cache.aliases, asked) if len(cache.aliases) else asked
-        return {kind: Requests.of(cache, kind, *rows) for kind, rows in asked.items()}
+        return _at_targets(cache, asked)
+
+
+def requests_below(cache: Cache, asked: Requests, branching: int) -> RequestsByKind:
+    """Subdivisions of what has come of subdivisions (k,), where rays will want them; see `below`.
+    Aliases may ask for loads of their targets.
+    """
+    tile = cache.nodes.child_tn.view(-1)[asked.node].to(torch.int64)
+    priority = asked.priority // branching
+    free = sum(lru.unused for lru in cache.lru[REQUEST_SUBDIVIDE])
+    node, split = below(cache, tile, priority, free)
+    node, priority = node[split], priority[:, None].expand_as(split)[split]
+    none = node[:0], priority[:0]
+    return _at_targets(cache, {REQUEST_LOAD: none, REQUEST_SUBDIVIDE: (node, priority)})
+
+
+def _at_targets(cache: Cache, asked: dict[int, tuple[Tensor, Tensor]]) -> dict[int, Requests]:
+    """Requests of nodes (k,) and their priorities by kind, those of aliases at their targets."""
+    asked = by_target(cache.aliases, asked) if len(cache.aliases) else asked
+    return {kind: Requests.of(cache, kind, *rows) for kind, rows in asked.items()}
 
 
 def _fits(coarse: Tensor, room: Sequence[int]) -> Tensor:

@@ -12,13 +12,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..base.constants import ABSENT, CONSTANT, EMPTY, REQUEST_LOAD, REQUEST_SUBDIVIDE
+from ..base.constants import CONSTANT, EMPTY, REQUEST_LOAD, REQUEST_SUBDIVIDE
 from ..cache import Cache, Scheduler
+from ..cache.requests import below
 from ..cache.write import Put, Targets, put_bricks, put_rows_of, put_tiles, put_uniform
 from ..producers import Region
 from ..producers.answer import checked_bricks, checked_regions
 from .parents import once, parent_bricks, ready
-from .recorded import PIXEL, RecordedFrame
+from .recorded import RecordedFrame
 from .request_batch import ProducedTree, RequestBatch, children_of
 from .stats import FrameStats, Readbacks
 
@@ -86,9 +87,8 @@ class DeviceFrame(RecordedFrame):
         """Subdivides nodes (batch,), and notes which of their children are to be subdivided, too,
         those of the first nodes first.
         """
-        pool, number, free = self.cache.nodes, self.tree_of(chosen), self._unused[:1]
+        number, free = self.tree_of(chosen), self._unused[:1]
         slot, wide = torch.full_like(chosen, -1), torch.zeros_like(chosen)
-        child = torch.arange(pool.nodes_per_tile, device=chosen.device)
         for source in self.trees:
             mine = (number == source.tree.number) & (chosen >= 0)
             put, failed = self._classify(source, torch.where(mine, chosen, -1), free)
@@ -98,13 +98,12 @@ class DeviceFrame(RecordedFrame):
             self._made[5:] += failed
             slot = torch.where(mine, put.slot, slot)
             wide = torch.where(mine, priority // source.layout.branching, wide)
-        split = (slot[:, None] >= 0) & (pool.child_tn[slot.clamp(min=0)] == ABSENT)
-        split = (split & (wide[:, None] >= PIXEL)).flatten()
-        place = torch.where(split, split.cumsum(0) - 1, self.batch)
-        node = slot[:, None] * pool.nodes_per_tile + child
+        node, split = below(self.cache, slot, wide, free)
+        rank = split.flatten().cumsum(0)
         rows = torch.stack((node, wide[:, None].expand_as(node)), 2).flatten(0, 1)
         self._below.fill_(-1)
-        put_rows_of(self._below, torch.where(place < self.batch, place, -1), rows)
+        taken = split.flatten() & (rank <= self.batch)
+        put_rows_of(self._below, torch.where(taken, rank - 1, -1), rows)
 
     def _fill(
         self, source: ProducedTree, node: Tensor, free: Tensor

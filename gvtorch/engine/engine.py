@@ -18,11 +18,12 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.constants import REQUEST_SUBDIVIDE
 from ..base.explicit import explicit
 from ..base.records import Hits, Rays, add
 from ..base.stage import Progress, collect_timings, mark, milliseconds, no_progress, stage
 from ..cache import Cache, RequestList, Scheduler
-from ..cache.requests import coarser_requests
+from ..cache.requests import Requests, coarser_requests, levels_wanted, requests_below
 from ..cameras import Camera
 from ..cameras.custom import as_camera
 from ..io.http import ask_again
@@ -301,10 +302,33 @@ class Engine:
                 nodes, deferred, _ = self.scheduler.choose(coarser, room)
             stats.deferred += deferred
             stats.capacity_exceeded |= exceeded
+        self.produce(nodes, stats)
+        if not (exceeded or self._by_level):
+            self.deepen(requests[REQUEST_SUBDIVIDE], stats)
+
+    def produce(self, nodes: Mapping[int, Tensor], stats: FrameStats) -> None:
+        """Asks the producers for the chosen nodes of each kind, and writes the answers that are
+        here at once.
+        """
         with stage("produce"):
             answers = self.production.ask([*self.trees.values()], nodes)
         with stage("write"):
             self.production.write(answers, stats)
+
+    def deepen(self, asked: Requests, stats: FrameStats) -> None:
+        """Subdivides what has come of subdivisions, too, where rays will want it, before they ask:
+        by as many levels as the subdivisions want in the mean.
+        """
+        branching = max(source.layout.branching for source in self.trees.values())
+        levels = int(levels_wanted(asked.priority, branching)) / max(1, len(asked))
+        for _ in range(round(levels)):
+            with stage("schedule"):
+                requests = requests_below(self.cache, asked, branching)
+                asked = requests[REQUEST_SUBDIVIDE]
+                nodes = self.scheduler.choose(requests, self.production.room()).nodes
+            if not any(map(len, nodes.values())):
+                break
+            self.produce(nodes, stats)
 
     def scout(self, view: View, stats: FrameStats) -> None:
         """Sends rays ahead of the picture: while answers are written at once, some of those that
@@ -488,8 +512,8 @@ class Engine:
         Args:
             camera: Cameras as those of the replays.
             shader: For all trees, or one for each; no `ModuleShader`.
-            batch: Most bricks that a replay makes, and most node tiles of each level. Where
-                producers are `on_device`, a replay may deepen the tree by several levels.
+            batch: Most bricks that a replay makes, and most node tiles of each level, for each
+                tree. Where producers are `on_device`, a tree may deepen by several levels.
             look_ahead: While the camera moves, a replay also asks for what its picture so many
                 frames on will miss, as far as the motion tells, by a sixteenth of the picture's
                 rays. This is served behind what the picture itself missed. 0: only what is missed.

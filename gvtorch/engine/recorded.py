@@ -20,6 +20,7 @@ from ..base.constants import (
 )
 from ..base.records import Hits
 from ..cache import Cache, RequestList, Scheduler
+from ..cache.requests import levels_wanted
 from ..cache.write import put_rows_of
 from .request_batch import ProducedTree
 from .stats import Collected, Readbacks
@@ -27,8 +28,6 @@ from .stats import Collected, Readbacks
 _MOST_LISTED = 1 << 14  # nodes whose requests are sorted
 _AHEAD = 1 << 20  # added to the rank of what the next pictures will miss
 _LAST = 1 << 30  # the rank of what is not asked for
-PIXEL = 16  # the priority of a node whose voxels are a pixel wide: wider ones are to be subdivided
-DEEPER = 2  # levels below the first by which a tree deepens in a frame at most
 
 
 class Chosen(NamedTuple):
@@ -56,9 +55,7 @@ class RecordedFrame:
         self._coarse_first = scheduler.order == "coarse"
         self._most = min(_MOST_LISTED, cache.nodes.request_tn.numel())
         device = cache.frame_1.device
-        # Priorities from which a subdivision wants one level below the first, two, ...
-        n = max(source.layout.branching for source in trees)
-        self._widths = PIXEL * n ** torch.arange(1, DEEPER + 1, device=device)
+        self._branching = max(source.layout.branching for source in trees)
         # What the last picture asked for, and what the next ones will: nodes and their words.
         self._requests = torch.zeros((2, 2, self._most), dtype=torch.int32, device=device)
         self._unused = torch.zeros(2, dtype=torch.int64, device=device)  # tiles, bricks
@@ -112,7 +109,7 @@ class RecordedFrame:
         """(1,) int64 levels that are wanted below the first by what is to be subdivided, summed."""
         word = self._requests[:, 1].flatten()
         wide = torch.where((word & REQUEST_SUBDIVIDE) != 0, word & REQUEST_PRIORITY, 0)
-        return (wide >= self._widths[:, None]).sum().view(1)
+        return levels_wanted(wide, self._branching).view(1)
 
     def choose(self, kind: int) -> Chosen:
         """Returns what is served first of the lists, as `Scheduler.choose` takes them: what the
