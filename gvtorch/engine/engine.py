@@ -303,7 +303,7 @@ class Engine:
             stats.deferred += deferred
             stats.capacity_exceeded |= exceeded
         self.produce(nodes, stats)
-        if not (exceeded or self._by_level):
+        if counts.subdivide and not (exceeded or self._by_level):
             self.deepen(requests[REQUEST_SUBDIVIDE], stats)
 
     def produce(self, nodes: Mapping[int, Tensor], stats: FrameStats) -> None:
