@@ -6,11 +6,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers.afar import compare, matter, picture, rays, walls
+from helpers.afar import assert_same_bits, compare, filtered, matter, picture, rays, walls
 from helpers.packets import INSTRUCTIONS, result, start
 from helpers.rays import camera_rays
-from helpers.traces import SHADER, assert_equal, run
-from helpers.trees import forget
+from helpers.traces import SHADER, run
 
 import gvtorch as gv
 
@@ -19,25 +18,13 @@ MISTY = gv.TransferFunction(
 )
 
 
-def filtered(transfer: gv.TransferFunction, **options) -> tuple[gv.N3Tree, gv.Filtered]:
-    volume = matter(**{k: options.pop(k) for k in ("spacing",) if k in options})
-    tree = gv.N3Tree.from_volume(volume, 4, branching=options.pop("branching", 2), threshold=0.0)
-    return tree, gv.Filtered.of(tree, volume, transfer, **options)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("branching", [2, 3])
 @pytest.mark.parametrize("directions", [True, False])
 def test_compiled_equals_reference(compiled, directions, branching, dtype):
     tree, shader = filtered(SHADER, directions=directions, branching=branching)
     for distance, step in ((0.3, 0.5), (1.3, 0.4), (5.0, 2.3)):
-        rays = camera_rays(tree, 14, distance=distance)
-        for which in (tree, forget(tree, 0.3, 5)):
-            options = {"dtype": dtype, "step": step}
-            found, _, actual = assert_equal(which, compiled, rays, shader, **options)
-            if compiled == "cpp" and dtype == torch.float32:
-                for field in ("color", "alpha", "depth"):
-                    assert torch.equal(actual[field], found[field]), field
+        found = assert_same_bits(tree, compiled, distance, shader, dtype=dtype, step=step)
         if distance == 1.3:
             assert found["alpha"].max() > 0.3, "the test must see something"
 
@@ -47,12 +34,15 @@ def all_shaded() -> list[torch.Tensor]:
 
 
 def shaded(backend: str) -> list[torch.Tensor]:
-    found = []
-    for directions in (True, False):
-        tree, shader = filtered(SHADER, directions=directions)
-        for size, distance in ((21, 1.5), (9, 1.5), (13, 4.0)):
-            result, marks = run(tree, backend, camera_rays(tree, size, distance=distance), shader)
-            found += [*result.values(), *marks.values()]
+    """Of the plain function and of a lit one."""
+    found, lamp = [], gv.PointLight((0.0, 40.0, 60.0), (1.0, 0.9, 0.8))
+    for look in (SHADER, gv.Lit(SHADER, light=lamp)):
+        for directions in (True, False):
+            tree, shader = filtered(look, directions=directions)
+            for size, distance in ((21, 1.5), (9, 1.5), (13, 4.0)):
+                rays = camera_rays(tree, size, distance=distance)
+                result, marks = run(tree, backend, rays, shader)
+                found += [*result.values(), *marks.values()]
     return found
 
 

@@ -7,23 +7,15 @@ from __future__ import annotations
 import pytest
 import torch
 from helpers import ROOT, gvtorch
-from helpers.afar import compare, matter, picture
-from helpers.packets import INSTRUCTIONS, result, start
+from helpers.afar import assert_same_bits, compare, filtered, matter, picture
 from helpers.rays import camera_rays
-from helpers.traces import SHADER, assert_equal, run
-from helpers.trees import forget
+from helpers.traces import SHADER
 
 import gvtorch as gv
 
 SUN = gv.DirectionalLight((-1.0, -0.5, 0.3), (1.0, 0.9, 0.8))
 LAMP = gv.PointLight((0.0, 40.0, 60.0), (1.0, 0.9, 0.8))
 FIELDS = ("color", "alpha", "depth", "normal")
-
-
-def filtered(look: gv.Lit, branching: int = 2, **options) -> tuple[gv.N3Tree, gv.Filtered]:
-    volume = matter()
-    tree = gv.N3Tree.from_volume(volume, 4, branching=branching, threshold=0.0)
-    return tree, gv.Filtered.of(tree, volume, look, **options)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -39,37 +31,9 @@ def test_compiled_equals_reference(compiled, directions, branching, dtype):
         (LAMP, 5.0, 2.3),
     ):
         shader.transfer = gv.Lit(SHADER, light=light, specular=0.9, shininess=25.0)
-        rays = camera_rays(tree, 14, distance=distance)
-        for which in (tree, forget(tree, 0.3, 5)):
-            options = {"dtype": dtype, "step": step}
-            found, _, actual = assert_equal(which, compiled, rays, shader, **options)
-            if compiled == "cpp" and dtype == torch.float32:
-                for field in FIELDS:
-                    assert torch.equal(actual[field], found[field]), (light, field)
+        found = assert_same_bits(tree, compiled, distance, shader, dtype=dtype, step=step)
         if distance == 1.3:
             assert found["alpha"].max() > 0.3, "the test must see something"
-
-
-def all_shaded() -> list[torch.Tensor]:
-    return shaded("cpp")
-
-
-def shaded(backend: str) -> list[torch.Tensor]:
-    found = []
-    for directions in (True, False):
-        tree, shader = filtered(gv.Lit(SHADER, light=LAMP), directions=directions)
-        for size, distance in ((21, 1.5), (9, 1.5), (13, 4.0)):
-            result, marks = run(tree, backend, camera_rays(tree, size, distance=distance), shader)
-            found += [*result.values(), *marks.values()]
-    return found
-
-
-@pytest.mark.backend("cpp")
-def test_every_bit_is_the_same_for_all_instruction_sets(tmp_path):
-    expected = shaded("reference")
-    for found in map(result, [start(all_shaded, tmp_path, name) for name in INSTRUCTIONS]):
-        for one, other in zip(found, expected, strict=True):
-            assert torch.equal(one.nan_to_num(7), other.nan_to_num(7))
 
 
 @pytest.mark.backend("cpp")

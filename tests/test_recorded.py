@@ -106,11 +106,8 @@ def test_a_volume_that_the_device_reads_in_place_is_recorded(backend, monkeypatc
     with gv.Engine(gv.VolumeProducer(volume, hold="mapped"), **options) as engine:
         frames = Frames(engine, view(), LOOK, 64)
         assert isinstance(frames.served, DeviceFrame)
-        for _ in range(200):
-            hits, stats = frames.frame()
-            if stats.converged:
-                break
-        assert stats.converged and expected.alpha.max() > 0.5
+        hits, _ = frames.whole()
+        assert expected.alpha.max() > 0.5
         engine.validate()
     assert torch.equal(hits.color, expected.color.reshape(-1, 3))
 
@@ -128,10 +125,7 @@ def test_joined_producers_are_recorded_where_all_are(backend):
     with gv.Engine(joined(), **options) as own:
         frames = Frames(own, view(), LOOK, 64)
         assert isinstance(frames.served, DeviceFrame)
-        for _ in range(200):
-            hits, stats = frames.frame()
-            if stats.converged:
-                break
+        hits, stats = frames.whole()
         own.validate()
         assert torch.equal(own.render(view(), LOOK, channel="b").color, other.color)
     assert stats.converged and (expected.alpha > 0.5).any()
@@ -258,11 +252,8 @@ def test_what_fails_on_the_host_is_named_and_not_asked_for_again(blobs, backend)
 
     with gv.Engine(Spoiled(blobs), brick_size=4, device=DEVICES[backend]) as engine:
         frames = Frames(engine, view(24), LOOK, 64)
-        for _ in range(200):
-            hits, stats = frames.frame()
-            if stats.converged:
-                break
-        assert stats.converged and stats.failed == len(engine.failures) > 4
+        hits, stats = frames.whole()
+        assert stats.failed == len(engine.failures) > 4
         assert all(one.message == "spoiled" and one.loc[3] == 3 for one in engine.failures)
         engine.validate()
     assert bool(torch.isfinite(hits.color).all())
@@ -282,12 +273,7 @@ def test_what_raises_costs_itself_alone_and_what_never_comes_is_given_up(blobs, 
 
     with gv.Engine(Unruly(blobs), brick_size=4, device=DEVICES[backend]) as engine:
         frames = Frames(engine, view(16), LOOK, 64)
-        for _ in range(400):
-            hits, stats = frames.frame()
-            time.sleep(0.002)
-            if stats.converged:
-                break
-        assert stats.converged
+        hits, _ = frames.whole(400, 0.002)
         told = {one.message for one in engine.failures}
         assert "OSError: no such column" in told
         assert told <= {"OSError: no such column", "no answer within 0.2 s"}

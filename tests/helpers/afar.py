@@ -7,6 +7,9 @@ import math
 import torch
 
 import gvtorch as gv
+from helpers.rays import camera_rays
+from helpers.traces import assert_equal
+from helpers.trees import forget
 
 
 def matter(spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> gv.Volume:
@@ -17,6 +20,30 @@ def matter(spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> gv.Volume:
     value = value + 0.2 * torch.rand(value.shape, generator=generator)
     value[:14], value[:, 24:, :20] = 0.0, 0.35
     return gv.Volume(value, spacing)
+
+
+def filtered(
+    look: gv.TransferFunction | gv.Lit, branching: int = 2, **options
+) -> tuple[gv.N3Tree, gv.Filtered]:
+    """Matter in a tree with colours for its coarse voxels; options of `matter` and `Filtered`."""
+    volume = matter(**{name: options.pop(name) for name in ("spacing",) if name in options})
+    tree = gv.N3Tree.from_volume(volume, 4, branching=branching, threshold=0.0)
+    return tree, gv.Filtered.of(tree, volume, look, **options)
+
+
+def assert_same_bits(
+    tree: gv.N3Tree, backend: str, distance: float, shader: gv.Shader, **options
+) -> dict[str, torch.Tensor]:
+    """The twin's hits of rays from a distance, through the tree and through one with holes; they
+    are those of a backend, in float32 on the CPU in every bit.
+    """
+    rays = camera_rays(tree, 14, distance=distance)
+    for which in (tree, forget(tree, 0.3, 5)):
+        found, _, actual = assert_equal(which, backend, rays, shader, **options)
+        if backend == "cpp" and options["dtype"] == torch.float32:
+            for field in {"color", "alpha", "depth", "normal"} & {*found}:
+                assert torch.equal(actual[field], found[field]), field
+    return found
 
 
 def walls() -> gv.Volume:

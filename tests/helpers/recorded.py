@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from functools import partial
 
 import gvtorch as gv
@@ -37,6 +38,15 @@ class Frames:
 
     def look_from(self, camera: gv.Camera) -> None:
         self.camera = camera.placed(self.view.box)
+
+    def whole(self, most: int = 200, pause: float = 0.0) -> tuple[gv.Hits, gv.FrameStats]:
+        """Frames, with pauses of so many seconds, until one misses nothing."""
+        for _ in range(most):
+            hits, stats = self.frame()
+            time.sleep(pause)
+            if stats.converged:
+                return hits, stats
+        raise AssertionError(f"not whole within {most} frames: {stats.requests}")
 
     def frame(self) -> tuple[gv.Hits, gv.FrameStats]:
         with self.engine.new_frame(self.view.options) as stats:
