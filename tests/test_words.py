@@ -16,7 +16,7 @@ from helpers.traces import SHADER, arguments, assert_equal, run
 from helpers.trees import on
 
 import gvtorch as gv
-from gvtorch.base.constants import ABSENT
+from gvtorch.base.constants import ABSENT, TERMINAL
 from gvtorch.ops import trace_rays
 
 FAR = (2**31 - 1, 2**30, 10**6)
@@ -48,6 +48,21 @@ def test_words_that_lead_out_of_the_pools_count_as_absent(blobs, backend, dtype,
     for mine, other in zip(actual, expected, strict=True):
         assert all(torch.equal(mine[name], other[name]) for name in other)
     assert actual[0]["missed"].any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("word", [-3, -(2**31)])
+def test_words_below_all_that_are_known_end_a_tree_and_hide_nothing(blobs, backend, dtype, word):
+    tree = gv.N3Tree.from_volume(blobs, 4)
+    rays, found = camera_rays(tree, 8), []
+    for instead in (word, TERMINAL):
+        copy = on(tree, "cpu")
+        chosen = torch.rand(copy.nodes.child_tn.shape, generator=torch.Generator().manual_seed(5))
+        copy.nodes.child_tn[chosen < 0.3] = instead
+        found.append(run(copy, backend, rays, dtype=dtype))
+    for mine, other in zip(*found, strict=True):
+        assert all(torch.equal(mine[name], other[name]) for name in other)
+    assert found[0][0]["alpha"].max() > 0.1, "the test must see something"
 
 
 @pytest.mark.parametrize("high", [1e6, -5.0, torch.nan])

@@ -58,8 +58,8 @@ class DeviceFrame(RecordedFrame):
         self._subdivide(*self.choose(REQUEST_SUBDIVIDE))
 
     def deepen(self) -> None:
-        """Subdivides what has just been made and what rays will want finer, as the priority of the
-        nodes above tells: there is a level less that must be asked for.
+        """Subdivides those nodes that `serve`, or `deepen` before, has just made and that rays will
+        want finer, as the priority of the node above tells, so that no ray has to ask for it.
         """
         self._subdivide(*self._below.unbind(1))
 

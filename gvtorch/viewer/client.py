@@ -32,7 +32,7 @@ class Interrupted(Exception):
 
 
 def _nobody(_: str | bytes) -> None:
-    """Is told what nobody hears."""
+    """Takes what is sent to a page that has gone."""
 
 
 class Client:

@@ -76,7 +76,7 @@ struct TreeView {
   GV_HD int32_t tile_of(int32_t node) const { return within(child_tn[node], tiles); }
   GV_HD int32_t brick_of(int32_t node) const { return within(brick_tn[node], bricks); }
   GV_HD NodeWords words_of(int32_t node, bool hidden) const {
-    return {brick_of(node), hidden ? kConcealed : tile_of(node)};
+    return {brick_of(node), hidden ? kConcealed : larger(tile_of(node), kTerminal)};  // whoever wrote a lower word
   }
   GV_HD static int32_t within(int32_t word, int32_t count) { return word < count ? word : kAbsent; }
 };
