@@ -26,7 +26,7 @@ struct LanesOf {
   using Real = T;
   using Int = int32_t;
   using Word = uint32_t;  // sums wrap
-  using Index = int64_t;  // into a table
+  using Index = int32_t;  // into a table
   using Mask = bool;
   using Pointer = T*;
   static constexpr bool kPacket = false;
@@ -50,6 +50,16 @@ template <class T>
 GV_HD void set_lane(T& value, int, T own) {
   value = own;
 }
+// The smallest of what the threads of a warp have that are at this place together, none below 0; on the CPU, and on
+// GPUs that are older than this instruction, one's own.
+GV_HD float smallest_together(float value) {
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+  return __uint_as_float(__reduce_min_sync(__activemask(), __float_as_uint(value)));
+#else
+  return value;
+#endif
+}
+GV_HD double smallest_together(double value) { return value; }
 template <class T>
 GV_HD T pick(const T* table, int32_t index) {
   return table[index];

@@ -237,7 +237,7 @@ ShadeArgs take_walk(const Op& a, bool integrates = false) {
   if (unread) args.request_tn = nullptr;
   STD_TORCH_CHECK(a.child_tn.size(1) >= a.branching * a.branching * a.branching, "gvtorch: child_tn has too few nodes");
   STD_TORCH_CHECK(a.width == 0 || args.rays % a.width == 0, "gvtorch: rays are no rows of this width");
-  STD_TORCH_CHECK(levels <= INT32_MAX && rows <= INT32_MAX, "gvtorch: table_lm4 is too large");
+  STD_TORCH_CHECK(levels <= INT32_MAX && rows <= INT32_MAX && table <= INT32_MAX, "gvtorch: table_lm4 is too large");
   STD_TORCH_CHECK(reinterpret_cast<uintptr_t>(args.table_lm4) % 16 == 0,
                   "gvtorch: table_lm4 must begin at a multiple of 16 bytes");
   args.nodes_per_tile = static_cast<int32_t>(a.child_tn.size(1));

@@ -204,9 +204,10 @@ struct Probe {
 
   // The shader's own value at distance t.
   GV_HD T value(T t) const { return number_at(channels.value, channels.component, t); }
-  // Calls body(value), where value(t) is that: in the quickest way there is for this visit.
+  // Calls body(value), where value(t) is that for distances from `begin` to `end`: in the quickest way there is for
+  // this visit. Places along a ray keep their order where they are rounded, so those of the ends tell for all.
   template <class Body>
-  GV_HD int32_t with_value(const Body& body) const {
+  GV_HD int32_t with_value(T, T, const Body& body) const {
     return body([this](T t) { return value(t); });
   }
 
@@ -312,8 +313,8 @@ struct Probe {
     return number + weight(t) * (read(coarse) - number);
   }
   GV_HD int64_t first_of(const ChannelView& channel, int32_t component, const Spot<T>& spot) const {
-    const int64_t volume = static_cast<int64_t>(channels.side) * channels.side * channels.side;
-    return spot.brick * volume * channel.width + component;
+    const int32_t numbers = channels.side * channels.side * channels.side * channel.width;  // they fit: check_bricks
+    return static_cast<int64_t>(spot.brick) * numbers + component;
   }
 
  private:
@@ -383,13 +384,16 @@ struct TypedProbe : Probe<T> {
     return slope;
   }
   template <class Body>
-  GV_HD int32_t with_value(const Body& body) const {
+  GV_HD int32_t with_value(T begin, T end, const Body& body) const {
 #ifdef __CUDA_ARCH__
-    // The usual bricks, 8 and 16 voxels wide with a border of 1.
-    if (!this->mixed && this->fine.brick >= 0 && this->channels.value.width == 1) {
-      const Voxel* voxels = first(this->fine);
-      if (this->channels.side == 10) return body([&](T t) { return trilinear<10>(voxels, 10, 1, this->fine.at(t)); });
-      if (this->channels.side == 18) return body([&](T t) { return trilinear<18>(voxels, 18, 1, this->fine.at(t)); });
+    // The usual bricks, 8 and 16 voxels wide with a border of 1: eight addresses are one and seven constants.
+    const int32_t side = this->channels.side;
+    const Spot<T>& spot = this->fine;
+    if (!this->mixed && spot.brick >= 0 && this->channels.value.width == 1 &&
+        Eight<T>::is_inside(spot.at(begin), side) && Eight<T>::is_inside(spot.at(end), side)) {
+      const Voxel* voxels = first(spot);
+      if (side == 10) return body([&](T t) { return trilinear(voxels, Eight<T>(spot.at(t)), 10, 1); });
+      if (side == 18) return body([&](T t) { return trilinear(voxels, Eight<T>(spot.at(t)), 18, 1); });
     }
 #endif
     return body([this](T t) { return value(t); });

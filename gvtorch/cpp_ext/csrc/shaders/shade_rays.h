@@ -217,7 +217,11 @@ struct ShadeRay : Walk<T> {
     template <class Adds>
     GV_HD int32_t take(const Adds& adds, const Eye& probe, const Intervals<T>& at, int32_t alike, bool last) {
       if (!kShort || last) return take_by(adds, [&](T t) { return probe.value(t); }, probe, at, alike, last);
-      return probe.with_value([&](const auto& value) { return take_by(adds, value, probe, at, alike, false); });
+      const T last_number = at.count + static_cast<T>(alike - 1);
+      const T begin = kEnds ? at.start : at.middle_of(at.count);
+      const T end = kEnds ? at.start_of(last_number + 1) : at.middle_of(last_number);
+      return probe.with_value(begin, end,
+                              [&](const auto& value) { return take_by(adds, value, probe, at, alike, false); });
     }
     template <class Adds, class Value>
     GV_HD int32_t take_by(const Adds& adds, const Value& value, const Eye& probe, const Intervals<T>& at, int32_t alike,

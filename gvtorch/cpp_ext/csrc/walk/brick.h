@@ -108,27 +108,38 @@ struct Eight {
       weight[axis] = place - static_cast<T>(cell[axis]);
     }
   }
+  // Of a place for which is_inside is true.
+  GV_HD explicit Eight(const Vec3<T>& at) {
+    for (int axis = 0; axis < 3; ++axis) {
+      cell[axis] = static_cast<int32_t>(at[axis]);
+      weight[axis] = at[axis] - static_cast<T>(cell[axis]);
+    }
+  }
+  GV_HD static bool is_inside(const Vec3<T>& at, int32_t side) {
+    const T last = static_cast<T>(side - 1);
+    return at.x >= 0 && at.y >= 0 && at.z >= 0 && at.x < last && at.y < last && at.z < last;
+  }
   template <class Pair>
   GV_HD T blend(const Pair& pair) const {
     return blend_eight<T>(weight, pair);
   }
 };
 
-// Value at a place of a brick. kSide > 0: a brick of one channel and that side, so that eight addresses are one address
-// and seven constants.
-template <int32_t kSide = 0, class T, class Voxel>
-GV_HD T trilinear(const Voxel* voxels, int32_t any_side, int32_t channels, Vec3<T> at) {
-  const int32_t side = kSide > 0 ? kSide : any_side;
-  const int32_t step_x = kSide > 0 ? 1 : channels;
-  const int32_t step_y = step_x * side;
-  const int32_t step_z = step_y * side;
-  const Eight<T> eight(at, side);
-  const Voxel* corner = voxels + (eight.cell[2] * step_z + eight.cell[1] * step_y + eight.cell[0] * step_x);
+// Value at a place of a brick, between the voxels that are told.
+template <class T, class Voxel>
+GV_HD T trilinear(const Voxel* voxels, const Eight<T>& eight, int32_t side, int32_t channels) {
+  const int32_t step_y = channels * side, step_z = step_y * side;
+  const auto offset = static_cast<uint32_t>(eight.cell[2] * step_z + eight.cell[1] * step_y + eight.cell[0] * channels);
+  const Voxel* corner = voxels + offset;
   return eight.blend([&](int y, int z, T& left, T& right) {
     const Voxel* first = corner + (z * step_z + y * step_y);
     left = number<T>(first[0]);
-    right = number<T>(first[step_x]);
+    right = number<T>(first[channels]);
   });
+}
+template <class T, class Voxel>
+GV_HD T trilinear(const Voxel* voxels, int32_t side, int32_t channels, Vec3<T> at) {
+  return trilinear(voxels, Eight<T>(at, side), side, channels);
 }
 
 }  // namespace GV_NAMESPACE

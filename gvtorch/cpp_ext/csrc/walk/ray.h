@@ -51,9 +51,8 @@ struct Ray {
       const double size = rays.place_33[3 + axis];
       from[axis] = (rays.origin_r3[3 * index + axis] - rays.place_33[axis]) / size;
       along[axis] = rays.direction_r3[3 * index + axis] / size;
-      const double low = -from[axis] / along[axis];
-      const double far = (rays.high(axis) - from[axis]) / along[axis];
-      if (along[axis] != 0) near = larger(near, smaller(low, far));
+      const double face = along[axis] > 0 ? -from[axis] : rays.high(axis) - from[axis];  // the nearer one
+      if (along[axis] != 0) near = larger(near, face / along[axis]);
     }
     const double shift = near > 0 && near < static_cast<double>(INFINITY) ? near : 0;
     const double growth = rays.cone_r2[2 * index + 1] * rays.cone_scale;
@@ -234,7 +233,7 @@ struct Intervals {
       limit = select(growth < 0, smaller(limit, (shortest - near) / growth), limit);
     }
     const T one = splat<T>(static_cast<Real>(1)), most = static_cast<Real>(kMostIntervals) - count;
-    IntOf<T> alike = floor_int(clamp((limit - start) * shortness + one, one, most));
+    IntOf<T> alike = truncated(clamp((limit - start) * shortness + one, one, most));
     for (;;) {
       const Mask over = which && alike > 1 && !same(count + to_real<T>(alike - 1), extent);
       if (!any(over)) return alike;

@@ -35,6 +35,18 @@ GV_HD Row<T> make_row(MaskOf<T> which, const Column& column) {
   return row;
 }
 
+// A row in one load (in float64 four): the compiler would read its numbers one by one.
+template <class T>
+GV_HD Row<T> load_row(const Row<T>* row) {
+#ifdef __CUDA_ARCH__
+  if constexpr (sizeof(T) == sizeof(float)) {
+    const float4 four = *reinterpret_cast<const float4*>(row);
+    return {four.x, four.y, four.z, four.w};
+  }
+#endif
+  return *row;
+}
+
 // Where a value stands in the table: between two rows.
 template <class T>
 struct Cell {
@@ -110,7 +122,7 @@ struct Transfer {
   }
 
   // The row `index`, or the one that lies so many behind it.
-  GV_HD const Row<T>& row_at(int64_t index, int32_t behind) const { return table_lm[index + behind]; }
+  GV_HD Row<T> row_at(int32_t index, int32_t behind) const { return load_row(&table_lm[index + behind]); }
 #ifndef __CUDACC__
   GV_HD Row<Floats> row_at(Ints index, int32_t behind) const {
     Row<Floats> row;

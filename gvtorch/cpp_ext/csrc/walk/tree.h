@@ -199,8 +199,8 @@ GV_HD Place descend(const TreeView& tree, Number& digits, int32_t wanted, bool b
   place.node = tree.root;
   int32_t own_tile = tree.root_tile;  // of the node
   for (;;) {
-    store_stamp(&tree.stamp_t[own_tile], frame);
     const NodeWords words = words_of(place.node);
+    store_stamp(&tree.stamp_t[own_tile], frame);
     place.brick = words.brick;
     place.tile = words.tile;
     place.hidden = words.tile == kConcealed;

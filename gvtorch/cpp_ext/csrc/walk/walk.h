@@ -115,7 +115,18 @@ struct Walk {
   template <class Digits, class Visitor>
   GV_HD void follow(const Ray<T>& ray, Intervals<T>& at, Visitor& visitor) const {
     int32_t wanted = 0;
-    while (at.inside() && visitor.more()) visit<Digits>(ray, at, visitor, wanted);
+    while (at.inside()) {
+      if (is_ahead(at.start, wanted)) continue;
+      if (!visitor.more()) return;
+      visit<Digits>(ray, at, visitor, wanted);
+    }
+  }
+
+  // Rays of a warp sample together, each as many intervals as its node has: those that come through a corner of another
+  // node would fall behind the others, and the whole warp take as long in each node as its longest piece of a ray. So a
+  // ray that is farther than the side of a node from the warp's last one waits. The last one never does.
+  GV_HD bool is_ahead(T start, int32_t wanted) const {
+    return start - smallest_together(start) > levels.voxel[wanted] * levels.scale[0];
   }
 
   // One node: finds it, marks it, and takes all intervals whose middle lies in it.
@@ -177,7 +188,8 @@ struct Walk {
     visit.fine = place.fine;
     visit.coarse = place.coarse.node >= 0 ? place.coarse : visit.fine;
     if (!visit.hidden && visit.fine.brick >= 0) store_stamp(&stamp_b[visit.fine.brick], *frame_1);
-    if (!visit.hidden && visit.coarse.brick >= 0) store_stamp(&stamp_b[visit.coarse.brick], *frame_1);
+    const bool other = visit.coarse.node != visit.fine.node;
+    if (!visit.hidden && other && visit.coarse.brick >= 0) store_stamp(&stamp_b[visit.coarse.brick], *frame_1);
     return visit;
   }
 
