@@ -52,6 +52,52 @@ def test_compact_requests_lists_open_requests_and_keeps_pending_ones(
 
 
 @fixed
+@given(
+    data=st.data(),
+    listed=st.integers(1, 20),
+    batch=st.integers(1, 30),
+    coarse_first=st.booleans(),
+    room=st.tuples(st.integers(0, 30), st.integers(0, 30)),
+)
+def test_requests_are_chosen_by_list_level_and_size(
+    backend, data, listed, batch, coarse_first, room
+):
+    """Few levels and sizes, so that many are alike and their order decides; in the pool of 10 tiles
+    some nodes are not.
+    """
+    device, place = DEVICES[backend], torch.zeros((10, 4), dtype=torch.int32)
+    place[:, 3] = torch.tensor(data.draw(st.lists(st.integers(0, 2), min_size=10, max_size=10)))
+    numbers = st.lists(st.integers(-1, 85), min_size=listed, max_size=listed)
+    sizes = st.sampled_from([0, 7, config.REQUEST_PRIORITY])
+    kinds = st.sampled_from([0, LOAD, SUBDIVIDE, LOAD | SUBDIVIDE])
+    asked = [[], []]
+    for rows in asked:
+        words = st.lists(st.tuples(kinds, sizes).map(sum), min_size=listed, max_size=listed)
+        rows += [data.draw(numbers), data.draw(words)]
+    node, priority = ops.choose_requests(
+        int32(asked, device),
+        place.to(device),
+        torch.tensor(room, device=device),
+        8,
+        batch,
+        coarse_first,
+        backend=backend,
+    )
+    wanted = []
+    for number, (nodes, words) in enumerate(asked):
+        for at, (one, word) in enumerate(zip(nodes, words, strict=True)):
+            if 0 <= one < 80:
+                level = int(place[one // 8, 3]) * (1 if coarse_first else -1)
+                size = word & config.REQUEST_PRIORITY
+                wanted.append(((number, level, -size, at), one, word, size))
+    wanted.sort()
+    for row, (kind, most) in enumerate(((LOAD, room[1]), (SUBDIVIDE, room[0]))):
+        chosen = [(one, size) for _, one, word, size in wanted if word & kind][: min(batch, most)]
+        expected = [*chosen, *[(-1, 0)] * (batch - len(chosen))]
+        assert list(zip(node[row].tolist(), priority[row].tolist(), strict=True)) == expected
+
+
+@fixed
 @given(data=st.data(), size=st.integers(1, 60))
 def test_lru_equals_a_python_list_over_random_traces(backend, data, size):
     """Frames use slots at random and take some: the model is a list, used slots moved back."""
@@ -296,6 +342,17 @@ def test_kernels_equal_twins_on_a_large_pool(compiled):
     actual = ops.lacking(*there, 1, 0, 2, backend=compiled)
     assert torch.equal(actual.cpu(), expected) and 0 < int(expected.sum()) < len(node)
 
+    asked = torch.randint(0, tiles * per_tile, (2, 2, 3000), generator=generator).to(torch.int32)
+    asked[:, 1] &= LOAD | SUBDIVIDE | 15  # of few sizes
+    asked[0, 0, 2000:] = -1
+    given = asked, pool[1], torch.tensor([900, 5000])
+    for order_ in (True, False):
+        expected = ops.choose_requests(*given, per_tile, 1024, order_, backend="reference")
+        there = [one.to(device) for one in given]
+        actual = ops.choose_requests(*there, per_tile, 1024, order_, backend=compiled)
+        assert all(torch.equal(a.cpu(), e) for a, e in zip(actual, expected, strict=True))
+        assert (expected[0] >= 0).sum(1).tolist() == [1024, 900]
+
 
 def test_cache_ops_pass_opcheck(compiled):
     device = DEVICES[compiled]
@@ -306,6 +363,10 @@ def test_cache_ops_pass_opcheck(compiled):
     row, none = torch.zeros_like(frame).long(), torch.zeros_like(frame)
     for op, arguments in (
         (table.compact_requests, (request, 3)),
+        (
+            table.choose_requests,
+            (int32([[[1, 0], [LOAD, 9]]], device), words, place[0, :2].clone(), 4, 3, True),
+        ),
         (table.lru_partition, (int32([2, 0, 1], device), int32([1, 0, 1], device), frame)),
         (table.unlink, (words, frame.clone(), frame.bool(), int32([0, -1], device))),
         (table.orphan, (words, frame.clone(), int32([0, -1], device))),
@@ -365,6 +426,10 @@ def test_nothing_to_do(backend):
         (lambda w: ops.compact_requests(w.float(), 4), "request_tn must be (t, n) int16"),
         (lambda w: ops.compact_requests(w.short().T, 4), "request_tn must be contiguous"),
         (lambda w: ops.compact_requests(w.short(), 0), "capacity must be an int >= 1"),
+        (
+            lambda w: ops.choose_requests(w, w[:, :4].clone(), w[0, :2].long(), 8, 1, True),
+            "asked_l2k must be (l, 2, k) int32",
+        ),
         (lambda w: ops.lru_partition(w, w[0], w[0, :1]), "order_k must be (k,)"),
         (lambda w: ops.unlink(w, w[0], w[0, :3] > 0, w[0]), "shared_s must be (8,) bool"),
         (lambda w: ops.orphan(w, w[0], w), "tile_k must be (k,)"),

@@ -7,12 +7,14 @@ import math
 
 import pytest
 import torch
+from helpers import DEVICES
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.depth import unproject_meshgrid
 
 import gvtorch as gv
+from gvtorch import ops
 from gvtorch.base.volume import DIRECTIONS
 from gvtorch.cameras.custom import CustomCamera
 from gvtorch.tracing import pixels
@@ -282,6 +284,40 @@ def test_a_thinned_camera_looks_through_the_middle_of_its_pixels_ahead_of_the_mo
     moved = camera.numbers_ahead(now, before, 4, 1)[:, move]
     torch.testing.assert_close(moved, now[:, move] + torch.tensor([1.0, -2.0, 4.0]).double())
     assert torch.equal(camera.numbers_ahead(now, -now, 4, 1)[:, move], now[:, move]), "a cut"
+
+
+@pytest.mark.parametrize("cameras", [1, 3])
+def test_pinhole_rays_are_the_twin_s(compiled, cameras):
+    """In every bit, for one camera and for a batch, whose rows have a camera each."""
+    camera = gv.Camera.orbit([0, 40, 80][:cameras], 10, [2.0, 1.0, 3.0][:cameras], 30, 41, 23)
+    camera, device = camera.placed(BOX), DEVICES[compiled]
+    numbers = camera.numbers(device)
+    numbers = numbers if cameras == 1 else numbers.repeat_interleave(23, 0)
+    generator = torch.Generator().manual_seed(1)
+    x = torch.randn((len(numbers), 41), dtype=torch.float64, generator=generator).to(device)
+    y = torch.randn(cameras * 23, dtype=torch.float64, generator=generator).to(device)
+    made = ops.pinhole_rays(x, y, numbers, backend=compiled)
+    twins = ops.pinhole_rays(x.cpu(), y.cpu(), numbers.cpu(), backend="reference")
+    for one, twin in zip(made, twins, strict=True):
+        assert torch.equal(one.cpu(), twin) and len(twin) == cameras * 23 * 41
+    assert torch.allclose(twins[1].norm(dim=1), torch.ones(1, dtype=torch.float64))
+    assert torch.equal(twins[0][-1], numbers[-1, 9:12].cpu())
+    torch.library.opcheck(torch.ops.gvtorch.pinhole_rays.default, (x, y, numbers))
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "camera", "message"),
+    [
+        ((2, 5), (3,), (2, 26), "x_kw must have a row, or 3, got 2"),
+        ((1, 5), (3,), (1, 19), "camera_kc must have 20 columns or more, got 19"),
+        ((1, 5), (3,), (3, 26), "camera_kc must be (1, c) float64"),
+    ],
+)
+def test_pinhole_rays_name_what_is_wrong(x, y, camera, message):
+    given_ = [torch.zeros(shape, dtype=torch.float64) for shape in (x, y, camera)]
+    with pytest.raises(ValueError, match="pinhole_rays: ") as caught:
+        ops.pinhole_rays(*given_)
+    assert message in str(caught.value)
 
 
 def test_rows_are_counted_through_the_batch():

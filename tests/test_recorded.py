@@ -17,7 +17,7 @@ from helpers.recorded import Frames
 from helpers.waits import nobody_waits
 
 import gvtorch as gv
-from gvtorch.base.constants import REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUEST_SUBDIVIDE
+from gvtorch.base.constants import REQUEST_PENDING_SHIFT
 from gvtorch.cache.requests import DEEPER
 from gvtorch.engine import host_frame
 from gvtorch.engine.device_frame import DeviceFrame
@@ -401,8 +401,7 @@ def test_what_the_picture_misses_comes_before_what_the_next_ones_will():
                 _, stats = frames.frame()
             told.append((stats.requests, stats.misses, stats.bricks_used, stats.tiles_used))
             wanted = frames.served._requests[0, 0]
-            kinds = (REQUEST_LOAD, REQUEST_SUBDIVIDE)
-            chosen = torch.cat([frames.served.choose(kind).node for kind in kinds])
+            chosen = torch.cat([one.node for one in frames.served.choose()])
             assert (chosen >= 0).any() and (stats.ahead > 0) == (look_ahead > 0)
             assert torch.isin(chosen[chosen >= 0], wanted.long()).all()
             words = engine.cache.nodes.request_tn

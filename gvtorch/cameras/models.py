@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ..base.records import Rays
+from ..ops import pinhole_rays
 
 CameraModel = Literal["pinhole", "ortho", "fisheye", "panorama"]
 _NEWTON = 20  # steps; each halves the bracket where Newton's leaves it
@@ -125,11 +126,9 @@ class Pinhole(Model):
     """The direction is (x, y, 1)."""
 
     def rays(self, plane: Plane) -> Rays:
-        x, y, rotation = plane.x, plane.y, plane.rotation
-        length = (x * x + (y * y + 1)[:, None]).sqrt_()  # (y, w)
-        across = x[..., None] * rotation[:, None, 0]
-        down = y[:, None] * rotation[:, 1] + rotation[:, 2]
-        return plane.rays((across + down[:, None]).div_(length[..., None]))
+        columns = pinhole_rays(plane.x, plane.y, plane.numbers.contiguous())
+        named = dict(zip(("origin", "direction", "cone", "range"), columns, strict=True))
+        return Rays(**named, width=plane.x.shape[1])
 
 
 class Ortho(Model):

@@ -54,8 +54,9 @@ class DeviceFrame(RecordedFrame):
 
     def serve(self) -> None:
         """Answers the most wanted requests of the last frame."""
-        self._load(self.choose(REQUEST_LOAD).node)
-        self._subdivide(*self.choose(REQUEST_SUBDIVIDE))
+        loads, subdivisions = self.choose()
+        self._load(loads.node)
+        self._subdivide(*subdivisions)
 
     def deepen(self) -> None:
         """Subdivides those nodes that `serve`, or `deepen` before, has just made and that rays will

@@ -116,19 +116,18 @@ class HostFrame(RecordedFrame):
     def finish(self, hits: Hits) -> Collected:
         """And chooses what the host is asked for, which is marked as pending."""
         collected = super().finish(hits)
-        chosen, words = [], self.cache.nodes.request_tn.view(-1)
-        for kind in KINDS.values():
-            node = self.choose(kind).node
+        words, chosen = self.cache.nodes.request_tn.view(-1), self.choose()
+        for kind, (node, _) in zip(KINDS.values(), chosen, strict=True):
             marked = words[node.clamp(min=0)] | kind << REQUEST_PENDING_SHIFT
             put_rows_of(words[:, None], node, marked[:, None])
-            number = self.tree_of(node)
-            loc = self.trees[0].tree.loc(node)
-            for source in self.trees[1:]:  # N may differ
-                mine = (number == source.tree.number)[:, None]
-                loc = torch.where(mine, source.tree.loc(node), loc)
-            chosen.append(torch.cat((node[:, None], number[:, None].to(torch.int64), loc), 1))
-        numbers = torch.cat((collected.numbers, torch.stack(chosen).flatten()))
-        return collected._replace(numbers=numbers)
+        node = torch.cat([one.node for one in chosen])
+        number = self.tree_of(node)
+        loc = self.trees[0].tree.loc(node)
+        for source in self.trees[1:]:  # N may differ
+            mine = (number == source.tree.number)[:, None]
+            loc = torch.where(mine, source.tree.loc(node), loc)
+        rows = torch.cat((node[:, None], number[:, None].to(torch.int64), loc), 1)
+        return collected._replace(numbers=torch.cat((collected.numbers, rows.flatten())))
 
     def _write(self, source: ProducedTree, mail: Mail) -> None:
         """Writes what was sent for one tree; what finds no slot may be asked for again."""

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from ..base.constants import (
     REQUEST_KINDS,
-    REQUEST_LOAD,
     REQUEST_PENDING_SHIFT,
     REQUEST_PRIORITY,
     REQUEST_SUBDIVIDE,
@@ -22,12 +21,11 @@ from ..base.records import Hits
 from ..cache import Cache, RequestList, Scheduler
 from ..cache.requests import levels_wanted
 from ..cache.write import put_rows_of
+from ..ops import choose_requests
 from .request_batch import ProducedTree
 from .stats import Collected, Readbacks
 
 _MOST_LISTED = 1 << 14  # nodes whose requests are sorted
-_AHEAD = 1 << 20  # added to the rank of what the next pictures will miss
-_LAST = 1 << 30  # the rank of what is not asked for
 
 
 class Chosen(NamedTuple):
@@ -111,24 +109,21 @@ class RecordedFrame:
         wide = torch.where((word & REQUEST_SUBDIVIDE) != 0, word & REQUEST_PRIORITY, 0)
         return levels_wanted(wide, self._branching).view(1)
 
-    def choose(self, kind: int) -> Chosen:
-        """Returns what is served first of the lists, as `Scheduler.choose` takes them: what the
-        picture asked for before the rest, and at most as much as there are slots.
+    def choose(self) -> tuple[Chosen, Chosen]:
+        """Returns which loads, and which subdivisions, are served first of the lists, as
+        `Scheduler.choose` takes them: what the picture asked for before the rest, and at most as
+        much as there are slots.
         """
         nodes = self.cache.nodes
-        node_k, word_k = self._requests.transpose(0, 1).flatten(1)
-        asked = (word_k & kind) != 0
-        node = node_k.clamp(min=0).to(torch.int64)
-        depth = nodes.loc_t4[node // nodes.nodes_per_tile, 3].to(torch.int32)
-        level = depth if self._coarse_first else -depth
-        small = REQUEST_PRIORITY - (word_k & REQUEST_PRIORITY)
-        rank = (level * (REQUEST_PRIORITY + 1) + small).view(2, -1)
-        rank = torch.stack((rank[0], rank[1] + _AHEAD)).flatten()
-        rank = torch.where(asked, rank, _LAST)
-        row = rank.argsort(stable=True)[: self.batch]
-        room = self._unused[int(kind == REQUEST_LOAD)]
-        served = asked[row] & (torch.arange(len(row), device=row.device) < room)
-        return Chosen(torch.where(served, node[row], -1), word_k[row] & REQUEST_PRIORITY)
+        node, priority = choose_requests(
+            self._requests,
+            nodes.loc_t4,
+            self._unused,
+            nodes.nodes_per_tile,
+            self.batch,
+            self._coarse_first,
+        )
+        return Chosen(node[0], priority[0]), Chosen(node[1], priority[1])
 
     def tree_of(self, node: Tensor) -> Tensor:
         """(k,) int32 numbers of the trees of nodes (k,); of any where the index is -1."""

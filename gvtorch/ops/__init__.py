@@ -3,6 +3,7 @@ archives and exported programs that hold `gvtorch::` ops can be loaded."""
 
 from .arguments import RayArguments, Samples, Segments, ShadeArguments, TraceArguments
 from .cache import (
+    choose_requests,
     compact_requests,
     cut_bricks,
     lacking,
@@ -15,6 +16,7 @@ from .cache import (
     put_rows,
     unlink,
 )
+from .cameras import pinhole_rays
 from .noise import noise
 from .registry import available
 from .trace import (
@@ -34,6 +36,7 @@ __all__ = [
     "ShadeArguments",
     "TraceArguments",
     "available",
+    "choose_requests",
     "compact_requests",
     "composite",
     "cut_bricks",
@@ -46,6 +49,7 @@ __all__ = [
     "lru_partition",
     "noise",
     "orphan",
+    "pinhole_rays",
     "put_rows",
     "sample_bricks",
     "shade_rays",

@@ -62,6 +62,43 @@ def compact_requests(
 
 
 @op()
+def choose_requests(
+    asked_l2k: Words,  # lists of nodes, -1 for none, and their words; earlier lists first
+    loc_t4: Words,  # of which the depth of each tile's nodes counts
+    room_2: Longs,  # how many tiles and bricks there may be
+    per_tile: Positive,  # nodes of a tile
+    batch: Positive,
+    coarse_first: bool,
+    *,
+    backend: Backend = "auto",
+) -> tuple[Tensor, Tensor]:
+    """Chooses which requests are served: list by list, coarse levels first, or fine ones; then by
+    size on the screen; then in their order.
+
+    Returns:
+        node_2b (2, batch) int64 nodes to load, and nodes to subdivide, the most wanted first, -1
+        behind the last; priority_2b (2, batch) int32 of each.
+    """
+    lists, _, listed = asked_l2k.shape
+    node, word = asked_l2k.transpose(0, 1).flatten(1)
+    known = (node >= 0) & (node < len(loc_t4) * per_tile)
+    tile = torch.where(known, node, 0).to(torch.int64) // per_tile
+    level = loc_t4[tile, 3].to(torch.int64) * (1 if coarse_first else -1)
+    size = word & REQUEST_PRIORITY
+    which = torch.arange(lists, device=node.device).repeat_interleave(listed)
+    rank = (which << 20) + level * (REQUEST_PRIORITY + 1) + REQUEST_PRIORITY - size
+    order = rank.argsort(stable=True)
+    node_2b = torch.full((2, batch), -1, dtype=torch.int64, device=node.device)
+    priority_2b = torch.zeros((2, batch), dtype=torch.int32, device=node.device)
+    for row, kind in enumerate((REQUEST_LOAD, REQUEST_SUBDIVIDE)):
+        wanted = order[known[order] & ((word[order] & kind) != 0)]
+        chosen = wanted[: min(batch, int(room_2[1 - row]))]
+        node_2b[row, : len(chosen)] = node[chosen].to(torch.int64)
+        priority_2b[row, : len(chosen)] = size[chosen]
+    return node_2b, priority_2b
+
+
+@op()
 def lru_partition(
     order_k: Words,  # slots; those that are never given away are not among them
     stamp_s: Words,  # last frame that used each slot

@@ -22,6 +22,8 @@ Longs = Annotated[Tensor, torch.int64]
 Requests = Annotated[Tensor, torch.int16]
 Flags = Annotated[Tensor, torch.bool]
 Bytes = Annotated[Tensor, torch.uint8]
+Doubles = Annotated[Tensor, torch.float64]
+_DTYPES = (torch.int32, torch.int64, torch.int16, torch.bool, torch.uint8, torch.float64)
 _Twin = TypeVar("_Twin", bound=Callable[..., Any])
 
 
@@ -55,8 +57,8 @@ def op(also: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
     the twin, as its argument `backend` says: auto, reference, cpp or cuda.
 
     Tensors must be contiguous, on one device, and of the shape that their name ends with (of any,
-    if it has no such end) and the dtype of Words, Longs, Requests, Flags or Bytes; numbers inside
-    their range. Else the op raises ValueError.
+    if it has no such end) and the dtype of Words, Longs, Requests, Flags, Bytes or Doubles; numbers
+    inside their range. Else the op raises ValueError.
 
     Args:
         also: One more check, which gets the arguments by name.
@@ -71,7 +73,7 @@ def op(also: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
         places = {name: place for place, name in enumerate(names)}
         tensors = [
             (places[name], name, check.shape_of(name) if "_" in name else "", dtype)
-            for dtype in (torch.int32, torch.int64, torch.int16, torch.bool, torch.uint8)
+            for dtype in _DTYPES
             for name, mark in marks.items()
             if mark == dtype
         ]
@@ -174,6 +176,11 @@ def _cut_bricks(*, values_zyxc: Tensor, place_k3: Tensor, brick_size: int, borde
     return values_zyxc.new_empty((place_k3.shape[0], side, side, side, values_zyxc.shape[3]))
 
 
+def _pinhole_rays(*, x_kw: Tensor, y_h: Tensor, **_: Any) -> tuple[Tensor, ...]:
+    rays = y_h.shape[0] * x_kw.shape[1]
+    return tuple(x_kw.new_empty((rays, width)) for width in (3, 3, 2, 2))
+
+
 def _voxelize(
     *, low_k3: Tensor, side: int, shares: bool, weights: bool, wide: bool, **_: Any
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -199,6 +206,10 @@ FAKES: dict[str, Callable[..., Any]] = {
         request_tn.new_empty((capacity,), dtype=torch.int32),
         request_tn.new_empty((3,), dtype=torch.int64),
     ),
+    "choose_requests": lambda *, asked_l2k, batch, **_: (
+        asked_l2k.new_empty((2, batch), dtype=torch.int64),
+        asked_l2k.new_empty((2, batch)),
+    ),
     "lru_partition": lambda *, order_k, **_: (
         torch.empty_like(order_k),
         order_k.new_empty((1,), dtype=torch.int64),
@@ -206,6 +217,7 @@ FAKES: dict[str, Callable[..., Any]] = {
     "locate": lambda *, node_k, **_: node_k.new_empty((node_k.shape[0], 4)),
     "lacking": lambda *, node_k, **_: torch.empty_like(node_k, dtype=torch.bool),
     "cut_bricks": _cut_bricks,
+    "pinhole_rays": _pinhole_rays,
     "voxelize": _voxelize,
     "noise": lambda *, point_pn, **_: point_pn.new_empty((point_pn.shape[0],)),
     **dict.fromkeys(

@@ -332,6 +332,12 @@ def test_arguments_of_ops(blobs):
         "trace_rays": (*rays, *given),
         "count_segments": (*rays, *given, None, 0, False),
         "compact_requests": (request, 8),
+        "choose_requests": (
+            order.view(1, 2, 4) << 9,
+            tree.nodes.loc_t4,
+            torch.arange(2) + 2,
+            *(8, 3, True),
+        ),
         "lru_partition": (order, order.clone(), torch.ones(1, dtype=torch.int32)),
         "locate": (tree.nodes.loc_t4, torch.arange(8), 2, 8),
         "cut_bricks": (torch.rand(8, 8, 8, 1), torch.zeros((2, 3), dtype=torch.int64), 4, 1),

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "entry/entry_cache.h"
+#include "entry/entry_camera.h"
 #include "entry/entry_mesh.h"
 #include "entry/entry_noise.h"
 #include "packets/processor.h"
@@ -72,11 +73,13 @@ STABLE_TORCH_LIBRARY(gvtorch, library) {
   gvtorch::define(library, gvtorch::SegmentOps{});
   gvtorch::define(library, gvtorch::CacheOps{});
   gvtorch::define(library, gvtorch::MeshOps{});
+  gvtorch::define(library, gvtorch::CameraOps{});
   gvtorch::define(library, gvtorch::NoiseOps{});
 }
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) {
   gvtorch::implement(library, gvtorch::CacheOps{});
   gvtorch::implement(library, gvtorch::MeshOps{});
+  gvtorch::implement(library, gvtorch::CameraOps{});
   gvtorch::implement(library, gvtorch::NoiseOps{});
 }

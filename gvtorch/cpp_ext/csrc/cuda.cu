@@ -4,6 +4,7 @@
 #include <cub/block/block_scan.cuh>
 
 #include "entry/entry_cache.h"
+#include "entry/entry_camera.h"
 #include "entry/entry_mesh.h"
 #include "entry/entry_noise.h"
 #include "entry/entry_segments.h"
@@ -112,5 +113,6 @@ STABLE_TORCH_LIBRARY_IMPL(gvtorch, CUDA, library) {
   gvtorch::implement(library, gvtorch::SegmentOps{});
   gvtorch::implement(library, gvtorch::CacheOps{});
   gvtorch::implement(library, gvtorch::MeshOps{});
+  gvtorch::implement(library, gvtorch::CameraOps{});
   gvtorch::implement(library, gvtorch::NoiseOps{});
 }

@@ -93,6 +93,28 @@ GV_HD void store_byte(uint8_t* byte, uint8_t value) {
 #endif
 }
 
+// Adds to a sum that other threads add to as well.
+template <class T>
+GV_HD void add_to(T* sum, T value) {
+#ifdef __CUDA_ARCH__
+  atomicAdd(sum, value);
+#else
+  T seen = *sum;
+  T next = seen + value;
+  while (!__atomic_compare_exchange(sum, &seen, &next, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) next = seen + value;
+#endif
+}
+// Raises a number that other threads raise as well.
+GV_HD void raise_to(int32_t* count, int32_t least) {
+#ifdef __CUDA_ARCH__
+  atomicMax(count, least);
+#else
+  int32_t seen = __atomic_load_n(count, __ATOMIC_RELAXED);
+  while (seen < least && !__atomic_compare_exchange_n(count, &seen, least, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
+  }
+#endif
+}
+
 // Joins a request into a request word, which is never negative: kind bits (above kPriorityMask) by OR, priority by
 // maximum. Commutative, so the word does not depend on the order of the rays.
 constexpr int32_t kPriorityMask = 0x7ff;

@@ -77,6 +77,83 @@ struct ListRequests {
   }
 };
 
+// lists, listed, tiles
+#define GV_CHOOSE_REQUESTS(X)             \
+  X(Words, asked_l2k, 2 * lists * listed) \
+  X(Words, loc_t4, 4 * tiles)             \
+  X(Longs, room_2, 2)                     \
+  X(Int, per_tile, kAny)                  \
+  X(Int, batch, kAny)                     \
+  X(Bool, coarse_first, kAny)
+
+constexpr int64_t kUnranked = INT64_MAX;  // no request of a node of the pool
+constexpr int64_t kComparedAtOnce = 256;
+
+struct ChooseArgs {
+  GV_CHOOSE_REQUESTS(GV_VIEW)
+  int64_t lists, listed, tiles;
+  int64_t* rank_lk;             // the lower, the more wanted
+  int32_t *end_l, *before_2lk;  // behind a list's last request; how many loads, and subdivisions, are wanted more
+  int64_t* node_2b;             // loads, then subdivisions
+  int32_t* priority_2b;
+
+  GV_HD int64_t parts() const { return (listed + kComparedAtOnce - 1) / kComparedAtOnce; }  // of a list
+  GV_HD int64_t node_at(int64_t index) const { return asked_l2k[index + index / listed * listed]; }
+  GV_HD int32_t word_at(int64_t index) const { return asked_l2k[index + (index / listed + 1) * listed]; }
+};
+
+// Ranks requests, and empties what is given.
+struct RankRequests : ChooseArgs {
+  GV_HD void operator()(int64_t index) const {
+    if (index < int64_t{2} * batch) {
+      node_2b[index] = -1;
+      priority_2b[index] = 0;
+    }
+    if (index >= lists * listed) return;
+    const int64_t node = node_at(index), list = index / listed;
+    const int32_t word = word_at(index);
+    rank_lk[index] = kUnranked;
+    if (node < 0 || node >= tiles * per_tile || (word & kKinds) == 0) return;
+    const int64_t depth = loc_t4[4 * (node / per_tile) + 3];
+    const int32_t small = kPriorityMask - (word & kPriorityMask);
+    rank_lk[index] = (list << 20) + (coarse_first ? depth : -depth) * (kPriorityMask + 1) + small;
+    raise_to(&end_l[list], static_cast<int32_t>(index % listed + 1));
+  }
+};
+
+// Compares a request with those of a part of a list. Most frames have some hundred of them: to compare each with each
+// costs less than to sort the places of as many as there may be.
+struct CompareRequests : ChooseArgs {
+  GV_HD void operator()(int64_t number) const {
+    const int64_t index = number % (lists * listed), part = number / (lists * listed), list = part / parts();
+    const int64_t rank = rank_lk[index], first = part % parts() * kComparedAtOnce;
+    const int64_t end = smaller<int64_t>(end_l[list], first + kComparedAtOnce);
+    if (rank == kUnranked) return;
+    int32_t loads = 0, subdivisions = 0;
+    for (int64_t other = list * listed + first; other < list * listed + end; ++other) {
+      if (rank_lk[other] > rank || (rank_lk[other] == rank && other >= index)) continue;
+      const int32_t kinds = word_at(other);
+      loads += (kinds & kLoad) != 0;
+      subdivisions += (kinds & kSubdivide) != 0;
+    }
+    if (loads > 0) add_to(&before_2lk[index], loads);
+    if (subdivisions > 0) add_to(&before_2lk[lists * listed + index], subdivisions);
+  }
+};
+
+struct ServeRequests : ChooseArgs {
+  GV_HD void operator()(int64_t index) const {
+    if (rank_lk[index] == kUnranked) return;
+    const int32_t word = word_at(index);
+    for (int64_t which = 0; which < 2; ++which) {
+      const int64_t place = before_2lk[which * lists * listed + index], room = room_2[1 - which];  // tiles, bricks
+      if ((word & (which == 0 ? kLoad : kSubdivide)) == 0 || place >= smaller<int64_t>(batch, room)) continue;
+      node_2b[which * batch + place] = node_at(index);
+      priority_2b[which * batch + place] = word & kPriorityMask;
+    }
+  }
+};
+
 // --- The order of use
 
 #define GV_LRU_PARTITION(X) X(Words, order_k, kAny) X(Words, stamp_s, kAny) X(Words, frame_1, 1)

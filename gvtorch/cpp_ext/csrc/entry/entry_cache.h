@@ -28,6 +28,31 @@ inline auto run(const CompactRequestsOp& a) {
   return std::make_tuple(node_k, word_k, count_3);
 }
 
+GV_OP(ChooseRequestsOp, "choose_requests", GV_CHOOSE_REQUESTS, "(Tensor node_2b, Tensor priority_2b)");
+
+inline auto run(const ChooseRequestsOp& a) {
+  const Like like{a.asked_l2k};
+  STD_TORCH_CHECK(a.asked_l2k.dim() == 3, "gvtorch: asked_l2k must be (l, 2, k)");
+  const int64_t lists = a.asked_l2k.size(0), listed = a.asked_l2k.size(2), tiles = a.loc_t4.numel() / 4;
+  ChooseArgs args{};
+  GV_CHOOSE_REQUESTS(GV_TAKE)
+  STD_TORCH_CHECK(a.batch >= 1 && a.per_tile >= 1 && lists < 512, "gvtorch: no batch, no nodes, or too many lists");
+  args.lists = lists;
+  args.listed = listed;
+  args.tiles = tiles;
+  const int64_t requests = lists * listed;
+  const Tensor rank_lk = give(args.rank_lk, a.asked_l2k, {requests});
+  const Tensor counts = torch::stable::new_zeros(a.asked_l2k, {2 * requests + lists});
+  args.before_2lk = lay(counts);
+  args.end_l = args.before_2lk + 2 * requests;
+  Tensor node_2b = give(args.node_2b, a.asked_l2k, {2, a.batch});
+  Tensor priority_2b = give(args.priority_2b, a.asked_l2k, {2, a.batch});
+  for_each(a.asked_l2k, std::max(requests, 2 * a.batch), RankRequests{args});
+  for_each(a.asked_l2k, requests * lists * args.parts(), CompareRequests{args});
+  for_each(a.asked_l2k, requests, ServeRequests{args});
+  return std::make_tuple(node_2b, priority_2b);
+}
+
 GV_OP(LruPartitionOp, "lru_partition", GV_LRU_PARTITION, "(Tensor order_k, Tensor unused_1)");
 
 inline auto run(const LruPartitionOp& a) {
@@ -197,7 +222,7 @@ inline Tensor run(const CutBricksOp& a) {
   return bricks_kzyxc;
 }
 
-using CacheOps = Types<CompactRequestsOp, LruPartitionOp, UnlinkOp, OrphanOp, LinkOp, LinkBricksOp, LinkTilesOp,
-                       PutRowsOp, LocateOp, LackingOp, CutBricksOp>;
+using CacheOps = Types<CompactRequestsOp, ChooseRequestsOp, LruPartitionOp, UnlinkOp, OrphanOp, LinkOp, LinkBricksOp,
+                       LinkTilesOp, PutRowsOp, LocateOp, LackingOp, CutBricksOp>;
 
 }  // namespace gvtorch

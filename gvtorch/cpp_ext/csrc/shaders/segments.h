@@ -195,18 +195,6 @@ struct WriteSegments {
   }
 };
 
-// Adds to a sum that other threads add to as well.
-template <class T>
-GV_HD void add_to(T* sum, T value) {
-#ifdef __CUDA_ARCH__
-  atomicAdd(sum, value);
-#else
-  T seen = *sum;
-  T next = seen + value;
-  while (!__atomic_compare_exchange(sum, &seen, &next, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) next = seen + value;
-#endif
-}
-
 // A channel of a dtype that the compiler knows.
 template <class Voxel>
 struct BrickView {
