@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..base.constants import CONSTANT, EMPTY, REQUEST_LOAD, REQUEST_SUBDIVIDE
+from ..base.constants import CONSTANT, EMPTY, REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
 from ..cache import Cache, Scheduler
-from ..cache.requests import below
+from ..cache.requests import below, levels_wanted
 from ..cache.write import Put, Targets, put_bricks, put_rows_of, put_tiles, put_uniform
 from ..producers import Region
 from ..producers.answer import checked_bricks, checked_regions
@@ -69,6 +69,12 @@ class DeviceFrame(RecordedFrame):
         needs its bricks first.
         """
         return 0 if self._by_level else readbacks.deeper
+
+    def _levels(self) -> Tensor:
+        word = self._requests[:, 1].flatten()
+        wide = torch.where((word & REQUEST_SUBDIVIDE) != 0, word & REQUEST_PRIORITY, 0)
+        branching = max(source.layout.branching for source in self.trees)
+        return levels_wanted(wide, branching).view(1)
 
     def _load(self, chosen: Tensor) -> None:
         """Loads nodes (batch,)."""

@@ -14,12 +14,9 @@ from torch import Tensor
 from ..base.constants import (
     REQUEST_KINDS,
     REQUEST_PENDING_SHIFT,
-    REQUEST_PRIORITY,
-    REQUEST_SUBDIVIDE,
 )
 from ..base.records import Hits
 from ..cache import Cache, RequestList, Scheduler
-from ..cache.requests import levels_wanted
 from ..cache.write import put_rows_of
 from ..ops import choose_requests
 from .request_batch import ProducedTree
@@ -53,21 +50,22 @@ class RecordedFrame:
         self._coarse_first = scheduler.order == "coarse"
         self._most = min(_MOST_LISTED, cache.nodes.request_tn.numel())
         device = cache.frame_1.device
-        self._branching = max(source.layout.branching for source in trees)
         # What the last picture asked for, and what the next ones will: nodes and their words.
         self._requests = torch.zeros((2, 2, self._most), dtype=torch.int32, device=device)
         self._unused = torch.zeros(2, dtype=torch.int64, device=device)  # tiles, bricks
         # Since the last frame: tiles and bricks that were made, nodes that need none, tiles and
         # bricks that were replaced, nodes that failed.
         self._made = self._unused.new_zeros(6)
+        self._none = self._unused.new_zeros(1)
 
-    def draw(self, trace: Callable[[], Hits]) -> Hits:
-        """Traces the picture, and lists what it asks for."""
+    def draw(self, trace: Callable[[], Hits], ahead: bool = False) -> Hits:
+        """Traces the picture, and lists what it asks for. `ahead`: `look` may follow."""
         self.cache.frame_1.add_(1)
         hits = trace()
-        self._seen = self._list(0)
-        self._requests[1].zero_()
-        self._used = self.cache.used()
+        self._seen, self._ahead = self._list(0), ahead
+        if ahead:
+            self._requests[1].zero_()
+            self._used = self.cache.used()
         return hits
 
     def look(self, trace: Callable[[], Hits]) -> None:
@@ -94,20 +92,21 @@ class RecordedFrame:
         """Brings slots into the order of use and counts; what the picture used is counted apart
         from what `look` used.
         """
-        use = self.cache.sort_by_use()
+        use, ahead = self.cache.sort_by_use(), self._none
         self._unused.copy_(use[0:4:2])
-        use[1:4:2] = self._used
+        if self._ahead:
+            use[1:4:2] = self._used
+            ahead = (self._requests[1, 1] & REQUEST_KINDS).count_nonzero().view(1)
         samples = hits.samples.sum(dtype=torch.int64).view(1)
-        ahead = (self._requests[1, 1] & REQUEST_KINDS).count_nonzero().view(1)
         numbers = torch.cat((self._seen.count, use, samples, self._made, ahead, self._levels()))
         self._made.zero_()
         return Collected(self._seen, numbers)
 
     def _levels(self) -> Tensor:
-        """(1,) int64 levels that are wanted below the first by what is to be subdivided, summed."""
-        word = self._requests[:, 1].flatten()
-        wide = torch.where((word & REQUEST_SUBDIVIDE) != 0, word & REQUEST_PRIORITY, 0)
-        return levels_wanted(wide, self._branching).view(1)
+        """(1,) int64 levels that are wanted below the first by what is to be subdivided, summed; 0
+        where no frame deepens a tree by several.
+        """
+        return self._none
 
     def choose(self) -> tuple[Chosen, Chosen]:
         """Returns which loads, and which subdivisions, are served first of the lists, as

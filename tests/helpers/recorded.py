@@ -64,7 +64,7 @@ class Frames:
             if ahead is not None:
                 ahead.follow(self.camera, numbers, stale)
             self.view.numbers.copy_(numbers)
-            hits = self.served.draw(self.view.hits)
+            hits = self.served.draw(self.view.hits, ahead is not None)
             if ahead is not None and ahead.due:
                 self.served.look(ahead.hits)
             collected = self.served.finish(hits)
