@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tensorstore  # noqa: F401  # it looks for NumPy's own functions when it is loaded
 import torch
 from helpers.pictures import GRAY
 from helpers.stores import assert_holds, noise
@@ -218,7 +219,7 @@ def test_a_frame_that_finds_no_memory_leaves_the_pools_in_order(blobs):
             engine.validate()
         if operations.calls <= number:
             break
-        step = max(step, operations.calls // 12)
+        step = max(step, operations.calls // 60)  # one in 45 falls where a tile changes hands
         number += step
     assert failed > 8
 

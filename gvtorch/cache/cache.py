@@ -176,7 +176,9 @@ class Cache:
     def validate(self) -> None:
         """Raises ValueError unless every slot is where the order, its owner and all pointers say.
 
-        Pointers that lead nowhere are found by `N3Tree.validate`.
+        Pointers that lead nowhere are found by `N3Tree.validate`. Words of a tile that hangs in no
+        tree count for nothing: one that changes hands when memory runs out keeps its old ones until
+        it is given away again.
         """
         nodes, bricks = self.nodes, self.bricks
         sizes = (nodes.capacity, bricks.capacity)
@@ -184,14 +186,17 @@ class Cache:
             order = torch.cat([lru.order for lru in group]).sort().values
             if not torch.equal(order, torch.arange(capacity - len(order), capacity).to(order)):
                 raise ValueError("Cache: the order of use is no permutation of the slots")
-        for what, owner, pointer, shared in (
-            ("brick", bricks.owner_b, nodes.brick_tn.view(-1), bricks.shared_b),
-            ("tile", nodes.parent_t, nodes.child_tn.view(-1), nodes.shared_t),
+        hangs = (nodes.parent_t >= 0) | nodes.shared_t
+        hangs[: len(self.finest)] = True  # the roots
+        for what, owner, words, shared in (
+            ("brick", bricks.owner_b, nodes.brick_tn, bricks.shared_b),
+            ("tile", nodes.parent_t, nodes.child_tn, nodes.shared_t),
         ):
             slot = (owner >= 0).nonzero()[:, 0]
-            if bool((pointer[owner[slot].to(torch.int64)] != slot).any()):
+            if bool((words.view(-1)[owner[slot].to(torch.int64)] != slot).any()):
                 raise ValueError(f"Cache: a {what}'s owner does not point to it")
-            named = pointer[pointer >= 0].to(torch.int64)
+            named = words[hangs]
+            named = named[named >= 0].to(torch.int64)
             if bool(((owner[named] < 0) & ~shared[named]).any()):
                 raise ValueError(f"Cache: a pointer leads to a {what} without an owner")
 

@@ -145,6 +145,46 @@ GV_HD void load_rows(const void* base, Ints offset, Floats row[4]) {
 #endif
 }
 
+// Two such rows, one behind the other: wider loads, and half as many.
+GV_HD void load_row_pairs(const void* base, Ints offset, Floats first[4], Floats second[4]) {
+#if defined(__AVX2__)
+  int32_t lane[kLanes];
+  memcpy(lane, &offset, sizeof(lane));
+  const auto eight = [&](int i) {
+    return _mm256_loadu_ps(reinterpret_cast<const float*>(static_cast<const char*>(base) + lane[i]));
+  };
+  Native half[2][4];  // of four or eight lanes, each number of the first row, then of the second, by turns
+  for (int h = 0; h < 2; ++h) {
+    Native own[4];
+    for (int i = 0; i < 4; ++i) {
+#if defined(__AVX512F__)
+      own[i] = _mm512_insertf32x8(_mm512_castps256_ps512(eight(8 * h + i)), eight(8 * h + i + 4), 1);
+#else
+      own[i] = eight(4 * h + i);
+#endif
+    }
+    const Native a = GV_MM(unpacklo_ps)(own[0], own[1]), b = GV_MM(unpacklo_ps)(own[2], own[3]);
+    const Native c = GV_MM(unpackhi_ps)(own[0], own[1]), d = GV_MM(unpackhi_ps)(own[2], own[3]);
+    half[h][0] = GV_MM(shuffle_ps)(a, b, 0x44);
+    half[h][1] = GV_MM(shuffle_ps)(a, b, 0xee);
+    half[h][2] = GV_MM(shuffle_ps)(c, d, 0x44);
+    half[h][3] = GV_MM(shuffle_ps)(c, d, 0xee);
+  }
+  for (int i = 0; i < 4; ++i) {
+#if defined(__AVX512F__)
+    first[i] = (Floats)_mm512_shuffle_f32x4(half[0][i], half[1][i], 0x88);
+    second[i] = (Floats)_mm512_shuffle_f32x4(half[0][i], half[1][i], 0xdd);
+#else
+    first[i] = (Floats)_mm256_permute2f128_ps(half[0][i], half[1][i], 0x20);
+    second[i] = (Floats)_mm256_permute2f128_ps(half[0][i], half[1][i], 0x31);
+#endif
+  }
+#else
+  load_rows(base, offset, first);
+  load_rows(static_cast<const char*>(base) + 16, offset, second);
+#endif
+}
+
 // The voxel in the low bytes of each word, as a number.
 template <class Voxel>
 struct Unpack;

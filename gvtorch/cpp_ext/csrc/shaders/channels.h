@@ -47,8 +47,8 @@ struct ChannelRows : Transfer<T> {
   GV_HD Row<V> look_up(V value, IntOf<V> level, MaskOf<V> which) const {
     const Cell<V> cell = this->find(value);
     const auto index = static_cast<typename LanesOf<V>::Index>(level) * stride + cell.row;
-    const auto a = this->row_at(index, 0), b = this->row_at(index, 1);
-    return make_row<V>(which, [&](int column) { return a[column] + cell.weight * (b[column] - a[column]); });
+    const RowPair<V> pair = this->rows_at(index);
+    return make_row<V>(which, [&](int column) { return pair.at(cell.weight, column); });
   }
 };
 

@@ -111,7 +111,7 @@ struct Labels : ShaderFacts {
       label = probe.value_in(spot, cell[0], cell[1], cell[2]);
     }
     look.label = row_of(places, label);
-    Row<T> row = places.row_at((odd ? 0 : level) * places.rows + look.label, 0);
+    Row<T> row = load_row(&places.table_lm[(odd ? 0 : level) * places.rows + look.label]);
     if (!(row.alpha > 0)) return look;
     if (odd) row.alpha = stretch(row.alpha, length / step);
     if (own_numbers<Own>(light.parameters).lit > 0) {

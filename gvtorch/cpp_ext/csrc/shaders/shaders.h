@@ -262,11 +262,9 @@ struct PreIntegrated : ShaderFacts {
     const Cell<V> front = places.find(from), back = places.find(to);
     const int32_t rows = places.rows;
     const auto index = (static_cast<typename LanesOf<V>::Index>(level) * rows + front.row) * rows + back.row;
-    const auto a = places.row_at(index, 0), b = places.row_at(index, 1);
-    const auto c = places.row_at(index, rows), d = places.row_at(index, rows + 1);
+    const RowPair<V> nearer = places.rows_at(index), farther = places.rows_at(index, rows);
     return make_row<V>(which, [&](int column) {
-      const V near = a[column] + back.weight * (b[column] - a[column]);
-      const V far = c[column] + back.weight * (d[column] - c[column]);
+      const V near = nearer.at(back.weight, column), far = farther.at(back.weight, column);
       return near + front.weight * (far - near);
     });
   }

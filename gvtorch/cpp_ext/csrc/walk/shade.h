@@ -47,6 +47,13 @@ GV_HD Row<T> load_row(const Row<T>* row) {
   return *row;
 }
 
+template <class T>
+struct RowPair {
+  Row<T> first, second;
+
+  GV_HD T at(T weight, int column) const { return first[column] + weight * (second[column] - first[column]); }
+};
+
 // Where a value stands in the table: between two rows.
 template <class T>
 struct Cell {
@@ -121,13 +128,16 @@ struct Transfer {
     return {row, place - to_real<V>(row)};
   }
 
-  // The row `index`, or the one that lies so many behind it.
-  GV_HD Row<T> row_at(int32_t index, int32_t behind) const { return load_row(&table_lm[index + behind]); }
+  // The row so many behind `index`, and the next one.
+  GV_HD RowPair<T> rows_at(int32_t index, int32_t behind = 0) const {
+    const Row<T>* const row = table_lm + (index + behind);
+    return {load_row(row), load_row(row + 1)};
+  }
 #ifndef __CUDACC__
-  GV_HD Row<Floats> row_at(Ints index, int32_t behind) const {
-    Row<Floats> row;
-    load_rows(table_lm + behind, index << 4, &row.red);
-    return row;
+  GV_HD RowPair<Floats> rows_at(Ints index, int32_t behind = 0) const {
+    RowPair<Floats> rows;
+    load_row_pairs(table_lm + behind, index << 4, &rows.first.red, &rows.second.red);
+    return rows;
   }
 #endif
 
@@ -136,8 +146,8 @@ struct Transfer {
   GV_HD Row<V> look_up(V value, IntOf<V> level, MaskOf<V> which = all_lanes<V>()) const {
     const Cell<V> cell = find(value);
     const auto index = static_cast<typename LanesOf<V>::Index>(level) * rows + cell.row;
-    const auto a = row_at(index, 0), b = row_at(index, 1);
-    return make_row<V>(which, [&](int column) { return a[column] + cell.weight * (b[column] - a[column]); });
+    const RowPair<V> pair = rows_at(index);
+    return make_row<V>(which, [&](int column) { return pair.at(cell.weight, column); });
   }
 
   // No value between the two is seen. They are taken a little apart: interpolation may round beyond its ends.
