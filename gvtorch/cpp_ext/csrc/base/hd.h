@@ -68,7 +68,8 @@ GV_HD T number(Half voxel) {
 }
 
 // Stamps: many rays store the same value, so a relaxed store is enough; the read first spares the cache line. On a GPU
-// it comes from the nearest cache: what is old there costs a store more, where the whole GPU's word is 200 cycles away.
+// it may come from the first-level cache, which is not kept up to date: an old value there costs one more store, while
+// a read past it (volatile) waits some 200 cycles.
 GV_HD void store_stamp(int32_t* word, int32_t stamp) {
 #ifdef __CUDA_ARCH__
   if (*word != stamp) *word = stamp;

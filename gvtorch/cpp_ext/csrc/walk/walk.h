@@ -122,9 +122,10 @@ struct Walk {
     }
   }
 
-  // Rays of a warp sample together, each as many intervals as its node has: those that come through a corner of another
-  // node would fall behind the others, and the whole warp take as long in each node as its longest piece of a ray. So a
-  // ray that is farther than the side of a node from the warp's last one waits. The last one never does.
+  // Whether a ray waits for the others of its warp (on CUDA; results do not depend on it). In each turn a warp visits
+  // one node a ray and samples as long as the ray with the most intervals there. Rays that cut a corner of one more
+  // node fall a turn behind, and then long and short runs fall together. So a ray waits while it is more than the side
+  // of a node ahead of the warp's hindmost one, which never waits.
   GV_HD bool is_ahead(T start, int32_t wanted) const {
     return start - smallest_together(start) > levels.voxel[wanted] * levels.scale[0];
   }
