@@ -11,34 +11,30 @@ around it that holds the orbits of all points of the box (`Iteration.ranges` bou
 stretches there). That bounds where and when they escape, and so the very number that `forward`
 gives, whatever it means.
 
-Sources: White, Nylander, "The Mandelbulb", 2009 (z^n in spherical coordinates); Lowe, "Mandelbox",
-    2010; Hart, Sandin, Kauffman, "Ray tracing deterministic 3-D fractals", SIGGRAPH 1989 (distance
-    estimates of escape-time fractals); Pickover, "Computers, pattern, chaos, and beauty", 1990
-    (orbit traps).
+Sources: ops/reference/orbits.py, which follows the orbits; Pickover, "Computers, pattern, chaos, and
+    beauty", 1990 (orbit traps).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
+from .. import ops
 from ..base import check
+from ..ops.reference import orbits as plain
 from .distance import Color, Distance
 from .field import Interval, joined, length, parts_of
 
 _PARTS = 2  # of a box along each axis: more cost as much as the bricks that they save
-_FAR = 1e3  # a box's orbits that get so far apart tell nothing any more
-_INSIDE = 1.0  # world units that the fractal's inside is told to be deep: no estimate is known
 
 
 class Iteration(nn.Module):
     """One step of an orbit, without the constant that is added. Points are (3, ...)."""
 
     logarithmic: bool = True  # |z| grows as a power; else by a factor
-    rounds_alike: bool = False  # it takes + - * /, roots and comparisons alone
 
     def forward(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Returns f(z) and (...,) how far it takes neighbours apart, by unit of their distance."""
@@ -49,13 +45,11 @@ class Iteration(nn.Module):
         points apart, by unit of their distance, and the smallest and largest of `forward`'s second
         answers, (k,) each. Unless overridden, nothing is known, so nothing is proven.
         """
-        return torch.full_like(reach, math.inf), torch.zeros_like(reach), reach + math.inf
+        return torch.full_like(reach, torch.inf), torch.zeros_like(reach), reach + torch.inf
 
 
 class Power(Iteration):
     """z^n in spherical coordinates: |z|^n, and both angles n times."""
-
-    rounds_alike = True
 
     def __init__(self, power: int) -> None:
         """Takes n."""
@@ -63,30 +57,10 @@ class Power(Iteration):
         self.power = check.whole("Power", "power", power, low=2, high=64)
 
     def forward(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Two complex powers: of z + i rho, whose angle is that from the axis, and of the direction
-        (x + i y) / rho; rho is the distance from the axis.
-        """
-        x, y, up = z.unbind(0)
-        away = (x * x + y * y).clamp(min=1e-30).sqrt()
-        radius = (away * away + up * up).sqrt()
-        cosine, sine = _power(x / away, y / away, self.power)
-        height, width = _power(up, away, self.power)
-        raised = torch.stack((width * cosine, width * sine, height))
-        return raised, self.power * _product(radius, self.power - 1)
+        return plain.power(z, self.power)
 
     def ranges(self, z: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Along radius and meridian n r^(n-1), along the circle of latitude that times
-        |sin(n angle) / sin(angle)|, which is at most n. The angle, which is that from the axis,
-        changes by at most asin(reach / r) in a ball.
-        """
-        n, radius, away = self.power, z.norm(dim=0), z[:2].norm(dim=0)
-        least, most = (radius - reach).clamp(min=0), radius + reach
-        sine = (away - reach).clamp(min=0) / most.clamp(min=1e-30)
-        change = (reach / radius.clamp(min=1e-30)).clamp(max=1).asin()
-        turned = (n * torch.atan2(away, z[2])).sin().abs() + n * change
-        turn = (turned.clamp(max=1) / sine.clamp(min=1 / n)).clamp(min=1, max=n)
-        low, high = n * least ** (n - 1), n * most ** (n - 1)
-        return high * turn, low, high
+        return plain.power_ranges(z, reach, self.power)
 
 
 class Fold(Iteration):
@@ -94,7 +68,7 @@ class Fold(Iteration):
     of radius 1/2 and 1, and all is scaled.
     """
 
-    logarithmic, rounds_alike = False, True
+    logarithmic = False
 
     def __init__(self, scale: float) -> None:
         """Takes the scale; its size must be more than 1."""
@@ -111,17 +85,17 @@ class Fold(Iteration):
         return 2 * (self.scale + 1) / (self.scale - 1) if self.scale > 1 else 2.0
 
     def forward(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        folded = 2 * z.clamp(-1, 1) - z
-        grown = 1 / _squared(folded).clamp(0.25, 1.0)
-        return folded * (grown * self.scale), grown * abs(self.scale)
+        return plain.fold(z, self.scale)
 
     def ranges(self, z: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The fold takes nothing apart, inversion at most by 1 / r^2."""
-        radius = (2 * z.clamp(-1, 1) - z).norm(dim=0)
-        near = (radius - reach).clamp(0.5, 1.0)
-        far = (radius + reach).clamp(0.5, 1.0)
-        high = abs(self.scale) / (near * near)
-        return high, abs(self.scale) / (far * far), high
+        return plain.fold_ranges(z, reach, self.scale)
+
+
+def _compiled_step(iteration: Iteration) -> tuple[str, float] | None:
+    """A step that the ops know, by its kind and number; None for a step of one's own."""
+    if type(iteration) is Power:
+        return "power", iteration.power
+    return ("fold", iteration.scale) if type(iteration) is Fold else None
 
 
 class Fractal(Distance):
@@ -167,59 +141,36 @@ class Fractal(Distance):
         self.register_buffer("colors_33", check.reals(where, "colors", colors, (3, 3)).clamp(0, 1))
 
     def forward(self, points: Tensor) -> Tensor:
-        return self._orbit(points, traps=False)[0]
+        return self._orbits(points)[0]
 
     def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        value, near, plane = self._orbit(points, traps=True)
+        value, near, plane = self._orbits(points)
         one, two, three = self.colors_33.to(points)
         color = torch.lerp(three, two, (1 - plane[..., None]).clamp(0, 1) ** 4)
         return value, torch.lerp(color, one, (1.2 - near[..., None]).clamp(0, 1) ** 2)
 
-    def _orbit(self, points: Tensor, traps: bool) -> tuple[Tensor, Tensor, Tensor]:
-        """Distance, and how near the orbit came to the origin and to a plane of two axes, (...,)
-        each.
+    def _orbits(self, points: Tensor) -> Tensor:
+        """(3, ...) distances, and how near the orbits came to the origin and to a plane of two
+        axes.
         """
-        z = points.movedim(-1, 0).reshape(3, -1).contiguous()
-        constant = self.constant.to(z)[:, None] if self.julia else z
-        radius = length(points).flatten()
-        state = [torch.ones_like(radius), radius, *([radius, z.abs().amin(0)] if traps else [])]
-        whole, rows = state, None
-        looks = points.device.type == "cpu" and self.iteration.rounds_alike
-        looks = looks and not (points.requires_grad or torch.compiler.is_compiling())
-        for _ in range(self.iterations):
-            alive = state[1] <= self.bailout
-            if looks and 4 * int(alive.sum()) < 3 * len(alive):  # go on with those that are
-                kept, whole = alive.nonzero()[:, 0], _with(whole, rows, state)
-                rows = kept if rows is None else rows[kept]
-                z, constant = z[:, kept], constant if self.julia else constant[:, kept]
-                state, alive = [one[kept] for one in state], alive[kept]
-            z, state = self._step(z, constant, alive, state)
-        lead = points.shape[:-1]
-        apart, radius, *trapped = (one.view(lead) for one in _with(whole, rows, state))
-        found = torch.where(radius <= self.bailout, -_INSIDE, self._estimate(radius, apart))
-        near, plane = trapped or (radius, radius)
-        return found, near, plane
+        point, step = points.reshape(-1, 3).contiguous(), _compiled_step(self.iteration)
+        constant, bailout = self._numbers(point)
+        if step is None:
+            found = plain.orbits(
+                point,
+                constant if self.julia else None,
+                bailout,
+                self.iteration,
+                self.iterations,
+                self.iteration.logarithmic,
+            )
+        else:
+            found = ops.orbits(point, constant, bailout, *step, self.iterations, self.julia)
+        return found.view(3, *points.shape[:-1])
 
-    def _step(
-        self, z: Tensor, constant: Tensor, alive: Tensor, state: list[Tensor]
-    ) -> tuple[Tensor, list[Tensor]]:
-        """One step of those that are alive: z, how far neighbours are apart, the radius, and what
-        traps tell, if there are any.
-        """
-        after, grown = self.iteration(z)
-        z = torch.where(alive, after + constant, z)
-        apart = torch.where(alive, grown * state[0] + (0.0 if self.julia else 1.0), state[0])
-        radius = _squared(z).sqrt()
-        if len(state) == 2:
-            return z, [apart, radius]
-        near, plane = torch.minimum(state[2], radius), torch.minimum(state[3], z.abs().amin(0))
-        return z, [apart, radius, near, plane]
-
-    def _estimate(self, radius: Tensor, apart: Tensor) -> Tensor:
-        """A distance, of an orbit that has got to a radius while neighbours came apart."""
-        if self.iteration.logarithmic:
-            return 0.5 * radius * radius.log() / apart
-        return radius / apart
+    def _numbers(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """(3,) constant and (1,) bailout, in the dtype of `like`."""
+        return self.constant.to(like), self.bailout.to(like).view(1)
 
     def slope(self, center: Tensor, half: Tensor) -> Tensor:
         """Not known: the value jumps where an orbit takes one more step."""
@@ -227,37 +178,24 @@ class Fractal(Distance):
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         """Follows the orbits of whole boxes, in parts; see the head of the file."""
-        return joined(self._follow(*parts_of(center, half, _PARTS)), _PARTS)
-
-    def _follow(self, center: Tensor, half: Tensor) -> Interval:
-        """Intervals of boxes (k, 3)."""
-        z, reach = center.mT.contiguous(), length(half)
-        constant = self.constant.to(z)[:, None] if self.julia else z
-        low_apart = high_apart = torch.ones_like(reach)
-        step, add = (0.0, 0.0) if self.julia else (reach, 1.0)
-        low, high = torch.full_like(reach, math.inf), torch.full_like(reach, -math.inf)
-        inside = torch.ones_like(reach, dtype=torch.bool)  # whether any point may be, still
-        lost = ~inside
-        for turn in range(self.iterations + 1):
-            radius = z.norm(dim=0)
-            least, most = (radius - reach).clamp(min=0), radius + reach
-            escaping = inside & (most > self.bailout)
-            first = self._estimate(torch.maximum(least, self.bailout), high_apart)
-            last = self._estimate(most, low_apart)
-            low = torch.where(escaping, torch.minimum(low, first), low)
-            high = torch.where(escaping, torch.maximum(high, last), high)
-            lost = lost | (inside & ~(reach < _FAR))
-            inside = inside & (least <= self.bailout) & ~lost
-            if turn == self.iterations:
-                break
-            stretch, slow, fast = self.iteration.ranges(z, reach)
-            after, _ = self.iteration(z)
-            z = torch.where(inside, after + constant, z)
-            reach = torch.where(inside, stretch * reach + step, reach)
-            low_apart, high_apart = slow * low_apart + add, fast * high_apart + add
-        low = torch.where(inside, low.clamp(max=-_INSIDE), low)
-        high = torch.where(inside, high.clamp(min=-_INSIDE), high)
-        return torch.where(lost, -_INSIDE, low), torch.where(lost, math.inf, high)
+        middle, part = parts_of(center, half, _PARTS)
+        step, (constant, bailout) = _compiled_step(self.iteration), self._numbers(middle)
+        if step is None:
+            found = plain.orbit_bounds(
+                middle,
+                length(part),
+                constant if self.julia else None,
+                bailout,
+                self.iteration,
+                self.iteration.ranges,
+                self.iterations,
+                self.iteration.logarithmic,
+            )
+        else:
+            numbers = (constant, bailout, *step, self.iterations, self.julia)
+            found = ops.orbit_bounds(middle, length(part), *numbers)
+        low, high = found
+        return joined((low, high), _PARTS)
 
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         """Between the darkest and the brightest of each."""
@@ -317,33 +255,3 @@ class Mandelbox(Fractal):
         """
         side = torch.tensor((-self._side, self._side), dtype=torch.float64)
         return side.to(self.colors_33.device)[:, None].expand(2, 3)
-
-
-def _with(whole: list[Tensor], rows: Tensor | None, part: list[Tensor]) -> list[Tensor]:
-    """Returns (n,) tensors in which some rows are those of others; None: all are."""
-    if rows is None:
-        return part
-    return [one.index_copy(0, rows, own) for one, own in zip(whole, part, strict=True)]
-
-
-def _squared(z: Tensor) -> Tensor:
-    """Returns (...,) squared lengths of (3, ...) vectors."""
-    x, y, up = z.unbind(0)
-    return x * x + y * y + up * up
-
-
-def _product(value: Tensor, n: int) -> Tensor:
-    """A number n times itself, n >= 1, by squares and products."""
-    if n == 1:
-        return value
-    root = _product(value, n // 2)
-    return root * root * value if n % 2 else root * root
-
-
-def _power(real: Tensor, imaginary: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """The n-th power of complex numbers, by squares and products."""
-    if n == 1:
-        return real, imaginary
-    a, b = _power(real, imaginary, n // 2)
-    a, b = (a - b) * (a + b), 2 * a * b
-    return (a * real - b * imaginary, a * imaginary + b * real) if n % 2 else (a, b)

@@ -18,6 +18,7 @@ from .cache import (
 )
 from .cameras import pinhole_rays
 from .noise import noise
+from .orbits import orbit_bounds, orbits
 from .registry import available
 from .trace import (
     composite,
@@ -48,6 +49,8 @@ __all__ = [
     "locate",
     "lru_partition",
     "noise",
+    "orbit_bounds",
+    "orbits",
     "orphan",
     "pinhole_rays",
     "put_rows",

@@ -219,6 +219,8 @@ FAKES: dict[str, Callable[..., Any]] = {
     "cut_bricks": _cut_bricks,
     "pinhole_rays": _pinhole_rays,
     "voxelize": _voxelize,
+    "orbits": lambda *, point_p3, **_: point_p3.new_empty((3, point_p3.shape[0])),
+    "orbit_bounds": lambda *, center_k3, **_: center_k3.new_empty((2, center_k3.shape[0])),
     "noise": lambda *, point_pn, **_: point_pn.new_empty((point_pn.shape[0],)),
     **dict.fromkeys(
         ("unlink", "orphan", "link", "link_bricks", "link_tiles", "put_rows"), lambda **_: None
@@ -299,6 +301,8 @@ if not _reasons["cpp"]:
     _refuse_gradients(torch.ops.gvtorch.trace_rays)
     _refuse_gradients(torch.ops.gvtorch.shade_rays)
     _refuse_gradients(torch.ops.gvtorch.noise)
+    _refuse_gradients(torch.ops.gvtorch.orbits)
+    _refuse_gradients(torch.ops.gvtorch.orbit_bounds)
     torch.library.register_autograd(
         "gvtorch::sample_bricks", _sample_gradient, setup_context=_save_samples
     )

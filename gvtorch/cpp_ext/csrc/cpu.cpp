@@ -7,6 +7,7 @@
 
 #include "entry/entry_cache.h"
 #include "entry/entry_camera.h"
+#include "entry/entry_fields.h"
 #include "entry/entry_mesh.h"
 #include "entry/entry_noise.h"
 #include "packets/processor.h"
@@ -25,13 +26,22 @@ void voxelize(const Tensor& like, const VoxelizeArgs& args) {
   for_each(like, (rows + kRows - 1) / kRows, chunk, 1);
 }
 
+// Points of float32, a chunk at a time.
+template <class Args>
+void in_chunks(const Tensor& like, void (*run)(const Args&, int64_t, int64_t), const Args& args, int64_t points,
+               int64_t chunk) {
+  const auto some = [&](int64_t number) { run(args, number * chunk, std::min(points, (number + 1) * chunk)); };
+  for_each(like, (points + chunk - 1) / chunk, some, 1);
+}
+
 void make_noise(const Tensor& like, const NoiseArgs& args, int64_t points) {
   if (is_wide(like)) return noise_each<double>(like, args, points);
-  constexpr int64_t kChunk = 1 << 11;
-  const auto chunk = [&](int64_t number) {
-    processor().chunks.noise(args, number * kChunk, std::min(points, (number + 1) * kChunk));
-  };
-  for_each(like, (points + kChunk - 1) / kChunk, chunk, 1);
+  in_chunks(like, processor().chunks.noise, args, points, 1 << 11);
+}
+
+void follow_points(const Tensor& like, const OrbitArgs& args) {
+  if (is_wide(like)) return follow_each_point<double>(like, args);
+  in_chunks(like, processor().chunks.orbits, args, args.points, 1 << 9);
 }
 
 // See cache.h. Threads count chunks, then take them: ranks do not depend on the number of threads.
@@ -75,6 +85,7 @@ STABLE_TORCH_LIBRARY(gvtorch, library) {
   gvtorch::define(library, gvtorch::MeshOps{});
   gvtorch::define(library, gvtorch::CameraOps{});
   gvtorch::define(library, gvtorch::NoiseOps{});
+  gvtorch::define(library, gvtorch::FieldOps{});
 }
 
 STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) {
@@ -82,4 +93,5 @@ STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) {
   gvtorch::implement(library, gvtorch::MeshOps{});
   gvtorch::implement(library, gvtorch::CameraOps{});
   gvtorch::implement(library, gvtorch::NoiseOps{});
+  gvtorch::implement(library, gvtorch::FieldOps{});
 }

@@ -5,6 +5,7 @@
 
 #include "entry/entry_cache.h"
 #include "entry/entry_camera.h"
+#include "entry/entry_fields.h"
 #include "entry/entry_mesh.h"
 #include "entry/entry_noise.h"
 #include "entry/entry_segments.h"
@@ -28,6 +29,10 @@ void voxelize(const Tensor& like, const VoxelizeArgs& args) {
 
 void make_noise(const Tensor& like, const NoiseArgs& args, int64_t points) {
   is_wide(like) ? noise_each<double>(like, args, points) : noise_each<float>(like, args, points);
+}
+
+void follow_points(const Tensor& like, const OrbitArgs& args) {
+  is_wide(like) ? follow_each_point<double>(like, args) : follow_each_point<float>(like, args);
 }
 
 // `compact` of cache.h in three kernels: blocks count chunks, one block adds the counts up, and blocks take their
@@ -115,4 +120,5 @@ STABLE_TORCH_LIBRARY_IMPL(gvtorch, CUDA, library) {
   gvtorch::implement(library, gvtorch::MeshOps{});
   gvtorch::implement(library, gvtorch::CameraOps{});
   gvtorch::implement(library, gvtorch::NoiseOps{});
+  gvtorch::implement(library, gvtorch::FieldOps{});
 }

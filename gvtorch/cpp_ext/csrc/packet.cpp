@@ -1,5 +1,6 @@
-// Tracing, voxelizing and noise on the CPU, compiled once for each instruction set (build.py), GV_NAMESPACE its name.
+// Tracing, voxelizing, noise and orbits on the CPU, compiled once for each instruction set (build.py), GV_NAMESPACE its name.
 // Nothing of torch or of the standard library's templates may stand here: see hd.h.
+#include "fields/orbits.h"
 #include "mesh/voxelize.h"
 #include "noise/noise.h"
 #include "packets/chunks.h"
@@ -39,7 +40,7 @@ void noise_chunk(const NoiseArgs& args, int64_t begin, int64_t end) {
 }
 
 extern const Chunks chunks;
-const Chunks chunks = {shade_chunk, voxelize_chunk, noise_chunk};
+const Chunks chunks = {shade_chunk, voxelize_chunk, noise_chunk, orbits_in_lanes};
 
 }  // namespace GV_NAMESPACE
 }  // namespace gvtorch

@@ -72,6 +72,21 @@ def log2_exact(value: Tensor) -> Tensor:
     return exponent + series * s
 
 
+def log_exact(value: Tensor) -> Tensor:
+    """Natural logarithm of positive normal numbers, from + - * / alone in both precisions; of what
+    is infinite or no number, itself. Source: as `log2_exact`.
+    """
+    known = value.detach()
+    fraction, power = torch.frexp(known)
+    large = fraction > 0.70710678
+    mantissa = torch.where(large, fraction, fraction + fraction)
+    exponent = torch.where(large, power, power - 1).to(value.dtype)
+    s = (mantissa - 1) / (mantissa + 1)
+    series = _polynomial(s * s, *(2 / odd for odd in range(19, 0, -2)))
+    found = torch.where(known < torch.inf, exponent * 0.6931471805599453 + s * series, known)
+    return found + (value - known) / known if value.requires_grad else found
+
+
 def _exp2_slope(f: Tensor) -> Tensor:
     """(2^f - 1) / f for f in [-0.5, 0.5]."""
     low = (1.52527338e-5, 1.54035304e-4, 1.33335581e-3, 9.61812911e-3)

@@ -222,6 +222,36 @@ GV_HD T exp2_exact(T value) {
 }
 
 GV_HD double log2_exact(double value) { return ::log2(value); }
+
+// What float and double keep below 1: a positive, normal number as fraction * 2^power, the fraction from a half up.
+template <class T>
+GV_HD T fraction_of(T value, IntOf<T>& power) {
+  const auto bits = bit_cast<IntOf<T>>(value);
+  power = (bits >> 23) - 126;
+  return bit_cast<T>((bits & 0x007fffff) | 0x3f000000);
+}
+GV_HD double fraction_of(double value, int32_t& power) {
+  const auto bits = bit_cast<int64_t>(value);
+  power = static_cast<int32_t>(bits >> 52) - 1022;
+  return bit_cast<double>((bits & 0x000fffffffffffff) | 0x3fe0000000000000);
+}
+
+// Natural logarithm of a positive, normal number, in both precisions; of what is infinite or no number, itself.
+template <class T>
+GV_HD T log_exact(T value) {
+  using Real = RealOf<T>;
+  IntOf<T> power;
+  const T fraction = fraction_of(value, power);
+  const auto large = fraction > static_cast<Real>(0.70710678);
+  const T mantissa = select(large, fraction, fraction + fraction);
+  const T exponent = to_real<T>(select(large, power, power - 1));
+  const T s = (mantissa - static_cast<Real>(1)) / (mantissa + static_cast<Real>(1));
+  const T z = s * s;
+  T series = splat<T>(static_cast<Real>(2.0 / 19));
+  for (int32_t odd = 17; odd > 0; odd -= 2) series = series * z + static_cast<Real>(2.0 / odd);
+  const T found = exponent * static_cast<Real>(0.6931471805599453) + s * series;
+  return select(value < static_cast<Real>(INFINITY), found, value);
+}
 GV_HD double exp2_exact(double value) { return ::exp2(value); }
 
 // What is taken from light that is halved so often: 1 - 2^-halvings, as exact where that is little.

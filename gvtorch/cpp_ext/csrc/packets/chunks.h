@@ -8,11 +8,13 @@ namespace gvtorch {
 struct ShadeArgs;
 struct VoxelizeArgs;
 struct NoiseArgs;
+struct OrbitArgs;
 
 struct Chunks {
   void (*shade)(const ShadeArgs& args, int64_t begin, int64_t end);        // rays
   void (*voxelize)(const VoxelizeArgs& args, int64_t begin, int64_t end);  // rows of voxels
   void (*noise)(const NoiseArgs& args, int64_t begin, int64_t end);        // points, in float32
+  void (*orbits)(const OrbitArgs& args, int64_t begin, int64_t end);       // the same
 };
 
 }  // namespace gvtorch

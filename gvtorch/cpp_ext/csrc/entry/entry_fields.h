@@ -1,0 +1,56 @@
+// The ops of fields: from tensors to the functors of fields/. See entry.h.
+#pragma once
+
+#include "entry/entry.h"
+#include "fields/orbits.h"
+
+namespace gvtorch {
+
+GV_OP(OrbitsOp, "orbits", GV_ORBITS, "Tensor");
+GV_OP(OrbitBoundsOp, "orbit_bounds", GV_ORBIT_BOUNDS, "Tensor");
+
+void follow_points(const Tensor& like, const OrbitArgs& args);  // in cpu.cpp and in cuda.cu
+
+template <class T>
+void follow_each_point(const Tensor& like, const OrbitArgs& args) {
+  with_step<T>(args.kind, [&](auto* step) {
+    for_each(like, args.points, FollowPoints<T, std::decay_t<decltype(*step)>>{args});
+  });
+}
+
+template <class T>
+void follow_balls(const Tensor& like, const OrbitBoundsArgs& args) {
+  with_step<T>(args.kind, [&](auto* step) {
+    for_each(like, args.balls, FollowBalls<T, std::decay_t<decltype(*step)>>{args});
+  });
+}
+
+inline auto run(const OrbitsOp& a) {
+  is_wide(a.point_p3);  // or refuses
+  const Like like{a.point_p3, a.point_p3.scalar_type()};
+  const int64_t points = a.point_p3.numel() / 3;
+  OrbitArgs args{};
+  GV_ORBITS(GV_TAKE)
+  args.points = points;
+  Tensor found_3p = torch::stable::new_empty(a.point_p3, {3, points}, like.real);
+  args.found_3p = lay(found_3p);
+  follow_points(a.point_p3, args);
+  return found_3p;
+}
+
+inline auto run(const OrbitBoundsOp& a) {
+  const bool wide = is_wide(a.center_k3);
+  const Like like{a.center_k3, a.center_k3.scalar_type()};
+  const int64_t balls = a.reach_k.numel();
+  OrbitBoundsArgs args{};
+  GV_ORBIT_BOUNDS(GV_TAKE)
+  args.balls = balls;
+  Tensor ends_2k = torch::stable::new_empty(a.center_k3, {2, balls}, like.real);
+  args.ends_2k = lay(ends_2k);
+  wide ? follow_balls<double>(a.center_k3, args) : follow_balls<float>(a.center_k3, args);
+  return ends_2k;
+}
+
+using FieldOps = Types<OrbitsOp, OrbitBoundsOp>;
+
+}  // namespace gvtorch

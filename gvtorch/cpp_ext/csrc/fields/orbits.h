@@ -1,0 +1,278 @@
+// Orbits of escape-time fractals: of points, and of balls of points. Twin and sources: ops/reference/orbits.py, whose
+// order of operations is kept. On a T of arithmetic.h: one point, or one in each lane.
+#pragma once
+
+#include "base/arguments.h"
+#include "base/arithmetic.h"
+
+namespace gvtorch {
+
+enum class StepKind : int32_t { kPower, kFold, kCount };
+
+// What orbits go by. `amount`: n of z^n, or the Mandelbox's scale; `julia`: constant_3 is added, else each point's own
+// place.
+#define GV_ORBIT(X)                                  \
+  X(Reals, constant_3, 3)                            \
+  X(Reals, bailout_1, 1)                             \
+  X(Int, kind, static_cast<int64_t>(StepKind::kCount)) \
+  X(Float, amount, kAny)                             \
+  X(Int, iterations, kAny)                           \
+  X(Bool, julia, kAny)
+
+// points
+#define GV_ORBITS(X)            \
+  X(Reals, point_p3, 3 * points) \
+  GV_ORBIT(X)
+
+// balls
+#define GV_ORBIT_BOUNDS(X)       \
+  X(Reals, center_k3, 3 * balls) \
+  X(Reals, reach_k, balls)       \
+  GV_ORBIT(X)
+
+struct OrbitArgs {
+  GV_ORBITS(GV_VIEW)
+  int64_t points;
+  void* found_3p;  // distance, least distance from the origin and from a plane of two axes
+};
+
+struct OrbitBoundsArgs {
+  GV_ORBIT_BOUNDS(GV_VIEW)
+  int64_t balls;
+  void* ends_2k;
+};
+
+inline namespace GV_NAMESPACE {
+
+constexpr double kDeepInside = 1, kLostBeyond = 1e3;  // INSIDE and FAR of the twin
+
+template <class T>
+GV_HD T squared(const Vec3<T>& z) {
+  return z.x * z.x + z.y * z.y + z.z * z.z;
+}
+template <class T>
+GV_HD T absolute(T value) {
+  return larger(value, -value);
+}
+template <class T>
+GV_HD T from_planes(const Vec3<T>& z) {
+  return smaller(smaller(absolute(z.x), absolute(z.y)), absolute(z.z));
+}
+template <class T>
+GV_HD T number_of(double value) {
+  return splat<T>(static_cast<RealOf<T>>(value));
+}
+
+// The bits of n below its highest one, from high to low: body(whether it is set).
+template <class Body>
+GV_HD void for_bits(int32_t n, const Body& body) {
+  int32_t bit = 1;
+  while (bit <= n / 2) bit *= 2;
+  while (bit > 1) {
+    bit /= 2;
+    body((n & bit) != 0);
+  }
+}
+// A number n times itself, n >= 1.
+template <class T>
+GV_HD T product(T value, int32_t n) {
+  T whole = value;
+  for_bits(n, [&](bool odd) {
+    whole = whole * whole;
+    if (odd) whole = whole * value;
+  });
+  return whole;
+}
+// The n-th power of a complex number.
+template <class T>
+GV_HD void complex_power(T& real, T& imaginary, int32_t n) {
+  const T x = real, y = imaginary;
+  for_bits(n, [&](bool odd) {
+    const T a = (real - imaginary) * (real + imaginary), b = static_cast<RealOf<T>>(2) * real * imaginary;
+    real = odd ? a * x - b * y : a;
+    imaginary = odd ? a * y + b * x : b;
+  });
+}
+
+// How far a step may take points of a ball apart, and the ends of how far it takes neighbours.
+template <class T>
+struct Stretch {
+  T most, low, high;
+};
+
+template <class T>
+struct PowerStep {
+  static constexpr bool kLogarithmic = true;
+  int32_t n;
+
+  GV_HD explicit PowerStep(double amount) : n(static_cast<int32_t>(amount)) {}
+  GV_HD Vec3<T> operator()(const Vec3<T>& z, T& grown) const {
+    const T away = square_root(larger(z.x * z.x + z.y * z.y, number_of<T>(1e-30)));
+    const T radius = square_root(away * away + z.z * z.z);
+    T cosine = z.x / away, sine = z.y / away, height = z.z, width = away;
+    complex_power(cosine, sine, n);
+    complex_power(height, width, n);
+    grown = static_cast<RealOf<T>>(n) * product(radius, n - 1);
+    return {width * cosine, width * sine, height};
+  }
+  GV_HD Stretch<T> stretch(const Vec3<T>& z, T reach) const {
+    const T count = static_cast<T>(n), none = 0, one = 1;
+    const T away = square_root(z.x * z.x + z.y * z.y), radius = square_root(squared(z));
+    const T least = larger(radius - reach, none), most = radius + reach, safe = larger(radius, number_of<T>(1e-30));
+    const T part = smaller(reach / safe, one);
+    const T change = part + static_cast<T>(0.5707963267948966) * (part * part * part);  // pi / 2 - 1
+    T cosine = z.z / safe, sine = away / safe;
+    complex_power(cosine, sine, n);
+    const T turned = absolute(sine) + count * change;
+    const T own = larger(larger(away - reach, none) / larger(most, number_of<T>(1e-30)), number_of<T>(1.0 / n));
+    const T around = clamp(smaller(turned, one) / own, one, count);
+    const T low = count * product(least, n - 1), high = count * product(most, n - 1);
+    return {high * around, low, high};
+  }
+};
+
+template <class T>
+struct FoldStep {
+  static constexpr bool kLogarithmic = false;
+  RealOf<T> scale, size;
+
+  GV_HD explicit FoldStep(double amount)
+      : scale(static_cast<RealOf<T>>(amount)), size(static_cast<RealOf<T>>(amount < 0 ? -amount : amount)) {}
+  GV_HD static Vec3<T> folded(const Vec3<T>& z) {
+    Vec3<T> to;
+    for (int axis = 0; axis < 3; ++axis) {
+      to[axis] = static_cast<RealOf<T>>(2) * clamp(z[axis], number_of<T>(-1), number_of<T>(1)) - z[axis];
+    }
+    return to;
+  }
+  GV_HD Vec3<T> operator()(const Vec3<T>& z, T& grown) const {
+    const Vec3<T> to = folded(z);
+    const T inverted = static_cast<RealOf<T>>(1) / clamp(squared(to), number_of<T>(0.25), number_of<T>(1));
+    const T scaled = inverted * scale;
+    grown = inverted * size;
+    return {to.x * scaled, to.y * scaled, to.z * scaled};
+  }
+  GV_HD Stretch<T> stretch(const Vec3<T>& z, T reach) const {
+    const T radius = square_root(squared(folded(z))), half = number_of<T>(0.5), one = 1;
+    const T near = clamp(radius - reach, half, one), far = clamp(radius + reach, half, one);
+    const T high = size / (near * near);
+    return {high, size / (far * far), high};
+  }
+};
+
+// A distance, of an orbit that has got to a radius while neighbours came apart.
+template <class Step, class T>
+GV_HD T estimate(T radius, T apart) {
+  if constexpr (Step::kLogarithmic) return static_cast<RealOf<T>>(0.5) * radius * log_exact(radius) / apart;
+  return radius / apart;
+}
+
+// Follows points. An index is a point.
+template <class T, class Step>
+struct FollowPoints {
+  OrbitArgs args;
+
+  GV_HD void follow(Vec3<T> z, T* found) const {
+    using Real = RealOf<T>;
+    const Real bailout = *static_cast<const Real*>(args.bailout_1), add = args.julia ? 0 : 1;
+    const auto* own = static_cast<const Real*>(args.constant_3);
+    Vec3<T> constant = z;
+    for (int axis = 0; axis < 3; ++axis) {
+      if (args.julia) constant[axis] = splat<T>(own[axis]);
+    }
+    const Step step(args.amount);
+    T radius = square_root(squared(z)), apart = number_of<T>(1), near = radius, plane = from_planes(z);
+    MaskOf<T> alive = radius <= bailout;
+    for (int32_t turn = 0; turn < args.iterations && any(alive); ++turn) {
+      T grown;
+      const Vec3<T> after = step(z, grown);
+      for (int axis = 0; axis < 3; ++axis) z[axis] = select(alive, after[axis] + constant[axis], z[axis]);
+      apart = select(alive, grown * apart + add, apart);
+      radius = square_root(squared(z));
+      near = smaller(near, radius);
+      plane = smaller(plane, from_planes(z));
+      alive = radius <= bailout;
+    }
+    found[0] = select(alive, number_of<T>(-kDeepInside), estimate<Step>(radius, apart));
+    found[1] = near;
+    found[2] = plane;
+  }
+  GV_HD void operator()(int64_t index) const {
+    const T* point = static_cast<const T*>(args.point_p3) + 3 * index;
+    T found[3];
+    follow({point[0], point[1], point[2]}, found);
+    for (int which = 0; which < 3; ++which) static_cast<T*>(args.found_3p)[which * args.points + index] = found[which];
+  }
+};
+
+// Follows the middle of balls, and a radius that holds the orbits of all of their points. An index is a ball.
+template <class T, class Step>
+struct FollowBalls {
+  OrbitBoundsArgs args;
+
+  GV_HD void operator()(int64_t index) const {
+    const T* center = static_cast<const T*>(args.center_k3) + 3 * index;
+    const auto* own = static_cast<const T*>(args.constant_3);
+    const T bailout = *static_cast<const T*>(args.bailout_1), first = static_cast<const T*>(args.reach_k)[index];
+    const T infinity = static_cast<T>(INFINITY), deep = -kDeepInside;
+    const Step step(args.amount);
+    Vec3<T> z{center[0], center[1], center[2]};
+    const Vec3<T> constant = args.julia ? Vec3<T>{own[0], own[1], own[2]} : z;
+    const T push = args.julia ? T{} : first, add = args.julia ? 0 : 1;
+    T reach = first, low_apart = 1, high_apart = 1, low = infinity, high = -infinity;
+    bool inside = true, lost = false;  // whether any point may be, still
+    for (int32_t turn = 0;; ++turn) {
+      const T radius = square_root(squared(z)), least = larger(radius - reach, T{}), most = radius + reach;
+      if (most > bailout) {
+        low = smaller(low, estimate<Step>(larger(least, bailout), high_apart));
+        high = larger(high, estimate<Step>(most, low_apart));
+      }
+      lost = !(reach < static_cast<T>(kLostBeyond));
+      inside = least <= bailout && !lost;
+      if (!inside || turn == args.iterations) break;
+      const Stretch<T> stretch = step.stretch(z, reach);
+      T grown;
+      const Vec3<T> after = step(z, grown);
+      for (int axis = 0; axis < 3; ++axis) z[axis] = after[axis] + constant[axis];
+      reach = stretch.most * reach + push;
+      low_apart = stretch.low * low_apart + add;
+      high_apart = stretch.high * high_apart + add;
+    }
+    auto* ends = static_cast<T*>(args.ends_2k);
+    ends[index] = lost ? deep : inside ? smaller(low, deep) : low;
+    ends[args.balls + index] = lost ? infinity : inside ? larger(high, deep) : high;
+  }
+};
+
+// body(Step*), with a null pointer, for a step of T has no default.
+template <class T, class Body>
+void with_step(int32_t kind, const Body& body) {
+  if (kind == static_cast<int32_t>(StepKind::kPower)) return body(static_cast<PowerStep<T>*>(nullptr));
+  body(static_cast<FoldStep<T>*>(nullptr));
+}
+
+#ifndef __CUDACC__
+// Points begin to end of float32, a vector of them at a time.
+inline void orbits_in_lanes(const OrbitArgs& args, int64_t begin, int64_t end) {
+  with_step<Floats>(args.kind, [&](auto* step) {
+    const FollowPoints<Floats, std::decay_t<decltype(*step)>> points{args};
+    for (int64_t index = begin; index < end; index += kLanes) {
+      const int64_t some = end - index < kLanes ? end - index : kLanes;
+      float last[3 * kLanes] = {};
+      memcpy(last, static_cast<const float*>(args.point_p3) + 3 * index, static_cast<size_t>(3 * some) * sizeof(float));
+      Floats found[3];
+      const Ints each = 3 * lane_numbers();
+      points.follow({pick(last, each), pick(last + 1, each), pick(last + 2, each)}, found);
+      for (int which = 0; which < 3; ++which) {
+        float value[kLanes];
+        memcpy(value, &found[which], sizeof(value));
+        memcpy(static_cast<float*>(args.found_3p) + which * args.points + index, value,
+               static_cast<size_t>(some) * sizeof(float));
+      }
+    }
+  });
+}
+#endif
+
+}  // namespace GV_NAMESPACE
+}  // namespace gvtorch

@@ -1,0 +1,183 @@
+"""Orbits of escape-time fractals: of points, and of balls of points, for any step. The ops of
+`ops/orbits.py` are compiled for two of them, `power` and `fold`. Points are (3, k) here, so that
+each coordinate is a tensor of its own.
+
+Sources: White, Nylander, "The Mandelbulb", 2009 (z^n in spherical coordinates); Lowe, "Mandelbox",
+    2010; Hart, Sandin, Kauffman, "Ray tracing deterministic 3-D fractals", SIGGRAPH 1989 (distance
+    estimates of escape-time fractals).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from .exact import clamp, divide, larger, log_exact, smaller, sqrt_exact
+
+#: A step of an orbit, z (3, k) to f(z) (3, k), and how far it takes neighbours apart, (k,).
+Step = Callable[[Tensor], tuple[Tensor, Tensor]]
+#: For balls around z (3, k) of radii (k,): the most that a step takes points apart, by unit of
+#: their distance, and the smallest and largest of its second answers, (k,) each.
+Ranges = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+
+INSIDE = 1.0  # world units that the fractal's inside is told to be deep: no estimate is known
+FAR = 1e3  # a ball's orbits that get so far apart tell nothing any more
+
+
+def power(z: Tensor, n: int) -> tuple[Tensor, Tensor]:
+    """z^n in spherical coordinates: |z|^n, and both angles n times. Two complex powers: of z + i
+    rho, whose angle is that from the axis, and of the direction (x + i y) / rho; rho is the
+    distance from the axis.
+    """
+    x, y, up = z.unbind(0)
+    away = sqrt_exact(_at_least(x * x + y * y, 1e-30))
+    radius = sqrt_exact(away * away + up * up)
+    cosine, sine = _turned(x / away, y / away, n)
+    height, width = _turned(up, away, n)
+    raised = torch.stack((width * cosine, width * sine, height))
+    return raised, n * _product(radius, n - 1)
+
+
+def power_ranges(z: Tensor, reach: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
+    """`Ranges` of `power`. Along radius and meridian n r^(n-1), along the circle of latitude that
+    times |sin(n angle) / sin(angle)|, which is at most n. The angle, which is that from the axis,
+    changes by at most asin(reach / r) in a ball; asin(s) <= s + (pi / 2 - 1) s^3, since all terms
+    of its series are positive and all beyond the first together pi / 2 - 1 at s = 1.
+    """
+    x, y, up = z.unbind(0)
+    away, radius = sqrt_exact(x * x + y * y), sqrt_exact(_squared(z))
+    least, most = _at_least(radius - reach, 0.0), radius + reach
+    safe = _at_least(radius, 1e-30)
+    part = smaller(reach / safe, torch.ones_like(reach))
+    change = part + (math.pi / 2 - 1) * (part * part * part)
+    _, sine = _turned(up / safe, away / safe, n)
+    turned = larger(sine, -sine) + n * change
+    own = _at_least(_at_least(away - reach, 0.0) / _at_least(most, 1e-30), 1 / n)
+    turn = clamp(smaller(turned, torch.ones_like(turned)) / own, 1.0, n)
+    low, high = n * _product(least, n - 1), n * _product(most, n - 1)
+    return high * turn, low, high
+
+
+def fold(z: Tensor, scale: float) -> tuple[Tensor, Tensor]:
+    """The Mandelbox's step: coordinates beyond 1 are folded back, small vectors inverted in balls
+    of radius 1/2 and 1, and all is scaled.
+    """
+    folded = 2 * clamp(z, -1.0, 1.0) - z
+    grown = divide(1.0, clamp(_squared(folded), 0.25, 1.0), z[0])
+    return folded * (grown * scale), grown * abs(scale)
+
+
+def fold_ranges(z: Tensor, reach: Tensor, scale: float) -> tuple[Tensor, Tensor, Tensor]:
+    """`Ranges` of `fold`: the fold takes nothing apart, inversion at most by 1 / r^2."""
+    radius = sqrt_exact(_squared(2 * clamp(z, -1.0, 1.0) - z))
+    near, far = clamp(radius - reach, 0.5, 1.0), clamp(radius + reach, 0.5, 1.0)
+    high = divide(abs(scale), near * near, reach)
+    return high, divide(abs(scale), far * far, reach), high
+
+
+def orbits(
+    point_p3: Tensor,
+    constant_3: Tensor | None,
+    bailout: Tensor,
+    step: Step,
+    iterations: int,
+    logarithmic: bool,
+) -> Tensor:
+    """Follows points until they escape; see `ops.orbits`. No constant: each point's own place."""
+    z = point_p3.mT
+    constant, add = (z, 1.0) if constant_3 is None else (constant_3[:, None], 0.0)
+    radius = sqrt_exact(_squared(z))
+    apart, near, plane = torch.ones_like(radius), radius, _from_planes(z)
+    for _ in range(iterations):
+        alive = radius <= bailout
+        after, grown = step(z)
+        z = torch.where(alive, after + constant, z)
+        apart = torch.where(alive, grown * apart + add, apart)
+        radius = sqrt_exact(_squared(z))
+        near, plane = smaller(near, radius), smaller(plane, _from_planes(z))
+    value = torch.where(radius <= bailout, -INSIDE, _estimate(radius, apart, logarithmic))
+    return torch.stack((value, near, plane))
+
+
+def orbit_bounds(
+    center_k3: Tensor,
+    reach_k: Tensor,
+    constant_3: Tensor | None,
+    bailout: Tensor,
+    step: Step,
+    ranges: Ranges,
+    iterations: int,
+    logarithmic: bool,
+) -> Tensor:
+    """Follows the middle of balls, and a radius that holds the orbits of all of their points; see
+    `ops.orbit_bounds`.
+    """
+    z, reach = center_k3.mT, reach_k
+    constant, push, add = (z, reach, 1.0) if constant_3 is None else (constant_3[:, None], 0.0, 0.0)
+    low_apart = high_apart = torch.ones_like(reach)
+    low, high = torch.full_like(reach, math.inf), torch.full_like(reach, -math.inf)
+    inside = torch.ones_like(reach, dtype=torch.bool)  # whether any point may be, still
+    lost = ~inside
+    for turn in range(iterations + 1):
+        radius = sqrt_exact(_squared(z))
+        least, most = _at_least(radius - reach, 0.0), radius + reach
+        escaping = inside & (most > bailout)
+        first = _estimate(larger(least, bailout), high_apart, logarithmic)
+        last = _estimate(most, low_apart, logarithmic)
+        low = torch.where(escaping, smaller(low, first), low)
+        high = torch.where(escaping, larger(high, last), high)
+        lost = lost | (inside & ~(reach < FAR))
+        inside = inside & (least <= bailout) & ~lost
+        if turn == iterations:
+            break
+        stretch, slow, fast = ranges(z, reach)
+        after, _ = step(z)
+        z = torch.where(inside, after + constant, z)
+        reach = torch.where(inside, stretch * reach + push, reach)
+        low_apart = torch.where(inside, slow * low_apart + add, low_apart)
+        high_apart = torch.where(inside, fast * high_apart + add, high_apart)
+    deep = torch.full_like(low, -INSIDE)
+    low = torch.where(inside, smaller(low, deep), low)
+    high = torch.where(inside, larger(high, deep), high)
+    return torch.stack((torch.where(lost, deep, low), torch.where(lost, math.inf, high)))
+
+
+def _estimate(radius: Tensor, apart: Tensor, logarithmic: bool) -> Tensor:
+    """A distance, of orbits that have got to a radius while neighbours came apart."""
+    return 0.5 * radius * log_exact(radius) / apart if logarithmic else radius / apart
+
+
+def _squared(z: Tensor) -> Tensor:
+    """Returns (k,) squared lengths of (3, k) vectors."""
+    x, y, up = z.unbind(0)
+    return x * x + y * y + up * up
+
+
+def _from_planes(z: Tensor) -> Tensor:
+    """Returns (k,) distances from the nearest of the three planes of two axes."""
+    x, y, up = larger(z, -z).unbind(0)
+    return smaller(smaller(x, y), up)
+
+
+def _at_least(value: Tensor, low: float) -> Tensor:
+    return larger(value, torch.full_like(value, low))
+
+
+def _product(value: Tensor, n: int) -> Tensor:
+    """A number n times itself, n >= 1, by squares and products."""
+    if n == 1:
+        return value
+    root = _product(value, n // 2)
+    return root * root * value if n % 2 else root * root
+
+
+def _turned(real: Tensor, imaginary: Tensor, n: int) -> tuple[Tensor, Tensor]:
+    """The n-th power of complex numbers, by squares and products."""
+    if n == 1:
+        return real, imaginary
+    a, b = _turned(real, imaginary, n // 2)
+    a, b = (a - b) * (a + b), 2 * a * b
+    return (a * real - b * imaginary, a * imaginary + b * real) if n % 2 else (a, b)
